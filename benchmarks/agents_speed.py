@@ -49,7 +49,7 @@ def picture(by_task: Mapping[str, Mapping[str, Any]]) -> str:
     axes.plot(agents, median, color=figures.COLOURS[0], marker="o")
     axes.fill_between(agents, least, most, color=figures.COLOURS[0], alpha=0.18, linewidth=0)
     for task, x, y in zip(by_task, agents, median, strict=True):
-        axes.annotate(task, (x, y), (6, -12), textcoords="offset points")
+        axes.text(x + 0.5, y, task, verticalalignment="top")
     axes.set(xlabel="agents", ylabel="minutes for 2.05 million steps", xlim=(0, 33), ylim=(0, None))
     return figures.add_white_background(figures.to_svg(figure))
 

@@ -9,7 +9,8 @@ those steps and of the mean error (in their standard deviations), and the median
 """
 
 import sys
-from collections.abc import Callable, Iterator
+from collections import defaultdict
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 
@@ -121,39 +122,55 @@ def standardised(rows: np.ndarray, n_train: int, end: int) -> Array:
     return jnp.asarray((rows[:end] - rows[:n_train].mean(axis=0)) / np.where(deviation > 0, deviation, 1))
 
 
+Groups = Sequence[Array]
+"""The groups of features of a basis; each has one row for every step."""
+
+
+def predict_next_episodes(
+    groups: Groups, reward: np.ndarray, ends: np.ndarray, count: int
+) -> tuple[float, float] | None:
+    """Fit the first `count` episodes, and return correlation and error on the next ones; None if their rewards are constant."""
+    n_train = ends[count - 1]
+    true = reward[n_train : ends[count + TEST_EPISODES - 1]]
+    if true.std() == 0 or reward[:n_train].std() == 0:
+        return None
+    features = np.asarray(jnp.concatenate(groups, axis=1), np.float64)
+    group = tuple(np.repeat(np.arange(len(groups)), [columns.shape[1] for columns in groups]).tolist())
+    begins, length = np.append(0, ends[: count - 1]), np.diff(np.append(0, ends[:count]))
+    means = np.add.reduceat(features[:n_train], begins) / length[:, None]
+    with jax.enable_x64(True):
+        weight, bias = fitted(means, np.add.reduceat(reward[:n_train], begins), length, group)
+    r_hat = features[n_train:] @ np.asarray(weight) + float(bias)
+    return float(np.corrcoef(r_hat, true)[0, 1]), float(np.abs(r_hat - true).mean() / true.std())
+
+
+def summarise(fits: Mapping[str, Sequence[tuple[float, float]]]) -> dict[str, dict[str, float]]:
+    """Means and medians over the fits of each basis, which are printed too."""
+    table = {}
+    for name, values in fits.items():
+        correlation, error = np.array(values).T
+        table[name] = {
+            "correlation": round(float(np.nanmean(correlation)), 3),
+            "error": round(float(error.mean()), 3),
+            "median error": round(float(np.median(error)), 3),
+            "fits": len(values),
+        }
+        print(f"{name:62s} {table[name]}")
+    return table
+
+
 def main(directory: str) -> None:
     task = read_config(Path(directory)).task.name
-    errors: dict[str, list[tuple[float, float]]] = {}
+    fits = defaultdict(list)
     for after, action, z, reward_paid, ends in stored_episodes(directory):
         truths = scores(after, action, reward_paid, SPEED[task])
         for count in (n for n in EPISODES if n + TEST_EPISODES <= len(ends)):
             n_train, end = ends[count - 1], ends[count + TEST_EPISODES - 1]
             standard = [standardised(rows, n_train, end) for rows in (z, np.concatenate([after, action], axis=1))]
-            begins, length = np.append(0, ends[: count - 1]), np.diff(np.append(0, ends[:count]))
             for name, groups in bases(*standard):
-                features = np.asarray(jnp.concatenate(groups, axis=1), np.float64)
-                group = tuple(np.repeat(np.arange(len(groups)), [columns.shape[1] for columns in groups]).tolist())
-                means = np.add.reduceat(features[:n_train], begins) / length[:, None]
-                for reward in truths.values():
-                    true = reward[n_train:end]
-                    if true.std() == 0 or reward[:n_train].std() == 0:
-                        continue
-                    with jax.enable_x64(True):
-                        weight, bias = fitted(means, np.add.reduceat(reward[:n_train], begins), length, group)
-                    r_hat = features[n_train:end] @ np.asarray(weight) + float(bias)
-                    error = np.abs(r_hat - true).mean() / true.std()
-                    errors.setdefault(name, []).append((np.corrcoef(r_hat, true)[0, 1], error))
-    table = {}
-    for name, fits in errors.items():
-        correlation, error = np.array(fits).T
-        table[name] = {
-            "correlation": round(float(np.nanmean(correlation)), 3),
-            "error": round(float(error.mean()), 3),
-            "median error": round(float(np.median(error)), 3),
-            "fits": len(fits),
-        }
-        print(f"{name:62s} {table[name]}")
-    write("basis", {"task": task, "episodes": EPISODES, "asked": TEST_EPISODES, "bases": table})
+                results = (predict_next_episodes(groups, reward, ends, count) for reward in truths.values())
+                fits[name] += [result for result in results if result is not None]
+    write("basis", {"task": task, "episodes": EPISODES, "asked": TEST_EPISODES, "bases": summarise(fits)})
 
 
 if __name__ == "__main__":

@@ -10,7 +10,7 @@ import sys
 
 import numpy as np
 
-from lare_rl.evaluation.team_samples import sample_steps
+from lare_rl.evaluation.rollout import sample_steps
 from lare_rl.runs.directory import open_run
 from lare_rl.util.statistics import column_correlations
 from measure import write

@@ -39,7 +39,7 @@ def untrained(learner: Learner, config: TrainConfig, key: jax.Array) -> Learner:
     stored_replay = learner.replay
     valid = replay.read(stored_replay, replay.newest_steps(stored_replay, int(replay.n_transitions(stored_replay)[0])))
     credit = decomposition.observe_steps(credit, decoder_inputs(valid, config, 0))
-    return learner._replace(credit=(credit._replace(scale=learner.scale[0]),))
+    return learner._replace(decoders=(credit._replace(scale=learner.scale[0]),))
 
 
 def curve(learner: Learner, config: TrainConfig, fits: tuple[int, ...], seed: int) -> list[dict[str, float]]:
@@ -54,9 +54,9 @@ def curve(learner: Learner, config: TrainConfig, fits: tuple[int, ...], seed: in
     for n_fits in fits:
         while done < n_fits:
             credit, _ = fit_some(learner, jax.random.key(1000 * seed + done), config=config)
-            learner = learner._replace(credit=credit)
+            learner = learner._replace(decoders=credit)
             done += AT_A_TIME
-        r_hat = proxy_rewards(recent, RewardState(learner.credit, learner.scale), config, 0)[:, 0]
+        r_hat = proxy_rewards(recent, RewardState(learner.decoders, learner.scale), config, 0)[:, 0]
         accuracies.append(
             {
                 "fits": done,

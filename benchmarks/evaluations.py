@@ -25,7 +25,7 @@ def evaluate(model: Any, environment: gymnasium.Env, seed: int, episodes: int) -
 
 
 class Evaluations(BaseCallback):
-    """Evaluates every so many steps, after the update that follows them."""
+    """Evaluates after each `interval` steps and the update that follows."""
 
     def __init__(self, interval: int, report: Callable[[int], None]):
         super().__init__()

@@ -8,17 +8,16 @@ the returns of the first N episodes of a seed, and predict the rewards of the st
 """
 
 import sys
+from collections import defaultdict
 from collections.abc import Iterator
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
 import lare_rl
-from basis import CHOSEN, TEST_EPISODES, fitted, scores, standardised
+from basis import CHOSEN, TEST_EPISODES, predict_next_episodes, scores, standardised, summarise
 from lare_rl.credit.basis import pair_products
 from lare_rl.runs.config_file import read_config
 from measure import write
@@ -51,7 +50,7 @@ def feature_groups(z: Array | None, x: Array) -> Iterator[tuple[str, list[Array]
 
 def main(directory: str) -> None:
     chosen: dict[str, lare_rl.LatentFunction | None] = {**dict(functions()), "none": None}
-    errors: dict[tuple[str, str], list[tuple[float, float]]] = {}
+    fits = defaultdict(list)
     for after, action, _, true_reward, ends in stored_episodes(directory):
         truths = scores(after, action, true_reward, SPEED)
         x = np.concatenate([after, action], axis=1)
@@ -59,37 +58,14 @@ def main(directory: str) -> None:
             z = None if function is None else np.asarray(function(after, action))
             for count in (n for n in EPISODES if n + TEST_EPISODES <= len(ends)):
                 n_train, end = ends[count - 1], ends[count + TEST_EPISODES - 1]
-                begins, length = np.append(0, ends[: count - 1]), np.diff(np.append(0, ends[:count]))
                 factors = None if z is None else standardised(z, n_train, end)
                 for kind, groups in feature_groups(factors, standardised(x, n_train, end)):
-                    features = np.asarray(jnp.concatenate(groups, axis=1), np.float64)
-                    group = tuple(np.repeat(np.arange(len(groups)), [columns.shape[1] for columns in groups]).tolist())
-                    means = np.add.reduceat(features[:n_train], begins) / length[:, None]
                     for score in ASKED_OF:
-                        reward = truths[score]
-                        with jax.enable_x64(True):
-                            weight, bias = fitted(means, np.add.reduceat(reward[:n_train], begins), length, group)
-                        r_hat, true = features[n_train:end] @ np.asarray(weight) + float(bias), reward[n_train:end]
-                        error = np.abs(r_hat - true).mean() / true.std()
-                        errors.setdefault((name, kind), []).append((np.corrcoef(r_hat, true)[0, 1], error))
-    table = {}
-    for (name, kind), fits in errors.items():
-        correlation, error = np.array(fits).T
-        table[f"{name}, {kind}"] = {
-            "correlation": round(float(np.nanmean(correlation)), 3),
-            "median error": round(float(np.median(error)), 3),
-            "fits": len(fits),
-        }
-        print(f"{name + ', ' + kind:44s} {table[f'{name}, {kind}']}")
-    write(
-        "functions",
-        {
-            "task": read_config(Path(directory)).task.name,
-            "episodes": EPISODES,
-            "asked": TEST_EPISODES,
-            "functions": table,
-        },
-    )
+                        result = predict_next_episodes(groups, truths[score], ends, count)
+                        if result is not None:
+                            fits[f"{name}, {kind}"].append(result)
+    figures = {"episodes": EPISODES, "asked": TEST_EPISODES, "functions": summarise(fits)}
+    write("functions", {"task": read_config(Path(directory)).task.name, **figures})
 
 
 if __name__ == "__main__":

@@ -67,14 +67,14 @@ def run(directory: Path, names_to_run: list[str]) -> None:
             lare_rl.train(task, lare_rl.Settings(**DEFAULTS, **EXPERIMENTS[task][label]), out=out)
 
 
-def keep(directory: Path) -> None:
+def keep(directory: Path, results: Path = RESULTS) -> None:
     """Copy settings and metrics of every finished run."""
-    for metrics in sorted(directory.glob("*/*/metrics.jsonl")):
-        target = RESULTS / metrics.parent.relative_to(directory)
+    for metrics in sorted(directory.rglob("metrics.jsonl")):
         config, lines = read(metrics.parent)
         settings = config["settings"]
         ended = {line["seed"] for line in lines if line["step"] == settings["steps"]}
         if len(ended) == settings["seeds"]:
+            target = results / metrics.parent.relative_to(directory)
             target.mkdir(parents=True, exist_ok=True)
             for path in (config_path(metrics.parent), metrics):
                 shutil.copyfile(path, target / path.name)

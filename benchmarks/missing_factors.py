@@ -9,13 +9,12 @@ FUNCTION is `all` (draw 0 of the recorded functions), `without-f_NAME` (the same
 """
 
 import re
-import shutil
 import sys
 from pathlib import Path
 from typing import Any
 
 import lare_rl
-from learning import read
+from learning import keep
 
 SETTINGS: dict[str, dict[str, Any]] = {
     "HalfCheetah-v4": {"steps": 60_000, "seeds": 3},
@@ -79,23 +78,11 @@ def run(directory: Path, names_to_run: list[str]) -> None:
         lare_rl.train(task, lare_rl.Settings(method=method, **settings), function=phi, out=out)
 
 
-def keep(directory: Path) -> None:
-    """Copy settings and metrics of every finished run."""
-    for name in experiments():
-        if not (directory / name / "metrics.jsonl").exists():
-            continue
-        config, lines = read(directory / name)
-        if lines[-1]["step"] == config["settings"]["steps"]:
-            (RESULTS / name).mkdir(parents=True, exist_ok=True)
-            for file in ("config.json", "metrics.jsonl"):
-                shutil.copyfile(directory / name / file, RESULTS / name / file)
-
-
 if __name__ == "__main__":
     match sys.argv[1:]:
         case ["run", runs, *names_to_run]:
             run(Path(runs), names_to_run)
         case ["keep", runs]:
-            keep(Path(runs))
+            keep(Path(runs), RESULTS)
         case _:
             sys.exit(__doc__)

@@ -7,14 +7,14 @@ have runs of one seed at two commits, or a run of another library. Scores are th
 `--late`, means over the last quarter of these steps. The ratio of means is nan unless both means are positive.
 """
 
-import argparse
 import json
 import math
 from pathlib import Path
 
 import numpy as np
+import tyro
 
-from lare_rl.compare.mann_whitney import mann_whitney, mann_whitney_u
+from lare_rl.compare.bootstrap import mann_whitney, mann_whitney_u
 from lare_rl.compare.scores import last_quarter
 from learning import mean_and_spread, read
 
@@ -32,31 +32,34 @@ def curves(directory: Path, key: str) -> list[dict[int, float]]:
     return list(curves_by_seed.values())
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("ours", type=Path, nargs="+")
-    parser.add_argument("--over", type=Path, nargs="+", required=True)
-    parser.add_argument("--key", default="evaluation/return")
-    parser.add_argument("--late", action="store_true")
-    args = parser.parse_args()
-    groups = [
-        [curve for path in directories for curve in curves(path, args.key)] for directories in (args.ours, args.over)
-    ]
+def main(
+    directories: tyro.conf.Positional[tuple[Path, ...]],
+    over: tuple[Path, ...],
+    key: str = "evaluation/return",
+    late: bool = False,
+) -> None:
+    """Compare.
+
+    Args:
+        directories: the runs of the first group.
+        over: the runs of the second group.
+        key: the key of metrics.jsonl to compare.
+        late: compare means over the last quarter.
+    """
+    groups = [[curve for path in paths for curve in curves(path, key)] for paths in (directories, over)]
     shared = sorted(set.intersection(*(set(curve) for group in groups for curve in group)))
     last = shared[-1]
-    steps = last_quarter(shared) if args.late else [last]
-    ours, reference = (np.array([np.mean([curve[step] for step in steps]) for curve in group]) for group in groups)
-    for values in (ours, reference):
+    steps = last_quarter(shared) if late else [last]
+    scores, reference = (np.array([np.mean([curve[step] for step in steps]) for curve in group]) for group in groups)
+    for values in (scores, reference):
         mean, spread = mean_and_spread(list(values))
         print(f"{mean:,.5g} ± {spread:,.3g} ({', '.join(f'{value:,.5g}' for value in values)})")
-    positive = min(np.mean(ours), np.mean(reference)) > 0
-    print(f"ratio of the means {np.mean(ours) / np.mean(reference) if positive else math.nan:.3g}, at step {last:,}")
-    more, fewer = mann_whitney([(ours, reference)])
-    print(
-        f"{mann_whitney_u(ours, reference):g} of {ours.size * reference.size} pairs won; p of at least so many {more:.2g}, of at most so "
-        f"many {fewer:.2g}"
-    )
+    positive = min(np.mean(scores), np.mean(reference)) > 0
+    print(f"ratio of the means {np.mean(scores) / np.mean(reference) if positive else math.nan:.3g}, at step {last:,}")
+    more, fewer = mann_whitney([(scores, reference)])
+    won, pairs = mann_whitney_u(scores, reference), scores.size * reference.size
+    print(f"{won:g} of {pairs} pairs won; p of this many or more {more:.2g}, of this many or fewer {fewer:.2g}")
 
 
 if __name__ == "__main__":
-    main()
+    tyro.cli(main, description=__doc__)

@@ -56,7 +56,7 @@ def newest(learner: Learner, config: TrainConfig) -> tuple[jax.Array, jax.Array]
 
 
 def refit(learner: Learner, config: TrainConfig, fit: Fit, scale: Scale) -> list[dict[str, float]]:
-    (decoder,) = learner.credit
+    (decoder,) = learner.decoders
     (features, reward), valid = newest(learner, config), jnp.ones(RECENT_STEPS, bool)
     (credit,) = init_decoders([jax.random.key(0)], config)
     credit = credit._replace(statistics=decoder.statistics, scale=scale)

@@ -32,7 +32,7 @@ from measure import write
 streams = sys.stdout, sys.stderr
 from jaxmarl.environments.smax.heuristic_enemy import create_heuristic_policy  # noqa: E402
 from jaxmarl.environments.smax.heuristic_enemy_smax_env import HeuristicEnemySMAX  # noqa: E402
-from jaxmarl.environments.smax.smax_env import Scenario as Theirs  # noqa: E402
+from jaxmarl.environments.smax.smax_env import Scenario as JaxmarlScenario  # noqa: E402
 
 sys.stdout, sys.stderr = streams  # the import has replaced them
 
@@ -49,12 +49,12 @@ class Style(NamedTuple):
 
 
 STYLES = (Style(0.1), Style(0.4), Style(1.0), Style(), Style(0.05, kites=True), Style(kites=True))
-SHOWN = "observation", "state", "reward", "ends", "legal actions"
+OUTPUTS = "observation", "state", "reward", "ends", "legal actions"
 PINNED = {"2s3z": "won", "3s_vs_5z": "lost", "1c3s5z": "lost"}
 """For each task, the longest battle with this end is saved for the tests."""
 
 
-def theirs(scenario: Scenario) -> HeuristicEnemySMAX:
+def make_jaxmarl_env(scenario: Scenario) -> HeuristicEnemySMAX:
     """JaxMARL's environment, with the colossus appended to its unit types if the battle has one."""
     table = list(UNIT_TYPES.values())[: scenario.n_unit_types]
     figures = {
@@ -77,8 +77,10 @@ def theirs(scenario: Scenario) -> HeuristicEnemySMAX:
         arguments["unit_type_names"] = [*defaults.unit_type_names, *list(UNIT_TYPES)[6 : scenario.n_unit_types]]
         arguments["unit_type_shorthands"] = [*defaults.unit_type_shorthands, "c"]
     kinds = jnp.asarray(scenario.unit_type, jnp.uint8)
-    their = Theirs(kinds, scenario.n_allies, scenario.n_enemies, False, False)
-    return HeuristicEnemySMAX(scenario=their, attack_mode="closest", max_steps=scenario.max_steps - 1, **arguments)
+    jaxmarl_scenario = JaxmarlScenario(kinds, scenario.n_allies, scenario.n_enemies, False, False)
+    return HeuristicEnemySMAX(
+        scenario=jaxmarl_scenario, attack_mode="closest", max_steps=scenario.max_steps - 1, **arguments
+    )
 
 
 @dataclass
@@ -89,25 +91,25 @@ class Worst:
     differing: dict[str, int] = field(default_factory=lambda: defaultdict(int))
     compared: dict[str, int] = field(default_factory=lambda: defaultdict(int))
 
-    def close(self, name: str, one: Any, other: Any) -> None:
-        one, other = np.asarray(one, np.float64), np.asarray(other, np.float64)
-        assert one.shape == other.shape, name
-        self.compared[name] += one.size
-        self.deviation[name] = max(self.deviation[name], float(np.abs(one - other).max(initial=0)))
+    def close(self, name: str, value: Any, other: Any) -> None:
+        value, other = np.asarray(value, np.float64), np.asarray(other, np.float64)
+        assert value.shape == other.shape, name
+        self.compared[name] += value.size
+        self.deviation[name] = max(self.deviation[name], float(np.abs(value - other).max(initial=0)))
 
-    def same(self, name: str, one: Any, other: Any) -> None:
-        one, other = np.asarray(one), np.asarray(other)
-        assert one.shape == other.shape, name
-        self.compared[name] += one.size
-        self.differing[name] += int((one != other).sum())
+    def same(self, name: str, value: Any, other: Any) -> None:
+        value, other = np.asarray(value), np.asarray(other)
+        assert value.shape == other.shape, name
+        self.compared[name] += value.size
+        self.differing[name] += int((value != other).sum())
 
     def off(self, name: str) -> str:
         """The largest deviation, or how many values differ."""
         return format(self.deviation[name], ".1e") if name in self.deviation else str(self.differing.get(name, ""))
 
 
-def drawn(key: jax.Array, units: int) -> jax.Array:
-    """The random numbers that JaxMARL's `step_env` adds to the cooldowns, drawn in the same way."""
+def draw_cooldowns(key: jax.Array, units: int) -> jax.Array:
+    """The random numbers that JaxMARL's `step_env` adds to the cooldowns, with the same keys."""
     key, _ = jax.random.split(key)
     rows = []
     for _ in range(battle.TICKS):
@@ -122,29 +124,35 @@ class Match:
 
     def __init__(self, name: str):
         self.scenario = find_scenario(name)
-        self.whole = theirs(self.scenario)
-        self.env = self.whole._env
+        self.jaxmarl = make_jaxmarl_env(self.scenario)
+        self.env = self.jaxmarl._env
         self.policy = create_heuristic_policy(self.env, 0, attack_mode="closest")
         self.choose, self.their_step, self.our_step = map(jax.jit, (self._choose, self._their_step, self._our_step))
-        self.drawn = jax.jit(partial(drawn, units=self.scenario.n_units))
+        self.draw_cooldowns = jax.jit(partial(draw_cooldowns, units=self.scenario.n_units))
 
-    def rows(self, of: dict, side: str) -> jax.Array:
+    def rows(self, values: dict, side: str) -> jax.Array:
         count = self.scenario.n_allies if side == "ally" else self.scenario.n_enemies
-        return jnp.stack([of[f"{side}_{i}"] for i in range(count)])
+        return jnp.stack([values[f"{side}_{i}"] for i in range(count)])
 
     def _choose(self, key, state, memories, style):
         """The actions of both sides; the enemy always follows JaxMARL's heuristic."""
         allies = self.scenario.n_allies
         seen = self.env.get_obs(state)
         keys = jax.random.split(key, 4)
-        ours, first = jax.vmap(self.policy)(jax.random.split(keys[0], allies), memories[0], self.rows(seen, "ally"))
+        ally_action, first = jax.vmap(self.policy)(
+            jax.random.split(keys[0], allies), memories[0], self.rows(seen, "ally")
+        )
         legal = self.rows(self.env.get_avail_actions(state), "ally")
-        ours = jnp.where(style.kites & (state.unit_weapon_cooldowns[:allies] > 0), self._retreat(state), ours)
+        ally_action = jnp.where(
+            style.kites & (state.unit_weapon_cooldowns[:allies] > 0), self._retreat(state), ally_action
+        )
         chance = jnp.argmax(jnp.where(legal, jax.random.uniform(keys[1], legal.shape), -1), axis=1)
-        ours = jnp.where(jax.random.uniform(keys[2], ours.shape) < style.random, chance, ours)
-        ours = jnp.where(state.unit_alive[:allies], ours, battle.STOP)  # its heuristic chooses for the dead too
-        enemies, second = self.whole.get_enemy_actions(keys[3], memories[1], self.rows(seen, "enemy"))
-        action = jnp.concatenate([ours, self.rows(enemies, "enemy")])
+        ally_action = jnp.where(jax.random.uniform(keys[2], ally_action.shape) < style.random, chance, ally_action)
+        ally_action = jnp.where(
+            state.unit_alive[:allies], ally_action, battle.STOP
+        )  # its heuristic chooses for the dead too
+        enemies, second = self.jaxmarl.get_enemy_actions(keys[3], memories[1], self.rows(seen, "enemy"))
+        action = jnp.concatenate([ally_action, self.rows(enemies, "enemy")])
         return jnp.where(style.waits, battle.STOP, action).astype(jnp.int32), (first, second)
 
     def _retreat(self, state):
@@ -156,13 +164,13 @@ class Match:
         return jnp.argmax((jnp.sum(nearness * offset, axis=1) + inwards) @ battle.DIRECTIONS.T, axis=1)
 
     def _their_step(self, key, state, action):
-        seen, state, paid, over, _ = self.env.step_env(key, state, dict(zip(self.env.agents, action, strict=True)))
+        seen, state, rewards, over, _ = self.env.step_env(key, state, dict(zip(self.env.agents, action, strict=True)))
         legal = self.rows(self.env.get_avail_actions(state), "ally")
         return (
             state,
             self.rows(seen, "ally"),
             seen["world_state"],
-            WIN_RETURN / 2 * paid["ally_0"],
+            WIN_RETURN / 2 * rewards["ally_0"],
             over["__all__"],
             legal,
         )
@@ -174,100 +182,102 @@ class Match:
         near = (battle.distances(state.position) < sight) & battle.alive(state)
         sees = jnp.sum(near[scenario.n_allies :, : scenario.n_allies], axis=1)
         after = battle.advance(scenario, state, action, longer)
-        ours, theirs = battle.defeated(scenario, after)
-        over = ours | theirs | (after.step >= scenario.max_steps)
+        lost, won = battle.defeated(scenario, after)
+        over = lost | won | (after.step >= scenario.max_steps)
         seen, field = observation.observe(scenario, after), observation.global_state(scenario, after)
-        shown = seen, field, reward(scenario, state, after), over, battle.available_actions(scenario, after)
-        return after, memory, choice, sees, shown
+        outputs = seen, field, reward(scenario, state, after), over, battle.available_actions(scenario, after)
+        return after, memory, choice, sees, outputs
 
     def begin(self, key: jax.Array, worst: Worst):
-        """JaxMARL's initial state, and ours from the same draws."""
+        """JaxMARL's initial state, and our state from the same draws."""
         scenario = self.scenario
         _, state = self.env.reset(key)
         _, *keys = jax.random.split(key, 3)
         sides = zip(keys, (scenario.n_allies, scenario.n_enemies), strict=True)
-        noise = [jax.random.uniform(one, (count, 2), minval=-2, maxval=2) for one, count in sides]
+        noise = [jax.random.uniform(side_key, (count, 2), minval=-2, maxval=2) for side_key, count in sides]
         middle = np.repeat(
             np.array([battle.ALLY_START, battle.ENEMY_START]), [scenario.n_allies, scenario.n_enemies], axis=0
         )
         placed = battle.separate_units(scenario, jnp.concatenate(noise) + middle, jnp.ones(scenario.n_units, bool))
         worst.close("position at the start", placed, state.unit_positions)
-        mine = battle.start_battle(scenario, key)._replace(position=state.unit_positions)
-        worst.same("health", mine.health, state.unit_health)
-        return state, mine
+        battle_state = battle.start_battle(scenario, key)._replace(position=state.unit_positions)
+        worst.same("health", battle_state.health, state.unit_health)
+        return state, battle_state
 
     def play(self, seed: int, style: Style, worst: Worst, alone: Worst) -> tuple[str, dict[str, np.ndarray]]:
         """Play one battle to its end; returns how it ended, and all of JaxMARL's data."""
         scenario, allies = self.scenario, self.scenario.n_allies
         start, key = jax.random.split(jax.random.key(seed))
-        state, mine = self.begin(start, worst)
-        memory = enemy.init_memory(scenario, mine)
-        one = jax.tree.map(lambda leaf: leaf[0], self.whole.get_enemy_policy_initial_state(start))
+        state, battle_state = self.begin(start, worst)
+        memory = enemy.init_memory(scenario, battle_state)
+        memory_row = jax.tree.map(lambda leaf: leaf[0], self.jaxmarl.get_enemy_policy_initial_state(start))
         memories = tuple(
-            jax.tree.map(lambda leaf, count=count: jnp.stack([leaf] * count), one)
+            jax.tree.map(lambda leaf, count=count: jnp.stack([leaf] * count), memory_row)
             for count in (allies, scenario.n_enemies)
         )
-        kept: dict[str, list] = defaultdict(list)
-        free, over = mine, False
+        records: dict[str, list] = defaultdict(list)
+        free, over = battle_state, False
         while not over:
             key, choice_key, step_key = jax.random.split(key, 3)
             action, memories = self.choose(choice_key, state, memories, style)
-            lived, longer = np.asarray(state.unit_alive), self.drawn(step_key)
-            mine = mine._replace(
+            lived, longer = np.asarray(state.unit_alive), self.draw_cooldowns(step_key)
+            battle_state = battle_state._replace(
                 position=state.unit_positions, health=state.unit_health, cooldown=state.unit_weapon_cooldowns
             )
             for name in ("position", "health", "cooldown"):
-                kept[f"before/{name}"].append(getattr(mine, name))
-            state, *their_shown = self.their_step(step_key, state, action)
-            free, *_, free_shown = self.our_step(choice_key, free, memory, action, longer)
-            mine, memory, choice, sees, our_shown = self.our_step(choice_key, mine, memory, action, longer)
+                records[f"before/{name}"].append(getattr(battle_state, name))
+            state, *their_outputs = self.their_step(step_key, state, action)
+            free, *_, free_outputs = self.our_step(choice_key, free, memory, action, longer)
+            battle_state, memory, choice, sees, our_outputs = self.our_step(
+                choice_key, battle_state, memory, action, longer
+            )
 
-            theirs = np.asarray(action)[allies:]
-            attacks = (theirs >= battle.ATTACK) | (np.asarray(choice) >= battle.ATTACK)
+            enemy_action = np.asarray(action)[allies:]
+            attacks = (enemy_action >= battle.ATTACK) | (np.asarray(choice) >= battle.ATTACK)
             decided = lived[allies:] & (attacks | (np.asarray(sees) <= 1))
             if not style.waits:
-                worst.same("the enemy's choices", np.asarray(choice)[decided], theirs[decided])
+                worst.same("the enemy's choices", np.asarray(choice)[decided], enemy_action[decided])
                 worst.compared["walks towards one of several, left out"] += int((lived[allies:] & ~decided).sum())
-            for one, after, shown in ((worst, mine, our_shown), (alone, free, free_shown)):
-                one.same("health", after.health, state.unit_health)
-                one.same("who lives", battle.alive(after), state.unit_alive)
-                one.same("who may attack", after.cooldown <= 0, state.unit_weapon_cooldowns <= 0)
-                one.close("cooldown", after.cooldown, state.unit_weapon_cooldowns)
-                one.close("position", after.position, state.unit_positions)
-                for name, ours, their in zip(SHOWN, shown, their_shown, strict=True):
-                    (one.same if name in ("ends", "legal actions") else one.close)(name, ours, their)
-            for name, their in zip(SHOWN, their_shown, strict=True):
-                kept[name].append(their)
-            over = bool(their_shown[3])
-            kept["action"].append(action)
-            kept["longer"].append(used(scenario, longer, state.unit_weapon_cooldowns))
-            kept["health"].append(state.unit_health)
-            kept["cooldown"].append(state.unit_weapon_cooldowns)
-            kept["position"].append(state.unit_positions)
-        ours_dead, theirs_dead = map(bool, battle.defeated(scenario, mine))
-        end = "won" if theirs_dead and not ours_dead else "lost" if ours_dead else "time"
-        return end, {name: np.stack([np.asarray(one) for one in rows]) for name, rows in kept.items()}
+            for deviations, after, outputs in ((worst, battle_state, our_outputs), (alone, free, free_outputs)):
+                deviations.same("health", after.health, state.unit_health)
+                deviations.same("who lives", battle.alive(after), state.unit_alive)
+                deviations.same("who may attack", after.cooldown <= 0, state.unit_weapon_cooldowns <= 0)
+                deviations.close("cooldown", after.cooldown, state.unit_weapon_cooldowns)
+                deviations.close("position", after.position, state.unit_positions)
+                for name, value, expected in zip(OUTPUTS, outputs, their_outputs, strict=True):
+                    (deviations.same if name in ("ends", "legal actions") else deviations.close)(name, value, expected)
+            for name, their in zip(OUTPUTS, their_outputs, strict=True):
+                records[name].append(their)
+            over = bool(their_outputs[3])
+            records["action"].append(action)
+            records["longer"].append(used(scenario, longer, state.unit_weapon_cooldowns))
+            records["health"].append(state.unit_health)
+            records["cooldown"].append(state.unit_weapon_cooldowns)
+            records["position"].append(state.unit_positions)
+        allies_dead, enemies_dead = map(bool, battle.defeated(scenario, battle_state))
+        end = "won" if enemies_dead and not allies_dead else "lost" if allies_dead else "time"
+        return end, {name: np.stack([np.asarray(row) for row in rows]) for name, rows in records.items()}
 
 
 def used(scenario: Scenario, longer: jax.Array, cooldown: jax.Array) -> np.ndarray:
     """The random draw that each unit's attack used, among those of a step's ticks; 0 without an attack. No unit attacks twice in a
     step.
     """
-    left = battle.TICK * (battle.TICKS - 1 - np.arange(battle.TICKS))[:, None]
-    off = np.abs(scenario.unit_stats("cooldown") + np.asarray(longer) - left - np.asarray(cooldown))
+    remaining = battle.TICK * (battle.TICKS - 1 - np.arange(battle.TICKS))[:, None]
+    off = np.abs(scenario.unit_stats("cooldown") + np.asarray(longer) - remaining - np.asarray(cooldown))
     chosen = np.take_along_axis(np.asarray(longer), off.argmin(0)[None], axis=0)[0]
     return np.where(off.min(0) < 1e-5, chosen, 0).astype(np.float32)
 
 
-def pinned(kept: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+def pinned(records: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
     """The data of a battle that the tests need: some of its steps, each with inputs and outputs."""
-    last = len(kept["action"]) - 1
-    some = np.unique(np.linspace(0, last, 16).astype(int))
-    few = np.isin(some, some[[3, 8, -1]])
+    last = len(records["action"]) - 1
+    steps = np.unique(np.linspace(0, last, 16).astype(int))
+    few = np.isin(steps, steps[[3, 8, -1]])
     narrow = {"action": np.uint8, "legal actions": bool, "reward": np.float32}
-    rows = {name: row[some].astype(narrow.get(name, row.dtype)) for name, row in kept.items()}
+    rows = {name: row[steps].astype(narrow.get(name, row.dtype)) for name, row in records.items()}
     rows |= {name: rows[name][few] for name in ("observation", "state")}
-    return {"step": some, "few": few} | {name.replace(" ", "_"): row for name, row in rows.items()}
+    return {"step": steps, "few": few} | {name.replace(" ", "_"): row for name, row in rows.items()}
 
 
 def main(battles: int = 12, tasks: tuple[str, ...] = SCENARIO_NAMES, pin: Path | None = None) -> None:
@@ -283,18 +293,18 @@ def main(battles: int = 12, tasks: tuple[str, ...] = SCENARIO_NAMES, pin: Path |
         match, worst, alone, ends, steps = Match(name), Worst(), Worst(), defaultdict(int), 0
         for seed in range(battles + 1):
             style = STYLES[seed % len(STYLES)] if seed < battles else Style(waits=True)
-            end, kept = match.play(seed, style, worst, alone)
+            end, records = match.play(seed, style, worst, alone)
             ends[end] += 1
-            steps += len(kept["action"])
-            if end == PINNED[name] and len(kept["action"]) > len(keep.get(name, {"action": ()})["action"]):
-                keep[name] = kept
+            steps += len(records["action"])
+            if end == PINNED[name] and len(records["action"]) > len(keep.get(name, {"action": ()})["action"]):
+                keep[name] = records
         figures[name] = {"battles": dict(ends), "steps": steps, **vars(worst), "never set right": vars(alone)}
         print(f"\n{name}: {steps} steps, {dict(ends)}")
         print(f"{'compared':42s} {'numbers':>9s} {'off by':>9s}   never set right")
         for what, count in worst.compared.items():
             print(f"{what:42s} {count:9d} {worst.off(what):>9s} {alone.off(what):>9s}")
     if pin:
-        flat = {f"{name}/{key}": row for name, kept in keep.items() for key, row in pinned(kept).items()}
+        flat = {f"{name}/{key}": row for name, records in keep.items() for key, row in pinned(records).items()}
         np.savez_compressed(pin, allow_pickle=False, **flat)
     write(
         "smax_oracle",

@@ -6,9 +6,10 @@ A DIRECTORY is a run, or contains runs at any depth (`benchmarks/results/sweeps/
 over the agents, as in the paper, and the row says so; `--key evaluation/return` gives their mean.
 """
 
-import argparse
 from pathlib import Path
 from typing import Any
+
+import tyro
 
 from learning import mean_and_spread, read
 
@@ -54,23 +55,25 @@ def described(directory: Path, config: dict[str, Any]) -> tuple[str, str]:
     return config["task"]["name"], f"`{method}`, {algorithm}{apart}"
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--at", type=int)
-    parser.add_argument("--key")
-    parser.add_argument("directories", type=Path, nargs="+")
-    args = parser.parse_args()
+def main(directories: tyro.conf.Positional[tuple[Path, ...]], at: int | None = None, key: str | None = None) -> None:
+    """Print the table.
+
+    Args:
+        directories: runs, or directories that contain runs.
+        at: the step of the results; the default is the last one.
+        key: the metric that is shown as the return.
+    """
     print(
         "| task | method | steps | return at the end | over the last quarter | correlation | mean error | R² of returns |"
     )
     print("|---|---|---|---|---|---|---|---|")
-    for directory in args.directories:
+    for directory in directories:
         runs = sorted(metrics.parent for metrics in directory.rglob("metrics.jsonl"))
         if not runs:
-            parser.error(f"there is no run in {directory}")
+            raise SystemExit(f"there is no run in {directory}")
         for run in runs:
-            print(row(run, args.at, args.key))
+            print(row(run, at, key))
 
 
 if __name__ == "__main__":
-    main()
+    tyro.cli(main, description=__doc__)

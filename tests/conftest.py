@@ -12,65 +12,58 @@ import jax
 import pytest
 
 from helpers.jax_toy_envs import echo_spec
-from helpers.toy_envs import PHI, REWARD, Chase, toy_spec
-from helpers.untrained_runs import make_run
+from helpers.toy_envs import PHI, REWARD, toy_spec
+from helpers.untrained_runs import write_run
 from lare_rl import cli
 from lare_rl.algorithms.ppo import PPOSettings
 from lare_rl.algorithms.registry import ALGORITHMS
 from lare_rl.compare import bootstrap
+from lare_rl.config.resolve import resolve
 from lare_rl.config.settings import Settings
 from lare_rl.latent.function import LatentFunction, verify_function
+from lare_rl.runs.directory import Run
 from lare_rl.tasks.spec import TaskSpec
 from lare_rl.training.compile_cache import clear_compile_cache
 
-# Most of a small run's time is compilation, and many tests compile the same. JAX may have been imported already, and
-# some tests start processes of their own.
+# Most of a small run's time is compilation, and many tests compile the same programs. The options are set both in JAX, which may
+# be imported already, and in the environment, for processes that tests start.
 CACHE = {
     "jax_compilation_cache_dir": str(Path(__file__).parents[1] / ".pytest_cache" / "jax"),
     "jax_persistent_cache_min_compile_time_secs": 0,
     "jax_persistent_cache_min_entry_size_bytes": -1,
-    # Nobody looks for the lines of Python in a compiled test program, and to note them takes a few percent of the time.
+    # Compiled programs without the lines of Python that made them: this saves a few percent of the time.
     "jax_include_full_tracebacks_in_locations": False,
 }
-# Code that runs for a moment need not be optimised for minutes. Fusion emitters double the time that small programs take to
-# compile, and a program in parts, for the compiler's threads, takes a fifth more; a JAX that does not know a flag would end the
-# process, so these are given to those that do.
+# Tests run compiled code only for a moment, so the compiler need not optimise it. Fusion emitters double the compile time of small
+# programs, and compiling a program in parallel parts takes a fifth more. A JAX that does not know a flag ends the process.
 QUICK = ["--xla_backend_optimization_level=0"]
 if jax.__version_info__ < (0, 11):
     QUICK += ["--xla_cpu_use_fusion_emitters=false", "--xla_cpu_parallel_codegen_split_count=1"]
 os.environ["XLA_FLAGS"] = " ".join([os.environ.get("XLA_FLAGS", ""), *QUICK]).strip()
-# There are as many workers as cores. Several threads in each (of t-SNE, and of NumPy's linear algebra) would spin for a core.
+# There are as many test processes as cores, so more threads in a process (t-SNE, linear algebra) would only wait for a core.
 for variable in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
     os.environ.setdefault(variable, "1")
 for option, value in CACHE.items():
     os.environ.setdefault(option.upper(), str(value))
     jax.config.update(option, value)
 
-collect_ignore_glob = ["helpers/*"]
-"""No tests in there, and looking for doctests would import it, and register its environments, a second time."""
-
-__all__ = ["PHI", "Chase", "make_run", "toy_spec"]
-
 
 def pytest_collection_finish():
-    """Tracing makes many objects. Python shall not look through all that is imported each time that there are 700 new ones."""
+    """Collect garbage rarely, and never among the imported modules: tracing makes many objects that stay."""
     gc.collect()
     gc.freeze()
     gc.set_threshold(50_000, 20, 20)
 
 
-MODULES_UNTIL_FORGOTTEN = itertools.cycle([False] * 3 + [True])
+MODULE_NUMBERS = itertools.count(1)
 
 
 @pytest.fixture(autouse=True, scope="module")
-def forget_what_was_compiled():
-    """What JAX keeps of every program would grow to gigabytes, and Python would look through it again and again.
-
-    Some modules share what is kept: hundreds of small programs that nearly all of them run.
-    """
+def clear_compiled_programs():
+    """Free the memory of compiled programs, which would grow to gigabytes. Four modules share JAX's own, mostly small, programs."""
     yield
     clear_compile_cache()
-    if next(MODULES_UNTIL_FORGOTTEN):
+    if next(MODULE_NUMBERS) % 4 == 0:
         jax.clear_caches()
         gc.collect()
 
@@ -82,7 +75,7 @@ def chase() -> TaskSpec:
 
 @pytest.fixture
 def spec_file(tmp_path) -> Callable[..., Path]:
-    """Writes the toy's spec to a TOML file, with changes; None leaves a key out."""
+    """Return a function that writes the toy's spec to a TOML file, with changes; None omits a key."""
 
     def write(**changes) -> Path:
         values = toy_spec().model_dump(exclude_defaults=True) | changes
@@ -96,7 +89,7 @@ def spec_file(tmp_path) -> Callable[..., Path]:
 
 @pytest.fixture
 def command(monkeypatch, capsys, tmp_path):
-    """Runs `lare ARGUMENTS` in an empty directory; gives exit status, stdout and stderr."""
+    """Return a function that runs `lare-rl ARGUMENTS` in an empty directory, and returns exit status, stdout and stderr."""
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("COLUMNS", "120")
 
@@ -105,16 +98,34 @@ def command(monkeypatch, capsys, tmp_path):
         status = 0
         try:
             cli.main()
-        except SystemExit as left:
-            status = left.code
+        except SystemExit as exit_:
+            status = exit_.code
         return status, *capsys.readouterr()
 
     return run
 
 
 @pytest.fixture
+def make_run(tmp_path):
+    """Return a function that writes a run directory: configuration and metrics."""
+
+    def make(name, returns, task="Chase", steps=(50, 100), method="dense", **changes):
+        spec = toy_spec(name=task)
+        settings = resolve(Settings(method=method, steps=100, seeds=len(returns), **changes), spec)
+        metrics = [
+            {"step": step, "seed": seed, "evaluation/return": value * index / len(steps), "critic/loss": 1.0}
+            for index, step in enumerate(steps, 1)
+            for seed, value in zip(settings.all_seeds, returns, strict=True)
+        ]
+        directory = tmp_path / "runs" / task / name
+        return Run(directory, write_run(directory, spec, settings, metrics), ())
+
+    return make
+
+
+@pytest.fixture
 def echo() -> TaskSpec:
-    """The toy of many agents in JAX, of a family of its own."""
+    """Return the task of many agents in JAX."""
     return echo_spec()
 
 
@@ -125,13 +136,13 @@ def phi() -> LatentFunction:
 
 @pytest.fixture(scope="session")
 def reward() -> LatentFunction:
-    """What a language model might write for `--kind reward`."""
+    """Return a function of `--kind reward`."""
     return verify_function(REWARD, toy_spec(), "reward")
 
 
 @pytest.fixture(scope="session")
 def small():
-    """Settings of a run that takes a second."""
+    """Return a function that makes the settings of a small run."""
 
     def build(**changes) -> Settings:
         values = {
@@ -156,7 +167,7 @@ def small():
 
 @pytest.fixture(scope="session")
 def small_many():
-    """The same for tasks of many agents: two iterations of two seeds on a particle task."""
+    """Return a function that makes the settings of two iterations of two seeds on a particle task."""
 
     def build(**changes) -> Settings:
         quick = {"hidden": 8, "embed": 4, "hypernet": 4, "batch_size": 4, "update_every": 4, "epsilon_steps": 100}
@@ -183,5 +194,5 @@ def small_many():
 
 @pytest.fixture(autouse=True)
 def few_bootstrap_samples(monkeypatch):
-    """Two thousand of them take seconds; tests of the intervals themselves ask for more."""
+    """Draw 50 samples instead of 2000, which take seconds. Tests of the intervals set another number."""
     monkeypatch.setattr(bootstrap, "REPETITIONS", 50)

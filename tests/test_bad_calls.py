@@ -9,8 +9,6 @@ import subprocess
 import sys
 from pathlib import Path
 
-import pytest
-
 SETUP = """
 import json, sys
 import numpy as np
@@ -73,6 +71,7 @@ CALLS = {
     "lare_rl.logged_steps('none', 7)": "TaskSpec",
 }
 """Bad calls, and what the message must contain."""
+
 GOOD_CALLS = {
     "phi([0.5, 0], [0.5]).shape": "(2,)",
     "phi([[0.5, 0]] * 3, [[0.5]] * 3).shape": "(3, 2)",
@@ -80,34 +79,22 @@ GOOD_CALLS = {
     "policy([[0.5, 0]] * 3).shape": "(3, 1)",
     "bool(np.allclose(policy([[0.5, 0], [0, 1]])[1], policy([0, 1]), rtol=1e-5))": "True",
     "lare_rl.evaluate_run('run', 2)['Chase'].shape": "(1, 2)",
-    "lare_rl.write_report('run').name": "'report.html'",
-    "lare_rl.write_report(run).name": "'report.html'",
 }
 
 
-@pytest.fixture(scope="module")
-def results(tmp_path_factory):
-    """The result or the error of each call."""
-    calls = [*CALLS, *GOOD_CALLS]
+def test_calls(tmp_path):
+    calls = CALLS | GOOD_CALLS
     process = subprocess.run(
         [sys.executable, "-c", SETUP],
-        input=json.dumps(calls),
+        input=json.dumps(list(calls)),
         capture_output=True,
         text=True,
-        cwd=tmp_path_factory.mktemp("calls"),
-        env={**os.environ, "PYTHONPATH": str(Path(__file__).parent)},
+        cwd=tmp_path,
+        env=os.environ | {"PYTHONPATH": os.pathsep.join([str(Path(__file__).parent), *sys.path])},
     )
     assert process.returncode == 0, process.stderr
-    return dict(zip(calls, map(json.loads, process.stdout.splitlines()[-len(calls) :]), strict=True))
-
-
-@pytest.mark.parametrize("call", CALLS)
-def test_bad_call(call, results):
-    assert CALLS[call] in results[call]
-    assert "NOT A LareError" not in results[call]
-    assert "\n" not in results[call]
-
-
-@pytest.mark.parametrize("call", GOOD_CALLS)
-def test_good_call(call, results):
-    assert results[call] == GOOD_CALLS[call]
+    results = dict(zip(calls, map(json.loads, process.stdout.splitlines()[-len(calls) :]), strict=True))
+    for call, words in calls.items():
+        assert words in results[call], call
+        assert "NOT A LareError" not in results[call], call
+        assert "\n" not in results[call], call

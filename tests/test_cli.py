@@ -31,18 +31,15 @@ def first_column(table):
     return [line.split()[0] for line in table.splitlines()[1:] if not line.startswith(" ")]
 
 
-# --- arguments -------------------------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize(
-    ("arguments", "parts"),
+    ("arguments", "words"),
     [
         ("train Task --steps 1e5", ["'1e5'", "whole number"]),
         ("train Task --step 9", ["--step, 9", "'--steps'"]),
         ("train Task --td3.gama 9", ["--td3.gama", "'--td3.gamma'"]),
+        ("train Task --evaluate-evry 9", ["'--evaluate-every'"]),
         ("train Task --td3.gamma high", ["'high'", "number"]),
         ("train Task --td3.gamma 3", ["td3.gamma = 3.0"]),
-        ("train Task --credit.steps 0", ["credit.steps = 0"]),
         ("train Task --judges left", ["'left'", "before, after, both"]),
         ("train Task --algorithm dqn", ["'dqn'", *ALGORITHMS]),
         ("train Task --seeds", ["--seeds"]),
@@ -53,31 +50,14 @@ def first_column(table):
         ("evaluate", ["RUN"]),
         ("export a", ["--out DIR"]),
         ("design Task --price 1", ["--price"]),
-        ("compare", ["run"]),
-        ("report", ["run"]),
-    ],
-)
-def test_parse_mistake(arguments, parts, command):
-    status, out, err = command(*arguments.split())
-    assert (status, out, err.count("\n")) == (2, "", 1)
-    assert all(part in err for part in ["lare-rl: ", *parts])
-
-
-@pytest.mark.parametrize(
-    ("arguments", "words"),
-    [
         ("train", ["lare-rl train TASK", "--resume DIR"]),
         ("train --resume runs/none", ["runs/none is not a run"]),
         ("train Reacher-v4 --resume runs/none", ["--resume", "--steps"]),
         ("train --resume runs/none --seed 1", ["--resume", "--steps"]),
         ("train Reacher-v4 --function none.py", ["none.py does not exist"]),
         ("train Reacher-v4 --steps 120", ["steps = 120", "rollout_steps = 50"]),
-        ("train Reacher-v4 --seed -1", ["seed = -1"]),
-        ("train Reacher-v4 --seed 2147483647 --seeds 2", ["seeds = 2", "2147483647"]),
         ("train Reacher-v4 --method magic", ["'magic'", *METHODS]),
         ("train CN-6 --algorithm ppo", ["ppo", "CN-6"]),
-        ("train CN-6 --capacity 50", ["capacity = 50"]),
-        ("train CN-6 --ippo.hidden -1", ["hidden.0 = -1"]),
         ("train CompetitivePP-6-prey", ["CompetitivePP-6-prey is one team"]),
         ("train CompetitivePP-6 --function phi.py", ["CompetitivePP-6-predator, CompetitivePP-6-prey", "1 were given"]),
         ("train CN-6 --method dense --credit.sum-form True", ["credit.sum_form", "dense"]),
@@ -94,9 +74,7 @@ def test_parse_mistake(arguments, parts, command):
         ("design Reacher-v4 --base-url http://x", ["--base-url", "--model"]),
         ("design Reacher-v4 --budget 9", ["--budget", "--model"]),
         ("design Reacher-v4 --model m --budget 0", ["budget = 0"]),
-        ("design Reacher-v4 --model m --minutes nan", ["minutes = nan"]),
         ("design Reacher-v4 --model m --price 1 -1", ["price"]),
-        ("design Reacher-v4 --model m --temperature -1", ["temperature = -1"]),
         ("design Reacher-v4 --policy run", ["--policy", "--reflect"]),
         ("design Reacher-v4 --reflect -1", ["reflect = -1"]),
         ("design Reacher-v4 --reflect 1 --data log", ["--reflect", "--data"]),
@@ -106,7 +84,7 @@ def test_parse_mistake(arguments, parts, command):
         ("report one two", ["one is not a run"]),
     ],
 )
-def test_mistake_is_one_line_and_status_2(command, tmp_path, arguments, words):
+def test_command_mistake(command, tmp_path, arguments, words):
     status, out, err = command(*arguments.split())
     assert (status, out, err.count("\n")) == (2, "", 1)
     assert all(word in err for word in ["lare-rl: ", *words])
@@ -125,37 +103,20 @@ def test_version(command):
     assert command("--version") == (0, f"{code_version()}\n", "")
 
 
-def test_help_names_every_command(command):
-    status, out, _ = command("--help")
-    assert status == 0
-    assert all(name in out for name in cli.COMMANDS)
-
-
-@pytest.mark.parametrize("name", cli.COMMANDS)
-def test_help_of_a_command(name, command):
-    status, out, _ = command(name, "--help")
-    assert status == 0
-    assert "None" not in out
-    assert "(default: )" not in out
+def test_help(command):
+    assert all(name in command("--help")[1] for name in cli.COMMANDS)
+    for name in cli.COMMANDS:
+        status, out, _ = command(name, "--help")
+        assert (status, "None" in out, "(default: )" in out) == (0, False, False), name
 
 
 def test_help_of_options(command):
     _, out, _ = command("train", "--help")
-    for option in (
-        "--steps INT",
-        "--out DIR",
-        "--judges {before,after,both}",
-        "--credit.hidden [INT [INT ...]]",
-        "--td3.gamma FLOAT",
-    ):
-        assert f" {option} " in out
-    # Lines of a docstring are joined: these two begin a line in the source.
-    lines = [line.strip(" |│") for line in out.splitlines()]
-    assert "one --function for each, in the order of the task. (repeatable)" not in lines
-    assert "qmix if there are a global state and action masks, else ippo." not in lines
-
-
-# --- lists, prompt, new-task -----------------------------------------------------------------------------------------
+    options = ("steps INT", "out DIR", "judges {before,after,both}", "credit.hidden [INT [INT ...]]", "td3.gamma FLOAT")
+    assert all(f" --{option} " in out for option in options)
+    # Lines of a docstring are joined.
+    lines = {line.strip() for line in cli.train.__doc__.partition("Args:")[2].splitlines()} - {""}
+    assert lines.isdisjoint(line.strip(" |│") for line in out.splitlines())
 
 
 def test_tasks(command):
@@ -190,11 +151,9 @@ def test_new_task(command, tmp_path):
     content = (tmp_path / "Pendulum-v1.toml").read_bytes()
     status, out, err = command("new-task", "Pendulum-v1")
     assert (status, out) == (2, "")
-    assert "not overwritten; choose another --out" in err
+    assert "choose another --out" in err
     assert (tmp_path / "Pendulum-v1.toml").read_bytes() == content
-    status, out, _ = command("prompt", "Pendulum-v1.toml")
-    assert status == 0
-    assert "# Task\nThe inverted pendulum swingup problem" in out
+    assert "# Task\nThe inverted pendulum swingup problem" in command("prompt", "Pendulum-v1.toml")[1]
 
 
 def test_new_task_of_two_teams(command, tmp_path):
@@ -209,33 +168,22 @@ def test_new_task_of_two_teams(command, tmp_path):
 
 
 def test_new_task_without_documentation(command):
-    status, out, _ = command("new-task", "Hopper-v4", "--out", "hopper.toml")
-    assert status == 0
-    missing = re.findall(r"fill in: (\w+) ", out)
-    assert missing == ["description", "observation", "action"]
+    out = command("new-task", "Hopper-v4", "--out", "hopper.toml")[1]
+    assert re.findall(r"fill in: (\w+) ", out) == ["description", "observation", "action"]
 
 
-# --- design, verify --------------------------------------------------------------------------------------------------
-
-
-def test_design(command):
+def test_design(command, tmp_path):
     status, out, err = command("design", "Reacher-v4", "--kind", "reward")
     assert (status, err) == (0, "".join(f"candidate {n}: passes\n" for n in range(1, 6)) + "attempt 1: passes\n")
     assert "def evaluation_func(observation, action):\n" in out
-    status, out, err = command("design", "Reacher-v4", "--candidates", 1, "--no-pre-verification")
-    assert (status, err) == (0, "")
-    assert "def evaluation_func" in out
-
-
-def test_design_to_a_file(command, tmp_path):
-    status, out, _ = command("design", "Reacher-v4", "--out", "phi.py")
-    assert status == 0
-    assert out.startswith("wrote phi.py: ")
+    assert command("design", "Reacher-v4", "--candidates", 1, "--no-pre-verification", "--out", "phi.py")[0] == 0
     content = {name: (tmp_path / name).read_bytes() for name in ("phi.py", "phi.json")}
     status, out, err = command("design", "Reacher-v4", "--draw", 1, "--out", "phi")
     assert (status, out) == (2, "")
     assert "phi.py exists" in err
     assert {name: (tmp_path / name).read_bytes() for name in content} == content
+    (tmp_path / "phi.json").unlink()
+    assert command("design", "Reacher-v4", "--out", "phi.py")[:2] == (2, "")  # not even printed
 
 
 def test_verify(command, phi, spec_file):
@@ -262,42 +210,35 @@ def test_verify_with_returns(command, phi, spec_file):
     assert "before" in both.partition("Fitted to all 30 episodes")[2]
 
 
-@pytest.mark.parametrize(
-    ("options", "words"), [(["--fit", "10"], "at least 20 episodes"), (["--policy", "run"], "--policy")]
+SAVED_REPLY = json.dumps(
+    {"Understand": "", "Analyze": "", "Functions": "def evaluation_func(o, a):\n    return [a[:, 0]]"}
 )
-def test_verify_with_too_few_returns(command, phi, spec_file, options, words):
-    status, out, err = command("verify", phi, "--task", spec_file(), *options)
-    assert (status, out, err.count("\n")) == (2, "", 1)
-    assert words in err
+BAD_SOURCE = "import os\ndef evaluation_func(o, a):\n    return [np.clamp(a), open('x')]\n"
+DULL_SOURCE = "def evaluation_func(o, a):\n    still = 0 * a\n    return [still, a]\n"
 
 
-def test_verify_prints_every_error(command, spec_file, tmp_path):
-    (tmp_path / "bad.py").write_text("import os\ndef evaluation_func(o, a):\n    return [np.clamp(a), open('x')]\n")
-    status, out, err = command("verify", "bad.py", "--task", spec_file())
-    assert (status, err) == (1, "")
-    _, failed, *errors = out.splitlines()
-    assert failed == "FAILED  read"
-    assert [error.split(":")[0] for error in errors] == ["        E-IMPORT line 1", "        E-NUMPY line 3"]
-    assert "np.clip" in errors[1]
-
-
-def test_verify_reply_of_a_chat(command, spec_file, tmp_path):
-    source = "def evaluation_func(o, a):\n    return [a[:, 0]]"
-    (tmp_path / "reply.json").write_text(json.dumps({"Understand": "", "Analyze": "", "Functions": source}))
-    status, out, err = command("verify", "reply.json", "--task", spec_file())
-    assert (status, err) == (1, "")
-    assert "        E-FORM line 2" in out
-    assert "into the same chat" in out.splitlines()[-1]
-
-
-def test_verify_gives_advice(command, spec_file, tmp_path):
-    (tmp_path / "dull.py").write_text("def evaluation_func(o, a):\n    still = 0 * a\n    return [still, a]\n")
-    status, out, _ = command("verify", "dull.py", "--task", spec_file())
-    assert status == 0
-    assert "advice  factor 'still' never varies" in out
-
-
-# --- runs ------------------------------------------------------------------------------------------------------------
+@pytest.mark.parametrize(
+    ("file", "text", "options", "status", "words"),
+    [
+        ("phi.py", PHI, "--fit 19", 2, ["at least 20 episodes"]),
+        ("phi.py", PHI, "--policy run", 2, ["--policy"]),
+        (
+            "bad.py",
+            BAD_SOURCE,
+            "",
+            1,
+            ["FAILED  read\n        E-IMPORT line 1:", "\n        E-NUMPY line 3:", "np.clip"],
+        ),
+        ("reply.json", SAVED_REPLY, "", 1, ["        E-FORM line 2", "into the same chat"]),
+        ("dull.py", DULL_SOURCE, "", 0, ["advice  factor 'still' never varies"]),
+    ],
+)
+def test_verify_messages(file, text, options, status, words, command, spec_file, tmp_path):
+    (tmp_path / file).write_text(text)
+    result, out, err = command("verify", file, "--task", spec_file(), *options.split())
+    assert result == status
+    assert (out if status == 2 else err) == ""
+    assert all(word in out + err for word in words)
 
 
 def test_error_of_many_lines(command, spec_file, tmp_path):

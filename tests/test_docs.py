@@ -1,6 +1,8 @@
-"""Links, Python and public names in the documentation."""
+"""Links, Python and public names in the documentation; docstrings."""
 
 import ast
+import doctest
+import importlib
 import re
 from pathlib import Path
 
@@ -21,22 +23,40 @@ def anchors(page: Path) -> set[str]:
     return {re.sub(r"[^\w\- ]", "", heading.lower()).replace(" ", "-") for heading in headings}
 
 
-@pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
-def test_links(page):
+def test_links():
     broken = []
-    for path, anchor in LINK.findall(page.read_text(encoding="utf-8")):
-        target = page.parent / path if path else page
-        if "://" not in path and not (target.exists() and (not anchor or anchor in anchors(target))):
-            broken.append(f"{path}#{anchor}")
+    for page in PAGES:
+        for path, anchor in LINK.findall(page.read_text(encoding="utf-8")):
+            target = page.parent / path if path else page
+            if "://" not in path and not (target.exists() and (not anchor or anchor in anchors(target))):
+                broken.append(f"{page.relative_to(ROOT)}: {path}#{anchor}")
     assert broken == []
 
 
-@pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
-def test_python_blocks_parse(page):
-    for block in PYTHON.findall(page.read_text(encoding="utf-8")):
-        ast.parse(block)
+def test_python_blocks_parse():
+    for page in PAGES:
+        for block in PYTHON.findall(page.read_text(encoding="utf-8")):
+            ast.parse(block, str(page))
 
 
 def test_api_page_has_every_public_name():
     text = (ROOT / "docs" / "api.md").read_text(encoding="utf-8")
     assert [name for name in lare_rl.__all__ if name != "__version__" and f"`{name}" not in text] == []
+
+
+@pytest.mark.parametrize("model", [lare_rl.TaskSpec, lare_rl.Settings])
+def test_help_describes_every_field(model):
+    described = set(re.findall(r"^    (\w+):", model.__doc__.partition("Attributes:")[2], re.MULTILINE))
+    algorithms = {
+        name for name, field in model.model_fields.items() if isinstance(field.default, lare_rl.errors.CheckedModel)
+    }
+    assert described == set(model.model_fields) - algorithms
+
+
+def test_docstring_examples():
+    package = Path(lare_rl.__file__).parent
+    paths = [path for path in package.rglob("*.py") if re.search(r"^ *>>> ", path.read_text(encoding="utf-8"), re.M)]
+    assert len(paths) > 3
+    for path in paths:
+        name = str(path.relative_to(package.parent).with_suffix("")).replace("/", ".")
+        assert doctest.testmod(importlib.import_module(name)).failed == 0, name

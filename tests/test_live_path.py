@@ -50,14 +50,27 @@ def serve(monkeypatch):
         server.stop()
 
 
-def all_bytes(directory) -> bytes:
-    return b"".join(path.read_bytes() for path in directory.rglob("*") if path.is_file())
+def to_reply(source: str) -> str:
+    return json.dumps({"Understand": "", "Analyze": "", "Functions": source})
 
 
-def test_live_model_to_trained_policy(serve, command, tmp_path):
+@pytest.fixture
+def design_live(serve, command):
+    """Return a function that runs `lare-rl design Reacher-v4` with a model behind a server."""
+
+    def run(server, *options):
+        return command("design", "Reacher-v4", "--model", "m", "--base-url", server.url, *options)
+
+    return run
+
+
+def saved_stages(path) -> list[str]:
+    return [exchange.stage for exchange in read_recording(path.read_text(), path.name).exchanges]
+
+
+def test_live_model_to_trained_policy(serve, command, design_live, tmp_path):
     server = serve(recorded_answers)
-    options = ("--model", "m", "--base-url", server.url, "--record", "talk.json", "--price", 1, 2)
-    status, out, err = command("design", "Reacher-v4", *options, "--out", "phi.py")
+    status, out, err = design_live(server, "--record", "talk.json", "--price", 1, 2, "--out", "phi.py")
     assert status == 0
     assert out.startswith("wrote phi.py: ")
     assert err.splitlines()[-1] == "m: 6 requests, 600 tokens in, 60 out, 0.0007 by the given prices"
@@ -73,32 +86,29 @@ def test_live_model_to_trained_policy(serve, command, tmp_path):
     assert (status, out) == (0, recorded.source + "\n")
     assert len(server.requests) == 6
 
-    length = "--steps 100 --rollout-steps 50 --evaluate-every 100 --evaluation-episodes 1".split()
-    size = "--method lare-linear --td3.warmup 50 --td3.hidden 8 8".split()
-    status, _, err = command("train", "Reacher-v4", "--function", "phi.py", "--out", "run", *length, *size)
-    assert status == 0
-    assert KEY.encode() not in all_bytes(tmp_path)
-
-
-def test_recording_is_not_overwritten(serve, command, tmp_path):
-    (tmp_path / "talk.json").write_text("mine")
-    server = serve(recorded_answers)
-    status, _, err = command("design", "Reacher-v4", "--model", "m", "--base-url", server.url, "--record", "talk.json")
+    # A file that exists is not overwritten.
+    status, out, err = design_live(server, "--record", "talk.json")
     assert status == 2
     assert "choose another --record" in err
-    assert (tmp_path / "talk.json").read_text() == "mine"
+    assert read_recording((tmp_path / "talk.json").read_text(), "talk.json") == recording
+
+    small = (
+        "--steps 100 --rollout-steps 50 --evaluate-every 100 --evaluation-episodes 1 --td3.warmup 50 --td3.hidden 8 8"
+    )
+    arguments = f"train Reacher-v4 --function phi.py --out run --method lare-linear {small}".split()
+    assert command(*arguments)[0] == 0
+    assert not any(KEY.encode() in path.read_bytes() for path in tmp_path.rglob("*") if path.is_file())
 
 
-def test_failed_attempts_are_saved(serve, command, tmp_path):
+def test_failed_attempts_are_saved(serve, design_live, tmp_path):
     server = serve(reply_with("I would rather talk about something else."))
     for name in ("Reacher-v4.attempts.json", "Reacher-v4.attempts-2.json"):
-        status, out, err = command("design", "Reacher-v4", "--model", "m", "--base-url", server.url, "--candidates", 1)
+        status, out, err = design_live(server, "--candidates", 1)
         assert (status, out) == (1, "")
         assert len([line for line in err.splitlines() if line.startswith("lare-rl: ")]) == 1
         assert "not one JSON object" in err
         assert f"every attempt is kept in {name}" in err
-        recording = read_recording((tmp_path / name).read_text(), name)
-        assert [exchange.stage for exchange in recording.exchanges] == ["candidate", *["correct"] * 4]
+        assert saved_stages(tmp_path / name) == ["candidate", *["correct"] * 4]
 
 
 @pytest.mark.parametrize(
@@ -109,47 +119,39 @@ def test_failed_attempts_are_saved(serve, command, tmp_path):
         (["--minutes", 1e-6], "waiting for the model are over"),
     ],
 )
-def test_budget(serve, command, options, words):
+def test_budget(serve, design_live, options, words):
     server = serve(recorded_answers)
-    status, out, err = command("design", "Reacher-v4", "--model", "m", "--base-url", server.url, *options)
+    status, out, err = design_live(server, *options)
     assert (status, out) == (2, "")
     assert words in err
     assert len(server.requests) <= 2
 
 
-def test_replies_are_saved_when_the_budget_ends(serve, command, tmp_path):
-    server = serve(reply_with("Not today."))
-    arguments = ("design", "Reacher-v4", "--model", "m", "--base-url", server.url, "--candidates", 1, "--requests", 2)
-    status, out, err = command(*arguments)
+def test_replies_are_saved_when_the_budget_ends(serve, design_live, tmp_path):
+    status, out, err = design_live(serve(reply_with("\x1b[31mno")), "--candidates", 1, "--requests", 2)
     assert (status, out) == (2, "")
     assert err.splitlines()[-2:-1] == ["every attempt is kept in Reacher-v4.attempts.json"]
-    recording = read_recording((tmp_path / "Reacher-v4.attempts.json").read_text(), "attempts")
-    assert [exchange.stage for exchange in recording.exchanges] == ["candidate", "correct"]
+    assert "\x1b" not in err
+    assert saved_stages(tmp_path / "Reacher-v4.attempts.json") == ["candidate", "correct"]
 
 
-def test_failed_design_is_one_line(serve, command):
-    wrong = json.dumps({"Understand": "", "Analyze": "", "Functions": "x = np.load('a')\ny = np.fromfile('b')"})
-    server = serve(reply_with(wrong))
-    status, _, err = command("design", "Reacher-v4", "--model", "m", "--base-url", server.url, "--candidates", 1)
+def test_failed_design_is_one_line(serve, design_live, tmp_path):
+    server = serve(reply_with(to_reply("x = np.load('a')\ny = np.fromfile('b')")))
+    status, _, err = design_live(server, "--candidates", 1, "--record", "talk.json")
     (line,) = [line for line in err.splitlines() if line.startswith("lare-rl: ")]
     assert status == 1
     assert "'Reacher-v4'" in line
     assert "E-NUMPY line 1" in line
     assert line.endswith(" (and 1 more)")
+    assert "every attempt is kept in talk.json" in err
+    assert saved_stages(tmp_path / "talk.json") == ["candidate", *["correct"] * 4]
 
 
-def test_error_of_a_server_is_sanitized(serve, command):
-    server = serve(refuse(401, "\x1b[2J\u202eno\U000e0041"))
-    status, _, err = command("design", "Reacher-v4", "--model", "m", "--base-url", server.url)
+def test_error_of_a_server_is_sanitized(serve, design_live):
+    status, _, err = design_live(serve(refuse(401, "\x1b[2J\u202eno\U000e0041")))
     assert status == 2
     assert "HTTP 401: ?[2J?no?" in err.splitlines()[-1]
     assert err.isascii()
-
-
-def test_reply_of_a_model_is_sanitized(serve, command):
-    server = serve(reply_with('{"Functions": 1, "\x1b]0;gone\x07": 2}'), reply_with("\x1b[31mno"))
-    arguments = ("design", "Reacher-v4", "--model", "m", "--base-url", server.url, "--candidates", 1, "--requests", 2)
-    assert "\x1b" not in command(*arguments)[2]
 
 
 @pytest.mark.parametrize(
@@ -179,14 +181,9 @@ def run_lare(*arguments, **streams):
 
 def test_terminal_without_unicode(tmp_path):
     source = "def evaluation_func(o, a):\n    # größe 漢字 😀\n    return [o[:, :1]]"
-    recording = shipped_recordings("factors", 0)[0].model_dump()
-    recording["exchanges"] = [
-        {
-            "stage": "candidate",
-            "messages": prompts.candidate(read_task("Reacher-v4")),
-            "replies": [json.dumps({"Understand": "", "Analyze": "", "Functions": source})],
-        }
-    ]
+    messages = prompts.candidate(read_task("Reacher-v4"))
+    exchange = {"stage": "candidate", "messages": messages, "replies": [to_reply(source)]}
+    recording = shipped_recordings("factors", 0)[0].model_dump() | {"exchanges": [exchange]}
     (tmp_path / "r.json").write_text(json.dumps(recording))
     arguments = ("design", "Reacher-v4", "--model", "r.json", "--candidates", 1)
     plain = os.environ | {"PYTHONIOENCODING": "cp1252"}
@@ -223,8 +220,7 @@ def test_function_of_another_task_is_corrected(serve):
     # The chase has observations of size 2; the recorded function of Reacher reads entry 10.
     reacher = shipped_recordings("factors", 0)
     other = next(recording for recording in reacher if recording.task == "Reacher-v4").exchanges[-1].replies[0]
-    good = json.dumps({"Understand": "", "Analyze": "", "Functions": PHI})
-    server = serve(reply_with(other), reply_with(good))
+    server = serve(reply_with(other), reply_with(to_reply(PHI)))
     assert design(toy_spec(), model=LiveModel("m", server.url), candidates=1).source == PHI.strip("\n")
     error = server.requests[1]["messages"][-1]["content"]
     assert re.search(r"^E-RUN line \d+: IndexError: .* beyond the end of an axis", error, re.MULTILINE)
@@ -233,19 +229,9 @@ def test_function_of_another_task_is_corrected(serve):
 REPLIES = st.one_of(
     st.text(max_size=200),
     st.binary(max_size=50).map(lambda body: body.decode("latin-1")),
-    st.text(max_size=200).map(lambda code: json.dumps({"Understand": "", "Analyze": "", "Functions": code or "?"})),
-    st.integers(0, len(PHI)).map(
-        lambda cut: json.dumps({"Understand": "", "Analyze": "", "Functions": PHI[:cut] or "?"})
-    ),
-    st.sampled_from(
-        [
-            "",
-            "{}",
-            "null",
-            "```python\ndef evaluation_func(observation, action):\n    return [action]\n```",
-            json.dumps({"Understand": "", "Analyze": "", "Functions": PHI}),
-        ]
-    ),
+    st.text(max_size=200).map(lambda code: to_reply(code or "?")),
+    st.integers(0, len(PHI)).map(lambda length: to_reply(PHI[:length] or "?")),
+    st.sampled_from(["", "{}", "null", f"```python\n{PHI}```", to_reply(PHI)]),
 )
 
 

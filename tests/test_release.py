@@ -1,7 +1,6 @@
 """What is released: a wheel and an sdist that work without the checkout."""
 
 import os
-import re
 import subprocess
 import sys
 import tarfile
@@ -29,53 +28,42 @@ main()
 
 @pytest.fixture(scope="module")
 def built(tmp_path_factory):
-    """Both, by the name of their kind. What is built is what git knows of, with the changes that it has."""
+    """Return the paths of the wheel and the sdist, built from the files that git tracks, with their changes."""
     out = tmp_path_factory.mktemp("dist")
     command = [sys.executable, "-m", "build", "--no-isolation", "--outdir", str(out), str(ROOT)]
     subprocess.run(command, check=True, capture_output=True)
-    (wheel,), (sdist,) = out.glob("*.whl"), out.glob("*.tar.gz")
-    return {"wheel": wheel, "sdist": sdist}
+    return *out.glob("*.whl"), *out.glob("*.tar.gz")
 
 
 @pytest.mark.long
-def test_the_wheel_does_the_main_job_without_the_checkout(built, tmp_path):
-    with zipfile.ZipFile(built["wheel"]) as archive:
+def test_wheel_does_the_main_job_without_the_checkout(built, tmp_path):
+    with zipfile.ZipFile(built[0]) as archive:
         archive.extractall(tmp_path / "installed")
     environment = os.environ | {"PYTHONPATH": str(tmp_path / "installed")}
-    done = subprocess.run(
-        [sys.executable, "-c", MAIN_JOB], cwd=tmp_path, env=environment, capture_output=True, text=True
-    )
+    command = [sys.executable, "-c", MAIN_JOB]
+    done = subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, text=True)
     assert (done.returncode, done.stdout) == (0, "wrote run/report.html\n"), done.stderr
 
 
-def test_the_wheel_holds_the_package_and_its_data_alone(built):
-    with zipfile.ZipFile(built["wheel"]) as archive:
-        names = archive.namelist()
-        metadata = archive.read(f"lare_rl-{lare_rl.__version__}.dist-info/METADATA").decode()
-    assert {name.split("/")[0] for name in names} == {"lare_rl", f"lare_rl-{lare_rl.__version__}.dist-info"}
-    every = {str(path.relative_to(ROOT / "src")) for path in (ROOT / "src" / "lare_rl").rglob("*") if path.is_file()}
-    assert {name for name in every if "__pycache__" not in name} <= set(names)
+def test_released_files(built):
+    wheel, sdist = built
+    package = f"lare_rl-{lare_rl.__version__}"
+    with zipfile.ZipFile(wheel) as archive:
+        names = set(archive.namelist())
+        metadata = archive.read(f"{package}.dist-info/METADATA").decode()
+    assert {name.split("/")[0] for name in names} == {"lare_rl", f"{package}.dist-info"}
+    sources = [path.relative_to(ROOT / "src") for path in (ROOT / "src" / "lare_rl").rglob("*") if path.is_file()]
+    assert {str(path) for path in sources if "__pycache__" not in str(path)} <= names
     for line in ("License-Expression: MIT", "Requires-Python: >=3.11", "Project-URL: Paper, "):
         assert line in metadata
-
-
-def test_the_sdist_holds_what_the_tests_need_and_no_results(built):
-    with tarfile.open(built["sdist"]) as archive:
+    with tarfile.open(sdist) as archive:
         names = {name.partition("/")[2] for name in archive.getnames()}
-    assert {
-        "pyproject.toml",
-        "README.md",
-        "LICENSE",
-        "CITATION.cff",
-        "Makefile",
-        "tests/conftest.py",
-        "src/lare_rl/py.typed",
-    } <= names
+    needed = "pyproject.toml README.md LICENSE CITATION.cff Makefile tests/conftest.py src/lare_rl/py.typed"
+    assert set(needed.split()) <= names
     assert not any(name.startswith("benchmarks/results") for name in names)
 
 
-def test_one_version_is_everywhere():
-    assert f"version: {lare_rl.__version__}\n" in (ROOT / "CITATION.cff").read_text(encoding="utf-8")
-    assert re.search(
-        rf"^## {re.escape(lare_rl.__version__)} ", (ROOT / "CHANGELOG.md").read_text(encoding="utf-8"), re.MULTILINE
-    )
+def test_version_is_the_same_everywhere():
+    version = lare_rl.__version__
+    assert f"version: {version}\n" in (ROOT / "CITATION.cff").read_text(encoding="utf-8")
+    assert f"\n## {version} " in (ROOT / "CHANGELOG.md").read_text(encoding="utf-8")

@@ -1,13 +1,14 @@
-"""Every command and every snippet of the documentation runs, page by page, from top to bottom: `make docs`.
+"""All commands and snippets of the documentation run, page by page, and so does the notebook: `make docs`.
 
-A page is run as it stands, but for its budgets: `CUTS` makes numbers of steps and episodes small, `miniature` networks and
-batches. A function of the table `BEFORE` makes whatever the reader of a page already has (a log, a server).
+Only budgets are changed: `CUTS` makes numbers of steps and episodes small, `small_runs` makes networks and batches small. A function
+of the table `PREPARE` makes what the reader of a page already has (a log, a server).
 """
 
 import json
 import os
 import re
 import shlex
+import subprocess
 import sys
 import tomllib
 from pathlib import Path
@@ -19,8 +20,7 @@ import pytest
 
 import lare_rl
 from helpers.chat_servers import Server, text_completion
-from lare_rl.compare import bootstrap
-from lare_rl.runs.config_file import make_config
+from helpers.untrained_runs import write_run
 from lare_rl.sweep import processes
 from lare_rl.sweep.sweep import read_sweep
 from lare_rl.tasks import spec
@@ -38,12 +38,20 @@ RUNNABLE = ("sh", "python", "toml")
 
 
 def blocks(page):
-    """Language and text of every block that is to be run."""
+    """Return language and text of each block to run."""
     return [(name, text) for name, text in BLOCK.findall(page.read_text(encoding="utf-8")) if name in RUNNABLE]
 
 
-WITH_BLOCKS = [str(page.relative_to(ROOT)) for page in PAGES if blocks(page)]
+PAGES_WITH_BLOCKS = [str(page.relative_to(ROOT)) for page in PAGES if blocks(page)]
 
+RUN_NOTEBOOK = """
+import sys
+import nbformat
+from nbclient import NotebookClient
+notebook = nbformat.read(sys.argv[1], as_version=4)
+NotebookClient(notebook, timeout=600, kernel_name="python3").execute()
+print(sum(bool(cell.get("outputs")) for cell in notebook.cells))
+"""
 SELF_HOSTED = re.compile(r"http://localhost:(11434|8000)/v1")
 
 CUTS = {
@@ -68,25 +76,23 @@ CUTS = {
     r"http://localhost:5000": "file:mlruns",
     r"runs/\.\.\.": "runs/Reacher-v4-lare-bayes-td3-s0",
 }
-"""What is run instead of what stands there, by regular expression: short runs, on a task of short episodes."""
+"""Replacements by regular expression: short runs, on a task of short episodes."""
 
 
-def cut(text):
-    for pattern, less in CUTS.items():
-        text = re.sub(pattern, less, text, flags=re.MULTILINE)
+def shorten(text):
+    for pattern, replacement in CUTS.items():
+        text = re.sub(pattern, replacement, text, flags=re.MULTILINE)
     return text
 
 
 class Page:
-    """What a page is run with: a directory, variables of the environment, names of Python."""
+    """The state in which a page runs: a directory, variables of the environment, names of Python."""
+
+    url = "none"
 
     def __init__(self, command, monkeypatch, directory):
         self.command, self.patch, self.directory = command, monkeypatch, directory
         self.names = {}
-
-    def define(self, code):
-        """Define names that the page assumes."""
-        exec(code, self.names)
 
     def write(self, name, text):
         path = self.directory / name
@@ -94,14 +100,14 @@ class Page:
         path.write_text(text, encoding="utf-8")
 
     def serve(self, source):
-        """A language model that always writes the same function, wherever the page says that one is."""
+        """Start a language model that always writes the same function; it answers at all addresses on the page."""
         server = Server(lambda handler: handler.send(200, json.dumps(text_completion(to_reply(source))).encode()))
         self.patch.setenv("OPENAI_BASE_URL", server.url)
         self.patch.setenv("OPENAI_API_KEY", "key")
         self.url = server.url
 
     def shell(self, line):
-        """A command, or an assignment."""
+        """Run a command, or an assignment."""
         words = shlex.split(line, comments=True)
         if not words:
             return
@@ -135,220 +141,199 @@ class Page:
     def run(self, language, text):
         if language == "sh":
             for line in text.splitlines():
-                self.shell(SELF_HOSTED.sub(self.url, cut(line.split("  #")[0].strip())))
+                self.shell(SELF_HOSTED.sub(self.url, shorten(line.split("  #")[0].strip())))
         elif language == "python":
-            exec(compile(SELF_HOSTED.sub(self.url, cut(text)), "snippet", "exec"), self.names)
-
-    url = "none"
+            exec(compile(SELF_HOSTED.sub(self.url, shorten(text)), "snippet", "exec"), self.names)
 
 
-def made_up(job, cores, running):
-    """Instead of training a run of a sweep: metrics as it would have them."""
-    job.directory.mkdir(parents=True)
-    (job.directory / "config.json").write_text(make_config(job.task, job.resolved, ()).model_dump_json())
-    lines = [
+def invent_run(job, cores, running):
+    """Write metrics instead of training a run of a sweep."""
+    metrics = [
         {"step": job.resolved.steps, "seed": seed, **dict.fromkeys(MEANING, seed + 1.0)}
         for seed in job.resolved.all_seeds
     ]
-    (job.directory / "metrics.jsonl").write_text("".join(json.dumps(line) + "\n" for line in lines))
+    write_run(job.directory, job.task, job.resolved, metrics)
 
 
-def to_python(page, number):
-    """One of its blocks."""
-    return [text for language, text in blocks(ROOT / page) if language == "python"][number]
+def block(page, language, number):
+    return [text for name, text in blocks(ROOT / page) if name == language][number]
 
 
-def to_toml(page, number):
-    return [text for language, text in blocks(ROOT / page) if language == "toml"][number]
-
-
-PENDULUM = to_python("docs/bring-your-own-task.md", 0)
-STUDY = to_toml("docs/sweeps.md", 0).replace("processes = 2", "processes = 1")
-
-
-def a_study(page):
-    """The files that the study names; its runs are not trained."""
-    page.write("study.toml", cut(STUDY))
-    page.write("my-task.toml", to_toml("docs/bring-your-own-task.md", 0).replace('"Pendulum"', '"MyTask"'))
-    page.write("phi.py", PENDULUM)
-    page.patch.setattr(processes, "train_in_process", made_up)
-    page.patch.setattr(bootstrap, "REPETITIONS", 50)
-
-
-def logs(page):
-    """Episodes of HalfCheetah as files, and as a data set of Minari's."""
-    import minari
-    from minari.data_collector import EpisodeBuffer
-
-    page.patch.setenv("MINARI_DATASETS_PATH", str(page.directory / "minari"))
-    random = np.random.default_rng(0)
-
-    def episode(steps=60):
-        observations = random.normal(size=(steps + 1, 17)) + random.normal(size=17)
-        rewards = observations[1:, 8] + 1.0
-        return (
-            observations,
-            random.normal(size=(steps, 6)),
-            rewards,
-            np.zeros(steps, bool),
-            np.arange(steps) == steps - 1,
-        )
-
-    (page.directory / "runs" / "2024").mkdir(parents=True)
-    names = ("observations", "actions", "rewards", "terminations", "truncations")
-    for number in range(90):
-        np.savez(page.directory / "runs" / "2024" / f"{number}.npz", **dict(zip(names, episode(), strict=True)))
-    buffers = [
-        EpisodeBuffer(
-            observations=seen, actions=action, rewards=list(paid), terminations=list(over), truncations=list(cut)
-        )
-        for seen, action, paid, over, cut in (episode() for _ in range(90))
-    ]
-    box = gymnasium.spaces.Box
-    minari.create_dataset_from_buffers(
-        "mujoco/hopper/medium-v0",
-        buffers,
-        observation_space=box(-np.inf, np.inf, (17,), np.float64),
-        action_space=box(-np.inf, np.inf, (6,), np.float64),
-    )
-    page.serve(lare_rl.design("HalfCheetah-v4").source)
-
-
-def a_run(page):
-    settings = lare_rl.Settings(method="lare-bayes", steps=400, evaluation_episodes=1, seeds=2)
-    return lare_rl.train("Reacher-v4", settings, out="runs/lare", listeners=[])
-
-
-def for_the_api(page):
-    run = a_run(page)
-    page.patch.setenv("WANDB_MODE", "offline")
-    page.patch.setenv("WANDB_SILENT", "true")
-    page.patch.setenv("MLFLOW_ALLOW_FILE_STORE", "true")
-    page.names["model"] = SimpleNamespace(name="says", reply=lambda messages, sample: to_reply(run.functions[0].source))
-    page.define(
-        "import gymnasium, numpy as np\n"
-        "envs = gymnasium.make_vec('Reacher-v4', num_envs=4)\n"
-        "observation, _ = envs.reset(seed=0)\n"
-        "action = envs.action_space.sample()\n"
-        "next_observation, reward, terminated, truncated, _ = envs.step(action)\n"
-        "before, after = observation, next_observation\n"
-    )
+PENDULUM = block("docs/bring-your-own-task.md", "python", 0)
+STUDY = block("docs/sweeps.md", "toml", 0).replace("processes = 2", "processes = 1")
+API_NAMES = """
+import gymnasium, numpy as np
+envs = gymnasium.make_vec('Reacher-v4', num_envs=4)
+observation, _ = envs.reset(seed=0)
+action = envs.action_space.sample()
+next_observation, reward, terminated, truncated, _ = envs.step(action)
+before, after = observation, next_observation
+"""
+EXPORT_NAMES = """
+import numpy as np
+observations = before = after = np.ones((5, 11), np.float32)
+action = np.ones((5, 2), np.float32)
+"""
 
 
 def to_reply(source):
     return json.dumps({"Understand": "", "Analyze": "", "Functions": source})
 
 
-def an_export(page):
-    run = a_run(page)
-    lare_rl.export_run(run, page.directory / "exported")
-    page.patch.chdir(page.directory / "exported")
-    page.patch.syspath_prepend(page.directory / "exported")
-    page.define(
-        "import numpy as np\n"
-        "observations = before = after = np.ones((5, 11), np.float32)\naction = np.ones((5, 2), np.float32)"
-    )
+def write_study(page):
+    """Write the files that the study names. Its runs are not trained."""
+    page.write("study.toml", shorten(STUDY))
+    page.write("my-task.toml", block("docs/bring-your-own-task.md", "toml", 0).replace('"Pendulum"', '"MyTask"'))
+    page.write("phi.py", PENDULUM)
+    page.patch.setattr(processes, "train_in_process", invent_run)
 
 
-def a_plugin(page):
-    """The snippets are one module, which can be imported by its name."""
+def write_readme_study(page):
+    """Write a study of one task, whose runs can be compared."""
+    write_study(page)
+    (page.directory / "phi.py").unlink()
+    page.write("study.toml", shorten(STUDY).replace(', "my-task.toml"', "").replace('MyTask = ["phi.py"]', ""))
+    page.serve(PENDULUM)
+
+
+def write_logs(page):
+    """Write episodes of HalfCheetah as files, and as a Minari data set."""
+    import minari
+    from minari.data_collector import EpisodeBuffer
+
+    page.patch.setenv("MINARI_DATASETS_PATH", str(page.directory / "minari"))
+    random = np.random.default_rng(0)
+    (page.directory / "runs" / "2024").mkdir(parents=True)
+    buffers = []
+    for number in range(180):
+        observations = random.normal(size=(61, 17)) + random.normal(size=17)
+        episode = {
+            "observations": observations,
+            "actions": random.normal(size=(60, 6)),
+            "rewards": observations[1:, 8] + 1.0,
+            "terminations": np.zeros(60, bool),
+            "truncations": np.arange(60) == 59,
+        }
+        if number < 90:
+            np.savez(page.directory / "runs" / "2024" / f"{number}.npz", **episode)
+        else:
+            lists = {name: list(episode[name]) for name in ("rewards", "terminations", "truncations")}
+            buffers.append(EpisodeBuffer(**episode | lists))
+    spaces = {
+        f"{name}_space": gymnasium.spaces.Box(-np.inf, np.inf, (size,), np.float64)
+        for name, size in (("observation", 17), ("action", 6))
+    }
+    minari.create_dataset_from_buffers("mujoco/hopper/medium-v0", buffers, **spaces)
+    page.serve(lare_rl.design("HalfCheetah-v4").source)
+
+
+def train_run(page):
+    settings = lare_rl.Settings(method="lare-bayes", steps=400, evaluation_episodes=1, seeds=2)
+    return lare_rl.train("Reacher-v4", settings, out="runs/lare", listeners=[])
+
+
+def prepare_api(page):
+    source = train_run(page).functions[0].source
+    for name, value in (("WANDB_MODE", "offline"), ("WANDB_SILENT", "true"), ("MLFLOW_ALLOW_FILE_STORE", "true")):
+        page.patch.setenv(name, value)
+    page.names["model"] = SimpleNamespace(name="model", reply=lambda messages, sample: to_reply(source))
+    exec(API_NAMES, page.names)
+
+
+def export_policy(page):
+    directory = page.directory / "exported"
+    lare_rl.export_run(train_run(page), directory)
+    page.patch.chdir(directory)
+    page.patch.syspath_prepend(directory)
+    exec(EXPORT_NAMES, page.names)
+
+
+def prepare_plugin(page):
+    """Make the snippets one module, which can be imported by its name."""
     module = ModuleType("my_plugin")
     page.patch.setitem(sys.modules, module.__name__, module)
     page.names = module.__dict__
 
 
-def a_function(page):
-    lare_rl.design("Reacher-v4").save(page.directory / "phi.py")
-
-
-def a_user(page):
-    page.serve(PENDULUM)
-
-
-def for_the_readme(page):
-    """A study of one task, whose runs can be compared."""
-    a_study(page)
-    (page.directory / "phi.py").unlink()
-    page.write("study.toml", cut(STUDY).replace(', "my-task.toml"', "").replace('MyTask = ["phi.py"]', ""))
-    page.serve(PENDULUM)
-
-
-BEFORE = {
-    "README.md": for_the_readme,
-    "docs/api.md": for_the_api,
-    "docs/bring-your-own-task.md": a_user,
-    "docs/export.md": an_export,
-    "docs/extending.md": a_plugin,
-    "docs/logs.md": logs,
-    "docs/plugs/sb3.md": a_function,
-    "docs/reproduce.md": a_study,
-    "docs/runs.md": a_run,
-    "docs/starcraft.md": a_study,
-    "docs/sweeps.md": a_study,
+PREPARE = {
+    "README.md": write_readme_study,
+    "docs/api.md": prepare_api,
+    "docs/bring-your-own-task.md": lambda page: page.serve(PENDULUM),
+    "docs/export.md": export_policy,
+    "docs/extending.md": prepare_plugin,
+    "docs/logs.md": write_logs,
+    "docs/plugs/sb3.md": lambda page: lare_rl.design("Reacher-v4").save(page.directory / "phi.py"),
+    "docs/reproduce.md": write_study,
+    "docs/runs.md": train_run,
+    "docs/starcraft.md": write_study,
+    "docs/sweeps.md": write_study,
 }
-"""What the reader of a page has."""
+"""What the reader of a page already has."""
 
 EXCERPTS = {"docs/plugs/others.md": ("tianshou_td3.py", "skrl_td3.py", "rllib_ppo.py")}
-"""Pages whose snippets are lines of examples, which `test_examples.py` runs where the library is installed."""
+"""Pages whose snippets are lines of examples, which `test_examples.py` runs if the library is installed."""
 
 
 @pytest.fixture
-def miniature(monkeypatch):
-    """Every run that begins in this process is as it is asked for, but for small networks and little work for them."""
-    decide = training.resolve
+def small_runs(monkeypatch):
+    """Give every run in this process small networks and few updates."""
+    resolve = training.resolve
 
-    def smaller(settings, task):
-        plan = decide(settings, task)
-        credit = plan.credit.model_copy(update={"hidden": (8,), "drawn_steps": 4, "steps": 16})
-        algorithm = plan.hyperparameters
-        less = {"hidden": 8 if plan.algorithm in ("qmix", "vdn") else (8,), "batch_size": 8, "epochs": 1}
-        less = {name: value for name, value in less.items() if name in type(algorithm).model_fields}
-        changes = {"credit": credit, "hyperparameters": algorithm.model_copy(update=less), "fit_updates": 1}
-        return plan.model_copy(update=changes)
+    def resolve_small(settings, task):
+        resolved = resolve(settings, task)
+        credit = resolved.credit.model_copy(update={"hidden": (8,), "drawn_steps": 4, "steps": 16})
+        fields = type(resolved.hyperparameters).model_fields
+        small = {"hidden": 8 if resolved.algorithm in ("qmix", "vdn") else (8,), "batch_size": 8, "epochs": 1}
+        small = resolved.hyperparameters.model_copy(update={name: small[name] for name in small if name in fields})
+        return resolved.model_copy(update={"credit": credit, "hyperparameters": small, "fit_updates": 1})
 
-    monkeypatch.setattr(training, "resolve", smaller)
+    monkeypatch.setattr(training, "resolve", resolve_small)
 
 
-@pytest.mark.usefixtures("miniature")
+@pytest.mark.usefixtures("small_runs")
 @pytest.mark.filterwarnings("ignore:.*v4 is out of date", "ignore::UserWarning:minari")
-@pytest.mark.parametrize("name", [name for name in WITH_BLOCKS if name not in EXCERPTS])
-def test_a_page_runs(name, command, monkeypatch, tmp_path):
-    monkeypatch.delitem(sys.modules, "exported", raising=False)  # that of another page
+@pytest.mark.parametrize("name", [name for name in PAGES_WITH_BLOCKS if name not in EXCERPTS])
+def test_page(name, command, monkeypatch, tmp_path):
+    monkeypatch.delitem(sys.modules, "exported", raising=False)  # of another page
     page = Page(command, monkeypatch, tmp_path)
-    BEFORE.get(name, lambda page: None)(page)
+    PREPARE.get(name, lambda page: None)(page)
     for language, text in blocks(ROOT / name):
         page.run(language, text)
 
 
 @pytest.mark.parametrize(("name", "examples"), EXCERPTS.items())
-def test_an_excerpt_is_in_its_example(name, examples):
+def test_excerpts_are_in_their_examples(name, examples):
     for example, (_, text) in zip(examples, blocks(ROOT / name), strict=True):
-        whole = re.sub(r"\s+", "", (ROOT / "examples" / example).read_text(encoding="utf-8"))
+        program = re.sub(r"\s+", "", (ROOT / "examples" / example).read_text(encoding="utf-8"))
         for line in text.splitlines():
-            assert re.sub(r"\s+", "", line.split("  #")[0]) in whole
+            assert re.sub(r"\s+", "", line.split("  #")[0]) in program
 
 
-def test_task_files_are_task_files(tmp_path):
-    """Those of one agent and of many; and of two teams, where the page leaves out the texts."""
+def test_task_files(tmp_path):
+    """One agent, many agents, and two teams, where the page leaves out the texts."""
     for number in range(4):
-        text = to_toml("docs/bring-your-own-task.md", number)
+        text = block("docs/bring-your-own-task.md", "toml", number)
         if "description = " not in text:
-            text += "".join(f'{key} = "what it is"\n' for key in ("description", "observation", "action"))
+            text += "".join(f'{key} = "text"\n' for key in ("description", "observation", "action"))
         name = tomllib.loads(text)["name"]
         (tmp_path / ("simple_adversary_v3-adversary.toml" if name == "adversary" else f"{name}.toml")).write_text(text)
     other = (tmp_path / "simple_adversary_v3-adversary.toml").read_text().replace("adversary_*", "agent_*")
-    (tmp_path / "simple_adversary_v3-agent.toml").write_text(
-        re.sub('(name|team) = "adversary"', r'\1 = "agent"', other)
-    )
+    agent = re.sub('(name|team) = "adversary"', r'\1 = "agent"', other)
+    (tmp_path / "simple_adversary_v3-agent.toml").write_text(agent)
     loaded = [lare_rl.load_task(tmp_path / f"{name}.toml") for name in ("Pendulum", "spread", "simple_adversary_v3")]
     assert [len(task.roles) for task in loaded] == [1, 1, 2]
 
 
-def test_a_study_can_be_trained(monkeypatch, tmp_path):
-    a_study(Page(None, monkeypatch, tmp_path))
-    _, jobs = read_sweep(tmp_path / "study.toml")
-    assert len(jobs) == 2 * (2 + 2 + 3 + 1)
+def test_study_and_exhibit(monkeypatch, tmp_path):
+    write_study(Page(None, monkeypatch, tmp_path))
+    assert len(read_sweep(tmp_path / "study.toml")[1]) == 2 * (2 + 2 + 3 + 1)
+    exhibit = Exhibit(**read_toml(block("docs/reproduce.md", "toml", 0)))
+    assert list(exhibit.contenders) == ["64 units", "256 units"]
 
 
-def test_an_exhibit_of_ones_own():
-    assert list(Exhibit(**read_toml(to_toml("docs/reproduce.md", 0))).contenders) == ["64 units", "256 units"]
+def test_notebook(tmp_path):
+    environment = os.environ | {"STEPS": "1000", "MPLBACKEND": "module://matplotlib_inline.backend_inline"}
+    command = [sys.executable, "-c", RUN_NOTEBOOK, str(ROOT / "examples" / "first_run.ipynb")]
+    done = subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, text=True)
+    assert (done.returncode, done.stdout) == (0, "7\n"), done.stderr[-2000:]
+    assert (tmp_path / "report.html").is_file()

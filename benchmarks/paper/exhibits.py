@@ -12,7 +12,7 @@ from typing import Annotated, Any
 
 from pydantic import Field, field_validator
 
-from lare_rl.config.defaults import choose_algorithm
+from lare_rl.config.resolve import choose_algorithm
 from lare_rl.config.settings import Settings
 from lare_rl.credit.methods import find_method
 from lare_rl.envs.families import load_env_spec

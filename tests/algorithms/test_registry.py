@@ -2,49 +2,42 @@
 
 import subprocess
 import sys
+from dataclasses import replace
 
 import pytest
 
 from lare_rl.algorithms.registry import ALGORITHMS, register_algorithm
 from lare_rl.errors import LareError
 
-PLUGIN = '''
-"""TD3 with a deterministic exploration, in one file."""
+PLUGIN = """
+from dataclasses import replace
 
-from typing import Annotated
-
-from pydantic import Field
-
-from lare_rl.algorithms.off_policy import OffPolicySettings, run_defaults
-from lare_rl.algorithms.registry import Algorithm, Consumes, register_algorithm
+from lare_rl.algorithms.registry import ALGORITHMS, register_algorithm
 from lare_rl.algorithms.td3.td3 import TD3Settings, act, get_actor, init, update
 
 
 class QuietSettings(TD3Settings):
-    shift: Annotated[float, Field(ge=0)] = 0.5
+    shift: float = 0.5
 
 
 def explore(actor, observation, noise, settings):
     return act(actor, observation) * settings.shift
 
 
-register_algorithm(
-    Algorithm(
-        name="quiet",
-        consumes=Consumes.TRANSITIONS,
-        settings=QuietSettings(hidden=(8,), batch_size=8, warmup=50),
-        module=__name__,
-        run_defaults=run_defaults,
-        summary="a test",
-        source="-",
-        discrete=False,
-    )
-)
-'''
+settings = QuietSettings(hidden=(8,), batch_size=8, warmup=50)
+register_algorithm(replace(ALGORITHMS["td3"], name="quiet", settings=settings, module=__name__, summary="a test"))
+"""
 
 PROGRAM = """
-import lare_rl
-settings = lare_rl.Settings(algorithm="quiet", method="dense", steps=150, quiet={"shift": 0.25}, evaluation_episodes=1)
+import sys
+import lare_rl.cli
+for arguments in (["algorithms"], ["train", "--help"]):
+    sys.argv[1:] = arguments
+    try:
+        lare_rl.cli.main()
+    except SystemExit:
+        pass
+settings = lare_rl.Settings(algorithm="quiet", method="dense", steps=100, quiet={"shift": 0.25}, evaluation_episodes=1)
 run = lare_rl.train("Reacher-v4", settings, out="run")
 print(run.config.settings.hyperparameters)
 print(lare_rl.open_run("run").config.settings == run.config.settings)
@@ -60,22 +53,16 @@ def test_greedy_samples_distributions_over_choices(discrete):
 def test_register_algorithm_refuses_used_name():
     register_algorithm(ALGORITHMS["td3"])
     with pytest.raises(LareError, match="'td3'"):
-        register_algorithm(ALGORITHMS["td3"].__class__(**{**vars(ALGORITHMS["sac"]), "name": "td3"}))
+        register_algorithm(replace(ALGORITHMS["sac"], name="td3"))
 
 
 def test_plugin_algorithm(tmp_path, monkeypatch):
     (tmp_path / "quiet_td3.py").write_text(PLUGIN)
     monkeypatch.setenv("LARE_PLUGINS", "quiet_td3")
-    monkeypatch.setenv("PYTHONPATH", str(tmp_path))
-
-    def run(*arguments):
-        return subprocess.run(
-            [sys.executable, *arguments], capture_output=True, text=True, check=True, cwd=tmp_path
-        ).stdout
-
-    assert "quiet" in run("-m", "lare_rl", "algorithms")
-    assert "--quiet.shift FLOAT" in run("-m", "lare_rl", "train", "--help")
-    *_, hyperparameters, is_equal = run("-c", PROGRAM).splitlines()
+    output = subprocess.run([sys.executable, "-c", PROGRAM], capture_output=True, text=True, check=True, cwd=tmp_path)
+    *texts, hyperparameters, is_equal = output.stdout.splitlines()
+    assert any("quiet" in line and "a test" in line for line in texts)
+    assert any("--quiet.shift FLOAT" in line for line in texts)
     assert "shift=0.25" in hyperparameters
     assert "batch_size=8" in hyperparameters
     assert is_equal == "True"

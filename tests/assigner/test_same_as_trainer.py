@@ -67,7 +67,7 @@ def learn(method, env, phi=None):
 
 
 @pytest.mark.parametrize(
-    ("method", "env"), [("lare-bayes", PHI_ENV), ("rd-linear", ONE_TEAM), long_case("ircr", ONE_AGENT)]
+    ("method", "env"), [("lare-bayes", PHI_ENV), long_case("rd-linear", ONE_TEAM), long_case("ircr", ONE_AGENT)]
 )
 def test_rewards_agree(method, env, phi):
     learner, config, credit = learn(method, env, phi if METHODS[method].needs_phi else None)
@@ -76,5 +76,5 @@ def test_rewards_agree(method, env, phi):
     r_hat = credit.rewards_at(np.arange(credit.store.steps))
     np.testing.assert_allclose(r_hat, expected, rtol=1e-4, atol=1e-5 * np.abs(expected).max())
     assert np.abs(expected).max() > 0
-    if learner.credit:
+    if learner.decoders:
         assert credit.learner.n_learned == int(learner.n_learned.sum())

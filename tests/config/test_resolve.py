@@ -4,10 +4,11 @@ import pytest
 
 from helpers.toy_envs import pick_spec, toy_spec
 from lare_rl.algorithms.qmix import QMIXSettings
-from lare_rl.config.replay_size import replay_rows
-from lare_rl.config.resolve import resolve
+from lare_rl.config.resolve import replay_rows, resolve
 from lare_rl.config.settings import Settings
+from lare_rl.config.validity import check_credit
 from lare_rl.credit.decoder_settings import MULTI_AGENT_CREDIT, RECENT_STEPS, CreditSettings
+from lare_rl.credit.methods import find_method
 from lare_rl.envs.load import read_task
 from lare_rl.errors import LareError
 
@@ -43,92 +44,82 @@ def test_resolve_refuses(task, settings, texts):
     assert all(text in str(error.value) for text in texts)
 
 
-def test_resolve_refuses_continuous_algorithm_for_choices():
+def test_resolve_refuses_algorithm_and_method_of_other_tasks(echo):
     with pytest.raises(LareError, match=r"sac needs continuous actions.*ppo"):
         resolve(Settings(algorithm="sac"), pick_spec())
-
-
-def test_resolve_refuses_method_of_agents_on_team_level(echo):
     task = echo.model_copy(update={"judged_from": "state", "observation_size": 9, "action_size": 9})
     with pytest.raises(LareError, match=r"lare-rd-shared.*global state"):
         resolve(Settings(method="lare-rd-shared"), task)
 
 
-@pytest.mark.parametrize(
-    ("task", "settings", "expected"),
-    [
+def test_resolve_defaults(echo):
+    cases = [
         (
             toy_spec(),
-            {},
             {"algorithm": "td3", "method": "lare-bayes", "steps": 1_000_000, "evaluate_every": 5000, "environments": 1}
             | {"rollout_steps": 50, "capacity": 1_000_000, "credit": CreditSettings()},
         ),
         (
             pick_spec(),
-            {},
             {"algorithm": "ppo", "method": "lare-bayes", "steps": 1_000_000, "evaluate_every": 10_000, "fit_every": 1}
             | {"environments": 1, "rollout_steps": 2000, "fit_updates": 500},
         ),
         (
             read_task("CN-6"),
-            {},
             {"algorithm": "ippo", "method": "lare-bayes", "steps": 2_050_000, "environments": 82, "rollout_steps": 25}
             | {"evaluate_every": 20_500, "evaluation_episodes": 50, "fit_every": 10, "fit_updates": 50}
             | {"credit": MULTI_AGENT_CREDIT, "first_fit": None},
         ),
-        (read_task("CN-6"), {"method": "lare-rd"}, {"first_fit": "held-out"}),
-    ],
-)
-def test_resolve_defaults(task, settings, expected):
-    resolved = resolve(Settings(**settings), task)
-    assert {name: getattr(resolved, name) for name in expected} == expected
+        (
+            echo,
+            {"algorithm": "qmix", "method": "lare-rd", "hyperparameters": QMIXSettings(), "environments": 8}
+            | {"rollout_steps": 50, "steps": 2_000_000, "evaluate_every": 10_000, "evaluation_episodes": 32}
+            | {"capacity": 5000 * 7},
+        ),
+    ]
+    for task, expected in cases:
+        resolved = resolve(Settings(), task)
+        assert {name: getattr(resolved, name) for name in expected} == expected
+    assert resolve_named("CN-6", {"method": "lare-rd"}).first_fit == "held-out"
 
 
-def test_resolve_defaults_of_qmix(echo):
-    resolved = resolve(Settings(), echo)
-    assert (resolved.algorithm, resolved.method, resolved.hyperparameters) == ("qmix", "lare-rd", QMIXSettings())
-    assert (resolved.environments, resolved.evaluation_episodes, resolved.capacity) == (8, 32, 5000 * 7)
-    assert resolved.steps % resolved.iteration_steps == resolved.evaluate_every % resolved.iteration_steps == 0
-    assert abs(resolved.steps - 2_000_000) < 400
-
-
-def test_resolve_keeps_given_values():
-    settings = Settings(method="dense", steps=4100, evaluate_every=2050, evaluation_episodes=3)
-    resolved = resolve(settings, read_task("CN-6"))
-    assert {name: getattr(resolved, name) for name in settings.model_fields_set} == settings.model_dump(
-        exclude_unset=True
-    )
+def test_resolve_keeps_set_values():
+    values = {"method": "dense", "steps": 4100, "evaluate_every": 2050, "evaluation_episodes": 3}
+    resolved = resolve_named("CN-6", values)
+    assert {name: getattr(resolved, name) for name in values} == values
 
 
 @pytest.mark.parametrize(("task", "default"), [("CN-6", MULTI_AGENT_CREDIT), ("Reacher-v4", CreditSettings())])
-@pytest.mark.parametrize("changes", [{"learning_rate": 0.5}, {"hidden": (256, 256)}])
-def test_resolve_completes_credit(task, default, changes):
+def test_resolve_completes_credit(task, default):
     """A set value replaces the algorithm's, even if it is the default of the class."""
+    changes = {"learning_rate": 0.5, "hidden": (256, 256)}
     for credit in (changes, CreditSettings(**changes)):
         assert resolve_named(task, {"credit": credit}).credit == default.model_copy(update=changes)
 
 
-@pytest.mark.parametrize(
-    ("settings", "fit_updates"),
-    [
-        ({"method": "rd", "algorithm": "ppo", "rollout_steps": 2000}, 500),
-        ({"method": "diaster", "algorithm": "ppo", "rollout_steps": 2000}, 40),
-        ({"method": "diaster", "algorithm": "ppo", "rollout_steps": 2000, "fit_updates": 120}, 120),
-        ({"method": "diaster", "environments": 4}, 4),
-    ],
-)
-def test_resolve_fit_updates(settings, fit_updates):
+def test_resolve_fit_updates():
     """The fit of diaster is expensive: one update for 50 steps."""
-    assert resolve_named("Reacher-v4", settings).fit_updates == fit_updates
+    ppo = {"algorithm": "ppo", "rollout_steps": 2000}
+    cases = [
+        (500, ppo | {"method": "rd"}),
+        (40, ppo | {"method": "diaster"}),
+        (120, ppo | {"method": "diaster", "fit_updates": 120}),
+        (4, {"method": "diaster", "environments": 4}),
+    ]
+    for expected, settings in cases:
+        assert resolve_named("Reacher-v4", settings).fit_updates == expected
 
 
-@pytest.mark.parametrize(
-    ("task_score", "user_score", "score"),
-    [(None, "auto", "auto"), ("average", "auto", "average"), ("average", "sum", "sum"), ("sum", "average", "average")],
-)
-def test_resolve_score(task_score, user_score, score):
-    settings = Settings(method="lare-linear", algorithm="td3", credit={"score": user_score})
-    assert resolve(settings, toy_spec(score=task_score)).credit.score == score
+def test_resolve_score():
+    cases = [
+        (None, "auto", "auto"),
+        ("average", "auto", "average"),
+        ("average", "sum", "sum"),
+        ("sum", "average", "average"),
+    ]
+    for task_score, user_score, score in cases:
+        settings = Settings(method="lare-linear", algorithm="td3", credit={"score": user_score})
+        assert resolve(settings, toy_spec(score=task_score)).credit.score == score
 
 
 def test_resolve_normalises_settings_without_effect():
@@ -140,15 +131,54 @@ def test_resolve_normalises_settings_without_effect():
     assert resolve_named("SMAX-2s3z", {"method": "rd"}).credit.score == "sum"
 
 
-@pytest.mark.parametrize(
-    ("task", "settings", "max_steps", "rows"),
-    [
-        ("Reacher-v4", {"algorithm": "ppo", "method": "rrdu", "steps": 100_000}, 50, 200_002),
-        ("Reacher-v4", {"algorithm": "ppo", "method": "dense", "steps": 100_000}, 50, 2 * 2000 + 50 + RECENT_STEPS),
-        ("Reacher-v4", {"algorithm": "ppo", "method": "dense", "steps": 2000, "evaluate_every": 2000}, 50, 4050),
+def test_replay_rows():
+    ppo = {"algorithm": "ppo", "steps": 100_000}
+    cases = [
+        ("Reacher-v4", ppo | {"method": "rrdu"}, 50, 200_002),
+        ("Reacher-v4", ppo | {"method": "dense"}, 50, 2 * 2000 + 50 + RECENT_STEPS),
+        ("Reacher-v4", ppo | {"method": "dense", "steps": 2000, "evaluate_every": 2000}, 50, 4050),
         ("CN-6", {"method": "rrdu"}, 25, 15_000 * 26 // 82),
         ("CN-6", {"method": "dense"}, 25, 2 * 25 + 25 + RECENT_STEPS // 82),
+    ]
+    for task, settings, max_steps, rows in cases:
+        assert replay_rows(resolve_named(task, settings), max_steps) == rows
+
+
+VALID = {"credit": CreditSettings(), "n_agents": 1, "n_raw_features": 9}
+
+
+@pytest.mark.parametrize(
+    ("method", "changes", "texts"),
+    [
+        ("llm-reward", {"factor_inputs": "both"}, ["judges", "'before' or 'after'"]),
+        ("ircr", {"scale_rewards": True}, ["scale_rewards"]),
+        ("diaster", {"n_agents": 3}, ["single agent", "3"]),
+        ("arel", {"n_agents": 1, "fixed_length": True}, ["among agents"]),
+        ("arel", {"n_agents": 3}, ["whole episodes"]),
+        ("stas", {"n_agents": 3, "team_level": True, "fixed_length": True}, ["global state"]),
+        ("rrd", {"credit": CreditSettings(steps=16)}, ["steps = 16", "drawn_steps = 64"]),
+        ("bayes", {"n_raw_features": 7057}, ["1024", "7057", "rrdu"]),
+        ("rd-linear", {"n_raw_features": 1025}, ["1024", "1025"]),
+        ("diaster", {"credit": CreditSettings(hidden=())}, ["hidden"]),
     ],
 )
-def test_replay_rows(task, settings, max_steps, rows):
-    assert replay_rows(resolve_named(task, settings), max_steps) == rows
+def test_check_credit_refuses(method, changes, texts):
+    with pytest.raises(LareError) as error:
+        check_credit(find_method(method), **VALID | changes)
+    assert all(text in str(error.value) for text in texts)
+
+
+def test_check_credit_accepts():
+    cases = [
+        ("llm-reward", {}),
+        ("dense", {"scale_rewards": True, "n_agents": 3}),
+        ("lare-bayes", {"n_raw_features": 7057}),
+        ("bayes", {"n_raw_features": 1024, "team_level": True}),
+        ("rrdu", {"n_raw_features": 7057}),
+        ("arel", {"n_agents": 3, "fixed_length": True}),
+        ("rrd", {"credit": CreditSettings(steps=16), "fixed_length": True}),
+        ("rrd", {"credit": CreditSettings(steps=64)}),
+        ("rd", {"credit": CreditSettings(steps=16)}),
+    ]
+    for method, changes in cases:
+        check_credit(find_method(method), **VALID | changes)

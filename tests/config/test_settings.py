@@ -1,5 +1,7 @@
 """Settings as a user gives them, read back, and without effect."""
 
+import re
+
 import pytest
 
 from helpers.toy_envs import pick_spec
@@ -48,6 +50,20 @@ def test_settings_refuse(settings, texts):
     assert all(text in str(error.value) for text in texts)
 
 
+@pytest.mark.parametrize(
+    ("changes", "text"),
+    [
+        ({"steps": None}, "steps = None"),
+        ({"hyperparameters": {"gamma": 2}}, "hyperparameters.gamma = 2"),
+        ({"algorithm": "dqn"}, "'dqn'"),
+    ],
+)
+def test_resolved_settings_refuse(changes, text):
+    values = resolve(Settings(), read_task("Reacher-v4")).model_dump()
+    with pytest.raises(LareError, match=re.escape(text)):
+        ResolvedSettings(**values | changes)
+
+
 def test_settings_accept_models_and_mappings():
     settings = Settings(credit={"steps": 800}, ippo={"gae_lambda": 1.0}, method="dense")
     assert settings.credit.steps == 800
@@ -63,21 +79,6 @@ def test_resolved_settings_round_trip(task, algorithm):
     restored = ResolvedSettings.model_validate_json(resolved.model_dump_json())
     assert restored == resolved
     assert type(restored.hyperparameters) is type(resolved.hyperparameters)
-
-
-@pytest.mark.parametrize(
-    ("changes", "texts"),
-    [
-        ({"steps": None}, ["steps = None"]),
-        ({"hyperparameters": {"gamma": 2}}, ["hyperparameters.gamma = 2"]),
-        ({"algorithm": "dqn"}, ["'dqn'"]),
-    ],
-)
-def test_resolved_settings_refuse(changes, texts):
-    values = resolve(Settings(), read_task("Reacher-v4")).model_dump()
-    with pytest.raises(LareError) as error:
-        ResolvedSettings(**values | changes)
-    assert all(text in str(error.value) for text in texts)
 
 
 @pytest.mark.parametrize(

@@ -5,7 +5,7 @@ import pytest
 from lare_rl.credit.basis import MAX_FEATURES, MAX_PAIRED_RAW_FEATURES, Basis, expand, fourier_terms
 
 U = np.array([0.5, -1.0, 2.0, 9.0, -0.3], np.float32)
-"""Three factors and two raw features, one of which is far from its mean."""
+"""Three factors and two raw features. The first raw feature is far from its mean."""
 
 
 def numpy_fourier_terms(u):
@@ -48,6 +48,7 @@ def test_many_raw_features_have_fewer_frequencies_and_no_pairs(n_raw, frequencie
     assert basis.raw_frequencies == frequencies
     assert basis.n_features == n_raw * (1 + 2 * frequencies) + n_pairs
     assert basis.n_features <= max(MAX_FEATURES, n_raw)
+    assert Basis(20, 50, extended=True).raw_frequencies == 1  # factors leave less room
 
 
 def test_raw_features_of_images_are_not_used():

@@ -6,12 +6,13 @@ import pytest
 from lare_rl.credit.explanation import Explanation
 from lare_rl.credit.explanation_text import MESSAGES, explanation_findings, explanation_lines, raw_feature_names
 from lare_rl.credit.score_type import ScoreType, ScoreTypeEstimate
-from lare_rl.envs.load import read_task
 from lare_rl.util.findings import Finding, render
 
 FACTORS, RAW_FEATURES = ["speed", "cost"], ["entry 0", "entry 1 (the foot)"]
 BOTH_STATES = ["speed (before)", "speed (after)"]
 WELL_EXPLAINED = {"factors_r2": 0.99, "total_r2": 0.99}
+ONE_VARIES = WELL_EXPLAINED | {"factor_varies": np.array([True, False])}
+NO_RESIDUAL = {"residual_correlation": np.zeros(2)}
 
 
 def explanation(**changes):
@@ -36,40 +37,25 @@ def find(changes, factors=FACTORS, raw_features=(), score_type=None):
     return explanation_findings(explanation(**changes), score_type, factors, raw_features)
 
 
+ABOUT = "factors_explain about_factors"
+LACKING = NO_RESIDUAL | {"factors_r2": 0.8, "raw_feature_shares": np.array([0.02, 0.4])}
+
+
 @pytest.mark.parametrize(
     ("changes", "factors", "raw_features", "codes"),
     [
-        ({}, FACTORS, RAW_FEATURES, "factors_explain about_factors factor factor high_when_small"),
-        ({}, FACTORS, [], "factors_explain about_factors factor factor"),
-        (
-            {"residual_correlation": np.array([0.5, 0.1])},
-            FACTORS,
-            RAW_FEATURES,
-            "factors_explain about_factors factor factor high_when_large",
-        ),
-        ({"factors_r2": 0.05, "residual_correlation": np.zeros(2)}, FACTORS, [], "factors_explain phi_explains_little"),
-        (WELL_EXPLAINED, FACTORS, RAW_FEATURES, "factors_explain about_factors factor factor"),
-        (
-            {"factors_r2": 0.8, "residual_correlation": np.zeros(2), "raw_feature_shares": np.array([0.02, 0.4])},
-            FACTORS,
-            RAW_FEATURES,
-            "factors_explain about_factors factor factor phi_lacks_features",
-        ),
-        (WELL_EXPLAINED, BOTH_STATES, [], "factors_explain about_factors factor about_states"),
-        (
-            WELL_EXPLAINED | {"factor_varies": np.array([True, False])},
-            BOTH_STATES,
-            [],
-            "factors_explain about_factors factor",
-        ),
-        (
-            WELL_EXPLAINED | {"factor_varies": np.array([True, False])},
-            FACTORS,
-            [],
-            "factors_explain about_factors unknown_factor factor",
-        ),
+        ({}, FACTORS, RAW_FEATURES, f"{ABOUT} factor factor high_when_small"),
+        ({}, FACTORS, [], f"{ABOUT} factor factor"),
+        ({"residual_correlation": np.array([0.5, 0])}, FACTORS, RAW_FEATURES, f"{ABOUT} factor factor high_when_large"),
+        (NO_RESIDUAL | {"factors_r2": 0.05}, FACTORS, [], "factors_explain phi_explains_little"),
+        (WELL_EXPLAINED, FACTORS, RAW_FEATURES, f"{ABOUT} factor factor"),
+        (LACKING, FACTORS, RAW_FEATURES, f"{ABOUT} factor factor phi_lacks_features"),
+        (WELL_EXPLAINED, BOTH_STATES, [], f"{ABOUT} factor about_states"),
+        (ONE_VARIES, BOTH_STATES, [], f"{ABOUT} factor"),
+        (ONE_VARIES, FACTORS, [], f"{ABOUT} unknown_factor factor"),
         ({}, [], [], "raw_features_explain"),
         ({"n_episodes": 19}, FACTORS, RAW_FEATURES, ""),
+        ({"n_episodes": 20}, [], [], "raw_features_explain"),
         ({"total_r2": np.nan}, FACTORS, RAW_FEATURES, "equal_returns"),
     ],
 )
@@ -89,14 +75,11 @@ def test_shares():
     assert largest == [{"name": RAW_FEATURES[1], "share": 0.77}, {"name": RAW_FEATURES[0], "share": 0.2}]
 
 
-@pytest.mark.parametrize("is_certain", [True, False])
-@pytest.mark.parametrize(
-    ("score_type", "this", "other"), [(ScoreType.SUM, "sum", "mean"), (ScoreType.MEAN, "mean", "sum")]
-)
-def test_score_type(score_type, this, other, is_certain):
-    finding = find({}, score_type=ScoreTypeEstimate(score_type, is_certain))[0]
-    code = "score_type_is_certain" if is_certain else "score_type_is_uncertain"
-    assert finding == Finding(code, {"this": Finding(this), "other": Finding(other)})
+def test_score_type():
+    for score_type, this, other in ((ScoreType.SUM, "sum", "mean"), (ScoreType.MEAN, "mean", "sum")):
+        for is_certain, code in ((True, "score_type_is_certain"), (False, "score_type_is_uncertain")):
+            finding = find({}, score_type=ScoreTypeEstimate(score_type, is_certain))[0]
+            assert finding == Finding(code, {"this": Finding(this), "other": Finding(other)})
 
 
 def test_factors_are_in_order_of_shares():
@@ -124,10 +107,10 @@ def test_factor_before_and_after():
     assert (values["name"], values["share"]) == ("speed", 0.9)
     assert values["effect"].values == pytest.approx({"slope": 3.0, "std": 0.02})
     assert values["states"].values["after"].values == pytest.approx({"slope": 2.0, "std": 0.1})
-    changes = find(WELL_EXPLAINED | {"slope": np.array([-20.5, 20.1])}, BOTH_STATES)[2].values
-    assert changes["effect"] == Finding("change_pays")
-    constant = find(WELL_EXPLAINED | {"factor_varies": np.array([True, False])}, BOTH_STATES)[2].values
-    assert constant["states"].values["after"] == Finding("equal_means")
+    for slope, cancels in (([-20.5, 20.1], True), ([-0.15, 0.15], False), ([-20.5, 17.0], False)):
+        effect = find(WELL_EXPLAINED | {"slope": np.array(slope)}, BOTH_STATES)[2].values["effect"]
+        assert (effect == Finding("change_pays")) == cancels
+    assert find(ONE_VARIES, BOTH_STATES)[2].values["states"].values["after"] == Finding("equal_means")
 
 
 def test_residual_values():
@@ -143,25 +126,24 @@ ANYTHING = {
 }
 
 
-@pytest.mark.parametrize("code", MESSAGES)
-def test_messages_render(code):
-    text = render(Finding(code, ANYTHING), MESSAGES)
-    assert text
-    assert "{" not in text
-
-
-def test_lines():
+def test_messages_and_lines():
+    for code in MESSAGES:
+        text = render(Finding(code, ANYTHING), MESSAGES)
+        assert text
+        assert "{" not in text
     lines = explanation_lines(explanation(), None, FACTORS, RAW_FEATURES)
     assert "90%" in lines[0]
     assert lines[2:4] == ["- cost: 65%, +2 ± 0.1", "- speed: 25%, +1 ± 0.1"]
 
 
 def test_raw_feature_names():
-    task = read_task("HalfCheetah-v4")
-    names = raw_feature_names(task.observation, task.action, 23, task.action_size, both=False)
-    assert names[7] == "entry 7 of the observation (angle of the front foot (rad))"
-    assert names[17].startswith("entry 0 of the action")
-    assert len(names) == 23
+    observation, action = "- 0: price\n[1] (none)\n2. angle (rad)\n", "0: torque"
+    assert raw_feature_names(observation, action, 4, 1, both=False) == [
+        "entry 0 of the observation (price)",
+        "entry 1 of the observation",
+        "entry 2 of the observation (angle (rad))",
+        "entry 0 of the action (torque)",
+    ]
     assert raw_feature_names("0: price", "", 3, 1, both=True) == [
         "entry 0 of the observation before the step (price)",
         "entry 0 of the observation after the step (price)",

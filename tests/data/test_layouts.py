@@ -9,41 +9,40 @@ from hypothesis import strategies as st
 
 from lare_rl.data.layouts import lay_out_drawn, lay_out_packed, lay_out_padded, sample_step_numbers
 
+pack = jax.jit(lay_out_packed, static_argnums=2)
 sample_numbers = jax.jit(sample_step_numbers, static_argnums=2)
-LENGTHS = st.lists(st.integers(1, 9), min_size=1, max_size=6)
 
 
-@given(LENGTHS, st.integers(0, 6), st.integers(9, 40))
+@given(
+    st.lists(st.integers(1, 9), min_size=6, max_size=6),
+    st.integers(0, 5),
+    st.sampled_from([9, 24, 60]),
+)
 @settings(max_examples=60, deadline=None)
 def test_lay_out_packed(lengths, n_masked, rows):
-    length, mask = np.array(lengths), (np.arange(len(lengths)) < max(1, len(lengths) - n_masked)).astype(float)
+    length, mask = np.array(lengths), (np.arange(6) < 6 - n_masked).astype(float)
     layout, fits = lay_out_packed(length, mask, rows)
     steps, n_rows = [], 0
     for slot, count in enumerate(lengths):
         n_rows += count
         assert fits[slot] == (mask[slot] and n_rows <= rows)
         steps += [(slot, t) for t in range(count)] if fits[slot] else []
-    padding = [(len(lengths), 0)] * (rows - len(steps))
+    padding = [(6, 0)] * (rows - len(steps))
     assert list(zip(layout.slot.tolist(), layout.number.tolist(), strict=True)) == steps + padding
-    in_jax, fits_in_jax = lay_out_packed(jnp.asarray(length), jnp.asarray(mask), rows)
-    jax.tree.map(np.testing.assert_array_equal, (in_jax, fits_in_jax), (layout, fits))
+    jax.tree.map(np.testing.assert_array_equal, pack(length, mask, rows), (layout, fits))
 
 
 @pytest.mark.parametrize("xp", [np, jnp])
-def test_lay_out_padded(xp):
+def test_lay_out_padded_and_drawn(xp):
     layout = lay_out_padded(xp.array([[3, 1], [2, 4]]), 4)
     assert layout.number.tolist() == [[[0, 1, 2, 2], [0] * 4], [[0, 1, 1, 1], [0, 1, 2, 3]]]
     assert layout.slot.tolist() == [[[0] * 4, [1] * 4]] * 2
-
-
-@pytest.mark.parametrize("xp", [np, jnp])
-def test_lay_out_drawn(xp):
     layout = lay_out_drawn(xp.array([2, 5]), xp.array([[0, 1, 1], [4, 2, 0]]))
     assert layout.slot.tolist() == [[0, 0, 2], [1, 1, 1]]
     assert layout.number.tolist() == [[0, 1, 1], [4, 2, 0]]
 
 
-@given(st.lists(st.integers(1, 40), min_size=6, max_size=6), st.sampled_from([1, 2, 5, 12]), st.integers(0, 1000))
+@given(st.lists(st.integers(1, 40), min_size=6, max_size=6), st.sampled_from([1, 2, 12]), st.integers(0, 1000))
 @settings(max_examples=15, deadline=None)
 def test_sample_step_numbers_has_no_repeats(lengths, steps, seed):
     numbers = np.asarray(sample_numbers(jax.random.key(seed), jnp.asarray(lengths), steps))
@@ -54,13 +53,6 @@ def test_sample_step_numbers_has_no_repeats(lengths, steps, seed):
         assert len(set(row)) == min(length, steps)
         if length < steps:
             np.testing.assert_array_equal(row, np.minimum(np.arange(steps), length - 1))
-
-
-@pytest.mark.parametrize(("length", "steps"), [(6, 3), (6, 6)])
-def test_sample_step_numbers_is_uniform(length, steps):
-    numbers = sample_numbers(jax.random.key(1), jnp.full(20_000, length), steps)
-    share = np.bincount(np.asarray(numbers).ravel(), minlength=length) / numbers.size
-    np.testing.assert_allclose(share, 1 / length, atol=0.01)
 
 
 def test_sample_step_numbers_is_uniform_over_pairs():

@@ -7,130 +7,69 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from helpers.replays import COLUMNS, extend, filled_replay, read, replay_columns, slow_replay, stream
 from lare_rl.data import replay
 from lare_rl.data.replay import Index
+from lare_rl.data.trajectory import Trajectory
+from lare_rl.envs.interface import Timestep
 
 ENVS, LONGEST, CHUNKS = 3, 6, (1, 3, 7)
 CAPACITY = replay.required_capacity(max(CHUNKS), LONGEST)
-COLUMNS = {
-    "observation": jax.ShapeDtypeStruct((2, 1), np.float32),
-    "state": jax.ShapeDtypeStruct((3,), np.float32),
-    "action": jax.ShapeDtypeStruct((2, 1), np.float32),
-    "terminated": jax.ShapeDtypeStruct((), np.bool_),
-}
-extend, read = jax.jit(replay.extend), jax.jit(replay.read)
-
-
-def stream(lengths, env=0):
-    """Return steps of episodes, the last of which is running: (observation, next observation, team rewards, ended).
-
-    Every observation is a different number, so that each row can be recognised.
-    """
-    rows = []
-    for episode, length in enumerate(lengths):
-        for step in range(length):
-            observation = 100_000 * env + 20 * episode + step
-            ended = step == length - 1 and episode < len(lengths) - 1
-            rows.append((observation, observation + 1, np.float32([episode + 0.5, -step]), ended))
-    return rows
-
-
-def replay_columns(rows_by_env):
-    """Return some steps of each environment as the replay stores them."""
-    observation, next_observation, reward, ended = (
-        np.array([[row[k] for row in rows] for rows in rows_by_env]).swapaxes(0, 1) for k in range(4)
-    )
-
-    def columns(number):
-        values = number[..., None].astype(np.float32)
-        return {"observation": np.stack([values, -values], axis=2), "state": values * np.float32([1, 2, 3])}
-
-    before = columns(observation)
-    before |= {"action": 7 + before["observation"], "terminated": ended & (observation % 2 == 0)}
-    return before, columns(next_observation), reward, ended
-
-
-def filled_replay(rows_by_env, chunks, capacity=CAPACITY):
-    buffer, start = replay.init_replay(COLUMNS, len(rows_by_env), capacity, 2), 0
-    for count in chunks:
-        buffer = extend(buffer, *replay_columns([rows[start : start + count] for rows in rows_by_env]))
-        start += count
-    return buffer
-
-
-def slow_replay(rows, chunks, capacity=CAPACITY):
-    """Return the finished episodes and the running one that a replay stores: before each chunk, remove the oldest until it fits."""
-    episodes, running, start = [], [], 0
-    for count in chunks:
-        n_removable = len(episodes)
-        for row in rows[start : start + count]:
-            running.append(row)
-            if row[3]:
-                episodes.append(running)
-                running = []
-        start += count
-        while n_removable and sum(len(e) + 1 for e in episodes) + (len(running) + 1 if running else 0) > capacity:
-            episodes.pop(0)
-            n_removable -= 1
-    return episodes, running
-
-
 LENGTHS = st.lists(st.integers(1, LONGEST), min_size=1, max_size=8)
 
 
 @given(st.lists(LENGTHS, min_size=ENVS, max_size=ENVS), st.lists(st.sampled_from(CHUNKS), min_size=1, max_size=8))
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=25, deadline=None)
 def test_replay_matches_slow_twin(lengths_by_env, chunks):
     total = sum(chunks)
     rows = [stream(lengths * (total + 1), env)[:total] for env, lengths in enumerate(lengths_by_env)]
-    buffer = filled_replay(rows, chunks)
+    buffer = filled_replay(rows, chunks, CAPACITY)
     number = np.asarray(replay.oldest_transition(buffer))[:, None] + np.arange(CAPACITY)
-    steps = read(buffer, Index(jnp.repeat(jnp.arange(ENVS)[:, None], CAPACITY, axis=1), jnp.asarray(number)))
+    index = Index(np.repeat(np.arange(ENVS)[:, None], CAPACITY, axis=1), number)
+    steps = jax.tree.map(np.asarray, read(buffer, index))
+    mean_length = ENVS * total // max(1, sum(row[3] for env_rows in rows for row in env_rows))
     n_transitions, n_finished = np.asarray(replay.n_transitions(buffer)), np.asarray(replay.n_finished(buffer))
     for env in range(ENVS):
-        episodes, running = slow_replay(rows[env], chunks)
-        assert n_finished[env] == len(episodes)
-        assert n_transitions[env] == sum(map(len, episodes)) + len(running)
-        i = 0
-        for is_finished, episode in [*((True, episode) for episode in episodes), (False, running)]:
-            return_ = np.sum([step[2] for step in episode], axis=0) if episode else None
-            for t, (observation, next_observation, _, ended) in enumerate(episode):
-                at, is_last = (env, i), t == len(episode) - 1
-                columns, next_columns, *_ = replay_columns([[(observation, next_observation, [0, 0], ended)]])
-                for name in COLUMNS:
-                    np.testing.assert_array_equal(steps.columns[name][at], columns[name][0, 0])
-                for name in ("observation", "state"):
-                    np.testing.assert_array_equal(steps.next_columns[name][at], next_columns[name][0, 0])
-                assert bool(steps.finished[at]) == is_finished
-                np.testing.assert_allclose(steps.mean_reward[at], return_ / len(episode), rtol=1e-6)
-                np.testing.assert_allclose(steps.episodic_reward[at], return_ * (is_finished and is_last), rtol=1e-6)
-                i += 1
+        finished, running = slow_replay(rows[env], chunks, CAPACITY)
+        episodes = [*finished, running] if running else finished
+        stored = [step for episode in episodes for step in episode]
+        assert n_finished[env] == len(finished)
+        assert n_transitions[env] == len(stored)
+        at = env, slice(len(stored))
+        columns, next_columns, *_ = replay_columns([stored])
+        for name in COLUMNS:
+            np.testing.assert_array_equal(steps.columns[name][at], columns[name][:, 0])
+        for name in ("observation", "state"):
+            np.testing.assert_array_equal(steps.next_columns[name][at], next_columns[name][:, 0])
+        lengths = [len(episode) for episode in episodes]
+        length = np.repeat(lengths, lengths)
+        return_ = np.repeat([np.sum([step[2] for step in episode], axis=0) for episode in episodes], lengths, axis=0)
+        np.testing.assert_allclose(steps.mean_reward[at], return_ / length[:, None], rtol=1e-6)
+        is_last = np.array([step[3] for step in stored])
+        np.testing.assert_array_equal(steps.last[at], is_last)
+        np.testing.assert_allclose(steps.episodic_reward[at], return_ * is_last[:, None], rtol=1e-6)
+        is_finished = np.arange(len(stored)) < len(stored) - len(running)
+        np.testing.assert_array_equal(steps.finished[at], is_finished)
+        expected_length = np.where(is_finished, length, np.maximum(length, mean_length))
+        np.testing.assert_array_equal(steps.length[at], expected_length)
     assert set(steps.next_columns) == {"observation", "state"}
 
 
 def test_extend_in_chunks():
-    rows = [stream([4, 6, 3, 2, 5], env) for env in range(ENVS)]
-    chunked, at_once = filled_replay(rows, [3, 7, 1, 7, 1, 1], capacity=60), filled_replay(rows, [20], capacity=60)
-    assert jax.tree.all(jax.tree.map(jnp.array_equal, chunked, at_once))
-
-
-def test_columns_are_those_of_init():
-    steps, few = replay_columns([stream([3, 4], env) for env in range(2)]), {"observation": COLUMNS["observation"]}
-    before, after = ({"observation": columns["observation"]} for columns in steps[:2])
-    buffer = replay.extend(replay.init_replay(few, 2, CAPACITY, 2), before, after, *steps[2:])
-    newest = replay.read(buffer, replay.newest_steps(buffer, 2))
-    assert (set(newest.columns), set(newest.next_columns)) == ({"observation"}, {"observation"})
+    rows = [stream([4, 3, 2, 5], env) for env in range(ENVS)]
+    chunked, at_once = (filled_replay(rows, chunks, CAPACITY) for chunks in ([1, 3, 3, 7], [7, 7]))
+    jax.tree.map(np.testing.assert_array_equal, chunked, at_once)
 
 
 def test_newest_steps():
     rows = [stream([4, 6, 3, 2, 5], env) for env in range(ENVS)]
-    buffer = filled_replay(rows, [7, 7])
+    buffer = filled_replay(rows, [7, 7], CAPACITY)
     observation = read(buffer, replay.newest_steps(buffer, 5)).columns["observation"]
     np.testing.assert_array_equal(observation[..., 0, 0], [[row[0] for row in env[9:14]] for env in rows])
 
 
 def test_abandon_running():
-    buffer = filled_replay([stream([2, 5], 0), stream([4, 3], 1), stream([3, 1, 9], 2)], [7])
+    buffer = filled_replay([stream([2, 5], 0), stream([4, 3], 1), stream([3, 1, 9], 2)], [7], CAPACITY)
     assert buffer.running.tolist() == [True, True, True]
     abandoned = replay.abandon_running(buffer, jnp.array([True, False, True]))
     assert replay.n_transitions(abandoned).tolist() == [2, 7, 4]
@@ -143,17 +82,18 @@ def test_abandon_running():
     )
     np.testing.assert_allclose(steps.mean_reward[0], [[0.5, -1]] * 3)
     unchanged = replay.abandon_running(abandoned, jnp.array([True, False, True]))
-    assert jax.tree.all(jax.tree.map(jnp.array_equal, unchanged, abandoned))
+    assert jax.tree.all(jax.tree.map(np.array_equal, unchanged, abandoned))
 
 
 def test_hide_newest():
-    buffer = filled_replay([stream([2, 3, 1, 1])], [7])
-    hidden = replay.hide_newest(buffer, jnp.array([2]))
-    assert replay.n_finished(hidden).tolist() == [1]
-    number = jnp.arange(7)
-    assert read(hidden, Index(0 * number, number)).finished.tolist() == [True] * 2 + [False] * 5
+    buffer = filled_replay([stream([2, 3, 2, 1])[:7]] * ENVS, [7], CAPACITY)
+    hidden = replay.hide_newest(buffer, jnp.array([2, 0, 1]))
+    assert replay.n_finished(hidden).tolist() == [1, 3, 2]
+    assert hidden.running.tolist() == [True, False, True]
+    finished = read(hidden, replay.newest_steps(hidden, 7)).finished
+    assert finished.sum(axis=1).tolist() == [2, 7, 5]
     restored = hidden._replace(episodes=buffer.episodes, running=buffer.running)
-    assert jax.tree.all(jax.tree.map(jnp.array_equal, restored, buffer))
+    assert jax.tree.all(jax.tree.map(np.array_equal, restored, buffer))
 
 
 @pytest.mark.parametrize(("steps", "longest"), [(1, 1), (7, 6), (50, 1000)])
@@ -168,3 +108,11 @@ def test_required_capacity(steps, longest):
 def test_empty_replay():
     empty = replay.init_replay(COLUMNS, ENVS, CAPACITY, 2)
     assert replay.n_transitions(empty).tolist() == replay.n_finished(empty).tolist() == [0, 0, 0]
+
+
+def test_trajectory_ended():
+    """A step is the last of its episode if it is terminated or truncated."""
+    terminated, truncated = np.array([[False, True, False, True]]), np.array([[False, False, True, True]])
+    timestep = Timestep(*[np.zeros((1, 4))] * 5, terminated=terminated, truncated=truncated, measures={})
+    trajectory = Trajectory(timestep, np.zeros((1, 4, 1, 1)), np.zeros((1, 4, 1, 1)), timestep)
+    np.testing.assert_array_equal(trajectory.ended, [[False, True, True, True]])

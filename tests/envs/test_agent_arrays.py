@@ -1,13 +1,16 @@
-"""Agents with different spaces in common arrays. `test_pettingzoo_env.py` tests them in episodes."""
+"""Agents with different spaces in common arrays, and in teams. `test_pettingzoo_env.py` tests them in episodes."""
 
 import numpy as np
 import pytest
 from gymnasium import Space
 from gymnasium.spaces import Box, Dict, Discrete, MultiBinary
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from helpers.toy_envs import toy_spec
 from lare_rl.envs.agent_arrays import Agent, AgentArrays, make_agent
+from lare_rl.envs.interface import Team
+from lare_rl.envs.pettingzoo_construct import agent_kind, group_by_team
 from lare_rl.errors import LareError
 
 PLANE = Box(-1, 1, (2,), np.float32)
@@ -23,7 +26,6 @@ def agent(name: str = "a_0", observation: Space = PLANE, action: Space = PLANE) 
         (Discrete(3, start=-1), [0, 0.5, 0.25, 9], 0),  # the fourth entry is padding
         (Box(-2, 2, (2,), np.float32), [3, -0.5, 9, 9], [2, -0.5]),
         (Box(0, 9, (1, 2), np.int32), [2.6, 3.2, 0, 0], [[3, 3]]),
-        (Box(0, 9, (2,), np.uint8), [-0.4, 9.7, 0, 0], [0, 9]),
     ],
 )
 def test_decode_action(space, vector, action):
@@ -44,21 +46,7 @@ def test_bounds_and_available_actions_are_padded():
     assert [bound.shape for bound in discrete.bounds] == [(2, 0), (2, 0)]
 
 
-def test_observations_of_different_agents_end_with_their_index():
-    layout = AgentArrays([agent(), agent("b_0", observation=Box(-1, 1, (3,), np.float32))])
-    assert layout.observation_size == 5
-    vectors = {0: np.array([0.1, 0.2], np.float32), 1: np.array([1, 2, 3], np.float32)}
-    expected = np.array([[0.1, 0.2, 0, 1, 0], [1, 2, 3, 0, 1]], np.float32)
-    np.testing.assert_array_equal(layout.pad_observations(vectors), expected)
-    assert layout.pad_observations({1: vectors[1]})[0].tolist() == [0] * 5
-
-
-def test_observations_of_equal_agents_have_no_index():
-    assert AgentArrays([agent(), agent("a_1")]).observation_size == 2
-    other_action = AgentArrays([agent(), agent("a_1", action=Box(-1, 1, (1,), np.float32))])
-    assert other_action.observation_size == 4
-
-
+@settings(deadline=None, max_examples=40)
 @given(
     value=st.lists(st.floats() | st.integers() | st.none() | st.text(max_size=2), max_size=3)
     | st.none()
@@ -87,3 +75,55 @@ def test_read_mask_of_anything(value, size):
 def test_spaces_that_do_not_fit_together(spaces, content):
     with pytest.raises(LareError, match=content):
         AgentArrays([agent(f"a_{index}", *pair) for index, pair in enumerate(spaces)])
+
+
+# Teams
+
+NAMES = ["cat_0", "mouse_0", "cat_1"]
+
+
+def test_agent_kind():
+    kinds = {"prey_12": "prey", "prey": "prey", "walker3": "walker", "red_2_1": "red_2", "7": "7", 7: "7", "_3": "_3"}
+    assert {name: agent_kind(name) for name in kinds} == kinds
+
+
+def make_roles(**patterns):
+    return [toy_spec(name=name, team=name, agents=agents, environment="a/b") for name, agents in patterns.items()]
+
+
+@pytest.mark.parametrize(
+    ("changes", "order", "teams"),
+    [
+        ({}, NAMES, (Team("agent", 0, 3),)),
+        ({"team": "all"}, NAMES, (Team("all", 0, 3),)),
+        (
+            {"team": "mouse", "agents": ("mouse_0",)},
+            ["mouse_0", "cat_0", "cat_1"],
+            (Team("mouse", 0, 1), Team("not mouse", 1, 3)),
+        ),
+        (
+            {"environment": "a/b", "teams": make_roles(mouse=("mouse_*",), cat=("cat_*",))},
+            ["mouse_0", "cat_0", "cat_1"],
+            (Team("mouse", 0, 1), Team("cat", 1, 3)),
+        ),
+    ],
+)
+def test_group_by_team(changes, order, teams):
+    assert group_by_team(NAMES, toy_spec(**changes)) == (order, teams)
+
+
+def test_agents_of_one_kind_name_their_team():
+    assert group_by_team(["cat_0", "cat_1"], toy_spec()) == (["cat_0", "cat_1"], (Team("cat", 0, 2),))
+
+
+@pytest.mark.parametrize(
+    ("patterns", "content"),
+    [
+        ({"x": ("cat_*",), "y": ("dog_*",)}, "no agent is in y"),
+        ({"x": ("cat_*",), "y": ("*_1", "mouse_*")}, "cat_1 is in x and y"),
+        ({"x": ("cat_*",)}, "mouse_0 is in no team"),
+    ],
+)
+def test_teams_that_are_refused(patterns, content):
+    with pytest.raises(LareError, match=content):
+        group_by_team(NAMES, toy_spec(environment="a/b", teams=make_roles(**patterns)))

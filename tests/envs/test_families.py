@@ -1,8 +1,5 @@
 """From a task to its environment: families, the keys that they read, and what must agree."""
 
-import os
-import subprocess
-import sys
 from dataclasses import replace
 
 import numpy as np
@@ -15,22 +12,14 @@ from lare_rl.envs.families import find_score, load_env_spec, make_env, make_host
 from lare_rl.envs.interface import EnvSpec, Team
 from lare_rl.envs.jax_on_host import JaxOnHost
 from lare_rl.envs.load import read_task
-from lare_rl.envs.pettingzoo_env import ParallelHost
 from lare_rl.errors import LareError
 from lare_rl.tasks.spec import TaskSpec
 
 TOY = "pettingzoo/helpers.parallel_toy_envs:Toy"
 KEYS = {"max_episode_steps": 25, "arguments": {"N": 3}, "agents": ("a_*",)}
 
-HUNT = EnvSpec(
-    (Team("cat", 0, 2), Team("mouse", 2, 5)),
-    observation_size=4,
-    action_size=3,
-    discrete=True,
-    max_steps=9,
-    state_size=7,
-    measures=("caught",),
-)
+TEAMS = Team("cat", 0, 2), Team("mouse", 2, 5)
+HUNT = EnvSpec(TEAMS, 4, 3, discrete=True, max_steps=9, state_size=7, measures=("caught",))
 
 
 class Logged(ToyHostEnv):
@@ -69,25 +58,13 @@ def make_teams(**changes) -> tuple[TaskSpec, ...]:
 # Families
 
 
-PROGRAM = """
-from helpers.toy_envs import toy_spec
-from lare_rl.envs.families import make_env
-print(type(make_env(toy_spec(environment="plugin/two", action_size=2))).__name__)
-"""
-
-
-def test_plugin_families_are_found(tmp_path):
-    """A plugin registers a family by the location of its maker. Plugins are imported once, so this needs a new process."""
+def test_maker_may_be_a_location(tmp_path, monkeypatch):
     (tmp_path / "my_envs.py").write_text(
-        "from helpers.host_envs import ToyHostEnv\n"
-        "from lare_rl.envs.families import register_family\n"
-        'register_family("plugin", "my_envs:make")\n'
-        "def make(task, **_): return ToyHostEnv()\n"
+        "from helpers.host_envs import ToyHostEnv\ndef make(task): return ToyHostEnv()\n"
     )
-    path = os.pathsep.join([str(tmp_path), *sys.path])
-    variables = os.environ | {"PYTHONPATH": path, "LARE_PLUGINS": "my_envs"}
-    output = subprocess.run([sys.executable, "-c", PROGRAM], env=variables, capture_output=True, text=True, check=True)
-    assert output.stdout.split() == ["ToyHostEnv"]
+    monkeypatch.syspath_prepend(tmp_path)
+    register_family("located", "my_envs:make")
+    assert isinstance(make_env(toy_spec(environment="located/two", action_size=2)), ToyHostEnv)
 
 
 def test_family_names_are_unique():
@@ -99,9 +76,9 @@ def test_family_names_are_unique():
 @pytest.mark.parametrize(
     ("environment", "key"),
     [
-        *(("particles/CN-6", key) for key in KEYS),
-        *(("smax/2s3z", key) for key in KEYS),
         *(("smac/2s3z", key) for key in KEYS),
+        ("particles/CN-6", "agents"),
+        ("smax/2s3z", "max_episode_steps"),
         ("toys/Chase-v0", "arguments"),
         ("toys/Chase-v0", "agents"),
     ],
@@ -136,9 +113,8 @@ def test_unregistered_names_belong_to_gymnasium():
 
 
 def test_score_of_a_task_comes_before_its_family():
-    assert find_score(read_task("SMAX-2s3z")) == "sum"
-    assert find_score(toy_spec(environment="smax/2s3z", score="average")) == "average"
-    assert find_score(toy_spec()) is None
+    tasks = read_task("SMAX-2s3z"), toy_spec(environment="smax/2s3z", score="average"), toy_spec()
+    assert list(map(find_score, tasks)) == ["sum", "average", None]
 
 
 # Agreement of a task and its environment
@@ -158,18 +134,14 @@ def test_tasks_that_agree():
     [
         ({}, "has the teams cat, mouse"),
         ({"teams": make_teams()[::-1]}, "must be cat, mouse, in this order"),
-        ({"teams": make_teams()[:1]}, "must be cat, mouse, in this order"),
         ({"team": "mose"}, "team = 'mose', but the teams .* are cat, mouse"),
         ({"team": "cat", "max_episode_steps": 10}, "max_episode_steps = 10, but 9"),
         ({"team": "cat", "measures": ("caught", "won")}, "no measure 'won'"),
         ({"team": "cat", "observation_size": 5}, "observation_size = 5, but .* observations of size 4"),
         ({"team": "cat", "judged_from": "state"}, "observation_size = 4, but .* states of size 7"),
-        ({"team": "cat", "judged_from": "state", "observation_size": 7}, "joint actions of size 6"),
         ({"team": "mouse", "judged_from": "state", "observation_size": 7, "action_size": 6}, "joint actions of size 9"),
         ({"teams": make_teams(action_size=2)}, "'Mouse': action_size = 2, but .* actions of size 3"),
         ({"teams": make_teams(judges="after")}, "'Mouse': judges = 'after', but 'before' in 'Hunt'"),
-        ({"teams": make_teams(judged_from="state")}, "'Mouse': judged_from = 'state', but 'observation' in 'Hunt'"),
-        ({"teams": make_teams(arguments={"n": 3})}, r"'Mouse': arguments = {'n': 3}, but {} in 'Hunt'"),
         ({"teams": make_teams(), "max_episode_steps": 9}, "'Cat': max_episode_steps = None, but 9 in 'Hunt'"),
         ({"team": "cat", "judged_from": "state", "description": "No state."}, "has no global state"),
         ({"teams": make_teams(), "agents": ("a_*",)}, "agents has no effect on a task with teams"),
@@ -180,12 +152,6 @@ def test_tasks_that_agree():
 def test_tasks_that_do_not_agree(changes, content):
     with pytest.raises(LareError, match=content):
         make_env(make_task(**changes))
-
-
-@pytest.mark.parametrize("environment", ["toys/Chase-v0", "particles/CN-6"])
-def test_environments_without_state(environment):
-    with pytest.raises(LareError, match=f"{environment} has no global state"):
-        make_env(toy_spec(environment=environment, judged_from="state"))
 
 
 # Making environments
@@ -209,22 +175,10 @@ def test_sizes_are_read_once(log):
     assert load_env_spec(make_toy_task(name="sizes", description="Run.")) is not first
 
 
-def test_arguments_are_passed_on(log):
-    make_env(make_toy_task(), render_mode="rgb_array")
+def test_make_host_env(echo, log):
+    assert isinstance(make_host_env(make_toy_task(), render_mode="rgb_array"), Logged)
     assert log == [("made", {"render_mode": "rgb_array"})]
-
-
-def test_make_host_env(echo):
-    assert isinstance(make_host_env(make_toy_task()), Logged)
     assert isinstance(make_env(echo), Echo)
     env = make_host_env(echo)
     assert isinstance(env, JaxOnHost)
     assert env.spec is Echo.spec
-
-
-def test_single_team_of_pettingzoo_is_first():
-    task = toy_spec(environment=TOY, observation_size=2, action_size=3, team="second", agents=("a_1",))
-    env = make_host_env(task)
-    assert isinstance(env, ParallelHost)
-    assert env.spec.teams == (Team("second", 0, 1), Team("not second", 1, 2))
-    assert [agent.name for agent in env.layout.agents] == ["a_1", "a_0"]

@@ -9,6 +9,7 @@ from helpers.toy_envs import Chase, toy_spec
 from lare_rl.envs.families import load_env_spec
 from lare_rl.envs.load import load_task, read_task, shipped_tasks
 from lare_rl.errors import LareError
+from lare_rl.tasks.spec import require_role, select_states
 
 NAMES = (
     "CN-15, CN-30, CN-6, CompetitivePP-6, CompetitivePP-6-predator, CompetitivePP-6-prey, HalfCheetah-v4, "
@@ -38,19 +39,12 @@ gymnasium.register("misfits/Board-v0", entry_point=Board, max_episode_steps=20)
 gymnasium.register("misfits/Broken-v0", entry_point=Broken, max_episode_steps=20)
 
 
-@pytest.mark.parametrize("name", [name for name in shipped_tasks() if not name.startswith("SMAC-")])
-def test_shipped_tasks_match_their_environments(name):
-    assert load_task(name).name == name
-
-
-@pytest.mark.parametrize("name", shipped_tasks())
-def test_texts_do_not_mention_rewards(name):
-    task = read_task(name)
-    assert "reward" not in f"{task.description} {task.observation} {task.action}".lower()
-
-
-def test_shipped_names():
+def test_shipped_tasks():
     assert ", ".join(shipped_tasks()) == NAMES
+    for name in shipped_tasks():
+        task = read_task(name) if name.startswith("SMAC-") else load_task(name)  # StarCraft II may not be installed
+        assert task.name == name
+        assert "reward" not in f"{task.description} {task.observation} {task.action}".lower()
 
 
 def test_task_file(spec_file):
@@ -60,48 +54,27 @@ def test_task_file(spec_file):
     )
 
 
-def test_paths_are_relative_to_the_file(spec_file, tmp_path):
-    spec_file()
-    (tmp_path / "child.toml").write_text('like = "chase.toml"\nname = "Child"\n')
-    assert load_task(tmp_path / "child.toml") == toy_spec(name="Child")
-
-
-def test_like_provides_missing_keys():
-    parent, child = read_task("HalfCheetah-v4"), read_task("HalfCheetahSparse-v4")
-    changed = {"name", "environment", "measures"}
-    assert child.model_dump(exclude=changed) == parent.model_dump(exclude=changed)
-    assert {key: getattr(child, key) for key in changed} == {
-        "name": "HalfCheetahSparse-v4",
-        "environment": "lare/HalfCheetahSparse-v4",
-        "measures": ("x_position",),
-    }
-
-
 def test_like_over_two_generations(spec_file, tmp_path):
+    spec_file(like="Reacher-v4", action=None)
     child = tmp_path / "child.toml"
-    child.write_text(f'like = "{spec_file(like="Reacher-v4", action=None)}"\nname = "Child"\n')
+    child.write_text('like = "chase.toml"\nname = "Child"\n')
     assert read_task(child) == toy_spec(name="Child", action=read_task("Reacher-v4").action)
 
 
 @pytest.mark.parametrize(
     ("changes", "content"),
     [
-        ({"action": None}, "'action' is missing"),
         ({"action": None, "observation": None}, "'observation', 'action' are missing"),
         ({"reward": "1 a step"}, "no key 'reward'"),
-        ({"self": "x"}, "no key 'self'"),
         ({"judge": "after"}, "did you mean 'judges'"),
         ({"description": "  "}, "description = '  '"),
         ({"judges": "during"}, "judges = 'during'"),
         ({"name": "a/b"}, "name = 'a/b'"),
         ({"action_size": 0}, "action_size = 0"),
-        ({"max_episode_steps": 0}, "max_episode_steps = 0"),
-        ({"like": 3}, "like = 3 must be"),
         ({"like": ["PP-6"]}, r"like = \['PP-6'\] must be"),
         ({"teams": "PP-6"}, "teams = 'PP-6' must be"),
         ({"teams": [3]}, r"teams = \[3\] must be"),
         ({"like": "Reacher"}, "did you mean 'Reacher-v4'"),
-        ({"observation_size": 3}, "observation_size = 3, but .* observations of size 2"),
         ({"environment": "CartPole-v1", "observation_size": 4}, "action_size = 1, but .* actions of size 2"),
         ({"environment": "misfits/Board-v0"}, "action space of misfits/Board-v0"),
         ({"environment": "misfits/Unbounded-v0"}, "no bounds"),
@@ -130,6 +103,9 @@ def test_unknown_environment(spec_file, environment):
         (b"Dear reader", "not valid TOML: Expected"),
         (b"\xff", "cannot be read"),
         (b"", "'name', 'environment', .* are missing"),
+        # TOML has values that JSON lacks. A run would store them as null or text, which make another environment.
+        (b'like = "CN-6"\narguments = { n = 2001-02-03 }', r"arguments = .*a run cannot store"),
+        (b'like = "CN-6"\narguments = { n = [1, nan] }', r"arguments = .*a run cannot store"),
     ],
 )
 def test_file_without_a_task(tmp_path, text, content):
@@ -142,11 +118,8 @@ def test_file_without_a_task(tmp_path, text, content):
 @pytest.mark.parametrize(
     ("task", "content"),
     [
-        ("HalfCheeta-v4", "did you mean 'HalfCheetah-v4'"),
         ("walker2d-v4", "did you mean 'Walker2d-v4'"),
-        ("cheetah", "did you mean 'HalfCheetah-v4'"),
         ("chess", "no task 'chess'. .* CN-6"),
-        ("", "no task ''"),
         ("x" * 300, "no task 'xxx"),
         ("no/such/file.toml", "no task file no/such/file.toml"),
         ("/", "is a folder"),
@@ -157,36 +130,28 @@ def test_unknown_task(task, content):
         load_task(task)
 
 
-def test_roles_of_teams():
-    task = read_task("CompetitivePP-6")
-    assert [role.name for role in task.roles] == ["CompetitivePP-6-predator", "CompetitivePP-6-prey"]
-    assert (task.family, task.environment_name, task.team) == ("particles", "CompetitivePP-6", None)
-    assert [(role.environment, role.team) for role in task.roles] == [
-        (task.environment, "predator"),
-        (task.environment, "prey"),
-    ]
-    single = read_task("CN-6")
-    assert (single.roles, single.team) == ((single,), None)
-
-
 def test_teams_inherit_shared_keys(spec_file, tmp_path):
-    spec_file(team="one", environment=None, judges=None)
-    (tmp_path / "whole.toml").write_text(
-        'like = "chase.toml"\nname = "Whole"\nenvironment = "x/y"\nteams = ["chase.toml"]\n'
+    spec_file(team="first", environment=None, judges=None)
+    (tmp_path / "both.toml").write_text(
+        'like = "Reacher-v4"\nname = "Both"\nenvironment = "x/y"\nteams = ["chase.toml"]\njudges = "both"\n'
+        "arguments = { n = 3 }\n"
     )
-    text = (tmp_path / "whole.toml").read_text() + 'judges = "both"\narguments = { n = 3 }\n'
-    (tmp_path / "whole.toml").write_text(text.replace('like = "chase.toml"\n', 'like = "Reacher-v4"\n'))
-    (role,) = read_task(tmp_path / "whole.toml").teams
-    assert (role.environment, role.judges, role.arguments, role.team) == ("x/y", "both", {"n": 3}, "one")
+    (role,) = read_task(tmp_path / "both.toml").teams
+    assert (role.environment, role.judges, role.arguments, role.team) == ("x/y", "both", {"n": 3}, "first")
 
 
 def test_like_keeps_teams(tmp_path):
     (tmp_path / "mine.toml").write_text('like = "CompetitivePP-6"\nname = "Mine"\n')
     task = read_task(tmp_path / "mine.toml")
-    assert [role.team for role in task.roles] == ["predator", "prey"]
+    assert [(role.name, role.team) for role in task.roles] == [
+        ("CompetitivePP-6-predator", "predator"),
+        ("CompetitivePP-6-prey", "prey"),
+    ]
+    assert (task.family, task.environment_name, task.team) == ("particles", "CompetitivePP-6", None)
+    assert read_task("CN-6").roles == (read_task("CN-6"),)
 
 
-@pytest.mark.parametrize("circle", [["a"], ["a", "b"], ["a", "b", "c"]])
+@pytest.mark.parametrize("circle", [["a"], ["a", "b", "c"]])
 def test_like_cycle(tmp_path, circle):
     files = [tmp_path / name for name in circle]
     for index, file in enumerate(files):
@@ -202,16 +167,30 @@ def test_time_limit_of_the_task_comes_first():
 
 
 def test_environment_with_module(spec_file):
-    assert (
-        load_task(spec_file(environment="helpers.toy_envs:toys/Chase-v0")).environment
-        == "helpers.toy_envs:toys/Chase-v0"
-    )
+    environment = "helpers.toy_envs:toys/Chase-v0"
+    assert load_task(spec_file(environment=environment)).environment == environment
 
 
-@pytest.mark.parametrize("value", ["inf", "-inf", "nan", "2001-02-03", "[1, nan]", "{ n = inf }"])
-def test_arguments_that_json_lacks(tmp_path, value):
-    """TOML has them and JSON has not: they would come back as null, or as text, and make another environment."""
-    path = tmp_path / "task.toml"
-    path.write_text(f'like = "CN-6"\narguments = {{ n = {value} }}\n')
-    with pytest.raises(LareError, match=r"arguments = .*a run cannot store"):
-        read_task(path)
+# Tasks as values
+
+
+@pytest.mark.parametrize("key", ["name", "description", "observation", "action", "environment"])
+def test_digest_depends_on_every_text(key):
+    assert toy_spec().digest == toy_spec().digest
+    assert toy_spec(**{key: "another"}).digest != toy_spec().digest
+
+
+def test_select_states():
+    assert [select_states(key, 0, 1) for key in ("before", "after", "both")] == [[0], [1], [0, 1]]
+
+
+def test_require_role():
+    assert require_role(toy_spec()) == toy_spec()
+    teams = tuple(toy_spec(name=name, team=name) for name in ("cat", "mouse"))
+    with pytest.raises(LareError, match="cat, mouse"):
+        require_role(toy_spec(teams=teams))
+
+
+def test_team_of_another_environment():
+    with pytest.raises(LareError, match="Cat is not a team of a/b"):
+        toy_spec(environment="a/b", teams=(toy_spec(name="Cat", team="cat", environment="c/d"),))

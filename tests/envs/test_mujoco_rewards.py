@@ -5,7 +5,6 @@ import numpy as np
 import pytest
 from gymnasium.spaces import Box
 
-import lare_rl
 from lare_rl.envs.gymnasium_env import make_gymnasium
 from lare_rl.envs.load import read_task
 from lare_rl.envs.mujoco_rewards import HIDDEN_REWARDS, TARGET_SPEEDS, SparseDistanceReward, register
@@ -34,11 +33,13 @@ def test_hidden_rewards_by_hand(name, velocity, foot_angle, effort, reward):
 def test_only_the_reward_differs(name):
     body = next(body for body in TARGET_SPEEDS if name.startswith(body))
     task, original = read_task(name), read_task(f"{body}-v4")
+    # The same texts have the same recorded replies.
     assert task.model_copy(update={"name": original.name, "environment": original.environment}) == original
     hidden_env, original_env = make_gymnasium(task.environment), make_gymnasium(original.environment)
     np.testing.assert_array_equal(*(env.reset(seed=3)[0] for env in (hidden_env, original_env)))
-    for seed in range(5):
-        action = np.random.default_rng(seed).uniform(-1, 1, hidden_env.action_space.shape).astype(np.float32)
+    rng = np.random.default_rng(0)
+    for _ in range(3):
+        action = rng.uniform(-1, 1, hidden_env.action_space.shape).astype(np.float32)
         next_obs, reward, *ends, _ = hidden_env.step(action)
         expected, original_reward, *expected_ends, _ = original_env.step(action)
         np.testing.assert_array_equal(next_obs, expected)
@@ -46,11 +47,6 @@ def test_only_the_reward_differs(name):
         compute_reward = HIDDEN_REWARDS[name.removeprefix(body).removesuffix("-v4")]
         assert reward == pytest.approx(compute_reward(next_obs, float(np.sum(action**2)), TARGET_SPEEDS[body]))
         assert reward != pytest.approx(original_reward)
-
-
-def test_recorded_replies_are_those_of_the_original_task():
-    hidden, original = (lare_rl.design(lare_rl.load_task(name)) for name in ("HalfCheetahTarget-v4", "HalfCheetah-v4"))
-    assert hidden.source == original.source
 
 
 class OneStep(gymnasium.Env):
@@ -81,18 +77,16 @@ def test_sparse_reward_by_hand(x_position, terminated, truncated, reward):
     assert SparseDistanceReward(env).step(np.zeros(1)) == (observation, reward, *rest)
 
 
-@pytest.mark.parametrize("limit", [None, 20])
-def test_sparse_half_cheetah(limit):
+def test_sparse_half_cheetah():
     """The wrapper must be outside the time limit, to see the end of an episode."""
-    env, length = make_gymnasium(SPARSE, max_episode_steps=limit), limit or 1000
-    assert env.get_wrapper_attr("distance") == 500.0
+    assert make_gymnasium(SPARSE).get_wrapper_attr("distance") == 500.0
+    env = make_gymnasium(SPARSE, max_episode_steps=20)
     env.reset(seed=0)
-    if limit:
-        env.set_wrapper_attr("distance", -100.0)
-    results = [env.step(np.zeros(6, np.float32)) for _ in range(length)]
+    env.set_wrapper_attr("distance", -100.0)
+    results = [env.step(np.zeros(6, np.float32)) for _ in range(20)]
     env.close()
-    assert [reward for _, reward, *_ in results] == [0.0] * (length - 1) + [float(limit is not None)]
-    assert [truncated for *_, truncated, _ in results] == [False] * (length - 1) + [True]
+    assert [reward for _, reward, *_ in results] == [0.0] * 19 + [1.0]
+    assert [truncated for *_, truncated, _ in results] == [False] * 19 + [True]
 
 
 def test_registering_again_changes_nothing():

@@ -6,9 +6,8 @@ import gymnasium
 import numpy as np
 import pytest
 from gymnasium.spaces import Box, Dict, Discrete, MultiBinary, MultiDiscrete
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
-from pettingzoo.test import parallel_api_test
 
 from helpers.parallel_toy_envs import Toy
 from helpers.toy_envs import toy_spec
@@ -51,15 +50,7 @@ def check_episode(host: ParallelHost, timesteps) -> None:
     """Assert what the interface promises for every episode."""
     spec = host.spec
     agents = spec.n_agents
-    shapes = [
-        (agents, spec.observation_size),
-        (spec.state_size,),
-        (agents, spec.action_size),
-        (agents,),
-        (agents,),
-        (),
-        (),
-    ]
+    shapes = [(agents, spec.observation_size), (spec.state_size,), (agents, spec.action_size), *[(agents,)] * 2, (), ()]
     was_alive, departed = np.zeros((2, agents), bool)
     for number, timestep in enumerate(timesteps):
         assert [value.shape for value in timestep[:-1]] == shapes
@@ -85,11 +76,10 @@ def check_episode(host: ParallelHost, timesteps) -> None:
 @pytest.mark.parametrize(
     ("environment", "arguments", "sizes", "n_episodes"),
     [
-        (SPREAD, {}, (18, 5, 54, 25), 5),
-        (SPREAD, {"N": 5, "max_cycles": 7, "continuous_actions": True}, (30, 5, 150, 7), 3),
-        (ADVERSARY, {}, (10 + 3, 5, 28, 25), 5),
-        (WALKERS, {}, (31, 4, 75, 500), 3),
-        (KNIGHTS, {"max_zombies": 20}, (185, 6, 144, 900), 6),
+        (SPREAD, {"N": 5, "max_cycles": 7, "continuous_actions": True}, (30, 5, 150, 7), 2),
+        (ADVERSARY, {}, (10 + 3, 5, 28, 25), 2),
+        (WALKERS, {}, (31, 4, 75, 500), 2),
+        (KNIGHTS, {"max_zombies": 20}, (185, 6, 144, 900), 2),
     ],
 )
 def test_real_environments(environment, arguments, sizes, n_episodes, monkeypatch):
@@ -116,10 +106,6 @@ def test_real_environments(environment, arguments, sizes, n_episodes, monkeypatc
         assert all(timesteps[-1].terminated for timesteps in episodes)
 
 
-def test_toy_is_a_parallel_env():
-    parallel_api_test(Toy(), 100)
-
-
 # Teams
 
 
@@ -130,9 +116,7 @@ def test_teams_follow_the_task_file(tmp_path):
     keys = f'environment = "{ADVERSARY}"\nobservation_size = 13\naction_size = 5\n'
     (tmp_path / "all.toml").write_text(f'name = "all"\n{keys}description = "d"\nobservation = "o"\naction = "a"\n')
     (tmp_path / "both.toml").write_text('like = "all.toml"\nname = "both"\nteams = ["good.toml", "bad.toml"]')
-    task = load_task(tmp_path / "both.toml")
-    assert [(role.name, role.agents) for role in task.roles] == [("good", ("agent_*",)), ("bad", ("adversary_*",))]
-    host = make(task)
+    host = make(load_task(tmp_path / "both.toml"))
     assert host.spec.teams == (Team("good", 0, 2), Team("bad", 2, 3))
     first = host.reset(0)
     np.testing.assert_array_equal(first.observation[:, 10:], np.eye(3))
@@ -155,8 +139,14 @@ def test_agents_that_leave():
         *[[False, True, True]] * 2,
         *[[False, False, True]] * 2,
     ]
-    rewards = [timestep.reward.tolist() for timestep in timesteps]
-    assert rewards == [[0] * 3, [1] * 3, [1] * 3, [0, 1, 1], [0, 1, 1], [0, 0, 1]]
+    assert [timestep.reward.tolist() for timestep in timesteps] == [
+        [0] * 3,
+        [1] * 3,
+        [1] * 3,
+        [0, 1, 1],
+        [0, 1, 1],
+        [0, 0, 1],
+    ]
     assert timesteps[-1].truncated
     np.testing.assert_array_equal(timesteps[-1].observation, [[0, 0], [0, 0], [7, 5]])
     assert list(toy.received_actions[-1]) == ["a_2"]
@@ -167,12 +157,11 @@ def test_agents_that_leave():
 @pytest.mark.parametrize(
     ("leaves", "limit", "end"),
     [
-        ({"a_0": 2, "a_1": 2}, None, (2, True, [True, True])),
         ({"a_0": 1, "a_1": 2}, None, (2, True, [False, True])),
         ({}, None, (5, False, [True, True])),
         ({"a_0": 5}, None, (5, False, [False, True])),  # terminated, while the other agent is truncated
         ({}, 3, (3, False, [True, True])),
-        ({"a_0": 3, "a_1": 3}, 3, (3, True, [True, True])),
+        ({"a_0": 3, "a_1": 3}, 3, (3, True, [True, True])),  # both leave at the limit
         ({"a_0": 3}, 3, (3, False, [False, True])),
     ],
 )
@@ -209,22 +198,6 @@ def test_agents_that_left_may_still_be_listed():
     check_episode(host, timesteps)
     assert [len(actions) for actions in toy.received_actions] == [2, 2, 1, 1, 1]
     assert [timestep.alive[0] for timestep in timesteps] == [True, True, False, False, False, False]
-
-
-def test_arrays_are_copied():
-    class Reuses(Toy):
-        memory = np.zeros(2, np.float32)
-
-        def observe(self, agent):
-            self.memory[:] = self.seed, self.steps
-            return self.memory
-
-        def state(self):
-            return self.memory
-
-    timesteps = play(make_host(Reuses()), 4)
-    assert [timestep.observation[0].tolist() for timestep in timesteps] == [[4, step] for step in range(6)]
-    assert [timestep.state.tolist() for timestep in timesteps] == [[4, step] for step in range(6)]
 
 
 def test_observations_replace_a_missing_state():
@@ -270,19 +243,14 @@ def test_render():
 # Masks
 
 
-def toy_with_masks(make_mask):
-    """Agents whose observations contain the mask `make_mask(toy)`."""
-    space = Dict({"observation": Box(-9e9, 9e9, (2,), np.float32), "action_mask": MultiBinary(3)})
+def masked_toy(make_mask, in_info=True) -> Toy:
+    """Agents that find `make_mask(toy)` in `info`, or in a dictionary with their observation."""
 
     class Masks(Toy):
         def observe(self, agent):
-            return {"observation": super().observe(agent), "action_mask": make_mask(self)}
+            observation = super().observe(agent)
+            return observation if in_info else {"observation": observation, "action_mask": make_mask(self)}
 
-    return Masks(observations=dict.fromkeys(("a_0", "a_1"), space))
-
-
-def toy_with_masks_in_info(make_mask, first_step=0):
-    class Masks(Toy):
         def reset(self, seed=None, options=None):
             observations, infos = super().reset(seed)
             return observations, self.make_infos(infos)
@@ -292,18 +260,19 @@ def toy_with_masks_in_info(make_mask, first_step=0):
             return *results, self.make_infos(infos)
 
         def make_infos(self, infos):
-            return {agent: {"action_mask": make_mask(self)} if self.steps >= first_step else {} for agent in infos}
+            return {agent: {"action_mask": make_mask(self)} if in_info else {} for agent in infos}
 
-    return Masks()
-
-
-MASKED_TOYS = [toy_with_masks, toy_with_masks_in_info]
+    space = Dict({"observation": Box(-9e9, 9e9, (2,), np.float32), "action_mask": MultiBinary(3)})
+    return Masks(observations=None if in_info else dict.fromkeys(("a_0", "a_1"), space))
 
 
-@pytest.mark.parametrize("make_toy", MASKED_TOYS)
-@given(masks=st.lists(st.lists(st.booleans(), min_size=3, max_size=3).filter(any), min_size=6, max_size=6))
-def test_masks(make_toy, masks):
-    host = make_host(make_toy(lambda toy: np.array(masks[toy.steps], np.int8)))
+@pytest.mark.parametrize("in_info", [False, True])
+@settings(deadline=None, max_examples=10)
+@given(masks=st.lists(st.lists(st.booleans(), min_size=3, max_size=3).filter(any), min_size=5, max_size=5))
+def test_masks(in_info, masks):
+    """The last observation has a mask without actions, which nobody reads."""
+    masks = [*masks, [False] * 3]
+    host = make_host(masked_toy(lambda toy: np.array(masks[toy.steps], np.int8), in_info))
     assert host.spec.masks_actions
     assert host.spec.observation_size == 2
     timesteps = play(host)
@@ -312,26 +281,21 @@ def test_masks(make_toy, masks):
     assert timesteps[-1].available.all()
 
 
-@pytest.mark.parametrize("make_toy", MASKED_TOYS)
 @pytest.mark.parametrize(
     ("mask", "content"),
-    [([0, 0, 0], "is 0 for all"), ([1, 0], "shape"), ([1, 0.5, 0], "0.5"), ([1, 2, 0], "2"), ("no", "'no'")],
+    [([0, 0, 0], "is 0 for all"), ([1, 0], "shape"), ([1, 0.5, 0], "0.5"), ("no", "'no'")],
 )
-def test_invalid_masks(make_toy, mask, content):
-    host = make_host(make_toy(lambda toy: mask if toy.steps == 1 else np.ones(3, np.int8)))
+def test_invalid_masks(mask, content):
+    host = make_host(masked_toy(lambda toy: mask if toy.steps == 1 else np.ones(3, np.int8)))
     host.reset(0)
     with pytest.raises(EnvOutputError, match=f"action mask of a_0 .*{content}"):
         host.step(first_actions(host))
 
 
-def test_mask_without_actions_at_the_end():
-    host = make_host(toy_with_masks(lambda toy: np.full(3, toy.steps < 5)))
-    assert play(host)[-1].available.all()
-
-
 # Spaces
 
 
+@settings(deadline=None, max_examples=40)
 @given(data=st.data(), sizes=st.lists(st.integers(1, 3), min_size=1, max_size=3), discrete=st.booleans())
 def test_agents_with_different_spaces(data, sizes, discrete):
     names = [f"a_{index}" for index in range(len(sizes))]
@@ -375,15 +339,11 @@ def test_agents_with_different_spaces(data, sizes, discrete):
     [
         ("nowhere:parallel_env", r"No module named 'nowhere' .*PYTHONPATH"),
         ("helpers.parallel_toy_envs:Toi", "did you mean 'Toy'"),
-        ("helpers.parallel_toy_envs:xx", "it has .*Toy"),
-        ("helpers.parallel_toy_envs:NUMBER", "'int' object is not callable"),
         ("helpers.parallel_toy_envs:raises", "no asset$"),
-        ("helpers.parallel_toy_envs:leaves", "no window"),
         ("helpers.parallel_toy_envs:nothing", "3 is not a ParallelEnv: it has no possible_agents"),
         ("mpe2.simple_spread_v3:env", "AECEnv"),
         ("helpers.parallel_toy_envs", "MODULE:NAME"),
         (":Toy", "MODULE:NAME"),
-        ("pettingzoo:make", "missing 2 required"),
     ],
 )
 def test_environment_that_cannot_be_made(environment, content):
@@ -407,7 +367,7 @@ def test_arguments():
         make(make_task(SPREAD, 18, 5, arguments={"agents": 3}))
 
 
-def toy_with_agents(names):
+def toy_with_agents(names) -> Toy:
     toy = Toy()
     toy.possible_agents = names
     return toy
@@ -418,7 +378,6 @@ def toy_with_agents(names):
     [
         (Toy(cycles=None), "no time limit"),
         (Toy(actions=dict.fromkeys(("a_0", "a_1"), MultiDiscrete([2, 2]))), f"{TOY}.*action space of a_0"),
-        (toy_with_agents([]), "possible agents"),
         (toy_with_agents(["a", "a"]), "possible agents"),
         (toy_with_agents(["a_0", "b_0"]), "spaces cannot be read: 'b_0'"),
     ],
@@ -455,21 +414,16 @@ def list_agents(*names):
 INVALID_STEPS = {
     "no observation for a_1": change(None, "observations"),
     "no reward for a_1": change(None, "rewards"),
-    "no termination for a_1": change(None, "terminations"),
     "no truncation for a_1": change(None, "truncations"),
-    "reward of a_1 contains nan": change(np.nan, "rewards"),
     "reward of a_1 contains inf": change(1e39, "rewards"),
     "reward of a_1 is 'much'": change("much", "rewards"),
     "termination of a_1 is array": change(np.zeros(2), "terminations"),
     "observation of a_1 contains nan": change([0, np.nan], "observations"),
-    "observation of a_1 has the shape": change([0, 1, 2], "observations"),
-    "observation of a_1 is 'left'": change("left", "observations"),
     "action mask for a_1, but none at its first": change({"action_mask": [1, 1, 1]}, "infos"),
     "has the agent 'z'": list_agents("a_0", "z"),
     "not 5 dictionaries": lambda *_: (1, 2, 3),
     "not 5 dictionaries by": lambda toy, o, r, *rest: (o, 1.0, *rest),
     "failed in step: 0": lambda *_: sys.exit(0),
-    "failed in step: division": lambda *_: 1 / 0,
 }
 
 
@@ -486,24 +440,21 @@ def test_agent_that_comes_back():
         play(make_host(Toy(leaves={"a_0": 2}, spoil=list_agents("a_0", "a_1"))))
 
 
-INVALID_RESETS = {
-    "no agents": list_agents(),
-    "has the agent 'z'": list_agents("a_0", "z"),
-    "not 2 dictionaries": lambda toy, observations, infos: observations,
-    "no observation for a_0": lambda toy, observations, infos: ({}, infos),
-    "failed in reset: division": lambda *_: 1 / 0,
-}
-
-
-@pytest.mark.parametrize("content", INVALID_RESETS)
-def test_invalid_reset(content):
+@pytest.mark.parametrize(
+    ("spoil", "content"),
+    [
+        (list_agents(), "no agents"),
+        (lambda toy, observations, infos: observations, "not 2 dictionaries"),
+        (lambda toy, observations, infos: ({}, infos), "no observation for a_0"),
+        (lambda *_: 1 / 0, "failed in reset: division"),
+    ],
+)
+def test_invalid_reset(spoil, content):
     toy = Toy()
     host = make_host(toy)
-    toy.spoil_reset = INVALID_RESETS[content]
+    toy.spoil_reset = spoil
     with pytest.raises(LareError, match=content):
         host.reset(7)
-    with pytest.raises(LareError, match=content):
-        make_host(toy)
 
 
 @pytest.mark.parametrize(("state", "content"), [([0, np.inf], "inf"), ([0, 1, 2], "shape"), ("x", "'x'")])

@@ -9,8 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from helpers.fake_smac import FROM_SMAC, FakeSmac
-from lare_rl.envs.smax.smax_env import SMAX
+from helpers.fake_smac import FROM_SMAC, FakeSmac, compiled_smax
 from lare_rl.envs.starcraft import StarCraft
 from lare_rl.errors import LareError
 
@@ -30,31 +29,21 @@ def sample_actions(timestep, rng) -> np.ndarray:
 
 
 def test_episode_equals_smax():
-    env, battle = StarCraft("2s3z", make_game=FakeSmac), SMAX("2s3z")
-    key, rng, step = jax.random.key(7), np.random.default_rng(0), jax.jit(battle.step)
+    env, (_, reset, step) = StarCraft("2s3z", make_game=FakeSmac), compiled_smax("2s3z")
+    key, rng = jax.random.key(7), np.random.default_rng(0)
     timestep = env.reset(7)
     key, start_key = jax.random.split(key)
-    state, expected = jax.jit(battle.reset)(start_key)
+    state, expected = reset(start_key)
     spec = env.spec
-    assert (spec.n_agents, spec.action_size, spec.max_steps, spec.observation_size, spec.state_size) == (
-        5,
-        11,
-        120,
-        127,
-        120,
-    )
+    sizes = (spec.n_agents, spec.action_size, spec.max_steps, spec.observation_size, spec.state_size)
+    assert sizes == (5, 11, 120, 127, 120)
     assert (spec.discrete, spec.masks_actions, spec.agents_leave, spec.measures) == (True, True, True, ("won",))
     steps, n_dead = 0, 0
     while True:
-        np.testing.assert_array_equal(timestep.observation, expected.observation)
-        np.testing.assert_array_equal(timestep.state, expected.state)
-        np.testing.assert_array_equal(timestep.alive, expected.alive)
-        np.testing.assert_array_equal(
-            timestep.available[:, 1:][timestep.alive][:, TO_SMAC - 1], expected.available[expected.alive]
-        )
-        np.testing.assert_array_equal(timestep.reward, expected.reward)
-        assert (timestep.terminated, timestep.truncated) == (expected.terminated, expected.truncated)
-        assert timestep.measures["won"] == expected.measures["won"]
+        available = timestep.available[timestep.alive][:, TO_SMAC]
+        np.testing.assert_array_equal(available, expected.available[expected.alive])
+        for values, smax_values in zip(timestep._replace(available=()), expected._replace(available=()), strict=True):
+            jax.tree.map(np.testing.assert_array_equal, values, smax_values)
         if timestep.terminated or timestep.truncated:
             break
         action = sample_actions(timestep, rng)
@@ -72,21 +61,20 @@ def test_episode_equals_smax():
 STOP = np.eye(11, dtype=np.float32)[[1] * 5]
 
 
-def test_time_limit_truncates():
-    games = []
+@pytest.mark.parametrize("won", [False, True])
+def test_time_limit(won):
+    """A battle that is won in the last step has terminated too."""
 
-    class Recorded(FakeSmac):
-        def __init__(self, **kwargs):
-            super().__init__(**kwargs)
-            games.append(self)
+    class Ending(FakeSmac):
+        def step(self, actions):
+            super().step(actions)
+            return 1.0, True, {"battle_won": won}
 
-    env = StarCraft("2s3z", make_game=Recorded)
+    env = StarCraft("2s3z", make_game=Ending)
     env.reset(0)
     env.spec = replace(env.spec, max_steps=1)
-    battle = games[-1].state.battle
-    games[-1].state = games[-1].state._replace(battle=battle._replace(step=jnp.array(119, jnp.int32)))
     timestep = env.step(STOP)
-    assert (bool(timestep.truncated), bool(timestep.terminated)) == (True, False)
+    assert (bool(timestep.truncated), bool(timestep.terminated)) == (True, won)
 
 
 def test_crash_truncates_the_episode():
@@ -103,33 +91,42 @@ def test_crash_truncates_the_episode():
 
 
 def test_repeated_crashes_end_the_run():
-    env = StarCraft("2s3z", make_game=partial(FakeSmac, crash_at=1))
-    for seed in range(2):
-        env.reset(seed)
-        with pytest.warns(RuntimeWarning):
+    """A complete episode between crashes starts a new count."""
+    infos = iter([{}, {}, {"battle_won": False}, {}, {}, {}])  # at the end of each episode; a crash has none
+
+    class Ending(FakeSmac):
+        def step(self, actions):
+            super().step(actions)
+            self.ended = True
+            return 0.0, True, next(infos)
+
+    env = StarCraft("2s3z", make_game=Ending)
+
+    def play_episodes():
+        for seed in range(5):
+            env.reset(seed)
             env.step(STOP)
-    env.reset(2)
+
+    with pytest.warns(RuntimeWarning) as crashes:
+        play_episodes()
+    assert len(crashes) == 4
+    env.reset(5)
     with pytest.raises(LareError, match=r"crashed .* 3rd time"):
         env.step(STOP)
 
 
 def test_launches():
-    """A new game only for the first episode and after an incomplete one, or for all with `relaunch`."""
+    """A new game is made only for the first episode, and again if that was incomplete."""
     env, rng = StarCraft("2s3z", make_game=FakeSmac), np.random.default_rng(0)
     timestep = env.reset(3)
     while not (timestep.terminated or timestep.truncated):
         timestep = env.step(sample_actions(timestep, rng))
     env.reset(4)
     assert FakeSmac.launched == (0, 3)
-    env = StarCraft("2s3z", relaunch=True, make_game=FakeSmac)
-    first, other, again = env.reset(3), env.reset(4), env.reset(3)
-    assert FakeSmac.launched[2:] == (0, 3, 4, 3)
-    np.testing.assert_array_equal(first.state, again.state)
-    assert (first.state != other.state).any()
     env = StarCraft("2s3z", make_game=FakeSmac)
     env.reset(3)
     env.reset(4)
-    assert FakeSmac.launched[6:] == (0, 3, 4)
+    assert FakeSmac.launched[2:] == (0, 3, 4)
     assert env.render().shape == (4, 4, 3)
     env.close()
     env.close()
@@ -141,11 +138,11 @@ def test_errors():
     with pytest.raises(LareError, match=r"agent 0 .* action 0"):
         env.step(np.eye(11, dtype=np.float32)[[0] * 5])
 
-    def refuse(**_):
+    def fail(**_):
         raise KeyError("no map\n2s3y")
 
     with pytest.raises(LareError, match=r"cannot make '2s3y': .*no map") as error:
-        StarCraft("2s3y", make_game=refuse)
+        StarCraft("2s3y", make_game=fail)
     assert "\n" not in str(error.value)
 
 
@@ -164,14 +161,11 @@ def write_package(tmp_path, monkeypatch):
         del sys.modules[name]
 
 
-def test_other_smac_package_is_refused(write_package):
-    write_package("smac")
-    with pytest.raises(LareError, match=r"not installed.* another project"):
-        StarCraft("2s3z")
-
-
 @pytest.mark.parametrize("packages", [("smacv2", "smacv2/env"), ("smac", "smac/env", "smac/env/starcraft2")])
 def test_installed_game(write_package, packages, monkeypatch, tmp_path):
+    write_package("smac")  # another project on PyPI
+    with pytest.raises(LareError, match=r"not installed.* another project"):
+        StarCraft("2s3z")
     for package in packages:
         write_package(package, "from helpers.fake_smac import FakeSmac as StarCraft2Env")
     monkeypatch.setenv("SC2PATH", str(tmp_path / "nowhere"))

@@ -1,4 +1,4 @@
-"""Environments in worker processes are those in this one, and say in one line how they fail."""
+"""Environments in worker processes equal those in this process, and their failures are errors of one line."""
 
 import os
 import signal
@@ -9,6 +9,7 @@ from copy import deepcopy
 from functools import partial
 from pathlib import Path
 
+import jax
 import numpy as np
 import pytest
 
@@ -23,15 +24,8 @@ from lare_rl.errors import LareError
 BOTH = [LocalVecEnv, partial(SubprocVecEnv, processes=2)]
 
 
-def same(actual, other):
-    *arrays, measures = actual
-    *other_arrays, other_measures = other
-    for first_array, right in zip(arrays, other_arrays, strict=True):
-        np.testing.assert_array_equal(first_array, right)
-        assert first_array.dtype == right.dtype
-    assert measures.keys() == other_measures.keys()
-    for name, first_array in measures.items():
-        np.testing.assert_array_equal(first_array, other_measures[name])
+def assert_equal(actual, expected) -> None:
+    jax.tree.map(partial(np.testing.assert_array_equal, strict=True), actual, expected)
 
 
 def walk(envs, steps=3):
@@ -41,128 +35,121 @@ def walk(envs, steps=3):
         envs.step(np.zeros((n, 2, 2), np.float32))
 
 
-def test_workers_do_what_is_done_in_one_process():
-    chance = np.random.default_rng(0)
+def is_running(pid):
+    try:
+        os.kill(pid, 0)
+    except ProcessLookupError:
+        return False
+    # A process that has ended stays in the table until its parent waits for it.
+    with open(f"/proc/{pid}/stat") as file:
+        return file.read().rpartition(")")[2].split()[0] != "Z"
+
+
+def test_workers_equal_one_process():
+    rng = np.random.default_rng(0)
     makers = [ToyHostEnv] * 5
-    with LocalVecEnv(makers) as near, SubprocVecEnv(makers, processes=2) as far:
-        assert os.getpid() not in far.pids
-        assert len(set(far.pids)) == 2
-        assert far.spec.teams == near.spec.teams
-        for _ in range(4):
-            where, seeds = chance.random(5) < 0.7, chance.integers(0, 2**31, 5)
-            if not near.batch.alive[0].any():
-                where[:] = True
-            actual, other = near.reset(where, seeds), far.reset(where, seeds)
-            assert not other.state.any(), "a worker has imported JAX"
-            same(actual._replace(state=other.state), other)
-            for _ in range(3):
-                action = chance.normal(size=(5, 2, 2)).astype(np.float32)
-                where = chance.random(5) < 0.5
-                actual, other = near.step(action, where), far.step(action, where)
-                same(actual._replace(state=other.state), other)
-        same(near.step(action)._replace(state=far.batch.state[:1].repeat(5, 0)), far.step(action))
+    with LocalVecEnv(makers) as local, SubprocVecEnv(makers, processes=2) as remote:
+        assert os.getpid() not in remote.pids
+        assert len(set(remote.pids)) == 2
+        assert remote.spec.teams == local.spec.teams
+        for attempt in range(4):
+            where, seeds = (rng.random(5) < 0.7) | (attempt == 0), rng.integers(0, 2**31, 5)
+            expected, actual = local.reset(where, seeds), remote.reset(where, seeds)
+            assert not actual.state.any(), "a worker has imported JAX"
+            assert_equal(actual, expected._replace(state=actual.state))
+            for where in (rng.random(5) < 0.5, None):
+                action = rng.normal(size=(5, 2, 2)).astype(np.float32)
+                expected, actual = local.step(action, where), remote.step(action, where)
+                assert_equal(actual, expected._replace(state=actual.state))
 
 
 def test_pettingzoo_in_workers():
-    task = toy_spec(
-        name="spread",
-        environment="pettingzoo/mpe2.simple_spread_v3:parallel_env",
-        observation_size=18,
-        action_size=5,
-    )
-    chance = np.random.default_rng(0)
-    makers = [partial(make, task)] * 3
-    with LocalVecEnv(makers) as near, SubprocVecEnv(makers, processes=2) as far:
-        same(near.reset(np.ones(3, bool), np.arange(3)), far.reset(np.ones(3, bool), np.arange(3)))
+    spread = "pettingzoo/mpe2.simple_spread_v3:parallel_env"
+    task = toy_spec(name="spread", environment=spread, observation_size=18, action_size=5)
+    makers, action = [partial(make, task)] * 3, np.eye(5, dtype=np.float32)[[[1, 2, 3]] * 3]
+    with LocalVecEnv(makers) as local, SubprocVecEnv(makers, processes=2) as remote:
+        assert_equal(*(envs.reset(np.ones(3, bool), np.arange(3)) for envs in (remote, local)))
         for _ in range(25):
-            action = np.eye(5, dtype=np.float32)[chance.integers(0, 5, (3, 3))]
-            actual, other = near.step(action), far.step(action)
-            same(actual, other)
-        assert other.truncated.all()
+            assert_equal(*(envs.step(action) for envs in (remote, local)))
+        assert remote.batch.truncated.all()
 
 
-@pytest.mark.parametrize("envs", BOTH)
-def test_rows_of_the_others_stay(envs):
-    with envs([ToyHostEnv] * 3) as vec_env:
-        first = deepcopy(vec_env.reset(np.array([True, False, True]), np.arange(3)))
+@pytest.mark.parametrize("make_vec_env", BOTH)
+def test_other_rows_do_not_change(make_vec_env):
+    with make_vec_env([ToyHostEnv] * 3) as envs:
+        first = deepcopy(envs.reset(np.array([True, False, True]), np.arange(3)))
         assert not first.observation[1].any()
         assert not first.alive[1].any()
-        second = deepcopy(vec_env.reset(np.array([False, True, False]), np.array([9, 9, 9])))
+        second = deepcopy(envs.reset(np.array([False, True, False]), np.array([9, 9, 9])))
         np.testing.assert_array_equal(second.observation[[0, 2]], first.observation[[0, 2]])
         assert second.observation[1].any()
-        assert vec_env.batch.observation.shape[1:] == (2, 2)
-        third = vec_env.step(np.ones((3, 2, 2), np.float32), np.array([False, False, True]))
+        third = envs.step(np.ones((3, 2, 2), np.float32), np.array([False, False, True]))
         np.testing.assert_array_equal(third.observation[:2], second.observation[:2])
         assert not np.array_equal(third.observation[2], second.observation[2])
 
 
-@pytest.mark.parametrize("envs", BOTH)
+@pytest.mark.parametrize("make_vec_env", BOTH)
 @pytest.mark.parametrize(
     ("fault", "message"),
     [
         ("itself", "the battery is empty"),
-        ("error", "environment 1 failed in step: ZeroDivisionError"),
         ("exit", "environment 1 failed in step: the window is closed"),
         ("make", "environment 1 cannot be made: no asset"),
+        ("output", "the reward is nan"),
     ],
 )
-def test_what_an_environment_raises_is_one_line(envs, fault, message):
+def test_error_of_an_environment(make_vec_env, fault, message):
     with pytest.raises(LareError) as error:
-        walk(envs([ToyHostEnv, partial(ToyHostEnv, fault)]))
+        walk(make_vec_env([ToyHostEnv, partial(ToyHostEnv, fault)]))
     assert str(error.value) == message
+    assert getattr(error.value, "env_index", None) == (1 if fault == "output" else None)
 
 
-@pytest.mark.parametrize(("fault", "how"), [("dies", "signal SIGKILL"), ("leaves", "exit status 3")])
-def test_a_worker_that_dies(fault, how):
-    far = SubprocVecEnv([ToyHostEnv, ToyHostEnv, ToyHostEnv, partial(ToyHostEnv, fault)], processes=2)
-    pids = far.pids
+@pytest.mark.parametrize(
+    ("fault", "timeout", "message"),
+    [
+        ("dies", 60, "died: signal SIGKILL"),
+        ("leaves", 60, "died: exit status 3"),
+        ("hangs", 0.5, "did not reply for 0.5 s in step"),
+    ],
+)
+def test_worker_that_fails(fault, timeout, message):
+    envs = SubprocVecEnv([ToyHostEnv, ToyHostEnv, ToyHostEnv, partial(ToyHostEnv, fault)], processes=2)
+    pids = envs.pids
+    walk(envs, steps=2)
+    envs.timeout = timeout
     with pytest.raises(LareError) as error:
-        walk(far)
-    assert str(error.value) == f"environment 3 (in worker process {pids[1]}) died: {how}"
-    assert not any(map(runs, pids))
+        envs.step(np.zeros((4, 2, 2), np.float32))
+    assert str(error.value) == f"environment 3 (in worker process {pids[1]}) {message}"
+    assert not any(map(is_running, pids))
     with pytest.raises(LareError, match="the worker processes have ended"):
-        far.step(np.zeros((4, 2, 2), np.float32))
+        envs.step(np.zeros((4, 2, 2), np.float32))
 
 
-def test_a_worker_that_is_killed_between_steps():
-    far = SubprocVecEnv([ToyHostEnv])
-    pid = far.pids[0]
-    far.reset(np.ones(1, bool), np.arange(1))
+def test_worker_that_is_killed_between_steps():
+    envs = SubprocVecEnv([ToyHostEnv])
+    pid = envs.pids[0]
+    walk(envs, steps=0)
     os.kill(pid, signal.SIGKILL)
-    while runs(pid):
+    while is_running(pid):
         time.sleep(0.01)
-    with pytest.raises(LareError) as error:
-        far.step(np.zeros((1, 2, 2), np.float32))
-    assert str(error.value) == f"environment 0 (in worker process {pid}) died: signal SIGKILL"
+    with pytest.raises(LareError, match=rf"environment 0 \(in worker process {pid}\) died: signal SIGKILL"):
+        envs.step(np.zeros((1, 2, 2), np.float32))
 
 
-def test_a_worker_that_hangs():
-    far = SubprocVecEnv([ToyHostEnv, ToyHostEnv, partial(ToyHostEnv, "hangs"), ToyHostEnv], processes=2)
-    pid = far.pids[0]
-    walk(far, steps=2)
-    far.timeout = 0.5
-    with pytest.raises(LareError) as error:
-        far.step(np.zeros((4, 2, 2), np.float32))
-    assert str(error.value) == f"environment 2 (in worker process {pid}) did not reply for 0.5 s in step"
-    assert not runs(pid)
-
-
-def test_closing_closes_the_environments(tmp_path):
-    notes = [tmp_path / name for name in ("one", "two")]
-    far = SubprocVecEnv([partial(ToyHostEnv, note=str(note)) for note in notes], processes=1)
-    pid = far.pids[0]
-    far.close()
+def test_close(tmp_path):
+    notes = [tmp_path / name for name in ("first", "second")]
+    envs = SubprocVecEnv([partial(ToyHostEnv, note=str(note)) for note in notes], processes=1)
+    pid = envs.pids[0]
+    envs.close()
     assert [note.read_text() for note in notes] == ["closed", "closed"]
-    assert not runs(pid)
-    far.close()
+    assert not is_running(pid)
+    envs.close()
 
 
-def test_environments_must_be_alike():
+def test_makers_that_are_refused():
     with pytest.raises(LareError, match=r"^environment 1 differs from environment 0: .* 3, .*, not .* 2, "):
         LocalVecEnv([ToyHostEnv, partial(ToyHostEnv, size=3)])
-
-
-def test_what_cannot_be_sent():
     with pytest.raises(LareError, match=r"^environment 0 cannot be sent to a worker process: .*lambda"):
         SubprocVecEnv([lambda: ToyHostEnv()])
 
@@ -175,20 +162,20 @@ from helpers.host_envs import ToyHostEnv
 from lare_rl.envs.workers import SubprocVecEnv
 
 signal.signal(signal.SIGINT, signal.default_int_handler)  # a job in the background ignores it
-far = SubprocVecEnv([partial(ToyHostEnv, seconds=0.05)] * 2, processes=2)
-print(*far.pids, flush=True)
-far.reset(np.ones(2, bool), np.arange(2))
+envs = SubprocVecEnv([partial(ToyHostEnv, sys.argv[1], seconds=0.05)] * 2, processes=2)
+print(*envs.pids, flush=True)
+envs.reset(np.ones(2, bool), np.arange(2))
 while True:
-    far.step(np.zeros((2, 2, 2), np.float32))
+    envs.step(np.zeros((2, 2, 2), np.float32))
 """
 
 
-@pytest.mark.parametrize("how", [signal.SIGINT, signal.SIGKILL])
-def test_workers_end_with_their_parent_and_say_nothing(how):
-    """The program has no `if __name__ == "__main__"`: workers do not run it again."""
+@pytest.mark.parametrize(("how", "fault"), [(signal.SIGINT, ""), (signal.SIGKILL, ""), (signal.SIGKILL, "hangs")])
+def test_workers_end_silently_with_their_parent(how, fault):
+    """The program has no `if __name__ == "__main__"`: workers do not run it again. A step that hangs must end too."""
     paths = os.pathsep.join(str(Path(module.__file__).parents[1]) for module in (lare_rl, host_envs))
     parent = subprocess.Popen(
-        [sys.executable, "-c", PROGRAM],
+        [sys.executable, "-c", PROGRAM, fault],
         env=os.environ | {"PYTHONPATH": paths},
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
@@ -197,24 +184,14 @@ def test_workers_end_with_their_parent_and_say_nothing(how):
     )
     try:
         pids = list(map(int, parent.stdout.readline().split()))
-        assert all(map(runs, pids))
-        time.sleep(0.2)
+        assert all(map(is_running, pids))
+        time.sleep(0.5)  # the third step has begun
         os.killpg(parent.pid, how)  # as a terminal does
         _, error_output = parent.communicate(timeout=30)
     finally:
         parent.kill()
-    assert error_output.count("Traceback") == (how == signal.SIGINT)  # the parent's own
-    until = time.monotonic() + 10
-    while any(map(runs, pids)) and time.monotonic() < until:
+    assert error_output.count("Traceback") == (how == signal.SIGINT)  # only the parent's
+    deadline = time.monotonic() + 10
+    while any(map(is_running, pids)) and time.monotonic() < deadline:
         time.sleep(0.05)
-    assert not any(map(runs, pids))
-
-
-def runs(pid):
-    try:
-        os.kill(pid, 0)
-    except ProcessLookupError:
-        return False
-    # Without anybody to wait for it, one that has ended stays in the table.
-    with open(f"/proc/{pid}/stat") as file:
-        return file.read().rpartition(")")[2].split()[0] != "Z"
+    assert not any(map(is_running, pids))

@@ -7,15 +7,15 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from PIL import Image
 
 import lare_rl
-from helpers.toy_envs import toy_spec
+from helpers.toy_envs import Chase, toy_spec
 from lare_rl.envs.families import make_host_env
-from lare_rl.envs.gymnasium_env import GymnasiumEnv
 from lare_rl.envs.workers import LocalVecEnv
 from lare_rl.errors import LareError
-from lare_rl.evaluation import evaluate
 from lare_rl.evaluation.evaluate import (
+    MAX_OPEN_ENVS,
     RANDOM_EPISODES,
     evaluate_run,
     gain_over_random,
@@ -23,17 +23,49 @@ from lare_rl.evaluation.evaluate import (
     play_random,
 )
 from lare_rl.evaluation.policy import load_policy
-from lare_rl.evaluation.video import check_video_path, write_video
+from lare_rl.evaluation.video import check_video_path, record_video, write_video
 from lare_rl.training.compiled import compile_functions
 from lare_rl.training.saved_state import load_learner
 from lare_rl.training.unroll_host import HostPolicy, evaluate_on_host
 from lare_rl.util.statistics import format_mean_std
 
 
+class FilmedChase(Chase):
+    """It can be rendered, at 50 frames a second. It counts environments that are open."""
+
+    metadata = {"render_modes": ["rgb_array"], "render_fps": 50}  # noqa: RUF012
+    open_envs: set[int] = set()  # noqa: RUF012
+    max_open = 0
+
+    def __init__(self, render_mode=None):
+        super().__init__()
+        self.render_mode, self.n_frames = render_mode, 0
+        self.open_envs.add(id(self))
+        FilmedChase.max_open = max(FilmedChase.max_open, len(self.open_envs))
+
+    def render(self):
+        self.n_frames += 1  # a GIF has no equal frames
+        return np.full((16, 16, 3), 20 * self.n_frames, np.uint8)
+
+    def close(self):
+        self.open_envs.discard(id(self))
+
+
+gymnasium.register("toys/FilmedChase-v0", entry_point=FilmedChase, max_episode_steps=20)
+TASK = toy_spec(environment="toys/FilmedChase-v0", measures=("distance",))
+
+
 @pytest.fixture(scope="module")
 def run(small, tmp_path_factory):
     out = tmp_path_factory.mktemp("runs") / "run"
-    return lare_rl.train(toy_spec(), small(method="dense", steps=60), out=out, listeners=[])
+    return lare_rl.train(TASK, small(method="dense", steps=60), out=out, listeners=[])
+
+
+@pytest.fixture(scope="module")
+def returns(run):
+    """Returns of one episode more than there may be open environments of a seed."""
+    FilmedChase.max_open = 0
+    return evaluate_run(run, MAX_OPEN_ENVS + 1)["Chase"]
 
 
 def test_write_video(tmp_path):
@@ -50,8 +82,22 @@ def test_check_video_path(tmp_path, name, words):
         check_video_path(tmp_path / name)
 
 
+def test_record_video(run, tmp_path):
+    """A GIF has at most 25 frames a second, so it shows every second step."""
+    record_video(run, tmp_path / "film.gif")
+    with Image.open(tmp_path / "film.gif") as film:
+        assert (film.n_frames, film.info["duration"]) == (10, 40)
+    assert not FilmedChase.open_envs
+    with pytest.raises(LareError, match=r"toys/Chase-v0.* cannot be made"):
+        record_video(replace_task(run, toy_spec()), tmp_path / "film.gif")
+
+
+def replace_task(run, task):
+    return type(run)(run.directory, run.config.model_copy(update={"task": task}), run.functions)
+
+
 def test_gain_over_random():
-    """The error is the larger one of that over the seeds and that over the episodes, with that of random actions."""
+    """The error over the seeds or over the episodes, whichever is larger, is combined with the error of random actions."""
     random = np.array([0.0, 2.0])  # variance 2
     seeds_differ = np.array([[10.0, 10.0], [14.0, 14.0]])  # variance 8 over the seeds
     assert gain_over_random(seeds_differ, random) == pytest.approx((11.0, np.sqrt(2 / 2 + 8 / 2)))
@@ -60,35 +106,27 @@ def test_gain_over_random():
     assert gain_over_random(np.array([[10.0]]), random) is None
 
 
-def test_random_play_is_bounded(monkeypatch):
-    assert len(measure_random_returns(toy_spec())) == RANDOM_EPISODES
+def test_random_play_is_bounded():
+    assert len(play_random(TASK, limit_s=60.0)) == RANDOM_EPISODES
+    assert not FilmedChase.open_envs
     assert len(measure_random_returns(toy_spec(environment="no-such-environment"))) == 0
-    monkeypatch.setattr(evaluate, "RANDOM_PLAY_LIMIT_S", -1.0)
-    assert len(measure_random_returns(toy_spec())) == 0
+    assert play_random(TASK, limit_s=-1.0) == []
 
 
-def test_measures_of_random_play(small, tmp_path, command):
-    task = toy_spec(measures=("distance",))
-    lare_rl.train(task, small(method="dense", steps=60, seeds=1), out=tmp_path / "run", listeners=[])
-    status, out, err = command("evaluate", tmp_path / "run", "--episodes", 3)
+def test_measures_of_random_play(run, command):
+    status, out, err = command("evaluate", run.directory, "--episodes", 4)
     assert (status, err) == (0, "")
-    distances = np.array([episode.measures["distance"] for episode in play_random(task)])
+    distances = np.array([episode.measures["distance"] for episode in play_random(TASK)])
     assert f"random actions: distance {format_mean_std(distances)}" in out.splitlines()
     assert distances.std() > 0
 
 
-def test_evaluate_in_several_batches(run, monkeypatch):
+def test_evaluate_in_several_batches(returns):
     """Every episode begins from a different initial state, and no environment stays open."""
-    returns = evaluate_run(run, 5)["Chase"]
-    assert returns.shape == (2, 5)
-    assert len(np.unique(returns)) == 10
-    opened, closed = [], []
-    monkeypatch.setattr(evaluate, "MAX_OPEN_ENVS", 2)
-    monkeypatch.setattr(evaluate, "make_host_env", lambda task: opened.append(make_host_env(task)) or opened[-1])
-    monkeypatch.setattr(GymnasiumEnv, "close", lambda env: closed.append(env))
-    np.testing.assert_allclose(evaluate_run(run, 5)["Chase"], returns, rtol=1e-5)
-    assert len(opened) == 2 * 5
-    assert set(map(id, opened)) <= set(map(id, closed))
+    assert returns.shape == (2, 21)
+    assert len(np.unique(returns)) == 42
+    assert FilmedChase.max_open == 2 * MAX_OPEN_ENVS
+    assert not FilmedChase.open_envs
 
 
 def test_evaluate_no_episodes(run):
@@ -96,19 +134,19 @@ def test_evaluate_no_episodes(run):
         evaluate_run(run, 0)
 
 
-def test_evaluate_continues_after_initial_states_of_run(run):
+def test_evaluate_continues_after_initial_states_of_run(run, returns):
     state = load_learner(run)
     functions = compile_functions(state.config)
     policy = HostPolicy(functions, state.config, functions.get_actor(state.learner, 60), run.seeds, 4)
-    with LocalVecEnv([partial(make_host_env, toy_spec())] * 8) as envs:
-        returns = evaluate_on_host(envs, policy, run.seeds, 4).returns[..., 0]
+    with LocalVecEnv([partial(make_host_env, TASK)] * 8) as envs:
+        first_returns = evaluate_on_host(envs, policy, run.seeds, 4).returns[..., 0]
     last_evaluation = [line["evaluation/return"] for line in run.metrics()[-2:]]
-    np.testing.assert_allclose(returns[:, :2].mean(axis=1), last_evaluation, rtol=1e-5)
-    np.testing.assert_allclose(evaluate_run(run, 2)["Chase"], returns[:, 2:], rtol=1e-5)
+    np.testing.assert_allclose(first_returns[:, :2].mean(axis=1), last_evaluation, rtol=1e-5)
+    np.testing.assert_allclose(returns[:, :2], first_returns[:, 2:], rtol=1e-5)
 
 
 def test_load_policy(run):
-    observation = np.ones(toy_spec().observation_size, np.float32)
+    observation = np.ones(TASK.observation_size, np.float32)
     actors = load_learner(run).learner.algorithm.online.actor
     env_actions = 2 * jnp.tanh(jax.vmap(lambda actor: actor(jnp.ones((1, 2))))(actors))
     for seed_index, seed in enumerate(run.seeds):
@@ -129,7 +167,8 @@ def test_policy_checks_observations(run, observation, words):
 
 def test_policy_with_discrete_actions(small, tmp_path):
     spec = toy_spec(environment="toys/Pick-v0", observation_size=4, action_size=4)
-    run = lare_rl.train(spec, small(method="dense", algorithm="ppo"), out=tmp_path / "run", listeners=[])
+    settings = small(method="dense", algorithm="ppo", steps=60)
+    run = lare_rl.train(spec, settings, out=tmp_path / "run", listeners=[])
     policy, observation = load_policy(run), np.eye(4, dtype=np.float32)[2]
     assert gymnasium.make("toys/Pick-v0").action_space.contains(np.int64(policy(observation)))
     np.testing.assert_array_equal(np.sort(policy.select_env_action(observation)), [0, 0, 0, 1])
@@ -142,9 +181,3 @@ def test_policy_with_discrete_actions(small, tmp_path):
     assert set(load_policy(run, deterministic=True)(batch)) == {np.argmax(np.bincount(choices))}
     sampled, likeliest = (evaluate_run(run, 4, deterministic=flag)["Chase"] for flag in (False, True))
     assert not np.array_equal(sampled, likeliest)
-
-
-def test_many_agents_have_no_single_policy(small_many, tmp_path):
-    run = lare_rl.train("TriangleArea", small_many(method="dense", seeds=1, steps=100), out=tmp_path / "run")
-    with pytest.raises(LareError, match="many agents"):
-        load_policy(run)

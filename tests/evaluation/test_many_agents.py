@@ -12,24 +12,26 @@ from lare_rl.envs.families import make_env
 from lare_rl.envs.interface import Team, team_mean
 from lare_rl.errors import LareError
 from lare_rl.evaluation.cross_play import combine_policies, cross_play
-from lare_rl.evaluation.evaluate import evaluate_run
-from lare_rl.evaluation.rollout import roll_out
-from lare_rl.evaluation.team_samples import N_SAMPLE_EPISODES, sample_steps
+from lare_rl.evaluation.policy import load_policy
+from lare_rl.evaluation.rollout import N_SAMPLE_EPISODES, roll_out, sample_steps
 from lare_rl.evaluation.video import record_video, render_rollout
-from lare_rl.report import agents_details
+from lare_rl.report.overview import render_learning_curves
+from lare_rl.report.run_details import render_agents
+from lare_rl.report.run_summary import ReportedRun
 from lare_rl.training.collect_device import unroll_on_device
 from lare_rl.training.compiled import training_module
 from lare_rl.training.saved_state import load_learner
 
+N_EPISODES = 8
+
 
 @pytest.fixture(scope="module")
 def runs(tmp_path_factory, small_many):
-    """Two runs with two teams, and one with a single team."""
+    """Two runs with two teams. They run the same compiled programs."""
     directory = tmp_path_factory.mktemp("runs")
-    tasks_and_methods = [("CompetitivePP-6", "lare-rd"), ("CompetitivePP-6", "dense"), ("TriangleArea", "rd")]
     return [
-        lare_rl.train(task, small_many(method=method, steps=200, seed=i), out=directory / str(i), listeners=[])
-        for i, (task, method) in enumerate(tasks_and_methods)
+        lare_rl.train("CompetitivePP-6", small_many(seed=seed), out=directory / str(seed), listeners=[])
+        for seed in (0, 2)
     ]
 
 
@@ -40,47 +42,46 @@ def test_rollout(runs):
     assert rollout.proxy_reward.std() > 0
     assert rollout.select_episode(rollout.reward).shape == (25, 8)
     assert [frame.shape for frame in render_rollout(runs[0], rollout)] == [(400, 400, 3)] * 25
-    without_proxy = roll_out(runs[1])
-    assert without_proxy.proxy_reward is None
-    np.testing.assert_array_equal(without_proxy.credit, without_proxy.reward)
+
+
+@pytest.mark.long
+def test_rollout_without_proxy_rewards(small_many, tmp_path):
+    run = lare_rl.train("TriangleArea", small_many(method="dense"), out=tmp_path / "run", listeners=[])
+    rollout = roll_out(run)
+    assert rollout.proxy_reward is None
+    np.testing.assert_array_equal(rollout.credit, rollout.reward)
+    page = lare_rl.write_report(run, tmp_path / "report.html").read_text()
+    assert "proxy" not in page.split("Who got which credit when")[1].split("Settings")[0]
 
 
 def test_sample_steps(runs):
-    predators, preys = sample_steps(runs[0])
+    (predators, preys), (random_predators, _) = (sample_steps(runs[0], random=random) for random in (False, True))
     n_steps = N_SAMPLE_EPISODES * 25
     assert (predators.next_observation.shape, preys.next_observation.shape) == ((6 * n_steps, 24), (2 * n_steps, 24))
     for sample, function in zip((predators, preys), runs[0].functions, strict=True):
         assert sample.factors.shape == (len(sample.reward), function.size)
         assert np.nanmax(np.abs(sample.correlations)) > 0.3
-    assert sample_steps(runs[1])[0].factors.shape == (6 * n_steps, 0)
+    assert not np.array_equal(predators.next_observation, random_predators.next_observation)
 
 
-def test_sample_steps_of_random_actions(runs):
-    policy, random = (sample_steps(runs[2], random=random)[0] for random in (False, True))
-    assert not np.array_equal(policy.next_observation, random.next_observation)
-
-
-def test_evaluate_teams(runs):
-    returns = evaluate_run(runs[0], 6)
-    assert list(returns) == ["CompetitivePP-6-predator", "CompetitivePP-6-prey"]
-    assert all(values.shape == (2, 6) for values in returns.values())
-    assert list(evaluate_run(runs[2], 3)) == ["TriangleArea"]
-
-
-def test_cross_play(runs):
-    matches = cross_play((runs[0], runs[1]), episodes=40)
-    assert [(match.first, match.second) for match in matches] == [(a, b) for a in runs[:2] for b in runs[:2]]
+def test_cross_play(runs, command):
+    matches = cross_play((runs[0], runs[1]), episodes=N_EPISODES)
+    assert [(match.first, match.second) for match in matches] == [(a, b) for a in runs for b in runs]
     assert all(match.returns.shape == (2, 2) and np.isfinite(match.returns).all() for match in matches)
     assert len({match.returns[0, 1] for match in matches}) == 4
     # A policy that plays against itself plays as it does alone.
     state, env = load_learner(runs[0]), make_env(runs[0].config.task)
-    play = jax.jit(partial(unroll_on_device, env, n_episodes=40, config=state.config, greedy=False))
+    play = jax.jit(partial(unroll_on_device, env, n_episodes=N_EPISODES, config=state.config, greedy=False))
     for seed in range(2):
         learner = jax.tree.map(lambda leaf, seed=seed: leaf[seed : seed + 1], state.learner)
         batch = play(training_module(state.config).get_actor(learner, 200, state.config), jax.random.key(0)[None])
         team, steps = state.config.env.teams[0], batch.steps
         reward = team_mean(steps.next_timestep.reward, steps.timestep.alive, team)
         np.testing.assert_allclose(matches[0].returns[seed, seed], reward.sum(axis=0).mean(), rtol=1e-4)
+    status, out, err = command("cross-play", *(run.directory for run in runs), "--episodes", N_EPISODES)
+    assert (status, err) == (0, "")
+    assert out.count(" ± ") == 5  # four matches, and the line that explains the numbers
+    assert out.startswith("predator of, against prey of")
 
 
 def test_combine_policies():
@@ -91,17 +92,13 @@ def test_combine_policies():
     np.testing.assert_array_equal(actions[0, :, :, 0], np.tile([1.0] * 6 + [4.0] * 2, (3, 1)))
 
 
-@pytest.mark.parametrize(("second", "tasks"), [(2, "TriangleArea"), (0, "CompetitivePP-6, TriangleArea")])
-def test_cross_play_of_other_tasks(runs, second, tasks):
-    with pytest.raises(LareError, match=f"two teams.* {tasks}$"):
-        cross_play((runs[2], runs[second]))
-
-
-def test_cross_play_command(runs, command):
-    status, out, err = command("cross-play", runs[0].directory, runs[1].directory, "--episodes", 3)
-    assert (status, err) == (0, "")
-    assert out.count(" ± ") == 5  # four, and the line that says what they are
-    assert out.startswith("predator of, against prey of")
+def test_bad_cross_play(runs, make_run):
+    chase = make_run("a", [1.0])
+    with pytest.raises(LareError, match="episodes = 0"):
+        cross_play((runs[0], runs[1]), episodes=0)
+    for other, tasks in ((chase, "Chase"), (runs[0], "Chase, CompetitivePP-6")):
+        with pytest.raises(LareError, match=f"two teams.* {tasks}$"):
+            cross_play((chase, other))
 
 
 def test_evaluate_command(runs, command, tmp_path):
@@ -112,22 +109,26 @@ def test_evaluate_command(runs, command, tmp_path):
     assert (tmp_path / "film.gif").read_bytes().startswith(b"GIF8")
 
 
-def test_film_of_best_policy_of_many_agents(runs, tmp_path):
+def test_single_agent_functions_refuse_many_agents(runs, tmp_path):
     with pytest.raises(LareError, match="best"):
         record_video(runs[0], tmp_path / "film.gif", best=True)
+    with pytest.raises(LareError, match="many agents"):
+        load_policy(runs[0])
 
 
-def test_report(runs, tmp_path, monkeypatch):
-    monkeypatch.setattr(agents_details, "MAX_TSNE_POINTS", 100)
-    page = lare_rl.write_report([run.directory for run in runs], tmp_path / "report.html").read_text()
-    assert page.count("data:image/gif;base64,") == 3
-    for heading in (
+def test_report(runs):
+    details = "\n".join(render_agents(runs[0], max_tsne_points=50))
+    for text in (
+        "Who got which credit when",
         "The factors of CompetitivePP-6-predator",
         "The latent function of CompetitivePP-6-prey",
-        "True return, team of prey",
-        "Correlation of proxy and true reward, team of predator",
-        "Who got which credit when",
+        ">true reward<",
+        ">proxy reward<",
     ):
-        assert heading in page
-    assert page.count("t-SNE of steps of agents") == 2
-    assert ">nan<" not in page
+        assert text in details
+    assert details.count("data:image/gif;base64,") == 1
+    assert details.count("t-SNE of steps of agents") == 2
+    assert ">nan<" not in details
+    curves = "\n".join(render_learning_curves(runs[0].config.task, [ReportedRun("a", runs[0])], np.zeros(0)))
+    assert "True return, team of prey" in curves
+    assert "Correlation of proxy and true reward, team of predator" in curves

@@ -5,7 +5,7 @@ import json
 import subprocess
 import sys
 from dataclasses import replace
-from functools import partial
+from functools import cache, partial
 from pathlib import Path
 
 import jax
@@ -15,8 +15,9 @@ import onnxruntime
 import pytest
 
 import lare_rl
+from helpers.jax_toy_envs import echo_spec
 from helpers.long_tests import long_case
-from helpers.small_configs import TOTAL, random_steps
+from helpers.small_configs import ONE_TEAM, TOTAL, TWO_TEAMS, random_steps, small_config, untrained_learner
 from helpers.toy_envs import pick_spec, toy_spec
 from lare_rl.algorithms.ppo import ppo
 from lare_rl.credit import decomposition
@@ -24,8 +25,9 @@ from lare_rl.credit.methods import METHODS
 from lare_rl.data import replay
 from lare_rl.envs.interface import to_env_action
 from lare_rl.envs.load import read_task
-from lare_rl.export import export
+from lare_rl.export.policy_graph import policy_graph
 from lare_rl.latent.function import verify_function
+from lare_rl.phi.evaluate import evaluate
 from lare_rl.training import learner as learners
 from lare_rl.training import on_policy
 from lare_rl.training.compiled import compile_functions, init_memory
@@ -68,34 +70,43 @@ def evaluation_func(o, a):
 MEDIAN = PHI.replace("np.sum(a", "np.median(a")
 
 
-def make_task(kind, method, echo):
+def make_task(kind, method):
     match kind:
         case "ppo":
             return pick_spec(judges="after" if method == "llm-reward" else "both")
         case "ippo" | "qmix" | "vdn":
-            return echo
+            return echo_spec()
         case "ippo-state":
-            return echo.model_copy(update={"judged_from": "state", "observation_size": 9, "action_size": 9})
+            return echo_spec(judged_from="state", observation_size=9, action_size=9)
         case "ippo-teams":
             return read_task("CompetitivePP-6")
         case _:
             return toy_spec(judges="both" if method == "lare-signs" else "before")
 
 
-def train_briefly(kind, method, small, small_many, echo, out):
-    """Train two seeds for a moment."""
-    single = kind in ("td3", "ddpg", "sac", "ppo")
-    task, phi_kind = make_task(kind, method, echo), METHODS[method].phi_kind
-    source = MEDIAN if "ppo" in kind else PHI
-    source = source.replace(", o[:, 1:2]", "") if phi_kind == "reward" else source
-    function = None
-    if METHODS[method].needs_phi:
-        functions = [verify_function(source, role, phi_kind) for role in task.roles]
-        function = functions if len(functions) > 1 else functions[0]
-    settings = (small if single else small_many)(
-        method=method, algorithm=kind.partition("-")[0], steps=120 if single else 200
-    )
-    return lare_rl.train(task, settings, function=function, out=out, listeners=[])
+@pytest.fixture(scope="module")
+def export_run(small, small_many, tmp_path_factory):
+    """Return a function that trains two seeds for a moment, and exports the second one: the run, and what was exported."""
+
+    @cache
+    def train_and_export(kind, method):
+        single = kind in ("td3", "ddpg", "sac", "ppo")
+        task, phi_kind = make_task(kind, method), METHODS[method].phi_kind
+        source = MEDIAN if "ppo" in kind else PHI
+        source = source.replace(", o[:, 1:2]", "") if phi_kind == "reward" else source
+        function = None
+        if METHODS[method].needs_phi:
+            functions = [verify_function(source, role, phi_kind) for role in task.roles]
+            function = functions if len(functions) > 1 else functions[0]
+        settings = (small if single else small_many)(
+            method=method, algorithm=kind.partition("-")[0], steps=120 if single else 200
+        )
+        directory = tmp_path_factory.mktemp("export")
+        run = lare_rl.train(task, settings, function=function, out=directory / "run", listeners=[])
+        result = lare_rl.export_run(run, directory / "out", seed=1)
+        return run, result, import_exported(directory / "out")
+
+    return train_and_export
 
 
 def import_exported(directory):
@@ -129,14 +140,12 @@ def check_function(exported, name, inputs, expected):
 
 
 @pytest.mark.parametrize(("kind", "method"), CASES)
-def test_export_agrees_with_jax(kind, method, small, small_many, echo, tmp_path):
-    run = train_briefly(kind, method, small, small_many, echo, tmp_path / "run")
-    result = lare_rl.export_run(run, tmp_path / "out", seed=1)
-    exported = import_exported(tmp_path / "out")
+def test_export_agrees_with_jax(kind, method, export_run):
+    run, result, exported = export_run(kind, method)
     config, learner, host, _ = load_learner(run)
     seed_learner = select_seed(learner, 1)
     actors = compile_functions(config).get_actor(learner, host["step"])
-    check_policy(exported, config, jax.tree.map(lambda leaf: leaf[1:], actors))
+    check_function(exported, "policy", *policy_case(config, jax.tree.map(lambda leaf: leaf[1:], actors)))
     names = [name for name in result.functions if name != "policy"]
     if result.no_reward_reason:
         assert NO_REWARD[method] in result.no_reward_reason
@@ -149,12 +158,31 @@ def test_export_agrees_with_jax(kind, method, small, small_many, echo, tmp_path)
     steps = jax.tree.map(lambda leaf: np.concatenate(np.swapaxes(leaf, 0, 1)), steps)
     # Exported rewards are in the unit of the true rewards, before they are scaled.
     unscaled = replace(config, scale_rewards=False)
-    expected = np.asarray(rewards(stored, RewardState(seed_learner.credit, seed_learner.scale), unscaled))
+    expected = np.asarray(rewards(stored, RewardState(seed_learner.decoders, seed_learner.scale), unscaled))
     for team_index, name in enumerate(names):
         check_reward(exported, name, config, steps, np.asarray(stored.length, np.float32), expected, team_index)
 
 
-def check_policy(exported, config, actor):
+@pytest.mark.parametrize(("algorithm", "env"), [("qmix", ONE_TEAM), ("ippo", TWO_TEAMS)])
+def test_policy_graph_of_teams(algorithm, env):
+    """The policies of teams, untrained: recurrent networks, and networks that read the index of the agent."""
+    config = small_config("ircr", algorithm, env)
+    learner = jax.tree.map(lambda leaf: leaf[None], untrained_learner(config))
+    actor = compile_functions(config).get_actor(learner, 0)
+    if algorithm == "ippo":
+        statistics = jax.tree.map(
+            lambda leaf: leaf + jnp.linspace(1, 2, leaf.size).reshape(leaf.shape), actor.observations
+        )
+        actor = actor._replace(observations=statistics)
+    inputs, expected = policy_case(config, actor)
+    outputs = evaluate(policy_graph(jax.tree.map(lambda leaf: leaf[0], actor), config, 0), inputs)
+    assert outputs.keys() == expected.keys()
+    for name, values in outputs.items():
+        np.testing.assert_allclose(values, expected[name], rtol=2e-5, atol=2e-5)
+
+
+def policy_case(config, actor):
+    """Return inputs of a policy, and the outputs by JAX."""
     env, random = config.env, np.random.default_rng(0)
     rows = (3, env.n_agents)
     observation = random.normal(size=(*rows, env.observation_size)).astype(np.float32)
@@ -190,7 +218,7 @@ def check_policy(exported, config, actor):
     if env.n_agents == 1:
         inputs = {name: rows[:, 0] for name, rows in inputs.items()}
         expected = {name: rows[:, 0] for name, rows in expected.items()}
-    check_function(exported, "policy", inputs, expected)
+    return inputs, expected
 
 
 def check_reward(exported, name, config, steps, length, expected, team_index):
@@ -230,12 +258,6 @@ def check_choice_numbers(exported, name, inputs, n_choices):
             exported.reward(**{**steps, "action": invalid}, name=name, **options)
 
 
-@pytest.fixture
-def run(small, tmp_path, phi):
-    settings = small(method="lare-bayes", steps=120)
-    return lare_rl.train(toy_spec(), settings, function=phi, out=tmp_path / "run", listeners=[])
-
-
 WITHOUT_LARE = """
 import sys
 import numpy as np
@@ -246,39 +268,46 @@ print(repr(exported.reward(**steps).tolist()))
 """
 
 
-def test_reward_without_lare(run, tmp_path, phi):
-    lare_rl.export_run(run, tmp_path / "out")
-    rng = np.random.default_rng(0)
+@pytest.fixture(scope="module")
+def export(export_run):
+    """Return a run of a single agent, and its exported functions."""
+    run, _, exported = export_run("td3", "lare-bayes")
+    return run, exported
+
+
+def test_reward_without_lare(export):
+    run, exported = export
+    directory, rng = Path(exported.__file__).parent, np.random.default_rng(0)
     before, after = rng.uniform(-1, 1, (2, 5, 2)).astype(np.float32)
     action = rng.uniform(-2, 2, (5, 1)).astype(np.float32)
-    np.savez(tmp_path / "out" / "steps.npz", before=before, action=action, after=after)
+    np.savez(directory / "steps.npz", before=before, action=action, after=after)
     process = subprocess.run(
-        [sys.executable, "-c", WITHOUT_LARE], cwd=tmp_path / "out", capture_output=True, text=True, check=True
+        [sys.executable, "-c", WITHOUT_LARE], cwd=directory, capture_output=True, text=True, check=True
     )
     config, learner, _, _ = load_learner(run)
     # Actions of the toy are in [-2, 2], and those of the trainer in [-1, 1].
-    features = np.concatenate([phi(before, action), before, action / 2], axis=1)
-    expected = decomposition.proxy_rewards(select_seed(learner, 0).credit[0], jnp.asarray(features), config.credit)
+    features = np.concatenate([run.functions[0](before, action), before, action / 2], axis=1)
+    expected = decomposition.proxy_rewards(select_seed(learner, 1).decoders[0], jnp.asarray(features), config.credit)
     np.testing.assert_allclose(json.loads(process.stdout), expected, rtol=1e-4, atol=1e-6)
-    exported = import_exported(tmp_path / "out")
     np.testing.assert_allclose(exported.reward(before[0], action[0], after[0]), expected[0], rtol=1e-4)
     assert np.std(expected) > 0
     assert set(describe(exported, "reward")["inputs"]) == {"before", "action"}
 
 
-def test_policy_is_that_of_load_policy(run, tmp_path):
-    lare_rl.export_run(run, tmp_path / "out", seed=1)
+def test_policy_is_that_of_load_policy(export):
+    run, exported = export
     observation = np.random.default_rng(0).uniform(-1, 1, (4, 2)).astype(np.float32)
     policy = lare_rl.load_policy(run, seed=1)
-    action = import_exported(tmp_path / "out").load("policy")(observation=observation)["action"]
+    action = exported.load("policy")(observation=observation)["action"]
     np.testing.assert_allclose(action, [policy(row) for row in observation], rtol=1e-5)
 
 
-def test_command(run, command, monkeypatch, tmp_path):
+def test_command(export, command, monkeypatch, tmp_path):
+    run, _ = export
     status, out, err = command("export", run.directory, "--out", "first")
     assert (status, err) == (0, "")
     assert out.startswith("wrote policy, reward to first; exported.py")
-    monkeypatch.setattr(export, "is_installed", lambda: False)
+    monkeypatch.setitem(sys.modules, "onnx", None)
     status, _, err = command("export", run.directory, "--out", "second")
     assert (status, err.count("\n")) == (0, 1)
     assert "[onnx]" in err
@@ -289,9 +318,8 @@ def test_command(run, command, monkeypatch, tmp_path):
         assert words in err
 
 
-def test_invalid_inputs(run, tmp_path):
-    lare_rl.export_run(run, tmp_path / "out")
-    exported = import_exported(tmp_path / "out")
+def test_invalid_inputs(export):
+    _, exported = export
     with pytest.raises(ValueError, match="'nope', only policy, reward"):
         exported.load("nope")
     policy, observation = exported.load("policy"), np.zeros((1, 2))

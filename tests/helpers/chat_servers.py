@@ -133,10 +133,10 @@ def flood(status: int) -> Answer:
 
 
 def compress(encoding: str, times: int) -> Answer:
-    """Send 64 MB in a few bytes."""
+    """Send 16 MB in a few bytes."""
 
     def answer(handler: Handler) -> None:
-        body = b" " * (64 << 20)
+        body = b" " * (16 << 20)
         for _ in range(times):
             body = gzip.compress(body)
         handler.send(200, body, Content_Encoding=encoding)

@@ -1,4 +1,6 @@
-"""What SMAC's StarCraft2Env looks like from outside, with SMAX's battles within."""
+"""A mock of SMAC's StarCraft2Env, in which SMAX plays the battles."""
+
+from functools import cache
 
 import jax
 import jax.numpy as jnp
@@ -7,7 +9,14 @@ import numpy as np
 from lare_rl.envs.smax.smax_env import SMAX
 
 FROM_SMAC = (4, 4, 0, 2, 1, 3)
-"""Nothing and stop, north, south, east, west, as SMAX counts them."""
+"""SMAX's numbers of no-op, stop, north, south, east and west."""
+
+
+@cache
+def compiled_smax(name: str):
+    """Return a SMAX environment, and its compiled `reset` and `step`."""
+    env = SMAX(name)
+    return env, jax.jit(env.reset), jax.jit(env.step)
 
 
 class FakeSmac:
@@ -18,8 +27,8 @@ class FakeSmac:
     def __init__(self, map_name: str, difficulty: str, seed: int, crash_at: int | None = None):
         assert difficulty == "7"
         type(self).launched += (seed,)
-        self.env, self.key, self.crash_at = SMAX(map_name), jax.random.key(seed), crash_at
-        self.advance = jax.jit(self.env.step)
+        self.env, self.start, self.advance = compiled_smax(map_name)
+        self.key, self.crash_at = jax.random.key(seed), crash_at
         self.steps, self.closed, self.runs, self.ended = 0, False, False, False
 
     def get_env_info(self) -> dict[str, int]:
@@ -33,7 +42,7 @@ class FakeSmac:
         assert self.ended or not self.runs, "a second game is started"
         self.runs = True
         self.key, key = jax.random.split(self.key)
-        (self.state, self.timestep), self.steps = jax.jit(self.env.reset)(key), 0
+        (self.state, self.timestep), self.steps = self.start(key), 0
         return self.get_obs(), self.get_state()
 
     def get_obs(self) -> list[np.ndarray]:

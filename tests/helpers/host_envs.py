@@ -7,6 +7,7 @@ import time
 
 import numpy as np
 
+from lare_rl.envs.env_errors import EnvOutputError
 from lare_rl.envs.interface import EnvSpec, Team, Timestep
 from lare_rl.errors import LareError
 
@@ -40,8 +41,8 @@ class ToyHostEnv:
         match self.fault:
             case "itself":
                 raise LareError("the battery is empty")
-            case "error":
-                raise ZeroDivisionError
+            case "output":
+                raise EnvOutputError("the reward is nan")
             case "exit":
                 sys.exit("the window is closed")
             case "dies":

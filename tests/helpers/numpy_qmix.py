@@ -10,8 +10,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from lare_rl.algorithms.batches import Sequences
 from lare_rl.algorithms.qmix import QMIXSettings, qmix
-from lare_rl.algorithms.qmix.qmix import Networks, Sequences
+from lare_rl.algorithms.qmix.qmix import Networks
 
 PINNED = json.loads((Path(__file__).parent / "qmix_pinned.json").read_text())
 SETTINGS = QMIXSettings(hidden=2, embed=2, hypernet=2)
@@ -35,8 +36,8 @@ def numpy_networks(numbers) -> Networks:
         leaf = np.reshape(numbers[start : start + np.prod(shape)], shape)
         arrays[name] = jnp.asarray(swap_gates(leaf) if name.startswith("gru") else leaf, jnp.float32)
         start += np.prod(shape)
-    like = qmix.init(jax.random.key(0), 2, 2, 3, 2, SETTINGS).online
-    return jax.tree.unflatten(jax.tree.structure(like), [arrays[name] for name in LEAVES])
+    state = jax.eval_shape(lambda: qmix.init(jax.random.key(0), 2, 2, 3, 2, SETTINGS))
+    return jax.tree.unflatten(jax.tree.structure(state.online), [arrays[name] for name in LEAVES])
 
 
 def numpy_sequences() -> Sequences:

@@ -1,5 +1,6 @@
 """What the NumPy twins of several algorithms need."""
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 
@@ -7,14 +8,25 @@ from lare_rl.algorithms.batches import Transitions
 
 
 def random_transitions():
-    """A batch of 16, of which every fourth terminates."""
+    """Return a batch of 16 steps. Every fourth terminates."""
     rng = np.random.default_rng(0)
-    s, a, r, n = (jnp.asarray(rng.normal(size=shape), jnp.float32) for shape in [(16, 3), (16, 2), (16,), (16, 3)])
-    return Transitions(s, jnp.tanh(a), r, n, jnp.asarray(np.arange(16) % 4 == 0, jnp.float32))
+    s, a, r, n = (np.asarray(rng.normal(size=shape), np.float32) for shape in [(16, 3), (16, 2), (16,), (16, 3)])
+    return Transitions(*map(jnp.asarray, (s, np.tanh(a), r, n, np.float32(np.arange(16) % 4 == 0))))
 
 
 def mlp_forward(network, x):
-    """An MLP in plain NumPy."""
+    """Return the outputs of an MLP."""
     for layer in network.layers[:-1]:
         x = np.maximum(x @ np.asarray(layer.weight) + np.asarray(layer.bias), 0)
     return x @ np.asarray(network.layers[-1].weight) + np.asarray(network.layers[-1].bias)
+
+
+def q_values(critics, observation, action):
+    """Return the values of each critic."""
+    x, critics = np.concatenate([observation, action], axis=1), jax.tree.map(np.asarray, critics)
+    count = len(critics.layers[0].weight)
+    return np.stack([mlp_forward(jax.tree.map(lambda leaf, i=i: leaf[i], critics), x)[:, 0] for i in range(count)])
+
+
+def equal(a, b):
+    return jax.tree.all(jax.tree.map(np.array_equal, a, b))

@@ -1,10 +1,8 @@
 """A small PettingZoo environment whose results a test can change (`pettingzoo/helpers.parallel_toy_envs:Toy`)."""
 
-import sys
-
 import numpy as np
 from gymnasium.spaces import Box, Discrete
-from pettingzoo import AECEnv, ParallelEnv
+from pettingzoo import ParallelEnv
 
 
 class Toy(ParallelEnv):
@@ -71,25 +69,9 @@ class Toy(ParallelEnv):
         pass
 
 
-class Turns(AECEnv):
-    """Agents take turns."""
-
-    possible_agents = ("a_0",)
-
-    def agent_iter(self):
-        return iter(())
-
-
-def leaves():
-    sys.exit("no window")
-
-
 def raises():
     raise OSError("no asset\ntrack.bin")
 
 
 def nothing():
     return 3
-
-
-NUMBER = 5

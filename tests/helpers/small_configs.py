@@ -3,15 +3,19 @@
 from functools import partial
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 
 from lare_rl.algorithms.ppo import PPOSettings
 from lare_rl.algorithms.qmix import QMIXSettings
 from lare_rl.algorithms.registry import ALGORITHMS
 from lare_rl.algorithms.td3 import TD3Settings
+from lare_rl.credit.basis import Basis
+from lare_rl.credit.closed_form import LinearDecoder
 from lare_rl.credit.decoder_settings import CreditSettings
 from lare_rl.credit.methods import METHODS
 from lare_rl.data import replay
+from lare_rl.data.replay import STEP_COLUMNS
 from lare_rl.data.trajectory import Trajectory
 from lare_rl.envs.interface import EnvSpec, Team, Timestep, to_env_action
 from lare_rl.training import learner as learners
@@ -38,6 +42,10 @@ SMALL_SETTINGS = {
     "ippo": PPOSettings(hidden=(8,), minibatch_size=50, epochs=1),
     "qmix": QMIXSettings(hidden=4, embed=2, hypernet=3, batch_size=4, update_every=2, target_every=4),
 }
+
+
+SUM_CREDIT = CreditSettings(hidden=(8,), drawn_steps=4, steps=24, score="sum")
+"""Nothing is fitted to find out the type of the score, which takes seconds to compile."""
 
 
 def small_config(method, algorithm="td3", env=ONE_AGENT, **changes):
@@ -124,22 +132,57 @@ def random_factors(config, steps, seed=1):
 
 
 def untrained_learner(config, seed=0):
-    return jitted(_init_learner, config)(jax.random.key(seed))
+    """Return an untrained learner. It is not compiled: single operations are shared by all configurations."""
+    init_algorithm = partial(training_module(config).init, config=config)
+    return learners.init_learner(jax.random.key(seed), config, init_algorithm)
 
 
-def _init_learner(key, config):
-    return learners.init_learner(key, config, partial(training_module(config).init, config=config))
+def steps_as_stored(config, steps=None, factors=None):
+    """Return steps of the first environment, which are whole episodes, as `stored_steps` does, without a replay."""
+    steps = random_steps(config.env) if steps is None else steps
+    timestep, next_timestep = (
+        {name: getattr(timestep, name)[:, 0] for name in STEP_COLUMNS}
+        for timestep in (steps.timestep, steps.next_timestep)
+    )
+    columns = timestep | {
+        "action": steps.action[:, 0],
+        "factors": (random_factors(config, steps) if factors is None else factors)[:, 0],
+        "reward": steps.next_timestep.reward[:, 0],
+        "terminated": steps.next_timestep.terminated[:, 0],
+    }
+    last = steps.ended[:, 0]
+    length = np.diff(np.flatnonzero(last), prepend=-1)
+    by_team = [team_rewards(steps, team) for team in config.env.teams]
+    total = np.add.reduceat(np.stack(by_team, axis=-1), np.cumsum(length) - length).astype(np.float32)
+    return replay.StoredSteps(
+        columns={name: jnp.asarray(columns[name]) for name in config.columns},
+        next_columns={name: jnp.asarray(next_timestep[name]) for name in STEP_COLUMNS if name in config.columns},
+        episodic_reward=jnp.asarray(np.where(last[:, None], np.repeat(total, length, axis=0), 0)),
+        mean_reward=jnp.asarray(np.repeat(total / length[:, None], length, axis=0), jnp.float32),
+        finished=jnp.ones(len(last), bool),
+        last=jnp.asarray(last),
+        length=jnp.asarray(np.repeat(length, length), jnp.int32),
+    )
 
 
-def add_steps(learner, config, steps, factors=None, learn=False):
+def team_rewards(steps, team, env=0):
+    """Return the team's reward of each step: the mean over its agents that are alive, by a loop."""
+    means = []
+    for reward, alive in zip(steps.next_timestep.reward[:, env], steps.timestep.alive[:, env], strict=True):
+        values = [reward[agent] for agent in range(team.start, team.stop) if alive[agent]]
+        means.append(np.mean(values) if values else 0.0)
+    return np.array(means)
+
+
+def add_steps(learner, config, steps, factors=None, learn=None):
     """Return a learner that has stored these steps too.
 
-    Decoders in closed form learn from the finished episodes. Other decoders do so if `learn` is true: they would only learn the type
-    of the score, and compiling this takes a second.
+    By default, only decoders in closed form learn from the finished episodes. Other decoders would only learn the type
+    of the score, and compiling this takes seconds.
     """
     factors = random_factors(config, steps) if factors is None else factors
     learner = jitted(learners.store_with_factors, config)(learner, steps, factors)
-    learns = learner.credit and (learn or not config.method.uses_gradient)
+    learns = learner.decoders and (not config.method.uses_gradient if learn is None else learn)
     return learn_stored_returns(learner, config) if learns else learner
 
 
@@ -161,11 +204,22 @@ def jitted(function, config):
 
 def learn_stored_returns(learner, config):
     """Return a learner whose decoders have learned from all finished episodes."""
-    arrays = jax.tree.map(lambda leaf: np.asarray(leaf)[None], (learner.credit, learner.replay, learner.n_learned))
+    arrays = jax.tree.map(lambda leaf: np.asarray(leaf)[None], (learner.decoders, learner.replay, learner.n_learned))
     with jax.enable_x64(True):
         learned = jitted(learn_returns, config)(*arrays)
     decoders, n_learned = jax.tree.map(lambda leaf: leaf[0], learned)
-    return learner._replace(credit=decoders, n_learned=n_learned)
+    return learner._replace(decoders=decoders, n_learned=n_learned)
+
+
+def with_factor_decoders(learner, weights):
+    """Return the learner with decoders whose output is their only factor, times a weight for each team."""
+    decoders = tuple(
+        team._replace(
+            decoder=LinearDecoder(Basis(1, 0, False), *(jnp.array([x]) for x in (0.0, 1.0, weight)), jnp.zeros(()))
+        )
+        for team, weight in zip(learner.decoders, weights, strict=True)
+    )
+    return learner._replace(decoders=decoders)
 
 
 def learner_with_episodes(config, seed=0):
@@ -184,4 +238,4 @@ read = jax.jit(replay.read)
 
 
 def reward_state(learner):
-    return RewardState(learner.credit, learner.scale)
+    return RewardState(learner.decoders, learner.scale)

@@ -1,4 +1,4 @@
-"""The assigner is shown what a logging environment has logged, in every autoreset mode."""
+"""The assigner receives what a logging environment has logged, in every autoreset mode."""
 
 import copy
 
@@ -8,13 +8,12 @@ import pytest
 from gymnasium import spaces
 from gymnasium.utils import RecordConstructorArgs
 from gymnasium.utils.env_checker import check_env
-from gymnasium.vector import AutoresetMode, SyncVectorEnv, VectorEnv
+from gymnasium.vector import AutoresetMode, SyncVectorEnv, VectorEnv, VectorWrapper
 from gymnasium.wrappers import NormalizeObservation, TimeLimit
 from gymnasium.wrappers.vector import RecordEpisodeStatistics
 
-from helpers.assigner_episodes import SMALL_CREDIT, LoggedEnv, check_stored_episodes, small_assigner
+from helpers.logged_envs import LoggedEnv, RandomEnv, RecordingAssigner, check_episodes, recording_assigner
 from helpers.toy_envs import toy_spec
-from lare_rl.assigner.assigner import CreditAssigner
 from lare_rl.envs.episodic import TRUE_REWARD, EpisodicReward
 from lare_rl.errors import LareError
 from lare_rl.integrations.gymnasium import Credit, VectorCredit
@@ -25,31 +24,19 @@ SPACES = {
     "integers": (spaces.Box(0, 255, (2, 3), np.uint8), spaces.Discrete(3, start=1)),
     "discrete": (spaces.Discrete(5), spaces.Discrete(3)),
     "dict": (
-        spaces.Dict(place=spaces.Box(-1, 1, (2,)), mode=spaces.Discrete(3), flags=spaces.MultiBinary(2)),
+        spaces.Dict(position=spaces.Box(-1, 1, (2,)), mode=spaces.Discrete(3), flags=spaces.MultiBinary(2)),
         spaces.MultiDiscrete([2, 3]),
     ),
-    "tuple": (spaces.Tuple([spaces.Discrete(2), spaces.Box(-1, 1, (1, 2))]), spaces.Dict(a=spaces.Box(-1, 1, ()))),
+    "tuple": (spaces.Tuple([spaces.Discrete(2), spaces.Box(-1, 1, (1, 2))]), spaces.Box(-1, 1, ())),
 }
-MODES = list(AutoresetMode)
-all_modes = pytest.mark.parametrize("mode", MODES, ids=lambda mode: mode.name)
-all_spaces = pytest.mark.parametrize("env_spaces", SPACES.values(), ids=SPACES)
+NEXT_STEP, SAME_STEP, DISABLED = AutoresetMode.NEXT_STEP, AutoresetMode.SAME_STEP, AutoresetMode.DISABLED
+all_modes = pytest.mark.parametrize("mode", AutoresetMode, ids=lambda mode: mode.name)
 
 
-def make_assigner(env):
-    return CreditAssigner(
-        "rd",
-        observation_space=env.observation_space,
-        action_space=env.action_space,
-        settings=SMALL_CREDIT,
-        capacity=1000,
-    )
-
-
-def make_vector(mode=AutoresetMode.NEXT_STEP, env_spaces=(None, None), copies=3):
+def make_vector(mode=NEXT_STEP, env_spaces=(None, None), copies=3):
     """Return a vector environment and its environments, which write each observation into the same memory."""
     # In SAME_STEP mode, Gymnasium keeps no copy of `final_obs` either.
-    rewrites = mode != AutoresetMode.SAME_STEP
-    envs = [LoggedEnv(*copy.deepcopy(env_spaces), seed=seed, rewrites=rewrites) for seed in range(copies)]
+    envs = [LoggedEnv(RandomEnv(*env_spaces, seed=seed, rewrites=mode != SAME_STEP)) for seed in range(copies)]
     return SyncVectorEnv([lambda env=env: env for env in envs], copy=False, autoreset_mode=mode), envs
 
 
@@ -61,140 +48,134 @@ def play(envs, n_steps, seed=0):
     for _ in range(n_steps):
         results.append(copy.deepcopy(envs.step(envs.action_space.sample())))
         done = results[-1][2] | results[-1][3]
-        if envs.metadata["autoreset_mode"] == AutoresetMode.DISABLED and done.any():
+        if envs.metadata["autoreset_mode"] == DISABLED and done.any():
             envs.reset(options={"reset_mask": done})
     return results
 
 
 def play_episodes(env, n_episodes):
+    """Play episodes of random steps. Return the rewards and the `info` of each step."""
+    results = []
     for _ in range(n_episodes):
         env.reset()
-        while not any(env.step(env.action_space.sample())[2:4]):
-            pass
-
-
-@all_spaces
-@all_modes
-def test_vector_steps(mode, env_spaces):
-    vector, envs = make_vector(mode, env_spaces)
-    credit = make_assigner(envs[0])
-    play(VectorCredit(vector, credit, pay="environment"), 40)
-    check_stored_episodes(credit, envs)
-    assert credit.store.dropped == 0
-    n_finished = sum(len(steps) for env in envs for steps, _ in env.episodes)
-    assert credit.store.steps == n_finished + sum(len(env.going) for env in envs if env.left > 0)
-
-
-@all_spaces
-def test_single_steps(env_spaces):
-    env = LoggedEnv(*copy.deepcopy(env_spaces), rewrites=True)
-    credit = make_assigner(env)
-    wrapped = Credit(env, credit, pay="environment")
-    for _ in range(8):
-        wrapped.reset()
         done = False
         while not done:
-            _, reward, terminated, truncated, info = wrapped.step(env.action_space.sample())
-            assert reward == info[TRUE_REWARD] == env.going[-1][3]
+            _, reward, terminated, truncated, info = env.step(env.action_space.sample())
+            results.append((reward, info))
             done = terminated or truncated
-        assert info[CREDIT_STEP] == credit.store.steps - 1
-    check_stored_episodes(credit, [env])
-    assert credit.store.dropped == 0
+    return results
+
+
+@pytest.mark.parametrize(
+    ("mode", "kind"), [(NEXT_STEP, "integers"), (DISABLED, "discrete"), (SAME_STEP, "dict"), (SAME_STEP, "tuple")]
+)
+def test_vector_steps_of_spaces(mode, kind):
+    vector, envs = make_vector(mode, SPACES[kind])
+    credit = recording_assigner(envs[0])
+    play(VectorCredit(vector, credit, pay="environment"), 40)
+    check_episodes(credit, envs)
+    assert credit.store.dropped == credit.n_fits == 0
+
+
+@pytest.mark.parametrize("kind", SPACES)
+def test_single_steps_of_spaces(kind):
+    env = LoggedEnv(RandomEnv(*SPACES[kind], rewrites=True))
+    credit = recording_assigner(env)
+    results = play_episodes(Credit(env, credit, pay="environment"), 8)
+    check_episodes(credit, [env])
+    logged_rewards = [step[3] for step in env.all_steps()]
+    assert [reward for reward, _ in results] == [info[TRUE_REWARD] for _, info in results] == logged_rewards
+    assert [info[CREDIT_STEP] for _, info in results] == list(range(credit.store.steps))
+    assert credit.store.dropped == credit.n_fits == 0
 
 
 @all_modes
 def test_vector_rewards(mode):
     """r_hat is returned, and `infos` has the rewards and step numbers. A row that resets is no step."""
     plain = play(make_vector(mode)[0], 40)
-    credit = small_assigner("rd-linear")
-    results = play(VectorCredit(make_vector(mode)[0], credit), 40)
+    vector, envs = make_vector(mode)
+    credit = recording_assigner(envs[0], "rd-linear")
+    results = play(VectorCredit(vector, credit), 40)
+    check_episodes(credit, envs)
     for (_, r_hat, *_, infos), (_, reward, *_) in zip(results, plain, strict=True):
         steps = infos[CREDIT_STEP]
         np.testing.assert_array_equal(infos[TRUE_REWARD], reward)
-        np.testing.assert_array_equal(infos[f"_{CREDIT_STEP}"], steps >= 0)
+        for name in (TRUE_REWARD, CREDIT_STEP):
+            np.testing.assert_array_equal(infos[f"_{name}"], steps >= 0)
         assert (r_hat[steps < 0] == 0).all()
         assert r_hat.dtype == reward.dtype
     numbers = np.concatenate([infos[CREDIT_STEP] for *_, infos in results])
-    assert (numbers < 0).any() == (mode == AutoresetMode.NEXT_STEP)
+    assert (numbers < 0).any() == (mode == NEXT_STEP)
     assert sorted(numbers[numbers >= 0].tolist()) == list(range(credit.store.steps))
+    assert (credit.n_fits, credit.store.dropped) == (40, 0)
+    assert credit.store.steps == sum(len(env.all_steps()) for env in envs)
     assert (results[0][1] == 0).all()  # before the first fit
+    assert results[-1][1].any()
     np.testing.assert_allclose(results[-1][1], credit.rewards_at(results[-1][-1][CREDIT_STEP]), rtol=1e-6)
-
-
-def test_gradient_updates():
-    """They are made as steps come in, unless the loop trains on the environment's rewards."""
-    n_updates = {}
-    for pay in ("proxy", "environment"):
-        credit = small_assigner("rrdu")
-        play(VectorCredit(make_vector()[0], credit, pay=pay), 40)
-        n_updates[pay] = credit.metrics()["credit/fits"]
-    assert 0 < n_updates["proxy"] <= credit.store.steps
-    assert n_updates["environment"] == 0
 
 
 @all_modes
 def test_vector_reset_drops_episodes(mode):
     vector, envs = make_vector(mode)
-    credit = small_assigner("rd")
+    credit = recording_assigner(envs[0])
     wrapped = VectorCredit(vector, credit, pay="environment")
     play(wrapped, 10)
-    n_running = sum(env.left > 0 and bool(env.going) for env in envs)
+    n_running = sum(bool(env.steps) for env in envs)
     play(wrapped, 10)
-    check_stored_episodes(credit, envs)
+    check_episodes(credit, envs)
     assert credit.store.dropped == n_running > 0
 
 
 def test_reset_mask_drops_one_episode():
-    vector, envs = make_vector(AutoresetMode.DISABLED)
-    credit = small_assigner("rd")
+    vector, envs = make_vector(DISABLED)
+    credit = recording_assigner(envs[0])
     wrapped = VectorCredit(vector, credit, pay="environment")
-    for env in envs:
-        env.reset = lambda env=env, **_: (LoggedEnv.reset(env), setattr(env, "left", 4))[0]
     wrapped.reset()
     actions = wrapped.action_space.sample()
+    for env in envs:
+        env.unwrapped.steps_left = 4
     wrapped.step(actions)
     wrapped.reset(options={"reset_mask": np.array([False, True, False])})
+    envs[1].unwrapped.steps_left = 4
     for _ in range(3):
         wrapped.step(actions)
-    check_stored_episodes(credit, envs)
+    check_episodes(credit, envs)
     assert (len(credit.store.episodes), credit.store.dropped) == (2, 1)
 
 
-def test_single_reset_drops_episode():
-    """Also if all observations are the same."""
-    env = LoggedEnv(spaces.Discrete(1), None)
-    credit = make_assigner(env)
+def test_single_rewards_and_reset():
+    """A reset drops the running episode, also if all observations are the same."""
+    env = LoggedEnv(RandomEnv(spaces.Discrete(1)))
+    credit = recording_assigner(env, "rd-linear")
     wrapped = Credit(env, credit)
     wrapped.reset()
-    env.left = 3
+    env.unwrapped.steps_left = 3
     wrapped.step(env.action_space.sample())
-    wrapped.reset()
-    env.left = 2
-    for _ in range(2):
-        wrapped.step(env.action_space.sample())
-    check_stored_episodes(credit, [env])
-    assert credit.store.dropped == 1
+    results = play_episodes(wrapped, 12)
+    check_episodes(credit, [env])
+    assert (credit.store.dropped, credit.n_fits) == (1, credit.store.steps)
+    assert results[-1][0] == pytest.approx(float(credit.rewards_at([credit.store.steps - 1])[0])) != 0
 
 
 @all_modes
 def test_score_in_info(mode):
     vector, envs = make_vector(mode)
-    credit = small_assigner("rd")
+    credit = recording_assigner(envs[0])
     play(VectorCredit(vector, credit, pay="environment", score="score"), 40)
-    check_stored_episodes(credit, envs, by="score")
-    env = LoggedEnv()
-    credit = make_assigner(env)
+    check_episodes(credit, envs, use_score=True)
+    env = LoggedEnv(RandomEnv())
+    credit = recording_assigner(env)
     play_episodes(Credit(env, credit, score="score"), 3)
-    check_stored_episodes(credit, [env], by="score")
+    check_episodes(credit, [env], use_score=True)
     with pytest.raises(LareError, match="'goals'"):
-        play(VectorCredit(make_vector(mode)[0], small_assigner("rd"), score="goals"), 40)
+        play(VectorCredit(make_vector(mode)[0], recording_assigner(env), score="goals"), 40)
 
 
 def test_shared_assigner():
-    envs = [LoggedEnv(seed=seed) for seed in range(3)]
-    credit = make_assigner(envs[0])
+    envs = [LoggedEnv(RandomEnv(seed=seed)) for seed in range(3)]
+    credit = recording_assigner(envs[0])
     play(SyncVectorEnv([lambda env=env: Credit(env, credit) for env in envs]), 30)
-    check_stored_episodes(credit, envs)
+    check_episodes(credit, envs)
     assert credit.store.dropped == 0
 
 
@@ -202,51 +183,60 @@ def test_other_wrappers():
     """Statistics inside see the environment's rewards, statistics outside r_hat."""
     vector, envs = make_vector()
     inside = RecordEpisodeStatistics(vector)
-    outside = RecordEpisodeStatistics(VectorCredit(inside, small_assigner("rd-linear")), stats_key="r_hat")
+    outside = RecordEpisodeStatistics(VectorCredit(inside, recording_assigner(envs[0])), stats_key="r_hat")
     play(outside, 40)
     returns = [sum(step[3] for step in steps) for env in envs for steps, _ in env.episodes]
     assert sorted(inside.return_queue) == pytest.approx(sorted(returns), abs=1e-5)
     assert outside.return_queue != inside.return_queue
-    play_episodes(NormalizeObservation(Credit(TimeLimit(LoggedEnv(), 3), small_assigner("rd"))), 1)
+    env = RandomEnv()
+    play_episodes(NormalizeObservation(Credit(TimeLimit(env, 3), recording_assigner(env))), 1)
 
 
 @all_modes
 def test_rewards_replaced_by_inner_wrapper(mode):
     """`infos` still has the environment's own rewards."""
-    envs = [LoggedEnv(seed=3 + seed) for seed in range(2)]
+    envs = [LoggedEnv(RandomEnv(seed=3 + seed)) for seed in range(2)]
     vector = SyncVectorEnv([lambda env=env: EpisodicReward(env) for env in envs], autoreset_mode=mode)
-    for *_, infos in play(VectorCredit(vector, make_assigner(envs[0])), 20):
-        mask = infos[f"_{TRUE_REWARD}"]
-        rewards = {step[3] for env in envs for steps, _ in [*env.episodes, (env.going, 0)] for step in steps}
-        assert set(infos[TRUE_REWARD][mask].tolist()) <= rewards
+    results = play(VectorCredit(vector, recording_assigner(envs[0])), 20)
+    rewards = {step[3] for env in envs for step in env.all_steps()}
+    for *_, infos in results:
+        assert set(infos[TRUE_REWARD][infos[f"_{TRUE_REWARD}"]].tolist()) <= rewards
 
 
-def test_task_without_spaces(phi):
+def test_task_without_spaces():
     """The assigner only has the sizes of the rows, and the environment says how to make them."""
     observation_space = spaces.Dict(target=spaces.Box(-1, 1, (1,)), noise=spaces.Box(-1, 1, (1,)))
     vector, envs = make_vector(env_spaces=(observation_space, spaces.Box(-1, 1, (1, 1))))
-    credit = CreditAssigner("lare-linear", phi, task=toy_spec(), capacity=100)
+    credit = RecordingAssigner("ircr", task=toy_spec())
     play(VectorCredit(vector, credit), 20)
-    credit.metrics()  # computes all features
-    for steps, _ in (episode for env in envs for episode in env.episodes):
-        observation = np.float32([spaces.flatten(observation_space, step[0]) for step in steps])
-        action = np.float32([step[1].ravel() for step in steps])
-        return_ = sum(step[3] for step in steps)
-        (episode,) = (episode for episode in credit.store.episodes.values() if episode.score == return_)
-        np.testing.assert_array_equal(credit.store.features[episode.steps], phi(observation, action))
+    check_episodes(credit, envs)
+
+
+class WithoutFinalObs(VectorWrapper):
+    def step(self, actions):
+        *results, infos = self.env.step(actions)
+        return *results, {name: value for name, value in infos.items() if name != "final_obs"}
+
+
+def small_assigner(**changes):
+    return RecordingAssigner("ircr", **({"observation_space": 2, "action_space": 1} | changes))
 
 
 @pytest.mark.parametrize(
     ("wrap", "message"),
     [
-        (lambda: check_assigner("bayes"), "must be a CreditAssigner, and is 'bayes'"),
-        (lambda: Credit(LoggedEnv(), small_assigner("rd", agents=2, max_steps=5)), "agents=2.* has 1"),
+        (lambda: check_assigner("bayes"), "CreditAssigner.*'bayes'"),
+        (lambda: Credit(RandomEnv(), small_assigner(agents=2, max_steps=5)), "agents=2.* has 1"),
         (lambda: check_pay("all"), "pay = 'all'"),
-        (lambda: Credit(LoggedEnv(), small_assigner("rd", observation_space=3)), "observations .* 2 numbers.* 3"),
-        (lambda: VectorCredit(make_vector()[0], small_assigner("rd", action_space=4)), "actions .* 1 numbers.* 4"),
+        (lambda: Credit(RandomEnv(), small_assigner(observation_space=3)), "observations .* 2 numbers.* 3"),
+        (lambda: VectorCredit(make_vector()[0], small_assigner(action_space=4)), "actions .* 1 numbers.* 4"),
         (
-            lambda: VectorCredit(type("Silent", (VectorEnv,), {"metadata": {}})(), small_assigner("rd")),
+            lambda: VectorCredit(type("Silent", (VectorEnv,), {"metadata": {}})(), small_assigner()),
             "autoreset_mode.* = None",
+        ),
+        (
+            lambda: play(VectorCredit(WithoutFinalObs(make_vector(SAME_STEP)[0]), small_assigner()), 9),
+            "SAME_STEP.* no final_obs",
         ),
     ],
 )
@@ -269,16 +259,15 @@ class WithoutStepNumber(gymnasium.Wrapper, RecordConstructorArgs):
 
 @pytest.mark.filterwarnings("ignore:.*is different from the unwrapped version:UserWarning")
 @pytest.mark.filterwarnings("ignore:.*we recommend using a symmetric and normalized space:UserWarning")
-@pytest.mark.parametrize("pay", ["proxy", "environment"])
-def test_checker_of_gymnasium(pay):
+def test_checker_of_gymnasium():
     env = gymnasium.make("Pendulum-v1")
-    wrapped = WithoutStepNumber(Credit(env, make_assigner(env), pay))
+    wrapped = WithoutStepNumber(Credit(env, recording_assigner(env)))
     check_env(wrapped, skip_render_check=True)
     wrapped.close()
 
 
 def test_make_from_spec():
     env = gymnasium.make("Pendulum-v1")
-    again = gymnasium.make(Credit(env, make_assigner(env), score="score").spec)
+    again = gymnasium.make(Credit(env, recording_assigner(env), score="score").spec)
     assert isinstance(again, Credit)
     assert again.score == "score"

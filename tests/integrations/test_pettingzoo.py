@@ -1,13 +1,12 @@
-"""A team is shown as its agents act: rows, alive agents, and the mean of their rewards."""
+"""The assigner receives the steps of a team: rows, alive agents, and the mean of their rewards."""
 
 import numpy as np
 import pytest
 from gymnasium import spaces
 from pettingzoo.test import parallel_api_test
 
-from helpers.assigner_episodes import SMALL_CREDIT
+from helpers.logged_envs import RecordingAssigner
 from helpers.parallel_toy_envs import Toy
-from lare_rl.assigner.assigner import CreditAssigner
 from lare_rl.envs.episodic import TRUE_REWARD
 from lare_rl.errors import LareError
 from lare_rl.integrations.pettingzoo import CreditParallel
@@ -36,9 +35,9 @@ class LoggedTeam(Toy):
         return observations, rewards, terminated, truncated, infos
 
 
-def make_assigner(method="rrdu-next", agents=3, **changes):
-    values = {"observation_space": 2, "action_space": spaces.Discrete(3), "max_steps": 5, "capacity": 500}
-    return CreditAssigner(method, agents=agents, settings=SMALL_CREDIT, **(values | changes))
+def make_assigner(method="ircr", agents=3, **changes):
+    values = {"observation_space": 2, "action_space": spaces.Discrete(3), "max_steps": 5}
+    return RecordingAssigner(method, agents=agents, **(values | changes))
 
 
 def play(env, seed=0):
@@ -59,18 +58,21 @@ def test_steps(presence):
     returns = []
     for seed in range(4):
         team.log.clear()
-        play(wrapped, seed)
-        credit.metrics()  # computes all features
+        results = play(wrapped, seed)
         returns.append(sum(np.mean([reward for *_, reward in step.values()]) for step in team.log))
         first = credit.store.steps - len(team.log)
-        for number, step in enumerate(team.log):
-            assert credit.store.alive[first + number].tolist() == [name in step for name in NAMES]
-            for name, (observation, action, next_observation, _) in step.items():
-                expected = np.concatenate([next_observation, np.eye(3)[action]])
-                np.testing.assert_array_equal(credit.store.features[first + number, NAMES.index(name)], expected)
-                assert observation[1] == number
+        for number, (step, result) in enumerate(zip(team.log, results, strict=True), start=first):
+            assert credit.store.alive[number].tolist() == [name in step for name in NAMES]
+            for index, name in enumerate(NAMES):
+                if name not in step:
+                    assert not credit.recorded[number][index, 2:5].any()  # no action
+                    continue
+                observation, action, next_observation, reward = step[name]
+                expected = np.concatenate([observation, np.eye(3)[action], next_observation])
+                np.testing.assert_array_equal(credit.recorded[number][index], expected)
+                assert result[1][name] == reward
     assert [episode.score for episode in credit.store.episodes.values()] == pytest.approx(returns)
-    assert credit.store.dropped == 0
+    assert credit.store.dropped == credit.n_fits == 0
 
 
 def test_rewards():
@@ -85,6 +87,7 @@ def test_rewards():
         for agent in rewards:
             assert infos[agent][TRUE_REWARD] == step[agent][3]
             assert "count" in infos[agent]
+    assert credit.n_fits == credit.store.steps
     _, rewards, _, _, infos = results[-1]
     for agent, reward in rewards.items():
         r_hat = credit.rewards_at(infos[agent][CREDIT_STEP])
@@ -109,13 +112,12 @@ def test_team_of_one():
 
 
 def test_dict_space():
-    space = spaces.Dict(place=spaces.Box(-9, 9, (1,)), count=spaces.Discrete(9))
+    space = spaces.Dict(position=spaces.Box(-9, 9, (1,)), count=spaces.Discrete(9))
     team = LoggedTeam(NAMES[:2], observations=dict.fromkeys(NAMES[:2], space))
-    team.observe = lambda agent: {"place": np.zeros(1, np.float32), "count": team.steps}
+    team.observe = lambda agent: {"position": np.zeros(1, np.float32), "count": team.steps}
     credit = make_assigner(agents=2, observation_space=10)
     play(CreditParallel(team, credit))
-    credit.metrics()
-    np.testing.assert_array_equal(credit.store.features[:5, 0, 1:10], np.eye(9)[1:6])
+    np.testing.assert_array_equal([credit.recorded[t][0, 14:23] for t in range(5)], np.eye(9)[1:6])
 
 
 def test_checker_of_pettingzoo(recwarn):

@@ -3,11 +3,10 @@
 import json
 import re
 
-import gymnasium
 import pytest
 
 from helpers.long_tests import long_case
-from helpers.toy_envs import PHI, Chase, phi_source, toy_spec
+from helpers.toy_envs import PHI, phi_source, toy_spec
 from lare_rl.envs.load import read_task, shipped_tasks
 from lare_rl.errors import LareError
 from lare_rl.latent.design import DesignError, DesignInterruptedError, DesignModelError, design
@@ -51,7 +50,7 @@ class ScriptedModel:
         return self.replies.pop(0)
 
 
-QUICK_TASKS = ("CN-6", "CompetitivePP-6", "HalfCheetah-v4", "Reacher-v4", "SMAX-2s3z", "TriangleArea", "Walker2d-v4")
+QUICK_TASKS = ("CompetitivePP-6", "HalfCheetah-v4", "Reacher-v4", "TriangleArea")
 
 
 @pytest.mark.parametrize(
@@ -78,9 +77,6 @@ def test_draws_and_kinds():
     assert functions[0].digest != functions[1].digest
     reward = design(task, "reward", candidates=1)
     assert (reward.kind, reward.size) == ("reward", 1)
-
-
-def test_task_without_recording():
     with pytest.raises(LareError, match="no recorded reply"):
         design(toy_spec())
 
@@ -104,17 +100,13 @@ def test_error_goes_back(chase):
 @pytest.mark.parametrize(
     ("bad", "quote", "errors"),
     [
-        (reply("import os\n" + phi_source("return [action, np.two(3)]")), None, None),
         (MALFORMED, MALFORMED, NOT_JSON),
         ("x" * (MAX_QUOTE + 5), "x" * MAX_QUOTE, NOT_JSON),
         ("", "(an empty reply)", "the reply is empty"),
     ],
-    ids=["two errors", "malformed", "long", "empty"],
+    ids=["malformed", "long", "empty"],
 )
 def test_correction_request(chase, bad, quote, errors):
-    if errors is None:
-        quote, errors = bad, verify(json.loads(bad)["Functions"], chase).errors
-        assert len(errors.splitlines()) == 2
     model = ScriptedModel(bad, GOOD)
     function = design(chase, model=model, candidates=1)
     assert model.requests == [(candidate(chase), 0), (correct(candidate(chase), quote, errors), 0)]
@@ -144,9 +136,11 @@ def test_passing_candidates_are_combined(chase):
 
 
 def test_all_candidates_are_combined_if_none_passes(chase):
-    model = ScriptedModel(MALFORMED, failing_reply("no_idea"), "x" * (MAX_QUOTE + 5), GOOD)
-    design(chase, model=model, candidates=3)
-    assert model.requests[-1] == (combine(chase, [MALFORMED, failing_reply("no_idea"), "x" * MAX_QUOTE]), 0)
+    two_errors = reply("import os\n" + phi_source("return [action, np.two(3)]"))
+    model, messages = ScriptedModel(MALFORMED, two_errors, "x" * (MAX_QUOTE + 5), GOOD), []
+    design(chase, model=model, candidates=3, on_message=messages.append)
+    assert model.requests[-1] == (combine(chase, [MALFORMED, two_errors, "x" * MAX_QUOTE]), 0)
+    assert messages[1].endswith("(and 1 more)")
 
 
 def test_reward_has_its_own_request_and_check(chase):
@@ -160,6 +154,7 @@ def test_reward_has_its_own_request_and_check(chase):
 
 def test_attempts_end(chase):
     bad = [failing_reply(f"attempt_{number}") for number in range(1, ATTEMPTS + 1)]
+    assert len(design(chase, model=ScriptedModel(*bad[1:], GOOD), candidates=1).exchanges) == ATTEMPTS
     model, messages = ScriptedModel(*bad, GOOD), []
     with pytest.raises(DesignError, match=r"'Chase'.*attempt_5 is not defined") as error:
         design(chase, model=model, candidates=1, on_message=messages.append)
@@ -169,11 +164,6 @@ def test_attempts_end(chase):
     assert [message["content"] for message in last_request if message["role"] == "assistant"] == bad[:-1]
     assert [exchange.replies for exchange in error.value.recorder.exchanges] == [[text] for text in bad]
     assert error.value.model == "scripted"
-
-
-def test_last_attempt_can_pass(chase):
-    model = ScriptedModel(*[MALFORMED] * (ATTEMPTS - 1), GOOD)
-    assert len(design(chase, model=model, candidates=1).exchanges) == ATTEMPTS
 
 
 def test_record(chase, tmp_path):
@@ -231,22 +221,16 @@ def test_replies_survive_an_error(chase, error, design_error, status):
     assert raised.value is error
 
 
-class FailingEnv(Chase):
-    def reset(self, *, seed=None, options=None):
-        raise RuntimeError("no track\nin sight")
-
-
-gymnasium.register("misfits/Fails-v0", entry_point=FailingEnv, max_episode_steps=20)
-
-
 def test_environment_is_checked_first():
     model = ScriptedModel(GOOD)
-    with pytest.raises(LareError, match=r"'misfits/Fails-v0' failed in reset: no track$"):
-        design(toy_spec(environment="misfits/Fails-v0"), model=model, candidates=1)
+    with pytest.raises(LareError, match="nothing/Here-v0"):
+        design(toy_spec(environment="nothing/Here-v0"), model=model, candidates=1)
     assert model.replies == [GOOD]
 
 
-@pytest.mark.parametrize("n", [0, -1, 101])
-def test_number_of_candidates(chase, n):
-    with pytest.raises(LareError, match=f"candidates = {n}"):
-        design(chase, candidates=n)
+@pytest.mark.parametrize(
+    ("arguments", "words"), [({"candidates": 0}, "= 0"), ({"candidates": 101}, "= 101"), ({"model": 3}, "3")]
+)
+def test_invalid_arguments(chase, arguments, words):
+    with pytest.raises(LareError, match=words):
+        design(chase, **arguments)

@@ -25,13 +25,9 @@ def test_verify_function(verified, chase):
     assert verify_function(f"\n{PHI}\n", chase) == verified
 
 
-@pytest.mark.parametrize(
-    ("source", "words"),
-    [(phi_source("x = [][0]\nreturn [x]"), "E-RUN line 2"), (phi_source("return [action]") + "\0", "E-SYNTAX line 2")],
-)
-def test_verify_function_refuses(chase, source, words):
-    with pytest.raises(LareError, match=f"'Chase': {words}"):
-        verify_function(source, chase)
+def test_verify_function_refuses(chase):
+    with pytest.raises(LareError, match="'Chase': E-RUN line 2"):
+        verify_function(phi_source("return [nothing]"), chase)
 
 
 def test_factors(function):
@@ -115,8 +111,6 @@ def test_pickle(function):
 
 def test_digest(function):
     assert function.digest == hashlib.sha256(SOURCE.encode()).hexdigest()
-    assert replace(function, source=SOURCE + " ").digest != function.digest
-    assert replace(function, model="Another").digest == function.digest
 
 
 def test_normalise_source():

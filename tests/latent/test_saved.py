@@ -21,37 +21,31 @@ def path(function, tmp_path):
 
 
 def test_saved_files(function, path):
-    assert path.read_text() == (
-        "# lare: task: Chase\n"
-        "# lare: kind: factors\n"
-        "# lare: model: A model, draw 0\n"
-        f"# lare: sha256: {function.digest}\n"
-        "# lare: passed: read, finite\n"
-        f"{SOURCE}\n"
-    )
+    header = [
+        "task: Chase",
+        "kind: factors",
+        "model: A model, draw 0",
+        f"sha256: {function.digest}",
+        "passed: read, finite",
+    ]
+    assert path.read_text() == "".join(f"# lare: {line}\n" for line in header) + SOURCE + "\n"
     assert json.loads(path.with_suffix(".json").read_text())["exchanges"] == list(function.exchanges)
 
 
-@pytest.mark.parametrize("suffix", [".py", ".json"])
-def test_load_function(function, chase, path, suffix):
+def test_load_function(function, chase, path):
     content = path.read_text()
-    loaded = load_function(path.with_suffix(suffix), chase)
-    assert loaded == function
-    loaded.save(path)
+    assert load_function(path.with_suffix(".json"), chase) == load_function(path, chase) == function
+    load_function(path, chase).save(path)
     assert path.read_text() == content
 
 
-def test_load_reward(chase, path):
-    function = verify_function(phi_source("return [action]"), chase, "reward")
+@pytest.mark.parametrize(
+    ("source", "kind"), [(phi_source("return [action]"), "reward"), (PHI.replace("\n", "\r\n"), "factors")]
+)
+def test_load_what_was_saved(chase, path, source, kind):
+    function = verify_function(source, chase, kind)
     function.save(path)
     assert load_function(path, chase) == function
-
-
-@pytest.mark.parametrize("source", ["\n" + PHI, PHI.replace("\n", "\r\n")])
-def test_load_function_with_other_line_ends(chase, path, source):
-    function = verify_function(source, chase)
-    function.save(path)
-    assert load_function(path, chase).digest == function.digest
 
 
 def test_load_function_without_record(function, verified, chase, path):
@@ -145,15 +139,12 @@ def test_unreadable_file(chase, tmp_path, name, content, words):
 
 @pytest.mark.parametrize(
     "record",
-    [
-        "{",
-        "{}",
-        '{"source": "", "model": null, "exchanges": []}',
-        "[" * 20_000,
-        "[]",
-        '{"source": "", "model": "m", "exchanges": 3}',
-        '{"source": "\\ud800", "model": "m", "exchanges": []}',
-    ],
+    ["{", "{}", "[" * 20_000, "[]"]
+    + [
+        f'{{"source": {values}}}'
+        for values in ('"", "model": null, "exchanges": []', '"", "model": "m", "exchanges": 3')
+    ]
+    + ['{"source": "\\ud800", "model": "m", "exchanges": []}'],
 )
 def test_broken_record(chase, path, record):
     path.with_suffix(".json").write_text(record)
@@ -161,6 +152,8 @@ def test_broken_record(chase, path, record):
         load_function(path, chase)
 
 
-def test_save_without_directory(verified, tmp_path):
-    with pytest.raises(LareError, match="cannot be written"):
-        verified.save(tmp_path / "none" / "phi.py")
+@pytest.mark.parametrize(("path", "words"), [("none/phi.py", "cannot be written"), ("", "not the name of a file")])
+def test_unwritable_file(verified, tmp_path, monkeypatch, path, words):
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(LareError, match=words):
+        verified.save(path)

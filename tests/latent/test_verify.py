@@ -11,31 +11,16 @@ from lare_rl.latent.verify import Check, random_steps, sample_steps, verify
 from lare_rl.llm.recording import SHIPPED_RECORDINGS, read_recording
 from lare_rl.llm.reply import parse_reply
 
-RECORDINGS = {
-    f"{kind.name}/{entry.name}": read_recording(entry.read_text(encoding="utf-8"), entry.name)
-    for kind in sorted(SHIPPED_RECORDINGS.iterdir(), key=lambda folder: folder.name)
-    for entry in sorted(kind.iterdir(), key=lambda file: file.name)
-}
-CASES = [name if name.startswith("reward/") and "draw0" in name else long_case(name) for name in RECORDINGS]
-# `test_design.py` verifies the first draw of each task's factors.
+RECORDINGS = sorted(f"{kind.name}/{entry.name}" for kind in SHIPPED_RECORDINGS.iterdir() for entry in kind.iterdir())
+SHORT = ("reward/HalfCheetah-v4.draw0.json", "reward/Reacher-v4.draw0.json", "factors/Reacher-v4.draw2.json")
 
 
 @pytest.mark.parametrize(
     ("source", "errors"),
     [
         (phi_source("raise ValueError(np.load('x'))"), ["E-NUMPY line 2: np.load"]),
-        (
-            "import os\n" + phi_source("return [action, np.two(3)]"),
-            ["E-IMPORT line 1: import os", "E-NUMPY line 3: np.two"],
-        ),
-        ("(" * 41, ["E-SYNTAX line 1: "]),
-        ("X = [1][1:][0]\n" + phi_source("return [action]"), ["E-RUN line 1: IndexError: list index out of range"]),
-        (phi_source("return [no_idea]"), ["E-RUN line 2: no_idea is not defined"]),
-        (phi_source("while True: pass\nreturn [action]"), ["E-COST line 2: "]),
+        ("import os\n" + phi_source("return [np.two(3)]"), ["E-IMPORT line 1: import os", "E-NUMPY line 3: np.two"]),
         (phi_source("return [action[:, 0]]"), ["E-FORM line 2: factor 1 must be an array of the shape (batch, 1)"]),
-        (phi_source("return [action - action.mean()]"), ["E-ROWS line 2: "]),
-        (phi_source("x = action * np.sign(action[0])\nreturn [x]"), ["E-ROWS line 2: "]),
-        (phi_source("for row in action: pass\nreturn [action]"), ["E-ROWS line 2: "]),
         ("x = 1", ["E-FORM line 1: there is no function evaluation_func"]),
     ],
 )
@@ -63,14 +48,7 @@ def test_verify_reward_is_one_array(chase, returned):
     verdict = verify(phi_source(f"return {returned}"), chase, "reward")
     assert verdict.errors.startswith("E-FORM line 2: evaluation_func must return exactly one reward array")
     assert verify(phi_source("return [action]"), chase, "reward").passed
-
-
-@pytest.mark.parametrize("count", [0, 33])
-def test_verify_number_of_factors(chase, count):
     assert verify(phi_source("return [action] * 32"), chase).passed
-    assert verify(phi_source(f"return [action] * {count}"), chase).errors.startswith(
-        "E-FORM line 2: evaluation_func must re"
-    )
 
 
 @pytest.mark.parametrize(
@@ -82,12 +60,7 @@ def test_verify_number_of_factors(chase, count):
         ("np.sqrt(2.5 - np.abs(action))", "nan", "sqrt", "random steps"),
         ("action / np.sum(np.abs(observation), axis=1, keepdims=True)", "nan", "divide", "nothing but zeros"),
         ("1 / (np.prod(observation, axis=1, keepdims=True) - 1)", "inf", "divide", "nothing but ones"),
-        (
-            "1 / (observation[:, 0:1] + 2 * np.sum(observation, axis=1, keepdims=True) - 3)",
-            "inf",
-            "divide",
-            "single one",
-        ),
+        ("1 / (3 * observation[:, :1] + 2 * observation[:, 1:] - 3)", "inf", "divide", "single one"),
         ("np.sqrt(1000 - 10 * np.abs(observation[:, 0:1]))", "nan", "sqrt", "times 1000"),
         ("np.where(observation == 0, 0, 1 / observation**5)[:, 0:1]", "inf", "divide", "times 1e-9"),
     ],
@@ -119,9 +92,9 @@ def test_verify_no_advice_for_factors_that_are_nearly_the_same(chase):
     assert verify(phi_source(body), chase).advice == ()
 
 
-@pytest.mark.parametrize("name", CASES)
+@pytest.mark.parametrize("name", [name if name in SHORT else long_case(name) for name in RECORDINGS])
 def test_verify_recorded_combination(name):
-    recording = RECORDINGS[name]
+    recording = read_recording((SHIPPED_RECORDINGS / name).read_text(encoding="utf-8"), name)
     source = parse_reply(recording.exchanges[-1].replies[0]).functions
     verdict = verify(source, read_task(recording.task), recording.kind)
     assert verdict.errors == ""
@@ -147,12 +120,7 @@ def test_random_steps(chase):
     assert not np.array_equal(action, random_steps(toy_spec(max_episode_steps=50), 50)[1])
 
 
-PARALLEL = {
-    "name": "toy",
-    "environment": "pettingzoo/helpers.parallel_toy_envs:Toy",
-    "observation_size": 2,
-    "action_size": 3,
-}
+PARALLEL = {"environment": "pettingzoo/helpers.parallel_toy_envs:Toy", "observation_size": 2, "action_size": 3}
 """The second entry of an observation is the step within an episode of five steps."""
 
 
@@ -174,13 +142,13 @@ def test_random_steps_of_factor_inputs(judges, counts):
 
 def test_random_steps_include_first_and_last():
     longer = toy_spec(max_episode_steps=1000)
-    for every, few in zip(random_steps(longer, 1000), random_steps(longer, 50), strict=True):
-        np.testing.assert_array_equal(few[[0, -1]], every[[0, -1]])
+    for rows, selected in zip(random_steps(longer, 1000), random_steps(longer, 50), strict=True):
+        np.testing.assert_array_equal(selected[[0, -1]], rows[[0, -1]])
 
 
 def test_random_steps_of_an_agent_that_never_acts():
     team = toy_spec(**PARALLEL, arguments={"joins": {"a_1": 9}}, agents=("a_1",), team="late")
-    with pytest.raises(LareError, match="no agent of toy"):
+    with pytest.raises(LareError, match="no agent of Chase"):
         random_steps(team, 10)
 
 
@@ -196,14 +164,14 @@ def test_sample_steps_evenly_spaced(chase):
 
 
 @pytest.mark.parametrize(
-    ("observation", "action", "words"),
+    ("observations", "actions", "words"),
     [
         (np.zeros((5, 3)), np.zeros((5, 1)), r"observations .*\(n, 2\)"),
-        (np.zeros((5, 2)), np.zeros((5, 2)), r"actions .*\(n, 1\)"),
+        (np.zeros((5, 2)), np.zeros((4, 1)), r"actions .*\(n, 1\)"),
         (np.zeros((0, 2)), np.zeros((0, 1)), r"observations .*\(n, 2\)"),
         (np.full((5, 2), np.nan), np.zeros((5, 1)), "observations .*not finite"),
     ],
 )
-def test_invalid_sample_steps(chase, observation, action, words):
+def test_invalid_sample_steps(chase, observations, actions, words):
     with pytest.raises(LareError, match=words):
-        sample_steps(chase, (observation, action))
+        sample_steps(chase, (observations, actions))

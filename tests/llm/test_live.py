@@ -70,10 +70,7 @@ def test_request(start):
         (reply_with("x" * 100_000), "x" * 100_000),
         (reply_with("a \ud800 b"), "a ? b"),  # a lone surrogate, which no file can store
         (reply_with(f"Your key is {KEY}."), "Your key is [key]."),
-        (
-            raw_answer(gzip.compress(json.dumps(text_completion("hello")).encode()), Content_Encoding="gzip"),
-            "hello",
-        ),
+        (raw_answer(gzip.compress(json.dumps(text_completion("hello")).encode()), Content_Encoding="gzip"), "hello"),
     ],
 )
 def test_reply_text(start, answer, text):
@@ -92,12 +89,12 @@ def test_truncated_reply_is_reported(start):
     assert "16,384" in messages[1]
 
 
-@pytest.mark.parametrize("status", [408, 409, 429, 500, 503, 529])
-def test_temporary_error_is_retried(start, status):
-    server, model, pauses = start(refuse(status), refuse(status), reply_with("hello"))
-    assert model.reply(REQUEST, 0) == "hello"
-    assert len(server.requests) == model.budget.requests_used == 3
-    assert pauses == [0.5, 1.0]
+def test_temporary_error_is_retried(start):
+    for statuses in ((408, 409, 429), (500, 503, 529)):
+        server, model, pauses = start(*map(refuse, statuses), reply_with("hello"))
+        assert model.reply(REQUEST, 0) == "hello"
+        assert len(server.requests) == model.budget.requests_used == 4
+        assert pauses == [0.5, 1.0, 2.0]
 
 
 def test_retry_after(start):
@@ -118,7 +115,6 @@ def test_broken_connection_is_retried_and_counted(start, answer):
 @pytest.mark.parametrize(
     ("body", "reason"),
     [
-        (b"", "JSONDecodeError"),
         (b'{"choices": [', "JSONDecodeError"),
         (b"<html>Bad gateway</html>", "'<html>Bad gateway</html>'"),
         (b"null", "TypeError"),
@@ -143,7 +139,6 @@ def test_answer_without_completion(start, body, reason):
     [
         (refuse(400, "you may not"), 4, ["HTTP 400", "you may not"]),
         (refuse(401, "you may not"), 1, ["HTTP 401", "you may not"]),
-        (refuse(404, "you may not"), 1, ["HTTP 404", "you may not"]),
         (refuse(422, "you may not"), 4, ["HTTP 422", "you may not"]),
         (refuse(429, "insufficient_quota: pay first"), 1, ["HTTP 429", "pay first"]),
         (raw_answer(b"Your plan has ended.", 401), 1, ["HTTP 401", "'Your plan has ended.'"]),
@@ -169,6 +164,10 @@ def test_retries_end(start):
     assert pauses == [0.5, 1, 2, 4, 8]
 
 
+def hang(handler):
+    threading.Event().wait(30)
+
+
 def test_closed_port(start):
     server, model, pauses = start(reply_with("hello"))
     server.stop()
@@ -178,12 +177,14 @@ def test_closed_port(start):
     assert model.budget.tokens_out == 0
 
 
-@pytest.mark.parametrize("answer", [drip_body(200), drip_body(500), drip_headers])
+@pytest.mark.parametrize("answer", [drip_body(200), drip_body(500), drip_headers, hang])
 def test_slow_answer_ends_with_the_time_of_the_design(start, answer):
-    server, model, _ = start(answer, budget=Budget(seconds=0.4))
+    messages = []
+    server, model, _ = start(answer, budget=Budget(seconds=0.4), on_message=messages.append)
     began = time.monotonic()
-    with pytest.raises(BudgetExceededError, match=r"TimeoutError.*not complete"):
+    with pytest.raises(BudgetExceededError, match="TimeoutError"):
         model.reply(REQUEST, 0)
+    assert "0 s at most" in messages[0]
     assert time.monotonic() - began < 5
     with pytest.raises(BudgetExceededError):
         model.reply(REQUEST, 1)
@@ -259,30 +260,16 @@ def test_token_budget(start):
         }
         reply_with("x", usage=usage)(handler)
 
+    server, model, _ = start(use_all_tokens, budget=Budget(tokens=max_request_tokens(REQUEST) + 1023))
+    with pytest.raises(BudgetExceededError):  # no room for a reply
+        model.reply(REQUEST, 0)
+    assert server.requests == []
     server, model, _ = start(use_all_tokens, budget=Budget(tokens=40_000))
     assert [model.reply(REQUEST, number) for number in range(3)] == ["x"] * 3
     with pytest.raises(BudgetExceededError, match="40,000"):
         model.reply(REQUEST, 3)
     assert model.budget.tokens_in + model.budget.tokens_out == 40_000
     assert [request["max_completion_tokens"] for request in server.requests[:2]] == [REPLY_TOKENS] * 2
-
-
-def test_reply_needs_room(start):
-    server, model, _ = start(reply_with("hello"), budget=Budget(tokens=max_request_tokens(REQUEST) + 1023))
-    with pytest.raises(BudgetExceededError):
-        model.reply(REQUEST, 0)
-    assert server.requests == []
-
-
-def test_hanging_connection(start):
-    def hang(handler):
-        threading.Event().wait(30)
-
-    messages = []
-    _, model, _ = start(hang, budget=Budget(seconds=0.5), on_message=messages.append)
-    with pytest.raises(BudgetExceededError, match="TimeoutError"):
-        model.reply(REQUEST, 0)
-    assert "0 s at most" in messages[0]
 
 
 def test_pauses_count_as_waiting(start):
@@ -298,9 +285,9 @@ def test_pauses_count_as_waiting(start):
 
 
 @pytest.mark.parametrize(
-    "location", ["https://elsewhere.example/v1", "http://127.0.0.1:1/v1/chat/completions", "//127.0.0.2/v1"]
+    ("status", "location"),
+    [(301, "https://elsewhere.example/v1"), (302, "http://127.0.0.1:1/v1/chat/completions"), (308, "//127.0.0.2/v1")],
 )
-@pytest.mark.parametrize("status", [301, 308])
 def test_redirect_to_another_server(start, status, location):
     server, model, pauses = start(raw_answer(b"", status, Location=location))
     with pytest.raises(ModelError, match="redirects to http"):
@@ -314,16 +301,14 @@ def test_redirect_within_a_server(start):
     assert server.requests[0] == server.requests[1]
 
 
-@pytest.mark.parametrize("key", ["schlüssel", "two words", "line\nbreak"])
-def test_invalid_key(monkeypatch, key):
+@pytest.mark.parametrize(
+    ("name", "key", "words"),
+    [(name, KEY, "not the name of a model") for name in ("", " ", "\udcff", "two\nlines")]
+    + [("m", key, "OPENAI_API_KEY") for key in ("schlüssel", "two words", "line\nbreak")],
+)
+def test_invalid_name_or_key(monkeypatch, name, key, words):
     monkeypatch.setenv("OPENAI_API_KEY", key)
-    with pytest.raises(ModelError, match="OPENAI_API_KEY"):
-        LiveModel("m", "http://127.0.0.1:1/v1")
-
-
-@pytest.mark.parametrize("name", ["", " ", "\udcff", "two\nlines"])
-def test_invalid_name(name):
-    with pytest.raises(ModelError, match="not the name of a model"):
+    with pytest.raises(ModelError, match=words):
         LiveModel(name, "http://127.0.0.1:1/v1")
 
 

@@ -13,15 +13,8 @@ from lare_rl.llm.recording import RecordedModel, Recorder, read_recording, shipp
 
 REQUEST = [{"role": "user", "content": "Write some."}]
 EXCHANGE = {"stage": "candidate", "messages": REQUEST, "replies": ["one", "two"]}
-RECORDING = {
-    "task": "Chase",
-    "kind": "factors",
-    "draw": 3,
-    "model": "A model",
-    "recorded": "2026-01-31",
-    "temperature": None,
-    "exchanges": [EXCHANGE],
-}
+RECORDING = {"task": "Chase", "kind": "factors", "draw": 3, "model": "A model", "recorded": "2026-01-31"}
+RECORDING |= {"temperature": None, "exchanges": [EXCHANGE]}
 
 
 def recorded_model(**changes) -> RecordedModel:
@@ -36,13 +29,7 @@ def test_reply():
 
 @pytest.mark.parametrize(
     ("messages", "sample"),
-    [
-        ([{"role": "user", "content": "Write some"}], 0),
-        ([{"role": "system", "content": "Write some."}], 0),
-        ([*REQUEST, *REQUEST], 0),
-        ([], 0),
-        (REQUEST, 2),
-    ],
+    [([{"role": "system", "content": "Write some."}], 0), ([*REQUEST, *REQUEST], 0), ([], 0), (REQUEST, 2)],
 )
 def test_unknown_request(messages, sample):
     with pytest.raises(LareError, match=rf"'Chase' \(reply {sample + 1}\)"):
@@ -55,23 +42,18 @@ def test_repeated_request_has_all_replies():
     assert [model.reply(REQUEST, sample) for sample in range(3)] == ["one", "two", "three"]
 
 
-@pytest.mark.parametrize("draw", range(5))
-def test_shipped_recordings(draw):
-    model = RecordedModel(shipped_recordings("factors", draw), "Reacher-v4")
+def test_shipped_recordings():
     task = read_task("Reacher-v4")
-    replies = [model.reply(candidate(task), sample) for sample in range(5)]
-    assert len(set(replies)) == 5
-    assert model.reply(combine(task, replies), 0)
-    assert model.name.endswith(f", draw {draw}")
-
-
-@pytest.mark.parametrize("key", ["description", "observation", "action"])
-def test_changed_task_has_no_recording(key):
-    task = read_task("Reacher-v4")
-    changed = toy_spec(**(task.model_dump() | {key: getattr(task, key) + " Please."}))
-    model = RecordedModel(shipped_recordings("factors", 0), task.name)
-    with pytest.raises(LareError, match="no recorded reply"):
-        model.reply(candidate(changed), 0)
+    for draw in range(5):
+        model = RecordedModel(shipped_recordings("factors", draw), task.name)
+        replies = [model.reply(candidate(task), sample) for sample in range(5)]
+        assert len(set(replies)) == 5
+        assert model.reply(combine(task, replies), 0)
+        assert model.name.endswith(f", draw {draw}")
+    for key in ("description", "observation", "action"):
+        changed = toy_spec(**(task.model_dump() | {key: getattr(task, key) + " Please."}))
+        with pytest.raises(LareError, match="no recorded reply"):
+            model.reply(candidate(changed), 0)
 
 
 @pytest.mark.parametrize(("kind", "draw", "draws"), [("factors", 5, "0, 1, 2, 3, 4"), ("reward", 1, "draws are 0")])

@@ -83,14 +83,14 @@ JSON = st.recursive(
 )
 
 
-@settings(deadline=None)
+@settings(deadline=None, max_examples=50)
 @given(st.text() | st.builds(json.dumps, JSON))
 def test_every_text_is_read_or_refused(text):
     with contextlib.suppress(MalformedReplyError):
         assert parse_reply(text).functions
 
 
-@settings(deadline=None)
+@settings(deadline=None, max_examples=50)
 @given(st.fixed_dictionaries({"Understand": st.text(), "Analyze": st.text(), "Functions": st.text(min_size=1)}))
 def test_valid_reply_is_read_unchanged(values):
     assert parse_reply(json.dumps(values)) == Reply(**values)

@@ -3,6 +3,7 @@
 import hypothesis
 import numpy as np
 import pytest
+from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as arrays
 
@@ -94,14 +95,14 @@ def test_infer_layout_of_images():
 
 def any_array():
     shapes = arrays.array_shapes(min_dims=0, max_dims=3, min_side=0, max_side=4)
-    usual_dtypes = st.sampled_from([np.dtype(np.float32), np.dtype(np.float64), np.dtype(np.int64), np.dtype(bool)])
-    return st.one_of(arrays.scalar_dtypes(), usual_dtypes).flatmap(lambda dtype: arrays.arrays(dtype, shapes))
+    common_dtypes = st.sampled_from([np.dtype(np.float32), np.dtype(np.float64), np.dtype(np.int64), np.dtype(bool)])
+    return st.one_of(arrays.scalar_dtypes(), common_dtypes).flatmap(lambda dtype: arrays.arrays(dtype, shapes))
 
 
 @hypothesis.settings(
-    max_examples=300, deadline=None, suppress_health_check=[hypothesis.HealthCheck.function_scoped_fixture]
+    max_examples=150, deadline=None, suppress_health_check=[hypothesis.HealthCheck.function_scoped_fixture]
 )
-@hypothesis.given(
+@given(
     values=st.dictionaries(st.sampled_from(KEYS), any_array(), max_size=8),
     size=st.integers(1, 3),
     choices=st.booleans(),

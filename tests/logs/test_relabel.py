@@ -1,9 +1,9 @@
 """`relabel`: rewards near the true ones where returns show them, and a warning where they do not."""
 
+import io
 import json
 import math
 import signal
-import subprocess
 import sys
 
 import numpy as np
@@ -11,16 +11,10 @@ import pytest
 
 import lare_rl
 from helpers.long_tests import long_case
-from helpers.toy_logs import PHI, logged_episodes
+from helpers.toy_logs import PHI, logged_episodes, read_directory
 from lare_rl import LareError
-from lare_rl.latent.function import verify_function
-from lare_rl.logs.relabel import hold_out_flags
-from lare_rl.logs.relabelled import MESSAGES, Relabelled
+from lare_rl.logs.relabel import MESSAGES, Relabelled, hold_out_flags, predicted_return_statistics
 from lare_rl.util.findings import render
-
-
-def read(path):
-    return [dict(np.load(file)) for file in sorted(path.glob("*.npz"))]
 
 
 def codes(result):
@@ -28,15 +22,24 @@ def codes(result):
 
 
 def test_linear_score(folder, tmp_path):
-    result = lare_rl.relabel(folder(logged_episodes(120)), tmp_path / "new")
-    assert (result.method, result.episodes, result.cut, result.held_out) == ("bayes", 120, 0, 12)
+    """Nothing is learned from episodes that were cut. They get rewards too."""
+    episodes = list(logged_episodes(120))
+    for number in (3, 7, 8):
+        episodes[number] |= {"cut": np.array(True), "rewards": np.full_like(episodes[number]["rewards"], 1e6)}
+    for number in (20, 21):
+        episodes[number] |= {key: np.zeros_like(episodes[number][key]) for key in ("terminations", "truncations")}
+    stages = []
+    result = lare_rl.relabel(folder(episodes), tmp_path / "new", listener=lambda *stage: stages.append(stage))
+    assert stages == [(stage, n, 120) for stage in ("fit", "write") for n in range(1, 121)]
+    assert (result.method, result.out, result.episodes, result.cut) == ("bayes", tmp_path / "new", 120, 5)
+    assert (result.held_out, result.steps) == (11, sum(len(episode["actions"]) for episode in episodes))
     assert result.return_r2 > 0.98
     assert result.return_correlation > 0.98
-    assert codes(result) == ["relabelled", "r2"]
-    assert result.summary[2:] == list(result.explanation) != []
-    for old, new in zip(logged_episodes(120), read(tmp_path / "new"), strict=True):
+    assert codes(result) == ["relabelled", "cut", "r2"]
+    assert result.summary[3:] == list(result.explanation) != []
+    for episode, old, new in zip(logged_episodes(120), episodes, read_directory(tmp_path / "new"), strict=True):
         np.testing.assert_array_equal(new["paid"], old["rewards"])
-        np.testing.assert_allclose(new["rewards"], old["rewards"], atol=0.5)
+        np.testing.assert_allclose(new["rewards"], episode["rewards"], atol=0.5)
         assert all(np.array_equal(new[key], old[key]) for key in ("observations", "actions", "terminations"))
 
 
@@ -47,88 +50,22 @@ def test_score_of_noise(tmp_path):
     assert codes(result) == ["relabelled", "r2", "worthless"]
 
 
-def test_latent_function(folder, tmp_path, task):
-    path = folder(logged_episodes(60))
-    phi = verify_function(PHI, task, steps=lare_rl.logged_steps(path, task))
-    result = lare_rl.relabel(path, tmp_path / "new", phi=phi, task=task, hold_out=0.2)
-    assert (result.method, result.held_out) == ("lare-bayes", 12)
-    assert result.return_r2 > 0.95
-    assert any("first" in line for line in result.explanation)
-
-
-def test_cut_episodes_are_not_fitted(folder, tmp_path):
-    episodes = list(logged_episodes(60))
-    for number in (3, 7, 8):
-        episodes[number] |= {"cut": np.array(True), "rewards": np.full_like(episodes[number]["rewards"], 1e6)}
-    for number in (20, 21):
-        episodes[number] |= {key: np.zeros_like(episodes[number][key]) for key in ("terminations", "truncations")}
-    result = lare_rl.relabel(folder(episodes), tmp_path / "new", hold_out=0.2)
-    assert result.cut == 5
-    assert "cut" in codes(result)
-    assert result.return_r2 > 0.95
-    assert np.abs(read(tmp_path / "new")[3]["rewards"]).max() < 20
-
-
-def test_time_limit_of_task(tmp_path, task):
-    task = task.model_copy(update={"max_episode_steps": 29})
-    result = lare_rl.relabel(list(logged_episodes(80)), tmp_path / "new", task=task)
-    lengths = [len(episode["actions"]) for episode in logged_episodes(80) if episode["truncations"].any()]
-    assert result.cut == sum(length < 29 for length in lengths) > 0
-
-
-def test_score_instead_of_rewards(folder, tmp_path):
-    def scored():
-        for episode in logged_episodes(100):
-            score = episode.pop("rewards").sum()
-            del episode["terminations"], episode["truncations"]
-            yield episode | {"score": score}
-
-    result = lare_rl.relabel(folder(scored()), tmp_path / "new")
-    assert result.cut == 0
-    assert result.return_r2 > 0.95
-    first = read(tmp_path / "new")[0]
-    assert first["paid"][-1] == first["score"] == pytest.approx(first["paid"].sum())
-    again = lare_rl.relabel(tmp_path / "new", tmp_path / "again")
-    assert again.return_r2 == pytest.approx(result.return_r2, abs=1e-6)
-
-
-def test_relabel_twice_in_place(folder, tmp_path):
+@pytest.mark.parametrize("method", ["rrdu", long_case("rd"), long_case("diaster"), long_case("bayes")])
+def test_relabel_twice_in_place(folder, tmp_path, method):
     """The second fit is to the original rewards, so that nothing changes."""
     path = folder(logged_episodes(40))
-    lare_rl.relabel(path, path, method="rd-linear", overwrite=True)
-    first = read(path)
-    lare_rl.relabel(path, path, method="rd-linear", overwrite=True)
-    for before, after in zip(first, read(path), strict=True):
+    options = {"method": method, "updates": 16, "hold_out": 0.25, "overwrite": True}
+    result = lare_rl.relabel(path, path, **options)
+    assert math.isfinite(result.return_r2)
+    first = read_directory(path)
+    lare_rl.relabel(path, path, **options)
+    for before, after in zip(first, read_directory(path), strict=True):
         assert all(np.array_equal(before[key], after[key]) for key in before)
     assert list(tmp_path.iterdir()) == [path]
 
 
-@pytest.mark.parametrize("method", ["rrdu", long_case("rd"), long_case("diaster"), long_case("rd-linear")])
-def test_other_methods(tmp_path, method):
-    result = lare_rl.relabel(list(logged_episodes(40)), tmp_path / "new", method=method, updates=16, hold_out=0.25)
-    assert math.isfinite(result.return_r2)
-
-
-def test_flat_arrays_of_d4rl(tmp_path):
-    episodes = [
-        episode | {"observations": episode["observations"][:-1], "next_observations": episode["observations"][1:]}
-        for episode in logged_episodes(50)
-    ]
-    flat = {key: np.concatenate([episode[key] for episode in episodes]) for key in episodes[0]}
-    flat["terminals"], flat["timeouts"] = flat.pop("terminations"), flat.pop("truncations")
-    flat["metadata/algorithm"] = np.array("sac")
-    flat["timeouts"][-1] = flat["terminals"][-1] = False
-    result = lare_rl.relabel(flat, tmp_path / "new", hold_out=0.2)
-    assert (result.episodes, result.cut, result.held_out) == (50, 1, 9)
-    original_reward = np.concatenate([episode["paid"] for episode in read(tmp_path / "new")])
-    np.testing.assert_array_equal(original_reward, flat["rewards"])
-    del flat["next_observations"]
-    with pytest.raises(LareError, match="next_observations is missing"):
-        lare_rl.relabel(flat, tmp_path / "other")
-
-
 def test_log_is_a_stream(tmp_path):
-    """Of 120 long episodes, no more than two batches are alive at a time."""
+    """Of 60 long episodes, no more than two batches are alive at a time."""
     n_alive, most_alive = 0, 0
 
     class CountedEpisode(dict):
@@ -144,10 +81,10 @@ def test_log_is_a_stream(tmp_path):
 
     class CountedLog:
         def __iter__(self):
-            return map(CountedEpisode, logged_episodes(120, max_length=1000))
+            return map(CountedEpisode, logged_episodes(60, max_length=1000))
 
     result = lare_rl.relabel(CountedLog(), tmp_path / "new", method="rd-linear")
-    assert result.episodes == 120
+    assert result.episodes == 60
     assert most_alive < 30
 
 
@@ -158,10 +95,22 @@ def test_hold_out_flags_are_even():
         assert all(abs(sum(flags[start : start + 100]) - 100 * share) <= 1 for start in range(0, 1000, 100))
 
 
+def test_predicted_return_statistics():
+    returns, predictions = [0.0, 1, 2, 3, 4, 5, 6, 7], [14.0, 12, 10, 8, 6, 4, 2, 0]
+    r2, error, correlation = predicted_return_statistics(returns, predictions)
+    assert r2 == pytest.approx(1 - sum((y - y_hat) ** 2 for y, y_hat in zip(returns, predictions, strict=True)) / 42)
+    assert error > 0
+    assert correlation == pytest.approx(-1)
+    assert np.isnan(predicted_return_statistics(returns[:7], predictions[:7])).all()
+    for constant in ([1e4] * 8, [1e4 + 1e-4 * value for value in returns]):
+        assert math.isnan(predicted_return_statistics(returns, constant)[2])
+        assert math.isnan(predicted_return_statistics(constant, returns)[2])
+
+
 @pytest.mark.parametrize(
     ("changes", "expected"),
     [
-        ({"held_out": 1}, ["too_few"]),
+        ({"held_out": 7}, ["too_few"]),
         ({"return_correlation": math.nan}, ["constant"]),
         ({"return_r2": math.nan}, ["correlation"]),
         ({"return_r2": 0.09}, ["r2", "worthless"]),
@@ -195,11 +144,11 @@ def test_failure_in_second_pass_keeps_old_output(tmp_path):
             return iter(logged_episodes(20 if self.passes < 4 else 19))
 
     (tmp_path / "new").mkdir()
-    (tmp_path / "new" / "mine.npz").write_text("kept")
+    (tmp_path / "new" / "mine.npz").write_text("old")
     with pytest.raises(LareError, match="changed while it was read: it had 20 episodes, and now 19"):
-        lare_rl.relabel(ChangingLog(), tmp_path / "new", overwrite=True)
+        lare_rl.relabel(ChangingLog(), tmp_path / "new", method="rd-linear", overwrite=True)
     assert [path.name for path in tmp_path.rglob("*")] == ["new", "mine.npz"]
-    assert (tmp_path / "new" / "mine.npz").read_text() == "kept"
+    assert (tmp_path / "new" / "mine.npz").read_text() == "old"
 
 
 def test_directory_of_other_files_is_not_replaced(folder, tmp_path):
@@ -211,46 +160,39 @@ def test_directory_of_other_files_is_not_replaced(folder, tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("options", "message"),
+    ("log", "options", "message"),
     [
-        ({"method": "ircr"}, "ircr gives all steps"),
-        ({"method": "dense"}, "dense assigns no credit"),
-        ({"method": "lare-bayes"}, "lare-bayes needs a phi"),
-        ({"hold_out": 1.0}, "hold_out = 1.0"),
-        ({"hold_out": math.nan}, "hold_out = nan"),
-        ({"memory": 0.0}, "memory = 0.0"),
-        ({"updates": 0}, "updates = 0"),
+        (None, {"method": "ircr"}, "ircr gives all steps"),
+        (None, {"method": "dense"}, "dense assigns no credit"),
+        (None, {"method": "lare-bayes"}, "lare-bayes needs a phi"),
+        (None, {"hold_out": 1.0}, "hold_out = 1.0"),
+        (None, {"hold_out": math.nan}, "hold_out = nan"),
+        (None, {"memory": 0.0}, "memory = 0.0"),
+        (None, {"updates": 0}, "updates = 0"),
+        ([episode | {"cut": True} for episode in logged_episodes(3)], {}, "none of 3 episodes"),
+        ([], {}, "no episode"),
+        ([7], {}, "episode 0 must be a mapping"),
+        (logged_episodes(3), {}, "read twice"),
+        (b"log", {}, "b'log' is not a log"),
     ],
 )
-def test_bad_options(tmp_path, options, message):
+def test_bad_arguments(tmp_path, log, options, message):
     with pytest.raises(LareError, match=message):
-        lare_rl.relabel(list(logged_episodes(10)), tmp_path / "new", **options)
+        lare_rl.relabel(list(logged_episodes(10)) if log is None else log, tmp_path / "new", **options)
     assert list(tmp_path.iterdir()) == []
 
 
-@pytest.mark.parametrize(
-    ("log", "message"),
-    [
-        ([episode | {"cut": True} for episode in logged_episodes(3)], "none of 3 episodes"),
-        ([], "no episode"),
-        ([7], "episode 0 must be a mapping"),
-        (logged_episodes(3), "read twice"),
-    ],
-)
-def test_bad_list(tmp_path, log, message):
-    with pytest.raises(LareError, match=message):
-        lare_rl.relabel(log, tmp_path / "new")
-
-
 def test_command(command, folder, tmp_path, task):
-    path = folder(logged_episodes(40))
+    path = folder(logged_episodes(60))
     keys = ("name", "environment", "observation_size", "action_size", "description", "observation", "action")
     (tmp_path / "task.toml").write_text("".join(f"{key} = {json.dumps(getattr(task, key))}\n" for key in keys))
     (tmp_path / "phi.py").write_text(PHI)
     options = ("--task", "task.toml", "--function", "phi.py", "--hold-out", "0.2")
     status, out, error = command("relabel", path, "--out", "new", *options)
-    assert (status, error) == (0, "learning, 40 episodes\nwriting, 40 episodes\n")
+    assert (status, error) == (0, "learning, 60 episodes\nwriting, 60 episodes\n")
     assert "lare-bayes" in out.splitlines()[0]
+    assert "first" in out  # the rewarded factor
+    assert "Warning" not in out
     assert out.splitlines()[-1] == "wrote new"
     status, out, error = command("relabel", path, "--out", "new")
     assert (status, out) == (2, "")
@@ -264,12 +206,19 @@ def test_command(command, folder, tmp_path, task):
     assert "gone/ does not exist" in command("relabel", "gone/", "--out", "new2")[2]
 
 
-def test_terminated_command_leaves_nothing(folder, tmp_path):
-    path = folder(logged_episodes(3000))
-    command = [sys.executable, "-c", "from lare_rl.cli import main; main()", "relabel", str(path), "--out", "new"]
-    with subprocess.Popen(command, cwd=tmp_path, stderr=subprocess.PIPE, text=True) as process:
-        while not process.stderr.readline().startswith("writing"):
-            assert process.poll() is None
-        process.terminate()
-    assert process.returncode == 128 + signal.SIGTERM
-    assert [file.name for file in tmp_path.iterdir() if "new" in file.name] == []
+def test_terminated_command_leaves_nothing(command, folder, tmp_path, monkeypatch):
+    class TerminatingStream(io.StringIO):
+        def write(self, text):
+            if "writing" in text:
+                assert any(file.name.startswith(".new.") for file in tmp_path.iterdir())
+                signal.raise_signal(signal.SIGTERM)
+            return super().write(text)
+
+    path, handler = folder(logged_episodes(10)), signal.getsignal(signal.SIGTERM)
+    monkeypatch.setattr(sys, "stderr", TerminatingStream())
+    try:
+        status, _, _ = command("relabel", path, "--out", "new", "--method", "rd-linear")
+    finally:
+        signal.signal(signal.SIGTERM, handler)
+    assert status == 128 + signal.SIGTERM
+    assert list(tmp_path.iterdir()) == [path]

@@ -1,4 +1,4 @@
-"""Steps of a log on which functions are tried."""
+"""Steps and episodes of a log, and the first task file of a log."""
 
 import numpy as np
 import pytest
@@ -7,6 +7,8 @@ import lare_rl
 from helpers.toy_logs import PHI, logged_episodes
 from lare_rl import LareError
 from lare_rl.latent.verify import verify
+from lare_rl.logs import steps
+from lare_rl.logs.draft_from_log import draft_log_task
 
 
 def distinct(rows):
@@ -26,22 +28,34 @@ def test_logged_steps(task, judges):
 
 
 @pytest.mark.parametrize(
-    ("steps", "message"),
+    ("bad_steps", "message"),
     [
         ((np.zeros((3, 4)), np.zeros((3, 1))), r"observations .*\(n, 2\)"),
         ((np.zeros((3, 2)), np.full((3, 1), np.inf)), "actions .*not finite"),
     ],
 )
-def test_bad_steps(task, steps, message):
+def test_bad_steps(task, bad_steps, message):
     with pytest.raises(LareError, match=message):
-        verify(PHI, task, steps=steps)
+        verify(PHI, task, steps=bad_steps)
 
 
-def test_task_without_environment_has_no_measures(tmp_path):
-    path = tmp_path / "task.toml"
-    path.write_text(
-        'name = "Logs"\nenvironment = "none"\nobservation_size = 2\naction_size = 1\ndescription = "d"\nobservation = "o"\n'
-        'action = "a"\nmeasures = ["x"]\n'
-    )
+def test_logged_episodes_are_complete(task):
+    log = [episode | {"cut": number == 1} for number, episode in enumerate(logged_episodes(4))]
+    episodes = steps.logged_episodes(log, task, 2)
+    for episode, arrays in zip(episodes, (log[0], log[2]), strict=True):
+        np.testing.assert_array_equal(episode.observation[:, 0], arrays["observations"][:-1])
+        np.testing.assert_array_equal(episode.next_observation[:, 0], arrays["observations"][1:])
+        np.testing.assert_array_equal(episode.env_action[:, 0], arrays["actions"])
+        np.testing.assert_array_equal(episode.team_reward, arrays["rewards"])
+        assert episode.reward.shape == episode.alive.shape == (len(arrays["rewards"]), 1)
+
+
+def test_draft_log_task(folder, tmp_path):
+    draft = draft_log_task(folder(logged_episodes(1)))
+    assert (draft.name, draft.missing_keys, draft.logs_only) == ("log", ("description", "observation", "action"), True)
+    (tmp_path / "task.toml").write_text(draft.toml.replace("FILL IN", "Filled in"))
+    task = lare_rl.load_task(tmp_path / "task.toml")
+    assert (task.observation_size, task.action_size, task.environment) == (2, 1, "none")
+    (tmp_path / "task.toml").write_text(draft.toml.replace("FILL IN", "Filled in") + 'measures = ["x"]\n')
     with pytest.raises(LareError, match="measures"):
-        lare_rl.load_task(path)
+        lare_rl.load_task(tmp_path / "task.toml")

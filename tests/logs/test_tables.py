@@ -6,9 +6,8 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
-from helpers.toy_logs import check_log, logged_episodes
+from helpers.toy_logs import check_log, logged_episodes, write_rewards_plus_one
 from lare_rl import LareError
-from lare_rl.logs.episode import RelabelledEpisode
 from lare_rl.logs.log import open_log
 
 
@@ -53,12 +52,6 @@ def read_data_set(path):
     return datasets.load_from_disk(path).data.table.combine_chunks()
 
 
-def relabel(path, out):
-    """Write the log with the rewards plus one."""
-    log = open_log(path)
-    return log.write(out, (RelabelledEpisode(episode, episode.reward + 1) for episode in log.episodes()), False, "")
-
-
 @pytest.mark.parametrize(("write", "read"), [(write_parquet, pq.read_table), (write_data_set, read_data_set)])
 @pytest.mark.parametrize(("rows", "count"), [(step_rows, 400), (episode_rows, 12)])
 def test_round_trip(tmp_path, write, read, rows, count):
@@ -66,7 +59,7 @@ def test_round_trip(tmp_path, write, read, rows, count):
     old = rows(logged_episodes(count))
     write(old, tmp_path / "log.parquet")
     check_log(open_log(tmp_path / "log.parquet"), logged_episodes(count))
-    out = relabel(tmp_path / "log.parquet", tmp_path / "new.parquet")
+    out = write_rewards_plus_one(tmp_path / "log.parquet", tmp_path / "new.parquet")
     new = read(out)
     assert new.column_names == [*old.column_names, "paid"]
     unchanged = [name for name in old.column_names if name != "rewards"]
@@ -147,7 +140,7 @@ def test_bad_table(tmp_path, rows, message):
     path = tmp_path / "log.parquet"
     pq.write_table(rows, path)
     with pytest.raises(LareError, match=rf"\A{path}.*{message}"):
-        relabel(path, tmp_path / "new.parquet")
+        write_rewards_plus_one(path, tmp_path / "new.parquet")
     assert list(tmp_path.iterdir()) == [path]
 
 

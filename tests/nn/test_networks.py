@@ -1,8 +1,6 @@
 import jax
 import jax.numpy as jnp
 import numpy as np
-import optax
-import pytest
 
 from lare_rl.nn.networks import MLP, adam_step, clip_gradient, init_adam, polyak_update
 
@@ -24,15 +22,13 @@ def test_adam_step():
     np.testing.assert_allclose(parameters, [0.99, -2.01], rtol=1e-5)
 
 
-@pytest.mark.parametrize(("max_norm", "want"), [(6.5, [1.5, 2, 6]), (13.0, [3, 4, 12]), (20.0, [3, 4, 12])])
-def test_clip_gradient(max_norm, want):
-    clipped = clip_gradient({"a": jnp.array([3.0, 4.0]), "b": jnp.array(12.0)}, max_norm)
-    np.testing.assert_allclose([*clipped["a"], clipped["b"]], want, rtol=1e-6)
-    assert float(clip_gradient(jnp.array(0.0), max_norm)) == 0
+def test_clip_gradient():
+    for max_norm, expected in [(6.5, [1.5, 2, 6]), (13.0, [3, 4, 12]), (20.0, [3, 4, 12])]:
+        clipped = clip_gradient({"a": jnp.array([3.0, 4.0]), "b": jnp.array(12.0)}, max_norm)
+        np.testing.assert_allclose([*clipped["a"], clipped["b"]], expected, rtol=1e-6)
+    assert float(clip_gradient(jnp.array(0.0), 1.0)) == 0
 
 
-@pytest.mark.parametrize("tau", [0.0, 0.25, 1.0])
-def test_polyak_update(tau):
-    target, online = {"a": jnp.array(1.0)}, {"a": jnp.array(3.0)}
-    want = optax.incremental_update(online, target, tau)
-    assert float(polyak_update(target, online, tau)["a"]) == pytest.approx(float(want["a"]))
+def test_polyak_update():
+    for tau, expected in [(0.0, 1.0), (0.25, 1.5), (1.0, 3.0)]:
+        assert polyak_update({"a": jnp.array(1.0)}, {"a": jnp.array(3.0)}, tau) == {"a": expected}

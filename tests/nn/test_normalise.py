@@ -1,3 +1,4 @@
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -6,12 +7,12 @@ from hypothesis import strategies as st
 
 from lare_rl.nn import normalise
 
+update_mean_std, update_scale = jax.jit(normalise.update_mean_std), jax.jit(normalise.update_scale)
+standardise = jax.jit(normalise.standardise)
 
-def observe(*batches):
-    statistics = normalise.empty_mean_std(batches[0].shape[1])
-    for batch in batches:
-        statistics = normalise.update_mean_std(statistics, jnp.asarray(batch))
-    return statistics
+
+def observe(batch):
+    return update_mean_std(normalise.empty_mean_std(batch.shape[1]), jnp.asarray(batch))
 
 
 @given(
@@ -25,7 +26,7 @@ def test_statistics_are_those_of_all_valid_rows(masks, seed, scale):
     for mask in np.array(masks):
         rows = (scale * (3 + rng.normal(size=(5, 2)))).astype(np.float32)
         batch = jnp.asarray(np.where(mask[:, None], rows, 1e6 * scale))
-        statistics = normalise.update_mean_std(statistics, batch, None if mask.all() else jnp.asarray(mask))
+        statistics = update_mean_std(statistics, batch, None if mask.all() else jnp.asarray(mask))
         valid_rows.append(rows[mask])
     rows = np.concatenate(valid_rows)
     assert float(statistics.n_rows) == len(rows)
@@ -37,42 +38,42 @@ def test_statistics_are_those_of_all_valid_rows(masks, seed, scale):
 
 def test_standardise():
     rows = np.random.default_rng(0).normal(5, 3, (1000, 1)).astype(np.float32)
-    scaled = np.asarray(normalise.standardise(observe(rows), jnp.asarray(rows)))
+    scaled = np.asarray(standardise(observe(rows), jnp.asarray(rows)))
     assert scaled.mean() == pytest.approx(0, abs=1e-4)
     assert scaled.std() == pytest.approx(1, rel=1e-4)
-    assert float(normalise.standardise(observe(rows), jnp.array([[1e9]]))[0, 0]) == normalise.CLIP
+    assert float(standardise(observe(rows), jnp.array([[1e9]]))[0, 0]) == normalise.CLIP
     for factor in (1e-3, 1e3):
-        other = normalise.standardise(observe(rows * factor), jnp.asarray(rows * factor))
+        other = standardise(observe(rows * factor), jnp.asarray(rows * factor))
         np.testing.assert_allclose(scaled, other, atol=1e-3)
 
 
 def test_standardise_if_observed():
     rows, statistics = jnp.array([[3.0, -70.0]]), observe(np.array([[1.0, 2.0], [3.0, 6.0]], np.float32))
     np.testing.assert_array_equal(normalise.standardise_if_observed(normalise.empty_mean_std(2), rows), rows)
-    want = normalise.standardise(statistics, rows)
+    want = standardise(statistics, rows)
     np.testing.assert_array_equal(normalise.standardise_if_observed(statistics, rows), want)
 
 
-@pytest.mark.parametrize("constant", [0.0, 7.0, 1e9, -1e-9])
-def test_constant_feature_becomes_zero(constant):
-    rows = jnp.full((50, 1), constant)
-    assert float(jnp.abs(normalise.standardise(observe(rows, rows), rows)).max()) == 0.0
+def test_constant_feature_becomes_zero():
+    for constant in (0.0, 1e9, -1e-9):
+        rows = jnp.full((50, 1), constant)
+        assert not standardise(update_mean_std(observe(rows), rows), rows).any()
 
 
 def test_root_mean_square():
     scale = normalise.empty_scale()
     assert float(normalise.root_mean_square(scale)) == 1.0
-    scale = normalise.update_scale(scale, jnp.zeros(4), jnp.zeros(4, bool))
+    scale = update_scale(scale, jnp.zeros(4), jnp.zeros(4, bool))
     assert float(normalise.root_mean_square(scale)) == 1.0
-    scale = normalise.update_scale(scale, jnp.array([3.0, 100.0]), jnp.array([True, False]))
-    scale = normalise.update_scale(scale, jnp.array([4.0, 5.0]), jnp.array([True, True]))
+    scale = update_scale(scale, jnp.array([3.0, 100.0]), jnp.array([True, False]))
+    scale = update_scale(scale, jnp.array([4.0, 5.0]), jnp.array([True, True]))
     assert float(normalise.root_mean_square(scale)) == pytest.approx(np.sqrt((9 + 16 + 25) / 3))
 
 
 def test_min_max_scale():
-    scale = normalise.update_scale(normalise.empty_scale(), jnp.array([3.0]), jnp.array([False]))
+    scale = update_scale(normalise.empty_scale(), jnp.array([3.0]), jnp.array([False]))
     assert (float(scale.lowest), float(scale.highest)) == (0, 0)
-    scale = normalise.update_scale(scale, jnp.array([3.0, 9.0, -5.0]), jnp.array([True, False, False]))
+    scale = update_scale(scale, jnp.array([3.0, 9.0, -5.0]), jnp.array([True, False, False]))
     np.testing.assert_array_equal(normalise.min_max_scale(scale, jnp.array([3.0, 4.0])), [0.5, 0.5])
-    scale = normalise.update_scale(scale, jnp.array([1.0, 5.0, 99.0]), jnp.array([True, True, False]))
+    scale = update_scale(scale, jnp.array([1.0, 5.0, 99.0]), jnp.array([True, True, False]))
     np.testing.assert_array_equal(normalise.min_max_scale(scale, jnp.array([1.0, 2.0, 5.0])), [0, 0.25, 1])

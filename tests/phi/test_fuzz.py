@@ -25,39 +25,20 @@ BUDGET = settings(
     derandomize="LARE_FUZZ" not in os.environ,
     suppress_health_check=list(HealthCheck),
 )
-LEAVES = [
-    "x",
-    "a",
-    "x[:, :3]",
-    "x[:, :1]",
-    "x[:, 0]",
-    "y",
-    "2",
-    "0.5",
-    "np.arange(3.0)",
-    "np.eye(3)",
-    "np.ones((len(x), 3))",
-    "x[0]",
-    "i",
-    "b",
-]
+LEAVES = "x|a|x[:, :3]|x[:, :1]|x[:, 0]|y|2|0.5|np.arange(3.0)|np.eye(3)|np.ones((len(x), 3))|x[0]|i|b".split("|")
 TEMPLATES = [
-    re.sub(r"\b[xnyt]\b", "{}", case.values[0].replace("¦", "|"), count=2)
-    for case in CASES
-    if "lambda" not in case.values[0] and case.values[0].count("{") == 0
+    re.sub(r"\b[xnyt]\b", "{}", expression, count=2)
+    for expressions in CASES.values()
+    for expression in expressions
+    if "lambda" not in expression and "{" not in expression
 ]
 STATEMENTS = [
     "z = {}", "z = x.copy(); z[:, 0] = {}",
     "z = np.zeros((len(x), 3)); z[...] = {}", "z = x.copy(); z += {}", "z = x * 1; z[z < 0] = {}",
     "z = x.copy(); w = z[:, ::2]; w -= 1; z = z + {}", "z = x.copy(); z[np.arange(len(x)), np.argmax(x, axis=1)] = {}",
 ]  # fmt: skip
-RESULTS = [
-    "z",
-    "z[:, :1]",
-    "z.sum(axis=-1, keepdims=True)",
-    "z[:, None]",
-    "np.sum(np.reshape(z, (len(x), -1)) * 1.0, axis=1, keepdims=True)",
-]
+RESULTS = ["z", "z[:, :1]", "z.sum(axis=-1, keepdims=True)", "z[:, None]"]
+RESULTS += ["np.sum(np.reshape(z, (len(x), -1)) * 1.0, axis=1, keepdims=True)"]
 
 
 def fill(template, expressions):
@@ -159,8 +140,7 @@ def test_mutant_is_refused_or_its_rows_are_independent(mutant):
     event("accepted")
     generator = np.random.default_rng(0)
     inputs = {
-        "observation": generator.standard_normal((6, sizes[0])),
-        "action": generator.standard_normal((6, sizes[1])),
+        key: generator.standard_normal((6, size)) for key, size in zip(("observation", "action"), sizes, strict=True)
     }
     factors = evaluate(graph, inputs, dtype=np.float64)["factors"]
     alone = evaluate(graph, {key: array[2:3] for key, array in inputs.items()}, dtype=np.float64)["factors"]

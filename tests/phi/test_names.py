@@ -17,11 +17,7 @@ from lare_rl.phi.names import factor_meanings, factor_names
         (phi_source("return [-action, action]"), 2, ["factor_1", "action"]),
         (phi_source("return (action, -action)"), 2, ["action", "factor_2"]),
         (phi_source("factors = [action, -action]\nreturn factors"), 2, ["action", "factor_2"]),
-        (
-            phi_source("factors = [action, observation]\nreturn [f[:, :1] for f in factors]"),
-            2,
-            ["action", "observation"],
-        ),
+        (phi_source("f = [action, observation]\nreturn [x[:, :1] for x in f]"), 2, ["action", "observation"]),
         # Where the list is not written out, or not once, or not at the end, or not as long, there are no names in it.
         (phi_source("factors = [action]\nfactors = [action, -action]\nreturn factors"), 2, ["factor_1", "factor_2"]),
         (phi_source("factors = [action]\nfactors.append(action)\nreturn factors"), 2, ["factor_1", "factor_2"]),
@@ -35,11 +31,7 @@ from lare_rl.phi.names import factor_meanings, factor_names
         ("x = 1", 1, ["factor_1"]),
         ("not (Python", 1, ["factor_1"]),
         # Another function's list is not this one's.
-        (
-            "def helper(a, b):\n    return [a, b]\n\n" + phi_source("return [observation, action]"),
-            2,
-            ["observation", "action"],
-        ),
+        ("def helper(a, b):\n    return [a, b]\n\n" + phi_source("return [b, action]"), 2, ["b", "action"]),
     ],
 )
 def test_factor_names(source, count, names):
@@ -64,24 +56,19 @@ def test_factor_meanings_comment_above_an_assignment(lines, meaning):
     assert factor_meanings(phi_source(f"{lines}\nx = action\nreturn [x]"), ["x"]) == [meaning]
 
 
-def test_factor_meanings_of_other_comments():
-    source = phi_source("# not this one\n\nx = action\ny = action  # nor this\nx[0] = 1\n# nor that\nreturn [x, y]")
-    assert factor_meanings(source, ["x", "y"]) == ["", ""]
-
-
-def test_factor_meanings_of_the_last_assignment():
-    assert factor_meanings(phi_source("# first\nx = action\n# then\nx = -x\nreturn [x]"), ["x"]) == ["then"]
-
-
-def test_factor_meanings_of_several():
-    assert factor_meanings(PHI, ["f_near", "f_effort"]) == ["how near the action comes", "effort"]
-    assert factor_meanings(PHI, ["f_effort", "factor_2"]) == ["effort", ""]
-
-
-def test_factor_meanings_above_the_first_of_several_lines():
-    """Such a comment must be numbered."""
-    body = "# 1. how near\nd = action\nx = -d\n# 2. effort\ny = action\nz = x\n# not numbered\ne = x\nw = e\nreturn [x, y, z, w]"
-    assert factor_meanings(phi_source(body), ["x", "y", "z", "w"]) == ["how near", "effort", "", ""]
+@pytest.mark.parametrize(
+    ("body", "meanings"),
+    [
+        ("# not this one\n\nx = action\ny = action  # nor this\nx[0] = 1\n# nor that\nreturn [x, y]", ["", ""]),
+        ("# first\nx = action\n# then\nx = -x\n# 3. effort\ny = action", ["then", "effort"]),
+        # Only a numbered comment is for a factor that is assigned some lines below it.
+        ("# 1. how near\nd = action\nx = -d\n# 2. effort\ny = action\nz = x", ["how near", "effort"]),
+        ("# not numbered\ne = action\nx = e\n# 2. effort\ny = action", ["", "effort"]),
+        ("# 2. effort\ny = action", ["", "effort"]),
+    ],
+)
+def test_factor_meanings_of_two(body, meanings):
+    assert factor_meanings(phi_source(body), ["x", "y"]) == meanings
 
 
 def test_factor_names_in_threads():

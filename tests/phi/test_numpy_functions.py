@@ -1,18 +1,27 @@
 """Each function of NumPy, with its arguments, beside NumPy itself. x is (batch, 6), y (batch, 3, 2), b a condition, i integers.
 
-Expressions are separated by | and by the ends of lines; ¦ stands for the operator |.
+Expressions are separated by |, and ¦ stands for the operator |. Each line is one program, with a factor for each expression.
 """
 
 import numpy as np
+import onnxruntime
 import pytest
 
-from helpers.phi_programs import execute_program, random_inputs
+from helpers.long_tests import long_case
+from helpers.phi_programs import benign_programs, execute_program, random_inputs, recorded_programs, varied_programs
 from lare_rl.phi.evaluate import evaluate
-from lare_rl.phi.numpy_functions import FUNCTIONS
+from lare_rl.phi.limits import RefusedError
+from lare_rl.phi.numpy_functions.registry import FUNCTIONS
+from lare_rl.phi.onnx import onnx_model
 from lare_rl.phi.read import read
 
 SETUP = """import numpy as np
 import math
+
+def weigh(z):
+    z = np.asarray(z)
+    z = (z.astype(float) if z.dtype == bool else z).reshape(len(z), -1)
+    return np.sum(z * np.arange(1, z.shape[1] + 1), axis=1, keepdims=True)
 
 def evaluation_func(observation, action):
     x, a = observation, action
@@ -20,10 +29,7 @@ def evaluation_func(observation, action):
     b, i = x > 0.2, np.floor(np.abs(x) * 3).astype(int)
     n = np.where(x > 1, np.nan, x)
     t = np.array([0.5, 1.5, -2.0, 4.0])
-    z = {}
-    z = np.asarray(z)
-    z = z.astype(float) if z.dtype == bool else z
-    return [np.sum(z.reshape(len(x), -1) * np.arange(1, {} + 1), axis=1, keepdims=True)]
+    return [{}]
 """
 EXPRESSIONS = {
     "elementwise": """
@@ -71,7 +77,8 @@ EXPRESSIONS = {
         np.trapezoid(x, dx=0.1) | np.sort(x, axis=1) | np.argsort(x, axis=1) | np.sort(y, axis=1)
         np.partition(x, 2, axis=1)[:, 2] | np.lexsort((x, i)) | np.median(x, axis=1) | np.median(y, axis=(1, 2))
         np.percentile(x, 30, axis=1) | np.quantile(x, 0.25, axis=1, keepdims=True)
-        np.quantile(x, [0.25, 0.5], axis=1).T | np.percentile(x, 60, axis=1, method="nearest")
+        np.quantile(x, [0.25, 0.5], axis=1).T | np.percentile(x, 25, axis=1, method="nearest")
+        np.percentile(x, 25, axis=1, method="higher") | np.percentile(x, 25, axis=1, method="midpoint")
         np.linalg.norm(x, axis=1) | np.linalg.norm(y, axis=2, keepdims=True) | np.linalg.norm(x, ord=1, axis=1)
         np.linalg.norm(x, 3, 1) | np.linalg.norm(x, np.inf, axis=1) | np.linalg.norm(x, ord=0, axis=1)
         np.linalg.norm(y, axis=(1, 2)) | np.linalg.norm(y, 1, axis=(1, 2))
@@ -162,47 +169,57 @@ EXPRESSIONS = {
         np.finfo(np.float32).max * 0 * x | np.pi * x | np.array([[1, 2], [3, 4]])[1, 0] * x
     """,
 }
-CASES = [
-    pytest.param(expression.strip(), id=f"{group}: {expression.strip()}")
+CASES = {
+    f"{group} {number}": [expression.strip().replace("¦", "|") for expression in line.split("|")]
     for group, text in EXPRESSIONS.items()
-    for expression in text.replace("\n", "|").split("|")
-    if expression.strip()
-]
+    for number, line in enumerate(text.strip().split("\n"))
+}
+PROGRAMS = {p.name: p for p in (*benign_programs(), *varied_programs(), *recorded_programs())}
+IN_SHORT = {p.name for p in (*varied_programs()[::20], *recorded_programs()[::120])}
 
 
-@pytest.mark.parametrize("expression", CASES)
-def test_function_agrees_with_numpy(expression):
-    expression = expression.replace("¦", "|")
+def read_case(name):
+    source = SETUP.format(", ".join(f"weigh({expression})" for expression in CASES[name]))
+    return source, read(source, 6, 3)
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_function_agrees_with_numpy(name):
+    source, graph = read_case(name)
     observation, action = random_inputs((6, 3), rows=9)
-    width = (
-        np.size(
-            execute_program(
-                SETUP.format(expression, 1).replace(
-                    "np.sum(z.reshape(len(x), -1) * np.arange(1, 1 + 1), axis=1, keepdims=True)",
-                    "z.reshape(len(x), -1)",
-                ),
-                observation,
-                action,
-            )
-        )
-        // 9
-    )
-    source = SETUP.format(expression, width)
-    result = evaluate(read(source, 6, 3), {"observation": observation, "action": action}, dtype=np.float64)["factors"]
-    np.testing.assert_allclose(result, execute_program(source, observation, action), rtol=1e-9, atol=1e-9)
+    result = evaluate(graph, {"observation": observation, "action": action}, dtype=np.float64)["factors"]
+    expected = execute_program(source, observation, action)
+    for expression, column, expected_column in zip(CASES[name], result.T, expected.T, strict=True):
+        np.testing.assert_allclose(column, expected_column, rtol=1e-9, atol=1e-9, err_msg=expression)
 
 
 def test_every_function_is_tried():
     """Each registered name, or another name of the same function, is in an expression above or in a program of the corpus."""
-    from helpers.phi_programs import benign_programs, recorded_programs, varied_programs
-
-    text = "\n".join(
-        [*EXPRESSIONS.values(), *(p.source for p in (*recorded_programs(), *benign_programs(), *varied_programs()))]
-    )
+    text = "\n".join([*EXPRESSIONS.values(), *(program.source for program in PROGRAMS.values())])
     names_by_function = {}
     for name, function in FUNCTIONS.items():
-        names_by_function.setdefault(function, []).append(name)
-    untried = [
-        names for names in names_by_function.values() if not any(name.rpartition(".")[2] in text for name in names)
-    ]
-    assert untried == []
+        names_by_function.setdefault(function, []).append(name.rpartition(".")[2])
+    assert [names for names in names_by_function.values() if not any(name in text for name in names)] == []
+
+
+def check_onnx(graph, sizes):
+    model = onnx_model(graph, "phi").SerializeToString()
+    session = onnxruntime.InferenceSession(model, providers=["CPUExecutionProvider"])
+    inputs = dict(zip(("observation", "action"), random_inputs(sizes, rows=7, dtype=np.float32), strict=True))
+    (factors,) = session.run(["factors"], inputs)
+    np.testing.assert_allclose(factors, evaluate(graph, inputs)["factors"], rtol=2e-3, atol=2e-4)
+
+
+@pytest.mark.parametrize("name", list(CASES)[::2])
+def test_onnx_model_of_functions(name):
+    check_onnx(read_case(name)[1], (6, 3))
+
+
+@pytest.mark.parametrize("name", [name if name in IN_SHORT else long_case(name) for name in PROGRAMS])
+def test_onnx_model_of_a_program(name):
+    program = PROGRAMS[name]
+    try:
+        graph = read(program.source, *program.sizes)
+    except RefusedError:
+        pytest.skip("it is refused")
+    check_onnx(graph, program.sizes)

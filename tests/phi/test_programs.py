@@ -1,4 +1,4 @@
-"""Every trusted program is read, and the graph gives the numbers that Python and NumPy give."""
+"""Every trusted program is read. Its graph gives the numbers of Python and NumPy, row by row, in NumPy and in JAX."""
 
 import jax
 import jax.numpy as jnp
@@ -14,6 +14,7 @@ from helpers.phi_programs import (
     repaired_programs,
     varied_programs,
 )
+from helpers.toy_envs import phi_source
 from lare_rl.phi.evaluate import evaluate
 from lare_rl.phi.limits import RefusedError
 from lare_rl.phi.read import read
@@ -22,18 +23,15 @@ REFUSED = {
     "a_covariance_logdet": "eigenvalues of 4 x 4 matrices",
     "b_chess_material": "an array of texts",
     "c_traffic_lights_grid": "np.ma",
-    "c_crane_sway_loops": "a loop over the rows",
-    "c_nbody_tugboats": "a loop over the rows",
-    "c_heat_exchanger_march": "a loop over the rows",
-    "c_truss_robot_welder": "a loop over the rows",
-    "c_reservoir_cascade": "a loop over the rows",
-    "c_satellites_debris_avoid": "a loop over the rows",
-    "c_greenhouse_beginner": "a loop over the rows",
-    "c_hospital_beds_beginner": "a loop over the rows",
+    **dict.fromkeys(
+        "c_crane_sway_loops c_nbody_tugboats c_heat_exchanger_march c_truss_robot_welder c_reservoir_cascade "
+        "c_satellites_debris_avoid c_greenhouse_beginner c_hospital_beds_beginner".split(),
+        "a loop over the rows",
+    ),
 }
 """Varied programs that are refused, and why."""
 PROGRAMS = {p.name: p for p in (*benign_programs(), *varied_programs(), *recorded_programs()) if p.name not in REFUSED}
-IN_SHORT = {p.name for p in (*benign_programs(), *varied_programs(), *recorded_programs()[::8])}
+SHORT = {p.name for p in (*benign_programs(), *varied_programs()[::2], *recorded_programs()[::24])} & set(PROGRAMS)
 SINGLE = ("float32", "single", "float16")
 """Programs with these words compute in single precision here and there. Graphs do not follow that."""
 
@@ -44,46 +42,82 @@ def check_equal(result, expected, tolerance):
     assert same.all(), (result[~same][:3], expected[~same][:3])
 
 
-@pytest.mark.parametrize("name", [name if name in IN_SHORT else long_case(name) for name in PROGRAMS])
+def make_inputs(program, **kwargs):
+    return dict(zip(("observation", "action"), random_inputs(program.sizes, **kwargs), strict=True))
+
+
+@pytest.mark.parametrize("name", [name if name in SHORT else long_case(name) for name in PROGRAMS])
 def test_program_agrees_with_numpy(name):
     program = PROGRAMS[name]
     graph = read(program.source, *program.sizes)
-    for seed, scale in ((0, 1.0), (1, 10.0), (2, 0.0)):
-        observation, action = (
-            np.float32(scale) * array for array in random_inputs(program.sizes, seed=seed, dtype=np.float32)
-        )
-        exact = evaluate(graph, {"observation": observation, "action": action}, dtype=np.float64)["factors"]
-        expected = execute_program(program.source, observation.astype(np.float64), action.astype(np.float64))
-        check_equal(exact, expected, 1e-6 if any(word in program.source for word in SINGLE) else 1e-9)
+    inputs = make_inputs(program, dtype=np.float32)
+    # A third of the rows each: as they are, ten times as large, and zeros.
+    scales = np.repeat(np.array([1, 10, 0], np.float32), 16)[:, None]
+    inputs = {key: (array * scales).astype(np.float64) for key, array in inputs.items()}
+    exact = evaluate(graph, inputs, dtype=np.float64)["factors"]
+    expected = execute_program(program.source, **inputs)
+    check_equal(exact, expected, 1e-6 if any(word in program.source for word in SINGLE) else 1e-9)
 
 
-@pytest.mark.parametrize("name", [name for name in PROGRAMS if name in IN_SHORT][::7])
-def test_program_agrees_in_jax(name):
+@pytest.mark.parametrize("name", [p.name for p in recorded_programs()[::60]])
+def test_rows_are_independent_in_any_batch_shape(name):
     program = PROGRAMS[name]
-    graph = read(program.source, *program.sizes)
-    inputs = dict(zip(("observation", "action"), random_inputs(program.sizes, dtype=np.float32), strict=True))
-    compiled = jax.jit(lambda inputs: evaluate(graph, inputs, jnp)["factors"])
+    graph, inputs = read(program.source, *program.sizes), make_inputs(program, rows=24, dtype=np.float32)
+    factors = evaluate(graph, inputs)["factors"]
+    shaped = evaluate(graph, {key: array.reshape(2, 3, 4, -1) for key, array in inputs.items()})["factors"]
+    single = evaluate(graph, {key: array[5] for key, array in inputs.items()})["factors"]
+    empty = evaluate(graph, {key: array[:0] for key, array in inputs.items()})["factors"]
+    np.testing.assert_allclose(shaped.reshape(factors.shape), factors, rtol=1e-5, atol=1e-5)
+    np.testing.assert_allclose(single, factors[5], rtol=1e-5, atol=1e-5)
+    assert empty.shape == (0, graph.n_factors)
+    assert factors.dtype == np.float32
+
+
+@pytest.mark.parametrize("index", range(9))
+def test_program_agrees_in_jax(index):
+    program = PROGRAMS[sorted(SHORT)[3 + 16 * index]]
+    graph, inputs = read(program.source, *program.sizes), make_inputs(program, dtype=np.float32)
     expected = evaluate(graph, inputs)["factors"]
-    result = np.asarray(compiled(inputs))
+    transform = jax.vmap if index % 2 else lambda function: function
+    result = np.asarray(jax.jit(transform(lambda inputs: evaluate(graph, inputs, jnp)["factors"]))(inputs))
     close = np.isclose(result, expected, rtol=2e-4, atol=2e-5, equal_nan=True)
     assert close.mean() > 0.995, (result[~close], expected[~close])  # a threshold may fall the other way
-    row = {key: array[3] for key, array in inputs.items()}
-    check_equal(np.asarray(jax.jit(lambda row: evaluate(graph, row, jnp)["factors"])(row)), result[3], 2e-4)
 
 
-@pytest.mark.parametrize("name", sorted(REFUSED))
+def test_gradient_flows_through_factors():
+    source = "import numpy as np\n" + phi_source("return [np.sum(observation ** 2, axis=1, keepdims=True) * action]")
+    graph = read(source, 3, 1)
+
+    def factor(observation):
+        return evaluate(graph, {"observation": observation, "action": jnp.ones(1)}, jnp)["factors"][0]
+
+    np.testing.assert_allclose(jax.grad(factor)(jnp.array([1.0, 2.0, 3.0])), [2.0, 4.0, 6.0])
+
+
+@pytest.mark.parametrize("xp", [np, jnp])
+def test_integers_never_fail(xp):
+    expressions = {
+        "(observation[:, :1] > 0).astype(int) // 0": 0,
+        "np.array([5, 7])[(observation[:, :1] * 0 + 9).astype(int)]": 7,  # beyond the end: the last entry
+        "(observation[:, :1] * 0 + 1e20).astype(int)": 2**31 - 128,
+        "np.sum(observation[:, :2] > -99, axis=1, keepdims=True)": 2,
+        "(observation[:, :1] * 2).astype(int) ** (action - 2).astype(int)": 1,
+    }
+    graph = read("import numpy as np\n" + phi_source(f"return [{', '.join(expressions)}]"), 2, 1)
+    inputs = {"observation": np.ones((2, 2), np.float32), "action": np.ones((2, 1), np.float32)}
+    np.testing.assert_array_equal(evaluate(graph, inputs, xp)["factors"], [list(expressions.values())] * 2)
+
+
+@pytest.mark.parametrize("name", REFUSED)
 def test_program_is_refused(name):
     program = next(p for p in varied_programs() if p.name == name)
     with pytest.raises(RefusedError, match=r"^E-[A-Z]+ line \d+: "):
         read(program.source, *program.sizes)
 
 
-@pytest.mark.parametrize("name", [entry["name"] for entry in repaired_programs()])
-def test_refusal_was_enough_to_mend_the_program(name):
-    """A language model that saw a refused program and the errors, and nothing else, wrote `mended.json`, each at the first try."""
-    entry = next(entry for entry in repaired_programs() if entry["name"] == name)
-    program = next(p for p in varied_programs() if p.name == name)
-    graph = read(entry["code"], *program.sizes)
-    observation, action = random_inputs(program.sizes)
-    factors = evaluate(graph, {"observation": observation, "action": action}, dtype=np.float64)["factors"]
-    check_equal(factors, execute_program(program.source, observation, action), 1e-6)
+@pytest.mark.parametrize("entry", repaired_programs(), ids=lambda entry: entry["name"])
+def test_refusal_was_enough_to_mend_the_program(entry):
+    """A language model that saw a refused program and its errors, and nothing else, wrote `mended.json` at the first try."""
+    program = next(p for p in varied_programs() if p.name == entry["name"])
+    graph, inputs = read(entry["code"], *program.sizes), make_inputs(program)
+    check_equal(evaluate(graph, inputs, dtype=np.float64)["factors"], execute_program(program.source, **inputs), 1e-6)

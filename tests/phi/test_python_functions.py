@@ -39,10 +39,14 @@ EXPRESSIONS = """
 """
 
 
-@pytest.mark.parametrize("expression", [e.strip() for e in EXPRESSIONS.replace("\n", "|").split("|") if e.strip()])
-def test_number_is_that_of_python(expression):
-    imports = "".join(f"import {name}\n" for name in MODULES)
-    graph = read(imports + phi_source(f"return [observation[:, :1] * 0 + {expression}]"), 17, 6)
+CASES = [[e.strip() for e in line.split("|")] for line in EXPRESSIONS.strip().split("\n")]
+
+
+@pytest.mark.parametrize("expressions", CASES, ids=lambda expressions: expressions[0])
+def test_number_is_that_of_python(expressions):
+    factors = ", ".join(f"observation[:, :1] * 0 + ({expression})" for expression in expressions)
+    graph = read("".join(f"import {name}\n" for name in MODULES) + phi_source(f"return [{factors}]"), 17, 6)
     inputs = {"observation": np.ones((2, 17)), "action": np.ones((2, 6))}
-    factors = evaluate(graph, inputs, dtype=np.float64)["factors"]
-    np.testing.assert_allclose(factors, float(eval(expression, dict(MODULES))), rtol=1e-15)
+    results = evaluate(graph, inputs, dtype=np.float64)["factors"]
+    expected = [float(eval(expression, dict(MODULES))) for expression in expressions]
+    np.testing.assert_allclose(results, [expected] * 2, rtol=1e-15)

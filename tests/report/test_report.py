@@ -12,65 +12,11 @@ from PIL import Image
 import lare_rl
 from helpers.toy_envs import Chase, toy_spec
 from lare_rl.report.html import render_lines, render_table
-from lare_rl.report.live_page import PAGE, LivePage
+from lare_rl.report.live_page import LivePage
 
 CHROMIUM = next(
     (path for name in ("chromium", "chromium-browser", "google-chrome") if (path := shutil.which(name))), None
 )
-
-
-@pytest.fixture(scope="module")
-def runs(tmp_path_factory):
-    """Two small runs of a toy."""
-    directory = tmp_path_factory.mktemp("runs")
-    td3 = {"hidden": (8,), "batch_size": 8, "warmup": 36}
-    tiny = {"steps": 240, "rollout_steps": 12, "evaluate_every": 60, "evaluation_episodes": 2, "td3": td3}
-    return [
-        lare_rl.train(toy_spec(), lare_rl.Settings(method=method, **tiny), out=directory / method, listeners=[])
-        for method in ("bayes", "episodic")
-    ]
-
-
-def test_sections_of_report(runs, tmp_path):
-    page = lare_rl.write_report(runs, tmp_path / "report.html").read_text()
-    diagnoses = re.findall(r'<p class="verdict"><strong>(.*?)\.</strong> (.*?)</p>', page)
-    assert [name for name, _ in diagnoses] == ["bayes", "episodic"]
-    # The first run is compared with the second one, which was trained on the return of the episode alone.
-    assert ["return of the episode alone" in text for _, text in diagnoses] == [True, False]
-    sections = (
-        "verdict",
-        "<table>",
-        "<svg",
-        "bayes on Chase",
-        "Credit over one episode",
-        "Settings",
-        "episodic on Chase",
-    )
-    positions = [page.index(section) for section in sections]
-    assert positions == sorted(positions)
-    assert "<code>" in page
-    assert 'src="data:image/gif' not in page
-
-
-def test_names_of_runs(runs, tmp_path):
-    page = lare_rl.write_report([runs[0], runs[0].directory, runs[1]], tmp_path / "report.html").read_text()
-    assert re.findall(r'<p class="verdict"><strong>(.*?)\.</strong>', page) == ["bayes #1", "bayes #2", "episodic"]
-
-
-def test_film_in_report(runs, tmp_path):
-    Image.new("RGB", (8, 8)).save(runs[0].directory / "film.gif")
-    assert 'src="data:image/gif;base64,' in lare_rl.write_report(runs[0], tmp_path / "report.html").read_text()
-    (runs[0].directory / "film.gif").unlink()
-
-
-@pytest.mark.parametrize(
-    ("arguments", "words"), [(([],), "No runs"), ((["RUN"], "none/report.html"), "there is no folder")]
-)
-def test_report_errors(runs, tmp_path, arguments, words):
-    sources, *out = arguments
-    sources = [runs[0] for _ in sources]
-    with pytest.raises(lare_rl.LareError, match=words):
-        lare_rl.write_report(sources, *(tmp_path / path for path in out))
 
 
 def episodic_chase(**settings):
@@ -81,7 +27,63 @@ def episodic_chase(**settings):
 gymnasium.register("toys/EpisodicChase-v0", entry_point=episodic_chase, max_episode_steps=20)
 
 
-def test_unknown_step_rewards(small, phi, tmp_path):
+@pytest.fixture(scope="module")
+def runs(small, phi, tmp_path_factory):
+    """Two small runs of a toy, one with rewards at each step, and one with a reward at the last step."""
+    directory, settings = tmp_path_factory.mktemp("runs"), small(method="lare-bayes", steps=240)
+    return [
+        lare_rl.train(toy_spec(environment=name), settings, function=phi, out=directory / name[5:-3], listeners=[])
+        for name in ("toys/Chase-v0", "toys/EpisodicChase-v0")
+    ]
+
+
+def test_sections_of_report(runs, make_run, tmp_path):
+    episodic = make_run("a", [-5.0, -6.0], method="episodic")
+    page = lare_rl.write_report([runs[0], episodic], tmp_path / "report.html").read_text()
+    diagnoses = re.findall(r'<p class="verdict"><strong>(.*?)\.</strong> (.*?)</p>', page)
+    assert [name for name, _ in diagnoses] == ["lare-bayes", "episodic"]
+    # The first run is compared with the second one, which was trained on the return of the episode alone.
+    assert ["return of the episode alone" in text for _, text in diagnoses] == [True, False]
+    sections = (
+        "verdict",
+        "<table>",
+        "<svg",
+        "lare-bayes on Chase",
+        "Credit over one episode",
+        "The factors",
+        "The latent function",
+        "Settings",
+        "episodic on Chase",
+        "no checkpoint",
+    )
+    positions = [page.index(section) for section in sections]
+    assert positions == sorted(positions)
+    assert "<code>" in page
+    assert 'src="data:image/gif' not in page
+
+
+def test_report_names_and_film(runs, make_run, tmp_path):
+    first, second = make_run("a", [1.0]), make_run("b", [1.0], method="rd")
+    Image.new("RGB", (8, 8)).save(runs[0].directory / "film.gif")
+    page = lare_rl.write_report([runs[0], second, first.directory, first], tmp_path / "report.html").read_text()
+    names = re.findall(r'<p class="verdict"><strong>(.*?)\.</strong>', page)
+    assert names == ["lare-bayes", "rd", "dense (a) #3", "dense (a) #4"]
+    assert page.count('src="data:image/gif;base64,') == 1
+    (runs[0].directory / "film.gif").unlink()
+
+
+def test_report_errors(make_run, tmp_path):
+    run, empty = make_run("a", [1.0]), make_run("b", [1.0], steps=())
+    for sources, out, words in (
+        ([], "report.html", "No runs"),
+        ([run], "none/report.html", "there is no folder"),
+        ([empty], "report.html", "b has no evaluation yet"),
+    ):
+        with pytest.raises(lare_rl.LareError, match=words):
+            lare_rl.write_report(sources, tmp_path / out)
+
+
+def test_unknown_step_rewards(runs, tmp_path):
     """If only the last step has a reward, there is no error, no correlation, and no curve of true rewards."""
     about_true_rewards = (
         "credit error",
@@ -90,34 +92,31 @@ def test_unknown_step_rewards(small, phi, tmp_path):
         "correlation with the true reward",
     )
 
-    def texts_in_report(name, **task):
-        run = lare_rl.train(
-            toy_spec(**task), small(method="lare-bayes", steps=240), function=phi, out=tmp_path / name, listeners=[]
-        )
-        page = lare_rl.write_report(run, tmp_path / f"{name}.html").read_text()
+    def texts_in_report(run):
+        page = lare_rl.write_report(run, tmp_path / "report.html").read_text()
         assert "R² of returns" in page
         assert "proxy reward" in page
         return [text for text in about_true_rewards if text in page]
 
-    assert texts_in_report("unknown", environment="toys/EpisodicChase-v0") == []
-    assert texts_in_report("known") == list(about_true_rewards)
+    assert [texts_in_report(run) for run in runs] == [list(about_true_rewards), []]
 
 
-def test_live_page(small, tmp_path, monkeypatch):
-    opened, pages = [], []
+def test_live_page(make_run, monkeypatch):
+    opened = []
     monkeypatch.setattr(webbrowser, "open", opened.append)
-
-    class Reader(LivePage):
-        def on_evaluation(self, metrics):
-            super().on_evaluation(metrics)
-            pages.append((out / PAGE).read_text())
-
-    out = tmp_path / "run"
-    lare_rl.train(toy_spec(), small(method="dense", steps=120), out=out, listeners=[Reader(out)])
-    assert opened == [(out / "watch.html").resolve().as_uri()]
-    assert [re.search(r"Step (\d+) of 120", page)[1] for page in pages] == ["60", "120"]
-    assert all('<meta http-equiv="refresh" content="10">' in page for page in pages)
-    assert "refresh" not in (out / "watch.html").read_text()
+    run, trained = make_run("a", [1.0], steps=()), make_run("b", [2.0])
+    path, page = run.directory / "watch.html", LivePage(run.directory)
+    page.on_stop()
+    assert not path.exists()
+    page.on_start("a", 0, 100)
+    assert opened == [path.resolve().as_uri()]
+    assert "Step 0 of 100" in path.read_text()
+    shutil.copy(trained.directory / "metrics.jsonl", run.directory)
+    page.on_evaluation([])
+    for text in ('<meta http-equiv="refresh" content="10">', "Step 100 of 100", "<svg", 'class="verdict"'):
+        assert text in path.read_text()
+    page.on_stop()
+    assert "refresh" not in path.read_text()
 
 
 def test_html_is_escaped():
@@ -129,10 +128,10 @@ def test_html_is_escaped():
 
 
 @pytest.mark.skipif(CHROMIUM is None, reason="there is no Chromium")
-@pytest.mark.parametrize(("width", "columns"), [(390, 1), (1280, 2)])
+@pytest.mark.parametrize(("width", "columns"), [(390, 1), pytest.param(1280, 2, marks=pytest.mark.long)])
 def test_page_fits_phone_and_desktop(runs, tmp_path, width, columns):
     """Nothing is wider than the screen, and curves stand side by side where there is room."""
-    page = lare_rl.write_report(runs, tmp_path / "report.html")
+    page = lare_rl.write_report(runs[0], tmp_path / "report.html")
     probe = (
         "<script>document.title = JSON.stringify([document.documentElement.scrollWidth, "
         "getComputedStyle(document.querySelector('.figures')).gridTemplateColumns.split(' ').length])</script>"

@@ -17,6 +17,7 @@ CAPACITY = 16
 
 class Replay(NamedTuple):
     columns: Any
+    row: Any
     next_row: Any
 
 
@@ -25,13 +26,14 @@ class Learner(NamedTuple):
 
 
 def template(*shape):
-    return Learner(Replay({"reward": jnp.zeros(shape)}, jnp.zeros(shape[:-1], int)))
+    return Learner(Replay({"reward": jnp.zeros(shape)}, jnp.zeros(shape, int), jnp.zeros(shape[:-1], int)))
 
 
 def save(directory, rows, end):
     """Save the replay of one seed, of one or several environments."""
     rows, end = np.atleast_2d(rows), np.atleast_1d(end)
-    learner = Learner(Replay({"reward": jnp.asarray(rows[None], jnp.float32)}, jnp.asarray(end[None])))
+    row = jnp.broadcast_to(jnp.arange(rows.shape[1]), (1, *rows.shape))
+    learner = Learner(Replay({"reward": jnp.asarray(rows[None], jnp.float32)}, row, jnp.asarray(end[None])))
     checkpoint.save(directory, learner, {"step": int(end.sum())}, {})
 
 
@@ -99,11 +101,23 @@ def test_packed_entry_is_refused(tmp_path):
     content = bytearray((directory / "state.npz").read_bytes())
     content[content.index(b"PK\x01\x02") + 10] ^= 64  # a bit that names another compression
     (directory / "state.npz").write_bytes(content)
-    with pytest.raises(LareError, match=r"\.replay\.next_row\.npy is packed"):
+    with pytest.raises(LareError, match=r"\.replay\.row\.npy is packed"):
         checkpoint.load(directory, template(1, 1, CAPACITY))
 
 
 def test_other_shape_is_refused(tmp_path):
     save(tmp_path / "checkpoint", np.zeros(CAPACITY), 3)
-    with pytest.raises(LareError, match=r"\.replay\.next_row has shape \(1, 1\), not \(1, 2\)"):
+    with pytest.raises(LareError, match=r"\.replay\.row has shape \(1, 1, 16\), not \(1, 2, 16\)"):
         checkpoint.load(tmp_path / "checkpoint", template(1, 2, CAPACITY))
+
+
+@pytest.mark.parametrize("capacity", [CAPACITY + 4, CAPACITY - 4])
+def test_replay_of_extended_run_may_be_larger(capacity, tmp_path):
+    save(tmp_path / "checkpoint", np.arange(1.0, CAPACITY + 1), 9)
+    if capacity < CAPACITY:
+        with pytest.raises(LareError, match="has shape"):
+            checkpoint.load(tmp_path / "checkpoint", template(1, 1, capacity))
+        return
+    learner, _, _ = checkpoint.load(tmp_path / "checkpoint", template(1, 1, capacity))
+    np.testing.assert_array_equal(learner.replay.columns["reward"][0, 0], [*range(1, 11), *[0] * (capacity - 10)])
+    np.testing.assert_array_equal(learner.replay.row[0, 0], [*range(CAPACITY), *[0] * 4])

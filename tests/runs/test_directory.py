@@ -1,4 +1,4 @@
-"""The run directory: latent functions of old runs, metrics, and locks."""
+"""The run directory: latent functions of old runs, metrics, locks, and the runs below a directory."""
 
 import json
 import os
@@ -9,8 +9,9 @@ import pytest
 from helpers.toy_envs import PHI, toy_spec
 from lare_rl.config.resolve import resolve
 from lare_rl.config.settings import Settings
+from lare_rl.errors import LareError
 from lare_rl.latent.function import verify_function
-from lare_rl.runs.directory import RunBusyError, as_run, create_run, lock_run, open_run
+from lare_rl.runs.directory import RunBusyError, as_run, create_run, find_run_directories, lock_run, open_run
 from lare_rl.runs.metrics_file import append_metrics, read_metrics, truncate_metrics
 
 
@@ -58,3 +59,39 @@ def test_metrics_are_parsed_once_per_file_state(run, monkeypatch):
 def test_lock_refuses_second_process(run):
     with lock_run(run), pytest.raises(RunBusyError, match="another process"), lock_run(run):
         pass
+
+
+# Runs below a directory, as of a sweep
+
+
+def test_runs_below_directory(make_run, tmp_path):
+    first, second, _ = make_run("a", [1.0]), make_run("b", [2.0], method="rd"), make_run(".c.0123.new", [3.0])
+    both = [first.directory, second.directory]
+    assert find_run_directories([tmp_path / "runs"]) == both
+    assert find_run_directories([tmp_path / "runs" / "Chase"]) == both
+    assert find_run_directories([first.directory]) == both[:1]
+
+
+def test_run_counts_once(make_run):
+    first, second = make_run("a", [1.0]), make_run("b", [2.0], method="rd")
+    paths = [second.directory, first.directory.parent]
+    assert find_run_directories(paths) == [second.directory, first.directory]
+
+
+def test_logs_of_sweep_are_skipped(make_run):
+    run = make_run("a-td3", [1.0])
+    log = run.directory.with_name("a-td3.log")
+    log.write_text("step 50")
+    assert find_run_directories([run.directory, log]) == [run.directory]
+    with pytest.raises(LareError, match="no runs"):
+        find_run_directories([log])
+    with pytest.raises(LareError, match=r"b\.log is not a run"):
+        find_run_directories([run.directory, log.rename(log.with_name("b.log"))])
+
+
+@pytest.mark.parametrize(("name", "hint"), [("nothing", False), ("results.csv", True)])
+def test_other_paths_are_refused(name, hint, tmp_path):
+    (tmp_path / "results.csv").touch()
+    with pytest.raises(LareError, match=f"{name} is not a run") as error:
+        find_run_directories([tmp_path / name])
+    assert ("docs/sweeps.md" in str(error.value)) == hint

@@ -1,24 +1,25 @@
 """Sweeps: their runs, bad files, and processes that train, fail and are stopped."""
 
 import csv
-import fcntl
+import json
 import os
 import re
+import shutil
 import signal
 import subprocess
 import sys
+import threading
 import time
 from pathlib import Path
 
 import pytest
+from pyarrow import parquet
 
 import lare_rl
-from helpers.listeners import AtStep
 from helpers.long_tests import long_case
-from lare_rl.compare.metric_tables import read_metric_rows, write_table
 from lare_rl.errors import LareError
-from lare_rl.runs.directory import open_run
-from lare_rl.sweep import processes
+from lare_rl.latent.function import verify_function
+from lare_rl.runs.config_file import make_config
 from lare_rl.sweep.jobs import job_to_json, train_job
 from lare_rl.sweep.processes import RunningProcesses, assign_cores, train_in_process
 from lare_rl.sweep.sweep import Resources, read_sweep, run_sweep
@@ -38,6 +39,7 @@ evaluation_episodes = 1
 td3 = { hidden = [8], warmup = 100, batch_size = 8 }
 """
 FUNCTIONS = ("draws = [0, 3]", '[functions]\nReacher-v4 = ["phi.py"]')
+DENSE_ONLY = FILE.replace(', "lare-linear"', "").replace("draws = [0, 3]", "")
 
 
 def ignore(message):
@@ -51,130 +53,125 @@ def file(tmp_path):
     return path
 
 
+def write_run(job, directory=None, steps=(100, 200), functions=()):
+    """Write the files of a run without a checkpoint, as of an earlier training."""
+    directory = directory or job.directory
+    directory.mkdir(parents=True)
+    (directory / "config.json").write_text(make_config(job.task, job.resolved, functions).model_dump_json())
+    values = {"evaluation/return": -1.5} | ({"credit/error": 0.25} if job.resolved.method == "lare-linear" else {})
+    lines = [{"step": step, "seed": seed, **values} for step in steps for seed in (0, 1)]
+    (directory / "metrics.jsonl").write_text("".join(json.dumps(line) + "\n" for line in lines))
+
+
 @pytest.fixture
-def trained(monkeypatch):
-    """Train in this process. Return the names of the jobs that were trained."""
-    names = []
+def python_script(tmp_path, monkeypatch):
+    """Return a function that replaces Python by a shell script, in the processes that a test starts."""
 
-    def train(job, core_ids, running):
-        names.append(job.name)
-        train_job(job_to_json(job))
+    def replace(script):
+        path = tmp_path / "python.sh"
+        path.write_text(f"#!/bin/sh\n{script}\n")
+        path.chmod(0o755)
+        monkeypatch.setattr(sys, "executable", str(path))
 
-    monkeypatch.setattr(processes, "train_in_process", train)
-    return names
+    return replace
 
 
-def test_jobs_of_file(file, tmp_path):
+@pytest.fixture
+def copying_python(file, python_script, tmp_path):
+    """Let processes copy a finished run instead of training it, or fail for draw 3. Return the file with the names of the runs."""
+    for job in read_sweep(file)[1]:
+        write_run(job, tmp_path / "finished" / job.directory.name)
+    python_script(f"""
+        directory=$(head -n 1 | sed 's/.*"directory": "\\([^"]*\\)".*/\\1/')
+        echo $(basename $directory) >> {tmp_path}/names
+        case $directory in *draw3) echo no luck; exit 2;; esac
+        mkdir -p $directory
+        cp {tmp_path}/finished/$(basename $directory)/* $directory""")
+    return tmp_path / "names"
+
+
+def test_jobs_of_file(file, tmp_path, command):
+    """`--check` trains nothing, and says that the file needs more cores than this machine has."""
     _, jobs = read_sweep(file)
-    assert [job.name for job in jobs] == [
-        "Reacher-v4/dense-td3",
-        "Reacher-v4/lare-linear-td3-draw0",
-        "Reacher-v4/lare-linear-td3-draw3",
+    names = [f"Reacher-v4/{name}" for name in ("dense-td3", "lare-linear-td3-draw0", "lare-linear-td3-draw3")]
+    assert [job.name for job in jobs] == names
+    assert [job.directory for job in jobs] == [tmp_path / "runs" / "small" / name for name in names]
+    assert [(job.resolved.draw, job.resolved.steps, job.started, job.done) for job in jobs] == [
+        (draw, 200, False, False) for draw in (0, 0, 3)
     ]
-    assert jobs[0].directory == tmp_path / "runs" / "small" / "Reacher-v4" / "dense-td3"
-    assert [job.resolved.draw for job in jobs] == [0, 0, 3]
-    assert {job.resolved.steps for job in jobs} == {200}
-    assert not any(job.done or job.started for job in jobs)
-
-
-def test_check_option(file, command):
-    """It trains nothing, and says that the file needs more cores than this machine has."""
-    train_job(job_to_json(read_sweep(file)[1][0]))
+    write_run(jobs[0])
     file.write_text(FILE.replace("[settings]", "cores = 1000\n[settings]"))
     status, out, error = command("sweep", file, "--check")
-    assert status == 0
-    assert out.splitlines() == [
-        "Reacher-v4/dense-td3: done",
-        "Reacher-v4/lare-linear-td3-draw0: step 0 of 200",
-        "Reacher-v4/lare-linear-td3-draw3: step 0 of 200",
-    ]
+    assert (status, out.splitlines()) == (0, [f"{names[0]}: done", *(f"{name}: step 0 of 200" for name in names[1:])])
     assert re.search(r"1 processes with 1000 cores each need 1000 cores, and \d+ are usable", error)
+    file.write_text(FILE.replace("[settings]", "[settings]\ncandidates = 1").replace("[0, 3]", "[0]"))
+    assert read_sweep(file)[1][1].directory.name == "lare-linear-td3-draw0-candidates1"
 
 
 def test_assign_cores():
     with pytest.raises(LareError, match=r"1000 processes with 3 cores each need 3000 cores"):
         assign_cores(1000, 3)
-    (core_ids,) = assign_cores(1, 1)
-    assert set(core_ids) <= os.sched_getaffinity(0)
+    usable = sorted(os.sched_getaffinity(0))
+    assert assign_cores(len(usable), 1) == [[core_id] for core_id in usable]
+    assert assign_cores(1, len(usable)) == [usable]
 
 
-def test_finished_runs_are_skipped_and_others_continue(file, trained):
-    resources, (dense, first, second) = read_sweep(file)
-    train_job(job_to_json(dense))
-    stop = AtStep(100, lambda: signal.raise_signal(signal.SIGINT))
-    with pytest.raises(RunInterruptedError):
-        lare_rl.train(first.task, first.settings, out=first.directory, listeners=[stop])
+def test_finished_runs_are_skipped_and_others_continue(file, copying_python):
+    resources, jobs = read_sweep(file)
+    dense, linear, failing = jobs
+    write_run(dense)
+    write_run(linear, steps=(100,))
     messages = []
-    assert run_sweep(resources, [dense, first, second], messages.append) == []
-    assert trained == [first.name, second.name]
+    assert run_sweep(resources, jobs, messages.append) == [failing]
+    assert copying_python.read_text().split() == ["lare-linear-td3-draw0", "lare-linear-td3-draw3"]
     assert sorted(messages) == sorted(
         [
             "3 runs, 1 of them done",
-            f"{first.name} begins again at step 100",
-            f"2 of 3: {first.name} is done",
-            f"{second.name} begins",
-            f"3 of 3: {second.name} is done",
+            f"{linear.name} begins again at step 100",
+            f"2 of 3: {linear.name} is done",
+            f"{failing.name} begins",
+            f"3 of 3: {failing.name} failed: no luck ({failing.directory}.log)",
         ]
     )
-    metrics = first.directory / "metrics.jsonl"
-    lines = metrics.read_text()
-    metrics.write_text("".join(lines.splitlines(keepends=True)[:-1]))  # a full disk lost the last line of a seed
-    assert [job.done for job in (dense, first, second)] == [True, False, True]
-    metrics.write_text(lines)
-    assert run_sweep(resources, [dense, first, second], ignore) == []
-    assert len(trained) == 2
+    copying_python.unlink()
+    assert run_sweep(resources, jobs[:2], ignore) == []
+    assert not copying_python.exists()
+    metrics = dense.directory / "metrics.jsonl"
+    metrics.write_text("".join(metrics.read_text().splitlines(keepends=True)[:-1]))  # a full disk lost the last line
+    assert not dense.done
 
 
-def test_metric_table(file, trained, tmp_path):
+def test_damaged_run_does_not_stop_others(file, copying_python):
     resources, jobs = read_sweep(file)
-    run_sweep(resources, jobs[:1], ignore)
-    rows = read_metric_rows([*(job.directory for job in jobs), tmp_path / "nothing"])
-    assert len(rows) == 2 * 2
-    rows[-1]["credit/error"] = 0.5
-    paths = write_table(rows, tmp_path / "results")
-    assert [path.name for path in paths] == ["results.csv", "results.parquet"]
-    with paths[0].open() as file:
-        table = list(csv.DictReader(file))
-    expected = [("dense", "0", seed, step) for step in ("100", "200") for seed in ("0", "1")]
-    assert [(row["method"], row["draw"], row["seed"], row["step"]) for row in table] == expected
-    assert [row["credit/error"] for row in table] == ["", "", "", "0.5"]
-    from pyarrow import parquet
-
-    columns = parquet.read_table(paths[1]).to_pydict()
-    assert columns["credit/error"] == [None, None, None, 0.5]
-    assert columns["evaluation/return"] == [float(row["evaluation/return"]) for row in table]
-
-
-def test_failed_and_damaged_runs_do_not_stop_others(file, monkeypatch):
-    resources, jobs = read_sweep(file)
-    monkeypatch.setattr(
-        processes, "train_in_process", lambda job, core_ids, running: "no luck" if "draw3" in job.name else None
-    )
     jobs[0].directory.mkdir(parents=True)
     (jobs[0].directory / "config.json").write_text("{}")
     (jobs[0].directory / "metrics.jsonl").write_text("5\n")
     messages = []
-    assert sorted(job.name for job in run_sweep(resources, jobs, messages.append)) == [jobs[0].name, jobs[2].name]
-    assert any(message.endswith("lare-linear-td3-draw3 failed: no luck") for message in messages)
+    assert run_sweep(resources, jobs[:2], messages.append) == [jobs[0]]
     assert any(re.search(r"dense-td3 failed: .*metrics\.jsonl .* line 1", message) for message in messages)
     assert any(message.endswith("lare-linear-td3-draw0 is done") for message in messages)
 
 
-def test_commands(command, file, tmp_path):
-    """A file json.py in the user's folder does not replace Python's module in the processes."""
-    (tmp_path / "json.py").write_text("raise SystemExit('not this one')")
-    file.write_text(FILE.replace("draws = [0, 3]", ""))
+def test_tables_of_command(command, file, copying_python, tmp_path):
+    """A failure gives status 1, and the tables are written all the same."""
     status, out, error = command("sweep", file)
-    assert status == 0, error
     root = tmp_path / "runs" / "small"
-    assert out == f"wrote {root}/results.csv\nwrote {root}/results.parquet\n"
-    assert error.splitlines()[-1].startswith("2 of 2: Reacher-v4/")
-    assert "step 200 of 200" in (root / "Reacher-v4" / "dense-td3.log").read_text()
-    status, out, _ = command("compare", root)
-    assert status == 0
-    assert out.splitlines()[-1] == "wrote compare.html"
-    rows = [line.split()[0] for line in out.splitlines()[1:] if line.startswith(("dense", "lare"))]
-    assert rows == ["dense", "lare-linear"]
+    assert (status, out) == (1, f"wrote {root}/results.csv\nwrote {root}/results.parquet\n")
+    assert error.splitlines()[-1].startswith("3 of 3: Reacher-v4/")
+    with (root / "results.csv").open() as csv_file:
+        table = list(csv.DictReader(csv_file))
+    assert list(table[0])[:8] == ["task", "run", "method", "algorithm", "judges", "draw", "seed", "step"]
+    assert [(row["method"], row["draw"], row["seed"], row["step"]) for row in table] == [
+        (method, "0", seed, step)
+        for method in ("dense", "lare-linear")
+        for step in ("100", "200")
+        for seed in ("0", "1")
+    ]
+    columns = parquet.read_table(root / "results.parquet").to_pydict()
+    assert list(columns) == list(table[0])
+    for name in ("evaluation/return", "credit/error"):  # dense has no credit, which is an empty cell
+        assert columns[name] == [float(row[name]) if row[name] else None for row in table]
+    assert [row["credit/error"] == "" for row in table] == 4 * [True] + 4 * [False]
 
 
 @pytest.mark.long
@@ -188,52 +185,72 @@ def test_ray(file, tmp_path):
     assert read_sweep(file)[1][0].done
 
 
-BENCHMARKS = Path(__file__).parents[2] / "benchmarks"
+SWEEPS = sorted((Path(__file__).parents[2] / "benchmarks" / "sweeps").glob("*.toml"))
 
 
-@pytest.mark.parametrize("path", sorted(BENCHMARKS.glob("sweeps/*.toml")), ids=lambda path: path.stem)
+@pytest.mark.parametrize("path", [path if path.stem == "large" else long_case(path) for path in SWEEPS])
 def test_sweeps_of_benchmarks(path):
     assert read_sweep(path)[1]
 
 
-@pytest.mark.parametrize(
-    ("number", "step"), [(signal.SIGINT, 200), long_case(signal.SIGINT, 0), long_case(signal.SIGKILL, 200)]
-)
-def test_stopped_sweep_saves_its_run(number, step, file, tmp_path):
-    """Ctrl-C reaches the whole group of processes, as in a terminal. At step 0, the run is still compiling."""
-    file.write_text(FILE.replace('"dense", ', "").replace("[0, 3]", "[0]").replace("steps = 200", "steps = 100_000"))
-    # A shell that runs these tests in the background lets its children ignore Ctrl-C.
-    handler = "import signal; signal.signal(signal.SIGINT, signal.default_int_handler)"
-    command = [sys.executable, "-c", f"{handler}; from lare_rl.cli import main; main()", "sweep", str(file)]
-    sweep = subprocess.Popen(command, cwd=tmp_path, stderr=subprocess.PIPE, text=True, start_new_session=True)
-    (job,) = read_sweep(file)[1]
-    deadline = time.monotonic() + 120
+def wait_for_step(job, step, deadline):
     while not job.started or job.step() < step:
         assert time.monotonic() < deadline
         time.sleep(0.1)
-    (os.killpg if number is signal.SIGINT else os.kill)(sweep.pid, number)
-    error = sweep.communicate(timeout=60)[1]
-    if number is signal.SIGINT:
-        assert sweep.returncode == 130
-        assert "stopped; all running runs were saved" in error.splitlines()[-1]
-    with open_run(job.directory).directory.joinpath("lock").open() as lock:
-        while True:
-            try:
-                fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-                break
-            except OSError:
-                assert time.monotonic() < deadline
-                time.sleep(0.1)
-    last = job.directory.with_name(job.directory.name + ".log").read_text().splitlines()[-1:]
-    if step or last:  # while it compiles, there may be nothing to save
-        assert re.match(r"stopped at step \d+ of \d+ and saved", last[0])
+
+
+@pytest.fixture
+def default_interrupt():
+    """A shell that runs these tests in the background lets its children ignore Ctrl-C."""
+    handler = signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield
+    signal.signal(signal.SIGINT, handler)
+
+
+def test_interrupted_sweep_saves_its_run(file, tmp_path, monkeypatch, default_interrupt):
+    """A file json.py in the user's folder does not replace Python's module in the processes."""
+    (tmp_path / "json.py").write_text("raise SystemExit('not this one')")
+    monkeypatch.chdir(tmp_path)
+    file.write_text(DENSE_ONLY.replace("steps = 200", "steps = 100_000"))
+    resources, (job,) = read_sweep(file)
+
+    def interrupt():
+        wait_for_step(job, 200, time.monotonic() + 120)
+        signal.pthread_kill(threading.main_thread().ident, signal.SIGINT)
+
+    thread = threading.Thread(target=interrupt)
+    thread.start()
+    with pytest.raises(RunInterruptedError, match="all running runs were saved"):
+        run_sweep(resources, [job], ignore)
+    thread.join()
+    log = job.directory.with_name("dense-td3.log").read_text().splitlines()
+    assert re.match(r"stopped at step [\d,]+ of [\d,]+ and saved", log[-1])
+    assert 200 <= job.step() < 100_000
+    assert not job.done
+
+
+@pytest.mark.long
+def test_killed_sweep_saves_its_run(file, tmp_path):
+    """A process notices that its parent was killed."""
+    file.write_text(DENSE_ONLY.replace("steps = 200", "steps = 100_000"))
+    command = [sys.executable, "-c", "from lare_rl.cli import main; main()", "sweep", str(file)]
+    sweep = subprocess.Popen(command, cwd=tmp_path, stderr=subprocess.DEVNULL)
+    (job,) = read_sweep(file)[1]
+    deadline = time.monotonic() + 120
+    wait_for_step(job, 200, deadline)
+    sweep.kill()
+    sweep.wait()
+    log = job.directory.with_name("dense-td3.log")
+    while not re.search(r"stopped at step \d+ of \d+ and saved", log.read_text().replace(",", "")):
+        assert time.monotonic() < deadline
+        time.sleep(0.1)
 
 
 def test_error_of_process(file):
-    _, jobs = read_sweep(file)
-    jobs[0].directory.mkdir(parents=True)  # as if another sweep had just started it
-    error = train_in_process(jobs[0], [], RunningProcesses())
-    assert error.startswith(f"{jobs[0].directory} exists")
+    job = read_sweep(file)[1][0]
+    job.directory.mkdir(parents=True)  # as if another sweep had just started it
+    error = train_in_process(job, [], RunningProcesses())
+    assert error.startswith(f"{job.directory} exists")
     assert error.endswith("dense-td3.log)")
 
 
@@ -247,15 +264,12 @@ def test_error_of_process(file):
         ("echo last line >&2; exit 3", "last line"),
     ],
 )
-def test_end_of_process(file, monkeypatch, tmp_path, script, error):
+def test_end_of_process(file, python_script, script, error):
     job = read_sweep(file)[1][0]
     log = job.directory.with_name("dense-td3.log")
     log.parent.mkdir(parents=True)
     log.write_text("step 100 of 200: all is well\n")
-    program = tmp_path / "python.sh"
-    program.write_text(f"#!/bin/sh\n{script}\n")
-    program.chmod(0o755)
-    monkeypatch.setattr(sys, "executable", str(program))
+    python_script(script)
     assert train_in_process(job, [], RunningProcesses()) == f"{error} ({log})"
 
 
@@ -296,24 +310,29 @@ def test_bad_file(change, message, file):
         read_sweep(file)
 
 
-def test_functions_instead_of_draws(file, tmp_path, trained):
-    lare_rl.design(lare_rl.load_task("Reacher-v4"), draw=2).save(tmp_path / "phi.py")
+def test_functions_instead_of_draws(file, tmp_path):
+    source = "def evaluation_func(observation, action):\n    return [action[:, {}:{}]]\n"
+    first, second = (verify_function(source.format(i, i + 1), lare_rl.load_task("Reacher-v4")) for i in (0, 1))
+    first.save(tmp_path / "phi.py")
     file.write_text(FILE.replace(*FUNCTIONS))
-    resources, jobs = read_sweep(file)
+    jobs = read_sweep(file)[1]
     assert [job.directory.name for job in jobs] == ["dense-td3", "lare-linear-td3"]
-    assert run_sweep(resources, jobs, ignore) == []
-    function = lare_rl.load_function(tmp_path / "phi.py", jobs[1].task)
-    assert open_run(jobs[1].directory).function.source == function.source
+    write_run(jobs[1], functions=(first,))
+    assert read_sweep(file)[1][1].done
+    with pytest.raises(LareError, match=r"latent_function\.py"):  # a run that has begun is resumed
+        train_job(job_to_json(jobs[1]))
     for name in ("phi.py", "phi.json"):
         (tmp_path / name).unlink()
-    lare_rl.design(lare_rl.load_task("Reacher-v4"), draw=1).save(tmp_path / "phi.py")
+    with pytest.raises(LareError, match=r"phi\.py"):
+        train_job(job_to_json(jobs[1]) | {"directory": str(tmp_path / "other")})
+    second.save(tmp_path / "phi.py")
     with pytest.raises(LareError, match="lare-linear-td3 holds a run with another latent function"):
         read_sweep(file)
 
 
-def test_directory_of_another_run(file, trained):
-    resources, jobs = read_sweep(file)
-    run_sweep(resources, jobs[:1], ignore)
+def test_directory_of_another_run(file):
+    jobs = read_sweep(file)[1]
+    write_run(jobs[0])
     file.write_text(FILE.replace("steps = 200", "steps = 400"))
     with pytest.raises(LareError, match="dense-td3 holds a run with steps = 200, not 400"):
         read_sweep(file)
@@ -323,9 +342,14 @@ def test_directory_of_another_run(file, trained):
     ):  # settings of other algorithms and methods do not matter
         file.write_text(change)
         assert read_sweep(file)[1][0].done
+    file.write_text(FILE)
+    config = jobs[0].directory / "config.json"
+    config.write_text(config.read_text().replace('"description":"', '"description":"Another task. '))
+    with pytest.raises(LareError, match="dense-td3 holds a run of another task"):
+        read_sweep(file)
+    shutil.rmtree(jobs[0].directory)
     jobs[1].directory.mkdir(parents=True)
     (jobs[1].directory / "thesis.tex").write_text("")
-    file.write_text(FILE)
     with pytest.raises(LareError, match="lare-linear-td3-draw0 exists, and is not a run"):
         read_sweep(file)
 

@@ -10,19 +10,21 @@ from gymnasium.spaces import Box
 import lare_rl
 from helpers.listeners import MessageListener
 from helpers.toy_envs import Chase, pick_spec, toy_spec
-from helpers.training_runs import train_quietly
+from helpers.training_runs import CHASE, train_quietly
+from lare_rl.algorithms.ppo import PPOSettings
 from lare_rl.config.resolve import resolve
 from lare_rl.config.settings import Settings
 from lare_rl.runs.config_file import make_config
 from lare_rl.runs.directory import Run
-from lare_rl.runs.metric_names import ACTOR_SATURATION
 from lare_rl.training.advice import (
     MESSAGES,
     find_constant_returns,
+    find_large_observations,
     find_saturated_policies,
     find_untrained,
     saturation,
 )
+from lare_rl.training.saved_state import load_learner
 from lare_rl.training.session import restore_session
 from lare_rl.util.findings import render
 
@@ -38,21 +40,28 @@ class Bright(Chase):
 
 gymnasium.register("toys/Bright-v0", entry_point=Bright, max_episode_steps=20)
 
-BRIGHT = toy_spec(name="Bright", environment="toys/Bright-v0", observation="0: the target\n1: light (W/m²)")
-
-
-@pytest.mark.parametrize(
-    ("task", "algorithm", "count"), [(BRIGHT, "td3", 1), (toy_spec(), "td3", 0), (BRIGHT, "ppo", 0)]
+BRIGHT = CHASE.model_copy(
+    update={"name": "Bright", "environment": "toys/Bright-v0", "observation": "0: the target\n1: light (W/m²)"}
 )
-def test_large_observations_are_reported_once(task, algorithm, count, small, tmp_path):
+
+
+def test_large_observations_are_reported_once(dense, tmp_path):
+    """Of a run with small observations, `test_train.py` sees that there is no such message."""
     listener = MessageListener()
-    settings = small(method="dense", algorithm=algorithm, seeds=2, steps=204)
-    train_quietly(task, settings, tmp_path / "run", listeners=[listener])
-    messages = [line for line in listener.messages if line.startswith("Observations are large")]
-    assert len(messages) == count
-    for message in messages:
-        assert "light (W/m²)" in message
-        assert "--algorithm ppo" in message
+    train_quietly(BRIGHT, dense(steps=60), tmp_path / "run", listeners=[listener])
+    (message,) = (line for line in listener.messages if line.startswith("Observations are large"))
+    assert "light (W/m²)" in message
+    assert "--algorithm ppo" in message
+
+
+@pytest.mark.parametrize(("normalise", "expected"), [(True, []), (False, ["large observations"])])
+def test_large_observations_of_ppo(normalise, expected, dense_run):
+    config, learner, _, _ = load_learner(dense_run)
+    replay = learner.replay._replace(columns={"observation": 50 * learner.replay.columns["observation"]})
+    settings = Settings(method="rrdu", algorithm="ppo", ppo=PPOSettings(normalise_observations=normalise))
+    run_config = dense_run.config.model_copy(update={"settings": resolve(settings, toy_spec())})
+    findings = find_large_observations(Run(dense_run.directory, run_config, ()), replay, config)
+    assert [finding.code for finding in findings] == expected
 
 
 @pytest.mark.parametrize(
@@ -93,26 +102,16 @@ def test_saturated_policies(action, saturations, start):
         assert render(finding, MESSAGES).startswith(start)
 
 
-def test_greedy_actions_of_newest_states(small, tmp_path):
-    run = train_quietly(toy_spec(), small(method="dense", algorithm="td3", seeds=2), tmp_path / "run")
-    session, _ = restore_session(run)
+def test_greedy_actions_of_newest_states(dense_run):
+    session, _ = restore_session(dense_run)
     actions = session.greedy_actions(5)
+    session.close()
     assert actions.shape == (2, 5, 1)
     replay = session.learner.replay
-    rows = int(replay.next_row[1, 0]) - np.arange(1, 6)
+    rows = (int(replay.next_row[1, 0]) - np.arange(1, 6)) % 64
     observation = np.asarray(replay.columns["observation"][1, 0, rows, 0])
-    policy = lare_rl.load_policy(run, seed=run.seeds[1])
+    policy = lare_rl.load_policy(dense_run, seed=dense_run.seeds[1])
     np.testing.assert_allclose(2 * actions[1], policy(observation), rtol=1e-5)
-    assert session.greedy_actions(5000).shape == (2, 5000, 1)  # more than are stored: they are repeated
-    session.close()
-
-
-@pytest.mark.parametrize(("steps", "count"), [(24, 0), (48, 1)])
-def test_saturation_is_measured_after_warmup(steps, count, small, tmp_path):
-    listener = MessageListener()
-    settings = small(method="dense", algorithm="td3", seeds=1, steps=steps, evaluate_every=24, td3={"warmup": 24})
-    run = train_quietly(toy_spec(), settings, tmp_path / "run", listeners=[listener])
-    assert (run.metrics()[-1].get(ACTOR_SATURATION) is not None) == bool(count)
 
 
 @pytest.mark.parametrize(

@@ -1,11 +1,13 @@
 """Collecting from environments on the host: steps, restored episodes, evaluations, and faults with their place."""
 
+import itertools
 from functools import partial
 
 import gymnasium
+import jax
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from helpers.toy_envs import toy_spec
@@ -32,10 +34,28 @@ gymnasium.register("toys/Wrapped-v0", entry_point=Wrapped, max_episode_steps=20,
 WRAPPED = toy_spec(environment="toys/Wrapped-v0")
 
 
+class Countdown(gymnasium.Wrapper):
+    """Episodes terminate after the next of some numbers of steps. Every reward is 1."""
+
+    def __init__(self, env, lengths):
+        super().__init__(env)
+        self.lengths = lengths
+
+    def reset(self, *, seed=None, options=None):
+        self.steps_left = next(self.lengths)
+        return self.env.reset(seed=seed)
+
+    def step(self, action):
+        assert self.steps_left > 0, "stepped after the end"
+        self.steps_left -= 1
+        observation, _, _, truncated, _ = self.env.step(action)
+        return observation, 1.0, self.steps_left == 0, truncated, {"left": self.steps_left}
+
+
 @pytest.fixture
 def wrap(monkeypatch):
     """Choose the wrapper of toys/Wrapped-v0."""
-    return lambda wrapper: monkeypatch.setattr(Wrapped, "wrap", staticmethod(wrapper))
+    return lambda wrapper, **options: monkeypatch.setattr(Wrapped, "wrap", staticmethod(partial(wrapper, **options)))
 
 
 def local_envs(count, task=None):
@@ -72,6 +92,7 @@ def test_to_env_action_scales():
 
 
 @pytest.mark.parametrize("dtype", [np.float32, np.float64])
+@settings(max_examples=30, deadline=None)
 @given(low=st.lists(st.floats(-1e3, 1e3, width=32), min_size=1, max_size=3), width=st.floats(0.125, 1e3, width=32))
 def test_to_env_action_stays_in_space(dtype, low, width):
     """Rounding could lead beyond a bound."""
@@ -96,8 +117,8 @@ def test_episode_seeds_of_streams_differ():
     assert len(seeds) == 3 * len(Stream) * 20
 
 
-@pytest.mark.parametrize("n_envs", [1, 3])
-def test_collect_steps_are_consecutive(n_envs):
+def test_collect_steps_are_consecutive():
+    n_envs = 3
     steps = collect(make_envs(n_envs=n_envs), 45)
     assert steps.timestep.observation.shape == (2, 45, n_envs, 1, 2)
     inside = ~steps.ended[:, :-1]
@@ -123,39 +144,26 @@ def test_collect_tells_policy_episode_starts():
     starts, envs = [], make_envs((0,), 2)
 
     def policy(timestep, noise, episode_start):
-        starts.append(episode_start.ravel().tolist())
+        starts.append(episode_start.all() + 2 * episode_start.any())
         return noise
 
     for n_steps in (21, 20):
         envs.collect(policy, np.zeros((n_steps, *envs.shape, 1, 1), np.float32))
-    assert [t for t, start in enumerate(starts) if start == [True, True]] == [0, 20, 40]
-    assert starts.count([False, False]) == 38
+    assert np.flatnonzero(np.array(starts) == 3).tolist() == [0, 20, 40]
+    assert starts.count(0) == 38
 
 
 def test_collect_result_is_not_overwritten():
     envs = make_envs()
-    first = collect(envs, 7)
-    copies = [array.copy() for array in (first.timestep.observation, first.next_timestep.observation, first.env_action)]
+    steps = collect(envs, 7)
+    copies = jax.tree.map(np.copy, steps)
     collect(envs, 30, noise=0.1)
-    for array, copy in zip(
-        (first.timestep.observation, first.next_timestep.observation, first.env_action), copies, strict=True
-    ):
-        np.testing.assert_array_equal(array, copy)
+    jax.tree.map(np.testing.assert_array_equal, steps, copies)
 
 
 @pytest.mark.parametrize(("limit", "ends", "terminated"), [(5, [4, 9, 14, 19], []), (9, [6, 13], [6, 13])])
 def test_collect_distinguishes_termination(limit, ends, terminated, wrap):
-    class TerminatesAt7(gymnasium.Wrapper):
-        def step(self, action):
-            observation, reward, _, truncated, info = self.env.step(action)
-            self.steps += 1
-            return observation, reward, self.steps == 7, truncated, info
-
-        def reset(self, **options):
-            self.steps = 0
-            return self.env.reset(**options)
-
-    wrap(TerminatesAt7)
+    wrap(Countdown, lengths=itertools.repeat(7))
     steps = collect(make_envs((0,), task=WRAPPED.model_copy(update={"max_episode_steps": limit})), 20)
     np.testing.assert_array_equal(np.flatnonzero(steps.ended[0]), ends)
     np.testing.assert_array_equal(np.flatnonzero(steps.next_timestep.terminated[0]), terminated)
@@ -184,12 +192,21 @@ def test_collect_copies_reused_observation(wrap):
     assert (state["observation0"] == 3).all()
 
 
-def test_worker_processes_collect_the_same():
+def test_worker_processes_collect_and_restore_the_same():
     make_env = partial(make_host_env, toy_spec(environment="helpers.toy_envs:toys/Chase-v0"))
-    with SubprocVecEnv([make_env] * 4) as workers:
-        envs = HostVecEnv(workers, (0, 1), 2)
+    with SubprocVecEnv([make_env] * 2) as workers:
+        envs, expected = HostVecEnv(workers, (0,), 2), make_envs((0,), 2)
         envs.reset()
-        steps, expected = collect(envs, 25), collect(make_envs((0, 1), 2), 25)
+        assert_equal_steps(collect(envs, 25), collect(expected, 25))
+        state = envs.state_dict()
+        continued = collect(expected, 25)
+        collect(envs, 5)
+        dropped, _ = envs.restore(state)
+        assert not dropped.any()
+        assert_equal_steps(collect(envs, 25), continued)
+
+
+def assert_equal_steps(steps, expected):
     for name in ("timestep", "next_timestep"):
         for array, other in zip(getattr(steps, name)[:-1], getattr(expected, name)[:-1], strict=True):
             np.testing.assert_array_equal(array, other)
@@ -198,15 +215,12 @@ def test_worker_processes_collect_the_same():
 # Restored episodes.
 
 
-@pytest.mark.parametrize("n_envs", [1, 2])
-def test_restore_continues_episodes(n_envs):
-    envs, restored = make_envs(n_envs=n_envs), make_envs(n_envs=n_envs)
+def test_restore_continues_episodes():
+    envs, restored = make_envs(n_envs=2), make_envs(n_envs=2)
     collect(envs, 27)
     dropped, messages = restored.restore(envs.state_dict())
     assert (dropped.any(), messages) == (False, [])
-    steps, expected = collect(restored, 25), collect(envs, 25)
-    np.testing.assert_array_equal(steps.timestep.observation, expected.timestep.observation)
-    np.testing.assert_array_equal(steps.next_timestep.observation, expected.next_timestep.observation)
+    assert_equal_steps(collect(restored, 25), collect(envs, 25))
 
 
 def test_restore_drops_only_other_observations():
@@ -222,19 +236,7 @@ def test_restore_drops_only_other_observations():
 
 
 def test_restore_drops_episode_that_ends_early(wrap):
-    lengths = iter((9, 2, 9))
-
-    class Chancy(gymnasium.Wrapper):
-        def reset(self, *, seed=None, options=None):
-            self.steps_left = next(lengths)
-            return np.zeros(2, np.float32), self.env.reset()[1]
-
-        def step(self, action):
-            assert self.steps_left, "stepped after the end"
-            self.steps_left -= 1
-            return np.zeros(2, np.float32), 0.0, not self.steps_left, False, {}
-
-    wrap(Chancy)
+    wrap(Countdown, lengths=iter((9, 2, 9)))
     envs = make_envs((0,), task=WRAPPED)
     collect(envs, 5)
     dropped, _ = envs.restore(envs.state_dict())
@@ -269,20 +271,7 @@ def test_evaluate_initial_states_and_returns():
 
 
 def test_evaluate_episodes_of_different_lengths(wrap):
-    class Countdown(gymnasium.Wrapper):
-        lengths = iter((3, 1, 7) * 2)
-
-        def reset(self, *, seed=None, options=None):
-            self.steps_left = next(self.lengths)
-            return self.env.reset(seed=seed)
-
-        def step(self, action):
-            assert self.steps_left > 0, "stepped after the end"
-            self.steps_left -= 1
-            observation, *_ = self.env.step(action)
-            return observation, 1.0, self.steps_left == 0, False, {"left": self.steps_left}
-
-    wrap(Countdown)
+    wrap(Countdown, lengths=iter((3, 1, 7) * 2))
     envs = local_envs(3, WRAPPED.model_copy(update={"measures": ("left",)}))
     evaluation = evaluate_on_host(envs, proportional(0.0), [0], 3)
     np.testing.assert_array_equal(evaluation.returns[..., 0], [[3, 1, 7]])
@@ -327,26 +316,25 @@ class BadOutput(gymnasium.Wrapper):
 BAD_OBSERVATIONS = [(np.array([0.0, np.nan]), "nan"), (np.zeros(3), r"\(3,\)"), (None, r"\(\)"), ("left", "'left'")]
 
 
-@pytest.mark.parametrize(("n_envs", "where"), [(1, "seed 4"), (2, "seed 4 in environment 0")])
 @pytest.mark.parametrize(("value", "text"), BAD_OBSERVATIONS)
-def test_collect_locates_bad_observation(value, text, n_envs, where, wrap):
-    wrap(partial(BadOutput, value=value))
-    with pytest.raises(EnvOutputError, match=f"observation.*{text}.*, at step 3 of episode 0 of {where}$"):
-        collect(make_envs((4,), n_envs, task=WRAPPED), 20)
+def test_collect_locates_bad_observation(value, text, wrap):
+    wrap(BadOutput, value=value)
+    with pytest.raises(EnvOutputError, match=f"observation.*{text}.*, at step 3 of episode 0 of seed 4$"):
+        collect(make_envs((4,), task=WRAPPED), 20)
 
 
 def test_collect_locates_bad_reward(wrap):
     """In the second episode of the second environment of seed 9, which is the seed's episode number 3."""
     seed = episode_seed(9, Stream.TRAINING_EPISODES, 3)
-    wrap(partial(BadOutput, value=float("nan"), seeds={seed}, reward=True))
+    wrap(BadOutput, value=float("nan"), seeds={seed}, reward=True)
     with pytest.raises(EnvOutputError, match=r"reward.*nan.*, at step 3 of episode 1 of seed 9 in environment 1$"):
         collect(make_envs((4, 9), 2, task=WRAPPED), 40)
 
 
-@pytest.mark.parametrize(("value", "text"), [*BAD_OBSERVATIONS, (float("nan"), "nan")])
+@pytest.mark.parametrize(("value", "text"), [BAD_OBSERVATIONS[1], (float("nan"), "nan")])
 def test_evaluate_locates_bad_output(value, text, wrap):
     seed = episode_seed(1, Stream.EVALUATION_EPISODES, 2)
-    wrap(partial(BadOutput, value=value, seeds={seed}, reward=isinstance(value, float)))
+    wrap(BadOutput, value=value, seeds={seed}, reward=isinstance(value, float))
     envs = local_envs(4, WRAPPED)
     evaluate_on_host(envs, proportional(0.0), (0, 1), 2)
     with pytest.raises(EnvOutputError, match=f"{text}.*, in an evaluation of seed 1$"):

@@ -11,8 +11,8 @@ import pytest
 from helpers.long_tests import long_case
 from helpers.small_configs import (
     LENGTHS,
+    ONE_AGENT,
     ONE_TEAM,
-    TWO_TEAMS,
     add_steps,
     jitted,
     learner_with_episodes,
@@ -29,7 +29,6 @@ from lare_rl.credit.score_type import ScoreTypeEstimate
 from lare_rl.data import replay
 from lare_rl.training import episodes
 from lare_rl.training.decoder_inputs import decoder_inputs
-from lare_rl.training.episodes import learn_returns
 from lare_rl.training.rewards import rewards
 
 LONG = LENGTHS * 8
@@ -60,17 +59,14 @@ to_float64 = jax.jit(closed_form.to_float64)
 
 def statistics_of_decoder(learner):
     with jax.enable_x64(True):
-        return jax.tree.map(np.asarray, to_float64(learner.credit[0].closed_form.sufficient_statistics))
+        return jax.tree.map(np.asarray, to_float64(learner.decoders[0].closed_form.sufficient_statistics))
 
 
 def statistics_from_scratch(learner, config):
     """Return sums over all stored episodes, of features standardised as the learner's are."""
-    decoder = learner.credit[0]
-    empty = decoder._replace(
-        closed_form=decoder.closed_form._replace(
-            sufficient_statistics=jax.tree.map(jnp.zeros_like, decoder.closed_form.sufficient_statistics)
-        )
-    )
+    decoder = learner.decoders[0]
+    zeros = jax.tree.map(jnp.zeros_like, decoder.closed_form.sufficient_statistics)
+    empty = decoder._replace(closed_form=decoder.closed_form._replace(sufficient_statistics=zeros))
     with jax.enable_x64(True):
         rebuilt = jitted(add_all, config)((empty,), learner.replay)
         return to_float64(rebuilt[0].closed_form.sufficient_statistics)
@@ -81,19 +77,22 @@ def add_all(decoders, buffer, config):
 
 
 @pytest.mark.parametrize(
-    "env", [pytest.param(None, marks=pytest.mark.long, id="one"), pytest.param(ONE_TEAM, id="many")]
+    ("method", "algorithm", "env"),
+    [
+        ("lare-bayes", "ippo", ONE_TEAM),
+        long_case("lare-bayes", "td3", ONE_AGENT),
+        long_case("rd-linear", "td3", ONE_AGENT),
+    ],
 )
-@pytest.mark.parametrize("method", ["lare-bayes", long_case("rd-linear")])
-def test_learn_returns_keeps_the_statistics_from_scratch(method, env):
-    config = small_config(method, capacity=1000) if env is None else small_config(method, "ippo", env, capacity=1000)
-    steps = with_growing_observations(random_steps(config.env, lengths=LONG), 100)
+def test_learn_returns_keeps_the_statistics_from_scratch(method, algorithm, env):
+    config = small_config(method, algorithm, env, capacity=1000)
+    steps = with_growing_observations(random_steps(env, lengths=LONG), 100)
     n_steps = set()
     for learner in learn_in_chunks(config, steps, random_factors(config, steps), 40):
-        closed = learner.credit[0].closed_form
+        closed = learner.decoders[0].closed_form
         n_steps.add(float(closed.n_steps))
-        assert (
-            float(closed.n_steps) >= float(learner.credit[0].statistics.n_rows) / closed_form.STATISTICS_GROWTH - 3 * 12
-        )
+        least = float(learner.decoders[0].statistics.n_rows) / closed_form.STATISTICS_GROWTH - 3 * 12
+        assert float(closed.n_steps) >= least
         for a, b in zip(statistics_of_decoder(learner), statistics_from_scratch(learner, config), strict=True):
             np.testing.assert_allclose(a, b, rtol=1e-5, atol=1e-5)  # features are of float32
     assert float(statistics_of_decoder(learner).n_episodes) == len(LONG)
@@ -103,14 +102,14 @@ def test_learn_returns_keeps_the_statistics_from_scratch(method, env):
 def test_rebuild_statistics_standardises_by_the_newest_statistics():
     config = small_config("rd-linear")
     learner = learner_with_episodes(config)
-    statistics = learner.credit[0].statistics
-    credit = (learner.credit[0]._replace(statistics=statistics._replace(mean=statistics.mean + 1)),)
+    statistics = learner.decoders[0].statistics
+    credit = (learner.decoders[0]._replace(statistics=statistics._replace(mean=statistics.mean + 1)),)
     with jax.enable_x64(True):
-        rebuilt = jax.jit(partial(episodes._rebuild_statistics, config=config))(credit, learner.replay, jnp.array(True))
-        same = jax.jit(partial(episodes._rebuild_statistics, config=config))(credit, learner.replay, jnp.array(False))
+        rebuild = jax.jit(partial(episodes._rebuild_statistics, config=config))
+        rebuilt, same = (rebuild(credit, learner.replay, jnp.array(is_stale)) for is_stale in (True, False))
     np.testing.assert_allclose(rebuilt[0].closed_form.decoder.mean, statistics.mean + 1)
     shift = np.asarray(1 / rebuilt[0].closed_form.decoder.std)
-    before, after = map(statistics_of_decoder, (learner, learner._replace(credit=rebuilt)))
+    before, after = map(statistics_of_decoder, (learner, learner._replace(decoders=rebuilt)))
     np.testing.assert_allclose(after.mean[:-2], before.mean[:-2] - shift, atol=1e-5)
     for a, b in zip(jax.tree.leaves(same), jax.tree.leaves(credit), strict=True):
         np.testing.assert_array_equal(a, b)
@@ -130,7 +129,7 @@ def inputs_from(buffer, start, config):
     return decoder_inputs(replay.read(buffer, replay.Index(jnp.zeros_like(number), number)), config, 0)
 
 
-@pytest.mark.parametrize("method", [long_case("lare-linear"), "lare-rd", "bayes", "lare-signs"])
+@pytest.mark.parametrize("method", ["lare-linear", *map(long_case, ("bayes", "lare-rd", "lare-signs"))])
 def test_learn_returns_predicts_first(method):
     # The first episodes are not predicted, because nothing is fitted yet. Gradient updates are not made here at all.
     config, lengths = small_config(method, capacity=1000), (5, 12) * 3
@@ -139,9 +138,9 @@ def test_learn_returns_predicts_first(method):
     ends, learner, predictions = np.cumsum(lengths), untrained_learner(config), []
     for start, end in zip([0, *ends], ends, strict=False):
         rows = jax.tree.map(lambda leaf, start=start, end=end: leaf[start:end], steps)
-        before = learner.credit[0]
+        before = learner.decoders[0]
         learner = add_steps(learner, config, rows, factors[start:end], learn=True)
-        after = learner.credit[0].predictions
+        after = learner.decoders[0].predictions
         if int(after.n_episodes) > int(before.predictions.n_episodes):
             i = int(after.n_episodes) - 1
             inputs = jitted(inputs_from, config)(learner.replay, start)[: end - start]
@@ -167,50 +166,33 @@ def scored_episodes(learner_config, score, count=60, seed=0):
     for start, end in zip([0, *ends], ends, strict=False):
         total = step_score[start:end].sum()
         reward[end - 1, 0, 0] = total if score == "sum" else total / (end - start)
-    return (
-        steps._replace(next_timestep=steps.next_timestep._replace(reward=reward)),
-        factors,
-        step_score,
-        np.array(lengths),
-    )
+    steps = steps._replace(next_timestep=steps.next_timestep._replace(reward=reward))
+    return steps, factors, step_score, np.array(lengths)
 
 
-@pytest.mark.parametrize("method", [long_case("lare-linear"), "lare-bayes", "lare-rd"])
+@pytest.mark.parametrize("method", [*map(long_case, ("lare-linear", "lare-bayes")), "lare-rd"])
 @pytest.mark.parametrize("score", ["sum", "average"])
 def test_learn_returns_finds_the_score_type(method, score):
     config = small_config(method, capacity=2000)
     steps, factors, _, _ = scored_episodes(config, score)
     *_, last = learn_in_chunks(config, steps, factors, 6)
-    assert bool(last.credit[0].is_mean) == (score == "average")
-    assert returns.estimate_score_type(untrained_learner(config).credit[0]) is None
-    assert returns.estimate_score_type(last.credit[0]) == ScoreTypeEstimate(score == "average", is_certain=True)
-    assert (
-        returns.estimate_score_type(
-            untrained_learner(small_config(method, credit=CreditSettings(score=score))).credit[0]
-        )
-        is None
-    )
+    assert bool(last.decoders[0].is_mean) == (score == "average")
+    assert returns.estimate_score_type(last.decoders[0]) == ScoreTypeEstimate(score == "average", is_certain=True)
+    fixed = small_config(method, credit=CreditSettings(score=score))
+    for untrained in (config, fixed):
+        assert returns.estimate_score_type(untrained_learner(untrained).decoders[0]) is None
 
 
 @pytest.mark.parametrize(
-    ("average", "errors", "decided"),
+    ("score", "setting"),
     [
-        (True, (1.0, 0.9), True),
-        (False, (0.9, 1.0), True),
-        (False, (1.0, 0.97), False),
-        (False, (0.97, 1.0), False),
-        (True, (0.9, 1.0), False),  # the last returns show another type than those before the last fit
-        (False, (1.0, 1.0), None),
+        ("sum", "auto"),
+        ("average", "auto"),
+        ("average", "sum"),
+        long_case("sum", "sum"),
+        long_case("average", "average"),
     ],
 )
-def test_estimate_score_type_is_decided_by_errors(average, errors, decided, monkeypatch):
-    monkeypatch.setattr(returns, "_score_type_errors", lambda _: np.array(errors))
-    state = untrained_learner(small_config("lare-linear")).credit[0]._replace(is_mean=np.array(average))
-    assert returns.estimate_score_type(state) == (None if decided is None else ScoreTypeEstimate(average, decided))
-
-
-@pytest.mark.parametrize("setting", ["auto", "sum", "average"])
-@pytest.mark.parametrize("score", ["sum", "average"])
 def test_proxy_rewards_of_the_right_score_type_add_up_to_the_return(score, setting):
     config = small_config("lare-linear", capacity=2000, credit=CreditSettings(score=setting))
     steps, factors, step_score, lengths = scored_episodes(config, score)
@@ -232,27 +214,6 @@ def test_score_types_that_are_fitted():
     assert small_config("lare-linear", env=fixed).score_types == (0,)
     assert small_config("lare-linear", credit=CreditSettings(score="average")).score_types == (1,)
     assert small_config("lare-signs").score_types == small_config("dense").score_types == (0,)
-
-
-@pytest.mark.long
-@pytest.mark.parametrize("method", ["lare-bayes", "lare-rd"])
-def test_learn_returns_of_seeds_in_lockstep(method):
-    config = small_config(method, "ippo", TWO_TEAMS, n_envs=2, capacity=400)
-    learners, n_learned = [], []
-    for seed, lengths in enumerate((LENGTHS * 3, (12, 12, 12, 5) * 3)):
-        steps = random_steps(TWO_TEAMS, 2, seed, lengths)
-        learners.append(add_steps(untrained_learner(config, seed), config, steps, learn=True))
-        n_learned.append(learners[-1].n_learned.tolist())
-    fresh = [learner._replace(n_learned=0 * learner.n_learned) for learner in learners]
-    together = jax.tree.map(lambda *leaves: jnp.stack(leaves), *[(x.credit, x.replay, x.n_learned) for x in fresh])
-    with jax.enable_x64(True):
-        learn = jitted(learn_returns, config)
-        decoders, n_together = learn(*together)
-        alone = [learn(*jax.tree.map(lambda leaf: leaf[None], (x.credit, x.replay, x.n_learned))) for x in fresh]
-    assert n_together.tolist() == n_learned
-    for i, (single, _) in enumerate(alone):
-        for a, b in zip(jax.tree.leaves(decoders), jax.tree.leaves(single), strict=True):
-            np.testing.assert_allclose(np.asarray(a)[i], np.asarray(b)[0], rtol=1e-2, atol=1e-3)
 
 
 def test_learn_returns_waits_for_enough_short_episodes():

@@ -1,41 +1,48 @@
 """Whole runs of many agents: particle tasks, teams, a toy whose agents leave."""
 
+from dataclasses import replace
+
+import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
 import lare_rl
+from helpers.jax_toy_envs import Echo
 from helpers.long_tests import long_case
-from helpers.training_runs import train_quietly
+from helpers.small_configs import random_steps, small_config
+from helpers.training_runs import ECHO_PHI, train_quietly
+from lare_rl.config.resolve import resolve
 from lare_rl.envs.particles.catalogue import TASKS
-from lare_rl.envs.particles.task import MAX_STEPS
 from lare_rl.errors import LareError
 from lare_rl.latent.function import verify_function
-from lare_rl.runs.directory import open_run
+from lare_rl.runs.directory import create_run, open_run
+from lare_rl.training.factors import compute_factors
+from lare_rl.training.latent_functions import choose_functions
 from lare_rl.training.saved_state import load_learner
-from lare_rl.training.session import start_session
-
-SMALLEST_TASK = "TriangleArea"
-
-ECHO_PHI = "def evaluation_func(o, a):\n    return [np.sum(o[:, :3] * a, axis=1, keepdims=True), o[:, 3:4]]\n"
+from lare_rl.training.session import restore_session
 
 
-def test_decoders_are_fitted_before_first_update(small_many, tmp_path):
-    settings = small_many(method="rd", seeds=1, environments=2, fit_every=2, fit_updates=1)
-    session = start_session(train_quietly(SMALLEST_TASK, settings, tmp_path / "run"))
-    functions, fit_steps, train_steps = session.functions, [], []
+def test_advance_fits_decoders_before_the_update(echo_run):
+    config = echo_run.config
+    settings = config.settings.model_copy(update={"fit_every": 2})
+    session, _ = restore_session(replace(echo_run, config=config.model_copy(update={"settings": settings})))
+    calls = []
 
-    def fit(*arguments):
-        fit_steps.append(session.step)
-        return functions.fit(*arguments)
+    def fit(learner, keys):
+        calls.append(("fit", session.step))
+        return learner, {"credit/loss": jnp.zeros(2)}
 
-    def train_step(*arguments):
-        train_steps.append(arguments[-1])
-        return functions.train_step(*arguments)
+    def train_step(learner, steps, keys, step):
+        calls.append(("train", step))
+        return learner, {}
 
-    session.functions = functions._replace(fit=fit, train_step=train_step)
-    for _ in range(4):
+    session.functions = session.functions._replace(fit=fit, train_step=train_step)
+    for _ in range(3):
         session.advance()
-    assert (fit_steps, train_steps) == ([0, 100], [0, 50, 100, 150])
+    session.close()
+    assert calls == [("fit", 80), ("train", 80), ("train", 100), ("fit", 120), ("train", 120)]
+    assert "credit/loss" in session.latest_metrics
 
 
 @pytest.mark.long
@@ -56,56 +63,46 @@ def test_particle_task_trains_with_recorded_functions(task, small_many, tmp_path
     ]
 
 
-def test_return_is_mean_over_agents(small_many, tmp_path):
-    run = train_quietly(SMALLEST_TASK, small_many(method="dense", steps=100), tmp_path / "run")
-    for line in run.metrics():
-        assert line["evaluation/summed_return"] == pytest.approx(3 * line["evaluation/return"], rel=1e-4)
-        assert line["evaluation/length"] == MAX_STEPS
+def test_stored_factors_follow_judges(echo_run):
+    """A row has the factors of the observations before and after a step: the second factor is the time, 0 after an
+    agent left."""
+    config, learner, _, _ = load_learner(echo_run)
+    assert config.n_factors == (4,)
+    alive, factors = (np.asarray(learner.replay.columns[name])[0, :, :10] for name in ("alive", "factors"))
+    time_before, time_after = 6 * factors[..., 1], 6 * factors[..., 3]
+    goes_on = alive[:, 1:] & alive[:, :-1] & np.isclose(time_before[:, 1:], 1 + time_before[:, :-1])
+    assert goes_on.mean() > 0.3
+    np.testing.assert_allclose(time_after[:, :-1][goes_on], time_before[:, 1:][goes_on], atol=1e-5)
 
 
-@pytest.mark.parametrize("judges", [long_case("before"), "both"])
-def test_stored_factors_follow_judges(judges, small_many, tmp_path):
-    run = train_quietly(SMALLEST_TASK, small_many(judges=judges, steps=100), tmp_path / "run")
-    config, learner, _, _ = load_learner(run)
-    size = run.functions[0].size
-    assert config.n_factors == ((2 if judges == "both" else 1) * size,)
-    factors = np.asarray(learner.replay.columns["factors"])[0, :, :MAX_STEPS]
-    assert factors.shape == (4, MAX_STEPS, 3, config.n_factors[0])
-    assert factors.std() > 0
-    if judges == "both":  # after one step is before the next, for the factors that read the state alone
-        before, after = factors[..., :size], factors[..., size:]
-        assert np.isclose(before[:, 1:], after[:, :-1], atol=1e-5).all(axis=(0, 1, 2)).any()
-
-
-def test_one_function_per_team(small_many, tmp_path):
+def test_create_run_with_one_function_per_team(tmp_path):
     task = lare_rl.load_task("CompetitivePP-6")
+    settings = resolve(lare_rl.Settings(method="lare-rd"), task)
     functions = [lare_rl.design(role, draw=1) for role in task.roles]
-    run = train_quietly(task, small_many(steps=100), tmp_path / "run", functions)
-    assert [function.digest for function in run.functions] == [function.digest for function in functions]
+    assert choose_functions(task, settings, functions) == tuple(functions)
+    run = create_run(tmp_path / "run", task, settings, functions)
+    assert [function.digest for function in open_run(run.directory).functions] == [
+        function.digest for function in functions
+    ]
     with pytest.raises(LareError, match="CompetitivePP-6-predator, CompetitivePP-6-prey; 1 "):
-        train_quietly(task, small_many(), tmp_path / "other", functions[0])
+        choose_functions(task, settings, functions[0])
     predator, prey = (run.directory / f"latent_function_{team}.py" for team in ("predator", "prey"))
     predator.write_bytes(prey.read_bytes())
     with pytest.raises(LareError, match=r"latent_function_predator.py is not the function"):
         open_run(run.directory)
 
 
-@pytest.mark.long
-def test_factors_of_state(small_many, echo, tmp_path):
+def test_compute_factors_of_state(echo):
     """One row in each step: the global state, and all actions concatenated."""
     task = echo.model_copy(update={"judged_from": "state", "observation_size": 9, "action_size": 9})
     source = "def evaluation_func(s, a):\n    return [np.sum(s * a, axis=1, keepdims=True), s[:, 0:1]]\n"
-    settings = small_many(algorithm="qmix", method="lare-rd", steps=100, judges="before")
-    run = train_quietly(task, settings, tmp_path / "run", verify_function(source, task))
-    replay = load_learner(run).learner.replay
-    assert replay.columns["factors"].shape[-2:] == (1, 2)
-    seed, env = np.indices(replay.transitions.shape)
-    newest = np.asarray(replay.row)[seed, env, np.asarray(replay.transitions) - 1]
-    for index in np.ndindex(newest.shape):
-        row = (*index, newest[index] % replay.row.shape[-1])
-        state, action, z = (np.asarray(replay.columns[name])[row] for name in ("state", "action", "factors"))
-        np.testing.assert_allclose(z[0], [state @ action.ravel(), state[0]], rtol=1e-5)
-    assert run.metrics()[-1]["credit/error"] is not None
+    graph, steps = verify_function(source, task).graph, random_steps(Echo.spec)
+    for judges in ("before", "after"):
+        config = small_config("lare-rd", "qmix", Echo.spec, credit_scope="state", factor_inputs=judges)
+        state = (steps.timestep if judges == "before" else steps.next_timestep).state
+        expected = np.stack([(state * steps.action.reshape(state.shape)).sum(axis=-1), state[..., 0]], axis=-1)
+        factors = compute_factors([graph], jax.tree.map(jnp.asarray, steps), config)
+        np.testing.assert_allclose(factors[..., 0, :], expected, rtol=1e-5, atol=1e-6)
 
 
 @pytest.mark.parametrize(
@@ -124,7 +121,7 @@ def test_many_agents_learn_echo(algorithm, method, echo, tmp_path):
         evaluation_episodes=50,
         qmix={**small, "update_every": 4, "target_every": 40, "gamma": 0.5},
         ippo={"hidden": (32,), "learning_rate": 5e-3, "gamma": 0.5, "epochs": 5, "minibatch_size": 120},
-        credit={"hidden": (32,), "learning_rate": 3e-3, "steps": 100, "drawn_steps": 4},
+        credit={"hidden": (32,), "learning_rate": 3e-3, "steps": 100, "drawn_steps": 4, "score": "sum"},
     )
     function = None if method == "dense" else verify_function(ECHO_PHI, echo)
     line = train_quietly(echo, settings, tmp_path / "run", function).metrics()[-1]

@@ -9,6 +9,7 @@ import pytest
 
 from helpers.small_configs import (
     ONE_AGENT,
+    SUM_CREDIT,
     add_steps,
     jitted,
     learner_with_episodes,
@@ -36,7 +37,7 @@ def test_train_step_relabels_by_the_newest_decoder():
     sample = off_policy._sample(learner.replay, sample_key, 1, config)
     steps, losses = read(learner.replay, jax.tree.map(lambda leaf: leaf[0], sample.batch)), []
     update = jax.jit(partial(td3.update, settings=config.hyperparameters))
-    for decoders in (learner.credit, updated.credit):
+    for decoders in (learner.decoders, updated.decoders):
         reward = jitted(rewards, config)(steps, RewardState(decoders, learner.scale))
         _, key = jax.random.split(jax.random.split(noise_key, 1)[0])
         _, update_metrics = update(learner.algorithm, off_policy._transitions(steps, reward), key, jnp.array(0))
@@ -45,8 +46,8 @@ def test_train_step_relabels_by_the_newest_decoder():
     assert losses[0] != pytest.approx(losses[1], rel=1e-2)
 
 
-@pytest.mark.parametrize("envs", [1, 2])
-def test_train_step_updates_once_for_each_step(envs, monkeypatch):
+def test_train_step_updates_once_for_each_step(monkeypatch):
+    envs = 2
     config, steps, batches = small_config("dense", rollout_steps=3, n_envs=envs), random_steps(envs=envs), []
     steps.next_timestep.terminated[tuple(np.argwhere(steps.ended)[::2].T)] = True
     learner, td3_update = add_steps(untrained_learner(config), config, steps), td3.update
@@ -86,7 +87,7 @@ def test_scale_rewards_divides_by_the_scale_of_returns():
 
 
 def test_train_step_of_seeds_in_lockstep():
-    config = small_config("lare-rrdu")
+    config = small_config("lare-rrdu", credit=SUM_CREDIT)
     functions = compile_functions(config)
     keys = jax.vmap(jax.random.key)(jnp.arange(3))
     start, steps = functions.init(keys), random_steps()

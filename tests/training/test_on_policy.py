@@ -14,6 +14,7 @@ from helpers.small_configs import (
     ONE_AGENT,
     ONE_TEAM,
     SMALL_SETTINGS,
+    SUM_CREDIT,
     TOTAL,
     TWO_TEAMS,
     add_steps,
@@ -47,7 +48,7 @@ def store_and_roll_out(config, steps, factors=None):
     return learner, jitted(on_policy._rollout, config)(learner, newest(steps))
 
 
-@pytest.mark.parametrize("method", ["dense", "episodic", "lare-rrdu"])
+@pytest.mark.parametrize("method", [*map(long_case, ("dense", "episodic")), "lare-rrdu"])
 def test_rollout_has_the_newest_steps_with_the_rewards_of_the_method(method):
     config, steps = ppo_config(method), random_steps()
     learner, rollout = store_and_roll_out(config, steps)
@@ -64,26 +65,21 @@ def test_rollout_has_the_newest_steps_with_the_rewards_of_the_method(method):
     assert rollout.mask is rollout.available is None
 
 
-def test_rollout_tells_termination_from_truncation():
-    config, steps = ppo_config("dense"), random_steps()
+@pytest.mark.parametrize(("gamma", "n_rows"), [(0.9, TOTAL), (1.0, TOTAL), (0.9, TOTAL - 3)])
+def test_rollout_tells_termination_from_truncation(gamma, n_rows):
+    """Without a discount, an episode also terminates at its time limit."""
+    steps = random_steps()
     steps.next_timestep.terminated[-1] = True  # the episode before is truncated
-    _, rollout = store_and_roll_out(config, steps)
-    assert rollout.done.sum() == 2
-    np.testing.assert_array_equal(rollout.terminated[:, 0], [0.0] * 19 + [1.0])
-
-
-def test_rollout_without_discount_terminates_at_a_time_limit():
-    undiscounted = SMALL_SETTINGS["ppo"].model_copy(update={"gamma": 1.0})
-    _, rollout = store_and_roll_out(ppo_config("dense", hyperparameters=undiscounted), random_steps())
-    assert rollout.done.sum() == 2
-    np.testing.assert_array_equal(rollout.terminated, rollout.done)
-
-
-def test_rollout_of_a_running_episode():
-    steps = jax.tree.map(lambda rows: rows[:-3], random_steps())
-    _, rollout = store_and_roll_out(ppo_config("dense"), steps)
+    steps, settings = (
+        jax.tree.map(lambda rows: rows[:n_rows], steps),
+        SMALL_SETTINGS["ppo"].model_copy(update={"gamma": gamma}),
+    )
+    _, rollout = store_and_roll_out(ppo_config("dense", hyperparameters=settings), steps)
     np.testing.assert_array_equal(rollout.done, steps.ended[-20:])
-    assert not rollout.done[-1, 0]
+    assert rollout.done.sum() == 2
+    assert bool(rollout.done[-1, 0]) == (n_rows == TOTAL)
+    expected = rollout.done if gamma == 1 else steps.next_timestep.terminated[-20:].astype(np.float32)
+    np.testing.assert_array_equal(rollout.terminated, expected)
 
 
 def test_train_step_hands_on_the_remaining_progress(monkeypatch):
@@ -144,9 +140,9 @@ def test_act_chooses_available_actions():
 
 
 def test_policy_input_of_several_teams_has_the_agent():
-    one, several = ippo_config("dense", env=ONE_TEAM), ippo_config("dense", env=TWO_TEAMS)
+    single, several = ippo_config("dense", env=ONE_TEAM), ippo_config("dense", env=TWO_TEAMS)
     rows = jnp.zeros((2, 5, 3))
-    assert on_policy.policy_input(rows, one) is rows
+    assert on_policy.policy_input(rows, single) is rows
     one_hot = on_policy.policy_input(rows, several)[..., 3:]
     np.testing.assert_array_equal(one_hot, np.broadcast_to(np.eye(5), (2, 5, 5)))
 
@@ -202,7 +198,7 @@ def test_train_step_ignores_dead_agents():
 
 @pytest.mark.parametrize(("algorithm", "env"), [("ppo", ONE_AGENT), long_case("ippo", TWO_TEAMS)])
 def test_train_step_of_seeds_in_lockstep(algorithm, env):
-    config = small_config("lare-rd", algorithm, env, rollout_steps=TOTAL, n_envs=2)
+    config = small_config("lare-rd", algorithm, env, rollout_steps=TOTAL, n_envs=2, credit=SUM_CREDIT)
     functions = compile_functions(config)
     keys = jax.vmap(jax.random.key)(jnp.arange(3))
     start, steps = functions.init(keys), random_steps(env, 2)
@@ -211,7 +207,7 @@ def test_train_step_of_seeds_in_lockstep(algorithm, env):
     together, _ = functions.fit(functions.learn_returns(store_seeds(config)(start, *stacked)), keys)
     together, _ = functions.train_step(together, stacked[0], keys, 40)
     alone = add_steps(alone, config, steps, learn=True)
-    alone = alone._replace(credit=jax.jit(partial(fit_repeatedly, config=config))(alone, keys[1])[0])
+    alone = alone._replace(decoders=jax.jit(partial(fit_repeatedly, config=config))(alone, keys[1])[0])
     alone, _ = jax.jit(partial(on_policy._train_seed, config=config))(alone, steps, keys[1], jnp.array(40))
     for a, b in zip(jax.tree.leaves(together), jax.tree.leaves(alone), strict=True):
         np.testing.assert_allclose(np.asarray(a)[1], b, rtol=1e-3, atol=1e-4)

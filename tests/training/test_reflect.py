@@ -8,7 +8,6 @@ import pytest
 
 from helpers.scripted_model import ScriptedModel
 from helpers.toy_envs import toy_spec
-from helpers.training_runs import train_quietly
 from lare_rl.envs.play import Episode, play_episodes
 from lare_rl.errors import LareError
 from lare_rl.latent.design import design
@@ -122,12 +121,10 @@ def test_episodes_of_policy():
     assert assess(RIGHT, episodes).ranges[0] in model.requests[1][-1]["content"]
 
 
-def test_episodes_of_finished_run(small, tmp_path):
-    task = toy_spec(judges="before")
-    run = train_quietly(task, small(method="rrdu", seeds=2, steps=600), tmp_path / "run")
-    model = ScriptedModel(RIGHT)
-    assert reflect(verify_function(WRONG, task), task, model, episodes=run).source == RIGHT
-    assert assess(WRONG, stored_role_episodes(run, task), task).ranges[0] in model.requests[0][-1]["content"]
+def test_episodes_of_finished_run(learned_training):
+    (run, _), model = learned_training, ScriptedModel(RIGHT)
+    assert reflect(verify_function(WRONG, TASK), TASK, model, episodes=run).source == RIGHT
+    assert assess(WRONG, stored_role_episodes(run, TASK), TASK).ranges[0] in model.requests[0][-1]["content"]
 
 
 def test_recording_answers_again(tmp_path):

@@ -1,43 +1,45 @@
 """Metrics in Weights & Biases and MLflow, without a network."""
 
 import builtins
+from itertools import groupby
 
 import pytest
 
-from helpers.toy_envs import toy_spec
-from helpers.training_runs import train_quietly
 from lare_rl.errors import LareError
 from lare_rl.training.trackers import MLflow, WeightsAndBiases
 
 
-def numbers_by_step(run, seed):
-    """Return the metrics of a seed in metrics.jsonl."""
-    return {
-        line["step"]: {key: value for key, value in line.items() if key not in ("step", "seed") and value is not None}
-        for line in run.metrics()
-        if line["seed"] == seed
-    }
+def send_metrics(listener, run):
+    """Send the metrics of a finished run as if it trained. Return the numbers of each seed by step."""
+    listener.on_start("Chase dense", 0, 240)
+    for _, lines in groupby(run.metrics(), key=lambda line: line["step"]):
+        listener.on_evaluation(list(lines))
+    listener.on_stop()
+    numbers = {seed: {} for seed in run.seeds}
+    for line in run.metrics():
+        names = {name for name, value in line.items() if value is not None} - {"step", "seed"}
+        numbers[line["seed"]][line["step"]] = {name: line[name] for name in names}
+    return numbers
 
 
-def test_mlflow_gets_every_number(small, tmp_path, monkeypatch):
+def test_mlflow_gets_every_number(dense_run, tmp_path, monkeypatch):
     monkeypatch.setenv("MLFLOW_ALLOW_FILE_STORE", "true")
     uri = (tmp_path / "mlruns").as_uri()
-    listener = MLflow("toys", uri, {"method": "rrdu"})
-    run = train_quietly(toy_spec(), small(method="rrdu", steps=120), tmp_path / "run", listeners=[listener])
+    listener = MLflow("toys", uri, {"method": "dense"})
+    numbers = send_metrics(listener, dense_run)
     assert MLflow("toys", uri).experiment == listener.experiment
     assert sorted(listener.runs) == [0, 1]
     for seed, run_id in listener.runs.items():
-        tracked = listener.client.get_run(run_id)
-        assert (tracked.info.run_name, tracked.info.status) == (f"Chase rrdu seed {seed}", "FINISHED")
-        assert tracked.data.params == {"method": "rrdu"}
-        expected = numbers_by_step(run, seed)
+        tracked, expected = listener.client.get_run(run_id), numbers[seed]
+        assert (tracked.info.run_name, tracked.info.status) == (f"Chase dense seed {seed}", "FINISHED")
+        assert tracked.data.params == {"method": "dense"}
         assert set(tracked.data.metrics) == set().union(*expected.values())
         for key in tracked.data.metrics:
             history = {point.step: point.value for point in listener.client.get_metric_history(run_id, key)}
             assert history == {step: line[key] for step, line in expected.items() if key in line}
 
 
-def test_wandb_gets_every_number(small, tmp_path, monkeypatch):
+def test_wandb_gets_every_number(dense_run, tmp_path, monkeypatch):
     monkeypatch.setenv("WANDB_SILENT", "true")
     listener = WeightsAndBiases(project="toys", mode="offline", dir=tmp_path)
     logged, init = [], listener.init
@@ -51,10 +53,8 @@ def test_wandb_gets_every_number(small, tmp_path, monkeypatch):
         return run
 
     listener.init = init_and_record
-    run = train_quietly(toy_spec(), small(method="rrdu", steps=120), tmp_path / "run", listeners=[listener])
-    for seed in (0, 1):
-        numbers = {step: line for name, step, line in logged if name == f"Chase rrdu seed {seed}"}
-        assert numbers == numbers_by_step(run, seed)
+    for seed, numbers in send_metrics(listener, dense_run).items():
+        assert {step: line for name, step, line in logged if name == f"Chase dense seed {seed}"} == numbers
     assert len(list(tmp_path.glob("wandb/offline-run-*/*.wandb"))) == 2
 
 

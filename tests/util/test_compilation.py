@@ -12,9 +12,13 @@ from lare_rl.util.compilation import cache_variables, enable_cache
 # The first program makes JAX ask whether there is a cache. Only a program that takes a while to compile is saved.
 COMPILE = """
 import jax
-jax.jit(lambda x: x * 2)(1.0).block_until_ready()
+from jax import monitoring
 from lare_rl.util.compilation import enable_cache
+
+jax.jit(lambda x: x * 2)(1.0).block_until_ready()
 enable_cache()
+hits = []
+monitoring.register_event_listener(lambda event, **_: hits.append(event) if event.endswith("/cache_hits") else None)
 
 @jax.jit
 def slow(x):
@@ -23,6 +27,10 @@ def slow(x):
     return x
 
 slow(jax.numpy.eye(3))
+assert not hits
+jax.clear_caches()
+slow(jax.numpy.eye(3))
+assert hits
 """
 
 
@@ -59,14 +67,13 @@ def test_incomplete_programs_are_removed(tmp_path):
 def test_enable_cache_after_a_compilation(tmp_path):
     environment = {name: value for name, value in os.environ.items() if not name.startswith("JAX_")}
     environment["LARE_CACHE"] = str(tmp_path)
-    for _ in range(2):  # the second process finds the program, and adds none
-        subprocess.run([sys.executable, "-W", "error", "-c", COMPILE], check=True, env=environment)
-        assert len(list(tmp_path.glob("*/jit_slow-*-cache"))) == 1
+    subprocess.run([sys.executable, "-W", "error", "-c", COMPILE], check=True, env=environment)
+    assert len(list(tmp_path.glob("*/jit_slow-*-cache"))) == 1
 
 
 def test_enable_cache_keeps_a_chosen_cache():
     import jax
 
-    chosen = jax.config.jax_compilation_cache_dir  # that of the tests
+    chosen = jax.config.jax_compilation_cache_dir  # the cache of the tests
     enable_cache()
     assert jax.config.jax_compilation_cache_dir == chosen

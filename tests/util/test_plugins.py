@@ -1,31 +1,36 @@
 import importlib.metadata
 import sys
+import types
 
 import pytest
 
-from lare_rl.credit.methods import METHODS, find_method
 from lare_rl.errors import LareError
 from lare_rl.util.plugins import Registry, load_plugins
 
-PLUGIN = """
-from lare_rl.credit.methods import Method, register_method
-register_method(Method("from-plugin", "a plugin's method", "this test"))
-"""
+PLUGIN = "from numbers_of_the_test import NUMBERS\nNUMBERS.register('two', 2)\n"
 
 
 @pytest.fixture
-def plugin_directory(tmp_path, monkeypatch):
+def numbers():
+    registry = Registry[int]("number")
+    registry.register("one", 1)
+    return registry
+
+
+@pytest.fixture
+def plugin(tmp_path, monkeypatch, numbers):
+    """The path of a plugin that registers another number. It is not written yet."""
+    module = types.ModuleType("numbers_of_the_test")
+    module.NUMBERS = numbers
+    monkeypatch.setitem(sys.modules, module.__name__, module)
     monkeypatch.syspath_prepend(tmp_path)
-    monkeypatch.setattr(METHODS, "_values", dict(METHODS._values))
     load_plugins.cache_clear()
-    yield tmp_path
+    yield tmp_path / "my_plugin.py"
     load_plugins.cache_clear()
     sys.modules.pop("my_plugin", None)
 
 
-def test_registry():
-    numbers = Registry[int]("number")
-    numbers.register("one", 1)
+def test_registry(numbers):
     numbers.register("one", 1)
     assert (dict(numbers), numbers.find("one"), len(numbers), "two" in numbers) == ({"one": 1}, 1, 1, False)
     with pytest.raises(LareError, match="another number 'one'"):
@@ -36,30 +41,30 @@ def test_registry():
         numbers["ones"]
 
 
-def test_plugin_of_the_environment_variable(plugin_directory, monkeypatch):
-    (plugin_directory / "my_plugin.py").write_text(PLUGIN)
+def test_plugin_of_the_environment_variable(plugin, numbers, monkeypatch):
+    plugin.write_text(PLUGIN)
     monkeypatch.setenv("LARE_PLUGINS", " my_plugin, ")
-    assert find_method("rd").name == "rd"
+    assert numbers.find("one") == 1
     assert "my_plugin" not in sys.modules
-    assert find_method("from-plugin").name == "from-plugin"
-    assert "from-plugin" in list(METHODS)
+    assert numbers.find("two") == 2
+    assert list(numbers) == ["one", "two"]
 
 
-def test_plugin_of_an_installed_package(plugin_directory):
-    (plugin_directory / "my_plugin.py").write_text(PLUGIN)
-    info = plugin_directory / "my_package-1.0.dist-info"
+def test_plugin_of_an_installed_package(plugin, numbers):
+    plugin.write_text(PLUGIN)
+    info = plugin.parent / "my_package-1.0.dist-info"
     info.mkdir()
     (info / "METADATA").write_text("Metadata-Version: 2.1\nName: my-package\nVersion: 1.0\n")
     (info / "entry_points.txt").write_text("[lare_rl.plugins]\nmine = my_plugin\n")
     assert importlib.metadata.entry_points(group="lare_rl.plugins")
-    assert "from-plugin" in list(METHODS)
+    assert len(numbers) == 2
 
 
 @pytest.mark.parametrize("source", [None, "raise ValueError('two\\nlines')"])
-def test_broken_plugin(source, plugin_directory, monkeypatch):
+def test_broken_plugin(source, plugin, numbers, monkeypatch):
     if source is not None:
-        (plugin_directory / "my_plugin.py").write_text(source)
+        plugin.write_text(source)
     monkeypatch.setenv("LARE_PLUGINS", "my_plugin")
     with pytest.raises(LareError, match="'my_plugin'") as error:
-        find_method("from-plugin")
+        numbers.find("two")
     assert "\n" not in str(error.value)

@@ -22,22 +22,21 @@ def checkout(tmp_path):
     return tmp_path
 
 
-def test_commit_of_a_checkout(checkout):
-    assert code_version(checkout) == f"{lare_rl.__version__} ({git(checkout, 'rev-parse', 'HEAD')[:10]})"
-
-
-def test_changed_checkout(checkout):
+def test_code_version_of_a_checkout(checkout):
+    version = f"{lare_rl.__version__} ({git(checkout, 'rev-parse', 'HEAD')[:10]}"
+    assert code_version(checkout) == f"{version})"
     (checkout / "code.py").write_text("2\n")
-    assert code_version(checkout).endswith(", changed)")
+    code_version.cache_clear()
+    assert code_version(checkout) == f"{version}, changed)"
 
 
-def test_other_repository_around_it(checkout):
+def test_code_version_within_another_repository(checkout):
     (checkout / ".gitignore").write_text(".venv\n")
     package = checkout / ".venv" / "lare"
     package.mkdir(parents=True)
     assert code_version(package) == lare_rl.__version__
 
 
-def test_missing_git(checkout, monkeypatch):
+def test_code_version_without_git(checkout, monkeypatch):
     monkeypatch.setenv("PATH", "")
     assert code_version(checkout) == lare_rl.__version__

@@ -8,8 +8,10 @@ from lare_rl.util.renamed_fields import rename_fields
 @pytest.mark.parametrize(
     ("old", "new"),
     [
-        (".credit[0].closed.summed.episodes", ".credit[0].closed_form.sufficient_statistics.n_episodes"),
-        (".credit[0].average", ".credit[0].is_mean"),
+        (".credit[0].closed.summed.episodes", ".decoders[0].closed_form.sufficient_statistics.n_episodes"),
+        (".credit[0].average", ".decoders[0].is_mean"),
+        (".credit[0].decoder.step", ".decoders[0].decoder.position"),
+        (".algorithm.done", ".algorithm.n_due"),
         (".replay.episodes", ".replay.episodes"),
         (".algorithm.qmix.online.agent.decoder.weight", ".algorithm.qmix.online.agent.head.weight"),
         (

@@ -1,10 +1,18 @@
-"""The data that the training loop hands to an update, by what the algorithm consumes."""
+"""The data that the training loop hands to an update, by what the algorithm consumes, and the shapes that algorithms share."""
 
 from typing import NamedTuple
 
 from jaxtyping import Array, Bool, Float
 
-__all__ = ["Rollout", "Sequences", "Transitions"]
+__all__ = ["Action", "Available", "Metrics", "Observation", "Rollout", "Sequences", "Transitions", "Value"]
+
+Observation = Float[Array, "*batch observation"]
+Action = Float[Array, "*batch action"]
+"""In [-1, 1], or a one-hot row."""
+Available = Bool[Array, "*batch action"] | None
+"""Which choices are available. None: all of them, or the actions are continuous."""
+Value = Float[Array, "*batch"]
+Metrics = dict[str, Float[Array, ""]]
 
 
 class Transitions(NamedTuple):

@@ -5,7 +5,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, PRNGKeyArray
 
-from lare_rl.algorithms.batches import Transitions
+from lare_rl.algorithms.batches import Action, Observation, Transitions, Value
 from lare_rl.nn.networks import MLP
 
 __all__ = ["critic_loss", "init_critics", "q_value", "q_values"]
@@ -19,16 +19,12 @@ def init_critics(
     return make_critic(jax.random.split(key, n_critics))
 
 
-def q_value(
-    critic: MLP, observation: Float[Array, "*batch observation"], action: Float[Array, "*batch action"]
-) -> Float[Array, "*batch"]:
+def q_value(critic: MLP, observation: Observation, action: Action) -> Value:
     """Return Q(s, a) by one critic."""
     return critic(jnp.concatenate([observation, action], axis=-1))[..., 0]
 
 
-def q_values(
-    critics: MLP, observation: Float[Array, "batch observation"], action: Float[Array, "batch action"]
-) -> Float[Array, "critics batch"]:
+def q_values(critics: MLP, observation: Observation, action: Action) -> Float[Array, "critics *batch"]:
     """Return Q_i(s, a) by each critic."""
     return jax.vmap(q_value, (0, None, None))(critics, observation, action)
 

@@ -16,20 +16,28 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
 
 from lare_rl.assigner import saving
-from lare_rl.assigner.assigner_config import AssignerConfig, Space, check_config, resolve_layouts
+from lare_rl.assigner.assigner_config import (
+    AssignerConfig,
+    Space,
+    check_config,
+    check_finite,
+    resolve_layouts,
+    to_flags,
+    to_step_numbers,
+)
 from lare_rl.assigner.decoder_learner import DecoderLearner
 from lare_rl.assigner.saving import AssignerState
 from lare_rl.assigner.store import Store
 from lare_rl.credit.decoder_settings import MULTI_AGENT_CREDIT, CreditSettings
-from lare_rl.credit.explanation_text import explanation_lines, raw_feature_names
+from lare_rl.credit.explanation_text import explanation_lines
 from lare_rl.credit.methods import Reward, find_method
 from lare_rl.credit.returns import estimate_score_type
 from lare_rl.envs.families import find_score
 from lare_rl.envs.load import resolve_task
-from lare_rl.errors import LareError, short_repr
+from lare_rl.errors import LareError
 from lare_rl.latent.function import LatentFunction
 from lare_rl.tasks.spec import FactorInputs, TaskSpec
 
@@ -151,66 +159,46 @@ class CreditAssigner:
             LareError: shapes do not fit, a number is not finite, or the steps or an episode are more than `capacity`.
         """
         with self.lock:
-            observation, action, next_observation = self.config.to_rows(observation, action, next_observation)
-            n_rows = len(observation)
-            reward, alive = self.config.to_team_reward(reward, alive, n_rows)
-            ended = _to_flags(terminated, "terminated", n_rows) | _to_flags(truncated, "truncated", n_rows)
-            rows = np.flatnonzero(np.ones(n_rows, bool) if valid is None else _to_flags(valid, "valid", n_rows))
-            env_ids = lanes if env_ids is None else env_ids
-            env_ids = range(n_rows) if env_ids is None else env_ids
-            if len(env_ids) != n_rows:
-                raise LareError(f"env_ids has {len(env_ids)} entries, but there are {n_rows} steps")
+            steps = self.config.to_rows(observation, action, next_observation)
+            n_rows = len(steps[0])
+            team_reward, alive = self.config.to_team_reward(reward, alive, n_rows)
+            ended = to_flags(terminated, "terminated", n_rows) | to_flags(truncated, "truncated", n_rows)
+            rows = np.flatnonzero(np.ones(n_rows, bool) if valid is None else to_flags(valid, "valid", n_rows))
+            ids = next(ids for ids in (env_ids, lanes, range(n_rows)) if ids is not None)
+            if len(ids) != n_rows:
+                raise LareError(f"env_ids has {len(ids)} entries, but there are {n_rows} steps")
             # Copies, because an environment may write its next step into the same memory.
-            arrays = (observation, action, next_observation, reward, ended)
-            observation, action, next_observation, reward, ended = (array[rows] for array in arrays)
-            _check_finite(
-                rows, observation=observation, action=action, next_observation=next_observation, reward=reward
-            )
+            steps, team_reward, ended = tuple(array[rows] for array in steps), team_reward[rows], ended[rows]
+            check_finite(rows, steps, team_reward)
             numbers = np.full(n_rows, -1)
-            if not len(rows):
-                return numbers
-            alive = None if alive is None else alive[rows]
-            numbers[rows] = self.learner.add_steps(observation, action, next_observation, alive)
-            has_ended = False
-            for i, row in enumerate(rows.tolist()):
-                episode = self.store.get_running(env_ids[row], observation[i])
-                episode.steps.append(int(numbers[row]))
-                episode.return_ += float(reward[i])
-                episode.last_observation = next_observation[i]
-                if ended[i]:
-                    self.learner.end_episode(self.store.end(env_ids[row], episode.return_), same_call=has_ended)
-                    has_ended = True
-            self.learner.flush_large_queues()
+            if len(rows):
+                numbers[rows] = self.learner.add_steps(*steps, None if alive is None else alive[rows])
+                env_ids = [ids[row] for row in rows]
+                self.learner.end_episodes(self.store.extend(env_ids, numbers[rows], steps, team_reward, ended))
+                self.learner.flush_large_queues()
             return numbers
 
     def add_episode(
         self, observation: Any, action: Any, next_observation: Any, reward: Any, *, alive: Any = None
     ) -> Int[np.ndarray, " steps"]:
-        """Add a whole episode that has ended. `reward` is that of each step, (T,), or the score, a single number.
+        """Add a whole episode that has ended. `reward` is the reward of each step, (T,), or the score, a single number.
 
         Raises:
             LareError: as in `add`, or the episode has no step.
         """
         with self.lock:
-            rows = self.config.to_rows(observation, action, next_observation)
-            observation, action, next_observation = (array.copy() for array in rows)
-            n_steps = len(observation)
+            steps = tuple(array.copy() for array in self.config.to_rows(observation, action, next_observation))
+            n_steps = len(steps[0])
             if not n_steps:
                 raise LareError("the episode has no step")
             is_score = np.ndim(reward) == 0
             rewards, alive = self.config.to_team_reward(np.zeros(n_steps) if is_score else reward, alive, n_steps)
-            _check_finite(
-                np.arange(n_steps),
-                observation=observation,
-                action=action,
-                next_observation=next_observation,
-                reward=rewards,
-            )
+            check_finite(np.arange(n_steps), steps, rewards)
             score = float(reward) if is_score else float(rewards.sum())
             if not np.isfinite(score):
                 raise LareError(f"the score is {score}: give a finite number")
-            numbers = self.learner.add_steps(observation, action, next_observation, alive)
-            self.learner.end_episode(self.store.add_episode(numbers, score))
+            numbers = self.learner.add_steps(*steps, alive)
+            self.learner.end_episodes([self.store.add_episode(numbers, score)])
             self.learner.flush_large_queues()
             return numbers
 
@@ -223,16 +211,10 @@ class CreditAssigner:
             LareError: no episode is running in this environment, or the score is not finite.
         """
         with self.lock:
-            episode = self.store.running.get(env_id)
-            if episode is None:
-                raise LareError(
-                    f"no episode is running in the environment {env_id!r}: it has ended, or is older than "
-                    f"{self.store.capacity} steps (capacity)"
-                )
+            return_ = self.store.find_running(env_id).return_
             if score is not None and not np.isfinite(score):
                 raise LareError(f"the score of the environment {env_id!r} is {score}: give a finite number")
-            score = episode.return_ if score is None else float(score)
-            self.learner.end_episode(self.store.end(env_id, score))
+            self.learner.end_episodes([self.store.end(env_id, return_ if score is None else float(score))])
 
     def drop(self, env_id: Hashable) -> None:
         """Abandon the episode of an environment: it is never learned from. Its steps still have proxy rewards."""
@@ -254,9 +236,7 @@ class CreditAssigner:
             self.learner.catch_up()
             self.learner.fit_pending()
 
-    def fit_owed(self) -> None:
-        """Do the same as `fit_pending`, under its earlier name."""
-        self.fit_pending()
+    fit_owed = fit_pending  # the earlier name
 
     def rewards_at(self, steps: Any) -> Float[np.ndarray, "*shape"]:
         """Return r_hat of stored steps by the newest decoder: an array of the shape of `steps`, for many agents with one more axis.
@@ -268,17 +248,11 @@ class CreditAssigner:
         """
         with self.lock:
             self.learner.catch_up()
-            numbers = _to_step_numbers(steps)
-            flat = numbers.ravel()
-            is_step = flat >= 0
-            rows = self.store.rows(flat[is_step])
-            if len(rows) and flat.max() >= self.store.steps - self.learner.n_pending_steps:
-                self.learner.flush_inputs()
-            reward = np.zeros((len(flat), *self.config.agent_axis), np.float32)
-            alive = None if self.store.alive is None else self.store.alive[rows]
-            inputs, length = self.store.features[rows], self.store.lengths(rows)
-            reward[is_step] = self.learner.rewards(inputs, length, alive, rows)
-            return reward.reshape(*numbers.shape, *self.config.agent_axis)
+            numbers = to_step_numbers(steps)
+            reward = np.zeros((*numbers.shape, *self.config.agent_axis), np.float32)
+            is_step = numbers >= 0
+            reward[is_step] = self.learner.rewards_at(numbers[is_step])
+            return reward
 
     def rewards(
         self, observation: Any, action: Any, next_observation: Any, *, length: Any = None
@@ -291,17 +265,13 @@ class CreditAssigner:
         Raises:
             LareError: the method pays by the return of the step's episode (`ircr`), or shapes do not fit.
         """
-        if self.config.method.reward is Reward.UNIFORM:
-            name = self.config.method.name
-            raise LareError(
-                f"{name} pays by the return of a step's episode: call rewards_at, with the numbers of steps"
-            )
+        method = self.config.method
+        if method.reward is Reward.UNIFORM:
+            raise LareError(f"{method.name} pays by the return of a step's episode: call rewards_at, with step numbers")
         with self.lock:
             self.learner.catch_up()
             inputs = self.config.compute_inputs(*self.config.to_rows(observation, action, next_observation))
-            if length is None:
-                length = np.full(len(inputs), self.store.mean_length)
-            length = np.asarray(length, np.int32)
+            length = np.full(len(inputs), self.store.mean_length) if length is None else np.asarray(length, np.int32)
             if length.shape != (len(inputs),):
                 raise LareError(f"length has the shape {length.shape}: give one number for each of {len(inputs)} steps")
             return self.learner.rewards(inputs, length)
@@ -313,17 +283,10 @@ class CreditAssigner:
         8, or all the same. `credit/loss` is the mean loss of the last gradient updates.
         """
         with self.lock:
-            self.learner.learn_returns()
-            return {
-                "credit/return_r2": self.learner.return_r2(),
-                "credit/episodes": float(self.store.ended),
-                "credit/dropped": float(self.store.dropped),
-                "credit/fits": float(self.learner.n_updates),
-                "credit/loss": self.learner.loss,
-            }
+            return self.learner.metrics()
 
     def explanation(self) -> list[str]:
-        """Explain the stored returns by the factors, in sentences: how much they explain, which of them, what may be missing.
+        """Return sentences that explain the stored returns by the factors: how much they explain, and what may be missing.
 
         The list is empty for fewer than 20 episodes, and for a method without a decoder.
         """
@@ -334,13 +297,8 @@ class CreditAssigner:
                 return []
             assert self.learner.decoder is not None
             factor_names = [] if config.phi is None else config.phi.factor_columns(config.judges)
-            raw_names, raw_inputs = [], tuple(name for name in config.spec.inputs if name != "factors")
-            if "observation_change" not in raw_inputs and raw_inputs[-1:] == ("action",):
-                texts = ("", "") if config.task is None else (config.task.observation, config.task.action)
-                n_raw = len(explanation.residual_correlation)
-                raw_names = raw_feature_names(*texts, n_raw, config.action.size, len(raw_inputs) > 2)
-            score_type = estimate_score_type(self.learner.decoder)
-            return explanation_lines(explanation, score_type, factor_names, raw_names)
+            raw_names = config.raw_feature_names(len(explanation.residual_correlation))
+            return explanation_lines(explanation, estimate_score_type(self.learner.decoder), factor_names, raw_names)
 
     @property
     def score_type(self) -> str:
@@ -348,18 +306,15 @@ class CreditAssigner:
         decoder = self.learner.decoder
         return "average" if decoder is not None and bool(decoder.is_mean) else "sum"
 
-    @property
-    def form(self) -> str:
-        """The same as `score_type`, under its earlier name."""
-        return self.score_type
+    form = score_type  # the earlier name
 
     def save(self, directory: str | Path, episodes: bool = True) -> None:
-        """Write everything to a directory: settings, decoder, `phi` and, if `episodes` is true, steps and episodes.
+        """Write settings, decoder, `phi` and, if `episodes` is true, steps and ended episodes to a directory.
 
-        A running episode is not saved. Raises `LareError` if the directory cannot be written.
+        Raises:
+            LareError: the directory cannot be written.
         """
-        with self.lock:
-            saving.write_state(saving.get_state(self.config, self.learner, episodes=episodes), Path(directory))
+        saving.write_state(self.get_state(episodes=episodes), Path(directory))
 
     @classmethod
     def load(cls, directory: str | Path) -> "CreditAssigner":
@@ -369,40 +324,19 @@ class CreditAssigner:
             LareError: the directory does not exist, is damaged, or was written by another version.
         """
         credit = cls.__new__(cls)
-        state = saving.read_state(Path(directory))
-        try:
-            credit.__setstate__(state)
-        except saving.DAMAGED_FILE_ERRORS as error:
-            raise saving.damaged_error(Path(directory), error) from error
+        with saving.report_damage(Path(directory)):
+            credit.__setstate__(saving.read_state(Path(directory)))
         return credit
+
+    def get_state(self, *, episodes: bool) -> AssignerState:
+        """Return the state, as plain data. `__setstate__` restores it. Steps and episodes are in it if `episodes` is true."""
+        with self.lock:
+            return saving.get_state(self.config, self.learner, episodes=episodes)
 
     def __getstate__(self) -> AssignerState:
         """Return the state for another process, or for a model's file: decoder and `phi`, without steps and episodes."""
-        with self.lock:
-            return saving.get_state(self.config, self.learner, episodes=False)
+        return self.get_state(episodes=False)
 
     def __setstate__(self, state: AssignerState) -> None:
         self._init(state.config)
         saving.restore(self.learner, state)
-
-
-def _to_flags(values: Any, name: str, n_rows: int) -> Bool[np.ndarray, " steps"]:
-    flags = np.asarray(values, bool)
-    if flags.shape != (n_rows,):
-        raise LareError(f"{name} has the shape {flags.shape}: give one flag for each of {n_rows} steps")
-    return flags
-
-
-def _to_step_numbers(steps: Any) -> Int[np.ndarray, "*shape"]:
-    numbers = np.asarray(steps)
-    if numbers.size and (numbers.dtype.kind not in "iu" or numbers.min() < -1):
-        raise LareError(f"steps are {short_repr(steps)}: give numbers that `add` has returned, or -1")
-    return numbers.astype(np.int64)
-
-
-def _check_finite(rows: np.ndarray, **arrays: np.ndarray) -> None:
-    """Raise `LareError` for the first number that is not finite. `rows` are the indices of the rows in the user's arrays."""
-    for name, values in arrays.items():
-        if not np.isfinite(values).all():
-            index = np.argwhere(~np.isfinite(values))[0]
-            raise LareError(f"{name} of row {rows[index[0]]} has {values[tuple(index)]}: give finite numbers")

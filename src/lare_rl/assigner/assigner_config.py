@@ -1,26 +1,35 @@
 """The fixed configuration of a `CreditAssigner`: method, function, spaces and settings; and the decoder's inputs of steps."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
 
 import gymnasium
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 
 from lare_rl.assigner.layout import Layout, make_layout
 from lare_rl.config.validity import check_credit
 from lare_rl.credit.decoder_settings import CreditSettings
 from lare_rl.credit.encoders import input_arrays
 from lare_rl.credit.engine import CreditSpec, credit_spec
+from lare_rl.credit.explanation_text import raw_feature_names
 from lare_rl.credit.methods import Method
 from lare_rl.envs.families import load_env_spec
 from lare_rl.errors import LareError, short_repr
 from lare_rl.latent.function import LatentFunction, check_task
 from lare_rl.tasks.spec import FactorInputs, TaskSpec
 
-__all__ = ["AssignerConfig", "Space", "check_config", "resolve_layouts"]
+__all__ = [
+    "AssignerConfig",
+    "Space",
+    "check_config",
+    "check_finite",
+    "resolve_layouts",
+    "to_flags",
+    "to_step_numbers",
+]
 
 Space = gymnasium.Space | Layout | int
 """A space of Gymnasium, a layout, or the length of a row of numbers."""
@@ -69,6 +78,14 @@ class AssignerConfig:
             fixed_length=False,
             scale_rewards=self.scale_rewards,
         )
+
+    def raw_feature_names(self, n_features: int) -> list[str]:
+        """Return names of the raw features; none if they are not entries of observations and the action."""
+        inputs = tuple(name for name in self.spec.inputs if name != "factors")
+        if "observation_change" in inputs or inputs[-1:] != ("action",):
+            return []
+        texts = ("", "") if self.task is None else (self.task.observation, self.task.action)
+        return raw_feature_names(*texts, n_features, self.action.size, both=len(inputs) > 2)
 
     def compute_inputs(
         self, observation: np.ndarray, action: np.ndarray, next_observation: np.ndarray
@@ -168,3 +185,28 @@ def check_config(config: AssignerConfig) -> None:
     )
     if config.agents > 1 and config.max_steps is None:
         raise LareError("many agents need max_steps, the number of steps of the longest episode")
+
+
+def to_flags(values: Any, name: str, n_rows: int) -> Bool[np.ndarray, " steps"]:
+    """Return one flag for each row. Raises `LareError` if there are more or fewer."""
+    flags = np.asarray(values, bool)
+    if flags.shape != (n_rows,):
+        raise LareError(f"{name} has the shape {flags.shape}: give one flag for each of {n_rows} steps")
+    return flags
+
+
+def to_step_numbers(steps: Any) -> Int[np.ndarray, "*shape"]:
+    """Return numbers of steps as an array. Raises `LareError` for anything else."""
+    numbers = np.asarray(steps)
+    if numbers.size and (numbers.dtype.kind not in "iu" or numbers.min() < -1):
+        raise LareError(f"steps are {short_repr(steps)}: give numbers that `add` has returned, or -1")
+    return numbers.astype(np.int64)
+
+
+def check_finite(rows: np.ndarray, steps: Sequence[np.ndarray], reward: np.ndarray) -> None:
+    """Raise `LareError` for the first number that is not finite. `rows` are the indices of the rows in the user's arrays."""
+    names = ("observation", "action", "next_observation", "reward")
+    for name, values in zip(names, (*steps, reward), strict=True):
+        if not np.isfinite(values).all():
+            index = np.argwhere(~np.isfinite(values))[0]
+            raise LareError(f"{name} of row {rows[index[0]]} has {values[tuple(index)]}: give finite numbers")

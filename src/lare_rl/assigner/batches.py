@@ -19,11 +19,7 @@ __all__ = ["pack_in_order", "sample_batch"]
 def sample_batch(store: Store, spec: CreditSpec, random: np.random.Generator, longest: int) -> CreditBatch:
     """Draw the steps of one gradient update, from episodes that are drawn uniformly with replacement.
 
-    Args:
-        store: a store with at least one episode.
-        spec: what is fitted.
-        random: the generator of random numbers.
-        longest: the largest number of steps of an episode. Batches with the same value have the same shape.
+    The store needs an episode. `longest` is the largest number of steps of one. Batches with the same value have the same shape.
     """
     settings, fit = spec.settings, spec.method.fit
     assert fit is not None
@@ -36,9 +32,8 @@ def sample_batch(store: Store, spec: CreditSpec, random: np.random.Generator, lo
         key = jax.random.key(int(random.integers(2**31)))
         number = np.asarray(compiled.draw_step_numbers(key, length.astype(np.int32), steps=settings.drawn_steps))
         return _gather(store, episodes, lay_out_drawn(length, number), len(episodes))
-    mean_length = max(1, store.ended_steps // store.ended)
     n_slots = max(1, settings.steps // 2)
-    episodes = _sample_episodes(store, max(1, settings.steps // mean_length), random)[:n_slots]
+    episodes = _sample_episodes(store, max(1, settings.steps // store.mean_length), random)[:n_slots]
     return _pack(store, episodes, n_slots, max(settings.steps, longest))
 
 
@@ -74,11 +69,7 @@ def _pack(store: Store, episodes: Sequence[Episode], n_slots: int, rows: int) ->
 def _gather(store: Store, episodes: Sequence[Episode], layout: Layout, n_slots: int) -> CreditBatch:
     """Return the features of the steps of a layout, with the returns of their episodes.
 
-    Args:
-        store: the store.
-        episodes: the episodes of the batch.
-        layout: the step of each row, with an axis of episodes or without. Padding reads some stored step.
-        n_slots: the number of episodes that the arrays have, at least as many as there are.
+    The layout has an axis of episodes, or none. Padding reads some stored step. The arrays have room for `n_slots` episodes.
     """
     count = len(episodes)
     first = np.cumsum(_lengths(episodes)) - _lengths(episodes)

@@ -1,4 +1,4 @@
-"""The compiled functions of a `CreditAssigner`: those of `lare_rl.credit`, on batches of steps and episodes."""
+"""The compiled functions of a `CreditAssigner`: functions of `lare_rl.credit`, on batches of steps and episodes."""
 
 from contextlib import AbstractContextManager
 from functools import partial

@@ -4,11 +4,11 @@ Calls of compiled functions cost the same for one row as for hundreds, so data w
 depends on them:
 
     add_steps ────► pending steps ──flush_inputs──► inputs in the store ──flush_statistics──► running statistics
-    end_episode ──► pending returns ──────────────────────────────────────flush_statistics──► scales of returns
+    end_episodes ─► pending returns ──────────────────────────────────────flush_statistics──► scales of returns
                 └─► pending episodes ─────────────────────────────────────learn_returns─────► sufficient statistics, decoder
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import replace
 from itertools import chain
 from math import inf
@@ -95,15 +95,17 @@ class DecoderLearner:
         self._pending_updates = min(self._pending_updates + self.config.fits_per_step * n_steps, MAX_PENDING_UPDATES)
         return numbers
 
-    def end_episode(self, episode: Episode, *, same_call: bool = False) -> None:
-        """Queue an episode that has ended. `same_call`: it ended in the same call as the previous one."""
-        if not same_call:
-            self._pending_episodes.append([])
-        self._pending_episodes[-1].append(episode)
-        self._pending_returns.append((episode.score / len(episode.steps), len(episode.steps)))
+    def end_episodes(self, episodes: Iterable[Episode]) -> None:
+        """Queue episodes that ended in one call."""
+        group: list[Episode] = []
+        for episode in episodes:
+            if not group:
+                self._pending_episodes.append(group)
+            group.append(episode)
+            self._pending_returns.append((episode.score / len(episode.steps), len(episode.steps)))
 
     def flush_large_queues(self) -> None:
-        """Process what waits, if there is much of it."""
+        """Process the queues that have become long."""
         if self.n_pending_steps >= PENDING_STEPS:
             self.flush_inputs()
         if sum(len(episode.steps) for episode in chain.from_iterable(self._pending_episodes)) >= CHUNK_ROWS:
@@ -291,6 +293,14 @@ class DecoderLearner:
             reward[chunk] = np.asarray(r_hat)[: len(inputs[chunk])].reshape(reward[chunk].shape)
         return reward
 
+    def rewards_at(self, numbers: Int[np.ndarray, " n"]) -> Float[np.ndarray, "n *agents"]:
+        """Return the rewards of stored steps. Raises `LareError` if a step is not stored."""
+        rows = self.store.rows(numbers)
+        if len(rows) and numbers.max() >= self.store.steps - self.n_pending_steps:
+            self.flush_inputs()
+        alive = None if self.store.alive is None else self.store.alive[rows]
+        return self.rewards(self.store.features[rows], self.store.lengths(rows), alive, rows)
+
     def _flat_state(self) -> FlatState:
         """Return the parts of the decoder that compute rewards, and the scale, in flat form."""
         decoder, scale, flat = self._flat
@@ -304,12 +314,18 @@ class DecoderLearner:
             self._flat = self.decoder, self.scale, flat
         return flat
 
-    def return_r2(self) -> float:
-        """Return R^2 of the last returns, each predicted before it was learned from; NaN if they are few or all the same."""
-        if self.decoder is None:
-            return float("nan")
+    def metrics(self) -> dict[str, float]:
+        """Return metrics that need no true rewards. Returns are predicted before they are learned from."""
+        self.learn_returns()
         with on_cpu():
-            return float(prequential.r2(self.decoder.predictions)[0])
+            return_r2 = float("nan") if self.decoder is None else float(prequential.r2(self.decoder.predictions)[0])
+        return {
+            "credit/return_r2": return_r2,
+            "credit/episodes": float(self.store.ended),
+            "credit/dropped": float(self.store.dropped),
+            "credit/fits": float(self.n_updates),
+            "credit/loss": self.loss,
+        }
 
     def explain(self) -> Explanation | None:
         """Explain the stored returns by the inputs. Return None for a method without a decoder, and without episodes."""

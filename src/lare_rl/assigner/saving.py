@@ -7,6 +7,8 @@ DIRECTORY/
 """
 
 import json
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -22,7 +24,6 @@ from lare_rl.assigner.store import Episode, Store
 from lare_rl.credit.decoder_settings import CreditSettings
 from lare_rl.credit.methods import find_method
 from lare_rl.errors import LareError, short_repr
-from lare_rl.latent.function import LatentFunction
 from lare_rl.latent.saved import load_function
 from lare_rl.runs.checkpoint import DAMAGED_FILE_ERRORS, open_npz
 from lare_rl.tasks.spec import TaskSpec
@@ -30,10 +31,12 @@ from lare_rl.util.files import write_atomically
 from lare_rl.util.renamed_fields import rename_fields
 from lare_rl.util.safe_io import read_json, read_text
 
-__all__ = ["DAMAGED_FILE_ERRORS", "AssignerState", "damaged_error", "get_state", "read_state", "restore", "write_state"]
+__all__ = ["AssignerState", "get_state", "read_state", "report_damage", "restore", "write_state"]
 
 FORMAT = 1
 TEXT_FILE, ARRAYS_FILE, FUNCTION_FILE = "assigner.json", "state.npz", "phi.py"
+PLAIN_FIELDS = ("judges", "agents", "max_steps", "capacity", "seed", "fits_per_step", "scale_rewards", "forget")
+"""The fields of a configuration that are JSON values."""
 PHI_SAMPLE = ("tried/observation", "tried/action")
 """The steps on which `phi` is verified when it is loaded, because there may be no environment."""
 
@@ -100,28 +103,38 @@ def read_state(directory: Path) -> AssignerState:
         LareError: the directory does not exist, is damaged, or was written by another version.
     """
     path = directory / TEXT_FILE
-    try:
+    with report_damage(directory):
         values = read_json(read_text(path))
         with open_npz(directory / ARRAYS_FILE) as saved:
             arrays = {rename_fields(name): saved[name] for name in saved.files}
         if not isinstance(values, dict) or values.get("format") != FORMAT:
             raise LareError(f"{path} is not of format {FORMAT}: another version of LaRe has written it")
-        sample = (arrays[PHI_SAMPLE[0]], arrays[PHI_SAMPLE[1]]) if set(PHI_SAMPLE) <= set(arrays) else None
         task = None if values["task"] is None else TaskSpec(**values["task"])
         phi = None
         if task is not None and values["phi"]:
+            sample = (arrays[PHI_SAMPLE[0]], arrays[PHI_SAMPLE[1]]) if set(PHI_SAMPLE) <= set(arrays) else None
             phi = load_function(directory / FUNCTION_FILE, task, steps=sample)
-        config = _parse_config(values, task, phi)
+        config = AssignerConfig(
+            method=find_method(values["method"]),
+            phi=phi,
+            task=task,
+            observation=Layout(**values["observation"]),
+            action=Layout(**values["action"]),
+            settings=CreditSettings(**values["settings"]),
+            **{name: values[name] for name in PLAIN_FIELDS},
+        )
         return AssignerState(config, values["told"], values["fits"], arrays)
+
+
+@contextmanager
+def report_damage(directory: Path) -> Iterator[None]:
+    """Raise a `LareError` that names the directory, in place of the errors that damaged files cause."""
+    try:
+        yield
     except (*DAMAGED_FILE_ERRORS, TypeError, RecursionError) as error:
-        raise damaged_error(directory, error) from error
-
-
-def damaged_error(directory: Path, error: BaseException) -> LareError:
-    """Return the error for files that are not those of an assigner."""
-    return LareError(
-        f"{directory} holds no credit assigner, or one that is damaged or of another version: {short_repr(error)}"
-    )
+        raise LareError(
+            f"{directory} holds no credit assigner, or one that is damaged or of another version: {short_repr(error)}"
+        ) from error
 
 
 def _named_leaves(learner: DecoderLearner) -> dict[str, Any]:
@@ -132,38 +145,16 @@ def _named_leaves(learner: DecoderLearner) -> dict[str, Any]:
 
 def _config_values(state: AssignerState) -> dict[str, Any]:
     config = state.config
+    models = ("task", "observation", "action", "settings")
     return {
         "format": FORMAT,
         "method": config.method.name,
-        "task": None if config.task is None else config.task.model_dump(mode="json"),
-        "observation": config.observation.model_dump(mode="json"),
-        "action": config.action.model_dump(mode="json"),
-        "judges": config.judges,
-        "agents": config.agents,
-        "max_steps": config.max_steps,
-        "capacity": config.capacity,
-        "settings": config.settings.model_dump(mode="json"),
-        "seed": config.seed,
-        "fits_per_step": config.fits_per_step,
-        "scale_rewards": config.scale_rewards,
-        "forget": config.forget,
+        **{name: model and model.model_dump(mode="json") for name in models for model in [getattr(config, name)]},
+        **{name: getattr(config, name) for name in PLAIN_FIELDS},
         "phi": config.phi is not None,
         "told": state.n_learned,
         "fits": state.n_updates,
     }
-
-
-def _parse_config(values: dict[str, Any], task: TaskSpec | None, phi: LatentFunction | None) -> AssignerConfig:
-    names = ("judges", "agents", "max_steps", "capacity", "seed", "fits_per_step", "scale_rewards", "forget")
-    return AssignerConfig(
-        method=find_method(values["method"]),
-        phi=phi,
-        task=task,
-        observation=Layout(**values["observation"]),
-        action=Layout(**values["action"]),
-        settings=CreditSettings(**values["settings"]),
-        **{name: values[name] for name in names},
-    )
 
 
 def _store_arrays(store: Store) -> dict[str, np.ndarray]:

@@ -7,7 +7,7 @@ the oldest ones, whose episodes are removed.
 
 import heapq
 import sys
-from collections.abc import Hashable
+from collections.abc import Hashable, Iterator, Sequence
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
@@ -48,13 +48,7 @@ class Store:
     """Inputs of steps, and the episodes that they belong to."""
 
     def __init__(self, capacity: int, row_shape: tuple[int, ...], agents: int = 1):
-        """Make an empty store.
-
-        Args:
-            capacity: the number of steps that are stored.
-            row_shape: the shape of a step's inputs: (inputs,), or (agents, inputs).
-            agents: the number of agents.
-        """
+        """Make an empty store. `row_shape` is the shape of a step's inputs: (inputs,), or (agents, inputs)."""
         self.capacity, self.agents = capacity, agents
         self.features = np.zeros((capacity, *row_shape), np.float32)
         """The decoder's inputs for each step: [capacity *agents inputs]."""
@@ -99,6 +93,36 @@ class Store:
         if self.alive is not None:
             self.alive[numbers % self.capacity] = True if alive is None else alive
         return numbers
+
+    def extend(
+        self,
+        env_ids: Sequence[Hashable],
+        numbers: Int[np.ndarray, " n"],
+        steps: Sequence[np.ndarray],
+        reward: Float[np.ndarray, " n"],
+        ended: Bool[np.ndarray, " n"],
+    ) -> Iterator[Episode]:
+        """Add new steps to the running episodes of their environments. Yield each episode that ends.
+
+        `numbers` are from `add`. `steps` are observations, actions and next observations. Raises `LareError` like `end`.
+        """
+        observation, _, next_observation = steps
+        for i, env_id in enumerate(env_ids):
+            episode = self.get_running(env_id, observation[i])
+            episode.steps.append(int(numbers[i]))
+            episode.return_ += float(reward[i])
+            episode.last_observation = next_observation[i]
+            if ended[i]:
+                yield self.end(env_id, episode.return_)
+
+    def find_running(self, env_id: Hashable) -> RunningEpisode:
+        """Return the running episode of an environment. Raises `LareError` if there is none."""
+        if env_id not in self.running:
+            raise LareError(
+                f"no episode is running in the environment {env_id!r}: it has ended, or is older than "
+                f"{self.capacity} steps (capacity)"
+            )
+        return self.running[env_id]
 
     def end(self, env_id: Hashable, score: float) -> Episode:
         """End the running episode of an environment, with `score` as its return.

@@ -100,22 +100,21 @@ def design(
     from lare_rl.llm.model import RECORDED, recorded_model
 
     is_live = model is not None and model != RECORDED and not model.endswith(".json")
-    _check_model_options(is_live, draw, live)
-    _check_reflect_options(reflect, policy, data)
+    _check_options(is_live, live, draw, reflect, policy, data)
     _check_files(out, record)
     spec = load_task(task) if data is None else read_task(task)
     play = load_policy(policy, spec)
     budget = Budget(requests=live.requests, tokens=live.budget, seconds=60 * live.minutes)
     if is_live:
-        asked_model = LiveModel(str(model), live.base_url, live.temperature, budget, on_message=print_progress)
+        requested_model = LiveModel(str(model), live.base_url, live.temperature, budget, on_message=print_progress)
     else:
         recording = None if model in (None, RECORDED) else Path(str(model))
-        asked_model = recorded_model(spec.name, kind, draw, recording)
+        requested_model = recorded_model(spec.name, kind, draw, recording)
     try:
         function = design_function(
             spec,
             kind,
-            asked_model,
+            requested_model,
             candidates=candidates,
             pre_verification=pre_verification,
             record=record,
@@ -126,7 +125,7 @@ def design(
             from lare_rl.training.reflect import reflect as reflect_on
 
             function = reflect_on(
-                function, spec, asked_model, reflect, policy=play, record=record, on_message=print_progress
+                function, spec, requested_model, reflect, policy=play, record=record, on_message=print_progress
             )
     except DesignError as error:
         print_error(error)
@@ -134,7 +133,7 @@ def design(
         sys.exit(error.status)
     finally:
         if budget.requests_used:
-            print_progress(f"{asked_model.name}: {budget.summary(live.price)}")
+            print_progress(f"{requested_model.name}: {budget.summary(live.price)}")
     if out is None:
         _print_function(function, find_free_path(Path(f"{spec.name}.py")))
     else:
@@ -154,50 +153,41 @@ def load_policy(run: Path | None, spec: "TaskSpec") -> "Callable[[np.ndarray], n
     return Policy(opened, 0, best=False).select_env_action
 
 
-def _check_model_options(is_live: bool, draw: int, live: LiveOptions) -> None:
-    """Raise `LareError` if options do not fit the model."""
-    if is_live and draw:
-        raise LareError("--draw chooses a recording, and a live model uses none: leave --draw out")
-    if is_live:
-        return
-    if live.base_url is not None:
-        raise LareError("--base-url is for a live model: say which one with --model NAME")
-    if live != DEFAULT_LIVE:
-        raise LareError(
-            "--budget, --requests, --minutes, --price and --temperature are for a live model: say which one with --model NAME"
-        )
-
-
-def _check_reflect_options(reflect: int, policy: Path | None, data: str | None) -> None:
-    """Raise `LareError` if the options of the reflection do not go together."""
-    if policy is not None and not reflect:
-        raise LareError("--policy plays the episodes for --reflect: give --reflect too, with a number of rounds")
-    if reflect < 0:
-        raise LareError(f"reflect = {reflect}: the number of rounds cannot be negative")
-    if data is not None and reflect:
-        raise LareError(
-            "--reflect plays episodes in the environment, and --data is for tasks without one: leave one out"
-        )
+def _check_options(
+    is_live: bool, live: LiveOptions, draw: int, reflect: int, policy: Path | None, data: str | None
+) -> None:
+    """Raise `LareError` if options do not go together."""
+    live_options = "--base-url, --budget, --requests, --minutes, --price and --temperature"
+    problems = [
+        (is_live and draw != 0, "--draw chooses a recording, and a live model uses none: leave --draw out"),
+        (not is_live and live != DEFAULT_LIVE, f"{live_options} are for a live model: say which one with --model NAME"),
+        (policy and not reflect, "--policy plays the episodes for --reflect: give --reflect a number of rounds"),
+        (reflect < 0, f"reflect = {reflect}: the number of rounds cannot be negative"),
+        (data and reflect, "--reflect plays episodes, and --data is for tasks without an environment: leave one out"),
+    ]
+    for applies, message in problems:
+        if applies:
+            raise LareError(message)
 
 
 def _check_files(out: Path | None, record: Path | None) -> None:
     """Raise `LareError` if a file could not be written, before a model is asked and paid."""
-    if out is not None and not out.name:
-        raise LareError(f"{out} is not the name of a file; choose another --out")
-    out_paths = [] if out is None else [out, out.with_suffix(".py"), out.with_suffix(".json")]
-    record_paths = [] if record is None else [record]
-    options = [(path, "--record") for path in record_paths] + [(path, "--out") for path in out_paths]
+    options = [] if record is None else [(record, "--record")]
     try:
+        if out is not None:
+            if out.is_dir():
+                raise LareError(f"{out} is not the name of a file; choose another --out")
+            options += [(out.with_suffix(suffix), "--out") for suffix in (".py", ".json")]
         for path, option in options:
             if path.is_dir():
                 raise LareError(f"{path} is not the name of a file; choose another {option}")
-            if path.exists() and path != out:
+            if path.exists():
                 raise LareError(f"{path} exists, and is not overwritten; choose another {option}")
             if not path.parent.is_dir():
                 raise LareError(
                     f"{path} cannot be written: there is no directory {path.parent}; choose another {option}"
                 )
-        if record is not None and record.resolve() in [path.resolve() for path in out_paths]:
+        if record is not None and record.resolve() in [path.resolve() for path, option in options if option == "--out"]:
             raise LareError(f"--out writes {record} too: choose another --record")
     except OSError as error:
         raise LareError(f"{error.filename} cannot be written: {error.strerror}") from error

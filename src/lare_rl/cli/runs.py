@@ -2,6 +2,7 @@
 
 import os
 import sys
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -14,8 +15,11 @@ from lare_rl.config.settings import ResolvedSettings, Settings
 from lare_rl.errors import LareError, install_command
 
 if TYPE_CHECKING:
+    from lare_rl.envs.play import Episode
     from lare_rl.latent.function import LatentFunction
+    from lare_rl.runs.directory import Run
     from lare_rl.tasks.spec import TaskSpec
+    from lare_rl.training.evaluation import Evaluation
     from lare_rl.training.progress import Listener
 
 DEFAULTS = Settings()
@@ -136,17 +140,13 @@ def evaluate(
         deterministic: always take the most likely action, where training's evaluations sample it (ppo with choices, ippo).
         video: a .gif to write of one episode of the first seed (.mp4 with the extra lare-rl[video]).
     """
-    import numpy as np
-
     from lare_rl.algorithms.registry import ALGORITHMS
     from lare_rl.envs.families import load_env_spec
-    from lare_rl.evaluation.evaluate import RANDOM_EPISODES, evaluate_policy, gain_over_random, play_random
+    from lare_rl.evaluation.evaluate import RANDOM_EPISODES, evaluate_policy, play_random
     from lare_rl.evaluation.video import check_video_path, record_video
     from lare_rl.runs.directory import open_run
     from lare_rl.training.explain import explain_run
     from lare_rl.training.saved_state import load_actor
-    from lare_rl.util.findings import format_value
-    from lare_rl.util.statistics import format_mean_std, format_plus_minus
 
     opened = open_run(run)
     task, settings = opened.config.task, opened.config.settings
@@ -159,39 +159,54 @@ def evaluate(
         record_video(opened, video, best, deterministic)
         print_line(f"wrote {video}")
     evaluation = evaluate_policy(opened, episodes, best, deterministic)
-    best_steps = load_actor(opened, best=True)[2] if best else None
-    episodes_text = format_value(episodes, "count episode")
-    for team_index, role in enumerate(task.roles):
-        for seed_index, seed in enumerate(opened.seeds):
-            returns, sums = (
-                format_mean_std(values[seed_index, :, team_index])
-                for values in (evaluation.returns, evaluation.summed_returns)
-            )
-            line = f"{role.name}, " if len(task.roles) > 1 else ""
-            line += f"seed {seed}: return {returns} over {episodes_text}"
-            if best_steps is not None:
-                step = int(best_steps[seed_index])
-                untrained = ", before its first update" if step <= settings.warmup else ""
-                line += f" (the policy of step {step:,}{untrained})"
-            print_line(line + (f"; summed over the agents {sums}" if env_spec.n_agents > 1 else ""))
+    best_steps = load_actor(opened, best=True)[2].tolist() if best else None
     random_episodes = play_random(task, max(episodes, RANDOM_EPISODES)) if len(task.roles) == 1 else []
-    if random_episodes:
-        random_returns = np.array([episode.return_ for episode in random_episodes])
-        print_line(f"random actions: return {format_mean_std(random_returns)} over {len(random_episodes)} episodes")
-        if (gain := gain_over_random(evaluation.returns[:, :, 0], random_returns)) is not None:
-            print_line(f"difference: {format_plus_minus(*gain)} (± is its standard error)")
+    for line in _describe_evaluation(opened, evaluation, random_episodes, best_steps):
+        print_line(line)
     if not (deterministic or ALGORITHMS[settings.algorithm].greedy(env_spec.discrete)):
         print_line("The policy samples its actions, as in training; --deterministic plays the most likely ones.")
-    for name, seed_values in evaluation.measures.items():
-        for seed, values in zip(opened.seeds, seed_values, strict=True):
-            print_line(f"seed {seed}: {name} {format_mean_std(values)}")
-        if random_episodes:
-            values = np.array([episode.measures[name] for episode in random_episodes])
-            print_line(f"random actions: {name} {format_mean_std(values)}")
     if explanation := explain_run(opened):
         print_line(f"Credit, judged on the stored training episodes of seed {opened.seeds[0]}:")
     for line in explanation:
         print_line(line)
+
+
+def _describe_evaluation(
+    run: "Run", evaluation: "Evaluation", random_episodes: "Sequence[Episode]", best_steps: "Sequence[int] | None"
+) -> Iterator[str]:
+    """Yield the returns and measures of each seed, and of random actions. `best_steps` are the steps of the best policies."""
+    import numpy as np
+
+    from lare_rl.envs.families import load_env_spec
+    from lare_rl.evaluation.evaluate import gain_over_random
+    from lare_rl.util.findings import format_value
+    from lare_rl.util.statistics import format_mean_std, format_plus_minus
+
+    roles, has_many_agents = run.config.task.roles, load_env_spec(run.config.task).n_agents > 1
+    for team_index, role in enumerate(roles):
+        for seed_index, seed in enumerate(run.seeds):
+            returns = evaluation.returns[seed_index, :, team_index]
+            line = f"{role.name}, " if len(roles) > 1 else ""
+            line += f"seed {seed}: return {format_mean_std(returns)} over {format_value(len(returns), 'count episode')}"
+            if best_steps is not None:
+                step = best_steps[seed_index]
+                untrained = ", before its first update" if step <= run.config.settings.warmup else ""
+                line += f" (the policy of step {step:,}{untrained})"
+            if has_many_agents:
+                sums = evaluation.summed_returns[seed_index, :, team_index]
+                line += f"; summed over the agents {format_mean_std(sums)}"
+            yield line
+    if random_episodes:
+        returns = np.array([episode.return_ for episode in random_episodes])
+        yield f"random actions: return {format_mean_std(returns)} over {len(random_episodes)} episodes"
+        if (gain := gain_over_random(evaluation.returns[:, :, 0], returns)) is not None:
+            yield f"difference: {format_plus_minus(*gain)} (± is its standard error)"
+    for name, seed_values in evaluation.measures.items():
+        for seed, values in zip(run.seeds, seed_values, strict=True):
+            yield f"seed {seed}: {name} {format_mean_std(values)}"
+        if random_episodes:
+            values = np.array([episode.measures[name] for episode in random_episodes])
+            yield f"random actions: {name} {format_mean_std(values)}"
 
 
 def _render_without_screen() -> None:
@@ -211,7 +226,7 @@ def report(runs: RunDirectories, out: Path | None = None, film: bool = False) ->
     """
     from lare_rl.report.report import write_report
     from lare_rl.runs.config_file import read_config
-    from lare_rl.runs.discover import find_run_directories
+    from lare_rl.runs.directory import find_run_directories
     from lare_rl.tasks.trust import TRUST_VARIABLE, untrusted_module
 
     if film:

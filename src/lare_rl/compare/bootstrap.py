@@ -1,10 +1,11 @@
 """Estimates with 95% intervals, by the stratified bootstrap of rliable (Agarwal et al., "Deep RL at the edge of the statistical
-precipice", NeurIPS 2021).
+precipice", NeurIPS 2021), and the exact test of Mann and Whitney (1947).
 """
 
 import contextlib
+import itertools
 import warnings
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -23,6 +24,8 @@ __all__ = [
     "bootstrap_band",
     "interquartile_means",
     "load_rliable",
+    "mann_whitney",
+    "mann_whitney_u",
     "probability_of_improvement",
 ]
 
@@ -69,12 +72,7 @@ def bootstrap_band(
 ) -> Band:
     """Estimate the curve of a function of scores."""
     curve = bootstrap(scores, function)
-    return Band(
-        x=x,
-        value=np.array([estimate.value for estimate in curve]),
-        low=np.array([estimate.low for estimate in curve]),
-        high=np.array([estimate.high for estimate in curve]),
-    )
+    return Band(x, *np.transpose([(estimate.value, estimate.low, estimate.high) for estimate in curve]))
 
 
 # A bootstrap calls these functions thousands of times, and the checks of the same functions in rliable take most of their time.
@@ -90,6 +88,34 @@ def interquartile_means(scores: Scores) -> Float[np.ndarray, " steps"]:
 def probability_of_improvement(scores: Scores, baseline: OtherScores) -> float:
     """Return the share of pairs of runs on a task in which the run scores more than the baseline. A tie counts half."""
     return float(np.mean((scores[:, None] > baseline) + 0.5 * (scores[:, None] == baseline)))
+
+
+def mann_whitney_u(a: Float[np.ndarray, " a"], b: Float[np.ndarray, " b"]) -> float:
+    """Return the number of pairs in which a is larger than b. A tie counts half."""
+    return float(np.sum(a[:, None] > b) + 0.5 * np.sum(a[:, None] == b))
+
+
+def mann_whitney(tasks: Sequence[tuple[Float[np.ndarray, " _"], Float[np.ndarray, " _"]]]) -> tuple[float, float]:
+    """Return two probabilities: that U is at least as large by chance, and that it is at most as large.
+
+        U = sum over tasks and over all pairs of [a > b] + [a = b] / 2
+
+    `tasks` has the values a and b of each task. If they had the same distribution, all ways to split them into two groups would
+    be equally likely.
+    """
+    u, probabilities = 0.0, {0.0: 1.0}  # the distribution of U over the tasks so far
+    for a, b in tasks:
+        u += mann_whitney_u(a, b)
+        values = np.concatenate([a, b])
+        splits = [list(split) for split in itertools.combinations(range(len(values)), len(a))]
+        task_us = [mann_whitney_u(values[split], np.delete(values, split)) for split in splits]
+        convolved: dict[float, float] = {}
+        for (total, probability), task_u in itertools.product(probabilities.items(), task_us):
+            convolved[total + task_u] = convolved.get(total + task_u, 0.0) + probability / len(splits)
+        probabilities = convolved
+    at_least = sum(probability for total, probability in probabilities.items() if total >= u)
+    at_most = sum(probability for total, probability in probabilities.items() if total <= u)
+    return min(1.0, at_least), min(1.0, at_most)
 
 
 def load_rliable() -> Any:

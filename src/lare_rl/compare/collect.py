@@ -6,8 +6,7 @@ from pathlib import Path
 from lare_rl.compare.labels import find_differences, find_origin_differences, label_runs
 from lare_rl.compare.results import Results, read_results_table, read_run_results
 from lare_rl.errors import LareError, did_you_mean
-from lare_rl.runs.directory import Run, open_without_functions
-from lare_rl.runs.discover import find_run_directories
+from lare_rl.runs.directory import Run, find_run_directories, open_without_functions
 from lare_rl.runs.metric_names import RETURN, SUMMED_RETURN
 from lare_rl.training.advice import describe_untrained
 from lare_rl.util.findings import Finding
@@ -27,9 +26,7 @@ def collect_results(paths: Sequence[Path], metric: str = RETURN) -> tuple[list[R
     directories = [path for path in paths if path not in tables]
     runs, findings = [], []
     if directories or not tables:
-        runs, findings = select_runs(
-            [open_without_functions(path) for path in find_run_directories(directories)], metric
-        )
+        runs, findings = select_runs(list(map(open_without_functions, find_run_directories(directories))), metric)
     run_results = read_run_results(label_runs(runs), metric)
     table_results = [result for path in tables for result in read_results_table(path, metric)]
     if run_results:
@@ -38,12 +35,8 @@ def collect_results(paths: Sequence[Path], metric: str = RETURN) -> tuple[list[R
         table_results = [result for result in table_results if result.task in tasks]
         findings += _find_other_steps(run_results, table_results, metric)
     results = run_results + table_results
-    if (
-        paths
-        and paths[0] in tables
-        and (first := [result.label for result in table_results if result.source == paths[0]])
-    ):
-        results.sort(key=lambda result: result.label != first[0])
+    if first := next((result.label for result in table_results if result.source == paths[0]), None):
+        results.sort(key=lambda result: result.label != first)
     several = len({result.label for result in results}) > 1
     if differences := (find_differences(runs) if several else []) + find_origin_differences(runs):
         findings.append(Finding("differ", {"differences": tuple(differences)}))

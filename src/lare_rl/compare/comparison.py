@@ -17,9 +17,9 @@ from lare_rl.compare.bootstrap import (
     bootstrap,
     bootstrap_band,
     interquartile_means,
+    mann_whitney,
     probability_of_improvement,
 )
-from lare_rl.compare.mann_whitney import mann_whitney
 from lare_rl.compare.results import Results
 from lare_rl.compare.scores import Group, group_results
 from lare_rl.evaluation.reference_returns import REFERENCE_RETURNS
@@ -48,7 +48,7 @@ class Row:
     draw_mean: Estimate | None
     """The mean, its interval over the draws; None for a single draw."""
     difference: Estimate | None
-    """The interquartile mean minus that of the baseline; None for the baseline and for single seeds."""
+    """The interquartile mean minus the interquartile mean of the baseline; None for the baseline and for single seeds."""
     improvement: Estimate | None
     """Probability that a run scores more than a run of the baseline; None like `difference`."""
     p_value: float | None
@@ -71,7 +71,7 @@ class OverallRow:
 
 @dataclass(frozen=True)
 class Comparison:
-    """The statistics of some methods. The first one is the baseline."""
+    """The statistics of some methods. The first method is the baseline."""
 
     rows: tuple[Row, ...]
     curves: Mapping[str, Band]
@@ -107,10 +107,7 @@ def compare(
 ) -> Comparison:
     """Compare results by their labels. The first label is the baseline.
 
-    Args:
-        results: for each label, the same tasks, seeds and draws.
-        metric: the metric of the results.
-        step, late: what a score is (`group_results`).
+    All labels have the same tasks. `step` and `late` choose what a score is (`group_results`).
 
     Raises:
         LareError: some results are missing, or rliable is not installed.
@@ -177,8 +174,11 @@ def _make_row(group: Group, baseline: Scores | None) -> Row:
     draw_mean = difference = improvement = p_value = None
     if len(group.draws) > 1:
         (draw_mean,) = bootstrap(group.final_scores.mean(axis=1), lambda draws: np.array([np.mean(draws)]))
+    if baseline is not None and min(len(scores), len(baseline)) > 1:
+        (difference,) = bootstrap(
+            (scores, baseline), lambda a, b: interquartile_means(a[..., None]) - interquartile_means(b[..., None])
+        )
     if baseline is not None:
-        difference = _iqm_difference(scores, baseline)
         improvement, p_value = _improvement(scores, baseline)
     return Row(
         label=group.label,
@@ -192,16 +192,6 @@ def _make_row(group: Group, baseline: Scores | None) -> Row:
         improvement=improvement,
         p_value=p_value,
     )
-
-
-def _iqm_difference(scores: Scores, baseline: OtherScores) -> Estimate | None:
-    """Return the difference of two interquartile means, or None for single seeds."""
-    if min(len(scores), len(baseline)) < 2:
-        return None
-    (difference,) = bootstrap(
-        (scores, baseline), lambda a, b: interquartile_means(a[..., None]) - interquartile_means(b[..., None])
-    )
-    return difference
 
 
 def _improvement(scores: Scores, baseline: OtherScores) -> tuple[Estimate | None, float | None]:

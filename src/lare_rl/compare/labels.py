@@ -1,5 +1,6 @@
-"""The rows of a comparison: which runs belong to one label, and in what the runs of different labels differ."""
+"""The rows of a comparison: which runs have the same label, and how the runs of different labels differ."""
 
+import os
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import combinations, permutations
@@ -107,18 +108,16 @@ def _function_name(run: Run) -> str:
 
 
 def _find_function_differences(runs: Sequence[Run]) -> list[Difference]:
-    """Return the tasks on which methods were trained with different latent functions of one kind and draw."""
-    by_place = group_pairs(
+    """Return the tasks on which methods were trained with different latent functions of the same kind and draw."""
+    pairs_by_draw = group_pairs(
         (
             (run.config.task.name, method.phi_kind, settings.draw, settings.candidates),
             (_function_name(run), method.name),
         )
-        for run, settings, method in (
-            (run, run.config.settings, find_method(run.config.settings.method)) for run in runs
-        )
-        if method.needs_phi
+        for run, settings in ((run, run.config.settings) for run in runs)
+        if (method := find_method(settings.method)).needs_phi
     )
-    differences = (_make_difference(f"phi on {task}", pairs) for (task, *_), pairs in by_place.items())
+    differences = (_make_difference(f"phi on {task}", pairs) for (task, *_), pairs in pairs_by_draw.items())
     return [difference for difference in differences if len(set(difference.methods.values())) > 1]
 
 
@@ -134,9 +133,9 @@ def _split_by_function(label: str, runs: Sequence[Run]) -> dict[str, list[Run]]:
 def _split_by_directory(label: str, runs: Sequence[Run]) -> dict[str, list[Run]]:
     """Split runs with equal settings and functions if two of them have the same task, draw and seed: the method was trained twice.
 
-    The labels end in the part of the path in which these two differ.
+    The labels end in the first name in which the paths of these two differ.
     """
-    paths = [run.directory.resolve().parts for run in runs]
+    paths = [str(run.directory.resolve()).split(os.sep) for run in runs]
     seeds = [
         {(run.config.task.name, run.config.settings.draw, seed) for seed in run.config.settings.all_seeds}
         for run in runs

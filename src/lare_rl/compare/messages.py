@@ -1,4 +1,4 @@
-"""What a comparison says in sentences: their templates, and the rules that choose them."""
+"""The sentences of a comparison: their templates, and the rules that choose them."""
 
 import math
 from collections.abc import Iterable, Iterator
@@ -46,7 +46,7 @@ MESSAGES = {
     "min_p": "With these few runs, p is at least {p:.2g}.",
     # Legends.
     "columns": "IQM: interquartile mean over seeds and tasks; of fewer than four scores it is the mean. sd: standard deviation over "
-    "the seeds (n - 1). Minus baseline: the IQM minus that of the baseline, the first method; its interval is too narrow for two or "
+    "the seeds (n - 1). Minus baseline: the IQM minus the IQM of the baseline, the first method; its interval is too narrow for two or "
     "three seeds. Above baseline: the probability that a run scores more than a run of the baseline; without an interval if it is 0 "
     "or 1 on every task. Neither is computed for a single seed. If the score is an error or a loss, a low probability is good. p: "
     "the probability that chance wins at least as many pairs of runs or, if fewer than half were won, loses at least as many (exact "
@@ -85,16 +85,16 @@ def find_small_samples(comparison: Comparison) -> Iterator[Finding]:
     The bootstrap's interval of n = 2 or 3 values is their range: one sample in n^n has the lowest value n times, which is more than
     2.5% of the samples. The range contains the median with probability 1 - 2^(1 - n).
     """
-    counts = {
-        "few_seeds": sorted({row.n_seeds for row in comparison.rows} & {2, 3}),
-        "few_draws": sorted({row.n_draws for row in comparison.rows} & {2, 3}),
+    samples = {
+        "few_seeds": {row.n_seeds for row in comparison.rows},
+        "few_draws": {row.n_draws for row in comparison.rows},
     }
-    if comparison.normalised and any(counts.values()):
+    small_samples = [(code, count) for code, counts in samples.items() for count in sorted(counts & {2, 3})]
+    if comparison.normalised and small_samples:
         yield Finding("few_over_tasks")
-    else:
-        for code, few in counts.items():
-            for count in few:
-                yield Finding(code, {"count": count, "coverage": 1 - 2.0 ** (1 - count)})
+        return
+    for code, count in small_samples:
+        yield Finding(code, {"count": count, "coverage": 1 - 2.0 ** (1 - count)})
 
 
 def find_min_p(comparison: Comparison) -> Iterator[Finding]:

@@ -45,7 +45,7 @@ def write_comparisons(
 
 
 def describe(comparison: Comparison) -> str:
-    """Return what the scores are, and what so few runs cannot show."""
+    """Return what the scores are, and what few runs cannot show."""
     return to_text([find_score_meaning(comparison), *find_small_samples(comparison), *find_min_p(comparison)])
 
 
@@ -85,7 +85,7 @@ def _format_cell(value: Estimate | float | None) -> str:
 
 
 def _find_origin(results: Sequence[Results]) -> Finding | None:
-    """Return what all runs share of their versions, machines and evaluations."""
+    """Return the versions, machine and evaluations that all runs share."""
     configs = [result.config for result in results if result.config is not None]
     values = {
         "lare_version": {config.lare for config in configs},
@@ -105,9 +105,8 @@ def _body(comparisons: Sequence[Comparison]) -> Iterator[str]:
         header, rows = comparison_table(comparison)
         yield render_table(header, rows, range(1, len(header)))
         yield render_note(describe(comparison))
-        score = (
-            comparison.metric if comparison.metric != RETURN else "score" if comparison.normalised else "true return"
-        )
+        scale = "score" if comparison.normalised else "true return"
+        score = scale if comparison.metric == RETURN else comparison.metric
         yield f"<h{level}>Learning</h{level}>"
         yield figures.draw_bands(comparison.curves, "environment steps", f"IQM of the {score}", steps=True)
         yield render_note(MESSAGES["curves"])

@@ -8,6 +8,7 @@ import csv
 import io
 import math
 from collections.abc import Callable, Hashable, Iterable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TypeVar
@@ -61,15 +62,9 @@ def read_run_results(runs: Mapping[str, Sequence[Run]], metric: str) -> list[Res
         curves: dict[int, dict[int, float]] = {seed: {} for seed in run.seeds}
         for line in lines:
             curves[line["seed"]][line["step"]] = float(line[metric])
+        task, draw = run.config.task.name, run.config.settings.draw
         results.append(
-            Results(
-                label=label,
-                source=run.directory,
-                task=run.config.task.name,
-                draw=run.config.settings.draw,
-                curves=curves,
-                config=run.config,
-            )
+            Results(label=label, source=run.directory, task=task, draw=draw, curves=curves, config=run.config)
         )
     return results
 
@@ -93,10 +88,9 @@ def read_results_table(path: Path, metric: str) -> list[Results]:
 
 def _check_columns(path: Path, header: Sequence[str], metric: str) -> None:
     columns = (*COLUMNS, metric)
-    for name in columns:
-        if name not in header:
-            hint = did_you_mean(name, header)
-            raise LareError(f"{path} has no column {name!r}{hint}: a table of results needs {', '.join(columns)}")
+    if name := next((name for name in columns if name not in header), None):
+        hint = did_you_mean(name, header)
+        raise LareError(f"{path} has no column {name!r}{hint}: a table of results needs {', '.join(columns)}")
 
 
 def _read_curves(path: Path, rows: csv.DictReader, metric: str) -> dict[tuple[str, str], dict[int, dict[int, float]]]:
@@ -118,10 +112,8 @@ def _read_curves(path: Path, rows: csv.DictReader, metric: str) -> dict[tuple[st
 
 
 def _parse(where: str, text: str | None, convert: Callable[[str], _Number], kind: str) -> _Number:
-    try:
+    with suppress(ValueError, OverflowError):
         value = convert(text or "")
         if math.isfinite(value):
             return value
-    except (ValueError, OverflowError):
-        pass
     raise LareError(f"{where} {short_repr(text)} is not a {kind} number")

@@ -110,13 +110,13 @@ def _check_tasks(results: Sequence[Results], tasks: Sequence[str], metric: str) 
         raise LareError(f"{metric} has no common scale over several tasks: compare each task alone")
     if len(tasks) > 1 and (unknown := [task for task in tasks if task not in REFERENCE_RETURNS]):
         raise LareError(f"the returns of {', '.join(unknown)} have no common scale: compare each task alone")
-    first: dict[str, Results] = {}
+    sources: dict[str, tuple[Path, str]] = {}  # the first source of each task, and the task's digest
     for result in results:
         if result.config is not None:
-            other = first.setdefault(result.task, result)
-            if other.config is not None and other.config.task.digest != result.config.task.digest:
+            other, digest = sources.setdefault(result.task, (result.source, result.config.task.digest))
+            if digest != result.config.task.digest:
                 raise LareError(
-                    f"{result.source} and {other.source} have two different tasks {result.task}: compare them separately"
+                    f"{result.source} and {other} have two different tasks {result.task}: compare them separately"
                 )
 
 
@@ -126,13 +126,11 @@ def _index_curves(results: Sequence[Results], metric: str) -> dict[_Key, _Curve]
         for seed, values in result.curves.items():
             key = _Key(result.label, result.task, result.draw, seed)
             if key in curves:
-                hint = (
-                    ", or rename the method in the table"
-                    if result.config is None or curves[key].source.suffix == ".csv"
-                    else ""
-                )
+                other = curves[key].source
+                from_table = result.config is None or other.suffix == ".csv"
+                hint = ", or rename the method in the table" if from_table else ""
                 raise LareError(
-                    f"{result.source} and {curves[key].source} both have {key.label} on {key.task} with seed {seed}: leave out one{hint}"
+                    f"{result.source} and {other} both have {key.label} on {key.task} with seed {seed}: leave out one{hint}"
                 )
             if not values:
                 raise LareError(f"{result.source} has no {metric} of seed {seed}: leave it out")

@@ -1,10 +1,12 @@
 """Decide all settings of a run, and check that settings, method, algorithm and task go together."""
 
+from typing import Any
+
 from lare_rl.algorithms.registry import ALGORITHMS, Algorithm, Consumes
-from lare_rl.config.defaults import apply_defaults, choose_algorithm
 from lare_rl.config.effective import ineffective_names, needs_replay
 from lare_rl.config.settings import ResolvedSettings, Settings
 from lare_rl.config.validity import check_credit
+from lare_rl.credit.decoder_settings import MULTI_AGENT_CREDIT, RECENT_STEPS, CreditSettings
 from lare_rl.credit.methods import find_method
 from lare_rl.data.replay import required_capacity
 from lare_rl.envs.families import find_score, load_env_spec
@@ -12,7 +14,7 @@ from lare_rl.envs.interface import EnvSpec
 from lare_rl.errors import LareError
 from lare_rl.tasks.spec import TaskSpec
 
-__all__ = ["resolve"]
+__all__ = ["apply_defaults", "choose_algorithm", "replay_rows", "resolve"]
 
 
 def resolve(settings: Settings, task: TaskSpec) -> ResolvedSettings:
@@ -46,6 +48,53 @@ def resolve(settings: Settings, task: TaskSpec) -> ResolvedSettings:
         )
     _check_size(resolved, task, env)
     return resolved
+
+
+def choose_algorithm(name: str | None, env: EnvSpec) -> str:
+    """Return the requested algorithm, or the default one for an environment."""
+    if name is not None:
+        return name
+    if env.n_agents == 1:
+        return "ppo" if env.discrete else "td3"
+    return "qmix" if env.state_size and env.masks_actions and len(env.teams) == 1 else "ippo"
+
+
+def apply_defaults(settings: Settings, env: EnvSpec) -> ResolvedSettings:
+    """Fill in the settings that are None.
+
+    Raises:
+        LareError: the steps are not a multiple of an iteration's.
+    """
+    algorithm = choose_algorithm(settings.algorithm, env)
+    row = ALGORITHMS[algorithm]
+    defaults: dict[str, Any] = {
+        "method": "lare-bayes",
+        "steps": 1_000_000,
+        "fit_every": 1,
+        "fit_updates": 1,
+        "evaluation_episodes": 10,
+        "credit": {},
+        **row.run_defaults(env, settings.environments or 0),
+    }
+    iteration = (settings.rollout_steps or defaults["rollout_steps"]) * defaults["environments"]
+    for name, iterations in (("steps", "steps_iterations"), ("evaluate_every", "evaluate_iterations")):
+        n_iterations = defaults.pop(iterations, None) or max(1, round(defaults[name] / iteration))
+        defaults[name] = n_iterations * iteration
+    method = find_method(settings.method or defaults["method"])
+    if method.fit is not None and method.fit.separate:
+        defaults["fit_updates"] = max(1, iteration // 50)
+
+    set_values = {name: value for name, value in settings if value is not None and name not in ALGORITHMS}
+    credit = MULTI_AGENT_CREDIT if row.multi_agent else CreditSettings()
+    set_credit = (
+        {name: getattr(settings.credit, name) for name in settings.credit.model_fields_set} if settings.credit else {}
+    )
+    decided = {
+        "algorithm": algorithm,
+        "hyperparameters": getattr(settings, algorithm, row.settings),  # one that was registered late has no field
+        "credit": credit.model_copy(update=defaults["credit"] | set_credit),
+    }
+    return ResolvedSettings(**{**defaults, **set_values, **decided})
 
 
 def _normalise(resolved: ResolvedSettings, task: TaskSpec, env: EnvSpec) -> ResolvedSettings:
@@ -90,3 +139,12 @@ def _check_size(resolved: ResolvedSettings, task: TaskSpec, env: EnvSpec) -> Non
     if needs_replay(resolved) and resolved.capacity < required:
         data = "a rollout" if ALGORITHMS[resolved.algorithm].consumes is Consumes.ROLLOUTS else "an iteration"
         raise LareError(f"capacity = {resolved.capacity} is too small: {data} of {task.name} takes up to {required}")
+
+
+def replay_rows(settings: ResolvedSettings, max_steps: int) -> int:
+    """Return the rows of each environment, if an episode has up to `max_steps` steps."""
+    required = required_capacity(settings.rollout_steps, max_steps)
+    rows = settings.capacity // settings.environments
+    if not needs_replay(settings):  # only to compare the newest rewards with the true ones
+        rows = required + RECENT_STEPS // settings.environments
+    return min(rows, max(required, 2 * settings.steps // settings.environments + 2))

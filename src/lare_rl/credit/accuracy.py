@@ -13,16 +13,10 @@ def metrics(
     mask: Bool[Array, " steps"],
     calibrated: bool,
 ) -> dict[str, Float[Array, ""]]:
-    """Return the accuracy, under the keys of metrics.jsonl.
+    """Return the accuracy over the steps where `mask` is true, under the keys of metrics.jsonl.
 
-    All values are NaN if only last steps of episodes have a reward, because the true rewards of single steps are then unknown.
-
-    Args:
-        r_hat: the proxy rewards.
-        reward: the true rewards.
-        last: which steps are the last of an episode.
-        mask: which steps are valid.
-        calibrated: whether proxy rewards are in the unit of the true rewards. If not, the error is left out.
+    All values are NaN if only the last steps of episodes (`last`) have a reward, because the true rewards of single steps are then
+    unknown. The error is left out unless proxy rewards are in the unit of the true rewards (`calibrated`).
     """
     has_step_rewards = jnp.any((reward != 0) & mask & ~last)
     values = {"credit/correlation": correlation(r_hat, reward, mask)}

@@ -202,12 +202,7 @@ def _set_weights(
 
 
 def select_score_type(decoder: LinearDecoder, index: Int[Array, ""] | int) -> LinearDecoder:
-    """Return the decoder of one score type.
-
-    Args:
-        decoder: the decoders of all fitted score types, along a leading axis.
-        index: the position of the score type in the list of fitted score types.
-    """
+    """Return the decoder of one score type, from the decoders of all fitted score types. `index` is its position among them."""
     return eqx.tree_at(lambda d: (d.weight, d.bias), decoder, (decoder.weight[index], decoder.bias[index]))
 
 

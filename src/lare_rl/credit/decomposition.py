@@ -124,16 +124,16 @@ def init(
     n_agents: int,
     score_types: tuple[int, ...] = (ScoreType.SUM,),
 ) -> Decomposition:
-    """Return the state with an untrained decoder.
+    """Return the state with an untrained decoder. All other functions need the same `settings` and `score_types`.
 
     Args:
         key: the random key of the weights.
         features: the features that a decoder in closed form computes, or the number of inputs, which are used unchanged.
         method: the method.
-        settings: the settings of the decoder and its fit. Pass the same settings to all other functions of this file.
+        settings: the settings of the decoder and its fit.
         max_steps: the number of steps of the longest episode.
         n_agents: the number of agents of a step.
-        score_types: the types that the score may have. Pass the same types to all other functions that take them.
+        score_types: the types that the score may have.
     """
     basis = Basis(n_factors=0, n_raw=features, extended=False) if isinstance(features, int) else features
     shape = DecoderShape(basis, max_steps, n_agents)
@@ -231,11 +231,7 @@ def proxy_rewards(
 ) -> Float[Array, "rows *agents"]:
     """Return r_hat of some steps, in the unit of the true rewards. The decoder need not have been fitted yet.
 
-    Args:
-        state: the state, which holds the decoder.
-        features: the inputs of the decoder at the steps.
-        settings: the settings that `init` was called with.
-        length: T, the number of steps of each row's episode. Without it, the score is treated as a sum.
+    `length` is T, the number of steps of each row's episode. Without it, the score is treated as a sum.
     """
     output = decode(state.decoder, state, features, settings).r_hat
     return _per_step(reward_unit(state, settings) * output, state, length)
@@ -251,7 +247,7 @@ def optimistic_rewards(
 
     sigma is the posterior standard deviation of r_hat, and c is `settings.optimism`. These rewards no longer add up to the return:
     they are too high for uncertain steps, on purpose. The decoder must be in closed form, and `init` must have had the same
-    optimism. The arguments are those of `proxy_rewards`.
+    optimism.
     """
     r_hat = proxy_rewards(state, features, settings, length)
     assert state.closed_form is not None

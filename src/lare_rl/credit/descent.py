@@ -40,15 +40,8 @@ def update_in_chunks(
 ) -> tuple[Decomposition, dict[str, Float[Array, ""]]]:
     """Take one step by the mean of the gradients of several chunks of a batch.
 
-    The gradient equals that of all episodes together, but intermediate arrays are only as large as for one chunk, so that they stay
-    in the processor's cache.
-
-    Args:
-        state: the state.
-        chunks: the chunks, along a leading axis. Each has the same number of episodes, and all masks are 1.
-        key: the random key.
-        fit: the fit of the method.
-        settings: the settings of the decoder.
+    The chunks are along a leading axis. Each has the same number of episodes, and all masks are 1. The gradient equals that of all
+    episodes together, but intermediate arrays are only as large as for one chunk, so that they stay in the processor's cache.
     """
     n_chunks = len(chunks.length)
 

@@ -79,12 +79,7 @@ FACTORS_AND_SCORED = Encoder(("factors", "scored_observation", "action"))
 
 
 def input_size(inputs: tuple[str, ...], sizes: Mapping[str, int]) -> int:
-    """Return how many numbers the inputs have.
-
-    Args:
-        inputs: names, from `Encoder.inputs`.
-        sizes: the sizes of `factors`, `observation` and `action`.
-    """
+    """Return how many numbers the inputs have, by the sizes of `factors`, `observation` and `action`."""
     same_size = {"next_observation": "observation", "observation_change": "observation"}
     return sum(sizes[same_size.get(name, name)] for name in inputs)
 
@@ -92,9 +87,7 @@ def input_size(inputs: tuple[str, ...], sizes: Mapping[str, int]) -> int:
 def input_arrays(inputs: tuple[str, ...], step: Mapping[str, Any]) -> list[Any]:
     """Return the arrays to concatenate, in order. They may be of NumPy, of JAX, or nodes of a graph.
 
-    Args:
-        inputs: names, from `Encoder.inputs`.
-        step: the arrays `factors`, `observation`, `action` and `next_observation`, as far as the inputs need them.
+    `step` has the arrays `factors`, `observation`, `action` and `next_observation`, as far as the inputs need them.
     """
     return [
         step["observation"] - step["next_observation"] if name == "observation_change" else step[name]

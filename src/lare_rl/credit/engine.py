@@ -88,7 +88,7 @@ def credit_spec(
     fixed_length: bool,
     scale_rewards: bool,
 ) -> CreditSpec:
-    """Return the spec of a method for one team.
+    """Return the spec of a method for one team. The arguments that a spec has too are described there.
 
     Args:
         method: the method.
@@ -99,11 +99,10 @@ def credit_spec(
         agents: the number of proxy rewards of a step.
         max_steps: the number of steps of the longest episode.
         fixed_length: whether all episodes have the same length. A sum and a mean are then the same.
-        scale_rewards: whether training rewards are divided by the running root mean square of R/T.
+        scale_rewards: whether training rewards are divided by the scale of R/T.
     """
-    encoder = method.encoder
-    inputs = () if encoder is None else encoder.inputs(judges, single_agent=single_agent)
-    score_types = score_types_to_fit(settings, fixed_length) if "score" in method.settings else (ScoreType.SUM,)
+    inputs = method.encoder.inputs(judges, single_agent=single_agent) if method.encoder is not None else ()
+    score_types = score_types_to_fit(settings.score, fixed_length) if "score" in method.settings else (ScoreType.SUM,)
     return CreditSpec(
         method=method,
         settings=settings,
@@ -120,15 +119,8 @@ def init_decoder(key: PRNGKeyArray, spec: CreditSpec) -> Decomposition | None:
     """Return an untrained decoder. Return None for a method that fits nothing."""
     if spec.method.reward is not Reward.PROXY:
         return None
-    return decomposition.init(
-        key,
-        spec.basis,
-        spec.method,
-        spec.settings,
-        max_steps=spec.max_steps,
-        n_agents=spec.agents,
-        score_types=spec.score_types,
-    )
+    sizes = {"max_steps": spec.max_steps, "n_agents": spec.agents}
+    return decomposition.init(key, spec.basis, spec.method, spec.settings, score_types=spec.score_types, **sizes)
 
 
 class StepBatch(NamedTuple):
@@ -149,12 +141,8 @@ def proxy_rewards(
 ) -> Float[Array, "*batch agents"]:
     """Return r_hat of each agent, in the unit of the true rewards if the method's rewards have one.
 
-    Args:
-        decoder: the decoder; None for a method that has none.
-        scale: the scale of R/T.
-        steps: the steps.
-        spec: the spec that the decoder was made for.
-        optimistic: add the optimism that the settings ask for.
+    `decoder` is None for a method that has none. `scale` is the scale of R/T. If `optimistic`, the optimism that the settings ask
+    for is added.
     """
     match spec.method.reward:
         case Reward.DESIGNED:
@@ -178,15 +166,7 @@ def training_rewards(
     spec: CreditSpec,
     alive: Bool[Array, "*batch team"],
 ) -> Float[Array, "*batch team"]:
-    """Return the rewards that an algorithm is trained on, for each agent of the team.
-
-    Args:
-        decoder: the decoder; None for a method that has none.
-        scale: the scale of R/T.
-        steps: the steps.
-        spec: the spec that the decoder was made for.
-        alive: which agents acted.
-    """
+    """Return the rewards that an algorithm is trained on, for each agent of the team. `alive` says which agents acted."""
     r_hat = jnp.broadcast_to(proxy_rewards(decoder, scale, steps, spec, optimistic=True), alive.shape)
     if spec.method.shared:
         r_hat = jnp.broadcast_to(alive_mean(r_hat, alive)[..., None], alive.shape)
@@ -217,12 +197,7 @@ class ExplanationState(NamedTuple):
 
 
 def init_explanation(statistics: RunningMeanStd, basis: Basis) -> ExplanationState:
-    """Return empty sums.
-
-    Args:
-        statistics: mean and deviation of the inputs. They standardise the inputs.
-        basis: the features that explain the returns.
-    """
+    """Return empty sums. `statistics` standardise the inputs, and the features of `basis` explain the returns."""
     closed = closed_form.reset_statistics(closed_form.init(basis, 1), statistics)
     return ExplanationState(closed, empty_step_statistics(basis))
 

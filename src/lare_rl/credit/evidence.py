@@ -180,7 +180,7 @@ def fit(
     score_type: Int[Array, ""] | int,
     group_index: Int[np.ndarray, " features"],
     start: Posterior,
-    max_rounds: int,
+    max_rounds: int | Int[Array, ""],
 ) -> Posterior:
     """Return the posterior under the precisions that maximise the evidence.
 

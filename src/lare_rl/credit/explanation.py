@@ -103,14 +103,7 @@ def add_steps(
 def explain(
     statistics: SufficientStatistics, step_statistics: StepStatistics, score_type: Int[Array, ""] | int, basis: Basis
 ) -> Explanation:
-    """Explain returns by the features of a basis, within `float64()`.
-
-    Args:
-        statistics: the sums over episodes.
-        step_statistics: the sums over their steps.
-        score_type: a `ScoreType`.
-        basis: the features.
-    """
+    """Explain returns by the features of a basis, from sums over episodes and over their steps. Call this within `float64()`."""
     is_factor, extended = basis.is_factor_feature, int(basis.extended)
     full = _fit(statistics, score_type, basis.group_index)
     raw_single, raw_pairs = _input_shares(
@@ -237,10 +230,7 @@ def _slopes(
 def _residual_correlation(problem: Regression, basis: Basis, posterior: Posterior) -> Float[Array, " raw"]:
     """Return the correlation of the raw features with the residual of a fit on the factors.
 
-    Args:
-        problem: the regression on all features.
-        basis: the features.
-        posterior: the posterior of the fit on the factors.
+    `problem` is the regression on all features, `posterior` that of the fit on the factors.
     """
     n_factor_features = int(np.sum(basis.is_factor_feature))
     weight = posterior.weight / jnp.where(problem.y_std > 0, problem.y_std, 1)

@@ -20,7 +20,7 @@ COMPLETE_SHARE = 0.95
 NOTICEABLE_SHARE = 0.05
 """Nothing is said about the effect of a factor, or about a raw feature, with a smaller share."""
 LARGE_SHARE = 0.1
-"""Raw features are named if they add a larger share to that of the factors."""
+"""Raw features are named if they add a larger share to the share of the factors."""
 STRAIGHT_SHARE = 0.8
 """The effect of a factor is curved if the closest line has a smaller share of its variance."""
 CLEAR_STDS = 2.0
@@ -197,7 +197,7 @@ def _residual_findings(explanation: Explanation, factors: Sequence[str], raw_fea
 
 
 def _factor_findings(explanation: Explanation, names: Sequence[str]) -> list[Finding]:
-    """Report each factor, those with the largest shares first. Its values before and after a step are reported together."""
+    """Report each factor, in order of their shares. The values of a factor before and after a step are reported together."""
     indices: dict[str, list[int]] = {}
     for i, name in enumerate(names):
         indices.setdefault(name.removesuffix(" (before)").removesuffix(" (after)"), []).append(i)

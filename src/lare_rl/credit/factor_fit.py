@@ -24,7 +24,7 @@ from lare_rl.credit.closed_form import FIT_GROWTH, MAX_ROUNDS, LinearDecoder
 from lare_rl.credit.evidence import Posterior, SufficientStatistics
 from lare_rl.credit.explanation import Explanation, StepStatistics, add_steps, empty_step_statistics, explain
 from lare_rl.credit.returns import MAX_ERROR_RATIO
-from lare_rl.credit.score_type import ScoreType, ScoreTypeEstimate
+from lare_rl.credit.score_type import ScoreType, ScoreTypeEstimate, score_types_to_fit
 from lare_rl.util.float64 import float64
 from lare_rl.util.statistics import r_squared
 
@@ -66,8 +66,7 @@ def assess_factors(
     """
     length = np.array([len(episode) for episode in inputs])
     lengths_differ = len(set(length)) > 1
-    all_types = (ScoreType.SUM, ScoreType.MEAN) if lengths_differ else (ScoreType.SUM,)
-    score_types = {"sum": (ScoreType.SUM,), "average": (ScoreType.MEAN,)}.get(score or "", all_types)
+    score_types = score_types_to_fit(score or "auto", fixed_length=not lengths_differ)
     with float64():
         features, step_statistics = mean_features(inputs, alive, basis)
         predict = partial(predict_returns, returns=returns, length=length, basis=basis)
@@ -82,13 +81,8 @@ def assess_factors(
         explanation = jax.tree.map(np.asarray, explanation)
     is_certain = min(errors.values()) < MAX_ERROR_RATIO * max(errors.values())
     r2, r2_error = r_squared(returns[N_FIRST:], predicted[score_type])
-    return FactorAssessment(
-        r2=r2,
-        r2_error=r2_error,
-        length_r2=length_r2,
-        score_type=ScoreTypeEstimate(score_type, is_certain) if len(score_types) > 1 else None,
-        explanation=explanation,
-    )
+    estimate = ScoreTypeEstimate(score_type, is_certain) if len(score_types) > 1 else None
+    return FactorAssessment(r2, r2_error, length_r2=length_r2, score_type=estimate, explanation=explanation)
 
 
 def mean_features(
@@ -117,7 +111,6 @@ def _add_episode(
     inputs: Float[Array, "steps agents inputs"],
     share: Float[Array, "steps agents"],
 ) -> tuple[Float[Array, " features"], StepStatistics]:
-    """Return the weighted sum of the features of an episode's steps, and the sums over all steps so far."""
     features = decoder.features(inputs).astype(float)
     return jnp.einsum("taf,ta->f", features, share), add_steps(statistics, features, share > 0, decoder.basis)
 
@@ -131,12 +124,7 @@ def predict_returns(
 ) -> Float[np.ndarray, " later_episodes"]:
     """Return R_hat of all episodes but the first `N_FIRST`, each by a fit to episodes before it. Call this within `float64()`.
 
-    Args:
-        features: the mean features of each episode.
-        returns: R of each episode.
-        length: T of each episode.
-        basis: the features. Only functions of factors are used.
-        score_type: a `ScoreType`.
+    `features` are the means of each episode. Only functions of factors are used.
     """
     features, group_index = features[:, basis.is_factor_feature], basis.group_index[basis.is_factor_feature]
     n_features, n_groups = len(group_index), int(group_index.max()) + 1

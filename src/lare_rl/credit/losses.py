@@ -18,10 +18,7 @@ def episode_means(
 ) -> Float[Array, " episodes"]:
     """Return mean_t r_hat_t of each episode over its steps in the batch: all T of them, or K sampled ones.
 
-    Args:
-        r_hat: the proxy rewards of the steps.
-        episode_index: the index of each step's episode. Steps whose index is not in 0..B-1 are ignored.
-        n_steps: the number of steps of each episode in the batch.
+    `n_steps` is the number of steps of each episode in the batch. Steps whose `episode_index` is not in 0..B-1 are ignored.
     """
     total = jnp.zeros(n_steps.shape, r_hat.dtype).at[episode_index].add(r_hat, mode="drop")
     return total / jnp.maximum(n_steps, 1)
@@ -33,7 +30,7 @@ def squared_error(
     """Return sum_b w_b (mean_b - target_b)^2 / B, over the B episodes whose weight is not zero.
 
     With `mean` over all T steps and `target` = R/T, this is the loss of RD (Efroni et al., 2021; LaRe, Eq. 6). With `mean` over K
-    sampled steps, it is that of RRD (Ren et al., 2022, Eq. 6). `weight` is that of `episode_weight`.
+    sampled steps, it is the loss of RRD (Ren et al., 2022, Eq. 6). `episode_weight` computes `weight`.
     """
     return jnp.sum(weight * (mean - target) ** 2) / jnp.maximum(jnp.sum(weight > 0), 1)
 
@@ -43,7 +40,7 @@ def subsampling_variance(
 ) -> Float[Array, " episodes"]:
     """Return Var_K(r_hat) (1 - K/T) / K, which sampling K of T steps adds to the squared error (Ren et al., 2022, Appendix).
 
-    Var_K is the sample variance (divided by K - 1). The finite-population factor (1 - K/T) is that of sampling without replacement.
+    Var_K is the sample variance (divided by K - 1). The finite-population factor (1 - K/T) is due to sampling without replacement.
     If K >= T, all T steps are used and the value is 0. It is never negative.
     """
     k = r_hat.shape[1]
@@ -57,7 +54,7 @@ def unbiased_squared_error(
     weight: Float[Array, " episodes"],
     variance: Float[Array, " episodes"],
 ) -> Float[Array, ""]:
-    """Return the loss of RRD-unbiased: that of RRD minus the `subsampling_variance`, so that its expectation is RD's loss."""
+    """Return the loss of RRD-unbiased: RRD's loss minus the `subsampling_variance`. Its expectation is RD's loss."""
     correction = jnp.sum(weight * variance) / jnp.maximum(jnp.sum(weight > 0), 1)
     return squared_error(mean, target, weight) - correction
 

@@ -33,7 +33,7 @@ __all__ = [
 ]
 
 MAX_ERROR_RATIO = 0.95
-"""A score is treated as a mean if the squared error of a mean's predictions is below this fraction of that of a sum's. If all
+"""A score is treated as a mean if its predictions as a mean have a squared error below this fraction of the error as a sum. If all
 episodes are equally long, both errors are equal except for rounding."""
 MIN_GROWTH = 0.02
 """A decoder learns from new episodes when their number exceeds this fraction of the number of old ones. Short episodes thus come in

@@ -3,8 +3,6 @@
 from enum import IntEnum
 from typing import NamedTuple
 
-from lare_rl.credit.decoder_settings import CreditSettings
-
 __all__ = ["ScoreType", "ScoreTypeEstimate", "score_types_to_fit"]
 
 
@@ -25,8 +23,8 @@ class ScoreTypeEstimate(NamedTuple):
     """Whether this type predicts the returns clearly better than the other one."""
 
 
-def score_types_to_fit(settings: CreditSettings, fixed_length: bool) -> tuple[ScoreType, ...]:
-    """Return the types to fit: both if the type is unknown and episodes differ in length, else one."""
-    if settings.score == "auto":
+def score_types_to_fit(score: str, fixed_length: bool) -> tuple[ScoreType, ...]:
+    """Return the types to fit, by the setting `score`: both if it is "auto" and episodes differ in length, else one."""
+    if score == "auto":
         return (ScoreType.SUM,) if fixed_length else (ScoreType.SUM, ScoreType.MEAN)
-    return (ScoreType.SUM,) if settings.score == "sum" else (ScoreType.MEAN,)
+    return (ScoreType.SUM,) if score == "sum" else (ScoreType.MEAN,)

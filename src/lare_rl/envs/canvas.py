@@ -1,12 +1,14 @@
 """A square figure without a window, on which all environments draw."""
 
+from collections.abc import Callable
+
 import numpy as np
 from jaxtyping import UInt8
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
-__all__ = ["blank_figure", "to_pixels"]
+__all__ = ["blank_figure", "paint_frames", "to_pixels"]
 
 
 def blank_figure() -> tuple[Figure, Axes]:
@@ -14,6 +16,17 @@ def blank_figure() -> tuple[Figure, Axes]:
     figure = Figure(figsize=(4, 4))
     FigureCanvasAgg(figure)
     return figure, figure.add_axes((0, 0, 1, 1))
+
+
+def paint_frames(n_frames: int, paint: Callable[[Axes, int], None]) -> list[UInt8[np.ndarray, "height width 3"]]:
+    """Return pictures. `paint` draws the picture of an index on empty axes."""
+    figure, axes = blank_figure()
+    frames = []
+    for index in range(n_frames):
+        axes.clear()
+        paint(axes, index)
+        frames.append(to_pixels(figure))
+    return frames
 
 
 def to_pixels(figure: Figure) -> UInt8[np.ndarray, "height width 3"]:

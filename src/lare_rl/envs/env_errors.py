@@ -8,8 +8,9 @@ from typing import Any
 import numpy as np
 
 from lare_rl.errors import LareError, short_repr
+from lare_rl.tasks.spec import TaskSpec
 
-__all__ = ["EnvOutputError", "as_lare_error", "one_line_errors", "read_measure", "to_float"]
+__all__ = ["EnvOutputError", "as_lare_error", "no_time_limit_error", "one_line_errors", "read_measure", "to_float"]
 
 
 class EnvOutputError(LareError):
@@ -38,6 +39,13 @@ def one_line_errors(message: str, make_hint: Callable[[BaseException], str] = la
         yield
     except (Exception, SystemExit) as error:
         raise as_lare_error(message, error, make_hint(error)) from error
+
+
+def no_time_limit_error(task: TaskSpec) -> LareError:
+    return LareError(
+        f"task {task.name!r}: {task.environment} has no time limit, so an episode may never end. "
+        "Set max_episode_steps in the task file, to the length of its longest episode or more."
+    )
 
 
 def to_float(value: Any) -> float:

@@ -145,7 +145,6 @@ def _refuse_to_make(task: TaskSpec, **_: Any) -> HostEnv:
 
 
 def _check_keys(task: TaskSpec, family: Family) -> None:
-    """Raise `LareError` at the first key that would be ignored."""
     for role in (task, *task.teams):
         for key in OPTIONAL_KEYS:
             if getattr(role, key) and key not in family.reads:
@@ -180,9 +179,8 @@ def _check_spec(task: TaskSpec, spec: EnvSpec) -> None:
         for key in SHARED_KEYS:  # training reads only the task's keys, verification only the team's
             team_value, task_value = getattr(role, key), getattr(task, key)
             if team_value != task_value:
-                raise fail(
-                    role, f"{key} = {team_value!r}, but {task_value!r} in {task.name!r}. Use the same value in both."
-                )
+                advice = "Use the same value in both."
+                raise fail(role, f"{key} = {team_value!r}, but {task_value!r} in {task.name!r}. {advice}")
     if not task.teams and task.team not in (None, *names):
         raise fail(task, f"team = {task.team!r}, but the teams of {env} are {', '.join(names)}")
     if task.max_episode_steps not in (None, spec.max_steps):
@@ -195,12 +193,10 @@ def _check_spec(task: TaskSpec, spec: EnvSpec) -> None:
         raise fail(task, f"judged_from = 'state', but {env} has no global state")
     for role in task.roles:
         team = spec.teams[names.index(role.team)] if role.team in names else spec.teams[0]
-        sizes = {
-            "observation_size": ("states", spec.state_size) if from_state else ("observations", spec.observation_size),
-            "action_size": ("joint actions", spec.action_size * team.n_agents)
-            if from_state
-            else ("actions", spec.action_size),
-        }
-        for key, (content, size) in sizes.items():
+        if from_state:
+            sizes = ("states", spec.state_size), ("joint actions", spec.action_size * team.n_agents)
+        else:
+            sizes = ("observations", spec.observation_size), ("actions", spec.action_size)
+        for key, (content, size) in zip(("observation_size", "action_size"), sizes, strict=True):
             if getattr(role, key) != size:
                 raise fail(role, f"{key} = {getattr(role, key)}, but {env} has {content} of size {size}")

@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Float
 
 from lare_rl.envs import mujoco_rewards
-from lare_rl.envs.env_errors import EnvOutputError, one_line_errors, read_measure, to_float
+from lare_rl.envs.env_errors import EnvOutputError, no_time_limit_error, one_line_errors, read_measure, to_float
 from lare_rl.envs.interface import EnvSpec, Team, Timestep
 from lare_rl.envs.spaces import OneHot, check_spaces, finite_array, flatten_spaces
 from lare_rl.errors import LareError, short_repr
@@ -57,11 +57,7 @@ class GymnasiumEnv:
     """A Gymnasium environment as a `HostEnv`. All values that the environment returns are checked."""
 
     def __init__(self, task: TaskSpec, **kwargs: Any):
-        """Make the environment of a task.
-
-        Args:
-            task: the task.
-            kwargs: arguments of `gymnasium.make`.
+        """Make the environment of a task. See `gymnasium.make` for the keyword arguments.
 
         Raises:
             LareError: the environment cannot be made, or has no time limit.
@@ -70,10 +66,7 @@ class GymnasiumEnv:
         self.environment = make_gymnasium(task.environment, task.max_episode_steps, **kwargs)
         if not (self.environment.spec and self.environment.spec.max_episode_steps):
             self.close()
-            raise LareError(
-                f"task {task.name!r}: {task.environment} has no time limit, so an episode may never end. "
-                "Set max_episode_steps in the task file, to the length of its longest episode or more."
-            )
+            raise no_time_limit_error(task)
         observation_space, action_space = self.environment.observation_space, self.environment.action_space
         dtype = np.result_type(action_space.dtype or np.float32, np.float32)  # bounds stay as precise as they are
         self.spec = EnvSpec(
@@ -88,13 +81,11 @@ class GymnasiumEnv:
         )
 
     def reset(self, seed: int) -> Timestep:
-        """Start an episode."""
         with one_line_errors(f"environment {self._name!r} failed in reset"):
             observation, info = self.environment.reset(seed=seed)
         return self._make_timestep(observation, 0.0, False, False, info)
 
     def step(self, action: Float[np.ndarray, "1 action"]) -> Timestep:
-        """Make one step."""
         with one_line_errors(f"environment {self._name!r} failed in step"):
             observation, reward, terminated, truncated, info = self.environment.step(action[0])
             terminated, truncated = bool(terminated), bool(truncated)  # fails for arrays with several elements
@@ -125,11 +116,9 @@ class GymnasiumEnv:
         )
 
     def render(self) -> Any:
-        """Return the environment's picture."""
         with one_line_errors(f"environment {self._name!r} failed in render"):
             return self.environment.render()
 
     def close(self) -> None:
-        """Close the environment."""
         with one_line_errors(f"environment {self._name!r} failed in close"):
             self.environment.close()

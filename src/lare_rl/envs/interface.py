@@ -167,4 +167,3 @@ class HostEnv(Protocol):
 
     def close(self) -> None:
         """Release the resources of the environment."""
-        ...

@@ -20,13 +20,11 @@ class JaxOnHost:
         self._reset, self._step = jax.jit(env.reset), jax.jit(env.step)
 
     def reset(self, seed: int) -> Timestep:
-        """Start an episode."""
         key, self._key = jax.random.split(jax.random.key(seed))
         self._state, timestep = self._reset(key)
         return jax.tree.map(np.asarray, timestep)
 
     def step(self, action: Float[np.ndarray, "agents action"]) -> Timestep:
-        """Make one step."""
         self._key, key = jax.random.split(self._key)
         self._state, timestep = self._step(self._state, action, key)
         return jax.tree.map(np.asarray, timestep)
@@ -37,5 +35,4 @@ class JaxOnHost:
             "an environment in JAX cannot be rendered step by step. Call its frames() on the states of an episode."
         )
 
-    def close(self) -> None:
-        """Do nothing."""
+    def close(self) -> None: ...

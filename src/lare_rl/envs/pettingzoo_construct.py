@@ -1,17 +1,20 @@
-"""Makes a PettingZoo environment from its name, and finds its time limit."""
+"""Makes a PettingZoo environment from its name, finds its time limit, and groups its agents into teams."""
 
 import importlib
+import re
 import warnings
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from fnmatch import fnmatchcase
 from typing import Any
 
 import numpy as np
 
 from lare_rl.envs.env_errors import one_line_errors
+from lare_rl.envs.interface import Team
 from lare_rl.errors import LareError, did_you_mean, install_command, short_repr
-from lare_rl.tasks.spec import PETTINGZOO_PREFIX
+from lare_rl.tasks.spec import PETTINGZOO_PREFIX, TaskSpec
 
-__all__ = ["find_time_limit", "make_parallel_env"]
+__all__ = ["agent_kind", "find_time_limit", "group_by_team", "make_parallel_env"]
 
 REQUIRED = ("possible_agents", "observation_space", "action_space", "reset", "step")
 """The attributes of a ParallelEnv."""
@@ -37,7 +40,7 @@ def make_parallel_env(name: str, arguments: Mapping[str, Any]) -> Any:
         warnings.filterwarnings("ignore", message="The old environment creation API", category=DeprecationWarning)
         module = importlib.import_module(module_name)
         if not hasattr(module, maker_name):
-            raise LareError(f"{message}: {module_name} has no {maker_name!r}{_suggest_makers(module, maker_name)}")
+            raise LareError(f"{message}: {module_name} has no {maker_name!r}{did_you_mean(maker_name, vars(module))}")
         env = getattr(module, maker_name)(**arguments)
     if hasattr(env, "agent_iter"):
         raise LareError(f"{message}: {maker_name} makes an AECEnv, whose agents take turns. Name its parallel_env.")
@@ -55,11 +58,6 @@ def _make_hint(error: BaseException) -> str:
     return " (a module in this folder is found with PYTHONPATH=.)"
 
 
-def _suggest_makers(module: Any, name: str) -> str:
-    makers = [key for key, value in vars(module).items() if callable(value) and not key.startswith("_")]
-    return did_you_mean(name, makers) or (f"; it has {', '.join(makers[:8])}" if makers else "")
-
-
 def find_time_limit(env: Any, arguments: Mapping[str, Any]) -> int | None:
     """Return an environment's own time limit (steps), if the environment or its arguments contain one."""
     unwrapped = getattr(env, "unwrapped", env)
@@ -67,3 +65,47 @@ def find_time_limit(env: Any, arguments: Mapping[str, Any]) -> int | None:
     for owner in (env, unwrapped, getattr(unwrapped, "env", None)):
         candidates += [getattr(owner, name, None) for name in TIME_LIMITS]
     return next((int(limit) for limit in candidates if isinstance(limit, int | np.integer) and limit >= 1), None)
+
+
+def agent_kind(name: Any) -> str:
+    """Return an agent's name without its number: `prey` for `prey_0`."""
+    return re.sub(r"_?\d+$", "", str(name)) or str(name)
+
+
+def group_by_team(names: Sequence[Any], task: TaskSpec) -> tuple[list[Any], tuple[Team, ...]]:
+    """Return the agents' names, team by team, and the teams.
+
+    Raises:
+        LareError: an agent is in no team or in several, or a team has no agents.
+    """
+    patterns = "; ".join(f"{role.team or role.name}: {', '.join(role.agents) or 'all'}" for role in task.roles)
+    teams = {role.team or role.name: [name for name in names if _is_member(name, role)] for role in task.roles}
+    for team, members in teams.items():
+        if not members:
+            agents = ", ".join(map(str, names))
+            raise LareError(f"task {task.name!r}: no agent is in {team}. The agents are {agents} ({patterns}).")
+    if task.team is not None:  # the task file of a single team, used to verify its function
+        rest = [name for name in names if name not in teams[task.team]]
+        return _make_teams(teams | ({f"not {task.team}": rest} if rest else {}))
+    for name in names:
+        memberships = [team for team, members in teams.items() if name in members]
+        if len(memberships) != 1:
+            where = " and ".join(memberships) or "no team"
+            raise LareError(f"task {task.name!r}: {name} is in {where}. Each agent must be in one team ({patterns}).")
+    if not task.teams:
+        kinds = {agent_kind(name) for name in names}
+        teams = {kinds.pop() if len(kinds) == 1 else "agent": list(names)}
+    return _make_teams(teams)
+
+
+def _make_teams(members: Mapping[str, Sequence[Any]]) -> tuple[list[Any], tuple[Team, ...]]:
+    names: list[Any] = []
+    teams: list[Team] = []
+    for team, agents in members.items():
+        teams.append(Team(team, len(names), len(names) + len(agents)))
+        names += agents
+    return names, tuple(teams)
+
+
+def _is_member(name: Any, role: TaskSpec) -> bool:
+    return not role.agents or any(fnmatchcase(str(name), pattern) for pattern in role.agents)

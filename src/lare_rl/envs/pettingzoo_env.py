@@ -11,11 +11,11 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float
 
+from lare_rl.envs import env_errors
 from lare_rl.envs.agent_arrays import Agent, AgentArrays, make_agent
-from lare_rl.envs.agent_teams import group_by_team
-from lare_rl.envs.env_errors import EnvOutputError, as_lare_error, one_line_errors, read_measure, to_float
+from lare_rl.envs.env_errors import EnvOutputError, one_line_errors, read_measure, to_float
 from lare_rl.envs.interface import EnvSpec, Timestep
-from lare_rl.envs.pettingzoo_construct import find_time_limit, make_parallel_env
+from lare_rl.envs.pettingzoo_construct import find_time_limit, group_by_team, make_parallel_env
 from lare_rl.envs.spaces import finite_array
 from lare_rl.errors import LareError, short_repr
 from lare_rl.tasks.spec import TaskSpec
@@ -66,10 +66,7 @@ class ParallelHost:
             raise LareError(f"environment {self._name!r}: {error}") from None
         max_steps = task.max_episode_steps or find_time_limit(environment, task.arguments)
         if max_steps is None:
-            raise LareError(
-                f"task {task.name!r}: {self._name} has no time limit, so an episode may never end. "
-                "Set max_episode_steps in the task file, to the length of its longest episode or more."
-            )
+            raise env_errors.no_time_limit_error(task)
         self._available = self.layout.available
         self._masks_actions = any(agent.observes_mask for agent in agents) or not self._available.all()
         self._credit_from_state = any(role.judged_from == "state" for role in (task, *task.teams))
@@ -95,19 +92,17 @@ class ParallelHost:
         )
 
     def reset(self, seed: int) -> Timestep:
-        """Start an episode. The same seed gives the same episode."""
         self._alive[:] = False
         observations, infos = self._call("reset", 2, seed=int(seed))
         self._steps = 0
         self._present = self._read_present()
         self._left = np.zeros_like(self._alive)
         if not self._present.any():
-            raise EnvOutputError(f"environment {self._name!r} has no agents after reset")
+            raise self._error(" has no agents after reset")
         self._alive = self._present.copy()
         return self._make_timestep(observations, infos, np.zeros(len(self._alive)), self._alive, self._alive)
 
     def step(self, action: Float[np.ndarray, "agents action"]) -> Timestep:
-        """Make one step. Continuous actions are in the environment's units, discrete actions are one-hot."""
         acted = self._alive
         if not acted.any():
             raise LareError(f"environment {self._name!r} has no running episode. Call reset before step.")
@@ -118,9 +113,7 @@ class ParallelHost:
         was_present, self._present = self._present, self._read_present()
         self._left |= was_present & ~self._present
         for index in np.flatnonzero(self._present & ~was_present & self._left):
-            raise EnvOutputError(
-                f"environment {self._name!r}: {agents[index].name} is among its agents again after it left"
-            )
+            raise self._error(f": {agents[index].name} is among its agents again after it left")
 
         reward = np.zeros(len(agents))
         terminated, truncated = np.zeros((2, len(agents)), bool)
@@ -145,7 +138,6 @@ class ParallelHost:
         )
 
     def render(self) -> Float[np.ndarray, "height width 3"] | Any:
-        """Return a picture of the environment (height, width, 3)."""
         with one_line_errors(f"environment {self._name!r} failed in render"):
             pixels = self.environment.render()
         if not isinstance(pixels, np.ndarray) or pixels.ndim != 3 or pixels.shape[2] != 3:
@@ -156,28 +148,26 @@ class ParallelHost:
         return pixels
 
     def close(self) -> None:
-        """Release the resources of the environment."""
         with one_line_errors(f"environment {self._name!r} failed in close"):
             self.environment.close()
+
+    def _error(self, predicate: str) -> EnvOutputError:
+        return EnvOutputError(f"environment {self._name!r}{predicate}")
 
     def _call(self, method: str, n: int, *args: Any, **kwargs: Any) -> tuple[Mapping[Any, Any], ...]:
         """Return the n dictionaries by agent that `reset` or `step` of the environment returns."""
         with one_line_errors(f"environment {self._name!r} failed in {method}"):
             values = getattr(self.environment, method)(*args, **kwargs)
         if not (isinstance(values, tuple) and len(values) == n and all(isinstance(value, Mapping) for value in values)):
-            raise EnvOutputError(
-                f"environment {self._name!r} returned {short_repr(values)} from {method}, not {n} dictionaries by agent"
-            )
+            raise self._error(f" returned {short_repr(values)} from {method}, not {n} dictionaries by agent")
         return values
 
     def _read_present(self) -> Bool[np.ndarray, " agents"]:
-        """Return which agents the environment lists."""
         names, index = self.environment.agents, self.layout.index
         for name in names:
             if name not in index:
-                raise EnvOutputError(
-                    f"environment {self._name!r} has the agent {name!r}, but its possible agents are {', '.join(map(str, index))}"
-                )
+                possible = ", ".join(map(str, index))
+                raise self._error(f" has the agent {name!r}, but its possible agents are {possible}")
         return np.array([name in names for name in index])
 
     def _read(
@@ -188,7 +178,7 @@ class ParallelHost:
             value = values[agent.name]  # not `in`: PettingZoo's own wrapper returns rewards as a defaultdict
         except KeyError:
             if required:
-                raise EnvOutputError(f"environment {self._name!r} returned no {name} for {agent.name}") from None
+                raise self._error(f" returned no {name} for {agent.name}") from None
             return 0
         return self._convert(name, agent, convert, value)
 
@@ -196,7 +186,7 @@ class ParallelHost:
         try:
             return convert(*values)
         except ValueError as error:
-            raise EnvOutputError(f"environment {self._name!r}: the {name} of {agent.name} {error}") from None
+            raise self._error(f": the {name} of {agent.name} {error}") from None
 
     def _make_timestep(
         self,
@@ -241,9 +231,8 @@ class ParallelHost:
         if self._initialising:
             self._masks_actions = True
         elif not self._masks_actions:
-            raise EnvOutputError(
-                f"environment {self._name!r} returned an action mask for {agent.name}, but none at its first reset. "
-                "Return masks at every step."
+            raise self._error(
+                f" returned an action mask for {agent.name}, but none at its first reset. Return masks at every step."
             )
 
     def _read_state(self, observation: Float[np.ndarray, "agents observation"]) -> Float[np.ndarray, " state"]:
@@ -265,7 +254,7 @@ class ParallelHost:
         except (Exception, SystemExit) as error:
             if self._initialising and isinstance(error, NotImplementedError):
                 return  # from PettingZoo's base class: the environment has no state
-            error = as_lare_error(f"environment {self._name!r} failed in state", error)
+            error = env_errors.as_lare_error(f"environment {self._name!r} failed in state", error)
             if self._initialising or self._credit_from_state:
                 raise error from None
             # Only a critic reads the state: keep the previous one. Multiwalker has no state once an agent has fallen.
@@ -276,7 +265,7 @@ class ParallelHost:
         try:
             self._state = finite_array(value, None if self._state is None else self._state.shape)
         except ValueError as error:
-            raise EnvOutputError(f"environment {self._name!r}: the state {error}") from None
+            raise self._error(f": the state {error}") from None
 
 
 def _to_reward(value: Any) -> float:

@@ -42,19 +42,17 @@ class StarCraft:
 
     spec: EnvSpec
 
-    def __init__(self, name: str, relaunch: bool = False, make_game: Callable[..., Any] | None = None):
+    def __init__(self, name: str, make_game: Callable[..., Any] | None = None):
         """Make the game.
 
         Args:
             name: the name of the map.
-            relaunch: start the game again at each `reset`, with its seed. SMAC accepts a seed only at the start of a game, and a
-                start takes many seconds. Without it, only the first episode follows its seed, and later ones continue from there.
             make_game: a function that makes the game. Default: SMAC's class.
 
         Raises:
             LareError: the package, StarCraft II or the map is missing.
         """
-        self._name, self._relaunch, self._make_game = name, relaunch, make_game or _find_game()
+        self._name, self._make_game = name, make_game or _find_game()
         self._game: Any = None
         self._can_continue = False
         self._n_crashes = 0
@@ -79,9 +77,9 @@ class StarCraft:
         return self._game
 
     def reset(self, seed: int) -> Timestep:
-        """Start an episode."""
+        """Start an episode. Only the first one follows its seed: SMAC accepts a seed only at the start of a game, which is slow."""
         # Before an episode has ended, SMAC's reset would start another game in addition to the running one.
-        if self._relaunch or not self._can_continue:
+        if not self._can_continue:
             self._launch(seed)
         with one_line_errors(f"StarCraft II does not start {self._name!r}"):
             self._game.reset()
@@ -126,20 +124,17 @@ class StarCraft:
             available=available,
             alive=alive,
             reward=reward,
-            terminated=np.array(
-                done and (not at_limit or won or not alive.any())
-            ),  # SMAC does not tell truncation apart
+            # SMAC does not distinguish truncation.
+            terminated=np.array(done and (not at_limit or won or not alive.any())),
             truncated=np.array(at_limit),
             measures={"won": np.array(won, np.float32)},
         )
         return self._timestep
 
     def render(self) -> Any:
-        """Return the battle as pixels (height, width, 3)."""
         return self._game.render(mode="rgb_array")
 
     def close(self) -> None:
-        """End the game."""
         if self._game is not None:
             self._game.close()
             self._game = None
@@ -158,9 +153,8 @@ def _find_game() -> Callable[..., Any]:
         raise LareError(
             f"StarCraft II is not at {folder}. Set SC2PATH to its folder, with SMAC's maps in Maps/SMAC_Maps."
         )
-    with one_line_errors(
-        f"{modules[0]} cannot be imported"
-    ):  # old protocol buffers fail with a new protobuf, for example
+    # For example, old protocol buffers fail with a new protobuf.
+    with one_line_errors(f"{modules[0]} cannot be imported"):
         return importlib.import_module(modules[0]).StarCraft2Env
 
 

@@ -51,21 +51,18 @@ class VecEnv(ABC):
 
     def __init__(self, specs: Sequence[EnvSpec]):
         self.spec = specs[0]
-        for env_index, spec in enumerate(specs):
-            if _sizes(spec) != _sizes(self.spec):
-                raise LareError(
-                    f"environment {env_index} differs from environment 0: {_sizes(spec)}, not {_sizes(self.spec)}"
-                )
+        first, *rest = map(_sizes, specs)
+        for env_index, sizes in enumerate(rest, 1):
+            if sizes != first:
+                raise LareError(f"environment {env_index} differs from environment 0: {sizes}, not {first}")
         self.batch = _empty_batch(self.spec, len(specs))
 
     def reset(self, where: Bool[np.ndarray, " n"], seeds: Integer[np.ndarray, " n"]) -> Timestep:
-        """Start episodes. The same seeds give the same episodes."""
         return self._update_batch("reset", {index: int(seeds[index]) for index in np.flatnonzero(where).tolist()})
 
     def step(
         self, action: Float[np.ndarray, "n agents action"], where: Bool[np.ndarray, " n"] | None = None
     ) -> Timestep:
-        """Make one step of each selected environment."""
         indices = range(len(self.batch.alive)) if where is None else np.flatnonzero(where).tolist()
         return self._update_batch("step", {index: action[index] for index in indices})
 
@@ -84,8 +81,7 @@ class VecEnv(ABC):
         """Return the replies of the environments of these indices to "reset" or "step"."""
 
     @abstractmethod
-    def close(self) -> None:
-        """Close all environments."""
+    def close(self) -> None: ...
 
     def __enter__(self):
         return self
@@ -138,7 +134,6 @@ class SubprocVecEnv(VecEnv):
 
     @property
     def pids(self) -> list[int]:
-        """The ids of the worker processes."""
         return [worker.process.pid for worker in self._workers]
 
     def _request(self, command: str, arguments: Mapping[int, Any]) -> dict[int, Any]:
@@ -155,7 +150,6 @@ class SubprocVecEnv(VecEnv):
             raise
 
     def _receive(self, command: str) -> dict[int, Any]:
-        """Return all replies, in the order of their arrival."""
         replies: dict[int, Any] = {}
         while busy := [worker for worker in self._workers if worker.pending]:
             deadline = min(worker.last_active for worker in busy) + self.timeout
@@ -214,11 +208,8 @@ class _Worker:
         self.last_active = time.monotonic()
         self.connection, worker_end = Pipe()
         # The same import paths as in this process, and one thread, so that other workers can use the other cores.
-        variables = (
-            {"OMP_NUM_THREADS": "1"}
-            | os.environ
-            | {"PYTHONPATH": os.pathsep.join(path or os.getcwd() for path in sys.path)}
-        )
+        paths = os.pathsep.join(path or os.getcwd() for path in sys.path)
+        variables = {"OMP_NUM_THREADS": "1"} | os.environ | {"PYTHONPATH": paths}
         with worker_end:
             self.process = subprocess.Popen(
                 [sys.executable, "-P", "-c", PROGRAM, str(worker_end.fileno())],
@@ -324,7 +315,6 @@ def _sizes(spec: EnvSpec) -> tuple[Any, ...]:
 
 
 def _empty_batch(spec: EnvSpec, n: int) -> Timestep:
-    """Return the timesteps of n environments whose first episode has not started."""
     return Timestep(
         observation=np.zeros((n, spec.n_agents, spec.observation_size), np.float32),
         state=np.zeros((n, spec.state_size), np.float32),

@@ -1,6 +1,7 @@
 """Matches between the teams of two runs."""
 
 from functools import partial
+from itertools import product
 from typing import Any, NamedTuple
 
 import jax
@@ -50,13 +51,12 @@ def cross_play(runs: tuple[Run, Run], episodes: int = 200) -> list[Match]:
     config = configs_and_actors[0][0]
     play_match = jax.jit(partial(_play_match, env, n_episodes=episodes, config=config))
     matches = []
-    for first_run, (_, first_actors) in zip(runs, configs_and_actors, strict=True):
-        for second_run, (_, second_actors) in zip(runs, configs_and_actors, strict=True):
-            returns = [
-                [float(play_match(first, second, jax.random.key(0))) for second in second_actors]
-                for first in first_actors
-            ]
-            matches.append(Match(first=first_run, second=second_run, returns=np.array(returns)))
+    players = [(run, actors) for run, (_, actors) in zip(runs, configs_and_actors, strict=True)]
+    for (first_run, first_actors), (second_run, second_actors) in product(players, repeat=2):
+        returns = [
+            [float(play_match(first, second, jax.random.key(0))) for second in second_actors] for first in first_actors
+        ]
+        matches.append(Match(first=first_run, second=second_run, returns=np.array(returns)))
     return matches
 
 

@@ -61,8 +61,7 @@ def label_factors(run: Run, team_index: int = 0) -> list[FactorLabel]:
     function = run.functions[team_index]
     names = function.factor_columns(run.factor_inputs)
     n_observations = len(names) // function.size
-    labels = zip(names, function.meanings * n_observations, function.reads * n_observations, strict=True)
-    return [FactorLabel(name=name, meaning=meaning, reads=reads) for name, meaning, reads in labels]
+    return list(map(FactorLabel, names, function.meanings * n_observations, function.reads * n_observations))
 
 
 def load_episode_credit(run: Run) -> EpisodeCredit | None:
@@ -74,10 +73,10 @@ def load_episode_credit(run: Run) -> EpisodeCredit | None:
         return None
     steps, proxy_reward = jax.jit(partial(_read_rewards, config=config))(learner, index)
     uncertainty = None
-    if learner.credit and config.method.fit is Fit.EVIDENCE and config.credit_rows == 1:
+    if learner.decoders and config.method.fit is Fit.EVIDENCE and config.credit_rows == 1:
         with float64():
-            std = np.asarray(jax.jit(partial(_posterior_std, config=config))(learner.credit[0], steps))
-        uncertainty = 2 * std / np.where(learner.credit[0].is_mean, steps.length, 1)
+            std = np.asarray(jax.jit(partial(_posterior_std, config=config))(learner.decoders[0], steps))
+        uncertainty = 2 * std / np.where(learner.decoders[0].is_mean, steps.length, 1)
     reward = np.asarray(steps.columns["reward"])
     return EpisodeCredit(
         reward=reward,
@@ -105,7 +104,7 @@ def _read_rewards(
 ) -> tuple[StoredSteps, Float[Array, "steps agents"]]:
     """Read steps of one seed's replay, and compute their proxy rewards."""
     steps = replay.read(learner.replay, index)
-    return steps, rewards(steps, RewardState(learner.credit, learner.scale), config)
+    return steps, rewards(steps, RewardState(learner.decoders, learner.scale), config)
 
 
 def _posterior_std(decoder: Decomposition, steps: StoredSteps, config: TrainConfig) -> Float[Array, " steps"]:

@@ -46,7 +46,7 @@ RANDOM_PLAY_LIMIT_S = 5.0
 def evaluate_run(
     run: Run | str | Path, episodes: int = 10, best: bool = False, deterministic: bool = False
 ) -> dict[str, Float[np.ndarray, "seeds episodes"]]:
-    """Return true returns by the name of the team. If a task has a single team, the name is that of the task.
+    """Return true returns by the name of the team. The name of a single team is the name of the task.
 
     The episodes begin in initial states that no evaluation of the run has used. Policies act as in training's evaluations: the
     choices of PPO and all actions of IPPO are sampled, other actions are deterministic. A team's return is the sum over the steps
@@ -67,7 +67,7 @@ def evaluate_run(
 
 
 def evaluate_policy(run: Run, episodes: int, best: bool = False, deterministic: bool = False) -> Evaluation:
-    """Return everything that is measured of the episodes of `evaluate_run`, whose arguments and errors these are."""
+    """Return all measurements of the episodes of `evaluate_run`, which has the same arguments and errors."""
     if not isinstance(episodes, int) or episodes < 1:
         raise LareError(f"episodes = {episodes}: a whole number, 1 or more")
     task = run.config.task
@@ -91,7 +91,7 @@ def evaluate_policy(run: Run, episodes: int, best: bool = False, deterministic: 
 def gain_over_random(
     returns: Float[np.ndarray, "seeds episodes"], random_returns: Float[np.ndarray, " random_episodes"]
 ) -> tuple[float, float] | None:
-    """Return how much higher the mean return is than that of random actions, and the standard error of this difference.
+    """Return the mean return minus the mean return of random actions, and the standard error of this difference.
 
         error^2 = var(random) / n + max(var over the seeds / seeds, mean var over the episodes / (seeds episodes))
 
@@ -109,16 +109,18 @@ def measure_random_returns(task: TaskSpec) -> Float[np.ndarray, " episodes"]:
     return np.array([episode.return_ for episode in play_random(task)])
 
 
-def play_random(task: TaskSpec, n_episodes: int = RANDOM_EPISODES) -> list[Episode]:
-    """Play episodes of random actions: `n_episodes`, or as many as begin within `RANDOM_PLAY_LIMIT_S`.
+def play_random(
+    task: TaskSpec, n_episodes: int = RANDOM_EPISODES, limit_s: float = RANDOM_PLAY_LIMIT_S
+) -> list[Episode]:
+    """Play `n_episodes` episodes of random actions, or fewer if `limit_s` seconds have passed: no episode begins after that.
 
     The list is empty if the environment does not run, or if its module must not be imported for a report.
     """
     episodes: list[Episode] = []
-    limit = time.monotonic() + RANDOM_PLAY_LIMIT_S
+    deadline = time.monotonic() + limit_s
     if untrusted_module(task) is None:
         with suppress(LareError), closing(make_host_env(task.roles[0])) as env:
-            while len(episodes) < n_episodes and time.monotonic() < limit:
+            while len(episodes) < n_episodes and time.monotonic() < deadline:
                 random = np.random.default_rng(len(episodes))
                 episodes.append(play_episode(env, task.roles[0], None, random, len(episodes)))
     return episodes

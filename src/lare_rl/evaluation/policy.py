@@ -20,7 +20,7 @@ from lare_rl.training.saved_state import load_actor
 from lare_rl.training.streams import Stream, numpy_generator
 from lare_rl.training.unroll_host import select_action
 
-__all__ = ["Policy", "discrete_action_space", "load_policy"]
+__all__ = ["Policy", "load_policy"]
 
 
 def load_policy(
@@ -59,7 +59,11 @@ class Policy:
         self._actor = jax.tree.map(lambda leaf: leaf[seed_index : seed_index + 1], actors)
         self._functions = compile_functions(self._config)
         self._rng = numpy_generator(run.seeds[seed_index], Stream.EVALUATION_NOISE, 0)
-        self._choices = discrete_action_space(run) if self._env.discrete else None
+        self._choices: OneHot | None = None
+        if self._env.discrete:
+            with closing(GymnasiumEnv(run.config.task)) as env:
+                assert isinstance(env.environment.action_space, OneHot)
+                self._choices = env.environment.action_space
         self.reset()
 
     def reset(self) -> None:
@@ -85,9 +89,8 @@ class Policy:
     def _select_actions(self, rows: Float[np.ndarray, "batch observation"]) -> Float[np.ndarray, "batch action"]:
         n_rows, has_memory = len(rows), bool(jax.tree.leaves(self._memory))
         if has_memory and n_rows > 1:
-            raise LareError(
-                f"the policy of {self._config.algorithm.name} remembers its episode: give it one observation at a time"
-            )
+            name = self._config.algorithm.name
+            raise LareError(f"the policy of {name} remembers its episode: give it one observation at a time")
         action, self._memory = select_action(
             self._functions,
             self._config,
@@ -115,10 +118,3 @@ class Policy:
         if not np.isfinite(rows).all():
             raise LareError("an observation holds a number that is not finite")
         return np.atleast_2d(rows), rows.ndim == 1
-
-
-def discrete_action_space(run: Run) -> OneHot:
-    """Return the action space of a run's environment, whose actions must be choices."""
-    with closing(GymnasiumEnv(run.config.task)) as env:
-        assert isinstance(env.environment.action_space, OneHot)
-        return env.environment.action_space

@@ -1,4 +1,4 @@
-"""New episodes of a run's policy, with the credit of each agent, for films, credit maps and statistics."""
+"""New episodes of a run's policy, with the credit of each agent, and samples of their steps."""
 
 from contextlib import closing
 from dataclasses import dataclass
@@ -13,7 +13,8 @@ from jaxtyping import Array, Bool, Float
 from lare_rl.data import replay
 from lare_rl.data.trajectory import Trajectory
 from lare_rl.envs.families import make_env, make_host_env
-from lare_rl.envs.interface import HostEnv, JaxEnv
+from lare_rl.envs.interface import HostEnv, JaxEnv, Team
+from lare_rl.envs.play import phi_inputs
 from lare_rl.envs.workers import LocalVecEnv
 from lare_rl.runs.directory import Run
 from lare_rl.training.collect_device import unroll_on_device
@@ -27,8 +28,19 @@ from lare_rl.training.seed_axis import select_seed
 from lare_rl.training.static_config import TrainConfig
 from lare_rl.training.streams import Stream, episode_seed
 from lare_rl.training.unroll_host import HostPolicy, record_on_host
+from lare_rl.util.statistics import column_correlations
 
-__all__ = ["Rollout", "compute_proxy_rewards", "roll_out", "unroll_policy"]
+__all__ = [
+    "N_SAMPLE_EPISODES",
+    "Rollout",
+    "TeamSample",
+    "compute_proxy_rewards",
+    "roll_out",
+    "sample_steps",
+    "unroll_policy",
+]
+
+N_SAMPLE_EPISODES = 40
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -126,6 +138,43 @@ def compute_proxy_rewards(
     def compute(steps: Trajectory, factors: Array) -> Array:
         filled = store_with_factors(learner._replace(replay=buffer), steps, factors, config).replay
         stored = replay.read(filled, replay.newest_steps(filled, n_steps))
-        return jnp.swapaxes(rewards(stored, RewardState(learner.credit, learner.scale), config), 0, 1)
+        return jnp.swapaxes(rewards(stored, RewardState(learner.decoders, learner.scale), config), 0, 1)
 
     return np.asarray(compute(jax.tree.map(jnp.asarray, steps), jnp.asarray(factors)))
+
+
+@dataclass(frozen=True, kw_only=True)
+class TeamSample:
+    """Steps of one team, over some episodes of the first seed's policy. A row is a step of an agent or, for a state, of the team."""
+
+    team: Team
+    next_observation: Float[np.ndarray, "rows observation"]
+    """Each agent's observation after the step, or the state."""
+    factors: Float[np.ndarray, "rows factors"]
+    reward: Float[np.ndarray, " rows"]
+    """The true reward."""
+
+    @property
+    def correlations(self) -> Float[np.ndarray, " factors"]:
+        """Pearson's correlation of each factor with the true reward. NaN if one of the two never varies."""
+        return column_correlations(self.factors, self.reward)
+
+
+def sample_steps(run: Run, random: bool = False) -> list[TeamSample]:
+    """Sample steps of each team, under the first seed's policy or under random actions."""
+    rollout = roll_out(run, N_SAMPLE_EPISODES, random=random, key=1)
+    config, steps, samples = rollout.config, jax.tree.map(np.asarray, rollout.steps), []
+    for team_index, team in enumerate(config.env.teams):
+        observation, _ = phi_inputs(config.credit_scope, team, steps.next_timestep, steps.env_action)
+        mask = np.broadcast_to(rollout.mask[..., None], observation.shape[:-1])
+        reward = rollout.reward[..., team.agents]
+        if config.team_level:
+            reward = reward.mean(axis=-1, keepdims=True)
+        else:
+            mask = mask & steps.timestep.alive[..., team.agents]
+        n_factors = config.n_factors[team_index] if config.n_factors else 0
+        factors = rollout.factors[..., config.team_rows(team_index), :n_factors]
+        samples.append(
+            TeamSample(team=team, next_observation=observation[mask], factors=factors[mask], reward=reward[mask])
+        )
+    return samples

@@ -98,9 +98,8 @@ def write_video(path: Path, frames: Sequence[Frame], frame_seconds: float) -> No
     try:
         imageio.imwrite(path, list(frames), **timing)
     except (OSError, ValueError, ImportError, TypeError) as error:
-        raise LareError(
-            f"the video {path} cannot be written: {error}; .gif always works, .mp4 needs lare-rl[video]"
-        ) from error
+        hint = ".gif always works, .mp4 needs lare-rl[video]"
+        raise LareError(f"the video {path} cannot be written: {error}; {hint}") from error
 
 
 def _play_and_render(run: Run, env: HostEnv, policy: Policy, interval: int) -> list[Frame]:
@@ -121,9 +120,8 @@ def _play_and_render(run: Run, env: HostEnv, policy: Policy, interval: int) -> l
 def _render(env: HostEnv, run: Run) -> Frame:
     try:
         with warnings.catch_warnings():
-            warnings.simplefilter(
-                "ignore"
-            )  # graphics libraries warn if they find no screen, although another may not need it
+            # Graphics libraries warn if they find no screen, although another one may not need it.
+            warnings.simplefilter("ignore")
             return np.asarray(env.render())
     except Exception as error:  # every graphics library has a different error for a missing display
         raise LareError(

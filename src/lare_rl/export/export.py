@@ -13,7 +13,6 @@ from contextlib import closing
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import jax
 import numpy as np
 
 from lare_rl.envs.gymnasium_env import GymnasiumEnv
@@ -66,60 +65,52 @@ def export_run(run: Run | str | Path, out: str | Path, seed: int | None = None, 
         LareError: there is no such seed, no checkpoint, or the directory exists or cannot be written.
     """
     out, run = Path(out), as_run(run)
-    seed_index = run.seed_index(seed)
+    seed_index, task, settings = run.seed_index(seed), run.config.task, run.config.settings
     if out.exists():
         raise LareError(f"{out} exists, and is not overwritten; choose another directory")
     config, learner, host_state, _ = load_learner(run)
+    step = host_state["step"]
     if best:
         _, actors, best_steps = load_actor(run, best=True)
         step = int(best_steps[seed_index])
     else:
-        step = host_state["step"]
         actors = compile_functions(config).get_actor(learner, step)
-    actor = jax.tree.map(lambda leaf: leaf[seed_index], actors)
     first_choice = _first_choice(run) if config.env.discrete and config.env.n_agents == 1 else 0
-    graphs = {"policy": policy_graph(actor, config, first_choice)}
-    credit = select_seed(learner.credit, seed_index)
+    graphs = {"policy": policy_graph(select_seed(actors, seed_index), config, first_choice)}
+    credit = select_seed(learner.decoders, seed_index)
     no_reward_reason = missing_reward_reason(config, credit[0].decoder if credit else None)
-    function_files: dict[str, str] = {}
-    for team_index, role in enumerate(run.config.task.roles if no_reward_reason is None else ()):
-        name = "reward" if role is run.config.task else f"reward_{role.team}"
+    for team_index, role in enumerate(task.roles if no_reward_reason is None else ()):
         phi = run.functions[team_index].graph if run.functions else None
-        function_files[name] = function_filename(run.config.task, role)
-        graphs[name] = reward_graph(credit[team_index] if credit else None, config, team_index, phi)
-    description: dict[str, Any] = {
-        "lare": code_version(),
-        "task": run.config.task.name,
-        "method": run.config.settings.method,
-        "algorithm": run.config.settings.algorithm,
-        "seed": run.seeds[seed_index],
-        "step": step,
-        **{name: _describe_graph(graph) for name, graph in graphs.items()},
-    }
+        graph = reward_graph(credit[team_index] if credit else None, config, team_index, phi)
+        graphs["reward" if role is task else f"reward_{role.team}"] = graph
+    functions = {name: _describe_graph(graph) for name, graph in graphs.items()}
     if config.env.discrete and not config.team_level:
-        for name in function_files:
-            description[name]["choices"] = {"first": first_choice, "count": config.env.action_size}
+        choices = {"first": first_choice, "count": config.env.action_size}
+        functions |= {name: {**functions[name], "choices": choices} for name in graphs if name != "policy"}
+    origin = {"method": settings.method, "algorithm": settings.algorithm, "seed": run.seeds[seed_index], "step": step}
+    _write_directory(out, graphs, {"lare": code_version(), "task": task.name, **origin, **functions})
+    if no_reward_reason is None:
+        for role, function in zip(task.roles, run.functions, strict=False):
+            function.save(out / function_filename(task, role))
+    return ExportResult(directory=out, functions=tuple(graphs), no_reward_reason=no_reward_reason, onnx=is_installed())
+
+
+def _write_directory(out: Path, graphs: dict[str, Graph], description: dict[str, Any]) -> None:
     try:
         out.mkdir(parents=True)
-    except FileExistsError:
-        raise LareError(f"{out} exists, and is not overwritten; choose another directory") from None
     except OSError as error:
         raise LareError(f"{out} cannot be written: {error.strerror}") from error
     for name, graph in graphs.items():
         _write_arrays(out / f"{name}.npz", graph)
         if is_installed():
             _write_bytes(out / f"{name}.onnx", onnx_model(graph, name).SerializeToString())
-    for file, function in zip(function_files.values(), run.functions, strict=False):
-        function.save(out / file)
     _write_bytes(out / "export.json", json.dumps(description, indent=1).encode())
     for module in (exported, evaluate):
         source = Path(str(module.__file__))
         _write_bytes(out / source.name, source.read_bytes())
-    return ExportResult(directory=out, functions=tuple(graphs), no_reward_reason=no_reward_reason, onnx=is_installed())
 
 
 def _first_choice(run: Run) -> int:
-    """Return the number of the first choice of an environment."""
     with closing(GymnasiumEnv(run.config.task)) as env:
         space = env.environment.action_space
         assert isinstance(space, OneHot)
@@ -132,10 +123,9 @@ def _describe_graph(graph: Graph) -> dict[str, Any]:
     def describe_arrays(nodes: dict[str, Node]) -> dict[str, Any]:
         return {name: {"shape": [BATCH, *node.shape], "type": _DTYPES[node.kind]} for name, node in nodes.items()}
 
-    outputs = {name: graph.nodes[i] for name, i in graph.outputs.items()}
     return {
         "inputs": describe_arrays(graph.inputs),
-        "outputs": describe_arrays(outputs),
+        "outputs": describe_arrays({name: graph.nodes[i] for name, i in graph.outputs.items()}),
         "output_nodes": graph.outputs,
         "nodes": [[node.op, node.inputs, node.shape, node.kind, _option_json(node.option)] for node in graph.nodes],
     }

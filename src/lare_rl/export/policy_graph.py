@@ -15,11 +15,11 @@ import numpy as np
 
 from lare_rl.algorithms.ppo import ppo
 from lare_rl.algorithms.ppo.policies import UNAVAILABLE_LOGIT
+from lare_rl.algorithms.qmix.networks import RecurrentNetwork
 from lare_rl.envs.interface import EnvSpec
 from lare_rl.export.layers import finish, first_outputs, graph_input, linear, network, numpy_op, sigmoid, standardize
 from lare_rl.nn.networks import MLP, Linear
 from lare_rl.nn.normalise import CLIP, running_std
-from lare_rl.nn.recurrent import RecurrentNetwork
 from lare_rl.phi.arrays import Array, as_array, elementwise
 from lare_rl.phi.builder import Builder, building
 from lare_rl.phi.graph import Graph

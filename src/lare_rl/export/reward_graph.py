@@ -9,7 +9,6 @@ The graph has only the inputs that the method uses, and the graph of phi is a pa
 `before` and `after` are states, `action` holds the actions of all agents side by side, and there is one r_hat for the team.
 """
 
-from collections.abc import Iterator, Mapping
 from typing import Any
 
 import numpy as np
@@ -23,9 +22,8 @@ from lare_rl.credit.step_decoders import Bottleneck, StepDecoder
 from lare_rl.export.layers import finish, first_outputs, graph_input, network, numpy_op, standardize
 from lare_rl.nn.normalise import CLIP, running_std
 from lare_rl.phi.arrays import Array, elementwise
-from lare_rl.phi.builder import Builder, building, current_builder
+from lare_rl.phi.builder import Builder, building, current_builder, inline
 from lare_rl.phi.graph import Graph
-from lare_rl.phi.inline import inline
 from lare_rl.phi.limits import UNLIMITED
 from lare_rl.tasks.spec import select_states
 from lare_rl.training.static_config import TrainConfig
@@ -73,38 +71,34 @@ def reward_graph(credit: Decomposition | None, config: TrainConfig, team_index: 
         return finish(r_hat=r_hat)
 
 
-class _StepInputs(Mapping[str, Any]):
-    """The decoder's inputs of a step, by their names in `credit/encoders.py`. The graph gets an input when it is first read."""
+class _StepInputs(dict[str, Any]):
+    """The decoder's inputs of a step, by their names in `credit/encoders.py`; `before`, `after` and `env_action` are graph inputs.
+
+    An input is added to the graph when it is first read.
+    """
 
     def __init__(self, config: TrainConfig, rows: tuple[int, ...], team_index: int, phi: Graph | None):
+        super().__init__()
         self.config, self.rows, self.team_index, self.phi = config, rows, team_index, phi
-        self._graph_inputs: dict[str, Array] = {}
 
-    def _graph_input(self, name: str) -> Array:
-        if name not in self._graph_inputs:
-            env, config = self.config.env, self.config
-            action_size = env.action_size * (env.n_agents if config.team_level else 1)
-            size = action_size if name == "action" else config.observed_size
-            self._graph_inputs[name] = graph_input(name, (*self.rows, size))
-        return self._graph_inputs[name]
-
-    def __getitem__(self, name: str) -> Any:
+    def __missing__(self, name: str) -> Any:
         match name:
             case "factors":
-                return self._factors()
+                self[name] = self._factors()
             case "action":
-                return self._action()
-        return self._graph_input({"observation": "before", "next_observation": "after"}[name])
-
-    def __iter__(self) -> Iterator[str]:
-        return iter(("factors", "observation", "action", "next_observation"))
-
-    def __len__(self) -> int:
-        return 4
+                self[name] = self._action()
+            case "observation" | "next_observation":
+                self[name] = self["before" if name == "observation" else "after"]
+            case "env_action":
+                n_agents = self.config.env.n_agents if self.config.team_level else 1
+                self[name] = graph_input("action", (*self.rows, n_agents * self.config.env.action_size))
+            case _:
+                self[name] = graph_input(name, (*self.rows, self.config.observed_size))
+        return self[name]
 
     def _action(self) -> Any:
         """Return the action as the policy's networks see it, from the action in the environment's units."""
-        env, action = self.config.env, self._graph_input("action")
+        env, action = self.config.env, self["env_action"]
         if env.discrete:
             return action
         agents = slice(None) if self.config.team_level else env.teams[self.team_index].agents
@@ -116,7 +110,7 @@ class _StepInputs(Mapping[str, Any]):
         assert self.phi is not None
         factors = []
         for side in select_states(self.config.factor_inputs, "before", "after"):
-            nodes = {"observation": self._graph_input(side).node, "action": self._graph_input("action").node}
+            nodes = {"observation": self[side].node, "action": self["env_action"].node}
             node = inline(current_builder(), self.phi, nodes, self.rows[0] if self.rows else None)["factors"]
             factors.append(Array(node, None))
         return numpy_op("concatenate", factors, axis=-1) if len(factors) > 1 else factors[0]
@@ -139,7 +133,9 @@ def _decode(x: Array, credit: Decomposition, config: TrainConfig) -> Any:
 
 def _linear_reward(x: Array, decoder: LinearDecoder) -> Any:
     """Return r_hat = b + w . f(u), one group of features after the other. The groups are those of `credit/basis.py`."""
-    basis, weights = decoder.basis, _group_weights(decoder)
+    basis: Basis = decoder.basis
+    ends = np.cumsum(list(basis.group_sizes.values()))[:-1]
+    weights = dict(zip(basis.group_sizes, np.split(np.asarray(decoder.weight, np.float32), ends), strict=True))
     u = standardize(x, decoder.mean, decoder.std)
     clipped = numpy_op("clip", u, -HALF_PERIOD, HALF_PERIOD)
     factors, raw = slice(0, basis.n_factors), slice(basis.n_factors, basis.n_factors + basis.n_raw_used)
@@ -164,13 +160,6 @@ def _linear_reward(x: Array, decoder: LinearDecoder) -> Any:
     if pairs.any():
         r_hat = r_hat + numpy_op("sum", clipped * numpy_op("matmul", clipped, pairs.T), axis=-1)
     return r_hat
-
-
-def _group_weights(decoder: LinearDecoder) -> dict[str, np.ndarray]:
-    """Return the weights of each group of features."""
-    basis: Basis = decoder.basis
-    ends = np.cumsum(list(basis.group_sizes.values()))
-    return dict(zip(basis.group_sizes, np.split(np.asarray(decoder.weight, np.float32), ends[:-1]), strict=True))
 
 
 def _team_mean(r_hat: Array, rows: tuple[int, ...], config: TrainConfig) -> Any:

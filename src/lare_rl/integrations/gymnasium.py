@@ -96,13 +96,7 @@ class VectorCredit(VectorWrapper, RecordConstructorArgs):
     """
 
     def __init__(self, env: VectorEnv, credit: CreditAssigner, pay: Pay = "proxy", score: str | None = None):
-        """Wrap a vector environment.
-
-        Args:
-            env: the vector environment. Its single environments have the spaces that the assigner was made for.
-            credit: the assigner.
-            pay: the rewards that `step` returns. With "proxy" the decoder is fitted as steps come in.
-            score: the key of the last step's `info` with the score of the episode. The default is the sum of the rewards.
+        """Wrap a vector environment. The arguments are those of `Credit`.
 
         Raises:
             LareError: `metadata` has no autoreset mode, or the assigner was made for other spaces or for many agents.
@@ -169,9 +163,7 @@ class VectorCredit(VectorWrapper, RecordConstructorArgs):
         if self.mode != AutoresetMode.SAME_STEP or not done.any():
             return observation
         if "final_obs" not in infos:
-            raise LareError(
-                "an episode has ended in SAME_STEP mode, and infos has no final_obs, the observation after its last step"
-            )
+            raise LareError("an episode ended in SAME_STEP mode, and infos has no final_obs, the observation after it")
         space = self.env.single_observation_space
         rows = list(iterate(self.env.observation_space, observation))
         for env_index in np.flatnonzero(done):
@@ -183,11 +175,10 @@ class VectorCredit(VectorWrapper, RecordConstructorArgs):
         assert self.score is not None
         scores = np.zeros(self.num_envs)
         last = infos.get("final_info", infos) if self.mode == AutoresetMode.SAME_STEP else infos
-        names = [
-            name for name in last if not name.startswith("_")
-        ]  # `_name` is the mask of the environments with `name`
+        # `_name` is the mask of the environments with `name`.
+        values = {name: (value, last.get(f"_{name}", done)) for name, value in last.items() if name[:1] != "_"}
         for env_index in np.flatnonzero(done):
-            info = {name: last[name][env_index] for name in names if last.get(f"_{name}", done)[env_index]}
+            info = {name: value[env_index] for name, (value, mask) in values.items() if mask[env_index]}
             scores[env_index] = read_score(info, self.score)
         return scores
 

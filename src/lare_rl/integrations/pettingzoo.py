@@ -1,13 +1,13 @@
 """A wrapper of PettingZoo environments that shows every step of a team to a `CreditAssigner`, and returns each agent's r_hat."""
 
 from copy import deepcopy
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from jaxtyping import Float
 
 from lare_rl.assigner.assigner import CreditAssigner
-from lare_rl.assigner.layout import Layout, make_layout
+from lare_rl.assigner.layout import make_layout
 from lare_rl.envs.episodic import TRUE_REWARD
 from lare_rl.errors import LareError, missing_extra_error
 from lare_rl.integrations.gymnasium import batch_of_one
@@ -54,37 +54,39 @@ class CreditParallel(BaseParallelWrapper):
                     raise LareError(
                         f"the agents of a team need the same {name} space: {agent!r} has another one than {self.team[0]!r}"
                     )
-        first = self.team[0]
+        first, n_agents = self.team[0], len(self.team)
         self._recorder = StepRecorder(
-            credit, env.observation_space(first), env.action_space(first), env_ids=[object()], agents=len(self.team)
+            credit, env.observation_space(first), env.action_space(first), env_ids=[object()], agents=n_agents
         )
-        self._observation = self._empty_rows(self._recorder.observation_layout)
+        self._no_observation = np.zeros((n_agents, self._recorder.observation_layout.size), np.float32)
+        self._no_action = np.zeros((n_agents, self._recorder.action_layout.size), np.float32)
+        self._observation = self._no_observation
         """The last observation of each agent; zeros for an agent that has not appeared yet."""
 
     def reset(self, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[dict, dict]:
         self._recorder.drop(0)
         observations, infos = self.env.reset(seed=seed, options=options)
-        self._observation = self._empty_rows(self._recorder.observation_layout)
-        self._observation = self._update_observation(observations)
+        self._observation = self._replace_rows(self._no_observation, "observation", observations)
         return observations, infos
 
     def step(self, actions: dict) -> tuple[dict, dict, dict, dict, dict]:
         acting = {agent: index for index, agent in enumerate(self.team) if agent in actions}
-        action = self._action_rows(actions)
+        action = self._replace_rows(self._no_action, "action", actions)
         observations, rewards, terminated, truncated, infos = self.env.step(deepcopy(actions))
-        next_observation = self._update_observation(observations)
+        next_observation = self._replace_rows(self._observation, "observation", observations)
         reward = np.array([float(rewards.get(agent, 0)) for agent in self.team])
         alive = np.array([agent in acting for agent in self.team])
-        several = len(self.team) > 1  # a team of one is a single agent, whose arrays have no axis of agents
+        # A team of one is a single agent, whose arrays have no axis of agents.
+        lead = (1, len(self.team)) if len(self.team) > 1 else (1,)
         steps = self.credit.add(
-            self._observation[None] if several else self._observation,
-            action[None] if several else action,
-            next_observation[None] if several else next_observation,
-            reward[None] if several else reward,
+            self._observation.reshape(*lead, -1),
+            action.reshape(*lead, -1),
+            next_observation.reshape(*lead, -1),
+            reward.reshape(lead),
             [not self.env.agents],
             [False],
             env_ids=self._recorder.env_ids,
-            alive=alive[None] if several else None,
+            alive=alive.reshape(lead) if len(self.team) > 1 else None,
         )
         self._observation = next_observation
         infos = {agent: dict(info) for agent, info in infos.items()}
@@ -96,24 +98,13 @@ class CreditParallel(BaseParallelWrapper):
             rewards = {agent: float(r_hat[acting[agent]]) if agent in acting else 0.0 for agent in rewards}
         return observations, rewards, terminated, truncated, infos
 
-    def _update_observation(self, observations: dict) -> Float[np.ndarray, "agents observation"]:
-        """Return the observation of each agent, or its last one if it has left."""
-        rows, layout = self._observation.copy(), self._recorder.observation_layout
+    def _replace_rows(
+        self, rows: Float[np.ndarray, "agents size"], kind: Literal["observation", "action"], values: dict
+    ) -> Float[np.ndarray, "agents size"]:
+        """Return a copy of the rows with the new observations or actions of some agents."""
+        rows, layout = rows.copy(), getattr(self._recorder, f"{kind}_layout")
         for index, agent in enumerate(self.team):
-            if agent in observations:
-                rows[index] = layout.rows(
-                    batch_of_one(self.env.observation_space(agent), observations[agent]), "observation"
-                )[0]
+            if agent in values:
+                space = getattr(self.env, f"{kind}_space")(agent)
+                rows[index] = layout.rows(batch_of_one(space, values[agent]), kind)[0]
         return rows
-
-    def _action_rows(self, actions: dict) -> Float[np.ndarray, "agents action"]:
-        """Return the action of each agent, and zeros for an agent that does not act."""
-        layout = self._recorder.action_layout
-        rows = self._empty_rows(layout)
-        for index, agent in enumerate(self.team):
-            if agent in actions:
-                rows[index] = layout.rows(batch_of_one(self.env.action_space(agent), actions[agent]), "action")[0]
-        return rows
-
-    def _empty_rows(self, layout: Layout) -> Float[np.ndarray, "agents size"]:
-        return np.zeros((len(self.team), layout.size), np.float32)

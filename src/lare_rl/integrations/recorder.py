@@ -5,7 +5,7 @@ from typing import Any, Literal
 
 import gymnasium
 import numpy as np
-from jaxtyping import Int
+from jaxtyping import Bool, Int
 
 from lare_rl.assigner.assigner import CreditAssigner
 from lare_rl.assigner.layout import make_layout
@@ -35,17 +35,10 @@ class StepRecorder:
         env_ids: Sequence[Hashable],
         agents: int = 1,
     ):
-        """Create a recorder.
+        """Create a recorder for environments with these spaces of one agent.
 
-        Args:
-            credit: the assigner.
-            observation_space: the space of one agent in one environment.
-            action_space: the space of one agent in one environment.
-            env_ids: a key for each environment, which no other environment of the assigner has.
-            agents: the number of agents in an environment.
-
-        Raises:
-            LareError: the assigner was made for other sizes, or another number of agents.
+        `env_ids` holds a key for each environment, which no other environment of the assigner has. Raises `LareError` if the
+        assigner was made for other sizes, or another number of agents.
         """
         check_assigner(credit, agents)
         self.credit, self.env_ids = credit, env_ids
@@ -67,20 +60,19 @@ class StepRecorder:
         observation: Any,
         action: Any,
         next_observation: Any,
-        reward: Any,
-        terminated: Any,
-        truncated: Any,
-        **options: Any,
+        *results: Any,
+        valid: Bool[np.ndarray, " environments"] | None = None,
     ) -> Int[np.ndarray, " environments"]:
-        """Show one step of each environment, and return their numbers: `CreditAssigner.add`."""
+        """Show one step of each environment, and return their numbers.
+
+        `results` are the rewards and the two flags of the steps, as in `CreditAssigner.add`.
+        """
         if not self._same_observations:
             observation = self.observation_layout.rows(observation, "observation")
             next_observation = self.observation_layout.rows(next_observation, "next_observation")
         if not self._same_actions:
             action = self.action_layout.rows(action, "action")
-        return self.credit.add(
-            observation, action, next_observation, reward, terminated, truncated, env_ids=self.env_ids, **options
-        )
+        return self.credit.add(observation, action, next_observation, *results, env_ids=self.env_ids, valid=valid)
 
     def drop(self, env_index: int) -> None:
         """Give up the running episode of an environment, which was reset."""

@@ -24,9 +24,7 @@ class LatentRewardError(LareError):
 
 
 def compute_factors(
-    graph: Graph,
-    observation: Float[np.ndarray, "batch observation"],
-    action: Float[np.ndarray, "batch action"],
+    graph: Graph, observation: Float[np.ndarray, "batch observation"], action: Float[np.ndarray, "batch action"]
 ) -> Float[np.ndarray, "batch factors"]:
     """Compute the factors of a batch. They are not checked: they may be infinite or NaN."""
     rows = max(1, _CHUNK_NUMBERS // max(graph.size, 1))

@@ -23,17 +23,9 @@ from lare_rl.phi.read import read
 from lare_rl.tasks.spec import FactorInputs, TaskSpec, require_role, select_states
 
 __all__ = [
-    "CHANGED_SUFFIX",
-    "HEADER_PREFIX",
-    "LatentFunction",
-    "check_task",
-    "features_text",
-    "function_from_verdict",
-    "normalise_source",
-    "pair_with_roles",
-    "source_hash",
-    "verify_function",
-]
+    "CHANGED_SUFFIX", "HEADER_PREFIX", "LatentFunction", "check_task", "features_text", "function_from_verdict",
+    "normalise_source", "pair_with_roles", "source_hash", "verify_function",
+]  # fmt: skip
 
 CHANGED_SUFFIX = "; changed by hand since"
 """It is appended to the model's name if a source is not the saved one."""
@@ -118,9 +110,7 @@ class LatentFunction:
         single = observations.ndim == actions.ndim == 1
         observations, actions = np.atleast_2d(observations), np.atleast_2d(actions)
         if len(observations) != len(actions):
-            raise LareError(
-                f"there are {len(observations)} observations and {len(actions)} actions: each step needs one of both"
-            )
+            raise LareError(f"there are {len(observations)} observations and {len(actions)} actions")
         factors = compute_factors(self.graph, observations, actions)
         check_finite(factors, self.names, observations, actions)
         return factors[0] if single else factors
@@ -188,9 +178,7 @@ def _as_array(name: str, values: Any, size: int) -> np.ndarray:
     except (TypeError, ValueError):
         raise LareError(f"{name}s must be arrays of numbers, not {short_repr(values)}") from None
     if array.ndim not in (1, 2) or array.shape[-1] != size:
-        raise LareError(
-            f"{name}s must have the shape (batch, {size}), or ({size},) for a single step: the shape is {array.shape}"
-        )
+        raise LareError(f"{name}s must have the shape (batch, {size}) or ({size},): the shape is {array.shape}")
     return array
 
 
@@ -236,8 +224,8 @@ def function_from_verdict(source: str, task: TaskSpec, kind: Kind, verdict: Verd
 def normalise_source(source: str) -> str:
     r"""Return a source as it is saved: lines end with \n, no surrounding blank lines, and no header.
 
-    A line ends where Python's parser ends it, and nowhere else. Variation selectors, which make an emoji of a sign, are removed:
-    models write warning signs into comments, and a variation selector is invisible.
+    A line ends where Python's parser ends it, and nowhere else. Variation selectors, which make an emoji of a sign, are
+    removed: models write warning signs into comments, and a variation selector is invisible.
     """
     lines = source.replace(_VARIATION_SELECTOR, "").replace("\r\n", "\n").replace("\r", "\n").split("\n")
     body = itertools.dropwhile(lambda line: not line or line.startswith(HEADER_PREFIX), lines)

@@ -1,6 +1,7 @@
 """Reflection, an extension of the paper: the model sees how well its factors explain returns, and may improve its function.
 
-The caller passes the function that assesses (`lare_rl.training.reflect`), because no module of this folder has access to returns.
+The caller passes the function that assesses (`lare_rl.training.reflect`), because no module of this folder has access to
+returns.
 """
 
 from collections.abc import Callable

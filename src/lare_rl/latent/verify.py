@@ -1,7 +1,7 @@
 """Verifies that a source is a latent function of a task: it is read, and its factors are finite on steps of the task.
 
-Every function that can be read (`lare_rl.phi`) treats rows independently, does not depend on chance or on earlier calls, and needs
-bounded time and memory.
+Every function that can be read (`lare_rl.phi`) treats rows independently, does not depend on chance or on earlier calls, and
+needs bounded time and memory.
 """
 
 import contextlib
@@ -78,8 +78,8 @@ def verify(source: str, task: TaskSpec, kind: Kind = "factors", steps: Steps | N
             256 steps are enough. Without them, it is tried on random steps of the task's environment.
 
     Raises:
-        LareError: the task's environment cannot be made, the steps do not have the task's sizes, or each team of the task needs its
-            own function.
+        LareError: the task's environment cannot be made, the steps do not have the task's sizes, or each team of the task
+            needs its own function.
     """
     observation, action = sample_steps(task, steps)
     try:
@@ -151,7 +151,7 @@ def _advice(graph: Graph, names: Sequence[str], factors: Float[np.ndarray, "step
 
 
 def sample_steps(task: TaskSpec, steps: Steps | None) -> Steps:
-    """Return the steps that a function of a task is tried on: at most `N_SAMPLE_STEPS` of `steps`, evenly spaced, or random steps.
+    """Return the steps that a function of a task is tried on: at most 256 of `steps`, evenly spaced, or random steps.
 
     Raises:
         LareError: as for `verify`.
@@ -177,9 +177,9 @@ def sample_steps(task: TaskSpec, steps: Steps | None) -> Steps:
 def random_steps(task: TaskSpec, n_steps: int = N_SAMPLE_STEPS, seed: int = 0) -> Steps:
     """Play episodes by uniformly random actions, and return steps of them (the paper's pre-collected state-action pairs).
 
-    The task's `judges` selects the observations before or after a step, or both: half of the rows are then observations before a
-    step. If more steps were played than requested, the result is evenly spaced among them, from the first to the last. The arrays
-    are cached, and therefore read-only.
+    The task's `judges` selects the observations before or after a step, or both: half of the rows are then observations
+    before a step. If more steps were played than requested, the result is evenly spaced among them, from the first to the
+    last. The arrays are cached, and therefore read-only.
     """
     return _random_steps(task.model_dump_json(), n_steps, seed)
 

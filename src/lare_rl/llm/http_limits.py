@@ -9,14 +9,9 @@ from collections.abc import Callable, Mapping
 from typing import Any
 
 __all__ = [
-    "MAX_BODY_BYTES",
-    "BodyTooLargeError",
-    "RedirectError",
-    "StatusError",
-    "check_response",
-    "read_body",
+    "MAX_BODY_BYTES", "BodyTooLargeError", "RedirectError", "StatusError", "check_response", "read_body",
     "run_in_time",
-]
+]  # fmt: skip
 
 MAX_BODY_BYTES = 8 << 20
 
@@ -78,7 +73,8 @@ def read_body(response: Any) -> bytes:
 def run_in_time(fetch: Callable[[], bytes], timeout_s: float) -> bytes:
     """Return what `fetch` returns, or raise what it raises.
 
-    The time-out of a socket is not enough: a server may send its headers byte by byte, and each byte starts that time-out again.
+    The time-out of a socket is not enough: a server may send its headers byte by byte, and each byte starts that time-out
+    again.
 
     Raises:
         TimeoutError: `fetch` takes longer than `timeout_s`. Its thread then runs on.

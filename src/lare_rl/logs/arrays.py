@@ -1,5 +1,6 @@
-"""Logs in memory: flat arrays, as in D4RL and CORL, or one mapping of arrays for each episode."""
+"""Logs of NumPy arrays: directories with an .npz file for each episode, and logs in memory."""
 
+import zipfile
 from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
@@ -8,17 +9,68 @@ import numpy as np
 
 from lare_rl.errors import LareError, short_repr
 from lare_rl.logs.episode import KEYS, RelabelledEpisode
-from lare_rl.logs.log import Log
-from lare_rl.logs.npz import write_npz_directory
+from lare_rl.logs.log import Log, atomic_output
 from lare_rl.tasks.spec import TaskSpec
 
-__all__ = ["FlatLog", "ListLog"]
+__all__ = ["FlatLog", "ListLog", "NpzLog", "read_npz"]
 
 D4RL_NAMES = {"terminals": "terminations", "timeouts": "truncations"}
 """Names of flags in D4RL's data sets, and the names here."""
 
 
-class ListLog(Log):
+class ArrayLog(Log):
+    """A log whose episodes are mappings of arrays. It is written as a directory of .npz files."""
+
+    def write(self, out: str | Path, episodes: Iterable[RelabelledEpisode], overwrite: bool, comment: str) -> Path:
+        with atomic_output(Path(out), overwrite) as directory:
+            directory.mkdir()
+            for number, (episode, r_hat) in enumerate(episodes):
+                arrays = {**episode.contents, "rewards": r_hat, "paid": episode.reward}
+                _save_npz(directory / self.file_name(number, episode.name), arrays)
+        return Path(out)
+
+    def file_name(self, number: int, name: str) -> str:
+        """Return the name of the file of an episode."""
+        return f"{number:08d}.npz"
+
+
+class NpzLog(ArrayLog):
+    """Files in the order of their names. Arrays with other names than those of `parse_episode` are copied unchanged."""
+
+    def __init__(self, directory: Path, role: TaskSpec | None):
+        self.name, self.files = str(directory), sorted(directory.glob("*.npz"))
+        if not self.files:
+            raise LareError(f"{directory} holds no .npz and no .parquet files")
+        self.n_episodes = len(self.files)
+        self.layout = self.infer_layout(role)
+
+    def read(self) -> Iterator[tuple[str, dict[str, np.ndarray], dict[str, np.ndarray]]]:
+        for file in self.files:
+            arrays = read_npz(file)
+            yield str(file), arrays, arrays
+
+    def file_name(self, number: int, name: str) -> str:
+        return Path(name).name
+
+
+def read_npz(file: Path) -> dict[str, np.ndarray]:
+    """Read the arrays of a file, without unpickling anything. Raises `LareError` if the file is damaged."""
+    try:
+        with file.open("rb") as stream, np.load(stream, allow_pickle=False) as archive:
+            return {key: archive[key] for key in archive.files}
+    except Exception as error:  # NumPy and zipfile may raise anything for an untrusted file
+        raise LareError(f"{file} is not an .npz file, or damaged: {short_repr(error)}") from error
+
+
+def _save_npz(file: Path, arrays: Mapping[str, np.ndarray]) -> None:
+    """Write arrays of any name. `numpy.savez` cannot save an array whose name is one of its arguments."""
+    with zipfile.ZipFile(file, "x", allowZip64=True) as archive:
+        for key, array in arrays.items():
+            with archive.open(f"{key}.npy", "w", force_zip64=True) as member:
+                np.lib.format.write_array(member, np.asanyarray(array), allow_pickle=False)
+
+
+class ListLog(ArrayLog):
     """An iterable of mappings, which can be iterated more than once. One episode is read at a time."""
 
     name = "the list of episodes"
@@ -35,12 +87,6 @@ class ListLog(Log):
             if not isinstance(arrays, Mapping):
                 raise LareError(f"episode {number} must be a mapping of arrays, and is {short_repr(arrays)}")
             yield f"episode {number}", arrays, arrays
-
-    def write(self, out: str | Path, episodes: Iterable[RelabelledEpisode], overwrite: bool, comment: str) -> Path:
-        """Write a directory of .npz files."""
-        return write_npz_directory(
-            out, ((f"{number:08d}.npz", item) for number, item in enumerate(episodes)), overwrite
-        )
 
 
 class FlatLog(ListLog):

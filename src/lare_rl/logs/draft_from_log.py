@@ -43,8 +43,7 @@ def draft_log_task(source: Any) -> Draft:
 
 
 def _description(log: Log) -> str:
-    """Return the description of a Minari data set, or an empty text for other logs."""
-    dataset = getattr(log, "dataset", None)
+    dataset = getattr(log, "dataset", None)  # only a Minari data set has a description
     return "" if dataset is None else str(dataset.storage.metadata.get("description") or "")
 
 

@@ -1,16 +1,21 @@
 """Logs: Minari and Hugging Face data sets, directories of .npz files, Parquet files, and arrays."""
 
+import contextlib
+import shutil
 from abc import ABC, abstractmethod
 from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
+from uuid import uuid4
 
 from lare_rl.errors import LareError, short_repr
 from lare_rl.logs.episode import LoggedEpisode, LogLayout, RelabelledEpisode, infer_layout, parse_episode
-from lare_rl.logs.output import check_output
 from lare_rl.tasks.spec import TaskSpec, require_role
 
-__all__ = ["Log", "open_log"]
+__all__ = ["Log", "atomic_output", "check_output", "open_log"]
+
+LOG_SUFFIXES = frozenset({".npz", ".parquet", ".arrow", ".json"})
+"""Files of logs. A directory with other files is never replaced."""
 
 
 class Log(ABC):
@@ -70,21 +75,17 @@ def open_log(source: Any, task: TaskSpec | None = None) -> Log:
         LareError: the log does not exist, is not a log, or its first episode is damaged.
     """
     role = None if task is None else require_role(task)
+    if isinstance(source, str | Path):
+        return _open_path(source, role)
     # Each format is imported when it is needed, because the libraries of most formats are optional.
-    if isinstance(source, Mapping):
-        from lare_rl.logs.arrays import FlatLog
-
-        return FlatLog(source, role)
     if hasattr(source, "iterate_episodes"):
         from lare_rl.logs.minari import MinariLog
 
         return MinariLog(source, role)
-    if isinstance(source, str | Path):
-        return _open_path(source, role)
     if isinstance(source, Iterable) and not isinstance(source, bytes):
-        from lare_rl.logs.arrays import ListLog
+        from lare_rl.logs.arrays import FlatLog, ListLog
 
-        return ListLog(source, role)
+        return FlatLog(source, role) if isinstance(source, Mapping) else ListLog(source, role)
     raise LareError(
         f"{short_repr(source)} is not a log: give a path, a Minari id, arrays by name, or a list of episodes"
     )
@@ -97,7 +98,7 @@ def _open_path(source: str | Path, role: TaskSpec | None) -> Log:
             f"{path} is text, which cannot be read: write the log as .npz or Parquet (docs/logs.md, Formats)"
         )
     if path.is_file() or any(path.glob("*.parquet")):
-        from lare_rl.logs.parquet import ParquetLog
+        from lare_rl.logs.tables import ParquetLog
 
         return ParquetLog(path, role)
     if any((path / name).exists() for name in ("state.json", "dataset_dict.json")):
@@ -105,7 +106,7 @@ def _open_path(source: str | Path, role: TaskSpec | None) -> Log:
 
         return HuggingFaceLog(path, role)
     if path.is_dir():
-        from lare_rl.logs.npz import NpzLog
+        from lare_rl.logs.arrays import NpzLog
 
         return NpzLog(path, role)
     if isinstance(source, Path) or source.endswith((".parquet", "/")):
@@ -115,3 +116,41 @@ def _open_path(source: str | Path, role: TaskSpec | None) -> Log:
     except LareError as error:
         raise LareError(f"no file or directory {source} exists. If it is the id of a data set: {error}") from error
     return MinariLog(load_dataset(source), role)
+
+
+def check_output(out: Path, overwrite: bool) -> None:
+    """Raise `LareError` if `out` exists and must not be replaced, or if nothing can be written there."""
+    if out.exists() and not overwrite:
+        raise LareError(f"{out} exists: choose another path, or replace it with --overwrite (overwrite=True)")
+    if out.is_dir():
+        foreign = [path.name for path in sorted(out.iterdir()) if path.is_dir() or path.suffix not in LOG_SUFFIXES]
+        if foreign:
+            raise LareError(f"{out} cannot be replaced, because {foreign[0]} in it is not a log: choose another path")
+    if not out.name or not out.parent.is_dir():
+        raise LareError(f"{out} cannot be written: there is no directory {out.parent}")
+
+
+@contextlib.contextmanager
+def atomic_output(out: Path, overwrite: bool) -> Iterator[Path]:
+    """Yield a temporary path for a file or a directory. At the end it replaces `out`; after an error it is removed.
+
+    Raises:
+        LareError: `out` exists, or cannot be written.
+    """
+    check_output(out, overwrite)
+    new, old = (out.with_name(f".{out.name}.{uuid4().hex}.{kind}") for kind in ("new", "old"))
+    try:
+        yield new
+        check_output(out, overwrite)
+        if out.exists():
+            out.rename(old)
+        new.rename(out)
+    except OSError as error:
+        raise LareError(f"{out} cannot be written ({error.strerror or error}); existing data are unchanged") from error
+    finally:
+        if old.exists() and not out.exists():
+            old.rename(out)
+        for path in (new, old):
+            shutil.rmtree(path, ignore_errors=True)  # does nothing for a file or a link
+            with contextlib.suppress(OSError):
+                path.unlink()

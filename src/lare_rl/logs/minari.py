@@ -10,8 +10,7 @@ import numpy as np
 from lare_rl.assigner.layout import make_layout
 from lare_rl.errors import LareError, missing_extra_error, short_repr
 from lare_rl.logs.episode import LogLayout, RelabelledEpisode
-from lare_rl.logs.log import Log
-from lare_rl.logs.output import atomic_output, check_output
+from lare_rl.logs.log import Log, atomic_output, check_output
 from lare_rl.tasks.spec import TaskSpec
 
 try:

@@ -5,8 +5,9 @@ and writes them.
 """
 
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -20,10 +21,11 @@ from lare_rl.errors import LareError
 from lare_rl.latent.function import LatentFunction
 from lare_rl.logs.episode import LoggedEpisode, RelabelledEpisode
 from lare_rl.logs.log import Log, open_log
-from lare_rl.logs.relabelled import Relabelled, predicted_return_statistics
 from lare_rl.tasks.spec import TaskSpec
+from lare_rl.util.findings import Finding, render
+from lare_rl.util.statistics import correlation, r_squared
 
-__all__ = ["hold_out_flags", "relabel"]
+__all__ = ["MESSAGES", "Relabelled", "hold_out_flags", "predicted_return_statistics", "relabel"]
 
 BATCH_STEPS = 8192
 """Steps whose rewards are computed at a time. `phi` takes about as long for many steps as for few."""
@@ -32,9 +34,85 @@ BLOCK_EPISODES = 10
 MIN_CAPACITY = 100_000
 UPDATES = 10_000
 """Gradient updates of a decoder."""
+MIN_HELD_OUT = 8
+"""The least number of held-out episodes for statistics of their returns."""
+MIN_R2 = 0.1
+"""Below this R², the rewards come with a warning."""
+
+MESSAGES = {
+    "relabelled": "{method} gave rewards to {steps:count step} of {episodes:count episode}.",
+    "cut": "Cut before their end, and not learned from: {episodes:count episode}.",
+    "too_few": "How well new returns are predicted is unknown: {episodes:count episode} held out, and {needed} are needed. Hold out "
+    "a larger share (--hold-out 0.2, hold_out=0.2 in Python).",
+    "constant": "The returns of {episodes:count episode} held out, or their predictions, are all equal: nothing can be said about "
+    "these rewards.",
+    "correlation": "The returns of {episodes:count episode} held out of the fit and their predictions have a correlation of "
+    "{correlation:.2f}.",
+    "r2": "The returns of {episodes:count episode} held out of the fit are predicted with an R² of {r2:r2}, with a standard error "
+    "of {error:error}.",
+    "worthless": "Warning: that is no better than their mean. Do not train on these rewards.",
+}
+"""The sentences of `Relabelled.findings`."""
 
 Listener = Callable[[str, int, int | None], None]
 """Called with the name of the pass, the number of episodes so far, and the number of all episodes, if it is known."""
+
+
+@dataclass(frozen=True)
+class Relabelled:
+    """What `relabel` wrote, and how well its rewards predict returns."""
+
+    out: str | Path
+    method: str
+    episodes: int
+    steps: int
+    cut: int
+    """Episodes that were cut before their end. They get rewards, but nothing is learned from them."""
+    held_out: int
+    """Complete episodes that were held out of the fit."""
+    return_r2: float
+    """R^2 of the returns of the held-out episodes. NaN if they are fewer than 8 or have equal returns, or if r_hat is not in the
+    unit of returns."""
+    return_r2_error: float
+    """The standard error of `return_r2` over these episodes."""
+    return_correlation: float
+    """Pearson's correlation of these returns with their predictions. NaN if they are fewer than 8, or one side never varies."""
+    explanation: tuple[str, ...]
+    """What the returns say about the factors: `CreditAssigner.explanation`."""
+
+    @property
+    def findings(self) -> list[Finding]:
+        """The result as findings, whose sentences are in `MESSAGES`."""
+        counts = {"method": self.method, "steps": self.steps, "episodes": self.episodes}
+        cut = [Finding("cut", {"episodes": self.cut})] if self.cut else []
+        return [Finding("relabelled", counts), *cut, *self._prediction_findings()]
+
+    @property
+    def summary(self) -> list[str]:
+        """The result and the explanation as sentences."""
+        return [*(render(finding, MESSAGES) for finding in self.findings), *self.explanation]
+
+    def _prediction_findings(self) -> Iterator[Finding]:
+        episodes = {"episodes": self.held_out}
+        if self.held_out < MIN_HELD_OUT:
+            yield Finding("too_few", {**episodes, "needed": MIN_HELD_OUT})
+        elif math.isnan(self.return_correlation):
+            yield Finding("constant", episodes)
+        elif math.isnan(self.return_r2):
+            yield Finding("correlation", {**episodes, "correlation": self.return_correlation})
+        else:
+            yield Finding("r2", {**episodes, "r2": self.return_r2, "error": self.return_r2_error})
+            if self.return_r2 < MIN_R2:
+                yield Finding("worthless")
+
+
+def predicted_return_statistics(returns: Sequence[float], predictions: Sequence[float]) -> tuple[float, float, float]:
+    """Return R^2 of predicted returns, its standard error, and the correlation. NaN for fewer than 8 episodes."""
+    if len(returns) < MIN_HELD_OUT:
+        return math.nan, math.nan, math.nan
+    y, predicted = np.array(returns), np.array(predictions)
+    varies = all(np.ptp(values) > 1e-6 * np.abs(values).max() for values in (y, predicted))
+    return *r_squared(y, predicted), correlation(y, predicted) if varies else math.nan
 
 
 def relabel(
@@ -84,14 +162,12 @@ def relabel(
     name = method or ("bayes" if phi is None else "lare-bayes")
     credit = _create_assigner(log, name, phi, task, settings, memory, seed)
     size = _fit(credit, log, hold_out_flags(hold_out, seed), updates, listener)
-    explanation = tuple(credit.explanation())
-    counts = _Counts()
+    explanation, counts = tuple(credit.explanation()), _Counts()
     episodes = _compute_rewards(credit, log, hold_out_flags(hold_out, seed), size, counts, listener)
     comment = f"Rewards by lare-rl relabel, {name}; the old rewards are in infos['paid'], after an entry for the reset."
     path = log.write(out, episodes, overwrite, comment)
-    r2, r2_error, correlation = predicted_return_statistics(counts.returns, counts.predictions)
-    if not credit.config.method.calibrated:
-        r2 = r2_error = math.nan
+    r2, r2_error, return_correlation = predicted_return_statistics(counts.returns, counts.predictions)
+    is_calibrated = credit.config.method.calibrated
     return Relabelled(
         out=path,
         method=name,
@@ -99,9 +175,9 @@ def relabel(
         steps=counts.steps,
         cut=counts.cut,
         held_out=len(counts.returns),
-        return_r2=r2,
-        return_r2_error=r2_error,
-        return_correlation=correlation,
+        return_r2=r2 if is_calibrated else math.nan,
+        return_r2_error=r2_error if is_calibrated else math.nan,
+        return_correlation=return_correlation,
         explanation=explanation,
     )
 
@@ -143,23 +219,22 @@ def _create_assigner(
         raise LareError(
             f"{method} gives all steps of an episode the same reward, and needs no relabelling: compute it from the return"
         )
-
-    def create(capacity: int) -> CreditAssigner:
-        return CreditAssigner(
-            method,
-            phi,
-            task=task,
-            observation_space=log.layout.observation.size,  # `parse_episode` returns rows
-            action_space=log.layout.action.size,
-            capacity=capacity,
-            settings=settings,
-            seed=seed,
-            fits_per_step=0.0,
-            forget=False,
-        )
-
-    bytes_per_step = 4 * create(1).config.spec.basis.n_inputs + 16  # features, and the store's own data of each step
-    return create(max(MIN_CAPACITY, int(memory * 2**30 / bytes_per_step)))
+    create = partial(
+        CreditAssigner,
+        method,
+        phi,
+        task=task,
+        observation_space=log.layout.observation.size,  # `parse_episode` returns rows
+        action_space=log.layout.action.size,
+        settings=settings,
+        seed=seed,
+        fits_per_step=0.0,
+        forget=False,
+    )
+    bytes_per_step = (
+        4 * create(capacity=1).config.spec.basis.n_inputs + 16
+    )  # features, and the store's own data of each step
+    return create(capacity=max(MIN_CAPACITY, int(memory * 2**30 / bytes_per_step)))
 
 
 def _fit(

@@ -1,4 +1,4 @@
-"""Tables with a row for each step or for each episode, in the memory format of Arrow.
+"""Tables with a row for each step or for each episode, in the memory format of Arrow, and Parquet files.
 
 Rows of steps have a column `episode`, and the rows of an episode follow each other. Rows of episodes hold lists.
 """
@@ -7,19 +7,24 @@ import itertools
 from abc import abstractmethod
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import AbstractContextManager
+from operator import itemgetter
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pyarrow as pa
 
-from lare_rl.errors import LareError
+from lare_rl.errors import LareError, missing_extra_error, short_repr
 from lare_rl.logs.episode import KEYS, LoggedEpisode, RelabelledEpisode
-from lare_rl.logs.log import Log
-from lare_rl.logs.output import atomic_output
+from lare_rl.logs.log import Log, atomic_output
 from lare_rl.tasks.spec import TaskSpec
 
-__all__ = ["BATCH_ROWS", "TableLog", "write_tables"]
+try:
+    import pyarrow as pa
+    import pyarrow.parquet as pq
+except ImportError as missing:
+    raise missing_extra_error("a Parquet file", "parquet") from missing
+
+__all__ = ["BATCH_ROWS", "ParquetLog", "TableLog", "write_tables"]
 
 BATCH_ROWS = 8192
 """Rows that are read at a time, and the least number of rows that are written at a time."""
@@ -41,20 +46,6 @@ class TableLog(Log):
         """Write tables one after the other, as a file or a directory."""
 
     def read(self) -> Iterator[tuple[str, dict[str, np.ndarray], pa.Table]]:
-        for episode, table in self._tables():
-            name = self._episode_name(episode)
-            yield name, _read_arrays(name, table), table
-
-    def write(self, out: str | Path, episodes: Iterable[RelabelledEpisode], overwrite: bool, comment: str) -> Path:
-        with atomic_output(Path(out), overwrite) as path:
-            self.write_file(path, _merge_small(_replace_rewards(*item) for item in episodes))
-        return Path(out)
-
-    def _episode_name(self, episode: int | str) -> str:
-        return f"{self.name}, episode {episode}"
-
-    def _tables(self) -> Iterator[tuple[int | str, pa.Table]]:
-        """Yield the number and the rows of each episode."""
         batches = (batch for batch in self.read_batches() if len(batch))
         first = next(batches, None)
         if first is None:
@@ -62,20 +53,48 @@ class TableLog(Log):
         _check_columns(self.path, first.schema)
         batches = itertools.chain([first], batches)
         if "episode" in first.schema.names:
-            yield from self._group_steps(batches)
+            tables = self._group_steps(batches)
         else:
             rows = (batch.slice(row, 1) for batch in batches for row in range(len(batch)))
-            yield from enumerate(pa.Table.from_batches([row]) for row in rows)
+            tables = enumerate(pa.Table.from_batches([row]) for row in rows)
+        for episode, table in tables:
+            name = f"{self.name}, episode {episode}"
+            yield name, _read_arrays(name, table), table
+
+    def write(self, out: str | Path, episodes: Iterable[RelabelledEpisode], overwrite: bool, comment: str) -> Path:
+        with atomic_output(Path(out), overwrite) as path:
+            self.write_file(path, _merge_small(_replace_rewards(*item) for item in episodes))
+        return Path(out)
 
     def _group_steps(self, batches: Iterator[pa.RecordBatch]) -> Iterator[tuple[int | str, pa.Table]]:
         """Yield the number and the rows of each episode of a table whose rows are steps."""
         finished: set[int | str] = set()
         runs = (run for batch in batches for run in _split_episodes(batch))
-        for episode, group in itertools.groupby(runs, key=lambda run: run[0]):
+        for episode, group in itertools.groupby(runs, key=itemgetter(0)):
             if episode in finished:
-                raise LareError(f"{self._episode_name(episode)} comes twice: sort the rows by episode")
+                raise LareError(f"{self.name}, episode {episode} comes twice: sort the rows by episode")
             finished.add(episode)
             yield episode, pa.Table.from_batches([rows for _, rows in group])
+
+
+class ParquetLog(TableLog):
+    """A Parquet file, or a directory of files with the same columns, in the order of their names. The output is one file."""
+
+    def read_batches(self) -> Iterator[pa.RecordBatch]:
+        files = sorted(self.path.glob("*.parquet")) if self.path.is_dir() else [self.path]
+        schema = None
+        for file in files:
+            try:
+                with pq.ParquetFile(file) as reader:
+                    schema = schema or reader.schema_arrow
+                    if reader.schema_arrow != schema:
+                        raise LareError(f"{file} has other columns than {files[0]}")
+                    yield from reader.iter_batches(BATCH_ROWS)
+            except (OSError, pa.ArrowException, NotImplementedError) as error:
+                raise LareError(f"{file} is not a Parquet file, or damaged: {short_repr(error)}") from error
+
+    def write_file(self, path: Path, tables: Iterator[pa.Table]) -> None:
+        write_tables(tables, lambda schema: pq.ParquetWriter(path, schema))
 
 
 def write_tables(tables: Iterator[pa.Table], open_writer: Callable[[pa.Schema], AbstractContextManager[Any]]) -> None:

@@ -61,13 +61,7 @@ class Draft:
 def warning_lines(
     removed: Sequence[str], origin: str = "the documentation of the environment", unused: Sequence[str] = ()
 ) -> list[str]:
-    """Return the comments at the top of a draft.
-
-    Args:
-        removed: the sentences that were removed.
-        origin: the source of the texts.
-        unused: the titles of sections that were not used.
-    """
+    """Return the comments at the top of a draft, with the titles of `unused` sections."""
     count = "1 sentence or row" if len(removed) == 1 else f"{len(removed)} sentences or rows"
     return [
         f"# A first draft, from {origin}. Read it before you use it: a language model will",
@@ -95,7 +89,6 @@ def text_lines(texts: Mapping[str, str], first_lines: Mapping[str, str]) -> list
 
 
 def _quote(text: str) -> str:
-    """Return a text as a multi-line string in TOML."""
     escaped = text.replace("\\", "\\\\").replace('"""', '\\"\\"\\"')
     escaped = re.sub(r"[\x00-\x08\x0b-\x1f\x7f]", lambda match: f"\\u{ord(match[0]):04x}", escaped)
     return f'"""\n{escaped}\n"""'
@@ -107,7 +100,6 @@ def file_name(text: str) -> str:
 
 
 def count_entries(count: int) -> str:
-    """Return a number of entries as text."""
     return "1 entry" if count == 1 else f"{count} entries"
 
 

@@ -5,27 +5,17 @@ import inspect
 import json
 import re
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from fnmatch import fnmatchcase
 from typing import Any
 
 from lare_rl.envs.agent_arrays import Agent
-from lare_rl.envs.agent_teams import agent_kind
 from lare_rl.envs.interface import Team
-from lare_rl.envs.pettingzoo_construct import find_time_limit, make_parallel_env
+from lare_rl.envs.pettingzoo_construct import agent_kind, find_time_limit, make_parallel_env
 from lare_rl.envs.pettingzoo_env import ParallelHost
+from lare_rl.new_task import draft
 from lare_rl.new_task.documentation import first_section, plain_lines, split_sections, write_texts
-from lare_rl.new_task.draft import (
-    JUDGES_LINE,
-    SCORE_LINE,
-    Draft,
-    count_entries,
-    describe_action,
-    describe_flattening,
-    file_name,
-    text_lines,
-    warning_lines,
-)
+from lare_rl.new_task.draft import Draft, count_entries, file_name, text_lines, warning_lines
 from lare_rl.tasks.spec import PETTINGZOO_PREFIX, TaskSpec
 
 __all__ = ["draft_multi_agent_task"]
@@ -59,27 +49,15 @@ def draft_multi_agent_task(environment_id: str) -> Draft:
             f'environment = "{environment_id}"',
             f"observation_size = {host.spec.observation_size}",
             f"action_size = {host.spec.action_size}",
-            JUDGES_LINE,
+            draft.JUDGES_LINE,
         ]
-        files = {
-            f"{name}-{team.name}.toml": "\n".join(
-                [
-                    *warning_lines(removed),
-                    *_team_lines(host, team),
-                    *environment_lines,
-                    *_team_text_lines(host, team, texts),
-                ]
-            )
-            + "\n"
-            for team in (host.spec.teams if several else ())
-        }
+        files = {}
+        for team in host.spec.teams if several else ():
+            head, team_texts = _team_lines(host, team), _team_text_lines(host, team, texts)
+            team_lines = [*warning_lines(removed), *head, *environment_lines, *team_texts]
+            files[f"{name}-{team.name}.toml"] = "\n".join(team_lines) + "\n"
         if several:
-            own_texts = {
-                "description": texts["description"],
-                "observation": "See the teams.",
-                "action": "See the teams.",
-            }
-            own_text_lines = text_lines(own_texts, {})
+            own_text_lines = text_lines(texts | dict.fromkeys(("observation", "action"), "See the teams."), {})
         else:
             own_text_lines = text_lines(texts, _first_lines(host, host.spec.teams[0]))
     arguments = _default_arguments(env)
@@ -88,7 +66,7 @@ def draft_multi_agent_task(environment_id: str) -> Draft:
         f'name = "{name}"',
         *([*TEAMS_COMMENT, f"teams = {json.dumps(list(files))}"] if several else []),
         *environment_lines,
-        SCORE_LINE,
+        draft.SCORE_LINE,
         *([] if limit else ["max_episode_steps = 1000 # the environment does not state its own limit"]),
         *([f"# arguments = {{ {arguments} }} # the defaults, unless they are set here"] if arguments else []),
         *own_text_lines,
@@ -116,9 +94,8 @@ def _patterns(kind: str) -> tuple[str, ...]:
 def _read_texts(env: Any) -> tuple[dict[str, str], tuple[str, ...]]:
     """Return the texts by their keys, and the removed lines, from the docstring of the class or of its module."""
     module = sys.modules.get(type(env).__module__)
-    sections = split_sections(
-        max(vars(type(env)).get("__doc__") or "", getattr(module, "__doc__", None) or "", key=len)
-    )
+    docstrings = vars(type(env)).get("__doc__") or "", getattr(module, "__doc__", None) or ""
+    sections = split_sections(max(docstrings, key=len))
     titled = next((body for title, body in sections.items() if title and body.strip()), "")
     summary = sections.get("description") or f"{sections['']}\n\n{titled}"
     # PettingZoo's pages begin with a table about the library, not about the task.
@@ -152,12 +129,12 @@ def _team_text_lines(host: ParallelHost, team: Team, texts: Mapping[str, str]) -
 def _first_lines(host: ParallelHost, team: Team) -> dict[str, str]:
     """Return the descriptions of the spaces of a team's first agent, with the padding that other agents require."""
     agent, spec = host.layout.agents[team.start], host.spec
-    flattening, padding = describe_flattening(agent.observation_space), _describe_padding(host, agent)
+    flattening, padding = draft.describe_flattening(agent.observation_space), _describe_padding(host, agent)
     fewer = f"; {agent.name} has only the first {agent.action_size}"
     missing_actions = fewer if agent.discrete and agent.action_size < spec.action_size else ""
     return {
         "observation": f"{count_entries(spec.observation_size)}{flattening}{padding}.",
-        "action": f"{count_entries(spec.action_size)}{describe_action(agent.action_space)}{missing_actions}.",
+        "action": f"{count_entries(spec.action_size)}{draft.describe_action(agent.action_space)}{missing_actions}.",
     }
 
 
@@ -174,10 +151,8 @@ def _describe_padding(host: ParallelHost, agent: Agent) -> str:
 def _default_arguments(env: Any) -> str:
     """Return the arguments of the environment's class that TOML can represent, as a table."""
     try:
-        parameters: Sequence[Any] = list(
-            inspect.signature(type(getattr(env, "unwrapped", env)).__init__).parameters.values()
-        )
+        signature = inspect.signature(type(getattr(env, "unwrapped", env)).__init__)
     except (TypeError, ValueError):
         return ""
-    simple = [parameter for parameter in parameters if isinstance(parameter.default, bool | int | float | str)]
+    simple = [item for item in signature.parameters.values() if isinstance(item.default, bool | int | float | str)]
     return ", ".join(f"{item.name} = {json.dumps(item.default)}" for item in simple if item.name != "render_mode")

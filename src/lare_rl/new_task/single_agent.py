@@ -5,19 +5,9 @@ import contextlib
 import gymnasium
 
 from lare_rl.envs.gymnasium_env import make_gymnasium
+from lare_rl.new_task import draft
 from lare_rl.new_task.documentation import first_section, plain_lines, split_sections, write_texts
-from lare_rl.new_task.draft import (
-    JUDGES_LINE,
-    MEASURES_LINE,
-    SCORE_LINE,
-    Draft,
-    count_entries,
-    describe_action,
-    describe_flattening,
-    file_name,
-    text_lines,
-    warning_lines,
-)
+from lare_rl.new_task.draft import Draft, count_entries, file_name, text_lines, warning_lines
 from lare_rl.tasks.spec import PETTINGZOO_PREFIX
 
 __all__ = ["draft_task"]
@@ -59,10 +49,10 @@ def _write_draft(environment_id: str, env: gymnasium.Env) -> Draft:
         sections,
     )
     observation_size, action_size = env.observation_space.shape[0], env.action_space.shape[0]  # type: ignore[index]
-    flattening = describe_flattening(env.unwrapped.observation_space)
+    flattening = draft.describe_flattening(env.unwrapped.observation_space)
     first_lines = {
         "observation": f"{count_entries(observation_size)}{flattening}.",
-        "action": f"{count_entries(action_size)}{describe_action(env.action_space)}.",
+        "action": f"{count_entries(action_size)}{draft.describe_action(env.action_space)}.",
     }
     # An id without a version means the latest version, which may change later.
     module, colon, name = environment_id.rpartition(":")
@@ -74,9 +64,9 @@ def _write_draft(environment_id: str, env: gymnasium.Env) -> Draft:
         f'environment = "{full_id}"',
         f"observation_size = {observation_size}",
         f"action_size = {action_size}",
-        JUDGES_LINE,
-        SCORE_LINE,
-        MEASURES_LINE,
+        draft.JUDGES_LINE,
+        draft.SCORE_LINE,
+        draft.MEASURES_LINE,
         *([] if env.spec and env.spec.max_episode_steps else [LIMIT_LINE]),
         *text_lines(texts, first_lines),
     ]

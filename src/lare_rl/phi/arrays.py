@@ -1,15 +1,17 @@
 """The arrays that a program works with: NumPy's shapes, views, indices and writing, on top of a graph of one row.
 
-A program sees a batch: one axis of its arrays has a length that it does not know. In the graph this axis has length 1, or m if the
-program has merged m numbers of a row into it: `x.reshape(batch * m, k)`. All other axes are the same in program and graph.
-An operation that would combine rows is refused: along the batch axis, with an index into it, or on arrays whose batch axes do not meet.
+A program sees a batch: one axis of its arrays has a length that it does not know. In the graph this axis has length 1, or m
+if the program has merged m numbers of a row into it: `x.reshape(batch * m, k)`. All other axes are the same in program and
+graph. An operation that would combine rows is refused: along the batch axis, with an index into it, or on arrays whose batch
+axes do not meet.
 
-The numbers of a view are at `positions` of another array, its base. NumPy itself is applied to positions, to find out where slices,
-transposes, flips or repetitions take their numbers from, and whether the result is a view.
+The numbers of a view are at `positions` of another array, its base. NumPy itself is applied to positions, to find out where
+slices, transposes, flips or repetitions take their numbers from, and whether the result is a view.
 """
 
 from __future__ import annotations
 
+import itertools
 import math
 import operator
 from collections.abc import Callable, Iterator, Sequence
@@ -17,13 +19,12 @@ from typing import Any
 
 import numpy as np
 
-from lare_rl.phi.batch import BATCH, BatchSize, common_batch_axis
 from lare_rl.phi.builder import current_builder
-from lare_rl.phi.graph import Kind, all_positions
+from lare_rl.phi.graph import Kind, all_positions, widest
 from lare_rl.phi.indices import ALL, computed_positions, fixed_index, index_entries, is_mask, masked_index, overwrite
-from lare_rl.phi.kinds import widest
 from lare_rl.phi.limits import RefusedError
-from lare_rl.phi.operand import Operand
+from lare_rl.phi.operand import BATCH, BatchSize, Operand, common_batch_axis
+from lare_rl.phi.values import describe
 
 __all__ = [
     "Array", "Complex", "Masked", "as_array", "broadcast", "concatenate", "elementwise", "invert", "power", "stack",
@@ -91,8 +92,9 @@ class Array(_Value):
         """Return the only number of a constant, as a number of Python."""
         values = self.constant
         if values is None:
-            what = "a number or a condition that differs from row to row"
-            raise RefusedError("E-FLOW", f"{what}: use np.where instead of if")
+            raise RefusedError(
+                "E-FLOW", "a number or condition that differs from row to row: use np.where instead of if"
+            )
         if values.size != 1:
             raise ValueError("the truth value of an array with more than one element is ambiguous")
         return values.item()
@@ -186,7 +188,7 @@ class Array(_Value):
                 value = value.values
             elif isinstance(value, Array) and value.batch_axis is not None:
                 raise ValueError(
-                    "x[mask] = y has other numbers in each row: write x[mask] = y[mask], or np.where(mask, y, x)"
+                    "x[mask] = y differs from row to row: write x[mask] = y[mask], or np.where(mask, y, x)"
                 )
             value = elementwise("where", region.mask_for(region.values), value, region.values)
             self[masked_index(self, entries)] = value
@@ -246,7 +248,9 @@ def as_array(value: Any) -> Array:
         return value
     if isinstance(value, (bool, int, float, np.ndarray, np.generic)):
         return Array(current_builder().constant(value), None)
-    if isinstance(value, (list, tuple, range)) and len(value):
+    if isinstance(value, (list, tuple, range)):
+        if not len(value):
+            raise TypeError("an empty list has no numbers")
         current_builder().spend(len(value))
         if all(isinstance(item, (bool, int, float)) for item in value):
             return Array(current_builder().constant(list(value)), None)
@@ -254,12 +258,8 @@ def as_array(value: Any) -> Array:
     if isinstance(value, BatchSize):
         value.refuse()
     if isinstance(value, Masked):
-        raise RefusedError(
-            "E-ROWS", "x[mask] can only be computed with, and written to the same places: use np.where(mask, x, 0)"
-        )
-    if value in ([], ()):
-        raise TypeError("an empty list has no numbers")
-    raise TypeError(f"no array can be made of a {type(value).__name__}")
+        raise RefusedError("E-ROWS", "what x[mask] selects differs from row to row: use np.where(mask, x, 0)")
+    raise TypeError(f"no array can be made of {describe(value)}")
 
 
 COMPLEX_OPERATIONS: dict[str, Callable[..., Any]] = {}
@@ -270,9 +270,7 @@ def elementwise(op: str, *operands: Any) -> Any:
     """Apply an operation on each number to arrays, which are broadcast to each other."""
     if any(isinstance(operand, (complex, Complex)) for operand in operands):
         if op not in COMPLEX_OPERATIONS:
-            raise RefusedError(
-                "E-NUMPY", f"{op} of complex numbers is not available: use np.abs, np.angle, .real or .imag"
-            )
+            raise RefusedError("E-NUMPY", f"{op} of complex numbers: use np.abs, np.angle, .real or .imag")
         return COMPLEX_OPERATIONS[op](*operands)
     masks = {operand.mask.node: operand.mask for operand in operands if isinstance(operand, Masked)}
     if masks:
@@ -300,14 +298,9 @@ def power(x: Any, exponent: Any) -> Any:
         x = elementwise("multiply", x, 1.0)
     x = x if isinstance(x, Operand) else as_array(x)
     square = elementwise("multiply", x, x)
-    match int(value):
-        case 1:
-            return x
-        case 2:
-            return square
-        case 3:
-            return elementwise("multiply", square, x)
-    return elementwise("multiply", square, square)
+    if value <= 2:
+        return x if value == 1 else square
+    return elementwise("multiply", square, x if value == 3 else square)
 
 
 def invert(x: Any) -> Any:
@@ -344,11 +337,10 @@ def concatenate(arrays: Sequence[Array], axis: Any) -> Array:
         raise ValueError(f"the shapes {_shapes_text(arrays)} cannot be joined along axis {at}")
     builder = current_builder()
     kind = widest([array.kind for array in arrays])
-    positions, start = [], 0
-    for array in arrays:
-        positions.append(all_positions(array.row_shape) + start)
-        start += positions[-1].size
-    builder.check_size((start,))
+    sizes = [math.prod(array.row_shape) for array in arrays]
+    builder.check_size((sum(sizes),))
+    starts = itertools.accumulate(sizes, initial=0)
+    positions = [all_positions(array.row_shape) + start for array, start in zip(arrays, starts, strict=False)]
     node = builder.concat([builder.cast(array.node, kind) for array in arrays])
     return Array(builder.gather(node, np.concatenate(positions, at)), first.batch_axis)
 

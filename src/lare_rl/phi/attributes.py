@@ -10,10 +10,10 @@ from typing import Any
 import numpy as np
 
 from lare_rl.phi.arrays import Array, Complex, Masked
-from lare_rl.phi.batch import BatchSize
 from lare_rl.phi.complex_numbers import call_with_complex
 from lare_rl.phi.limits import RefusedError
 from lare_rl.phi.numpy_functions import FUNCTIONS, INDEXED, KIND_OF_DTYPE, Polynomial, call_numpy
+from lare_rl.phi.operand import BatchSize
 from lare_rl.phi.python_functions import BUILTINS
 from lare_rl.phi.runtime import Runtime
 from lare_rl.phi.text import METHODS, call_method
@@ -152,7 +152,7 @@ def get_attribute(runtime: Runtime, owner: Any, name: str) -> Any:
             return Bound(lambda *args, **kwargs: call_numpy(name, [owner, *args], kwargs) if name != "copy" else owner)
     if isinstance(owner, Masked):
         raise RefusedError(
-            "E-ROWS", f"x[mask].{name[:60]}: what a mask selects differs from row to row: use np.where(mask, x, 0)"
+            "E-ROWS", f"x[mask].{name[:60]}: rows differ in what a mask selects: use np.where(mask, x, 0)"
         )
     raise RefusedError("E-ATTRIBUTE", f".{name[:60]} of a {value_type(owner)} is not available")
 

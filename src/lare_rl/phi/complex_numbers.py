@@ -42,9 +42,7 @@ def call_with_complex(name: str, args: Sequence[Any], kwargs: Mapping[str, Any])
     if name in COMPLEX_FUNCTIONS:
         return COMPLEX_FUNCTIONS[name](*args, **kwargs)
     if name not in BY_COMPONENT:
-        raise RefusedError(
-            "E-NUMPY", f"np.{name} of complex numbers is not available: use np.abs, np.angle, .real or .imag"
-        )
+        raise RefusedError("E-NUMPY", f"np.{name} of complex numbers: use np.abs, np.angle, .real or .imag")
 
     def component(value: Any, key: str) -> Any:
         if isinstance(value, (list, tuple)) and is_complex(value):
@@ -120,22 +118,8 @@ array_functions(
 )
 
 
-def fft(a: Any, n: Any = None, axis: int = -1) -> Complex:
-    """Return the sum over t of a_t exp(-2 pi i k t / n)."""
-    return _transform(a, axis, -1.0, half=False)
-
-
-def ifft(a: Any, n: Any = None, axis: int = -1) -> Complex:
-    result = _transform(a, axis, 1.0, half=False)
-    size = result.real.row_shape[result.real.axis(axis)]
-    return Complex(result.real / size, result.imag / size)
-
-
-def rfft(a: Any, n: Any = None, axis: int = -1) -> Complex:
-    return _transform(a, axis, -1.0, half=True)
-
-
 def _transform(a: Any, axis: int, sign: float, half: bool) -> Complex:
+    """Return the sum over t of a_t exp(sign 2 pi i k t / n)."""
     x = as_complex(a)
     (at,) = x.real.row_axes(axis)
     n = x.real.row_shape[at]
@@ -151,8 +135,20 @@ def _transform(a: Any, axis: int, sign: float, half: bool) -> Complex:
     return Complex(real, product(x.real, sin) + product(x.imag, cos))
 
 
-for _name, _function in {"fft.fft": fft, "fft.ifft": ifft, "fft.rfft": rfft}.items():
-    COMPLEX_FUNCTIONS[_name] = numpy_function(_name)(_function)
+def _register_transform(name: str, sign: float, half: bool) -> None:
+    def transform(a: Any, n: Any = None, axis: int = -1) -> Complex:
+        result = _transform(a, axis, sign, half)
+        if sign < 0:
+            return result
+        size = result.real.row_shape[result.real.axis(axis)]
+        return Complex(result.real / size, result.imag / size)
+
+    COMPLEX_FUNCTIONS[name] = numpy_function(name)(transform)
+
+
+_register_transform("fft.fft", -1.0, half=False)
+_register_transform("fft.ifft", 1.0, half=False)
+_register_transform("fft.rfft", -1.0, half=True)
 
 
 def _register_frequencies(name: str) -> None:

@@ -1,8 +1,9 @@
 """Computes a graph for any number of rows, with NumPy or jax.numpy: under `jax.jit`, `vmap` and `grad`, on any device.
 
 An array has the axes of its row last. In front of them are the batch axes, as many as the caller has: (observation size,),
-(batch, observation size), (seeds, time, envs, observation size). Operations name their axes from the end, so they never touch a
-batch axis. Constants have no batch axes. `lare-rl export` copies this file next to the exported graphs, so it may import NumPy only.
+(batch, observation size), (seeds, time, envs, observation size). Operations name their axes from the end, so they never touch
+a batch axis. Constants have no batch axes. `lare-rl export` copies this file next to the exported graphs, so it may import
+NumPy only.
 """
 
 from __future__ import annotations

@@ -1,18 +1,145 @@
-"""Expressions of a program. Each kind of expression has one rule; all other kinds are refused."""
+"""Expressions of a program, and Python's operators on its values. Each kind of expression has one rule; others are refused."""
 
 import ast
-from collections.abc import Iterable, Sequence
+import operator
+from collections.abc import Callable, Iterable, Sequence
 from typing import Any
 
+from lare_rl.phi.arrays import Array, Complex, as_array
 from lare_rl.phi.calls import evaluate_call
 from lare_rl.phi.limits import MAX_INT_BITS, RefusedError
-from lare_rl.phi.meter import check_key, check_text
-from lare_rl.phi.operators import apply_unary, compare
-from lare_rl.phi.runtime import Runtime
-from lare_rl.phi.text import format_value
-from lare_rl.phi.values import Iterator, Scope, Set, type_name
+from lare_rl.phi.numpy_functions import INDEXED, call_numpy
+from lare_rl.phi.operand import BatchSize, Operand
+from lare_rl.phi.runtime import Runtime, check_key, check_number, check_text
+from lare_rl.phi.text import combine_values, format_value
+from lare_rl.phi.values import Class, Function, Instance, Iterator, Scope, Set, Symbol, describe
 
-__all__ = ["evaluate", "evaluate_entries"]
+__all__ = [
+    "apply_binary", "apply_unary", "compare", "evaluate", "evaluate_entries", "get_item", "list_items",
+    "test_truth",
+]  # fmt: skip
+
+NUMBERS = (bool, int, float, complex)
+BINARY: dict[type[ast.operator], tuple[str, Callable[[Any, Any], Any]]] = {
+    ast.Add: ("add", operator.add), ast.Sub: ("sub", operator.sub), ast.Mult: ("mul", operator.mul),
+    ast.Div: ("truediv", operator.truediv), ast.FloorDiv: ("floordiv", operator.floordiv), ast.Mod: ("mod", operator.mod),
+    ast.Pow: ("pow", operator.pow), ast.BitAnd: ("and", operator.and_), ast.BitOr: ("or", operator.or_),
+    ast.BitXor: ("xor", operator.xor), ast.LShift: ("lshift", operator.lshift), ast.RShift: ("rshift", operator.rshift),
+}  # fmt: skip
+UNARY: dict[type[ast.unaryop], Callable[[Any], Any]] = {
+    ast.USub: operator.neg, ast.UAdd: operator.pos, ast.Invert: operator.invert,
+}  # fmt: skip
+COMPARISONS: dict[type[ast.cmpop], Callable[[Any, Any], Any]] = {
+    ast.Lt: operator.lt, ast.LtE: operator.le, ast.Gt: operator.gt, ast.GtE: operator.ge, ast.Eq: operator.eq,
+    ast.NotEq: operator.ne, ast.Is: operator.is_, ast.IsNot: operator.is_not, ast.In: lambda x, y: x in y,
+    ast.NotIn: lambda x, y: x not in y,
+}  # fmt: skip
+GENERIC_TYPES = ("list", "tuple", "dict", "set", "type")
+"""Types that annotations index: list[float]."""
+
+
+def apply_unary(runtime: Runtime, op: ast.unaryop, value: Any) -> Any:
+    if isinstance(op, ast.Not):
+        return not runtime.truth(value)
+    function = UNARY[type(op)]
+    if isinstance(value, Instance):
+        return runtime.call(runtime.attribute(value, f"__{function.__name__}__"), [], {})
+    if not isinstance(value, (*NUMBERS, Operand)):
+        raise TypeError(f"bad operand type for {type(op).__name__}: {describe(value)}")
+    return function(value)
+
+
+def apply_binary(runtime: Runtime, op: ast.operator, x: Any, y: Any) -> Any:
+    if isinstance(op, ast.MatMult):
+        return call_numpy("matmul", [x, y], {})
+    name, function = BINARY[type(op)]
+    for owner, method, other in ((x, f"__{name}__", y), (y, f"__r{name}__", x)):
+        if isinstance(owner, Instance) and owner.cls.has(method):
+            return runtime.call(runtime.attribute(owner, method), [other], {})
+    if isinstance(x, Operand) or isinstance(y, Operand):
+        runtime.meter.pay_for_all_within([x, y])
+        return function(*(value if isinstance(value, (Operand, int, complex)) else as_array(value) for value in (x, y)))
+    if isinstance(x, BatchSize) or isinstance(y, BatchSize):
+        if not isinstance(x, (int, float, BatchSize)) or not isinstance(y, (int, float, BatchSize)):
+            raise TypeError(f"the number of rows and {describe(x if isinstance(y, BatchSize) else y)}")
+        return function(x, y)
+    if isinstance(x, NUMBERS) and isinstance(y, NUMBERS):
+        if isinstance(x, int) and isinstance(y, int) and name in ("pow", "lshift"):
+            bits = x.bit_length() * y if name == "pow" else x.bit_length() + y
+            if bits > 4 * MAX_INT_BITS:
+                raise RefusedError("E-COST", "an integer is too large")
+        return check_number(function(x, y))
+    return combine_values(runtime.meter, name, x, y)
+
+
+def compare(runtime: Runtime, op: ast.cmpop, x: Any, y: Any) -> Any:
+    runtime.meter.pay_for_all_within([x, y])
+    if isinstance(op, (ast.In, ast.NotIn)):
+        if isinstance(x, Operand) and isinstance(y, (list, tuple)):
+            return any(runtime.truth(x == item) for item in y) == isinstance(op, ast.In)
+    elif not isinstance(op, (ast.Is, ast.IsNot)) and isinstance(x, Operand) != isinstance(y, Operand):
+        if x is None or y is None:
+            return isinstance(op, ast.NotEq)
+        x, y = (value if isinstance(value, Operand) else as_array(value) for value in (x, y))
+    return COMPARISONS[type(op)](x, y)
+
+
+def get_item(runtime: Runtime, container: Any, index: Any) -> Any:
+    """Return container[index]."""
+    runtime.meter.pay_for_all_within([index])
+    match container:
+        case Array() | Complex():
+            return container[index]
+        case Set():
+            raise TypeError("a set has no order: it cannot be indexed")
+        case dict():
+            return container[check_key(index)]
+        case list() | tuple() | range() | str():
+            result = container[index]
+            return runtime.meter.pay_for_list(result) if isinstance(index, slice) else result
+        case Instance() if container.cls.is_tuple:
+            return runtime.items(container)[index]
+        case Instance():
+            return runtime.call(runtime.attribute(container, "__getitem__"), [index], {})
+        case Symbol(name) if name.removeprefix("np.") in INDEXED and name.startswith("np."):
+            return INDEXED[name.removeprefix("np.")][index]
+        case Symbol("np.s_" | "np.index_exp"):
+            return index
+        case Symbol(name) if name in GENERIC_TYPES or name.startswith(("typing.", "np.typing.")):
+            return container
+    raise TypeError(f"{describe(container)} cannot be indexed")
+
+
+def test_truth(runtime: Runtime, value: Any) -> bool:
+    runtime.meter.pay()
+    return bool(value)
+
+
+def list_items(runtime: Runtime, value: Any) -> Sequence[Any]:
+    """Return the entries that a loop goes through."""
+    match value:
+        case BatchSize():
+            value.refuse()
+        case Iterator():
+            items = list(value)
+            value.clear()
+        case list() | tuple() | range() | str():
+            items = value
+        case dict() | Array():
+            items = list(value)
+        case Instance() if value.cls.is_tuple:
+            items = [value.attributes[name] for name in value.cls.fields or ()]
+        case Instance() if value.cls.has("__iter__"):
+            items = runtime.items(runtime.call(runtime.attribute(value, "__iter__"), [], {}))
+        case Class():  # the members of an Enum
+            members = value.attributes.items()
+            items = [
+                member for name, member in members if not name.startswith("_") and not isinstance(member, Function)
+            ]
+        case _:
+            raise TypeError(f"{describe(value)} cannot be gone through")
+    runtime.meter.pay(len(items))
+    return items
 
 
 def evaluate(runtime: Runtime, node: ast.expr, scope: Scope) -> Any:
@@ -45,14 +172,10 @@ def evaluate(runtime: Runtime, node: ast.expr, scope: Scope) -> Any:
             return Set(dict.fromkeys(map(check_key, runtime.entries(items, scope))))
         case ast.Dict(keys=keys, values=values):
             return _evaluate_dict(runtime, keys, values, scope)
-        case ast.Compare():
-            return _evaluate_comparison(runtime, node, scope)
-        case ast.BoolOp(op=op, values=values):
-            for operand in values[:-1]:
-                value = runtime.evaluate(operand, scope)
-                if runtime.truth(value) == isinstance(op, ast.Or):
-                    return value
-            return runtime.evaluate(values[-1], scope)
+        case ast.Compare(first, ops, comparators):
+            return _evaluate_comparison(runtime, first, list(zip(ops, comparators, strict=True)), scope)
+        case ast.BoolOp():
+            return _evaluate_and_or(runtime, node, scope)
         case ast.IfExp(test=test, body=body, orelse=orelse):
             return runtime.evaluate(body if runtime.truth(runtime.evaluate(test, scope)) else orelse, scope)
         case ast.NamedExpr(target=ast.Name(id=name), value=value):
@@ -61,16 +184,8 @@ def evaluate(runtime: Runtime, node: ast.expr, scope: Scope) -> Any:
             return result
         case ast.Lambda():
             return runtime.define(node, scope)
-        case ast.ListComp(elt=item, generators=generators):
-            return [runtime.evaluate(item, inner) for inner in _turns(runtime, generators, scope)]
-        case ast.GeneratorExp(elt=item, generators=generators):
-            return Iterator([runtime.evaluate(item, inner) for inner in _turns(runtime, generators, scope)])
-        case ast.SetComp(elt=item, generators=generators):
-            turns = _turns(runtime, generators, scope)
-            return Set({check_key(runtime.evaluate(item, inner)): None for inner in turns})
-        case ast.DictComp(key=key, value=value, generators=generators):
-            turns = _turns(runtime, generators, scope)
-            return {check_key(runtime.evaluate(key, inner)): runtime.evaluate(value, inner) for inner in turns}
+        case ast.ListComp() | ast.GeneratorExp() | ast.SetComp() | ast.DictComp():
+            return _evaluate_comprehension(runtime, node, scope)
         case ast.JoinedStr(values=values):
             text = ""
             for value in values:
@@ -79,15 +194,8 @@ def evaluate(runtime: Runtime, node: ast.expr, scope: Scope) -> Any:
         case ast.FormattedValue(value=value, format_spec=spec):
             format_spec = "" if spec is None else runtime.evaluate(spec, scope)
             return format_value(runtime.meter, runtime.evaluate(value, scope), format_spec)
-        case ast.Yield(value=value):
-            yielded = scope.function.yielded
-            if yielded is None:
-                raise RefusedError("E-PYTHON", "yield outside a function")
-            yielded.append(None if value is None else runtime.evaluate(value, scope))
-            return None
-        case ast.YieldFrom(value=value) if scope.function.yielded is not None:
-            scope.function.yielded.extend(runtime.items(runtime.evaluate(value, scope)))
-            return None
+        case ast.Yield() | ast.YieldFrom():
+            return _evaluate_yield(runtime, node, scope)
     raise RefusedError("E-PYTHON", f"{type(node).__name__.lower()} is not available")
 
 
@@ -115,20 +223,56 @@ def _evaluate_dict(
             result |= value
             runtime.meter.pay_for_list(len(result))
         else:
-            raise TypeError(f"** of a {type_name(value)}")
+            raise TypeError(f"** of {describe(value)}")
     return result
 
 
-def _evaluate_comparison(runtime: Runtime, node: ast.Compare, scope: Scope) -> Any:
+def _evaluate_and_or(runtime: Runtime, node: ast.BoolOp, scope: Scope) -> Any:
+    for operand in node.values[:-1]:
+        value = runtime.evaluate(operand, scope)
+        if runtime.truth(value) == isinstance(node.op, ast.Or):
+            return value
+    return runtime.evaluate(node.values[-1], scope)
+
+
+def _evaluate_yield(runtime: Runtime, node: ast.Yield | ast.YieldFrom, scope: Scope) -> None:
+    yielded = scope.function.yielded
+    if yielded is None:
+        raise RefusedError("E-PYTHON", "yield outside a function")
+    value = None if node.value is None else runtime.evaluate(node.value, scope)
+    if isinstance(node, ast.YieldFrom):
+        yielded.extend(runtime.items(value))
+    else:
+        yielded.append(value)
+
+
+def _evaluate_comparison(
+    runtime: Runtime, first: ast.expr, comparisons: Sequence[tuple[ast.cmpop, ast.expr]], scope: Scope
+) -> Any:
     """Compare each operand with the next one, until a comparison is false: a < b < c."""
     result: Any = True
-    x = runtime.evaluate(node.left, scope)
-    for i, (op, comparator) in enumerate(zip(node.ops, node.comparators, strict=True)):
+    x = runtime.evaluate(first, scope)
+    for i, (op, comparator) in enumerate(comparisons):
         if i and not runtime.truth(result):
             break
         y = runtime.evaluate(comparator, scope)
         result, x = compare(runtime, op, x, y), y
     return result
+
+
+def _evaluate_comprehension(
+    runtime: Runtime, node: ast.ListComp | ast.GeneratorExp | ast.SetComp | ast.DictComp, scope: Scope
+) -> Any:
+    turns = _turns(runtime, node.generators, scope)
+    if isinstance(node, ast.DictComp):
+        return {check_key(runtime.evaluate(node.key, turn)): runtime.evaluate(node.value, turn) for turn in turns}
+    items = [runtime.evaluate(node.elt, turn) for turn in turns]
+    match node:
+        case ast.SetComp():
+            return Set(dict.fromkeys(map(check_key, items)))
+        case ast.GeneratorExp():
+            return Iterator(items)
+    return items
 
 
 def _turns(runtime: Runtime, generators: Sequence[ast.comprehension], scope: Scope) -> Iterable[Scope]:

@@ -12,10 +12,10 @@ from typing import Any
 
 import numpy as np
 
-from lare_rl.phi.batch import BatchSize, Shaped
 from lare_rl.phi.builder import current_builder
 from lare_rl.phi.graph import all_positions
 from lare_rl.phi.limits import RefusedError
+from lare_rl.phi.operand import BatchSize, Shaped
 
 __all__ = ["ALL", "computed_positions", "fixed_index", "index_entries", "is_mask", "masked_index", "overwrite"]
 
@@ -61,9 +61,7 @@ def fixed_index(array: Shaped, entries: Sequence[Any]) -> tuple[Callable[[np.nda
     """Return what an index does to positions, and where the batch axis then is. NumPy finds it on an array without numbers."""
     axes = [entry for entry in entries if entry is not None]
     if array.batch_axis is not None and axes[array.batch_axis] not in (ALL, slice(0, None), slice(0, None, 1)):
-        raise RefusedError(
-            "E-ROWS", f"an index into the batch axis of the shape {array.shape} takes one row for all: write x[:, i]"
-        )
+        raise RefusedError("E-ROWS", f"an index into the rows of {array.shape} takes one row for all: write x[:, i]")
     # An axis of length 0 marks the batch axis; without one, it is behind all others.
     at = array.ndim if array.batch_axis is None else array.batch_axis
     shape, index = [*array.row_shape[:at], 0, *array.row_shape[at + 1 :]], tuple(entries)
@@ -88,7 +86,8 @@ def masked_index(array: Shaped, entries: Sequence[Any]) -> tuple[Any, ...]:
 def computed_positions(array: Shaped, entries: Sequence[Any], as_array: Callable[[Any], Any]) -> Any:
     """Return the array of the positions of x[np.arange(batch), i, 2:4] in a row.
 
-    Each row reads its own numbers, or those of a constant. A computed index beyond the end of an axis stands for the last entry.
+    Each row reads its own numbers, or those of a constant. A computed index beyond the end of an axis stands for the last
+    entry.
     """
     at_arrays = [i for i, entry in enumerate(entries) if not isinstance(entry, slice) and entry is not None]
     apart = at_arrays != list(range(at_arrays[0], at_arrays[-1] + 1))
@@ -104,10 +103,7 @@ def computed_positions(array: Shaped, entries: Sequence[Any], as_array: Callable
         size, stride = (1, 0) if axis is None else (array.row_shape[axis], math.prod(array.row_shape[axis + 1 :]))
         if axis is not None and axis == array.batch_axis:
             if entry is None or not getattr(entry, "is_row_number", False) or size > 1:
-                raise RefusedError(
-                    "E-ROWS",
-                    "an index that differs from row to row begins with np.arange(batch): x[np.arange(len(x)), i]",
-                )
+                raise RefusedError("E-ROWS", "an index that differs from row to row is x[np.arange(len(x)), i]")
             computed = as_array(np.zeros(entry.row_shape, int)).reshaped(entry.row_shape, entry.batch_axis) + computed
         elif isinstance(entry, slice) or entry is None:
             (behind if i > first else before).append(np.arange(size)[entry or ALL] * stride)

@@ -1,21 +1,22 @@
 """Carries out a program: a small, closed subset of Python, in which arrays are nodes of a graph.
 
-Nothing of the source is compiled or executed. Each kind of statement (statements.py) and of expression (expressions.py) has one rule,
-and all others are refused. A name is defined by the program or by `python_functions`. A function is defined by the program, by
-`python_functions` or by `numpy_functions`. An attribute is in a table (attributes.py) or in a class of the program (classes.py).
+Nothing of the source is compiled or executed. Each kind of statement (statements.py) and of expression (expressions.py) has
+one rule, and all others are refused. A name is defined by the program or by `python_functions`. A function is defined by the
+program, by `python_functions` or by `numpy_functions`. An attribute is in a table (attributes.py) or in a class of the
+program (calls.py).
 
-A program ends soon: the meter counts every step, and numbers, texts, lists and arrays are limited before they are made (limits.py).
+A program ends soon: the meter counts every step, and numbers, texts, lists and arrays are limited before they are made
+(limits.py).
 """
 
 from typing import Any
 
-from lare_rl.phi import calls, expressions, operators, statements
+from lare_rl.phi import calls, expressions, statements
 from lare_rl.phi.attributes import get_attribute
 from lare_rl.phi.builder import Builder
-from lare_rl.phi.classes import class_attribute
-from lare_rl.phi.meter import Meter
+from lare_rl.phi.calls import class_attribute
 from lare_rl.phi.python_functions import BUILTINS
-from lare_rl.phi.runtime import Runtime
+from lare_rl.phi.runtime import Meter, Runtime
 from lare_rl.phi.values import Class, Instance, Scope, Symbol
 
 __all__ = ["Interpreter"]
@@ -39,10 +40,10 @@ class Interpreter(Runtime):
     entries = expressions.evaluate_entries
     define = calls.define_function
     call = calls.call
-    binary = operators.apply_binary
-    item = operators.get_item
-    items = operators.list_items
-    truth = operators.test_truth
+    binary = expressions.apply_binary
+    item = expressions.get_item
+    items = expressions.list_items
+    truth = expressions.test_truth
 
     def attribute(self, owner: Any, name: str) -> Any:
         """Return owner.name."""

@@ -1,7 +1,7 @@
 """Every limit on a program and on its graph, and the error that a program gets when it is refused.
 
-Each limit is checked before the time or the memory is spent. `Meter` (meter.py) counts the steps of a program, `Builder` (builder.py)
-the sizes of its arrays.
+Each limit is checked before the time or the memory is spent. `Meter` (runtime.py) counts the steps of a program, `Builder`
+(builder.py) the sizes of its arrays.
 """
 
 from dataclasses import dataclass
@@ -9,39 +9,30 @@ from dataclasses import dataclass
 __all__ = ["DEFAULT_LIMITS", "UNLIMITED", "GraphLimits", "RefusedError"]
 
 # The text
-MAX_SOURCE_LENGTH = 20_000
-"""Characters of a program."""
-MAX_SYNTAX_DEPTH = 100
-"""Levels of its syntax tree."""
-PARSER_STACK_BYTES = 32 << 20
-"""Stack of the thread in which Python's parser runs."""
+MAX_SOURCE_LENGTH = 20_000  # characters
+MAX_SYNTAX_DEPTH = 100  # levels of the syntax tree
+PARSER_STACK_BYTES = 32 << 20  # of the thread in which Python's parser runs
 
 # Running
-MAX_STEPS = 40_000
-"""Steps of a program: statements, expressions, and entries of lists that are created or read."""
+MAX_STEPS = 40_000  # statements, expressions, and entries of lists that are created or read
 MAX_CALL_DEPTH = 12
-"""Calls of functions within each other."""
 MAX_LIST_LENGTH = 10_000
 MAX_TEXT_LENGTH = 10_000
-MAX_KEY_LENGTH = 16
-"""Entries of a tuple that is the key of a dictionary."""
+MAX_KEY_LENGTH = 16  # entries of a tuple that is the key of a dictionary
 MAX_INT_BITS = 63
 
 # The result
 MAX_FACTORS = 32
-MAX_MESSAGES = 8
-"""Messages about names that are not available, in one refusal."""
+MAX_MESSAGES = 8  # about names that are not available, in one refusal
 MAX_MESSAGE_LENGTH = 500
 
 # Single functions of NumPy
-MAX_CONSTANT_SIZE = 1024
-"""Numbers in an argument of a function that NumPy computes on constants, and the largest integer there."""
-MAX_SYSTEM_SIZE = 64
-"""The same for functions that solve equations."""
+MAX_CONSTANT_SIZE = (
+    1024  # numbers in an argument of a function that NumPy computes on constants, and the largest integer there
+)
+MAX_SYSTEM_SIZE = 64  # the same for functions that solve equations
 MAX_TRANSFORM_LENGTH = 256
-"""Numbers of a Fourier transform."""
-MAX_INVERSE_SIZE = 4
-"""Rows of a matrix that is inverted."""
+MAX_INVERSE_SIZE = 4  # rows of a matrix that is inverted
 MAX_MATRIX_POWER = 64
 MAX_EINSUM_ARRAYS = 8
 MAX_EINSUM_LETTERS = 20

@@ -6,8 +6,7 @@ import re
 from collections.abc import Sequence
 
 from lare_rl.phi.limits import RefusedError
-from lare_rl.phi.parse import parse
-from lare_rl.phi.read import FUNCTION_NAME
+from lare_rl.phi.read import FUNCTION_NAME, parse
 
 __all__ = ["factor_meanings", "factor_names"]
 
@@ -67,7 +66,7 @@ def _returned_names(tree: ast.Module) -> list[str] | None:
 
 
 def _returned_items(function: ast.FunctionDef, returned: ast.expr | None) -> list[ast.expr] | None:
-    """Return the items of `[a, b]`, of `factors`, or of `[f[:, None] for f in factors]`, where the function assigns `factors` once."""
+    """Return the items of `[a, b]`, or of `factors` or `[f[:, None] for f in factors]`, if `factors` is assigned once."""
     if isinstance(returned, ast.ListComp) and len(returned.generators) == 1 and not returned.generators[0].ifs:
         returned = returned.generators[0].iter
         returned = returned if isinstance(returned, ast.Name) else None

@@ -4,7 +4,7 @@ Every operation of a graph has a form in ONNX; some need several of its operatio
 """
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from importlib.util import find_spec
 from typing import Any
 
@@ -33,6 +33,20 @@ COMPARISONS = {
 REDUCTIONS = {
     "sum": "ReduceSum", "prod": "ReduceProd", "max": "ReduceMax", "min": "ReduceMin", "any": "ReduceMax", "all": "ReduceMin",
 }  # fmt: skip
+COMPOSED: dict[str, Callable[..., str]] = {
+    "not_equal": lambda op, x, y: op("Not", op("Equal", x, y)),
+    "isfinite": lambda op, x: op("Not", op("Or", op("IsNaN", x), op("IsInf", x))),
+    "trunc": lambda op, x: op("Mul", op("Sign", x), op("Floor", op("Abs", x))),
+    "log1p": lambda op, x: op("Log", op("Add", x, 1.0)),
+    "expm1": lambda op, x: op("Sub", op("Exp", x), 1.0),
+    "exp2": lambda op, x: op("Pow", np.float32(2), x),
+    "log2": lambda op, x: op("Mul", op("Log", x), 1 / math.log(2)),
+    "log10": lambda op, x: op("Mul", op("Log", x), 1 / math.log(10)),
+    "cbrt": lambda op, x: op("Mul", op("Sign", x), op("Pow", op("Abs", x), 1 / 3)),
+    "hypot": lambda op, x, y: op("Sqrt", op("Add", op("Mul", x, x), op("Mul", y, y))),
+    "left_shift": lambda op, x, y: op("Mul", x, op("Pow", np.array(2), y)),
+}
+"""Operations that are some operations of ONNX. `op` adds one of them."""
 DTYPES = {"float": np.float32, "int": np.int64, "bool": np.bool_}
 
 
@@ -183,29 +197,13 @@ class _Writer:
     def _write_composed(self, node: Node, x: list[str], kind: str) -> str:
         """Add an operation on each number that needs several of ONNX."""
         op = self.op
+        if node.op in COMPOSED:
+            return COMPOSED[node.op](op, *x)
         match node.op:
             case "power":
                 return op("Pow", *x) if kind == "float" else op("Pow", x[0], op("Max", x[1], np.array(0)))
-            case "not_equal":
-                return op("Not", op("Equal", *x))
-            case "isfinite":
-                return op("Not", op("Or", op("IsNaN", x[0]), op("IsInf", x[0])))
             case "signbit":
                 return op("Less", x[0], np.zeros((), DTYPES[self.graph.nodes[node.inputs[0]].kind]))
-            case "trunc":
-                return op("Mul", op("Sign", x[0]), op("Floor", op("Abs", x[0])))
-            case "log1p":
-                return op("Log", op("Add", x[0], 1.0))
-            case "expm1":
-                return op("Sub", op("Exp", x[0]), 1.0)
-            case "exp2":
-                return op("Pow", np.float32(2), x[0])
-            case "log2" | "log10":
-                return op("Mul", op("Log", x[0]), 1 / math.log(float(node.op[3:])))
-            case "cbrt":
-                return op("Mul", op("Sign", x[0]), op("Pow", op("Abs", x[0]), 1 / 3))
-            case "hypot":
-                return op("Sqrt", op("Add", op("Mul", x[0], x[0]), op("Mul", x[1], x[1])))
             case "logaddexp" | "logaddexp2":
                 unit = 1.0 if node.op == "logaddexp" else math.log(2)
                 distance = op("Mul", op("Neg", op("Abs", op("Sub", *x))), unit)
@@ -218,9 +216,9 @@ class _Writer:
                 if kind != "float":
                     return both
                 return op("Where", op("IsNaN", x[0]), x[1], op("Where", op("IsNaN", x[1]), x[0], both))
-            case "floor_divide" | "remainder" | "fmod" if kind == "float":
-                if node.op == "fmod":
-                    return op("Mod", *x, fmod=1)
+            case "fmod" if kind == "float":
+                return op("Mod", *x, fmod=1)
+            case "floor_divide" | "remainder" if kind == "float":
                 quotient = op("Floor", op("Div", *x))
                 return quotient if node.op == "floor_divide" else op("Sub", x[0], op("Mul", x[1], quotient))
             case "floor_divide" | "remainder" | "fmod":
@@ -229,8 +227,6 @@ class _Writer:
                 rest = op("Mod", x[0], divisor, fmod=int(node.op == "fmod"))
                 result = op("Div", op("Sub", x[0], rest), divisor) if node.op == "floor_divide" else rest
                 return op("Where", zero, np.array(0), result)
-            case "left_shift":
-                return op("Mul", x[0], op("Pow", np.array(2), x[1]))
             case "right_shift":
                 divisor = op("Pow", np.array(2), x[1])
                 return op("Div", op("Sub", x[0], op("Mod", x[0], divisor)), divisor)

@@ -5,16 +5,25 @@ evaluate(graph, {"observation": observation, "action": action})["factors"]
 """
 
 import ast
+import threading
 import warnings
+from concurrent.futures import ThreadPoolExecutor
 
 from lare_rl.phi.arrays import Array
 from lare_rl.phi.attributes import module_attribute
 from lare_rl.phi.builder import Builder, building, current_builder
 from lare_rl.phi.graph import Graph
 from lare_rl.phi.interpreter import Interpreter
-from lare_rl.phi.limits import MAX_FACTORS, MAX_MESSAGE_LENGTH, MAX_MESSAGES, RefusedError
-from lare_rl.phi.meter import Meter
-from lare_rl.phi.parse import parse
+from lare_rl.phi.limits import (
+    MAX_FACTORS,
+    MAX_MESSAGE_LENGTH,
+    MAX_MESSAGES,
+    MAX_SOURCE_LENGTH,
+    MAX_SYNTAX_DEPTH,
+    PARSER_STACK_BYTES,
+    RefusedError,
+)
+from lare_rl.phi.runtime import Meter
 from lare_rl.phi.values import (
     PYTHON_ERRORS,
     BreakSignal,
@@ -24,9 +33,54 @@ from lare_rl.phi.values import (
     ReturnSignal,
     Scope,
     Symbol,
+    describe,
 )
+from lare_rl.util.sanitize import first_invisible
 
-__all__ = ["FUNCTION_NAME", "read"]
+__all__ = ["FUNCTION_NAME", "parse", "read"]
+
+_PARSING = threading.Lock()
+"""`threading.stack_size` is for the whole process. Before Python 3.11.8 and 3.12.2, parsers in two threads may also miscount
+their recursion depth (python/cpython#106905)."""
+
+
+def parse(source: str) -> ast.Module:
+    """Parse a source.
+
+    Raises:
+        RefusedError: it is too long, nested too deeply, has invisible characters, or is not Python.
+    """
+    if len(source) > MAX_SOURCE_LENGTH:
+        raise RefusedError("E-SIZE", f"{len(source)} characters: at most {MAX_SOURCE_LENGTH} are accepted")
+    hidden = first_invisible(source)
+    if hidden is not None:
+        line = source.count("\n", 0, hidden) + 1
+        raise RefusedError("E-SYNTAX", f"{source[hidden]!a} is a character that no reader sees: remove it", line)
+    try:
+        tree = _parse_in_thread(source)
+    except SyntaxError as error:
+        raise RefusedError("E-SYNTAX", error.msg, error.lineno) from None
+    except (ValueError, MemoryError, RecursionError) as error:
+        raise RefusedError("E-SYNTAX", f"this is not Python: {error or type(error).__name__}") from None
+    level, depth = [tree], 0
+    while level:
+        depth += 1
+        level = [child for node in level for child in ast.iter_child_nodes(node)]
+    if depth > MAX_SYNTAX_DEPTH:
+        raise RefusedError("E-SIZE", f"the code is nested {depth} levels deep: at most {MAX_SYNTAX_DEPTH} are accepted")
+    return tree
+
+
+def _parse_in_thread(source: str) -> ast.Module:
+    with _PARSING, warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # about escapes in texts
+        before = threading.stack_size(PARSER_STACK_BYTES)
+        try:
+            with ThreadPoolExecutor(1) as pool:
+                return pool.submit(ast.parse, source).result()
+        finally:
+            threading.stack_size(before)
+
 
 FUNCTION_NAME = "evaluation_func"
 """The name of the function that a program must define."""
@@ -38,8 +92,8 @@ def read(source: str, observation_size: int, action_size: int, max_factors: int 
     The program sees arrays (batch, observation_size) and (batch, action_size), and returns a list of arrays (batch, 1).
 
     Raises:
-        RefusedError: the text is no such function. Each line of the message names a rule, a line of the source, what is wrong, and often
-            what to write instead: first what stopped the reader, then further names that are not available.
+        RefusedError: the text is no such function. Each line of the message names a rule, a line of the source, what is wrong,
+            and often what to write instead: first what stopped the reader, then further names that are not available.
     """
     builder, tree = Builder(), None
     interpreter = Interpreter(builder, has_yield="yield" in source)
@@ -129,4 +183,4 @@ def _check_factors(factors: object, max_factors: int) -> list[int]:
 
 
 def _describe(value: object) -> str:
-    return f"of the shape {value.shape}" if isinstance(value, Array) else f"a {type(value).__name__.lower()}"
+    return f"of the shape {value.shape}" if isinstance(value, Array) else describe(value)

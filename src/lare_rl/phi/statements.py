@@ -9,11 +9,10 @@ from typing import Any
 
 from lare_rl.phi.arrays import Array
 from lare_rl.phi.attributes import imported_names
-from lare_rl.phi.classes import decorate, make_class
+from lare_rl.phi.calls import decorate, make_class
 from lare_rl.phi.limits import RefusedError
-from lare_rl.phi.meter import check_key
 from lare_rl.phi.python_functions import ERRORS
-from lare_rl.phi.runtime import Runtime
+from lare_rl.phi.runtime import Runtime, check_key
 from lare_rl.phi.text import format_value
 from lare_rl.phi.values import (
     PYTHON_ERRORS,
@@ -26,7 +25,7 @@ from lare_rl.phi.values import (
     Scope,
     Set,
     Symbol,
-    type_name,
+    describe,
 )
 
 __all__ = ["assign", "run_statements"]
@@ -67,20 +66,15 @@ def _execute(runtime: Runtime, statement: ast.stmt, scope: Scope) -> None:
         case ast.While(test=test, body=body, orelse=orelse):
             turns = iter(lambda: runtime.truth(runtime.evaluate(test, scope)), False)
             _loop(runtime, turns, body, orelse, scope)
-        case ast.FunctionDef():
-            value = decorate(runtime, runtime.define(statement, scope), statement.decorator_list, scope)
-            scope.assign(statement.name, value)
-        case ast.ClassDef():
-            value = decorate(runtime, make_class(runtime, statement, scope), statement.decorator_list, scope)
-            scope.assign(statement.name, value)
+        case ast.FunctionDef() | ast.ClassDef():
+            is_function = isinstance(statement, ast.FunctionDef)
+            value = runtime.define(statement, scope) if is_function else make_class(runtime, statement, scope)
+            scope.assign(statement.name, decorate(runtime, value, statement.decorator_list, scope))
         case ast.Try():
             _try(runtime, statement, scope)
         case ast.With(items=managers, body=body):
             for manager in managers:
-                call = manager.context_expr
-                function = runtime.evaluate(call.func if isinstance(call, ast.Call) else call, scope)
-                if function not in IGNORED_MANAGERS or manager.optional_vars is not None:
-                    raise RefusedError("E-PYTHON", "with is available for np.errstate only")
+                _check_manager(runtime, manager, scope)
             runtime.run(body, scope)
         case ast.Import() | ast.ImportFrom():
             for name, value in imported_names(statement):
@@ -105,6 +99,13 @@ def _execute(runtime: Runtime, statement: ast.stmt, scope: Scope) -> None:
         case _:
             name = type(statement).__name__
             raise RefusedError("E-PYTHON", f"the statement {_KEYWORDS.get(name, name.lower())} is not available")
+
+
+def _check_manager(runtime: Runtime, manager: ast.withitem, scope: Scope) -> None:
+    call = manager.context_expr
+    function = runtime.evaluate(call.func if isinstance(call, ast.Call) else call, scope)
+    if function not in IGNORED_MANAGERS or manager.optional_vars is not None:
+        raise RefusedError("E-PYTHON", "with is available for np.errstate only")
 
 
 def _loop(
@@ -143,9 +144,7 @@ def assign(runtime: Runtime, target: ast.expr, value: Any, scope: Scope) -> None
         case ast.Attribute(value=owner_node, attr=name):
             owner = runtime.evaluate(owner_node, scope)
             if not isinstance(owner, (Instance, Class)):
-                raise RefusedError(
-                    "E-PYTHON", f".{name} cannot be assigned: only attributes of the program's own classes can"
-                )
+                raise RefusedError("E-PYTHON", f".{name} of {describe(owner)} cannot be assigned")
             owner.attributes[name] = value
         case _:
             raise RefusedError("E-PYTHON", f"nothing can be assigned to {type(target).__name__.lower()}")
@@ -158,7 +157,7 @@ def _set_item(runtime: Runtime, container: Any, index: Any, value: Any) -> None:
     elif isinstance(container, Array) or (isinstance(container, list) and not isinstance(index, slice)):
         container[index] = value
     else:
-        raise TypeError(f"nothing can be written into a {type_name(container)}")
+        raise TypeError(f"nothing can be written into {describe(container)}")
 
 
 def _augment(runtime: Runtime, statement: ast.AugAssign, scope: Scope) -> None:
@@ -193,7 +192,7 @@ def _delete(runtime: Runtime, target: ast.expr, scope: Scope) -> None:
         case ast.Subscript(value=container, slice=index):
             owner, key = runtime.evaluate(container, scope), runtime.evaluate(index, scope)
             if not isinstance(owner, (dict, list)):
-                raise TypeError(f"entries of a {type_name(owner)} cannot be deleted")
+                raise TypeError(f"entries of {describe(owner)} cannot be deleted")
             del owner[check_key(key) if isinstance(owner, dict) else key]
         case _:
             raise NameError("a name that is not defined cannot be deleted")

@@ -7,11 +7,9 @@ from collections.abc import Sequence
 from typing import Any
 
 from lare_rl.phi.arrays import Array
-from lare_rl.phi.batch import BatchSize
 from lare_rl.phi.limits import RefusedError
-from lare_rl.phi.meter import Meter, check_key, check_text, check_text_length
-from lare_rl.phi.operand import Operand
-from lare_rl.phi.runtime import Runtime
+from lare_rl.phi.operand import BatchSize, Operand
+from lare_rl.phi.runtime import Meter, Runtime, check_key, check_text, check_text_length
 from lare_rl.phi.values import Set, Symbol, value_type
 
 __all__ = ["METHODS", "call_method", "combine_values", "format_value"]

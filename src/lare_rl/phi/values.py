@@ -7,8 +7,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
-from lare_rl.phi.batch import BatchSize
-from lare_rl.phi.operand import Operand
+from lare_rl.phi.operand import BatchSize, Operand
 
 
 class _Value:
@@ -177,6 +176,9 @@ def value_type(value: Any) -> Symbol:
     return Symbol(_TYPE_NAMES.get(type(value), type(value).__name__))
 
 
-def type_name(value: Any) -> str:
-    """Return the type of a value, for a message."""
-    return value_type(value).name.removeprefix("np.")
+def describe(value: Any) -> str:
+    """Return what a value is, for a message: np.sin, a list, an array."""
+    if value is None or isinstance(value, Symbol):
+        return str(value)
+    name = "array" if isinstance(value, Operand) else value_type(value).name
+    return f"{'an' if name[0] in 'aeiou' else 'a'} {name}"

@@ -105,11 +105,9 @@ def _proxy_rewards(run: RunSummary) -> Finding | None:
         "amount": Finding("little" if r2 < LITTLE_R2 else "nearly_all" if r2 > HIGH_R2 else "a_part"),
         "r2": r2,
     }
-    return (
-        Finding("decoder_is_outdated", values | {"last_r2": run.return_r2})
-        if outdated
-        else Finding("explained", values)
-    )
+    if outdated:
+        return Finding("decoder_is_outdated", values | {"last_r2": run.return_r2})
+    return Finding("explained", values)
 
 
 def _explains_little(run: RunSummary) -> Finding | None:
@@ -140,9 +138,8 @@ def _one_seed_was_better(run: RunSummary) -> Finding | None:
     return_ = float(run.trained_returns[seed_index, best])
     if return_ <= run.random_mean + EVALUATION_STDS * run.random_std:
         return None
-    return Finding(
-        "one_seed_was_better", {"step": int(run.steps[best]), "return_": return_, "directory": run.directory}
-    )
+    values = {"step": int(run.steps[best]), "return_": return_, "directory": run.directory}
+    return Finding("one_seed_was_better", values)
 
 
 def _has_fallen(run: RunSummary) -> Finding | None:

@@ -85,9 +85,8 @@ def render_lines(lines: Iterable[str]) -> str:
 
 def render_gif(data: bytes, description: str) -> str:
     """Return an image that holds its data."""
-    return (
-        f'<img class="film" alt="{escape(description)}" src="data:image/gif;base64,{base64.b64encode(data).decode()}">'
-    )
+    content = base64.b64encode(data).decode()
+    return f'<img class="film" alt="{escape(description)}" src="data:image/gif;base64,{content}">'
 
 
 def render_factor_table(labels: Sequence[tuple[str, str, str]], correlations: Float[np.ndarray, " factors"]) -> str:

@@ -11,7 +11,7 @@ from lare_rl.errors import LareError
 from lare_rl.evaluation.evaluate import measure_random_returns
 from lare_rl.report.html import render_note, write_page
 from lare_rl.report.overview import render_diagnoses, render_learning_curves
-from lare_rl.report.reported_run import ReportedRun
+from lare_rl.report.run_summary import ReportedRun
 from lare_rl.runs.directory import open_without_functions
 from lare_rl.training.progress import Metrics
 

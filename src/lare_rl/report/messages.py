@@ -73,7 +73,7 @@ MESSAGES = {
     "saturated": "the policy chooses the same action in every state{seeds}, with each entry at a bound",
     "saturated_seeds": " with {n_saturated} of {n_seeds} seeds",
     "repeats_behaviour": (
-        "it repeats one behaviour: the last {n_evaluations} returns of a seed hardly differ, and those of random actions do"
+        "it repeats one behaviour: the last {n_evaluations} returns of a seed hardly differ, but the returns of random actions do"
     ),
     "needs_training": "{limit}Next: {evaluate}more `--steps`, or another `--algorithm` (`lare-rl algorithms`).{phi}",
     "algorithm_is_limit": (

@@ -12,7 +12,7 @@ from lare_rl.report.diagnosis import diagnose
 from lare_rl.report.figures import draw_curves
 from lare_rl.report.html import render_note, render_table
 from lare_rl.report.messages import MESSAGES
-from lare_rl.report.reported_run import ReportedRun, summarise_run
+from lare_rl.report.run_summary import ReportedRun, summarise_run
 from lare_rl.runs.metric_names import CREDIT_CORRELATION, CREDIT_ERROR, RETURN, RETURN_R2, RETURN_STD
 from lare_rl.tasks.spec import TaskSpec
 from lare_rl.util.findings import render
@@ -21,24 +21,16 @@ from lare_rl.util.statistics import format_mean_std
 __all__ = ["render_diagnoses", "render_final_values", "render_learning_curves"]
 
 
-class _Column(NamedTuple):
-    """A column of the table of final values."""
-
-    title: str
-    explanation: str
-
-
 _COLUMNS = {
-    RETURN: _Column("return", "Return: mean true return at the last evaluation."),
-    CREDIT_ERROR: _Column("credit error", "Credit error: mean |proxy reward - true reward| over the newest steps."),
-    CREDIT_CORRELATION: _Column(
-        "correlation", "Correlation: Pearson's, of proxy and true rewards over the newest steps."
-    ),
-    RETURN_R2: _Column(
+    RETURN: ("return", "mean true return at the last evaluation."),
+    CREDIT_ERROR: ("credit error", "mean |proxy reward - true reward| over the newest steps."),
+    CREDIT_CORRELATION: ("correlation", "Pearson's, of proxy and true rewards over the newest steps."),
+    RETURN_R2: (
         "R² of returns",
-        "R² of returns: how well the last episodes' returns were predicted before anything was fitted to them.",
+        "how well the last episodes' returns were predicted before anything was fitted to them.",
     ),
 }
+"""The columns of the table of final values: titles and meanings."""
 
 
 class _Chart(NamedTuple):
@@ -74,8 +66,8 @@ def render_final_values(runs: Sequence[ReportedRun]) -> str:
         run, last_step = reported.run, reported.metrics[-1]["step"]
         cells = [format_mean_std(values[row]) if len(values[row]) else "-" for values in finals.values()]
         rows.append((run.config.task.name, reported.name, str(len(run.seeds)), f"{last_step:,}", *cells))
-    header = "task", "method", "seeds", "steps", *(_COLUMNS[metric].title for metric in finals)
-    notes = [_COLUMNS[metric].explanation for metric in finals]
+    header = "task", "method", "seeds", "steps", *(_COLUMNS[metric][0] for metric in finals)
+    notes = [f"{title[0].upper()}{title[1:]}: {meaning}" for title, meaning in (_COLUMNS[metric] for metric in finals)]
     if max(len(reported.run.seeds) for reported in runs) > 1:
         notes.append("±: standard deviation over seeds.")
     return render_table(header, rows, numbers=range(2, len(header))) + render_note(" ".join(notes))
@@ -86,7 +78,10 @@ def render_learning_curves(
 ) -> Iterable[str]:
     """Yield the charts of one task, with all its runs in each."""
     reference_lines = {"random actions": float(random_returns.mean())} if len(random_returns) else {}
-    reference_lines |= _trained_reference(task, runs)
+    if (reference := REFERENCE_RETURNS.get(task.name)) is not None:
+        best = max((float(np.nanmax(returns)) for _, returns in _curves(runs, RETURN).values()), default=-np.inf)
+        if best > (reference.random + reference.trained) / 2:  # the curves of bad runs would look flat below this line
+            reference_lines["true rewards, a million steps"] = reference.trained
     warmups = {reported.run.config.settings.warmup for reported in runs}
     warmup = warmups.pop() if len(warmups) == 1 else 0
     yield f"<h2>Learning {escape(task.name)}</h2>"
@@ -131,23 +126,12 @@ def _charts(task: TaskSpec) -> Iterable[_Chart]:
             yield chart._replace(metric=f"{chart.metric}_{role.team}", title=f"{chart.title}, team of {role.team}")
 
 
-def _trained_reference(task: TaskSpec, runs: Sequence[ReportedRun]) -> dict[str, float]:
-    """Return the return that true rewards reach, if it is known and not so high that the curves would look flat below it."""
-    if task.name not in REFERENCE_RETURNS:
-        return {}
-    best = max((float(np.nanmax(returns)) for _, returns in _curves(runs, RETURN).values()), default=-np.inf)
-    reference = REFERENCE_RETURNS[task.name]
-    halfway = (reference.random + reference.trained) / 2
-    return {"true rewards, a million steps": reference.trained} if best > halfway else {}
-
-
 def _explain_charts(task: TaskSpec, runs: Sequence[ReportedRun], warmup: int) -> Iterable[str]:
     """Yield what lines and areas mean."""
     seed_counts = [len(reported.run.seeds) for reported in runs]
     if max(seed_counts) > 1:
-        yield "Line: mean over seeds. Band: ± one standard deviation over seeds" + (
-            "; of a single seed, over the episodes of an evaluation." if min(seed_counts) == 1 else "."
-        )
+        single_seed = "; of a single seed, over the episodes of an evaluation" if min(seed_counts) == 1 else ""
+        yield f"Line: mean over seeds. Band: ± one standard deviation over seeds{single_seed}."
     else:
         yield "Band of the return: ± one standard deviation over the episodes of an evaluation."
     if warmup:

@@ -10,10 +10,9 @@ from lare_rl.evaluation.evaluate import measure_random_returns
 from lare_rl.evaluation.video import record_video
 from lare_rl.report.html import render_note, write_page
 from lare_rl.report.overview import render_diagnoses, render_final_values, render_learning_curves
-from lare_rl.report.reported_run import ReportedRun
 from lare_rl.report.run_details import FILM, render_run
-from lare_rl.runs.directory import Run, open_run, open_without_functions
-from lare_rl.runs.discover import find_run_directories
+from lare_rl.report.run_summary import ReportedRun
+from lare_rl.runs.directory import Run, find_run_directories, open_run, open_without_functions
 from lare_rl.tasks.trust import untrusted_module
 from lare_rl.util.provenance import code_version
 
@@ -34,12 +33,15 @@ def write_report(
         film: film an episode of each run, as `film.gif` in its directory. The page shows every film that exists.
 
     Raises:
-        LareError: one of them is not a run, or has no evaluation yet, or the file cannot be written.
+        LareError: a directory has no run, a run has no evaluation yet, or the file cannot be written.
     """
     sources = [runs] if isinstance(runs, (Run, str, Path)) else list(runs)
     if not sources:
         raise LareError("No runs to report. Name one run or more.")
-    reported_runs = _name_runs([run for source in sources for run in _open_runs(source)])
+    opened: list[Run] = []
+    for source in sources:
+        opened += [source] if isinstance(source, Run) else map(_open_run, find_run_directories([Path(source)]))
+    reported_runs = _name_runs(opened)
     for reported in reported_runs:
         if not reported.metrics:
             raise LareError(f"{reported.run.directory} has no evaluation yet: there is nothing to report")
@@ -51,11 +53,6 @@ def write_report(
             record_video(reported.run, reported.run.directory / FILM)
     title = _title(reported_runs)
     return write_page(path, title, "\n".join(_render_body(title, reported_runs)))
-
-
-def _open_runs(source: Run | str | Path) -> list[Run]:
-    """Return a run, or the runs in a directory."""
-    return [source] if isinstance(source, Run) else [_open_run(path) for path in find_run_directories([Path(source)])]
 
 
 def _open_run(directory: Path) -> Run:

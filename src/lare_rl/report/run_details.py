@@ -1,20 +1,23 @@
-"""The sections of a report on one run: credit, factors, function and settings."""
+"""The sections of a report on one run: credit, factors, functions and settings."""
 
 import json
 from collections.abc import Iterable
 from html import escape
 
 import numpy as np
+from jaxtyping import Float
 
-from lare_rl.config.defaults import apply_defaults
 from lare_rl.config.effective import effective_settings
+from lare_rl.config.resolve import apply_defaults
 from lare_rl.config.settings import Settings
 from lare_rl.credit.methods import find_method
 from lare_rl.envs.families import load_env_spec
+from lare_rl.errors import install_command
 from lare_rl.evaluation.episode_credit import EpisodeCredit, label_factors, load_episode_credit
+from lare_rl.evaluation.rollout import TeamSample, roll_out, sample_steps
+from lare_rl.evaluation.video import encode_gif, render_rollout
 from lare_rl.latent.saved import read_source
-from lare_rl.report.agents_details import render_agents
-from lare_rl.report.figures import draw_credit, draw_factors, visible_steps
+from lare_rl.report.figures import draw_credit, draw_credit_map, draw_factors, draw_scatters, visible_steps
 from lare_rl.report.html import (
     render_factor_table,
     render_function,
@@ -26,13 +29,15 @@ from lare_rl.report.html import (
 from lare_rl.runs.directory import Run, function_paths
 from lare_rl.tasks.trust import TRUST_VARIABLE, untrusted_module
 from lare_rl.training.explain import explain_run
+from lare_rl.util.statistics import column_correlations
 
-__all__ = ["FILM", "render_run"]
+__all__ = ["FILM", "render_agents", "render_run"]
 
 FILM = "film.gif"
 """The film in a run's directory."""
 MAX_FILM_BYTES = 64 << 20
 """The largest film that a page shows."""
+MAX_TSNE_POINTS = 1000
 _OBSERVATIONS = {"before": "before", "after": "after", "both": "before and the observation after"}
 """Texts of the observations that phi reads."""
 
@@ -46,8 +51,12 @@ def render_run(name: str, run: Run) -> Iterable[str]:
     if module := untrusted_module(run.config.task):
         yield from _render_untrusted(run, module)
     elif run.has_checkpoint():
-        yield _render_film(run)
-        yield from _render_explanation(run)
+        film = run.directory / FILM  # by `lare-rl report --film`
+        shows_film = film.is_file() and film.stat().st_size <= MAX_FILM_BYTES
+        yield render_gif(film.read_bytes(), "one episode of the policy") if shows_film else ""
+        if lines := explain_run(run):
+            yield "<h3>What the returns say</h3>"
+            yield render_lines(lines)
         yield from render_agents(run) if load_env_spec(run.config.task).n_agents > 1 else _render_single_agent(run)
     else:
         yield render_note("The run has no checkpoint any more, so credit and factors cannot be drawn.")
@@ -65,20 +74,6 @@ def _render_untrusted(run: Run, module: str) -> Iterable[str]:
         yield f"<pre>{escape(read_source(path).source)}</pre>"
 
 
-def _render_film(run: Run) -> str:
-    """Return the film that `lare-rl report --film` has made. Empty without one."""
-    path = run.directory / FILM
-    if not path.is_file() or path.stat().st_size > MAX_FILM_BYTES:
-        return ""
-    return render_gif(path.read_bytes(), "one episode of the policy")
-
-
-def _render_explanation(run: Run) -> Iterable[str]:
-    if lines := explain_run(run):
-        yield "<h3>What the returns say</h3>"
-        yield render_lines(lines)
-
-
 def _render_single_agent(run: Run) -> Iterable[str]:
     credit = load_episode_credit(run)
     if credit is not None:
@@ -90,7 +85,7 @@ def _render_single_agent(run: Run) -> Iterable[str]:
 
 
 def _render_credit(credit: EpisodeCredit) -> Iterable[str]:
-    """Yield the proxy rewards of an episode, and what the figure shows."""
+    """Yield the figure of an episode's proxy rewards, and its explanation."""
     reward, proxy_reward = credit.reward[:, 0], credit.proxy_reward[:, 0]
     steps = visible_steps(len(reward))
     points = ", the points all steps" if credit.has_step_rewards else ""
@@ -116,6 +111,61 @@ def _render_factors(run: Run, credit: EpisodeCredit | None) -> Iterable[str]:
     if credit is not None:
         yield draw_factors(credit.factors[:, 0], [label.name for label in labels])
     yield render_note(f"phi judges the observation {_OBSERVATIONS[run.factor_inputs]} the step.")
+
+
+def render_agents(run: Run, max_tsne_points: int = MAX_TSNE_POINTS) -> Iterable[str]:
+    """Yield the credit of each agent and step, a film of the episode, and the factors of each team."""
+    rollout = roll_out(run)
+    reward, proxy_reward = rollout.select_episode((rollout.reward, rollout.proxy_reward))
+    sums = f"Sum of the true rewards {reward.sum():.1f}"
+    if proxy_reward is not None:
+        sums += f", of the proxy rewards {proxy_reward.sum():.1f}"
+    yield "<h3>Who got which credit when</h3>"
+    yield draw_credit_map(reward, proxy_reward)
+    yield render_note(
+        f"One episode of the first seed's policy, every agent a row. {sums}. A film shows the credit beside each agent as "
+        "number and colour: blue for more, red for less."
+    )
+    if (frames := render_rollout(run, rollout)) is not None:
+        yield render_gif(encode_gif(frames), "one episode, with the credit of each agent")
+    if run.functions:
+        for team_index, sample in enumerate(sample_steps(run)):
+            yield from _render_team(run, team_index, sample, max_tsne_points)
+
+
+def _render_team(run: Run, team_index: int, sample: TeamSample, max_tsne_points: int) -> Iterable[str]:
+    """Yield a team's factors and its latent function."""
+    name = escape(run.config.task.roles[team_index].name)
+    observation_correlations = column_correlations(sample.next_observation, sample.reward)
+    raw, latent = (np.nanmean(np.abs(values)) for values in (observation_correlations, sample.correlations))
+    yield f"<h3>The factors of {name}</h3>"
+    yield render_factor_table(label_factors(run, team_index), sample.correlations)
+    yield render_note(
+        f"Absolute correlation with the true reward, mean over dimensions: {raw:.2f} for the {len(observation_correlations)} "
+        f"numbers of an observation, {latent:.2f} for the {len(sample.correlations)} factors."
+    )
+    yield from _render_tsne(sample, max_tsne_points)
+    yield f"<h3>The latent function of {name}</h3>"
+    yield render_function(run.functions[team_index])
+
+
+def _render_tsne(sample: TeamSample, max_points: int) -> Iterable[str]:
+    """Yield t-SNE pictures of observations and of factors, coloured by the true reward (the paper's appendix G)."""
+    try:
+        from sklearn.manifold import TSNE
+    except ImportError:
+        yield render_note(f"A t-SNE picture of observations and factors is drawn here after {install_command('tsne')}.")
+        return
+    points = np.random.default_rng(0).permutation(len(sample.reward))[:max_points]
+
+    def embed(columns: Float[np.ndarray, "rows columns"]) -> Float[np.ndarray, "points 2"]:
+        rows = columns[points]
+        rows = (rows - rows.mean(axis=0)) / np.maximum(rows.std(axis=0), 1e-9)
+        return TSNE(init="pca", random_state=0).fit_transform(rows)
+
+    embeddings = {"observations": embed(sample.next_observation), "factors": embed(sample.factors)}
+    yield draw_scatters(embeddings, sample.reward[points])
+    yield render_note("t-SNE of steps of agents: similar steps are close together. Colour: the true reward.")
 
 
 def _render_settings(run: Run) -> Iterable[str]:

@@ -1,4 +1,4 @@
-"""What the diagnosis of a run needs to know about it, and the statistics of this summary."""
+"""A run in a report: its curves by name, and the summary that its diagnosis is made from."""
 
 import math
 from dataclasses import dataclass, field
@@ -8,9 +8,15 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
+from lare_rl.credit.methods import find_method
+from lare_rl.envs.load import shipped_tasks
+from lare_rl.report.figures import Curve
+from lare_rl.runs.directory import Run
+from lare_rl.runs.metric_names import ACTOR_SATURATION, RETURN, RETURN_R2, RETURN_STD, SUMMED_RETURN
+from lare_rl.training.advice import describe_untrained
 from lare_rl.util.statistics import grouped_standard_error, sample_std, standard_error
 
-__all__ = ["CLEAR_ERRORS", "LITTLE_R2", "MIN_ERROR", "MIN_EVALUATIONS", "POSSIBLE_ERRORS", "RunSummary"]
+__all__ = ["CLEAR_ERRORS", "LITTLE_R2", "MIN_EVALUATIONS", "ReportedRun", "RunSummary", "summarise_run"]
 
 CLEAR_ERRORS, POSSIBLE_ERRORS = 2, 1
 """A difference is clear, or possible, if it exceeds this number of its standard errors."""
@@ -22,6 +28,35 @@ LITTLE_R2 = 0.1
 """Proxy rewards explain next to nothing of the score if R^2 of the returns is lower."""
 MIN_EVALUATIONS = 5
 """With fewer evaluations, nothing is said about a trend."""
+
+
+@dataclass(frozen=True)
+class ReportedRun:
+    """A run under its name in a report. Its metrics are read once."""
+
+    name: str
+    run: Run
+
+    @cached_property
+    def metrics(self) -> list[dict[str, Any]]:
+        """The lines of metrics.jsonl."""
+        return self.run.metrics()
+
+    def curve(self, key: str) -> Curve | None:
+        """Return a metric over the steps, with NaN where it is missing. None if it was never measured."""
+        values = {
+            (line["step"], line["seed"]): line.get(key) for line in self.metrics if line["seed"] in self.run.seeds
+        }
+        if all(value is None for value in values.values()):
+            return None
+        steps = sorted({step for step, _ in values})
+        rows = [[values.get((step, seed)) for step in steps] for seed in self.run.seeds]
+        return np.array(steps, float), np.array(rows, float)
+
+    def final_values(self, key: str) -> Float[np.ndarray, " seeds"]:
+        """Return the values of a metric at the last evaluation, for the seeds for which it is known."""
+        curve = self.curve(key)
+        return np.zeros(0) if curve is None else _finite(curve[1][:, -1])
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -111,7 +146,7 @@ class RunSummary:
         return max(math.hypot(standard_error(self.random_returns), self.final_error), MIN_ERROR)
 
     def beats_random(self, n_errors: int = CLEAR_ERRORS) -> bool:
-        """Return whether the final return exceeds that of random actions by more than `n_errors` standard errors."""
+        """Return whether the final return exceeds the mean return of random actions by more than `n_errors` standard errors."""
         return bool(len(self.random_returns) and self.final_return > self.random_mean + n_errors * self.gain_error)
 
     def beats_initial_policy(self, n_errors: int = CLEAR_ERRORS) -> bool:
@@ -166,3 +201,54 @@ class RunSummary:
         """Whether proxy rewards explain next to nothing of the returns, neither at the end nor in most evaluations."""
         r2s = [r2 for r2 in (self.return_r2, self.median_r2) if r2 is not None]
         return self.return_r2 is not None and max(r2s) < LITTLE_R2
+
+
+def summarise_run(
+    reported: ReportedRun, random_returns: Float[np.ndarray, " episodes"], episodic_return: float | None
+) -> RunSummary | None:
+    """Return the summary of a run for its diagnosis. None if it has no returns."""
+    if (curve := reported.curve(RETURN)) is None:
+        return None
+    steps, returns = curve
+    _, r2s = reported.curve(RETURN_R2) or (None, None)
+    run, task, settings = reported.run, reported.run.config.task, reported.run.config.settings
+    method = find_method(settings.method)
+    is_initial = steps <= settings.warmup
+    initial_returns = returns[:, is_initial].mean(axis=1) if is_initial.any() else np.full(1, np.nan)
+    return RunSummary(
+        steps=steps,
+        returns=returns,
+        random_returns=random_returns,
+        initial_returns=initial_returns if np.isfinite(initial_returns).all() else None,
+        episode_error=_episode_error(reported),
+        episodic_return=episodic_return,
+        return_r2=None if r2s is None else _last_mean(r2s),
+        median_r2=None if r2s is None or not len(_finite(r2s)) else float(np.median(_finite(r2s))),
+        sees_factors=method.encoder is not None and method.encoder.has_factors,
+        sees_raw_features=method.encoder is None or method.encoder.has_raw_features,
+        many_agents=SUMMED_RETURN in reported.metrics[-1],
+        uses_gradient=method.uses_gradient,
+        untrained=describe_untrained(run),
+        warmup=settings.warmup,
+        n_saturated=int(np.sum(reported.final_values(ACTOR_SATURATION) == 1)),
+        directory=str(run.directory),
+        task=task.name if task.name in shipped_tasks() else "TASK.toml",
+    )
+
+
+def _episode_error(reported: ReportedRun) -> float:
+    """Return the standard error of the mean return of the last evaluation, from episode to episode, all seeds together."""
+    stds = reported.final_values(RETURN_STD)
+    if len(stds) < len(reported.run.seeds):
+        return 0.0
+    n_free = max(1, reported.run.config.settings.evaluation_episodes - 1)  # the deviations have n in the denominator
+    return math.sqrt(np.mean(stds**2) / n_free / len(stds))
+
+
+def _last_mean(values: Float[np.ndarray, "seeds evaluations"]) -> float | None:
+    """Return the mean over the seeds at the last evaluation that has a finite value."""
+    return next((float(finite.mean()) for column in values.T[::-1] if len(finite := _finite(column))), None)
+
+
+def _finite(values: np.ndarray) -> Float[np.ndarray, " values"]:
+    return values[np.isfinite(values)]

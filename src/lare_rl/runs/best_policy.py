@@ -2,8 +2,8 @@
 
     checkpoint/best.npz     the arrays that are needed to act; score and step of each seed
 
-The best of many evaluations overestimates its policy. So `lare-rl evaluate --best` plays it from initial states that none of them
-has used.
+The best of many evaluations overestimates its policy. So `lare-rl evaluate --best` plays it from initial states that
+none of them has used.
 """
 
 from pathlib import Path

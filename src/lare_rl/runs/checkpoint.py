@@ -215,7 +215,7 @@ def _pad_rows(array: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
 
 def _load_rows(learner: State, directory: Path, segments: list[_Segment]) -> State:
     capacity, columns = _capacity(learner), dict(learner.replay.columns)
-    for name, column in columns.items():  # one after the other, so that only one of them is in memory twice
+    for name, column in columns.items():  # one after the other, so that only one is in memory twice
         buffer = np.zeros(column.shape, column.dtype)
         for segment in segments:
             with open_npz(directory / f"rows-{segment.number}.npz") as saved:

@@ -21,7 +21,7 @@ from lare_rl.latent.function import LatentFunction, pair_with_roles
 from lare_rl.latent.saved import load_function, read_source
 from lare_rl.phi.graph import Graph
 from lare_rl.runs.checkpoint import STATE_FILE, read_host_state
-from lare_rl.runs.config_file import Config, make_config, read_config, write_config
+from lare_rl.runs.config_file import CONFIG, Config, make_config, read_config, write_config
 from lare_rl.runs.metrics_file import read_metrics
 from lare_rl.tasks.spec import FactorInputs, TaskSpec
 from lare_rl.tasks.trust import check_trusted
@@ -34,6 +34,7 @@ __all__ = [
     "create_run",
     "default_directory",
     "extend_run",
+    "find_run_directories",
     "function_filename",
     "function_paths",
     "lock_run",
@@ -81,7 +82,7 @@ class Run:
         return self.config.settings.factor_inputs(self.config.task)
 
     def seed_index(self, seed: int | None) -> int:
-        """Return the index of a seed among those of the run; 0 for None. Raises `LareError` for another seed."""
+        """Return the index of one of the run's seeds; 0 for None. Raises `LareError` for another seed."""
         if seed is None:
             return 0
         if seed not in self.seeds:
@@ -226,3 +227,28 @@ def lock_run(run: Run) -> Iterator[None]:
         except OSError:  # some network file systems have no locks
             pass
         yield
+
+
+def find_run_directories(paths: Sequence[Path]) -> list[Path]:
+    """Return the runs among some paths and up to two levels below them, in the order of the paths.
+
+    A run that is found twice counts once, at its first path. The log that a sweep writes next to the directory of a run is
+    skipped, so `DIRECTORY/*` may be passed.
+
+    Raises:
+        LareError: there is no path, or a path contains no run.
+    """
+    directories: dict[Path, Path] = {}  # by resolved path
+    for path in paths:
+        if path.suffix == ".log" and path.with_suffix("").is_dir():
+            continue
+        # A name that begins with a dot is the directory of a run that was killed before it was complete.
+        configs = [config for depth in ("", "[!.]*/", "[!.]*/[!.]*/") for config in path.glob(depth + CONFIG)]
+        if not configs:
+            hint = "; give the directory of a run (lare-rl compare also reads .csv files: docs/sweeps.md)"
+            raise LareError(f"{path} is not a run, and contains none{hint if path.is_file() else ''}")
+        for config in sorted(configs):
+            directories.setdefault(config.parent.resolve(), config.parent)
+    if not directories:
+        raise LareError("no runs given")
+    return list(directories.values())

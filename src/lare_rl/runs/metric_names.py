@@ -1,7 +1,10 @@
-"""Names of the metrics in a run's metrics.jsonl. With several teams, each has its own, which ends in `_` and the team's name."""
+"""Names of the metrics in a run's metrics.jsonl. With several teams, each has its own, which ends in `_` and the team's
+name.
+"""
 
 RETURN = "evaluation/return"
-"""The mean true return over the episodes of an evaluation. A team's return is the sum over the steps of the mean over its agents."""
+"""The mean true return over the episodes of an evaluation. A team's return is the sum over the steps of the mean over
+its agents."""
 RETURN_STD = "evaluation/return_std"
 """The standard deviation of the true return over these episodes, with n in the denominator."""
 SUMMED_RETURN = "evaluation/summed_return"

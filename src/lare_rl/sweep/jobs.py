@@ -102,12 +102,10 @@ def check_job(job: Job) -> None:
     config = read_config(job.directory)
     if config.task.digest != job.task.digest:
         raise LareError(f"{job.directory} holds a run of another task: choose another out")
-    old, new = effective_settings(config.settings, config.task), effective_settings(job.resolved, job.task)
-    for name, value in new.items():
-        if old.get(name) != value:
-            raise LareError(
-                f"{job.directory} holds a run with {name} = {old.get(name)}, not {value}: choose another out"
-            )
+    old = effective_settings(config.settings, config.task)
+    for name, value in effective_settings(job.resolved, job.task).items():
+        if (old_value := old.get(name)) != value:
+            raise LareError(f"{job.directory} holds a run with {name} = {old_value}, not {value}: choose another out")
     if functions and config.function_sha256 != tuple(function.digest for function in functions):
         raise LareError(f"{job.directory} holds a run with another latent function: choose another out")
 

@@ -1,7 +1,11 @@
-"""Runs on this machine: each in its own process, on its own cores. A process ends when its parent ends."""
+"""Training of jobs: on this machine, each in its own process and on its own cores, or on a Ray cluster.
+
+A process ends when its parent ends.
+"""
 
 import contextlib
 import json
+import logging
 import os
 import queue
 import signal
@@ -13,11 +17,11 @@ from collections.abc import Callable, Generator, Sequence
 from concurrent.futures import ThreadPoolExecutor, as_completed
 from typing import Any
 
-from lare_rl.errors import LareError
+from lare_rl.errors import LareError, missing_extra_error
 from lare_rl.runs.directory import RunBusyError
 from lare_rl.sweep.jobs import Job, job_to_json, train_job
 
-__all__ = ["RunningProcesses", "assign_cores", "train_in_process", "train_in_processes"]
+__all__ = ["RunningProcesses", "assign_cores", "train_in_process", "train_in_processes", "train_on_ray"]
 
 LOCK_TIMEOUT_S = 60.0
 """Time to wait for an earlier process that is still saving the run."""
@@ -144,14 +148,46 @@ def train_in_process(job: Job, core_ids: list[int], running: RunningProcesses) -
     return f"{error} ({log})"
 
 
+def train_on_ray(jobs: Sequence[Job], cores: int, address: str) -> Generator[tuple[Job, str | None], None, None]:
+    """Train jobs on a Ray cluster, each on `cores` cores. Yield each job when it ends, and its error or None.
+
+    All machines must share the directory of the runs.
+
+    Raises:
+        LareError: Ray is not installed, or cannot be reached.
+    """
+    try:
+        import ray
+        from ray.exceptions import RayError
+    except ImportError:
+        raise missing_extra_error("a Ray cluster", "ray") from None
+    try:
+        quiet: dict[str, Any] = {"log_to_driver": False, "include_dashboard": False, "logging_level": logging.ERROR}
+        ray.init(None if address == "local" else address, **quiet)
+    except (ConnectionError, ValueError, RuntimeError) as error:
+        raise LareError(f"there is no Ray cluster at {address}: {error}") from error
+    try:
+        remote = ray.remote(num_cpus=cores, max_calls=1)(train_job)
+        pending = {remote.remote(job_to_json(job)): job for job in jobs}
+        while pending:
+            (task,), _ = ray.wait(list(pending), num_returns=1)
+            job = pending.pop(task)
+            try:
+                ray.get(task)
+                yield job, None
+            except RayError as error:
+                yield job, str(error).strip().splitlines()[-1]
+    finally:
+        ray.shutdown()
+
+
 def main() -> None:
     """Train one run, which the first line of standard input describes. `train_in_process` starts this program.
 
     Errors go to standard output, all other output to the log. The program ends when its parent ends, which closes standard input.
     """
-    signal.signal(
-        signal.SIGINT, lambda number, frame: os._exit(130)
-    )  # before training begins, there is nothing to save
+    # Before training begins, there is nothing to save.
+    signal.signal(signal.SIGINT, lambda number, frame: os._exit(130))
     parent = os.fdopen(os.dup(sys.stdout.fileno()), "w")
     os.dup2(sys.stderr.fileno(), sys.stdout.fileno())
     request = json.loads(sys.stdin.readline())

@@ -17,9 +17,8 @@ from lare_rl.config.settings import Settings
 from lare_rl.credit.methods import find_method
 from lare_rl.envs.load import load_task
 from lare_rl.errors import CheckedModel, LareError
-from lare_rl.sweep.cluster import train_on_ray
 from lare_rl.sweep.jobs import Job, check_job, make_job
-from lare_rl.sweep.processes import train_in_processes
+from lare_rl.sweep.processes import train_in_processes, train_on_ray
 from lare_rl.training.loop import RunInterruptedError
 from lare_rl.util.safe_io import MAX_SETTINGS_BYTES, read_text, read_toml
 
@@ -76,7 +75,7 @@ def read_sweep(path: Path) -> tuple[Sweep, list[Job]]:
     """Read a file, and check all of its runs before any is trained.
 
     Raises:
-        LareError: the file cannot be read, one of its runs could not be trained, or a setting affects none of them.
+        LareError: the file cannot be read, a run could not be trained, or a setting affects no run.
     """
     text = read_text(path, MAX_SETTINGS_BYTES)
     try:

@@ -101,8 +101,7 @@ def find_large_observations(run: Run, replay: Replay, config: TrainConfig) -> li
 def saturation(action: Float[np.ndarray, "seeds steps action"]) -> Float[np.ndarray, " seeds"]:
     """Return the fraction of an action's components that are at the same bound in all states.
 
-    Args:
-        action: actions of each seed's policy in some states, without noise, between -1 and 1.
+    Each seed's policy has chosen the actions in the same states, without noise, between -1 and 1.
     """
     bound = np.where(np.abs(action) > ACTION_BOUND, np.sign(action), 0)
     return np.mean((bound[:, 0] != 0) & np.all(bound == bound[:, :1], axis=1), axis=-1)
@@ -121,8 +120,7 @@ def find_saturated_policies(saturations: Sequence[float], seeds: Sequence[int]) 
 def find_constant_returns(returns: Sequence[Float[np.ndarray, " seeds"]]) -> list[Finding]:
     """Find out whether the last evaluations of every seed have the same return. It is reported once.
 
-    Args:
-        returns: those of the evaluations since the policy was first updated.
+    `returns` has all evaluations since the policy was first updated.
     """
     if not _are_equal(returns[-N_EQUAL_EVALUATIONS:]) or _are_equal(returns[-N_EQUAL_EVALUATIONS - 1 : -1]):
         return []

@@ -17,7 +17,7 @@ from lare_rl.training.evaluation import EpisodeBatch, Evaluation
 from lare_rl.training.static_config import TrainConfig
 from lare_rl.training.streams import Stream, device_noise, stream_keys
 
-__all__ = ["DeviceCollector", "VecEnvState", "collect", "unroll_on_device"]
+__all__ = ["DeviceCollector", "VecEnvState", "collect", "reset", "unroll_on_device"]
 
 Act = Callable[..., tuple[Array, Any]]
 """From actor, memory, observation, available actions, noise and episode starts to the action and the new memory."""
@@ -79,7 +79,7 @@ def unroll_on_device(
     """Play whole episodes of a policy, each from a different initial state. `act` replaces the policy of training."""
     act = act or policy_function(config, greedy)
     reset_keys, step_keys = jnp.unstack(_split_keys(keys, 2), axis=1)
-    envs = _reset(env, reset_keys, n_episodes, config)
+    envs = reset(env, reset_keys, n_episodes, config)
 
     def body(
         carry: tuple[VecEnvState, Bool[Array, "seeds episodes"]], keys: Key[Array, " seeds"]
@@ -95,13 +95,13 @@ def unroll_on_device(
 @cache_by_value
 def _jit_functions(env: JaxEnv, config: TrainConfig) -> tuple[Callable[..., Any], ...]:
     return (
-        jax.jit(partial(_reset, env, n_envs=config.n_envs, config=config)),
+        jax.jit(partial(reset, env, n_envs=config.n_envs, config=config)),
         jax.jit(partial(collect, env, config=config), donate_argnums=0),
         jax.jit(partial(_evaluate, env, config=config), static_argnums=2),
     )
 
 
-def _reset(env: JaxEnv, keys: Key[Array, " seeds"], n_envs: int, config: TrainConfig) -> VecEnvState:
+def reset(env: JaxEnv, keys: Key[Array, " seeds"], n_envs: int, config: TrainConfig) -> VecEnvState:
     state, timestep = _map_envs(env.reset)(_split_keys(keys, n_envs))
     episode_start = jnp.ones((len(keys), n_envs), bool)
     return VecEnvState(state, timestep, init_memory(config, *episode_start.shape), episode_start)
@@ -143,7 +143,7 @@ def collect(
         )
 
         def reset_ended(envs: VecEnvState) -> VecEnvState:
-            fresh = _reset(env, reset_keys, envs.episode_start.shape[1], config)
+            fresh = reset(env, reset_keys, envs.episode_start.shape[1], config)
 
             def choose(new: Array, old: Array) -> Array:
                 return jnp.where(steps.ended.reshape(*steps.ended.shape, *[1] * (old.ndim - 2)), new, old)

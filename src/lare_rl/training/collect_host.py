@@ -1,7 +1,7 @@
 """Collects from environments that step on the host: each step calls the policy once, for all environments of all seeds.
 
-An episode is determined by its seed and its actions. So a run can be resumed in the middle of an episode, in any simulator: reset
-with the seed, play the actions, and compare the observation bit for bit.
+An episode is determined by its seed and its actions. So a run can be resumed in the middle of an episode, in any
+simulator: reset with the seed, play the actions, and compare the observation bit for bit.
 """
 
 from collections.abc import Callable, Sequence
@@ -31,7 +31,7 @@ class HostVecEnv:
     """The training environments of a run, and the running episode of each.
 
     Args:
-        envs: those of the first seed, of the second, and so on.
+        envs: `n_envs` environments of the first seed, then of the second, and so on.
         seeds: the seeds of the run.
         n_envs: the number of environments of each seed.
     """
@@ -62,9 +62,7 @@ class HostVecEnv:
     ) -> Trajectory:
         """Let a policy act for as many steps as there is noise. When an episode ends, the next one begins.
 
-        Args:
-            policy: from a timestep, noise, and which episodes have just begun, to the action.
-            noise: the noise of each step.
+        The policy is a function from a timestep, noise, and which episodes have just begun, to the action.
         """
         steps = _empty_trajectory(self._spec, self._timestep, len(noise))
         for t, noise_t in enumerate(noise):

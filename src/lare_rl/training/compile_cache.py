@@ -50,7 +50,7 @@ def clear_compile_cache() -> None:
 
 
 def _static_key(value: Any) -> Any:
-    """Return a hashable key that two values share only if a function compiled for one of them serves the other."""
+    """Return a hashable key that two values share only if the same compiled function serves both."""
     match value:
         case np.ndarray():
             return np.ndarray, value.dtype.str, value.shape, value.tobytes()

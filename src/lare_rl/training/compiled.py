@@ -1,5 +1,7 @@
 """The functions of a run, compiled, with a leading seed axis on every array but the number of steps done."""
 
+import contextlib
+import ctypes
 from collections.abc import Callable, Sequence
 from functools import partial
 from types import ModuleType
@@ -7,10 +9,12 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Float, Key
 
 from lare_rl.algorithms.registry import Consumes
 from lare_rl.data.trajectory import Trajectory
+from lare_rl.envs.interface import Timestep
 from lare_rl.phi.graph import Graph
 from lare_rl.training import episodes, off_policy, on_policy, sequences
 from lare_rl.training.compile_cache import cache_by_value
@@ -18,9 +22,20 @@ from lare_rl.training.decoder_fits import fit_seeds
 from lare_rl.training.learner import Learner, init_learner, store
 from lare_rl.training.rewards import assess
 from lare_rl.training.static_config import TrainConfig
+from lare_rl.training.streams import seed_keys
 from lare_rl.util.float64 import float64
 
-__all__ = ["CompiledFunctions", "compile_functions", "init_memory", "policy_function", "training_module"]
+__all__ = [
+    "CompiledFunctions",
+    "compile_ahead",
+    "compile_functions",
+    "init_memory",
+    "init_seeds",
+    "keys_shape",
+    "learner_shape",
+    "policy_function",
+    "training_module",
+]
 
 Metrics = dict[str, Float[Array, " seeds"]]
 
@@ -37,14 +52,15 @@ class CompiledFunctions(NamedTuple):
     fit: Callable[[Learner, Key[Array, " seeds"]], tuple[Learner, Metrics]]
     """Make the decoders' own gradient updates. Return the mean of each metric."""
     train_step: Callable[..., tuple[Learner, Metrics]]
-    """Update the algorithm, from learner, newest steps, keys, and the number of environment steps before."""
+    """Update the algorithm, from learner, newest steps (which are stored), keys, and the number of environment steps
+    before. Return the mean of each metric."""
     assess: Callable[[Learner], Metrics]
     """Compare proxy rewards with true rewards."""
     get_actor: Callable[[Learner, int], Any]
     """Return the parts of the learner that are needed to act."""
     explore: Callable[..., tuple[Float[Array, "seeds envs agents action"], Any]]
-    """Return actions of the policy that collects, and its new memory, from actor, memory, observation, available actions, noise, and
-    which episodes are new."""
+    """Return actions of the policy that collects, and its new memory, from actor, memory, observation, available
+    actions, noise, and which episodes are new."""
     act: Callable[..., tuple[Float[Array, "seeds envs agents action"], Any]]
     """Return actions of the policy without noise, from the same arguments with None as the noise."""
 
@@ -103,8 +119,8 @@ def compile_functions(config: TrainConfig, phi: Sequence[Graph] = ()) -> Compile
 
     def learn_returns(learner: Learner) -> Learner:
         with float64():
-            decoders, n_learned = jax.block_until_ready(learn(learner.credit, learner.replay, learner.n_learned))
-        return learner._replace(credit=decoders, n_learned=n_learned)
+            decoders, n_learned = jax.block_until_ready(learn(learner.decoders, learner.replay, learner.n_learned))
+        return learner._replace(decoders=decoders, n_learned=n_learned)
 
     return CompiledFunctions(
         init=jax.jit(init),
@@ -117,3 +133,77 @@ def compile_functions(config: TrainConfig, phi: Sequence[Graph] = ()) -> Compile
         explore=jax.jit(policy_function(config, greedy=False)),
         act=jax.jit(policy_function(config, greedy=True)),
     )
+
+
+def compile_ahead(
+    config: TrainConfig, phi: Sequence[Graph], n_seeds: int, *, iterates_on_host: bool
+) -> CompiledFunctions:
+    """Return the functions of a run, compiled for the shapes that they will see, before the run needs its memory.
+
+    The compiler needs hundreds of megabytes for a while. They are returned to the system before the replay is made.
+    """
+    functions = compile_functions(config, phi)
+    learner, steps = learner_shape(config, n_seeds), _steps_shape(config, n_seeds)
+    functions = functions._replace(assess=_compile(functions.assess, learner))
+    if iterates_on_host:
+        functions = functions._replace(
+            store=_compile(functions.store, learner, steps),
+            train_step=_compile(functions.train_step, learner, steps, keys_shape(n_seeds), 0),
+        )
+    _free_memory()
+    return functions
+
+
+def init_seeds(functions: CompiledFunctions, keys: Key[Array, " seeds"]) -> Learner:
+    """Return an untrained learner of all seeds."""
+    init = _compile(functions.init, jax.eval_shape(lambda: keys))
+    _free_memory()
+    return init(keys)
+
+
+@cache_by_value
+def learner_shape(config: TrainConfig, n_seeds: int) -> Learner:
+    """Return a learner with shapes instead of arrays."""
+    return jax.eval_shape(compile_functions(config).init, keys_shape(n_seeds))
+
+
+def keys_shape(n_seeds: int) -> Any:
+    """Return keys with a shape instead of an array."""
+    return jax.eval_shape(seed_keys, jnp.zeros(n_seeds, int), 0)
+
+
+def _steps_shape(config: TrainConfig, n_seeds: int) -> Trajectory:
+    """Return the steps of an iteration with shapes instead of arrays."""
+    env = config.env
+
+    def shape(*sizes: int, dtype: Any = np.float32) -> Any:
+        return jax.ShapeDtypeStruct((n_seeds, config.rollout_steps, config.n_envs, *sizes), dtype)
+
+    timestep = Timestep(
+        observation=shape(env.n_agents, env.observation_size),
+        state=shape(env.state_size),
+        available=shape(env.n_agents, env.action_size, dtype=np.bool_),
+        alive=shape(env.n_agents, dtype=np.bool_),
+        reward=shape(env.n_agents),
+        terminated=shape(dtype=np.bool_),
+        truncated=shape(dtype=np.bool_),
+        measures={name: shape() for name in env.measures},
+    )
+    return Trajectory(
+        timestep=timestep,
+        action=shape(env.n_agents, env.action_size),
+        env_action=shape(env.n_agents, env.action_size, dtype=np.float32 if env.discrete else env.low.dtype),
+        next_timestep=timestep,
+    )
+
+
+@cache_by_value
+def _compile(function: Any, *shapes: Any) -> Any:
+    """Return a jitted function compiled for arguments of these shapes."""
+    return function.lower(*shapes).compile()
+
+
+def _free_memory() -> None:
+    """Return memory that the compiler has freed to the system. Otherwise, glibc keeps it for the process."""
+    with contextlib.suppress(OSError, AttributeError):  # another C library may not have this function
+        ctypes.CDLL(None).malloc_trim(0)

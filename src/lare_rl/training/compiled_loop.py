@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, Int, Key, Scalar
+from jaxtyping import Array, Bool, Float, Int, Key
 
 from lare_rl.data.trajectory import Trajectory
 from lare_rl.envs.interface import JaxEnv
@@ -17,13 +17,13 @@ from lare_rl.phi.graph import Graph
 from lare_rl.training import collect_device, episodes
 from lare_rl.training.collect_device import VecEnvState
 from lare_rl.training.compile_cache import cache_by_value
-from lare_rl.training.compiled import training_module
+from lare_rl.training.compiled import keys_shape, learner_shape, training_module
 from lare_rl.training.decoder_fits import fit_seeds
 from lare_rl.training.learner import Learner, store
 from lare_rl.training.static_config import TrainConfig
 from lare_rl.training.streams import Stream, seed_keys, stream_keys
 
-__all__ = ["LoopState", "compile_loop", "init_loop"]
+__all__ = ["CompiledLoop", "LoopState", "compile_loop", "init_loop"]
 
 Metrics = dict[str, Float[Array, " seeds"]]
 Measured = tuple[Metrics, dict[str, Bool[Array, ""]]]
@@ -45,63 +45,76 @@ class LoopState(NamedTuple):
     """Whether all factors of the newest steps are finite."""
 
 
-Loop = Callable[[LoopState, Int[Array, " seeds"], int, int], LoopState]
-"""From the state, the seeds, the number of iterations before and the number of iterations to make to the new state."""
+class CompiledLoop(NamedTuple):
+    """The compiled iterations of a run."""
 
-
-def init_loop(learner: Learner, envs: VecEnvState, metrics: Metrics, env: JaxEnv, config: TrainConfig) -> LoopState:
-    """Return the state before an iteration. `metrics` are those of the newest updates, or empty before the first."""
-    shapes = jax.eval_shape(partial(_measure_and_collect, env=env, config=config), learner, envs)
-    zeros, steps = jax.tree.map(lambda shape: jnp.zeros(shape.shape, shape.dtype), shapes)
-    return LoopState(
-        learner=learner,
-        envs=envs,
-        metrics={name: jnp.asarray(metrics.get(name, zero)) for name, zero in zeros.items()},
-        is_measured={name: jnp.array(name in metrics) for name in zeros},
-        steps=steps,
-        is_finite=jnp.ones(len(envs.episode_start), bool),
-    )
-
-
-def _measure_and_collect(
-    learner: Learner, envs: VecEnvState, env: JaxEnv, config: TrainConfig
-) -> tuple[Metrics, Trajectory]:
-    """Return all metrics of an iteration, and its steps. Only their shapes are used."""
-    module, keys = training_module(config), seed_keys(jnp.zeros(len(envs.episode_start), int), 0)
-    _, steps = collect_device.collect(env, envs, module.get_actor(learner, 0, config), keys, config)
-    metrics = module.train_step(learner, steps, keys, 0, config)[1]
-    return (fit_seeds(learner, keys, config)[1] if config.fits_separately else {}) | metrics, steps
+    run: Callable[[LoopState, Int[Array, " seeds"], Int[Array, ""], Int[Array, ""]], LoopState]
+    """From the state, the seeds, the number of iterations before, and the number of iterations to make, to the new state. It
+    consumes its state. It stops after an iteration with a factor that is not finite."""
+    shape: LoopState
+    """The state with shapes instead of arrays."""
 
 
 @cache_by_value
-def compile_loop(env: JaxEnv, config: TrainConfig, phi: Sequence[Graph], fit_every: int) -> Loop:
-    """Return the compiled function. It consumes its state. It stops after an iteration with a factor that is not finite.
+def compile_loop(env: JaxEnv, config: TrainConfig, phi: Sequence[Graph], fit_every: int, n_seeds: int) -> CompiledLoop:
+    """Compile the iterations of a run.
 
     Args:
         env: the environment.
         config: the configuration of the run.
         phi: the graph of each team's phi.
-        fit_every: the decoders make their own gradient updates in every so many iterations.
+        fit_every: the decoders make gradient updates of their own in every iteration whose number is a multiple of this.
+        n_seeds: the number of seeds.
     """
 
     def loop(
-        state: LoopState, seeds: Int[Array, " seeds"], n_done: Int[Scalar, ""], n_iterations: Int[Scalar, ""]
+        state: LoopState, seeds: Int[Array, " seeds"], n_done: Int[Array, ""], n_iterations: Int[Array, ""]
     ) -> LoopState:
-        def is_running(carry: tuple[Int[Scalar, ""], LoopState]) -> Bool[Array, ""]:
+        def is_running(carry: tuple[Int[Array, ""], LoopState]) -> Bool[Array, ""]:
             return (carry[0] < n_done + n_iterations) & jnp.all(carry[1].is_finite)
 
-        def body(carry: tuple[Int[Scalar, ""], LoopState]) -> tuple[Int[Scalar, ""], LoopState]:
+        def body(carry: tuple[Int[Array, ""], LoopState]) -> tuple[Int[Array, ""], LoopState]:
             return carry[0] + 1, _iterate(carry[1], seeds, carry[0], env, config, phi, fit_every)
 
-        return jax.lax.while_loop(is_running, body, (jnp.asarray(n_done, jnp.int32), state))[1]
+        return jax.lax.while_loop(is_running, body, (n_done, state))[1]
 
-    return jax.jit(loop, donate_argnums=0)
+    shape = _loop_shape(env, config, n_seeds)
+    seeds, number = jax.ShapeDtypeStruct((n_seeds,), int), jax.ShapeDtypeStruct((), int)
+    return CompiledLoop(jax.jit(loop, donate_argnums=0).lower(shape, seeds, number, number).compile(), shape)
+
+
+def init_loop(loop: CompiledLoop, learner: Learner, envs: VecEnvState, metrics: Metrics) -> LoopState:
+    """Return the state before an iteration. `metrics` are those of the newest updates, or empty before the first."""
+    empty = jax.tree.map(lambda shape: jnp.zeros(shape.shape, shape.dtype), loop.shape._replace(learner=(), envs=()))
+    return LoopState(
+        learner=learner,
+        envs=envs,
+        metrics={name: jnp.array(metrics.get(name, zero)) for name, zero in empty.metrics.items()},
+        is_measured={name: jnp.array(name in metrics) for name in empty.metrics},
+        steps=empty.steps,
+        is_finite=jnp.ones_like(empty.is_finite),
+    )
+
+
+def _loop_shape(env: JaxEnv, config: TrainConfig, n_seeds: int) -> LoopState:
+    module = training_module(config)
+
+    def measure_and_collect(learner: Learner, keys: Key[Array, " seeds"]) -> LoopState:
+        envs, actor = collect_device.reset(env, keys, config.n_envs, config), module.get_actor(learner, 0, config)
+        _, steps = collect_device.collect(env, envs, actor, keys, config)
+        metrics = module.train_step(learner, steps, keys, 0, config)[1]
+        if config.fits_separately:
+            metrics |= fit_seeds(learner, keys, config)[1]
+        is_measured = {name: jnp.array(False) for name in metrics}
+        return LoopState(learner, envs, metrics, is_measured, steps, jnp.ones(n_seeds, bool))
+
+    return jax.eval_shape(measure_and_collect, learner_shape(config, n_seeds), keys_shape(n_seeds))
 
 
 def _iterate(
     state: LoopState,
     seeds: Int[Array, " seeds"],
-    iteration: Int[Scalar, ""],
+    iteration: Int[Array, ""],
     env: JaxEnv,
     config: TrainConfig,
     phi: Sequence[Graph],
@@ -113,7 +126,7 @@ def _iterate(
     keys = stream_keys(seeds, Stream.EXPLORATION, env_steps)
     envs, steps = collect_device.collect(env, state.envs, actor, keys, config)
     learner, is_finite = jax.vmap(partial(store, config=config, phi=phi))(state.learner, steps)
-    if learner.credit:
+    if learner.decoders:
         learn = partial(_learn_returns, config=config)
         learner = jax.lax.cond(jnp.any(steps.ended), learn, lambda unchanged: unchanged, learner)
 
@@ -150,5 +163,5 @@ def _record(measured: Measured, metrics: Metrics, is_new: Bool[Array, ""]) -> Me
 
 def _learn_returns(learner: Learner, config: TrainConfig) -> Learner:
     with jax.enable_x64(True):
-        decoders, n_learned = episodes.learn_returns(learner.credit, learner.replay, learner.n_learned, config)
-    return learner._replace(credit=decoders, n_learned=n_learned)
+        decoders, n_learned = episodes.learn_returns(learner.decoders, learner.replay, learner.n_learned, config)
+    return learner._replace(decoders=decoders, n_learned=n_learned)

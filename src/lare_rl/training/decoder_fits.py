@@ -18,8 +18,8 @@ from lare_rl.training.static_config import TrainConfig
 __all__ = ["fit_decoders", "fit_seeds", "sample_credit"]
 
 CHUNK_ROWS = 2400
-"""About how many rows each chunk of a decoder's gradient is computed from. More rows do not fit into the cache, and fewer make the
-matrix products inefficient. On one core, 256 episodes of six agents at once took 1.5 times as long."""
+"""About how many rows each chunk of a decoder's gradient is computed from. More rows do not fit into the cache, and
+fewer make the matrix products inefficient. On one core, 256 episodes of six agents at once took 1.5 times as long."""
 
 
 def sample_credit(buffer: Replay, key: PRNGKeyArray, updates: int, config: TrainConfig) -> CreditSample | None:
@@ -75,7 +75,7 @@ def fit_seeds(
     """Update the decoders of every seed `fit_updates` times. Return the mean of each metric."""
     # One seed after the other, because a large batch of episodes fills the caches already.
     decoders, metrics = jax.lax.map(lambda seed: _fit_repeatedly(seed[0], seed[1], config), (learner, keys))
-    return learner._replace(credit=decoders), metrics
+    return learner._replace(decoders=decoders), metrics
 
 
 def _fit_repeatedly(
@@ -85,10 +85,10 @@ def _fit_repeatedly(
     sample_key, key = jax.random.split(key)
     samples = sample_credit(learner.replay, sample_key, config.fit_updates, config)
     if samples is None:
-        return learner.credit, {}
+        return learner.decoders, {}
 
     def body(decoders: tuple[Decomposition, ...], update: tuple[CreditSample, PRNGKeyArray]):
         return fit_decoders(decoders, learner.replay, *update, config)
 
-    decoders, metrics = jax.lax.scan(body, learner.credit, (samples, jax.random.split(key, config.fit_updates)))
+    decoders, metrics = jax.lax.scan(body, learner.decoders, (samples, jax.random.split(key, config.fit_updates)))
     return decoders, jax.tree.map(jnp.mean, metrics)

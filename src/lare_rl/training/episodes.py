@@ -1,9 +1,10 @@
 """How the decoders learn from finished episodes: predict their returns, add them to sufficient statistics, fit.
 
-Every method that predicts returns has this order, so that `credit/return_r2` is measured on returns before anything is fitted to them.
+Every method that predicts returns has this order, so that `credit/return_r2` is measured on returns before anything is
+fitted to them.
 
-The functions are written for all seeds: steps are read in lockstep, and closed-form fits are made one seed after the other, when
-they are due. Call them within `float64()`, because `closed_form.py` needs float64.
+The functions are written for all seeds: steps are read in lockstep, and closed-form fits are made one seed after the
+other, when they are due. Call them within `float64()`, because `closed_form.py` needs float64.
 """
 
 from collections.abc import Callable
@@ -74,10 +75,10 @@ def fold_episodes(
     config: TrainConfig,
     expected: int = prequential.WINDOW,
 ) -> tuple[State, ...]:
-    """Apply `body` to the state of each team and to batches of the finished episodes from number `since` on, of one seed.
+    """Apply `body` to each team's state (such as its decoder) and to batches of the finished episodes of one seed.
 
     Args:
-        states: one state for each team, such as its decoder.
+        states: one state for each team.
         buffer: the replay.
         since: the number of the first episode, in each environment.
         body: the function from a state and a batch of whole episodes to the next state.

@@ -4,6 +4,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
+import jax
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
@@ -40,7 +41,7 @@ class Evaluation:
     def metrics(self, spec: EnvSpec) -> dict[str, Float[np.ndarray, " seeds"]]:
         """Return the means over the episodes, and the standard deviation of returns, by the keys of metrics.jsonl.
 
-        With several teams, each has its own keys, and the keys without a suffix are those of the first team.
+        With several teams, each has its own keys. The keys without a suffix belong to the first team.
         """
         metrics = {"evaluation/length": self.lengths.mean(axis=1)}
         metrics |= {f"evaluation/{name}": values.mean(axis=1) for name, values in self.measures.items()}
@@ -57,13 +58,5 @@ class Evaluation:
 
 def concatenate(evaluations: Sequence[Evaluation]) -> Evaluation:
     """Concatenate the episodes of evaluations of the same seeds."""
-    first = evaluations[0]
-    return Evaluation(
-        returns=np.concatenate([evaluation.returns for evaluation in evaluations], axis=1),
-        summed_returns=np.concatenate([evaluation.summed_returns for evaluation in evaluations], axis=1),
-        lengths=np.concatenate([evaluation.lengths for evaluation in evaluations], axis=1),
-        measures={
-            name: np.concatenate([evaluation.measures[name] for evaluation in evaluations], axis=1)
-            for name in first.measures
-        },
-    )
+    fields = [(result.returns, result.summed_returns, result.lengths, result.measures) for result in evaluations]
+    return Evaluation(*jax.tree.map(lambda *arrays: np.concatenate(arrays, axis=1), *fields))

@@ -47,7 +47,7 @@ def describe_returns(run: Run, learner: Learner, config: TrainConfig) -> list[st
             if config.team_level
             else raw_feature_names(role.observation, role.action, n_raw, role.action_size, has_both)
         )
-        score_type = returns.estimate_score_type(select_seed(learner.credit[i]))
+        score_type = returns.estimate_score_type(select_seed(learner.decoders[i]))
         prefix = f"{config.env.teams[i].name}: " if len(roles) > 1 else ""
         lines += [prefix + line for line in explanation_lines(explanation, score_type, factor_names, raw_names)]
     remarks = [f"of seed {run.seeds[0]} alone"] if len(run.seeds) > 1 else []
@@ -67,10 +67,10 @@ def explain_stored_returns(learner: Learner, config: TrainConfig) -> list[Explan
     config, replay = _explanation_config(config), learner.replay
     n_stored = np.sum(np.asarray(replay.episodes)[0] - np.asarray(replay.oldest)[0])
     has_features = all(spec.basis.n_features for spec in config.credit_specs)
-    if not learner.credit or not has_features or n_stored < MIN_EPISODES:
+    if not learner.decoders or not has_features or n_stored < MIN_EPISODES:
         return []
     with float64():
-        explanations = _compile(config)(replay, tuple(decoder.is_mean for decoder in learner.credit))
+        explanations = _compile(config)(replay, tuple(decoder.is_mean for decoder in learner.decoders))
         return jax.tree.map(np.asarray, explanations)
 
 
@@ -78,14 +78,12 @@ def _explanation_config(config: TrainConfig) -> TrainConfig:
     """Return the run's configuration with a closed-form method, whose inputs are in the columns of the run's replay."""
     observed = "state" if config.team_level else "observation"
     has_raw_features = {observed, "action"} <= set(config.columns)
-    if config.method.needs_phi:
-        method = METHODS["lare-bayes"]
-        if not has_raw_features:
-            method = replace(METHODS["lare-linear"], decoder="additive")
+    if has_raw_features:
+        method = METHODS["lare-bayes" if config.method.needs_phi else "bayes"]
+    elif config.method.needs_phi:
+        method = replace(METHODS["lare-linear"], decoder="additive")
     else:
-        method = METHODS["bayes"]
-        if not has_raw_features:
-            method = replace(method, encoder=config.method.encoder)
+        method = replace(METHODS["bayes"], encoder=config.method.encoder)
     return replace(config, method=method)
 
 

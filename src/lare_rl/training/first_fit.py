@@ -1,7 +1,7 @@
 """The first fit of gradient-trained decoders for many agents: it lasts until the error on held-out episodes stops falling.
 
-As published, a decoder is fitted in 50 updates to the first episodes and, after every tenth iteration, in 50 more. With 15 agents
-that is too few: the policy has settled before the decoder is accurate (docs/results/agents.md).
+As published, a decoder is fitted in 50 updates to the first episodes and, after every tenth iteration, in 50 more. With
+15 agents that is too few: the policy has settled before the decoder is accurate (docs/results/agents.md).
 """
 
 from collections.abc import Callable
@@ -29,8 +29,9 @@ PATIENCE = 2
 """A seed's fit ends after this many rounds in a row without improvement."""
 MAX_ROUNDS = 40
 BATCH_DIVISOR = 8
-"""Updates of the first fit read this fraction of the steps of later updates. There are few episodes yet, and large updates would read
-each of them several times. The decoder becomes as accurate in an eighth of the time (benchmarks/first_fit.py)."""
+"""Updates of the first fit read this fraction of the steps of later updates. There are few episodes yet, and large
+updates would read each of them several times. The decoder becomes as accurate in an eighth of the time
+(benchmarks/first_fit.py)."""
 
 FitFunction = Callable[[Learner, Key[Array, " seeds"]], tuple[Learner, dict[str, Float[Array, " seeds"]]]]
 
@@ -57,12 +58,12 @@ def fit_until_converged(
     config: TrainConfig,
     stop_requested: Callable[[], bool],
 ) -> tuple[Learner, dict[str, Float[Array, " seeds"]]]:
-    """Fit the decoders repeatedly, and keep those with the least error on held-out episodes, for each seed.
+    """Fit the decoders repeatedly. Keep, for each seed, the decoders with the least error on held-out episodes.
 
     Args:
         learner: the learner of all seeds, with enough episodes.
         fit: one round of updates. It consumes its learner.
-        keys: the random keys of the first round. Those of later rounds are derived from them.
+        keys: random keys; the keys of each round are derived from them.
         config: the configuration of the run.
         stop_requested: whether the user has asked the run to stop.
 
@@ -72,7 +73,7 @@ def fit_until_converged(
     episodes, running = jnp.copy(learner.replay.episodes), jnp.copy(learner.replay.running)
     n_hidden = jax.vmap(_count_held_out)(learner.replay)
     compute_error = jax.jit(jax.vmap(partial(_held_out_error, config=config)))
-    best_decoders, best_error = jax.tree.map(jnp.copy, learner.credit), np.full(len(episodes), np.inf)
+    best_decoders, best_error = jax.tree.map(jnp.copy, learner.decoders), np.full(len(episodes), np.inf)
     rounds_without_gain = np.zeros(len(episodes), int)
     metrics: dict[str, Float[Array, " seeds"]] = {}
     for number in range(MAX_ROUNDS):
@@ -83,15 +84,15 @@ def fit_until_converged(
         # Copies, because the next round consumes its learner.
         full = learner.replay._replace(episodes=jnp.copy(episodes), running=jnp.copy(running))
         learner = learner._replace(replay=full)
-        error = np.asarray(compute_error(learner.credit, full, n_hidden))
+        error = np.asarray(compute_error(learner.decoders, full, n_hidden))
         # How long a seed is fitted does not depend on the other seeds.
         is_better = (error < best_error) & (rounds_without_gain < PATIENCE)
-        best_decoders = jax.tree.map(partial(_select_seeds, jnp.asarray(is_better)), learner.credit, best_decoders)
+        best_decoders = jax.tree.map(partial(_select_seeds, jnp.asarray(is_better)), learner.decoders, best_decoders)
         best_error = np.where(is_better, error, best_error)
         rounds_without_gain = np.where(is_better, 0, rounds_without_gain + 1)
         if (rounds_without_gain >= PATIENCE).all():
             break
-    return learner._replace(credit=best_decoders), metrics
+    return learner._replace(decoders=best_decoders), metrics
 
 
 def _select_seeds(mask: Bool[Array, " seeds"], new: Array, old: Array) -> Array:

@@ -23,7 +23,7 @@ FunctionOrPath = LatentFunction | str | Path
 def choose_functions(
     task: TaskSpec, settings: ResolvedSettings, function: FunctionOrPath | Sequence[FunctionOrPath] | None
 ) -> tuple[LatentFunction, ...]:
-    """Return one function for each role of the task: the user's, or those of the shipped recordings.
+    """Return one function for each role of the task: the user's, or from the shipped recordings.
 
     It is empty for a method without phi.
 

@@ -34,7 +34,7 @@ class Learner(NamedTuple):
 
     algorithm: Any
     """The state of the algorithm."""
-    credit: tuple[Decomposition, ...]
+    decoders: tuple[Decomposition, ...]
     """The decoders, one for each team; empty for a method that fits nothing."""
     scale: tuple[Scale, ...]
     """The scale of each team's R/T."""
@@ -55,7 +55,7 @@ def init_learner(key: PRNGKeyArray, config: TrainConfig, init_algorithm: Callabl
     algorithm_key, *keys = jax.random.split(key, 1 + n_teams)
     return Learner(
         algorithm=init_algorithm(algorithm_key),
-        credit=init_decoders(keys, config),
+        decoders=init_decoders(keys, config),
         scale=tuple(empty_scale() for _ in config.env.teams),
         replay=replay.init_replay(config.columns, config.n_envs, config.capacity, n_teams),
         n_learned=jnp.zeros(config.n_envs, jnp.int32),
@@ -65,13 +65,7 @@ def init_learner(key: PRNGKeyArray, config: TrainConfig, init_algorithm: Callabl
 def store(
     learner: Learner, steps: Trajectory, config: TrainConfig, phi: Sequence[Graph] = ()
 ) -> tuple[Learner, Bool[Array, ""]]:
-    """Compute the factors of new steps, and put both into the replay and into the running statistics.
-
-    Args:
-        learner: the learner.
-        steps: the new steps.
-        config: the configuration of the run.
-        phi: the graph of each team's phi.
+    """Compute the factors of new steps by each team's phi, and put both into the replay and the running statistics.
 
     Returns:
         The new learner, and whether all factors are finite.
@@ -93,12 +87,12 @@ def store_with_factors(
         update_scale(scale, new_steps.mean_reward[..., i].ravel(), ended.ravel())
         for i, scale in enumerate(learner.scale)
     )
-    decoders = tuple(_observe(decoder, new_steps, ended, config, i) for i, decoder in enumerate(learner.credit))
-    return learner._replace(credit=decoders, scale=scales, replay=buffer)
+    decoders = tuple(_observe(decoder, new_steps, ended, config, i) for i, decoder in enumerate(learner.decoders))
+    return learner._replace(decoders=decoders, scale=scales, replay=buffer)
 
 
 def _replay_columns(steps: Trajectory, factors: Array, config: TrainConfig) -> tuple[dict[str, Any], dict[str, Any]]:
-    """Return the replay's columns for new steps, and those of `STEP_COLUMNS` after the steps."""
+    """Return the replay's columns for new steps, and the columns of `STEP_COLUMNS` after the steps."""
     columns = {
         **{name: getattr(steps.timestep, name) for name in STEP_COLUMNS},
         "action": steps.action,

@@ -1,4 +1,4 @@
-"""What the algorithms without a memory of their episode share: those that consume transitions or rollouts."""
+"""Functions shared by the algorithms without memory, which consume transitions or rollouts."""
 
 from typing import Any
 

@@ -62,15 +62,7 @@ def act(
 def train_step(
     learner: Learner, steps: Trajectory, keys: Key[Array, " seeds"], env_steps: Int[Scalar, ""], config: TrainConfig
 ) -> tuple[Learner, dict[str, Float[Array, " seeds"]]]:
-    """Update decoder and algorithm once for each new step of an environment. Return the mean of each metric.
-
-    Args:
-        learner: the learner of all seeds, which has stored the new steps.
-        steps: the new steps, of which only the number matters.
-        keys: the random keys.
-        env_steps: the number of environment steps before.
-        config: the configuration of the run.
-    """
+    """Update decoder and algorithm once for each new step of an environment. Of `steps`, only the number matters."""
     return jax.vmap(partial(_train_seed, config=config), in_axes=(0, 0, None))(learner, keys, env_steps)
 
 
@@ -99,8 +91,8 @@ def _train_seed(
 
     update_index = env_steps - settings.warmup + jnp.arange(n_updates)
     inputs = (update_index, _sample(buffer, sample_key, n_updates, config), jax.random.split(noise_key, n_updates))
-    (state, decoders), metrics = jax.lax.scan(update, (learner.algorithm, learner.credit), inputs)
-    return learner._replace(algorithm=state, credit=decoders), jax.tree.map(jnp.mean, metrics)
+    (state, decoders), metrics = jax.lax.scan(update, (learner.algorithm, learner.decoders), inputs)
+    return learner._replace(algorithm=state, decoders=decoders), jax.tree.map(jnp.mean, metrics)
 
 
 def _sample(buffer: Replay, key: PRNGKeyArray, n_updates: int, config: TrainConfig) -> UpdateSample:

@@ -59,15 +59,7 @@ def act(
 def train_step(
     learner: Learner, steps: Trajectory, keys: Key[Array, " seeds"], env_steps: Int[Scalar, ""], config: TrainConfig
 ) -> tuple[Learner, dict[str, Float[Array, " seeds"]]]:
-    """Update the policy on the steps that have just been stored.
-
-    Args:
-        learner: the learner of all seeds, which has stored the new steps.
-        steps: the new steps.
-        keys: the random keys.
-        env_steps: the number of environment steps before.
-        config: the configuration of the run.
-    """
+    """Update the policy on `steps`, which have just been stored."""
     return jax.vmap(partial(_train_seed, config=config), in_axes=(0, 0, 0, None))(learner, steps, keys, env_steps)
 
 
@@ -83,7 +75,7 @@ def _train_seed(
 def _rollout(learner: Learner, steps: Trajectory, config: TrainConfig) -> Rollout:
     """Return the newest steps with the method's rewards. Each agent of each environment is one actor of the rollout."""
     stored = replay.read(learner.replay, replay.newest_steps(learner.replay, config.rollout_steps))
-    reward = rewards(stored, RewardState(learner.credit, learner.scale), config)  # [envs time agents]
+    reward = rewards(stored, RewardState(learner.decoders, learner.scale), config)  # [envs time agents]
     n_agents, agents_leave = config.env.n_agents, config.env.agents_leave
 
     def for_each_agent(values: Array) -> Float[Array, "time envs agents"]:
@@ -94,8 +86,8 @@ def _rollout(learner: Learner, steps: Trajectory, config: TrainConfig) -> Rollou
     terminated = for_each_agent(jnp.asarray(steps.next_timestep.terminated if gamma < 1 else steps.ended))
     done = for_each_agent(jnp.asarray(steps.ended))
     if agents_leave:
-        left = ~jnp.asarray(steps.next_timestep.alive)
-        terminated, done = jnp.maximum(terminated, left), jnp.maximum(done, left)
+        has_left = ~jnp.asarray(steps.next_timestep.alive)
+        terminated, done = jnp.maximum(terminated, has_left), jnp.maximum(done, has_left)
 
     def merge_actors(rows: Shaped[Array, "time envs agents *rest"]) -> Shaped[Array, "time actors *rest"]:
         return rows.reshape(len(rows), -1, *rows.shape[3:])

@@ -9,7 +9,7 @@ from collections.abc import Iterator
 
 import jax
 
-from lare_rl.config.replay_size import replay_rows
+from lare_rl.config.resolve import replay_rows
 from lare_rl.errors import LareError
 from lare_rl.runs.directory import Run
 

@@ -1,6 +1,6 @@
 """Reflection: a model sees how well its function explains the returns of some episodes, and tries to improve it.
 
-The episodes are played for this purpose, or are those that a finished run has stored.
+The episodes are played for this purpose, or come from the replay of a finished run.
 """
 
 from collections.abc import Callable, Sequence

@@ -23,16 +23,16 @@ __all__ = ["RewardState", "assess", "proxy_rewards", "rewards", "team_metrics"]
 class RewardState(NamedTuple):
     """The decoders and reward scales of all teams: all that is needed to compute rewards."""
 
-    credit: tuple[Decomposition, ...]
+    decoders: tuple[Decomposition, ...]
     scale: tuple[Scale, ...]
 
     def decoder(self, team_index: int) -> Decomposition | None:
         """Return a team's decoder; None for a method that fits nothing."""
-        return self.credit[team_index] if self.credit else None
+        return self.decoders[team_index] if self.decoders else None
 
 
 def rewards(steps: StoredSteps, state: RewardState, config: TrainConfig) -> Float[Array, "*batch agents"]:
-    """Return the rewards that the algorithm is trained on, for each agent. Proxy rewards are those of the current decoders."""
+    """Return the rewards that the algorithm is trained on, for each agent. The current decoders compute proxy rewards."""
     alive = alive_agents(steps, config)
     team_rewards = []
     for i, team in enumerate(config.env.teams):
@@ -61,13 +61,13 @@ def assess(learner: Learner, config: TrainConfig) -> dict[str, Float[Array, ""]]
     if not config.method.has_proxy_rewards:
         return {}
     buffer = learner.replay
-    # Decoders of whole episodes need whole episodes: those of the newest iteration.
+    # Decoders of whole episodes need whole episodes: the newest iteration has them.
     count = config.rollout_steps if config.env.fixed_length else max(1, RECENT_STEPS // config.n_envs)
     index = replay.newest_steps(buffer, min(replay.capacity(buffer) - 1, count))
     oldest = replay.oldest_transition(buffer)[:, None]
     is_stored = (index.number >= oldest)[..., None]
     steps = replay.read(buffer, index._replace(number=jnp.maximum(index.number, oldest)))
-    alive, state = alive_agents(steps, config), RewardState(learner.credit, learner.scale)
+    alive, state = alive_agents(steps, config), RewardState(learner.decoders, learner.scale)
     metrics = []
     for i, team in enumerate(config.env.teams):
         reward, mask = steps.columns["reward"][..., team.agents], is_stored & alive[..., team.agents]
@@ -88,7 +88,7 @@ def assess(learner: Learner, config: TrainConfig) -> dict[str, Float[Array, ""]]
 
 
 def team_metrics(metrics: list[dict[str, Array]], config: TrainConfig) -> dict[str, Array]:
-    """Return the metrics of the first team; with several teams also those of each team, with the suffix `_<team>`."""
+    """Return the metrics of the first team; with several teams also the metrics of each team, with the suffix `_<team>`."""
     if len(metrics) == 1:
         return metrics[0]
     named = zip(config.env.teams, metrics, strict=True)

@@ -7,15 +7,14 @@ import numpy as np
 from jaxtyping import Int
 
 from lare_rl.algorithms.registry import ALGORITHMS
-from lare_rl.config.replay_size import replay_rows
+from lare_rl.config.resolve import replay_rows
 from lare_rl.credit.methods import find_method
 from lare_rl.envs.families import load_env_spec
 from lare_rl.errors import LareError
 from lare_rl.runs import checkpoint
 from lare_rl.runs.best_policy import load_best
 from lare_rl.runs.directory import Run
-from lare_rl.training.compile_ahead import learner_shape
-from lare_rl.training.compiled import compile_functions
+from lare_rl.training.compiled import compile_functions, learner_shape
 from lare_rl.training.learner import Learner
 from lare_rl.training.static_config import TrainConfig
 from lare_rl.util.provenance import code_version

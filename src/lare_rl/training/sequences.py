@@ -1,8 +1,9 @@
 """Algorithms that consume whole episodes: sample episodes, relabel them by the newest decoder, and update.
 
-There is one update for every `update_every` finished episodes. QMIX and VDN work like this. The team has one reward for each step: the
-mean over its agents that are alive. The mixer's input is the global state, standardised by its running mean and deviation (PyMARL2
-does not standardise it; its environments scale it). If there is no global state, the input is all observations side by side.
+There is one update for every `update_every` finished episodes. QMIX and VDN work like this. The team has one reward for
+each step: the mean over its agents that are alive. The mixer's input is the global state, standardised by its running
+mean and deviation (PyMARL2 does not standardise it; its environments scale it). If there is no global state, the input
+is all observations side by side.
 """
 
 from functools import partial
@@ -35,8 +36,8 @@ Updated = tuple[Any, tuple[Decomposition, ...]]
 """The state of the algorithm, and the decoders."""
 
 MIN_CUT_LENGTH = 32
-"""Batches are cut to shorter lengths only if the longest episode has at least this many steps. Each length compiles separately, and
-short episodes save little."""
+"""Batches are cut to shorter lengths only if the longest episode has at least this many steps. Each length compiles
+separately, and short episodes save little."""
 
 
 class SequenceState(NamedTuple):
@@ -45,7 +46,7 @@ class SequenceState(NamedTuple):
     qmix: Any
     states: RunningMeanStd
     """Running statistics of the mixer's input."""
-    done: Int[Array, ""]
+    n_due: Int[Array, ""]
     """The number of updates that were due so far, made or not: one for every `update_every` episodes."""
 
 
@@ -81,7 +82,7 @@ def get_actor(learner: Learner, env_steps: int, config: TrainConfig) -> Actor:
     """Return the parts of the learner that are needed to act, for all seeds."""
     state, algorithm = learner.algorithm, config.algorithm.load()
     epsilon = algorithm.epsilon(env_steps, _settings(config))
-    return Actor(algorithm.get_actor(state.qmix), jnp.full(state.done.shape, epsilon))
+    return Actor(algorithm.get_actor(state.qmix), jnp.full(state.n_due.shape, epsilon))
 
 
 def init_memory(config: TrainConfig) -> Any:
@@ -105,30 +106,23 @@ def act(
 def train_step(
     learner: Learner, steps: Trajectory, keys: Key[Array, " seeds"], env_steps: Int[Scalar, ""], config: TrainConfig
 ) -> tuple[Learner, dict[str, Float[Array, " seeds"]]]:
-    """Make the updates that are due, once there are enough episodes for a batch. Return the mean of each metric.
+    """Make the updates that are due, once there are enough episodes for a batch.
 
-    The function is written for all seeds, so that all of them use the same length of a batch: the smallest that fits the longest
-    episode of any seed.
-
-    Args:
-        learner: the learner of all seeds, which has stored the new steps.
-        steps: the new steps.
-        keys: the random keys.
-        env_steps: the number of environment steps before; not needed.
-        config: the configuration of the run.
+    The function is written for all seeds, so that all of them use the same length of a batch: the smallest that fits
+    the longest episode of any seed.
     """
-    settings, n_before = _settings(config), learner.algorithm.done
+    settings, n_before = _settings(config), learner.algorithm.n_due
     n_due = jnp.sum(learner.replay.episodes, axis=1) // settings.update_every
     has_batch = jnp.sum(jax.vmap(replay.n_finished)(learner.replay), axis=1) >= settings.batch_size
     n_updates = jnp.where(has_batch, n_due - n_before, 0)
     states = jax.vmap(partial(_observe_states, config=config))(learner.algorithm.states, steps)
-    learner = learner._replace(algorithm=learner.algorithm._replace(states=states, done=n_due))
+    learner = learner._replace(algorithm=learner.algorithm._replace(states=states, n_due=n_due))
     lengths = jnp.asarray(_cut_lengths(config))
     branches = [jax.vmap(partial(_update_seed, config=config, n_steps=length)) for length in _cut_lengths(config)]
 
     def update(number: Int[Scalar, ""], carry: tuple[Updated, Metrics]) -> tuple[Updated, Metrics]:
         (algorithm, decoders), sums = carry
-        current = learner._replace(algorithm=learner.algorithm._replace(qmix=algorithm), credit=decoders)
+        current = learner._replace(algorithm=learner.algorithm._replace(qmix=algorithm), decoders=decoders)
         number_keys = jax.vmap(lambda key: jax.random.split(jax.random.fold_in(key, number)))(keys)
         sample_keys, update_keys = jnp.unstack(number_keys, axis=1)
         sample = partial(sample_distinct_episodes, count=settings.batch_size)
@@ -148,9 +142,9 @@ def train_step(
     if config.joint_fit:
         names += team_metrics([{"credit/loss": jnp.zeros(())} for _ in config.env.teams], config)
     zeros = {name: jnp.zeros(len(n_updates)) for name in names}
-    start = ((learner.algorithm.qmix, learner.credit), zeros)
+    start = ((learner.algorithm.qmix, learner.decoders), zeros)
     (algorithm, decoders), sums = jax.lax.fori_loop(0, jnp.max(n_updates), update, start)
-    learner = learner._replace(algorithm=learner.algorithm._replace(qmix=algorithm), credit=decoders)
+    learner = learner._replace(algorithm=learner.algorithm._replace(qmix=algorithm), decoders=decoders)
     metrics = {name: total / n_updates for name, total in sums.items()}  # NaN where there was no update
     return learner, metrics | {"algorithm/updates": n_updates.astype(jnp.float32)}
 
@@ -180,7 +174,7 @@ def _update_seed(
 ) -> tuple[Updated, Metrics]:
     """Update the decoder and then the algorithm of one seed. Return only what changes: the learner holds much more."""
     sample_key, fit_key = jax.random.split(key)
-    decoders, metrics = learner.credit, {}
+    decoders, metrics = learner.decoders, {}
     samples = sample_credit(learner.replay, sample_key, 1, config)
     if samples is not None:
         sample = jax.tree.map(lambda leaf: leaf[0], samples)

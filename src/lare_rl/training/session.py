@@ -1,7 +1,8 @@
 """A running training: the training state, its environments, and the functions that advance it by one iteration."""
 
+import math
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -25,14 +26,12 @@ from lare_rl.tasks.spec import TaskSpec
 from lare_rl.training import advice, first_fit
 from lare_rl.training.collect_device import DeviceCollector
 from lare_rl.training.collect_host import HostCollector, make_host_collector
-from lare_rl.training.compile_ahead import compile_ahead, init_learner
 from lare_rl.training.compile_cache import cache_by_value
-from lare_rl.training.compiled import CompiledFunctions, compile_functions
-from lare_rl.training.compiled_loop import Loop, compile_loop, init_loop
+from lare_rl.training.compiled import CompiledFunctions, compile_ahead, compile_functions, init_seeds
+from lare_rl.training.compiled_loop import CompiledLoop, compile_loop, init_loop
 from lare_rl.training.factors import compute_host_factors
 from lare_rl.training.learner import Learner, abandon_episodes
 from lare_rl.training.saved_state import actor_shape, load_learner, make_train_config
-from lare_rl.training.seed_axis import metrics_lines
 from lare_rl.training.static_config import TrainConfig
 from lare_rl.training.streams import Stream, seed_keys, stream_keys
 from lare_rl.util.float64 import one_blas_thread
@@ -52,7 +51,7 @@ class Session:
     functions: CompiledFunctions
     learner: Learner
     collector: DeviceCollector | HostCollector
-    loop: Loop | None = None
+    loop: CompiledLoop | None = None
     """Iterations as one compiled call, for an environment of pure functions."""
     step: int = 0
     """Environment steps done, of each seed."""
@@ -97,7 +96,7 @@ class Session:
     @property
     def _is_before_first_fit(self) -> bool:
         """Whether the decoders' first fit is still to be made. The host decides when it ends."""
-        return self.config.fits_separately and self.settings.first_fit == "held-out" and not self.first_fit_done
+        return _has_first_fit(self.run, self.config) and not self.first_fit_done
 
     def _iterate_compiled(self, max_iterations: int) -> None:
         """Make iterations in one compiled call, for about `MAX_CALL_S`."""
@@ -105,10 +104,10 @@ class Session:
         assert isinstance(self.collector, DeviceCollector)
         n_iterations = max(1, min(max_iterations, int(MAX_CALL_S / self._iteration_s)))
         start = time.perf_counter()
-        state = init_loop(self.learner, self.collector.envs, self.latest_metrics, self.collector.env, self.config)
+        state = init_loop(self.loop, self.learner, self.collector.envs, self.latest_metrics)
         with one_blas_thread():
             n_done = self.step // self.settings.iteration_steps
-            state = self.loop(state, jnp.asarray(self.run.seeds), jnp.int32(n_done), jnp.int32(n_iterations))
+            state = self.loop.run(state, jnp.asarray(self.run.seeds), jnp.int32(n_done), jnp.int32(n_iterations))
             is_measured, is_finite = jax.device_get((state.is_measured, state.is_finite))
         self._iteration_s = max(1e-6, (time.perf_counter() - start) / n_iterations)
         self.learner, self.collector.envs = state.learner, state.envs
@@ -127,7 +126,7 @@ class Session:
         steps = self.collector.collect(self.actor, self.step)
         self.learner, is_finite = self.functions.store(self.learner, steps)
         self._check_factors(np.asarray(is_finite), steps)
-        if self.learner.credit and np.any(steps.ended):
+        if self.learner.decoders and np.any(steps.ended):
             self.learner = self.functions.learn_returns(self.learner)
         if self.step >= self.config.warmup:
             self._update(steps, stop_requested)
@@ -156,10 +155,7 @@ class Session:
         self.latest_metrics |= metrics
 
     def evaluate(self, rate: float) -> list[dict[str, Any]]:
-        """Evaluate, always from the same initial states, and keep the best policies.
-
-        Args:
-            rate: steps per second.
+        """Evaluate, always from the same initial states, and keep the best policies. `rate` is in steps per second.
 
         Returns:
             One line of metrics.jsonl for each seed.
@@ -170,7 +166,7 @@ class Session:
         metrics = evaluation.metrics(self.config.env) | self.functions.assess(self.learner) | self.latest_metrics
         if self.step > self.config.warmup and isinstance(self.settings.hyperparameters, OffPolicySettings):
             metrics |= {ACTOR_SATURATION: advice.saturation(self.greedy_actions(advice.N_PROBE_STATES))}
-        return metrics_lines(self.run.seeds, self.step, metrics, rate)
+        return _metrics_lines(self.run.seeds, self.step, metrics, rate)
 
     def greedy_actions(self, n_states: int) -> Float[np.ndarray, "seeds states action"]:
         """Return an off-policy algorithm's actions without noise in the newest states of the first environment.
@@ -221,10 +217,7 @@ class Session:
 
 def start_session(run: Run) -> Session:
     """Return a session before its first step."""
-    config = make_train_config(run)
-    functions = compile_ahead(config, run.graphs, len(run.seeds))
-    learner = init_learner(functions, seed_keys(jnp.asarray(run.seeds), 0))
-    return _make_session(run, config, functions, learner)
+    return _make_session(run, make_train_config(run), None)
 
 
 def restore_session(run: Run) -> tuple[Session, list[str]]:
@@ -234,7 +227,7 @@ def restore_session(run: Run) -> tuple[Session, list[str]]:
         LareError: there is no checkpoint, or it cannot be used.
     """
     config, learner, host, arrays = load_learner(run)
-    session = _make_session(run, config, compile_ahead(config, run.graphs, len(run.seeds)), learner)
+    session = _make_session(run, config, learner)
     try:
         return session, session.restore(host, arrays)
     except checkpoint.DAMAGED_FILE_ERRORS as error:
@@ -244,14 +237,24 @@ def restore_session(run: Run) -> tuple[Session, list[str]]:
         ) from error
 
 
-def _make_session(run: Run, config: TrainConfig, functions: CompiledFunctions, learner: Learner) -> Session:
-    task, settings = run.config.task, run.config.settings
-    if not config.env.is_jax:
+def _make_session(run: Run, config: TrainConfig, learner: Learner | None) -> Session:
+    """Compile the functions of a session and make its environments. Without a learner, start with an untrained one."""
+    task, settings, n_seeds = run.config.task, run.config.settings, len(run.seeds)
+    iterates_on_host = not config.env.is_jax or _has_first_fit(run, config)
+    functions = compile_ahead(config, run.graphs, n_seeds, iterates_on_host=iterates_on_host)
+    env = _make_jax_env(task) if config.env.is_jax else None
+    loop = env and compile_loop(env, config, run.graphs, settings.fit_every, n_seeds)
+    learner = learner or init_seeds(functions, seed_keys(jnp.asarray(run.seeds), 0))
+    if env is None:
         collector = make_host_collector(task, config, functions, run.seeds, settings.evaluation_episodes)
-        return Session(run, config, functions, learner, collector)
-    env = _make_jax_env(task)
-    loop = compile_loop(env, config, run.graphs, settings.fit_every)
-    return Session(run, config, functions, learner, DeviceCollector(env, config, run.seeds), loop)
+    else:
+        collector = DeviceCollector(env, config, run.seeds)
+    return Session(run, config, functions, learner, collector, loop)
+
+
+def _has_first_fit(run: Run, config: TrainConfig) -> bool:
+    """Whether the decoders have a first fit, which lasts until it brings no improvement."""
+    return config.fits_separately and run.config.settings.first_fit == "held-out"
 
 
 @cache_by_value
@@ -276,3 +279,14 @@ _abandon_episodes = jax.jit(jax.vmap(abandon_episodes))
 def _select_prefix(arrays: dict[str, np.ndarray], prefix: str) -> dict[str, np.ndarray]:
     """Return the arrays whose names begin with a prefix, by the rest of their names."""
     return {name.removeprefix(prefix): values for name, values in arrays.items() if name.startswith(prefix)}
+
+
+def _metrics_lines(seeds: Sequence[int], step: int, metrics: Mapping[str, Any], rate: float) -> list[dict[str, Any]]:
+    """Return one line of metrics.jsonl for each seed, from arrays with one number for each seed."""
+    lines = []
+    for seed_index, seed in enumerate(seeds):
+        numbers = {name: float(np.asarray(values)[seed_index]) for name, values in metrics.items()}
+        # JSON has no NaN: a correlation with a value that never varies is null.
+        valid = {name: value if math.isfinite(value) else None for name, value in numbers.items()}
+        lines.append({"step": step, "seed": seed, **valid, "time/steps_per_second": round(rate, 1)})
+    return lines

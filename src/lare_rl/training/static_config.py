@@ -39,7 +39,8 @@ class TrainConfig:
     steps: int
     """Environment steps of the whole run."""
     fit_updates: int
-    """Updates of the decoder in an iteration that fits it. Unused if the decoder is updated with every update of the algorithm."""
+    """Updates of the decoder in an iteration that fits it. Unused if the decoder is updated with every update of the
+    algorithm."""
     deterministic: bool = False
     """Whether a policy acts without noise outside training, even if its algorithm says otherwise."""
 
@@ -130,29 +131,23 @@ class TrainConfig:
 
     @property
     def columns(self) -> dict[str, jax.ShapeDtypeStruct]:
-        """The columns of a row of the replay: those that the algorithm and the decoder read, and no others."""
+        """The columns of a row of the replay: what the algorithm and the decoder read, and no more."""
         env, consumes = self.env, self.algorithm.consumes
         is_replayed = consumes is not Consumes.ROLLOUTS
         inputs = self.credit_specs[0].inputs
         has_raw_features = any(name != "factors" for name in inputs)
-        is_stored = {
-            "observation": is_replayed or (has_raw_features and not self.team_level),
-            "action": is_replayed or "action" in inputs,
-            "factors": self.method.needs_phi,
-            "reward": True,
-            "state": env.state_size > 0 and ((has_raw_features and self.team_level) or consumes is Consumes.SEQUENCES),
-            "available": env.masks_actions and consumes is Consumes.SEQUENCES,
-            "alive": env.agents_leave,
-            "terminated": consumes is Consumes.TRANSITIONS,
+        observed = (env.n_agents, env.observation_size)
+        actions = (env.n_agents, env.action_size)
+        factors = (self.credit_rows, max(self.n_factors, default=0))
+        reads_state = consumes is Consumes.SEQUENCES or (has_raw_features and self.team_level)
+        columns = {
+            "observation": (is_replayed or (has_raw_features and not self.team_level), observed, np.float32),
+            "action": (is_replayed or "action" in inputs, actions, np.float32),
+            "factors": (self.method.needs_phi, factors, np.float32),
+            "reward": (True, (env.n_agents,), np.float32),
+            "state": (env.state_size > 0 and reads_state, (env.state_size,), np.float32),
+            "available": (env.masks_actions and consumes is Consumes.SEQUENCES, actions, np.bool_),
+            "alive": (env.agents_leave, (env.n_agents,), np.bool_),
+            "terminated": (consumes is Consumes.TRANSITIONS, (), np.bool_),
         }
-        shapes: dict[str, tuple[tuple[int, ...], type]] = {
-            "observation": ((env.n_agents, env.observation_size), np.float32),
-            "action": ((env.n_agents, env.action_size), np.float32),
-            "factors": ((self.credit_rows, max(self.n_factors, default=0)), np.float32),
-            "reward": ((env.n_agents,), np.float32),
-            "state": ((env.state_size,), np.float32),
-            "available": ((env.n_agents, env.action_size), np.bool_),
-            "alive": ((env.n_agents,), np.bool_),
-            "terminated": ((), np.bool_),
-        }
-        return {name: jax.ShapeDtypeStruct(*shapes[name]) for name, stored in is_stored.items() if stored}
+        return {name: jax.ShapeDtypeStruct(shape, dtype) for name, (stored, shape, dtype) in columns.items() if stored}

@@ -36,7 +36,7 @@ def stored_episodes(run: Run | str | Path, seed: int | None = None) -> list[Log]
         terminations    [T]                      TD3, DDPG and SAC: whether the episode ended by itself
         truncations     [T]                      TD3, DDPG and SAC: whether it reached its time limit
 
-    With many agents, the first three have an axis of agents after that of steps. Observations are flattened.
+    With many agents, the first three have an axis of agents after the axis of steps. Observations are flattened.
 
     Args:
         run: the run, or its directory.

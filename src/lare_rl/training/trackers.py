@@ -103,5 +103,5 @@ class MLflow(Listener):
 
 
 def _numbers(line: Mapping[str, Any]) -> dict[str, float]:
-    """Return the metrics of a line of metrics.jsonl, without those that are null."""
+    """Return the metrics of a line of metrics.jsonl that are not null."""
     return {key: value for key, value in line.items() if key not in ("step", "seed") and value is not None}

@@ -80,7 +80,8 @@ def resume(
         listeners: objects that receive the progress; the default is the terminal.
 
     Raises:
-        LareError: it is not a run, its checkpoint does not exist any more, or `steps` is smaller than before; and as in `train`.
+        LareError: it is not a run, its checkpoint does not exist any more, or `steps` is smaller than before; and as in
+        `train`.
     """
     run, listeners = as_run(run), _check_listeners(listeners)
     tensorboard = tensorboard or (run.directory / EVENTS_DIRECTORY).is_dir()

@@ -38,15 +38,9 @@ class DivergedError(LareError):
 
 
 class HostPolicy:
-    """The policy of all seeds for whole episodes, all of which begin with its first call. It has the memory of the actors.
+    """The policy of all seeds for whole episodes, which all begin with its first call. It holds the memory of the actors.
 
-    Args:
-        functions: the compiled functions of the run.
-        config: the configuration of the run.
-        actor: the actors of all seeds.
-        seeds: the seeds of the run.
-        n_episodes: the number of episodes of each seed.
-        greedy: whether to act without noise; by default as in evaluations, where only PPO's policy has noise.
+    It acts without noise if `greedy` is true; by default as in evaluations, where only PPO's policy has noise.
     """
 
     def __init__(
@@ -101,11 +95,7 @@ def unroll_on_host(
 ) -> Iterator[tuple[Trajectory, Bool[np.ndarray, "seeds episodes"]]]:
     """Play one episode in each environment, all in lockstep. This is the only loop that plays whole episodes on the host.
 
-    Args:
-        envs: environments: those of the first seed, of the second, and so on.
-        policy: the policy of all seeds.
-        seeds: the seeds of the run.
-        episode_seeds: the random seed of the episode of each environment.
+    The environments of the first seed come first, then those of the second, and so on, and so do their `episode_seeds`.
 
     Yields:
         The next step of each environment, without the axis of time, and whether its episode had not ended before. The next
@@ -127,7 +117,7 @@ def unroll_on_host(
 
 
 def record_on_host(envs: VecEnv, policy: Policy, seeds: Sequence[int], episode_seeds: Sequence[int]) -> EpisodeBatch:
-    """Play one episode in each environment, and return all steps. The arguments are those of `unroll_on_host`."""
+    """Play one episode in each environment, and return all steps. The arguments are as in `unroll_on_host`."""
     steps, masks = [], []
     for step, running in unroll_on_host(envs, policy, seeds, episode_seeds):
         steps.append(jax.tree.map(np.copy, step))

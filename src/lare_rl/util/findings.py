@@ -1,4 +1,4 @@
-"""Findings: what a rule has found, as a code and values, and their sentences, which live in one catalogue for each room.
+"""Findings: results of rules, as a code and values. Their sentences are in one catalogue for each room.
 
 A catalogue is a dictionary from code to template. A template is a text of `str.format` with commands in backticks:
 
@@ -28,7 +28,7 @@ _MARKDOWN_SPECIAL = re.compile(r"([\\*_|<>\[\]])")
 
 @dataclass(frozen=True)
 class Finding:
-    """What a rule has found. Findings are hashable if their values are."""
+    """The result of a rule. Findings are hashable if their values are."""
 
     code: str
     """The key of its sentence in the catalogue of its room."""
@@ -75,11 +75,11 @@ def format_value(value: Any, spec: str = "") -> str:
     return format(value, spec)
 
 
+@dataclass
 class _Formatter(string.Formatter):
     """Formats values, and findings among them by the same catalogue."""
 
-    def __init__(self, catalogue: Catalogue):
-        self.catalogue = catalogue
+    catalogue: Catalogue
 
     def format_field(self, value: Any, format_spec: str) -> str:
         if value is None:

@@ -8,8 +8,10 @@ _RENAMED_FIELDS = {
     "average": "is_mean",
     "closed": "closed_form",
     "counted": "n_learned",
+    "credit": "decoders",
     "determined": "n_determined",
     "deviation": "std",
+    "done": "n_due",
     "fitted": "n_fitted",
     "given": "input_projection",
     "kept": "hidden_projection",
@@ -29,7 +31,7 @@ _RENAMED_FIELDS = {
 
 
 def rename_fields(name: str) -> str:
-    """Return the present name of an array, such as `.credit[0].is_mean` for `.credit[0].average`."""
+    """Return the present name of an array, such as `.decoders[0].is_mean` for `.credit[0].average`."""
     name = re.sub(r"(?<=\.)\w+", lambda match: _RENAMED_FIELDS.get(match.group(), match.group()), name)
     name = re.sub(r"\.agent\.decoder\b", ".agent.head", name)
     for stas_field, present in (
@@ -37,5 +39,5 @@ def rename_fields(name: str) -> str:
         ("number$", "agent_number"),
         (r"last(?=\.(weight|bias)$)", "head"),
     ):
-        name = re.sub(rf"(\.credit\[.*)\.{stas_field}", rf"\1.{present}", name)
+        name = re.sub(rf"(\.decoders\[.*)\.{stas_field}", rf"\1.{present}", name)
     return re.sub(r"(?<!\.replay)\.episodes\b", ".n_episodes", name)

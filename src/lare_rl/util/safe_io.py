@@ -96,12 +96,10 @@ def check_depth(value: Any) -> Any:
     """
     level = [value]
     for _ in range(MAX_DEPTH):
-        containers = [item for item in level if isinstance(item, dict | list)]
-        level = [
-            item
-            for container in containers
-            for item in (container.values() if isinstance(container, dict) else container)
+        containers = [
+            item.values() if isinstance(item, dict) else item for item in level if isinstance(item, dict | list)
         ]
+        level = [item for container in containers for item in container]
         if not level:
             return value
     raise ValueError(_TOO_DEEP)

@@ -33,7 +33,6 @@ def first_invisible(text: str) -> int | None:
 
 
 def _is_visible(letter: str) -> bool:
-    """Return whether a character is visible, or is common white space."""
-    return letter in "\n\t" or (
-        unicodedata.category(letter) not in _INVISIBLE_CATEGORIES and not _FILLERS.match(letter)
-    )
+    if letter in "\n\t":
+        return True
+    return unicodedata.category(letter) not in _INVISIBLE_CATEGORIES and not _FILLERS.match(letter)

@@ -71,7 +71,7 @@ def r_squared(y: Float[np.ndarray, " values"], predicted: Float[np.ndarray, " va
         e_k = (y_k - y_hat_k)^2,   d_k = (y_k - mean y)^2,   R^2 = 1 - sum e / sum d
         error^2 = n / (n - 1) * sum_k (e_k - (1 - R^2) d_k)^2 / (sum d)^2
 
-    1 - R^2 is a ratio of two means, and the error is that of a linearised ratio (Cochran, Sampling Techniques, 3rd edition, 1977,
+    1 - R^2 is a ratio of two means, and its error is the error of a linearised ratio (Cochran, Sampling Techniques, 3rd edition, 1977,
     section 2.11).
     """
     if len(y) < 2:

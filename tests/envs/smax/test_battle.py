@@ -1,6 +1,6 @@
 """The rules beside JaxMARL's: `pinned.npz` holds battles that `benchmarks/smax_oracle.py` played there."""
 
-from functools import partial
+from functools import cache, partial
 from pathlib import Path
 
 import jax
@@ -18,28 +18,33 @@ from lare_rl.errors import LareError
 PINNED = np.load(Path(__file__).parent / "pinned.npz")
 
 
-def begin(name: str, *positions: tuple[float, float]) -> battle.Battle:
-    """The first units of each side where they are wanted: ours, then theirs; all others lie dead in the middle."""
+def make_battle(name: str, *positions: tuple[float, float]) -> battle.Battle:
+    """Return a battle with the first unit of each side at these positions. All others lie dead in the middle."""
     scenario = find_scenario(name)
-    state = battle.start_battle(scenario, jax.random.key(0))
     alive = np.zeros(scenario.n_units, bool)
     position = np.full((scenario.n_units, 2), battle.FIELD / 2, np.float32)
-    for unit, index in zip((0, scenario.n_allies), positions, strict=True):
-        position[unit], alive[unit] = index, True
-    return state._replace(position=jnp.asarray(position), health=jnp.where(alive, state.health, 0))
+    for unit, xy in zip((0, scenario.n_allies), positions, strict=True):
+        position[unit], alive[unit] = xy, True
+    health = np.where(alive, scenario.unit_stats("health"), 0)
+    action = np.full(scenario.n_units, STOP, np.int32)
+    return battle.Battle(*map(jnp.asarray, (position, health, np.zeros_like(health), action)), step=jnp.array(0))
 
 
-def step(
-    name: str, state: battle.Battle, ally_action: int = STOP, enemy_action: int = STOP, longer: float = 0.0
-) -> battle.Battle:
-    """The first unit of each side chooses."""
+@cache
+def compile_advance(name: str):
     scenario = find_scenario(name)
-    action = jnp.full(scenario.n_units, STOP).at[0].set(ally_action).at[scenario.n_allies].set(enemy_action)
-    return jax.jit(partial(advance, scenario))(state, action, jnp.full((TICKS, scenario.n_units), longer))
+    return jax.jit(lambda state, action: advance(scenario, state, action, jnp.zeros((TICKS, scenario.n_units))))
+
+
+def step(name: str, state: battle.Battle, ally_action: int = STOP, enemy_action: int = STOP) -> battle.Battle:
+    """Make one step, in which the first unit of each side acts."""
+    action = np.full(len(state.health), STOP)
+    action[[0, find_scenario(name).n_allies]] = ally_action, enemy_action
+    return compile_advance(name)(state, action)
 
 
 @pytest.mark.parametrize("name", SCENARIO_NAMES)
-def test_goes_as_in_jaxmarl(name):
+def test_step_equals_jaxmarl(name):
     scenario = find_scenario(name)
     row = {key.removeprefix(f"{name}/"): PINNED[key] for key in PINNED.files if key.startswith(f"{name}/")}
 
@@ -61,21 +66,19 @@ def test_goes_as_in_jaxmarl(name):
     close(smax_reward, row["reward"])
     close(in_view[row["few"]], row["observation"])
     close(fields[row["few"]], row["state"])
-    # The steps that were kept are not all of them quiet.
+    # Some of the pinned steps have hits.
     assert (row["health"] < row["before/health"]).any()
     assert (row["longer"] != 0).any()
 
 
-@pytest.mark.parametrize(
-    ("choice", "where"), list(enumerate([(8, 18.065), (10.065, 16), (8, 13.935), (5.935, 16), (8, 16)]))
-)
-def test_a_stalker_walks_for_half_a_second(choice, where):
-    after = step("2s3z", begin("2s3z", (8, 16), (24, 16)), choice)
-    np.testing.assert_allclose(after.position[0], where, rtol=1e-6)
+def test_move():
+    for action, position in enumerate([(8, 18.065), (10.065, 16), (8, 13.935), (5.935, 16), (8, 16)]):
+        state = step("2s3z", make_battle("2s3z", (8, 16), (24, 16)), action)
+        np.testing.assert_allclose(state.position[0], position, rtol=1e-6)
 
 
-def test_an_attack_hits_once_and_again_when_the_weapon_is_ready():
-    state = begin("2s3z", (8, 16), (13.9, 16))
+def test_attack_repeats_after_the_cooldown():
+    state = make_battle("2s3z", (8, 16), (13.9, 16))
     health, cooldowns = [], []
     for _ in range(5):
         state = step("2s3z", state, ATTACK)
@@ -87,48 +90,40 @@ def test_an_attack_hits_once_and_again_when_the_weapon_is_ready():
     assert cooldowns[3] > 1
 
 
-def test_the_enemy_counts_our_units_from_the_last():
-    state = begin("2s3z", (8, 16), (13.9, 16))
+def test_enemy_counts_our_units_from_the_last():
+    state = make_battle("2s3z", (8, 16), (13.9, 16))
     assert step("2s3z", state, enemy_action=ATTACK + 4).health[0] == 147
     assert step("2s3z", state, enemy_action=ATTACK).health[0] == 160
 
 
-def test_out_of_reach_nothing_is_hit_and_a_zealot_reaches_two():
-    assert step("2s3z", begin("2s3z", (8, 16), (14.1, 16)), ATTACK).health[5] == 160
-    assert step("3s_vs_5z", begin("3s_vs_5z", (8, 16), (10.1, 16)), enemy_action=ATTACK + 2).health[0] == 160
-    assert step("3s_vs_5z", begin("3s_vs_5z", (8, 16), (9.9, 16)), enemy_action=ATTACK + 2).health[0] == 152
+def test_reach():
+    assert step("2s3z", make_battle("2s3z", (8, 16), (14.1, 16)), ATTACK).health[5] == 160
+    assert step("3s_vs_5z", make_battle("3s_vs_5z", (8, 16), (10.1, 16)), enemy_action=ATTACK + 2).health[0] == 160
+    assert step("3s_vs_5z", make_battle("3s_vs_5z", (8, 16), (9.9, 16)), enemy_action=ATTACK + 2).health[0] == 152
 
 
-def test_who_touches_the_border_dies_and_stays_there():
-    state = step("2s3z", begin("2s3z", (1, 16), (24, 16)), 3)
+def test_unit_at_the_border_dies():
+    state = step("2s3z", make_battle("2s3z", (1, 16), (24, 16)), 3)
     assert state.health[0] == 0
     np.testing.assert_allclose(state.position[0], (0, 16))
-    after = step("2s3z", state, 1)
-    np.testing.assert_allclose(after.position[0], (0, 16))
+    np.testing.assert_allclose(step("2s3z", state, 1).position[0], (0, 16))
 
 
-def test_units_that_overlap_part_evenly_and_the_dead_are_walked_over():
-    state = step("2s3z", begin("2s3z", (16, 16), (16.25, 16)))
+def test_overlapping_units_are_separated_and_dead_ones_are_not():
+    state = step("2s3z", make_battle("2s3z", (16, 16), (16.25, 16)))
     # Half of what is missing to 1.25, each in eight ticks: the whole gap closes in the first one.
     np.testing.assert_allclose(state.position[[0, 5], 0], (15.5, 16.75), atol=1e-4)
     np.testing.assert_allclose(state.position[1], (16, 16))
 
 
-def test_kinds_have_the_figures_that_the_texts_give():
-    scenario = SCENARIOS["1c3s5z"]
-    figures = {
-        name: scenario.unit_stats(name)[[0, 1, 4]] for name in ("reach", "cooldown", "speed", "health", "damage")
-    }
-    expected = [(7, 6, 2), (1.07, 1.87, 0.86), (3.15, 4.13, 3.15), (350, 160, 150), (20, 13, 8)]
-    np.testing.assert_allclose(list(figures.values()), expected, rtol=1e-6)
-    assert [(battle_.n_allies, battle_.n_enemies, battle_.max_steps) for battle_ in SCENARIOS.values()] == [
-        (5, 5, 120),
-        (3, 5, 250),
-        (9, 9, 180),
+def test_scenarios():
+    stats = [
+        SCENARIOS["1c3s5z"].unit_stats(name)[[0, 1, 4]] for name in ("reach", "cooldown", "speed", "health", "damage")
     ]
+    expected = [(7, 6, 2), (1.07, 1.87, 0.86), (3.15, 4.13, 3.15), (350, 160, 150), (20, 13, 8)]
+    np.testing.assert_allclose(stats, expected, rtol=1e-6)
+    sizes = [(scenario.n_allies, scenario.n_enemies, scenario.max_steps) for scenario in SCENARIOS.values()]
+    assert sizes == [(5, 5, 120), (3, 5, 250), (9, 9, 180)]
     assert tuple(SCENARIOS) == SCENARIO_NAMES
-
-
-def test_an_unknown_battle_is_named():
     with pytest.raises(LareError, match=r"no battle '2s3x' \(did you mean '2s3z'\?\).*3s_vs_5z"):
         find_scenario("2s3x")

@@ -1,3 +1,5 @@
+"""SMAX as a `JaxEnv`: random battles, and the ends of battles."""
+
 from functools import cache, partial
 
 import jax
@@ -5,268 +7,191 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from lare_rl.envs.interface import JaxEnv, Timestep
+from helpers.fake_smac import compiled_smax
+from lare_rl.envs.interface import Timestep
 from lare_rl.envs.smax import SCENARIO_NAMES
 from lare_rl.envs.smax.battle import ATTACK, STOP
 from lare_rl.envs.smax.scenarios import UNIT_TYPES
 from lare_rl.envs.smax.smax_env import SMAX, SmaxState
 
 BATTLES = 8
+PLAYED = ("2s3z", "1c3s5z")
+"""They differ in the number of unit types. `test_battle.py` compares all scenarios with JaxMARL."""
+EXPECTED = {"2s3z": (5, 127, 120, 10, 120), "3s_vs_5z": (3, 101, 96, 10, 250), "1c3s5z": (9, 249, 234, 14, 180)}
+"""Numbers of agents, sizes of observations, states and actions, and time limits."""
 
 
-def chosen(env: SMAX, timestep: Timestep, key, attacks: bool):
-    """A random legal choice of each agent; one that can attack does."""
-    weight = np.where(np.arange(env.spec.action_size) < ATTACK, 1, 3 if attacks else 1)
-    choice = jnp.argmax(
-        weight * timestep.available * jax.random.uniform(key, timestep.available.shape, minval=0.5), axis=1
-    )
-    return jax.nn.one_hot(choice, env.spec.action_size)
-
-
-@cache
-def make_smax(name: str) -> SMAX:
-    return SMAX(name)
+def sample_actions(env: SMAX, timestep: Timestep, key):
+    """Return random available actions. Attacks are preferred."""
+    weight = np.where(np.arange(env.spec.action_size) < ATTACK, 1, 3)
+    noise = jax.random.uniform(key, timestep.available.shape, minval=0.5)
+    return jax.nn.one_hot(jnp.argmax(weight * timestep.available * noise, axis=1), env.spec.action_size)
 
 
 @cache
-def played(name: str, attacks: bool = True) -> tuple[SmaxState, Timestep]:
-    """Battles of random play, [battles, steps + 1]; they go on to the time limit, whatever has happened."""
-    env = make_smax(name)
+def play(name: str) -> tuple[SMAX, SmaxState, Timestep]:
+    """Play random battles up to the time limit, even if they end before. Arrays have the axes [battles, steps + 1]."""
+    env = SMAX(name)
 
     def step(carry, key):
         action_key, step_key = jax.random.split(key)
-        after = env.step(carry[0], chosen(env, carry[1], action_key, attacks), step_key)
-        return after, after
+        result = env.step(carry[0], sample_actions(env, carry[1], action_key), step_key)
+        return result, result
 
     @jax.jit
     @jax.vmap
-    def play(key):
+    def play_battle(key):
         start_key, steps_key = jax.random.split(key)
         first = env.reset(start_key)
         rest = jax.lax.scan(step, first, jax.random.split(steps_key, env.spec.max_steps))[1]
         return jax.tree.map(lambda a, b: jnp.concatenate([a[None], b]), first, rest)
 
-    return jax.tree.map(np.asarray, play(jax.random.split(jax.random.key(0), BATTLES)))
+    keys = jax.random.split(jax.random.key(0), BATTLES)
+    return env, *jax.tree.map(np.asarray, play_battle(keys))
 
 
-def to_the_end(timestep: Timestep, battle: int) -> slice:
-    """The steps of a battle, as a collector plays them: up to the first end."""
-    return slice(0, 1 + int(np.argmax(timestep.terminated[battle] | timestep.truncated[battle])))
+def test_sizes():
+    for name in SCENARIO_NAMES:
+        spec = SMAX(name).spec
+        sizes = (spec.n_agents, spec.observation_size, spec.state_size, spec.action_size, spec.max_steps)
+        assert sizes == EXPECTED[name]
 
 
-def test_says_what_it_is():
-    env: JaxEnv = make_smax("2s3z")
-    sizes = [
-        (make_smax(name).spec.state_size, make_smax(name).spec.observation_size, make_smax(name).spec.max_steps)
-        for name in SCENARIO_NAMES
-    ]
-    assert sizes == [(120, 127, 120), (96, 101, 250), (234, 249, 180)]
-    assert [(make_smax(name).spec.n_agents, make_smax(name).spec.action_size) for name in SCENARIO_NAMES] == [
-        (5, 10),
-        (3, 10),
-        (9, 14),
-    ]
-    assert [team.name for team in env.spec.teams] == ["ally"]
-    assert env.spec.measures == ("won",)
-    assert env.spec.discrete
-    assert env.spec.masks_actions
-    assert env.spec.agents_leave
-    assert not env.spec.fixed_length
-
-
-@pytest.mark.parametrize("name", SCENARIO_NAMES)
-def test_every_array_has_the_promised_shape(name):
-    spec, timestep = make_smax(name).spec, played(name)[1]
-    time = (BATTLES, spec.max_steps + 1)
-    assert timestep.observation.shape == (*time, spec.n_agents, spec.observation_size)
-    assert timestep.state.shape == (*time, spec.state_size)
-    assert timestep.available.shape == (*time, spec.n_agents, spec.action_size)
-    assert timestep.alive.shape == timestep.reward.shape == (*time, spec.n_agents)
-    assert timestep.terminated.shape == timestep.truncated.shape == timestep.measures["won"].shape == time
+@pytest.mark.parametrize("name", PLAYED)
+def test_spec_and_shapes(name):
+    env, _, timestep = play(name)
+    spec = env.spec
+    assert [team.name for team in spec.teams] == ["ally"]
+    assert spec.measures == ("won",)
+    assert (spec.discrete, spec.masks_actions, spec.agents_leave, spec.fixed_length) == (True, True, True, False)
+    assert timestep.state.shape == (BATTLES, spec.max_steps + 1, spec.state_size)
     assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(timestep))
 
 
-@pytest.mark.parametrize("name", SCENARIO_NAMES)
-def test_health_never_rises_and_the_dead_stay_dead(name):
-    (battle, _), timestep = played(name)
+@pytest.mark.parametrize("name", PLAYED)
+def test_random_battles(name):
+    env, (battle, _), timestep = play(name)
     assert (np.diff(battle.health, axis=1) <= 0).all()
     assert (battle.health >= 0).all()
+    # Dead units stay dead, observe zeros, receive no reward and can only stop.
     assert not (timestep.alive[:, 1:] & ~timestep.alive[:, :-1]).any()
     assert (~timestep.alive).any()
-
-
-@pytest.mark.parametrize("name", SCENARIO_NAMES)
-def test_the_dead_see_nothing_earn_nothing_and_may_only_stop(name):
-    env, (_, timestep) = make_smax(name), played(name)
-    only_stop = np.arange(env.spec.action_size) == STOP
     assert timestep.available[timestep.alive][:, : STOP + 1].all()
-    assert (timestep.available[~timestep.alive] == only_stop).all()
+    assert (timestep.available[~timestep.alive] == (np.arange(env.spec.action_size) == STOP)).all()
     assert (timestep.observation[~timestep.alive] == 0).all()
     assert (timestep.reward[:, 1:][~timestep.alive[:, :-1]] == 0).all()
-    # The living are paid the same, also in the step in which one of them dies.
-    rewards = np.where(timestep.alive[:, :-1], timestep.reward[:, 1:], np.nan)
-    most, least = np.nanmax(np.nan_to_num(rewards, nan=-1), axis=2), np.nanmin(np.nan_to_num(rewards, nan=99), axis=2)
-    assert (most == least)[timestep.alive[:, :-1].any(axis=2)].all()
-
-
-@pytest.mark.parametrize("name", SCENARIO_NAMES)
-def test_random_play_ends_by_the_limit_and_pays_at_most_twenty(name):
-    timestep = played(name)[1]
-    for battle in range(BATTLES):
-        steps = to_the_end(timestep, battle)
-        assert timestep.truncated[battle, -1]
-        assert not timestep.truncated[battle, :-1].any()
-        assert steps.stop <= make_smax(name).spec.max_steps + 1
-        assert 0 <= timestep.reward[battle].max(axis=1).sum() <= 20 + 1e-4
+    # Units that were alive have the same reward, also those that die in the step.
+    was_alive, reward = timestep.alive[:, :-1], timestep.reward[:, 1:]
+    np.testing.assert_array_equal(reward, np.where(was_alive, reward.max(axis=2, keepdims=True), 0))
+    # All battles end at the time limit at the latest, with a return of at most 20.
+    assert timestep.truncated[:, -1].all()
+    assert not timestep.truncated[:, :-1].any()
     assert (timestep.reward[:, 0] == 0).all()
     assert (timestep.reward >= 0).all()
+    assert timestep.reward.max(axis=2).sum(axis=1).max() <= 20 + 1e-4
 
 
-def test_the_time_is_over_after_the_last_step():
-    env = make_smax("3s_vs_5z")
-    step = jax.jit(env.step)
-    state, _ = env.reset(jax.random.key(0))
-    state = state._replace(battle=state.battle._replace(step=jnp.array(248)))
-    stop = jax.nn.one_hot(jnp.full(3, STOP), 10)
-    state, timestep = step(state, stop, jax.random.key(1))
-    assert not timestep.truncated
-    state, timestep = step(state, stop, jax.random.key(1))
-    assert timestep.truncated
-    assert not timestep.terminated
+@pytest.mark.parametrize("name", PLAYED)
+def test_layout_of_states_and_observations(name):
+    env, (battle, _), timestep = play(name)
+    scenario = env.scenario
+    width = 4 + scenario.n_unit_types
+    types = list(UNIT_TYPES)
+    assert width == (11 if name == "1c3s5z" else 10)
+    assert timestep.state.shape[-1] == scenario.n_units * (width + 2)
+    for unit, unit_type in enumerate((*scenario.ally_types, *scenario.enemy_types)):
+        entries = timestep.state[..., unit * width : (unit + 1) * width]
+        alive = battle.health[..., unit] > 0
+        np.testing.assert_allclose(entries[..., 0], battle.health[..., unit] / UNIT_TYPES[unit_type].health, rtol=1e-6)
+        np.testing.assert_array_equal(entries[alive][:, 1:3], battle.position[alive][:, unit])
+        np.testing.assert_array_equal(entries[alive][:, 3], battle.cooldown[alive][:, unit])
+        one_hot = np.eye(width)[{"stalker": 6, "zealot": 7, "colossus": 10}[unit_type]]
+        np.testing.assert_array_equal(entries[alive][:, 4:], np.tile(one_hot[4:], (alive.sum(), 1)))
+        assert (entries[~alive] == 0).all()
+        sides = scenario.n_units * width
+        assert (timestep.state[..., sides + unit] == (unit >= scenario.n_allies)).all()
+        assert (timestep.state[..., sides + scenario.n_units + unit] == types.index(unit_type)).all()
+    assert (np.abs(timestep.observation) <= 1).all()
+    self_features = timestep.observation[..., -width:]
+    position = battle.position[:, :, : env.spec.n_agents]
+    np.testing.assert_allclose(self_features[timestep.alive][:, 1:3], position[timestep.alive] / 32, rtol=1e-6)
 
 
-def near_the_end(env: SMAX, allies: float, enemies: float) -> SmaxState:
-    """Two units face each other with so much health; all others are dead."""
-    state, _ = env.reset(jax.random.key(0))
-    enemy = env.scenario.n_allies
-    health = jnp.zeros(env.scenario.n_units).at[0].set(allies).at[enemy].set(enemies)
-    position = jnp.full_like(state.battle.position, 3.0).at[0].set((14, 16)).at[enemy].set((16, 16))
-    return state._replace(battle=state.battle._replace(health=health, position=position))
+def test_single_battle_equals_the_batch():
+    env, states, _ = play("2s3z")
+    _, reset, step = compiled_smax("2s3z")
+    start_key, steps_key = jax.random.split(jax.random.split(jax.random.key(0), BATTLES)[1])
+    state, timestep = reset(start_key)
+    for number, key in enumerate(jax.random.split(steps_key, env.spec.max_steps)[:3], 1):
+        action_key, step_key = jax.random.split(key)
+        state, timestep = step(state, sample_actions(env, timestep, action_key), step_key)
+        expected = jax.tree.map(lambda leaf, number=number: leaf[1, number], states)
+        jax.tree.map(partial(np.testing.assert_allclose, atol=1e-5), state, expected)
 
 
-def attack(env: SMAX) -> jax.Array:
-    return jax.nn.one_hot(jnp.full(env.spec.n_agents, STOP).at[0].set(ATTACK), env.spec.action_size)
-
-
-def test_a_win_is_paid_once_and_stays_a_win():
-    env = make_smax("2s3z")
-    step = jax.jit(env.step)
-    state, timestep = step(near_the_end(env, 160, 13), attack(env), jax.random.key(0))
-    assert timestep.terminated
-    assert timestep.measures["won"] == 1
-    np.testing.assert_allclose(timestep.reward, [10 + 10 * 13 / 160 / 5, 0, 0, 0, 0], rtol=1e-5)
-    state, timestep = step(state, attack(env), jax.random.key(1))
-    assert timestep.terminated
-    assert timestep.measures["won"] == 1
-    np.testing.assert_allclose(timestep.reward, 0)
-
-
-def test_nobody_wins_where_both_fall():
-    env = make_smax("2s3z")
-    step = jax.jit(env.step)
-    _state, timestep = step(near_the_end(env, 13, 13), attack(env), jax.random.key(0))
-    assert timestep.terminated
-    assert timestep.measures["won"] == 0
-    np.testing.assert_allclose(timestep.reward[0], 10 * 13 / 160 / 5, rtol=1e-5)
-
-
-def test_a_lost_battle_ends():
-    env = make_smax("2s3z")
-    _state, timestep = jax.jit(env.step)(near_the_end(env, 13, 100), attack(env), jax.random.key(0))
-    assert timestep.terminated
-    assert timestep.measures["won"] == 0
-    assert not timestep.alive.any()
-
-
-def test_an_attack_out_of_reach_does_nothing():
-    env = make_smax("2s3z")
-    state, _ = env.reset(jax.random.key(0))
-    _, timestep = jax.jit(env.step)(state, jax.nn.one_hot(jnp.full(5, ATTACK), 10), jax.random.key(1))
-    assert (timestep.reward == 0).all()
-
-
-@pytest.mark.parametrize("name", SCENARIO_NAMES)
-def test_reset_and_step_give_the_same_types(name):
-    env = make_smax(name)
-    key = jax.random.key(0)
+def test_reset_and_step_return_the_same_types():
+    """Otherwise a step is compiled twice."""
+    env, key = SMAX("3s_vs_5z"), jax.random.key(0)
     first = jax.eval_shape(env.reset, key)
     action = jax.ShapeDtypeStruct((env.spec.n_agents, env.spec.action_size), jnp.float32)
-    again = jax.eval_shape(env.step, first[0], action, key)
+    second = jax.eval_shape(env.step, first[0], action, key)
     types = partial(jax.tree.map, lambda leaf: (leaf.shape, leaf.dtype, leaf.weak_type))
-    assert types(first) == types(again)
+    assert types(first) == types(second)
     assert not any(leaf.weak_type for leaf in jax.tree.leaves(first))
 
 
-def test_a_step_is_compiled_once():
-    env = make_smax("3s_vs_5z")
-    step = jax.jit(env.step)
-    state, _ = jax.jit(env.reset)(jax.random.key(0))
-    for key in jax.random.split(jax.random.key(1), 3):
-        state, _ = step(state, attack(env), key)
-    assert step._cache_size() == 1
+# Ends of battles
+
+STOPS = np.eye(10, dtype=np.float32)[[STOP] * 5]
+ATTACKS = np.eye(10, dtype=np.float32)[[ATTACK] + [STOP] * 4]
 
 
-@pytest.mark.parametrize("name", SCENARIO_NAMES)
-def test_a_batch_is_its_battles_one_by_one(name):
-    env = make_smax(name)
-    keys = jax.random.split(jax.random.key(0), 3)
-
-    def play(key):
-        state, timestep = env.reset(key)
-        for number in jax.random.split(key, 2):
-            state, timestep = env.step(state, chosen(env, timestep, number, True), number)
-        return state, timestep
-
-    together, alone = jax.jit(jax.vmap(play))(keys), jax.jit(play)
-    for position_index, key in enumerate(keys):
-        jax.tree.map(
-            lambda number, all_, position_index=position_index: np.testing.assert_allclose(
-                number, all_[position_index], atol=1e-5
-            ),
-            alone(key),
-            together,
-        )
+def make_duel(ally_health: float, enemy_health: float, limit: int = 120) -> SmaxState:
+    """Return a battle of two stalkers in reach of each other, `limit` steps before the time limit."""
+    env, reset, _ = compiled_smax("2s3z")
+    state, _ = reset(jax.random.key(0))
+    enemy = env.scenario.n_allies
+    health = jnp.zeros(env.scenario.n_units).at[0].set(ally_health).at[enemy].set(enemy_health)
+    position = jnp.full_like(state.battle.position, 3.0).at[0].set((14, 16)).at[enemy].set((16, 16))
+    battle = state.battle._replace(health=health, position=position, step=jnp.array(120 - limit, jnp.int32))
+    return state._replace(battle=battle)
 
 
-@pytest.mark.parametrize("name", SCENARIO_NAMES)
-def test_the_state_is_laid_out_as_the_texts_say(name):
-    env, (state, timestep) = make_smax(name), played(name)
-    scenario, battle = env.scenario, state.battle
-    width = 4 + scenario.n_unit_types
-    kinds = list(UNIT_TYPES)
-    assert width == (11 if name == "1c3s5z" else 10)
-    for unit, kind in enumerate((*scenario.ally_types, *scenario.enemy_types)):
-        entries = timestep.state[..., unit * width : (unit + 1) * width]
-        lives = battle.health[..., unit] > 0
-        np.testing.assert_allclose(entries[..., 0], battle.health[..., unit] / UNIT_TYPES[kind].health, rtol=1e-6)
-        np.testing.assert_array_equal(entries[lives][:, 1:3], battle.position[lives][:, unit])
-        np.testing.assert_array_equal(entries[lives][:, 3], battle.cooldown[lives][:, unit])
-        position_index = {"stalker": 6, "zealot": 7, "colossus": 10}[kind]
-        np.testing.assert_array_equal(
-            entries[lives][:, 4:], np.eye(width)[[position_index]][:, 4:].repeat(lives.sum(), 0)
-        )
-        assert (entries[~lives] == 0).all()
-        sides = scenario.n_units * width
-        assert (timestep.state[..., sides + unit] == (unit >= scenario.n_allies)).all()
-        assert (timestep.state[..., sides + scenario.n_units + unit] == kinds.index(kind)).all()
-    assert timestep.state.shape[-1] == scenario.n_units * (width + 2)
+@pytest.mark.parametrize(
+    ("health", "won", "reward"),
+    [
+        ((160, 13), 1, 10 + 10 * 13 / 160 / 5),
+        ((13, 13), 0, 10 * 13 / 160 / 5),  # both die
+        ((13, 100), 0, 10 * 13 / 160 / 5),  # lost
+    ],
+)
+def test_end_of_a_battle(health, won, reward):
+    step = compiled_smax("2s3z")[2]
+    state, timestep = step(make_duel(*health), ATTACKS, jax.random.key(0))
+    assert timestep.terminated
+    assert timestep.measures["won"] == won
+    assert timestep.alive.any() == won
+    np.testing.assert_allclose(timestep.reward, [reward, 0, 0, 0, 0], rtol=1e-5)
+    _, timestep = step(state, ATTACKS, jax.random.key(1))  # the reward of a win is given once
+    assert timestep.terminated
+    assert timestep.measures["won"] == won
+    np.testing.assert_allclose(timestep.reward, 0)
 
 
-def test_the_weapon_falls_by_half_a_second_in_each_step_without_an_attack():
-    env = make_smax("2s3z")
-    state, timestep = env.reset(jax.random.key(0))
-    stop = jax.nn.one_hot(jnp.full(5, STOP), 10)
-    weapons = []
-    for key in jax.random.split(jax.random.key(1), 3):
-        state, timestep = jax.jit(env.step)(state, stop, key)
-        weapons.append(float(timestep.state[3]))
-    assert weapons == [-0.5, -1.0, -1.5]
+def test_time_limit():
+    step = compiled_smax("2s3z")[2]
+    state, timestep = step(make_duel(160, 160, limit=2), STOPS, jax.random.key(1))
+    assert not timestep.truncated
+    _, timestep = step(state, STOPS, jax.random.key(1))
+    assert (bool(timestep.truncated), bool(timestep.terminated)) == (True, False)
 
 
-@pytest.mark.parametrize("name", SCENARIO_NAMES)
-def test_observations_are_bounded_and_hold_ones_own_place(name):
-    env, (state, timestep) = make_smax(name), played(name)
-    assert (np.abs(timestep.observation) <= 1).all()
-    features = timestep.observation[..., -(4 + env.scenario.n_unit_types) :]
-    position = state.battle.position[:, :, : env.spec.n_agents]
-    np.testing.assert_allclose(features[timestep.alive][:, 1:3], position[timestep.alive] / 32, rtol=1e-6)
+def test_cooldowns_fall_by_half_a_second_without_hits():
+    _, reset, step = compiled_smax("2s3z")
+    state, _ = reset(jax.random.key(0))
+    cooldowns = []
+    for action in (STOPS, STOPS, ATTACKS):  # the attack is out of reach
+        state, timestep = step(state, action, jax.random.key(1))
+        cooldowns.append(float(timestep.state[3]))
+        assert (timestep.reward == 0).all()
+    assert cooldowns == [-0.5, -1.0, -1.5]

@@ -3,14 +3,12 @@
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Float
 
+from lare_rl.algorithms.batches import Action, Available, Observation, Value
 from lare_rl.nn.networks import MLP
 
-__all__ = ["UNAVAILABLE_LOGIT", "Available", "StochasticPolicy"]
-
-Available = Bool[Array, "*batch action"] | None
-"""Which choices are available. None: all of them, or the actions are continuous."""
+__all__ = ["UNAVAILABLE_LOGIT", "StochasticPolicy"]
 
 UNAVAILABLE_LOGIT = -1e9
 
@@ -24,28 +22,19 @@ class StochasticPolicy(eqx.Module):
     network: MLP
     log_std: Float[Array, "*stack action"] | None
 
-    def logits(
-        self, observation: Float[Array, "*batch observation"], available: Available
-    ) -> Float[Array, "*batch action"]:
+    def logits(self, observation: Observation, available: Available) -> Action:
         """Return the logit of each choice. That of an unavailable choice is so low that its probability is 0."""
         logits = self.network(observation)
         return logits if available is None else jnp.where(available, logits, UNAVAILABLE_LOGIT)
 
-    def log_probability(
-        self,
-        observation: Float[Array, "*batch observation"],
-        action: Float[Array, "*batch action"],
-        available: Available = None,
-    ) -> Float[Array, "*batch"]:
+    def log_probability(self, observation: Observation, action: Action, available: Available = None) -> Value:
         """Return log pi(a | s)."""
         if self.log_std is None:
             return jnp.sum(action * jax.nn.log_softmax(self.logits(observation, available)), axis=-1)
         z = (action - self.network(observation)) * jnp.exp(-self.log_std)
         return jnp.sum(-0.5 * z**2 - self.log_std - 0.5 * jnp.log(2 * jnp.pi), axis=-1)
 
-    def entropy(
-        self, observation: Float[Array, "*batch observation"], available: Available = None
-    ) -> Float[Array, "*batch"]:
+    def entropy(self, observation: Observation, available: Available = None) -> Value:
         """Return the entropy, -E log pi(a | s)."""
         if self.log_std is None:
             log_pi = jax.nn.log_softmax(self.logits(observation, available))
@@ -53,21 +42,14 @@ class StochasticPolicy(eqx.Module):
         entropy = self.log_std + 0.5 * jnp.log(2 * jnp.pi * jnp.e)
         return jnp.broadcast_to(jnp.sum(entropy, axis=-1), observation.shape[:-1])
 
-    def sample(
-        self,
-        observation: Float[Array, "*batch observation"],
-        noise: Float[Array, "*batch action"],
-        available: Available = None,
-    ) -> Float[Array, "*batch action"]:
+    def sample(self, observation: Observation, noise: Action, available: Available = None) -> Action:
         """Return the action for this noise: standard normal or, for choices, Gumbel (the largest logit plus noise is chosen)."""
         if self.log_std is None:
             logits = self.logits(observation, available)
             return jax.nn.one_hot(jnp.argmax(logits + noise, axis=-1), logits.shape[-1])
         return self.network(observation) + jnp.exp(self.log_std) * noise
 
-    def mode(
-        self, observation: Float[Array, "*batch observation"], available: Available = None
-    ) -> Float[Array, "*batch action"]:
+    def mode(self, observation: Observation, available: Available = None) -> Action:
         """Return the likeliest action."""
         if self.log_std is None:
             logits = self.logits(observation, available)

@@ -20,9 +20,9 @@ import jax.numpy as jnp
 import optax
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray, Scalar
 
-from lare_rl.algorithms.batches import Rollout
+from lare_rl.algorithms.batches import Action, Available, Metrics, Observation, Rollout, Value
 from lare_rl.algorithms.ppo import PPOSettings
-from lare_rl.algorithms.ppo.policies import Available, StochasticPolicy
+from lare_rl.algorithms.ppo.policies import StochasticPolicy
 from lare_rl.nn.networks import MLP, adam_step, clip_gradient, init_adam, init_orthogonal
 from lare_rl.nn.normalise import RunningMeanStd, empty_mean_std, running_std, standardise_if_observed, update_mean_std
 
@@ -31,7 +31,6 @@ __all__ = [
     "Actor",
     "Batch",
     "Networks",
-    "Rollout",
     "act",
     "advantages",
     "explore",
@@ -108,31 +107,22 @@ def get_actor(state: PPO) -> Actor:
     return Actor(state.params.actor, state.observations)
 
 
-def normalise(
-    observation: Float[Array, "*batch observation"], observations: RunningMeanStd | None
-) -> Float[Array, "*batch observation"]:
+def normalise(observation: Observation, observations: RunningMeanStd | None) -> Observation:
     """Return observations as the networks receive them: normalised, if there are statistics."""
     return observation if observations is None else standardise_if_observed(observations, observation)
 
 
-def act(
-    actor: Actor, observation: Float[Array, "*batch observation"], available: Available
-) -> Float[Array, "*batch action"]:
+def act(actor: Actor, observation: Observation, available: Available) -> Action:
     """Return the likeliest action."""
     return actor.policy.mode(normalise(observation, actor.observations), available)
 
 
-def explore(
-    actor: Actor,
-    observation: Float[Array, "*batch observation"],
-    available: Available,
-    noise: Float[Array, "*batch action"],
-) -> Float[Array, "*batch action"]:
+def explore(actor: Actor, observation: Observation, available: Available, noise: Action) -> Action:
     """Return an action sampled from the policy with this noise."""
     return actor.policy.sample(normalise(observation, actor.observations), noise, available)
 
 
-def values(state: PPO, observation: Float[Array, "*batch observation"]) -> Float[Array, "*batch"]:
+def values(state: PPO, observation: Observation) -> Value:
     """Return V(s) of normalised observations, in units of the reward."""
     return (state.returns.mean + _return_std(state.returns) * state.params.critic(observation))[..., 0]
 
@@ -190,7 +180,7 @@ def value_loss(
 
 def update(
     state: PPO, rollout: Rollout, key: PRNGKeyArray, progress_remaining: Float[Scalar, ""], settings: PPOSettings
-) -> tuple[PPO, dict[str, Float[Array, ""]]]:
+) -> tuple[PPO, Metrics]:
     """Take all gradient steps on one rollout. Return the new state, and the mean of each metric over the steps.
 
     `progress_remaining` falls from 1 to 0 over the run, for annealing.
@@ -200,7 +190,7 @@ def update(
     scale = progress_remaining if settings.anneal else 1.0
     rate, clip = settings.learning_rate * scale, settings.clip * scale
 
-    def loss(params: Networks, batch: Batch) -> tuple[Float[Array, ""], dict[str, Float[Array, ""]]]:
+    def loss(params: Networks, batch: Batch) -> tuple[Float[Array, ""], Metrics]:
         actor, mask = params.actor, batch.mask
         log_ratio = actor.log_probability(batch.observation, batch.action, batch.available) - batch.log_probability
         ratio = jnp.exp(log_ratio)
@@ -211,9 +201,8 @@ def update(
         return total, {
             "actor/objective": objective,
             "actor/entropy": entropy,
-            "actor/approx_kl": _masked_mean(
-                ratio - 1 - log_ratio, mask
-            ),  # Schulman, "Approximating KL divergence", 2020
+            # Schulman, "Approximating KL divergence", 2020
+            "actor/approx_kl": _masked_mean(ratio - 1 - log_ratio, mask),
             "actor/clip_fraction": _masked_mean((jnp.abs(ratio - 1) > clip).astype(jnp.float32), mask),
             "critic/loss": critic_loss,
         }
@@ -282,9 +271,9 @@ def _bool_mask(mask: Float[Array, "time actors"] | None) -> Bool[Array, " batch"
     return None if mask is None else mask.ravel() > 0
 
 
-def _masked_mean(x: Float[Array, "*batch"], mask: Float[Array, "*batch"] | None) -> Float[Array, ""]:
+def _masked_mean(x: Value, mask: Value | None) -> Float[Array, ""]:
     return jnp.mean(x) if mask is None else jnp.sum(x * mask) / jnp.maximum(jnp.sum(mask), 1)
 
 
-def _masked_variance(x: Float[Array, "*batch"], mask: Float[Array, "*batch"] | None) -> Float[Array, ""]:
+def _masked_variance(x: Value, mask: Value | None) -> Float[Array, ""]:
     return jnp.var(x) if mask is None else _masked_mean((x - _masked_mean(x, mask)) ** 2, mask)

@@ -17,17 +17,15 @@ import jax.numpy as jnp
 import optax
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray, Scalar
 
-from lare_rl.algorithms.batches import Sequences
+from lare_rl.algorithms.batches import Metrics, Sequences
 from lare_rl.algorithms.qmix import QMIXSettings
-from lare_rl.algorithms.qmix.mixer import Mixer, mix
+from lare_rl.algorithms.qmix.networks import Mixer, RecurrentNetwork, mix
 from lare_rl.nn.networks import adam_step, clip_gradient, init_adam
-from lare_rl.nn.recurrent import RecurrentNetwork
 
 __all__ = [
     "QMIX",
     "Memory",
     "Networks",
-    "Sequences",
     "act",
     "action_values",
     "agent_input",
@@ -41,6 +39,11 @@ __all__ = [
     "td_targets",
     "update",
 ]
+
+Observations = Float[Array, "*batch agents observation"]
+Actions = Float[Array, "*batch agents action"]
+AvailableActions = Bool[Array, "*batch agents action"]
+Steps = Float[Array, "episodes steps"]
 
 
 class Networks(NamedTuple):
@@ -61,7 +64,7 @@ class Memory(NamedTuple):
     """What the agents remember from one step to the next."""
 
     hidden: Float[Array, "*batch agents hidden"]
-    last_action: Float[Array, "*batch agents action"]
+    last_action: Actions
 
 
 def init(
@@ -95,18 +98,14 @@ def epsilon(step: Int[Scalar, ""] | int, settings: QMIXSettings) -> Float[Array,
     return settings.epsilon_start + (settings.epsilon_end - settings.epsilon_start) * fraction
 
 
-def agent_input(
-    observation: Float[Array, "*batch agents observation"], last_action: Float[Array, "*batch agents action"]
-) -> Float[Array, "*batch agents in"]:
+def agent_input(observation: Observations, last_action: Actions) -> Float[Array, "*batch agents in"]:
     """Return the network's input for each agent: its observation, its last action (zeros at first) and its one-hot index."""
     agents = observation.shape[-2]
     agent_id = jnp.broadcast_to(jnp.eye(agents), (*observation.shape[:-1], agents))
     return jnp.concatenate([observation, last_action, agent_id], axis=-1)
 
 
-def greedy_action(
-    value: Float[Array, "*batch agents action"], available: Bool[Array, "*batch agents action"]
-) -> Float[Array, "*batch agents action"]:
+def greedy_action(value: Actions, available: AvailableActions) -> Actions:
     """Return the available action of largest value; the first action if none is available, as in the padding of an episode."""
     return jax.nn.one_hot(jnp.argmax(jnp.where(available, value, -jnp.inf), axis=-1), value.shape[-1])
 
@@ -114,11 +113,11 @@ def greedy_action(
 def act(
     agent: RecurrentNetwork,
     memory: Memory,
-    observation: Float[Array, "*batch agents observation"],
-    available: Bool[Array, "*batch agents action"],
+    observation: Observations,
+    available: AvailableActions,
     noise: Float[Array, "*batch agents 1+action"] | None = None,
     epsilon: Float[Scalar, ""] | float = 0.0,
-) -> tuple[Float[Array, "*batch agents action"], Memory]:
+) -> tuple[Actions, Memory]:
     """Return the agents' actions, and their new memory.
 
     Without noise, each agent takes the best of its available actions. Noise is uniform in [0, 1): an agent whose first number
@@ -139,12 +138,12 @@ def action_values(agent: RecurrentNetwork, batch: Sequences) -> Float[Array, "ep
 
 
 def lambda_returns(
-    reward: Float[Array, "episodes steps"],
-    terminated: Float[Array, "episodes steps"],
-    mask: Float[Array, "episodes steps"],
+    reward: Steps,
+    terminated: Steps,
+    mask: Steps,
     value: Float[Array, "episodes steps+1"],
     settings: QMIXSettings,
-) -> Float[Array, "episodes steps"]:
+) -> Steps:
     """Return G, computed backwards from the end of the padding (PyMARL2's `build_td_lambda_targets`).
 
     After the last step of an episode G is 0: the rewards are masked there, and `terminated` removes the final value.
@@ -169,7 +168,7 @@ def td_targets(
     online_value: Float[Array, "episodes times agents action"],
     batch: Sequences,
     settings: QMIXSettings,
-) -> Float[Array, "episodes steps"]:
+) -> Steps:
     """Return G: the online networks choose the actions, and the target networks evaluate them (van Hasselt et al., 2016)."""
     action = greedy_action(online_value, batch.available)
     value = mix(target.mixer, jnp.sum(action * action_values(target.agent, batch), axis=-1), batch.state)
@@ -188,7 +187,7 @@ def loss(
 
 def update(
     state: QMIX, batch: Sequences, copy_target: Bool[Scalar, ""], settings: QMIXSettings
-) -> tuple[QMIX, dict[str, Float[Array, ""]]]:
+) -> tuple[QMIX, Metrics]:
     """Take one gradient step on whole episodes. If `copy_target`, the target networks then become copies of the online ones."""
     grad = jax.value_and_grad(loss, has_aux=True)
     (td_loss, mean_target), gradient = grad(state.online, state.target, batch, settings)
@@ -200,6 +199,6 @@ def update(
     return QMIX(online, target, optimizer), {"critic/loss": td_loss, "critic/value": mean_target}
 
 
-def _masked_mean(x: Float[Array, "episodes steps"], mask: Float[Array, "episodes steps"]) -> Float[Array, ""]:
+def _masked_mean(x: Steps, mask: Steps) -> Float[Array, ""]:
     """Return the mean over the steps of the episodes; 0 if there are none."""
     return jnp.sum(mask * x) / jnp.maximum(jnp.sum(mask), 1)

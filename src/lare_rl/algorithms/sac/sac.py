@@ -17,7 +17,7 @@ import jax.numpy as jnp
 import optax
 from jaxtyping import Array, Float, Int, PRNGKeyArray, Scalar
 
-from lare_rl.algorithms.batches import Transitions
+from lare_rl.algorithms.batches import Action, Metrics, Observation, Transitions
 from lare_rl.algorithms.critics import critic_loss, init_critics, q_values
 from lare_rl.algorithms.sac import SACSettings
 from lare_rl.nn.networks import MLP, adam_step, init_adam, polyak_update
@@ -67,25 +67,18 @@ def get_actor(state: SAC) -> MLP:
     return state.online.actor
 
 
-def _normal(
-    actor: MLP, observation: Float[Array, "*batch observation"]
-) -> tuple[Float[Array, "*batch action"], Float[Array, "*batch action"]]:
+def _normal(actor: MLP, observation: Observation) -> tuple[Action, Action]:
     """Return mu and log sigma of the policy, before the tanh."""
     mu, log_sigma = jnp.split(actor(observation), 2, axis=-1)
     return mu, jnp.clip(log_sigma, MIN_LOG_SIGMA, MAX_LOG_SIGMA)
 
 
-def act(actor: MLP, observation: Float[Array, "*batch observation"]) -> Float[Array, "*batch action"]:
+def act(actor: MLP, observation: Observation) -> Action:
     """Return the deterministic policy's action, tanh(mu(s))."""
     return jnp.tanh(_normal(actor, observation)[0])
 
 
-def explore(
-    actor: MLP,
-    observation: Float[Array, "*batch observation"],
-    noise: Float[Array, "*batch action"],
-    settings: SACSettings,
-) -> Float[Array, "*batch action"]:
+def explore(actor: MLP, observation: Observation, noise: Action, settings: SACSettings) -> Action:
     """Return an action sampled from the policy. `noise` is standard normal."""
     mu, log_sigma = _normal(actor, observation)
     return jnp.tanh(mu + jnp.exp(log_sigma) * noise)
@@ -115,7 +108,7 @@ def soft_td_targets(state: SAC, batch: Transitions, key: PRNGKeyArray, settings:
 
 def update(
     state: SAC, batch: Transitions, key: PRNGKeyArray, update_index: Int[Scalar, ""], settings: SACSettings
-) -> tuple[SAC, dict[str, Float[Array, ""]]]:
+) -> tuple[SAC, Metrics]:
     """Update critics, actor and temperature. Every `target_every`-th update also moves the target critics.
 
     `update_index` counts updates from 0. It is an argument, not part of the state, so that `vmap` over seeds keeps it a single

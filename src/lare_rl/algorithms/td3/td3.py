@@ -17,7 +17,7 @@ import jax.numpy as jnp
 import optax
 from jaxtyping import Array, Float, Int, PRNGKeyArray, Scalar
 
-from lare_rl.algorithms.batches import Transitions
+from lare_rl.algorithms.batches import Action, Metrics, Observation, Transitions
 from lare_rl.algorithms.critics import critic_loss, init_critics, q_value, q_values
 from lare_rl.algorithms.td3 import TD3Settings
 from lare_rl.nn.networks import MLP, adam_step, init_adam, polyak_update
@@ -60,17 +60,12 @@ def get_actor(state: TD3) -> MLP:
     return state.online.actor
 
 
-def act(actor: MLP, observation: Float[Array, "*batch observation"]) -> Float[Array, "*batch action"]:
+def act(actor: MLP, observation: Observation) -> Action:
     """Return the deterministic policy's action, in [-1, 1]."""
     return jnp.tanh(actor(observation))
 
 
-def explore(
-    actor: MLP,
-    observation: Float[Array, "*batch observation"],
-    noise: Float[Array, "*batch action"],
-    settings: TD3Settings,
-) -> Float[Array, "*batch action"]:
+def explore(actor: MLP, observation: Observation, noise: Action, settings: TD3Settings) -> Action:
     """Return the policy's action plus scaled exploration noise. `noise` is standard normal."""
     return jnp.clip(act(actor, observation) + settings.exploration_noise * noise, -1, 1)
 
@@ -89,7 +84,7 @@ def td_targets(
 
 def update(
     state: TD3, batch: Transitions, key: PRNGKeyArray, update_index: Int[Scalar, ""], settings: TD3Settings
-) -> tuple[TD3, dict[str, Float[Array, ""]]]:
+) -> tuple[TD3, Metrics]:
     """Update the critics. Every `policy_delay`-th update also updates the actor and moves the targets.
 
     `update_index` counts updates from 0. It is an argument, not part of the state, so that `vmap` over seeds keeps it a single

@@ -7,7 +7,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.patches import Circle, Rectangle
 
-from lare_rl.envs.canvas import blank_figure, to_pixels
+from lare_rl.envs.canvas import blank_figure, paint_frames
 from lare_rl.envs.particles.task import ParticleTask
 
 __all__ = ["draw_frames", "draw_state"]
@@ -37,19 +37,16 @@ def draw_frames(
     credit: Float[np.ndarray, "steps agents"] | None = None,
 ) -> list[UInt8[np.ndarray, "height width 3"]]:
     """Draw an episode as pictures with common scales of length and of credit."""
-    figure, axes = blank_figure()
     side = _half_side(task, positions)
     scale = None if credit is None else float(np.abs(credit).max())
-    frames = []
-    for step, position in enumerate(positions):
-        axes.clear()
-        _paint(axes, task, position, side, None if credit is None else credit[step], scale)
-        frames.append(to_pixels(figure))
-    return frames
+
+    def paint(axes: Axes, step: int) -> None:
+        _paint(axes, task, positions[step], side, None if credit is None else credit[step], scale)
+
+    return paint_frames(len(positions), paint)
 
 
 def _half_side(task: ParticleTask, position: Float[np.ndarray, "*steps entities 2"]) -> float:
-    """Return half the side of a picture that contains all entities."""
     outermost = np.abs(position) + task.world.size[:, None]
     return float(MARGIN * max(task.radius, outermost.max()))
 

@@ -3,23 +3,22 @@
     r_i = -min_l |x_i - x_l| - #{j != i: |x_i - x_j| < 2 * AGENT}
 
 after `simple_spread` of the multi-agent particle environments (Lowe et al., 2017), in the form of STAS and LaRe
-(`simple_spread_n6_noshare` and so on).
+(`simple_spread_n6_noshare` and so on). Landmarks keep a minimum distance, by Poisson disc sampling (Bridson, SIGGRAPH 2007).
 """
 
 from dataclasses import dataclass
-from functools import partial
+from functools import cache, partial
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 
-from lare_rl.envs.particles.layouts import make_layouts
-from lare_rl.envs.particles.nearest import concatenate_rows, distances, nearest_entities, relative_positions, slice_rows
+from lare_rl.envs.particles import views
 from lare_rl.envs.particles.task import ParticleTask, Team
 from lare_rl.envs.particles.world import State, World, at_rest
 
-__all__ = ["SIZES", "navigation"]
+__all__ = ["SIZES", "Size", "make_layouts", "navigation"]
 
 AGENT, LANDMARK = 0.15, 0.05
 """The radii of both."""
@@ -29,6 +28,10 @@ SEPARATION = 4.5 * AGENT
 """Landmarks are further apart than this."""
 N_VISIBLE_LANDMARKS, N_VISIBLE_AGENTS = 6, 5
 """The numbers of nearest landmarks and nearest agents that an agent sees."""
+N_CANDIDATES = 5
+"""The number of points that are tried around each point."""
+N_LAYOUTS = 2048
+"""The number of precomputed layouts. Each episode draws one of them."""
 
 
 @dataclass(frozen=True)
@@ -95,17 +98,72 @@ def _reset(size: Size, key: PRNGKeyArray) -> State:
 
 def _observe(size: Size, state: State) -> Float[Array, "agents observation"]:
     """Return each agent's velocity and position, the nearest landmarks, and the nearest other agents."""
-    landmarks = nearest_entities(state.position, size.agents, size.landmarks, N_VISIBLE_LANDMARKS)
-    other_agents = nearest_entities(state.position, size.agents, size.agents, N_VISIBLE_AGENTS)
-    return concatenate_rows(
-        slice_rows(state.velocity, size.agents),
-        slice_rows(state.position, size.agents),
-        relative_positions(state.position, size.agents, landmarks),
-        relative_positions(state.position, size.agents, other_agents),
+    landmarks = views.nearest_entities(state.position, size.agents, size.landmarks, N_VISIBLE_LANDMARKS)
+    other_agents = views.nearest_entities(state.position, size.agents, size.agents, N_VISIBLE_AGENTS)
+    return views.concatenate_rows(
+        views.slice_rows(state.velocity, size.agents),
+        views.slice_rows(state.position, size.agents),
+        views.relative_positions(state.position, size.agents, landmarks),
+        views.relative_positions(state.position, size.agents, other_agents),
     )
 
 
 def _reward(size: Size, state: State) -> Float[Array, " agents"]:
-    to_landmarks = distances(state.position, size.agents, size.landmarks)
-    to_agents = distances(state.position, size.agents, size.agents)
+    to_landmarks = views.distances(state.position, size.agents, size.landmarks)
+    to_agents = views.distances(state.position, size.agents, size.agents)
     return -jnp.min(to_landmarks, axis=1) - jnp.sum(to_agents < 2 * AGENT, axis=1)
+
+
+@cache
+def make_layouts(points: int, radius: float, separation: float) -> Float[np.ndarray, "layouts points 2"]:
+    """Return N_LAYOUTS layouts of `points` points within ±radius, which are further apart than `separation`.
+
+    The result is always the same. A layout is a uniform choice among the points of a sample that has enough points.
+    """
+    rng = np.random.default_rng(0)
+    layouts: list[np.ndarray] = []
+    while sum(map(len, layouts)) < N_LAYOUTS:
+        samples = _sample_poisson_discs(rng, N_LAYOUTS // 2, 2 * radius, separation)
+        # A random order of the points, with the missing points last.
+        rank = np.where(np.isinf(samples[..., 0]), np.inf, rng.random(samples.shape[:2]))
+        selected = np.argsort(rank, axis=1)[:, :points]
+        selected = np.take_along_axis(samples, selected[..., None], axis=1)
+        layouts.append(selected[np.isfinite(selected).all(axis=(1, 2))])
+    return (np.concatenate(layouts)[:N_LAYOUTS] - radius).astype(np.float32)
+
+
+def _sample_poisson_discs(
+    rng: np.random.Generator, samples: int, side: float, separation: float
+) -> Float[np.ndarray, "samples max_points 2"]:
+    """Return Poisson disc samples of a square (0, side)^2, computed in lockstep. Missing points of smaller samples are `inf`.
+
+    Bridson's algorithm starts with one active point, uniform in the square. It then chooses an active point at random and tries
+    N_CANDIDATES points, uniform in the ring of separation to 2 * separation around it. Candidates that are further than `separation`
+    from all existing points are added and become active; the selected point becomes inactive. It ends if no point is active.
+    """
+    # Discs with a radius of half the separation do not overlap, and lie within a square of side + separation.
+    max_points = int((side + separation) ** 2 / (np.pi * separation**2 / 4))
+    points = np.full((samples, max_points, 2), np.inf)
+    points[:, 0] = side * rng.random((samples, 2))
+    active = np.zeros((samples, max_points), bool)
+    active[:, 0] = True
+    n_points = np.ones(samples, int)
+    running = np.arange(samples)
+    while len(running):
+        used = n_points.max() + N_CANDIDATES
+        centre = np.argmax(rng.random((len(running), min(used, max_points))) * active[running, :used], axis=1)
+        active[running, centre] = False
+        for _ in range(N_CANDIDATES):
+            angle, u = 2 * np.pi * rng.random(len(running)), rng.random(len(running))
+            # 1 + 3 u: uniform by area between 1 and 2 separations.
+            reach = separation * np.sqrt(1 + 3 * u)
+            point = points[running, centre] + reach[:, None] * np.stack([np.cos(angle), np.sin(angle)], axis=1)
+            offset = points[running, :used] - point[:, None]
+            is_far = (offset[..., 0] ** 2 + offset[..., 1] ** 2 > separation**2).all(axis=1)
+            is_new = is_far & ((point >= 0) & (point < side)).all(axis=1)
+            sample = running[is_new]
+            points[sample, n_points[sample]] = point[is_new]
+            active[sample, n_points[sample]] = True
+            n_points[sample] += 1
+        running = running[active[running].any(axis=1)]
+    return points[:, : n_points.max()]

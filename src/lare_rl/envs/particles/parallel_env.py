@@ -22,7 +22,6 @@ try:
 except ImportError:
     raise missing_extra_error("lare_rl.envs.particles.parallel_env", "particles") from None
 
-
 __all__ = ["ParticleEnv"]
 
 
@@ -62,10 +61,8 @@ class ParticleEnv(ParallelEnv[str, Any, Any]):
         self.possible_agents = [f"{team.name}_{number}" for team in self.task.teams for number in range(team.n_agents)]
         observations, actions = Box(-np.inf, np.inf, (self.task.observation_size,), np.float32), Discrete(N_ACTIONS)
         # Each agent needs its own space, because a space has its own random number generator.
-        self.observation_spaces: dict[str, Space[Any]] = {
-            agent: deepcopy(observations) for agent in self.possible_agents
-        }
-        self.action_spaces: dict[str, Space[Any]] = {agent: deepcopy(actions) for agent in self.possible_agents}
+        self.observation_spaces: dict[str, Space[Any]] = {name: deepcopy(observations) for name in self.possible_agents}
+        self.action_spaces: dict[str, Space[Any]] = {name: deepcopy(actions) for name in self.possible_agents}
         self.agents: list[str] = []
         self._state: State | None = None
         self._key = jax.random.key(np.random.default_rng().integers(2**31))
@@ -99,19 +96,13 @@ class ParticleEnv(ParallelEnv[str, Any, Any]):
         self._state, observation, reward = _advance(self.task, state, action, self._next_key())
         self.steps += 1
         ended = self.steps == MAX_STEPS
-        results = (
-            self._by_agent(np.asarray(observation)),
-            self._by_agent(np.asarray(reward).tolist()),
-            dict.fromkeys(acted, False),
-            dict.fromkeys(acted, ended),
-            {agent: {} for agent in acted},
-        )
         if ended:
             self.agents = []
-        return results
+        observations, rewards = self._by_agent(np.asarray(observation)), self._by_agent(np.asarray(reward).tolist())
+        infos = {agent: {} for agent in acted}
+        return observations, rewards, dict.fromkeys(acted, False), dict.fromkeys(acted, ended), infos
 
     def render(self) -> np.ndarray:
-        """Draw the state as pixels (height, width, 3)."""
         return to_pixels(draw_state(self.task, np.asarray(self._world_state().position)))
 
     def state(self) -> np.ndarray:
@@ -119,7 +110,6 @@ class ParticleEnv(ParallelEnv[str, Any, Any]):
         return np.concatenate([np.asarray(values).ravel() for values in self._world_state()])
 
     def _world_state(self) -> State:
-        """Return the state of the world. Raises `LareError` before the first reset."""
         if self._state is None:
             raise LareError("there is no episode yet. Call reset first.")
         return self._state

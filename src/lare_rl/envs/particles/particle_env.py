@@ -43,14 +43,12 @@ class ParticleJaxEnv:
         )
 
     def reset(self, key: PRNGKeyArray) -> tuple[ParticleState, Timestep]:
-        """Start an episode."""
         state = ParticleState(self.task.reset(key), jnp.zeros((), jnp.int32))
         return state, self._make_timestep(state, jnp.zeros(self.spec.n_agents))
 
     def step(
         self, state: ParticleState, action: Float[Array, "agents action"], key: PRNGKeyArray
     ) -> tuple[ParticleState, Timestep]:
-        """Make one step, in which all agents act at once."""
         world = self.task.step(state.world, jnp.argmax(action, axis=-1), key)
         state = ParticleState(world, state.step + 1)
         return state, self._make_timestep(state, self.task.reward(world))
@@ -71,7 +69,6 @@ class ParticleJaxEnv:
     def frames(
         self, states: ParticleState, credit: Float[np.ndarray, "steps agents"] | None = None
     ) -> list[UInt8[np.ndarray, "height width 3"]]:
-        """Draw the states of an episode."""
         from lare_rl.envs.particles.drawing import draw_frames
 
         return draw_frames(self.task, np.asarray(states.world.position), credit)

@@ -16,7 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int, PRNGKeyArray
 
-from lare_rl.envs.particles.nearest import concatenate_rows, distances, nearest_entities, relative_positions, slice_rows
+from lare_rl.envs.particles import views
 from lare_rl.envs.particles.prey import Layers, sample_actions, shipped_prey
 from lare_rl.envs.particles.task import ParticleTask, Team
 from lare_rl.envs.particles.world import State, World, at_rest
@@ -24,15 +24,18 @@ from lare_rl.envs.particles.world import State, World, at_rest
 __all__ = [
     "SIZES",
     "Size",
+    "View",
     "chase",
     "competitive",
     "flee",
     "make_world",
+    "observe_predators",
     "observe_preys",
     "predator_prey",
     "reset",
     "reward_predators",
     "reward_preys",
+    "touches",
 ]
 
 PREDATOR_SENSITIVITY, PREY_SENSITIVITY = 3.0, 4.0
@@ -159,26 +162,30 @@ def observe_preys(size: Size, state: State) -> Float[Array, "preys observation"]
 def _observe(size: Size, state: State, observers: range, view: View) -> Float[Array, "observers observation"]:
     """Return each observer's velocity and position; the nearest obstacles, predators and preys; these preys' velocities."""
     position = state.position
-    preys = nearest_entities(position, observers, size.preys, view.preys)
-    return concatenate_rows(
-        slice_rows(state.velocity, observers),
-        slice_rows(position, observers),
-        relative_positions(position, observers, nearest_entities(position, observers, size.obstacles, view.landmarks)),
-        relative_positions(position, observers, nearest_entities(position, observers, size.predators, view.predators)),
-        relative_positions(position, observers, preys),
+    preys = views.nearest_entities(position, observers, size.preys, view.preys)
+    return views.concatenate_rows(
+        views.slice_rows(state.velocity, observers),
+        views.slice_rows(position, observers),
+        views.relative_positions(
+            position, observers, views.nearest_entities(position, observers, size.obstacles, view.landmarks)
+        ),
+        views.relative_positions(
+            position, observers, views.nearest_entities(position, observers, size.predators, view.predators)
+        ),
+        views.relative_positions(position, observers, preys),
         state.velocity[preys],
     )
 
 
 def touches(size: Size, state: State) -> Float[Array, "predators preys"]:
     """Return 1 where a predator touches a prey."""
-    return (distances(state.position, size.predators, size.preys) < size.predator_radius + size.prey_radius).astype(
-        jnp.float32
-    )
+    return (
+        views.distances(state.position, size.predators, size.preys) < size.predator_radius + size.prey_radius
+    ).astype(jnp.float32)
 
 
 def reward_predators(size: Size, state: State) -> Float[Array, " predators"]:
-    to_prey = jnp.min(distances(state.position, size.predators, size.preys), axis=1)
+    to_prey = jnp.min(views.distances(state.position, size.predators, size.preys), axis=1)
     return CATCH * jnp.sum(touches(size, state), axis=1) - DISTANCE_WEIGHT * to_prey
 
 
@@ -187,7 +194,6 @@ def reward_preys(size: Size, state: State) -> Float[Array, " preys"]:
 
 
 def flee(size: Size, layers: Layers, state: State, key: PRNGKeyArray) -> Int[Array, " preys"]:
-    """Sample the actions of scripted preys."""
     return sample_actions(layers, observe_preys(size, state), key)
 
 
@@ -196,6 +202,6 @@ def chase(size: Size, state: State) -> Int[Array, " predators"]:
 
     They move along the axis on which the nearest prey is further away.
     """
-    prey = nearest_entities(state.position, size.predators, size.preys, 1)
-    x, y = jnp.moveaxis(relative_positions(state.position, size.predators, prey)[:, 0], -1, 0)
+    prey = views.nearest_entities(state.position, size.predators, size.preys, 1)
+    x, y = jnp.moveaxis(views.relative_positions(state.position, size.predators, prey)[:, 0], -1, 0)
     return jnp.where(jnp.abs(x) > jnp.abs(y), jnp.where(x > 0, 2, 1), jnp.where(y > 0, 4, 3))

@@ -24,7 +24,6 @@ def shipped_prey() -> Layers:
 
 
 def logits(layers: Layers, observation: Float[Array, "preys observation"]) -> Float[Array, "preys actions"]:
-    """Return the network's outputs."""
     *hidden, (weight, bias) = layers
     for hidden_weight, hidden_bias in hidden:
         observation = jax.nn.relu(observation @ hidden_weight + hidden_bias)

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 
-from lare_rl.envs.particles.nearest import concatenate_rows, distances, relative_positions, slice_rows
+from lare_rl.envs.particles import views
 from lare_rl.envs.particles.task import ParticleTask, Team
 from lare_rl.envs.particles.world import State, World, at_rest
 
@@ -64,15 +64,15 @@ def _reset(key: PRNGKeyArray) -> State:
 
 def _observe(state: State) -> Float[Array, "agents observation"]:
     """Return each agent's velocity and position; the obstacles, in a fixed order; the other agents, sorted by x and then y."""
-    agents = slice_rows(state.position, AGENTS)
+    agents = views.slice_rows(state.position, AGENTS)
     obstacles = jnp.broadcast_to(jnp.array(OBSTACLES), (len(AGENTS), len(OBSTACLES)))
     other_agents = jnp.array([[j for j in AGENTS if j != i] for i in AGENTS])
-    offset = relative_positions(state.position, AGENTS, other_agents)
+    offset = views.relative_positions(state.position, AGENTS, other_agents)
     order = jax.vmap(lambda pair: jnp.lexsort((pair[:, 1], pair[:, 0])))(offset)
-    return concatenate_rows(
-        slice_rows(state.velocity, AGENTS),
+    return views.concatenate_rows(
+        views.slice_rows(state.velocity, AGENTS),
         agents,
-        relative_positions(state.position, AGENTS, obstacles),
+        views.relative_positions(state.position, AGENTS, obstacles),
         jnp.take_along_axis(offset, order[..., None], axis=1),
     )
 
@@ -80,5 +80,5 @@ def _observe(state: State) -> Float[Array, "agents observation"]:
 def _reward(state: State) -> Float[Array, " agents"]:
     first, second = state.position[1] - state.position[0], state.position[2] - state.position[0]
     area = jnp.abs(first[0] * second[1] - first[1] * second[0]) / 2
-    overlaps = jnp.sum(distances(state.position, AGENTS, OBSTACLES) < AGENT + OBSTACLE)
+    overlaps = jnp.sum(views.distances(state.position, AGENTS, OBSTACLES) < AGENT + OBSTACLE)
     return jnp.full(len(AGENTS), len(AGENTS) * AREA_WEIGHT * area - overlaps)

@@ -34,7 +34,7 @@ DIRECTIONS = np.array([(0, 0), (-1, 0), (1, 0), (0, -1), (0, 1)], np.float32)
 
 @dataclass(frozen=True, eq=False)
 class World:
-    """The constants of a world. The first `moving` entities are agents and preys; the others are landmarks, which do not move."""
+    """The constants of a world. The first `n_moving` entities are agents and preys. The others are landmarks, which do not move."""
 
     size: Float[np.ndarray, " entities"]
     """The radii."""

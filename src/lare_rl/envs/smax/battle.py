@@ -21,6 +21,22 @@ from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
 from lare_rl.envs.smax.scenarios import Scenario
 
+__all__ = [
+    "Battle",
+    "advance",
+    "alive",
+    "attack_target",
+    "available_actions",
+    "defeated",
+    "distances",
+    "move_direction",
+    "sample_cooldown_noise",
+    "separate_units",
+    "start_battle",
+    "within_reach",
+    "won",
+]
+
 FIELD = 32.0
 """The side of the square; its corners are (0, 0) and (FIELD, FIELD)."""
 TICK = 1 / 16

@@ -10,7 +10,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.patches import Circle, Rectangle, Wedge
 
-from lare_rl.envs.canvas import blank_figure, to_pixels
+from lare_rl.envs.canvas import blank_figure, paint_frames
 from lare_rl.envs.smax.battle import FIELD, Battle, attack_target
 from lare_rl.envs.smax.scenarios import Scenario
 
@@ -38,16 +38,14 @@ def draw_frames(
         battles: one state for each picture, along a leading axis.
         credit: for each state, the credit of the step before it, which is shown as a number.
     """
-    figure, axes = blank_figure()
     battles = jax.tree.map(np.asarray, battles)
-    frames, previous = [], None
-    for step in range(len(battles.step)):
-        axes.clear()
-        battle = jax.tree.map(itemgetter(step), battles)
-        _paint(axes, scenario, battle, previous, None if credit is None else float(credit[step]))
-        previous = battle
-        frames.append(to_pixels(figure))
-    return frames
+    states = [jax.tree.map(itemgetter(step), battles) for step in range(len(battles.step))]
+
+    def paint(axes: Axes, step: int) -> None:
+        previous = states[step - 1] if step else None
+        _paint(axes, scenario, states[step], previous, None if credit is None else float(credit[step]))
+
+    return paint_frames(len(states), paint)
 
 
 def _paint(axes: Axes, scenario: Scenario, battle: Battle, previous: Battle | None, credit: float | None) -> None:

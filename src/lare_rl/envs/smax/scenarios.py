@@ -15,7 +15,7 @@ from jaxtyping import Float, Int
 from lare_rl.envs.smax import SCENARIO_NAMES
 from lare_rl.errors import LareError, did_you_mean
 
-__all__ = ["SCENARIOS", "UNIT_TYPES", "Scenario", "find_scenario"]
+__all__ = ["SCENARIOS", "UNIT_TYPES", "Scenario", "UnitType", "find_scenario"]
 
 
 class UnitType(NamedTuple):

@@ -13,17 +13,8 @@ import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray, UInt8
 
 from lare_rl.envs.interface import EnvSpec, Team, Timestep
-from lare_rl.envs.smax.battle import (
-    ATTACK,
-    Battle,
-    advance,
-    alive,
-    available_actions,
-    defeated,
-    sample_cooldown_noise,
-    start_battle,
-    won,
-)
+from lare_rl.envs.smax import battle as rules
+from lare_rl.envs.smax.battle import ATTACK, Battle, alive, won
 from lare_rl.envs.smax.enemy import Memory, choose_actions, init_memory
 from lare_rl.envs.smax.observation import global_state, observation_size, observe, state_size
 from lare_rl.envs.smax.scenarios import Scenario, find_scenario
@@ -80,7 +71,7 @@ class SMAX:
 
     def reset(self, key: PRNGKeyArray) -> tuple[SmaxState, Timestep]:
         """Start a battle. Both armies have full health."""
-        battle = start_battle(self.scenario, key)
+        battle = rules.start_battle(self.scenario, key)
         state = SmaxState(battle, init_memory(self.scenario, battle))
         return state, self._make_timestep(battle, jnp.zeros(self.scenario.n_allies))
 
@@ -92,17 +83,17 @@ class SMAX:
         enemy_key, noise_key = jax.random.split(key)
         enemy_action, memory = choose_actions(scenario, battle, state.memory, enemy_key)
         joint_action = jnp.concatenate([jnp.argmax(action, axis=1).astype(jnp.int32), enemy_action])
-        next_battle = advance(scenario, battle, joint_action, sample_cooldown_noise(noise_key, scenario))
+        next_battle = rules.advance(scenario, battle, joint_action, rules.sample_cooldown_noise(noise_key, scenario))
         team_reward = reward(scenario, battle, next_battle)
         rewards = jnp.where(alive(battle)[: scenario.n_allies], team_reward, 0)
         return SmaxState(next_battle, memory), self._make_timestep(next_battle, rewards)
 
     def _make_timestep(self, battle: Battle, reward: Float[Array, " agents"]) -> Timestep:
-        allies_defeated, enemies_defeated = defeated(self.scenario, battle)
+        allies_defeated, enemies_defeated = rules.defeated(self.scenario, battle)
         return Timestep(
             observation=observe(self.scenario, battle),
             state=global_state(self.scenario, battle),
-            available=available_actions(self.scenario, battle),
+            available=rules.available_actions(self.scenario, battle),
             alive=alive(battle)[: self.scenario.n_allies],
             reward=reward,
             terminated=allies_defeated | enemies_defeated,
@@ -113,7 +104,6 @@ class SMAX:
     def frames(
         self, states: SmaxState, credit: Float[np.ndarray, "steps agents"] | None = None
     ) -> list[UInt8[np.ndarray, "height width 3"]]:
-        """Draw the states of an episode."""
         from lare_rl.envs.smax.drawing import draw_frames
 
         if credit is not None:  # all living units have the same credit, dead units none

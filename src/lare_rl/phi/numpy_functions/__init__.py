@@ -1,25 +1,20 @@
 """NumPy's functions, made of the operations of the graph. Importing a module registers its functions."""
 
 from lare_rl.phi.numpy_functions import (
-    constants,
     creation,
     elementwise,
-    joining,
-    linear_algebra,
-    order,
     positions,
     products,
     reductions,
     sequences,
     shapes,
     tables,
-)  # fmt: skip
+)
 from lare_rl.phi.numpy_functions.creation import INDEXED
 from lare_rl.phi.numpy_functions.registry import FUNCTIONS, KIND_OF_DTYPE, call_numpy
 from lare_rl.phi.numpy_functions.tables import Polynomial
 
 __all__ = [
     "FUNCTIONS", "INDEXED", "KIND_OF_DTYPE", "Polynomial", "call_numpy",
-    "constants", "creation", "elementwise", "joining", "linear_algebra", "order", "positions", "products", "reductions",
-    "sequences", "shapes", "tables",
+    "creation", "elementwise", "positions", "products", "reductions", "sequences", "shapes", "tables",
 ]  # fmt: skip

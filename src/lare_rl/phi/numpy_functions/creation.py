@@ -10,19 +10,20 @@ from typing import Any
 import numpy as np
 
 from lare_rl.phi.arrays import Array, as_array, broadcast, elementwise, stack
-from lare_rl.phi.batch import BatchSize
 from lare_rl.phi.builder import current_builder
 from lare_rl.phi.indices import ALL
 from lare_rl.phi.limits import RefusedError
-from lare_rl.phi.numpy_functions.joining import column_stack, concatenate_
 from lare_rl.phi.numpy_functions.registry import (
     FUNCTIONS,
+    array_functions,
     as_float,
     astype,
     dtype_kind,
     numpy_function,
+    numpy_functions,
 )
-from lare_rl.phi.numpy_functions.shapes import ravel, split_shape
+from lare_rl.phi.numpy_functions.shapes import column_stack, concatenate_, ravel, split_shape
+from lare_rl.phi.operand import BatchSize
 
 
 @numpy_function()
@@ -38,30 +39,10 @@ def asarray(a: Array, dtype: Any = None, count: Any = -1) -> Array:
     return a if dtype is None or dtype_kind(dtype) == a.kind else astype(a, dtype)
 
 
-@numpy_function("copy")
-def copy(a: Array) -> Array:
-    return a.copy()
-
-
-@numpy_function("astype")
-def astype_(x: Array, dtype: Any) -> Array:
-    return astype(x, dtype)
-
-
 @numpy_function()
 def full(shape: Any, fill_value: Any, dtype: Any = None) -> Array:
     filled = broadcast(as_array(fill_value), *split_shape(shape)).copy()
     return filled if dtype is None else astype(filled, dtype)
-
-
-@numpy_function()
-def zeros(shape: Any, dtype: Any = "float") -> Array:
-    return full(shape, 0, dtype)
-
-
-@numpy_function()
-def ones(shape: Any, dtype: Any = "float") -> Array:
-    return full(shape, 1, dtype)
 
 
 @numpy_function()
@@ -73,16 +54,6 @@ def empty(shape: Any, dtype: Any = "float") -> Array:
 @numpy_function()
 def full_like(a: Array, fill_value: Any, dtype: Any = None, shape: Any = None) -> Array:
     return full(a.shape if shape is None else shape, fill_value, a.kind if dtype is None else dtype)
-
-
-@numpy_function()
-def zeros_like(a: Array, dtype: Any = None, shape: Any = None) -> Array:
-    return full_like(a, 0, dtype, shape)
-
-
-@numpy_function()
-def ones_like(a: Array, dtype: Any = None, shape: Any = None) -> Array:
-    return full_like(a, 1, dtype, shape)
 
 
 @numpy_function()
@@ -104,17 +75,17 @@ def arange(start: Any, stop: Any = None, step: Any = 1, dtype: Any = None) -> Ar
     return numbers if dtype is None else astype(numbers, dtype)
 
 
-def _register_series(name: str, function: Callable[..., np.ndarray]) -> None:
+def _register_series(name: str) -> None:
     def series(start: float, stop: float, num: int = 50, endpoint: Any = True, base: float = 10.0) -> Array:
         current_builder().check_size([num])
         more = {"base": base} if name == "logspace" else {}
-        return as_array(function(start, stop, num, bool(endpoint), **more))
+        return as_array(getattr(np, name)(start, stop, num, bool(endpoint), **more))
 
     numpy_function(name)(series)
 
 
 for _name in ("linspace", "logspace", "geomspace"):
-    _register_series(_name, getattr(np, _name))
+    _register_series(_name)
 
 
 @numpy_function()
@@ -125,25 +96,10 @@ def eye(N: int, M: int | None = None, k: int = 0, dtype: Any = "float") -> Array
 
 
 @numpy_function()
-def identity(n: int, dtype: Any = "float") -> Array:
-    return eye(n, dtype=dtype)
-
-
-@numpy_function()
 def tri(N: int, M: int | None = None, k: int = 0, dtype: Any = "float") -> Array:  # noqa: N803
     shape = N, N if M is None else M
     current_builder().check_size(shape)
     return astype(np.tri(*shape, k), dtype)
-
-
-@numpy_function()
-def tril(m: Array, k: int = 0) -> Any:
-    return elementwise("where", tri(*_last_axes(m), k, "bool"), m, 0)
-
-
-@numpy_function()
-def triu(m: Array, k: int = 0) -> Any:
-    return elementwise("where", tri(*_last_axes(m), k - 1, "bool"), 0, m)
 
 
 def _last_axes(m: Array) -> tuple[int, ...]:
@@ -163,11 +119,6 @@ def diag(v: Array, k: int = 0) -> Any:
 
 
 @numpy_function()
-def diagflat(v: Array, k: int = 0) -> Any:
-    return diag(ravel(v), k)
-
-
-@numpy_function()
 def meshgrid(*xi: Array, indexing: Any = "xy", sparse: Any = False, copy: Any = True) -> list[Any]:
     for x in xi:
         x.row_axes(None)
@@ -176,11 +127,6 @@ def meshgrid(*xi: Array, indexing: Any = "xy", sparse: Any = False, copy: Any = 
     order = [1, 0, *range(2, len(xi))] if indexing == "xy" and len(xi) > 1 else list(range(len(xi)))
     grids = [x[tuple(ALL if j == i else None for j in order)] for i, x in enumerate(flat)]
     return grids if sparse else FUNCTIONS["broadcast_arrays"](*grids)
-
-
-@numpy_function("ix_")
-def ix_(*args: Array) -> tuple[Any, ...]:
-    return tuple(x[tuple(ALL if j == i else None for j in range(len(args)))] for i, x in enumerate(args))
 
 
 @numpy_function()
@@ -192,13 +138,11 @@ def fromfunction(function: Callable[..., Any], shape: Any, *, dtype: Any = "floa
 
 @numpy_function()
 def apply_along_axis(func1d: Callable[..., Any], axis: int, arr: Array, *args: Any, **kwargs: Any) -> Any:
-    """Apply a function to each series along an axis. It is called once for all rows, and once for each entry of the other axes."""
+    """Apply a function to each series along an axis. It is called once for all rows, for each entry of the other axes."""
     (at,) = arr.row_axes(axis)
     lead = [i for i in range(arr.ndim) if i not in (at, arr.batch_axis)]
     if at != arr.ndim - 1 or (arr.batch_axis is not None and (arr.batch_axis or arr.row_shape[0] != 1)):
-        raise RefusedError(
-            "E-NUMPY", "np.apply_along_axis is available along the last axis: write the function with axis=-1"
-        )
+        raise RefusedError("E-NUMPY", "np.apply_along_axis works along the last axis: use axis=-1")
     in_row = Array(arr.node, None).reshaped((-1, arr.row_shape[at]), None)  # arrays of one row, without a batch axis
     series = [as_array(func1d(in_row[i], *args, **kwargs)) for i in range(in_row.row_shape[0])]
     results = stack(series, 0)
@@ -249,3 +193,26 @@ def indices(dimensions: Any, dtype: Any = "int") -> Array:
     sizes = [operator.index(n) for n in dimensions]
     current_builder().check_size([*sizes, len(sizes)])
     return astype(np.indices(sizes), dtype)
+
+
+array_functions(
+    {
+        "copy": lambda a: a.copy(),
+        "zeros_like": lambda a, dtype=None, shape=None: full_like(a, 0, dtype, shape),
+        "ones_like": lambda a, dtype=None, shape=None: full_like(a, 1, dtype, shape),
+        "tril": lambda m, k=0: elementwise("where", tri(*_last_axes(m), operator.index(k), "bool"), m, 0),
+        "triu": lambda m, k=0: elementwise("where", tri(*_last_axes(m), operator.index(k) - 1, "bool"), 0, m),
+        "diagflat": lambda v, k=0: diag(ravel(v), operator.index(k)),
+        "ix_": lambda *args: tuple(
+            x[tuple(ALL if j == i else None for j in range(len(args)))] for i, x in enumerate(args)
+        ),
+    }
+)
+numpy_functions(
+    {
+        "astype": astype,
+        "identity": lambda n, dtype="float": eye(operator.index(n), dtype=dtype),
+        "zeros": lambda shape, dtype="float": full(shape, 0, dtype),
+        "ones": lambda shape, dtype="float": full(shape, 1, dtype),
+    }
+)

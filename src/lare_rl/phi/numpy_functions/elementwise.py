@@ -9,16 +9,10 @@ from typing import Any
 import numpy as np
 
 from lare_rl.phi.arrays import Array, as_array, concatenate, elementwise, invert, power
+from lare_rl.phi.graph import ELEMENTWISE
 from lare_rl.phi.indices import ALL
-from lare_rl.phi.kinds import ELEMENTWISE
 from lare_rl.phi.limits import RefusedError
-from lare_rl.phi.numpy_functions.registry import (
-    UFUNCS,
-    as_numbers,
-    as_operand,
-    call_numpy,
-    numpy_function,
-)
+from lare_rl.phi.numpy_functions.registry import UFUNCS, as_numbers, as_operand, call_numpy, numpy_function
 from lare_rl.phi.operand import Operand
 
 UNARY = frozenset(
@@ -49,28 +43,21 @@ for _op in ELEMENTWISE:
     _register_ufunc(_op, lambda *x, op=_op: elementwise(op, *x))
 UNARY |= {"square", "reciprocal", "positive", "degrees", "radians", "rad2deg", "deg2rad", "bitwise_not", "invert", "isneginf",
           "isposinf", "conj", "conjugate", "real", "bitwise_invert"}  # fmt: skip
-for _name, _function in {
-    "power": power,
-    "pow": power,
+for _names, _function in {
+    "power pow": power,
     "float_power": lambda x, y: power(elementwise("multiply", x, 1.0), y),
     "square": lambda x: elementwise("multiply", x, x),
     "reciprocal": lambda x: elementwise("divide", 1.0, x),
-    "positive": lambda x: x,
-    "conj": lambda x: x,
-    "conjugate": lambda x: x,
-    "real": lambda x: x,
-    "degrees": lambda x: elementwise("multiply", x, 180 / math.pi),
-    "rad2deg": lambda x: elementwise("multiply", x, 180 / math.pi),
-    "radians": lambda x: elementwise("multiply", x, math.pi / 180),
-    "deg2rad": lambda x: elementwise("multiply", x, math.pi / 180),
-    "bitwise_not": invert,
-    "invert": invert,
-    "bitwise_invert": invert,
+    "positive conj conjugate real": lambda x: x,
+    "degrees rad2deg": lambda x: elementwise("multiply", x, 180 / math.pi),
+    "radians deg2rad": lambda x: elementwise("multiply", x, math.pi / 180),
+    "bitwise_not invert bitwise_invert": invert,
     "isposinf": lambda x: elementwise("equal", x, math.inf),
     "isneginf": lambda x: elementwise("equal", x, -math.inf),
     "ldexp": lambda x, n: elementwise("multiply", x, elementwise("exp2", n)),
 }.items():
-    _register_ufunc(_name, _function)
+    for _name in _names.split():
+        _register_ufunc(_name, _function)
 
 
 # --- functions that are made of others ----------------------------------------------------------------------------------

@@ -9,7 +9,6 @@ from typing import Any
 import numpy as np
 
 from lare_rl.phi.arrays import Array, as_array, elementwise
-from lare_rl.phi.batch import BATCH, BatchSize
 from lare_rl.phi.builder import current_builder
 from lare_rl.phi.graph import all_positions
 from lare_rl.phi.indices import ALL
@@ -18,12 +17,13 @@ from lare_rl.phi.numpy_functions.registry import (
     FUNCTIONS,
     array_functions,
     numpy_function,
+    numpy_functions,
     require_constant,
 )
 from lare_rl.phi.numpy_functions.shapes import ravel, split_shape
+from lare_rl.phi.operand import BATCH, BatchSize
 
 
-@numpy_function()
 def flip(m: Array, axis: Any = None) -> Array:
     axes = m.row_axes(axis)
     return m.rearranged(lambda positions: np.flip(positions, axes), m.batch_axis)
@@ -97,7 +97,7 @@ def pad(array: Array, pad_width: Any, mode: Any = "constant", *, constant_values
         return array.rearranged(lambda positions: np.pad(positions, widths, mode), array.batch_axis)
     if mode != "constant":
         raise RefusedError(
-            "E-NUMPY", f"np.pad with mode={str(mode)[:40]!r}: use constant, edge, reflect, symmetric or wrap"
+            "E-NUMPY", f"np.pad, mode={str(mode)[:40]!r}: use constant, edge, reflect, symmetric or wrap"
         )
     builder = current_builder()
     fill = as_array(constant_values)
@@ -128,23 +128,8 @@ def _along_axis(arr: Array, indices: Array, axis: Any) -> tuple[Any, ...]:
 
 
 @numpy_function()
-def take_along_axis(arr: Array, indices: Array, axis: Any = -1) -> Any:
-    return arr[_along_axis(arr, indices, axis)]
-
-
-@numpy_function()
-def put_along_axis(arr: Array, indices: Array, values: Any, axis: Any) -> None:
-    arr[_along_axis(arr, indices, axis)] = values
-
-
-@numpy_function()
 def copyto(dst: Array, src: Any, casting: Any = "same_kind", where: Any = True) -> None:
     dst[...] = src if where is True else elementwise("where", where, src, dst)
-
-
-@numpy_function("putmask", "place")
-def putmask(a: Array, mask: Array, values: Any) -> None:
-    copyto(a, values, where=mask)
 
 
 @numpy_function()
@@ -175,4 +160,19 @@ def sliding_window_view(x: Array, window_shape: Any, axis: Any = None) -> Array:
     return x.rearranged(lambda positions: windows(positions, sizes, axes).copy(), x.batch_axis)
 
 
-array_functions({"fliplr": lambda m: flip(m, 1), "flipud": lambda m: flip(m, 0)})
+array_functions(
+    {
+        "flip": flip,
+        "fliplr": lambda m: flip(m, 1),
+        "flipud": lambda m: flip(m, 0),
+        "take_along_axis": lambda arr, indices, axis=-1: arr[_along_axis(arr, indices, axis)],
+    }
+)
+numpy_functions(
+    {
+        "put_along_axis": lambda arr, indices, values, axis: as_array(arr).__setitem__(
+            _along_axis(as_array(arr), as_array(indices), axis), values
+        ),
+        "putmask place": lambda a, mask, values: copyto(as_array(a), values, where=as_array(mask)),
+    }
+)

@@ -1,7 +1,8 @@
-"""Products and convolutions."""
+"""Products, convolutions, norms, and the linear algebra of small matrices."""
 
 from __future__ import annotations
 
+import functools
 import math
 import re
 import string
@@ -9,19 +10,19 @@ from typing import Any
 
 import numpy as np
 
-from lare_rl.phi.arrays import Array, as_array, elementwise, stack
+from lare_rl.phi.arrays import Array, as_array, elementwise, power, stack
 from lare_rl.phi.builder import current_builder
 from lare_rl.phi.indices import ALL
-from lare_rl.phi.limits import (
-    MAX_EINSUM_ARRAYS,
-    RefusedError,
-)
+from lare_rl.phi.limits import MAX_EINSUM_ARRAYS, MAX_INVERSE_SIZE, MAX_MATRIX_POWER, RefusedError
 from lare_rl.phi.numpy_functions.positions import diagonal
 from lare_rl.phi.numpy_functions.reductions import along
 from lare_rl.phi.numpy_functions.registry import (
     FUNCTIONS,
     array_functions,
+    as_arrays,
+    as_numbers,
     numpy_function,
+    numpy_functions,
     require_constant,
 )
 from lare_rl.phi.numpy_functions.shapes import ravel
@@ -40,7 +41,7 @@ def einsum(subscripts: Any, *operands: Array, optimize: Any = False) -> Array:
     output = [letter for letter in compact.partition("->")[2] if letter != "."]
     if not PATTERN.fullmatch(compact) or len(set(output)) < len(output) or len(operands) > MAX_EINSUM_ARRAYS:
         raise RefusedError(
-            "E-NUMPY", f"np.einsum({subscripts[:40]!r}): use at most 8 arrays and 20 letters, such as 'bij,bj->bi'"
+            "E-NUMPY", f"np.einsum({subscripts[:40]!r}): use at most 8 arrays and 20 letters: 'bij,bj->bi'"
         )
     inputs, arrow, result = compact.partition("->")
     terms = inputs.split(",")
@@ -56,9 +57,8 @@ def einsum(subscripts: Any, *operands: Array, optimize: Any = False) -> Array:
         for a, term in zip(operands, terms, strict=True)
     ]
     if any(len(term) != a.ndim for a, term in zip(operands, terms, strict=True)):
-        raise ValueError(
-            f"np.einsum({subscripts!r}) does not fit the shapes {' and '.join(str(a.shape) for a in operands)}"
-        )
+        shapes = " and ".join(str(a.shape) for a in operands)
+        raise ValueError(f"np.einsum({subscripts!r}) does not fit the shapes {shapes}")
     arrays, letters = [], []
     for a, term in zip(operands, terms, strict=True):  # NumPy broadcasts axes of length 1 behind the dots
         single = [i for i, c in enumerate(term) if c in dots and a.row_shape[i] == 1 and i != a.batch_axis]
@@ -145,10 +145,7 @@ def trace(a: Array, offset: int = 0, axis1: Any = None, axis2: Any = None) -> An
 
 def _correlate(a: Array, v: Array, mode: str, reverse: bool) -> Any:
     if a.ndim != 1 or v.ndim != 1 or a.batch_axis is not None or v.batch_axis is not None:
-        raise RefusedError(
-            "E-ROWS",
-            "np.convolve takes one series, not a batch: sum shifted slices, or use sliding_window_view along axis 1",
-        )
+        raise RefusedError("E-ROWS", "np.convolve takes one series, not a batch: use sliding_window_view along axis 1")
     if len(v.row_shape) and v.row_shape[0] > a.row_shape[0] and reverse:
         a, v = v, a
     n, m = a.row_shape[0], v.row_shape[0]
@@ -171,3 +168,135 @@ array_functions(
         "correlate": lambda a, v, mode="valid": _correlate(a, v, mode, reverse=False),
     }
 )
+
+
+# --- linear algebra --------------------------------------------------------------------------------------------------
+
+
+@numpy_function("linalg.norm")
+def norm(x: Array, ord: Any = None, axis: Any = None, keepdims: Any = False) -> Any:  # noqa: A002
+    x = as_numbers(x)
+    axes = x.row_axes(axis)
+    if len(axes) > 1 and ord is not None:
+        return _matrix_norm(x, ord, axes, keepdims)
+    magnitude = elementwise("abs", x)
+    if ord in (None, 2):
+        return elementwise("sqrt", along("sum", elementwise("multiply", x, x), axis, keepdims))
+    if ord in (math.inf, -math.inf):
+        return along("max" if ord > 0 else "min", magnitude, axis, keepdims)
+    if ord == 0:
+        return elementwise("multiply", FUNCTIONS["count_nonzero"](x, axis, keepdims=keepdims), 1.0)
+    return power(along("sum", power(magnitude, ord), axis, keepdims), 1 / float(ord))
+
+
+def _matrix_norm(x: Array, order: Any, axes: tuple[int, ...], keepdims: Any) -> Any:
+    """Frobenius' norm, or the largest sum of magnitudes of a column or of a row."""
+    if order == "fro":
+        return elementwise("sqrt", along("sum", elementwise("multiply", x, x), axes, keepdims))
+    if order in (1, -1, math.inf, -math.inf):
+        summed, other = axes if abs(order) == 1 else axes[::-1]
+        sums = along("sum", elementwise("abs", x), summed, True)
+        result = along("max" if order > 0 else "min", sums, other, True)
+        return result if keepdims else result[tuple(0 if i in axes else ALL for i in range(x.ndim))]
+    raise RefusedError("E-NUMPY", f"np.linalg.norm of matrices, ord={order!r}: use 'fro', 1 or np.inf")
+
+
+def _check_square(a: Array, name: str) -> int:
+    if a.ndim < 2 or a.row_shape[-1] != a.row_shape[-2] or a.batch_axis in (a.ndim - 1, a.ndim - 2):
+        raise ValueError(f"np.linalg.{name} needs square matrices in the last two axes: the shape is {a.shape}")
+    return a.row_shape[-1]
+
+
+@numpy_function("linalg.det")
+def det(a: Array) -> Array:
+    _check_square(a, "det")
+    return Array(current_builder().det(a.node), a.batch_axis)
+
+
+@numpy_function("linalg.inv")
+def inv(a: Array) -> Any:
+    """Return the inverse: by NumPy of a constant, else by cofactors. It is not finite if the matrix is singular."""
+    n = _check_square(a, "inv")
+    if a.constant is not None:
+        current_builder().spend(n * math.prod(a.row_shape))
+        return as_array(np.linalg.inv(a.constant))
+    if n > MAX_INVERSE_SIZE:
+        raise RefusedError("E-NUMPY", f"np.linalg.inv: at most {MAX_INVERSE_SIZE} x {MAX_INVERSE_SIZE} numbers")
+    if n == 1:
+        return elementwise("divide", 1.0, a)
+
+    def cofactor(i: int, j: int) -> Any:
+        rest = a[..., [k for k in range(n) if k != i], :][..., [k for k in range(n) if k != j]]
+        return elementwise("multiply", det(rest), (-1.0) ** (i + j))
+
+    adjugate = stack([stack([cofactor(i, j) for i in range(n)], -1) for j in range(n)], -2)
+    return elementwise("divide", adjugate, det(a)[..., None, None])
+
+
+@numpy_function("linalg.matrix_power")
+def matrix_power(a: Array, n: int) -> Any:
+    size = _check_square(a, "matrix_power")
+    base = inv(a) if n < 0 else a
+    if abs(n) > MAX_MATRIX_POWER:
+        raise RefusedError("E-COST", f"np.linalg.matrix_power: at most {MAX_MATRIX_POWER}")
+    if n == 0:
+        return FUNCTIONS["broadcast_to"](as_array(np.eye(size)), a.shape)
+    result = base
+    for _ in range(abs(n) - 1):
+        result = matmul(result, base)
+    return result
+
+
+@numpy_function("linalg.eigvalsh")
+def eigvalsh(a: Array, UPLO: Any = "L") -> Any:  # noqa: N803
+    """Return the eigenvalues of symmetric matrices of at most 3 x 3 numbers, in rising order; of a constant, by NumPy.
+
+    For 3 x 3: O. K. Smith, Eigenvalues of a symmetric 3 x 3 matrix, Communications of the ACM 4(4), 1961.
+    """
+    n = _check_square(a, "eigvalsh")
+    if a.constant is not None:
+        current_builder().spend(10 * n * math.prod(a.row_shape))
+        return as_array(np.linalg.eigvalsh(a.constant, UPLO))
+    if n > 3:
+        raise RefusedError("E-NUMPY", "np.linalg.eigvalsh of matrices larger than 3 x 3 is not available")
+    if n == 1:
+        return a[..., 0]
+    if n == 3:
+        return _eigenvalues_3x3(a, UPLO)
+    off = a[..., 1, 0] if UPLO == "L" else a[..., 0, 1]
+    middle = (a[..., 0, 0] + a[..., 1, 1]) / 2
+    radius = elementwise("hypot", (a[..., 0, 0] - a[..., 1, 1]) / 2, off)
+    return stack([middle - radius, middle + radius], -1)
+
+
+def _eigenvalues_3x3(a: Array, uplo: Any) -> Any:
+    rows, columns = ([1, 2, 2], [0, 0, 1]) if uplo == "L" else ([0, 0, 1], [1, 2, 2])
+    diagonals = diagonal(a, 0, a.ndim - 2, a.ndim - 1)
+    off = a[..., rows, columns]
+    middle = FUNCTIONS["mean"](diagonals, -1, keepdims=True)
+    centered = elementwise("subtract", diagonals, middle)
+    square = along("sum", elementwise("multiply", centered, centered), -1, True)
+    radius = elementwise("sqrt", (square + 2 * along("sum", elementwise("multiply", off, off), -1, True)) / 6)
+    scale = elementwise("where", elementwise("equal", radius, 0), 1.0, radius)
+    d, e = centered / scale, elementwise("divide", off, scale)
+    determinant = (
+        d[..., 0:1] * d[..., 1:2] * d[..., 2:3] + 2 * e[..., 0:1] * e[..., 1:2] * e[..., 2:3]
+        - d[..., 0:1] * e[..., 2:3] ** 2 - d[..., 1:2] * e[..., 1:2] ** 2 - d[..., 2:3] * e[..., 0:1] ** 2
+    )  # fmt: skip
+    angle = elementwise("arccos", FUNCTIONS["clip"](determinant / 2, -1.0, 1.0)) / 3
+    turns = as_array(np.array([2, -2, 0]) * math.pi / 3)  # from the smallest to the largest
+    return middle + 2 * radius * elementwise("cos", elementwise("add", angle, turns))
+
+
+def _sign_and_log(value: Array) -> tuple[Any, Any]:
+    return elementwise("sign", value), elementwise("log", elementwise("abs", value))
+
+
+array_functions(
+    {
+        "linalg.vector_norm": lambda x, *, axis=None, keepdims=False, ord=2: norm(x, ord, axis, keepdims),  # noqa: A006
+        "linalg.slogdet": lambda a: _sign_and_log(det(a)),
+        "linalg.solve": lambda a, b: matmul(inv(a), b),
+    }
+)
+numpy_functions({"linalg.multi_dot": lambda arrays: functools.reduce(matmul, as_arrays(arrays))})

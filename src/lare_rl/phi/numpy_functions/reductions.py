@@ -8,16 +8,11 @@ from typing import Any
 
 from lare_rl.phi.arrays import Array, as_array, broadcast, elementwise
 from lare_rl.phi.builder import current_builder
+from lare_rl.phi.graph import ELEMENTWISE
 from lare_rl.phi.indices import ALL
-from lare_rl.phi.kinds import ELEMENTWISE
 from lare_rl.phi.limits import RefusedError
 from lare_rl.phi.numpy_functions.elementwise import UNARY
-from lare_rl.phi.numpy_functions.registry import (
-    FUNCTIONS,
-    array_functions,
-    as_numbers,
-    numpy_function,
-)
+from lare_rl.phi.numpy_functions.registry import FUNCTIONS, array_functions, as_numbers, numpy_function
 
 UFUNC_REDUCTIONS = {
     "add": "sum", "multiply": "prod", "maximum": "max", "minimum": "min", "logical_and": "all", "logical_or": "any",

@@ -1,7 +1,8 @@
 """The functions of NumPy that a program can call, by name. Nothing else of NumPy can be reached.
 
-A function is registered with NumPy's name and parameters. Its annotations say what its arguments are converted to: an `Array`, an
-`Operand` (an array or x[mask]), a list of arrays, an int, a float. `out=` and `dtype=` are handled here for all functions.
+A function is registered with NumPy's name and parameters. Its annotations say what its arguments are converted to: an
+`Array`, an `Operand` (an array or x[mask]), a list of arrays, an int, a float. `out=` and `dtype=` are handled here for all
+functions.
 """
 
 from __future__ import annotations
@@ -16,6 +17,7 @@ from lare_rl.phi.builder import current_builder
 from lare_rl.phi.graph import Kind
 from lare_rl.phi.limits import RefusedError
 from lare_rl.phi.operand import Operand
+from lare_rl.phi.values import describe
 
 Function = Callable[..., Any]
 
@@ -30,7 +32,7 @@ KIND_OF_DTYPE: dict[str, Kind] = {
     ),
     **dict.fromkeys("bool bool_ ?".split(), "bool"),
 }
-"""The kinds of NumPy's types. Their precision is not followed: all numbers are float32, int32 or bool when a graph is computed."""
+"""The kinds of NumPy's types. Their precision is ignored: all numbers are float32, int32 or bool when a graph is computed."""
 
 IGNORED = frozenset("order casting subok copy like device".split())
 """Arguments of NumPy that change no number."""
@@ -63,13 +65,19 @@ def numpy_function(*names: str) -> Callable[[Function], Function]:
     return register
 
 
-def array_functions(table: Mapping[str, Function]) -> None:
-    """Register functions under names that are separated by spaces. Arguments without a default are converted to arrays."""
+def numpy_functions(table: Mapping[str, Function], converts: bool = False) -> None:
+    """Register functions under names that are separated by spaces. `converts`: arguments without a default become arrays."""
     for names, function in table.items():
-        for name in names.split():
-            numpy_function(name)(function)
-            parameters = _SIGNATURES[name].parameters
-            _CONVERTERS[name] = {key: as_array for key, p in parameters.items() if p.default is p.empty}
+        numpy_function(*names.split())(function)
+        if converts:
+            parameters = inspect.signature(function).parameters
+            converters = {key: as_array for key, p in parameters.items() if p.default is p.empty}
+            _CONVERTERS.update(dict.fromkeys(names.split(), converters))
+
+
+def array_functions(table: Mapping[str, Function]) -> None:
+    """Register functions whose arguments without a default become arrays."""
+    numpy_functions(table, converts=True)
 
 
 def call_numpy(name: str, args: Sequence[Any], kwargs: Mapping[str, Any]) -> Any:
@@ -91,9 +99,7 @@ def call_numpy(name: str, args: Sequence[Any], kwargs: Mapping[str, Any]) -> Any
             bound.arguments[key] = tuple(map(converters[key], value)) if several else converters[key](value)
     out, dtype = kwargs.get("out"), kwargs.get("dtype")
     if out is None and arguments.get("where", True) is not True and name in UFUNCS:
-        raise RefusedError(
-            "E-NUMPY", f"np.{name} with where= needs out=: without it, NumPy returns memory that nobody has written"
-        )
+        raise RefusedError("E-NUMPY", f"np.{name} with where= needs out=, or the other numbers are undefined")
     result = FUNCTIONS[name](*bound.args, **bound.kwargs)
     if dtype is not None and "dtype" not in signature.parameters:
         result = astype(result, dtype)
@@ -125,7 +131,7 @@ def as_arrays(values: Any) -> list[Array]:
 
 def as_float(value: Any) -> float:
     if not isinstance(value, (bool, int, float, Array)):
-        raise TypeError(f"a number is needed, not a {type(value).__name__}")
+        raise TypeError(f"a number is needed, not {describe(value)}")
     return float(value)
 
 

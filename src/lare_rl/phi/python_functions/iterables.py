@@ -10,9 +10,7 @@ from typing import Any
 
 from lare_rl.phi.arrays import Array
 from lare_rl.phi.limits import RefusedError
-from lare_rl.phi.meter import check_key
-from lare_rl.phi.python_functions.registry import BUILTINS, builtin, varies
-from lare_rl.phi.runtime import Runtime
+from lare_rl.phi.runtime import BUILTINS, Runtime, builtin, check_key, varies
 from lare_rl.phi.text import format_value
 from lare_rl.phi.values import Bound, Class, Iterator, Set, Symbol
 

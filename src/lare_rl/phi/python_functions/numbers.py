@@ -9,13 +9,10 @@ from collections.abc import Callable
 from typing import Any
 
 from lare_rl.phi.arrays import Array
-from lare_rl.phi.batch import BatchSize
 from lare_rl.phi.limits import RefusedError
-from lare_rl.phi.meter import check_number
 from lare_rl.phi.numpy_functions import call_numpy
-from lare_rl.phi.operand import Operand
-from lare_rl.phi.python_functions.registry import BUILTINS, builtin, varies
-from lare_rl.phi.runtime import Runtime
+from lare_rl.phi.operand import BatchSize, Operand
+from lare_rl.phi.runtime import BUILTINS, Runtime, builtin, check_number, varies
 
 SAME_IN_NUMPY = {
     "fabs": "abs", "pow": "power", "atan2": "arctan2", "asin": "arcsin", "acos": "arccos", "atan": "arctan",

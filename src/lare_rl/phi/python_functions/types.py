@@ -7,10 +7,8 @@ import numpy as np
 
 from lare_rl.phi.arrays import as_array
 from lare_rl.phi.limits import RefusedError
-from lare_rl.phi.meter import check_text
 from lare_rl.phi.numpy_functions.registry import KIND_OF_DTYPE, astype, dtype_kind, dtype_name
-from lare_rl.phi.python_functions.registry import BUILTINS, builtin
-from lare_rl.phi.runtime import Runtime
+from lare_rl.phi.runtime import BUILTINS, Runtime, builtin, check_text
 from lare_rl.phi.text import format_value
 from lare_rl.phi.values import Bound, Class, Function, Instance, Symbol, value_type
 

@@ -13,7 +13,8 @@ def distances(
 ) -> Float[Array, "observers targets"]:
     """Return the distances between the centres of observers and targets; infinite from an entity to itself."""
     offset = slice_rows(position, targets) - slice_rows(position, observers)[:, None]
-    return jnp.where(_is_same(observers, targets), jnp.inf, jnp.sqrt(jnp.sum(offset**2, axis=-1)))
+    is_same = np.asarray(observers)[:, None] == np.asarray(targets)
+    return jnp.where(is_same, jnp.inf, jnp.sqrt(jnp.sum(offset**2, axis=-1)))
 
 
 def nearest_entities(
@@ -27,18 +28,11 @@ def nearest_entities(
 def relative_positions(
     position: Float[Array, "entities 2"], observers: range, entities: Int[Array, "observers count"]
 ) -> Float[Array, "observers count 2"]:
-    """Return the positions of entities relative to each observer."""
     return position[entities] - slice_rows(position, observers)[:, None]
 
 
 def slice_rows(values: Float[Array, "entities 2"], entities: range) -> Float[Array, "range 2"]:
-    """Return the rows of a range of entities."""
     return values[entities.start : entities.stop]
-
-
-def _is_same(observers: range, targets: range) -> np.ndarray:
-    """Return where observer and target are the same entity."""
-    return np.asarray(observers)[:, None] == np.asarray(targets)
 
 
 def concatenate_rows(*arrays: Float[Array, "observers ..."]) -> Float[Array, "observers observation"]:

@@ -1,0 +1,244 @@
+"""Stable-Baselines3, sb3-contrib and SBX: replay buffers and a callback that replace rewards by r_hat.
+
+    from lare_rl.integrations.sb3 import CreditCallback, CreditReplayBuffer
+
+    TD3("MlpPolicy", env, replay_buffer_class=CreditReplayBuffer, replay_buffer_kwargs={"credit": credit})   # or SAC, DQN, TQC, ...
+    PPO("MlpPolicy", env).learn(1_000_000, callback=CreditCallback(credit))                              # or A2C, TRPO, ...
+
+The environment's rewards are unchanged, so that the returns that are logged and evaluated are the true ones.
+"""
+
+import re
+from copy import deepcopy
+from typing import Any
+
+import numpy as np
+from gymnasium import spaces
+from jaxtyping import Float, Int
+
+from lare_rl.assigner.assigner import CreditAssigner
+from lare_rl.errors import LareError, install_command, missing_extra_error
+from lare_rl.integrations.recorder import StepRecorder, check_assigner, check_capacity
+
+try:
+    import stable_baselines3
+except ImportError:
+    raise missing_extra_error("lare_rl.integrations.sb3", "sb3") from None
+if [int(number) for number in re.findall(r"\d+", stable_baselines3.__version__)[:2]] < [2, 9]:
+    raise LareError(
+        f"lare_rl.integrations.sb3 needs stable-baselines3 2.9 or later, and {stable_baselines3.__version__} is installed: "
+        f"{install_command('sb3')} --upgrade"
+    )
+
+from stable_baselines3.common.buffers import DictReplayBuffer, NStepReplayBuffer, ReplayBuffer
+from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.her.her_replay_buffer import HerReplayBuffer
+
+__all__ = ["CreditCallback", "CreditDictReplayBuffer", "CreditNStepReplayBuffer", "CreditReplayBuffer"]
+
+_HER_ARGUMENTS = {"n_sampled_goal", "goal_selection_strategy", "copy_info_dict"}
+"""Arguments that only `HerReplayBuffer` has."""
+
+
+class CreditReplayBuffer(ReplayBuffer):
+    """A replay buffer that samples steps with r_hat as their rewards, by the newest decoder.
+
+    It shows every step to the assigner, with actions in the environment's units and, under VecNormalize, with the observations and
+    rewards before they were normalised. r_hat is not divided by VecNormalize's scale, which is that of the environment's rewards.
+    """
+
+    def __init__(
+        self,
+        buffer_size: int,
+        observation_space: spaces.Space,
+        action_space: spaces.Space,
+        *args: Any,
+        credit: CreditAssigner | None = None,
+        **kwargs: Any,
+    ):
+        """Create an empty buffer. The algorithm does this; other arguments are those of Stable-Baselines3's buffer.
+
+        Args:
+            buffer_size: number of steps of all environments together.
+            observation_space: the space of one environment.
+            action_space: the space of one environment.
+            credit: the assigner, from `replay_buffer_kwargs`. Its capacity must be at least `buffer_size`.
+
+        Raises:
+            LareError: there is no assigner, it is too small or was made for other spaces, or another class of buffer is needed.
+        """
+        name = type(self).__name__
+        if credit is None:
+            raise LareError(f"{name} needs an assigner: replay_buffer_kwargs={{'credit': credit}}")
+        if isinstance(self, HerReplayBuffer) or not _HER_ARGUMENTS.isdisjoint(kwargs):
+            raise LareError(f"{name} cannot relabel goals, whose rewards come from compute_reward: use HerReplayBuffer")
+        if isinstance(observation_space, spaces.Dict) != isinstance(self, DictReplayBuffer):
+            other = "CreditReplayBuffer" if isinstance(self, DictReplayBuffer) else "CreditDictReplayBuffer"
+            raise LareError(f"{name} cannot store observations of {observation_space}: use {other}")
+        super().__init__(buffer_size, observation_space, action_space, *args, **kwargs)
+        check_capacity(credit, self.buffer_size * self.n_envs)
+        self.steps = np.full((self.buffer_size, self.n_envs), -1)  # the assigner's numbers; -1 if there is no step yet
+        self._connect(credit)
+
+    @property
+    def credit(self) -> CreditAssigner:
+        """The assigner. After the buffer was loaded, it is not the object that was given."""
+        return self._recorder.credit
+
+    def add(
+        self,
+        obs: Any,
+        next_obs: Any,
+        action: np.ndarray,
+        reward: np.ndarray,
+        done: np.ndarray,
+        infos: list[dict[str, Any]],
+    ) -> None:
+        """Add one step of each environment, as Stable-Baselines3 gives it: Box actions between -1 and 1, nothing normalised."""
+        env_action = action.reshape(self.n_envs, *(self.action_space.shape or ()))
+        if isinstance(self.action_space, spaces.Box):
+            low, high = self.action_space.low, self.action_space.high
+            env_action = low + (0.5 * (env_action + 1.0) * (high - low))  # as `BasePolicy.unscale_action`
+        # `done` includes time limits, and the assigner learns from both kinds of ends in the same way.
+        self.steps[self.pos] = self._recorder.add(obs, env_action, next_obs, reward, done, np.zeros_like(done))
+        super().add(obs, next_obs, action, reward, done, infos)
+
+    def sample(self, batch_size: int, env: Any = None) -> Any:
+        """Sample random rows with r_hat, after the decoder's pending updates."""
+        self.credit.fit_pending()
+        return super().sample(batch_size, env)
+
+    @staticmethod
+    def _normalize_reward(reward: np.ndarray, env: Any = None) -> np.ndarray:
+        return reward
+
+    def _connect(self, credit: CreditAssigner) -> None:
+        env_ids = [object() for _ in range(self.n_envs)]
+        self._recorder = StepRecorder(credit, self.observation_space, self.action_space, env_ids)
+        self.rewards = _ProxyRewards(credit, self.steps)  # pyright: ignore[reportAttributeAccessIssue]
+
+    def __getstate__(self) -> dict[str, Any]:
+        state = {name: value for name, value in vars(self).items() if name not in ("_recorder", "rewards")}
+        return state | {"credit": self.credit.get_state(episodes=True)}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        credit = CreditAssigner.__new__(CreditAssigner)
+        credit.__setstate__(state.pop("credit"))
+        vars(self).update(state)
+        self._connect(credit)
+
+
+class CreditDictReplayBuffer(CreditReplayBuffer, DictReplayBuffer):
+    """`CreditReplayBuffer` for observations of a Dict space."""
+
+
+class CreditNStepReplayBuffer(CreditReplayBuffer, NStepReplayBuffer):
+    """`CreditReplayBuffer` for returns of n steps: `replay_buffer_kwargs={"credit": credit, "n_steps": 3, "gamma": 0.99}`.
+
+    Each of the n steps has r_hat by the newest decoder. An algorithm's own argument `n_steps` does not change the buffer.
+    """
+
+
+class _ProxyRewards:
+    """Replaces a buffer's array of rewards. Reading rows computes r_hat by the newest decoder."""
+
+    def __init__(self, credit: CreditAssigner, steps: Int[np.ndarray, "rows environments"]):
+        self.credit, self.steps = credit, steps
+
+    def __getitem__(self, index: Any) -> Float[np.ndarray, "*shape"]:
+        return self.credit.rewards_at(self.steps[index])
+
+    def __setitem__(self, index: Any, value: Any) -> None:
+        """Ignore the environment's rewards, which Stable-Baselines3 writes here."""
+
+
+class CreditCallback(BaseCallback):
+    """Gives r_hat to an algorithm that learns from rollouts: `model.learn(steps, callback=CreditCallback(credit))`.
+
+    It shows every step to the assigner. When a rollout is complete, it fits the decoder and sets the rewards, before advantages are
+    computed. The gamma V(s') that the algorithm adds at a time limit is kept. Later callbacks in a list see rewards of 0.
+    """
+
+    def __init__(self, credit: CreditAssigner, updates: int = 500, verbose: int = 0):
+        """Create a callback for `learn`.
+
+        Args:
+            credit: the assigner. Its capacity must be at least the number of steps of a rollout, over all environments.
+            updates: gradient updates of the decoder after each rollout. A closed-form decoder is fitted once.
+            verbose: as in every callback of Stable-Baselines3.
+        """
+        super().__init__(verbose)
+        check_assigner(credit)
+        self.credit, self.updates = credit, updates
+        self.steps: list[Int[np.ndarray, " environments"]] = []  # the numbers of the steps of this rollout
+
+    def _on_training_start(self) -> None:
+        buffer = getattr(self.model, "rollout_buffer", None)
+        if buffer is None:
+            name = type(self.model).__name__
+            raise LareError(
+                f"CreditCallback needs rollouts, and {name} has a replay buffer: "
+                f"{name}(..., replay_buffer_class=CreditReplayBuffer, replay_buffer_kwargs={{'credit': credit}})"
+            )
+        check_capacity(self.credit, buffer.buffer_size * buffer.n_envs)
+        # The keys belong to the model, so that a second call of `learn` continues the running episodes.
+        env_ids = [(id(self.model), env_index) for env_index in range(buffer.n_envs)]
+        self._recorder = StepRecorder(self.credit, self.model.observation_space, self.model.action_space, env_ids)
+        self.steps = []
+        if self.model.num_timesteps == 0:  # every environment was reset
+            for env_index in range(buffer.n_envs):
+                self._recorder.drop(env_index)
+        self._observation = self._original_observation(self.model._last_obs)
+        # The algorithm calls this method between the rollout and the update. No callback is called there.
+        buffer.compute_returns_and_advantage = self._compute_returns_and_advantage
+
+    def _on_training_end(self) -> None:
+        vars(self.model.rollout_buffer).pop("compute_returns_and_advantage", None)  # pyright: ignore[reportAttributeAccessIssue]
+
+    def _on_step(self) -> bool:
+        normalize, values = self.model.get_vec_normalize_env(), self.locals
+        reward = values["rewards"] if normalize is None else normalize.get_original_reward()
+        observation = self._original_observation(values["new_obs"])
+        next_observation = deepcopy(observation)
+        for env_index in np.flatnonzero(values["dones"]):
+            last = values["infos"][env_index].get("terminal_observation")
+            if last is not None:
+                last = last if normalize is None else normalize.unnormalize_obs(last)
+                _set_row(next_observation, env_index, last)
+        env_action = values.get("clipped_actions", values["actions"])  # MaskablePPO does not clip actions
+        done = values["dones"]
+        steps = self._recorder.add(self._observation, env_action, next_observation, reward, done, np.zeros_like(done))
+        self.steps.append(steps)
+        self._observation = observation
+        # The algorithm itself writes this array into its buffer, and adds gamma V(s') to it at time limits.
+        values["rewards"][:] = 0
+        return True
+
+    def _compute_returns_and_advantage(self, last_values: Any, dones: np.ndarray) -> None:
+        """Replace the method of the rollout buffer while the model learns: add r_hat first."""
+        buffer: Any = self.model.rollout_buffer  # pyright: ignore[reportAttributeAccessIssue]
+        steps, self.steps = self.steps, []
+        if len(steps) != buffer.buffer_size:
+            raise LareError(
+                f"CreditCallback saw {len(steps)} of the {buffer.buffer_size} steps of a rollout: "
+                "give it to learn() directly, or in a list, not within another callback"
+            )
+        self.credit.fit(self.updates)
+        buffer.rewards += self.credit.rewards_at(np.stack(steps))
+        for name, value in self.credit.metrics().items():
+            self.logger.record(name, value)
+        type(buffer).compute_returns_and_advantage(buffer, last_values=last_values, dones=dones)
+
+    def _original_observation(self, observation: Any) -> Any:
+        """Return the environment's last observation, before any normalisation."""
+        normalize = self.model.get_vec_normalize_env()
+        return deepcopy(observation) if normalize is None else normalize.get_original_obs()
+
+
+def _set_row(batch: Any, index: Any, element: Any) -> None:
+    """Write an element into a batch, which is an array or a dictionary of arrays."""
+    if isinstance(batch, dict):
+        for key in batch:
+            batch[key][index] = element[key]
+    else:
+        batch[index] = element

@@ -1,0 +1,237 @@
+"""The particle tasks: physics by hand, all tasks beside slow twins, where episodes start, and the scripted prey."""
+
+from functools import cache
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from envs.particles import twin as slow
+from lare_rl.envs.particles.catalogue import TASKS, find_particle_task
+from lare_rl.envs.particles.navigation import N_LAYOUTS, make_layouts
+from lare_rl.envs.particles.predator_prey import SIZES, chase, observe_preys
+from lare_rl.envs.particles.prey import logits, sample_actions, shipped_prey
+from lare_rl.envs.particles.task import MAX_STEPS
+from lare_rl.envs.particles.world import State, at_rest, contact_force, move, push
+from lare_rl.errors import LareError
+
+# The number of agents, the size of an observation, and half the sides of the squares in which moving entities and
+# landmarks start, as the texts of the tasks say.
+EXPECTED = {
+    "CN-6": (6, 26, 1.5, 1.5),
+    "CN-15": (15, 26, 2.2, 2.2),
+    "CN-30": (30, 26, 3.0, 3.0),
+    "PP-6": (6, 28, 1.5, 1.4),
+    "PP-15": (15, 34, 1.0, 0.9),
+    "PP-30": (30, 46, 1.0, 0.9),
+    "CompetitivePP-6": (8, 24, 1.5, 1.4),
+    "TriangleArea": (3, 14, 0.2, 1.5),
+}
+FAR = 50.0
+
+
+def test_catalogue():
+    assert {name: (task.n_agents, task.observation_size) for name, task in TASKS.items()} == {
+        name: values[:2] for name, values in EXPECTED.items()
+    }
+    assert find_particle_task("PP-15").name == "PP-15"
+    for task in TASKS.values():
+        assert [team.start for team in task.teams] == [0, *(team.stop for team in task.teams)][:-1]
+    with pytest.raises(LareError, match=r"no particle task 'CN-60' \(did you mean 'CN-6'\?\).* CN-6, CN-15,"):
+        find_particle_task("CN-60")
+
+
+# Physics by hand
+
+
+def make_state(name: str, *positions: tuple[float, float]) -> State:
+    """Return a state at rest: the first entities at these positions, the others far from them and from each other."""
+    entities = len(TASKS[name].world.size)
+    position = FAR * (1 + np.arange(entities))[:, None] * np.ones(2)
+    position[: len(positions)] = positions
+    return at_rest(jnp.asarray(position, jnp.float32))
+
+
+move_once = jax.jit(move, static_argnums=0)
+
+
+def step(name: str, state: State, *actions: int) -> State:
+    world = TASKS[name].world
+    return move_once(world, state, push(world, jnp.array([*actions, *[0] * (world.n_moving - len(actions))])))
+
+
+def test_velocity_changes_before_position():
+    state = step("CN-6", make_state("CN-6", (0, 0)), 2)
+    np.testing.assert_allclose([state.velocity[0], state.position[0]], [(0.5, 0), (0.05, 0)], rtol=1e-6)
+    state = step("CN-6", state, 2)
+    np.testing.assert_allclose([state.velocity[0], state.position[0]], [(0.875, 0), (0.1375, 0)], rtol=1e-6)
+
+
+def test_directions_of_actions():
+    state = step("CN-6", make_state("CN-6", (0, 0)), 0, 1, 2, 3, 4)
+    np.testing.assert_allclose(state.velocity[:5], [(0, 0), (-0.5, 0), (0.5, 0), (0, -0.5), (0, 0.5)], rtol=1e-6)
+
+
+def test_overlapping_agents_push_each_other():
+    state = step("CN-6", make_state("CN-6", (0, 0), (0.2, 0)))
+    np.testing.assert_allclose(state.velocity[:2], [(-1, 0), (1, 0)], rtol=1e-5)
+    assert state.position[1, 0] - state.position[0, 0] == pytest.approx(0.4)
+    state = step("CN-6", make_state("CN-6", (0, 0), (0, 0)))  # in the same place, they stay finite
+    np.testing.assert_array_equal(state.position[:2], np.zeros((2, 2)))
+
+
+@pytest.mark.parametrize(
+    ("name", "distance", "force"),
+    [
+        ("PP-6", 0.2, 0),  # obstacles push from the distance at which two predators touch
+        ("PP-6", 0.1, -5),
+        ("TriangleArea", 0.5, -5),  # obstacles push from the sum of the radii
+    ],
+)
+def test_contact_with_an_obstacle(name, distance, force):
+    world = TASKS[name].world
+    far = [(FAR * i, 0.0) for i in range(1, world.n_moving)]
+    position = make_state(name, (0.0, 0.0), *far, (distance, 0.0)).position
+    np.testing.assert_allclose(contact_force(world, position)[0], (force, 0), rtol=1e-5, atol=1e-9)
+
+
+def test_speed_limit():
+    state, speeds = make_state("PP-6", (0, 0)), []
+    for _ in range(8):
+        state = step("PP-6", state, 2)
+        speeds.append(float(state.velocity[0, 0]))
+    np.testing.assert_allclose(speeds, [0.3, 0.525, 0.69375, 0.8203125, 0.915234, 0.986426, 1, 1], rtol=1e-6)
+
+
+# Slow twins
+
+
+@pytest.mark.parametrize("name", TASKS)
+def test_task_equals_its_twin(name):
+    task, twin = TASKS[name], slow.TWINS[name]
+    assert slow.learners(twin) == list(range(task.n_agents))
+
+    @jax.jit
+    def advance(state, action, key):
+        next_state = task.step(state, action, key)
+        return task.script(state, key), next_state, task.observe(next_state), task.reward(next_state)
+
+    rng = np.random.default_rng(0)
+    for episode in range(2 if task.n_agents < 10 else 1):
+        state = task.reset(jax.random.key(episode))
+        # The first episode is played in a crowd, where all entities push each other.
+        state = State(state.position / (1 if episode else 3), state.velocity)
+        for key in jax.random.split(jax.random.key(episode), MAX_STEPS):
+            action = rng.integers(0, 5, task.n_agents)
+            before = [np.asarray(values, np.float64) for values in state]
+            script, state, observation, reward = advance(state, jnp.asarray(action), key)
+            position, velocity = slow.step(twin, *before, [*action, *np.asarray(script)])
+            # float32 has an error of 2e-7 in a distance, the contact margin is 1e-3, and a force of 100 acts for 0.1.
+            np.testing.assert_allclose(state.velocity, velocity, rtol=1e-5, atol=1e-4)
+            np.testing.assert_allclose(state.position, position, rtol=1e-6, atol=1e-5)
+            # The twin observes exactly this state, so that a tie or a touch is the same for both.
+            position, velocity = (np.asarray(values, np.float64) for values in state)
+            observations = [slow.observe(twin, position, velocity, i) for i in range(task.n_agents)]
+            np.testing.assert_allclose(observation, observations, rtol=1e-6, atol=1e-6)
+            rewards = [slow.reward(twin, position, i) for i in range(task.n_agents)]
+            np.testing.assert_allclose(reward, rewards, rtol=1e-5, atol=1e-5)
+    np.testing.assert_array_equal(state.position[task.world.n_moving :], before[0][task.world.n_moving :])
+
+
+# Where episodes start
+
+
+@cache
+def starts(name: str) -> np.ndarray:
+    state = jax.jit(jax.vmap(TASKS[name].reset))(jax.random.split(jax.random.key(0), 2000))
+    assert jnp.all(state.velocity == 0)
+    return np.asarray(state.position)
+
+
+@pytest.mark.parametrize("name", TASKS)
+def test_starts_are_uniform(name):
+    n_moving, (*_, radius, landmark_radius) = TASKS[name].world.n_moving, EXPECTED[name]
+    positions = [starts(name)[:, :n_moving] / radius]
+    if not name.startswith("CN"):
+        positions.append(starts(name)[:, n_moving:] / landmark_radius)
+    for position in positions:
+        assert np.abs(position).max() <= 1
+        assert position.mean((0, 1)) == pytest.approx(0, abs=0.04)
+        assert position.std((0, 1)) == pytest.approx(3**-0.5, rel=0.03)
+
+
+@pytest.mark.parametrize(("agents", "radius", "to_nearest"), [(6, 1.5, 0.939), (15, 2.2, 0.874), (30, 3.0, 0.843)])
+def test_landmarks_of_navigation_are_separated(agents, radius, to_nearest):
+    position = starts(f"CN-{agents}")[:, agents:]
+    assert np.abs(position).max() <= radius
+    assert len(np.unique(position[:, 0, 0])) > N_LAYOUTS / 4
+    distance = np.linalg.norm(position[:, :, None] - position[:, None], axis=-1) + 10 * np.eye(agents)
+    assert distance.min() > 0.675 - 1e-6
+    # The mean of 400 layouts of the `bridson` package, which the published tasks use.
+    assert distance.min(axis=2).mean() == pytest.approx(to_nearest, abs=0.02)
+
+
+def test_layouts_are_reproducible():
+    first = make_layouts(6, 1.5, 0.675)
+    make_layouts.cache_clear()
+    np.testing.assert_array_equal(first, make_layouts(6, 1.5, 0.675))
+
+
+# Prey and predators
+
+
+def test_prey_network_equals_numpy():
+    layers = shipped_prey()
+    assert [weight.shape for weight, _ in layers] == [(26, 64), (64, 64), (64, 5)]
+    x = observation = np.random.default_rng(0).normal(size=(2, 26))
+    for weight, bias in layers[:-1]:
+        x = np.maximum(x @ weight.astype(np.float64) + bias, 0)
+    expected = x @ layers[-1][0].astype(np.float64) + layers[-1][1]
+    np.testing.assert_allclose(logits(layers, jnp.asarray(observation, jnp.float32)), expected, rtol=1e-4, atol=1e-4)
+
+
+def test_prey_samples_from_the_softmax():
+    layers = ((np.zeros((26, 5), np.float32), np.log(np.array([0.1, 0.2, 0.4, 0.3, 1e-9], np.float32))),)
+    action = sample_actions(layers, jnp.zeros((4000, 26)), jax.random.key(0))
+    np.testing.assert_allclose(np.bincount(action, minlength=5) / 4000, [0.1, 0.2, 0.4, 0.3, 0], atol=0.03)
+
+
+def test_observation_of_preys():
+    position = jnp.zeros((11, 2)).at[:, 0].set(jnp.arange(11.0))
+    state = at_rest(position)._replace(velocity=position / 10)
+    first, second = jax.jit(lambda state: observe_preys(SIZES["PP-6"], state))(state)
+    # Preys 6 and 7 between predators 0 to 5 and obstacles 8 to 10.
+    np.testing.assert_allclose(first[::2], [0.6, 6, 2, 3, 4, -1, -2, -3, -4, -5, -6, 1, 0.7], rtol=1e-6)
+    np.testing.assert_allclose(second[::2], [0.7, 7, 1, 2, 3, -2, -3, -4, -5, -6, -7, -1, 0.6], rtol=1e-6)
+    np.testing.assert_array_equal(first[1::2], 0)
+
+
+def test_greedy_predator_moves_along_the_longer_axis():
+    preys = jnp.array([(2, 1), (-2, 1), (1, 2), (1, -2)], float)
+    position = jnp.full((4, 11, 2), 20.0).at[:, 0].set(0).at[:, 6].set(preys)
+    actions = jax.jit(jax.vmap(lambda position: chase(SIZES["PP-6"], at_rest(position))[0]))(position)
+    assert actions.tolist() == [2, 1, 4, 3]
+
+
+@pytest.mark.parametrize("name", ["PP-6", pytest.param("PP-30", marks=pytest.mark.long)])
+def test_shipped_prey_is_harder_to_catch_than_a_random_one(name):
+    task, size = TASKS[name], SIZES[name]
+
+    def play(key, at_random):
+        def step(state, key):
+            random = jax.random.randint(key, (size.n_preys,), 0, 5)
+            prey = jnp.where(at_random, random, task.script(state, key))
+            state = move(task.world, state, push(task.world, jnp.concatenate([chase(size, state), prey])))
+            return state, jnp.sum(task.reward(state))
+
+        return jnp.sum(jax.lax.scan(step, task.reset(key), jax.random.split(key, MAX_STEPS))[1])
+
+    keys = jax.random.split(jax.random.key(0), 300)
+    play_all = jax.jit(jax.vmap(play, (0, None)))
+    scripted, random = (float(play_all(keys, at_random).mean()) for at_random in (False, True))
+    assert scripted < random / 2
+    if name == "PP-6":
+        # The published prey: 29.5, random preys: 80.2. Standard errors of 300 episodes are about 2.
+        assert scripted == pytest.approx(29.5, abs=8)
+        assert random == pytest.approx(80.2, abs=8)

@@ -1,0 +1,134 @@
+"""Directories of .npz files, and logs in memory."""
+
+import sys
+
+import hypothesis
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from helpers.toy_logs import check_log, logged_episodes, read_directory, write_rewards_plus_one
+from lare_rl import LareError
+from lare_rl.errors import install_command
+from lare_rl.logs.arrays import NpzLog, read_npz
+from lare_rl.logs.log import atomic_output, open_log
+
+
+def test_round_trip_keeps_other_arrays(folder, tmp_path):
+    """`file` and `name` are arguments of NumPy's functions."""
+    extra = {"infos/qpos": np.ones((2, 2)), "name": np.array("a walk")}
+    path = folder(episode | extra for episode in logged_episodes(3))
+    write_rewards_plus_one(path, tmp_path / "new")
+    for old_file, new_file in zip(sorted(path.iterdir()), sorted((tmp_path / "new").iterdir()), strict=True):
+        assert old_file.name == new_file.name
+        old, new = read_npz(old_file), read_npz(new_file)
+        assert set(new) == {*old, "paid"}
+        assert all(np.array_equal(old[key], new[key]) for key in old if key != "rewards")
+
+
+def test_time_limit_of_task(task):
+    log = open_log(list(logged_episodes(20)), task.model_copy(update={"max_episode_steps": 29}))
+    expected = [episode["terminations"].any() or len(episode["actions"]) == 29 for episode in logged_episodes(20)]
+    assert [episode.complete for episode in log.episodes()] == expected
+    assert 0 < sum(expected) < 20
+
+
+def test_score_instead_of_rewards(folder, tmp_path):
+    def scored():
+        for episode in logged_episodes(3):
+            score = episode.pop("rewards").sum()
+            del episode["terminations"], episode["truncations"]
+            yield episode | {"score": score}
+
+    out = write_rewards_plus_one(folder(scored()), tmp_path / "new")
+    for new, episode in zip(read_directory(out), open_log(out).episodes(), strict=True):
+        assert new["paid"][-1] == new["score"] == pytest.approx(new["paid"].sum())
+        np.testing.assert_array_equal(episode.reward, new["paid"])
+        assert episode.complete
+
+
+def test_flat_arrays_of_d4rl(tmp_path):
+    episodes = list(logged_episodes(5))
+    columns = [
+        episode | {"observations": episode["observations"][:-1], "next_observations": episode["observations"][1:]}
+        for episode in episodes
+    ]
+    flat = {key: np.concatenate([episode[key] for episode in columns]) for key in columns[0]}
+    flat["terminals"], flat["timeouts"] = flat.pop("terminations"), flat.pop("truncations")
+    flat["metadata/algorithm"] = np.array("sac")
+    flat["timeouts"][-1] = flat["terminals"][-1] = False
+    check_log(open_log(flat), episodes)
+    assert [episode.complete for episode in open_log(flat).episodes()] == [True] * 4 + [False]
+    written = read_directory(write_rewards_plus_one(flat, tmp_path / "new"))
+    np.testing.assert_array_equal(np.concatenate([episode["paid"] for episode in written]), flat["rewards"])
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"next_observations": None}, "next_observations is missing"),
+        ({"terminations": None}, "terminations or truncations"),
+        ({"rewards": np.zeros(3)}, r"rewards must have 4 rows.*\(3,\)"),
+    ],
+)
+def test_bad_flat_arrays(changes, message):
+    arrays = {key: np.zeros((4, 1)) for key in ("observations", "next_observations", "actions")}
+    arrays |= {"rewards": np.zeros(4), "terminations": np.zeros(4, bool)} | changes
+    with pytest.raises(LareError, match=message):
+        open_log({key: value for key, value in arrays.items() if value is not None})
+
+
+def test_failed_output_is_undone(tmp_path):
+    (tmp_path / "log").write_text("old")
+    with pytest.raises(LareError, match="log cannot be written"), atomic_output(tmp_path / "log", True):
+        pass  # nothing is written
+    assert [file.read_text() for file in tmp_path.iterdir()] == ["old"]
+
+
+def test_nothing_is_unpickled(folder, tmp_path):
+    path = folder(logged_episodes(1))
+    np.savez(path / "0000.npz", allow_pickle=True, observations=np.array([{}], object))
+    with pytest.raises(LareError, match=r"0000\.npz is not an \.npz file, or damaged: .*allow_pickle=False"):
+        open_log(path)
+
+
+def test_path_is_not_a_log(tmp_path, monkeypatch):
+    (tmp_path / "log.csv").write_text("observation,action\n")
+    (tmp_path / "empty").mkdir()
+    monkeypatch.setitem(sys.modules, "minari", None)
+    monkeypatch.delitem(sys.modules, "lare_rl.logs.minari", raising=False)
+    for source, message in (
+        (tmp_path / "log.csv", "log.csv is text"),
+        (tmp_path / "empty", "empty holds no .npz"),
+        (tmp_path / "gone", "gone does not exist"),
+        ("nologs", install_command("minari")),
+        (7, "7 is not a log"),
+    ):
+        with pytest.raises(LareError) as error:
+            open_log(source)
+        assert message in str(error.value)
+
+
+@hypothesis.settings(
+    max_examples=50, deadline=None, suppress_health_check=[hypothesis.HealthCheck.function_scoped_fixture]
+)
+@given(index=st.integers(0, 10_000), value=st.integers(0, 255), length=st.integers(0, 10_000))
+def test_damaged_file_is_read_or_refused(small_folder, index, value, length):
+    good, path = small_folder
+    damaged = bytearray(good[: max(1, len(good) - length % len(good))])
+    damaged[index % len(damaged)] = value
+    (path / "0000.npz").write_bytes(bytes(damaged))
+    message = str(path / "0000.npz")
+    try:
+        assert all(len(episode) for episode in NpzLog(path, None).episodes())
+    except LareError as error:
+        message = str(error)
+    assert str(path / "0000.npz") in message
+    assert "\n" not in message
+
+
+@pytest.fixture
+def small_folder(folder):
+    path = folder(logged_episodes(1))
+    return (path / "0000.npz").read_bytes(), path
