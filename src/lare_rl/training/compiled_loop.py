@@ -97,12 +97,12 @@ def init_loop(loop: CompiledLoop, learner: Learner, envs: VecEnvState, metrics: 
 
 
 def _loop_shape(env: JaxEnv, config: TrainConfig, n_seeds: int) -> LoopState:
-    module = training_module(config)
+    module, start = training_module(config), jnp.int32(0)
 
     def measure_and_collect(learner: Learner, keys: Key[Array, " seeds"]) -> LoopState:
-        envs, actor = collect_device.reset(env, keys, config.n_envs, config), module.get_actor(learner, 0, config)
+        envs, actor = collect_device.reset(env, keys, config.n_envs, config), module.get_actor(learner, start, config)
         _, steps = collect_device.collect(env, envs, actor, keys, config)
-        metrics = module.train_step(learner, steps, keys, 0, config)[1]
+        metrics = module.train_step(learner, steps, keys, start, config)[1]
         if config.fits_separately:
             metrics |= fit_seeds(learner, keys, config)[1]
         is_measured = {name: jnp.array(False) for name in metrics}

@@ -243,7 +243,7 @@ def _make_session(run: Run, config: TrainConfig, learner: Learner | None) -> Ses
     iterates_on_host = not config.env.is_jax or _has_first_fit(run, config)
     functions = compile_ahead(config, run.graphs, n_seeds, iterates_on_host=iterates_on_host)
     env = _make_jax_env(task) if config.env.is_jax else None
-    loop = env and compile_loop(env, config, run.graphs, settings.fit_every, n_seeds)
+    loop = None if env is None else compile_loop(env, config, run.graphs, settings.fit_every, n_seeds)
     learner = learner or init_seeds(functions, seed_keys(jnp.asarray(run.seeds), 0))
     if env is None:
         collector = make_host_collector(task, config, functions, run.seeds, settings.evaluation_episodes)
