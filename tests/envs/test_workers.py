@@ -80,7 +80,7 @@ def test_workers_import_the_module_of_a_family():
     task = toy_spec(environment="walkers/two", action_size=2)
     with SubprocVecEnv([picklable_maker(task)] * 2, processes=1) as envs:
         assert envs.spec.n_agents == 2
-    with pytest.raises(LareError, match="'script'.*module of its own"):
+    with pytest.raises(LareError, match=r"'script'.*module of its own"):
         families._import_and_make("__main__", toy_spec(environment="script/walkers"))
 
 

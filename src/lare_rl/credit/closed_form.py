@@ -189,7 +189,7 @@ def fit_signs(state: ClosedForm) -> ClosedForm:
     v = jnp.concatenate([signs, -jnp.ones((len(signs), 1))], axis=1)
     error = jnp.sum((v @ statistics.products[:-1, :-1]) * v, axis=1)
     error = error + statistics.n_steps * (v @ statistics.mean[:-1]) ** 2
-    return _set_weights(state, signs[jnp.argmin(error)][None], jnp.zeros(1))
+    return _set_weights(state, signs[jax.lax.argmin(error, 0, jnp.int32)][None], jnp.zeros(1))
 
 
 def _set_weights(

@@ -18,7 +18,7 @@ from lare_rl.training.evaluation import EpisodeBatch, Evaluation
 from lare_rl.training.static_config import TrainConfig
 from lare_rl.training.streams import Stream, device_noise, stream_keys
 
-__all__ = ["DeviceCollector", "unroll_on_device"]
+__all__ = ["DeviceCollector", "VecEnvState", "collect", "reset", "unroll_on_device"]
 
 Act = Callable[..., tuple[Array, Any]]
 """From actor, memory, observation, available actions, noise and episode starts to the action and the new memory."""
@@ -39,14 +39,14 @@ class DeviceCollector:
     """The environments of a run, if they are pure functions: one compiled call makes an iteration's steps."""
 
     def __init__(self, env: JaxEnv, config: TrainConfig, seeds: Sequence[int]):
-        self._seeds = seeds
+        self.env, self._seeds = env, seeds
         self._reset, self._collect, self._evaluate = _jit_functions(env, config)
-        self._envs: VecEnvState = self._reset(stream_keys(seeds, Stream.TRAINING_EPISODES, 0))
+        self.envs: VecEnvState = self._reset(stream_keys(seeds, Stream.TRAINING_EPISODES, 0))
 
     def collect(self, actor: Any, step: int) -> Trajectory:
         """Return the steps of the iteration that begins at `step`."""
         keys = stream_keys(self._seeds, Stream.EXPLORATION, step)
-        self._envs, steps = self._collect(self._envs, actor, keys)
+        self.envs, steps = self._collect(self.envs, actor, keys)
         return steps
 
     def evaluate(self, actor: Any, n_episodes: int, number: int = 0) -> Evaluation:
@@ -56,13 +56,13 @@ class DeviceCollector:
 
     def state_dict(self) -> dict[str, np.ndarray]:
         """Return the arrays that `restore` needs."""
-        return {str(i): np.asarray(leaf) for i, leaf in enumerate(jax.tree.leaves(self._envs))}
+        return {str(i): np.asarray(leaf) for i, leaf in enumerate(jax.tree.leaves(self.envs))}
 
     def restore(self, arrays: dict[str, np.ndarray]) -> tuple[Bool[np.ndarray, "seeds envs"], list[str]]:
         """Restore the environments. Return which episodes were dropped, and messages: never any, as on the host."""
-        leaves, structure = jax.tree.flatten(self._envs)
-        self._envs = jax.device_put(jax.tree.unflatten(structure, [arrays[str(i)] for i in range(len(leaves))]))
-        return np.zeros(self._envs.episode_start.shape, bool), []
+        leaves, structure = jax.tree.flatten(self.envs)
+        self.envs = jax.device_put(jax.tree.unflatten(structure, [arrays[str(i)] for i in range(len(leaves))]))
+        return np.zeros(self.envs.episode_start.shape, bool), []
 
     def close(self) -> None:
         """Do nothing: there is nothing to close."""
@@ -80,7 +80,7 @@ def unroll_on_device(
     """Play whole episodes of a policy, each from a different initial state. `act` replaces the policy of training."""
     act = act or policy_function(config, greedy)
     reset_keys, step_keys = jnp.unstack(_split_keys(keys, 2), axis=1)
-    envs = _reset(env, reset_keys, n_episodes, config)
+    envs = reset(env, reset_keys, n_episodes, config)
 
     def body(
         carry: tuple[VecEnvState, Bool[Array, "seeds episodes"]], keys: Key[Array, " seeds"]
@@ -96,13 +96,13 @@ def unroll_on_device(
 @cache_by_value
 def _jit_functions(env: JaxEnv, config: TrainConfig) -> tuple[Callable[..., Any], ...]:
     return (
-        jax.jit(partial(_reset, env, n_envs=config.n_envs, config=config)),
-        jax.jit(partial(_collect, env, config=config), donate_argnums=0),
+        jax.jit(partial(reset, env, n_envs=config.n_envs, config=config)),
+        jax.jit(partial(collect, env, config=config), donate_argnums=0),
         jax.jit(partial(_evaluate, env, config=config), static_argnums=2),
     )
 
 
-def _reset(env: JaxEnv, keys: Key[Array, " seeds"], n_envs: int, config: TrainConfig) -> VecEnvState:
+def reset(env: JaxEnv, keys: Key[Array, " seeds"], n_envs: int, config: TrainConfig) -> VecEnvState:
     state, timestep = _map_envs(env.reset)(_split_keys(keys, n_envs))
     episode_start = jnp.ones((len(keys), n_envs), bool)
     return VecEnvState(state, timestep, init_memory(config, *episode_start.shape), episode_start)
@@ -132,7 +132,7 @@ def _step(
     return VecEnvState(state, next_timestep, memory, jnp.zeros_like(envs.episode_start)), steps
 
 
-def _collect(
+def collect(
     env: JaxEnv, envs: VecEnvState, actor: Any, keys: Key[Array, " seeds"], config: TrainConfig
 ) -> tuple[VecEnvState, Trajectory]:
     """Make `rollout_steps` steps of every environment. When an episode ends, the next one begins."""
@@ -144,7 +144,7 @@ def _collect(
         )
 
         def reset_ended(envs: VecEnvState) -> VecEnvState:
-            fresh = _reset(env, reset_keys, envs.episode_start.shape[1], config)
+            fresh = reset(env, reset_keys, envs.episode_start.shape[1], config)
             state, timestep = select(steps.ended, (fresh.state, fresh.timestep), (envs.state, envs.timestep))
             return VecEnvState(state, timestep, envs.memory, episode_start=steps.ended)
 

@@ -19,7 +19,7 @@ from lare_rl.nn.masks import select
 from lare_rl.phi.graph import Graph
 from lare_rl.training import episodes, off_policy, on_policy, sequences
 from lare_rl.training.compile_cache import cache_by_value
-from lare_rl.training.decoder_fits import fit_repeatedly
+from lare_rl.training.decoder_fits import fit_seeds
 from lare_rl.training.learner import Learner, init_learner, store
 from lare_rl.training.rewards import assess
 from lare_rl.training.static_config import TrainConfig
@@ -32,6 +32,7 @@ __all__ = [
     "compile_functions",
     "init_memory",
     "init_seeds",
+    "keys_shape",
     "learner_shape",
     "policy_function",
     "training_module",
@@ -112,11 +113,6 @@ def compile_functions(config: TrainConfig, phi: Sequence[Graph] = ()) -> Compile
     def init(keys: Key[Array, " seeds"]) -> Learner:
         return jax.vmap(lambda key: init_learner(key, config, partial(module.init, config=config)))(keys)
 
-    def fit(learner: Learner, keys: Key[Array, " seeds"]) -> tuple[Learner, Metrics]:
-        # One seed after the other, because a large batch of episodes fills the caches already.
-        decoders, metrics = jax.lax.map(lambda seed: fit_repeatedly(seed[0], seed[1], config), (learner, keys))
-        return learner._replace(decoders=decoders), metrics
-
     learn = jax.jit(partial(episodes.learn_returns, config=config))
 
     def learn_returns(learner: Learner) -> Learner:
@@ -128,7 +124,7 @@ def compile_functions(config: TrainConfig, phi: Sequence[Graph] = ()) -> Compile
         init=jax.jit(init),
         learn_returns=learn_returns,
         store=jit_store(),
-        fit=jax.jit(fit, donate_argnums=0),
+        fit=jax.jit(partial(fit_seeds, config=config), donate_argnums=0),
         train_step=jax.jit(partial(module.train_step, config=config), donate_argnums=0),
         assess=jax.jit(jax.vmap(partial(assess, config=config))),
         get_actor=partial(module.get_actor, config=config),
@@ -137,18 +133,21 @@ def compile_functions(config: TrainConfig, phi: Sequence[Graph] = ()) -> Compile
     )
 
 
-def compile_ahead(config: TrainConfig, phi: Sequence[Graph], n_seeds: int) -> CompiledFunctions:
+def compile_ahead(
+    config: TrainConfig, phi: Sequence[Graph], n_seeds: int, *, iterates_on_host: bool
+) -> CompiledFunctions:
     """Return the functions of a run, compiled for the shapes that they will see, before the run needs its memory.
 
     The compiler needs hundreds of megabytes for a while. They are returned to the system before the replay is made.
     """
     functions = compile_functions(config, phi)
     learner, steps = learner_shape(config, n_seeds), _steps_shape(config, n_seeds)
-    functions = functions._replace(
-        store=_compile(functions.store, learner, steps),
-        train_step=_compile(functions.train_step, learner, steps, _keys_shape(n_seeds), 0),
-        assess=_compile(functions.assess, learner),
-    )
+    functions = functions._replace(assess=_compile(functions.assess, learner))
+    if iterates_on_host:
+        functions = functions._replace(
+            store=_compile(functions.store, learner, steps),
+            train_step=_compile(functions.train_step, learner, steps, keys_shape(n_seeds), 0),
+        )
     _free_memory()
     return functions
 
@@ -163,10 +162,11 @@ def init_seeds(functions: CompiledFunctions, keys: Key[Array, " seeds"]) -> Lear
 @cache_by_value
 def learner_shape(config: TrainConfig, n_seeds: int) -> Learner:
     """Return a learner with shapes instead of arrays."""
-    return jax.eval_shape(compile_functions(config).init, _keys_shape(n_seeds))
+    return jax.eval_shape(compile_functions(config).init, keys_shape(n_seeds))
 
 
-def _keys_shape(n_seeds: int) -> Any:
+def keys_shape(n_seeds: int) -> Any:
+    """Return keys with a shape instead of an array."""
     return jax.eval_shape(seed_keys, jnp.zeros(n_seeds, int), 0)
 
 

@@ -2,7 +2,7 @@
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, PRNGKeyArray
+from jaxtyping import Array, Float, Key, PRNGKeyArray
 
 from lare_rl.credit import descent
 from lare_rl.credit.decomposition import CreditBatch, Decomposition
@@ -15,7 +15,7 @@ from lare_rl.training.learner import Learner
 from lare_rl.training.rewards import team_metrics
 from lare_rl.training.static_config import TrainConfig
 
-__all__ = ["fit_decoders", "fit_repeatedly", "sample_credit"]
+__all__ = ["fit_decoders", "fit_seeds", "sample_credit"]
 
 CHUNK_ROWS = 2400
 """About how many rows each chunk of a decoder's gradient is computed from. More rows do not fit into the cache, and
@@ -69,7 +69,16 @@ def _update_decoder(
     return descent.update_in_chunks(decoder, chunks, key, config.method.fit, config.credit)
 
 
-def fit_repeatedly(
+def fit_seeds(
+    learner: Learner, keys: Key[Array, " seeds"], config: TrainConfig
+) -> tuple[Learner, dict[str, Float[Array, " seeds"]]]:
+    """Update the decoders of every seed `fit_updates` times. Return the mean of each metric."""
+    # One seed after the other, because a large batch of episodes fills the caches already.
+    decoders, metrics = jax.lax.map(lambda seed: _fit_repeatedly(seed[0], seed[1], config), (learner, keys))
+    return learner._replace(decoders=decoders), metrics
+
+
+def _fit_repeatedly(
     learner: Learner, key: PRNGKeyArray, config: TrainConfig
 ) -> tuple[tuple[Decomposition, ...], dict[str, Float[Array, ""]]]:
     """Update the decoders `fit_updates` times. Return them, and the mean of each metric."""

@@ -47,10 +47,11 @@ def run_session(session: Session, listeners: Sequence[Listener], stop: threading
         say(render(finding, advice.MESSAGES) for finding in findings)
 
     while session.step < settings.steps:
-        _advance(session, stop)
+        before = session.step
+        _advance(session, min(settings.steps, (before // settings.evaluate_every + 1) * settings.evaluate_every), stop)
         for listener in listeners:
             listener.on_step(session.step)
-        if session.step - settings.iteration_steps <= settings.warmup < session.step:
+        if before <= settings.warmup < session.step:
             report(advice.find_large_observations(run, session.learner.replay, session.config))
         is_last = session.step == settings.steps
         if not is_last and session.step % settings.evaluate_every:
@@ -69,15 +70,15 @@ def run_session(session: Session, listeners: Sequence[Listener], stop: threading
             report(_final_findings(session, lines))
 
 
-def _advance(session: Session, stop: threading.Event) -> None:
-    """Make one iteration, unless the user has asked the run to stop."""
+def _advance(session: Session, until: int, stop: threading.Event) -> None:
+    """Make iterations, none beyond step `until`, unless the user has asked the run to stop."""
     hint = f"to continue: lare-rl train --resume {session.run.directory}"
     if stop.is_set():
         _check_losses(session)
         session.save()
         raise RunInterruptedError(f"stopped at step {session.step} of {session.settings.steps} and saved; {hint}")
     try:
-        session.advance(stop.is_set)
+        session.advance(until, stop.is_set)
     except FirstFitStoppedError:
         raise RunInterruptedError(f"stopped during the decoder's first fit; {hint}") from None
 

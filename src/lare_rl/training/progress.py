@@ -26,7 +26,7 @@ class Listener(Protocol):
         """Training begins at `step` (above 0 if a run is resumed), and will end at `steps`."""
 
     def on_step(self, step: int) -> None:
-        """An iteration has been made: some steps, and their updates."""
+        """Iterations have been made: some steps, and their updates."""
 
     def on_evaluation(self, metrics: Metrics) -> None:
         """An evaluation has been made. Its lines of metrics.jsonl and the checkpoint have been written."""

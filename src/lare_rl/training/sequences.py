@@ -79,7 +79,7 @@ def init(key: PRNGKeyArray, config: TrainConfig) -> SequenceState:
     return SequenceState(state, empty_mean_std(input_size), jnp.zeros((), jnp.int32))
 
 
-def get_actor(learner: Learner, env_steps: int, config: TrainConfig) -> Actor:
+def get_actor(learner: Learner, env_steps: int | Int[Array, ""], config: TrainConfig) -> Actor:
     """Return the parts of the learner that are needed to act, for all seeds."""
     state, algorithm = learner.algorithm, config.algorithm.load()
     epsilon = algorithm.epsilon(env_steps, _settings(config))

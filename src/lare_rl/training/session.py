@@ -1,6 +1,7 @@
 """A running training: the training state, its environments, and the functions that advance it by one iteration."""
 
 import math
+import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
@@ -8,7 +9,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int, Key, Shaped
+from jaxtyping import Array, Bool, Float, Int, Key, Shaped
 
 from lare_rl.algorithms.off_policy import OffPolicySettings
 from lare_rl.config.settings import ResolvedSettings
@@ -27,13 +28,18 @@ from lare_rl.training.collect_device import DeviceCollector
 from lare_rl.training.collect_host import HostCollector, make_host_collector
 from lare_rl.training.compile_cache import cache_by_value
 from lare_rl.training.compiled import CompiledFunctions, compile_ahead, compile_functions, init_seeds
+from lare_rl.training.compiled_loop import CompiledLoop, compile_loop, init_loop
 from lare_rl.training.factors import compute_host_factors
 from lare_rl.training.learner import Learner, abandon_episodes
 from lare_rl.training.saved_state import actor_shape, load_learner, make_train_config
 from lare_rl.training.static_config import TrainConfig
 from lare_rl.training.streams import Stream, seed_keys, stream_keys
+from lare_rl.util.float64 import one_blas_thread
 
 __all__ = ["Session", "restore_session", "start_session"]
+
+MAX_CALL_S = 5.0
+"""About how long one compiled call may take. Until it returns, the user cannot stop the run."""
 
 
 @dataclass
@@ -45,6 +51,8 @@ class Session:
     functions: CompiledFunctions
     learner: Learner
     collector: DeviceCollector | HostCollector
+    loop: CompiledLoop | None = None
+    """Iterations as one compiled call, for an environment of pure functions."""
     step: int = 0
     """Environment steps done, of each seed."""
     metrics_bytes: int = 0
@@ -57,6 +65,9 @@ class Session:
     """The best evaluations so far. None before the first evaluation, and if several teams learn, whose returns depend on each
     other."""
 
+    _iteration_s: float = MAX_CALL_S
+    """How long an iteration of the last compiled call has taken."""
+
     @property
     def settings(self) -> ResolvedSettings:
         return self.run.config.settings
@@ -66,18 +77,55 @@ class Session:
         """The parts of the learner that are needed to act now."""
         return self.functions.get_actor(self.learner, self.step)
 
-    def advance(self, stop_requested: Callable[[], bool] = lambda: False) -> None:
-        """Make one iteration: collect steps, compute factors, store them, sometimes fit the decoder, update the algorithm.
+    def advance(self, until: int, stop_requested: Callable[[], bool] = lambda: False) -> None:
+        """Make iterations: one on the host, or several in one compiled call, but none beyond step `until`.
+
+        Args:
+            until: the step of the next evaluation.
+            stop_requested: whether the user has asked the run to stop.
 
         Raises:
             FirstFitStoppedError: the user has asked the run to stop, during the decoder's first fit. The session cannot
                 continue.
         """
-        steps = self.collector.collect(self.actor, self.step)
-        self.learner, is_finite = self.functions.store(self.learner, steps)
+        if self.loop is None or self._is_before_first_fit:
+            self._iterate(stop_requested)
+        else:
+            self._iterate_compiled((until - self.step) // self.settings.iteration_steps)
+
+    @property
+    def _is_before_first_fit(self) -> bool:
+        """Whether the decoders' first fit is still to be made. The host decides when it ends."""
+        return _has_first_fit(self.run, self.config) and not self.first_fit_done
+
+    def _iterate_compiled(self, max_iterations: int) -> None:
+        """Make iterations in one compiled call, for about `MAX_CALL_S`."""
+        assert self.loop is not None
+        assert isinstance(self.collector, DeviceCollector)
+        n_iterations = max(1, min(max_iterations, int(MAX_CALL_S / self._iteration_s)))
+        start = time.perf_counter()
+        state = init_loop(self.loop, self.learner, self.collector.envs, self.latest_metrics)
+        with one_blas_thread():
+            n_done = self.step // self.settings.iteration_steps
+            state = self.loop.run(state, jnp.asarray(self.run.seeds), jnp.int32(n_done), jnp.int32(n_iterations))
+            is_measured, is_finite = jax.device_get((state.is_measured, state.is_finite))
+        self._iteration_s = max(1e-6, (time.perf_counter() - start) / n_iterations)
+        self.learner, self.collector.envs = state.learner, state.envs
+        self._check_factors(is_finite, state.steps)
+        self.latest_metrics |= {name: values for name, values in state.metrics.items() if is_measured[name]}
+        self.step += n_iterations * self.settings.iteration_steps
+
+    def _check_factors(self, is_finite: Bool[np.ndarray, " seeds"], steps: Trajectory) -> None:
+        """Raise `LareError` if a factor of the newest steps is not finite."""
         if self.run.functions and not np.all(is_finite):
             compute_host_factors(self.run, self.config, steps)  # raises an error that names the factor
             raise LareError("a factor is not finite in the compiled function; the last checkpoint is whole")
+
+    def _iterate(self, stop_requested: Callable[[], bool]) -> None:
+        """Collect steps, compute factors, store them, sometimes fit the decoder, update the algorithm."""
+        steps = self.collector.collect(self.actor, self.step)
+        self.learner, is_finite = self.functions.store(self.learner, steps)
+        self._check_factors(np.asarray(is_finite), steps)
         if self.learner.decoders and np.any(steps.ended):
             self.learner = self.functions.learn_returns(self.learner)
         if self.step >= self.config.warmup:
@@ -87,8 +135,7 @@ class Session:
     def _update(self, steps: Trajectory, stop_requested: Callable[[], bool]) -> None:
         """Fit the decoders if they have updates of their own that are due, and update the algorithm."""
         iteration = self.step // self.settings.iteration_steps
-        fits_separately = self.config.method.uses_gradient and not self.config.joint_fit
-        if fits_separately and iteration % self.settings.fit_every == 0:
+        if self.config.fits_separately and iteration % self.settings.fit_every == 0:
             self.fit(stream_keys(self.run.seeds, Stream.FIT, self.step), stop_requested)
         keys = seed_keys(jnp.asarray(self.run.seeds), self.step + 1)
         self.learner, metrics = self.functions.train_step(self.learner, steps, keys, self.step)
@@ -97,8 +144,7 @@ class Session:
 
     def fit(self, keys: Key[Array, " seeds"], stop_requested: Callable[[], bool]) -> None:
         """Fit the decoders. The first fit lasts until it brings no improvement."""
-        is_first = self.settings.first_fit == "held-out" and not self.first_fit_done
-        if is_first and first_fit.has_enough_episodes(self.learner):
+        if self._is_before_first_fit and first_fit.has_enough_episodes(self.learner):
             fit = compile_functions(first_fit.config_of_first_fit(self.config)).fit
             self.learner, metrics = first_fit.fit_until_converged(
                 self.learner, fit, keys, self.config, stop_requested=stop_requested
@@ -171,10 +217,7 @@ class Session:
 
 def start_session(run: Run) -> Session:
     """Return a session before its first step."""
-    config = make_train_config(run)
-    functions = compile_ahead(config, run.graphs, len(run.seeds))
-    learner = init_seeds(functions, seed_keys(jnp.asarray(run.seeds), 0))
-    return Session(run, config, functions, learner, _make_collector(run, config, functions))
+    return _make_session(run, make_train_config(run), None)
 
 
 def restore_session(run: Run) -> tuple[Session, list[str]]:
@@ -184,8 +227,7 @@ def restore_session(run: Run) -> tuple[Session, list[str]]:
         LareError: there is no checkpoint, or it cannot be used.
     """
     config, learner, host, arrays = load_learner(run)
-    functions = compile_ahead(config, run.graphs, len(run.seeds))
-    session = Session(run, config, functions, learner, _make_collector(run, config, functions))
+    session = _make_session(run, config, learner)
     try:
         return session, session.restore(host, arrays)
     except checkpoint.DAMAGED_FILE_ERRORS as error:
@@ -195,11 +237,24 @@ def restore_session(run: Run) -> tuple[Session, list[str]]:
         ) from error
 
 
-def _make_collector(run: Run, config: TrainConfig, functions: CompiledFunctions) -> DeviceCollector | HostCollector:
-    task = run.config.task
-    if config.env.is_jax:
-        return DeviceCollector(_make_jax_env(task), config, run.seeds)
-    return make_host_collector(task, config, functions, run.seeds, run.config.settings.evaluation_episodes)
+def _make_session(run: Run, config: TrainConfig, learner: Learner | None) -> Session:
+    """Compile the functions of a session and make its environments. Without a learner, start with an untrained one."""
+    task, settings, n_seeds = run.config.task, run.config.settings, len(run.seeds)
+    iterates_on_host = not config.env.is_jax or _has_first_fit(run, config)
+    functions = compile_ahead(config, run.graphs, n_seeds, iterates_on_host=iterates_on_host)
+    env = _make_jax_env(task) if config.env.is_jax else None
+    loop = None if env is None else compile_loop(env, config, run.graphs, settings.fit_every, n_seeds)
+    learner = learner or init_seeds(functions, seed_keys(jnp.asarray(run.seeds), 0))
+    if env is None:
+        collector = make_host_collector(task, config, functions, run.seeds, settings.evaluation_episodes)
+    else:
+        collector = DeviceCollector(env, config, run.seeds)
+    return Session(run, config, functions, learner, collector, loop)
+
+
+def _has_first_fit(run: Run, config: TrainConfig) -> bool:
+    """Whether the decoders have a first fit, which lasts until it brings no improvement."""
+    return config.fits_separately and run.config.settings.first_fit == "held-out"
 
 
 @cache_by_value

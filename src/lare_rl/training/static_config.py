@@ -89,6 +89,11 @@ class TrainConfig:
         )
 
     @property
+    def fits_separately(self) -> bool:
+        """Whether the decoder makes gradient updates of its own, between iterations."""
+        return self.method.uses_gradient and not self.joint_fit
+
+    @property
     def observed_size(self) -> int:
         """Size of the observation or of the global state that credit is assigned by."""
         return self.env.state_size if self.team_level else self.env.observation_size

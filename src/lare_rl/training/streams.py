@@ -39,7 +39,9 @@ def seed_keys(seeds: Int[Array, " seeds"], number: int | Array) -> Key[Array, " 
     return jax.vmap(lambda seed: jax.random.fold_in(jax.random.key(seed), number))(seeds)
 
 
-def stream_keys(seeds: Sequence[int], stream: Stream, number: int) -> Key[Array, " seeds"]:
+def stream_keys(
+    seeds: Sequence[int] | Int[Array, " seeds"], stream: Stream, number: int | Int[Array, ""]
+) -> Key[Array, " seeds"]:
     """Return a key for each seed, by a purpose and a number."""
     streams = seed_keys(jnp.asarray(seeds), -1 - int(stream))
     return jax.vmap(lambda key: jax.random.fold_in(key, number))(streams)

@@ -3,22 +3,28 @@
 import contextlib
 from collections.abc import Iterator
 from functools import cache
+from typing import Any
 
 import jax
 from threadpoolctl import ThreadpoolController
 
-__all__ = ["float64"]
+__all__ = ["float64", "one_blas_thread"]
 
 
 @contextlib.contextmanager
 def float64() -> Iterator[None]:
-    """Let JAX calculate in float64, and linear algebra use one thread. Wait for results before the block ends.
+    """Let JAX calculate in float64, and linear algebra use one thread. Wait for results before the block ends."""
+    with jax.enable_x64(True), one_blas_thread():
+        yield
+
+
+def one_blas_thread() -> contextlib.AbstractContextManager[Any]:
+    """Let linear algebra use one thread. Wait for results before the block ends.
 
     The matrices of a fit are small. With several threads, the libraries of linear algebra wait actively until each thread has
     run. On a machine whose cores have other work, a fit then takes a hundred times as long.
     """
-    with jax.enable_x64(True), _linear_algebra_libraries().limit(limits=1, user_api="blas"):
-        yield
+    return _linear_algebra_libraries().limit(limits=1, user_api="blas")
 
 
 @cache

@@ -1,0 +1,167 @@
+"""Iterations of a run on an environment of pure functions: one compiled call makes as many as the caller wants.
+
+Collection, factors, replay, fits, relabelling and updates are one program, so nothing is transferred between two iterations.
+"""
+
+from collections.abc import Callable, Sequence
+from functools import partial
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int, Key
+
+from lare_rl.data.trajectory import Trajectory
+from lare_rl.envs.interface import JaxEnv
+from lare_rl.phi.graph import Graph
+from lare_rl.training import collect_device, episodes
+from lare_rl.training.collect_device import VecEnvState
+from lare_rl.training.compile_cache import cache_by_value
+from lare_rl.training.compiled import keys_shape, learner_shape, training_module
+from lare_rl.training.decoder_fits import fit_seeds
+from lare_rl.training.learner import Learner, store
+from lare_rl.training.static_config import TrainConfig
+from lare_rl.training.streams import Stream, seed_keys, stream_keys
+
+__all__ = ["CompiledLoop", "LoopState", "compile_loop", "init_loop"]
+
+Metrics = dict[str, Float[Array, " seeds"]]
+Measured = tuple[Metrics, dict[str, Bool[Array, ""]]]
+"""Metrics, and which of them have been measured."""
+
+
+class LoopState(NamedTuple):
+    """What an iteration changes. Every array has a leading seed axis, except `steps`' time axis which follows it."""
+
+    learner: Learner
+    envs: VecEnvState
+    metrics: Metrics
+    """The metrics of the newest updates."""
+    is_measured: dict[str, Bool[Array, ""]]
+    """Which metrics have been measured."""
+    steps: Trajectory
+    """The newest steps, for the message about a factor that is not finite."""
+    is_finite: Bool[Array, " seeds"]
+    """Whether all factors of the newest steps are finite."""
+
+
+class CompiledLoop(NamedTuple):
+    """The compiled iterations of a run."""
+
+    run: Callable[[LoopState, Int[Array, " seeds"], Int[Array, ""], Int[Array, ""]], LoopState]
+    """From the state, the seeds, the number of iterations before, and the number of iterations to make, to the new state. It
+    consumes its state. It stops after an iteration with a factor that is not finite."""
+    shape: LoopState
+    """The state with shapes instead of arrays."""
+
+
+@cache_by_value
+def compile_loop(env: JaxEnv, config: TrainConfig, phi: Sequence[Graph], fit_every: int, n_seeds: int) -> CompiledLoop:
+    """Compile the iterations of a run.
+
+    Args:
+        env: the environment.
+        config: the configuration of the run.
+        phi: the graph of each team's phi.
+        fit_every: the decoders make gradient updates of their own in every iteration whose number is a multiple of this.
+        n_seeds: the number of seeds.
+    """
+
+    def loop(
+        state: LoopState, seeds: Int[Array, " seeds"], n_done: Int[Array, ""], n_iterations: Int[Array, ""]
+    ) -> LoopState:
+        def is_running(carry: tuple[Int[Array, ""], LoopState]) -> Bool[Array, ""]:
+            return (carry[0] < n_done + n_iterations) & jnp.all(carry[1].is_finite)
+
+        def body(carry: tuple[Int[Array, ""], LoopState]) -> tuple[Int[Array, ""], LoopState]:
+            return carry[0] + 1, _iterate(carry[1], seeds, carry[0], env, config, phi, fit_every)
+
+        return jax.lax.while_loop(is_running, body, (n_done, state))[1]
+
+    shape = _loop_shape(env, config, n_seeds)
+    seeds, number = jax.ShapeDtypeStruct((n_seeds,), int), jax.ShapeDtypeStruct((), int)
+    return CompiledLoop(jax.jit(loop, donate_argnums=0).lower(shape, seeds, number, number).compile(), shape)
+
+
+def init_loop(loop: CompiledLoop, learner: Learner, envs: VecEnvState, metrics: Metrics) -> LoopState:
+    """Return the state before an iteration. `metrics` are those of the newest updates, or empty before the first."""
+    empty = jax.tree.map(lambda shape: jnp.zeros(shape.shape, shape.dtype), loop.shape._replace(learner=(), envs=()))
+    return LoopState(
+        learner=learner,
+        envs=envs,
+        metrics={name: jnp.array(metrics.get(name, zero)) for name, zero in empty.metrics.items()},
+        is_measured={name: jnp.array(name in metrics) for name in empty.metrics},
+        steps=empty.steps,
+        is_finite=jnp.ones_like(empty.is_finite),
+    )
+
+
+def _loop_shape(env: JaxEnv, config: TrainConfig, n_seeds: int) -> LoopState:
+    module, start = training_module(config), jnp.int32(0)
+
+    def measure_and_collect(learner: Learner, keys: Key[Array, " seeds"]) -> LoopState:
+        envs, actor = collect_device.reset(env, keys, config.n_envs, config), module.get_actor(learner, start, config)
+        _, steps = collect_device.collect(env, envs, actor, keys, config)
+        metrics = module.train_step(learner, steps, keys, start, config)[1]
+        if config.fits_separately:
+            metrics |= fit_seeds(learner, keys, config)[1]
+        is_measured = {name: jnp.array(False) for name in metrics}
+        return LoopState(learner, envs, metrics, is_measured, steps, jnp.ones(n_seeds, bool))
+
+    return jax.eval_shape(measure_and_collect, learner_shape(config, n_seeds), keys_shape(n_seeds))
+
+
+def _iterate(
+    state: LoopState,
+    seeds: Int[Array, " seeds"],
+    iteration: Int[Array, ""],
+    env: JaxEnv,
+    config: TrainConfig,
+    phi: Sequence[Graph],
+    fit_every: int,
+) -> LoopState:
+    """Make one iteration of Algorithm 1 of the LaRe paper."""
+    module, env_steps = training_module(config), iteration * config.rollout_steps * config.n_envs
+    actor = module.get_actor(state.learner, env_steps, config)
+    keys = stream_keys(seeds, Stream.EXPLORATION, env_steps)
+    envs, steps = collect_device.collect(env, state.envs, actor, keys, config)
+    learner, is_finite = jax.vmap(partial(store, config=config, phi=phi))(state.learner, steps)
+    if learner.decoders:
+        learn = partial(_learn_returns, config=config)
+        learner = jax.lax.cond(jnp.any(steps.ended), learn, lambda unchanged: unchanged, learner)
+
+    def update(learner: Learner, measured: Measured) -> tuple[Learner, Measured]:
+        if config.fits_separately:
+            keys = stream_keys(seeds, Stream.FIT, env_steps)
+            fit = partial(_fit, keys=keys, config=config)
+            learner, measured = jax.lax.cond(iteration % fit_every == 0, fit, _unchanged, learner, measured)
+        learner, metrics = module.train_step(learner, steps, seed_keys(seeds, env_steps + 1), env_steps, config)
+        is_new = jnp.any(metrics.get("algorithm/updates", jnp.ones(())) > 0)
+        return learner, _record(measured, metrics, is_new)
+
+    measured = state.metrics, state.is_measured
+    learner, (metrics, is_measured) = jax.lax.cond(env_steps >= config.warmup, update, _unchanged, learner, measured)
+    return LoopState(learner, envs, metrics, is_measured, steps, is_finite)
+
+
+def _unchanged(learner: Learner, measured: Measured) -> tuple[Learner, Measured]:
+    return learner, measured
+
+
+def _fit(
+    learner: Learner, measured: Measured, keys: Key[Array, " seeds"], config: TrainConfig
+) -> tuple[Learner, Measured]:
+    learner, metrics = fit_seeds(learner, keys, config)
+    return learner, _record(measured, metrics, jnp.array(True))
+
+
+def _record(measured: Measured, metrics: Metrics, is_new: Bool[Array, ""]) -> Measured:
+    old, is_measured = measured
+    new = {name: jnp.where(is_new, values, old[name]) for name, values in metrics.items()}
+    return old | new, is_measured | {name: is_measured[name] | is_new for name in metrics}
+
+
+def _learn_returns(learner: Learner, config: TrainConfig) -> Learner:
+    with jax.enable_x64(True):
+        decoders, n_learned = episodes.learn_returns(learner.decoders, learner.replay, learner.n_learned, config)
+    return learner._replace(decoders=decoders, n_learned=n_learned)

@@ -1,0 +1,62 @@
+"""Iterations in one compiled call make the same training state as iterations on the host."""
+
+import jax
+import numpy as np
+import pytest
+
+from helpers.jax_toy_envs import echo_spec
+from helpers.long_tests import long_case
+from helpers.training_runs import ECHO_PHI, QUICK_CREDIT
+from lare_rl.config.resolve import resolve
+from lare_rl.errors import LareError
+from lare_rl.latent.function import verify_function
+from lare_rl.runs.directory import create_run
+from lare_rl.training.session import start_session
+
+
+@pytest.fixture(scope="module")
+def begin(small_many, tmp_path_factory):
+    """Begins runs on the echo toy, whose agents leave; an iteration has ten steps, an episode three to six."""
+    function = verify_function(ECHO_PHI, echo_spec())
+
+    def begin(algorithm, method, judges="after"):
+        changes = {"environments": 2, "rollout_steps": 10, "steps": 80, "evaluate_every": 80, "fit_every": 2}
+        settings = small_many(algorithm=algorithm, method=method, judges=judges, credit=QUICK_CREDIT, **changes)
+        directory = tmp_path_factory.mktemp("loop") / "run"
+        return start_session(create_run(directory, echo_spec(), resolve(settings, echo_spec()), [function]))
+
+    return begin
+
+
+def assert_equal_sessions(session, other):
+    states = [(s.learner, s.collector.envs, s.latest_metrics) for s in (session, other)]
+    for (path, leaf), (_, other_leaf) in zip(*map(jax.tree_util.tree_leaves_with_path, states), strict=True):
+        if jax.dtypes.issubdtype(leaf.dtype, jax.dtypes.prng_key):
+            leaf, other_leaf = map(jax.random.key_data, (leaf, other_leaf))
+        np.testing.assert_allclose(leaf, other_leaf, rtol=1e-4, atol=1e-5, err_msg=jax.tree_util.keystr(path))
+
+
+@pytest.mark.parametrize(
+    ("algorithm", "method"),
+    [("ippo", "lare-bayes"), long_case("ippo", "lare-rd"), ("qmix", "lare-rd"), long_case("qmix", "bayes")],
+)
+def test_advance_equals_host_iterations(algorithm, method, begin):
+    compiled, host = begin(algorithm, method), begin(algorithm, method)
+    host.loop = None
+    for _ in range(4):
+        host.advance(80)
+    compiled.advance(20)
+    compiled.advance(80)
+    assert compiled.step == host.step == 80
+    assert_equal_sessions(compiled, host)
+
+
+def test_advance_stops_at_a_factor_that_is_not_finite(begin, tmp_path):
+    session = begin("ippo", "lare-bayes")
+    session.advance(20)
+    session.collector.envs = jax.tree.map(
+        lambda leaf: leaf.at[1].set(np.inf) if leaf.dtype == np.float32 else leaf, session.collector.envs
+    )
+    with pytest.raises(LareError, match=r"factor .*failed_batch.npz"):
+        session.advance(80)
+    assert session.step == 20
