@@ -19,9 +19,9 @@ def begin(small_many, tmp_path_factory):
     """Begins runs on the echo toy, whose agents leave; an iteration has ten steps, an episode three to six."""
     function = verify_function(ECHO_PHI, echo_spec())
 
-    def begin(algorithm, method, judges="after"):
+    def begin(algorithm, method, **more):
         changes = {"environments": 2, "rollout_steps": 10, "steps": 80, "evaluate_every": 80, "fit_every": 2}
-        settings = small_many(algorithm=algorithm, method=method, judges=judges, credit=QUICK_CREDIT, **changes)
+        settings = small_many(algorithm=algorithm, method=method, credit=QUICK_CREDIT, **changes, **more)
         directory = tmp_path_factory.mktemp("loop") / "run"
         return start_session(create_run(directory, echo_spec(), resolve(settings, echo_spec()), [function]))
 
@@ -51,12 +51,12 @@ def test_advance_equals_host_iterations(algorithm, method, begin):
     assert_equal_sessions(compiled, host)
 
 
-def test_advance_stops_at_a_factor_that_is_not_finite(begin, tmp_path):
-    session = begin("ippo", "lare-bayes")
+def test_advance_stops_at_a_factor_that_is_not_finite(begin):
+    session = begin("ippo", "lare-bayes", judges="before")
     session.advance(20)
-    session.collector.envs = jax.tree.map(
-        lambda leaf: leaf.at[1].set(np.inf) if leaf.dtype == np.float32 else leaf, session.collector.envs
-    )
+    envs = session.collector.envs
+    observation = envs.timestep.observation.at[1].set(np.inf)
+    session.collector.envs = envs._replace(timestep=envs.timestep._replace(observation=observation))
     with pytest.raises(LareError, match=r"factor .*failed_batch.npz"):
         session.advance(80)
     assert session.step == 20

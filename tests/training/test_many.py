@@ -37,9 +37,9 @@ def test_advance_fits_decoders_before_the_update(echo_run):
         calls.append(("train", step))
         return learner, {}
 
-    session.functions = session.functions._replace(fit=fit, train_step=train_step)
+    session.functions, session.loop = session.functions._replace(fit=fit, train_step=train_step), None
     for _ in range(3):
-        session.advance()
+        session.advance(140)
     session.close()
     assert calls == [("fit", 80), ("train", 80), ("train", 100), ("fit", 120), ("train", 120)]
     assert "credit/loss" in session.latest_metrics

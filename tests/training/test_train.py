@@ -173,8 +173,8 @@ def test_env_fault_is_located(fault, message, dense, tmp_path, monkeypatch):
 def test_diverged_loss_is_not_saved(dense, tmp_path, monkeypatch):
     advance = Session.advance
 
-    def spoil_loss(session, stop_requested):
-        advance(session, stop_requested)
+    def spoil_loss(session, until, stop_requested):
+        advance(session, until, stop_requested)
         if session.step == 84:
             session.latest_metrics["critic/loss"] = np.array([1.0, np.nan])
 
