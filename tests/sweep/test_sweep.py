@@ -295,7 +295,7 @@ def test_no_process_after_stop(file):
         (('["Reacher-v4"]', '["Reacher-v4", "Reacher-v4"]'), "Reacher-v4/dense-td3 .*twice"),
         (("[settings]", "[settings"), "Expected"),
         (("[settings]", "[settings]\nsac = { gamma = 0.9 }"), r"sac\.gamma .*td3\.gamma"),
-        (("[settings]", "[settings]\ncredit = { sum_form = true }"), r"credit\.sum_form .*dense, nor to lare-linear"),
+        (("[settings]", "[settings]\ncredit = { sum_form = true }"), r"credit\.sum_form .*dense.*, nor to lare-linear"),
         ((', "lare-linear"', ""), "draws"),
         ((FUNCTIONS[0], f"{FUNCTIONS[0]}\n{FUNCTIONS[1]}"), r"draws .*\[functions\]"),
         (("draws = [0, 3]", "draws = [7]"), "draw 7"),

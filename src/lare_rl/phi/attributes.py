@@ -91,7 +91,7 @@ def resolve_import(statement: ast.Import | ast.ImportFrom) -> Iterable[tuple[str
         return
     module = statement.module or ""
     if statement.level:
-        raise RefusedError("E-IMPORT", "relative imports are not available; import numpy or math")
+        raise RefusedError("E-IMPORT", "relative imports are not available; numpy and math are")
     _check_module(module)
     for alias in statement.names:
         if alias.name == "*":
