@@ -35,12 +35,9 @@ def test_published_rows(name, encoder, fit):
     assert (METHODS[name].encoder, METHODS[name].fit) == (encoder, fit)
 
 
-@pytest.mark.parametrize(
-    ("names", "words"), [(("observations",), "observation.*'observations'"), ("action", "'action'")]
-)
-def test_encoder_with_unknown_names(names, words):
-    with pytest.raises(LareError, match=words):
-        encoders.Encoder(names)
+def test_encoder_with_unknown_names():
+    with pytest.raises(LareError, match="observation, .*'observations'"):
+        encoders.Encoder(("observations",))
 
 
 @pytest.mark.parametrize(("name", "words"), [("lare_rrdu", "'lare_rrdu' .*'lare-rrdu'"), ("", "dense, episodic, ")])

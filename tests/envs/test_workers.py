@@ -49,7 +49,7 @@ def is_running(pid):
 
 def test_workers_equal_one_process():
     rng = np.random.default_rng(0)
-    makers = [ToyHostEnv] * 5
+    makers = [partial(ToyHostEnv, changes={"max_steps": 20})] * 5  # some are stepped after their end
     with LocalVecEnv(makers) as local, SubprocVecEnv(makers, processes=2) as remote:
         assert os.getpid() not in remote.pids
         assert len(set(remote.pids)) == 2

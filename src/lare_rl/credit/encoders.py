@@ -52,8 +52,7 @@ class Encoder:
 
     def __post_init__(self) -> None:
         for names in (self.names, self.names_of_many_agents or ()):
-            unknown = [name for name in names if name not in _NAMES]
-            if isinstance(names, str) or unknown:
+            if not set(names) <= set(_NAMES):
                 raise LareError(f"an encoder is a tuple of names among {', '.join(_NAMES)}, and was given {names!r}")
 
     def inputs(self, judges: FactorInputs = "after", *, single_agent: bool = True) -> tuple[str, ...]:
