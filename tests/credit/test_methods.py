@@ -36,7 +36,7 @@ def test_published_rows(name, encoder, fit):
 
 
 def test_encoder_with_unknown_names():
-    with pytest.raises(LareError, match="observation, .*'observations'"):
+    with pytest.raises(LareError, match=r"observation, .*'observations'"):
         encoders.Encoder(("observations",))
 
 

@@ -185,7 +185,7 @@ from helpers.host_envs import ToyHostEnv
 from lare_rl.envs.workers import SubprocVecEnv
 
 signal.signal(signal.SIGINT, signal.default_int_handler)  # a job in the background ignores it
-envs = SubprocVecEnv([partial(ToyHostEnv, sys.argv[1], seconds=0.05)] * 2, processes=2)
+envs = SubprocVecEnv([partial(ToyHostEnv, sys.argv[1], seconds=0.05, changes={"max_steps": 10**6})] * 2, processes=2)
 print(*envs.pids, flush=True)
 envs.reset(np.ones(2, bool), np.arange(2))
 while True:

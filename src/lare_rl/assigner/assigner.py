@@ -168,7 +168,8 @@ class CreditAssigner:
             if len(ids) != n_rows:
                 raise LareError(f"env_ids has {len(ids)} entries, but there are {n_rows} steps")
             # Copies, because an environment may write its next step into the same memory.
-            steps, team_reward, ended = tuple(array[rows] for array in steps), team_reward[rows], ended[rows]
+            observation, action, next_observation = (array[rows] for array in steps)
+            steps, team_reward, ended = (observation, action, next_observation), team_reward[rows], ended[rows]
             check_finite(rows, steps, team_reward)
             numbers = np.full(n_rows, -1)
             if len(rows):
@@ -187,7 +188,8 @@ class CreditAssigner:
             LareError: as in `add`, or the episode has no step.
         """
         with self.lock:
-            steps = tuple(array.copy() for array in self.config.to_rows(observation, action, next_observation))
+            rows = self.config.to_rows(observation, action, next_observation)
+            steps = rows[0].copy(), rows[1].copy(), rows[2].copy()
             n_steps = len(steps[0])
             if not n_steps:
                 raise LareError("the episode has no step")
