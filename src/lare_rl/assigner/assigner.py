@@ -174,7 +174,7 @@ class CreditAssigner:
             numbers = np.full(n_rows, -1)
             if len(rows):
                 numbers[rows] = self.learner.add_steps(*steps, None if alive is None else alive[rows])
-                env_ids = [ids[row] for row in rows]
+                env_ids = [ids[row] for row in rows.tolist()]
                 self.learner.queue_episodes(self.store.extend(env_ids, numbers[rows], steps, team_reward, ended))
                 self.learner.flush_large_queues()
             return numbers
