@@ -67,7 +67,9 @@ def make_page(budget: Budget, command: str) -> Page:
         ),
     ]
     lines = {label(redundant): band(history) for redundant, history in histories.items()}
-    return Page("theory", "\n\n".join(sections), {PICTURE: figures.draw_bands(lines, "episodes", "regret", steps=True)})
+    return Page(
+        "theory", "\n\n".join(sections), {PICTURE: figures.draw_bands(lines, "episodes", "regret", x_is_steps=True)}
+    )
 
 
 def played(redundant: int, episodes: int, runs: int) -> History:

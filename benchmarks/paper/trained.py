@@ -206,7 +206,7 @@ def picture(comparison: Comparison, exhibit: Exhibit) -> str:
         panel[label.removesuffix(f", {entry.algorithm}")] = comparison.curves[label]
     if len(panels) > 1:
         return figures.draw_band_panels(panels, across, up)
-    return figures.draw_bands(comparison.curves, across, up, steps=True, log_scale=exhibit.measure == CREDIT_ERROR)
+    return figures.draw_bands(comparison.curves, across, up, x_is_steps=True, log_scale=exhibit.measure == CREDIT_ERROR)
 
 
 def claimed(claim: Claim, other: str, exhibit: Exhibit, comparison: Mapping[str, Comparison]) -> list[str]:

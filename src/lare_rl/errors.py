@@ -1,4 +1,4 @@
-"""Errors for the user, about input that cannot be used."""
+"""Errors for the user, and checked models: Pydantic models whose errors are one line."""
 
 import difflib
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
@@ -41,7 +41,7 @@ class LareError(Exception):
 
 
 def install_command(extra: str, package: Path = Path(__file__).parent) -> str:
-    """Return the command that installs an extra: of the checkout that this package is in, or of the package index."""
+    """Return the pip command that installs an optional dependency group ("extra"), from a source checkout if this package is in one."""
     checkout = package.parents[1]
     if package.parent.name == "src" and (checkout / "pyproject.toml").is_file():
         return f"pip install --editable '{checkout}[{extra}]'"
@@ -63,7 +63,7 @@ def short_repr(value: Any) -> str:
 
 
 def did_you_mean(name: str, known_names: Iterable[str]) -> str:
-    """Return a hint at the closest known name, or at one that contains this name; empty if no name is close."""
+    """Return a hint at a known name: one that ends with ".NAME", else the closest, else one that contains it. Empty if none does."""
     names = list(known_names)
     suffixed = [other for other in names if other.endswith(f".{name.lstrip('-')}")]
     containing = [other for other in names if len(name) > 2 and name.lower() in other.lower()]
@@ -71,12 +71,16 @@ def did_you_mean(name: str, known_names: Iterable[str]) -> str:
     return f" (did you mean {close[0]!r}?)" if close else ""
 
 
+_is_validating: ContextVar[bool] = ContextVar("is_validating", default=False)
+"""Whether a model is being validated. Models inside it then leave their errors to it."""
+
+
 class CheckedModel(BaseModel):
     """Validated values from outside. They are frozen, and invalid values raise a `LareError` of one line."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", use_attribute_docstrings=True)
 
-    if TYPE_CHECKING:  # values are checked at run time, because most of them come from files
+    if TYPE_CHECKING:  # type checkers accept any keyword; Pydantic checks the values
 
         def __init__(self, /, **values: Any) -> None: ...
 
@@ -98,28 +102,25 @@ class CheckedModel(BaseModel):
 
     @classmethod
     def _validate(cls, values: Any, handler: Callable[[Any], Any]) -> Any:
-        if _is_nested.get():  # the outermost model reports the error, with the whole path of its key
+        if _is_validating.get():  # the outermost model reports the error, with the whole path of its key
             return handler(values)
-        token = _is_nested.set(True)
+        token = _is_validating.set(True)
         try:
             return handler(values)
         except ValidationError as error:
             raise LareError(_describe(error, tuple(model_keys(cls)))) from None
         finally:
-            _is_nested.reset(token)
-
-
-_is_nested: ContextVar[bool] = ContextVar("is_nested", default=False)
+            _is_validating.reset(token)
 
 
 def nested_model(field: FieldInfo) -> type[CheckedModel] | None:
-    """Return the model that is the value of a field, if it is not None."""
+    """Return the checked model among the types of a field, or None."""
     kinds = (field.annotation, *get_args(field.annotation))
     return next((kind for kind in kinds if isclass(kind) and issubclass(kind, CheckedModel)), None)
 
 
 def model_keys(model: type[CheckedModel]) -> Iterator[str]:
-    """Yield the keys of a model, and those of models directly in it as `td3.gamma`."""
+    """Yield the keys of a model and, with dots (`td3.gamma`), those of the models in its fields."""
     for name, field in model.model_fields.items():
         yield name
         if nested := nested_model(field):
@@ -147,7 +148,7 @@ def _describe_problem(problem: Mapping[str, Any], keys: Sequence[str]) -> str:
     path = _path(problem)
     if problem["type"] == "extra_forbidden":
         table, _, key = path.rpartition(".")
-        if path in keys:  # "td3.gamma" is no key of Python's
+        if path in keys:  # Python has no keyword argument with a dot
             return f"there is no key {path!r}: write {table}={{{key!r}: ...}}"
         siblings = [name.removeprefix(f"{table}.") for name in keys if table and name.startswith(f"{table}.")]
         all_keys = f"; the keys of {table} are {', '.join(siblings)}" if siblings else ""

@@ -35,7 +35,7 @@ def numpy_piece_reward(decoder, rows):
         u, w = numpy_linear(decoder.gru.input_projection, x), numpy_linear(decoder.gru.hidden_projection, h)
         z, r = sigmoid(u[:5] + w[:5]), sigmoid(u[5:10] + w[5:10])
         h = (1 - z) * np.tanh(u[10:] + r * w[10:]) + z * h
-    return float(numpy_linear(decoder.value, h)[0])
+    return float(numpy_linear(decoder.readout, h)[0])
 
 
 def test_piece_rewards_against_numpy(decoder, rows):
@@ -74,7 +74,7 @@ def loss_gradient(decoder, rows):
 
 def test_gradient_ignores_padding_and_the_step_model_does_not_train_the_other(decoder, rows):
     padded = np.where(np.arange(STEPS)[:, None] < LENGTH[:, None, None], rows, np.float32(99.0))
-    larger = eqx.tree_at(lambda d: d.step, decoder, jax.tree.map(lambda leaf: 100 * leaf, decoder.step))
+    larger = eqx.tree_at(lambda d: d.step_model, decoder, jax.tree.map(lambda leaf: 100 * leaf, decoder.step_model))
     gradient = loss_gradient(decoder, rows)
     pairs = (gradient, loss_gradient(decoder, padded)), (gradient.gru, loss_gradient(larger, rows).gru)
     for a, b in zip(*map(jax.tree.leaves, zip(*pairs, strict=True)), strict=True):

@@ -11,6 +11,8 @@ from lare_rl.util.renamed_fields import rename_fields
         (".credit[0].closed.summed.episodes", ".decoders[0].closed_form.sufficient_statistics.n_episodes"),
         (".credit[0].average", ".decoders[0].is_mean"),
         (".credit[0].decoder.step", ".decoders[0].decoder.position"),
+        (".credit[0].decoder.step.layers[0].weight", ".decoders[0].decoder.step_model.layers[0].weight"),
+        (".decoders[0].optimizer[0].mu.value.bias", ".decoders[0].optimizer[0].mu.readout.bias"),
         (".algorithm.done", ".algorithm.n_due"),
         (".replay.episodes", ".replay.episodes"),
         (".algorithm.qmix.online.agent.decoder.weight", ".algorithm.qmix.online.agent.head.weight"),

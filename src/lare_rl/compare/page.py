@@ -108,7 +108,7 @@ def _body(comparisons: Sequence[Comparison]) -> Iterator[str]:
         scale = "score" if comparison.normalised else "true return"
         score = scale if comparison.metric == RETURN else comparison.metric
         yield f"<h{level}>Learning</h{level}>"
-        yield figures.draw_bands(comparison.curves, "environment steps", f"IQM of the {score}", steps=True)
+        yield figures.draw_bands(comparison.curves, "environment steps", f"IQM of the {score}", x_is_steps=True)
         yield render_note(MESSAGES["curves"])
         yield f"<h{level}>Performance profiles</h{level}>"
         yield figures.draw_bands(comparison.profiles, f"x ({score})", "share of runs that score more")

@@ -1,7 +1,7 @@
 """The scores of a comparison, as arrays.
 
 A *score* is the value of the metric at an evaluation. If there are several tasks, the metric is the return, and it is scaled: 0 is
-the return of a random policy, and 1 a fixed return of a trained one (`REFERENCE_RETURNS`).
+the return of a random policy, and 1 the return of a policy trained by others (`REFERENCE_RETURNS`, for some tasks).
 """
 
 from collections.abc import Mapping, Sequence
@@ -36,7 +36,7 @@ class Group:
 
 
 class _Key(NamedTuple):
-    """What one curve belongs to."""
+    """The run and seed of a curve."""
 
     label: str
     task: str
@@ -47,7 +47,7 @@ class _Key(NamedTuple):
 class _Curve(NamedTuple):
     source: Path
     values: Mapping[int, float]
-    """By step."""
+    """From step to value."""
 
 
 def group_results(
@@ -56,10 +56,10 @@ def group_results(
     """Group results by label.
 
     Args:
-        results: the results of all labels.
-        metric: the name of the metric, for messages.
+        results: the curves of runs, each with a label: the name of its method in the comparison.
+        metric: the name of the metric. Only returns are scaled.
         step: the step at which results are compared. The default is the last step at which all of them have a value.
-        late: whether the final scores are means over the evaluations after three quarters of that step.
+        late: whether the final scores are means over the last quarter of the steps up to `step`.
 
     Raises:
         LareError: a label lacks a task, draw or seed, or not all results have a value at `step`.
@@ -83,7 +83,7 @@ def group_results(
                 )
             scores[i, j, k] = [curves[key].values[step] for step in steps]
         if len(tasks) > 1:
-            low, high = np.transpose([REFERENCE_RETURNS[task] for task in tasks])[..., None]
+            low, high = np.transpose([REFERENCE_RETURNS[task] for task in tasks])[..., None]  # each [tasks 1]
             scores = (scores - low) / (high - low)
         groups.append(
             Group(
@@ -116,7 +116,7 @@ def _check_tasks(results: Sequence[Results], tasks: Sequence[str], metric: str) 
             other, digest = sources.setdefault(result.task, (result.source, result.config.task.digest))
             if digest != result.config.task.digest:
                 raise LareError(
-                    f"{result.source} and {other} have two different tasks {result.task}: compare them separately"
+                    f"{result.source} and {other} have different tasks with the name {result.task}: compare them separately"
                 )
 
 
@@ -128,7 +128,7 @@ def _index_curves(results: Sequence[Results], metric: str) -> dict[_Key, _Curve]
             if key in curves:
                 other = curves[key].source
                 from_table = result.config is None or other.suffix == ".csv"
-                hint = ", or rename the method in the table" if from_table else ""
+                hint = ", or rename the method in the .csv file" if from_table else ""
                 raise LareError(
                     f"{result.source} and {other} both have {key.label} on {key.task} with seed {seed}: leave out one{hint}"
                 )
@@ -138,19 +138,19 @@ def _index_curves(results: Sequence[Results], metric: str) -> dict[_Key, _Curve]
     return curves
 
 
-def _shared_steps(curves: Mapping[_Key, _Curve], metric: str, last: int | None) -> list[int]:
-    """Return the steps at which all curves have a value, up to `last`."""
+def _shared_steps(curves: Mapping[_Key, _Curve], metric: str, step: int | None) -> list[int]:
+    """Return the steps at which all curves have a value, up to `step`."""
     steps = sorted(set.intersection(*(set(curve.values) for curve in curves.values())))
     if not steps:
         spans = {curve.source: f"{min(curve.values):,} to {max(curve.values):,}" for curve in curves.values()}
         text = "; ".join(f"{source}: {span}" for source, span in spans.items())
         raise LareError(f"no step has a value of {metric} in all runs ({text})")
-    if last is None:
+    if step is None:
         return steps
-    if last not in steps:
-        texts = [f"{step:,}" for step in steps]
+    if step not in steps:
+        texts = [f"{shared:,}" for shared in steps]
         texts = texts if len(texts) <= 6 else [*texts[:3], "...", texts[-1]]
         raise LareError(
-            f"not all runs have a value of {metric} at step {last:,}; all of them have one at {', '.join(texts)}"
+            f"not all runs have a value of {metric} at step {step:,}; all of them have one at {', '.join(texts)}"
         )
-    return [step for step in steps if step <= last]
+    return [shared for shared in steps if shared <= step]

@@ -1,17 +1,19 @@
 """Diaster: episodic return decomposition by difference of implicitly assigned sub-trajectory reward (Lin et al., AAAI 2024).
 
-A sub-trajectory model F predicts the reward of a piece of an episode. The rewards of the two pieces of a cut episode add up to
-the return:
+F[i:j] is a model of the reward of a piece of an episode: of its steps i to j - 1. An episode is cut into two pieces, whose rewards
+add up to the return:
 
-    (F(0..c) + F(c..T) - R)^2,    c uniform in 1..T-1
+    (F[0:c] + F[c:T] - R)^2,    c uniform in {1, ..., T - 1}
 
 The reward of a step is the difference of F for two prefixes. A step model learns this difference from the step alone:
 
-    (r_hat(s_t, a_t) - (F(0..t+1) - F(0..t)))^2,    with R instead of F(0..T)
+    (r_hat(s_t, a_t) - (F[0:t+1] - F[0:t]))^2
 
-F is a GRU (Cho et al., 2014) over the steps of a piece, with an initial state of zeros. With L the length of the longest
-episode, the unit of F is L times the scale of R/T, so that F is around 1. The step model is in units of the scale, and so
-learns L times the differences of F.
+At the last step, the return R is known and replaces F[0:T]. F is a GRU (Cho et al., 2014) over the steps of a piece, with an initial
+state of zeros.
+
+The step model is in units of the scale, the root mean square of R/T. F is in units of L times the scale, where L is the number of
+steps of the longest episode, so that it is at most about 1. The step model therefore learns L times the differences of F.
 """
 
 import equinox as eqx
@@ -30,31 +32,32 @@ class Diaster(eqx.Module):
     """The sub-trajectory model and the step model."""
 
     gru: GRU
-    value: Linear
-    step: MLP
+    readout: Linear
+    """From the state of the GRU to F."""
+    step_model: MLP
 
     def __init__(self, n_features: int, hidden: tuple[int, ...], *, key: PRNGKeyArray):
-        gru_key, value_key, step_key = jax.random.split(key, 3)
+        gru_key, readout_key, step_key = jax.random.split(key, 3)
         self.gru = GRU(n_features, hidden[0], key=gru_key)
-        self.value = Linear(hidden[0], 1, key=value_key)
-        self.step = MLP(n_features, hidden, 1, key=step_key)
+        self.readout = Linear(hidden[0], 1, key=readout_key)
+        self.step_model = MLP(n_features, hidden, 1, key=step_key)
 
     def __call__(self, features: Float[Array, "rows *agents features"], key: PRNGKeyArray | None) -> DecoderOutput:
-        """Return the output of the step model."""
-        return DecoderOutput(self.step(features)[..., 0], jnp.zeros(features.shape[:-1]))
+        """Return the output of the step model, which has no noise and no penalty."""
+        return DecoderOutput(self.step_model(features)[..., 0], jnp.zeros(features.shape[:-1]))
 
     def piece_rewards(
         self, features: Float[Array, "episodes steps features"], begins: Bool[Array, "episodes steps"]
     ) -> Float[Array, "episodes steps"]:
-        """Return F of the piece that ends with each step. A piece begins at each step where `begins` is true."""
+        """Return F of the piece that ends with each step. Pieces begin at the first step, and where `begins` is true."""
 
-        def body(h: Float[Array, "episodes size"], step: tuple[Array, Array]):
-            projected, first = step
+        def body(h: Float[Array, "episodes size"], inputs: tuple[Array, Array]):
+            projected, first = inputs
             h = self.gru(projected, jnp.where(first[:, None], 0, h))
-            return h, self.value(h)[:, 0]
+            return h, self.readout(h)[:, 0]
 
         projected = jnp.swapaxes(self.gru.input_projection(features), 0, 1)
-        h = jnp.zeros((len(features), self.value.weight.shape[0]))
+        h = jnp.zeros((len(features), self.readout.weight.shape[0]))
         return jax.lax.scan(body, h, (projected, begins.T))[1].T
 
     def loss(
@@ -82,10 +85,11 @@ class Diaster(eqx.Module):
         f_first = jnp.take_along_axis(f_ends, jnp.minimum(cut - 1, last), axis=1)[:, 0]
         f_second = jnp.where(length > 1, jnp.take_along_axis(f_ends, last, axis=1)[:, 0], 0)
         piece_loss = (f_first + f_second - total) ** 2
+        # The step model learns from F, and F only from returns.
         f_prefix = jax.lax.stop_gradient(self.piece_rewards(features, jnp.zeros_like(features[..., 0], bool)))
         f_prefix = jnp.where(t == last, total[:, None], f_prefix)
         step_target = max_steps * jnp.diff(f_prefix, axis=1, prepend=0)
-        squared_error = (self.step(features)[..., 0] - step_target) ** 2
+        squared_error = (self.step_model(features)[..., 0] - step_target) ** 2
         step_loss = jnp.sum((t < length[:, None]) * squared_error, axis=1) / jnp.maximum(length, 1)
         return jnp.sum(mask * (piece_loss + step_loss)) / jnp.maximum(jnp.sum(mask > 0), 1)
 

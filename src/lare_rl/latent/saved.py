@@ -1,4 +1,4 @@
-"""Function files: read again, and verified again, no matter who wrote them. `LatentFunction.save` writes them."""
+"""Reads the files that `LatentFunction.save` writes: `phi` (.py), and its model and replies (.json). Every `phi` is verified again."""
 
 import itertools
 import json
@@ -27,8 +27,8 @@ from lare_rl.util.safe_io import read_json, read_text
 __all__ = ["SavedSource", "load_function", "read_source"]
 
 _MAX_FILE_BYTES = 1 << 20
-_UNNAMED_MODEL = "a model that is not named"
-"""The model of a function that was read from a reply."""
+_UNNAMED_LLM = "a model that is not named"
+"""The language model of a function that was read from a reply."""
 
 
 class SavedSource(NamedTuple):
@@ -60,8 +60,10 @@ def load_function(path: str | Path, task: TaskSpec | str | Path, steps: Steps | 
     """Read a function from a file, and verify it. Files that `save` wrote are verified again too.
 
     Args:
-        path: a Python file, the .json that `save` wrote beside one, or the whole reply of a model to `lare-rl prompt` (.json, without
-            a .py beside it).
+        path: one of
+            - a Python file,
+            - the .json file that `save` wrote beside a Python file of the same name,
+            - a .json file with the whole reply of a language model to `lare-rl prompt`.
         task: the task of the function: a name, a path, or a spec.
         steps: observations (n, observation size) and actions (n, action size) that it is tried on if there is no environment.
 
@@ -73,13 +75,13 @@ def load_function(path: str | Path, task: TaskSpec | str | Path, steps: Steps | 
     saved_task = _header_value(header, "task")
     if saved_task not in (None, task.name):
         raise LareError(
-            f"{file} was written for the task {saved_task!r}, not for {task.name!r}. If it is right for both, remove its line "
-            f'"{HEADER_PREFIX}task: {saved_task}"'
+            f"{file} was written for the task {saved_task!r}, not for {task.name!r}. If the function is "
+            f'right for both tasks, remove the line "{HEADER_PREFIX}task: {saved_task}"'
         )
     kind: Kind = "reward" if _header_value(header, "kind") == "reward" else "factors"
     function = verify_function(source, task, kind, steps, file)
     if file.suffix == ".json":
-        return replace(function, model=_UNNAMED_MODEL)
+        return replace(function, model=_UNNAMED_LLM)
     function = replace(function, model=_header_value(header, "model") or function.model)
     function = _add_provenance(function, file.with_suffix(".json"))
     if _was_changed(header, source) and not function.changed:
@@ -88,7 +90,7 @@ def load_function(path: str | Path, task: TaskSpec | str | Path, steps: Steps | 
 
 
 def _find_file(path: str | Path) -> Path:
-    """Return the Python file of a saved function, or the file of a model's reply."""
+    """Return the Python file of a saved function, also for the .json beside it, or the file of a model's reply."""
     if not isinstance(path, (str, Path)):
         raise LareError(f"a latent function is read from the path of a file, not from {short_repr(path)}")
     path = Path(path)
@@ -132,12 +134,14 @@ def _was_changed(header: Sequence[str], source: str) -> bool:
 
 
 def _add_provenance(function: LatentFunction, record: Path) -> LatentFunction:
-    """Add the model and the replies from the .json beside the source. Mark the model if the source differs."""
+    """Add the model and the replies from the .json beside the source. If the source differs, add a suffix to the model's name."""
     if not record.is_file():
         return function
     try:
         saved = read_json(read_text(record))
-        json.dumps(saved, ensure_ascii=False).encode()  # a lone surrogate can be read but not written
+        json.dumps(
+            saved, ensure_ascii=False
+        ).encode()  # half of a two-part Unicode character can be read but not written
         model = saved["model"] if saved["source"] == function.source else saved["model"] + CHANGED_SUFFIX
         exchanges = tuple(Exchange(**exchange).model_dump() for exchange in saved["exchanges"])
         if not isinstance(model, str):

@@ -61,6 +61,7 @@ Curve = tuple[Float[np.ndarray, " evaluations"], Float[np.ndarray, "seeds evalua
 
 
 def to_svg(figure: Figure) -> str:
+    """Return a figure as an <svg> element, for use within an HTML page."""
     text = io.StringIO()
     with matplotlib.rc_context(_STYLE):
         figure.savefig(text, format="svg", bbox_inches="tight", metadata={"Date": None}, transparent=True)
@@ -97,10 +98,10 @@ def draw_curves(
         curves: the curves, by name.
         y_label: the label of the y axis.
         bottom: the lower end of the y axis.
-        lowest_bottom: a bound on the lower end of the y axis, which cuts off what is below it.
+        lowest_bottom: the lower end of the y axis where values are smaller than this.
         reference_lines: values that are drawn as dotted lines, by name.
         warmup: the number of first steps, with random actions, which are shaded.
-        episode_stds: half the width of the bands of curves with a single seed, by name.
+        episode_stds: the standard deviation over the episodes of each evaluation, by name. It is the band of a curve with one seed.
     """
     figure, (axes,) = make_figure(height=3.0)
     for (line, colour), (name, (steps, values)) in zip(cycle(_LINES), curves.items(), strict=False):
@@ -124,7 +125,7 @@ def draw_curves(
 
 
 def draw_bands(
-    bands: Mapping[str, Band], x_label: str, y_label: str, steps: bool = False, log_scale: bool = False
+    bands: Mapping[str, Band], x_label: str, y_label: str, x_is_steps: bool = False, log_scale: bool = False
 ) -> str:
     """Draw curves with an interval at every point.
 
@@ -132,11 +133,11 @@ def draw_bands(
         bands: the curves, by name.
         x_label: the label of the x axis.
         y_label: the label of the y axis.
-        steps: whether x counts environment steps. If it does not, y is a fraction, and is drawn as stairs.
+        x_is_steps: whether x counts environment steps. If not, y is a fraction of runs that changes at each x, drawn as stairs.
         log_scale: whether the y axis is logarithmic.
     """
     figure, (axes,) = make_figure()
-    _draw_bands_on(axes, bands, steps)
+    _draw_bands_on(axes, bands, x_is_steps)
     axes.set(xlabel=x_label, ylabel=y_label)
     if log_scale:
         axes.set_yscale("log")
@@ -151,7 +152,7 @@ def draw_band_panels(panels: Mapping[str, Mapping[str, Band]], x_label: str, y_l
     for axes in all_axes[len(panels) :]:
         axes.set_visible(False)
     for axes, (title, bands) in zip(all_axes, panels.items(), strict=False):
-        _draw_bands_on(axes, bands, steps=True)
+        _draw_bands_on(axes, bands, x_is_steps=True)
         axes.set_title(title, fontsize=11, loc="left")
     figure.supxlabel(x_label, fontsize=11)
     figure.supylabel(y_label, fontsize=11)
@@ -171,7 +172,7 @@ def draw_credit(
     proxy: Float[np.ndarray, " steps"],
     uncertainty: Float[np.ndarray, " steps"] | None = None,
 ) -> str:
-    """Draw the proxy rewards of an episode over the steps.
+    """Draw the proxy rewards of an episode over the steps, with a band of one standard deviation (`uncertainty`).
 
     If true rewards are known, they are drawn too, and a scatter plot has a point for each step.
     """
@@ -216,7 +217,7 @@ def draw_factors(factors: Float[np.ndarray, "steps factors"], names: Sequence[st
 def draw_credit_map(reward: Float[np.ndarray, "steps agents"], proxy: Float[np.ndarray, "steps agents"] | None) -> str:
     """Draw the rewards by agent and step: the true ones and, next to them, the proxy rewards.
 
-    Each has its own scale, because a decoder knows sums only.
+    Each has its own scale, because a decoder is fitted to sums: the level of a single agent is arbitrary.
     """
     rewards = {"true reward": reward} | ({} if proxy is None else {"proxy reward": proxy})
     with matplotlib.rc_context(_STYLE_WITHOUT_GRID):
@@ -233,7 +234,7 @@ def draw_credit_map(reward: Float[np.ndarray, "steps agents"], proxy: Float[np.n
 def draw_scatters(
     points_by_title: Mapping[str, Float[np.ndarray, "points 2"]], reward: Float[np.ndarray, " points"]
 ) -> str:
-    """Draw points in the plane, coloured by their true reward."""
+    """Draw embeddings of steps as points, coloured by their true reward. The colours leave out the extreme 2% on both sides."""
     low, high = np.percentile(reward, [2, 98])
     with matplotlib.rc_context(_STYLE_WITHOUT_GRID):
         figure = Figure(figsize=(6.4, 3.4), layout="constrained")
@@ -247,11 +248,11 @@ def draw_scatters(
     return to_svg(figure)
 
 
-def _draw_bands_on(axes: Axes, bands: Mapping[str, Band], steps: bool) -> None:
+def _draw_bands_on(axes: Axes, bands: Mapping[str, Band], x_is_steps: bool) -> None:
     for (line, colour), (name, (x, y, low, high)) in zip(cycle(_LINES), bands.items(), strict=False):
-        axes.plot(x, y, color=colour, linestyle=line, label=name, drawstyle="default" if steps else "steps-post")
-        axes.fill_between(x, low, high, color=colour, alpha=0.18, linewidth=0, step=None if steps else "post")
-    if steps:
+        axes.plot(x, y, color=colour, linestyle=line, label=name, drawstyle="default" if x_is_steps else "steps-post")
+        axes.fill_between(x, low, high, color=colour, alpha=0.18, linewidth=0, step=None if x_is_steps else "post")
+    if x_is_steps:
         axes.xaxis.set_major_formatter(_format_steps)
 
 

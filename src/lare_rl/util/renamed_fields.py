@@ -40,4 +40,6 @@ def rename_fields(name: str) -> str:
         (r"last(?=\.(weight|bias)$)", "head"),
     ):
         name = re.sub(rf"(\.decoders\[.*)\.{stas_field}", rf"\1.{present}", name)
+    for diaster_field, present in (("value", "readout"), ("step", "step_model")):
+        name = re.sub(rf"(\.decoders\[.*\.(?:decoder|mu|nu))\.{diaster_field}\.", rf"\1.{present}.", name)
     return re.sub(r"(?<!\.replay)\.episodes\b", ".n_episodes", name)
