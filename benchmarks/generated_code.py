@@ -295,8 +295,12 @@ def iteration_costs(task: str, settings: lare_rl.Settings, rounds: int = 5) -> d
     """Milliseconds of an iteration, of storing its steps, and of storing them without phi."""
     with tempfile.TemporaryDirectory() as folder:
         session = new_session(Path(folder) / "run", task, settings)
+
+        def iterate() -> None:
+            session.advance(session.step + session.settings.iteration_steps)
+
         for _ in range(3):
-            session.advance()
+            iterate()
         steps = session.collector.collect(session.actor, session.step)
         plain = compile_functions(session.config).store
         copies = {name: jax.tree.map(jnp.copy, session.learner) for name in ("with phi", "without phi")}
@@ -307,7 +311,7 @@ def iteration_costs(task: str, settings: lare_rl.Settings, rounds: int = 5) -> d
         work = {
             "with phi": lambda: store("with phi", session.functions.store),
             "without phi": lambda: store("without phi", plain),
-            "iteration": lambda: (session.advance(), jax.block_until_ready(session.learner)),
+            "iteration": lambda: (iterate(), jax.block_until_ready(session.learner)),
         }
         seconds = interleave(work, rounds)
         session.close()

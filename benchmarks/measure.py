@@ -153,6 +153,7 @@ def new_session(directory: Path, task_name: str, settings: lare_rl.Settings) -> 
 
 def advance(session: Session, steps: int) -> None:
     """Make `steps` environment steps of each seed, and wait for all computations."""
-    for _ in range(steps // session.settings.iteration_steps):
-        session.advance()
+    until = session.step + steps
+    while session.step < until:
+        session.advance(until)
     jax.block_until_ready(session.learner)

@@ -15,7 +15,7 @@ from lare_rl.training.learner import Learner
 from lare_rl.training.rewards import team_metrics
 from lare_rl.training.static_config import TrainConfig
 
-__all__ = ["fit_decoders", "fit_seeds", "sample_credit"]
+__all__ = ["fit_decoders", "fit_repeatedly", "fit_seeds", "sample_credit"]
 
 CHUNK_ROWS = 2400
 """About how many rows each chunk of a decoder's gradient is computed from. More rows do not fit into the cache, and
@@ -74,11 +74,11 @@ def fit_seeds(
 ) -> tuple[Learner, dict[str, Float[Array, " seeds"]]]:
     """Update the decoders of every seed `fit_updates` times. Return the mean of each metric."""
     # One seed after the other, because a large batch of episodes fills the caches already.
-    decoders, metrics = jax.lax.map(lambda seed: _fit_repeatedly(seed[0], seed[1], config), (learner, keys))
+    decoders, metrics = jax.lax.map(lambda seed: fit_repeatedly(seed[0], seed[1], config), (learner, keys))
     return learner._replace(decoders=decoders), metrics
 
 
-def _fit_repeatedly(
+def fit_repeatedly(
     learner: Learner, key: PRNGKeyArray, config: TrainConfig
 ) -> tuple[tuple[Decomposition, ...], dict[str, Float[Array, ""]]]:
     """Update the decoders `fit_updates` times. Return them, and the mean of each metric."""
