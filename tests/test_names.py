@@ -13,9 +13,6 @@ BANNED = set(
 )
 GENITIVE = re.compile(r"^_?of_\w+$")
 EXCEPTIONS: dict[str, int] = {
-    "src/lare_rl/assigner/layout.py": 7,
-    "src/lare_rl/integrations/torchrl.py": 1,
-    "src/lare_rl/logs/draft_from_log.py": 1,
     "src/lare_rl/phi/numpy_functions/tables.py": 3,
     "src/lare_rl/report/figures.py": 1,
 }

@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as arrays
 
 from lare_rl import LareError
-from lare_rl.assigner.layout import Layout, make_layout
+from lare_rl.assigner.space_layout import SpaceLayout, make_layout
 from lare_rl.logs.episode import KEYS, LogLayout, infer_layout, parse_episode
 
 LAYOUT = LogLayout(make_layout(2, "rows"), make_layout(1, "rows"))
@@ -111,7 +111,7 @@ def any_array():
 def test_any_arrays_are_parsed_or_refused(task, values, size, choices, good):
     """Nothing but a `LareError` of one line is raised, and nothing is warned."""
     values = GOOD | values if good else values
-    action = Layout(kind="choices", choices=(size,), first=(0,)) if choices else make_layout(size, "rows")
+    action = SpaceLayout(kind="choices", choices=(size,), first=(0,)) if choices else make_layout(size, "rows")
     message = "a.npz"
     try:
         layout = infer_layout("a.npz", values, task.model_copy(update={"action_size": size}))

@@ -9,7 +9,7 @@ import gymnasium
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from lare_rl.assigner.layout import Layout, make_layout
+from lare_rl.assigner.space_layout import SpaceLayout, make_layout
 from lare_rl.config.validity import check_credit
 from lare_rl.credit.decoder_settings import CreditSettings
 from lare_rl.credit.encoders import input_arrays
@@ -31,7 +31,7 @@ __all__ = [
     "to_step_numbers",
 ]
 
-Space = gymnasium.Space | Layout | int
+Space = gymnasium.Space | SpaceLayout | int
 """A space of Gymnasium, a layout, or the length of a row of numbers."""
 
 
@@ -42,8 +42,8 @@ class AssignerConfig:
     method: Method
     phi: LatentFunction | None
     task: TaskSpec | None
-    observation: Layout
-    action: Layout
+    observation: SpaceLayout
+    action: SpaceLayout
     judges: FactorInputs
     agents: int
     max_steps: int | None
@@ -133,7 +133,7 @@ class AssignerConfig:
         return reward, mask
 
 
-def resolve_layouts(task: TaskSpec | None, spaces: Mapping[str, Space | None]) -> list[Layout]:
+def resolve_layouts(task: TaskSpec | None, spaces: Mapping[str, Space | None]) -> list[SpaceLayout]:
     """Return the layouts of observations and actions.
 
     Raises:

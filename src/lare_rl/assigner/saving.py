@@ -19,7 +19,7 @@ import numpy as np
 
 from lare_rl.assigner.assigner_config import AssignerConfig
 from lare_rl.assigner.decoder_learner import DecoderLearner
-from lare_rl.assigner.layout import Layout
+from lare_rl.assigner.space_layout import SpaceLayout
 from lare_rl.assigner.store import Episode, Store
 from lare_rl.credit.decoder_settings import CreditSettings
 from lare_rl.credit.methods import find_method
@@ -118,8 +118,8 @@ def read_state(directory: Path) -> AssignerState:
             method=find_method(values["method"]),
             phi=phi,
             task=task,
-            observation=Layout(**values["observation"]),
-            action=Layout(**values["action"]),
+            observation=SpaceLayout(**values["observation"]),
+            action=SpaceLayout(**values["action"]),
             settings=CreditSettings(**values["settings"]),
             **{name: values[name] for name in PLAIN_FIELDS},
         )

@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Float
 
 from lare_rl.assigner.assigner import CreditAssigner
-from lare_rl.assigner.layout import make_layout
+from lare_rl.assigner.space_layout import make_layout
 from lare_rl.envs.episodic import TRUE_REWARD
 from lare_rl.errors import LareError, missing_extra_error
 from lare_rl.integrations.gymnasium import batch_of_one

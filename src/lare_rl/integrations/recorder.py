@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Bool, Int
 
 from lare_rl.assigner.assigner import CreditAssigner
-from lare_rl.assigner.layout import make_layout
+from lare_rl.assigner.space_layout import make_layout
 from lare_rl.errors import LareError, short_repr
 
 __all__ = ["CREDIT_STEP", "Pay", "StepRecorder", "check_assigner", "check_capacity", "check_pay"]

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from lare_rl.assigner.assigner import CreditAssigner
-from lare_rl.assigner.layout import Layout
+from lare_rl.assigner.space_layout import SpaceLayout
 from lare_rl.errors import LareError, missing_extra_error
 from lare_rl.integrations.recorder import CREDIT_STEP, check_assigner
 
@@ -113,10 +113,10 @@ def _read_flags(tensordict: TensorDictBase, key: str) -> np.ndarray:
     return _flatten(tensordict, key).reshape(-1)
 
 
-def _read_elements(tensordict: TensorDictBase, key: Any, layout: Layout) -> Any:
+def _read_elements(tensordict: TensorDictBase, key: Any, layout: SpaceLayout) -> Any:
     """Return observations or actions in the form that the assigner takes. In TorchRL, choices are one-hot rows or numbers."""
     if isinstance(key, dict):
-        children = zip(layout.names, layout.parts, strict=True)
+        children = zip(layout.names, layout.inner, strict=True)
         return {name: _read_elements(tensordict, key[name], child) for name, child in children}
     values = _flatten(tensordict, key)
     is_one_hot = layout.kind == "choices" and values.ndim == 2 and values.shape[1] == layout.size > 1

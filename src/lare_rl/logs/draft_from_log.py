@@ -3,7 +3,7 @@
 import re
 from typing import Any
 
-from lare_rl.assigner.layout import Layout
+from lare_rl.assigner.space_layout import SpaceLayout
 from lare_rl.logs.log import Log, open_log
 from lare_rl.new_task.documentation import plain_lines, remove_rewards
 from lare_rl.new_task.draft import SCORE_LINE, Draft, count_entries, text_lines, warning_lines
@@ -47,12 +47,12 @@ def _description(log: Log) -> str:
     return "" if dataset is None else str(dataset.storage.metadata.get("description") or "")
 
 
-def _first_line(layout: Layout, key: str) -> str:
+def _first_line(layout: SpaceLayout, key: str) -> str:
     """Return the first line of the text of a key: the number of entries, and what they are."""
     n_entries = count_entries(layout.size)
     if layout.kind == "choices":
         return f"{n_entries}, all 0 but one: the {'action that is taken' if key == 'action' else 'state'}."
     if layout.kind == "named":
-        children = zip(layout.names, layout.parts, strict=True)
+        children = zip(layout.names, layout.inner, strict=True)
         return f"{n_entries}: " + ", then ".join(f"{child.size} of {name}" for name, child in children) + "."
     return f"{n_entries}."

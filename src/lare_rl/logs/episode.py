@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from lare_rl.assigner.layout import Layout
+from lare_rl.assigner.space_layout import SpaceLayout
 from lare_rl.errors import LareError, short_repr
 from lare_rl.tasks.spec import TaskSpec
 
@@ -53,8 +53,8 @@ class RelabelledEpisode(NamedTuple):
 class LogLayout:
     """The layout that all episodes of a log share."""
 
-    observation: Layout
-    action: Layout
+    observation: SpaceLayout
+    action: SpaceLayout
     max_episode_steps: int | None = None
     """The time limit; None if it is unknown."""
 
@@ -81,9 +81,9 @@ def infer_layout(name: str, values: Mapping[str, Any], role: TaskSpec | None) ->
                 "docs/logs.md), and give it with --task FILE"
             )
         if is_discrete and sizes[kind] != 1:
-            layouts[kind] = Layout(kind="choices", choices=(sizes[kind],), first=(0,))
+            layouts[kind] = SpaceLayout(kind="choices", choices=(sizes[kind],), first=(0,))
         else:
-            layouts[kind] = Layout(kind="numbers", shape=array.shape[1:])
+            layouts[kind] = SpaceLayout(kind="numbers", shape=array.shape[1:])
     return LogLayout(**layouts, max_episode_steps=None if role is None else role.max_episode_steps)
 
 
@@ -134,7 +134,7 @@ def parse_episode(name: str, values: Mapping[str, Any], layout: LogLayout, conte
     )
 
 
-def _rows(where: str, values: Any, layout: Layout) -> Float[np.ndarray, "steps size"]:
+def _rows(where: str, values: Any, layout: SpaceLayout) -> Float[np.ndarray, "steps size"]:
     for leaf in _leaves(values):
         _check_numbers(where, leaf)
     rows = layout.rows(values, where)

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from lare_rl.assigner.layout import make_layout
+from lare_rl.assigner.space_layout import make_layout
 from lare_rl.errors import LareError, missing_extra_error, short_repr
 from lare_rl.logs.episode import LogLayout, RelabelledEpisode
 from lare_rl.logs.log import Log, atomic_output, check_output

@@ -6,16 +6,16 @@ from typing import Any, Literal
 import numpy as np
 from gymnasium import spaces
 from jaxtyping import Float, Shaped
-from pydantic import Field
+from pydantic import AliasChoices, Field
 
 from lare_rl.errors import CheckedModel, LareError, short_repr
 
-__all__ = ["Layout", "make_layout"]
+__all__ = ["SpaceLayout", "make_layout"]
 
 Kind = Literal["numbers", "choices", "named", "in a row"]
 
 
-class Layout(CheckedModel):
+class SpaceLayout(CheckedModel):
     """How the elements of a space become rows. It can be saved as JSON."""
 
     kind: Kind
@@ -27,15 +27,15 @@ class Layout(CheckedModel):
     """For `choices`: the number of the first option, of each choice."""
     names: tuple[str, ...] = ()
     """For `named`: the keys, in order."""
-    parts: tuple["Layout", ...] = Field(default=())
-    """For `named` and `in a row`: the inner spaces."""
+    inner: tuple["SpaceLayout", ...] = Field(default=(), validation_alias=AliasChoices("inner", "parts"))
+    """For `named` and `in a row`: the layouts of the spaces inside. Earlier versions saved them as `parts`."""
 
     @functools.cached_property
     def size(self) -> int:
         """The length of a row."""
         if self.kind == "numbers":
             return int(np.prod(self.shape, dtype=int))
-        return sum(self.choices) if self.kind == "choices" else sum(space.size for space in self.parts)
+        return sum(self.choices) if self.kind == "choices" else sum(space.size for space in self.inner)
 
     def rows(self, values: Any, name: str) -> Float[np.ndarray, "*batch size"]:
         """Return a batch of elements as rows. As in Gymnasium's vector environments, a batch of mappings is a mapping of batches.
@@ -51,7 +51,7 @@ class Layout(CheckedModel):
             if missing:
                 raise LareError(f"{name} has no {missing[0]!r}: it needs {', '.join(map(repr, self.names))}")
             return self._concatenate([values[key] for key in self.names], name)
-        if self.kind == "in a row" and isinstance(values, tuple | list) and len(values) == len(self.parts):
+        if self.kind == "in a row" and isinstance(values, tuple | list) and len(values) == len(self.inner):
             return self._concatenate(values, name)
         array = _to_array(values, name)
         if self.kind == "choices":
@@ -63,10 +63,10 @@ class Layout(CheckedModel):
 
     def _concatenate(self, values: Any, name: str) -> Float[np.ndarray, "*batch size"]:
         """Return the rows of all inner spaces, side by side."""
-        labels = self.names or range(len(self.parts))
+        labels = self.names or range(len(self.inner))
         arrays = [
             space.rows(value, f"{name}[{label!r}]")
-            for space, value, label in zip(self.parts, values, labels, strict=True)
+            for space, value, label in zip(self.inner, values, labels, strict=True)
         ]
         shapes = {array.shape[:-1] for array in arrays}
         if len(shapes) > 1:
@@ -113,28 +113,28 @@ def _to_float32(array: Shaped[np.ndarray, "*shape"]) -> Float[np.ndarray, "*shap
         return array.astype(np.float32, copy=False)
 
 
-def make_layout(space: "spaces.Space | int | Layout", name: str) -> Layout:
+def make_layout(space: "spaces.Space | int | SpaceLayout", name: str) -> SpaceLayout:
     """Return the layout of a Gymnasium space, or of rows of this many numbers.
 
     Raises:
         LareError: its elements have no fixed size.
     """
     match space:
-        case Layout():
+        case SpaceLayout():
             return space
         case int():
-            return Layout(kind="numbers", shape=(space,))
+            return SpaceLayout(kind="numbers", shape=(space,))
         case spaces.Box() | spaces.MultiBinary():
-            return Layout(kind="numbers", shape=space.shape)
+            return SpaceLayout(kind="numbers", shape=space.shape)
         case spaces.Discrete():
-            return Layout(kind="choices", choices=(int(space.n),), first=(int(space.start),))
+            return SpaceLayout(kind="choices", choices=(int(space.n),), first=(int(space.start),))
         case spaces.MultiDiscrete() if space.nvec.ndim == 1:
             first = tuple(map(int, space.start))
-            return Layout(kind="choices", shape=space.shape, choices=tuple(map(int, space.nvec)), first=first)
+            return SpaceLayout(kind="choices", shape=space.shape, choices=tuple(map(int, space.nvec)), first=first)
         case spaces.Dict():
             inner = tuple(make_layout(value, f"{name}[{key!r}]") for key, value in space.spaces.items())
-            return Layout(kind="named", names=tuple(space.spaces), parts=inner)
+            return SpaceLayout(kind="named", names=tuple(space.spaces), inner=inner)
         case spaces.Tuple():
             inner = tuple(make_layout(value, f"{name}[{i}]") for i, value in enumerate(space.spaces))
-            return Layout(kind="in a row", parts=inner)
+            return SpaceLayout(kind="in a row", inner=inner)
     raise LareError(f"{name} is {short_repr(space)}: its elements cannot be written as rows of numbers of one size")

@@ -7,7 +7,7 @@ from gymnasium.vector.utils import concatenate, create_empty_array
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from lare_rl.assigner.layout import Layout, make_layout
+from lare_rl.assigner.space_layout import SpaceLayout, make_layout
 from lare_rl.errors import LareError
 
 SIZES = st.integers(1, 3)
@@ -48,7 +48,7 @@ def test_rows_equal_flatten_of_gymnasium(space, count, seed):
     values = [space.sample() for _ in range(count)]
     batch = concatenate(space, values, create_empty_array(space, count))
     layout = make_layout(space, "observation_space")
-    assert Layout(**layout.model_dump(mode="json")) == layout
+    assert SpaceLayout(**layout.model_dump(mode="json")) == layout
     rows = layout.rows(batch, "observation")
     assert rows.dtype == np.float32
     assert rows.shape == (count, layout.size) == (count, spaces.flatdim(space))
