@@ -1,7 +1,7 @@
 """Plays episodes of a task from the view of one of its roles, to verify and examine latent functions before training."""
 
 import contextlib
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -16,6 +16,7 @@ __all__ = [
     "Episode",
     "Policy",
     "find_team",
+    "make_episode",
     "phi_inputs",
     "play_episode",
     "play_episodes",
@@ -73,17 +74,33 @@ def play_episodes(role: TaskSpec, n_episodes: int, policy: Policy | None = None,
 
 def play_episode(env: HostEnv, role: TaskSpec, policy: Policy | None, rng: np.random.Generator, seed: int) -> Episode:
     """Play one episode. See `play_episodes`."""
-    team, scope, columns, measures = find_team(role, env.spec), role.judged_from, [], {}
-    for timestep, action, next_timestep in play_steps(env, policy, rng, seed):
-        observation, env_action = phi_inputs(scope, team, timestep, action)
-        next_observation, _ = phi_inputs(scope, team, next_timestep, action)
-        team_reward = np.asarray(team_mean(next_timestep.reward, timestep.alive, team))
-        alive, reward = timestep.alive[team.agents], next_timestep.reward[team.agents]
-        if scope == "state":
-            alive, reward = np.ones(1, bool), team_reward[None]
-        columns.append((observation, env_action, next_observation, alive, reward, team_reward))
-        measures = {name: float(value) for name, value in next_timestep.measures.items()}
-    return Episode(*(np.stack(column) for column in zip(*columns, strict=True)), measures=measures)
+    timesteps, actions, next_timesteps = zip(*play_steps(env, policy, rng, seed), strict=True)
+    measures = {name: float(value) for name, value in next_timesteps[-1].measures.items()}
+    return make_episode(role, env.spec, _stack(timesteps), np.stack(actions), _stack(next_timesteps), measures)
+
+
+def make_episode(
+    role: TaskSpec,
+    spec: EnvSpec,
+    timestep: Timestep,
+    env_action: Float[np.ndarray, "steps agents action"],
+    next_timestep: Timestep,
+    measures: Mapping[str, float] | None = None,
+) -> Episode:
+    """Return the rows of a role, from all steps of an episode."""
+    team, scope = find_team(role, spec), role.judged_from
+    observation, action = phi_inputs(scope, team, timestep, env_action)
+    next_observation, _ = phi_inputs(scope, team, next_timestep, env_action)
+    team_reward = np.asarray(team_mean(next_timestep.reward, timestep.alive, team))
+    alive, reward = timestep.alive[:, team.agents], next_timestep.reward[:, team.agents]
+    if scope == "state":
+        alive, reward = np.ones((len(alive), 1), bool), team_reward[:, None]
+    return Episode(observation, action, next_observation, alive, reward, team_reward, measures or {})
+
+
+def _stack(timesteps: Sequence[Timestep]) -> Timestep:
+    *columns, _ = zip(*timesteps, strict=True)
+    return Timestep(*map(np.stack, columns), measures={})
 
 
 def play_steps(

@@ -22,7 +22,7 @@ import jax
 import numpy as np
 
 from lare_rl.errors import LareError, short_repr
-from lare_rl.util.files import write_atomically
+from lare_rl.util.files import write_arrays
 from lare_rl.util.renamed_fields import rename_fields
 from lare_rl.util.safe_io import read_json
 
@@ -110,14 +110,13 @@ def save(directory: Path, learner: WithReplay, host: Mapping[str, Any], arrays: 
     rows = _read_rows(learner.replay.columns, (start[..., None] + np.arange(width)) % capacity)
     segment_arrays = {name: np.asarray(values)[:, :, : count.max()] for name, values in rows.items()}
     number = segments[-1].number + 1 if segments else 0
-    path = directory / f"rows-{number}.npz"
-    write_atomically(path, lambda file: np.savez(file, allow_pickle=False, **segment_arrays))
+    write_arrays(directory / f"rows-{number}.npz", segment_arrays)
     segments.append(_Segment(number, start.tolist(), count.tolist()))
     in_use = [segment for segment in segments if np.any(np.add(segment.start, segment.count) > end - capacity)]
     state = {name: np.asarray(leaf) for name, leaf in named_leaves(learner).items()} | dict(arrays)
     state["host"] = np.array(json.dumps(host))
     state["segments"] = np.array(json.dumps([asdict(segment) for segment in in_use]))
-    write_atomically(directory / STATE_FILE, lambda file: np.savez(file, allow_pickle=False, **state))
+    write_arrays(directory / STATE_FILE, state)
     for segment in segments:
         if segment not in in_use:  # not always the oldest ones: a segment from before a drop may reach further
             (directory / f"rows-{segment.number}.npz").unlink(missing_ok=True)

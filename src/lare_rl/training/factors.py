@@ -17,7 +17,7 @@ from lare_rl.phi.graph import Graph
 from lare_rl.runs.directory import Run
 from lare_rl.tasks.spec import select_states
 from lare_rl.training.static_config import TrainConfig
-from lare_rl.util.files import write_atomically
+from lare_rl.util.files import write_arrays
 
 __all__ = ["compute_factors", "compute_host_factors", "is_compilable"]
 
@@ -80,7 +80,7 @@ def compute_host_factors(run: Run, config: TrainConfig, steps: Trajectory) -> Fl
             columns = function.step_factors(observation, env_action, next_observation, run.factor_inputs)
         except LatentRewardError as error:
             path, batch = run.directory / FAILED_BATCH, {"observation": error.observation, "action": error.action}
-            write_atomically(path, lambda file, batch=batch: np.savez(file, allow_pickle=False, **batch))
+            write_arrays(path, batch)
             raise LareError(f"{error}; it was given the batch in {path}; the last checkpoint is whole") from error
         factors[..., config.team_rows(i), : columns.shape[1]] = columns.reshape(*action.shape[:-1], -1)
     return factors

@@ -8,8 +8,8 @@ import numpy as np
 from jaxtyping import Int
 
 from lare_rl.data.replay import Replay, end_of_episode
-from lare_rl.envs.interface import EnvSpec, Timestep, team_mean, to_env_action
-from lare_rl.envs.play import Episode, find_team, phi_inputs
+from lare_rl.envs.interface import EnvSpec, Timestep, to_env_action
+from lare_rl.envs.play import Episode, make_episode
 from lare_rl.errors import LareError
 from lare_rl.runs.directory import Run, as_run
 from lare_rl.tasks.spec import TaskSpec
@@ -121,7 +121,7 @@ def _make_log(columns: Log, rows: Int[np.ndarray, " steps"], env: EnvSpec) -> Lo
 
 
 def _make_episode(columns: Log, rows: Int[np.ndarray, " steps"], env: EnvSpec, role: TaskSpec) -> Episode:
-    size, team = len(columns["reward"]), find_team(role, env)
+    size = len(columns["reward"])
 
     def read(name: str, rows: np.ndarray) -> np.ndarray:
         return columns[name][rows % size] if name in columns else np.zeros(0, np.float32)
@@ -130,20 +130,8 @@ def _make_episode(columns: Log, rows: Int[np.ndarray, " steps"], env: EnvSpec, r
         arrays = {name: read(name, rows) for name in Timestep._fields if name != "measures"}
         return Timestep(**arrays, measures={})
 
-    env_action = to_env_action(read("action", rows), env)
-    observation, action = phi_inputs(role.judged_from, team, read_timestep(rows), env_action)
-    next_observation, _ = phi_inputs(role.judged_from, team, read_timestep(rows + 1), env_action)
     alive = read("alive", rows) if "alive" in columns else np.ones((len(rows), env.n_agents), bool)
-    reward = read("reward", rows)
-    team_reward = np.asarray(team_mean(reward, alive, team))
-    alive, reward = alive[:, team.agents], reward[:, team.agents]
-    if role.judged_from == "state":
-        alive, reward = np.ones((len(rows), 1), bool), team_reward[:, None]
-    return Episode(
-        observation=observation,
-        env_action=action,
-        next_observation=next_observation,
-        alive=alive,
-        reward=reward,
-        team_reward=team_reward,
-    )
+    timestep = read_timestep(rows)._replace(alive=alive)
+    # The reward of a step is in its own row of the replay, and what it leads to in the next one.
+    next_timestep = read_timestep(rows + 1)._replace(reward=read("reward", rows))
+    return make_episode(role, env, timestep, to_env_action(read("action", rows), env), next_timestep)

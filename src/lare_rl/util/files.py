@@ -1,14 +1,14 @@
 """Files that are replaced as a whole. If the process is killed, or the disk is full, the old file stays."""
 
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 from uuid import uuid4
 
 from lare_rl.errors import LareError
 
-__all__ = ["replace_file", "write_atomically"]
+__all__ = ["replace_file", "write_arrays", "write_atomically"]
 
 
 def write_atomically(path: Path, write: Callable[[Any], object]) -> None:
@@ -22,6 +22,13 @@ def write_atomically(path: Path, write: Callable[[Any], object]) -> None:
     except OSError as error:
         reason = error.strerror or error
         raise LareError(f"{path} cannot be written ({reason}); an existing file is unchanged") from error
+
+
+def write_arrays(path: Path, arrays: Mapping[str, Any]) -> None:
+    """Replace an .npz file. Raises `LareError` if it cannot be written."""
+    import numpy as np  # here, because the command line imports this module before it shows a message
+
+    write_atomically(path, lambda file: np.savez(file, allow_pickle=False, **arrays))
 
 
 def replace_file(path: Path, write: Callable[[Any], object]) -> None:
