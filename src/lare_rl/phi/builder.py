@@ -174,12 +174,12 @@ class Builder:
         if positions.shape == node.shape and np.array_equal(positions, all_positions(node.shape)):
             return x
         if node.op == "gather":
-            return self.gather(node.inputs[0], node.option.reshape(-1)[positions])
+            return self.gather(node.inputs[0], np.asarray(node.option.reshape(-1)[positions]))
         if node.op == "concat":  # read a single source directly
             ends = np.cumsum([self.nodes[i].shape[0] for i in node.inputs])
             source = int(np.searchsorted(ends, positions.min(), side="right"))
             if positions.max() < ends[source]:
-                return self.gather(node.inputs[source], positions - (ends[source - 1] if source else 0))
+                return self.gather(node.inputs[source], np.asarray(positions - (ends[source - 1] if source else 0)))
         return self.add("gather", [x], positions.shape, node.kind, np.ascontiguousarray(positions))
 
     def concat(self, inputs: Sequence[int]) -> int:
