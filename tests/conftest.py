@@ -125,7 +125,7 @@ def make_run(tmp_path):
 
 @pytest.fixture
 def echo() -> TaskSpec:
-    """Return the task of many agents in JAX."""
+    """Return a JAX task with several agents."""
     return echo_spec()
 
 

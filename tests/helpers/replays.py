@@ -15,7 +15,7 @@ extend, read = jax.jit(replay.extend), jax.jit(replay.read)
 
 
 def stream(lengths, env=0):
-    """Return steps of episodes, the last of which is running: (observation, next observation, team rewards, ended).
+    """Return (observation, next observation, team rewards, ended) of several episodes. The last one is running.
 
     Every observation is a different number, so that each row can be recognised.
     """

@@ -217,10 +217,8 @@ def starting_precisions(problem: Regression, start: Posterior) -> tuple[Float[Ar
 def most_likely(candidates: Posterior) -> Posterior:
     """Return the candidate with the largest evidence. Among candidates within `TOLERANCE` of it, return the first."""
     log_evidence = jnp.nan_to_num(candidates.log_evidence, nan=-jnp.inf)
-    is_best = log_evidence > jnp.max(log_evidence) - TOLERANCE
-    best = jax.lax.argmax(
-        is_best, 0, jnp.int32
-    )  # the first index where it is true; int32, as a program without float64 has
+    # The first index where it is true, as int32: the program around this one may be compiled without float64.
+    best = jax.lax.argmax(log_evidence > jnp.max(log_evidence) - TOLERANCE, 0, jnp.int32)
     return jax.tree.map(lambda leaf: leaf[best], candidates)
 
 

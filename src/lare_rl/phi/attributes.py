@@ -97,7 +97,7 @@ def resolve_import(statement: ast.Import | ast.ImportFrom) -> Iterable[tuple[str
         if alias.name == "*":
             prefix = f"{MODULES[module]}."
             names = [*CONSTANTS, *NAMES, *BUILTINS, *(f"np.{name}" for name in FUNCTIONS)]
-            members = [name for name in names if f"{name.rpartition('.')[0]}." == prefix]
+            members = [name for name in names if name.rpartition(".")[0] == MODULES[module]]
             yield from ((name.removeprefix(prefix), CONSTANTS.get(name, Symbol(name))) for name in members)
             continue
         full = f"{module}.{alias.name}"

@@ -31,7 +31,7 @@ Measured = tuple[Metrics, dict[str, Bool[Array, ""]]]
 
 
 class LoopState(NamedTuple):
-    """What an iteration changes. Every array has a leading seed axis, except `steps`' time axis which follows it."""
+    """What an iteration changes. The first axis of an array is the seed."""
 
     learner: Learner
     envs: VecEnvState

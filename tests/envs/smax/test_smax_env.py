@@ -80,7 +80,7 @@ def test_random_battles(name):
     assert (timestep.available[~timestep.alive] == (np.arange(env.spec.action_size) == STOP)).all()
     assert (timestep.observation[~timestep.alive] == 0).all()
     assert (timestep.reward[:, 1:][~timestep.alive[:, :-1]] == 0).all()
-    # Units that were alive have the same reward, also those that die in the step.
+    # Units that were alive before the step have the same reward, even if they die in it.
     was_alive, reward = timestep.alive[:, :-1], timestep.reward[:, 1:]
     np.testing.assert_array_equal(reward, np.where(was_alive, reward.max(axis=2, keepdims=True), 0))
     # All battles end at the time limit at the latest, with a return of at most 20.
