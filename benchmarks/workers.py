@@ -12,7 +12,8 @@ import numpy as np
 import tyro
 
 from burning import Burns
-from lare_rl.envs.workers import LocalVecEnv, SubprocVecEnv, VecEnv
+from lare_rl.envs.vec_env import LocalVecEnv, VecEnv
+from lare_rl.envs.workers import SubprocVecEnv
 from measure import interleave, show, summary, write
 
 REFERENCE = "one process"

@@ -20,7 +20,8 @@ from helpers.toy_envs import toy_spec
 from lare_rl.envs import families
 from lare_rl.envs.families import picklable_maker
 from lare_rl.envs.pettingzoo_env import make
-from lare_rl.envs.workers import LocalVecEnv, SubprocVecEnv
+from lare_rl.envs.vec_env import LocalVecEnv
+from lare_rl.envs.workers import SubprocVecEnv
 from lare_rl.errors import LareError
 
 BOTH = [LocalVecEnv, partial(SubprocVecEnv, processes=2)]

@@ -12,7 +12,7 @@ from PIL import Image
 import lare_rl
 from helpers.toy_envs import Chase, toy_spec
 from lare_rl.envs.families import make_host_env
-from lare_rl.envs.workers import LocalVecEnv
+from lare_rl.envs.vec_env import LocalVecEnv
 from lare_rl.errors import LareError
 from lare_rl.evaluation.evaluate import (
     MAX_OPEN_ENVS,
@@ -25,8 +25,9 @@ from lare_rl.evaluation.evaluate import (
 from lare_rl.evaluation.policy import load_policy
 from lare_rl.evaluation.video import check_video_path, record_video, write_video
 from lare_rl.training.compiled import compile_functions
+from lare_rl.training.host_policy import EvaluationPolicy
 from lare_rl.training.saved_state import load_learner
-from lare_rl.training.unroll_host import HostPolicy, evaluate_on_host
+from lare_rl.training.unroll_host import evaluate_on_host
 from lare_rl.util.statistics import format_mean_std
 
 
@@ -137,7 +138,7 @@ def test_evaluate_no_episodes(run):
 def test_evaluate_continues_after_initial_states_of_run(run, returns):
     state = load_learner(run)
     functions = compile_functions(state.config)
-    policy = HostPolicy(functions, state.config, functions.get_actor(state.learner, 60), run.seeds, 4)
+    policy = EvaluationPolicy(state.config, functions.get_actor(state.learner, 60), run.seeds, 4)
     with LocalVecEnv([partial(make_host_env, TASK)] * 8) as envs:
         first_returns = evaluate_on_host(envs, policy, run.seeds, 4).returns[..., 0]
     last_evaluation = [line["evaluation/return"] for line in run.metrics()[-2:]]

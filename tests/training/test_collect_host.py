@@ -15,7 +15,8 @@ from lare_rl.envs.env_errors import EnvOutputError
 from lare_rl.envs.families import make_host_env
 from lare_rl.envs.gymnasium_env import GymnasiumEnv
 from lare_rl.envs.interface import EnvSpec, Team, to_env_action
-from lare_rl.envs.workers import LocalVecEnv, SubprocVecEnv
+from lare_rl.envs.vec_env import LocalVecEnv
+from lare_rl.envs.workers import SubprocVecEnv
 from lare_rl.training.collect_host import HostVecEnv
 from lare_rl.training.streams import Stream, episode_seed
 from lare_rl.training.unroll_host import DivergedError, evaluate_on_host, record_on_host

@@ -46,6 +46,12 @@ def resolve(settings: Settings, task: TaskSpec) -> ResolvedSettings:
             f"{method.name} reads whole episodes: rollout_steps = {resolved.rollout_steps} is not a multiple of their length, "
             f"{env.max_steps}"
         )
+    consumes = ALGORITHMS[resolved.algorithm].consumes
+    if resolved.overlap_collection and (env.is_jax or consumes is not Consumes.TRANSITIONS):
+        raise LareError(
+            f"overlap_collection needs td3, ddpg or sac and an environment on the host: remove it for {resolved.algorithm} on "
+            f"{task.name}"
+        )
     _check_size(resolved, task, env)
     return resolved
 

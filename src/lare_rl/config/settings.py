@@ -71,6 +71,9 @@ class _RunSettings(CheckedModel, Generic[Open]):
     ippo, and 5000 for qmix."""
     scale_rewards: bool = False
     """Divide the rewards that the algorithm sees by the running root mean square of R/T. It changes nothing for ppo and ippo."""
+    overlap_collection: bool = False
+    """Collect the next steps on the host while the device updates. It is faster on a card; the policy that collects is then one
+    update older. For algorithms that consume transitions, in an environment on the host."""
     credit: CreditSettings | Open = OPEN
     """How the decoder is fitted. The algorithm decides each of these settings that is not given."""
 

@@ -30,6 +30,7 @@ from lare_rl.credit.basis import Basis, expand
 from lare_rl.credit.decoder_network import DecoderOutput, DecoderShape
 from lare_rl.credit.decoder_settings import CreditSettings
 from lare_rl.credit.evidence import Posterior, PosteriorSpread, SufficientStatistics
+from lare_rl.nn.leading_axis import map_leading_axis
 from lare_rl.nn.normalise import RunningMeanStd, running_std
 
 __all__ = [
@@ -160,16 +161,18 @@ def is_due(state: ClosedForm) -> Bool[Array, ""]:
     return jnp.sum(state.sufficient_statistics.n_episodes) >= jnp.maximum(FIT_GROWTH * state.n_fitted, 1)
 
 
-def fit(state: ClosedForm, score_types: tuple[int, ...], max_rounds: int = MAX_ROUNDS) -> ClosedForm:
-    """Fit the decoder of each score type to the sums."""
+def fit(
+    state: ClosedForm, score_types: tuple[int, ...], max_rounds: int = MAX_ROUNDS, *, batched: bool = False
+) -> ClosedForm:
+    """Fit the decoder of each score type to the sums; of all types at once if `batched` is true."""
     group_index, statistics = state.decoder.basis.group_index, to_float64(state.sufficient_statistics)
 
     def fit_score_type(args: tuple[Int[Array, ""], Posterior]) -> Posterior:
         score_type, start = args
         start = jax.tree.map(lambda leaf: leaf.astype(float), start)
-        return evidence.fit(statistics, score_type, group_index, start, max_rounds)
+        return evidence.fit(statistics, score_type, group_index, start, max_rounds, batched=batched)
 
-    posteriors = jax.lax.map(fit_score_type, (jnp.asarray(score_types), state.posterior))
+    posteriors = map_leading_axis(fit_score_type, (jnp.asarray(score_types), state.posterior), batched=batched)
     posterior = jax.tree.map(lambda leaf: leaf.astype(jnp.float32), posteriors)
     state = _set_weights(state, posterior.weight, posterior.bias)._replace(posterior=posterior)
     if state.spread is None:

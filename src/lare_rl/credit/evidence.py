@@ -36,6 +36,8 @@ import numpy as np
 from jax.scipy.linalg import solve_triangular
 from jaxtyping import Array, Bool, Float, Int
 
+from lare_rl.nn.leading_axis import map_leading_axis
+
 __all__ = [
     "Posterior",
     "PosteriorSpread",
@@ -181,6 +183,8 @@ def fit(
     group_index: Int[np.ndarray, " features"],
     start: Posterior,
     max_rounds: int | Int[Array, ""],
+    *,
+    batched: bool = False,
 ) -> Posterior:
     """Return the posterior under the precisions that maximise the evidence.
 
@@ -195,12 +199,13 @@ def fit(
         group_index: the index of each feature's group.
         start: an earlier fit, whose precisions start the iteration, or `init_posterior`.
         max_rounds: the maximum number of rounds of each iteration.
+        batched: whether the three iterations run at once.
     """
     problem = regression(statistics, score_type, group_index)
     has_start, few = start.beta > 0, problem.dof < MANY_EPISODES_PER_FEATURE * len(group_index)
     limits = jnp.where(jnp.stack([jnp.array(True), has_start & few, ~has_start | few]), max_rounds, 1)
     starts = starting_precisions(problem, start)
-    candidates = jax.lax.map(lambda args: fixed_point(problem, *args), (*starts, limits))
+    candidates = map_leading_axis(lambda args: fixed_point(problem, *args), (*starts, limits), batched=batched)
     return to_return_units(statistics, problem, most_likely(candidates), fallback=start)
 
 

@@ -117,11 +117,18 @@ def add_to_sums(closed: ClosedForm, episodes: CreditBatch) -> ClosedForm:
     return closed._replace(sufficient_statistics=closed_form.split_double(statistics))
 
 
-def fit_closed_form(state: Decomposition, method: Method, score_types: tuple[int, ...]) -> Decomposition:
-    """Fit in closed form to all episodes that have been added, and determine the type of the score."""
+def fit_closed_form(
+    state: Decomposition, method: Method, score_types: tuple[int, ...], *, batched: bool = False
+) -> Decomposition:
+    """Fit in closed form to all episodes that have been added, and determine the type of the score.
+
+    `batched` is as in `evidence.fit`.
+    """
     assert state.closed_form is not None
-    signs = method.fit is Fit.SIGNS
-    closed = closed_form.fit_signs(state.closed_form) if signs else closed_form.fit(state.closed_form, score_types)
+    if method.fit is Fit.SIGNS:
+        closed = closed_form.fit_signs(state.closed_form)
+    else:
+        closed = closed_form.fit(state.closed_form, score_types, batched=batched)
     state = state._replace(closed_form=closed)
     if state.score_type_predictions is not None:
         sum_error, mean_error = _score_type_errors(state.score_type_predictions)

@@ -81,6 +81,8 @@ class GymnasiumEnv:
             high=action_space.high[None].astype(dtype),  # type: ignore[attr-defined]
             measures=task.measures,
         )
+        self._state, self._alive = np.zeros(0, np.float32), np.ones(1, bool)
+        self._available = np.ones((1, self.spec.action_size), bool)
 
     def reset(self, seed: int) -> Timestep:
         with one_line_errors(f"environment {self._name!r} failed in reset"):
@@ -108,9 +110,9 @@ class GymnasiumEnv:
         last = terminated or truncated
         return Timestep(
             observation=observation[None],
-            state=np.zeros(0, np.float32),
-            available=np.ones((1, self.spec.action_size), bool),
-            alive=np.ones(1, bool),
+            state=self._state,
+            available=self._available,
+            alive=self._alive,
             reward=reward[None],
             terminated=np.bool_(terminated),
             truncated=np.bool_(truncated),

@@ -68,6 +68,11 @@ class EnvSpec:
     def n_agents(self) -> int:
         return self.teams[-1].stop
 
+    @property
+    def action_dtype(self) -> np.dtype:
+        """The type of actions in the environment's units."""
+        return np.dtype(np.float32) if self.discrete else self.low.dtype
+
 
 class Timestep(NamedTuple):
     """The result of `reset` or `step`. `*batch` is empty for a single environment."""
@@ -113,8 +118,9 @@ def to_env_action(
     xp = _array_module(action)
     if spec.discrete:
         return xp.eye(spec.action_size, dtype=np.float32)[xp.argmax(action, axis=-1)]
-    scaled = spec.low + (xp.clip(action, -1, 1) + 1) / 2 * (spec.high - spec.low)
-    return xp.clip(scaled, spec.low, spec.high)  # rounding may exceed the bounds
+    clipped = xp.minimum(xp.maximum(action, -1), 1)  # np.clip takes ten times as long for small arrays
+    scaled = spec.low + (clipped + 1) / 2 * (spec.high - spec.low)
+    return xp.minimum(xp.maximum(scaled, spec.low), spec.high)  # rounding may exceed the bounds
 
 
 def _array_module(array: AnyArray) -> Any:

@@ -1,126 +1,91 @@
-"""Many copies of a `HostEnv`, stepped in lockstep: in this process (`LocalVecEnv`), or in several (`SubprocVecEnv`).
+"""Environments that step in several worker processes, in lockstep.
 
 Workers are new processes, never forks, because JAX runs threads in this process. They are not started by `multiprocessing`, which
 would run the user's script again in each of them. The functions that make environments are pickled, so they must be importable.
+Actions and timesteps lie in shared memory, so that a step sends only a short message to each worker.
 
 Gymnasium's AsyncVectorEnv is not used: it has one process for each environment, steps all of them or none, and does not report
 which one died.
 """
 
 import contextlib
+import mmap
 import os
 import pickle
 import signal
 import subprocess
 import sys
+import tempfile
 import threading
 import time
-from abc import ABC, abstractmethod
-from collections import deque
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from functools import partial
 from multiprocessing import Pipe
 from multiprocessing.connection import Connection, wait
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
-from jaxtyping import Bool, Float, Integer
+from jaxtyping import Bool, Float, Int, Shaped
 
 from lare_rl.envs.env_errors import EnvOutputError, one_line_errors
 from lare_rl.envs.interface import EnvSpec, HostEnv, Timestep
+from lare_rl.envs.vec_env import (
+    LocalVecEnv,
+    Maker,
+    VecEnv,
+    call_env,
+    check_same_sizes,
+    empty_batch,
+    make_env_at,
+    n_cores,
+)
 from lare_rl.errors import LareError
 
-__all__ = ["LocalVecEnv", "SubprocVecEnv", "VecEnv"]
+__all__ = ["SubprocVecEnv", "make_vec_env"]
 
-Maker = Callable[[], HostEnv]
-
-PROGRAM = "import sys; from lare_rl.envs.workers import _serve; _serve(int(sys.argv[1]))"
+PROGRAM = "import sys; from lare_rl.envs.workers import _serve; _serve(*map(int, sys.argv[1:]))"
 
 CLOSE_TIMEOUT_S = 2.0
 """Workers must close their environments within this time."""
+MIN_SAVED_S = 3e-4
+"""Workers are used if they make a step of all environments at least this much faster. A call of all workers costs about as much."""
+N_TIMED_STEPS = 10
 
 
-class VecEnv(ABC):
-    """A batch of environments with the same sizes.
+def make_vec_env(maker: Maker, n: int) -> VecEnv:
+    """Make `n` environments: in worker processes if their steps take long enough, and in this process otherwise.
 
-    `where` selects environments: the rows of the others do not change. The next call overwrites the returned arrays.
+    An environment that cannot be made in another process, such as one that the user's script registers, stays in this process.
     """
+    first = make_env_at(0, maker)
+    n_saved = n - -(-n // n_cores())
+    if n_saved and n_saved * _measure_step_s(first) > MIN_SAVED_S:
+        with contextlib.suppress(LareError):
+            workers = SubprocVecEnv([maker] * n)
+            first.close()
+            return workers
+    return LocalVecEnv([lambda: first, *[maker] * (n - 1)])
 
-    spec: EnvSpec
+
+def _measure_step_s(env: HostEnv) -> float:
+    """Return the time that a step of an environment takes (s)."""
+    timestep, spec = env.reset(0), env.spec
+    start = time.perf_counter()
+    n_steps = 0
+    while n_steps < N_TIMED_STEPS and not (timestep.terminated or timestep.truncated):
+        first_available = np.eye(spec.action_size, dtype=np.float32)[np.argmax(timestep.available, axis=-1)]
+        timestep = env.step(first_available if spec.discrete else (spec.low + spec.high) / 2)
+        n_steps += 1
+    return (time.perf_counter() - start) / max(n_steps, 1)
+
+
+class _SharedArrays(NamedTuple):
+    """The arrays of all environments, which this process and the workers read and write."""
+
+    where: Bool[np.ndarray, " n"]
+    seed: Int[np.ndarray, " n"]
+    action: Float[np.ndarray, "n agents action"]
     batch: Timestep
-    """The last timestep of each environment."""
-
-    def __init__(self, specs: Sequence[EnvSpec]):
-        self.spec = specs[0]
-        first, *rest = map(_sizes, specs)
-        for env_index, sizes in enumerate(rest, 1):
-            if sizes != first:
-                raise LareError(f"environment {env_index} differs from environment 0: {sizes}, not {first}")
-        self.batch = _empty_batch(self.spec, len(specs))
-        self._length = np.zeros(len(specs), int)
-        """The steps of each environment's running episode."""
-
-    def reset(self, where: Bool[np.ndarray, " n"], seeds: Integer[np.ndarray, " n"]) -> Timestep:
-        return self._update_batch("reset", {index: int(seeds[index]) for index in np.flatnonzero(where).tolist()})
-
-    def step(
-        self, action: Float[np.ndarray, "n agents action"], where: Bool[np.ndarray, " n"] | None = None
-    ) -> Timestep:
-        indices = range(len(self.batch.alive)) if where is None else np.flatnonzero(where).tolist()
-        return self._update_batch("step", {index: action[index] for index in indices})
-
-    def _update_batch(self, command: str, arguments: Mapping[int, Any]) -> Timestep:
-        for index, timestep in self._request(command, arguments).items():
-            *columns, measures = self.batch
-            *values, new_measures = timestep
-            for column, value in zip(columns, values, strict=True):
-                column[index] = value
-            for name, value in new_measures.items():
-                measures[name][index] = value
-            self._length[index] = 0 if command == "reset" else self._length[index] + 1
-            self._check_length(index)
-        return self.batch
-
-    def _check_length(self, index: int) -> None:
-        """Raise `EnvOutputError` if an episode is longer or shorter than the specification says."""
-        length, max_steps = int(self._length[index]), self.spec.max_steps
-        has_ended = bool(self.batch.terminated[index] or self.batch.truncated[index])
-        problem = None
-        if length >= max_steps and not has_ended:
-            problem = f"the episode has {length} steps and has not ended, but max_steps is {max_steps}"
-        elif self.spec.fixed_length and has_ended and length < max_steps:
-            problem = f"the episode ended after {length} steps, but fixed_length says that all have {max_steps}"
-        if problem is not None:
-            error = EnvOutputError(f"environment {index}: {problem}")
-            error.env_index = index
-            raise error
-
-    @abstractmethod
-    def _request(self, command: str, arguments: Mapping[int, Any]) -> Mapping[int, Timestep]:
-        """Return the replies of the environments of these indices to "reset" or "step"."""
-
-    @abstractmethod
-    def close(self) -> None: ...
-
-    def __enter__(self):
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()
-
-
-class LocalVecEnv(VecEnv):
-    """Environments in this process, stepped one after the other."""
-
-    def __init__(self, makers: Sequence[Maker]):
-        self._envs = [_make(index, maker) for index, maker in enumerate(makers)]
-        super().__init__([env.spec for env in self._envs])
-
-    def _request(self, command: str, arguments: Mapping[int, Any]) -> Mapping[int, Timestep]:
-        return {index: _call(index, self._envs[index], command, argument) for index, argument in arguments.items()}
-
-    def close(self) -> None:
-        for env in self._envs:
-            env.close()
 
 
 class SubprocVecEnv(VecEnv):
@@ -140,12 +105,24 @@ class SubprocVecEnv(VecEnv):
         """
         self.timeout = timeout
         self._workers: list[_Worker] = []
-        n_workers = min(len(makers), processes or _n_cores())
+        n_envs, n_workers = len(makers), min(len(makers), processes or n_cores())
         try:
-            for first in range(n_workers):
-                self._workers.append(_Worker(range(first, len(makers), n_workers)))
-            specs = self._request("make", {index: _pickle(index, maker) for index, maker in enumerate(makers)})
-            super().__init__([specs[index] for index in range(len(makers))])
+            with _shared_file() as file:
+                current = _map_current(file)
+                for worker_index in range(n_workers):
+                    env_indices = range(worker_index, n_envs, n_workers)
+                    self._workers.append(_Worker(env_indices, file, current[worker_index : worker_index + 1]))
+                for worker in self._workers:
+                    worker.send("make", {index: _pickle(index, makers[index]) for index in worker.env_indices})
+                replies = {index: spec for specs in self._receive("make") for index, spec in specs.items()}
+                specs = [replies[index] for index in range(n_envs)]
+                check_same_sizes(specs)
+                self._shared = _map_arrays(file, specs[0], n_envs)
+                self._shared.batch.available[:] = True
+            super().__init__(specs[0], self._shared.batch)
+            for worker in self._workers:
+                worker.send("share", (specs[0], n_envs))
+            self._receive("share")
         except BaseException:
             self._kill()
             raise
@@ -154,31 +131,30 @@ class SubprocVecEnv(VecEnv):
     def pids(self) -> list[int]:
         return [worker.process.pid for worker in self._workers]
 
-    def _request(self, command: str, arguments: Mapping[int, Any]) -> dict[int, Any]:
+    def _call(self, command: str, arguments: Shaped[np.ndarray, "n *rest"], where: Bool[np.ndarray, " n"]) -> None:
         if not self._workers:
             raise LareError("the worker processes have ended. Make the environments again.")
+        column = self._shared.seed if command == "reset" else self._shared.action
+        column[:], self._shared.where[:] = arguments, where
         try:
             for worker in self._workers:
-                worker_arguments = {index: arguments[index] for index in worker.env_indices if index in arguments}
-                if worker_arguments:
-                    worker.send(command, worker_arguments)
-            return self._receive(command)
+                if where[worker.env_indices].any():
+                    worker.send(command)
+            self._receive(command)
         except BaseException:  # Ctrl-C too: a pending reply would be taken for the next one
             self._kill()
             raise
 
-    def _receive(self, command: str) -> dict[int, Any]:
-        replies: dict[int, Any] = {}
-        while busy := [worker for worker in self._workers if worker.pending]:
+    def _receive(self, command: str) -> list[Any]:
+        """Return the replies of all workers that are busy."""
+        replies = []
+        while busy := [worker for worker in self._workers if worker.is_busy]:
             deadline = min(worker.last_active for worker in busy) + self.timeout
             ready = wait([worker.connection for worker in busy], max(0.0, deadline - time.monotonic()))
             for worker in busy:
                 if worker.connection in ready:
-                    index, reply = worker.receive()
-                    if isinstance(reply, _Failure):
-                        raise reply.to_error()
-                    replies[index] = reply
-                elif time.monotonic() > worker.last_active + self.timeout:
+                    replies.append(worker.receive())
+                elif worker.measure_idle_s() > self.timeout:
                     raise LareError(f"{worker.label} did not reply for {self.timeout:g} s in {command}")
         return replies
 
@@ -201,12 +177,11 @@ class SubprocVecEnv(VecEnv):
         self._kill()
 
 
-class _Failure:
+class _Failure(NamedTuple):
     """An error that a worker sends instead of a reply. Exceptions with attributes cannot be pickled reliably."""
 
-    def __init__(self, error: LareError):
-        self.message = str(error)
-        self.env_index = error.env_index if isinstance(error, EnvOutputError) else None
+    message: str
+    env_index: int | None
 
     def to_error(self) -> LareError:
         if self.env_index is None:
@@ -219,20 +194,22 @@ class _Failure:
 class _Worker:
     """A worker process and its environments, from the parent's side."""
 
-    def __init__(self, env_indices: Sequence[int]):
-        self.env_indices = env_indices
-        self.pending: deque[int] = deque()
-        """The indices of the environments that have not replied yet, in the order of their replies."""
-        self.last_active = time.monotonic()
+    def __init__(self, env_indices: range, file: int, current: Int[np.ndarray, "1"]):
+        self.env_indices, self._current = env_indices, current
+        self._current[0] = env_indices[0]
+        self.is_busy = False
+        """Whether a reply is pending."""
+        self.last_active, self._last_index = time.monotonic(), env_indices[0]
         self.connection, worker_end = Pipe()
         # The same import paths as in this process, and one thread, so that other workers can use the other cores.
         paths = os.pathsep.join(path or os.getcwd() for path in sys.path)
         variables = {"OMP_NUM_THREADS": "1"} | os.environ | {"PYTHONPATH": paths}
+        descriptors = worker_end.fileno(), file
         with worker_end:
             self.process = subprocess.Popen(
-                [sys.executable, "-P", "-c", PROGRAM, str(worker_end.fileno())],
+                [sys.executable, "-P", "-c", PROGRAM, *map(str, (*descriptors, env_indices[0]))],
                 stdin=subprocess.PIPE,
-                pass_fds=[worker_end.fileno()],
+                pass_fds=descriptors,
                 env=variables,
                 start_new_session=True,  # Ctrl-C must reach only the parent
             )
@@ -240,23 +217,30 @@ class _Worker:
     @property
     def label(self) -> str:
         """The environment that should reply and the process, for error messages."""
-        return f"environment {self.pending[0]} (in worker process {self.process.pid})"
+        return f"environment {self._current[0]} (in worker process {self.process.pid})"
 
-    def send(self, command: str, arguments: dict[int, Any]) -> None:
-        self.pending.extend(arguments)
-        self.last_active = time.monotonic()
+    def measure_idle_s(self) -> float:
+        """Return for how long the worker has been seen at the same environment (s)."""
+        if self._current[0] != self._last_index:
+            self.last_active, self._last_index = time.monotonic(), int(self._current[0])
+        return time.monotonic() - self.last_active
+
+    def send(self, command: str, argument: Any = None) -> None:
+        self.is_busy, self.last_active = True, time.monotonic()
         try:
-            self.connection.send((command, arguments))
+            self.connection.send((command, argument))
         except OSError:
             raise self._make_death_error() from None
 
-    def receive(self) -> tuple[int, Any]:
+    def receive(self) -> Any:
         try:
             reply = self.connection.recv()
         except (EOFError, OSError):
             raise self._make_death_error() from None
-        self.last_active = time.monotonic()
-        return self.pending.popleft(), reply
+        self.is_busy = False
+        if isinstance(reply, _Failure):
+            raise reply.to_error()
+        return reply
 
     def _make_death_error(self) -> LareError:
         with contextlib.suppress(subprocess.TimeoutExpired):
@@ -275,27 +259,42 @@ class _Worker:
         self.process.stdin.close()
 
 
-def _serve(descriptor: int) -> None:
-    """Run a worker: make, reset and step environments, with one reply for each, until the connection closes."""
+def _serve(connection_descriptor: int, file: int, worker_index: int) -> None:
+    """Run a worker: make, reset and step environments, with a reply to each command, until the connection closes."""
     threading.Thread(target=_end_with_parent, daemon=True).start()
-    connection = Connection(descriptor)
+    connection = Connection(connection_descriptor)
+    current = _map_current(file)[worker_index : worker_index + 1]
     envs: dict[int, HostEnv] = {}
+    shared: _SharedArrays | None = None
     with contextlib.suppress(EOFError, BrokenPipeError, ConnectionResetError):
         while True:
-            command, arguments = connection.recv()
-            for index, argument in arguments.items():
-                try:
-                    if command == "make":
-                        envs[index] = _make(index, lambda pickled=argument: pickle.loads(pickled)())
-                        reply = envs[index].spec
-                    else:
-                        reply = _call(index, envs[index], command, argument)
-                except LareError as error:
-                    reply = _Failure(error)
-                connection.send(reply)
+            command, argument = connection.recv()
+            reply = None
+            try:
+                if command == "make":
+                    for index, pickled in argument.items():
+                        current[0] = index
+                        envs[index] = make_env_at(index, partial(_unpickle_and_make, pickled))
+                    reply = {index: env.spec for index, env in envs.items()}
+                elif command == "share":
+                    shared = _map_arrays(file, *argument)
+                else:
+                    assert shared is not None
+                    _call_envs(envs, command, shared, current)
+            except LareError as error:
+                reply = _Failure(str(error), error.env_index if isinstance(error, EnvOutputError) else None)
+            connection.send(reply)
     for env in envs.values():
         with contextlib.suppress(Exception):
             env.close()
+
+
+def _call_envs(envs: Mapping[int, HostEnv], command: str, shared: _SharedArrays, current: Int[np.ndarray, "1"]) -> None:
+    arguments = shared.seed if command == "reset" else shared.action
+    for index, env in envs.items():
+        if shared.where[index]:
+            current[0] = index
+            call_env(index, env, command, np.copy(arguments[index]), shared.batch)
 
 
 def _end_with_parent() -> None:
@@ -310,36 +309,37 @@ def _pickle(env_index: int, maker: Maker) -> bytes:
         return pickle.dumps(maker)
 
 
-def _make(env_index: int, maker: Maker) -> HostEnv:
-    with one_line_errors(f"environment {env_index} cannot be made"):
-        return maker()
+def _unpickle_and_make(pickled: bytes) -> HostEnv:
+    return pickle.loads(pickled)()
 
 
-def _call(env_index: int, env: HostEnv, command: str, argument: Any) -> Timestep:
-    try:
-        with one_line_errors(f"environment {env_index} failed in {command}"):
-            return env.reset(argument) if command == "reset" else env.step(argument)
-    except EnvOutputError as error:
-        error.env_index = env_index
-        raise
+@contextlib.contextmanager
+def _shared_file() -> Iterator[int]:
+    """Yield the descriptor of a file without a name. It lasts as long as a process has mapped it."""
+    directory = "/dev/shm" if os.path.isdir("/dev/shm") else None
+    with tempfile.TemporaryFile(dir=directory) as file:
+        file.truncate(mmap.ALLOCATIONGRANULARITY)
+        yield file.fileno()
 
 
-def _n_cores() -> int:
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+def _map_current(file: int) -> Int[np.ndarray, " workers"]:
+    """Map the first page of the file: the index of the environment that each worker calls now."""
+    return np.frombuffer(mmap.mmap(file, mmap.ALLOCATIONGRANULARITY), np.int64)
 
 
-def _sizes(spec: EnvSpec) -> tuple[Any, ...]:
-    return spec.teams, spec.observation_size, spec.action_size, spec.discrete, spec.state_size, spec.measures
-
-
-def _empty_batch(spec: EnvSpec, n: int) -> Timestep:
-    return Timestep(
-        observation=np.zeros((n, spec.n_agents, spec.observation_size), np.float32),
-        state=np.zeros((n, spec.state_size), np.float32),
-        available=np.ones((n, spec.n_agents, spec.action_size), bool),
-        alive=np.zeros((n, spec.n_agents), bool),
-        reward=np.zeros((n, spec.n_agents), np.float32),
-        terminated=np.zeros(n, bool),
-        truncated=np.zeros(n, bool),
-        measures={name: np.zeros(n, np.float32) for name in spec.measures},
+def _map_arrays(file: int, spec: EnvSpec, n: int) -> _SharedArrays:
+    """Map the rest of the file: the arrays of `n` environments."""
+    batch = empty_batch(spec, n)
+    action = np.zeros((n, spec.n_agents, spec.action_size), spec.action_dtype)
+    arrays = [np.zeros(n, bool), np.zeros(n, np.int64), action, *batch[:-1], *batch.measures.values()]
+    starts = np.cumsum([0, *(-(-array.nbytes // 64) * 64 for array in arrays)])
+    size = int(starts[-1])
+    os.ftruncate(file, mmap.ALLOCATIONGRANULARITY + size)
+    memory = mmap.mmap(file, size, offset=mmap.ALLOCATIONGRANULARITY)
+    where, seed, action, *columns = (
+        np.ndarray(array.shape, array.dtype, memory, start)
+        for array, start in zip(arrays, starts[:-1].tolist(), strict=True)
     )
+    n_measures = len(spec.measures)
+    measures = dict(zip(spec.measures, columns[len(columns) - n_measures :], strict=True))
+    return _SharedArrays(where, seed, action, Timestep(*columns[: len(columns) - n_measures], measures))

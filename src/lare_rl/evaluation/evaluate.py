@@ -4,26 +4,25 @@ import math
 import time
 from contextlib import closing, suppress
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float
 
-from lare_rl.envs.families import make_env, make_host_env
+from lare_rl.envs.families import make_env, make_host_env, picklable_maker
 from lare_rl.envs.interface import HostEnv
 from lare_rl.envs.load import check_environment
 from lare_rl.envs.play import Episode, play_episode
-from lare_rl.envs.workers import LocalVecEnv
+from lare_rl.envs.workers import make_vec_env
 from lare_rl.errors import LareError
 from lare_rl.runs.directory import Run, as_run
 from lare_rl.tasks.spec import TaskSpec
 from lare_rl.tasks.trust import untrusted_module
 from lare_rl.training.collect_device import DeviceCollector
-from lare_rl.training.compiled import compile_functions
 from lare_rl.training.evaluation import Evaluation, concatenate
+from lare_rl.training.host_policy import EvaluationPolicy
 from lare_rl.training.saved_state import load_actor
-from lare_rl.training.unroll_host import HostPolicy, evaluate_on_host
+from lare_rl.training.unroll_host import evaluate_on_host
 from lare_rl.util.statistics import grouped_standard_error, standard_error
 
 __all__ = [
@@ -78,12 +77,12 @@ def evaluate_policy(run: Run, episodes: int, best: bool = False, deterministic: 
     if not isinstance(env, HostEnv):
         return DeviceCollector(env, config, run.seeds).evaluate(actor, episodes, number=1)
     env.close()
-    functions, evaluations = compile_functions(config), []
+    evaluations = []
     for n_done in range(0, episodes, MAX_OPEN_ENVS):
         n_episodes = min(MAX_OPEN_ENVS, episodes - n_done)
-        with closing(LocalVecEnv([partial(make_host_env, task)] * (n_episodes * len(run.seeds)))) as envs:
+        with make_vec_env(picklable_maker(task), n_episodes * len(run.seeds)) as envs:
             first = run.config.settings.evaluation_episodes + n_done
-            policy = HostPolicy(functions, config, actor, run.seeds, n_episodes)
+            policy = EvaluationPolicy(config, actor, run.seeds, n_episodes)
             evaluations.append(evaluate_on_host(envs, policy, run.seeds, n_episodes, first))
     return concatenate(evaluations)
 

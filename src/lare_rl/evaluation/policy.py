@@ -15,10 +15,9 @@ from lare_rl.envs.interface import to_env_action
 from lare_rl.envs.spaces import OneHot
 from lare_rl.errors import LareError
 from lare_rl.runs.directory import Run, as_run
-from lare_rl.training.compiled import compile_functions, init_memory
+from lare_rl.training.host_policy import HostPolicy, draw_noise, init_host_memory, make_policy
 from lare_rl.training.saved_state import load_actor
 from lare_rl.training.streams import Stream, numpy_generator
-from lare_rl.training.unroll_host import select_action
 
 __all__ = ["Policy", "load_policy"]
 
@@ -57,8 +56,9 @@ class Policy:
         config, actors, _ = load_actor(run, best)
         self._config = replace(config, deterministic=deterministic)
         self._actor = jax.tree.map(lambda leaf: leaf[seed_index : seed_index + 1], actors)
-        self._functions = compile_functions(self._config)
         self._rng = numpy_generator(run.seeds[seed_index], Stream.EVALUATION_NOISE, 0)
+        self._policies: dict[int, HostPolicy] = {}
+        """For each number of observations."""
         self._choices: OneHot | None = None
         if self._env.discrete and is_gymnasium(run.config.task):
             with closing(GymnasiumEnv(run.config.task)) as env:
@@ -68,7 +68,7 @@ class Policy:
 
     def reset(self) -> None:
         """Begin a new episode."""
-        self._memory = init_memory(self._config, 1, 1)
+        self._memory = init_host_memory(self._config, 1, 1)
 
     def __call__(self, observation: Any) -> Any:
         """Return the action for an observation (n,), or the actions for a batch (batch, n).
@@ -100,15 +100,15 @@ class Policy:
             raise LareError(
                 f"the policy of {name} has a memory: give it one observation at a time, and call reset() between episodes"
             )
-        action, self._memory = select_action(
-            self._functions,
-            self._config,
-            self._actor,
-            self._memory if has_memory else init_memory(self._config, 1, n_rows),
-            observation=rows[None, :, None],
-            available=np.ones((1, n_rows, 1, self._env.action_size), bool),
-            episode_start=np.zeros((1, n_rows), bool),
-            rngs=[self._rng],
+        greedy = self._config.greedy
+        if n_rows not in self._policies:
+            self._policies[n_rows] = make_policy(self._config, self._actor, n_rows, greedy=greedy)
+        action, self._memory = self._policies[n_rows](
+            self._memory if has_memory else init_host_memory(self._config, 1, n_rows),
+            rows[None, :, None],
+            np.ones((1, n_rows, 1, self._env.action_size), bool),
+            None if greedy else draw_noise(self._config, [self._rng], n_rows),
+            np.zeros((1, n_rows), bool),
         )
         return to_env_action(action[0, :, 0], self._env)
 

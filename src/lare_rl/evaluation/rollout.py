@@ -15,19 +15,20 @@ from lare_rl.data.trajectory import Trajectory
 from lare_rl.envs.families import make_env, make_host_env
 from lare_rl.envs.interface import HostEnv, JaxEnv, Team
 from lare_rl.envs.play import phi_inputs
-from lare_rl.envs.workers import LocalVecEnv
+from lare_rl.envs.vec_env import LocalVecEnv
 from lare_rl.runs.directory import Run
 from lare_rl.training.collect_device import unroll_on_device
-from lare_rl.training.compiled import compile_functions, training_module
+from lare_rl.training.compiled import training_module
 from lare_rl.training.evaluation import EpisodeBatch
 from lare_rl.training.factors import compute_host_factors
+from lare_rl.training.host_policy import EvaluationPolicy
 from lare_rl.training.learner import Learner, store_with_factors
 from lare_rl.training.rewards import RewardState, rewards
 from lare_rl.training.saved_state import load_learner
 from lare_rl.training.seed_axis import select_seed
 from lare_rl.training.static_config import TrainConfig
 from lare_rl.training.streams import Stream, episode_seed
-from lare_rl.training.unroll_host import HostPolicy, record_on_host
+from lare_rl.training.unroll_host import record_on_host
 from lare_rl.util.statistics import column_correlations
 
 __all__ = [
@@ -116,7 +117,7 @@ def unroll_policy(env: JaxEnv, config: TrainConfig, actor: Any, n_episodes: int,
 
 def _unroll_on_host(run: Run, config: TrainConfig, actor: Any, n_episodes: int) -> EpisodeBatch:
     seeds = run.seeds[:1]
-    policy = HostPolicy(compile_functions(config), config, actor, seeds, n_episodes, greedy=False)
+    policy = EvaluationPolicy(config, actor, seeds, n_episodes, greedy=False)
     episode_seeds = [episode_seed(seeds[0], Stream.TRAINING_EPISODES, number) for number in range(n_episodes)]
     with closing(LocalVecEnv([partial(make_host_env, run.config.task)] * n_episodes)) as envs:
         return _drop_seed_axis(record_on_host(envs, policy, seeds, episode_seeds))

@@ -1,5 +1,6 @@
 """Collects from an environment of pure functions: the policy and all environments of all seeds in one compiled call."""
 
+import math
 from collections.abc import Callable, Sequence
 from functools import partial
 from typing import Any, NamedTuple
@@ -7,7 +8,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Key
+from jaxtyping import Array, Bool, Float, Key
 
 from lare_rl.data.trajectory import Trajectory
 from lare_rl.envs.interface import JaxEnv, Timestep, team_mean, to_env_action
@@ -22,6 +23,11 @@ __all__ = ["DeviceCollector", "VecEnvState", "collect", "reset", "unroll_on_devi
 
 Act = Callable[..., tuple[Array, Any]]
 """From actor, memory, observation, available actions, noise and episode starts to the action and the new memory."""
+
+
+MAX_RESET_FLOPS = 2e7
+"""A card resets all environments with each step, and uses the result where an episode has ended, if that takes fewer operations than
+this. The host would need longer to ask whether one has ended."""
 
 
 class VecEnvState(NamedTuple):
@@ -83,14 +89,15 @@ def unroll_on_device(
     envs = reset(env, reset_keys, n_episodes, config)
 
     def body(
-        carry: tuple[VecEnvState, Bool[Array, "seeds episodes"]], keys: Key[Array, " seeds"]
+        carry: tuple[VecEnvState, Bool[Array, "seeds episodes"]], randomness: _Randomness
     ) -> tuple[tuple[VecEnvState, Bool[Array, "seeds episodes"]], EpisodeBatch]:
         envs, running = carry
-        envs, steps = _step(env, envs, actor, keys, config, greedy, act)
+        envs, steps = _step(env, envs, actor, randomness, config, act)
         return (envs, running & ~steps.ended), EpisodeBatch(steps, running, envs.state)
 
     keys = jnp.swapaxes(_split_keys(step_keys, config.env.max_steps), 0, 1)
-    return jax.lax.scan(body, (envs, jnp.ones_like(envs.episode_start)), keys)[1]
+    randomness = jax.vmap(lambda keys_t: _draw(keys_t, n_episodes, config, greedy))(keys)
+    return jax.lax.scan(body, (envs, jnp.ones_like(envs.episode_start)), randomness)[1]
 
 
 @cache_by_value
@@ -108,26 +115,31 @@ def reset(env: JaxEnv, keys: Key[Array, " seeds"], n_envs: int, config: TrainCon
     return VecEnvState(state, timestep, init_memory(config, *episode_start.shape), episode_start)
 
 
+class _Randomness(NamedTuple):
+    """The random numbers of a step. Those of many steps are drawn at once, which takes a card as long as those of one step."""
+
+    noise: Float[Array, "seeds envs agents noise"] | None
+    """The noise of the policy; None without noise."""
+    keys: Key[Array, "seeds envs"]
+    """The keys of the environments."""
+
+
+def _draw(keys: Key[Array, " seeds"], n_envs: int, config: TrainConfig, greedy: bool) -> _Randomness:
+    noise_keys, env_keys = jnp.unstack(_split_keys(keys, 2), axis=1)
+    noise, shape = None, (n_envs, config.env.n_agents, config.noise_size)
+    if not greedy:
+        noise = jax.vmap(lambda key: device_noise(key, config.noise, shape))(noise_keys)
+    return _Randomness(noise, _split_keys(env_keys, n_envs))
+
+
 def _step(
-    env: JaxEnv,
-    envs: VecEnvState,
-    actor: Any,
-    keys: Key[Array, " seeds"],
-    config: TrainConfig,
-    greedy: bool,
-    act: Act,
+    env: JaxEnv, envs: VecEnvState, actor: Any, randomness: _Randomness, config: TrainConfig, act: Act
 ) -> tuple[VecEnvState, Trajectory]:
     """Step all environments. Episodes that have ended are not reset."""
-    n_envs = envs.episode_start.shape[1]
-    noise_keys, keys = jnp.unstack(_split_keys(keys, 2), axis=1)
-    noise = None
-    if not greedy:
-        shape = n_envs, config.env.n_agents, config.noise_size
-        noise = jax.vmap(lambda key: device_noise(key, config.noise, shape))(noise_keys)
-    timestep = envs.timestep
+    timestep, noise = envs.timestep, randomness.noise
     action, memory = act(actor, envs.memory, timestep.observation, timestep.available, noise, envs.episode_start)
     env_action = action if config.env.discrete else to_env_action(action, config.env)
-    state, next_timestep = _map_envs(env.step)(envs.state, env_action, _split_keys(keys, n_envs))
+    state, next_timestep = _map_envs(env.step)(envs.state, env_action, randomness.keys)
     steps = Trajectory(timestep=timestep, action=action, env_action=env_action, next_timestep=next_timestep)
     return VecEnvState(state, next_timestep, memory, jnp.zeros_like(envs.episode_start)), steps
 
@@ -136,24 +148,34 @@ def collect(
     env: JaxEnv, envs: VecEnvState, actor: Any, keys: Key[Array, " seeds"], config: TrainConfig
 ) -> tuple[VecEnvState, Trajectory]:
     """Make `rollout_steps` steps of every environment. When an episode ends, the next one begins."""
+    act, n_envs = policy_function(config, greedy=False), config.n_envs
+    resets_always = config.batched and _reset_flops(env, envs.episode_start.size) < MAX_RESET_FLOPS
 
-    def body(envs: VecEnvState, keys: Key[Array, " seeds"]) -> tuple[VecEnvState, Trajectory]:
-        step_keys, reset_keys = jnp.unstack(_split_keys(keys, 2), axis=1)
-        envs, steps = _step(
-            env, envs, actor, step_keys, config, greedy=False, act=policy_function(config, greedy=False)
-        )
+    def body(envs: VecEnvState, randomness: tuple[_Randomness, Key[Array, " seeds"]]) -> tuple[VecEnvState, Trajectory]:
+        step_randomness, reset_keys = randomness
+        envs, steps = _step(env, envs, actor, step_randomness, config, act)
 
         def reset_ended(envs: VecEnvState) -> VecEnvState:
-            fresh = reset(env, reset_keys, envs.episode_start.shape[1], config)
+            fresh = reset(env, reset_keys, n_envs, config)
             state, timestep = select(steps.ended, (fresh.state, fresh.timestep), (envs.state, envs.timestep))
             return VecEnvState(state, timestep, envs.memory, episode_start=steps.ended)
 
-        # A reset costs as much as a step, so it is skipped if no episode has ended.
+        if resets_always:
+            return reset_ended(envs), steps
         return jax.lax.cond(jnp.any(steps.ended), reset_ended, lambda envs: envs, envs), steps
 
     keys = jnp.swapaxes(_split_keys(keys, config.rollout_steps), 0, 1)
-    envs, steps = jax.lax.scan(body, envs, keys)
+    step_keys, reset_keys = jnp.unstack(jax.vmap(partial(_split_keys, n_envs=2))(keys), axis=2)
+    randomness = jax.vmap(lambda keys_t: _draw(keys_t, n_envs, config, greedy=False))(step_keys)
+    envs, steps = jax.lax.scan(body, envs, (randomness, reset_keys))
     return envs, jax.tree.map(lambda rows: jnp.swapaxes(rows, 0, 1), steps)
+
+
+def _reset_flops(env: JaxEnv, n_envs: int) -> float:
+    """Return the floating-point operations of a reset of all environments, as XLA estimates them."""
+    keys = jax.eval_shape(lambda: jax.random.split(jax.random.key(0), n_envs))
+    cost = jax.jit(jax.vmap(env.reset)).lower(keys).cost_analysis()
+    return float((cost or {}).get("flops", math.inf))
 
 
 def _evaluate(

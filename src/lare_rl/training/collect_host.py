@@ -1,5 +1,7 @@
 """Collects from environments that step on the host: each step calls the policy once, for all environments of all seeds.
 
+The policy acts on the CPU. Once for each iteration, its weights are copied there, noise is drawn, and actions are checked.
+
 An episode is determined by its seed and its actions. So a run can be resumed in the middle of an episode, in any
 simulator: reset with the seed, play the actions, and compare the observation bit for bit.
 """
@@ -15,13 +17,15 @@ from lare_rl.data.trajectory import Trajectory
 from lare_rl.envs.env_errors import EnvOutputError
 from lare_rl.envs.families import picklable_maker
 from lare_rl.envs.interface import EnvSpec, Timestep, to_env_action
-from lare_rl.envs.workers import LocalVecEnv, SubprocVecEnv, VecEnv
+from lare_rl.envs.vec_env import VecEnv
+from lare_rl.envs.workers import SubprocVecEnv, make_vec_env
+from lare_rl.errors import LareError
 from lare_rl.tasks.spec import TaskSpec
-from lare_rl.training.compiled import CompiledFunctions, init_memory
 from lare_rl.training.evaluation import Evaluation
+from lare_rl.training.host_policy import EvaluationPolicy, init_host_memory, make_policy
 from lare_rl.training.static_config import TrainConfig
 from lare_rl.training.streams import Stream, episode_seed, host_noise, numpy_generator
-from lare_rl.training.unroll_host import HostPolicy, add_seed_axis, check_finite, evaluate_on_host
+from lare_rl.training.unroll_host import add_seed_axis, check_finite, evaluate_on_host
 
 __all__ = ["HostCollector", "HostVecEnv", "make_host_collector"]
 
@@ -64,22 +68,36 @@ class HostVecEnv:
         The policy is a function from a timestep, noise, and which episodes have just begun, to the action.
         """
         steps = _empty_trajectory(self._spec, self._timestep, len(noise))
-        for t, noise_t in enumerate(noise):
-            action = policy(self._timestep, noise_t, self._episode_start)
-            check_finite(action, self._seeds)
-            env_action = to_env_action(action, self._spec)
-            _write_timestep(steps.timestep, t, self._timestep)
-            steps.action[:, t], steps.env_action[:, t] = action, env_action
-            rows = env_action.reshape(-1, *env_action.shape[2:])
-            for actions, row in zip(self._actions, rows, strict=True):
-                actions.append(row)
-            self._call(lambda rows=rows: self._envs.step(rows))
-            _write_timestep(steps.next_timestep, t, self._timestep)
-            self._episode_start = np.zeros(self.shape, bool)
-            ended = np.logical_or(self._timestep.terminated, self._timestep.truncated)
-            if ended.any():
-                self.reset(ended.ravel())
+        try:
+            for t, noise_t in enumerate(noise):
+                self._collect_step(policy, noise_t, steps, t)
+        except LareError:
+            check_finite(steps.action, self._seeds)  # such actions may be the reason
+            raise
+        check_finite(steps.action, self._seeds)
         return steps
+
+    def _collect_step(
+        self,
+        policy: Callable[..., Any],
+        noise: Float[np.ndarray, "seeds envs agents noise"],
+        steps: Trajectory,
+        t: int,
+    ) -> None:
+        """Make a step, and write it into row `t` of the steps."""
+        action = policy(self._timestep, noise, self._episode_start)
+        env_action = to_env_action(action, self._spec)
+        _write_timestep(steps.timestep, t, self._timestep)
+        steps.action[:, t], steps.env_action[:, t] = action, env_action
+        rows = env_action.reshape(-1, *env_action.shape[2:])
+        for actions, row in zip(self._actions, rows, strict=True):
+            actions.append(row)
+        self._call(lambda: self._envs.step(rows))
+        _write_timestep(steps.next_timestep, t, self._timestep)
+        self._episode_start = np.zeros(self.shape, bool)
+        ended = np.logical_or(self._timestep.terminated, self._timestep.truncated)
+        if ended.any():
+            self.reset(ended.ravel())
 
     def state_dict(self) -> dict[str, np.ndarray]:
         """Return the arrays that `restore` needs to continue the running episodes."""
@@ -156,12 +174,11 @@ class HostCollector:
         envs: VecEnv,
         evaluation_envs: VecEnv,
         config: TrainConfig,
-        functions: CompiledFunctions,
         seeds: Sequence[int],
     ):
-        self._config, self._functions, self._seeds = config, functions, list(seeds)
+        self._config, self._seeds = config, list(seeds)
         self._envs, self._evaluation_envs = HostVecEnv(envs, seeds, config.n_envs), evaluation_envs
-        self._memory = init_memory(config, *self._envs.shape)
+        self._memory = init_host_memory(config, *self._envs.shape)
         self._envs.reset()
 
     def collect(self, actor: Any, step: int) -> Trajectory:
@@ -172,19 +189,20 @@ class HostCollector:
             uniform = [rng.uniform(-1, 1, (*shape, config.env.action_size)) for rng in rngs]
             action = np.stack(uniform, axis=1).astype(np.float32)
             return self._envs.collect(lambda timestep, action_t, episode_start: action_t, action)
+        policy = make_policy(config, actor, config.n_envs, greedy=False)
         noise = np.stack([host_noise(rng, config.noise, (*shape, config.noise_size)) for rng in rngs], axis=1)
 
         def explore(timestep: Timestep, noise_t: np.ndarray, episode_start: np.ndarray) -> np.ndarray:
-            action, self._memory = self._functions.explore(
-                actor, self._memory, timestep.observation, timestep.available, noise_t, episode_start
+            action, self._memory = policy(
+                self._memory, timestep.observation, timestep.available, noise_t, episode_start
             )
-            return np.asarray(action)
+            return action
 
         return self._envs.collect(explore, noise)
 
     def evaluate(self, actor: Any, n_episodes: int) -> Evaluation:
         """Evaluate whole episodes of the policy, always from the same initial states."""
-        policy = HostPolicy(self._functions, self._config, actor, self._seeds, n_episodes)
+        policy = EvaluationPolicy(self._config, actor, self._seeds, n_episodes)
         return evaluate_on_host(self._evaluation_envs, policy, self._seeds, n_episodes)
 
     def state_dict(self) -> dict[str, np.ndarray]:
@@ -195,7 +213,7 @@ class HostCollector:
     def restore(self, arrays: dict[str, np.ndarray]) -> tuple[Bool[np.ndarray, "seeds envs"], list[str]]:
         """Restore the running episodes. Return which of them were dropped, and messages about these."""
         leaves, structure = jax.tree.flatten(self._memory)
-        self._memory = jax.device_put(jax.tree.unflatten(structure, [arrays[f"memory{i}"] for i in range(len(leaves))]))
+        self._memory = jax.tree.unflatten(structure, [arrays[f"memory{i}"] for i in range(len(leaves))])
         return self._envs.restore(arrays)
 
     def close(self) -> None:
@@ -205,13 +223,14 @@ class HostCollector:
 
 
 def make_host_collector(
-    task: TaskSpec, config: TrainConfig, functions: CompiledFunctions, seeds: Sequence[int], n_evaluation_episodes: int
+    task: TaskSpec, config: TrainConfig, seeds: Sequence[int], n_evaluation_episodes: int
 ) -> HostCollector:
-    """Make a collector with a task's environments: in this process, or in worker processes if a seed has several."""
-    make_envs = LocalVecEnv if config.n_envs == 1 else SubprocVecEnv
-    make_env = picklable_maker(task)
-    envs, evaluation_envs = (make_envs([make_env] * (len(seeds) * n)) for n in (config.n_envs, n_evaluation_episodes))
-    return HostCollector(envs, evaluation_envs, config, functions, seeds)
+    """Make a collector with a task's environments. If a seed has several, they step in worker processes."""
+    make_env, n_seeds = picklable_maker(task), len(seeds)
+    n_envs = n_seeds * config.n_envs
+    envs = make_vec_env(make_env, n_envs) if config.n_envs == 1 else SubprocVecEnv([make_env] * n_envs)
+    evaluation_envs = make_vec_env(make_env, n_seeds * n_evaluation_episodes)
+    return HostCollector(envs, evaluation_envs, config, seeds)
 
 
 def _empty_trajectory(spec: EnvSpec, timestep: Timestep, n_steps: int) -> Trajectory:
@@ -221,7 +240,7 @@ def _empty_trajectory(spec: EnvSpec, timestep: Timestep, n_steps: int) -> Trajec
         return jax.tree.map(lambda leaf: np.zeros((n_seeds, n_steps, *leaf.shape[1:]), leaf.dtype), timestep)
 
     action = np.zeros((n_seeds, n_steps, n_envs, spec.n_agents, spec.action_size), np.float32)
-    env_action = action.astype(np.float32 if spec.discrete else spec.low.dtype)
+    env_action = action.astype(spec.action_dtype)
     return Trajectory(empty_timestep(), action, env_action, empty_timestep())
 
 

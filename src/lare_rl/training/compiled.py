@@ -35,6 +35,7 @@ __all__ = [
     "keys_shape",
     "learner_shape",
     "policy_function",
+    "steps_shape",
     "training_module",
 ]
 
@@ -141,7 +142,7 @@ def compile_ahead(
     The compiler needs hundreds of megabytes for a while. They are returned to the system before the replay is made.
     """
     functions = compile_functions(config, phi)
-    learner, steps = learner_shape(config, n_seeds), _steps_shape(config, n_seeds)
+    learner, steps = learner_shape(config, n_seeds), steps_shape(config, n_seeds)
     functions = functions._replace(assess=_compile(functions.assess, learner))
     if iterates_on_host:
         functions = functions._replace(
@@ -170,7 +171,7 @@ def keys_shape(n_seeds: int) -> Any:
     return jax.eval_shape(seed_keys, jnp.zeros(n_seeds, int), 0)
 
 
-def _steps_shape(config: TrainConfig, n_seeds: int) -> Trajectory:
+def steps_shape(config: TrainConfig, n_seeds: int) -> Trajectory:
     """Return the steps of an iteration with shapes instead of arrays."""
     env = config.env
 
@@ -190,7 +191,7 @@ def _steps_shape(config: TrainConfig, n_seeds: int) -> Trajectory:
     return Trajectory(
         timestep=timestep,
         action=shape(env.n_agents, env.action_size),
-        env_action=shape(env.n_agents, env.action_size, dtype=np.float32 if env.discrete else env.low.dtype),
+        env_action=shape(env.n_agents, env.action_size, dtype=env.action_dtype),
         next_timestep=timestep,
     )
 

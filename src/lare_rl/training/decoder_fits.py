@@ -10,6 +10,7 @@ from lare_rl.credit.methods import Fit
 from lare_rl.data import replay
 from lare_rl.data.replay import Replay
 from lare_rl.data.sampling import CreditSample, sample_drawn, sample_packed, sample_padded
+from lare_rl.nn.leading_axis import map_leading_axis
 from lare_rl.training.decoder_inputs import episode_batch
 from lare_rl.training.learner import Learner
 from lare_rl.training.rewards import team_metrics
@@ -73,8 +74,10 @@ def fit_seeds(
     learner: Learner, keys: Key[Array, " seeds"], config: TrainConfig
 ) -> tuple[Learner, dict[str, Float[Array, " seeds"]]]:
     """Update the decoders of every seed `fit_updates` times. Return the mean of each metric."""
-    # One seed after the other, because a large batch of episodes fills the caches already.
-    decoders, metrics = jax.lax.map(lambda seed: fit_repeatedly(seed[0], seed[1], config), (learner, keys))
+    # On a CPU, a large batch of episodes of one seed fills the caches already.
+    decoders, metrics = map_leading_axis(
+        lambda seed: fit_repeatedly(*seed, config), (learner, keys), batched=config.batched
+    )
     return learner._replace(decoders=decoders), metrics
 
 

@@ -3,8 +3,8 @@
 Every method that predicts returns has this order, so that `credit/return_r2` is measured on returns before anything is
 fitted to them.
 
-The functions are written for all seeds: steps are read in lockstep, and closed-form fits are made one seed after the
-other, when they are due. Call them within `float64()`, because `closed_form.py` needs float64.
+The functions are written for all seeds: steps are read in lockstep, and closed-form fits are made when they are due, of
+all seeds at once or of one after the other (`batched`). Call them within `float64()`, because `closed_form.py` needs float64.
 """
 
 from collections.abc import Callable
@@ -21,6 +21,7 @@ from lare_rl.credit.methods import Fit
 from lare_rl.data import replay
 from lare_rl.data.replay import Replay
 from lare_rl.data.sampling import count_episodes_since, episodes_in_order
+from lare_rl.nn.leading_axis import map_leading_axis
 from lare_rl.training.decoder_inputs import episode_batch
 from lare_rl.training.static_config import TrainConfig
 
@@ -116,12 +117,13 @@ def _rebuild_statistics(decoders: Decoders, buffer: Replay, is_stale: Bool[Array
 
 
 def _fit_closed_forms(decoder: Decomposition, is_due: Bool[Array, " seeds"], config: TrainConfig) -> Decomposition:
-    """Make the closed-form fits of a team's decoder for the seeds that are due, one after the other."""
-    fit = partial(returns.fit_closed_form, method=config.method, score_types=config.score_types)
+    """Make the closed-form fits of a team's decoder for the seeds that are due."""
+    batched = config.batched
+    fit = partial(returns.fit_closed_form, method=config.method, score_types=config.score_types, batched=batched)
 
     def fit_seed(seed: tuple[Decomposition, Bool[Array, ""]]) -> Decomposition:
         decoder, is_due = seed
         assert decoder.closed_form is not None
         return jax.lax.cond(is_due & closed_form.is_due(decoder.closed_form), fit, lambda unchanged: unchanged, decoder)
 
-    return jax.lax.map(fit_seed, (decoder, is_due))
+    return map_leading_axis(fit_seed, (decoder, is_due), batched=batched)

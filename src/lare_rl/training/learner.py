@@ -26,7 +26,15 @@ from lare_rl.training.decoder_inputs import decoder_inputs, row_mask
 from lare_rl.training.factors import compute_factors
 from lare_rl.training.static_config import TrainConfig
 
-__all__ = ["Learner", "abandon_episodes", "init_decoders", "init_learner", "store", "store_with_factors"]
+__all__ = [
+    "Learner",
+    "abandon_episodes",
+    "init_decoders",
+    "init_learner",
+    "replay_columns",
+    "store",
+    "store_with_factors",
+]
 
 
 class Learner(NamedTuple):
@@ -78,7 +86,7 @@ def store_with_factors(
     learner: Learner, steps: Trajectory, factors: Float[Array, "time envs rows factors"], config: TrainConfig
 ) -> Learner:
     """Put new steps into the replay and into the running statistics."""
-    columns, next_columns = _replay_columns(steps, factors, config)
+    columns, next_columns = replay_columns(steps, factors, config)
     buffer = replay.extend(learner.replay, columns, next_columns, _team_rewards(steps, config), steps.ended)
     ended = jnp.asarray(steps.ended)
     new_steps = replay.read(buffer, replay.newest_steps(buffer, len(ended)))
@@ -91,7 +99,7 @@ def store_with_factors(
     return learner._replace(decoders=decoders, scale=scales, replay=buffer)
 
 
-def _replay_columns(steps: Trajectory, factors: Array, config: TrainConfig) -> tuple[dict[str, Any], dict[str, Any]]:
+def replay_columns(steps: Trajectory, factors: Array, config: TrainConfig) -> tuple[dict[str, Any], dict[str, Any]]:
     """Return the replay's columns for new steps, and the columns of `STEP_COLUMNS` after the steps."""
     columns = {
         **{name: getattr(steps.timestep, name) for name in STEP_COLUMNS},

@@ -1,5 +1,6 @@
 """The training state of a run's last checkpoint."""
 
+from dataclasses import replace
 from typing import Any, NamedTuple
 
 import jax
@@ -62,7 +63,8 @@ def load_learner(run: Run) -> SavedState:
     """
     config = make_train_config(run)
     try:
-        return SavedState(config, *checkpoint.load(run.checkpoint, learner_shape(config, len(run.seeds))))
+        learner, host, arrays = checkpoint.load(run.checkpoint, learner_shape(config, len(run.seeds)))
+        return SavedState(replace(config, batched=host.get("batched", False)), learner, host, arrays)
     except LareError as error:
         if run.config.lare == code_version():
             raise

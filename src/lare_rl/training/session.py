@@ -3,13 +3,14 @@
 import math
 import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int, Key, Shaped
+from jaxtyping import Array, Float, Int, Key, Shaped
 
 from lare_rl.algorithms.off_policy import OffPolicySettings
 from lare_rl.config.settings import ResolvedSettings
@@ -24,10 +25,11 @@ from lare_rl.runs.directory import Run
 from lare_rl.runs.metric_names import ACTOR_SATURATION
 from lare_rl.tasks.spec import TaskSpec
 from lare_rl.training import advice, first_fit
+from lare_rl.training.batching import is_batching_faster
 from lare_rl.training.collect_device import DeviceCollector
 from lare_rl.training.collect_host import HostCollector, make_host_collector
 from lare_rl.training.compile_cache import cache_by_value
-from lare_rl.training.compiled import CompiledFunctions, compile_ahead, compile_functions, init_seeds
+from lare_rl.training.compiled import CompiledFunctions, compile_ahead, compile_functions, init_seeds, steps_shape
 from lare_rl.training.compiled_loop import CompiledLoop, compile_loop, init_loop
 from lare_rl.training.factors import compute_host_factors
 from lare_rl.training.learner import Learner, abandon_episodes
@@ -65,6 +67,8 @@ class Session:
     """The best evaluations so far. None before the first evaluation, and if several teams learn, whose returns depend on each
     other."""
 
+    _unchecked: tuple[Any, Trajectory] | None = None
+    """Whether all factors of the newest steps are finite, for each seed, and these steps."""
     _iteration_s: float = MAX_CALL_S
     """How long an iteration of the last compiled call has taken."""
 
@@ -111,35 +115,61 @@ class Session:
             is_measured, is_finite = jax.device_get((state.is_measured, state.is_finite))
         self._iteration_s = max(1e-6, (time.perf_counter() - start) / n_iterations)
         self.learner, self.collector.envs = state.learner, state.envs
-        self._check_factors(is_finite, state.steps)
+        self._unchecked = is_finite, state.steps
+        self._check_factors()
         self.latest_metrics |= {name: values for name, values in state.metrics.items() if is_measured[name]}
         self.step += n_iterations * self.settings.iteration_steps
 
-    def _check_factors(self, is_finite: Bool[np.ndarray, " seeds"], steps: Trajectory) -> None:
-        """Raise `LareError` if a factor of the newest steps is not finite."""
+    def _iterate(self, stop_requested: Callable[[], bool]) -> None:
+        """Collect steps, compute factors, store them, sometimes fit the decoder, update the algorithm.
+
+        With `overlap_collection`, the device updates while the host collects, by the policy from before the update.
+        """
+        if self.settings.overlap_collection:
+            actor = jax.tree.map(jnp.copy, self.actor)  # the update reuses the memory of its learner
+            with ThreadPoolExecutor(
+                1
+            ) as executor:  # a call of an update returns when the device has nearly finished it
+                update = executor.submit(self._update, _empty_steps(self.config, len(self.run.seeds)), stop_requested)
+                steps = self.collector.collect(actor, self.step)
+                update.result()
+            self._store(steps)
+        else:
+            steps = self.collector.collect(self.actor, self.step)
+            self._store(steps)
+            self._update(steps, stop_requested)
+        self.step += self.settings.iteration_steps
+
+    def _store(self, steps: Trajectory) -> None:
+        """Store new steps, and let the decoders learn from episodes that have finished."""
+        self._check_factors()
+        self.learner, is_finite = self.functions.store(self.learner, steps)
+        self._unchecked = is_finite, steps
+        if self.learner.decoders and np.any(steps.ended):
+            self.learner = self.functions.learn_returns(self.learner)
+
+    def _check_factors(self) -> None:
+        """Raise `LareError` if a factor of the newest steps is not finite.
+
+        The steps of an iteration are checked in the next one, so that the host need not wait for the device.
+        """
+        is_finite, steps = self._unchecked or (True, None)
+        self._unchecked = None
         if self.run.functions and not np.all(is_finite):
             compute_host_factors(self.run, self.config, steps)  # raises an error that names the factor
             raise LareError("a factor is not finite in the compiled function; the last checkpoint is whole")
 
-    def _iterate(self, stop_requested: Callable[[], bool]) -> None:
-        """Collect steps, compute factors, store them, sometimes fit the decoder, update the algorithm."""
-        steps = self.collector.collect(self.actor, self.step)
-        self.learner, is_finite = self.functions.store(self.learner, steps)
-        self._check_factors(np.asarray(is_finite), steps)
-        if self.learner.decoders and np.any(steps.ended):
-            self.learner = self.functions.learn_returns(self.learner)
-        if self.step >= self.config.warmup:
-            self._update(steps, stop_requested)
-        self.step += self.settings.iteration_steps
-
     def _update(self, steps: Trajectory, stop_requested: Callable[[], bool]) -> None:
         """Fit the decoders if they have updates of their own that are due, and update the algorithm."""
+        if self.step < self.config.warmup:
+            return
         iteration = self.step // self.settings.iteration_steps
         if self.config.fits_separately and iteration % self.settings.fit_every == 0:
             self.fit(stream_keys(self.run.seeds, Stream.FIT, self.step), stop_requested)
         keys = seed_keys(jnp.asarray(self.run.seeds), self.step + 1)
         self.learner, metrics = self.functions.train_step(self.learner, steps, keys, self.step)
-        if np.any(np.asarray(metrics.get("algorithm/updates", 1)) > 0):
+        n_updates = metrics.get("algorithm/updates")
+        if n_updates is None or np.any(np.asarray(n_updates) > 0):
             self.latest_metrics |= metrics
 
     def fit(self, keys: Key[Array, " seeds"], stop_requested: Callable[[], bool]) -> None:
@@ -160,6 +190,7 @@ class Session:
         Returns:
             One line of metrics.jsonl for each seed.
         """
+        self._check_factors()
         evaluation = self.collector.evaluate(self.actor, self.settings.evaluation_episodes)
         if len(self.config.env.teams) == 1:
             self._keep_best(evaluation.returns[..., 0].mean(axis=1))
@@ -188,10 +219,11 @@ class Session:
             save_best(self.run.checkpoint, self.best)
 
     def save(self) -> None:
-        """Write a checkpoint. Raises `LareError` if it cannot be written."""
+        """Write a checkpoint. Raises `LareError` if it cannot be written, or if a factor is not finite."""
+        self._check_factors()
         digests = [function.digest for function in self.run.functions]
         host = {"step": self.step, "metrics_length": self.metrics_bytes, "fitted": self.first_fit_done}
-        host |= {"function_sha256": digests}
+        host |= {"function_sha256": digests, "batched": self.config.batched}
         arrays = {f"latest/{name}": np.asarray(values) for name, values in self.latest_metrics.items()}
         arrays |= {f"collector/{name}": values for name, values in self.collector.state_dict().items()}
         checkpoint.save(self.run.checkpoint, self.learner, host, arrays)
@@ -217,7 +249,9 @@ class Session:
 
 def start_session(run: Run) -> Session:
     """Return a session before its first step."""
-    return _make_session(run, make_train_config(run), None)
+    config = make_train_config(run)
+    config = replace(config, batched=is_batching_faster(config, len(run.seeds)))
+    return _make_session(run, config, None)
 
 
 def restore_session(run: Run) -> tuple[Session, list[str]]:
@@ -246,7 +280,7 @@ def _make_session(run: Run, config: TrainConfig, learner: Learner | None) -> Ses
     loop = None if env is None else compile_loop(env, config, run.graphs, settings.fit_every, n_seeds)
     learner = learner or init_seeds(functions, seed_keys(jnp.asarray(run.seeds), 0))
     if env is None:
-        collector = make_host_collector(task, config, functions, run.seeds, settings.evaluation_episodes)
+        collector = make_host_collector(task, config, run.seeds, settings.evaluation_episodes)
     else:
         collector = DeviceCollector(env, config, run.seeds)
     return Session(run, config, functions, learner, collector, loop)
@@ -255,6 +289,12 @@ def _make_session(run: Run, config: TrainConfig, learner: Learner | None) -> Ses
 def _has_first_fit(run: Run, config: TrainConfig) -> bool:
     """Whether the decoders have a first fit, which lasts until it brings no improvement."""
     return config.fits_separately and run.config.settings.first_fit == "held-out"
+
+
+@cache_by_value
+def _empty_steps(config: TrainConfig, n_seeds: int) -> Trajectory:
+    """Return steps for an update that reads only stored ones."""
+    return jax.tree.map(lambda shape: np.zeros(shape.shape, shape.dtype), steps_shape(config, n_seeds))
 
 
 @cache_by_value

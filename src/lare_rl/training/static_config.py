@@ -41,6 +41,9 @@ class TrainConfig:
     fit_updates: int
     """Updates of the decoder in an iteration that fits it. Unused if the decoder is updated with every update of the
     algorithm."""
+    batched: bool = False
+    """Whether the device is faster with much work at once (`batching.py`): the fits of all seeds, and resets with every step. It
+    changes the last bits of a fit."""
     deterministic: bool = False
     """Whether a policy acts without noise outside training, even if its algorithm says otherwise."""
 

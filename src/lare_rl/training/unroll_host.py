@@ -1,8 +1,6 @@
 """Plays whole episodes of a policy in environments that step on the host, for evaluations and films."""
 
 from collections.abc import Callable, Iterator, Sequence
-from functools import partial
-from typing import Any
 
 import jax
 import numpy as np
@@ -11,21 +9,17 @@ from jaxtyping import Bool, Float
 from lare_rl.data.trajectory import Trajectory
 from lare_rl.envs.env_errors import EnvOutputError
 from lare_rl.envs.interface import Timestep, team_mean, to_env_action
-from lare_rl.envs.workers import VecEnv
+from lare_rl.envs.vec_env import VecEnv
 from lare_rl.errors import LareError
-from lare_rl.training.compiled import CompiledFunctions, init_memory
 from lare_rl.training.evaluation import EpisodeBatch, Evaluation
-from lare_rl.training.static_config import TrainConfig
-from lare_rl.training.streams import Stream, episode_seed, host_noise, numpy_generator
+from lare_rl.training.streams import Stream, episode_seed
 
 __all__ = [
     "DivergedError",
-    "HostPolicy",
     "add_seed_axis",
     "check_finite",
     "evaluate_on_host",
     "record_on_host",
-    "select_action",
     "unroll_on_host",
 ]
 
@@ -35,59 +29,6 @@ Policy = Callable[[Timestep, Bool[np.ndarray, "seeds envs"]], Float[np.ndarray, 
 
 class DivergedError(LareError):
     """The policy is not finite any more."""
-
-
-class HostPolicy:
-    """The policy of all seeds for whole episodes, which all begin with its first call. It holds the memory of the actors.
-
-    It acts without noise if `greedy` is true; by default as in evaluations, where only PPO's policy has noise.
-    """
-
-    def __init__(
-        self,
-        functions: CompiledFunctions,
-        config: TrainConfig,
-        actor: Any,
-        seeds: Sequence[int],
-        n_episodes: int,
-        greedy: bool | None = None,
-    ):
-        self._select_action = partial(select_action, functions, config, actor, greedy=greedy)
-        self._memory = init_memory(config, len(seeds), n_episodes)
-        self._rngs = [numpy_generator(seed, Stream.EVALUATION_NOISE, 0) for seed in seeds]
-
-    def __call__(self, timestep: Timestep, episode_start: Bool[np.ndarray, "seeds envs"]) -> np.ndarray:
-        action, self._memory = self._select_action(
-            self._memory, timestep.observation, timestep.available, episode_start, self._rngs
-        )
-        return action
-
-
-def select_action(
-    functions: CompiledFunctions,
-    config: TrainConfig,
-    actor: Any,
-    memory: Any,
-    observation: Float[np.ndarray, "seeds envs agents observation"],
-    available: Bool[np.ndarray, "seeds envs agents action"],
-    episode_start: Bool[np.ndarray, "seeds envs"],
-    rngs: Sequence[np.random.Generator],
-    *,
-    greedy: bool | None = None,
-) -> tuple[Float[np.ndarray, "seeds envs agents action"], Any]:
-    """Select the actions of a policy outside training. `rngs` has a generator for each seed.
-
-    Returns:
-        The actions, and the new memory of the actors.
-    """
-    inputs = actor, memory, observation, available
-    if config.greedy if greedy is None else greedy:
-        action, memory = functions.act(*inputs, None, episode_start)
-    else:
-        shape = (*observation.shape[1:3], config.noise_size)
-        noise = np.stack([host_noise(rng, config.noise, shape) for rng in rngs])
-        action, memory = functions.explore(*inputs, noise, episode_start)
-    return np.asarray(action), memory
 
 
 def unroll_on_host(

@@ -1,0 +1,22 @@
+"""A function over the leading axis of arrays: for all rows at once, or for one row after the other."""
+
+from collections.abc import Callable
+from typing import TypeVar
+
+import jax
+
+__all__ = ["map_leading_axis"]
+
+Rows = TypeVar("Rows")
+Result = TypeVar("Result")
+
+
+def map_leading_axis(function: Callable[[Rows], Result], rows: Rows, *, batched: bool) -> Result:
+    """Apply a function to each row of a pytree of arrays.
+
+    Args:
+        function: a function of one row.
+        rows: arrays with the same leading axis.
+        batched: all rows at once, which keeps a card busy; otherwise one after the other, which a CPU's caches prefer.
+    """
+    return jax.vmap(function)(rows) if batched else jax.lax.map(function, rows)

@@ -1,0 +1,98 @@
+"""Policies that act on the host, with NumPy, for environments that step there.
+
+A small network acts faster on the CPU than on a card, which needs two transfers and a launch for each step. The weights are copied once
+for many steps.
+"""
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import jax
+import numpy as np
+from jaxtyping import Bool, Float
+
+from lare_rl.envs.interface import Timestep
+from lare_rl.training.compile_cache import cache_by_value
+from lare_rl.training.compiled import compile_functions, init_memory, policy_function
+from lare_rl.training.numpy_program import UnsupportedOperationError, to_numpy
+from lare_rl.training.saved_state import actor_shape
+from lare_rl.training.static_config import TrainConfig
+from lare_rl.training.streams import Stream, host_noise, numpy_generator
+
+__all__ = ["EvaluationPolicy", "HostPolicy", "draw_noise", "init_host_memory", "make_policy"]
+
+HostPolicy = Callable[..., tuple[Float[np.ndarray, "seeds envs agents action"], Any]]
+"""From memory, observation, available actions, noise (or None), and which episodes are new, to the action and the new memory."""
+
+
+def make_policy(config: TrainConfig, actor: Any, n_envs: int, *, greedy: bool) -> HostPolicy:
+    """Return the policy of all seeds, each in `n_envs` environments. If `greedy`, it acts without noise."""
+    n_seeds = len(jax.tree.leaves(actor)[0])
+    bind = _translate_policy(config, n_seeds, n_envs, greedy)
+    if bind is not None:
+        return bind(jax.tree.map(np.array, jax.device_get(actor)))
+    functions = compile_functions(config)
+    act = functions.act if greedy else functions.explore
+
+    def act_compiled(*inputs: Any) -> tuple[Float[np.ndarray, "seeds envs agents action"], Any]:
+        return jax.device_get(act(actor, *inputs))
+
+    return act_compiled
+
+
+@cache_by_value
+def _translate_policy(
+    config: TrainConfig, n_seeds: int, n_envs: int, greedy: bool
+) -> Callable[[Any], HostPolicy] | None:
+    """Return the policy as a NumPy program, or None if it has an operation that cannot be translated."""
+    env, lead = config.env, (n_seeds, n_envs)
+
+    def shape(*sizes: int, dtype: Any = np.float32) -> jax.ShapeDtypeStruct:
+        return jax.ShapeDtypeStruct((*lead, *sizes), dtype)
+
+    memory = jax.eval_shape(lambda: init_memory(config, *lead))
+    observation, available = shape(env.n_agents, env.observation_size), shape(env.n_agents, env.action_size, dtype=bool)
+    noise = None if greedy else shape(env.n_agents, config.noise_size)
+    inputs = memory, observation, available, noise, shape(dtype=bool)
+    try:
+        return to_numpy(policy_function(config, greedy), actor_shape(config, n_seeds), *inputs)
+    except UnsupportedOperationError:
+        return None
+
+
+class EvaluationPolicy:
+    """The policy of all seeds for whole episodes, which all begin with its first call. It holds the memory of the actors.
+
+    It acts without noise if `greedy` is true; by default as in evaluations, where only PPO's policy has noise.
+    """
+
+    def __init__(
+        self, config: TrainConfig, actor: Any, seeds: Sequence[int], n_episodes: int, greedy: bool | None = None
+    ):
+        self._config, self._n_episodes = config, n_episodes
+        self._greedy = config.greedy if greedy is None else greedy
+        self._policy = make_policy(config, actor, n_episodes, greedy=self._greedy)
+        self._memory = init_host_memory(config, len(seeds), n_episodes)
+        self._rngs = [numpy_generator(seed, Stream.EVALUATION_NOISE, 0) for seed in seeds]
+
+    def __call__(
+        self, timestep: Timestep, episode_start: Bool[np.ndarray, "seeds envs"]
+    ) -> Float[np.ndarray, "seeds envs agents action"]:
+        noise = None if self._greedy else draw_noise(self._config, self._rngs, self._n_episodes)
+        action, self._memory = self._policy(
+            self._memory, timestep.observation, timestep.available, noise, episode_start
+        )
+        return action
+
+
+def init_host_memory(config: TrainConfig, *lead: int) -> Any:
+    """Return the memory of actors before the first step of an episode, as NumPy arrays."""
+    return jax.tree.map(np.array, init_memory(config, *lead))
+
+
+def draw_noise(
+    config: TrainConfig, rngs: Sequence[np.random.Generator], n_envs: int
+) -> Float[np.ndarray, "seeds envs agents noise"]:
+    """Draw the noise of a step. `rngs` has a generator for each seed."""
+    shape = n_envs, config.env.n_agents, config.noise_size
+    return np.stack([host_noise(rng, config.noise, shape) for rng in rngs])

@@ -1,0 +1,74 @@
+"""Functions of JAX as NumPy programs: the same results, and what is not translated."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from helpers.toy_envs import toy_spec
+from lare_rl.config.resolve import resolve
+from lare_rl.config.settings import Settings
+from lare_rl.runs.directory import create_run
+from lare_rl.training import host_policy
+from lare_rl.training.compiled import compile_functions, init_seeds
+from lare_rl.training.host_policy import make_policy
+from lare_rl.training.numpy_program import UnsupportedOperationError, to_numpy
+from lare_rl.training.saved_state import make_train_config
+from lare_rl.training.streams import seed_keys
+
+RNG = np.random.default_rng(0)
+
+
+def draw(*shape):
+    return RNG.normal(size=shape).astype(np.float32)
+
+
+@pytest.mark.parametrize(
+    ("function", "arguments"),
+    [
+        (lambda w, x: jnp.tanh(x @ w), (draw(4, 3), draw(5, 4))),
+        (jax.vmap(lambda w, x: jax.nn.relu(x @ w)), (draw(2, 4, 3), draw(2, 5, 4))),
+        (lambda w, x: jnp.einsum("ij,kj->ik", w, x), (draw(4, 3), draw(5, 3))),
+        (lambda w, x: jnp.einsum("bij,bkjl->bkil", w, x), (draw(2, 4, 3), draw(2, 5, 3, 2))),
+        (lambda w, x: jnp.concatenate(jnp.split(x + w, 3, axis=-1)[::-1], axis=-1), (draw(6), draw(5, 6))),
+        (lambda w, x: jnp.where(x > w, x, w)[:, 1:3], (draw(4), draw(5, 4))),
+        (lambda w, x: jax.nn.one_hot(jnp.argmax(x * w, axis=-1), 4), (draw(4), draw(5, 4))),
+        (lambda w, x: jax.nn.softmax(x / jnp.maximum(w, 0.1)), (draw(4), draw(5, 4))),
+        (lambda w, x: jax.nn.sigmoid(x) * jnp.exp(jnp.clip(w, -1, 1)) + jnp.square(x), (draw(4), draw(5, 4))),
+        (lambda w, x: (x.T.reshape(-1) ** 3).astype(jnp.int32) + jnp.arange(20), (draw(4), draw(5, 4))),
+        (lambda w, x: {"sum": jnp.sum(x, axis=0), "any": jnp.any(x > 3), "first": x}, (draw(4), draw(5, 4))),
+    ],
+)
+def test_program_equals_function(function, arguments):
+    fixed, *others = arguments
+    actual = to_numpy(function, fixed, *others)(fixed)(*others)
+    expected = function(*arguments)
+    jax.tree.map(lambda x, y: np.testing.assert_allclose(x, y, rtol=1e-5, atol=1e-6), actual, expected)
+    assert jax.tree.map(lambda x: (x.shape, x.dtype), actual) == jax.tree.map(lambda x: (x.shape, x.dtype), expected)
+
+
+@pytest.mark.parametrize("function", [lambda w, x: jnp.sort(x + w), lambda w, x: jax.lax.fori_loop(0, 3, jnp.add, x)])
+def test_other_operations_are_refused(function):
+    with pytest.raises(UnsupportedOperationError):
+        to_numpy(function, draw(4), draw(4))
+
+
+def make_run(tmp_path, algorithm, **changes):
+    task = toy_spec(**changes)
+    settings = resolve(Settings(method="dense", algorithm=algorithm, seeds=2, capacity=4000), task)
+    return make_train_config(create_run(tmp_path / "run", task, settings, ()))
+
+
+@pytest.mark.parametrize("greedy", [True, False])
+@pytest.mark.parametrize("algorithm", ["td3", "sac", "ppo"])
+def test_policy_on_host_equals_compiled_policy(algorithm, greedy, tmp_path, monkeypatch):
+    config = make_run(tmp_path, algorithm)
+    functions = compile_functions(config)
+    actor = functions.get_actor(init_seeds(functions, seed_keys(jnp.arange(2), 0)), 0)
+    noise = None if greedy else draw(2, 3, 1, config.noise_size)
+    inputs = (), draw(2, 3, 1, 2), np.ones((2, 3, 1, config.env.action_size), bool), noise, np.zeros((2, 3), bool)
+    assert host_policy._translate_policy(config, 2, 3, greedy) is not None
+    action, _ = make_policy(config, actor, 3, greedy=greedy)(*inputs)
+    monkeypatch.setattr(host_policy, "_translate_policy", lambda *_: None)
+    expected, _ = make_policy(config, actor, 3, greedy=greedy)(*inputs)
+    np.testing.assert_allclose(action, expected, atol=1e-6)
