@@ -109,7 +109,7 @@ def check_stored_episodes(credit, environments, by="reward"):
             return_ = sum(step[3] for step in steps) if by == "reward" else score
             logged.append((return_, np.hstack([*arrays[:2], arrays[0] - arrays[2]])))
     store = credit.store
-    stored = [(episode.score, store.features[store.rows(episode.steps)]) for episode in store.episodes.values()]
+    stored = [(episode.score, store.inputs[store.rows(episode.steps)]) for episode in store.episodes.values()]
     assert len(stored) == len(logged) > 0
     stored, logged = (sorted(episodes, key=lambda episode: episode[0]) for episodes in (stored, logged))
     for (score, features), (return_, rows) in zip(stored, logged, strict=True):

@@ -86,8 +86,8 @@ def test_unbiased_loss_has_the_expectation_of_the_full_loss(n_steps):
         config = small_config(name)
         learner = learner_with_episodes(config)
         # The rewards of steps shall differ.
-        steep = jax.tree.map(lambda weight: 6 * weight, learner.decoders[0].decoder)
-        learner = learner._replace(decoders=(learner.decoders[0]._replace(decoder=steep),))
+        steep = jax.tree.map(lambda weight: 6 * weight, learner.decoders[0].network)
+        learner = learner._replace(decoders=(learner.decoders[0]._replace(network=steep),))
         draws = sample_drawn(learner.replay, jax.random.key(3), 1, 40_000, n_steps)
         first = jax.tree.map(lambda leaf: leaf[0], draws)
         _, metrics = jitted(fit_decoders, config)(learner.decoders, learner.replay, first, jax.random.key(0))
@@ -244,7 +244,7 @@ def test_teams_have_separate_decoders_and_returns():
         np.testing.assert_array_equal(credit.scale, learner.scale[i])
     updated, _ = update_once(learner, config)
     for before, after in zip(learner.decoders, updated, strict=True):
-        assert not jax.tree.all(jax.tree.map(jnp.array_equal, before.decoder, after.decoder))
+        assert not jax.tree.all(jax.tree.map(jnp.array_equal, before.network, after.network))
 
 
 @pytest.mark.parametrize("method", [long_case("dense"), "episodic", "ircr"])

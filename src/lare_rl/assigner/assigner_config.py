@@ -12,9 +12,9 @@ from jaxtyping import Bool, Float, Int
 from lare_rl.assigner.space_layout import SpaceLayout, make_layout
 from lare_rl.config.validity import check_credit
 from lare_rl.credit.decoder_settings import CreditSettings
-from lare_rl.credit.encoders import input_arrays
 from lare_rl.credit.engine import CreditSpec, credit_spec
 from lare_rl.credit.explanation_text import raw_feature_names
+from lare_rl.credit.input_names import input_arrays
 from lare_rl.credit.methods import Method
 from lare_rl.envs.families import load_env_spec
 from lare_rl.errors import LareError, short_repr

@@ -67,7 +67,7 @@ def _pack(store: Store, episodes: Sequence[Episode], n_slots: int, rows: int) ->
 
 
 def _gather(store: Store, episodes: Sequence[Episode], layout: Layout, n_slots: int) -> CreditBatch:
-    """Return the features of the steps of a layout, with the returns of their episodes.
+    """Return the inputs of the steps of a layout, with the returns of their episodes.
 
     The layout has an axis of episodes, or none. Padding reads some stored step. The arrays have room for `n_slots` episodes.
     """
@@ -79,7 +79,7 @@ def _gather(store: Store, episodes: Sequence[Episode], layout: Layout, n_slots: 
     length, score = np.ones(n_slots, np.int32), np.zeros(n_slots)
     length[:count], score[:count] = _lengths(episodes), [episode.score for episode in episodes]
     return CreditBatch(
-        features=store.features[rows],  # pyright: ignore[reportArgumentType]
+        inputs=store.inputs[rows],  # pyright: ignore[reportArgumentType]
         episode_index=layout.slot.ravel().astype(np.int32),
         length=length,  # pyright: ignore[reportArgumentType]
         mean_reward=(score / length).astype(np.float32),  # pyright: ignore[reportArgumentType]

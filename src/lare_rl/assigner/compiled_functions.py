@@ -71,7 +71,7 @@ class FlatState(NamedTuple):
 @partial(jax.jit, static_argnames=("structure", "spec"))
 def training_rewards(
     leaves: list[Array],
-    features: Float[Array, "rows agents features"],
+    inputs: Float[Array, "rows agents inputs"],
     length: Int[Array, " rows"],
     mean_reward: Float[Array, " rows"] | None,
     finished: Bool[Array, " rows"] | None,
@@ -82,12 +82,12 @@ def training_rewards(
     """Return the rewards of steps by a flat state. `mean_reward` and `finished` are needed by methods that pay by the return."""
     decoder, scale = jax.tree.unflatten(structure, leaves)
     steps = StepBatch(
-        features=features,
+        inputs=inputs,
         length=length,
         mean_reward=jnp.zeros(len(length)) if mean_reward is None else mean_reward,
         finished=jnp.ones(len(length), bool) if finished is None else finished,
     )
-    alive = jnp.ones(features.shape[:-1], bool) if alive is None else alive
+    alive = jnp.ones(inputs.shape[:-1], bool) if alive is None else alive
     return engine.training_rewards(decoder, scale, steps, spec, alive)
 
 

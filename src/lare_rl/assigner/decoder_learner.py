@@ -121,7 +121,7 @@ class DecoderLearner:
         all_inputs = [self.config.compute_inputs(*(rows[chunk] for rows in steps)) for chunk in chunks]
         for chunk, inputs in zip(chunks, all_inputs, strict=True):
             rows = number[chunk] % self.store.capacity
-            self.store.features[rows] = inputs
+            self.store.inputs[rows] = inputs
             alive = np.ones(inputs.shape[:-1], bool) if self.store.alive is None else self.store.alive[rows]
             if self.decoder is not None:
                 self._pending_inputs.append((inputs, alive))
@@ -300,7 +300,7 @@ class DecoderLearner:
         if len(rows) and numbers.max() >= self.store.steps - self.n_pending_steps:
             self.flush_inputs()
         alive = None if self.store.alive is None else self.store.alive[rows]
-        return self.rewards(self.store.features[rows], self.store.lengths(rows), alive, rows)
+        return self.rewards(self.store.inputs[rows], self.store.lengths(rows), alive, rows)
 
     def _flat_state(self) -> FlatState:
         """Return the parts of the decoder that compute rewards, and the scale, in flat form."""

@@ -37,6 +37,8 @@ FORMAT = 1
 TEXT_FILE, ARRAYS_FILE, FUNCTION_FILE = "assigner.json", "state.npz", "phi.py"
 PLAIN_FIELDS = ("judges", "agents", "max_steps", "capacity", "seed", "fits_per_step", "scale_rewards", "forget")
 """The fields of a configuration that are JSON values."""
+STORE_ARRAYS = {"features": "inputs", "length": "length", "mean_reward": "mean_reward"}
+"""The arrays of a store by their names in the file."""
 PHI_SAMPLE = ("tried/observation", "tried/action")
 """The steps on which `phi` is verified when it is loaded, because there may be no environment."""
 
@@ -161,7 +163,7 @@ def _store_arrays(store: Store) -> dict[str, np.ndarray]:
     rows = np.arange(max(0, store.steps - store.capacity), store.steps) % store.capacity
     episodes = list(store.episodes.values())
     return {
-        **{name: getattr(store, name)[rows] for name in ("features", "length", "mean_reward")},
+        **{name: getattr(store, field)[rows] for name, field in STORE_ARRAYS.items()},
         **({} if store.alive is None else {"alive": store.alive[rows]}),
         "steps": np.array(store.steps),
         "episodes": np.concatenate([np.zeros(0, np.int64), *(episode.steps for episode in episodes)]),
@@ -173,8 +175,8 @@ def _store_arrays(store: Store) -> dict[str, np.ndarray]:
 def _restore_store(store: Store, arrays: dict[str, np.ndarray]) -> None:
     store.steps = int(arrays["steps"])
     rows = np.arange(max(0, store.steps - store.capacity), store.steps) % store.capacity
-    for name in ("features", "length", "mean_reward"):
-        getattr(store, name)[rows] = arrays[name]
+    for name, field in STORE_ARRAYS.items():
+        getattr(store, field)[rows] = arrays[name]
     if "alive" in arrays:
         store.alive = np.ones((store.capacity, store.agents), bool)
         store.alive[rows] = arrays["alive"]

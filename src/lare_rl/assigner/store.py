@@ -50,7 +50,7 @@ class Store:
     def __init__(self, capacity: int, row_shape: tuple[int, ...], agents: int = 1):
         """Make an empty store. `row_shape` is the shape of a step's inputs: (inputs,), or (agents, inputs)."""
         self.capacity, self.agents = capacity, agents
-        self.features = np.zeros((capacity, *row_shape), np.float32)
+        self.inputs = np.zeros((capacity, *row_shape), np.float32)
         """The decoder's inputs for each step: [capacity *agents inputs]."""
         self.alive: Bool[np.ndarray, "capacity agents"] | None = None
         """Which agents acted. None: all of them."""

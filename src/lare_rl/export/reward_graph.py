@@ -16,7 +16,7 @@ import numpy as np
 from lare_rl.credit.basis import HALF_PERIOD, N_FREQUENCIES, Basis
 from lare_rl.credit.closed_form import LinearDecoder
 from lare_rl.credit.decomposition import Decomposition, is_normalised, reward_unit
-from lare_rl.credit.encoders import input_arrays
+from lare_rl.credit.input_names import input_arrays
 from lare_rl.credit.methods import Reward
 from lare_rl.credit.step_decoders import Bottleneck, StepDecoder
 from lare_rl.export.layers import finish, first_outputs, graph_input, network, numpy_op, standardize
@@ -60,8 +60,8 @@ def reward_graph(credit: Decomposition | None, config: TrainConfig, team_index: 
     team = config.env.teams[team_index]
     rows = () if config.team_level or team.n_agents == 1 else (team.n_agents,)
     with building(Builder(UNLIMITED)):
-        features = input_arrays(config.credit_specs[team_index].inputs, _StepInputs(config, rows, team_index, phi))
-        x = numpy_op("concatenate", features, axis=-1) if len(features) > 1 else features[0]
+        inputs = input_arrays(config.credit_specs[team_index].inputs, _StepInputs(config, rows, team_index, phi))
+        x = numpy_op("concatenate", inputs, axis=-1) if len(inputs) > 1 else inputs[0]
         if credit is None:
             r_hat = x[..., 0]
         else:
@@ -74,7 +74,7 @@ def reward_graph(credit: Decomposition | None, config: TrainConfig, team_index: 
 
 
 class _StepInputs(dict[str, Any]):
-    """The decoder's inputs of a step, by their names in `credit/encoders.py`; `before`, `after` and `env_action` are graph inputs.
+    """The decoder's inputs of a step, by their names in `credit/input_names.py`; `before`, `after` and `env_action` are graph inputs.
 
     An input is added to the graph when it is first read.
     """
@@ -120,17 +120,17 @@ class _StepInputs(dict[str, Any]):
 
 def _decode(x: Array, credit: Decomposition, config: TrainConfig) -> Any:
     """Return the decoder's output for a step, in the unit of the true rewards."""
-    decoder = credit.decoder
+    decoder = credit.network
     if isinstance(decoder, LinearDecoder):
         return _linear_reward(x, decoder)
     if is_normalised(credit, config.credit):
         x = standardize(x, credit.statistics.mean, running_std(credit.statistics), CLIP)
     if isinstance(decoder, Bottleneck):
         x = network(x, first_outputs(decoder.encoder, decoder.encoder.layers[-1].weight.shape[1] // 2))
-        decoder = decoder.decoder
+        decoder = decoder.step_decoder
     assert isinstance(decoder, StepDecoder)
     scale = float(reward_unit(credit, config.credit)) * float(decoder.gain)
-    return network(x, decoder.network)[..., 0] * scale
+    return network(x, decoder.mlp)[..., 0] * scale
 
 
 def _linear_reward(x: Array, decoder: LinearDecoder) -> Any:

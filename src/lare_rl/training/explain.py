@@ -83,7 +83,7 @@ def _explanation_config(config: TrainConfig) -> TrainConfig:
     elif config.method.needs_phi:
         method = replace(METHODS["lare-linear"], decoder="additive")
     else:
-        method = replace(METHODS["bayes"], encoder=config.method.encoder)
+        method = replace(METHODS["bayes"], inputs=config.method.inputs)
     return replace(config, method=method)
 
 
@@ -98,7 +98,7 @@ def _explain_first_seed(
     buffer, is_mean = select_seed((replay, is_mean))
     bases = [spec.basis for spec in config.credit_specs]
     empty = tuple(empty_mean_std(basis.n_inputs) for basis in bases)
-    # The features are standardised first, because the run's decoder may have other inputs, or statistics of earlier steps.
+    # The inputs are standardised first, because the run's decoder may have other inputs, or statistics of earlier steps.
     statistics = fold_episodes(empty, buffer, buffer.oldest, _observe, config)
     states = tuple(init_explanation(team, basis) for team, basis in zip(statistics, bases, strict=True))
     states = fold_episodes(states, buffer, buffer.oldest, add_to_explanation, config)
@@ -106,5 +106,5 @@ def _explain_first_seed(
 
 
 def _observe(statistics: RunningMeanStd, episodes: CreditBatch) -> RunningMeanStd:
-    rows = episodes.features.reshape(-1, episodes.features.shape[-1])
+    rows = episodes.inputs.reshape(-1, episodes.inputs.shape[-1])
     return update_mean_std(statistics, rows, valid_rows(episodes).ravel())
