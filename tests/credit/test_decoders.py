@@ -104,7 +104,7 @@ def test_must_learn_credit_among_agents_from_the_mean_return(name):
         state = decomposition.observe_steps(state, jnp.asarray(rows))
         state = decomposition.observe_returns(state, jnp.asarray(mean_reward), length, jnp.ones(n_episodes, bool))
         state, losses = jax.lax.scan(body, state, jax.random.split(jax.random.key(0), n_updates))
-        return decomposition.proxy_rewards(state, jnp.asarray(rows).reshape(-1, AGENTS, 2), settings), losses
+        return decomposition.decoder_rewards(state, jnp.asarray(rows).reshape(-1, AGENTS, 2), settings), losses
 
     r_hat, losses = train()
     assert float(losses[-5:].mean()) < float(losses[:5].mean())

@@ -16,7 +16,7 @@ EPISODES, STEPS, FEATURES = 64, 10, 3
 KEY = jax.random.key(3)
 init = jax.jit(decomposition.init, static_argnums=range(1, 6))
 update = jax.jit(descent.update, static_argnames=("fit", "settings"))
-proxy_rewards = jax.jit(decomposition.proxy_rewards, static_argnames="settings")
+proxy_rewards = jax.jit(decomposition.decoder_rewards, static_argnames="settings")
 
 
 @partial(jax.jit, static_argnames=("fit", "settings"))

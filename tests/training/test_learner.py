@@ -40,8 +40,7 @@ from lare_rl.nn.normalise import root_mean_square
 from lare_rl.training.decoder_fits import fit_decoders, fit_repeatedly, sample_credit
 from lare_rl.training.decoder_inputs import alive_agents, decoder_inputs
 from lare_rl.training.learner import abandon_episodes
-from lare_rl.training.rewards import assess, rewards
-from lare_rl.training.rewards import proxy_rewards as team_proxy_rewards
+from lare_rl.training.rewards import assess, rewards, team_proxy_rewards
 
 ENDS = np.cumsum(LENGTHS)[:-1]
 MANY = partial(small_config, algorithm="ippo", env=ONE_TEAM)

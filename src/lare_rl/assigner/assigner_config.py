@@ -28,7 +28,7 @@ __all__ = [
     "check_finite",
     "resolve_layouts",
     "to_flags",
-    "to_step_numbers",
+    "to_step_ids",
 ]
 
 Space = gymnasium.Space | SpaceLayout | int
@@ -195,12 +195,12 @@ def to_flags(values: Any, name: str, n_rows: int) -> Bool[np.ndarray, " steps"]:
     return flags
 
 
-def to_step_numbers(steps: Any) -> Int[np.ndarray, "*shape"]:
+def to_step_ids(steps: Any) -> Int[np.ndarray, "*shape"]:
     """Return numbers of steps as an array. Raises `LareError` for anything else."""
-    numbers = np.asarray(steps)
-    if numbers.size and (numbers.dtype.kind not in "iu" or numbers.min() < -1):
+    step_ids = np.asarray(steps)
+    if step_ids.size and (step_ids.dtype.kind not in "iu" or step_ids.min() < -1):
         raise LareError(f"steps are {short_repr(steps)}: give numbers that `add` has returned, or -1")
-    return numbers.astype(np.int64)
+    return step_ids.astype(np.int64)
 
 
 def check_finite(rows: np.ndarray, steps: Sequence[np.ndarray], reward: np.ndarray) -> None:

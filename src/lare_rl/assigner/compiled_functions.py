@@ -12,7 +12,7 @@ from jaxtyping import Array, Bool, Float, Int, Key
 from lare_rl.credit import closed_form, decomposition, descent, engine, returns
 from lare_rl.credit.decomposition import CreditBatch, Decomposition
 from lare_rl.credit.engine import CreditSpec, StepBatch
-from lare_rl.data.layouts import sample_step_numbers
+from lare_rl.data.layouts import sample_steps as _sample_steps
 from lare_rl.nn.normalise import update_scale
 
 init_decoder = jax.jit(engine.init_decoder, static_argnames="spec")
@@ -26,7 +26,7 @@ reset_statistics = jax.jit(returns.reset_statistics)
 init_explanation = jax.jit(engine.init_explanation, static_argnames="basis")
 add_to_explanation = jax.jit(engine.add_to_explanation)
 explain_returns = jax.jit(engine.explain_returns)
-draw_step_numbers = jax.jit(sample_step_numbers, static_argnames="steps")
+sample_steps = jax.jit(_sample_steps, static_argnames="steps")
 
 
 @partial(jax.jit, static_argnames="spec")

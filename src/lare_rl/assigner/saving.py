@@ -20,7 +20,7 @@ import numpy as np
 from lare_rl.assigner.assigner_config import AssignerConfig
 from lare_rl.assigner.decoder_learner import DecoderLearner
 from lare_rl.assigner.space_layout import SpaceLayout
-from lare_rl.assigner.store import Episode, Store
+from lare_rl.assigner.store import Store, StoredEpisode
 from lare_rl.credit.decoder_settings import CreditSettings
 from lare_rl.credit.methods import find_method
 from lare_rl.errors import LareError, short_repr
@@ -183,4 +183,4 @@ def _restore_store(store: Store, arrays: dict[str, np.ndarray]) -> None:
     ends = np.cumsum(arrays["lengths"])
     first = store.ended - len(ends)
     for i, (end, length, score) in enumerate(zip(ends, arrays["lengths"], arrays["scores"], strict=True)):
-        store.restore_episode(first + i, Episode(arrays["episodes"][end - length : end], float(score)))
+        store.restore_episode(first + i, StoredEpisode(arrays["episodes"][end - length : end], float(score)))

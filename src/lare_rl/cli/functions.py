@@ -122,7 +122,7 @@ def verify(
         judges: which observation of a step the function judges, instead of the one that the task says.
     """
     from lare_rl.cli.design import load_policy
-    from lare_rl.credit.explanation_text import MIN_EPISODES
+    from lare_rl.credit.explanation_text import MIN_EXPLAINED_EPISODES
     from lare_rl.envs.load import load_task, read_task
     from lare_rl.latent.function import function_from_verdict
     from lare_rl.latent.saved import read_source
@@ -130,8 +130,8 @@ def verify(
     from lare_rl.tasks.spec import require_role
 
     source, changed, saved_task = read_source(file)
-    if fit and fit < MIN_EPISODES:
-        raise LareError(f"fit = {fit}: at least {MIN_EPISODES} episodes are needed")
+    if fit and fit < MIN_EXPLAINED_EPISODES:
+        raise LareError(f"fit = {fit}: at least {MIN_EXPLAINED_EPISODES} episodes are needed")
     if policy is not None and (not fit or data is not None):
         raise LareError("--policy plays the episodes for --fit: give --fit a number of episodes, and no --data")
     spec = load_task(task) if data is None else read_task(task)

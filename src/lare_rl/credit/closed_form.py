@@ -53,7 +53,7 @@ STATISTICS_GROWTH = 1.5
 """All episodes are summed again when the number of steps has grown by this factor."""
 FIT_GROWTH = 1.05
 """The decoder is fitted again when the number of episodes has grown by this factor."""
-MAX_ROUNDS = 20
+MAX_EVIDENCE_ROUNDS = 20
 """The maximum number of rounds of the evidence's fixed point, from each of its starts."""
 
 
@@ -160,7 +160,7 @@ def is_due(state: ClosedForm) -> Bool[Array, ""]:
     return jnp.sum(state.sufficient_statistics.n_episodes) >= jnp.maximum(FIT_GROWTH * state.n_fitted, 1)
 
 
-def fit(state: ClosedForm, score_types: tuple[int, ...], max_rounds: int = MAX_ROUNDS) -> ClosedForm:
+def fit(state: ClosedForm, score_types: tuple[int, ...], max_rounds: int = MAX_EVIDENCE_ROUNDS) -> ClosedForm:
     """Fit the decoder of each score type to the sums."""
     group_index, statistics = state.decoder.basis.group_index, to_float64(state.sufficient_statistics)
 

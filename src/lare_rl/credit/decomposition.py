@@ -50,6 +50,7 @@ __all__ = [
     "Decomposition",
     "agent_mean",
     "decode",
+    "decoder_rewards",
     "init",
     "is_normalised",
     "is_optimistic",
@@ -57,7 +58,6 @@ __all__ = [
     "observe_returns",
     "observe_steps",
     "optimistic_rewards",
-    "proxy_rewards",
     "reward_unit",
     "score_type_index",
     "valid_rows",
@@ -228,7 +228,7 @@ def decode(
     return network(normalise_inputs(state, inputs, settings), key)
 
 
-def proxy_rewards(
+def decoder_rewards(
     state: Decomposition,
     inputs: Float[Array, "rows *agents inputs"],
     settings: CreditSettings,
@@ -254,7 +254,7 @@ def optimistic_rewards(
     they are too high for uncertain steps, on purpose. The decoder must be in closed form, and `init` must have had the same
     optimism.
     """
-    r_hat = proxy_rewards(state, inputs, settings, length)
+    r_hat = decoder_rewards(state, inputs, settings, length)
     assert state.closed_form is not None
     assert state.closed_form.spread is not None
     assert isinstance(state.network, LinearDecoder)

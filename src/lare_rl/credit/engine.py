@@ -154,7 +154,7 @@ def proxy_rewards(
     assert decoder is not None
     rows = steps.inputs.reshape(-1, *steps.inputs.shape[-2:])
     with_optimism = optimistic and decomposition.is_optimistic(spec.method, spec.settings)
-    compute = decomposition.optimistic_rewards if with_optimism else decomposition.proxy_rewards
+    compute = decomposition.optimistic_rewards if with_optimism else decomposition.decoder_rewards
     r_hat = compute(decoder, rows, spec.settings, steps.length.ravel())
     return r_hat.reshape(steps.inputs.shape[:-1])
 

@@ -52,7 +52,7 @@ def row_mask(steps: StoredSteps, config: TrainConfig, team_index: int) -> Bool[A
 
 
 def step_batch(steps: StoredSteps, config: TrainConfig, team_index: int) -> StepBatch:
-    """Return the steps as the input of a team's `proxy_rewards`."""
+    """Return the steps as the input of the engine."""
     return StepBatch(
         inputs=decoder_inputs(steps, config, team_index),
         length=steps.length,

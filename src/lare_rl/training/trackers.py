@@ -11,7 +11,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from lare_rl.errors import LareError, missing_extra_error
-from lare_rl.training.progress import Listener, Metrics
+from lare_rl.training.progress import Listener, MetricLines
 
 __all__ = ["MLflow", "WeightsAndBiases"]
 
@@ -36,7 +36,7 @@ class WeightsAndBiases(Listener):
     def on_start(self, name: str, step: int, steps: int) -> None:
         self.name = name
 
-    def on_evaluation(self, metrics: Metrics) -> None:
+    def on_evaluation(self, metrics: MetricLines) -> None:
         for line in metrics:
             seed = line["seed"]
             if seed not in self.runs:
@@ -86,7 +86,7 @@ class MLflow(Listener):
     def on_start(self, name: str, step: int, steps: int) -> None:
         self.name = name
 
-    def on_evaluation(self, metrics: Metrics) -> None:
+    def on_evaluation(self, metrics: MetricLines) -> None:
         now_ms = int(1000 * time.time())
         for line in metrics:
             seed = line["seed"]
