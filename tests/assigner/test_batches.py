@@ -93,9 +93,8 @@ def test_pack_in_order_yields_every_episode_once():
     assert sorted(episodes) == [(number, list(range(length))) for number, length in enumerate(LENGTHS)]
 
 
-def test_pack_in_order_shares_among_agents_that_are_alive():
+def test_pack_in_order_says_which_agents_are_alive():
     store = filled_store(agents=3)
     batch = next(pack_in_order(store, list(store.episodes.values())[:1], 2, 10))
     ((number, steps),) = sampled_episodes(batch)
-    expected = [[1 / 3] * 3 if step < 2 else [1, 0, 0] for step in steps]
-    np.testing.assert_allclose(batch.share[: LENGTHS[number]], expected, rtol=1e-6)
+    assert batch.alive[: LENGTHS[number]].tolist() == [[True, step < 2, step < 2] for step in steps]

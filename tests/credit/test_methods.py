@@ -84,6 +84,13 @@ def test_registered_method_is_trained(fit, registered):
     assert np.isfinite(credit.metrics()["credit/loss"])
 
 
+def test_decoder_with_functions_is_refused_in_one_line(registered):
+    register_decoder(Decoder("mlp", lambda key, shape, settings: eqx.nn.MLP(shape.n_inputs, 1, 4, 1, key=key)))
+    register_method(Method("mlp", "mlp", "this test", inputs=input_names.RAW, fit=Fit.ALL_STEPS, decoder="mlp"))
+    with pytest.raises(LareError, match=r"'mlp' holds .* instead of eqx.nn.MLP.*, use lare_rl.nn.networks.MLP"):
+        CreditAssigner("mlp", observation_space=2, action_space=1)
+
+
 def test_register_refuses(registered):
     with pytest.raises(LareError, match="another method 'rd'"):
         register_method(Method("rd", "mine", "this test"))

@@ -58,7 +58,7 @@ CASES = [
 NO_REWARD = {
     "dense": "rewards of the environment",
     "ircr": "return of its episode",
-    "diaster": "all steps of an episode",
+    "diaster": "cannot be exported",
 }
 """Why there is no reward function."""
 

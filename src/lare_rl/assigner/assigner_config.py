@@ -93,9 +93,7 @@ class AssignerConfig:
         """Compute the decoder's inputs for some steps, which are rows already. Raises `LareError` if a factor is not finite."""
         arrays = {"observation": observation, "action": action, "next_observation": next_observation}
         if self.phi is not None:
-            before, actions, after = (array.reshape(-1, array.shape[-1]) for array in arrays.values())
-            factors = self.phi.step_factors(before, actions, after, self.judges)
-            arrays["factors"] = factors.reshape(*observation.shape[:-1], -1)
+            arrays["factors"] = self.phi.step_factors(*arrays.values(), self.judges)
         inputs = input_arrays(self.spec.inputs, arrays)
         return np.concatenate(inputs, axis=-1) if inputs else observation[..., :0]
 

@@ -9,7 +9,7 @@ from jaxtyping import Int
 from lare_rl.assigner import compiled_functions as compiled
 from lare_rl.assigner.store import Store, StoredEpisode
 from lare_rl.credit.decomposition import CreditBatch
-from lare_rl.credit.engine import CreditSpec, agent_shares
+from lare_rl.credit.engine import CreditSpec
 from lare_rl.credit.methods import Fit
 from lare_rl.data.layouts import Layout, lay_out_packed, lay_out_padded, lay_out_sampled
 
@@ -84,5 +84,5 @@ def _gather(store: Store, episodes: Sequence[StoredEpisode], layout: Layout, n_s
         length=length,  # pyright: ignore[reportArgumentType]
         mean_reward=(score / length).astype(np.float32),  # pyright: ignore[reportArgumentType]
         mask=(np.arange(n_slots) < count).astype(np.float32),  # pyright: ignore[reportArgumentType]
-        share=None if store.alive is None else agent_shares(store.alive[rows]),
+        alive=None if store.alive is None else store.alive[rows],  # pyright: ignore[reportArgumentType]
     )

@@ -19,6 +19,7 @@ r_hat. `normalise = false` is the published form, with raw features and raw targ
 
 from typing import NamedTuple
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import optax
@@ -33,6 +34,7 @@ from lare_rl.credit.decoders import DECODERS
 from lare_rl.credit.methods import Method
 from lare_rl.credit.prequential import Predictions, empty_predictions
 from lare_rl.credit.score_type import ScoreType
+from lare_rl.errors import LareError, short_repr
 from lare_rl.nn.networks import init_adam
 from lare_rl.nn.normalise import (
     RunningMeanStd,
@@ -49,6 +51,7 @@ __all__ = [
     "CreditBatch",
     "Decomposition",
     "agent_mean",
+    "agent_shares",
     "decode",
     "decoder_rewards",
     "init",
@@ -79,8 +82,8 @@ class CreditBatch(NamedTuple):
     """R/T."""
     mask: Float[Array, " episodes"]
     """1 for an episode, 0 for padding."""
-    share: Float[Array, "rows *agents"] | None = None
-    """Each agent's share of the team's reward: 1/n for each of the n agents that are alive, else 0. None means equal shares."""
+    alive: Bool[Array, "rows *agents"] | None = None
+    """Which agents acted. None means all."""
 
     @property
     def features(self):  # until `training/decoder_fits.py` says `inputs`
@@ -93,7 +96,7 @@ def valid_rows(episodes: CreditBatch) -> Bool[Array, "rows *agents"]:
     is_step = (episodes.episode_index < n_episodes) & (
         episodes.mask[jnp.minimum(episodes.episode_index, n_episodes - 1)] > 0
     )
-    acted = jnp.ones(shape, bool) if episodes.share is None else episodes.share > 0
+    acted = jnp.ones(shape, bool) if episodes.alive is None else episodes.alive
     return is_step.reshape(-1, *[1] * (len(shape) - 1)) & acted
 
 
@@ -143,6 +146,12 @@ def init(
     basis = Basis(n_factors=0, n_raw=basis, extended=False) if isinstance(basis, int) else basis
     shape = DecoderShape(basis, max_steps, n_agents)
     network = DECODERS[method.decoder].init_network(key, shape, settings)
+    for leaf in jax.tree.leaves(network):
+        if not eqx.is_array_like(leaf):
+            raise LareError(
+                f"the decoder {method.decoder!r} holds {short_repr(leaf)}, which cannot be trained: it may have arrays and static "
+                "fields; instead of eqx.nn.MLP, which holds functions, use lare_rl.nn.networks.MLP"
+            )
     both = len(score_types) > 1
     closed = None
     if both or not method.uses_gradient:
@@ -277,9 +286,14 @@ def _per_step(
 
 
 def agent_mean(
-    values: Float[Array, "rows *agents"], share: Float[Array, "rows *agents"] | None
+    values: Float[Array, "rows *agents"], alive: Bool[Array, "rows *agents"] | None
 ) -> Float[Array, " rows"]:
     """Return the mean over the agents that are alive."""
-    if share is None:
+    if alive is None:
         return jnp.mean(values.reshape(len(values), -1), axis=1)
-    return jnp.sum((values * share).reshape(len(values), -1), axis=1)
+    return jnp.sum((values * agent_shares(alive)).reshape(len(values), -1), axis=1)
+
+
+def agent_shares(alive: Bool[Array, "*batch agents"]) -> Float[Array, "*batch agents"]:
+    """Return each agent's share of the team's reward: 1/n for each of n agents that are alive, else 0."""
+    return (alive / alive.sum(axis=-1, keepdims=True).clip(1)).astype(jnp.float32)

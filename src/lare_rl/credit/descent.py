@@ -75,7 +75,7 @@ def _mean_loss(
     target, n_episodes = _targets(state, episodes, settings), len(episodes.length)
     weight = losses.episode_weight(episodes.length, episodes.mask, settings.sum_form)
     output = decode(network, state, episodes.inputs, settings, key)
-    r_hat, penalty = (agent_mean(values, episodes.share) for values in output)
+    r_hat, penalty = (agent_mean(values, episodes.alive) for values in output)
     n_steps = jnp.minimum(episodes.length, len(r_hat) // n_episodes) if fit.samples_steps else episodes.length
     mean = losses.episode_means(r_hat, episodes.episode_index, n_steps)
     if fit is Fit.SAMPLED_STEPS_UNBIASED:

@@ -13,10 +13,9 @@ Batches have an axis of agents, of length 1 for a single agent. For credit to wh
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
 from lare_rl.credit import closed_form, decomposition
@@ -38,7 +37,6 @@ __all__ = [
     "ExplanationState",
     "StepBatch",
     "add_to_explanation",
-    "agent_shares",
     "credit_spec",
     "explain_returns",
     "init_decoder",
@@ -179,14 +177,6 @@ def scale_and_mask(
     """Return rewards with 0 for agents that are not alive, divided by the scale of R/T if `scale_rewards` is true."""
     reward = jnp.where(alive, reward, 0)
     return reward / root_mean_square(scale) if scale_rewards else reward
-
-
-def agent_shares(alive: Any) -> Any:
-    """Return each agent's share of the team's reward: 1/n for each of n agents that are alive, else 0.
-
-    Arrays are [*batch agents], of NumPy or of JAX.
-    """
-    return (alive / alive.sum(axis=-1, keepdims=True).clip(1)).astype(np.float32)
 
 
 class ExplanationState(NamedTuple):

@@ -13,7 +13,14 @@ from jaxtyping import Array, Bool, Float
 from lare_rl.credit import closed_form, evidence
 from lare_rl.credit.closed_form import ClosedForm, LinearDecoder
 from lare_rl.credit.decoder_settings import CreditSettings
-from lare_rl.credit.decomposition import CreditBatch, Decomposition, agent_mean, decoder_rewards, score_type_index
+from lare_rl.credit.decomposition import (
+    CreditBatch,
+    Decomposition,
+    agent_mean,
+    agent_shares,
+    decoder_rewards,
+    score_type_index,
+)
 from lare_rl.credit.methods import Fit, Method
 from lare_rl.credit.prequential import Predictions, add_predictions, squared_errors
 from lare_rl.credit.score_type import ScoreType, ScoreTypeEstimate
@@ -64,7 +71,7 @@ def predict(state: Decomposition, episodes: CreditBatch, settings: CreditSetting
     is_new = episodes.mask > 0
     returns, n_episodes = episodes.mean_reward * episodes.length, len(episodes.length)
     row_length = episodes.length[jnp.clip(episodes.episode_index, 0, n_episodes - 1)]
-    r_hat = agent_mean(decoder_rewards(state, episodes.inputs, settings, row_length), episodes.share)
+    r_hat = agent_mean(decoder_rewards(state, episodes.inputs, settings, row_length), episodes.alive)
     predicted = jax.ops.segment_sum(r_hat, episodes.episode_index, n_episodes)[:, None]
     predictions = add_predictions(state.predictions, returns, predicted, is_new & is_fitted(state))
     state = state._replace(predictions=predictions)
@@ -82,7 +89,8 @@ def _mean_features(decoder: LinearDecoder, episodes: CreditBatch) -> Float[Array
     """Return the mean of a linear decoder's features over the steps of each episode, and over the agents that are alive."""
     features = decoder.features(episodes.inputs)
     if features.ndim == 3:
-        share = jnp.full(features.shape[:2], 1 / features.shape[1]) if episodes.share is None else episodes.share
+        n_agents = features.shape[1]
+        share = jnp.full(features.shape[:2], 1 / n_agents) if episodes.alive is None else agent_shares(episodes.alive)
         features = jnp.einsum("raf,ra->rf", features, share)
     total = jax.ops.segment_sum(features.astype(float), episodes.episode_index, len(episodes.length))
     return total / jnp.maximum(episodes.length, 1)[:, None]

@@ -15,9 +15,10 @@ import numpy as np
 
 from lare_rl.credit.basis import HALF_PERIOD, N_FREQUENCIES, Basis
 from lare_rl.credit.closed_form import LinearDecoder
+from lare_rl.credit.decoders import DECODERS
 from lare_rl.credit.decomposition import Decomposition, is_normalised, reward_unit
 from lare_rl.credit.input_names import input_arrays
-from lare_rl.credit.methods import Reward
+from lare_rl.credit.methods import Method, Reward
 from lare_rl.credit.step_decoders import Bottleneck, StepDecoder
 from lare_rl.export.layers import finish, first_outputs, graph_input, network, numpy_op, standardize
 from lare_rl.nn.normalise import CLIP, running_std
@@ -30,21 +31,15 @@ from lare_rl.training.static_config import TrainConfig
 
 __all__ = ["missing_reward_reason", "reward_graph"]
 
-_STEP_DECODERS = (StepDecoder, Bottleneck, LinearDecoder)
-"""Decoders that can be exported: those of this package whose proxy reward depends on a single step."""
 
-
-def missing_reward_reason(config: TrainConfig, decoder: object | None) -> str | None:
-    """Return why a method's rewards are not a function of a single step, or None if they are one."""
-    method = config.method
+def missing_reward_reason(method: Method) -> str | None:
+    """Return why a method's rewards cannot be exported, or None if they can be."""
     if not method.has_proxy_rewards:
         return f"{method.name} trains on the rewards of the environment"
     if method.reward is Reward.UNIFORM:
         return f"{method.name} takes the reward of a step from the return of its episode"
-    if method.needs_whole_episodes or method.decoder == "diaster":
-        return f"{method.name} reads all steps of an episode, not a single step"
-    if method.reward is Reward.PROXY and not isinstance(decoder, _STEP_DECODERS):
-        return f"the decoder of {method.name} is a plugin's, which cannot be exported"
+    if method.reward is Reward.PROXY and not DECODERS[method.decoder].exportable:
+        return f"the decoder of {method.name} ({method.decoder}) cannot be exported"
     return None
 
 

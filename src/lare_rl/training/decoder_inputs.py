@@ -8,7 +8,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from lare_rl.credit.decomposition import CreditBatch
-from lare_rl.credit.engine import StepBatch, agent_shares
+from lare_rl.credit.engine import StepBatch
 from lare_rl.credit.input_names import input_arrays
 from lare_rl.data.replay import StoredSteps
 from lare_rl.data.sampling import CreditSample
@@ -63,12 +63,12 @@ def step_batch(steps: StoredSteps, config: TrainConfig, team_index: int) -> Step
 
 def episode_batch(steps: StoredSteps, sample: CreditSample, config: TrainConfig, team_index: int) -> CreditBatch:
     """Return the batch that a team's decoder is fitted to, from the sampled steps."""
-    mask, episodes = row_mask(steps, config, team_index), sample.episodes
+    episodes = sample.episodes
     return CreditBatch(
         inputs=decoder_inputs(steps, config, team_index),
         episode_index=sample.episode,
         length=episodes.length,
         mean_reward=episodes.mean_reward[..., team_index],
         mask=episodes.mask,
-        share=None if mask is None else agent_shares(mask),
+        alive=row_mask(steps, config, team_index),
     )

@@ -12,10 +12,15 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from lare_rl.errors import missing_extra_error
 from lare_rl.util.sanitize import sanitize
 
-__all__ = ["Clock", "Listener", "MetricLines", "TensorBoard", "Terminal", "import_summary_writer"]
+__all__ = ["Clock", "Listener", "MetricLines", "TensorBoard", "Terminal", "import_summary_writer", "known_numbers"]
 
 MetricLines = Sequence[Mapping[str, Any]]
 """One mapping for each seed, as in metrics.jsonl."""
+
+
+def known_numbers(line: Mapping[str, Any]) -> dict[str, float]:
+    """Return the metrics of a line of metrics.jsonl that are not null."""
+    return {key: value for key, value in line.items() if key not in ("step", "seed") and value is not None}
 
 
 @runtime_checkable
@@ -133,9 +138,8 @@ class TensorBoard(Listener):
 
     def on_evaluation(self, metrics: MetricLines) -> None:
         for line in metrics:
-            for key, value in line.items():
-                if key not in ("step", "seed") and value is not None:
-                    self._writers[line["seed"]].add_scalar(key, value, line["step"])
+            for key, value in known_numbers(line).items():
+                self._writers[line["seed"]].add_scalar(key, value, line["step"])
 
     def on_stop(self) -> None:
         for writer in self._writers.values():
