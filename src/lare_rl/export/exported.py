@@ -17,8 +17,6 @@ from types import SimpleNamespace
 
 import numpy as np
 
-__all__ = ["load", "reward"]
-
 _DIRECTORY = Path(__file__).parent
 _Node = namedtuple("Node", "op inputs shape kind option")
 

@@ -18,8 +18,6 @@ from typing import Generic, TypeVar
 
 from lare_rl.errors import LareError, did_you_mean
 
-__all__ = ["Registry", "load_plugins"]
-
 T = TypeVar("T")
 
 

@@ -2,8 +2,6 @@
 
 import re
 
-__all__ = ["rename_fields"]
-
 _RENAMED_FIELDS = {
     "average": "is_mean",
     "closed": "closed_form",
