@@ -71,7 +71,7 @@ def restore(learner: DecoderLearner, state: AssignerState) -> None:
     learner.n_learned, learner.n_updates = state.n_learned, state.n_updates
     if set(PHI_SAMPLE) <= set(arrays):
         learner.phi_sample.append((arrays[PHI_SAMPLE[0]], arrays[PHI_SAMPLE[1]]))
-    learned = {name.removeprefix(LEARNED): array for name, array in arrays.items()}
+    learned = {rename_fields(name).removeprefix(LEARNED): array for name, array in arrays.items()}
     learner.decoder, learner.scale = fill_template((learner.decoder, learner.scale), learned)
     store = learner.store
     store.ended, store.ended_steps, store.dropped = map(int, arrays["counts"])
@@ -102,7 +102,7 @@ def read_state(directory: Path) -> AssignerState:
     with report_damage(directory):
         values = read_json(read_text(path))
         with open_npz(directory / ARRAYS_FILE) as saved:
-            arrays = {rename_fields(name): saved[name] for name in saved.files}
+            arrays = {name: saved[name] for name in saved.files}
         if not isinstance(values, dict) or values.get("format") != FORMAT:
             raise LareError(f"{path} is not of format {FORMAT}: another version of LaRe has written it")
         task = None if values["task"] is None else TaskSpec(**values["task"])

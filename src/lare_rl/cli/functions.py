@@ -18,6 +18,7 @@ if TYPE_CHECKING:
 
     from lare_rl.envs.play import Episode, Policy
     from lare_rl.latent.function import LatentFunction
+    from lare_rl.latent.verify import Verdict
     from lare_rl.new_task.draft import Draft
     from lare_rl.tasks.spec import TaskSpec
 
@@ -144,12 +145,7 @@ def verify(
         print_line(f"note    it was written for the task {saved_task!r}")
     verdict = verify_source(source, spec, kind, load_steps(data, spec))
     print_line(f"for {role.name}: observations of {role.observation_size} numbers, actions of {role.action_size}")
-    for check in verdict.checks:
-        print_line(f"{'passed' if check.passed else 'FAILED'}  {check.name}")
-        for line in check.message.splitlines():
-            print_line(f"        {line}")
-    for line in verdict.advice:
-        print_line(f"advice  {line}")
+    _print_verdict(verdict)
     if not verdict.passed:
         if file.suffix == ".json":
             print_line("Paste the lines after FAILED into the same chat, and ask for the whole reply again, corrected.")
@@ -159,6 +155,15 @@ def verify(
         print_line(f"factor  {name} reads {reads}")
     if fit:
         _print_assessment(function, role, _load_episodes(role, data, fit, play))
+
+
+def _print_verdict(verdict: "Verdict") -> None:
+    for check in verdict.checks:
+        print_line(f"{'passed' if check.passed else 'FAILED'}  {check.name}")
+        for line in check.message.splitlines():
+            print_line(f"        {line}")
+    for line in verdict.advice:
+        print_line(f"advice  {line}")
 
 
 def _load_episodes(role: "TaskSpec", data: str | None, n_episodes: int, policy: "Policy | None") -> "Sequence[Episode]":

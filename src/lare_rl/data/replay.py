@@ -26,9 +26,6 @@ from jaxtyping import Array, Bool, Float, Int
 STEP_COLUMNS = ("observation", "state", "available", "alive")
 """Columns that exist before and after a step. The values after a step are in the next row."""
 
-BY_ROW = "columns"
-"""The field of the replay that a checkpoint saves by row."""
-
 Columns = Mapping[str, Array]
 """Arrays with rows first, by name."""
 
