@@ -171,11 +171,7 @@ class Store:
         self.dropped += bool(run and run.steps)
 
     def rows(self, steps: Int[np.ndarray, "*batch"]) -> Int[np.ndarray, "*batch"]:
-        """Return the rows of stored steps.
-
-        Raises:
-            LareError: a step was never stored, or is not stored any more.
-        """
+        """Return the rows of stored steps. Raises `LareError` if a step was never stored, or is not stored any more."""
         oldest = max(0, self.steps - self.capacity)
         if steps.size and (steps.max() >= self.steps or steps.min() < oldest):
             missing = steps.max() if steps.max() >= self.steps else steps.min()

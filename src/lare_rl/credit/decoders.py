@@ -46,11 +46,7 @@ DECODERS = Registry[Decoder]("decoder")
 
 
 def register_decoder(decoder: Decoder) -> None:
-    """Add a decoder, which methods can then name.
-
-    Raises:
-        LareError: another decoder has this name.
-    """
+    """Add a decoder, which methods can then name. Raises `LareError` if another decoder has this name."""
     DECODERS.register(decoder.name, decoder)
 
 

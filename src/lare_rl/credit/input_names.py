@@ -28,11 +28,7 @@ _SCORED_OBSERVATIONS = {
 
 @dataclass(frozen=True)
 class InputNames:
-    """What a decoder reads of a step.
-
-    Raises:
-        LareError: a name is not one of the six above.
-    """
+    """What a decoder reads of a step. Raises `LareError` if a name is not one of the six above."""
 
     names: tuple[str, ...]
     names_of_many_agents: tuple[str, ...] | None = None

@@ -243,11 +243,7 @@ Item = TypeVar("Item")
 
 
 def pair_with_roles(items: Sequence[Item], task: TaskSpec) -> list[tuple[Item, TaskSpec]]:
-    """Pair functions, or their files, with the roles of a task.
-
-    Raises:
-        LareError: the numbers of items and roles differ.
-    """
+    """Pair functions, or their files, with the roles of a task. Raises `LareError` if the numbers of items and roles differ."""
     if len(items) != len(task.roles):
         names = ", ".join(role.name for role in task.roles)
         raise LareError(f"{task.name} needs one latent function for each of {names}; {len(items)} were given")
@@ -255,11 +251,7 @@ def pair_with_roles(items: Sequence[Item], task: TaskSpec) -> list[tuple[Item, T
 
 
 def check_task(function: LatentFunction, task: TaskSpec) -> None:
-    """Check that a function was written for a task.
-
-    Raises:
-        LareError: it was written for another task.
-    """
+    """Check that a function was written for a task. Raises `LareError` if it was written for another task."""
     if function.task != task.name:
         raise LareError(
             f"the latent function was written for the task {function.task!r}, not for {task.name!r}. If it is right for both, use "
