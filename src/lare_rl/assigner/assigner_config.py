@@ -83,7 +83,7 @@ class AssignerConfig:
         """Compute the decoder's inputs for some steps, which are rows already. Raises `LareError` if a factor is not finite."""
         arrays = {"observation": observation, "action": action, "next_observation": next_observation}
         if self.phi is not None:
-            arrays["factors"] = self.phi.step_factors(*arrays.values(), self.judges)
+            arrays["factors"] = self.phi.step_factors(observation, action, next_observation, self.judges)
         inputs = input_arrays(self.spec.inputs, arrays)
         return np.concatenate(inputs, axis=-1) if inputs else observation[..., :0]
 
