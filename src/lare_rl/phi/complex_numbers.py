@@ -12,7 +12,7 @@ from lare_rl.phi.arrays import COMPLEX_OPERATIONS, Array, Complex, as_array, ele
 from lare_rl.phi.builder import current_builder
 from lare_rl.phi.limits import MAX_TRANSFORM_LENGTH, RefusedError
 from lare_rl.phi.numpy_functions import call_numpy
-from lare_rl.phi.numpy_functions.registry import array_functions, numpy_function
+from lare_rl.phi.numpy_functions.registry import FUNCTIONS, array_functions, numpy_variants
 
 BY_COMPONENT = frozenset(
     "sum mean reshape ravel transpose swapaxes moveaxis take concatenate stack cumsum diff roll flip expand_dims squeeze copy "
@@ -118,9 +118,10 @@ array_functions(
 )
 
 
-def _transform(a: Any, axis: int, sign: float, half: bool) -> Complex:
-    """Return the sum over t of a_t exp(sign 2 pi i k t / n)."""
-    x = as_complex(a)
+@numpy_variants({"fft.fft": (-1.0, False), "fft.ifft": (1.0, False), "fft.rfft": (-1.0, True)})
+def transform(variant: tuple[float, bool], a: Any, n: Any = None, axis: int = -1) -> Complex:
+    """Return the sum over t of a_t exp(sign 2 pi i k t / n), divided by n if the sign is positive."""
+    (sign, half), x = variant, as_complex(a)
     (at,) = x.real.row_axes(axis)
     n = x.real.row_shape[at]
     if n > MAX_TRANSFORM_LENGTH:
@@ -132,32 +133,14 @@ def _transform(a: Any, axis: int, sign: float, half: bool) -> Complex:
         return call_numpy("moveaxis", [call_numpy("tensordot", [array, matrix], {"axes": [[at], [0]]}), -1, at], {})
 
     real = product(x.real, cos) - product(x.imag, sin)
-    return Complex(real, product(x.real, sin) + product(x.imag, cos))
+    imag = product(x.real, sin) + product(x.imag, cos)
+    return Complex(real, imag) if sign < 0 else Complex(real / n, imag / n)
 
 
-def _register_transform(name: str, sign: float, half: bool) -> None:
-    def transform(a: Any, n: Any = None, axis: int = -1) -> Complex:
-        result = _transform(a, axis, sign, half)
-        if sign < 0:
-            return result
-        size = result.real.row_shape[result.real.axis(axis)]
-        return Complex(result.real / size, result.imag / size)
-
-    COMPLEX_FUNCTIONS[name] = numpy_function(name)(transform)
+COMPLEX_FUNCTIONS |= {name: FUNCTIONS[name] for name in ("fft.fft", "fft.ifft", "fft.rfft")}
 
 
-_register_transform("fft.fft", -1.0, half=False)
-_register_transform("fft.ifft", 1.0, half=False)
-_register_transform("fft.rfft", -1.0, half=True)
-
-
-def _register_frequencies(name: str) -> None:
-    def frequencies(n: int, d: float = 1.0) -> Array:
-        current_builder().check_size([n])
-        return as_array(getattr(np.fft, name)(n, d))
-
-    numpy_function(f"fft.{name}")(frequencies)
-
-
-_register_frequencies("rfftfreq")
-_register_frequencies("fftfreq")
+@numpy_variants({"fft.rfftfreq": np.fft.rfftfreq, "fft.fftfreq": np.fft.fftfreq})
+def frequencies(function: Callable[[int, float], np.ndarray], n: int, d: float = 1.0) -> Array:
+    current_builder().check_size([n])
+    return as_array(function(n, d))

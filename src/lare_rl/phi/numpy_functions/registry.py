@@ -7,6 +7,7 @@ functions.
 
 from __future__ import annotations
 
+import functools
 import inspect
 import operator
 from collections.abc import Callable, Mapping, Sequence
@@ -60,6 +61,17 @@ def numpy_function(*names: str) -> Callable[[Function], Function]:
         }
         for name in names or (function.__name__.rstrip("_"),):
             FUNCTIONS[name], _SIGNATURES[name], _CONVERTERS[name] = function, signature, converters
+        return function
+
+    return register
+
+
+def numpy_variants(table: Mapping[str, Any]) -> Callable[[Function], Function]:
+    """Register one function for each row of a table: NumPy's names, separated by spaces, and the value that it takes first."""
+
+    def register(function: Function) -> Function:
+        for names, variant in table.items():
+            numpy_function(*names.split())(functools.partial(function, variant))
         return function
 
     return register

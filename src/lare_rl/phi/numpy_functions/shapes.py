@@ -20,6 +20,7 @@ from lare_rl.phi.numpy_functions.registry import (
     as_arrays,
     numpy_function,
     numpy_functions,
+    numpy_variants,
     require_constant,
 )
 from lare_rl.phi.operand import BATCH, BatchSize, common_batch_axis
@@ -225,21 +226,20 @@ def array_split(ary: Array, indices_or_sections: Any, axis: int = 0) -> list[Any
     return [ary[(*(ALL,) * at, slice(start, end))] for start, end in itertools.pairwise(ends)]
 
 
-def _register_split(name: str, axis_for: Callable[[Array, int], int]) -> None:
-    def split(ary: Array, indices_or_sections: Any, axis: int = 0) -> list[Any]:
-        at = axis_for(ary, axis)
-        size = ary.row_shape[ary.axis(at)]
-        if isinstance(indices_or_sections, int) and size % max(indices_or_sections, 1):
-            raise ValueError(f"{size} numbers cannot be split into {indices_or_sections} equal parts")
-        return array_split(ary, indices_or_sections, at)
-
-    numpy_function(name)(split)
-
-
-_register_split("split", lambda a, axis: axis)
-_register_split("hsplit", lambda a, _: min(a.ndim - 1, 1))
-_register_split("vsplit", lambda a, _: 0)
-_register_split("dsplit", lambda a, _: 2)
+@numpy_variants(
+    {
+        "split": lambda a, axis: axis,
+        "hsplit": lambda a, _: min(a.ndim - 1, 1),
+        "vsplit": lambda a, _: 0,
+        "dsplit": lambda a, _: 2,
+    }
+)
+def split(axis_for: Callable[[Array, int], int], ary: Array, indices_or_sections: Any, axis: int = 0) -> list[Any]:
+    at = axis_for(ary, axis)
+    size = ary.row_shape[ary.axis(at)]
+    if isinstance(indices_or_sections, int) and size % max(indices_or_sections, 1):
+        raise ValueError(f"{size} numbers cannot be split into {indices_or_sections} equal parts")
+    return array_split(ary, indices_or_sections, at)
 
 
 @numpy_function()

@@ -14,7 +14,14 @@ from lare_rl.phi.arrays import Array, as_array, elementwise
 from lare_rl.phi.builder import current_builder
 from lare_rl.phi.limits import MAX_CONSTANT_SIZE, MAX_SYSTEM_SIZE, RefusedError
 from lare_rl.phi.numpy_functions.reductions import along
-from lare_rl.phi.numpy_functions.registry import array_functions, as_float, as_numbers, numpy_function, require_constant
+from lare_rl.phi.numpy_functions.registry import (
+    array_functions,
+    as_float,
+    as_numbers,
+    numpy_function,
+    numpy_variants,
+    require_constant,
+)
 
 
 def register_constant_function(
@@ -180,21 +187,19 @@ def rising_polyval(x: Array, c: Any, tensor: Any = True) -> Any:
     return polyval(as_array(c)[::-1], x)
 
 
-def _register_series_value(name: str, to_powers: Callable[[Any], np.ndarray]) -> None:
-    def value(x: Array, c: Any, tensor: Any = True) -> Any:
-        return rising_polyval(x, to_powers(plain_constant(c, name, MAX_SYSTEM_SIZE)))
-
-    numpy_function(f"polynomial.{name}")(value)
-
-
-for _name, _convert in {
+SERIES: dict[str, Callable[[Any], np.ndarray]] = {
     "chebyshev.chebval": np.polynomial.chebyshev.cheb2poly,
     "legendre.legval": np.polynomial.legendre.leg2poly,
     "hermite.hermval": np.polynomial.hermite.herm2poly,
     "hermite_e.hermeval": np.polynomial.hermite_e.herme2poly,
     "laguerre.lagval": np.polynomial.laguerre.lag2poly,
-}.items():
-    _register_series_value(_name, _convert)
+}
+"""How coefficients become those of powers."""
+
+
+@numpy_variants({f"polynomial.{name}": name for name in SERIES})
+def series_value(name: str, x: Array, c: Any, tensor: Any = True) -> Any:
+    return rising_polyval(x, SERIES[name](plain_constant(c, name, MAX_SYSTEM_SIZE)))
 
 
 array_functions(
