@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import operator
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
@@ -123,11 +124,14 @@ def transform(variant: tuple[float, bool], a: Any, n: Any = None, axis: int = -1
     """Return the sum over t of a_t exp(sign 2 pi i k t / n), divided by n if the sign is positive."""
     (sign, half), x = variant, as_complex(a)
     (at,) = x.real.row_axes(axis)
-    n = x.real.row_shape[at]
-    if n > MAX_TRANSFORM_LENGTH:
-        raise RefusedError("E-COST", f"np.fft of {n} numbers: at most {MAX_TRANSFORM_LENGTH}")
-    phase = sign * 2 * math.pi * np.outer(np.arange(n), np.arange(n // 2 + 1 if half else n)) / n
-    cos, sin = np.cos(phase), np.sin(phase)
+    size = x.real.row_shape[at]
+    n = size if n is None else operator.index(n)  # zeros are added, or numbers left out, as NumPy does
+    if max(n, size) > MAX_TRANSFORM_LENGTH:
+        raise RefusedError("E-COST", f"np.fft of {max(n, size)} numbers: at most {MAX_TRANSFORM_LENGTH}")
+    if n < 1:
+        raise ValueError(f"np.fft with n = {n}")
+    phase = sign * 2 * math.pi * np.outer(np.arange(size), np.arange(n // 2 + 1 if half else n)) / n
+    cos, sin = (function(phase) * (np.arange(size) < n)[:, None] for function in (np.cos, np.sin))
 
     def product(array: Array, matrix: np.ndarray) -> Any:
         return call_numpy("moveaxis", [call_numpy("tensordot", [array, matrix], {"axes": [[at], [0]]}), -1, at], {})

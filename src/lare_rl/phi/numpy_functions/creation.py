@@ -77,9 +77,12 @@ def arange(start: Any, stop: Any = None, step: Any = 1, dtype: Any = None) -> Ar
 
 
 @numpy_variants({"linspace": np.linspace, "logspace": np.logspace, "geomspace": np.geomspace})
-def series(function: Any, start: float, stop: float, num: int = 50, endpoint: Any = True, base: float = 10.0) -> Array:
+def series(
+    function: Any, start: float, stop: float, num: int = 50, endpoint: Any = True, base: float = 10.0, dtype: Any = None
+) -> Array:
     current_builder().check_size([num])
-    return as_array(function(start, stop, num, bool(endpoint), **({"base": base} if function is np.logspace else {})))
+    more = {"base": base} if function is np.logspace else {}
+    return as_array(function(start, stop, num, bool(endpoint), dtype=dtype_kind(dtype or "float"), **more))
 
 
 @numpy_variants({"eye": np.eye, "tri": np.tri})

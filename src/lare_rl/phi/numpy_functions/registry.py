@@ -114,6 +114,8 @@ def call_numpy(name: str, args: Sequence[Any], kwargs: Mapping[str, Any]) -> Any
         raise RefusedError("E-NUMPY", f"np.{name} with where= needs out=, or the other numbers are undefined")
     result = FUNCTIONS[name](*bound.args, **bound.kwargs)
     if dtype is not None and "dtype" not in signature.parameters:
+        if dtype_kind(dtype) != "float" and as_array(result).kind == "float":
+            raise RefusedError("E-NUMPY", f"np.{name} of fractional numbers as another type: use astype")
         result = astype(result, dtype)
     if out is not None:
         out = out[0] if isinstance(out, tuple) else out

@@ -36,12 +36,17 @@ def split_shape(shape: Any) -> tuple[tuple[int, ...], int | None]:
     return row_shape, batch_axes[0] if batch_axes else None
 
 
+def check_order(order: Any) -> None:
+    """Raise `RefusedError` if numbers are not to be counted row by row."""
+    if order != "C":
+        raise RefusedError("E-NUMPY", "the order of an array is 'C' alone: use np.transpose")
+
+
 @numpy_function()
 def reshape(a: Array, shape: Any, order: Any = "C") -> Array:
     """Reshape. The batch axis may be merged with axes behind it, or divided again."""
     sizes = list(shape) if isinstance(shape, (list, tuple)) else [shape]
-    if order != "C":
-        raise RefusedError("E-NUMPY", "np.reshape in another order than 'C': use np.transpose")
+    check_order(order)
     row_shape, batch_axis = split_shape(sizes)
     free = [axis for axis, size in enumerate(row_shape) if size == -1]
     if batch_axis is None and a.batch_axis is not None:  # -1 stands for the batch
@@ -156,7 +161,7 @@ def size(a: Array, axis: Any = None) -> Any:
 
 
 def ravel(a: Array, order: Any = "C") -> Array:
-    return reshape(a, -1)
+    return reshape(a, -1, order)
 
 
 numpy_functions(

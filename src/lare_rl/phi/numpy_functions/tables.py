@@ -22,6 +22,7 @@ from lare_rl.phi.numpy_functions.registry import (
     numpy_variants,
     require_constant,
 )
+from lare_rl.phi.numpy_functions.shapes import check_order
 
 
 def register_constant_function(
@@ -143,17 +144,18 @@ def _interval(x: Array, knots: np.ndarray) -> Any:
 @numpy_function()
 def unravel_index(indices: Array, shape: Any, order: Any = "C") -> tuple[Any, ...]:
     sizes = [operator.index(size) for size in (shape if isinstance(shape, (tuple, list)) else [shape])]
-    return tuple((indices // stride) % size for stride, size in zip(_strides(sizes), sizes, strict=True))
+    return tuple((indices // stride) % size for stride, size in zip(_strides(sizes, order), sizes, strict=True))
 
 
 @numpy_function()
-def ravel_multi_index(multi_index: Any, dims: Any, mode: Any = "raise", order: Any = "C") -> Any:
-    strides = _strides([operator.index(size) for size in dims])
+def ravel_multi_index(multi_index: Any, dims: Any, *, order: Any = "C") -> Any:
+    strides = _strides([operator.index(size) for size in dims], order)
     terms = [elementwise("multiply", index, stride) for index, stride in zip(multi_index, strides, strict=True)]
     return functools.reduce(lambda x, y: elementwise("add", x, y), terms)
 
 
-def _strides(sizes: Sequence[int]) -> list[int]:
+def _strides(sizes: Sequence[int], order: Any) -> list[int]:
+    check_order(order)
     current_builder().check_size(sizes)
     return [math.prod(sizes[i + 1 :]) for i in range(len(sizes))]
 
@@ -204,9 +206,7 @@ def series_value(name: str, x: Array, c: Any, tensor: Any = True) -> Any:
 
 array_functions(
     {
-        "polynomial.Polynomial polynomial.polynomial.Polynomial": lambda coef, domain=None, window=None: Polynomial(
-            coef[::-1]
-        ),
+        "polynomial.Polynomial polynomial.polynomial.Polynomial": lambda coef: Polynomial(coef[::-1]),
         "poly1d": lambda c_or_r: Polynomial(c_or_r),
     }
 )
