@@ -12,6 +12,17 @@ from pydantic import BaseModel, ConfigDict, GetCoreSchemaHandler, ValidationErro
 from pydantic.fields import FieldInfo
 from pydantic_core import core_schema
 
+__all__ = [
+    "CheckedModel",
+    "LareError",
+    "did_you_mean",
+    "install_command",
+    "missing_extra_error",
+    "model_keys",
+    "nested_model",
+    "short_repr",
+]
+
 MAX_REPR = 100
 """Characters of a value that a message quotes."""
 

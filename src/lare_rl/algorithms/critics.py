@@ -8,6 +8,8 @@ from jaxtyping import Array, Float, PRNGKeyArray
 from lare_rl.algorithms.batches import Action, Observation, Transitions, Value
 from lare_rl.nn.networks import MLP
 
+__all__ = ["critic_loss", "init_critics", "q_value", "q_values"]
+
 
 def init_critics(
     key: PRNGKeyArray, observation_size: int, action_size: int, hidden: tuple[int, ...], n_critics: int

@@ -41,6 +41,8 @@ from lare_rl.errors import LareError
 from lare_rl.latent.function import LatentFunction
 from lare_rl.tasks.spec import FactorInputs, TaskSpec
 
+__all__ = ["CreditAssigner"]
+
 
 class CreditAssigner:
     """Proxy rewards for steps, by any method that assigns credit to steps (`lare-rl methods`). Several threads may use it."""

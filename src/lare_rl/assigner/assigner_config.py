@@ -21,6 +21,16 @@ from lare_rl.errors import LareError, short_repr
 from lare_rl.latent.function import LatentFunction, check_task
 from lare_rl.tasks.spec import FactorInputs, TaskSpec
 
+__all__ = [
+    "AssignerConfig",
+    "Space",
+    "check_config",
+    "check_finite",
+    "resolve_layouts",
+    "to_flags",
+    "to_step_ids",
+]
+
 Space = gymnasium.Space | SpaceLayout | int
 """A space of Gymnasium, a layout, or the length of a row of numbers."""
 

@@ -13,6 +13,8 @@ from lare_rl.credit.engine import CreditSpec
 from lare_rl.credit.methods import Fit
 from lare_rl.data.layouts import Layout, lay_out_packed, lay_out_padded, lay_out_sampled
 
+__all__ = ["pack_in_order", "sample_batch"]
+
 
 def sample_batch(store: Store, spec: CreditSpec, random: np.random.Generator, longest: int) -> CreditBatch:
     """Sample the steps of one gradient update, from episodes that are sampled uniformly with replacement.

@@ -30,6 +30,8 @@ from lare_rl.credit.methods import Fit, Reward
 from lare_rl.nn.normalise import Scale, empty_scale
 from lare_rl.util.float64 import float64
 
+__all__ = ["CHUNK_UPDATES", "DecoderLearner"]
+
 MAX_PENDING_STEPS = 256
 """The most steps that may wait for their inputs, or for the running statistics."""
 MAX_CALL_ROWS = 8192

@@ -29,6 +29,8 @@ from lare_rl.util.files import write_arrays, write_atomically
 from lare_rl.util.renamed_fields import rename_fields
 from lare_rl.util.safe_io import read_json, read_text
 
+__all__ = ["AssignerState", "get_state", "read_state", "report_damage", "restore", "write_state"]
+
 FORMAT = 1
 TEXT_FILE, ARRAYS_FILE, FUNCTION_FILE = "assigner.json", "state.npz", "phi.py"
 PLAIN_FIELDS = ("judges", "agents", "max_steps", "capacity", "seed", "fits_per_step", "scale_rewards", "forget")

@@ -16,6 +16,8 @@ from jaxtyping import Bool, Float, Int
 
 from lare_rl.errors import LareError
 
+__all__ = ["RunningEpisode", "Store", "StoredEpisode"]
+
 
 class StoredEpisode(NamedTuple):
     """An episode that has ended."""

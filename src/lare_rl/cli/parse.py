@@ -21,6 +21,8 @@ from tyro.constructors import (
 
 from lare_rl.errors import CheckedModel, LareError, did_you_mean, model_keys, nested_model
 
+__all__ = ["parse"]
+
 _RULES = ConstructorRegistry()
 _NUMBERS = {int: "a whole number, such as 10000", float: "a number, such as 0.5"}
 

@@ -13,6 +13,8 @@ from lare_rl.errors import LareError
 from lare_rl.sweep.jobs import Job
 from lare_rl.util.sanitize import sanitize
 
+__all__ = ["show_progress", "update_bars"]
+
 
 @contextlib.contextmanager
 def show_progress(jobs: Sequence[Job]) -> Iterator[Callable[[str], None]]:

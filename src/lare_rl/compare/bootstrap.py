@@ -15,6 +15,20 @@ from jaxtyping import Float
 from lare_rl.errors import missing_extra_error
 from lare_rl.util.statistics import Band, format_rounded
 
+__all__ = [
+    "REPETITIONS",
+    "Estimate",
+    "OtherScores",
+    "Scores",
+    "bootstrap",
+    "bootstrap_band",
+    "interquartile_means",
+    "load_rliable",
+    "mann_whitney",
+    "mann_whitney_u",
+    "probability_of_improvement",
+]
+
 REPETITIONS = 2000
 """Number of bootstrap samples."""
 

@@ -11,6 +11,8 @@ from lare_rl.runs.metric_names import RETURN, SUMMED_RETURN
 from lare_rl.training.advice import describe_untrained
 from lare_rl.util.findings import Finding
 
+__all__ = ["collect_results", "select_runs"]
+
 
 def collect_results(paths: Sequence[Path], metric: str = RETURN) -> tuple[list[Results], list[Finding]]:
     """Read the results in run directories and tables (.csv), and find what the user should know about them.

@@ -8,6 +8,8 @@ from lare_rl.evaluation.reference_returns import REFERENCE_RETURNS
 from lare_rl.runs.metric_names import RETURN
 from lare_rl.util.findings import Finding, render
 
+__all__ = ["MESSAGES", "find_min_p", "find_score_meaning", "find_small_samples", "to_text"]
+
 MIN_CERTAIN_P = 0.025
 """If p cannot be lower than this, the reader is told."""
 

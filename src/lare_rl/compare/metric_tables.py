@@ -10,6 +10,8 @@ from lare_rl.runs.config_file import CONFIG, read_config
 from lare_rl.runs.metrics_file import read_metrics
 from lare_rl.util.files import write_atomically
 
+__all__ = ["read_metric_rows", "write_table"]
+
 KEYS = ("task", "run", "method", "algorithm", "judges", "draw", "seed", "step")
 """The first columns of the table."""
 

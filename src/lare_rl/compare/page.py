@@ -14,6 +14,8 @@ from lare_rl.runs.metric_names import RETURN
 from lare_rl.util.findings import Finding, render
 from lare_rl.util.statistics import format_plus_minus
 
+__all__ = ["OVERALL_HEADER", "comparison_table", "describe", "overall_table", "write_comparisons"]
+
 HEADER = ("method", "seeds", "IQM [95%]", "mean ± sd", "minus baseline [95%]", "above baseline [95%]", "p")
 DRAWS_HEADER = ("draws", "mean [95%], draws")
 OVERALL_HEADER = ("all tasks", "seeds", "above baseline [95%]", "p")

@@ -18,6 +18,8 @@ from lare_rl.runs.config_file import Config
 from lare_rl.runs.directory import Run
 from lare_rl.util.safe_io import read_text
 
+__all__ = ["Results", "group_pairs", "read_results_table", "read_run_results"]
+
 _Key = TypeVar("_Key", bound=Hashable)
 _Value = TypeVar("_Value")
 _Number = TypeVar("_Number", int, float)

@@ -18,6 +18,8 @@ from lare_rl.errors import LareError
 from lare_rl.evaluation.reference_returns import REFERENCE_RETURNS
 from lare_rl.runs.metric_names import RETURN
 
+__all__ = ["Group", "group_results", "last_quarter"]
+
 
 @dataclass(frozen=True)
 class Group:

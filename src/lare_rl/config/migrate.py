@@ -9,6 +9,8 @@ from typing import Any
 
 from lare_rl.errors import LareError
 
+__all__ = ["FORMAT", "migrate"]
+
 FORMAT = 5
 """The format of config.json and of the checkpoint. It is increased whenever their contents change."""
 

@@ -14,6 +14,8 @@ from lare_rl.envs.interface import EnvSpec
 from lare_rl.errors import LareError
 from lare_rl.tasks.spec import TaskSpec
 
+__all__ = ["apply_defaults", "choose_algorithm", "replay_rows", "resolve"]
+
 
 def resolve(settings: Settings, task: TaskSpec) -> ResolvedSettings:
     """Fill in the settings that are None, by the task, and check all settings.

@@ -12,6 +12,8 @@ from lare_rl.errors import CheckedModel
 from lare_rl.llm.prompts import N_CANDIDATES
 from lare_rl.tasks.spec import FactorInputs, TaskSpec
 
+__all__ = ["ResolvedSettings", "Settings"]
+
 MAX_SEED = 2**31 - 1
 MAX_SEEDS = 1000
 """In one process."""

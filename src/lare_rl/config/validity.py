@@ -6,6 +6,8 @@ from lare_rl.credit.methods import Fit, Method, Reward
 from lare_rl.errors import LareError
 from lare_rl.tasks.spec import FactorInputs
 
+__all__ = ["check_credit"]
+
 
 def check_credit(
     method: Method,

@@ -23,6 +23,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
+__all__ = ["HALF_PERIOD", "MAX_RAW_FEATURES", "N_FREQUENCIES", "Basis", "expand", "fourier_terms", "pair_products"]
+
 N_FREQUENCIES = 3
 """The number of frequencies of a shape."""
 HALF_PERIOD = 4.0

@@ -7,6 +7,8 @@ from jaxtyping import Array, Float, PRNGKeyArray
 
 from lare_rl.credit.basis import Basis
 
+__all__ = ["DecoderNetwork", "DecoderOutput", "DecoderShape"]
+
 
 class DecoderOutput(NamedTuple):
     """A decoder's output for some steps."""

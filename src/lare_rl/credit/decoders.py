@@ -18,6 +18,8 @@ if TYPE_CHECKING:  # importing JAX takes longer than all else that the command l
     from lare_rl.credit.decoder_network import DecoderNetwork, DecoderShape
     from lare_rl.credit.decoder_settings import CreditSettings
 
+__all__ = ["DECODERS", "Decoder", "register_decoder"]
+
 
 @dataclass(frozen=True)
 class Decoder:

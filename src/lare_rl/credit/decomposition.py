@@ -47,6 +47,25 @@ from lare_rl.nn.normalise import (
     update_scale,
 )
 
+__all__ = [
+    "CreditBatch",
+    "Decomposition",
+    "agent_mean",
+    "agent_shares",
+    "decode",
+    "decoder_rewards",
+    "init",
+    "is_normalised",
+    "is_optimistic",
+    "normalise_inputs",
+    "observe_returns",
+    "observe_steps",
+    "optimistic_rewards",
+    "reward_unit",
+    "score_type_index",
+    "valid_rows",
+]
+
 
 class CreditBatch(NamedTuple):
     """Steps of some episodes, and the returns of these episodes.

@@ -14,6 +14,8 @@ from lare_rl.credit.decomposition import CreditBatch, Decomposition, agent_mean,
 from lare_rl.credit.methods import Fit
 from lare_rl.nn.networks import adam_step
 
+__all__ = ["loss_and_gradient", "update", "update_in_chunks"]
+
 
 def loss_and_gradient(
     state: Decomposition, episodes: CreditBatch, key: PRNGKeyArray, fit: Fit, settings: CreditSettings

@@ -25,6 +25,8 @@ from lare_rl.credit.decoder_network import DecoderOutput, DecoderShape
 from lare_rl.credit.decoder_settings import CreditSettings
 from lare_rl.nn.networks import GRU, MLP, Linear
 
+__all__ = ["Diaster", "init_diaster"]
+
 
 class Diaster(eqx.Module):
     """The sub-trajectory model and the step model."""

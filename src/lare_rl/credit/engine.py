@@ -32,6 +32,20 @@ from lare_rl.envs.interface import alive_mean
 from lare_rl.nn.normalise import RunningMeanStd, Scale, min_max_scale, root_mean_square
 from lare_rl.tasks.spec import FactorInputs
 
+__all__ = [
+    "CreditSpec",
+    "ExplanationState",
+    "StepBatch",
+    "add_to_explanation",
+    "credit_spec",
+    "explain_returns",
+    "init_decoder",
+    "init_explanation",
+    "proxy_rewards",
+    "scale_and_mask",
+    "training_rewards",
+]
+
 
 @dataclass(frozen=True)
 class CreditSpec:

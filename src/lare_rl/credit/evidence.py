@@ -36,6 +36,23 @@ import numpy as np
 from jax.scipy.linalg import solve_triangular
 from jaxtyping import Array, Bool, Float, Int
 
+__all__ = [
+    "Posterior",
+    "PosteriorSpread",
+    "SufficientStatistics",
+    "add_episodes",
+    "empty_statistics",
+    "fit",
+    "fixed_point",
+    "init_posterior",
+    "most_likely",
+    "posterior_spread",
+    "posterior_std",
+    "regression",
+    "starting_precisions",
+    "to_return_units",
+]
+
 PRIOR_RANGE = 1e6
 """A group may explain at most this many times more, or less, of the returns than its equal share. Without a limit, a group that was
 switched off could not be switched on again."""

@@ -9,6 +9,8 @@ from lare_rl.credit.explanation import Explanation
 from lare_rl.credit.score_type import ScoreType, ScoreTypeEstimate
 from lare_rl.util.findings import Finding, render
 
+__all__ = ["MESSAGES", "MIN_EXPLAINED_EPISODES", "explanation_findings", "explanation_lines", "raw_feature_names"]
+
 MIN_EXPLAINED_EPISODES = 20
 """With fewer episodes, nothing is said."""
 LITTLE_SHARE = 0.1

@@ -18,6 +18,18 @@ from typing import Any
 from lare_rl.errors import LareError
 from lare_rl.tasks.spec import FactorInputs
 
+__all__ = [
+    "FACTORS",
+    "FACTORS_AND_SCORED",
+    "NEXT_OBSERVATION_ACTION",
+    "OBSERVATION_ACTION",
+    "RAW",
+    "SCORED",
+    "InputNames",
+    "input_arrays",
+    "input_size",
+]
+
 _NAMES = ("factors", "observation", "action", "next_observation", "observation_change", "scored_observation")
 _SCORED_OBSERVATIONS = {
     "before": ("observation",),

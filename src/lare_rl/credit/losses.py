@@ -10,6 +10,8 @@ and has the same minimiser if all episodes have the same length. `sum_form` fits
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
+__all__ = ["episode_means", "episode_weight", "squared_error", "subsampling_variance", "unbiased_squared_error"]
+
 
 def episode_means(
     r_hat: Float[Array, " steps"], episode_index: Int[Array, " steps"], n_steps: Int[Array, " episodes"]

@@ -16,6 +16,8 @@ from lare_rl.credit.decoders import DECODERS
 from lare_rl.credit.input_names import InputNames
 from lare_rl.util.plugins import Registry
 
+__all__ = ["METHODS", "Fit", "Method", "Reward", "find_method", "register_method"]
+
 
 class Fit(StrEnum):
     """How the decoder is fitted to returns (equations in `losses.py`)."""

@@ -12,6 +12,8 @@ from typing import NamedTuple
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
+__all__ = ["WINDOW", "Predictions", "add_predictions", "empty_predictions", "r2", "squared_errors"]
+
 WINDOW = 32
 """R^2 is computed over this number of last episodes."""
 MIN_R2_EPISODES = 8

@@ -25,6 +25,20 @@ from lare_rl.credit.methods import Fit, Method
 from lare_rl.credit.prequential import Predictions, add_predictions, squared_errors
 from lare_rl.credit.score_type import ScoreType, ScoreTypeEstimate
 
+__all__ = [
+    "MIN_GROWTH",
+    "add_episodes",
+    "add_to_sums",
+    "estimate_score_type",
+    "fit_closed_form",
+    "is_fitted",
+    "is_stale",
+    "predict",
+    "predict_then_update",
+    "reset_statistics",
+    "reward_std",
+]
+
 MAX_ERROR_RATIO = 0.95
 """A score is treated as a mean if its predictions as a mean have a squared error below this fraction of the error as a sum. If all
 episodes are equally long, both errors are equal except for rounding."""

@@ -3,6 +3,8 @@
 from enum import IntEnum
 from typing import NamedTuple
 
+__all__ = ["ScoreType", "ScoreTypeEstimate", "score_types_to_fit"]
+
 
 class ScoreType(IntEnum):
     """How the score of an episode follows from its steps. Compiled functions take it as an integer."""

@@ -9,6 +9,8 @@ from lare_rl.credit.decoder_network import DecoderOutput, DecoderShape
 from lare_rl.credit.decoder_settings import CreditSettings
 from lare_rl.nn.networks import MLP
 
+__all__ = ["Bottleneck", "StepDecoder", "init_bottleneck", "init_step_decoder"]
+
 
 class StepDecoder(eqx.Module):
     """f_psi: an MLP, times a gain."""

@@ -17,6 +17,20 @@ from lare_rl.data.replay import (
     oldest_transition,
 )
 
+__all__ = [
+    "CreditSample",
+    "EpisodeSample",
+    "count_episodes_since",
+    "episodes_in_order",
+    "get_episodes",
+    "sample_distinct_episodes",
+    "sample_drawn",
+    "sample_episodes",
+    "sample_packed",
+    "sample_padded",
+    "sample_transitions",
+]
+
 
 class EpisodeSample(NamedTuple):
     """Some finished episodes."""

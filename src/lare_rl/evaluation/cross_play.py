@@ -18,6 +18,8 @@ from lare_rl.training.compiled import policy_function, training_module
 from lare_rl.training.saved_state import load_learner
 from lare_rl.training.static_config import TrainConfig
 
+__all__ = ["Match", "combine_policies", "cross_play"]
+
 
 class Match(NamedTuple):
     """The first team of one run against the second team of another."""

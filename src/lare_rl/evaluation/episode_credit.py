@@ -25,6 +25,8 @@ from lare_rl.training.static_config import TrainConfig
 from lare_rl.util.float64 import float64
 from lare_rl.util.statistics import column_correlations
 
+__all__ = ["EpisodeCredit", "FactorLabel", "label_factors", "load_episode_credit"]
+
 
 @dataclass(frozen=True, kw_only=True)
 class EpisodeCredit:

@@ -26,6 +26,15 @@ from lare_rl.training.saved_state import load_actor
 from lare_rl.training.unroll_host import HostPolicy, evaluate_on_host
 from lare_rl.util.statistics import grouped_standard_error, standard_error
 
+__all__ = [
+    "RANDOM_EPISODES",
+    "evaluate_policy",
+    "evaluate_run",
+    "gain_over_random",
+    "measure_random_returns",
+    "play_random",
+]
+
 MAX_OPEN_ENVS = 20
 """Environments of a seed that are open at the same time."""
 RANDOM_EPISODES = 10

@@ -20,6 +20,8 @@ from lare_rl.training.saved_state import load_actor
 from lare_rl.training.streams import Stream, numpy_generator
 from lare_rl.training.unroll_host import select_action
 
+__all__ = ["RunPolicy", "load_policy"]
+
 
 def load_policy(
     run: Run | str | Path, seed: int | None = None, best: bool = False, deterministic: bool = False

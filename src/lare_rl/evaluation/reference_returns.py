@@ -2,6 +2,8 @@
 
 from typing import NamedTuple
 
+__all__ = ["REFERENCE_RETURNS", "ReferenceReturns"]
+
 
 class ReferenceReturns(NamedTuple):
     """The returns that count as the scores 0 and 1 of a task."""

@@ -30,6 +30,16 @@ from lare_rl.training.streams import Stream, episode_seed
 from lare_rl.training.unroll_host import HostPolicy, record_on_host
 from lare_rl.util.statistics import column_correlations
 
+__all__ = [
+    "N_SAMPLE_EPISODES",
+    "Rollout",
+    "TeamSample",
+    "compute_training_rewards",
+    "roll_out",
+    "sample_steps",
+    "unroll_policy",
+]
+
 N_SAMPLE_EPISODES = 40
 
 

@@ -22,6 +22,8 @@ from lare_rl.evaluation.rollout import Rollout, roll_out
 from lare_rl.runs.directory import Run
 from lare_rl.training.streams import Stream, episode_seed
 
+__all__ = ["check_video_path", "encode_gif", "record_video", "render_rollout", "write_video"]
+
 FRAMES_PER_SECOND = 8
 """The frame rate of a film of many agents."""
 MAX_GIF_FRAMES_PER_SECOND = 25

@@ -32,6 +32,8 @@ from lare_rl.training.seed_axis import select_seed
 from lare_rl.util.files import write_arrays, write_atomically
 from lare_rl.util.provenance import code_version
 
+__all__ = ["ExportResult", "export_run"]
+
 _DTYPES = {"float": "float32", "int": "int64", "bool": "bool"}
 """The type of inputs and outputs of each kind."""
 

@@ -17,6 +17,8 @@ from types import SimpleNamespace
 
 import numpy as np
 
+__all__ = ["load", "reward"]
+
 _DIRECTORY = Path(__file__).parent
 _Node = namedtuple("Node", "op inputs shape kind option")
 

@@ -11,6 +11,8 @@ from lare_rl.phi.builder import current_builder
 from lare_rl.phi.graph import Graph, Kind
 from lare_rl.phi.numpy_functions import call_numpy
 
+__all__ = ["finish", "first_outputs", "graph_input", "linear", "network", "numpy_op", "sigmoid", "standardize"]
+
 
 def graph_input(name: str, shape: tuple[int, ...], kind: Kind = "float") -> Array:
     """Add an input to the graph."""

@@ -27,6 +27,8 @@ from lare_rl.phi.limits import UNLIMITED
 from lare_rl.training.sequences import Actor as RecurrentActor
 from lare_rl.training.static_config import TrainConfig
 
+__all__ = ["policy_graph"]
+
 
 def policy_graph(actor: Any, config: TrainConfig, first_choice: int) -> Graph:
     """Return the graph of an actor of one seed.

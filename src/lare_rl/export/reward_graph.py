@@ -29,6 +29,8 @@ from lare_rl.phi.limits import UNLIMITED
 from lare_rl.tasks.spec import select_states
 from lare_rl.training.static_config import TrainConfig
 
+__all__ = ["missing_reward_reason", "reward_graph"]
+
 
 def missing_reward_reason(method: Method) -> str | None:
     """Return why a method's rewards cannot be exported, or None if they can be."""

@@ -18,6 +18,8 @@ try:
 except ModuleNotFoundError as error:
     raise missing_extra_error("lare_rl.integrations.pettingzoo", "pettingzoo") from error
 
+__all__ = ["CreditParallel"]
+
 
 class CreditParallel(BaseParallelWrapper):
     """A ParallelEnv whose agents are one team. In the assigner's arrays the agents are in the order of `possible_agents`.

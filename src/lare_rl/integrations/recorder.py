@@ -11,6 +11,8 @@ from lare_rl.assigner.assigner import CreditAssigner
 from lare_rl.assigner.space_layout import make_layout
 from lare_rl.errors import LareError, short_repr
 
+__all__ = ["CREDIT_STEP", "Pay", "StepRecorder", "check_assigner", "check_capacity", "check_pay"]
+
 CREDIT_STEP = "credit_step"
 """The key under which the number of a step is stored, for `CreditAssigner.rewards_at`."""
 

@@ -34,6 +34,8 @@ from stable_baselines3.common.buffers import DictReplayBuffer, NStepReplayBuffer
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.her.her_replay_buffer import HerReplayBuffer
 
+__all__ = ["CreditCallback", "CreditDictReplayBuffer", "CreditNStepReplayBuffer", "CreditReplayBuffer"]
+
 _HER_ARGUMENTS = {"n_sampled_goal", "goal_selection_strategy", "copy_info_dict"}
 """Arguments that only `HerReplayBuffer` has."""
 

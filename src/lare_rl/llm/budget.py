@@ -9,6 +9,8 @@ from typing import Any
 from lare_rl.errors import LareError
 from lare_rl.llm.prompts import Message
 
+__all__ = ["Budget", "BudgetExceededError", "max_request_tokens"]
+
 _MAX_REPORTED_TOKENS = 1 << 40
 _REPLY_TIMEOUT_S = 120.0
 _REPLY_TIMEOUT_FRACTION = 1 / 8

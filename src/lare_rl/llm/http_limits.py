@@ -8,6 +8,11 @@ import threading
 from collections.abc import Callable, Mapping
 from typing import Any
 
+__all__ = [
+    "MAX_BODY_BYTES", "BodyTooLargeError", "RedirectError", "StatusError", "check_response", "read_body",
+    "run_in_time",
+]  # fmt: skip
+
 MAX_BODY_BYTES = 8 << 20
 
 

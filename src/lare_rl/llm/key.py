@@ -4,6 +4,8 @@ import functools
 import os
 import re
 
+__all__ = ["KEY_VARIABLE", "api_key", "redact_key"]
+
 KEY_VARIABLE = "OPENAI_API_KEY"
 
 _MIN_KEY_LENGTH = 8

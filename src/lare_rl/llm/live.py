@@ -32,6 +32,8 @@ from lare_rl.llm.prompts import Message
 from lare_rl.util.safe_io import read_json
 from lare_rl.util.sanitize import one_line
 
+__all__ = ["LiveModel", "ModelError"]
+
 _MAX_ATTEMPTS = 6
 _MAX_PAUSE_S = 60.0
 _MAX_REPLY_TOKENS, _MIN_REPLY_TOKENS = 16_384, 1024

@@ -9,6 +9,8 @@ from lare_rl.llm.prompts import Kind, Message
 from lare_rl.llm.recording import RecordedModel, read_recording, shipped_recordings
 from lare_rl.util.safe_io import read_text
 
+__all__ = ["RECORDED", "Model", "recorded_model"]
+
 
 @runtime_checkable
 class Model(Protocol):

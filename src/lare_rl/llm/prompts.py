@@ -10,6 +10,8 @@ from typing import Literal
 
 from lare_rl.tasks.spec import TaskSpec
 
+__all__ = ["MAX_CANDIDATES", "N_CANDIDATES", "Kind", "Message", "Stage", "candidate", "combine", "correct", "reflect"]
+
 N_CANDIDATES = 5
 """The default number of candidates for a function: n in line 2 of the paper's Algorithm 1."""
 

@@ -13,6 +13,8 @@ from lare_rl.llm.prompts import Kind, Message, Stage
 from lare_rl.util.files import replace_file
 from lare_rl.util.safe_io import read_json
 
+__all__ = ["SHIPPED_RECORDINGS", "Exchange", "RecordedModel", "Recorder", "read_recording", "shipped_recordings"]
+
 SHIPPED_RECORDINGS = files("lare_rl.llm") / "recordings"
 
 

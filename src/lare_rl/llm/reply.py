@@ -10,6 +10,8 @@ from lare_rl.errors import CheckedModel, LareError
 from lare_rl.llm.key import redact_key
 from lare_rl.util.safe_io import check_depth, parse_integer, read_json
 
+__all__ = ["MalformedReplyError", "Reply", "parse_reply"]
+
 _MAX_CHARACTERS = 200_000
 _MAX_STARTS = 100
 """The most positions of a text that are tried as the beginning of an object."""

@@ -12,6 +12,8 @@ from lare_rl.logs.episode import KEYS, RelabelledEpisode
 from lare_rl.logs.log import Log, atomic_output
 from lare_rl.tasks.spec import TaskSpec
 
+__all__ = ["FlatLog", "ListLog", "NpzLog", "read_npz"]
+
 D4RL_NAMES = {"terminals": "terminations", "timeouts": "truncations"}
 """Names of flags in D4RL's data sets, and the names here."""
 

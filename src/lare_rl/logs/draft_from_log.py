@@ -9,6 +9,8 @@ from lare_rl.new_task.documentation import plain_lines, remove_rewards
 from lare_rl.new_task.draft import SCORE_LINE, Draft, count_entries, text_lines, warning_lines
 from lare_rl.tasks.spec import NO_ENVIRONMENT
 
+__all__ = ["draft_log_task"]
+
 LIMIT_LINE = "# max_episode_steps = 1000 # episodes that did not terminate, and are shorter, were cut"
 
 

@@ -11,6 +11,8 @@ from lare_rl.assigner.space_layout import SpaceLayout
 from lare_rl.errors import LareError, short_repr
 from lare_rl.tasks.spec import TaskSpec
 
+__all__ = ["KEYS", "LogLayout", "LoggedEpisode", "RelabelledEpisode", "infer_layout", "parse_episode"]
+
 KEYS = (
     *("observations", "actions", "rewards", "score", "next_observations"),
     *("terminations", "truncations", "cut", "paid"),

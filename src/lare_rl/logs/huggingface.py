@@ -16,6 +16,8 @@ except ImportError as missing:
 
 from lare_rl.logs.tables import BATCH_ROWS, TableLog, write_tables
 
+__all__ = ["HuggingFaceLog"]
+
 STATE, SPLITS = "state.json", "dataset_dict.json"
 """The file that marks a data set, and the file that marks a directory of several."""
 

@@ -12,6 +12,8 @@ from lare_rl.errors import LareError, short_repr
 from lare_rl.logs.episode import LoggedEpisode, LogLayout, RelabelledEpisode, infer_layout, parse_episode
 from lare_rl.tasks.spec import TaskSpec, require_role
 
+__all__ = ["Log", "atomic_output", "check_output", "open_log"]
+
 LOG_SUFFIXES = frozenset({".npz", ".parquet", ".arrow", ".json"})
 """Files of logs. A directory with other files is never replaced."""
 

@@ -23,6 +23,8 @@ try:
 except ImportError as missing:
     raise missing_extra_error("a Minari data set", "minari") from missing
 
+__all__ = ["MinariLog", "is_local_dataset", "load_dataset"]
+
 COPIED_METADATA = (
     *("author", "author_email", "code_permalink", "algorithm_name", "requirements", "eval_env_spec"),
     *("ref_min_score", "ref_max_score", "num_episodes_average_score"),

@@ -25,6 +25,8 @@ from lare_rl.tasks.spec import TaskSpec
 from lare_rl.util.findings import Finding, render
 from lare_rl.util.statistics import correlation, r_squared
 
+__all__ = ["MESSAGES", "Relabelled", "hold_out_flags", "predicted_return_statistics", "relabel"]
+
 BATCH_STEPS = 8192
 """Steps whose rewards are computed at a time. `phi` takes about as long for many steps as for few."""
 BLOCK_EPISODES = 10

@@ -12,6 +12,8 @@ from lare_rl.latent.verify import N_SAMPLE_STEPS, Steps, evenly_spaced
 from lare_rl.logs.log import open_log
 from lare_rl.tasks.spec import TaskSpec, select_states
 
+__all__ = ["logged_episodes", "logged_steps"]
+
 SAMPLED_EPISODES = 64
 """Number of first episodes from which steps are sampled."""
 

@@ -24,6 +24,8 @@ try:
 except ImportError as missing:
     raise missing_extra_error("a Parquet file", "parquet") from missing
 
+__all__ = ["BATCH_ROWS", "ParquetLog", "TableLog", "write_tables"]
+
 BATCH_ROWS = 8192
 """Rows that are read at a time, and the least number of rows that are written at a time."""
 

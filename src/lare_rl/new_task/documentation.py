@@ -4,6 +4,8 @@ import inspect
 import re
 from collections.abc import Mapping, Sequence
 
+__all__ = ["first_section", "plain_lines", "remove_rewards", "split_sections", "write_texts"]
+
 HEADING = re.compile(r"^[ \t]*#+\s*(.+?)\s*$", re.MULTILINE)
 
 REWARD_WORDS = re.compile(

@@ -10,6 +10,19 @@ from gymnasium.spaces import Box, Discrete
 from lare_rl.envs.spaces import OneHot
 from lare_rl.tasks.spec import FILL_IN
 
+__all__ = [
+    "JUDGES_LINE",
+    "MEASURES_LINE",
+    "SCORE_LINE",
+    "Draft",
+    "count_entries",
+    "describe_action",
+    "describe_flattening",
+    "file_name",
+    "text_lines",
+    "warning_lines",
+]
+
 JUDGES_LINE = (
     'judges = "after" # the observation that shows what a step earned: "after" the action, "before" it, or "both"'
 )

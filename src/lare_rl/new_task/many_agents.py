@@ -18,6 +18,8 @@ from lare_rl.new_task.documentation import first_section, plain_lines, split_sec
 from lare_rl.new_task.draft import Draft, count_entries, file_name, text_lines, warning_lines
 from lare_rl.tasks.spec import PETTINGZOO_PREFIX, TaskSpec
 
+__all__ = ["draft_multi_agent_task"]
+
 GENERIC_MAKERS = ("parallel_env", "env", "raw_env")
 """Common names of functions that make environments. For these, the draft is named after the module."""
 

@@ -10,6 +10,8 @@ from lare_rl.new_task.documentation import first_section, plain_lines, split_sec
 from lare_rl.new_task.draft import Draft, count_entries, file_name, text_lines, warning_lines
 from lare_rl.tasks.spec import PETTINGZOO_PREFIX
 
+__all__ = ["draft_task"]
+
 USED_TITLES = {
     *("", "description", "observation space", "observation", "action space", "action"),
     *("episode end", "episode termination"),

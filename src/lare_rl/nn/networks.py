@@ -9,6 +9,8 @@ import jax.numpy as jnp
 import optax
 from jaxtyping import Array, Float, PRNGKeyArray
 
+__all__ = ["GRU", "MLP", "Linear", "adam_step", "clip_gradient", "init_adam", "init_orthogonal", "polyak_update"]
+
 
 class Linear(eqx.Module):
     """x W + b.

@@ -26,6 +26,10 @@ from lare_rl.phi.limits import RefusedError
 from lare_rl.phi.operand import BATCH, BatchSize, Operand, common_batch_axis
 from lare_rl.phi.values import describe
 
+__all__ = [
+    "Array", "Complex", "Masked", "as_array", "broadcast", "concatenate", "elementwise", "invert", "power", "stack",
+]  # fmt: skip
+
 
 class _Value(Operand):
     def apply(self, op: str, *operands: Any) -> Any:

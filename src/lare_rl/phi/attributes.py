@@ -19,6 +19,8 @@ from lare_rl.phi.runtime import Runtime
 from lare_rl.phi.text import METHODS, call_method
 from lare_rl.phi.values import Bound, Function, Symbol, value_type
 
+__all__ = ["IGNORED_CALLS", "get_attribute", "module_attribute", "resolve_import"]
+
 MODULES = {
     "numpy": "np", "numpy.linalg": "np.linalg", "numpy.polynomial": "np.polynomial", "numpy.typing": "np.typing",
     "numpy.polynomial.polynomial": "np.polynomial.polynomial", "numpy.lib.stride_tricks": "np.lib.stride_tricks",

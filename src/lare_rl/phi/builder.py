@@ -16,6 +16,8 @@ from lare_rl.phi.evaluate import compute
 from lare_rl.phi.graph import Gather, Graph, Kind, Node, all_positions, elementwise_kinds, letter_sizes, widest
 from lare_rl.phi.limits import DEFAULT_LIMITS, MAX_EINSUM_LETTERS, OPERATION_COST, GraphLimits, RefusedError
 
+__all__ = ["Builder", "building", "current_builder", "inline"]
+
 ROW_OPS = {
     "row_number": "a factor cannot depend on the number of its row in the batch",
     "first_row": "x[0] of the batch takes one row for all: write x[:, i] for entry i of every row",

@@ -24,6 +24,11 @@ from lare_rl.phi.values import (
     describe,
 )
 
+__all__ = [
+    "call", "class_attribute", "decorate", "define_function", "evaluate_call", "make_class", "new_instance",
+    "super_object",
+]  # fmt: skip
+
 
 def evaluate_call(runtime: Runtime, node: ast.Call, scope: Scope) -> Any:
     if isinstance(node.func, ast.Name) and node.func.id == "super" and not node.args:

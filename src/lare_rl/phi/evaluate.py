@@ -18,6 +18,8 @@ if TYPE_CHECKING:
 
     from lare_rl.phi.graph import Graph, Node
 
+__all__ = ["compute", "evaluate"]
+
 MAX_INT32_IN_FLOAT32 = 2.0**31 - 128
 """The largest float32 that an int32 can hold."""
 

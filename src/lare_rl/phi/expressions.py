@@ -14,6 +14,11 @@ from lare_rl.phi.runtime import Runtime, check_key, check_number, check_text
 from lare_rl.phi.text import combine_values, format_value
 from lare_rl.phi.values import Class, Function, Instance, Iterator, Scope, Set, Symbol, describe
 
+__all__ = [
+    "apply_binary", "apply_unary", "compare", "evaluate", "evaluate_entries", "get_item", "list_items",
+    "test_truth",
+]  # fmt: skip
+
 NUMBERS = (bool, int, float, complex)
 BINARY: dict[type[ast.operator], tuple[str, Callable[[Any, Any], Any]]] = {
     ast.Add: ("add", operator.add), ast.Sub: ("sub", operator.sub), ast.Mult: ("mul", operator.mul),

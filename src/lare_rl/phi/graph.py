@@ -23,6 +23,8 @@ from typing import Any, Literal, NamedTuple, get_args
 
 import numpy as np
 
+__all__ = ["ELEMENTWISE", "Gather", "Graph", "Kind", "Node", "Typed", "elementwise_kinds", "widest"]
+
 Kind = Literal["bool", "int", "float"]
 
 

@@ -17,6 +17,8 @@ from lare_rl.phi.graph import all_positions
 from lare_rl.phi.limits import RefusedError
 from lare_rl.phi.operand import BatchSize, Shaped
 
+__all__ = ["ALL", "computed_positions", "fixed_index", "index_entries", "is_mask", "masked_index", "overwrite"]
+
 ALL = slice(None)
 
 

@@ -19,6 +19,8 @@ from lare_rl.phi.python_functions import BUILTINS
 from lare_rl.phi.runtime import Meter, Runtime
 from lare_rl.phi.values import Class, Instance, Scope, Symbol
 
+__all__ = ["Interpreter"]
+
 
 class Interpreter(Runtime):
     """The state of a program that is carried out. Its methods are the functions of the modules that describe them."""

@@ -6,6 +6,8 @@ Each limit is checked before the time or the memory is spent. `Meter` (runtime.p
 
 from dataclasses import dataclass
 
+__all__ = ["DEFAULT_LIMITS", "UNLIMITED", "GraphLimits", "RefusedError"]
+
 # The text
 MAX_SOURCE_LENGTH = 20_000  # characters
 MAX_SYNTAX_DEPTH = 100  # levels of the syntax tree

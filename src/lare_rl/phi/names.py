@@ -8,6 +8,8 @@ from collections.abc import Sequence
 from lare_rl.phi.limits import RefusedError
 from lare_rl.phi.read import FUNCTION_NAME, parse
 
+__all__ = ["factor_meanings", "factor_names"]
+
 NUMBERING = re.compile(r"^(factor\s*)?\d+\s*[.:)]\s*", re.IGNORECASE)
 
 

@@ -12,6 +12,8 @@ import numpy as np
 
 from lare_rl.phi.graph import Graph, Node
 
+__all__ = ["BATCH", "is_installed", "onnx_model"]
+
 OPSET = 18
 """Version of ONNX's operations. Runtimes of 2023 and later support it."""
 BATCH = "batch"

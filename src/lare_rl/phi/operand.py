@@ -8,6 +8,8 @@ from typing import Any, Never, Protocol, runtime_checkable
 
 from lare_rl.phi.limits import RefusedError
 
+__all__ = ["BATCH", "BatchSize", "Operand", "Shaped", "common_batch_axis"]
+
 
 def _operators(op: str) -> tuple[Callable[[Any, Any], Any], Callable[[Any, Any], Any]]:
     """Return the methods of an operator, for an operand on its left and for one on its right."""

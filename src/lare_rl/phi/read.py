@@ -37,6 +37,8 @@ from lare_rl.phi.values import (
 )
 from lare_rl.util.sanitize import first_invisible
 
+__all__ = ["FUNCTION_NAME", "parse", "read"]
+
 _PARSING = threading.Lock()
 """`threading.stack_size` is for the whole process. Before Python 3.11.8 and 3.12.2, parsers in two threads may also miscount
 their recursion depth (python/cpython#106905)."""

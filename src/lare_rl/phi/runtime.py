@@ -14,6 +14,8 @@ from lare_rl.phi.builder import Builder
 from lare_rl.phi.limits import MAX_INT_BITS, MAX_KEY_LENGTH, MAX_LIST_LENGTH, MAX_STEPS, MAX_TEXT_LENGTH, RefusedError
 from lare_rl.phi.values import Function, Instance, Scope, Symbol
 
+__all__ = ["Meter", "Runtime", "builtin", "check_key", "check_number", "check_text", "check_text_length", "varies"]
+
 
 class Meter:
     """Counts the steps of a program."""

@@ -28,6 +28,8 @@ from lare_rl.phi.values import (
     describe,
 )
 
+__all__ = ["assign", "run_statements"]
+
 IGNORED_MANAGERS = {Symbol("np.errstate"), Symbol("np.printoptions"), Symbol("warnings.catch_warnings")}
 _KEYWORDS = {"AsyncFunctionDef": "async def", "AsyncFor": "async for", "AsyncWith": "async with", "TryStar": "except*"}
 

@@ -12,6 +12,8 @@ from lare_rl.phi.operand import BatchSize, Operand
 from lare_rl.phi.runtime import Meter, Runtime, check_key, check_text, check_text_length
 from lare_rl.phi.values import Set, Symbol, value_type
 
+__all__ = ["METHODS", "call_method", "combine_values", "format_value"]
+
 FORMAT = re.compile(r"[<>^=]?[-+ ]?#?0?\d{0,2}[,_]?(\.\d{1,2})?[bdeEfFgGnosxX%]?")
 """Format specifications of limited width."""
 PERCENT = re.compile(r"%(%|[-+ #0]*\d{0,2}(\.\d{1,2})?[sdifeEgG])")

@@ -13,6 +13,8 @@ from lare_rl.report.run_summary import CLEAR_ERRORS, LITTLE_R2, MIN_EVALUATIONS,
 from lare_rl.util.findings import Finding
 from lare_rl.util.statistics import sample_std
 
+__all__ = ["diagnose"]
+
 HIGH_R2 = 0.8
 """Proxy rewards explain nearly all of the score if R^2 of the returns is higher."""
 EVALUATION_STDS = 3

@@ -17,6 +17,22 @@ from matplotlib.figure import Figure
 
 from lare_rl.util.statistics import Band
 
+__all__ = [
+    "COLOURS",
+    "Curve",
+    "add_white_background",
+    "draw_band_panels",
+    "draw_bands",
+    "draw_credit",
+    "draw_credit_map",
+    "draw_curves",
+    "draw_factors",
+    "draw_scatters",
+    "make_figure",
+    "to_svg",
+    "visible_steps",
+]
+
 COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#000000", "#8c6d31")
 """Okabe and Ito's colours, which colour-blind readers can distinguish."""
 _LINES = tuple(product(("-", "--", ":", "-."), COLOURS))

@@ -14,6 +14,16 @@ from lare_rl.errors import LareError
 from lare_rl.latent.function import LatentFunction
 from lare_rl.util.files import replace_file
 
+__all__ = [
+    "render_factor_table",
+    "render_function",
+    "render_gif",
+    "render_lines",
+    "render_note",
+    "render_table",
+    "write_page",
+]
+
 _PAGE = """<!doctype html>
 <html lang="en">
 <head>

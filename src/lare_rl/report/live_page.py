@@ -15,6 +15,8 @@ from lare_rl.report.run_summary import ReportedRun
 from lare_rl.runs.directory import open_without_functions
 from lare_rl.training.progress import MetricLines
 
+__all__ = ["PAGE", "LivePage"]
+
 PAGE = "watch.html"
 """The file in the run's directory."""
 REFRESH_S = 10

@@ -1,5 +1,7 @@
 """The sentences of a run's diagnosis, by the codes of its findings (`util/findings.py`). Commands are in backticks."""
 
+__all__ = ["MESSAGES"]
+
 MESSAGES = {
     # Findings that stand alone
     "no_return": "Nothing can be said: the last evaluation gave no return.",

@@ -18,6 +18,9 @@ from lare_rl.tasks.spec import TaskSpec
 from lare_rl.util.findings import render
 from lare_rl.util.statistics import format_mean_std
 
+__all__ = ["render_diagnoses", "render_final_values", "render_learning_curves"]
+
+
 _COLUMNS = {
     RETURN: ("return", "mean true return at the last evaluation."),
     CREDIT_ERROR: ("credit error", "mean |proxy reward - true reward| over the newest steps."),

@@ -16,6 +16,8 @@ from lare_rl.runs.directory import Run, find_run_directories, open_run, open_wit
 from lare_rl.tasks.trust import untrusted_module
 from lare_rl.util.provenance import code_version
 
+__all__ = ["write_report"]
+
 MAX_TITLE_RUNS = 3
 """The largest number of runs that the title names."""
 

@@ -31,6 +31,8 @@ from lare_rl.tasks.trust import TRUST_VARIABLE, untrusted_module
 from lare_rl.training.explain import explain_run
 from lare_rl.util.statistics import column_correlations
 
+__all__ = ["FILM", "render_agents", "render_run"]
+
 FILM = "film.gif"
 """The film in a run's directory."""
 MAX_FILM_BYTES = 64 << 20

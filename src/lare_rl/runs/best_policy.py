@@ -18,6 +18,8 @@ from lare_rl.runs.checkpoint import DAMAGED_FILE_ERRORS, fill_template, named_le
 from lare_rl.util.files import write_arrays
 from lare_rl.util.renamed_fields import rename_fields
 
+__all__ = ["BEST_FILE", "BestPolicy", "empty_best", "load_best", "save_best", "update_best"]
+
 BEST_FILE = "best.npz"
 
 

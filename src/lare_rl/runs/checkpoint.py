@@ -26,6 +26,17 @@ from lare_rl.util.files import write_arrays
 from lare_rl.util.renamed_fields import rename_fields
 from lare_rl.util.safe_io import read_json
 
+__all__ = [
+    "DAMAGED_FILE_ERRORS",
+    "STATE_FILE",
+    "fill_template",
+    "load",
+    "named_leaves",
+    "open_npz",
+    "read_host_state",
+    "save",
+]
+
 STATE_FILE = "state.npz"
 
 DAMAGED_FILE_ERRORS = (

@@ -18,6 +18,8 @@ from lare_rl.util.files import write_atomically
 from lare_rl.util.provenance import code_version
 from lare_rl.util.safe_io import read_json, read_text
 
+__all__ = ["CONFIG", "Config", "make_config", "read_config", "write_config"]
+
 CONFIG = "config.json"
 
 MAX_CONFIG_BYTES = 8 << 20

@@ -26,6 +26,22 @@ from lare_rl.runs.metrics_file import read_metrics
 from lare_rl.tasks.spec import FactorInputs, TaskSpec
 from lare_rl.tasks.trust import check_trusted
 
+__all__ = [
+    "CHECKPOINT",
+    "Run",
+    "RunBusyError",
+    "as_run",
+    "create_run",
+    "default_directory",
+    "extend_run",
+    "find_run_directories",
+    "function_filename",
+    "function_paths",
+    "lock_run",
+    "open_run",
+    "open_without_functions",
+]
+
 CHECKPOINT = "checkpoint"
 
 

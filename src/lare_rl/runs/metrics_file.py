@@ -9,6 +9,8 @@ from typing import Any
 from lare_rl.errors import LareError
 from lare_rl.util.safe_io import read_json, read_text
 
+__all__ = ["append_metrics", "read_metrics", "truncate_metrics"]
+
 METRICS = "metrics.jsonl"
 
 MAX_METRICS_BYTES = 512 << 20

@@ -21,6 +21,8 @@ from lare_rl.runs.metrics_file import read_metrics
 from lare_rl.tasks.spec import TaskSpec
 from lare_rl.training.latent_functions import choose_functions
 
+__all__ = ["Job", "check_job", "job_to_json", "make_job", "train_job"]
+
 
 @dataclass(frozen=True)
 class Job:

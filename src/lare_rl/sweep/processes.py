@@ -21,6 +21,8 @@ from lare_rl.errors import LareError, missing_extra_error
 from lare_rl.runs.directory import RunBusyError
 from lare_rl.sweep.jobs import Job, job_to_json, train_job
 
+__all__ = ["RunningProcesses", "assign_cores", "train_in_process", "train_in_processes", "train_on_ray"]
+
 LOCK_TIMEOUT_S = 60.0
 """Time to wait for an earlier process that is still saving the run."""
 

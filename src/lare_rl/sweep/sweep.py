@@ -22,6 +22,8 @@ from lare_rl.sweep.processes import train_in_processes, train_on_ray
 from lare_rl.training.loop import RunInterruptedError
 from lare_rl.util.safe_io import MAX_SETTINGS_BYTES, read_text, read_toml
 
+__all__ = ["Resources", "Sweep", "read_sweep", "run_sweep"]
+
 Texts = Annotated[tuple[str, ...], Field(min_length=1)]
 Draws = Annotated[tuple[Annotated[int, Field(ge=0)], ...], Field(min_length=1)]
 

@@ -8,6 +8,18 @@ from pydantic import ConfigDict, Field, field_validator, model_validator
 
 from lare_rl.errors import CheckedModel, LareError
 
+__all__ = [
+    "FILL_IN",
+    "NO_ENVIRONMENT",
+    "PETTINGZOO_PREFIX",
+    "SHARED_KEYS",
+    "CreditScope",
+    "FactorInputs",
+    "TaskSpec",
+    "require_role",
+    "select_states",
+]
+
 FactorInputs = Literal["before", "after", "both"]
 """The observations of a step that `phi` reads: before the action, after it, or both. For both, `phi` is called on each, and the
 factors are concatenated. So are the raw features of closed-form decoders."""

@@ -10,6 +10,8 @@ from pathlib import Path
 from lare_rl.errors import LareError
 from lare_rl.tasks.spec import PETTINGZOO_PREFIX, TaskSpec
 
+__all__ = ["TRUST_VARIABLE", "check_trusted", "untrusted_module"]
+
 TRUST_VARIABLE = "LARE_TRUST"
 """The environment variable with the modules, separated by commas, that run directories and other files may import."""
 

@@ -11,6 +11,8 @@ from jaxtyping import Bool, Float, Int
 from lare_rl.data.trajectory import Trajectory
 from lare_rl.envs.interface import AnyArray, EnvSpec
 
+__all__ = ["EpisodeBatch", "Evaluation", "concatenate"]
+
 
 class EpisodeBatch(NamedTuple):
     """Whole episodes, each from a different initial state."""

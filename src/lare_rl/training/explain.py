@@ -25,6 +25,8 @@ from lare_rl.training.seed_axis import select_seed
 from lare_rl.training.static_config import TrainConfig
 from lare_rl.util.float64 import float64
 
+__all__ = ["describe_returns", "explain_run", "explain_stored_returns"]
+
 
 def explain_run(run: Run) -> list[str]:
     """Return the explanation of the returns in a run's last checkpoint, in sentences."""

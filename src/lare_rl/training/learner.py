@@ -26,6 +26,8 @@ from lare_rl.training.decoder_inputs import decoder_inputs, row_mask
 from lare_rl.training.factors import compute_factors
 from lare_rl.training.static_config import TrainConfig
 
+__all__ = ["Learner", "abandon_episodes", "init_decoders", "init_learner", "store", "store_with_factors"]
+
 
 class Learner(NamedTuple):
     """The whole training state of one seed."""

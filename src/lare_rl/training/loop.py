@@ -18,6 +18,8 @@ from lare_rl.training.session import Session
 from lare_rl.training.unroll_host import DivergedError
 from lare_rl.util.findings import Finding, render
 
+__all__ = ["RunInterruptedError", "run_session"]
+
 
 class RunInterruptedError(LareError):
     """The user stopped a run. It was saved."""

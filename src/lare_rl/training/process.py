@@ -13,6 +13,8 @@ from lare_rl.config.resolve import replay_rows
 from lare_rl.errors import LareError
 from lare_rl.runs.directory import Run
 
+__all__ = ["catch_stop_signals", "report_full_memory"]
+
 SAME_REQUEST_S = 1.0
 """Signals less than this many seconds apart count as one: a terminal and a parent process may each send one."""
 

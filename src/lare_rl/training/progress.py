@@ -12,6 +12,8 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from lare_rl.errors import missing_extra_error
 from lare_rl.util.sanitize import sanitize
 
+__all__ = ["Clock", "Listener", "MetricLines", "TensorBoard", "Terminal", "import_summary_writer", "known_numbers"]
+
 MetricLines = Sequence[Mapping[str, Any]]
 """One mapping for each seed, as in metrics.jsonl."""
 

@@ -17,6 +17,8 @@ from lare_rl.training.decoder_inputs import alive_agents, step_batch
 from lare_rl.training.learner import Learner
 from lare_rl.training.static_config import TrainConfig
 
+__all__ = ["RewardState", "assess", "rewards", "team_metrics", "team_proxy_rewards"]
+
 
 class RewardState(NamedTuple):
     """The decoders and reward scales of all teams: all that is needed to compute rewards."""

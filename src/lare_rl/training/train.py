@@ -19,6 +19,8 @@ from lare_rl.training.progress import Listener, TensorBoard, Terminal, import_su
 from lare_rl.training.session import Session, restore_session, start_session
 from lare_rl.util import compilation
 
+__all__ = ["resume", "train"]
+
 EVENTS_DIRECTORY = "tensorboard"
 """Within the run directory."""
 

@@ -16,6 +16,8 @@ from pathlib import Path
 from filelock import FileLock, Timeout
 from platformdirs import user_cache_path
 
+__all__ = ["cache_variables", "enable_cache"]
+
 _MAX_CACHE_BYTES = 2**30
 """JAX removes the programs that were not read for the longest time."""
 

@@ -8,6 +8,8 @@ from uuid import uuid4
 
 from lare_rl.errors import LareError
 
+__all__ = ["replace_file", "write_arrays", "write_atomically"]
+
 
 def write_atomically(path: Path, write: Callable[[Any], object]) -> None:
     """Replace a file by what `write` writes. Raises `LareError` if the file cannot be written."""

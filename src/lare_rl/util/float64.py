@@ -8,6 +8,8 @@ from typing import Any
 import jax
 from threadpoolctl import ThreadpoolController
 
+__all__ = ["float64", "one_blas_thread"]
+
 
 @contextlib.contextmanager
 def float64() -> Iterator[None]:

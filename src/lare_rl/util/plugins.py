@@ -18,6 +18,8 @@ from typing import Generic, TypeVar
 
 from lare_rl.errors import LareError, did_you_mean
 
+__all__ = ["Registry", "load_plugins"]
+
 T = TypeVar("T")
 
 

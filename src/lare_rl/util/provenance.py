@@ -6,6 +6,8 @@ from pathlib import Path
 
 from lare_rl._version import __version__
 
+__all__ = ["code_version"]
+
 
 @functools.cache
 def code_version(directory: Path = Path(__file__).parents[1]) -> str:

@@ -2,6 +2,8 @@
 
 import re
 
+__all__ = ["rename_fields"]
+
 _RENAMED_FIELDS = {
     "average": "is_mean",
     "closed": "closed_form",

@@ -11,6 +11,17 @@ from typing import Any
 
 from lare_rl.errors import LareError
 
+__all__ = [
+    "MAX_DEPTH",
+    "MAX_SETTINGS_BYTES",
+    "MAX_TEXT_BYTES",
+    "check_depth",
+    "parse_integer",
+    "read_json",
+    "read_text",
+    "read_toml",
+]
+
 MAX_DEPTH = 64
 """The largest depth of objects within objects."""
 

@@ -3,6 +3,8 @@
 import re
 import unicodedata
 
+__all__ = ["first_invisible", "one_line", "sanitize"]
+
 # Letters and marks by their category, but invisible (Default_Ignorable_Code_Point, and the empty Braille pattern).
 _FILLERS = re.compile(
     "[\u034f\u115f\u1160\u17b4\u17b5\u180b-\u180f\u2065\u2800\u3164\ufe00-\ufe0f\uffa0\U0001bca0-\U0001bca3\U000e0000-\U000e0fff]"

@@ -6,6 +6,19 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
+__all__ = [
+    "Band",
+    "column_correlations",
+    "correlation",
+    "format_mean_std",
+    "format_plus_minus",
+    "format_rounded",
+    "grouped_standard_error",
+    "r_squared",
+    "sample_std",
+    "standard_error",
+]
+
 CONSTANT = 1e-10
 """Values are taken as equal if the sum of their squared deviations is below this fraction of the sum of their squares."""
 

@@ -22,6 +22,8 @@ from lare_rl.algorithms.critics import critic_loss, init_critics, q_values
 from lare_rl.algorithms.sac import SACSettings
 from lare_rl.nn.networks import MLP, adam_step, init_adam, polyak_update
 
+__all__ = ["SAC", "Networks", "act", "explore", "get_actor", "init", "sample", "soft_td_targets", "update"]
+
 MIN_LOG_SIGMA, MAX_LOG_SIGMA = -20.0, 2.0
 
 
