@@ -16,7 +16,7 @@ from jaxtyping import Float
 
 from lare_rl.envs.families import make_env
 from lare_rl.envs.interface import JaxEnv
-from lare_rl.evaluation.rollout import compute_proxy_rewards, unroll_policy
+from lare_rl.evaluation.rollout import compute_training_rewards, unroll_policy
 from lare_rl.runs.directory import Run, open_run
 from lare_rl.training.compiled import training_module
 from lare_rl.training.factors import compute_host_factors
@@ -36,7 +36,7 @@ def true_and_proxy_rewards(run: Run, seed_index: int) -> tuple[Rewards, Rewards]
     one_seed = jax.tree.map(lambda leaf: leaf[seed_index : seed_index + 1], learner)
     actor = training_module(config).get_actor(one_seed, run.config.settings.steps, config)
     steps = unroll_policy(env, config, actor, EPISODES, KEY).steps
-    proxy = compute_proxy_rewards(
+    proxy = compute_training_rewards(
         select_seed(learner, seed_index), steps, compute_host_factors(run, config, steps), config
     )
     return steps.next_timestep.reward.swapaxes(0, 1), proxy.swapaxes(0, 1)

@@ -23,7 +23,7 @@ from lare_rl.runs.directory import open_run
 from lare_rl.training.decoder_fits import fit_repeatedly
 from lare_rl.training.decoder_inputs import decoder_inputs
 from lare_rl.training.learner import Learner, init_decoders
-from lare_rl.training.rewards import RewardState, proxy_rewards
+from lare_rl.training.rewards import RewardState, team_proxy_rewards
 from lare_rl.training.saved_state import load_learner
 from lare_rl.training.seed_axis import select_seed
 from lare_rl.training.static_config import TrainConfig
@@ -56,11 +56,11 @@ def curve(learner: Learner, config: TrainConfig, fits: tuple[int, ...], seed: in
             credit, _ = fit_some(learner, jax.random.key(1000 * seed + done), config=config)
             learner = learner._replace(decoders=credit)
             done += AT_A_TIME
-        r_hat = proxy_rewards(recent, RewardState(learner.decoders, learner.scale), config, 0)[:, 0]
+        r_hat = team_proxy_rewards(recent, RewardState(learner.decoders, learner.scale), config, 0)[:, 0]
         accuracies.append(
             {
                 "fits": done,
-                "correlation": float(accuracy.correlation(r_hat, reward, valid)),
+                "correlation": float(accuracy.masked_correlation(r_hat, reward, valid)),
                 "error": float(accuracy.mean_absolute_error(r_hat, reward, valid)),
                 "r_hat of the first step": float(r_hat[first].mean()),
                 "r of the first step": float(reward[first].mean()),

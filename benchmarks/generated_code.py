@@ -126,17 +126,7 @@ np.array([1],'O') observation.astype('O') (np:=1) np.frompyfunc(len,1,1) observa
 np.add.at(observation,0,1) np.add(observation,1,observation) np.fromfile('x') np.linalg np math __builtins__ breakpoint()
 (yield) (await x) np.apply_along_axis(len,1,observation) np.errstate(call=print) float('nan') id(observation) hash('x')
 """.split()
-FORBIDDEN = (
-    "open",
-    "import",
-    "exec",
-    "os.",
-    "subprocess",
-    "socket",
-    "ctypes",
-    "object.__getattr__",
-    "object.__setattr__",
-)
+FORBIDDEN = tuple("open import exec os. subprocess socket ctypes object.__getattr__ object.__setattr__".split())
 """Audit events that reading must not cause. `ast.parse` causes "compile"."""
 
 
@@ -164,20 +154,7 @@ def sweep() -> Iterator[str]:
     ]
     values += [len, sweep, range(1), slice(1), lambda: 0, np.sin, Ellipsis, type, object, (n for n in [1])]
     for name in sorted({name for value in values for name in dir(value)}):
-        for owner in (
-            "observation",
-            "[1]",
-            "{}",
-            "'a'",
-            "1.0",
-            "len",
-            "(lambda: 0)",
-            "np",
-            "np.sin",
-            "(1, 2)",
-            "{1}",
-            "slice(1)",
-        ):
+        for owner in "observation [1] {} 'a' 1.0 len (lambda:0) np np.sin (1,2) {1} slice(1)".split():
             yield f"{owner}.{name}"
             yield f"{owner}.{name}()"
 
@@ -244,11 +221,8 @@ def fuzz(budget: int = 3_000) -> None:
             seconds.append(1000 * (time.perf_counter() - start))
             outcomes["accepted" if graph else "refused"] += 1
             if graph is not None:
-                factors, alone = (
-                    compute_factors(graph, *steps),
-                    compute_factors(graph, *(array[2:3] for array in steps)),
-                )
-                same = np.allclose(factors[2], alone[0], rtol=1e-4, atol=1e-4, equal_nan=True)
+                alone = compute_factors(graph, *(array[2:3] for array in steps))[0]
+                same = np.allclose(compute_factors(graph, *steps)[2], alone, rtol=1e-4, atol=1e-4, equal_nan=True)
                 outcomes["accepted, but rows differ"] += not same
         figures[family] = {"programs": len(seconds), **outcomes, "ms to read": quantiles(seconds)}
     figures["audit events while reading"] = dict(events)

@@ -63,11 +63,11 @@ def refit(learner: Learner, config: TrainConfig, fit: Fit, scale: Scale) -> list
     rows = []
     for number in range(UPDATES // STRETCH):
         credit = updates(credit, learner.replay, jax.random.key(number), fit, config)
-        r_hat = decomposition.proxy_rewards(credit, features, config.credit)[:, 0]
+        r_hat = decomposition.decoder_rewards(credit, features, config.credit)[:, 0]
         rows.append(
             {
                 "updates": (number + 1) * STRETCH,
-                "correlation": float(accuracy.correlation(r_hat, reward, valid)),
+                "correlation": float(accuracy.masked_correlation(r_hat, reward, valid)),
                 "error": float(accuracy.mean_absolute_error(r_hat, reward, valid)),
             }
         )

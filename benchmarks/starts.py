@@ -22,7 +22,7 @@ from jaxtyping import Array
 from basis import SPEED, scores
 from lare_rl.credit import evidence
 from lare_rl.credit.basis import Basis, expand
-from lare_rl.credit.closed_form import MAX_ROUNDS
+from lare_rl.credit.closed_form import MAX_EVIDENCE_ROUNDS
 from lare_rl.credit.evidence import Posterior, SufficientStatistics
 from lare_rl.credit.score_type import ScoreType
 from lare_rl.util.statistics import r_squared
@@ -39,13 +39,13 @@ def from_fewer(count: int, sums: SufficientStatistics, basis: Basis, start: Post
     problem = evidence.regression(sums, ScoreType.SUM, basis.group_index)
     alpha, beta = evidence.starting_precisions(problem, start)
     candidates = jax.lax.map(
-        lambda args: evidence.fixed_point(problem, args[0], args[1], MAX_ROUNDS), (alpha[:count], beta[:count])
+        lambda args: evidence.fixed_point(problem, args[0], args[1], MAX_EVIDENCE_ROUNDS), (alpha[:count], beta[:count])
     )
     return evidence.to_return_units(sums, problem, evidence.most_likely(candidates), fallback=start)
 
 
 def from_three(sums: SufficientStatistics, basis: Basis, start: Posterior) -> Posterior:
-    return evidence.fit(sums, ScoreType.SUM, basis.group_index, start, MAX_ROUNDS)
+    return evidence.fit(sums, ScoreType.SUM, basis.group_index, start, MAX_EVIDENCE_ROUNDS)
 
 
 WAYS = {"one start": partial(from_fewer, 1), "two starts": partial(from_fewer, 2), "three starts": from_three}

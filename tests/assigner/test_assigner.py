@@ -146,7 +146,7 @@ def test_steps_episodes_and_scores_give_the_same_rewards(method, function):
         for credit in (by_step, by_episode, by_score):
             credit.fit_pending()
     steps = np.arange(by_step.store.steps)
-    np.testing.assert_array_equal(by_episode.store.features, by_step.store.features)
+    np.testing.assert_array_equal(by_episode.store.inputs, by_step.store.inputs)
     np.testing.assert_array_equal(by_episode.rewards_at(steps), by_step.rewards_at(steps))
     np.testing.assert_allclose(by_score.rewards_at(steps), by_step.rewards_at(steps), rtol=1e-3, atol=1e-4)
 
@@ -221,7 +221,7 @@ def test_many_steps_at_once_are_learned_in_chunks():
     for credit in (at_once, chunked):
         credit.fit()
         assert float(np.sum(credit.learner.decoder.closed_form.sufficient_statistics.n_episodes)) == 500
-    np.testing.assert_array_equal(chunked.store.features, at_once.store.features)
+    np.testing.assert_array_equal(chunked.store.inputs, at_once.store.inputs)
     r_hat = at_once.rewards_at(np.arange(10_000))
     np.testing.assert_allclose(chunked.rewards_at(np.arange(10_000)), r_hat, atol=0.1 * r_hat.std())
 
@@ -245,7 +245,7 @@ def test_failing_phi_loses_no_steps(phi, monkeypatch):
         credit.rewards_at(numbers)
     monkeypatch.setattr(FailingPhi, "fails", False)
     assert credit.rewards_at(numbers).shape == (4,)
-    np.testing.assert_array_equal(credit.store.features[numbers], phi.step_factors(*episode[:3], "before"))
+    np.testing.assert_array_equal(credit.store.inputs[numbers], phi.step_factors(*episode[:3], "before"))
 
 
 def test_several_threads_may_use_an_assigner():
@@ -312,7 +312,7 @@ def test_add_copies_arrays_that_an_environment_reuses():
     assert credit.store.dropped == 0
     credit.rewards_at(numbers)
     expected = np.hstack([episode.next_observation, episode.action])
-    np.testing.assert_array_equal(credit.store.features[numbers], expected)
+    np.testing.assert_array_equal(credit.store.inputs[numbers], expected)
 
 
 def test_drop_and_an_unseen_reset_abandon_the_episode():
@@ -455,14 +455,14 @@ def test_spaces_of_gymnasium():
     credit.rewards_at(credit.add(observation, np.array([1, 4]), observation, [0, 0], [False] * 2, [False] * 2))
     rows = [[1, 1, 1, 0, 0], [1, 1, 0, 0, 1]]
     expected = np.hstack([rows, [[1, 0, 0, 0], [0, 0, 0, 1]], np.zeros((2, 5))])
-    np.testing.assert_array_equal(credit.store.features[:2], expected)
+    np.testing.assert_array_equal(credit.store.inputs[:2], expected)
 
 
 def test_task_with_discrete_actions():
     credit = CreditAssigner("bayes", task=pick_spec())
     steps = np.eye(4)[:2], np.array([3, 0]), np.eye(4)[1:3], [0, 0], [False] * 2, [False] * 2
     credit.rewards_at(credit.add(*steps))
-    np.testing.assert_array_equal(credit.store.features[:2, 4:], np.eye(4)[[3, 0]])
+    np.testing.assert_array_equal(credit.store.inputs[:2, 4:], np.eye(4)[[3, 0]])
 
 
 @pytest.mark.parametrize("judges", ["before", "after", "both"])
@@ -473,13 +473,13 @@ def test_judges(judges, phi):
     for credit in (factors, raw, changes):
         credit.add_episode(*episode)
         credit.learner.flush_inputs()
-    np.testing.assert_array_equal(factors.store.features[:4], phi.step_factors(*episode[:3], judges))
+    np.testing.assert_array_equal(factors.store.inputs[:4], phi.step_factors(*episode[:3], judges))
     before, after = episode.observation, episode.next_observation
     observations = {"before": [before], "after": [after], "both": [before, after]}[judges]
     expected = np.concatenate([*observations, episode.action], axis=1)
-    np.testing.assert_array_equal(raw.store.features[:4], expected)
+    np.testing.assert_array_equal(raw.store.inputs[:4], expected)
     expected = np.concatenate([before, episode.action, before - after], axis=1)
-    np.testing.assert_array_equal(changes.store.features[:4], expected)
+    np.testing.assert_array_equal(changes.store.inputs[:4], expected)
 
 
 # Many agents

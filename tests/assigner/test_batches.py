@@ -25,7 +25,7 @@ def filled_store(capacity=100, agents=1):
         number, i, length = env.pop(0)
         alive = None if agents == 1 else np.array([[True] + [i < 2] * (agents - 1)])
         (step,) = store.add(1, alive)
-        store.features[step % capacity] = number, i
+        store.inputs[step % capacity] = number, i
         store.get_running(number, np.zeros(1, np.float32)).steps.append(int(step))
         if i == length - 1:
             store.end(number, 10.0 * number)
@@ -36,7 +36,7 @@ def sampled_episodes(batch):
     """Return number and step indices of each episode of a batch, after a check of length, R/T and padding."""
     episodes = []
     for slot in np.flatnonzero(batch.mask):
-        rows = batch.features[batch.episode_index == slot]
+        rows = batch.inputs[batch.episode_index == slot]
         rows = rows if rows.ndim == 2 else rows[:, 0]
         (number,) = set(rows[:, 0].astype(int).tolist())
         assert batch.length[slot] == LENGTHS[number]
@@ -53,7 +53,7 @@ def sample(store, method, seed=0, **settings):
 def test_sample_batch_draws_steps_without_replacement():
     for seed in range(5):
         batch = sample(filled_store(), "rrdu", seed, drawn_steps=4, steps=24)
-        assert batch.features.shape == (24, 2)
+        assert batch.inputs.shape == (24, 2)
         episodes = sampled_episodes(batch)
         assert len(episodes) == 6
         for number, steps in episodes:
@@ -67,9 +67,9 @@ def test_sample_batch_packs_whole_stored_episodes():
         assert (len(store.episodes) == 5) == (capacity == 100)
         for seed in range(20):
             batch = sample(store, "rd", seed, drawn_steps=4, steps=24)
-            assert (batch.features.shape, batch.length.shape) == ((24, 2), (12,))
+            assert (batch.inputs.shape, batch.length.shape) == ((24, 2), (12,))
             small = sample(store, "rd", seed, drawn_steps=2, steps=4)
-            assert small.features.shape == (16, 2)  # there is room for the longest episode
+            assert small.inputs.shape == (16, 2)  # there is room for the longest episode
             for number, steps in sampled_episodes(batch) + sampled_episodes(small):
                 assert steps == list(range(LENGTHS[number]))
                 numbers.add(number)
@@ -78,7 +78,7 @@ def test_sample_batch_packs_whole_stored_episodes():
 
 def test_sample_batch_pads_with_the_last_step():
     batch = sample(filled_store(), "diaster", episodes=3)
-    assert batch.features.shape == (48, 2)
+    assert batch.inputs.shape == (48, 2)
     for number, steps in sampled_episodes(batch):
         length = LENGTHS[number]
         assert steps == [*range(length), *[length - 1] * (16 - length)]
@@ -88,14 +88,13 @@ def test_pack_in_order_yields_every_episode_once():
     store = filled_store()
     batches = list(pack_in_order(store, list(store.episodes.values()), 2, 10))
     assert [int(batch.mask.sum()) for batch in batches] == [2, 2, 1]
-    assert {batch.features.shape for batch in batches} == {(10, 2)}
+    assert {batch.inputs.shape for batch in batches} == {(10, 2)}
     episodes = [episode for batch in batches for episode in sampled_episodes(batch)]
     assert sorted(episodes) == [(number, list(range(length))) for number, length in enumerate(LENGTHS)]
 
 
-def test_pack_in_order_shares_among_agents_that_are_alive():
+def test_pack_in_order_says_which_agents_are_alive():
     store = filled_store(agents=3)
     batch = next(pack_in_order(store, list(store.episodes.values())[:1], 2, 10))
     ((number, steps),) = sampled_episodes(batch)
-    expected = [[1 / 3] * 3 if step < 2 else [1, 0, 0] for step in steps]
-    np.testing.assert_allclose(batch.share[: LENGTHS[number]], expected, rtol=1e-6)
+    assert batch.alive[: LENGTHS[number]].tolist() == [[True, step < 2, step < 2] for step in steps]

@@ -24,4 +24,4 @@ def test_metrics_without_step_rewards_are_nan():
 
 
 def test_correlation_with_a_constant_is_nan():
-    assert np.isnan(float(accuracy.correlation(jnp.arange(5.0), jnp.ones(5), jnp.ones(5, bool))))
+    assert np.isnan(float(accuracy.masked_correlation(jnp.arange(5.0), jnp.ones(5), jnp.ones(5, bool))))

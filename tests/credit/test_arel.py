@@ -42,7 +42,7 @@ def test_loss_is_the_published_one_in_other_units():
         episode_index = jnp.repeat(jnp.arange(EPISODES), STEPS)
         batch = CreditBatch(jnp.asarray(ROWS), episode_index, length, mean_reward, mask=jnp.ones(EPISODES))
         loss, _ = descent.loss_and_gradient(state, batch, KEY, Fit.ALL_STEPS, settings)
-        return decomposition.proxy_rewards(state, batch.features, settings), loss
+        return decomposition.decoder_rewards(state, batch.inputs, settings), loss
 
     y, loss = map(np.asarray, compute())
     y, mean_reward = y.reshape(EPISODES, STEPS, AGENTS)[..., 0], np.asarray(mean_reward)

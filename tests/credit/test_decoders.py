@@ -65,7 +65,7 @@ def test_bottleneck_equations():
     mean, log_variance = jnp.split(decoder.encoder(jnp.asarray(ROWS)), 2, axis=-1)
     assert float(jnp.abs(log_variance).max()) > 0.1
     for key, z in ((KEY, mean + jnp.sqrt(jnp.exp(log_variance)) * noise), (None, mean)):
-        want = decoder.decoder(z, None).r_hat
+        want = decoder.step_decoder(z, None).r_hat
         np.testing.assert_allclose(decode(decoder, ROWS, key).r_hat, want, rtol=1e-4, atol=1e-5)
     divergence = 0.5 * (np.exp(log_variance) + mean**2 - 1 - log_variance).sum(axis=-1)
     np.testing.assert_allclose(decode(decoder, ROWS, KEY).penalty, 0.1 * divergence, rtol=1e-5)
@@ -104,7 +104,7 @@ def test_must_learn_credit_among_agents_from_the_mean_return(name):
         state = decomposition.observe_steps(state, jnp.asarray(rows))
         state = decomposition.observe_returns(state, jnp.asarray(mean_reward), length, jnp.ones(n_episodes, bool))
         state, losses = jax.lax.scan(body, state, jax.random.split(jax.random.key(0), n_updates))
-        return decomposition.proxy_rewards(state, jnp.asarray(rows).reshape(-1, AGENTS, 2), settings), losses
+        return decomposition.decoder_rewards(state, jnp.asarray(rows).reshape(-1, AGENTS, 2), settings), losses
 
     r_hat, losses = train()
     assert float(losses[-5:].mean()) < float(losses[:5].mean())

@@ -16,7 +16,7 @@ EPISODES, STEPS, FEATURES = 64, 10, 3
 KEY = jax.random.key(3)
 init = jax.jit(decomposition.init, static_argnums=range(1, 6))
 update = jax.jit(descent.update, static_argnames=("fit", "settings"))
-proxy_rewards = jax.jit(decomposition.proxy_rewards, static_argnames="settings")
+proxy_rewards = jax.jit(decomposition.decoder_rewards, static_argnames="settings")
 
 
 @partial(jax.jit, static_argnames=("fit", "settings"))
@@ -49,7 +49,7 @@ def train(fit, settings, reward_scale=1.0, feature_scale=1.0, updates=400):
     episodes = rng.permuted(np.tile(np.arange(EPISODES), (updates, 1)), axis=1)[:, :16]
     order = rng.permuted(np.tile(np.arange(STEPS), (updates, 16, 1)), axis=2)[..., :k]
     batches = CreditBatch(
-        features=features[episodes[..., None], order].reshape(updates, -1, FEATURES),
+        inputs=features[episodes[..., None], order].reshape(updates, -1, FEATURES),
         episode_index=np.tile(np.repeat(np.arange(16), k), (updates, 1)),
         length=np.full((updates, 16), STEPS),
         mean_reward=mean_reward[episodes],
@@ -109,7 +109,7 @@ def test_loss_of_packed_episodes_against_numpy():
     r_hat = np.asarray(proxy_rewards(state, rows, settings=settings))
     means = [values.mean() for values in np.split(r_hat[:9], [3, 4])]
     batch = CreditBatch(
-        features=rows,
+        inputs=rows,
         episode_index=np.repeat(np.arange(4), [*length, 3]),
         length=length,
         mean_reward=returns / length,
@@ -120,7 +120,7 @@ def test_loss_of_packed_episodes_against_numpy():
     assert float(metrics["credit/loss"]) == pytest.approx(want, rel=1e-4)
     after, metrics = update(state, batch._replace(mask=np.zeros(3)), KEY, fit=Fit.ALL_STEPS, settings=settings)
     assert float(metrics["credit/loss"]) == 0.0
-    for weight, new in zip(jax.tree.leaves(state.decoder), jax.tree.leaves(after.decoder), strict=True):
+    for weight, new in zip(jax.tree.leaves(state.network), jax.tree.leaves(after.network), strict=True):
         decayed = weight - settings.learning_rate * np.sign(weight)  # Adam's first step for the decay alone
         np.testing.assert_allclose(new, decayed, atol=3e-5)
 

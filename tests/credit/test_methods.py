@@ -6,7 +6,7 @@ from jaxtyping import Array, Float
 
 from lare_rl import CreditAssigner
 from lare_rl.config.settings import Settings
-from lare_rl.credit import encoders
+from lare_rl.credit import input_names
 from lare_rl.credit.decoder_network import DecoderOutput
 from lare_rl.credit.decoders import DECODERS, Decoder, register_decoder
 from lare_rl.credit.methods import METHODS, Fit, Method, Reward, find_method, register_method
@@ -16,28 +16,28 @@ from lare_rl.errors import LareError
 @pytest.mark.parametrize("method", METHODS.values(), ids=lambda method: method.name)
 def test_rows_are_consistent(method):
     assert (method.reward is Reward.PROXY) == (method.fit is not None)
-    assert (method.reward in (Reward.PROXY, Reward.DESIGNED)) == (method.encoder is not None)
+    assert (method.reward in (Reward.PROXY, Reward.DESIGNED)) == (method.inputs is not None)
     assert method.summary
     assert method.source
 
 
 @pytest.mark.parametrize(
-    ("name", "encoder", "fit"),
+    ("name", "inputs", "fit"),
     [
-        ("rd", encoders.RAW, Fit.ALL_STEPS),
-        ("rrd", encoders.RAW, Fit.SAMPLED_STEPS),
-        ("rrdu", encoders.RAW, Fit.SAMPLED_STEPS_UNBIASED),
-        ("lare-rd", encoders.FACTORS, Fit.ALL_STEPS),
-        ("lare-rrdu", encoders.FACTORS, Fit.SAMPLED_STEPS_UNBIASED),
+        ("rd", input_names.RAW, Fit.ALL_STEPS),
+        ("rrd", input_names.RAW, Fit.SAMPLED_STEPS),
+        ("rrdu", input_names.RAW, Fit.SAMPLED_STEPS_UNBIASED),
+        ("lare-rd", input_names.FACTORS, Fit.ALL_STEPS),
+        ("lare-rrdu", input_names.FACTORS, Fit.SAMPLED_STEPS_UNBIASED),
     ],
 )
-def test_published_rows(name, encoder, fit):
-    assert (METHODS[name].encoder, METHODS[name].fit) == (encoder, fit)
+def test_published_rows(name, inputs, fit):
+    assert (METHODS[name].inputs, METHODS[name].fit) == (inputs, fit)
 
 
 def test_encoder_with_unknown_names():
     with pytest.raises(LareError, match=r"observation, .*'observations'"):
-        encoders.Encoder(("observations",))
+        input_names.InputNames(("observations",))
 
 
 @pytest.mark.parametrize(("name", "words"), [("lare_rrdu", "'lare_rrdu' .*'lare-rrdu'"), ("", "dense, episodic, ")])
@@ -51,13 +51,13 @@ class Squares(eqx.Module):
 
     weight: Float[Array, " inputs"]
 
-    def __call__(self, features, key):
-        r_hat = features**2 @ self.weight
+    def __call__(self, inputs, key):
+        r_hat = inputs**2 @ self.weight
         return DecoderOutput(r_hat, jnp.zeros_like(r_hat))
 
-    def loss(self, features, length, target, mask, key):
-        valid = jnp.arange(features.shape[1]) < length[:, None]
-        mean = jnp.sum(self(features, key).r_hat * valid, axis=1) / length
+    def loss(self, inputs, length, target, mask, key):
+        valid = jnp.arange(inputs.shape[1]) < length[:, None]
+        mean = jnp.sum(self(inputs, key).r_hat * valid, axis=1) / length
         return jnp.mean(mask * (mean - target) ** 2)
 
 
@@ -71,7 +71,9 @@ def registered(monkeypatch):
 @pytest.mark.parametrize("fit", [Fit.ALL_STEPS, Fit.SAMPLED_STEPS_UNBIASED, Fit.DECODER_LOSS])
 def test_registered_method_is_trained(fit, registered):
     register_decoder(Decoder("squares", lambda key, shape, settings: Squares(shape.gain * jnp.ones(shape.n_inputs))))
-    register_method(Method(f"squares {fit}", "squares", "this test", encoder=encoders.RAW, fit=fit, decoder="squares"))
+    register_method(
+        Method(f"squares {fit}", "squares", "this test", inputs=input_names.RAW, fit=fit, decoder="squares")
+    )
     assert Settings(method=f"squares {fit}").method == f"squares {fit}"
     credit = CreditAssigner(f"squares {fit}", observation_space=2, action_space=1)
     random = np.random.default_rng(0)
@@ -80,6 +82,13 @@ def test_registered_method_is_trained(fit, registered):
         credit.add_episode(s, a, s + 1, reward)
     credit.fit(20)
     assert np.isfinite(credit.metrics()["credit/loss"])
+
+
+def test_decoder_with_functions_is_refused_in_one_line(registered):
+    register_decoder(Decoder("mlp", lambda key, shape, settings: eqx.nn.MLP(shape.n_inputs, 1, 4, 1, key=key)))
+    register_method(Method("mlp", "mlp", "this test", inputs=input_names.RAW, fit=Fit.ALL_STEPS, decoder="mlp"))
+    with pytest.raises(LareError, match=r"'mlp' holds .* instead of eqx.nn.MLP.*, use lare_rl.nn.networks.MLP"):
+        CreditAssigner("mlp", observation_space=2, action_space=1)
 
 
 def test_register_refuses(registered):

@@ -7,10 +7,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from lare_rl.data.layouts import lay_out_drawn, lay_out_packed, lay_out_padded, sample_step_numbers
+from lare_rl.data.layouts import lay_out_packed, lay_out_padded, lay_out_sampled, sample_steps
 
 pack = jax.jit(lay_out_packed, static_argnums=2)
-sample_numbers = jax.jit(sample_step_numbers, static_argnums=2)
+sample_numbers = jax.jit(sample_steps, static_argnums=2)
 
 
 @given(
@@ -28,23 +28,23 @@ def test_lay_out_packed(lengths, n_masked, rows):
         assert fits[slot] == (mask[slot] and n_rows <= rows)
         steps += [(slot, t) for t in range(count)] if fits[slot] else []
     padding = [(6, 0)] * (rows - len(steps))
-    assert list(zip(layout.slot.tolist(), layout.number.tolist(), strict=True)) == steps + padding
+    assert list(zip(layout.slot.tolist(), layout.step.tolist(), strict=True)) == steps + padding
     jax.tree.map(np.testing.assert_array_equal, pack(length, mask, rows), (layout, fits))
 
 
 @pytest.mark.parametrize("xp", [np, jnp])
 def test_lay_out_padded_and_drawn(xp):
     layout = lay_out_padded(xp.array([[3, 1], [2, 4]]), 4)
-    assert layout.number.tolist() == [[[0, 1, 2, 2], [0] * 4], [[0, 1, 1, 1], [0, 1, 2, 3]]]
+    assert layout.step.tolist() == [[[0, 1, 2, 2], [0] * 4], [[0, 1, 1, 1], [0, 1, 2, 3]]]
     assert layout.slot.tolist() == [[[0] * 4, [1] * 4]] * 2
-    layout = lay_out_drawn(xp.array([2, 5]), xp.array([[0, 1, 1], [4, 2, 0]]))
+    layout = lay_out_sampled(xp.array([2, 5]), xp.array([[0, 1, 1], [4, 2, 0]]))
     assert layout.slot.tolist() == [[0, 0, 2], [1, 1, 1]]
-    assert layout.number.tolist() == [[0, 1, 1], [4, 2, 0]]
+    assert layout.step.tolist() == [[0, 1, 1], [4, 2, 0]]
 
 
 @given(st.lists(st.integers(1, 40), min_size=6, max_size=6), st.sampled_from([1, 2, 12]), st.integers(0, 1000))
 @settings(max_examples=15, deadline=None)
-def test_sample_step_numbers_has_no_repeats(lengths, steps, seed):
+def test_sample_steps_has_no_repeats(lengths, steps, seed):
     numbers = np.asarray(sample_numbers(jax.random.key(seed), jnp.asarray(lengths), steps))
     assert numbers.shape == (len(lengths), steps)
     for length, row in zip(lengths, numbers, strict=True):
@@ -55,7 +55,7 @@ def test_sample_step_numbers_has_no_repeats(lengths, steps, seed):
             np.testing.assert_array_equal(row, np.minimum(np.arange(steps), length - 1))
 
 
-def test_sample_step_numbers_is_uniform_over_pairs():
+def test_sample_steps_is_uniform_over_pairs():
     numbers = np.sort(np.asarray(sample_numbers(jax.random.key(2), jnp.full(30_000, 5), 2)), axis=1)
     share = np.bincount(numbers[:, 0] * 5 + numbers[:, 1], minlength=25) / len(numbers)
     np.testing.assert_allclose(share[share > 0], 0.1, atol=0.01)

@@ -40,8 +40,8 @@ def runs(tmp_path_factory, small_many):
 def test_rollout(runs):
     rollout = roll_out(runs[0])
     assert rollout.state.world.position.shape == (25, 1, 11, 2)
-    assert rollout.reward.shape == rollout.proxy_reward.shape == rollout.credit.shape == (25, 1, 8)
-    assert rollout.proxy_reward.std() > 0
+    assert rollout.reward.shape == rollout.training_reward.shape == rollout.credit.shape == (25, 1, 8)
+    assert rollout.training_reward.std() > 0
     assert rollout.select_episode(rollout.reward).shape == (25, 8)
     assert [frame.shape for frame in render_rollout(runs[0], rollout)] == [(400, 400, 3)] * 25
 
@@ -50,7 +50,7 @@ def test_rollout(runs):
 def test_rollout_without_proxy_rewards(small_many, tmp_path):
     run = lare_rl.train("TriangleArea", small_many(method="dense"), out=tmp_path / "run", listeners=[])
     rollout = roll_out(run)
-    assert rollout.proxy_reward is None
+    assert rollout.training_reward is None
     np.testing.assert_array_equal(rollout.credit, rollout.reward)
     page = lare_rl.write_report(run, tmp_path / "report.html").read_text()
     assert "proxy" not in page.split("Who got which credit when")[1].split("Settings")[0]

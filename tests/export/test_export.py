@@ -58,7 +58,7 @@ CASES = [
 NO_REWARD = {
     "dense": "rewards of the environment",
     "ircr": "return of its episode",
-    "diaster": "all steps of an episode",
+    "diaster": "cannot be exported",
 }
 """Why there is no reward function."""
 
@@ -287,7 +287,7 @@ def test_reward_without_lare(export):
     config, learner, _, _ = load_learner(run)
     # Actions of the toy are in [-2, 2], and those of the trainer in [-1, 1].
     features = np.concatenate([run.functions[0](before, action), before, action / 2], axis=1)
-    expected = decomposition.proxy_rewards(select_seed(learner, 1).decoders[0], jnp.asarray(features), config.credit)
+    expected = decomposition.decoder_rewards(select_seed(learner, 1).decoders[0], jnp.asarray(features), config.credit)
     np.testing.assert_allclose(json.loads(process.stdout), expected, rtol=1e-4, atol=1e-6)
     np.testing.assert_allclose(exported.reward(before[0], action[0], after[0]), expected[0], rtol=1e-4)
     assert np.std(expected) > 0

@@ -215,7 +215,7 @@ def with_factor_decoders(learner, weights):
     """Return the learner with decoders whose output is their only factor, times a weight for each team."""
     decoders = tuple(
         team._replace(
-            decoder=LinearDecoder(Basis(1, 0, False), *(jnp.array([x]) for x in (0.0, 1.0, weight)), jnp.zeros(()))
+            network=LinearDecoder(Basis(1, 0, False), *(jnp.array([x]) for x in (0.0, 1.0, weight)), jnp.zeros(()))
         )
         for team, weight in zip(learner.decoders, weights, strict=True)
     )

@@ -146,6 +146,7 @@ EXPRESSIONS = {
         np.polynomial.polynomial.polyint([1, 2])[2] * x | np.polynomial.polynomial.polymul([1, 2], [3, 1])[1] * x
         np.polynomial.polynomial.polyadd([1, 2], [3])[0] * x | np.copyto(x.copy(), 1.0) or x
         np.fft.ifft(x, axis=1).real | np.fft.ifft(np.fft.fft(x, axis=1), axis=1).real
+        np.abs(np.fft.rfft(x, n=4, axis=1)) | np.fft.ifft(np.fft.fft(x, n=5, axis=1), n=8, axis=1).real
     """,
     "tables": """
         np.interp(x, [-1, 0, 2], [0.0, 1.0, -1.0]) | np.interp(x, [0, 1], [3, 4.0], left=-1, right=9)
@@ -159,6 +160,7 @@ EXPRESSIONS = {
         np.eye(4)[i % 4] | np.tril(np.ones((6, 6)))[2] * x | np.triu(y[:, :2]) | np.tri(3)[1] * x[:, :3]
         np.diag([1, 2, 3.0]) @ x[:, :3, None] | np.diag(np.ones(2), 1).sum() * x | np.identity(3)[0] * x[:, :3]
         np.linspace(0, 1, 6) * x | np.arange(0, 3, 0.5) * x | np.logspace(0, 1, 6) * x | np.geomspace(1, 8, 6) * x
+        np.linspace(-2, 1, 6, dtype=int) * x | np.logspace(0, 1, 6, base=2) * x
         np.meshgrid(t, t)[0].sum() * x | np.mgrid[0:2, 0:3].sum() * x | np.mgrid[-1:1:5j].sum() * x
         np.r_[1, 2, 0:4] * x | np.ix_([0, 1], [1])[0].sum() * x | np.indices((2, 2)).sum() * x
         np.tril_indices(3)[0].sum() * x | np.hanning(6) * x | np.vander([1, 2, 3]).sum() * x

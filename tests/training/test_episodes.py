@@ -146,7 +146,7 @@ def test_learn_returns_predicts_first(method):
         if int(after.n_episodes) > int(before.predictions.n_episodes):
             i = int(after.n_episodes) - 1
             inputs = jitted(inputs_from, config)(learner.replay, start)[: end - start]
-            r_hat = decomposition.proxy_rewards(before, inputs, config.credit, jnp.full(end - start, end - start))
+            r_hat = decomposition.decoder_rewards(before, inputs, config.credit, jnp.full(end - start, end - start))
             predictions.append((float(after.predicted[i, 0]), float(r_hat.sum())))
             assert float(after.returns[i]) == pytest.approx(steps.next_timestep.reward[start:end].sum(), rel=1e-4)
     assert len(predictions) == (0 if method == "lare-rd" else 4)

@@ -66,7 +66,7 @@ def test_fit_until_converged_keeps_the_best_decoders():
     assert all(n_episodes == [8, 8] for n_episodes, _ in rounds)
     assert len({str(keys) for _, keys in rounds}) == len(rounds)
     # The first seed has stopped before its error would have fallen again.
-    np.testing.assert_array_equal(fitted.decoders[0].decoder.weight, [[2.0], [3.0]])
+    np.testing.assert_array_equal(fitted.decoders[0].network.weight, [[2.0], [3.0]])
     np.testing.assert_array_equal(fitted.replay.episodes, [learner.replay.episodes] * 2)
     np.testing.assert_array_equal(fitted.replay.running, [learner.replay.running] * 2)
     assert "credit/loss" in metrics

@@ -40,8 +40,7 @@ from lare_rl.nn.normalise import root_mean_square
 from lare_rl.training.decoder_fits import fit_decoders, fit_repeatedly, sample_credit
 from lare_rl.training.decoder_inputs import alive_agents, decoder_inputs
 from lare_rl.training.learner import abandon_episodes
-from lare_rl.training.rewards import assess, rewards
-from lare_rl.training.rewards import proxy_rewards as team_proxy_rewards
+from lare_rl.training.rewards import assess, rewards, team_proxy_rewards
 
 ENDS = np.cumsum(LENGTHS)[:-1]
 MANY = partial(small_config, algorithm="ippo", env=ONE_TEAM)
@@ -86,8 +85,8 @@ def test_unbiased_loss_has_the_expectation_of_the_full_loss(n_steps):
         config = small_config(name)
         learner = learner_with_episodes(config)
         # The rewards of steps shall differ.
-        steep = jax.tree.map(lambda weight: 6 * weight, learner.decoders[0].decoder)
-        learner = learner._replace(decoders=(learner.decoders[0]._replace(decoder=steep),))
+        steep = jax.tree.map(lambda weight: 6 * weight, learner.decoders[0].network)
+        learner = learner._replace(decoders=(learner.decoders[0]._replace(network=steep),))
         draws = sample_drawn(learner.replay, jax.random.key(3), 1, 40_000, n_steps)
         first = jax.tree.map(lambda leaf: leaf[0], draws)
         _, metrics = jitted(fit_decoders, config)(learner.decoders, learner.replay, first, jax.random.key(0))
@@ -244,7 +243,7 @@ def test_teams_have_separate_decoders_and_returns():
         np.testing.assert_array_equal(credit.scale, learner.scale[i])
     updated, _ = update_once(learner, config)
     for before, after in zip(learner.decoders, updated, strict=True):
-        assert not jax.tree.all(jax.tree.map(jnp.array_equal, before.decoder, after.decoder))
+        assert not jax.tree.all(jax.tree.map(jnp.array_equal, before.network, after.network))
 
 
 @pytest.mark.parametrize("method", [long_case("dense"), "episodic", "ircr"])

@@ -12,7 +12,7 @@ Action = Float[Array, "*batch action"]
 Available = Bool[Array, "*batch action"] | None
 """Which choices are available. None: all of them, or the actions are continuous."""
 Value = Float[Array, "*batch"]
-Metrics = dict[str, Float[Array, ""]]
+Metrics = dict[str, Float[Array, "*seeds"]]
 
 
 class Transitions(NamedTuple):

@@ -26,7 +26,7 @@ from lare_rl.assigner.assigner_config import (
     check_finite,
     resolve_layouts,
     to_flags,
-    to_step_numbers,
+    to_step_ids,
 )
 from lare_rl.assigner.decoder_learner import DecoderLearner
 from lare_rl.assigner.saving import AssignerState
@@ -171,13 +171,13 @@ class CreditAssigner:
             observation, action, next_observation = (array[rows] for array in steps)
             steps, team_reward, ended = (observation, action, next_observation), team_reward[rows], ended[rows]
             check_finite(rows, steps, team_reward)
-            numbers = np.full(n_rows, -1)
+            step_ids = np.full(n_rows, -1)
             if len(rows):
-                numbers[rows] = self.learner.add_steps(*steps, None if alive is None else alive[rows])
+                step_ids[rows] = self.learner.add_steps(*steps, None if alive is None else alive[rows])
                 env_ids = [ids[row] for row in rows.tolist()]
-                self.learner.queue_episodes(self.store.extend(env_ids, numbers[rows], steps, team_reward, ended))
+                self.learner.queue_episodes(self.store.extend(env_ids, step_ids[rows], steps, team_reward, ended))
                 self.learner.flush_large_queues()
-            return numbers
+            return step_ids
 
     def add_episode(
         self, observation: Any, action: Any, next_observation: Any, reward: Any, *, alive: Any = None
@@ -199,10 +199,10 @@ class CreditAssigner:
             score = float(reward) if is_score else float(rewards.sum())
             if not np.isfinite(score):
                 raise LareError(f"the score is {score}: give a finite number")
-            numbers = self.learner.add_steps(*steps, alive)
-            self.learner.queue_episodes([self.store.add_episode(numbers, score)])
+            step_ids = self.learner.add_steps(*steps, alive)
+            self.learner.queue_episodes([self.store.add_episode(step_ids, score)])
             self.learner.flush_large_queues()
-            return numbers
+            return step_ids
 
     def end(self, env_id: Hashable, score: float | None = None) -> None:
         """End the episode of an environment, with `score` as its return, or else the sum of its rewards.
@@ -250,10 +250,10 @@ class CreditAssigner:
         """
         with self.lock:
             self.learner.learn_if_due()
-            numbers = to_step_numbers(steps)
-            reward = np.zeros((*numbers.shape, *self.config.agent_axis), np.float32)
-            is_step = numbers >= 0
-            reward[is_step] = self.learner.rewards_at(numbers[is_step])
+            step_ids = to_step_ids(steps)
+            reward = np.zeros((*step_ids.shape, *self.config.agent_axis), np.float32)
+            is_step = step_ids >= 0
+            reward[is_step] = self.learner.rewards_at(step_ids[is_step])
             return reward
 
     def rewards(

@@ -12,9 +12,9 @@ from jaxtyping import Bool, Float, Int
 from lare_rl.assigner.space_layout import SpaceLayout, make_layout
 from lare_rl.config.validity import check_credit
 from lare_rl.credit.decoder_settings import CreditSettings
-from lare_rl.credit.encoders import input_arrays
 from lare_rl.credit.engine import CreditSpec, credit_spec
 from lare_rl.credit.explanation_text import raw_feature_names
+from lare_rl.credit.input_names import input_arrays
 from lare_rl.credit.methods import Method
 from lare_rl.envs.families import load_env_spec
 from lare_rl.errors import LareError, short_repr
@@ -28,7 +28,7 @@ __all__ = [
     "check_finite",
     "resolve_layouts",
     "to_flags",
-    "to_step_numbers",
+    "to_step_ids",
 ]
 
 Space = gymnasium.Space | SpaceLayout | int
@@ -93,9 +93,7 @@ class AssignerConfig:
         """Compute the decoder's inputs for some steps, which are rows already. Raises `LareError` if a factor is not finite."""
         arrays = {"observation": observation, "action": action, "next_observation": next_observation}
         if self.phi is not None:
-            before, actions, after = (array.reshape(-1, array.shape[-1]) for array in arrays.values())
-            factors = self.phi.step_factors(before, actions, after, self.judges)
-            arrays["factors"] = factors.reshape(*observation.shape[:-1], -1)
+            arrays["factors"] = self.phi.step_factors(observation, action, next_observation, self.judges)
         inputs = input_arrays(self.spec.inputs, arrays)
         return np.concatenate(inputs, axis=-1) if inputs else observation[..., :0]
 
@@ -195,12 +193,12 @@ def to_flags(values: Any, name: str, n_rows: int) -> Bool[np.ndarray, " steps"]:
     return flags
 
 
-def to_step_numbers(steps: Any) -> Int[np.ndarray, "*shape"]:
+def to_step_ids(steps: Any) -> Int[np.ndarray, "*shape"]:
     """Return numbers of steps as an array. Raises `LareError` for anything else."""
-    numbers = np.asarray(steps)
-    if numbers.size and (numbers.dtype.kind not in "iu" or numbers.min() < -1):
+    step_ids = np.asarray(steps)
+    if step_ids.size and (step_ids.dtype.kind not in "iu" or step_ids.min() < -1):
         raise LareError(f"steps are {short_repr(steps)}: give numbers that `add` has returned, or -1")
-    return numbers.astype(np.int64)
+    return step_ids.astype(np.int64)
 
 
 def check_finite(rows: np.ndarray, steps: Sequence[np.ndarray], reward: np.ndarray) -> None:

@@ -12,7 +12,7 @@ from jaxtyping import Array, Bool, Float, Int, Key
 from lare_rl.credit import closed_form, decomposition, descent, engine, returns
 from lare_rl.credit.decomposition import CreditBatch, Decomposition
 from lare_rl.credit.engine import CreditSpec, StepBatch
-from lare_rl.data.layouts import sample_step_numbers
+from lare_rl.data.layouts import sample_steps as _sample_steps
 from lare_rl.nn.normalise import update_scale
 
 init_decoder = jax.jit(engine.init_decoder, static_argnames="spec")
@@ -26,7 +26,7 @@ reset_statistics = jax.jit(returns.reset_statistics)
 init_explanation = jax.jit(engine.init_explanation, static_argnames="basis")
 add_to_explanation = jax.jit(engine.add_to_explanation)
 explain_returns = jax.jit(engine.explain_returns)
-draw_step_numbers = jax.jit(sample_step_numbers, static_argnames="steps")
+sample_steps = jax.jit(_sample_steps, static_argnames="steps")
 
 
 @partial(jax.jit, static_argnames="spec")
@@ -71,7 +71,7 @@ class FlatState(NamedTuple):
 @partial(jax.jit, static_argnames=("structure", "spec"))
 def training_rewards(
     leaves: list[Array],
-    features: Float[Array, "rows agents features"],
+    inputs: Float[Array, "rows agents inputs"],
     length: Int[Array, " rows"],
     mean_reward: Float[Array, " rows"] | None,
     finished: Bool[Array, " rows"] | None,
@@ -82,12 +82,12 @@ def training_rewards(
     """Return the rewards of steps by a flat state. `mean_reward` and `finished` are needed by methods that pay by the return."""
     decoder, scale = jax.tree.unflatten(structure, leaves)
     steps = StepBatch(
-        features=features,
+        inputs=inputs,
         length=length,
         mean_reward=jnp.zeros(len(length)) if mean_reward is None else mean_reward,
         finished=jnp.ones(len(length), bool) if finished is None else finished,
     )
-    alive = jnp.ones(features.shape[:-1], bool) if alive is None else alive
+    alive = jnp.ones(inputs.shape[:-1], bool) if alive is None else alive
     return engine.training_rewards(decoder, scale, steps, spec, alive)
 
 

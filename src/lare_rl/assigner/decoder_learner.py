@@ -22,7 +22,7 @@ from lare_rl.assigner import batches
 from lare_rl.assigner import compiled_functions as compiled
 from lare_rl.assigner.assigner_config import AssignerConfig
 from lare_rl.assigner.compiled_functions import FlatState, on_cpu, pad, padded_size
-from lare_rl.assigner.store import Episode, Store
+from lare_rl.assigner.store import Store, StoredEpisode
 from lare_rl.credit import closed_form, decomposition, prequential, returns
 from lare_rl.credit.decomposition import CreditBatch, Decomposition
 from lare_rl.credit.explanation import Explanation
@@ -34,7 +34,7 @@ __all__ = ["CHUNK_UPDATES", "DecoderLearner"]
 
 MAX_PENDING_STEPS = 256
 """The most steps that may wait for their inputs, or for the running statistics."""
-CHUNK_ROWS = 8192
+MAX_CALL_ROWS = 8192
 """Rows that are processed in one call."""
 CHUNK_UPDATES = 16
 """Gradient updates of a decoder in one call."""
@@ -69,7 +69,7 @@ class DecoderLearner:
         """Inputs of steps that are not in the running statistics yet, and which agents acted."""
         self._pending_returns: list[tuple[float, int]] = []
         """R/T and T of episodes that are not in the scales yet."""
-        self._pending_episodes: list[list[Episode]] = []
+        self._pending_episodes: list[list[StoredEpisode]] = []
         """Episodes that the decoder has not learned from yet. Episodes that ended in one call are together."""
         self._pending_updates = 0.0
         self._is_fitted = False
@@ -89,15 +89,15 @@ class DecoderLearner:
     ) -> Int[np.ndarray, " steps"]:
         """Store new steps, and return their numbers. Raises `LareError` if they are more than the capacity."""
         n_steps = len(observation)
-        numbers = self.store.add(n_steps, alive)
-        self._pending_steps.append((numbers, observation, action, next_observation))
+        step_ids = self.store.add(n_steps, alive)
+        self._pending_steps.append((step_ids, observation, action, next_observation))
         self.n_pending_steps += n_steps
         self._pending_updates = min(self._pending_updates + self.config.fits_per_step * n_steps, MAX_PENDING_UPDATES)
-        return numbers
+        return step_ids
 
-    def queue_episodes(self, episodes: Iterable[Episode]) -> None:
+    def queue_episodes(self, episodes: Iterable[StoredEpisode]) -> None:
         """Queue episodes that ended in one call."""
-        batch: list[Episode] = []
+        batch: list[StoredEpisode] = []
         for episode in episodes:
             if not batch:
                 self._pending_episodes.append(batch)
@@ -108,20 +108,20 @@ class DecoderLearner:
         """Process the queues that have become long."""
         if self.n_pending_steps >= MAX_PENDING_STEPS:
             self.flush_inputs()
-        if sum(len(episode.steps) for episode in chain.from_iterable(self._pending_episodes)) >= CHUNK_ROWS:
+        if sum(len(episode.steps) for episode in chain.from_iterable(self._pending_episodes)) >= MAX_CALL_ROWS:
             self.learn_returns()
 
     def flush_inputs(self) -> None:
         """Compute the decoder's inputs of pending steps, with phi. Raises `LareError` if a factor is not finite."""
         if not self._pending_steps:
             return
-        number, *steps = (np.concatenate(arrays) for arrays in zip(*self._pending_steps, strict=True))
-        chunks = [slice(start, start + CHUNK_ROWS) for start in range(0, len(number), CHUNK_ROWS)]
+        step_ids, *steps = (np.concatenate(arrays) for arrays in zip(*self._pending_steps, strict=True))
+        chunks = [slice(start, start + MAX_CALL_ROWS) for start in range(0, len(step_ids), MAX_CALL_ROWS)]
         # Nothing changes before phi has been called for all steps, because phi may raise an error.
         all_inputs = [self.config.compute_inputs(*(rows[chunk] for rows in steps)) for chunk in chunks]
         for chunk, inputs in zip(chunks, all_inputs, strict=True):
-            rows = number[chunk] % self.store.capacity
-            self.store.features[rows] = inputs
+            rows = step_ids[chunk] % self.store.capacity
+            self.store.inputs[rows] = inputs
             alive = np.ones(inputs.shape[:-1], bool) if self.store.alive is None else self.store.alive[rows]
             if self.decoder is not None:
                 self._pending_inputs.append((inputs, alive))
@@ -140,8 +140,8 @@ class DecoderLearner:
             return
         inputs, alive = (np.concatenate(arrays) for arrays in zip(*self._pending_inputs, strict=True))
         self._pending_inputs.clear()
-        for start in range(0, len(inputs), CHUNK_ROWS):
-            chunk = slice(start, start + CHUNK_ROWS)
+        for start in range(0, len(inputs), MAX_CALL_ROWS):
+            chunk = slice(start, start + MAX_CALL_ROWS)
             size = padded_size(len(inputs[chunk]))
             with on_cpu():
                 self.decoder = compiled.observe_steps(self.decoder, pad(inputs[chunk], size), pad(alive[chunk], size))
@@ -193,7 +193,9 @@ class DecoderLearner:
             return inf
         return (closed_form.FIT_GROWTH - 1) * self.n_learned
 
-    def _learn(self, decoder: Decomposition, new: Sequence[Episode], later: Sequence[Episode]) -> Decomposition:
+    def _learn(
+        self, decoder: Decomposition, new: Sequence[StoredEpisode], later: Sequence[StoredEpisode]
+    ) -> Decomposition:
         """Return a decoder that has learned from some new episodes, while later ones still wait."""
         for batch in self._episode_batches(new):
             decoder = compiled.predict_then_update(decoder, batch, settings=self.config.settings)
@@ -207,13 +209,13 @@ class DecoderLearner:
                 decoder = compiled.add_episodes(decoder, batch)
         return compiled.fit_closed_form(decoder, spec=self.config.spec) if compiled.is_due(decoder) else decoder
 
-    def _episode_batches(self, episodes: Sequence[Episode]) -> Iterator[CreditBatch]:
+    def _episode_batches(self, episodes: Sequence[StoredEpisode]) -> Iterator[CreditBatch]:
         """Yield batches of whole episodes. Rows are padded to one of two sizes, so that few programs are compiled."""
         lengths = [len(episode.steps) for episode in episodes]
         longest = max(lengths, default=1)
         rows = padded_size(longest)
         if sum(lengths) > rows:
-            rows = padded_size(max(longest, min(CHUNK_ROWS // self.config.agents, prequential.WINDOW * longest)))
+            rows = padded_size(max(longest, min(MAX_CALL_ROWS // self.config.agents, prequential.WINDOW * longest)))
         return batches.pack_in_order(self.store, episodes, prequential.WINDOW, rows)
 
     def fit(self, n_updates: int) -> None:
@@ -275,8 +277,8 @@ class DecoderLearner:
         mean_reward, finished = None, None
         if self.config.method.reward is Reward.UNIFORM:
             mean_reward, finished = self.store.mean_reward[rows], self.store.length[rows] > 0
-        for start in range(0, len(inputs), CHUNK_ROWS):
-            chunk = slice(start, start + CHUNK_ROWS)
+        for start in range(0, len(inputs), MAX_CALL_ROWS):
+            chunk = slice(start, start + MAX_CALL_ROWS)
             size = padded_size(len(inputs[chunk]))
             padded_length = pad(length[chunk].astype(np.int32), size)
             padded_length[len(inputs[chunk]) :] = 1  # a score that is a mean is divided by T
@@ -294,13 +296,13 @@ class DecoderLearner:
             reward[chunk] = np.asarray(r_hat)[: len(inputs[chunk])].reshape(reward[chunk].shape)
         return reward
 
-    def rewards_at(self, numbers: Int[np.ndarray, " n"]) -> Float[np.ndarray, "n *agents"]:
+    def rewards_at(self, step_ids: Int[np.ndarray, " n"]) -> Float[np.ndarray, "n *agents"]:
         """Return the rewards of stored steps. Raises `LareError` if a step is not stored."""
-        rows = self.store.rows(numbers)
-        if len(rows) and numbers.max() >= self.store.steps - self.n_pending_steps:
+        rows = self.store.rows(step_ids)
+        if len(rows) and step_ids.max() >= self.store.steps - self.n_pending_steps:
             self.flush_inputs()
         alive = None if self.store.alive is None else self.store.alive[rows]
-        return self.rewards(self.store.features[rows], self.store.lengths(rows), alive, rows)
+        return self.rewards(self.store.inputs[rows], self.store.lengths(rows), alive, rows)
 
     def _flat_state(self) -> FlatState:
         """Return the parts of the decoder that compute rewards, and the scale, in flat form."""

@@ -13,19 +13,17 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 
 from lare_rl.assigner.assigner_config import AssignerConfig
 from lare_rl.assigner.decoder_learner import DecoderLearner
 from lare_rl.assigner.space_layout import SpaceLayout
-from lare_rl.assigner.store import Episode, Store
+from lare_rl.assigner.store import Store, StoredEpisode
 from lare_rl.credit.decoder_settings import CreditSettings
 from lare_rl.credit.methods import find_method
 from lare_rl.errors import LareError, short_repr
 from lare_rl.latent.saved import load_function
-from lare_rl.runs.checkpoint import DAMAGED_FILE_ERRORS, open_npz
+from lare_rl.runs.checkpoint import DAMAGED_FILE_ERRORS, fill_template, named_leaves, open_npz
 from lare_rl.tasks.spec import TaskSpec
 from lare_rl.util.files import write_arrays, write_atomically
 from lare_rl.util.renamed_fields import rename_fields
@@ -37,6 +35,10 @@ FORMAT = 1
 TEXT_FILE, ARRAYS_FILE, FUNCTION_FILE = "assigner.json", "state.npz", "phi.py"
 PLAIN_FIELDS = ("judges", "agents", "max_steps", "capacity", "seed", "fits_per_step", "scale_rewards", "forget")
 """The fields of a configuration that are JSON values."""
+LEARNED = "learned"
+"""The names of the arrays of the decoder and the scale begin with it."""
+STORE_ARRAYS = {"features": "inputs", "length": "length", "mean_reward": "mean_reward"}
+"""The arrays of a store by their names in the file."""
 PHI_SAMPLE = ("tried/observation", "tried/action")
 """The steps on which `phi` is verified when it is loaded, because there may be no environment."""
 
@@ -55,7 +57,8 @@ def get_state(config: AssignerConfig, learner: DecoderLearner, *, episodes: bool
     """Return the state of an assigner, with stored steps and episodes if `episodes` is true."""
     learner.learn_returns()
     store = learner.store
-    arrays = {name: np.asarray(leaf) for name, leaf in _named_leaves(learner).items()}
+    leaves = named_leaves((learner.decoder, learner.scale))
+    arrays = {LEARNED + name: np.asarray(leaf) for name, leaf in leaves.items()}
     arrays["counts"] = np.array([store.ended, store.ended_steps, store.dropped + len(store.running)])
     for name, chunks in zip(PHI_SAMPLE, zip(*learner.phi_sample, strict=True), strict=False):
         arrays[name] = np.concatenate(chunks)
@@ -70,13 +73,8 @@ def restore(learner: DecoderLearner, state: AssignerState) -> None:
     learner.n_learned, learner.n_updates = state.n_learned, state.n_updates
     if set(PHI_SAMPLE) <= set(arrays):
         learner.phi_sample.append((arrays[PHI_SAMPLE[0]], arrays[PHI_SAMPLE[1]]))
-    leaves = _named_leaves(learner)
-    for name, leaf in leaves.items():
-        if arrays[name].shape != leaf.shape:
-            raise ValueError(f"{name} has shape {arrays[name].shape}, not {leaf.shape}")
-    structure = jax.tree.structure((learner.decoder, learner.scale))
-    leaves = [jnp.asarray(arrays[name]) for name in leaves]
-    learner.decoder, learner.scale = jax.tree.unflatten(structure, leaves)
+    learned = {rename_fields(name).removeprefix(LEARNED): array for name, array in arrays.items()}
+    learner.decoder, learner.scale = fill_template((learner.decoder, learner.scale), learned)
     store = learner.store
     store.ended, store.ended_steps, store.dropped = map(int, arrays["counts"])
     if "steps" in arrays:
@@ -106,7 +104,7 @@ def read_state(directory: Path) -> AssignerState:
     with report_damage(directory):
         values = read_json(read_text(path))
         with open_npz(directory / ARRAYS_FILE) as saved:
-            arrays = {rename_fields(name): saved[name] for name in saved.files}
+            arrays = {name: saved[name] for name in saved.files}
         if not isinstance(values, dict) or values.get("format") != FORMAT:
             raise LareError(f"{path} is not of format {FORMAT}: another version of LaRe has written it")
         task = None if values["task"] is None else TaskSpec(**values["task"])
@@ -137,12 +135,6 @@ def report_damage(directory: Path) -> Iterator[None]:
         ) from error
 
 
-def _named_leaves(learner: DecoderLearner) -> dict[str, Any]:
-    """Return the arrays of the decoder and the scale, by their paths."""
-    leaves, _ = jax.tree_util.tree_flatten_with_path((learner.decoder, learner.scale))
-    return {f"learned{jax.tree_util.keystr(path)}": leaf for path, leaf in leaves}
-
-
 def _config_values(state: AssignerState) -> dict[str, Any]:
     config = state.config
     models = ("task", "observation", "action", "settings")
@@ -161,7 +153,7 @@ def _store_arrays(store: Store) -> dict[str, np.ndarray]:
     rows = np.arange(max(0, store.steps - store.capacity), store.steps) % store.capacity
     episodes = list(store.episodes.values())
     return {
-        **{name: getattr(store, name)[rows] for name in ("features", "length", "mean_reward")},
+        **{name: getattr(store, field)[rows] for name, field in STORE_ARRAYS.items()},
         **({} if store.alive is None else {"alive": store.alive[rows]}),
         "steps": np.array(store.steps),
         "episodes": np.concatenate([np.zeros(0, np.int64), *(episode.steps for episode in episodes)]),
@@ -173,12 +165,12 @@ def _store_arrays(store: Store) -> dict[str, np.ndarray]:
 def _restore_store(store: Store, arrays: dict[str, np.ndarray]) -> None:
     store.steps = int(arrays["steps"])
     rows = np.arange(max(0, store.steps - store.capacity), store.steps) % store.capacity
-    for name in ("features", "length", "mean_reward"):
-        getattr(store, name)[rows] = arrays[name]
+    for name, field in STORE_ARRAYS.items():
+        getattr(store, field)[rows] = arrays[name]
     if "alive" in arrays:
         store.alive = np.ones((store.capacity, store.agents), bool)
         store.alive[rows] = arrays["alive"]
     ends = np.cumsum(arrays["lengths"])
     first = store.ended - len(ends)
     for i, (end, length, score) in enumerate(zip(ends, arrays["lengths"], arrays["scores"], strict=True)):
-        store.restore_episode(first + i, Episode(arrays["episodes"][end - length : end], float(score)))
+        store.restore_episode(first + i, StoredEpisode(arrays["episodes"][end - length : end], float(score)))

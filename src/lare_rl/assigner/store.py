@@ -16,10 +16,10 @@ from jaxtyping import Bool, Float, Int
 
 from lare_rl.errors import LareError
 
-__all__ = ["Episode", "RunningEpisode", "Store"]
+__all__ = ["RunningEpisode", "Store", "StoredEpisode"]
 
 
-class Episode(NamedTuple):
+class StoredEpisode(NamedTuple):
     """An episode that has ended."""
 
     steps: Int[np.ndarray, " steps"]
@@ -50,7 +50,7 @@ class Store:
     def __init__(self, capacity: int, row_shape: tuple[int, ...], agents: int = 1):
         """Make an empty store. `row_shape` is the shape of a step's inputs: (inputs,), or (agents, inputs)."""
         self.capacity, self.agents = capacity, agents
-        self.features = np.zeros((capacity, *row_shape), np.float32)
+        self.inputs = np.zeros((capacity, *row_shape), np.float32)
         """The decoder's inputs for each step: [capacity *agents inputs]."""
         self.alive: Bool[np.ndarray, "capacity agents"] | None = None
         """Which agents acted. None: all of them."""
@@ -60,7 +60,7 @@ class Store:
         """R/T of each step's episode."""
         self.steps = 0
         """The number of steps that were ever added."""
-        self.episodes: dict[int, Episode] = {}
+        self.episodes: dict[int, StoredEpisode] = {}
         """The episodes whose steps are all stored, by number."""
         self.ended = 0
         """The number of episodes that have ever ended."""
@@ -83,33 +83,33 @@ class Store:
             raise LareError(f"{n_steps} steps at once are more than capacity = {self.capacity}: make capacity larger")
         while self.running and next(iter(self.running.values())).newest < self.steps - self.capacity:
             self.drop(next(iter(self.running)))
-        numbers = np.arange(self.steps, self.steps + n_steps)
+        step_ids = np.arange(self.steps, self.steps + n_steps)
         self.steps += n_steps
         while self.oldest and self.oldest[0][0] < self.steps - self.capacity:
             del self.episodes[heapq.heappop(self.oldest)[1]]
-        self.length[numbers % self.capacity] = 0
+        self.length[step_ids % self.capacity] = 0
         if self.alive is None and alive is not None:
             self.alive = np.ones((self.capacity, self.agents), bool)
         if self.alive is not None:
-            self.alive[numbers % self.capacity] = True if alive is None else alive
-        return numbers
+            self.alive[step_ids % self.capacity] = True if alive is None else alive
+        return step_ids
 
     def extend(
         self,
         env_ids: Sequence[Hashable],
-        numbers: Int[np.ndarray, " n"],
+        step_ids: Int[np.ndarray, " n"],
         steps: Sequence[np.ndarray],
         reward: Float[np.ndarray, " n"],
         ended: Bool[np.ndarray, " n"],
-    ) -> Iterator[Episode]:
+    ) -> Iterator[StoredEpisode]:
         """Add new steps to the running episodes of their environments. Yield each episode that ends.
 
-        `numbers` are from `add`. `steps` are observations, actions and next observations. Raises `LareError` like `end`.
+        `step_ids` are from `add`. `steps` are observations, actions and next observations. Raises `LareError` like `end`.
         """
         observation, _, next_observation = steps
         for i, env_id in enumerate(env_ids):
             episode = self.get_running(env_id, observation[i])
-            episode.steps.append(int(numbers[i]))
+            episode.steps.append(int(step_ids[i]))
             episode.return_ += float(reward[i])
             episode.last_observation = next_observation[i]
             if ended[i]:
@@ -124,7 +124,7 @@ class Store:
             )
         return self.running[env_id]
 
-    def end(self, env_id: Hashable, score: float) -> Episode:
+    def end(self, env_id: Hashable, score: float) -> StoredEpisode:
         """End the running episode of an environment, with `score` as its return.
 
         Raises:
@@ -132,9 +132,9 @@ class Store:
         """
         return self.add_episode(np.array(self.running.pop(env_id).steps, np.int64), score)
 
-    def add_episode(self, steps: Int[np.ndarray, " steps"], score: float) -> Episode:
+    def add_episode(self, steps: Int[np.ndarray, " steps"], score: float) -> StoredEpisode:
         """Store an episode that has just ended. Raises `LareError` like `end`."""
-        episode = Episode(steps, score)
+        episode = StoredEpisode(steps, score)
         if self.steps - steps[0] > self.capacity:
             raise LareError(
                 f"an episode of {len(steps)} steps has ended, and its first steps are not stored any more: "
@@ -148,7 +148,7 @@ class Store:
         self.mean_reward[rows] = score / len(rows)
         return episode
 
-    def restore_episode(self, number: int, episode: Episode) -> None:
+    def restore_episode(self, number: int, episode: StoredEpisode) -> None:
         """Store an episode under its number."""
         self.episodes[number] = episode
         heapq.heappush(self.oldest, (int(episode.steps[0]), number))
@@ -173,11 +173,7 @@ class Store:
         self.dropped += bool(run and run.steps)
 
     def rows(self, steps: Int[np.ndarray, "*batch"]) -> Int[np.ndarray, "*batch"]:
-        """Return the rows of stored steps.
-
-        Raises:
-            LareError: a step was never stored, or is not stored any more.
-        """
+        """Return the rows of stored steps. Raises `LareError` if a step was never stored, or is not stored any more."""
         oldest = max(0, self.steps - self.capacity)
         if steps.size and (steps.max() >= self.steps or steps.min() < oldest):
             missing = steps.max() if steps.max() >= self.steps else steps.min()

@@ -144,13 +144,13 @@ def load_policy(run: Path | None, spec: "TaskSpec") -> "Callable[[np.ndarray], n
     """Load the policy of a run that is to play a task."""
     if run is None:
         return None
-    from lare_rl.evaluation.policy import Policy
+    from lare_rl.evaluation.policy import RunPolicy
     from lare_rl.runs.directory import open_run
 
     opened = open_run(run)
     if opened.config.task.environment != spec.environment:
         raise LareError(f"{run} is a run of {opened.config.task.name}: its policy cannot play {spec.name}")
-    return Policy(opened, 0, best=False).select_env_action
+    return RunPolicy(opened, 0, best=False).select_env_action
 
 
 def _check_options(

@@ -18,6 +18,7 @@ if TYPE_CHECKING:
 
     from lare_rl.envs.play import Episode, Policy
     from lare_rl.latent.function import LatentFunction
+    from lare_rl.latent.verify import Verdict
     from lare_rl.new_task.draft import Draft
     from lare_rl.tasks.spec import TaskSpec
 
@@ -122,7 +123,7 @@ def verify(
         judges: which observation of a step the function judges, instead of the one that the task says.
     """
     from lare_rl.cli.design import load_policy
-    from lare_rl.credit.explanation_text import MIN_EPISODES
+    from lare_rl.credit.explanation_text import MIN_EXPLAINED_EPISODES
     from lare_rl.envs.load import load_task, read_task
     from lare_rl.latent.function import function_from_verdict
     from lare_rl.latent.saved import read_source
@@ -130,8 +131,8 @@ def verify(
     from lare_rl.tasks.spec import require_role
 
     source, changed, saved_task = read_source(file)
-    if fit and fit < MIN_EPISODES:
-        raise LareError(f"fit = {fit}: at least {MIN_EPISODES} episodes are needed")
+    if fit and fit < MIN_EXPLAINED_EPISODES:
+        raise LareError(f"fit = {fit}: at least {MIN_EXPLAINED_EPISODES} episodes are needed")
     if policy is not None and (not fit or data is not None):
         raise LareError("--policy plays the episodes for --fit: give --fit a number of episodes, and no --data")
     spec = load_task(task) if data is None else read_task(task)
@@ -144,12 +145,7 @@ def verify(
         print_line(f"note    it was written for the task {saved_task!r}")
     verdict = verify_source(source, spec, kind, load_steps(data, spec))
     print_line(f"for {role.name}: observations of {role.observation_size} numbers, actions of {role.action_size}")
-    for check in verdict.checks:
-        print_line(f"{'passed' if check.passed else 'FAILED'}  {check.name}")
-        for line in check.message.splitlines():
-            print_line(f"        {line}")
-    for line in verdict.advice:
-        print_line(f"advice  {line}")
+    _print_verdict(verdict)
     if not verdict.passed:
         if file.suffix == ".json":
             print_line("Paste the lines after FAILED into the same chat, and ask for the whole reply again, corrected.")
@@ -159,6 +155,15 @@ def verify(
         print_line(f"factor  {name} reads {reads}")
     if fit:
         _print_assessment(function, role, _load_episodes(role, data, fit, play))
+
+
+def _print_verdict(verdict: "Verdict") -> None:
+    for check in verdict.checks:
+        print_line(f"{'passed' if check.passed else 'FAILED'}  {check.name}")
+        for line in check.message.splitlines():
+            print_line(f"        {line}")
+    for line in verdict.advice:
+        print_line(f"advice  {line}")
 
 
 def _load_episodes(role: "TaskSpec", data: str | None, n_episodes: int, policy: "Policy | None") -> "Sequence[Episode]":

@@ -16,11 +16,7 @@ FORMAT = 5
 
 
 def migrate(values: dict[str, Any]) -> dict[str, Any]:
-    """Return the values in the current format.
-
-    Raises:
-        LareError: their format is newer, or too old.
-    """
+    """Return the values in the current format. Raises `LareError` if their format is newer, or too old."""
     number = values.get("format")
     while isinstance(number, int) and number in _MIGRATIONS:
         values = _MIGRATIONS[number](values) | {"format": number + 1}

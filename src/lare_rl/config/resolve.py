@@ -66,11 +66,7 @@ def choose_algorithm(name: str | None, env: EnvSpec) -> str:
 
 
 def apply_defaults(settings: Settings, env: EnvSpec) -> ResolvedSettings:
-    """Fill in the settings that are None.
-
-    Raises:
-        LareError: the steps are not a multiple of an iteration's.
-    """
+    """Fill in the settings that are None. Raises `LareError` if the steps are not a multiple of an iteration's."""
     algorithm = choose_algorithm(settings.algorithm, env)
     row = ALGORITHMS[algorithm]
     defaults: dict[str, Any] = {

@@ -5,7 +5,7 @@ from jaxtyping import Array, Bool, Float
 
 from lare_rl.nn.masks import masked_mean
 
-__all__ = ["correlation", "mean_absolute_error", "metrics"]
+__all__ = ["masked_correlation", "mean_absolute_error", "metrics"]
 
 
 def metrics(
@@ -21,7 +21,7 @@ def metrics(
     unknown. The error is left out unless proxy rewards are in the unit of the true rewards (`calibrated`).
     """
     has_step_rewards = jnp.any((reward != 0) & mask & ~last)
-    values = {"credit/correlation": correlation(r_hat, reward, mask)}
+    values = {"credit/correlation": masked_correlation(r_hat, reward, mask)}
     if calibrated:
         values["credit/error"] = mean_absolute_error(r_hat, reward, mask)
     return {name: jnp.where(has_step_rewards, value, jnp.nan) for name, value in values.items()}
@@ -34,7 +34,7 @@ def mean_absolute_error(
     return masked_mean(jnp.abs(r_hat - reward), mask)
 
 
-def correlation(
+def masked_correlation(
     r_hat: Float[Array, " steps"], reward: Float[Array, " steps"], mask: Bool[Array, " steps"]
 ) -> Float[Array, ""]:
     """Return Pearson's correlation over the steps where `mask` is true, or NaN where one of the two never varies."""

@@ -72,10 +72,10 @@ class AREL(eqx.Module):
     agent_blocks: tuple[Block, ...]
     read_out: tuple[Linear, Linear, Linear]
 
-    def __init__(self, n_features: int, max_steps: int, *, key: PRNGKeyArray):
-        size = min(n_features, MAX_WIDTH)
+    def __init__(self, n_inputs: int, max_steps: int, *, key: PRNGKeyArray):
+        size = min(n_inputs, MAX_WIDTH)
         embed_key, position_key, time_key, agents_key, *read_keys = jax.random.split(key, 7)
-        self.embed = Linear(n_features, size, key=embed_key)
+        self.embed = Linear(n_inputs, size, key=embed_key)
         self.position = jax.random.normal(position_key, (max_steps, size))
         self.time_blocks = tuple(Block(size, key=key) for key in jax.random.split(time_key, DEPTH))
         self.agent_blocks = tuple(Block(size, key=key) for key in jax.random.split(agents_key, DEPTH))
@@ -85,10 +85,10 @@ class AREL(eqx.Module):
             Linear(READ_OUT_WIDTH, 1, key=read_keys[2]),
         )
 
-    def __call__(self, features: Float[Array, "rows agents features"], key: PRNGKeyArray | None) -> DecoderOutput:
+    def __call__(self, inputs: Float[Array, "rows agents inputs"], key: PRNGKeyArray | None) -> DecoderOutput:
         steps = len(self.position)
-        rows, agents = features.shape[:2]
-        x = self.embed(features).reshape(-1, steps, agents, self.position.shape[-1])
+        rows, agents = inputs.shape[:2]
+        x = self.embed(inputs).reshape(-1, steps, agents, self.position.shape[-1])
         x = jnp.swapaxes(x, 1, 2) + self.position
         for time_block, agent_block in zip(self.time_blocks, self.agent_blocks, strict=True):
             x = time_block(x, causal_mask(steps))

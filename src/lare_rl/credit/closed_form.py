@@ -54,7 +54,7 @@ STATISTICS_GROWTH = 1.5
 """All episodes are summed again when the number of steps has grown by this factor."""
 FIT_GROWTH = 1.05
 """The decoder is fitted again when the number of episodes has grown by this factor."""
-MAX_ROUNDS = 20
+MAX_EVIDENCE_ROUNDS = 20
 """The maximum number of rounds of the evidence's fixed point, from each of its starts."""
 
 
@@ -162,7 +162,7 @@ def is_due(state: ClosedForm) -> Bool[Array, ""]:
 
 
 def fit(
-    state: ClosedForm, score_types: tuple[int, ...], max_rounds: int = MAX_ROUNDS, *, batched: bool = False
+    state: ClosedForm, score_types: tuple[int, ...], max_rounds: int = MAX_EVIDENCE_ROUNDS, *, batched: bool = False
 ) -> ClosedForm:
     """Fit the decoder of each score type to the sums; of all types at once if `batched` is true."""
     group_index, statistics = state.decoder.basis.group_index, to_float64(state.sufficient_statistics)

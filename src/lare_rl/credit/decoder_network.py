@@ -25,11 +25,11 @@ class DecoderNetwork(Protocol):
     A decoder for `Fit.DECODER_LOSS` has another method, `loss`, as in `diaster.py`.
     """
 
-    def __call__(self, features: Float[Array, "rows *agents features"], key: PRNGKeyArray | None) -> DecoderOutput:
+    def __call__(self, inputs: Float[Array, "rows *agents inputs"], key: PRNGKeyArray | None) -> DecoderOutput:
         """Return the proxy rewards of some steps.
 
         Args:
-            features: the inputs at each step.
+            inputs: the inputs at each step.
             key: the random key of an update of the decoder. Rewards for the algorithm are computed without a key.
         """
         ...

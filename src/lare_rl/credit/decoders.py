@@ -35,6 +35,8 @@ class Decoder:
     single_agent_only: bool = False
     extended_basis: bool = False
     """Whether a closed-form decoder has shapes and pairs of its inputs as features (`basis.py`)."""
+    exportable: bool = False
+    """Whether `lare-rl export` can write its rewards (`export/reward_graph.py`)."""
 
     def init_network(self, key: "PRNGKeyArray", shape: "DecoderShape", settings: "CreditSettings") -> "DecoderNetwork":
         """Return an untrained decoder."""
@@ -46,25 +48,22 @@ DECODERS = Registry[Decoder]("decoder")
 
 
 def register_decoder(decoder: Decoder) -> None:
-    """Add a decoder, which methods can then name.
-
-    Raises:
-        LareError: another decoder has this name.
-    """
+    """Add a decoder, which methods can then name. Raises `LareError` if another decoder has this name."""
     DECODERS.register(decoder.name, decoder)
 
 
 for _decoder in (
-    Decoder("step", "lare_rl.credit.step_decoders:init_step_decoder", frozenset({"hidden"})),
+    Decoder("step", "lare_rl.credit.step_decoders:init_step_decoder", frozenset({"hidden"}), exportable=True),
     Decoder(
         "bottleneck",
         "lare_rl.credit.step_decoders:init_bottleneck",
         frozenset({"hidden", "encoder", "bottleneck", "divergence"}),
+        exportable=True,
     ),
     Decoder("arel", "lare_rl.credit.arel:init_arel", whole_episodes=True),
     Decoder("stas", "lare_rl.credit.stas:init_stas", whole_episodes=True),
     Decoder("diaster", "lare_rl.credit.diaster:init_diaster", frozenset({"hidden"}), single_agent_only=True),
-    Decoder("linear", "lare_rl.credit.closed_form:init_linear_decoder"),
-    Decoder("additive", "lare_rl.credit.closed_form:init_linear_decoder", extended_basis=True),
+    Decoder("linear", "lare_rl.credit.closed_form:init_linear_decoder", exportable=True),
+    Decoder("additive", "lare_rl.credit.closed_form:init_linear_decoder", extended_basis=True, exportable=True),
 ):
     register_decoder(_decoder)

@@ -4,7 +4,7 @@
 
 psi is fitted by gradient descent in `descent.py` and in closed form in `returns.py`.
 
-x is the output of the method's encoder: the factors z = phi(s, a), or raw features. `scale` is the running root mean square of R/T.
+x are the method's inputs: the factors z = phi(s, a), or raw features. `scale` is the running root mean square of R/T.
 With n agents, each agent has its own proxy rewards, R is the mean of the agents' returns, and the mean of the agents' r_hat is
 fitted to it. The equations stay the same and assign credit over time and among agents.
 
@@ -13,12 +13,13 @@ agents is larger than this mean by about that factor. Adam changes an output by 
 of many agents is seldom fitted. Without the gain, its output would need dozens of updates of the policy to reach
 the size of a rare reward.
 
-Features and targets are normalised by statistics in the state. Scaling the return, or a factor, therefore changes only the scale of
+Inputs and targets are normalised by statistics in the state. Scaling the return, or a factor, therefore changes only the scale of
 r_hat. `normalise = false` is the published form, with raw features and raw targets.
 """
 
 from typing import NamedTuple
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import optax
@@ -33,6 +34,7 @@ from lare_rl.credit.decoders import DECODERS
 from lare_rl.credit.methods import Method
 from lare_rl.credit.prequential import Predictions, empty_predictions
 from lare_rl.credit.score_type import ScoreType
+from lare_rl.errors import LareError, short_repr
 from lare_rl.nn.networks import init_adam
 from lare_rl.nn.normalise import (
     RunningMeanStd,
@@ -49,15 +51,16 @@ __all__ = [
     "CreditBatch",
     "Decomposition",
     "agent_mean",
+    "agent_shares",
     "decode",
-    "decoder_inputs",
+    "decoder_rewards",
     "init",
     "is_normalised",
     "is_optimistic",
+    "normalise_inputs",
     "observe_returns",
     "observe_steps",
     "optimistic_rewards",
-    "proxy_rewards",
     "reward_unit",
     "score_type_index",
     "valid_rows",
@@ -71,7 +74,7 @@ class CreditBatch(NamedTuple):
     `Fit.DECODER_LOSS`, rows = episodes * (steps of the longest possible episode).
     """
 
-    features: Float[Array, "rows *agents features"]
+    inputs: Float[Array, "rows *agents inputs"]
     episode_index: Int[Array, " rows"]
     """The index of each row's episode. For padding, it is the number of episodes or more."""
     length: Int[Array, " episodes"]
@@ -79,28 +82,29 @@ class CreditBatch(NamedTuple):
     """R/T."""
     mask: Float[Array, " episodes"]
     """1 for an episode, 0 for padding."""
-    share: Float[Array, "rows *agents"] | None = None
-    """Each agent's share of the team's reward: 1/n for each of the n agents that are alive, else 0. None means equal shares."""
+    alive: Bool[Array, "rows *agents"] | None = None
+    """Which agents acted. None means all."""
 
 
 def valid_rows(episodes: CreditBatch) -> Bool[Array, "rows *agents"]:
     """Return which rows are steps of an episode of the batch, by agents that acted."""
-    shape, n_episodes = episodes.features.shape[:-1], len(episodes.length)
+    shape, n_episodes = episodes.inputs.shape[:-1], len(episodes.length)
     is_step = (episodes.episode_index < n_episodes) & (
         episodes.mask[jnp.minimum(episodes.episode_index, n_episodes - 1)] > 0
     )
-    acted = jnp.ones(shape, bool) if episodes.share is None else episodes.share > 0
+    acted = jnp.ones(shape, bool) if episodes.alive is None else episodes.alive
     return is_step.reshape(-1, *[1] * (len(shape) - 1)) & acted
 
 
 class Decomposition(NamedTuple):
     """The state of return decomposition."""
 
-    decoder: DecoderNetwork
+    network: DecoderNetwork
+    """What the decoder consists of: f_psi."""
     optimizer: optax.OptState
     """Empty for a decoder that is fitted in closed form."""
     statistics: RunningMeanStd
-    """Running mean and standard deviation of the features."""
+    """Running mean and standard deviation of the inputs."""
     scale: Scale
     """The scale of R/T."""
     return_scale: Scale
@@ -117,7 +121,7 @@ class Decomposition(NamedTuple):
 
 def init(
     key: PRNGKeyArray,
-    features: Basis | int,
+    basis: Basis | int,
     method: Method,
     settings: CreditSettings,
     max_steps: int,
@@ -128,23 +132,29 @@ def init(
 
     Args:
         key: the random key of the weights.
-        features: the features that a decoder in closed form computes, or the number of inputs, which are used unchanged.
+        basis: the features that a decoder in closed form computes, or the number of inputs, which are used unchanged.
         method: the method.
         settings: the settings of the decoder and its fit.
         max_steps: the number of steps of the longest episode.
         n_agents: the number of agents of a step.
         score_types: the types that the score may have.
     """
-    basis = Basis(n_factors=0, n_raw=features, extended=False) if isinstance(features, int) else features
+    basis = Basis(n_factors=0, n_raw=basis, extended=False) if isinstance(basis, int) else basis
     shape = DecoderShape(basis, max_steps, n_agents)
-    decoder = DECODERS[method.decoder].init_network(key, shape, settings)
+    network = DECODERS[method.decoder].init_network(key, shape, settings)
+    for leaf in jax.tree.leaves(network):
+        if not eqx.is_array_like(leaf):
+            raise LareError(
+                f"the decoder {method.decoder!r} holds {short_repr(leaf)}, which cannot be trained: it may have arrays and static "
+                "fields; instead of eqx.nn.MLP, which holds functions, use lare_rl.nn.networks.MLP"
+            )
     both = len(score_types) > 1
     closed = None
     if both or not method.uses_gradient:
         closed = closed_form.init(basis, len(score_types), with_spread=is_optimistic(method, settings))
     return Decomposition(
-        decoder=decoder,
-        optimizer=init_adam(decoder, settings.learning_rate) if method.uses_gradient else (),
+        network=network,
+        optimizer=init_adam(network, settings.learning_rate) if method.uses_gradient else (),
         statistics=empty_mean_std(basis.n_inputs),
         scale=empty_scale(),
         return_scale=empty_scale(),
@@ -166,13 +176,13 @@ def score_type_index(state: Decomposition, n_score_types: int) -> Int[Array, ""]
 
 
 def observe_steps(
-    state: Decomposition, features: Float[Array, "*batch features"], mask: Bool[Array, "*batch"] | None = None
+    state: Decomposition, inputs: Float[Array, "*batch inputs"], mask: Bool[Array, "*batch"] | None = None
 ) -> Decomposition:
     """Add new steps to the statistics that `normalise` uses. Add each step exactly once.
 
     Steps where `mask` is false are ignored.
     """
-    rows = features.reshape(-1, features.shape[-1])
+    rows = inputs.reshape(-1, inputs.shape[-1])
     mask = None if mask is None else mask.ravel()
     return state._replace(statistics=update_mean_std(state.statistics, rows, mask))
 
@@ -195,7 +205,7 @@ def observe_returns(
 
 def is_normalised(state: Decomposition, settings: CreditSettings) -> bool:
     """Return whether the decoder's inputs and outputs are normalised. A decoder in closed form does not need this."""
-    return settings.normalise and not isinstance(state.decoder, LinearDecoder)
+    return settings.normalise and not isinstance(state.network, LinearDecoder)
 
 
 def reward_unit(state: Decomposition, settings: CreditSettings) -> Float[Array, ""]:
@@ -205,27 +215,27 @@ def reward_unit(state: Decomposition, settings: CreditSettings) -> Float[Array, 
     return jnp.where(state.is_mean, root_mean_square(state.return_scale), root_mean_square(state.scale))
 
 
-def decoder_inputs(
-    state: Decomposition, features: Float[Array, "*batch features"], settings: CreditSettings
-) -> Float[Array, "*batch features"]:
-    """Return the features as the decoder receives them."""
-    return standardise(state.statistics, features) if is_normalised(state, settings) else features
+def normalise_inputs(
+    state: Decomposition, inputs: Float[Array, "*batch inputs"], settings: CreditSettings
+) -> Float[Array, "*batch inputs"]:
+    """Return the inputs as the decoder receives them."""
+    return standardise(state.statistics, inputs) if is_normalised(state, settings) else inputs
 
 
 def decode(
-    decoder: DecoderNetwork,
+    network: DecoderNetwork,
     state: Decomposition,
-    features: Float[Array, "rows *agents features"],
+    inputs: Float[Array, "rows *agents inputs"],
     settings: CreditSettings,
     key: PRNGKeyArray | None = None,
 ) -> DecoderOutput:
     """Return the output f_psi of the decoder, in units of `reward_unit`."""
-    return decoder(decoder_inputs(state, features, settings), key)
+    return network(normalise_inputs(state, inputs, settings), key)
 
 
-def proxy_rewards(
+def decoder_rewards(
     state: Decomposition,
-    features: Float[Array, "rows *agents features"],
+    inputs: Float[Array, "rows *agents inputs"],
     settings: CreditSettings,
     length: Float[Array, " rows"] | Int[Array, " rows"] | None = None,
 ) -> Float[Array, "rows *agents"]:
@@ -233,13 +243,13 @@ def proxy_rewards(
 
     `length` is T, the number of steps of each row's episode. Without it, the score is treated as a sum.
     """
-    output = decode(state.decoder, state, features, settings).r_hat
+    output = decode(state.network, state, inputs, settings).r_hat
     return _per_step(reward_unit(state, settings) * output, state, length)
 
 
 def optimistic_rewards(
     state: Decomposition,
-    features: Float[Array, "rows *agents features"],
+    inputs: Float[Array, "rows *agents inputs"],
     settings: CreditSettings,
     length: Float[Array, " rows"] | Int[Array, " rows"] | None = None,
 ) -> Float[Array, "rows *agents"]:
@@ -249,13 +259,13 @@ def optimistic_rewards(
     they are too high for uncertain steps, on purpose. The decoder must be in closed form, and `init` must have had the same
     optimism.
     """
-    r_hat = proxy_rewards(state, features, settings, length)
+    r_hat = decoder_rewards(state, inputs, settings, length)
     assert state.closed_form is not None
     assert state.closed_form.spread is not None
-    assert isinstance(state.decoder, LinearDecoder)
+    assert isinstance(state.network, LinearDecoder)
     index = score_type_index(state, len(state.closed_form.spread.centre_variance))
     spread = jax.tree.map(lambda leaf: leaf[index], state.closed_form.spread)
-    std = evidence.posterior_std(spread, state.decoder.features(features))
+    std = evidence.posterior_std(spread, state.network.features(inputs))
     return r_hat + settings.optimism * _per_step(std, state, length)
 
 
@@ -272,9 +282,14 @@ def _per_step(
 
 
 def agent_mean(
-    values: Float[Array, "rows *agents"], share: Float[Array, "rows *agents"] | None
+    values: Float[Array, "rows *agents"], alive: Bool[Array, "rows *agents"] | None
 ) -> Float[Array, " rows"]:
     """Return the mean over the agents that are alive."""
-    if share is None:
+    if alive is None:
         return jnp.mean(values.reshape(len(values), -1), axis=1)
-    return jnp.sum((values * share).reshape(len(values), -1), axis=1)
+    return jnp.sum((values * agent_shares(alive)).reshape(len(values), -1), axis=1)
+
+
+def agent_shares(alive: Bool[Array, "*batch agents"]) -> Float[Array, "*batch agents"]:
+    """Return each agent's share of the team's reward: 1/n for each of n agents that are alive, else 0."""
+    return (alive / alive.sum(axis=-1, keepdims=True).clip(1)).astype(jnp.float32)

@@ -10,7 +10,7 @@ from jaxtyping import Array, Float, PRNGKeyArray
 from lare_rl.credit import losses
 from lare_rl.credit.decoder_network import DecoderNetwork
 from lare_rl.credit.decoder_settings import CreditSettings
-from lare_rl.credit.decomposition import CreditBatch, Decomposition, agent_mean, decode, decoder_inputs, reward_unit
+from lare_rl.credit.decomposition import CreditBatch, Decomposition, agent_mean, decode, normalise_inputs, reward_unit
 from lare_rl.credit.methods import Fit
 from lare_rl.nn.networks import adam_step
 
@@ -22,7 +22,7 @@ def loss_and_gradient(
 ) -> tuple[Float[Array, ""], DecoderNetwork]:
     """Return the loss of `fit`, and its gradient with respect to the decoder's weights."""
     loss = _decoder_loss if fit is Fit.DECODER_LOSS else partial(_mean_loss, fit=fit)
-    return jax.value_and_grad(loss)(state.decoder, state, episodes, key, settings=settings)
+    return jax.value_and_grad(loss)(state.network, state, episodes, key, settings=settings)
 
 
 def update(
@@ -48,7 +48,7 @@ def update_in_chunks(
     def body(total: tuple[Array, DecoderNetwork], chunk: tuple[CreditBatch, PRNGKeyArray]):
         return jax.tree.map(jnp.add, total, loss_and_gradient(state, *chunk, fit, settings)), None
 
-    zero = jnp.zeros(()), jax.tree.map(jnp.zeros_like, state.decoder)
+    zero = jnp.zeros(()), jax.tree.map(jnp.zeros_like, state.network)
     total, _ = jax.lax.scan(body, zero, (chunks, jax.random.split(key, n_chunks)))
     loss, gradient = jax.tree.map(lambda leaf: leaf / n_chunks, total)
     return _step(state, loss, gradient, settings)
@@ -58,13 +58,13 @@ def _step(
     state: Decomposition, loss: Float[Array, ""], gradient: DecoderNetwork, settings: CreditSettings
 ) -> tuple[Decomposition, dict[str, Float[Array, ""]]]:
     """Take one step of Adam, with the weight decay added to the gradient."""
-    gradient = jax.tree.map(lambda slope, weight: slope + settings.weight_decay * weight, gradient, state.decoder)
-    decoder, optimizer = adam_step(state.decoder, gradient, state.optimizer, settings.learning_rate)
-    return state._replace(decoder=decoder, optimizer=optimizer), {"credit/loss": loss}
+    gradient = jax.tree.map(lambda slope, weight: slope + settings.weight_decay * weight, gradient, state.network)
+    network, optimizer = adam_step(state.network, gradient, state.optimizer, settings.learning_rate)
+    return state._replace(network=network, optimizer=optimizer), {"credit/loss": loss}
 
 
 def _mean_loss(
-    decoder: DecoderNetwork,
+    network: DecoderNetwork,
     state: Decomposition,
     episodes: CreditBatch,
     key: PRNGKeyArray,
@@ -74,8 +74,8 @@ def _mean_loss(
     """Return the loss of RD, RRD or RRD-unbiased: mean r_hat of an episode's steps against R/T, plus the decoder's penalty."""
     target, n_episodes = _targets(state, episodes, settings), len(episodes.length)
     weight = losses.episode_weight(episodes.length, episodes.mask, settings.sum_form)
-    output = decode(decoder, state, episodes.features, settings, key)
-    r_hat, penalty = (agent_mean(values, episodes.share) for values in output)
+    output = decode(network, state, episodes.inputs, settings, key)
+    r_hat, penalty = (agent_mean(values, episodes.alive) for values in output)
     n_steps = jnp.minimum(episodes.length, len(r_hat) // n_episodes) if fit.samples_steps else episodes.length
     mean = losses.episode_means(r_hat, episodes.episode_index, n_steps)
     if fit is Fit.SAMPLED_STEPS_UNBIASED:
@@ -89,13 +89,13 @@ def _mean_loss(
 
 
 def _decoder_loss(
-    decoder: Any, state: Decomposition, episodes: CreditBatch, key: PRNGKeyArray, settings: CreditSettings
+    network: Any, state: Decomposition, episodes: CreditBatch, key: PRNGKeyArray, settings: CreditSettings
 ) -> Float[Array, ""]:
     """Return the decoder's `loss` on whole episodes, which are padded to the same length."""
     target = _targets(state, episodes, settings)
-    features = decoder_inputs(state, episodes.features, settings)
-    features = features.reshape(len(target), -1, features.shape[-1])  # the axis of the single agent is merged
-    return decoder.loss(features, episodes.length, target, episodes.mask, key)
+    inputs = normalise_inputs(state, episodes.inputs, settings)
+    inputs = inputs.reshape(len(target), -1, inputs.shape[-1])  # the axis of the single agent is merged
+    return network.loss(inputs, episodes.length, target, episodes.mask, key)
 
 
 def _targets(state: Decomposition, episodes: CreditBatch, settings: CreditSettings) -> Float[Array, " episodes"]:

@@ -36,33 +36,33 @@ class Diaster(eqx.Module):
     """From the state of the GRU to F."""
     step_model: MLP
 
-    def __init__(self, n_features: int, hidden: tuple[int, ...], *, key: PRNGKeyArray):
+    def __init__(self, n_inputs: int, hidden: tuple[int, ...], *, key: PRNGKeyArray):
         gru_key, readout_key, step_key = jax.random.split(key, 3)
-        self.gru = GRU(n_features, hidden[0], key=gru_key)
+        self.gru = GRU(n_inputs, hidden[0], key=gru_key)
         self.readout = Linear(hidden[0], 1, key=readout_key)
-        self.step_model = MLP(n_features, hidden, 1, key=step_key)
+        self.step_model = MLP(n_inputs, hidden, 1, key=step_key)
 
-    def __call__(self, features: Float[Array, "rows *agents features"], key: PRNGKeyArray | None) -> DecoderOutput:
+    def __call__(self, inputs: Float[Array, "rows *agents inputs"], key: PRNGKeyArray | None) -> DecoderOutput:
         """Return the output of the step model, which has no noise and no penalty."""
-        return DecoderOutput(self.step_model(features)[..., 0], jnp.zeros(features.shape[:-1]))
+        return DecoderOutput(self.step_model(inputs)[..., 0], jnp.zeros(inputs.shape[:-1]))
 
     def piece_rewards(
-        self, features: Float[Array, "episodes steps features"], begins: Bool[Array, "episodes steps"]
+        self, inputs: Float[Array, "episodes steps inputs"], begins: Bool[Array, "episodes steps"]
     ) -> Float[Array, "episodes steps"]:
         """Return F of the piece that ends with each step. Pieces begin at the first step, and where `begins` is true."""
 
-        def body(h: Float[Array, "episodes size"], inputs: tuple[Array, Array]):
-            projected, first = inputs
+        def body(h: Float[Array, "episodes size"], step: tuple[Array, Array]):
+            projected, first = step
             h = self.gru(projected, jnp.where(first[:, None], 0, h))
             return h, self.readout(h)[:, 0]
 
-        projected = jnp.swapaxes(self.gru.input_projection(features), 0, 1)
-        h = jnp.zeros((len(features), self.readout.weight.shape[0]))
+        projected = jnp.swapaxes(self.gru.input_projection(inputs), 0, 1)
+        h = jnp.zeros((len(inputs), self.readout.weight.shape[0]))
         return jax.lax.scan(body, h, (projected, begins.T))[1].T
 
     def loss(
         self,
-        features: Float[Array, "episodes steps features"],
+        inputs: Float[Array, "episodes steps inputs"],
         length: Int[Array, " episodes"],
         target: Float[Array, " episodes"],
         mask: Float[Array, " episodes"],
@@ -71,25 +71,25 @@ class Diaster(eqx.Module):
         """Return the sum of both losses, as the mean over the episodes where `mask` is 1.
 
         Args:
-            features: the inputs at the steps. Steps beyond an episode's length are padding.
+            inputs: the inputs at the steps. Steps beyond an episode's length are padding.
             length: T of each episode.
             target: R/T in units of the scale.
             mask: 1 for an episode, 0 for padding.
             key: the random key of the cuts.
         """
-        max_steps = features.shape[1]
+        max_steps = inputs.shape[1]
         t, last = jnp.arange(max_steps), jnp.maximum(length - 1, 0)[:, None]
         total = target * length / max_steps  # R in the unit of F
         cut = jax.random.randint(key, length.shape, 1, jnp.maximum(length, 2))[:, None]
-        f_ends = self.piece_rewards(features, t == cut)
+        f_ends = self.piece_rewards(inputs, t == cut)
         f_first = jnp.take_along_axis(f_ends, jnp.minimum(cut - 1, last), axis=1)[:, 0]
         f_second = jnp.where(length > 1, jnp.take_along_axis(f_ends, last, axis=1)[:, 0], 0)
         piece_loss = (f_first + f_second - total) ** 2
         # The step model learns from F, and F only from returns.
-        f_prefix = jax.lax.stop_gradient(self.piece_rewards(features, jnp.zeros_like(features[..., 0], bool)))
+        f_prefix = jax.lax.stop_gradient(self.piece_rewards(inputs, jnp.zeros_like(inputs[..., 0], bool)))
         f_prefix = jnp.where(t == last, total[:, None], f_prefix)
         step_target = max_steps * jnp.diff(f_prefix, axis=1, prepend=0)
-        squared_error = (self.step_model(features)[..., 0] - step_target) ** 2
+        squared_error = (self.step_model(inputs)[..., 0] - step_target) ** 2
         step_loss = jnp.sum((t < length[:, None]) * squared_error, axis=1) / jnp.maximum(length, 1)
         return jnp.sum(mask * (piece_loss + step_loss)) / jnp.maximum(jnp.sum(mask > 0), 1)
 

@@ -13,10 +13,9 @@ Batches have an axis of agents, of length 1 for a single agent. For credit to wh
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
 from lare_rl.credit import closed_form, decomposition
@@ -24,8 +23,8 @@ from lare_rl.credit.basis import Basis
 from lare_rl.credit.closed_form import ClosedForm
 from lare_rl.credit.decoder_settings import CreditSettings
 from lare_rl.credit.decomposition import CreditBatch, Decomposition
-from lare_rl.credit.encoders import input_size
 from lare_rl.credit.explanation import Explanation, StepStatistics, add_steps, empty_step_statistics, explain
+from lare_rl.credit.input_names import input_size
 from lare_rl.credit.methods import Method, Reward
 from lare_rl.credit.returns import add_to_sums
 from lare_rl.credit.score_type import ScoreType, score_types_to_fit
@@ -38,7 +37,6 @@ __all__ = [
     "ExplanationState",
     "StepBatch",
     "add_to_explanation",
-    "agent_shares",
     "credit_spec",
     "explain_returns",
     "init_decoder",
@@ -56,7 +54,7 @@ class CreditSpec:
     method: Method
     settings: CreditSettings
     inputs: tuple[str, ...]
-    """The names of the decoder's inputs (`encoders.py`)."""
+    """The names of the decoder's inputs (`input_names.py`)."""
     sizes: tuple[tuple[str, int], ...]
     """The sizes of `factors`, `observation` and `action`."""
     score_types: tuple[int, ...]
@@ -101,7 +99,7 @@ def credit_spec(
         fixed_length: whether all episodes have the same length. A sum and a mean are then the same.
         scale_rewards: whether training rewards are divided by the scale of R/T.
     """
-    inputs = method.encoder.inputs(judges, single_agent=single_agent) if method.encoder is not None else ()
+    inputs = method.inputs.resolve(judges, single_agent=single_agent) if method.inputs is not None else ()
     score_types = score_types_to_fit(settings.score, fixed_length) if "score" in method.settings else (ScoreType.SUM,)
     return CreditSpec(
         method=method,
@@ -126,7 +124,7 @@ def init_decoder(key: PRNGKeyArray, spec: CreditSpec) -> Decomposition | None:
 class StepBatch(NamedTuple):
     """Steps, and facts about their episodes."""
 
-    features: Float[Array, "*batch agents features"]
+    inputs: Float[Array, "*batch agents inputs"]
     """The decoder's inputs."""
     length: Int[Array, "*batch"]
     """T of the step's episode; an estimate while it is running."""
@@ -146,17 +144,17 @@ def proxy_rewards(
     """
     match spec.method.reward:
         case Reward.DESIGNED:
-            return steps.features[..., 0]
+            return steps.inputs[..., 0]
         case Reward.UNIFORM:
             # The return of a running episode is not known yet.
             share = jnp.where(steps.finished, min_max_scale(scale, steps.mean_reward), 0.5)
-            return jnp.broadcast_to(share[..., None], steps.features.shape[:-1])
+            return jnp.broadcast_to(share[..., None], steps.inputs.shape[:-1])
     assert decoder is not None
-    rows = steps.features.reshape(-1, *steps.features.shape[-2:])
+    rows = steps.inputs.reshape(-1, *steps.inputs.shape[-2:])
     with_optimism = optimistic and decomposition.is_optimistic(spec.method, spec.settings)
-    compute = decomposition.optimistic_rewards if with_optimism else decomposition.proxy_rewards
+    compute = decomposition.optimistic_rewards if with_optimism else decomposition.decoder_rewards
     r_hat = compute(decoder, rows, spec.settings, steps.length.ravel())
-    return r_hat.reshape(steps.features.shape[:-1])
+    return r_hat.reshape(steps.inputs.shape[:-1])
 
 
 def training_rewards(
@@ -181,14 +179,6 @@ def scale_and_mask(
     return reward / root_mean_square(scale) if scale_rewards else reward
 
 
-def agent_shares(alive: Any) -> Any:
-    """Return each agent's share of the team's reward: 1/n for each of n agents that are alive, else 0.
-
-    Arrays are [*batch agents], of NumPy or of JAX.
-    """
-    return (alive / alive.sum(axis=-1, keepdims=True).clip(1)).astype(np.float32)
-
-
 class ExplanationState(NamedTuple):
     """Sums over episodes and over steps. They explain the returns."""
 
@@ -206,7 +196,7 @@ def add_to_explanation(state: ExplanationState, episodes: CreditBatch) -> Explan
     """Add whole episodes to the sums. Call this with float64 enabled."""
     decoder = state.closed_form.decoder
     rows = decomposition.valid_rows(episodes)
-    steps = add_steps(state.steps, decoder.features(episodes.features), rows, decoder.basis)
+    steps = add_steps(state.steps, decoder.features(episodes.inputs), rows, decoder.basis)
     return ExplanationState(add_to_sums(state.closed_form, episodes), steps)
 
 

@@ -38,7 +38,7 @@ from lare_rl.credit.score_type import ScoreType
 
 __all__ = ["Explanation", "StepStatistics", "add_steps", "empty_step_statistics", "explain"]
 
-MAX_ROUNDS = 100
+MAX_EXPLANATION_ROUNDS = 100
 """The maximum number of rounds of the evidence's fixed point. It is large because there is no earlier fit to start from."""
 MIN_MEAN_STD = 1e-5
 """The means of a standardised factor over episodes vary by more than rounding if their standard deviation exceeds this."""
@@ -164,7 +164,7 @@ def _fit(
 ) -> _Fit:
     problem = evidence.regression(statistics, score_type, group_index)
     start = evidence.init_posterior(len(group_index), int(group_index.max()) + 1)
-    posterior = evidence.fit(statistics, score_type, group_index, start, MAX_ROUNDS)
+    posterior = evidence.fit(statistics, score_type, group_index, start, MAX_EXPLANATION_ROUNDS)
     r2 = 1 - problem.dof / (problem.q * jnp.where(posterior.beta > 0, posterior.beta, 1))
     r2 = jnp.where((problem.dof > 1) & (problem.y_std > 0), jnp.clip(r2, 0, 1), jnp.nan)
     weight = posterior.weight / jnp.where(problem.y_std > 0, problem.y_std, 1)

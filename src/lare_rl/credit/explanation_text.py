@@ -9,9 +9,9 @@ from lare_rl.credit.explanation import Explanation
 from lare_rl.credit.score_type import ScoreType, ScoreTypeEstimate
 from lare_rl.util.findings import Finding, render
 
-__all__ = ["MESSAGES", "MIN_EPISODES", "explanation_findings", "explanation_lines", "raw_feature_names"]
+__all__ = ["MESSAGES", "MIN_EXPLAINED_EPISODES", "explanation_findings", "explanation_lines", "raw_feature_names"]
 
-MIN_EPISODES = 20
+MIN_EXPLAINED_EPISODES = 20
 """With fewer episodes, nothing is said."""
 LITTLE_SHARE = 0.1
 """Factors that explain a smaller share of the variation of the returns explain next to nothing."""
@@ -140,7 +140,7 @@ def explanation_findings(
         raw_features: names of the raw features; empty if they have none. Then nothing is said of single features.
     """
     n_episodes, factors_r2 = int(explanation.n_episodes), float(explanation.factors_r2)
-    if n_episodes < MIN_EPISODES:
+    if n_episodes < MIN_EXPLAINED_EPISODES:
         return []
     if not np.isfinite(explanation.total_r2):
         return [Finding("equal_returns")]

@@ -20,7 +20,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from lare_rl.credit import evidence
 from lare_rl.credit.basis import Basis
-from lare_rl.credit.closed_form import FIT_GROWTH, MAX_ROUNDS, LinearDecoder
+from lare_rl.credit.closed_form import FIT_GROWTH, MAX_EVIDENCE_ROUNDS, LinearDecoder
 from lare_rl.credit.evidence import Posterior, SufficientStatistics
 from lare_rl.credit.explanation import Explanation, StepStatistics, add_steps, empty_step_statistics, explain
 from lare_rl.credit.returns import MAX_ERROR_RATIO
@@ -155,7 +155,7 @@ def _add_and_fit(
 ) -> tuple[SufficientStatistics, Posterior]:
     statistics = evidence.add_episodes(statistics, features, returns, length)
     group_index = basis.group_index[basis.is_factor_feature]
-    return statistics, evidence.fit(statistics, score_type, group_index, posterior, MAX_ROUNDS)
+    return statistics, evidence.fit(statistics, score_type, group_index, posterior, MAX_EVIDENCE_ROUNDS)
 
 
 @partial(jax.jit, static_argnames="basis")

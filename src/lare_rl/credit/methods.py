@@ -1,7 +1,7 @@
-"""The table of methods: all published ways to assign credit, as encoder + fit + decoder.
+"""The table of methods: all published ways to assign credit, as inputs + fit + decoder.
 
-A *method* determines the rewards that the algorithm is trained on. `encoder` names the inputs of the decoder, `fit` the way it is
-fitted to returns, and `decoder` its kind. `dense` and `episodic` fit nothing: `dense` trains on the true rewards, `episodic` on the
+A *method* determines the rewards that the algorithm is trained on. `inputs` names what the decoder reads, `fit` the way it is fitted
+to returns, and `decoder` its kind. `dense` and `episodic` fit nothing: `dense` trains on the true rewards, `episodic` on the
 return, which is the reward of the last step. A method works for a single agent and for several, unless its row says otherwise.
 
 `register_method` adds a method, for this package and for plugins alike.
@@ -11,9 +11,9 @@ from dataclasses import KW_ONLY, dataclass
 from enum import StrEnum
 from typing import Literal
 
-from lare_rl.credit import encoders
+from lare_rl.credit import input_names
 from lare_rl.credit.decoders import DECODERS
-from lare_rl.credit.encoders import Encoder
+from lare_rl.credit.input_names import InputNames
 from lare_rl.util.plugins import Registry
 
 __all__ = ["METHODS", "Fit", "Method", "Reward", "find_method", "register_method"]
@@ -86,8 +86,8 @@ class Method:
     summary: str
     source: str
     _: KW_ONLY
-    encoder: Encoder | None = None
-    """The inputs of the decoder."""
+    inputs: InputNames | None = None
+    """What the decoder reads."""
     fit: Fit | None = None
     decoder: str = "step"
     """The name of a registered decoder."""
@@ -108,7 +108,7 @@ class Method:
     @property
     def needs_phi(self) -> bool:
         """Whether it needs a function that a language model wrote."""
-        return self.encoder is not None and self.encoder.has_factors
+        return self.inputs is not None and self.inputs.has_factors
 
     @property
     def phi_kind(self) -> Literal["factors", "reward"]:
@@ -118,7 +118,7 @@ class Method:
     @property
     def uses_factor_inputs(self) -> bool:
         """Whether it matters which observations the task's `judges` names."""
-        return self.needs_phi or (self.encoder is not None and self.encoder.depends_on_judges)
+        return self.needs_phi or (self.inputs is not None and self.inputs.depends_on_judges)
 
     @property
     def uses_gradient(self) -> bool:
@@ -188,27 +188,27 @@ for _method in (
         "Gangwani et al., IRCR, NeurIPS 2020",
         reward=Reward.UNIFORM,
     ),
-    Method("rd", "return decomposition on raw features", _RD, encoder=encoders.RAW, fit=Fit.ALL_STEPS),
-    Method("rrd", "randomized return decomposition", _RRD, encoder=encoders.RAW, fit=Fit.SAMPLED_STEPS),
+    Method("rd", "return decomposition on raw features", _RD, inputs=input_names.RAW, fit=Fit.ALL_STEPS),
+    Method("rrd", "randomized return decomposition", _RRD, inputs=input_names.RAW, fit=Fit.SAMPLED_STEPS),
     Method(
         "rrdu",
         "RRD without the bias of drawing steps",
         _RRD,
-        encoder=encoders.RAW,
+        inputs=input_names.RAW,
         fit=Fit.SAMPLED_STEPS_UNBIASED,
     ),
     Method(
         "rrdu-next",
         "rrdu on the next state and the action",
         f"{_RRD}; these inputs: this package",
-        encoder=encoders.NEXT_OBSERVATION_ACTION,
+        inputs=input_names.NEXT_OBSERVATION_ACTION,
         fit=Fit.SAMPLED_STEPS_UNBIASED,
     ),
     Method(
         "rd-linear",
         "linear regression on the state and the action",
         _BAYES,
-        encoder=encoders.SCORED,
+        inputs=input_names.SCORED,
         fit=Fit.EVIDENCE,
         decoder="linear",
     ),
@@ -216,7 +216,7 @@ for _method in (
         "bayes",
         "regression on functions of the entries of the state and the action",
         _BAYES,
-        encoder=encoders.SCORED,
+        inputs=input_names.SCORED,
         fit=Fit.EVIDENCE,
         decoder="additive",
     ),
@@ -224,7 +224,7 @@ for _method in (
         "vib-rd",
         "RD after a learned information bottleneck",
         _VIB,
-        encoder=encoders.RAW,
+        inputs=input_names.RAW,
         fit=Fit.ALL_STEPS,
         decoder="bottleneck",
     ),
@@ -232,7 +232,7 @@ for _method in (
         "vib-rrdu",
         "RRD-unbiased after a learned information bottleneck",
         _VIB,
-        encoder=encoders.RAW,
+        inputs=input_names.RAW,
         fit=Fit.SAMPLED_STEPS_UNBIASED,
         decoder="bottleneck",
     ),
@@ -240,7 +240,7 @@ for _method in (
         "diaster",
         "differences between predicted rewards of pieces of an episode",
         "Lin et al., Diaster, AAAI 2024",
-        encoder=encoders.OBSERVATION_ACTION,
+        inputs=input_names.OBSERVATION_ACTION,
         fit=Fit.DECODER_LOSS,
         decoder="diaster",
     ),
@@ -248,7 +248,7 @@ for _method in (
         "arel",
         "attention over time and agents, one reward a step",
         "Xiao et al., AREL, AAMAS 2022",
-        encoder=encoders.RAW,
+        inputs=input_names.RAW,
         fit=Fit.ALL_STEPS,
         decoder="arel",
     ),
@@ -256,23 +256,23 @@ for _method in (
         "stas",
         "attention over time, Shapley values over agents",
         "Chen et al., STAS, AAAI 2024",
-        encoder=encoders.OBSERVATION_ACTION,
+        inputs=input_names.OBSERVATION_ACTION,
         fit=Fit.ALL_STEPS,
         decoder="stas",
     ),
-    Method("lare-rd", "return decomposition on latent rewards", _LARE, encoder=encoders.FACTORS, fit=Fit.ALL_STEPS),
+    Method("lare-rd", "return decomposition on latent rewards", _LARE, inputs=input_names.FACTORS, fit=Fit.ALL_STEPS),
     Method(
         "lare-rrdu",
         "RRD-unbiased on latent rewards",
         _LARE,
-        encoder=encoders.FACTORS,
+        inputs=input_names.FACTORS,
         fit=Fit.SAMPLED_STEPS_UNBIASED,
     ),
     Method(
         "lare-linear",
         "linear regression on latent rewards",
         f"LaRe, appendix B; the fit: {_BAYES}",
-        encoder=encoders.FACTORS,
+        inputs=input_names.FACTORS,
         fit=Fit.EVIDENCE,
         decoder="linear",
     ),
@@ -280,7 +280,7 @@ for _method in (
         "lare-bayes",
         "regression on latent rewards and, if the returns require them, on functions of them and of raw entries",
         _BAYES,
-        encoder=encoders.FACTORS_AND_SCORED,
+        inputs=input_names.FACTORS_AND_SCORED,
         fit=Fit.EVIDENCE,
         decoder="additive",
     ),
@@ -288,7 +288,7 @@ for _method in (
         "lare-signs",
         "without a reward model: the sum of the factors, with the best signs",
         _LARE,
-        encoder=encoders.FACTORS,
+        inputs=input_names.FACTORS,
         fit=Fit.SIGNS,
         decoder="linear",
     ),
@@ -296,14 +296,14 @@ for _method in (
         "llm-reward",
         "the reward that the language model wrote; nothing is fitted",
         "LaRe, appendix F.4; Ma et al., Eureka, ICLR 2024",
-        encoder=encoders.FACTORS,
+        inputs=input_names.FACTORS,
         reward=Reward.DESIGNED,
     ),
     Method(
         "lare-rd-shared",
         "lare-rd without credit among agents: each agent gets the mean of all",
         _LARE,
-        encoder=encoders.FACTORS,
+        inputs=input_names.FACTORS,
         fit=Fit.ALL_STEPS,
         shared=True,
     ),

@@ -16,7 +16,7 @@ __all__ = ["WINDOW", "Predictions", "add_predictions", "empty_predictions", "r2"
 
 WINDOW = 32
 """R^2 is computed over this number of last episodes."""
-MIN_EPISODES = 8
+MIN_R2_EPISODES = 8
 """With fewer episodes, R^2 is NaN."""
 
 
@@ -63,5 +63,5 @@ def r2(predictions: Predictions) -> Float[Array, " decoders"]:
     count = jnp.sum(valid)
     mean = jnp.sum(jnp.where(valid, predictions.returns, 0)) / jnp.maximum(count, 1)
     total = jnp.sum(jnp.where(valid, (predictions.returns - mean) ** 2, 0))
-    is_defined = (count >= MIN_EPISODES) & (total > 1e-10 * count * mean**2)
+    is_defined = (count >= MIN_R2_EPISODES) & (total > 1e-10 * count * mean**2)
     return jnp.where(is_defined, 1 - squared_errors(predictions) / jnp.where(is_defined, total, 1), jnp.nan)

@@ -13,7 +13,14 @@ from jaxtyping import Array, Bool, Float
 from lare_rl.credit import closed_form, evidence
 from lare_rl.credit.closed_form import ClosedForm, LinearDecoder
 from lare_rl.credit.decoder_settings import CreditSettings
-from lare_rl.credit.decomposition import CreditBatch, Decomposition, agent_mean, proxy_rewards, score_type_index
+from lare_rl.credit.decomposition import (
+    CreditBatch,
+    Decomposition,
+    agent_mean,
+    agent_shares,
+    decoder_rewards,
+    score_type_index,
+)
 from lare_rl.credit.methods import Fit, Method
 from lare_rl.credit.prequential import Predictions, add_predictions, squared_errors
 from lare_rl.credit.score_type import ScoreType, ScoreTypeEstimate
@@ -44,7 +51,7 @@ ROUNDING = 1e-6
 
 def is_fitted(state: Decomposition) -> Bool[Array, ""]:
     """Return whether the decoder has learned anything yet."""
-    if isinstance(state.decoder, LinearDecoder):
+    if isinstance(state.network, LinearDecoder):
         assert state.closed_form is not None
         return state.closed_form.n_fitted > 1  # from one episode it only learns the mean reward
     return optax.tree_utils.tree_get(state.optimizer, "count") > 0
@@ -64,7 +71,7 @@ def predict(state: Decomposition, episodes: CreditBatch, settings: CreditSetting
     is_new = episodes.mask > 0
     returns, n_episodes = episodes.mean_reward * episodes.length, len(episodes.length)
     row_length = episodes.length[jnp.clip(episodes.episode_index, 0, n_episodes - 1)]
-    r_hat = agent_mean(proxy_rewards(state, episodes.features, settings, row_length), episodes.share)
+    r_hat = agent_mean(decoder_rewards(state, episodes.inputs, settings, row_length), episodes.alive)
     predicted = jax.ops.segment_sum(r_hat, episodes.episode_index, n_episodes)[:, None]
     predictions = add_predictions(state.predictions, returns, predicted, is_new & is_fitted(state))
     state = state._replace(predictions=predictions)
@@ -80,9 +87,10 @@ def predict(state: Decomposition, episodes: CreditBatch, settings: CreditSetting
 
 def _mean_features(decoder: LinearDecoder, episodes: CreditBatch) -> Float[Array, "episodes features"]:
     """Return the mean of a linear decoder's features over the steps of each episode, and over the agents that are alive."""
-    features = decoder.features(episodes.features)
+    features = decoder.features(episodes.inputs)
     if features.ndim == 3:
-        share = jnp.full(features.shape[:2], 1 / features.shape[1]) if episodes.share is None else episodes.share
+        n_agents = features.shape[1]
+        share = jnp.full(features.shape[:2], 1 / n_agents) if episodes.alive is None else agent_shares(episodes.alive)
         features = jnp.einsum("raf,ra->rf", features, share)
     total = jax.ops.segment_sum(features.astype(float), episodes.episode_index, len(episodes.length))
     return total / jnp.maximum(episodes.length, 1)[:, None]
@@ -135,7 +143,7 @@ def fit_closed_form(
         state = state._replace(is_mean=mean_error < MAX_ERROR_RATIO * sum_error)
     if not method.uses_gradient:
         index = score_type_index(state, len(score_types))
-        state = state._replace(decoder=closed_form.select_score_type(closed.decoder, index))
+        state = state._replace(network=closed_form.select_score_type(closed.decoder, index))
     return state
 
 
@@ -161,19 +169,19 @@ def _score_type_errors(predictions: Predictions) -> Float[Array, " score_types"]
 
 
 def reward_std(
-    state: Decomposition, rows: Float[Array, "rows features"], score_types: tuple[int, ...]
+    state: Decomposition, rows: Float[Array, "rows inputs"], score_types: tuple[int, ...]
 ) -> Float[Array, " rows"]:
     """Return the posterior standard deviation of r_hat, or of T r_hat if the score is a mean.
 
     The method's fit must be `Fit.EVIDENCE`. Call this within `float64()`.
     """
     assert state.closed_form is not None
-    assert isinstance(state.decoder, LinearDecoder)
+    assert isinstance(state.network, LinearDecoder)
     index = score_type_index(state, len(score_types))
     spread = evidence.posterior_spread(
         closed_form.to_float64(state.closed_form.sufficient_statistics),
         jnp.asarray(score_types)[index],
-        state.decoder.basis.group_index,
+        state.network.basis.group_index,
         jax.tree.map(lambda leaf: leaf[index].astype(float), state.closed_form.posterior),
     )
-    return evidence.posterior_std(spread, state.decoder.features(rows))
+    return evidence.posterior_std(spread, state.network.features(rows))

@@ -119,19 +119,19 @@ class STAS(eqx.Module):
     head: Linear
     gain: float = eqx.field(static=True)
 
-    def __init__(self, n_features: int, max_steps: int, n_agents: int, gain: float, *, key: PRNGKeyArray):
+    def __init__(self, n_inputs: int, max_steps: int, n_agents: int, gain: float, *, key: PRNGKeyArray):
         self.gain = gain
         embed_key, position_key, number_key, layers_key, coalitions_key, head_key = jax.random.split(key, 6)
-        self.embed = Linear(n_features, SIZE, key=embed_key)
+        self.embed = Linear(n_inputs, SIZE, key=embed_key)
         self.position = jax.random.normal(position_key, (max_steps, SIZE))
         self.agent_number = jax.random.normal(number_key, (n_agents, SIZE))
         self.layers = tuple(TimeLayer(key=key) for key in jax.random.split(layers_key, LAYERS))
         self.coalitions = Coalitions(n_agents, key=coalitions_key)
         self.head = Linear(SIZE, 1, key=head_key)
 
-    def __call__(self, features: Float[Array, "rows agents features"], key: PRNGKeyArray | None) -> DecoderOutput:
-        rows, agents = features.shape[:2]
-        x = self.embed(features).reshape(-1, len(self.position), agents, SIZE)
+    def __call__(self, inputs: Float[Array, "rows agents inputs"], key: PRNGKeyArray | None) -> DecoderOutput:
+        rows, agents = inputs.shape[:2]
+        x = self.embed(inputs).reshape(-1, len(self.position), agents, SIZE)
         x = jnp.swapaxes(x, 1, 2) + self.position
         sample_key, dropout_key, *keys = [None] * (2 + LAYERS) if key is None else jax.random.split(key, 2 + LAYERS)
         for layer, layer_key in zip(self.layers, keys, strict=True):

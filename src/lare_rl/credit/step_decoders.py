@@ -15,15 +15,15 @@ __all__ = ["Bottleneck", "StepDecoder", "init_bottleneck", "init_step_decoder"]
 class StepDecoder(eqx.Module):
     """f_psi: an MLP, times a gain."""
 
-    network: MLP
+    mlp: MLP
     gain: float = eqx.field(static=True)
 
-    def __init__(self, n_features: int, hidden: tuple[int, ...], gain: float, *, key: PRNGKeyArray):
+    def __init__(self, n_inputs: int, hidden: tuple[int, ...], gain: float, *, key: PRNGKeyArray):
         self.gain = gain
-        self.network = MLP(n_features, hidden, 1, key=key)
+        self.mlp = MLP(n_inputs, hidden, 1, key=key)
 
-    def __call__(self, features: Float[Array, "rows *agents features"], key: PRNGKeyArray | None) -> DecoderOutput:
-        return DecoderOutput(self.gain * self.network(features)[..., 0], jnp.zeros(features.shape[:-1]))
+    def __call__(self, inputs: Float[Array, "rows *agents inputs"], key: PRNGKeyArray | None) -> DecoderOutput:
+        return DecoderOutput(self.gain * self.mlp(inputs)[..., 0], jnp.zeros(inputs.shape[:-1]))
 
 
 class Bottleneck(eqx.Module):
@@ -35,12 +35,12 @@ class Bottleneck(eqx.Module):
     """
 
     encoder: MLP
-    decoder: StepDecoder
+    step_decoder: StepDecoder
     beta: float = eqx.field(static=True)
 
     def __init__(
         self,
-        n_features: int,
+        n_inputs: int,
         encoder: tuple[int, ...],
         size: int,
         hidden: tuple[int, ...],
@@ -51,16 +51,16 @@ class Bottleneck(eqx.Module):
     ):
         self.beta = beta
         encoder_key, decoder_key = jax.random.split(key)
-        self.encoder = MLP(n_features, encoder, 2 * size, key=encoder_key)
-        self.decoder = StepDecoder(size, hidden, gain, key=decoder_key)
+        self.encoder = MLP(n_inputs, encoder, 2 * size, key=encoder_key)
+        self.step_decoder = StepDecoder(size, hidden, gain, key=decoder_key)
 
-    def __call__(self, features: Float[Array, "rows *agents features"], key: PRNGKeyArray | None) -> DecoderOutput:
-        mean, log_variance = jnp.split(self.encoder(features), 2, axis=-1)
+    def __call__(self, inputs: Float[Array, "rows *agents inputs"], key: PRNGKeyArray | None) -> DecoderOutput:
+        mean, log_variance = jnp.split(self.encoder(inputs), 2, axis=-1)
         z = mean
         if key is not None:
             z = mean + jnp.exp(0.5 * log_variance) * jax.random.normal(key, mean.shape)
         divergence = 0.5 * jnp.sum(jnp.exp(log_variance) + mean**2 - 1 - log_variance, axis=-1)
-        return DecoderOutput(self.decoder(z, None).r_hat, self.beta * divergence)
+        return DecoderOutput(self.step_decoder(z, None).r_hat, self.beta * divergence)
 
 
 def init_step_decoder(key: PRNGKeyArray, shape: DecoderShape, settings: CreditSettings) -> StepDecoder:

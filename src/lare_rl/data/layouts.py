@@ -3,9 +3,9 @@
 Lengths 3, 2 and 4 give, with 8 rows:
 
     packed   slot    0 0 0  1 1  - - -        padded to 4   slot    0 0 0 0  1 1 1 1  2 2 2 2
-             number  0 1 2  0 1  - - -                      number  0 1 2 2  0 1 1 1  0 1 2 3
+             step    0 1 2  0 1  - - -                      step    0 1 2 2  0 1 1 1  0 1 2 3
 
-`slot` is the index of a row's episode in the batch, and `number` the index of the row's step in that episode. A row that belongs to no
+`slot` is the index of a row's episode in the batch, and `step` the index of the row's step in that episode. A row that belongs to no
 episode has the number of episodes as its slot. The functions work on arrays of NumPy and of JAX.
 """
 
@@ -16,7 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int, PRNGKeyArray, Scalar
 
-__all__ = ["Layout", "lay_out_drawn", "lay_out_packed", "lay_out_padded", "sample_step_numbers"]
+__all__ = ["Layout", "lay_out_packed", "lay_out_padded", "lay_out_sampled", "sample_steps"]
 
 
 class Layout(NamedTuple):
@@ -24,7 +24,7 @@ class Layout(NamedTuple):
 
     slot: Any
     """[rows]: the index of the row's episode; for padding, the number of episodes."""
-    number: Any
+    step: Any
     """[rows]: the index of the step in its episode."""
 
 
@@ -45,8 +45,8 @@ def lay_out_packed(length: Any, mask: Any, rows: int) -> tuple[Layout, Any]:
     row = xp.arange(rows)
     slot = xp.minimum(xp.searchsorted(end, row, side="right"), len(length) - 1)
     belongs = (mask[slot] > 0) & (row < end[slot])
-    number = xp.where(belongs, row - (end - length)[slot], 0)
-    return Layout(xp.where(belongs, slot, len(length)), number), mask
+    step = xp.where(belongs, row - (end - length)[slot], 0)
+    return Layout(xp.where(belongs, slot, len(length)), step), mask
 
 
 def lay_out_padded(length: Any, rows_per_episode: int) -> Layout:
@@ -60,35 +60,33 @@ def lay_out_padded(length: Any, rows_per_episode: int) -> Layout:
         Arrays of shape [*batch episodes rows_per_episode].
     """
     xp = jnp if isinstance(length, jax.Array) else np
-    number = xp.minimum(xp.arange(rows_per_episode), length[..., None] - 1)
-    return Layout(xp.broadcast_to(xp.arange(length.shape[-1])[:, None], number.shape), number)
+    step = xp.minimum(xp.arange(rows_per_episode), length[..., None] - 1)
+    return Layout(xp.broadcast_to(xp.arange(length.shape[-1])[:, None], step.shape), step)
 
 
-def lay_out_drawn(length: Any, number: Any) -> Layout:
+def lay_out_sampled(length: Any, step: Any) -> Layout:
     """Use K steps of each episode. An episode with T < K steps has T rows; its other rows are padding.
 
     Args:
         length: [*batch episodes] the number of steps of each episode.
-        number: [*batch episodes K] from `sample_step_numbers`.
+        step: [*batch episodes K] from `sample_steps`.
     """
     xp = jnp if isinstance(length, jax.Array) else np
     count = length.shape[-1]
-    belongs = xp.arange(number.shape[-1]) < length[..., None]
-    return Layout(xp.where(belongs, xp.arange(count)[:, None], count), number)
+    belongs = xp.arange(step.shape[-1]) < length[..., None]
+    return Layout(xp.where(belongs, xp.arange(count)[:, None], count), step)
 
 
-def sample_step_numbers(
-    key: PRNGKeyArray, length: Int[Array, "*episodes"], steps: int
-) -> Int[Array, "*episodes {steps}"]:
-    """Draw K of the steps 0..T-1 of each episode, without replacement. If T < K, return all of them, and copies of the last one.
+def sample_steps(key: PRNGKeyArray, length: Int[Array, "*episodes"], steps: int) -> Int[Array, "*episodes {steps}"]:
+    """Sample K of the steps 0..T-1 of each episode, without replacement. If T < K, return all of them, and copies of the last one.
 
-    Floyd's algorithm (Bentley and Floyd, 1987): for j = T-K .. T-1 take a uniform t of 0..j, or j if t was drawn before. It costs
+    Floyd's algorithm (Bentley and Floyd, 1987): for j = T-K .. T-1 take a uniform t of 0..j, or j if t was sampled before. It costs
     O(K^2) on K numbers, whatever T is, for all episodes at once.
     """
     uniform = jax.random.uniform(key, (steps, *length.shape))
 
-    def body(chosen: Int[Array, "*episodes K"], draw: tuple[Int[Scalar, ""], Float[Array, "*episodes"]]):
-        i, u = draw
+    def body(chosen: Int[Array, "*episodes K"], sample: tuple[Int[Scalar, ""], Float[Array, "*episodes"]]):
+        i, u = sample
         j = length - steps + i
         t = jnp.minimum(jnp.floor(u * (j + 1)).astype(jnp.int32), j)
         t = jnp.where(jnp.any(chosen == t[..., None], axis=-1), j, t)

@@ -1,4 +1,4 @@
-"""A replay of trajectories: each observation is stored once, and a draw costs O(batch).
+"""A replay of trajectories: each observation is stored once, and a sample costs O(batch).
 
 An episode of T steps takes T + 1 rows that follow each other, so that s' of a step is the next row:
 
@@ -25,9 +25,6 @@ from jaxtyping import Array, Bool, Float, Int
 
 STEP_COLUMNS = ("observation", "state", "available", "alive")
 """Columns that exist before and after a step. The values after a step are in the next row."""
-
-BY_ROW = "columns"
-"""The field of the replay that a checkpoint saves by row."""
 
 Columns = Mapping[str, Array]
 """Arrays with rows first, by name."""
@@ -117,12 +114,12 @@ def oldest_transition(replay: Replay) -> Int[Array, " envs"]:
 
 
 def n_transitions(replay: Replay) -> Int[Array, " envs"]:
-    """Return the number of transitions that can be drawn."""
+    """Return the number of transitions that can be sampled."""
     return replay.transitions - oldest_transition(replay)
 
 
 def n_finished(replay: Replay) -> Int[Array, " envs"]:
-    """Return the number of finished episodes that can be drawn."""
+    """Return the number of finished episodes that can be sampled."""
     return replay.episodes - replay.oldest
 
 

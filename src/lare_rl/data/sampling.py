@@ -1,4 +1,4 @@
-"""Draw the stored steps that an update reads. Only their numbers are drawn here; the rows are read later."""
+"""Sample the stored steps that an update reads. Only their numbers are sampled here; the rows are read later."""
 
 from typing import NamedTuple
 
@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int, PRNGKeyArray, Scalar
 
-from lare_rl.data.layouts import Layout, lay_out_drawn, lay_out_packed, lay_out_padded, sample_step_numbers
+from lare_rl.data.layouts import Layout, lay_out_packed, lay_out_padded, lay_out_sampled, sample_steps
 from lare_rl.data.replay import (
     Index,
     Replay,
@@ -55,7 +55,7 @@ class CreditSample(NamedTuple):
 
 
 def _sample_items(counts: Int[Array, " envs"], key: PRNGKeyArray, shape: tuple[int, ...]) -> Index:
-    """Draw uniformly from the items of all environments. `number` counts from 0 in each environment."""
+    """Sample uniformly from the items of all environments. `number` counts from 0 in each environment."""
     ends = jnp.cumsum(counts)
     number = jax.random.randint(key, shape, 0, jnp.maximum(ends[-1], 1))
     env = jnp.minimum(jnp.searchsorted(ends, number, side="right"), len(counts) - 1)
@@ -63,18 +63,18 @@ def _sample_items(counts: Int[Array, " envs"], key: PRNGKeyArray, shape: tuple[i
 
 
 def sample_transitions(replay: Replay, key: PRNGKeyArray, shape: tuple[int, ...]) -> Index:
-    """Draw transitions uniformly, of finished and of running episodes."""
+    """Sample transitions uniformly, of finished and of running episodes."""
     item = _sample_items(n_transitions(replay), key, shape)
     return Index(item.env, oldest_transition(replay)[item.env] + item.number)
 
 
 def sample_episodes(replay: Replay, key: PRNGKeyArray, shape: tuple[int, ...]) -> EpisodeSample:
-    """Draw finished episodes uniformly, with replacement."""
+    """Sample finished episodes uniformly, with replacement."""
     return get_episodes(replay, _sample_items(n_finished(replay), key, shape))
 
 
 def sample_distinct_episodes(replay: Replay, key: PRNGKeyArray, count: int) -> EpisodeSample:
-    """Draw finished episodes uniformly, without replacement. If there are fewer than `count`, the mask of the others is 0."""
+    """Sample finished episodes uniformly, without replacement. If there are fewer than `count`, the mask of the others is 0."""
     available, slots = n_finished(replay), replay.first.shape[-1]
     has_episode = jnp.arange(slots) < available[:, None]
     # The first episodes of a random order of all slots.
@@ -104,29 +104,29 @@ def get_episodes(replay: Replay, index: Index) -> EpisodeSample:
 def _credit_sample(episodes: EpisodeSample, layout: Layout) -> CreditSample:
     """Return the sample with this layout, which has the same number of rows for each episode."""
     lead = episodes.length.shape[:-1]
-    env = jnp.broadcast_to(episodes.first.env[..., None], layout.number.shape)
-    number = episodes.first.number[..., None] + layout.number
+    env = jnp.broadcast_to(episodes.first.env[..., None], layout.step.shape)
+    number = episodes.first.number[..., None] + layout.step
     return CreditSample(
         Index(env.reshape(*lead, -1), number.reshape(*lead, -1)), layout.slot.reshape(*lead, -1), episodes
     )
 
 
 def sample_drawn(replay: Replay, key: PRNGKeyArray, updates: int, count: int, steps: int) -> CreditSample:
-    """Draw `steps` steps of each of `count` episodes, for RRD."""
+    """Sample `steps` steps of each of `count` episodes, for RRD."""
     episodes_key, steps_key = jax.random.split(key)
     episodes = sample_episodes(replay, episodes_key, (updates, count))
-    number = sample_step_numbers(steps_key, episodes.length, steps)
-    return _credit_sample(episodes, lay_out_drawn(episodes.length, number))
+    layout = lay_out_sampled(episodes.length, sample_steps(steps_key, episodes.length, steps))
+    return _credit_sample(episodes, layout)
 
 
 def sample_padded(replay: Replay, key: PRNGKeyArray, updates: int, count: int, longest: int) -> CreditSample:
-    """Draw whole episodes, each padded to `longest` steps by copies of its last step."""
+    """Sample whole episodes, each padded to `longest` steps by copies of its last step."""
     episodes = sample_episodes(replay, key, (updates, count))
     return _credit_sample(episodes, lay_out_padded(episodes.length, longest))
 
 
 def sample_packed(replay: Replay, key: PRNGKeyArray, updates: int, steps: int, longest: int) -> CreditSample:
-    """Draw max(1, steps / mean length) whole episodes, and put them one after the other into max(steps, longest) rows, for RD."""
+    """Sample max(1, steps / mean length) whole episodes, and put them one after the other into max(steps, longest) rows, for RD."""
 
     def sample_update(key: PRNGKeyArray) -> CreditSample:
         episodes = sample_episodes(replay, key, (steps,))
@@ -141,7 +141,7 @@ def _pack(episodes: EpisodeSample, rows: int) -> CreditSample:
     """Put whole episodes one after the other. Episodes that do not fit into the rows are left out."""
     layout, mask = lay_out_packed(episodes.length, episodes.mask, rows)
     slot = jnp.where(layout.slot < len(mask), layout.slot, 0)  # padding reads a step that is certainly stored
-    steps = Index(episodes.first.env[slot], episodes.first.number[slot] + layout.number)
+    steps = Index(episodes.first.env[slot], episodes.first.number[slot] + layout.step)
     return CreditSample(steps, layout.slot, episodes._replace(mask=mask))
 
 

@@ -34,7 +34,7 @@ class EpisodeCredit:
 
     reward: Float[np.ndarray, "steps agents"]
     """True rewards."""
-    proxy_reward: Float[np.ndarray, "steps agents"]
+    training_reward: Float[np.ndarray, "steps agents"]
     """By the decoders of the last checkpoint."""
     uncertainty: Float[np.ndarray, " steps"] | None
     """Two posterior standard deviations of the proxy reward, for a single agent and a closed-form decoder."""
@@ -71,7 +71,7 @@ def load_episode_credit(run: Run) -> EpisodeCredit | None:
     index = _find_newest_episode(learner)
     if not config.method.has_proxy_rewards or index is None:
         return None
-    steps, proxy_reward = jax.jit(partial(_read_rewards, config=config))(learner, index)
+    steps, training_reward = jax.jit(partial(_read_rewards, config=config))(learner, index)
     uncertainty = None
     if learner.decoders and config.method.fit is Fit.EVIDENCE and config.credit_rows == 1:
         with float64():
@@ -80,7 +80,7 @@ def load_episode_credit(run: Run) -> EpisodeCredit | None:
     reward = np.asarray(steps.columns["reward"])
     return EpisodeCredit(
         reward=reward,
-        proxy_reward=np.asarray(proxy_reward),
+        training_reward=np.asarray(training_reward),
         uncertainty=uncertainty,
         factors=np.asarray(steps.columns.get("factors", np.zeros((len(reward), 1, 0)))),
         has_step_rewards=bool(reward[:-1].any()),
@@ -102,7 +102,7 @@ def _find_newest_episode(learner: Learner) -> Index | None:
 def _read_rewards(
     learner: Learner, index: Index, config: TrainConfig
 ) -> tuple[StoredSteps, Float[Array, "steps agents"]]:
-    """Read steps of one seed's replay, and compute their proxy rewards."""
+    """Read steps of one seed's replay, and compute their training rewards."""
     steps = replay.read(learner.replay, index)
     return steps, rewards(steps, RewardState(learner.decoders, learner.scale), config)
 

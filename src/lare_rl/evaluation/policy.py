@@ -19,12 +19,12 @@ from lare_rl.training.host_policy import HostPolicy, draw_noise, init_host_memor
 from lare_rl.training.saved_state import load_actor
 from lare_rl.training.streams import Stream, numpy_generator
 
-__all__ = ["Policy", "load_policy"]
+__all__ = ["RunPolicy", "load_policy"]
 
 
 def load_policy(
     run: Run | str | Path, seed: int | None = None, best: bool = False, deterministic: bool = False
-) -> "Policy":
+) -> "RunPolicy":
     """Load the policy of a seed: a function from an observation to an action of the environment, or from a batch to a batch.
 
     It acts as in evaluations: PPO's choices are sampled, and all other actions are deterministic. Observations that are not one row
@@ -40,10 +40,10 @@ def load_policy(
         LareError: the run has several agents, or has no such seed, or no checkpoint.
     """
     run = as_run(run)
-    return Policy(run, run.seed_index(seed), best, deterministic)
+    return RunPolicy(run, run.seed_index(seed), best, deterministic)
 
 
-class Policy:
+class RunPolicy:
     """The policy of one seed, which acts as in evaluations (`load_policy`).
 
     A recurrent policy (`qmix`, `vdn`) takes observations one at a time, in order, and `reset` begins a new episode.

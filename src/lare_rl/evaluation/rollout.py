@@ -35,7 +35,7 @@ __all__ = [
     "N_SAMPLE_EPISODES",
     "Rollout",
     "TeamSample",
-    "compute_proxy_rewards",
+    "compute_training_rewards",
     "roll_out",
     "sample_steps",
     "unroll_policy",
@@ -54,7 +54,7 @@ class Rollout:
     mask: Bool[np.ndarray, "time episodes"]
     """Whether the episode had not ended before the step."""
     factors: Float[np.ndarray, "time episodes rows factors"]
-    proxy_reward: Float[np.ndarray, "time episodes agents"] | None
+    training_reward: Float[np.ndarray, "time episodes agents"] | None
     """By the decoders of the last checkpoint. None for a method without proxy rewards."""
     state: Any
     """The states after each step, if the environment is made of pure functions."""
@@ -66,8 +66,8 @@ class Rollout:
 
     @property
     def credit(self) -> Float[np.ndarray, "time episodes agents"]:
-        """The proxy rewards or, for a method without any, the true rewards."""
-        return self.reward if self.proxy_reward is None else self.proxy_reward
+        """The training rewards or, for a method without any, the true rewards."""
+        return self.reward if self.training_reward is None else self.training_reward
 
     def select_episode(self, values: Any, episode: int = 0) -> Any:
         """Return the values of one episode, [time ...], until its end. `values` are arrays [time episodes ...]."""
@@ -104,7 +104,9 @@ def roll_out(run: Run, n_episodes: int = 1, *, random: bool = False, key: int = 
         steps=batch.steps,
         mask=batch.mask,
         factors=factors,
-        proxy_reward=compute_proxy_rewards(select_seed(learner), batch.steps, factors, config) if has_proxy else None,
+        training_reward=compute_training_rewards(select_seed(learner), batch.steps, factors, config)
+        if has_proxy
+        else None,
         state=batch.state,
     )
 
@@ -127,10 +129,10 @@ def _drop_seed_axis(batch: EpisodeBatch) -> EpisodeBatch:
     return jax.tree.map(lambda leaf: np.asarray(leaf)[:, 0], batch)
 
 
-def compute_proxy_rewards(
+def compute_training_rewards(
     learner: Learner, steps: Trajectory, factors: Float[np.ndarray, "time episodes rows factors"], config: TrainConfig
 ) -> Float[np.ndarray, "time episodes agents"]:
-    """Compute the proxy rewards of whole episodes by the decoders of a single seed."""
+    """Compute the training rewards of whole episodes by the decoders of a single seed."""
     n_steps, n_episodes = np.shape(steps.next_timestep.terminated)
     # Rewards are computed from stored steps, so a new replay stores these episodes alone.
     buffer = replay.init_replay(config.columns, n_episodes, 2 * n_steps + 2, len(config.env.teams))

@@ -17,7 +17,7 @@ from lare_rl.envs.gymnasium_env import GymnasiumEnv
 from lare_rl.envs.interface import HostEnv, JaxEnv
 from lare_rl.envs.play import play_steps
 from lare_rl.errors import LareError
-from lare_rl.evaluation.policy import Policy
+from lare_rl.evaluation.policy import RunPolicy
 from lare_rl.evaluation.rollout import Rollout, roll_out
 from lare_rl.runs.directory import Run
 from lare_rl.training.streams import Stream, episode_seed
@@ -59,7 +59,7 @@ def record_video(run: Run, path: str | Path, best: bool = False, deterministic: 
         assert isinstance(env, GymnasiumEnv)
         fps = env.environment.metadata.get("render_fps", 30)
         interval = max(1, round(fps / MAX_GIF_FRAMES_PER_SECOND)) if path.suffix == ".gif" else 1
-        frames = _play_and_render(run, env, Policy(run, 0, best, deterministic), interval)
+        frames = _play_and_render(run, env, RunPolicy(run, 0, best, deterministic), interval)
         write_video(path, frames, interval / fps)
 
 
@@ -102,7 +102,7 @@ def write_video(path: Path, frames: Sequence[Frame], frame_seconds: float) -> No
         raise LareError(f"the video {path} cannot be written: {error}; {hint}") from error
 
 
-def _play_and_render(run: Run, env: HostEnv, policy: Policy, interval: int) -> list[Frame]:
+def _play_and_render(run: Run, env: HostEnv, policy: RunPolicy, interval: int) -> list[Frame]:
     """Play an episode, and render every `interval`-th timestep at which the policy acts."""
     frames, steps = [], count()
 

@@ -79,7 +79,7 @@ def export_run(run: Run | str | Path, out: str | Path, seed: int | None = None, 
     first_choice = _first_choice(run) if config.env.discrete and config.env.n_agents == 1 else 0
     graphs = {"policy": policy_graph(select_seed(actors, seed_index), config, first_choice)}
     credit = select_seed(learner.decoders, seed_index)
-    no_reward_reason = missing_reward_reason(config, credit[0].decoder if credit else None)
+    no_reward_reason = missing_reward_reason(config.method)
     for team_index, role in enumerate(task.roles if no_reward_reason is None else ()):
         phi = run.functions[team_index].graph if run.functions else None
         graph = reward_graph(credit[team_index] if credit else None, config, team_index, phi)

@@ -15,9 +15,10 @@ import numpy as np
 
 from lare_rl.credit.basis import HALF_PERIOD, N_FREQUENCIES, Basis
 from lare_rl.credit.closed_form import LinearDecoder
+from lare_rl.credit.decoders import DECODERS
 from lare_rl.credit.decomposition import Decomposition, is_normalised, reward_unit
-from lare_rl.credit.encoders import input_arrays
-from lare_rl.credit.methods import Reward
+from lare_rl.credit.input_names import input_arrays
+from lare_rl.credit.methods import Method, Reward
 from lare_rl.credit.step_decoders import Bottleneck, StepDecoder
 from lare_rl.export.layers import finish, first_outputs, graph_input, network, numpy_op, standardize
 from lare_rl.nn.normalise import CLIP, running_std
@@ -30,21 +31,15 @@ from lare_rl.training.static_config import TrainConfig
 
 __all__ = ["missing_reward_reason", "reward_graph"]
 
-_STEP_DECODERS = (StepDecoder, Bottleneck, LinearDecoder)
-"""Decoders that can be exported: those of this package whose proxy reward depends on a single step."""
 
-
-def missing_reward_reason(config: TrainConfig, decoder: object | None) -> str | None:
-    """Return why a method's rewards are not a function of a single step, or None if they are one."""
-    method = config.method
+def missing_reward_reason(method: Method) -> str | None:
+    """Return why a method's rewards cannot be exported, or None if they can be."""
     if not method.has_proxy_rewards:
         return f"{method.name} trains on the rewards of the environment"
     if method.reward is Reward.UNIFORM:
         return f"{method.name} takes the reward of a step from the return of its episode"
-    if method.needs_whole_episodes or method.decoder == "diaster":
-        return f"{method.name} reads all steps of an episode, not a single step"
-    if method.reward is Reward.PROXY and not isinstance(decoder, _STEP_DECODERS):
-        return f"the decoder of {method.name} is a plugin's, which cannot be exported"
+    if method.reward is Reward.PROXY and not DECODERS[method.decoder].exportable:
+        return f"the decoder of {method.name} ({method.decoder}) cannot be exported"
     return None
 
 
@@ -60,8 +55,8 @@ def reward_graph(credit: Decomposition | None, config: TrainConfig, team_index: 
     team = config.env.teams[team_index]
     rows = () if config.team_level or team.n_agents == 1 else (team.n_agents,)
     with building(Builder(UNLIMITED)):
-        features = input_arrays(config.credit_specs[team_index].inputs, _StepInputs(config, rows, team_index, phi))
-        x = numpy_op("concatenate", features, axis=-1) if len(features) > 1 else features[0]
+        inputs = input_arrays(config.credit_specs[team_index].inputs, _StepInputs(config, rows, team_index, phi))
+        x = numpy_op("concatenate", inputs, axis=-1) if len(inputs) > 1 else inputs[0]
         if credit is None:
             r_hat = x[..., 0]
         else:
@@ -74,7 +69,7 @@ def reward_graph(credit: Decomposition | None, config: TrainConfig, team_index: 
 
 
 class _StepInputs(dict[str, Any]):
-    """The decoder's inputs of a step, by their names in `credit/encoders.py`; `before`, `after` and `env_action` are graph inputs.
+    """The decoder's inputs of a step, by their names in `credit/input_names.py`; `before`, `after` and `env_action` are graph inputs.
 
     An input is added to the graph when it is first read.
     """
@@ -120,17 +115,17 @@ class _StepInputs(dict[str, Any]):
 
 def _decode(x: Array, credit: Decomposition, config: TrainConfig) -> Any:
     """Return the decoder's output for a step, in the unit of the true rewards."""
-    decoder = credit.decoder
+    decoder = credit.network
     if isinstance(decoder, LinearDecoder):
         return _linear_reward(x, decoder)
     if is_normalised(credit, config.credit):
         x = standardize(x, credit.statistics.mean, running_std(credit.statistics), CLIP)
     if isinstance(decoder, Bottleneck):
         x = network(x, first_outputs(decoder.encoder, decoder.encoder.layers[-1].weight.shape[1] // 2))
-        decoder = decoder.decoder
+        decoder = decoder.step_decoder
     assert isinstance(decoder, StepDecoder)
     scale = float(reward_unit(credit, config.credit)) * float(decoder.gain)
-    return network(x, decoder.network)[..., 0] * scale
+    return network(x, decoder.mlp)[..., 0] * scale
 
 
 def _linear_reward(x: Array, decoder: LinearDecoder) -> Any:

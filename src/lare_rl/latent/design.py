@@ -114,11 +114,7 @@ class Conversation:
         return request, self.ask("combine", request)
 
     def correct(self, request: list[Message], reply: str) -> Attempt:
-        """Verify a reply, and ask for corrections until one passes.
-
-        Raises:
-            DesignError: no attempt has passed.
-        """
+        """Verify a reply, and ask for corrections until one passes. Raises `DesignError` if no attempt has passed."""
         attempt = self._examine(reply)
         for number in range(1, _MAX_ATTEMPTS + 1):
             self.on_message(f"attempt {number}: {attempt.first_error}")

@@ -41,11 +41,7 @@ def check_finite(
     observation: Float[np.ndarray, "batch observation"],
     action: Float[np.ndarray, "batch action"],
 ) -> None:
-    """Check that all factors are finite.
-
-    Raises:
-        LatentRewardError: a factor is infinite or NaN.
-    """
+    """Check that all factors are finite. Raises `LatentRewardError` if a factor is infinite or NaN."""
     if not np.isfinite(factors).all():
         row, column = np.argwhere(~np.isfinite(factors))[0]
         text = np.array2string(observation[row], precision=3, threshold=6)

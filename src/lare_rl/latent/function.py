@@ -118,7 +118,7 @@ class LatentFunction:
     def step_factors(
         self, observation: Any, action: Any, next_observation: Any, factor_inputs: FactorInputs
     ) -> Float[np.ndarray, "*batch factors"]:
-        """Compute the factors of steps from the observations that `factor_inputs` names.
+        """Compute the factors of steps from the observations that `factor_inputs` names. Arrays may have any batch axes.
 
         For "both", the factors of both observations are concatenated.
 
@@ -128,7 +128,8 @@ class LatentFunction:
         if factor_inputs not in ("before", "after", "both"):
             raise LareError(f"judges = {short_repr(factor_inputs)}: it is before, after or both")
         observations = select_states(factor_inputs, observation, next_observation)
-        return np.concatenate([self(array, action) for array in observations], axis=-1)
+        lead, actions = np.shape(action)[:-1], _to_rows(action)
+        return np.concatenate([self(_to_rows(array), actions) for array in observations], axis=-1).reshape(*lead, -1)
 
     def n_factors(self, factor_inputs: FactorInputs) -> int:
         """Return the number of factors of `step_factors`."""
@@ -169,6 +170,12 @@ class LatentFunction:
                 path.with_suffix(suffix).write_text(redact_key(text) + "\n", encoding="utf-8")
         except OSError as error:
             raise LareError(f"{path} cannot be written: {error.strerror}") from error
+
+
+def _to_rows(values: Any) -> np.ndarray:
+    """Merge all axes but the last."""
+    array = np.asarray(values)
+    return array.reshape(-1, array.shape[-1])
 
 
 def _as_array(name: str, values: Any, size: int) -> np.ndarray:
@@ -241,11 +248,7 @@ Item = TypeVar("Item")
 
 
 def pair_with_roles(items: Sequence[Item], task: TaskSpec) -> list[tuple[Item, TaskSpec]]:
-    """Pair functions, or their files, with the roles of a task.
-
-    Raises:
-        LareError: the numbers of items and roles differ.
-    """
+    """Pair functions, or their files, with the roles of a task. Raises `LareError` if the numbers of items and roles differ."""
     if len(items) != len(task.roles):
         names = ", ".join(role.name for role in task.roles)
         raise LareError(f"{task.name} needs one latent function for each of {names}; {len(items)} were given")
@@ -253,11 +256,7 @@ def pair_with_roles(items: Sequence[Item], task: TaskSpec) -> list[tuple[Item, T
 
 
 def check_task(function: LatentFunction, task: TaskSpec) -> None:
-    """Check that a function was written for a task.
-
-    Raises:
-        LareError: it was written for another task.
-    """
+    """Check that a function was written for a task. Raises `LareError` if it was written for another task."""
     if function.task != task.name:
         raise LareError(
             f"the latent function was written for the task {function.task!r}, not for {task.name!r}. If it is right for both, use "

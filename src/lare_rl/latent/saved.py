@@ -47,11 +47,7 @@ class SavedSource(NamedTuple):
 
 
 def read_source(path: str | Path) -> SavedSource:
-    """Read the source of a function file, or of a model's reply (.json).
-
-    Raises:
-        LareError: the file cannot be read.
-    """
+    """Read the source of a function file, or of a model's reply (.json). Raises `LareError` if the file cannot be read."""
     header, source = _split_header(_read_source_text(_find_file(path)))
     return SavedSource(source=source, changed=_was_changed(header, source), task=_header_value(header, "task"))
 

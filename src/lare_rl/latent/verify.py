@@ -170,7 +170,7 @@ def sample_steps(task: TaskSpec, steps: Steps | None) -> Steps:
             )
         if not np.isfinite(rows).all():
             raise LareError(f"{name}s of steps hold a number that is not finite")
-        sampled.append(rows[_evenly_spaced(len(rows), N_SAMPLE_STEPS)].astype(np.float32))
+        sampled.append(rows[evenly_spaced(len(rows), N_SAMPLE_STEPS)].astype(np.float32))
     return sampled[0], sampled[1]
 
 
@@ -210,13 +210,13 @@ def _random_steps(task_json: str, n_steps: int, seed: int) -> Steps:
     if not n_rows:
         raise LareError(f"no agent of {role.name} acted in {n_played} steps of random actions")
     columns = zip(*itertools.chain(*rows_by_side.values()), strict=True)
-    selected = _evenly_spaced(n_rows, n_steps)
+    selected = evenly_spaced(n_rows, n_steps)
     observation, action = (np.concatenate(arrays).astype(np.float32)[selected] for arrays in columns)
     observation.setflags(write=False)
     action.setflags(write=False)
     return observation, action
 
 
-def _evenly_spaced(n_rows: int, n_selected: int) -> np.ndarray:
+def evenly_spaced(n_rows: int, n_selected: int) -> np.ndarray:
     """Return the indices of at most `n_selected` rows, from the first to the last."""
     return np.linspace(0, n_rows - 1, min(n_selected, n_rows)).astype(int)

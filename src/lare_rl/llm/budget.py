@@ -63,11 +63,7 @@ class Budget:
         return max(0.0, self.seconds - self.seconds_used)
 
     def add_pause(self, seconds: float) -> None:
-        """Count a pause before it begins.
-
-        Raises:
-            BudgetExceededError: no time would be left after it.
-        """
+        """Count a pause before it begins. Raises `BudgetExceededError` if no time would be left after it."""
         if seconds >= self.seconds_left:
             pause = f", and a pause of {seconds:.0f} s comes next" if seconds else ""
             raise BudgetExceededError(

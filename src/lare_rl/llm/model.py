@@ -19,11 +19,7 @@ class Model(Protocol):
     name: str
 
     def reply(self, messages: Sequence[Message], sample: int) -> str:
-        """Return the text of reply number `sample` (0, 1, ...) to the same request.
-
-        Raises:
-            LareError: there is no reply.
-        """
+        """Return the text of reply number `sample` (0, 1, ...) to the same request. Raises `LareError` if there is no reply."""
         ...
 
 

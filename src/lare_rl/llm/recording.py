@@ -144,11 +144,7 @@ class Recorder:
             self.file_created = True
 
     def save(self, path: Path, model: str, new: bool = True) -> None:
-        """Write the recording to a file.
-
-        Raises:
-            LareError: the file cannot be written, or it exists and should be `new`.
-        """
+        """Write the recording to a file. Raises `LareError` if the file cannot be written, or it exists and should be `new`."""
         if new and path.exists():
             raise LareError(f"{path} exists, and is not overwritten; choose another file")
         try:

@@ -101,11 +101,7 @@ class MinariLog(Log):
 
 
 def load_dataset(dataset_id: str) -> MinariDataset:
-    """Load a local data set. Nothing is downloaded.
-
-    Raises:
-        LareError: there is no such data set, or it is damaged.
-    """
+    """Load a local data set. Nothing is downloaded. Raises `LareError` if there is no such data set, or it is damaged."""
     try:
         return minari.load_dataset(dataset_id)
     except Exception as error:  # h5py and Minari may raise anything for untrusted files

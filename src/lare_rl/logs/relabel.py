@@ -233,7 +233,7 @@ def _create_assigner(
     )
     bytes_per_step = (
         4 * create(capacity=1).config.spec.basis.n_inputs + 16
-    )  # features, and the store's own data of each step
+    )  # inputs, and the store's own data of each step
     return create(capacity=max(MIN_CAPACITY, int(memory * 2**30 / bytes_per_step)))
 
 

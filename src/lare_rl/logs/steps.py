@@ -5,11 +5,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Int
 
 from lare_rl.envs.load import resolve_task
 from lare_rl.envs.play import Episode
-from lare_rl.latent.verify import N_SAMPLE_STEPS, Steps
+from lare_rl.latent.verify import N_SAMPLE_STEPS, Steps, evenly_spaced
 from lare_rl.logs.log import open_log
 from lare_rl.tasks.spec import TaskSpec, select_states
 
@@ -37,12 +36,12 @@ def logged_steps(source: Any, task: TaskSpec | str | Path, count: int = N_SAMPLE
     task = resolve_task(task, playable=False)
     observations, actions = [], []
     for episode in itertools.islice(open_log(source, task).episodes(), SAMPLED_EPISODES):
-        steps = _spread(len(episode), count)
+        steps = evenly_spaced(len(episode), count)
         observations.append(select_states(task.judges, episode.observation[steps], episode.next_observation[steps]))
         actions.append(episode.action[steps])
     sides = [np.concatenate(side) for side in zip(*observations, strict=True)]
     observation, action = np.concatenate(sides), np.concatenate(actions * len(sides))
-    rows = _spread(len(action), count)
+    rows = evenly_spaced(len(action), count)
     return observation[rows], action[rows]
 
 
@@ -60,8 +59,3 @@ def logged_episodes(source: Any, task: TaskSpec, count: int) -> list[Episode]:
         )
         for episode in itertools.islice(complete, count)
     ]
-
-
-def _spread(length: int, count: int) -> Int[np.ndarray, " indices"]:
-    """Return at most `count` indices at even distances, from the first to the last."""
-    return np.unique(np.linspace(0, length - 1, min(count, length)).astype(int))

@@ -78,9 +78,9 @@ class GRU(eqx.Module):
     hidden_projection: Linear
     """W_z, W_r and W_n side by side."""
 
-    def __init__(self, n_features: int, size: int, *, key: PRNGKeyArray):
+    def __init__(self, in_size: int, size: int, *, key: PRNGKeyArray):
         input_key, hidden_key = jax.random.split(key)
-        self.input_projection = Linear(n_features, 3 * size, key=input_key)
+        self.input_projection = Linear(in_size, 3 * size, key=input_key)
         self.hidden_projection = Linear(size, 3 * size, key=hidden_key)
 
     def __call__(

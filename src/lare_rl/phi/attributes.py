@@ -233,7 +233,7 @@ def _to_list(runtime: Runtime, array: Array) -> Any:
 def _call_array_method(array: Array, name: str, args: tuple[Any, ...], kwargs: dict[str, Any]) -> Any:
     """Call a method of an array: the function of NumPy of this name."""
     if name == "flatten":
-        return call_numpy("ravel", [array], {}).copy()
+        return call_numpy("ravel", [array, *args], kwargs).copy()
     if name in ("reshape", "transpose") and (len(args) > 1 or (args and isinstance(args[0], BatchSize))):
         args = (args,)
     if name == "reshape" and "shape" not in kwargs and not args:

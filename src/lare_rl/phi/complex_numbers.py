@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import operator
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
@@ -12,7 +13,7 @@ from lare_rl.phi.arrays import COMPLEX_OPERATIONS, Array, Complex, as_array, ele
 from lare_rl.phi.builder import current_builder
 from lare_rl.phi.limits import MAX_TRANSFORM_LENGTH, RefusedError
 from lare_rl.phi.numpy_functions import call_numpy
-from lare_rl.phi.numpy_functions.registry import array_functions, numpy_function
+from lare_rl.phi.numpy_functions.registry import FUNCTIONS, array_functions, numpy_variants
 
 BY_COMPONENT = frozenset(
     "sum mean reshape ravel transpose swapaxes moveaxis take concatenate stack cumsum diff roll flip expand_dims squeeze copy "
@@ -118,46 +119,32 @@ array_functions(
 )
 
 
-def _transform(a: Any, axis: int, sign: float, half: bool) -> Complex:
-    """Return the sum over t of a_t exp(sign 2 pi i k t / n)."""
-    x = as_complex(a)
+@numpy_variants({"fft.fft": (-1.0, False), "fft.ifft": (1.0, False), "fft.rfft": (-1.0, True)})
+def transform(variant: tuple[float, bool], a: Any, n: Any = None, axis: int = -1) -> Complex:
+    """Return the sum over t of a_t exp(sign 2 pi i k t / n), divided by n if the sign is positive."""
+    (sign, half), x = variant, as_complex(a)
     (at,) = x.real.row_axes(axis)
-    n = x.real.row_shape[at]
-    if n > MAX_TRANSFORM_LENGTH:
-        raise RefusedError("E-COST", f"np.fft of {n} numbers: at most {MAX_TRANSFORM_LENGTH}")
-    phase = sign * 2 * math.pi * np.outer(np.arange(n), np.arange(n // 2 + 1 if half else n)) / n
-    cos, sin = np.cos(phase), np.sin(phase)
+    size = x.real.row_shape[at]
+    n = size if n is None else operator.index(n)  # zeros are added, or numbers left out, as NumPy does
+    if max(n, size) > MAX_TRANSFORM_LENGTH:
+        raise RefusedError("E-COST", f"np.fft of {max(n, size)} numbers: at most {MAX_TRANSFORM_LENGTH}")
+    if n < 1:
+        raise ValueError(f"np.fft with n = {n}")
+    phase = sign * 2 * math.pi * np.outer(np.arange(size), np.arange(n // 2 + 1 if half else n)) / n
+    cos, sin = (function(phase) * (np.arange(size) < n)[:, None] for function in (np.cos, np.sin))
 
     def product(array: Array, matrix: np.ndarray) -> Any:
         return call_numpy("moveaxis", [call_numpy("tensordot", [array, matrix], {"axes": [[at], [0]]}), -1, at], {})
 
     real = product(x.real, cos) - product(x.imag, sin)
-    return Complex(real, product(x.real, sin) + product(x.imag, cos))
+    imag = product(x.real, sin) + product(x.imag, cos)
+    return Complex(real, imag) if sign < 0 else Complex(real / n, imag / n)
 
 
-def _register_transform(name: str, sign: float, half: bool) -> None:
-    def transform(a: Any, n: Any = None, axis: int = -1) -> Complex:
-        result = _transform(a, axis, sign, half)
-        if sign < 0:
-            return result
-        size = result.real.row_shape[result.real.axis(axis)]
-        return Complex(result.real / size, result.imag / size)
-
-    COMPLEX_FUNCTIONS[name] = numpy_function(name)(transform)
+COMPLEX_FUNCTIONS |= {name: FUNCTIONS[name] for name in ("fft.fft", "fft.ifft", "fft.rfft")}
 
 
-_register_transform("fft.fft", -1.0, half=False)
-_register_transform("fft.ifft", 1.0, half=False)
-_register_transform("fft.rfft", -1.0, half=True)
-
-
-def _register_frequencies(name: str) -> None:
-    def frequencies(n: int, d: float = 1.0) -> Array:
-        current_builder().check_size([n])
-        return as_array(getattr(np.fft, name)(n, d))
-
-    numpy_function(f"fft.{name}")(frequencies)
-
-
-_register_frequencies("rfftfreq")
-_register_frequencies("fftfreq")
+@numpy_variants({"fft.rfftfreq": np.fft.rfftfreq, "fft.fftfreq": np.fft.fftfreq})
+def frequencies(function: Callable[[int, float], np.ndarray], n: int, d: float = 1.0) -> Array:
+    current_builder().check_size([n])
+    return as_array(function(n, d))

@@ -45,11 +45,7 @@ their recursion depth (python/cpython#106905)."""
 
 
 def parse(source: str) -> ast.Module:
-    """Parse a source.
-
-    Raises:
-        RefusedError: it is too long, nested too deeply, has invisible characters, or is not Python.
-    """
+    """Parse a source. Raises `RefusedError` if it is too long, nested too deeply, has invisible characters, or is not Python."""
     if len(source) > MAX_SOURCE_LENGTH:
         raise RefusedError("E-SIZE", f"{len(source)} characters: at most {MAX_SOURCE_LENGTH} are accepted")
     hidden = first_invisible(source)

@@ -4,6 +4,7 @@ Everything that takes time or memory is paid for before it happens.
 """
 
 import ast
+import functools
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any
@@ -130,6 +131,16 @@ def builtin(*names: str) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
 
     def register(function: Callable[..., Any]) -> Callable[..., Any]:
         BUILTINS.update(dict.fromkeys(names, function))
+        return function
+
+    return register
+
+
+def builtin_variants(table: Mapping[str, Any]) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
+    """Register one function for each row of a table: a name, and the value that it takes before the runtime."""
+
+    def register(function: Callable[..., Any]) -> Callable[..., Any]:
+        BUILTINS.update({name: functools.partial(function, variant) for name, variant in table.items()})
         return function
 
     return register

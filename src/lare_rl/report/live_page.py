@@ -13,7 +13,7 @@ from lare_rl.report.html import render_note, write_page
 from lare_rl.report.overview import render_diagnoses, render_learning_curves
 from lare_rl.report.run_summary import ReportedRun
 from lare_rl.runs.directory import open_without_functions
-from lare_rl.training.progress import Metrics
+from lare_rl.training.progress import MetricLines
 
 __all__ = ["PAGE", "LivePage"]
 
@@ -44,7 +44,7 @@ class LivePage:
     def on_step(self, step: int) -> None: ...
     def on_message(self, message: str) -> None: ...
 
-    def on_evaluation(self, metrics: Metrics) -> None:
+    def on_evaluation(self, metrics: MetricLines) -> None:
         self._write()
 
     def on_stop(self) -> None:

@@ -86,7 +86,7 @@ def _render_single_agent(run: Run) -> Iterable[str]:
 
 def _render_credit(credit: EpisodeCredit) -> Iterable[str]:
     """Yield the figure of an episode's proxy rewards, and its explanation."""
-    reward, proxy_reward = credit.reward[:, 0], credit.proxy_reward[:, 0]
+    reward, proxy_reward = credit.reward[:, 0], credit.training_reward[:, 0]
     steps = visible_steps(len(reward))
     points = ", the points all steps" if credit.has_step_rewards else ""
     band = (
@@ -116,7 +116,7 @@ def _render_factors(run: Run, credit: EpisodeCredit | None) -> Iterable[str]:
 def render_agents(run: Run, max_tsne_points: int = MAX_TSNE_POINTS) -> Iterable[str]:
     """Yield the credit of each agent and step, a film of the episode, and the factors of each team."""
     rollout = roll_out(run)
-    reward, proxy_reward = rollout.select_episode((rollout.reward, rollout.proxy_reward))
+    reward, proxy_reward = rollout.select_episode((rollout.reward, rollout.training_reward))
     sums = f"Sum of the true rewards {reward.sum():.1f}"
     if proxy_reward is not None:
         sums += f", of the proxy rewards {proxy_reward.sum():.1f}"

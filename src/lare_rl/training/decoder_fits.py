@@ -56,9 +56,9 @@ def _update_decoder(
 ) -> tuple[Decomposition, dict[str, Float[Array, ""]]]:
     """Take one gradient step. The gradient of a large batch of equally long episodes is computed in chunks."""
     assert config.method.fit is not None
-    n_rows, n_episodes = batch.features[..., 0].size, len(batch.length)
+    n_rows, n_episodes = batch.inputs[..., 0].size, len(batch.length)
     n_chunks = 1
-    if config.env.fixed_length and n_rows > CHUNK_ROWS:
+    if not config.batched and config.env.fixed_length and n_rows > CHUNK_ROWS:
         chunk_episodes = max(1, CHUNK_ROWS * n_episodes // n_rows)
         divisors = (n for n in range(1, n_episodes + 1) if n_episodes % n == 0)
         n_chunks = min(n for n in divisors if n_episodes // n <= chunk_episodes)

@@ -8,8 +8,8 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from lare_rl.credit.decomposition import CreditBatch
-from lare_rl.credit.encoders import input_arrays
-from lare_rl.credit.engine import StepBatch, agent_shares
+from lare_rl.credit.engine import StepBatch
+from lare_rl.credit.input_names import input_arrays
 from lare_rl.data.replay import StoredSteps
 from lare_rl.data.sampling import CreditSample
 from lare_rl.training.static_config import TrainConfig
@@ -17,7 +17,7 @@ from lare_rl.training.static_config import TrainConfig
 __all__ = ["alive_agents", "decoder_inputs", "episode_batch", "row_mask", "step_batch"]
 
 
-def decoder_inputs(steps: StoredSteps, config: TrainConfig, team_index: int) -> Float[Array, "*batch rows features"]:
+def decoder_inputs(steps: StoredSteps, config: TrainConfig, team_index: int) -> Float[Array, "*batch rows inputs"]:
     """Return the inputs of a team's decoder for some steps."""
     spec, agents = config.credit_specs[team_index], config.team_rows(team_index)
     if not spec.inputs:
@@ -52,9 +52,9 @@ def row_mask(steps: StoredSteps, config: TrainConfig, team_index: int) -> Bool[A
 
 
 def step_batch(steps: StoredSteps, config: TrainConfig, team_index: int) -> StepBatch:
-    """Return the steps as the input of a team's `proxy_rewards`."""
+    """Return the steps as the input of the engine."""
     return StepBatch(
-        features=decoder_inputs(steps, config, team_index),
+        inputs=decoder_inputs(steps, config, team_index),
         length=steps.length,
         mean_reward=steps.mean_reward[..., team_index],
         finished=steps.finished,
@@ -63,12 +63,12 @@ def step_batch(steps: StoredSteps, config: TrainConfig, team_index: int) -> Step
 
 def episode_batch(steps: StoredSteps, sample: CreditSample, config: TrainConfig, team_index: int) -> CreditBatch:
     """Return the batch that a team's decoder is fitted to, from the sampled steps."""
-    mask, episodes = row_mask(steps, config, team_index), sample.episodes
+    episodes = sample.episodes
     return CreditBatch(
-        features=decoder_inputs(steps, config, team_index),
+        inputs=decoder_inputs(steps, config, team_index),
         episode_index=sample.episode,
         length=episodes.length,
         mean_reward=episodes.mean_reward[..., team_index],
         mask=episodes.mask,
-        share=None if mask is None else agent_shares(mask),
+        alive=row_mask(steps, config, team_index),
     )

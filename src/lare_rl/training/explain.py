@@ -12,7 +12,7 @@ from lare_rl.credit import returns
 from lare_rl.credit.decomposition import CreditBatch, valid_rows
 from lare_rl.credit.engine import add_to_explanation, explain_returns, init_explanation
 from lare_rl.credit.explanation import Explanation
-from lare_rl.credit.explanation_text import MIN_EPISODES, explanation_lines, raw_feature_names
+from lare_rl.credit.explanation_text import MIN_EXPLAINED_EPISODES, explanation_lines, raw_feature_names
 from lare_rl.credit.methods import METHODS
 from lare_rl.data.replay import Replay
 from lare_rl.nn.normalise import RunningMeanStd, empty_mean_std, update_mean_std
@@ -62,12 +62,12 @@ def describe_returns(run: Run, learner: Learner, config: TrainConfig) -> list[st
 def explain_stored_returns(learner: Learner, config: TrainConfig) -> list[Explanation]:
     """Explain the returns of the first seed's stored episodes, for each team.
 
-    The list is empty for a method that fits nothing to returns, and for fewer than `MIN_EPISODES` episodes.
+    The list is empty for a method that fits nothing to returns, and for fewer than `MIN_EXPLAINED_EPISODES` episodes.
     """
     config, replay = _explanation_config(config), learner.replay
     n_stored = np.sum(np.asarray(replay.episodes)[0] - np.asarray(replay.oldest)[0])
     has_features = all(spec.basis.n_features for spec in config.credit_specs)
-    if not learner.decoders or not has_features or n_stored < MIN_EPISODES:
+    if not learner.decoders or not has_features or n_stored < MIN_EXPLAINED_EPISODES:
         return []
     with float64():
         explanations = _compile(config)(replay, tuple(decoder.is_mean for decoder in learner.decoders))
@@ -83,7 +83,7 @@ def _explanation_config(config: TrainConfig) -> TrainConfig:
     elif config.method.needs_phi:
         method = replace(METHODS["lare-linear"], decoder="additive")
     else:
-        method = replace(METHODS["bayes"], encoder=config.method.encoder)
+        method = replace(METHODS["bayes"], inputs=config.method.inputs)
     return replace(config, method=method)
 
 
@@ -98,7 +98,7 @@ def _explain_first_seed(
     buffer, is_mean = select_seed((replay, is_mean))
     bases = [spec.basis for spec in config.credit_specs]
     empty = tuple(empty_mean_std(basis.n_inputs) for basis in bases)
-    # The features are standardised first, because the run's decoder may have other inputs, or statistics of earlier steps.
+    # The inputs are standardised first, because the run's decoder may have other inputs, or statistics of earlier steps.
     statistics = fold_episodes(empty, buffer, buffer.oldest, _observe, config)
     states = tuple(init_explanation(team, basis) for team, basis in zip(statistics, bases, strict=True))
     states = fold_episodes(states, buffer, buffer.oldest, add_to_explanation, config)
@@ -106,5 +106,5 @@ def _explain_first_seed(
 
 
 def _observe(statistics: RunningMeanStd, episodes: CreditBatch) -> RunningMeanStd:
-    rows = episodes.features.reshape(-1, episodes.features.shape[-1])
+    rows = episodes.inputs.reshape(-1, episodes.inputs.shape[-1])
     return update_mean_std(statistics, rows, valid_rows(episodes).ravel())

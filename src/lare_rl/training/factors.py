@@ -73,14 +73,11 @@ def compute_host_factors(run: Run, config: TrainConfig, steps: Trajectory) -> Fl
     for i, (function, team) in enumerate(zip(run.functions, config.env.teams, strict=False)):
         before, action = phi_inputs(config.credit_scope, team, steps.timestep, steps.env_action)
         after, _ = phi_inputs(config.credit_scope, team, steps.next_timestep, steps.env_action)
-        observation, env_action, next_observation = (
-            array.reshape(-1, array.shape[-1]) for array in (before, action, after)
-        )
         try:
-            columns = function.step_factors(observation, env_action, next_observation, run.factor_inputs)
+            columns = function.step_factors(before, action, after, run.factor_inputs)
         except LatentRewardError as error:
             path, batch = run.directory / FAILED_BATCH, {"observation": error.observation, "action": error.action}
             write_arrays(path, batch)
             raise LareError(f"{error}; it was given the batch in {path}; the last checkpoint is whole") from error
-        factors[..., config.team_rows(i), : columns.shape[1]] = columns.reshape(*action.shape[:-1], -1)
+        factors[..., config.team_rows(i), : columns.shape[-1]] = columns
     return factors

@@ -24,11 +24,11 @@ from lare_rl.training.static_config import TrainConfig
 
 __all__ = ["FirstFitStoppedError", "config_of_first_fit", "fit_until_converged", "has_enough_episodes"]
 
-MIN_EPISODES = 10
+MIN_FIRST_EPISODES = 10
 """With fewer finished episodes of a seed, none are held out."""
 PATIENCE = 2
 """A seed's fit ends after this many rounds in a row without improvement."""
-MAX_ROUNDS = 40
+MAX_FIT_CALLS = 40
 BATCH_DIVISOR = 8
 """Updates of the first fit read this fraction of the steps of later updates. There are few episodes yet, and large
 updates would read each of them several times. The decoder becomes as accurate in an eighth of the time
@@ -43,7 +43,7 @@ class FirstFitStoppedError(Exception):
 
 def has_enough_episodes(learner: Learner) -> bool:
     """Return whether every seed has episodes to hold out."""
-    return int(jnp.min(jnp.sum(jax.vmap(n_finished)(learner.replay), axis=1))) >= MIN_EPISODES
+    return int(jnp.min(jnp.sum(jax.vmap(n_finished)(learner.replay), axis=1))) >= MIN_FIRST_EPISODES
 
 
 def config_of_first_fit(config: TrainConfig) -> TrainConfig:
@@ -77,7 +77,7 @@ def fit_until_converged(
     best_decoders, best_error = jax.tree.map(jnp.copy, learner.decoders), np.full(len(episodes), np.inf)
     rounds_without_gain = np.zeros(len(episodes), int)
     metrics: dict[str, Float[Array, " seeds"]] = {}
-    for number in range(MAX_ROUNDS):
+    for number in range(MAX_FIT_CALLS):
         if stop_requested():
             raise FirstFitStoppedError
         round_keys = jax.vmap(jax.random.fold_in, in_axes=(0, None))(keys, number)

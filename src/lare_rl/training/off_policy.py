@@ -96,7 +96,7 @@ def _train_seed(
 
 
 def _sample(buffer: Replay, key: PRNGKeyArray, n_updates: int, config: TrainConfig) -> UpdateSample:
-    """Draw the steps of many updates at once."""
+    """Sample the steps of many updates at once."""
     batch_key, credit_key = jax.random.split(key)
     batch = sample_transitions(buffer, batch_key, (n_updates, _settings(config).batch_size))
     return UpdateSample(batch, sample_credit(buffer, credit_key, n_updates, config) if config.joint_fit else None)

@@ -12,10 +12,15 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from lare_rl.errors import missing_extra_error
 from lare_rl.util.sanitize import sanitize
 
-__all__ = ["Clock", "Listener", "Metrics", "TensorBoard", "Terminal", "import_summary_writer"]
+__all__ = ["Clock", "Listener", "MetricLines", "TensorBoard", "Terminal", "import_summary_writer", "known_numbers"]
 
-Metrics = Sequence[Mapping[str, Any]]
+MetricLines = Sequence[Mapping[str, Any]]
 """One mapping for each seed, as in metrics.jsonl."""
+
+
+def known_numbers(line: Mapping[str, Any]) -> dict[str, float]:
+    """Return the metrics of a line of metrics.jsonl that are not null."""
+    return {key: value for key, value in line.items() if key not in ("step", "seed") and value is not None}
 
 
 @runtime_checkable
@@ -28,7 +33,7 @@ class Listener(Protocol):
     def on_step(self, step: int) -> None:
         """Iterations have been made: some steps, and their updates."""
 
-    def on_evaluation(self, metrics: Metrics) -> None:
+    def on_evaluation(self, metrics: MetricLines) -> None:
         """An evaluation has been made. Its lines of metrics.jsonl and the checkpoint have been written."""
 
     def on_message(self, message: str) -> None:
@@ -65,7 +70,7 @@ class Terminal(Listener):
         if self._progress:
             self._progress.update(self._progress.task_ids[0], completed=step)
 
-    def on_evaluation(self, metrics: Metrics) -> None:
+    def on_evaluation(self, metrics: MetricLines) -> None:
         if self._progress:
             self._progress.update(self._progress.task_ids[0], figures=_summarise(metrics))
         else:
@@ -81,7 +86,7 @@ class Terminal(Listener):
         if self._progress:
             self._progress.stop()
 
-    def _time_left(self, step: int, metrics: Metrics) -> str:
+    def _time_left(self, step: int, metrics: MetricLines) -> str:
         rate = _mean(metrics, "time/steps_per_second")
         # Updates take most of the time, so the rate before the first one is no estimate.
         if not rate or _mean(metrics, "critic/loss") is None or step >= self._steps:
@@ -99,14 +104,14 @@ _SUMMARY = {
 }
 
 
-def _summarise(metrics: Metrics) -> str:
+def _summarise(metrics: MetricLines) -> str:
     """Return the main metrics in one line, as means over the seeds."""
     means = {template: _mean(metrics, key) for key, template in _SUMMARY.items()}
     texts = [template.format(mean) for template, mean in means.items() if mean is not None]
     return ", ".join([f"{_mean(metrics, 'time/steps_per_second') or 0:.0f} steps/s", *texts])
 
 
-def _mean(metrics: Metrics, key: str) -> float | None:
+def _mean(metrics: MetricLines, key: str) -> float | None:
     values = [line[key] for line in metrics if line.get(key) is not None]
     return sum(values) / len(values) if values else None
 
@@ -131,11 +136,10 @@ class TensorBoard(Listener):
         options = {"purge_step": purge, "flush_secs": 10, "filename_suffix": f".{step}"}
         self._writers = {seed: writer(str(directory / f"seed-{seed}"), **options) for seed in seeds}
 
-    def on_evaluation(self, metrics: Metrics) -> None:
+    def on_evaluation(self, metrics: MetricLines) -> None:
         for line in metrics:
-            for key, value in line.items():
-                if key not in ("step", "seed") and value is not None:
-                    self._writers[line["seed"]].add_scalar(key, value, line["step"])
+            for key, value in known_numbers(line).items():
+                self._writers[line["seed"]].add_scalar(key, value, line["step"])
 
     def on_stop(self) -> None:
         for writer in self._writers.values():

@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Float
 
 from lare_rl.credit.basis import Basis
-from lare_rl.credit.explanation_text import MIN_EPISODES, explanation_lines, raw_feature_names
+from lare_rl.credit.explanation_text import MIN_EXPLAINED_EPISODES, explanation_lines, raw_feature_names
 from lare_rl.credit.factor_fit import assess_factors
 from lare_rl.envs.load import resolve_task
 from lare_rl.envs.play import Episode, Policy, play_episodes
@@ -100,8 +100,8 @@ def assess_function(function: LatentFunction, role: TaskSpec, episodes: Sequence
     Raises:
         LareError: there are too few episodes, or the function failed on one of them.
     """
-    if len(episodes) < MIN_EPISODES:
-        raise LareError(f"{len(episodes)} episodes say too little of a function: {MIN_EPISODES} are needed")
+    if len(episodes) < MIN_EXPLAINED_EPISODES:
+        raise LareError(f"{len(episodes)} episodes say too little of a function: {MIN_EXPLAINED_EPISODES} are needed")
     factors = [_compute_factors(function, role, episode) for episode in episodes]
     inputs = [
         np.concatenate(

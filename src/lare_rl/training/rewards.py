@@ -17,7 +17,7 @@ from lare_rl.training.decoder_inputs import alive_agents, step_batch
 from lare_rl.training.learner import Learner
 from lare_rl.training.static_config import TrainConfig
 
-__all__ = ["RewardState", "assess", "proxy_rewards", "rewards", "team_metrics"]
+__all__ = ["RewardState", "assess", "rewards", "team_metrics", "team_proxy_rewards"]
 
 
 class RewardState(NamedTuple):
@@ -48,7 +48,7 @@ def rewards(steps: StoredSteps, state: RewardState, config: TrainConfig) -> Floa
     return jnp.concatenate(team_rewards, axis=-1)
 
 
-def proxy_rewards(
+def team_proxy_rewards(
     steps: StoredSteps, state: RewardState, config: TrainConfig, team_index: int
 ) -> Float[Array, "*batch rows"]:
     """Return r_hat of a team, without optimism: one for each of its agents, or one for all if credit goes to whole teams."""
@@ -73,7 +73,7 @@ def assess(learner: Learner, config: TrainConfig) -> dict[str, Float[Array, ""]]
         reward, mask = steps.columns["reward"][..., team.agents], is_stored & alive[..., team.agents]
         if config.team_level:
             reward, mask = team_mean(steps.columns["reward"], alive, team)[..., None], is_stored
-        r_hat = jnp.broadcast_to(proxy_rewards(steps, state, config, i), reward.shape)
+        r_hat = jnp.broadcast_to(team_proxy_rewards(steps, state, config, i), reward.shape)
         last = jnp.broadcast_to(steps.last[..., None], reward.shape)
         metrics.append(
             accuracy.metrics(

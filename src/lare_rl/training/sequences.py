@@ -13,7 +13,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, Key, PRNGKeyArray, Scalar
 
-from lare_rl.algorithms.batches import Sequences
+from lare_rl.algorithms.batches import Metrics, Sequences
 from lare_rl.algorithms.qmix import QMIXSettings
 from lare_rl.credit.decomposition import Decomposition
 from lare_rl.data import replay
@@ -32,7 +32,6 @@ from lare_rl.training.static_config import TrainConfig
 
 __all__ = ["SequenceState", "act", "get_actor", "init", "init_memory", "train_step"]
 
-Metrics = dict[str, Float[Array, "*seeds"]]
 Updated = tuple[Any, tuple[Decomposition, ...]]
 """The state of the algorithm, and the decoders."""
 
@@ -194,9 +193,9 @@ def _sequences(
     config: TrainConfig,
 ) -> Sequences:
     """Return episodes with the method's rewards, each padded with its last step to `n_steps` steps."""
-    number = lay_out_padded(episodes.length, n_steps).number
-    env = jnp.broadcast_to(episodes.first.env[:, None], number.shape)
-    steps = replay.read(buffer, Index(env, episodes.first.number[:, None] + number))
+    step = lay_out_padded(episodes.length, n_steps).step
+    env = jnp.broadcast_to(episodes.first.env[:, None], step.shape)
+    steps = replay.read(buffer, Index(env, episodes.first.number[:, None] + step))
     mask = (jnp.arange(n_steps) < episodes.length[:, None]) * episodes.mask[:, None]
     reward = rewards(steps, reward_state, config)
 

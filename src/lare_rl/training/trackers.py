@@ -11,7 +11,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from lare_rl.errors import LareError, missing_extra_error
-from lare_rl.training.progress import Listener, Metrics
+from lare_rl.training.progress import Listener, MetricLines, known_numbers
 
 __all__ = ["MLflow", "WeightsAndBiases"]
 
@@ -36,13 +36,13 @@ class WeightsAndBiases(Listener):
     def on_start(self, name: str, step: int, steps: int) -> None:
         self.name = name
 
-    def on_evaluation(self, metrics: Metrics) -> None:
+    def on_evaluation(self, metrics: MetricLines) -> None:
         for line in metrics:
             seed = line["seed"]
             if seed not in self.runs:
                 arguments: dict[str, Any] = {"name": f"{self.name} seed {seed}", "group": self.name} | self.arguments
                 self.runs[seed] = self.init(reinit="create_new", **arguments)
-            self.runs[seed].log(_numbers(line), step=line["step"])
+            self.runs[seed].log(known_numbers(line), step=line["step"])
 
     def on_stop(self) -> None:
         for run in self.runs.values():
@@ -86,7 +86,7 @@ class MLflow(Listener):
     def on_start(self, name: str, step: int, steps: int) -> None:
         self.name = name
 
-    def on_evaluation(self, metrics: Metrics) -> None:
+    def on_evaluation(self, metrics: MetricLines) -> None:
         now_ms = int(1000 * time.time())
         for line in metrics:
             seed = line["seed"]
@@ -94,14 +94,9 @@ class MLflow(Listener):
                 run = self.client.create_run(self.experiment, run_name=f"{self.name} seed {seed}")
                 self.runs[seed] = run.info.run_id
                 self.client.log_batch(self.runs[seed], params=self.parameters)
-            numbers = [self.metric(key, value, now_ms, line["step"]) for key, value in _numbers(line).items()]
+            numbers = [self.metric(key, value, now_ms, line["step"]) for key, value in known_numbers(line).items()]
             self.client.log_batch(self.runs[seed], metrics=numbers)
 
     def on_stop(self) -> None:
         for run in self.runs.values():
             self.client.set_terminated(run)
-
-
-def _numbers(line: Mapping[str, Any]) -> dict[str, float]:
-    """Return the metrics of a line of metrics.jsonl that are not null."""
-    return {key: value for key, value in line.items() if key not in ("step", "seed") and value is not None}

@@ -12,11 +12,7 @@ __all__ = ["replace_file", "write_arrays", "write_atomically"]
 
 
 def write_atomically(path: Path, write: Callable[[Any], object]) -> None:
-    """Replace a file by what `write` writes.
-
-    Raises:
-        LareError: the file cannot be written.
-    """
+    """Replace a file by what `write` writes. Raises `LareError` if the file cannot be written."""
     try:
         replace_file(path, write)
     except OSError as error:

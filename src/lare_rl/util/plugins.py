@@ -25,11 +25,7 @@ T = TypeVar("T")
 
 @cache
 def load_plugins() -> None:
-    """Import all plugins. Later calls do nothing.
-
-    Raises:
-        LareError: a plugin cannot be imported.
-    """
+    """Import all plugins. Later calls do nothing. Raises `LareError` if a plugin cannot be imported."""
     modules = {entry.name: entry.module for entry in entry_points(group="lare_rl.plugins")}
     names = filter(None, map(str.strip, os.environ.get("LARE_PLUGINS", "").split(",")))
     for plugin, module in (modules | {name: name for name in names}).items():

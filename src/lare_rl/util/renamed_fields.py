@@ -29,17 +29,28 @@ _RENAMED_FIELDS = {
 }
 """From old to new names."""
 
+_DECODER = r"(?:\.decoders\[\d+\]|learned\[0\])"
+"""A decoder in a checkpoint, or in an assigner."""
+_NETWORK = rf"({_DECODER}\.(?:network|.*\.(?:mu|nu)))"
+"""Its network, or one of Adam's moments, which have the same fields."""
+_RENAMED_PATHS = {
+    r"\.agent\.decoder\b": ".agent.head",
+    rf"({_DECODER})\.decoder\b": r"\1.network",
+    rf"{_NETWORK}\.network\b": r"\1.mlp",
+    rf"{_NETWORK}\.decoder\.network\b": r"\1.step_decoder.mlp",
+    rf"{_NETWORK}\.step$": r"\1.position",  # STAS
+    rf"{_NETWORK}\.number$": r"\1.agent_number",
+    rf"{_NETWORK}\.last(?=\.(weight|bias)$)": r"\1.head",
+    rf"{_NETWORK}\.value\.": r"\1.readout.",  # Diaster
+    rf"{_NETWORK}\.step\.": r"\1.step_model.",
+    r"(?<!\.replay)\.episodes\b": ".n_episodes",
+}
+"""From patterns of old names to new names, in the order in which they are applied."""
+
 
 def rename_fields(name: str) -> str:
     """Return the present name of an array, such as `.decoders[0].is_mean` for `.credit[0].average`."""
     name = re.sub(r"(?<=\.)\w+", lambda match: _RENAMED_FIELDS.get(match.group(), match.group()), name)
-    name = re.sub(r"\.agent\.decoder\b", ".agent.head", name)
-    for stas_field, present in (
-        ("step$", "position"),
-        ("number$", "agent_number"),
-        (r"last(?=\.(weight|bias)$)", "head"),
-    ):
-        name = re.sub(rf"(\.decoders\[.*)\.{stas_field}", rf"\1.{present}", name)
-    for diaster_field, present in (("value", "readout"), ("step", "step_model")):
-        name = re.sub(rf"(\.decoders\[.*\.(?:decoder|mu|nu))\.{diaster_field}\.", rf"\1.{present}.", name)
-    return re.sub(r"(?<!\.replay)\.episodes\b", ".n_episodes", name)
+    for pattern, new in _RENAMED_PATHS.items():
+        name = re.sub(pattern, new, name)
+    return name

@@ -75,11 +75,7 @@ def read_json(text: str | bytes, strict: bool = True) -> Any:
 
 
 def read_toml(text: str) -> dict[str, Any]:
-    """Parse a TOML text.
-
-    Raises:
-        ValueError: the text is not TOML, or is nested too deep.
-    """
+    """Parse a TOML text. Raises `ValueError` if the text is not TOML, or is nested too deep."""
     if _DEEP_NAME.search(text):
         raise ValueError(_TOO_DEEP)
     try:
@@ -89,11 +85,7 @@ def read_toml(text: str) -> dict[str, Any]:
 
 
 def check_depth(value: Any) -> Any:
-    """Return a value that is not nested too deep for recursive functions.
-
-    Raises:
-        ValueError: it is nested too deep.
-    """
+    """Return a value that is not nested too deep for recursive functions. Raises `ValueError` if it is nested too deep."""
     level = [value]
     for _ in range(MAX_DEPTH):
         containers = [
@@ -106,11 +98,7 @@ def check_depth(value: Any) -> Any:
 
 
 def parse_integer(digits: str) -> int:
-    """Parse a whole number.
-
-    Raises:
-        ValueError: it has too many digits.
-    """
+    """Parse a whole number. Raises `ValueError` if it has too many digits."""
     if len(digits) > _MAX_DIGITS:
         raise ValueError(f"a number of {len(digits)} digits")
     return int(digits)

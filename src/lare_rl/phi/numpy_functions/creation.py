@@ -21,6 +21,7 @@ from lare_rl.phi.numpy_functions.registry import (
     dtype_kind,
     numpy_function,
     numpy_functions,
+    numpy_variants,
 )
 from lare_rl.phi.numpy_functions.shapes import column_stack, concatenate_, ravel, split_shape
 from lare_rl.phi.operand import BatchSize
@@ -75,31 +76,20 @@ def arange(start: Any, stop: Any = None, step: Any = 1, dtype: Any = None) -> Ar
     return numbers if dtype is None else astype(numbers, dtype)
 
 
-def _register_series(name: str) -> None:
-    def series(start: float, stop: float, num: int = 50, endpoint: Any = True, base: float = 10.0) -> Array:
-        current_builder().check_size([num])
-        more = {"base": base} if name == "logspace" else {}
-        return as_array(getattr(np, name)(start, stop, num, bool(endpoint), **more))
-
-    numpy_function(name)(series)
-
-
-for _name in ("linspace", "logspace", "geomspace"):
-    _register_series(_name)
+@numpy_variants({"linspace": np.linspace, "logspace": np.logspace, "geomspace": np.geomspace})
+def series(
+    function: Any, start: float, stop: float, num: int = 50, endpoint: Any = True, base: float = 10.0, dtype: Any = None
+) -> Array:
+    current_builder().check_size([num])
+    more = {"base": base} if function is np.logspace else {}
+    return as_array(function(start, stop, num, bool(endpoint), dtype=dtype_kind(dtype or "float"), **more))
 
 
-@numpy_function()
-def eye(N: int, M: int | None = None, k: int = 0, dtype: Any = "float") -> Array:  # noqa: N803
+@numpy_variants({"eye": np.eye, "tri": np.tri})
+def unit_matrix(function: Any, N: int, M: int | None = None, k: int = 0, dtype: Any = "float") -> Array:  # noqa: N803
     shape = N, N if M is None else M
     current_builder().check_size(shape)
-    return astype(np.eye(*shape, k), dtype)
-
-
-@numpy_function()
-def tri(N: int, M: int | None = None, k: int = 0, dtype: Any = "float") -> Array:  # noqa: N803
-    shape = N, N if M is None else M
-    current_builder().check_size(shape)
-    return astype(np.tri(*shape, k), dtype)
+    return astype(function(*shape, k), dtype)
 
 
 def _last_axes(m: Array) -> tuple[int, ...]:
@@ -200,8 +190,12 @@ array_functions(
         "copy": lambda a: a.copy(),
         "zeros_like": lambda a, dtype=None, shape=None: full_like(a, 0, dtype, shape),
         "ones_like": lambda a, dtype=None, shape=None: full_like(a, 1, dtype, shape),
-        "tril": lambda m, k=0: elementwise("where", tri(*_last_axes(m), operator.index(k), "bool"), m, 0),
-        "triu": lambda m, k=0: elementwise("where", tri(*_last_axes(m), operator.index(k) - 1, "bool"), 0, m),
+        "tril": lambda m, k=0: elementwise(
+            "where", unit_matrix(np.tri, *_last_axes(m), operator.index(k), "bool"), m, 0
+        ),
+        "triu": lambda m, k=0: elementwise(
+            "where", unit_matrix(np.tri, *_last_axes(m), operator.index(k) - 1, "bool"), 0, m
+        ),
         "diagflat": lambda v, k=0: diag(ravel(v), operator.index(k)),
         "ix_": lambda *args: tuple(
             x[tuple(ALL if j == i else None for j in range(len(args)))] for i, x in enumerate(args)
@@ -211,7 +205,7 @@ array_functions(
 numpy_functions(
     {
         "astype": astype,
-        "identity": lambda n, dtype="float": eye(operator.index(n), dtype=dtype),
+        "identity": lambda n, dtype="float": unit_matrix(np.eye, operator.index(n), dtype=dtype),
         "zeros": lambda shape, dtype="float": full(shape, 0, dtype),
         "ones": lambda shape, dtype="float": full(shape, 1, dtype),
     }

@@ -135,7 +135,7 @@ def select(condlist: Sequence[Any], choicelist: Sequence[Any], default: Any = 0)
 
 
 @numpy_function()
-def choose(a: Array, choices: Any, mode: Any = "raise") -> Any:
+def choose(a: Array, choices: Any) -> Any:
     choices = list(choices)
     return select([elementwise("equal", a, i) for i in range(len(choices) - 1)], choices[:-1], choices[-1])
 

@@ -133,7 +133,7 @@ def copyto(dst: Array, src: Any, casting: Any = "same_kind", where: Any = True) 
 
 
 @numpy_function()
-def fill_diagonal(a: Array, val: Any, wrap: Any = False) -> None:
+def fill_diagonal(a: Array, val: Any) -> None:
     a.row_axes(None)
     step = sum(math.prod(a.row_shape[i + 1 :]) for i in range(a.ndim))
     a.reshaped((-1,), None)[: a.row_shape[1] ** 2 : step] = val

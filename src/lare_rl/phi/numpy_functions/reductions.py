@@ -12,7 +12,7 @@ from lare_rl.phi.graph import ELEMENTWISE
 from lare_rl.phi.indices import ALL
 from lare_rl.phi.limits import RefusedError
 from lare_rl.phi.numpy_functions.elementwise import UNARY
-from lare_rl.phi.numpy_functions.registry import FUNCTIONS, array_functions, as_numbers, numpy_function
+from lare_rl.phi.numpy_functions.registry import FUNCTIONS, array_functions, as_numbers, numpy_function, numpy_variants
 
 UFUNC_REDUCTIONS = {
     "add": "sum", "multiply": "prod", "maximum": "max", "minimum": "min", "logical_and": "all", "logical_or": "any",
@@ -41,23 +41,21 @@ def flatten_constant(x: Array) -> Array:
     return x.reshaped((-1,), None)
 
 
-def _register_reduction(name: str, op: str, *aliases: str) -> None:
-    def reduce(a: Array, axis: Any = None, *, keepdims: Any = False, initial: Any = None, where: Any = True) -> Any:
-        if where is not True:
-            if initial is None and op not in NEUTRAL:
-                raise RefusedError("E-NUMPY", f"np.{op} with where= needs initial=")
-            a = elementwise("where", where, a, NEUTRAL.get(op, initial))
-        result = along(op, a, axis, keepdims)
-        if initial is not None:
-            ufunc_for = {reduction: ufunc for ufunc, reduction in UFUNC_REDUCTIONS.items()}[op]
-            result = elementwise(ufunc_for, result, initial)
-        return result
-
-    numpy_function(name, *aliases)(reduce)
-
-
-for _op in ("sum", "prod", "max", "min", "any", "all"):
-    _register_reduction(_op, _op, *{"max": ["amax"], "min": ["amin"], "prod": ["product"]}.get(_op, []))
+@numpy_variants(
+    {"sum": "sum", "prod product": "prod", "max amax": "max", "min amin": "min", "any": "any", "all": "all"}
+)
+def reduce(
+    op: str, a: Array, axis: Any = None, *, keepdims: Any = False, initial: Any = None, where: Any = True
+) -> Any:
+    if where is not True:
+        if initial is None and op not in NEUTRAL:
+            raise RefusedError("E-NUMPY", f"np.{op} with where= needs initial=")
+        a = elementwise("where", where, a, NEUTRAL.get(op, initial))
+    result = along(op, a, axis, keepdims)
+    if initial is not None:
+        ufunc_for = {reduction: ufunc for ufunc, reduction in UFUNC_REDUCTIONS.items()}[op]
+        result = elementwise(ufunc_for, result, initial)
+    return result
 
 
 def _count(x: Array, axis: Any, keepdims: Any, where: Any = True) -> Any:
@@ -87,50 +85,35 @@ def average(a: Array, axis: Any = None, weights: Any = None, *, keepdims: Any = 
     return _sum(a * weights, axis, keepdims) / _sum(weights, axis, keepdims)
 
 
-def _register_spread(name: str, has_root: bool) -> None:
-    def spread(
-        a: Array,
-        axis: Any = None,
-        *,
-        ddof: Any = 0,
-        keepdims: Any = False,
-        where: Any = True,
-        mean: Any = None,
-        correction: Any = None,
-    ) -> Any:
-        center = FUNCTIONS["mean"](a, axis, keepdims=True, where=where) if mean is None else mean
-        deviation = elementwise("subtract", as_numbers(a), center)
-        total = _sum(elementwise("multiply", deviation, deviation), axis, keepdims, where)
-        variance = total / (_count(a, axis, keepdims, where) - (correction or ddof))
-        return elementwise("sqrt", variance) if has_root else variance
-
-    numpy_function(name)(spread)
-
-
-_register_spread("var", has_root=False)
-_register_spread("std", has_root=True)
+@numpy_variants({"var": False, "std": True})
+def spread(
+    has_root: bool,
+    a: Array,
+    axis: Any = None,
+    *,
+    ddof: Any = 0,
+    keepdims: Any = False,
+    where: Any = True,
+    mean: Any = None,
+    correction: Any = None,
+) -> Any:
+    center = FUNCTIONS["mean"](a, axis, keepdims=True, where=where) if mean is None else mean
+    deviation = elementwise("subtract", as_numbers(a), center)
+    total = _sum(elementwise("multiply", deviation, deviation), axis, keepdims, where)
+    variance = total / (_count(a, axis, keepdims, where) - (correction or ddof))
+    return elementwise("sqrt", variance) if has_root else variance
 
 
-def _register_without_nan(name: str, substitute: int | float) -> None:
-    def reduce(a: Array, axis: Any = None, *, keepdims: Any = False) -> Any:
-        is_nan = elementwise("isnan", a)
-        result = along(name, elementwise("where", is_nan, substitute, a), axis, keepdims)
-        if name in ("max", "min"):  # NaN if nothing else is there
-            return elementwise("where", along("all", is_nan, axis, keepdims), math.nan, result)
-        return result
-
-    numpy_function(f"nan{name}")(reduce)
+SUBSTITUTES = {"sum": 0, "prod": 1, "max": -math.inf, "min": math.inf, "argmax": -math.inf, "argmin": math.inf}
 
 
-for _name, _substitute in {
-    "sum": 0,
-    "prod": 1,
-    "max": -math.inf,
-    "min": math.inf,
-    "argmax": -math.inf,
-    "argmin": math.inf,
-}.items():
-    _register_without_nan(_name, _substitute)
+@numpy_variants({f"nan{op}": op for op in SUBSTITUTES})
+def reduce_without_nan(op: str, a: Array, axis: Any = None, *, keepdims: Any = False) -> Any:
+    is_nan = elementwise("isnan", a)
+    result = along(op, elementwise("where", is_nan, SUBSTITUTES[op], a), axis, keepdims)
+    if op in ("max", "min"):  # NaN if nothing else is there
+        return elementwise("where", along("all", is_nan, axis, keepdims), math.nan, result)
+    return result
 
 
 @numpy_function()
@@ -163,24 +146,22 @@ array_functions(
 )
 
 
-def _register_ufunc_methods(ufunc: str) -> None:
-    """ufunc.reduce and ufunc.outer."""
-
-    def reduce(array: Array, axis: Any = 0, keepdims: Any = False, initial: Any = None, where: Any = True) -> Any:
-        if ufunc in UFUNC_REDUCTIONS:
-            more = {"initial": initial, "where": where} if initial is not None or where is not True else {}
-            return FUNCTIONS[UFUNC_REDUCTIONS[ufunc]](array, axis, keepdims=keepdims, **more)
-        for at in reversed(array.row_axes(axis)):
-            slices = [array[(*(ALL,) * at, slice(i, i + 1) if keepdims else i)] for i in range(array.row_shape[at])]
-            array = functools.reduce(lambda x, y: elementwise(ufunc, x, y), slices)
-        return array
-
-    def outer(a: Array, b: Array) -> Any:
-        return elementwise(ufunc, a[(..., *(None,) * b.ndim)], b)
-
-    numpy_function(f"{ufunc}.reduce")(reduce)
-    numpy_function(f"{ufunc}.outer")(outer)
+BINARY = ELEMENTWISE.keys() - UNARY
 
 
-for _ufunc in ELEMENTWISE.keys() - UNARY:
-    _register_ufunc_methods(_ufunc)
+@numpy_variants({f"{ufunc}.reduce": ufunc for ufunc in BINARY})
+def reduce_by(
+    ufunc: str, array: Array, axis: Any = 0, keepdims: Any = False, initial: Any = None, where: Any = True
+) -> Any:
+    if ufunc in UFUNC_REDUCTIONS:
+        more = {"initial": initial, "where": where} if initial is not None or where is not True else {}
+        return FUNCTIONS[UFUNC_REDUCTIONS[ufunc]](array, axis, keepdims=keepdims, **more)
+    for at in reversed(array.row_axes(axis)):
+        slices = [array[(*(ALL,) * at, slice(i, i + 1) if keepdims else i)] for i in range(array.row_shape[at])]
+        array = functools.reduce(lambda x, y: elementwise(ufunc, x, y), slices)
+    return array
+
+
+@numpy_variants({f"{ufunc}.outer": ufunc for ufunc in BINARY})
+def outer(ufunc: str, a: Array, b: Array) -> Any:
+    return elementwise(ufunc, a[(..., *(None,) * b.ndim)], b)

@@ -7,6 +7,7 @@ functions.
 
 from __future__ import annotations
 
+import functools
 import inspect
 import operator
 from collections.abc import Callable, Mapping, Sequence
@@ -65,6 +66,17 @@ def numpy_function(*names: str) -> Callable[[Function], Function]:
     return register
 
 
+def numpy_variants(table: Mapping[str, Any]) -> Callable[[Function], Function]:
+    """Register one function for each row of a table: NumPy's names, separated by spaces, and the value that it takes first."""
+
+    def register(function: Function) -> Function:
+        for names, variant in table.items():
+            numpy_function(*names.split())(functools.partial(function, variant))
+        return function
+
+    return register
+
+
 def numpy_functions(table: Mapping[str, Function], converts: bool = False) -> None:
     """Register functions under names that are separated by spaces. `converts`: arguments without a default become arrays."""
     for names, function in table.items():
@@ -102,6 +114,8 @@ def call_numpy(name: str, args: Sequence[Any], kwargs: Mapping[str, Any]) -> Any
         raise RefusedError("E-NUMPY", f"np.{name} with where= needs out=, or the other numbers are undefined")
     result = FUNCTIONS[name](*bound.args, **bound.kwargs)
     if dtype is not None and "dtype" not in signature.parameters:
+        if dtype_kind(dtype) != "float" and as_array(result).kind == "float":
+            raise RefusedError("E-NUMPY", f"np.{name} of fractional numbers as another type: use astype")
         result = astype(result, dtype)
     if out is not None:
         out = out[0] if isinstance(out, tuple) else out

@@ -16,6 +16,7 @@ from lare_rl.phi.numpy_functions.registry import (
     as_arrays,
     as_numbers,
     numpy_function,
+    numpy_variants,
     require_constant,
 )
 
@@ -38,23 +39,16 @@ array_functions(
 )
 
 
-def _register_accumulation(ufunc: str) -> None:
-    """maximum.accumulate and its like, by doubling: after k turns, an entry knows the 2^k before it."""
-
-    def accumulate(array: Array, axis: Any = 0) -> Any:
-        (at,) = array.row_axes(axis)
-        size, shift = array.row_shape[at], 1
-        while shift < size:
-            before = [max(i - shift, 0) for i in range(size)]
-            array = elementwise(ufunc, array, array[(*(ALL,) * at, before)])
-            shift *= 2
-        return array
-
-    numpy_function(f"{ufunc}.accumulate")(accumulate)
-
-
-for _ufunc in ("maximum", "minimum", "fmax", "fmin", "logical_and", "logical_or"):
-    _register_accumulation(_ufunc)
+@numpy_variants({f"{op}.accumulate": op for op in ("maximum", "minimum", "fmax", "fmin", "logical_and", "logical_or")})
+def accumulate(ufunc: str, array: Array, axis: Any = 0) -> Any:
+    """By doubling: after k turns, an entry knows the 2^k before it."""
+    (at,) = array.row_axes(axis)
+    size, shift = array.row_shape[at], 1
+    while shift < size:
+        before = [max(i - shift, 0) for i in range(size)]
+        array = elementwise(ufunc, array, array[(*(ALL,) * at, before)])
+        shift *= 2
+    return array
 
 
 @numpy_function()

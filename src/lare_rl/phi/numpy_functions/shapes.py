@@ -20,6 +20,7 @@ from lare_rl.phi.numpy_functions.registry import (
     as_arrays,
     numpy_function,
     numpy_functions,
+    numpy_variants,
     require_constant,
 )
 from lare_rl.phi.operand import BATCH, BatchSize, common_batch_axis
@@ -35,12 +36,17 @@ def split_shape(shape: Any) -> tuple[tuple[int, ...], int | None]:
     return row_shape, batch_axes[0] if batch_axes else None
 
 
+def check_order(order: Any) -> None:
+    """Raise `RefusedError` if numbers are not to be counted row by row."""
+    if order != "C":
+        raise RefusedError("E-NUMPY", "the order of an array is 'C' alone: use np.transpose")
+
+
 @numpy_function()
 def reshape(a: Array, shape: Any, order: Any = "C") -> Array:
     """Reshape. The batch axis may be merged with axes behind it, or divided again."""
     sizes = list(shape) if isinstance(shape, (list, tuple)) else [shape]
-    if order != "C":
-        raise RefusedError("E-NUMPY", "np.reshape in another order than 'C': use np.transpose")
+    check_order(order)
     row_shape, batch_axis = split_shape(sizes)
     free = [axis for axis, size in enumerate(row_shape) if size == -1]
     if batch_axis is None and a.batch_axis is not None:  # -1 stands for the batch
@@ -155,7 +161,7 @@ def size(a: Array, axis: Any = None) -> Any:
 
 
 def ravel(a: Array, order: Any = "C") -> Array:
-    return reshape(a, -1)
+    return reshape(a, -1, order)
 
 
 numpy_functions(
@@ -225,21 +231,20 @@ def array_split(ary: Array, indices_or_sections: Any, axis: int = 0) -> list[Any
     return [ary[(*(ALL,) * at, slice(start, end))] for start, end in itertools.pairwise(ends)]
 
 
-def _register_split(name: str, axis_for: Callable[[Array, int], int]) -> None:
-    def split(ary: Array, indices_or_sections: Any, axis: int = 0) -> list[Any]:
-        at = axis_for(ary, axis)
-        size = ary.row_shape[ary.axis(at)]
-        if isinstance(indices_or_sections, int) and size % max(indices_or_sections, 1):
-            raise ValueError(f"{size} numbers cannot be split into {indices_or_sections} equal parts")
-        return array_split(ary, indices_or_sections, at)
-
-    numpy_function(name)(split)
-
-
-_register_split("split", lambda a, axis: axis)
-_register_split("hsplit", lambda a, _: min(a.ndim - 1, 1))
-_register_split("vsplit", lambda a, _: 0)
-_register_split("dsplit", lambda a, _: 2)
+@numpy_variants(
+    {
+        "split": lambda a, axis: axis,
+        "hsplit": lambda a, _: min(a.ndim - 1, 1),
+        "vsplit": lambda a, _: 0,
+        "dsplit": lambda a, _: 2,
+    }
+)
+def split(axis_for: Callable[[Array, int], int], ary: Array, indices_or_sections: Any, axis: int = 0) -> list[Any]:
+    at = axis_for(ary, axis)
+    size = ary.row_shape[ary.axis(at)]
+    if isinstance(indices_or_sections, int) and size % max(indices_or_sections, 1):
+        raise ValueError(f"{size} numbers cannot be split into {indices_or_sections} equal parts")
+    return array_split(ary, indices_or_sections, at)
 
 
 @numpy_function()

@@ -14,7 +14,15 @@ from lare_rl.phi.arrays import Array, as_array, elementwise
 from lare_rl.phi.builder import current_builder
 from lare_rl.phi.limits import MAX_CONSTANT_SIZE, MAX_SYSTEM_SIZE, RefusedError
 from lare_rl.phi.numpy_functions.reductions import along
-from lare_rl.phi.numpy_functions.registry import array_functions, as_float, as_numbers, numpy_function, require_constant
+from lare_rl.phi.numpy_functions.registry import (
+    array_functions,
+    as_float,
+    as_numbers,
+    numpy_function,
+    numpy_variants,
+    require_constant,
+)
+from lare_rl.phi.numpy_functions.shapes import check_order
 
 
 def register_constant_function(
@@ -136,17 +144,18 @@ def _interval(x: Array, knots: np.ndarray) -> Any:
 @numpy_function()
 def unravel_index(indices: Array, shape: Any, order: Any = "C") -> tuple[Any, ...]:
     sizes = [operator.index(size) for size in (shape if isinstance(shape, (tuple, list)) else [shape])]
-    return tuple((indices // stride) % size for stride, size in zip(_strides(sizes), sizes, strict=True))
+    return tuple((indices // stride) % size for stride, size in zip(_strides(sizes, order), sizes, strict=True))
 
 
 @numpy_function()
-def ravel_multi_index(multi_index: Any, dims: Any, mode: Any = "raise", order: Any = "C") -> Any:
-    strides = _strides([operator.index(size) for size in dims])
+def ravel_multi_index(multi_index: Any, dims: Any, *, order: Any = "C") -> Any:
+    strides = _strides([operator.index(size) for size in dims], order)
     terms = [elementwise("multiply", index, stride) for index, stride in zip(multi_index, strides, strict=True)]
     return functools.reduce(lambda x, y: elementwise("add", x, y), terms)
 
 
-def _strides(sizes: Sequence[int]) -> list[int]:
+def _strides(sizes: Sequence[int], order: Any) -> list[int]:
+    check_order(order)
     current_builder().check_size(sizes)
     return [math.prod(sizes[i + 1 :]) for i in range(len(sizes))]
 
@@ -180,28 +189,24 @@ def rising_polyval(x: Array, c: Any, tensor: Any = True) -> Any:
     return polyval(as_array(c)[::-1], x)
 
 
-def _register_series_value(name: str, to_powers: Callable[[Any], np.ndarray]) -> None:
-    def value(x: Array, c: Any, tensor: Any = True) -> Any:
-        return rising_polyval(x, to_powers(plain_constant(c, name, MAX_SYSTEM_SIZE)))
-
-    numpy_function(f"polynomial.{name}")(value)
-
-
-for _name, _convert in {
+SERIES: dict[str, Callable[[Any], np.ndarray]] = {
     "chebyshev.chebval": np.polynomial.chebyshev.cheb2poly,
     "legendre.legval": np.polynomial.legendre.leg2poly,
     "hermite.hermval": np.polynomial.hermite.herm2poly,
     "hermite_e.hermeval": np.polynomial.hermite_e.herme2poly,
     "laguerre.lagval": np.polynomial.laguerre.lag2poly,
-}.items():
-    _register_series_value(_name, _convert)
+}
+"""How coefficients become those of powers."""
+
+
+@numpy_variants({f"polynomial.{name}": name for name in SERIES})
+def series_value(name: str, x: Array, c: Any, tensor: Any = True) -> Any:
+    return rising_polyval(x, SERIES[name](plain_constant(c, name, MAX_SYSTEM_SIZE)))
 
 
 array_functions(
     {
-        "polynomial.Polynomial polynomial.polynomial.Polynomial": lambda coef, domain=None, window=None: Polynomial(
-            coef[::-1]
-        ),
+        "polynomial.Polynomial polynomial.polynomial.Polynomial": lambda coef: Polynomial(coef[::-1]),
         "poly1d": lambda c_or_r: Polynomial(c_or_r),
     }
 )

@@ -10,7 +10,7 @@ from typing import Any
 
 from lare_rl.phi.arrays import Array
 from lare_rl.phi.limits import RefusedError
-from lare_rl.phi.runtime import BUILTINS, Runtime, builtin, check_key, varies
+from lare_rl.phi.runtime import BUILTINS, Runtime, builtin, builtin_variants, check_key, varies
 from lare_rl.phi.text import format_value
 from lare_rl.phi.values import Bound, Class, Iterator, Set, Symbol
 
@@ -40,19 +40,13 @@ def sum_(runtime: Runtime, values: Any, start: Any = 0) -> Any:
     return functools.reduce(lambda x, y: runtime.binary(ast.Add(), x, y), runtime.items(values), start)
 
 
-def _register_extreme(name: str, function: Callable[..., Any]) -> None:
-    def extreme(runtime: Runtime, *values: Any, key: Any = None, **default: Any) -> Any:
-        items = runtime.items(values[0]) if len(values) == 1 else values
-        if varies(items):
-            hint = f"use np.{name}imum, or np.{name} along axis=1"
-            raise RefusedError("E-FLOW", f"{name}() of numbers that differ from row to row: {hint}")
-        return function(items, key=_sort_key(runtime, key), **default)
-
-    builtin(name)(extreme)
-
-
-_register_extreme("max", max)
-_register_extreme("min", min)
+@builtin_variants({"max": max, "min": min})
+def extreme(function: Callable[..., Any], runtime: Runtime, /, *values: Any, key: Any = None, **default: Any) -> Any:
+    items, name = runtime.items(values[0]) if len(values) == 1 else values, function.__name__
+    if varies(items):
+        hint = f"use np.{name}imum, or np.{name} along axis=1"
+        raise RefusedError("E-FLOW", f"{name}() of numbers that differ from row to row: {hint}")
+    return function(items, key=_sort_key(runtime, key), **default)
 
 
 @builtin("sorted")
@@ -142,31 +136,28 @@ BUILTINS |= {
 }
 
 
-def _register_itertool(name: str, count: Callable[..., int]) -> None:
-    """Register a function of itertools. `count` returns the length of its result, which is paid for first."""
+LENGTHS: dict[str, Callable[..., int]] = {
+    "chain": lambda *x: sum(map(len, x)),
+    "pairwise": len,
+    "combinations": lambda x, r: math.comb(len(x), r) * max(r, 1),
+    "combinations_with_replacement": lambda x, r: math.comb(len(x) + r, r) * max(r, 1),
+    "permutations": lambda x, r=None: math.perm(min(len(x), 30), r) * 20,
+    "product": lambda *x, repeat=1: math.prod(map(len, x)) ** operator.index(repeat) * (len(x) * repeat or 1),
+    "islice": lambda x, *ends: len(x),
+    "repeat": lambda x, times: max(times, 0),
+    "zip_longest": lambda *x, fillvalue=None: len(x) * max(map(len, x)),
+}
+"""The lengths of the results of functions of itertools, which are paid for first."""
 
-    def results(runtime: Runtime, *args: Any, **kwargs: Any) -> Iterator:
-        many = len(args) > 20 or any(isinstance(x, int) and x > 20 for x in (*args, *kwargs.values()))
-        if many and name not in ("chain", "islice", "repeat"):
-            raise RefusedError("E-COST", f"itertools.{name} of more than 20 entries at a time")
-        plain = [x if isinstance(x, int) or x is None else list(runtime.items(x)) for x in args]
-        runtime.meter.pay_for_list(count(*plain, **kwargs))
-        return Iterator(getattr(itertools, name)(*plain, **kwargs))
 
-    builtin(f"itertools.{name}")(results)
-
-
-_register_itertool("chain", lambda *x: sum(map(len, x)))
-_register_itertool("pairwise", len)
-_register_itertool("combinations", lambda x, r: math.comb(len(x), r) * max(r, 1))
-_register_itertool("combinations_with_replacement", lambda x, r: math.comb(len(x) + r, r) * max(r, 1))
-_register_itertool("permutations", lambda x, r=None: math.perm(min(len(x), 30), r) * 20)
-_register_itertool(
-    "product", lambda *x, repeat=1: math.prod(map(len, x)) ** operator.index(repeat) * (len(x) * repeat or 1)
-)
-_register_itertool("islice", lambda x, *ends: len(x))
-_register_itertool("repeat", lambda x, times: max(times, 0))
-_register_itertool("zip_longest", lambda *x, fillvalue=None: len(x) * max(map(len, x)))
+@builtin_variants({f"itertools.{name}": name for name in LENGTHS})
+def combine(name: str, runtime: Runtime, /, *args: Any, **kwargs: Any) -> Iterator:
+    many = len(args) > 20 or any(isinstance(x, int) and x > 20 for x in (*args, *kwargs.values()))
+    if many and name not in ("chain", "islice", "repeat"):
+        raise RefusedError("E-COST", f"itertools.{name} of more than 20 entries at a time")
+    plain = [x if isinstance(x, int) or x is None else list(runtime.items(x)) for x in args]
+    runtime.meter.pay_for_list(LENGTHS[name](*plain, **kwargs))
+    return Iterator(getattr(itertools, name)(*plain, **kwargs))
 
 
 @builtin("np.ndindex")

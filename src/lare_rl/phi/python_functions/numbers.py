@@ -12,7 +12,7 @@ from lare_rl.phi.arrays import Array
 from lare_rl.phi.limits import RefusedError
 from lare_rl.phi.numpy_functions import call_numpy
 from lare_rl.phi.operand import BatchSize, Operand
-from lare_rl.phi.runtime import BUILTINS, Runtime, builtin, check_number, varies
+from lare_rl.phi.runtime import BUILTINS, Runtime, builtin, builtin_variants, check_number, varies
 
 SAME_IN_NUMPY = {
     "fabs": "abs", "pow": "power", "atan2": "arctan2", "asin": "arcsin", "acos": "arccos", "atan": "arctan",
@@ -23,25 +23,25 @@ OPERATORS: dict[str, type[ast.operator]] = {
 }  # fmt: skip
 
 
-def _register_conversion(name: str, text: str, convert: Callable[[Any], Any]) -> None:
-    """Register float or int. A text must match the pattern `text`."""
-
-    def number(_: Runtime, x: Any = 0) -> Any:
-        if isinstance(x, BatchSize):
-            x.refuse()
-        if varies([x]):
-            raise RefusedError("E-FLOW", f"{name}() of numbers that differ from row to row: use astype({name})")
-        if isinstance(x, str) and not re.fullmatch(text, x, re.IGNORECASE):
-            raise TypeError(f"{name}() of {x[:40]!r}")
-        if not isinstance(x, (bool, int, float, str, Array)):
-            raise TypeError(f"{name}() of a value that is no number")
-        return check_number(convert(x))
-
-    builtin(name)(number)
+TEXTS: dict[type, str] = {
+    float: r"\s*[-+]?(\d{1,30}\.?\d{0,30}([eE][-+]?\d{1,3})?|inf|infinity|nan)\s*",
+    int: r"\s*[-+]?\d{1,18}\s*",
+}
+"""What a text of a number looks like."""
 
 
-_register_conversion("float", r"\s*[-+]?(\d{1,30}\.?\d{0,30}([eE][-+]?\d{1,3})?|inf|infinity|nan)\s*", float)
-_register_conversion("int", r"\s*[-+]?\d{1,18}\s*", int)
+@builtin_variants({"float": float, "int": int})
+def number(kind: type, _: Runtime, /, x: Any = 0) -> Any:
+    name = kind.__name__
+    if isinstance(x, BatchSize):
+        x.refuse()
+    if varies([x]):
+        raise RefusedError("E-FLOW", f"{name}() of numbers that differ from row to row: use astype({name})")
+    if isinstance(x, str) and not re.fullmatch(TEXTS[kind], x, re.IGNORECASE):
+        raise TypeError(f"{name}() of {x[:40]!r}")
+    if not isinstance(x, (bool, int, float, str, Array)):
+        raise TypeError(f"{name}() of a value that is no number")
+    return check_number(kind(x))
 
 
 @builtin("round")
@@ -56,27 +56,24 @@ def divmod_(_: Runtime, x: Any, y: Any) -> Any:
     return call_numpy("divmod", [x, y], {}) if isinstance(x, Operand) or isinstance(y, Operand) else divmod(x, y)
 
 
-def _register_math(name: str) -> None:
-    def compute(runtime: Runtime, *args: Any, **kwargs: Any) -> Any:
-        if varies(args):
-            numpy_name = SAME_IN_NUMPY.get(name, name)
-            raise RefusedError("E-FLOW", f"math.{name} takes one number, not an array: use np.{numpy_name}")
-        numbers = [
-            [float(item) for item in runtime.items(x)]
-            if isinstance(x, (list, tuple))
-            else (x if isinstance(x, int) else float(x))
-            for x in args
-        ]
-        return check_number(getattr(math, name)(*numbers, **{key: float(x) for key, x in kwargs.items()}))
-
-    builtin(f"math.{name}")(compute)
-
-
-for _name in (
+MATH = (
     "acos acosh asin asinh atan atan2 atanh ceil copysign cos cosh degrees erf erfc exp expm1 fabs floor fmod gamma hypot isfinite "
     "isinf isnan isclose lgamma log log10 log1p log2 modf pow radians sin sinh sqrt tan tanh trunc remainder dist gcd lcm"
-).split():
-    _register_math(_name)
+).split()
+
+
+@builtin_variants({f"math.{name}": name for name in MATH})
+def compute(name: str, runtime: Runtime, /, *args: Any, **kwargs: Any) -> Any:
+    if varies(args):
+        numpy_name = SAME_IN_NUMPY.get(name, name)
+        raise RefusedError("E-FLOW", f"math.{name} takes one number, not an array: use np.{numpy_name}")
+    numbers = [
+        [float(item) for item in runtime.items(x)]
+        if isinstance(x, (list, tuple))
+        else (x if isinstance(x, int) else float(x))
+        for x in args
+    ]
+    return check_number(getattr(math, name)(*numbers, **{key: float(x) for key, x in kwargs.items()}))
 
 
 @builtin("math.factorial")

@@ -1,4 +1,4 @@
-"""The inputs of a decoder, as data: an encoder is a tuple of names.
+"""The inputs of a decoder, as data: a tuple of names.
 
     factors              z = phi(s, a), the output of the latent function
     observation          s, before the action
@@ -25,7 +25,7 @@ __all__ = [
     "OBSERVATION_ACTION",
     "RAW",
     "SCORED",
-    "Encoder",
+    "InputNames",
     "input_arrays",
     "input_size",
 ]
@@ -39,12 +39,8 @@ _SCORED_OBSERVATIONS = {
 
 
 @dataclass(frozen=True)
-class Encoder:
-    """What a decoder reads of a step.
-
-    Raises:
-        LareError: a name is not one of the six above.
-    """
+class InputNames:
+    """What a decoder reads of a step. Raises `LareError` if a name is not one of the six above."""
 
     names: tuple[str, ...]
     names_of_many_agents: tuple[str, ...] | None = None
@@ -53,9 +49,11 @@ class Encoder:
     def __post_init__(self) -> None:
         for names in (self.names, self.names_of_many_agents or ()):
             if not set(names) <= set(_NAMES):
-                raise LareError(f"an encoder is a tuple of names among {', '.join(_NAMES)}, and was given {names!r}")
+                raise LareError(
+                    f"the inputs of a decoder are a tuple of names among {', '.join(_NAMES)}, and was given {names!r}"
+                )
 
-    def inputs(self, judges: FactorInputs = "after", *, single_agent: bool = True) -> tuple[str, ...]:
+    def resolve(self, judges: FactorInputs = "after", *, single_agent: bool = True) -> tuple[str, ...]:
         """Return the names of the inputs, with `scored_observation` replaced by the observations that a task names."""
         names = self.names if single_agent or self.names_of_many_agents is None else self.names_of_many_agents
         return tuple(
@@ -80,13 +78,13 @@ class Encoder:
         return "scored_observation" in self.names
 
 
-RAW = Encoder(("observation", "action", "observation_change"), ("next_observation",))
+RAW = InputNames(("observation", "action", "observation_change"), ("next_observation",))
 """As published for RD and RRD."""
-OBSERVATION_ACTION = Encoder(("observation", "action"))
-NEXT_OBSERVATION_ACTION = Encoder(("next_observation", "action"))
-SCORED = Encoder(("scored_observation", "action"))
-FACTORS = Encoder(("factors",))
-FACTORS_AND_SCORED = Encoder(("factors", "scored_observation", "action"))
+OBSERVATION_ACTION = InputNames(("observation", "action"))
+NEXT_OBSERVATION_ACTION = InputNames(("next_observation", "action"))
+SCORED = InputNames(("scored_observation", "action"))
+FACTORS = InputNames(("factors",))
+FACTORS_AND_SCORED = InputNames(("factors", "scored_observation", "action"))
 
 
 def input_size(inputs: tuple[str, ...], sizes: Mapping[str, int]) -> int:
