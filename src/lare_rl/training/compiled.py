@@ -112,7 +112,9 @@ def compile_functions(config: TrainConfig, phi: Sequence[Graph] = ()) -> Compile
     module = training_module(config)
 
     def init(keys: Key[Array, " seeds"]) -> Learner:
-        return jax.vmap(lambda key: init_learner(key, config, partial(module.init, config=config)))(keys)
+        # One seed after the other: batched QR decompositions of several layers may wait for each other for ever on two cores
+        # (jaxlib 0.10, `ParallelBatchMap`).
+        return jax.lax.map(lambda key: init_learner(key, config, partial(module.init, config=config)), keys)
 
     learn = jax.jit(partial(episodes.learn_returns, config=config))
 
