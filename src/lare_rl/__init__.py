@@ -22,6 +22,8 @@ if TYPE_CHECKING:
     from lare_rl.evaluation.evaluate import evaluate_run as evaluate_run
     from lare_rl.evaluation.policy import load_policy as load_policy
     from lare_rl.export.export import export_run as export_run
+    from lare_rl.integrations.pure_credit import CreditSteps as CreditSteps
+    from lare_rl.integrations.pure_credit import pure_credit as pure_credit
     from lare_rl.latent.design import design as design
     from lare_rl.latent.function import LatentFunction as LatentFunction
     from lare_rl.latent.saved import load_function as load_function

@@ -105,14 +105,14 @@ HALF_EPISODES = {"rollout_steps": 10, "steps": 400, "evaluate_every": 80}
     ("build", "task", "changes", "stop"),
     [
         ("small_many", "CompetitivePP-6", {"algorithm": "ippo", "method": "lare-linear", "steps": 300}, 200),
-        ("small_many", echo_spec(), {"algorithm": "qmix", "method": "lare-rrdu"} | HALF_EPISODES, 200),
+        ("small_many", echo_spec(), {"algorithm": "qmix", "method": "lare-rrdu"} | HALF_EPISODES, 160),
         (
             "small_many",
             echo_spec(environment="hosted/three"),
             {"algorithm": "qmix", "method": "rrdu"} | HALF_EPISODES,
             80,
         ),
-        ("small", IN_WORKERS, {"algorithm": "ppo", "method": "rrdu", "environments": 2}, 72),
+        ("small", IN_WORKERS, {"algorithm": "ppo", "method": "rrdu", "environments": 2, "evaluate_every": 72}, 72),
         ("small", toy_spec(), {"algorithm": "sac", "method": "lare-rrdu"}, 156),
     ],
 )

@@ -140,7 +140,7 @@ class STAS(eqx.Module):
         if sample_key is not None:
             r_hat = self.agent_rewards(x, sample_key, dropout_key)
         else:
-            sample_keys = jax.random.split(jax.random.key(0), REWARD_SAMPLES)
+            sample_keys = jax.random.split(jax.random.key(jnp.uint32(0)), REWARD_SAMPLES)
             r_hat = jnp.mean(jax.lax.map(lambda key: self.agent_rewards(x, key, None), sample_keys), axis=0)
         return DecoderOutput(r_hat.reshape(rows, agents), jnp.zeros((rows, agents)))
 

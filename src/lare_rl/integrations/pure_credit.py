@@ -3,7 +3,7 @@
     credit = lare_rl.pure_credit("lare-bayes", phi, observation_size=4, action_size=2, n_envs=8, n_steps=128, max_steps=500)
     state = credit.init(key)
     ...
-    steps = CreditSteps(obs, action, next_obs, reward, terminated, truncated)      # [n_steps n_envs ...], inside jit and scan
+    steps = lare_rl.CreditSteps(obs, action, next_obs, reward, terminated, truncated)      # [n_steps n_envs ...], inside jit and scan
     state = credit.refit(credit.observe(state, steps), key)
     r_hat = credit.reward(state, steps)                                             # [n_steps n_envs]
 
@@ -11,7 +11,6 @@ All shapes are fixed. The functions can be jitted, and mapped by `vmap`, `scan` 
 """
 
 from collections.abc import Callable
-from functools import partial
 from typing import Any, NamedTuple
 
 import jax
@@ -48,7 +47,7 @@ class CreditSteps(NamedTuple):
     action: Float[Array, "time envs *agents action"]
     """Continuous actions in [-1, 1]; discrete actions one-hot."""
     next_observation: Float[Array, "time envs *agents observation"]
-    """After the step. At the end of an episode, this is its last observation, and not the first of the next one."""
+    """After the step: the observation of the next step or, at the end of an episode, its last one, not the first of the next."""
     reward: Float[Array, "time envs *agents"]
     """What the environment pays. Only its sum over an episode matters."""
     terminated: Bool[Array, "time envs"]
@@ -144,6 +143,7 @@ def pure_credit(
         fit_updates=fit_updates,
     )
     graphs = tuple(function.graph for function in functions)
+    learn_returns = _make_learn_returns(config)
 
     def init(key: PRNGKeyArray) -> State:
         return init_learner(key, config, lambda _: ())
@@ -152,7 +152,7 @@ def pure_credit(
         return store(state, _trajectory(steps, config), config, graphs)[0]
 
     def refit(state: State, key: PRNGKeyArray) -> State:
-        return _refit(state, key, config)
+        return _refit(state, key, learn_returns, config)
 
     def reward(state: State, steps: CreditSteps) -> Float[Array, "time envs *agents"]:
         trajectory = _trajectory(steps, config)
@@ -211,16 +211,39 @@ def _stored_steps(state: State, steps: Trajectory, factors: Array, config: Train
     )
 
 
-def _refit(state: State, key: PRNGKeyArray, config: TrainConfig) -> State:
+def _make_learn_returns(config: TrainConfig) -> Callable[..., Any]:
+    """Return `learn_returns` as a function that `vmap` can map at any time.
+
+    It calculates in float64, which must be enabled while it is traced. A user's `vmap` may trace it again later, when it is not. So
+    another axis is merged into the leading one, which `learn_returns` has anyway.
+    """
+
+    @jax.custom_batching.custom_vmap
+    def learn_returns(*inputs: Any) -> tuple[Any, ...]:
+        with jax.enable_x64(True):
+            return episodes.learn_returns(*inputs, config)
+
+    @learn_returns.def_vmap
+    def _map_learn_returns(axis_size: int, is_mapped: Any, *inputs: Any) -> tuple[Any, Any]:
+        def merge(leaf: Array, mapped: bool) -> Array:
+            leaf = leaf if mapped else jnp.broadcast_to(leaf, (axis_size, *leaf.shape))
+            return leaf.reshape(-1, *leaf.shape[2:])
+
+        learned = learn_returns(*jax.tree.map(merge, list(inputs), is_mapped))
+        learned = jax.tree.map(lambda leaf: leaf.reshape(axis_size, -1, *leaf.shape[1:]), learned)
+        return learned, jax.tree.map(lambda _: True, learned)
+
+    return learn_returns
+
+
+def _refit(state: State, key: PRNGKeyArray, learn_returns: Callable[..., Any], config: TrainConfig) -> State:
     if not state.decoders:
         return state
-    add_seed_axis = partial(jax.tree.map, lambda leaf: leaf[None])
-    with jax.enable_x64(True):
-        learned = episodes.learn_returns(
-            add_seed_axis(state.decoders), add_seed_axis(state.replay), state.n_learned[None], config
-        )
-    decoders, n_learned = jax.tree.map(lambda leaf: leaf[0], learned)
+    inputs = jax.tree.map(lambda leaf: leaf[None], (state.decoders, state.replay, state.n_learned))
+    decoders, n_learned = jax.tree.map(lambda leaf: leaf[0], learn_returns(*inputs))
     state = state._replace(decoders=decoders, n_learned=n_learned)
     if not config.method.uses_gradient:
         return state
-    return state._replace(decoders=fit_repeatedly(state, key, config)[0])
+    has_episode = jnp.any(state.replay.episodes > 0)
+    fitted = jax.lax.cond(has_episode, lambda: fit_repeatedly(state, key, config)[0], lambda: state.decoders)
+    return state._replace(decoders=fitted)

@@ -1,0 +1,99 @@
+"""Credit as pure functions: it recovers rewards from returns, and works under JAX's transformations."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from jax.sharding import PartitionSpec
+
+import lare_rl
+from lare_rl.errors import LareError
+from lare_rl.integrations.pure_credit import CreditSteps, pure_credit
+
+N_ENVS, N_STEPS, LENGTH = 4, 20, 10
+WEIGHT = np.array([1.0, -2.0, 0.5], np.float32)
+SIZES = {"observation_size": 2, "action_size": 1, "n_envs": N_ENVS, "n_steps": N_STEPS, "max_steps": LENGTH}
+
+
+def make_steps(key, agents=()):
+    """Return steps whose reward is linear in next observation and action; episodes have ten steps."""
+    state_key, action_key = jax.random.split(key)
+    states = jax.random.normal(state_key, (N_STEPS + 1, N_ENVS, *agents, 2))
+    observation, next_observation = states[:-1], states[1:]
+    action = jax.random.uniform(action_key, (N_STEPS, N_ENVS, *agents, 1), minval=-1, maxval=1)
+    true_reward = jnp.concatenate([next_observation, action], axis=-1) @ WEIGHT
+    last = jnp.broadcast_to((jnp.arange(N_STEPS) % LENGTH == LENGTH - 1)[:, None], (N_STEPS, N_ENVS))
+    returns = true_reward.reshape(-1, LENGTH, *true_reward.shape[1:]).sum(axis=1).repeat(LENGTH, axis=0)
+    paid = jnp.where(last.reshape(*last.shape, *[1] * len(agents)), returns, 0)
+    return CreditSteps(observation, action, next_observation, paid, last, jnp.zeros_like(last)), true_reward
+
+
+def correlation(x, y):
+    return float(np.corrcoef(np.ravel(x), np.ravel(y))[0, 1])
+
+
+def train(credit, key, n_rounds=30, agents=()):
+    """Observe and refit in a compiled loop. Return the state."""
+
+    def body(state, key):
+        steps, _ = make_steps(key, agents)
+        return credit.refit(credit.observe(state, steps), key), None
+
+    init_key, key = jax.random.split(key)
+    return jax.lax.scan(body, credit.init(init_key), jax.random.split(key, n_rounds))[0]
+
+
+@pytest.mark.parametrize("method", ["bayes", "rrdu"])
+def test_rewards_are_recovered_from_returns(method):
+    credit = pure_credit(method, **SIZES, fit_updates=100)
+    state = jax.jit(lambda key: train(credit, key))(jax.random.key(0))
+    steps, true_reward = make_steps(jax.random.key(1))
+    r_hat = jax.jit(credit.reward)(state, steps)
+    assert r_hat.shape == (N_STEPS, N_ENVS)
+    assert correlation(r_hat, true_reward) > (0.99 if method == "bayes" else 0.9)
+
+
+def test_rewards_of_many_agents():
+    credit = pure_credit("bayes", **SIZES, agents=3)
+    state = jax.jit(lambda key: train(credit, key, agents=(3,)))(jax.random.key(0))
+    steps, true_reward = make_steps(jax.random.key(1), (3,))
+    assert correlation(credit.reward(state, steps), true_reward) > 0.9
+
+
+def test_phi_is_part_of_the_program(phi):
+    credit = pure_credit("lare-bayes", phi, **SIZES | {"observation_size": phi.sizes[0], "action_size": phi.sizes[1]})
+    state = jax.jit(lambda key: train(credit, key))(jax.random.key(0))
+    steps, _ = make_steps(jax.random.key(1))
+    assert np.isfinite(jax.jit(credit.reward)(state, steps)).all()
+    assert "callback" not in str(jax.make_jaxpr(credit.observe)(state, steps))
+
+
+def test_functions_are_mapped_over_seeds():
+    """`vmap` and `shard_map` give what single calls give."""
+    credit = pure_credit("bayes", **SIZES)
+    keys = jax.random.split(jax.random.key(0), 2)
+
+    def run(key):
+        return credit.reward(train(credit, key, n_rounds=5), make_steps(jax.random.key(1))[0])
+
+    expected = jnp.stack([jax.jit(run)(key) for key in keys])
+    np.testing.assert_allclose(jax.jit(jax.vmap(run))(keys), expected, rtol=1e-3, atol=1e-4)
+    mesh = jax.sharding.Mesh(jax.devices()[:1], ("seeds",))
+    sharded = jax.shard_map(
+        jax.vmap(run), mesh=mesh, in_specs=PartitionSpec("seeds"), out_specs=PartitionSpec("seeds"), check_vma=False
+    )
+    np.testing.assert_allclose(jax.jit(sharded)(keys), expected, rtol=1e-3, atol=1e-4)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        ({"method": "episodic"}, "bayes"),
+        ({"method": "stas"}, "bayes"),
+        ({"method": "lare-bayes"}, "phi"),
+        ({"method": "nothing"}, "nothing"),
+    ],
+)
+def test_pure_credit_refuses(arguments, words):
+    with pytest.raises(LareError, match=words):
+        lare_rl.pure_credit(**arguments, **SIZES)
