@@ -69,6 +69,11 @@ register_family("particles", "lare_rl.envs.particles.particle_env:make")
 register_family("smax", "lare_rl.envs.smax.smax_env:make", score="sum")
 register_family("smac", "lare_rl.envs.starcraft:make", score="sum")
 register_family("pettingzoo", "lare_rl.envs.pettingzoo_env:make", reads=OPTIONAL_KEYS)
+register_family("gymnax", "lare_rl.envs.gymnax_env:make", reads=("max_episode_steps", "arguments"))
+register_family("brax", "lare_rl.envs.brax_env:make", reads=("max_episode_steps", "arguments"))
+register_family("playground", "lare_rl.envs.playground_env:make", reads=("max_episode_steps", "arguments"))
+register_family("jumanji", "lare_rl.envs.jumanji_env:make", reads=("max_episode_steps", "arguments"))
+register_family("jaxmarl", "lare_rl.envs.jaxmarl_env:make", reads=OPTIONAL_KEYS)
 
 
 def find_score(task: TaskSpec) -> str | None:
