@@ -66,7 +66,7 @@ def import_package(name: str, task: TaskSpec, extra: str | None = None) -> Modul
         with _silence():
             return importlib.import_module(name)
     except ModuleNotFoundError as error:
-        if error.name == name.partition(".")[0]:
+        if error.name in (name, name.partition(".")[0]):
             raise missing_extra_error(f"environment {task.environment!r}", extra) from error
         reason = error
     except Exception as error:  # an old package may raise anything if a newer JAX has removed a name
@@ -168,7 +168,7 @@ class Choices(NamedTuple):
 
     def mask_combinations(self, mask: Bool[Array, "..."]) -> Bool[Array, " size"]:
         """Return which combinations are available, from a mask of all combinations or of each choice."""
-        if mask.size == self.size:
+        if mask.shape == self.sizes:
             return mask.ravel()
         combinations = jnp.ones((), bool)
         for row, size in zip(mask, self.sizes, strict=True):

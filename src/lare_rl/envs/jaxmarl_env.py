@@ -96,23 +96,23 @@ class JaxMARLEnv:
             if not (isinstance(observations, Mapping) and set(names) <= set(observations)):
                 raise LareError(f"{message}: its observations are not a dictionary by agent")
             agents = [_make_agent(name, env.action_space(name), flat_size(observations[name])) for name in names]
-            self._layout = AgentArrays(agents)
-            self._masks = _find_masks(env, state) if self._layout.discrete else None
+            self.layout = AgentArrays(agents)
+            self._masks = _find_masks(env, state) if self.layout.discrete else None
             actions = {agent.name: jnp.asarray(agent.action_space.sample()) for agent in agents}
             infos = jax.eval_shape(env.step_env, jnp.zeros(2, jnp.uint32), state, actions)[-1]
         self._from_observations = any(role.judged_from == "state" for role in (task, *task.teams))
-        low, high = self._layout.bounds
+        low, high = self.layout.bounds
         self.spec = EnvSpec(
             teams=teams,
-            observation_size=self._layout.observation_size,
-            action_size=self._layout.action_size,
-            discrete=self._layout.discrete,
+            observation_size=self.layout.observation_size,
+            action_size=self.layout.action_size,
+            discrete=self.layout.discrete,
             max_steps=max_steps,
             state_size=jax.eval_shape(self._read_state, observations, state).shape[0],
             low=low,
             high=high,
             agents_leave=True,  # no environment states that they do not
-            masks_actions=self._masks is not None or not self._layout.available.all(),
+            masks_actions=self._masks is not None or not self.layout.available.all(),
             is_jax=True,
             measures=find_measures(task, infos),
         )
@@ -126,7 +126,7 @@ class JaxMARLEnv:
     def step(
         self, state: JaxMARLState, action: Float[Array, "agents action"], key: PRNGKeyArray
     ) -> tuple[JaxMARLState, Timestep]:
-        agents = self._layout.agents
+        agents = self.layout.agents
         actions = {agent.name: _decode(agent, action[index]) for index, agent in enumerate(agents)}
         observations, env_state, rewards, dones, infos = self.env.step_env(raw_key(key), state.env, actions)
         reward = jnp.stack([jnp.asarray(rewards[agent.name], jnp.float32).reshape(()) for agent in agents])
@@ -159,7 +159,7 @@ class JaxMARLEnv:
 
     def _pad(self, observations: Mapping[Any, Any]) -> Float[Array, "agents observation"]:
         """Return all observations in one array: padded, and with the agent's index if the agents' spaces differ."""
-        layout = self._layout
+        layout = self.layout
         vectors = [flatten_tree(observations[agent.name]) for agent in layout.agents]
         padded = jnp.stack([jnp.pad(vector, (0, layout.longest_observation - len(vector))) for vector in vectors])
         return jnp.concatenate([padded, jnp.eye(len(vectors))], axis=1) if layout.adds_index else padded
@@ -173,12 +173,12 @@ class JaxMARLEnv:
         return self._pad(observations).ravel() if self._from_observations else jnp.zeros(0)
 
     def _read_masks(self, state: JaxMARLState) -> Bool[Array, "agents action"]:
-        available = jnp.asarray(self._layout.available)
-        if not self._layout.discrete:
+        available = jnp.asarray(self.layout.available)
+        if not self.layout.discrete:
             return available
         if self._masks is not None:
             masks = self._masks(state.env)
-            rows = [jnp.asarray(masks[agent.name]).astype(bool).ravel() for agent in self._layout.agents]
+            rows = [jnp.asarray(masks[agent.name]).astype(bool).ravel() for agent in self.layout.agents]
             available &= jnp.stack([jnp.pad(row, (0, available.shape[1] - len(row))) for row in rows])
         first = jnp.arange(available.shape[1]) == 0
         acts = state.alive & available.any(axis=1)

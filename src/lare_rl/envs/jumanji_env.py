@@ -32,7 +32,7 @@ from lare_rl.envs.jax_spaces import (
 from lare_rl.errors import LareError, short_repr
 from lare_rl.tasks.spec import TaskSpec
 
-__all__ = ["JumanjiEnv", "make"]
+__all__ = ["JumanjiEnv", "make", "observed_arrays"]
 
 MASK = "action_mask"
 """Jumanji's name of the mask of available actions in an observation."""
@@ -129,10 +129,16 @@ class JumanjiEnv:
             viewer.close()
 
 
-def _observed(observation: Any) -> list[Any]:
-    """Return the arrays of an observation but the mask."""
+def observed_arrays(observation: Any) -> list[tuple[str, Any]]:
+    """Return the names and arrays of an observation, without the mask, in the order in which they are flattened."""
     leaves = jax.tree_util.tree_leaves_with_path(observation)
-    return [leaf for path, leaf in leaves if not _is_mask(path)]
+    return [
+        (jax.tree_util.keystr(path, simple=True, separator="."), leaf) for path, leaf in leaves if not _is_mask(path)
+    ]
+
+
+def _observed(observation: Any) -> list[Any]:
+    return [leaf for _, leaf in observed_arrays(observation)]
 
 
 def _find_mask(observation: Any) -> Any:

@@ -27,8 +27,8 @@ def make(task: TaskSpec, **_: Any) -> RobotEnv:
         config = playground.registry.get_default_config(name)
         if "impl" in config:
             config.impl = _choose_implementation(task)
-        config.update_from_flattened_dict(arguments)
-        return playground.registry.load(name, config=config), config
+        env = playground.registry.load(name, config=config, config_overrides=arguments)
+        return env, config  # with the arguments, because the environment writes them into it
 
     env, config = construct(task, playground.registry.ALL_ENVS, load)
     limit = math.ceil(config.episode_length / config.action_repeat)

@@ -1,18 +1,17 @@
 """Environments of Brax and of MuJoCo Playground as `JaxEnv`s: both have the functions `reset(rng)` and `step(state, action)`."""
 
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, PRNGKeyArray, UInt8
+from jaxtyping import Array, Float, Int, PRNGKeyArray, UInt8
 
 from lare_rl.envs.env_errors import one_line_errors
 from lare_rl.envs.interface import Timestep
 from lare_rl.envs.jax_spaces import (
     Bounds,
-    CountedState,
     agent_spec,
     agent_timestep,
     cast_like,
@@ -26,10 +25,19 @@ from lare_rl.envs.jax_spaces import (
 from lare_rl.errors import LareError
 from lare_rl.tasks.spec import TaskSpec
 
-__all__ = ["RobotEnv"]
+__all__ = ["RobotEnv", "RobotState"]
 
 OBSERVATION, PRIVILEGED = "state", "privileged_state"
 """Keys of an observation that is a dictionary: what the policy observes, and what only a critic may."""
+
+
+class RobotState(NamedTuple):
+    """The package's state, the number of steps since the start of the episode, and the newest observation."""
+
+    env: Any
+    steps: Int[Array, ""]
+    observation: Float[Array, " observation"]
+    privileged: Float[Array, " state"]
 
 
 class RobotEnv:
@@ -75,40 +83,41 @@ class RobotEnv:
             measures=find_measures(task, state.metrics),
         )
 
-    def reset(self, key: PRNGKeyArray) -> tuple[CountedState, Timestep]:
-        state = strong_types(self.env.reset(raw_key(key)))
-        observation, privileged = _split_observation(state.obs)
-        timestep = agent_timestep(self.spec, flatten_tree(observation), state=flatten_tree(privileged))
-        return CountedState(state, jnp.zeros((), jnp.int32)), timestep
+    def reset(self, key: PRNGKeyArray) -> tuple[RobotState, Timestep]:
+        env_state = strong_types(self.env.reset(raw_key(key)))
+        observation, privileged = map(flatten_tree, _split_observation(env_state.obs))
+        state = RobotState(env_state, jnp.zeros((), jnp.int32), observation, privileged)
+        return state, agent_timestep(self.spec, observation, state=privileged)
 
     def step(
-        self, state: CountedState, action: Float[Array, "1 action"], key: PRNGKeyArray
-    ) -> tuple[CountedState, Timestep]:
+        self, state: RobotState, action: Float[Array, "1 action"], key: PRNGKeyArray
+    ) -> tuple[RobotState, Timestep]:
         """Make one step. The key is not used: the package's state has its own."""
-        next_state = state.env
-        reward = jnp.zeros(())
+        env_state, reward = state.env, jnp.zeros(())
         for _ in range(self._action_repeat):
-            next_state = self.env.step(_copy(next_state), self._action.decode(action[0]))
-            reward += next_state.reward
-        next_state = cast_like(next_state, state.env)
-        is_finite = jnp.isfinite(flatten_tree((next_state.obs, reward))).all()
-        observation, privileged = _split_observation(
-            jax.tree.map(lambda new, old: jnp.where(is_finite, new, old), next_state.obs, state.env.obs)
+            env_state = self.env.step(_copy(env_state), self._action.decode(action[0]))
+            reward += env_state.reward
+        observation, privileged = map(flatten_tree, _split_observation(env_state.obs))
+        is_finite = jnp.isfinite(observation).all() & jnp.isfinite(privileged).all() & jnp.isfinite(reward)
+        next_state = RobotState(
+            env=cast_like(env_state, state.env),
+            steps=state.steps + 1,
+            observation=jnp.where(is_finite, observation, state.observation),
+            privileged=jnp.where(is_finite, privileged, state.privileged),
         )
-        steps = state.steps + 1
         timestep = agent_timestep(
             self.spec,
-            flatten_tree(observation),
+            next_state.observation,
             reward=jnp.where(is_finite, reward, 0.0),
-            terminated=(next_state.done > 0) | ~is_finite,
-            truncated=steps >= self.spec.max_steps,
-            state=flatten_tree(privileged),
-            measures=next_state.metrics,
+            terminated=(env_state.done > 0) | ~is_finite,
+            truncated=next_state.steps >= self.spec.max_steps,
+            state=next_state.privileged,
+            measures=env_state.metrics,
         )
-        return CountedState(next_state, steps), timestep
+        return next_state, timestep
 
     def frames(
-        self, states: CountedState, credit: Float[np.ndarray, "steps agents"] | None = None
+        self, states: RobotState, credit: Float[np.ndarray, "steps agents"] | None = None
     ) -> list[UInt8[np.ndarray, "height width 3"]]:
         """Return MuJoCo's pictures of states, which do not show credit. Raise `LareError` if nothing can be drawn here."""
         return draw_states(self._name, self._draw, states.env)
