@@ -32,7 +32,7 @@ def test_time_limit_truncates_and_keeps_the_last_observation():
     assert timesteps.alive.all()
     reset_key, keys = step_keys(2, 25)
     _, state = env.env.reset(reset_key)
-    rewards = 0.0
+    observations, rewards = {}, 0.0
     for number in range(25):
         choices = {name: jnp.int32(actions[0, number, index].argmax()) for index, name in enumerate(env.env.agents)}
         observations, state, reward, _, _ = env.env.step_env(keys[number], state, choices)

@@ -227,11 +227,12 @@ def _decode(agent: Agent, action: Float[Array, " action"]) -> Array:
 
 def _find_masks(env: Any, state: Any) -> Callable[[Any], Mapping[Any, Any]] | None:
     """Return the function that returns the available actions by agent, if the environment has one."""
-    for name in ("get_avail_actions", "get_legal_moves"):
-        function = getattr(env, name, None)
-        try:
-            if callable(function) and isinstance(jax.eval_shape(function, state), Mapping):
-                return function
-        except NotImplementedError:  # of JaxMARL's base class
-            continue
-    return None
+    functions = [getattr(env, name, None) for name in ("get_avail_actions", "get_legal_moves")]
+    return next((function for function in functions if function and _is_implemented(function, state)), None)
+
+
+def _is_implemented(function: Callable[[Any], Any], state: Any) -> bool:
+    try:
+        return isinstance(jax.eval_shape(function, state), Mapping)
+    except NotImplementedError:  # of JaxMARL's base class
+        return False

@@ -44,7 +44,7 @@ def make(task: TaskSpec, **_: Any) -> RobotEnv:
 def _choose_implementation(task: TaskSpec) -> str:
     """Return the faster implementation where it runs: Warp on a card of NVIDIA if it is installed, else the one in JAX.
 
-    Playground's own default is Warp everywhere.
+    Playground's own default is Warp everywhere. `GraphMode` is a number where the version of Warp does not fit that of MuJoCo.
     """
     io = import_package("mujoco.mjx._src.io", task)
-    return "warp" if io.mjxw.WARP_INSTALLED and io.has_cuda_gpu_device() else "jax"
+    return "warp" if io.has_cuda_gpu_device() and hasattr(io.mjxw.types.GraphMode, "WARP") else "jax"
