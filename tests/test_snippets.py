@@ -261,6 +261,7 @@ PREPARE = {
     "docs/bring-your-own-task.md": lambda page: page.serve(PENDULUM),
     "docs/export.md": export_policy,
     "docs/extending.md": prepare_plugin,
+    "docs/jax-environments.md": lambda page: page.write("pendulum.toml", block("docs/jax-environments.md", "toml", 0)),
     "docs/logs.md": write_logs,
     "docs/plugs/sb3.md": lambda page: lare_rl.design("Reacher-v4").save(page.directory / "phi.py"),
     "docs/reproduce.md": write_study,

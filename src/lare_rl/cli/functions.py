@@ -49,7 +49,8 @@ def new_task(
 
     Args:
         environment: a Gymnasium id, such as Pendulum-v1 (module:id first imports the module, which registers it); or
-            pettingzoo/MODULE:NAME, where NAME makes a PettingZoo ParallelEnv; or logged episodes, which are a directory, a
+            pettingzoo/MODULE:NAME, where NAME makes a PettingZoo ParallelEnv; or FAMILY/NAME for the JAX environments of gymnax,
+            brax, playground, jumanji and jaxmarl, such as gymnax/CartPole-v1; or logged episodes, which are a directory, a
             Parquet file, or the id of a local Minari data set.
         out: the file to write, which must not exist; the default is the task's name with .toml.
     """

@@ -19,6 +19,7 @@ __all__ = [
     "Family",
     "check_logs",
     "find_score",
+    "has_single_agent",
     "is_gymnasium",
     "load_env_spec",
     "make_env",
@@ -42,14 +43,23 @@ class Family(NamedTuple):
     """The keys of `OPTIONAL_KEYS` that the family reads."""
     score: str | None = None
     """Whether the return of all tasks of the family is a "sum" or an "average" over the steps, if known."""
+    single_agent: bool = False
+    """Whether all environments of the family have one agent."""
 
 
 FAMILIES = Registry[Family]("family of environments")
-_GYMNASIUM = Family("lare_rl.envs.gymnasium_env:GymnasiumEnv", reads=("max_episode_steps",))
+_GYMNASIUM = Family("lare_rl.envs.gymnasium_env:GymnasiumEnv", reads=("max_episode_steps",), single_agent=True)
 _LOGS_ONLY = Family("lare_rl.envs.families:_refuse_to_make", reads=("max_episode_steps",))
 
 
-def register_family(name: str, maker: Maker | str, *, reads: tuple[str, ...] = (), score: str | None = None) -> None:
+def register_family(
+    name: str,
+    maker: Maker | str,
+    *,
+    reads: tuple[str, ...] = (),
+    score: str | None = None,
+    single_agent: bool = False,
+) -> None:
     """Add a family of environments: a task with `environment = "NAME/..."` then uses its maker.
 
     Args:
@@ -58,17 +68,23 @@ def register_family(name: str, maker: Maker | str, *, reads: tuple[str, ...] = (
             `JaxEnv` or a `HostEnv`. The text "MODULE:ATTRIBUTE" is imported when the first environment is made.
         reads: the keys among "max_episode_steps", "arguments" and "agents" that the maker reads. Tasks with the others are refused.
         score: "sum" or "average" if the returns of all tasks of the family are sums or averages over the steps.
+        single_agent: whether all environments of the family have one agent.
 
     Raises:
         LareError: another family has this name.
     """
-    FAMILIES.register(name, Family(maker, tuple(reads), score))
+    FAMILIES.register(name, Family(maker, tuple(reads), score, single_agent))
 
 
 register_family("particles", "lare_rl.envs.particles.particle_env:make")
 register_family("smax", "lare_rl.envs.smax.smax_env:make", score="sum")
 register_family("smac", "lare_rl.envs.starcraft:make", score="sum")
 register_family("pettingzoo", "lare_rl.envs.pettingzoo_env:make", reads=OPTIONAL_KEYS)
+for _name in ("gymnax", "brax", "playground", "jumanji"):
+    register_family(
+        _name, f"lare_rl.envs.{_name}_env:make", reads=("max_episode_steps", "arguments"), single_agent=True
+    )
+register_family("jaxmarl", "lare_rl.envs.jaxmarl_env:make", reads=OPTIONAL_KEYS)
 
 
 def find_score(task: TaskSpec) -> str | None:
@@ -127,6 +143,11 @@ def _import_and_make(module: str, task: TaskSpec) -> HostEnv:
             "Move the family into a module of its own."
         )
     return make_host_env(task)
+
+
+def has_single_agent(task: TaskSpec) -> bool:
+    """Return whether all environments of the task's family have one agent."""
+    return _find_family(task).single_agent
 
 
 def is_gymnasium(task: TaskSpec) -> bool:

@@ -21,12 +21,12 @@ class JaxOnHost:
 
     def reset(self, seed: int) -> Timestep:
         key, self._key = jax.random.split(jax.random.key(seed))
-        self._state, timestep = self._reset(key)
+        self.state, timestep = self._reset(key)
         return jax.tree.map(np.asarray, timestep)
 
     def step(self, action: Float[np.ndarray, "agents action"]) -> Timestep:
         self._key, key = jax.random.split(self._key)
-        self._state, timestep = self._step(self._state, action, key)
+        self.state, timestep = self._step(self.state, action, key)
         return jax.tree.map(np.asarray, timestep)
 
     def render(self) -> Any:

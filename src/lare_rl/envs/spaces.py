@@ -98,9 +98,16 @@ def flatten_value(space: gymnasium.Space, value: Any) -> Float[np.ndarray, " siz
         if not isinstance(value, Sequence) or len(value) != len(space.spaces):
             raise ValueError(f"must have {len(space.spaces)} elements, but is {short_repr(value)}")
         return _concatenate([flatten_value(*pair) for pair in zip(space.spaces, value, strict=True)])
-    if not space.contains(value):
+    if not _contains(space, value):
         raise ValueError(f"is {short_repr(value)}, which is not in {short_repr(space)}")
     return np.array(gymnasium.spaces.flatten(space, value), np.float32)
+
+
+def _contains(space: gymnasium.Space, value: Any) -> bool:
+    try:
+        return space.contains(value)
+    except OverflowError:  # Gymnasium before 1.4 converts to an integer of 64 bits first
+        return False
 
 
 def _concatenate(vectors: Sequence[Float[np.ndarray, " _"]]) -> Float[np.ndarray, " _"]:

@@ -1,5 +1,6 @@
 """Films of an episode of a run's policy, for one agent and for many."""
 
+import math
 import warnings
 from collections.abc import Iterable, Sequence
 from contextlib import closing
@@ -8,6 +9,7 @@ from itertools import count
 from pathlib import Path
 from typing import Any
 
+import jax
 import numpy as np
 from jaxtyping import UInt8
 from PIL import Image
@@ -15,6 +17,7 @@ from PIL import Image
 from lare_rl.envs.families import load_env_spec, make_env, make_host_env
 from lare_rl.envs.gymnasium_env import GymnasiumEnv
 from lare_rl.envs.interface import HostEnv, JaxEnv
+from lare_rl.envs.jax_on_host import JaxOnHost
 from lare_rl.envs.play import play_steps
 from lare_rl.errors import LareError
 from lare_rl.evaluation.policy import RunPolicy
@@ -28,6 +31,8 @@ FRAMES_PER_SECOND = 8
 """The frame rate of a film of many agents."""
 MAX_GIF_FRAMES_PER_SECOND = 25
 """Browsers play a GIF at 50 frames a second at most, and a frame may take long without a graphics card."""
+MAX_DRAWINGS = 200
+"""The most pictures of a film of a single agent in JAX, whose package may need a second for each."""
 FRAME_SIZE = {"width": 320, "height": 320}
 """Pixels of a MuJoCo film. The default, 480 by 480, takes twice the time and space."""
 
@@ -44,7 +49,8 @@ def record_video(run: Run, path: str | Path, best: bool = False, deterministic: 
     """
     path = Path(path)
     check_video_path(path)
-    if load_env_spec(run.config.task).n_agents > 1:
+    spec = load_env_spec(run.config.task)
+    if spec.n_agents > 1:
         if best or deterministic:
             raise LareError(
                 "many agents are filmed as they act in training, with their credit: leave best and deterministic out"
@@ -53,6 +59,9 @@ def record_video(run: Run, path: str | Path, best: bool = False, deterministic: 
         if frames is None:
             raise LareError(f"{run.config.task.name} steps on the host, where only single agents are filmed")
         write_video(path, frames, 1 / FRAMES_PER_SECOND)
+        return
+    if spec.is_jax:
+        write_video(path, _play_and_draw(run, RunPolicy(run, 0, best, deterministic)), 1 / MAX_GIF_FRAMES_PER_SECOND)
         return
     camera = {"camera_name": "track", **FRAME_SIZE} if _has_tracking_camera(run) else {}
     with closing(make_host_env(run.config.task, render_mode="rgb_array", **camera)) as env:
@@ -102,6 +111,25 @@ def write_video(path: Path, frames: Sequence[Frame], frame_seconds: float) -> No
         raise LareError(f"the video {path} cannot be written: {error}; {hint}") from error
 
 
+def _play_and_draw(run: Run, policy: RunPolicy) -> Sequence[Frame]:
+    """Play an episode of an environment of pure functions, and draw the states in which the policy acts, or some of many."""
+    env, states = make_host_env(run.config.task), []
+    assert isinstance(env, JaxOnHost)
+
+    def act(observation: np.ndarray) -> np.ndarray:
+        states.append(env.state)
+        return policy.select_env_action(observation)
+
+    for _ in play_steps(env, act, np.random.default_rng(0), _film_seed(run)):
+        pass
+    states = states[:: math.ceil(len(states) / MAX_DRAWINGS)]
+    return env.env.frames(jax.tree.map(lambda *leaves: np.stack(leaves), *states))
+
+
+def _film_seed(run: Run) -> int:
+    return episode_seed(run.seeds[0], Stream.EVALUATION_EPISODES, 0)
+
+
 def _play_and_render(run: Run, env: HostEnv, policy: RunPolicy, interval: int) -> list[Frame]:
     """Play an episode, and render every `interval`-th timestep at which the policy acts."""
     frames, steps = [], count()
@@ -111,8 +139,7 @@ def _play_and_render(run: Run, env: HostEnv, policy: RunPolicy, interval: int) -
             frames.append(_render(env, run))
         return policy.select_env_action(observation)
 
-    seed = episode_seed(run.seeds[0], Stream.EVALUATION_EPISODES, 0)
-    for _ in play_steps(env, act, np.random.default_rng(0), seed):
+    for _ in play_steps(env, act, np.random.default_rng(0), _film_seed(run)):
         pass
     return frames
 

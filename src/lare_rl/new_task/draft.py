@@ -12,6 +12,7 @@ from lare_rl.tasks.spec import FILL_IN
 
 __all__ = [
     "JUDGES_LINE",
+    "LIMIT_LINE",
     "MEASURES_LINE",
     "SCORE_LINE",
     "Draft",
@@ -31,6 +32,11 @@ SCORE_LINE = (
     '"average": how good steps were on average'
 )
 MEASURES_LINE = '# measures = ["distance"] # keys of the last step\'s info to report beside the return'
+
+LIMIT_LINE = (
+    "max_episode_steps = 1000 # the environment has no limit of its own: write the length of its longest episode, or "
+    "more (longer episodes are cut)"
+)
 
 CONTENTS = {
     "description": "what is to be solved, and what the goal is; not a word about the reward",

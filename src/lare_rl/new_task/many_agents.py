@@ -5,12 +5,12 @@ import inspect
 import json
 import re
 import sys
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from fnmatch import fnmatchcase
-from typing import Any
+from typing import Any, Protocol, runtime_checkable
 
-from lare_rl.envs.agent_arrays import Agent
-from lare_rl.envs.interface import Team
+from lare_rl.envs.agent_arrays import Agent, AgentArrays
+from lare_rl.envs.interface import EnvSpec, Team
 from lare_rl.envs.pettingzoo_construct import agent_kind, find_time_limit, make_parallel_env
 from lare_rl.envs.pettingzoo_env import ParallelHost
 from lare_rl.new_task import draft
@@ -18,7 +18,8 @@ from lare_rl.new_task.documentation import first_section, plain_lines, split_sec
 from lare_rl.new_task.draft import Draft, count_entries, file_name, text_lines, warning_lines
 from lare_rl.tasks.spec import PETTINGZOO_PREFIX, TaskSpec
 
-__all__ = ["draft_multi_agent_task"]
+__all__ = ["draft_multi_agent_task", "make_stub", "write_team_drafts"]
+
 
 GENERIC_MAKERS = ("parallel_env", "env", "raw_env")
 """Common names of functions that make environments. For these, the draft is named after the module."""
@@ -34,6 +35,14 @@ TEAMS_COMMENT = [
 ]
 
 
+@runtime_checkable
+class Layouts(Protocol):
+    """An environment of many agents, with the layout of their arrays."""
+
+    spec: EnvSpec
+    layout: AgentArrays
+
+
 def draft_multi_agent_task(environment_id: str) -> Draft:
     """Draft a task file from a PettingZoo environment's documentation and spaces. Raises `LareError` if it cannot be made."""
     env = make_parallel_env(environment_id, {})
@@ -41,34 +50,59 @@ def draft_multi_agent_task(environment_id: str) -> Draft:
     module, _, maker = environment_id.removeprefix(PETTINGZOO_PREFIX).partition(":")
     name = file_name(module.rpartition(".")[2] if maker in GENERIC_MAKERS else maker)
     several = len(kinds) > 1
-    teams = [_stub(kind, environment_id, team=kind, agents=_patterns(kind)) for kind in kinds] if several else ()
-    task = _stub(name, environment_id, teams=teams, max_episode_steps=limit or 1000)
+    teams = [make_stub(kind, environment_id, team=kind, agents=_patterns(kind)) for kind in kinds] if several else ()
+    task = make_stub(name, environment_id, teams=teams, max_episode_steps=limit or 1000)
+    arguments = _default_arguments(env)
+    lines = [
+        *([] if limit else ["max_episode_steps = 1000 # the environment does not state its own limit"]),
+        *([f"# arguments = {{ {arguments} }} # the defaults, unless they are set here"] if arguments else []),
+    ]
     with contextlib.closing(ParallelHost(env, task)) as host:
         texts, removed = _read_texts(getattr(env, "unwrapped", env))
-        environment_lines = [
-            f'environment = "{environment_id}"',
-            f"observation_size = {host.spec.observation_size}",
-            f"action_size = {host.spec.action_size}",
-            draft.JUDGES_LINE,
-        ]
-        files = {}
-        for team in host.spec.teams if several else ():
-            head, team_texts = _team_lines(host, team), _team_text_lines(host, team, texts)
-            team_lines = [*warning_lines(removed), *head, *environment_lines, *team_texts]
-            files[f"{name}-{team.name}.toml"] = "\n".join(team_lines) + "\n"
-        if several:
-            own_text_lines = text_lines(texts | dict.fromkeys(("observation", "action"), "See the teams."), {})
-        else:
-            own_text_lines = text_lines(texts, _first_lines(host, host.spec.teams[0]))
-    arguments = _default_arguments(env)
+        return write_team_drafts(name, environment_id, host, texts, removed, lines)
+
+
+def write_team_drafts(
+    name: str,
+    environment_id: str,
+    env: Layouts,
+    texts: dict[str, str],
+    removed: tuple[str, ...],
+    more_lines: Sequence[str] = (),
+) -> Draft:
+    """Write a task file and, if there are several teams, one for each of them.
+
+    Args:
+        name: the name of the task.
+        environment_id: the name of the environment.
+        env: the environment, made for a task with these teams.
+        texts: the texts by their keys.
+        removed: the lines that were removed from the texts.
+        more_lines: further lines of the task file.
+    """
+    several = len(env.spec.teams) > 1
+    environment_lines = [
+        f'environment = "{environment_id}"',
+        f"observation_size = {env.spec.observation_size}",
+        f"action_size = {env.spec.action_size}",
+        draft.JUDGES_LINE,
+    ]
+    files = {}
+    for team in env.spec.teams if several else ():
+        head, team_texts = _team_lines(env, team), _team_text_lines(env, team, texts)
+        team_lines = [*warning_lines(removed), *head, *environment_lines, *team_texts]
+        files[f"{name}-{team.name}.toml"] = "\n".join(team_lines) + "\n"
+    if several:
+        own_text_lines = text_lines(texts | dict.fromkeys(("observation", "action"), "See the teams."), {})
+    else:
+        own_text_lines = text_lines(texts, _first_lines(env, env.spec.teams[0]))
     lines = [
         *warning_lines(removed),
         f'name = "{name}"',
         *([*TEAMS_COMMENT, f"teams = {json.dumps(list(files))}"] if several else []),
         *environment_lines,
         draft.SCORE_LINE,
-        *([] if limit else ["max_episode_steps = 1000 # the environment does not state its own limit"]),
-        *([f"# arguments = {{ {arguments} }} # the defaults, unless they are set here"] if arguments else []),
+        *more_lines,
         *own_text_lines,
     ]
     return Draft(
@@ -80,10 +114,10 @@ def draft_multi_agent_task(environment_id: str) -> Draft:
     )
 
 
-def _stub(name: str, environment: str, **keys: Any) -> TaskSpec:
+def make_stub(name: str, environment: str, **keys: Any) -> TaskSpec:
     """Return a task that only names the agents. Its sizes are placeholders, because the draft must determine them first."""
     texts = dict.fromkeys(("description", "observation", "action"), "-")
-    return TaskSpec(name=name, environment=environment, observation_size=1, action_size=1, **texts, **keys)
+    return TaskSpec(name=file_name(name), environment=environment, observation_size=1, action_size=1, **texts, **keys)
 
 
 def _patterns(kind: str) -> tuple[str, ...]:
@@ -108,13 +142,13 @@ def _read_texts(env: Any) -> tuple[dict[str, str], tuple[str, ...]]:
     return write_texts(lines, sections)
 
 
-def _team_lines(host: ParallelHost, team: Team) -> list[str]:
+def _team_lines(host: Layouts, team: Team) -> list[str]:
     names = [str(agent.name) for agent in host.layout.agents[team.agents]]
     patterns = [pattern for pattern in _patterns(team.name) if any(fnmatchcase(name, pattern) for name in names)]
     return [f'name = "{team.name}"', f'team = "{team.name}"', f"agents = {json.dumps(patterns)}"]
 
 
-def _team_text_lines(host: ParallelHost, team: Team, texts: Mapping[str, str]) -> list[str]:
+def _team_text_lines(host: Layouts, team: Team, texts: Mapping[str, str]) -> list[str]:
     """Return the texts of a team: the lines that do not begin with the name of another team."""
     other_teams = {other.name for other in host.spec.teams} - {team.name}
     team_texts = dict(texts)
@@ -126,7 +160,7 @@ def _team_text_lines(host: ParallelHost, team: Team, texts: Mapping[str, str]) -
     return text_lines(team_texts, _first_lines(host, team))
 
 
-def _first_lines(host: ParallelHost, team: Team) -> dict[str, str]:
+def _first_lines(host: Layouts, team: Team) -> dict[str, str]:
     """Return the descriptions of the spaces of a team's first agent, with the padding that other agents require."""
     agent, spec = host.layout.agents[team.start], host.spec
     flattening, padding = draft.describe_flattening(agent.observation_space), _describe_padding(host, agent)
@@ -138,7 +172,7 @@ def _first_lines(host: ParallelHost, team: Team) -> dict[str, str]:
     }
 
 
-def _describe_padding(host: ParallelHost, agent: Agent) -> str:
+def _describe_padding(host: Layouts, agent: Agent) -> str:
     layout = host.layout
     if not layout.adds_index:
         return ""

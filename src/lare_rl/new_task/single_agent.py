@@ -12,15 +12,13 @@ from lare_rl.tasks.spec import PETTINGZOO_PREFIX
 
 __all__ = ["draft_task"]
 
+JAX_FAMILIES = ("gymnax", "brax", "playground", "jumanji", "jaxmarl")
+"""Families whose environments are functions of JAX. Their drafts are written by a module that imports JAX."""
+
 USED_TITLES = {
     *("", "description", "observation space", "observation", "action space", "action"),
     *("episode end", "episode termination"),
 }
-
-LIMIT_LINE = (
-    "max_episode_steps = 1000 # the environment has no limit of its own: write the length of its longest episode, or "
-    "more (longer episodes are cut)"
-)
 
 
 def draft_task(environment_id: str) -> Draft:
@@ -33,6 +31,10 @@ def draft_task(environment_id: str) -> Draft:
         from lare_rl.new_task.many_agents import draft_multi_agent_task
 
         return draft_multi_agent_task(environment_id)
+    if environment_id.partition("/")[0] in JAX_FAMILIES:
+        from lare_rl.new_task.jax_env import draft_jax_task
+
+        return draft_jax_task(environment_id)
     with contextlib.closing(make_gymnasium(environment_id)) as env:
         return _write_draft(environment_id, env)
 
@@ -67,7 +69,7 @@ def _write_draft(environment_id: str, env: gymnasium.Env) -> Draft:
         draft.JUDGES_LINE,
         draft.SCORE_LINE,
         draft.MEASURES_LINE,
-        *([] if env.spec and env.spec.max_episode_steps else [LIMIT_LINE]),
+        *([] if env.spec and env.spec.max_episode_steps else [draft.LIMIT_LINE]),
         *text_lines(texts, first_lines),
     ]
     missing = tuple(key for key in texts if not texts[key])

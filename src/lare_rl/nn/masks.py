@@ -19,9 +19,14 @@ def masked_mean(
 
 
 def select(mask: Bool[Array, "*lead"], new: Tree, old: Tree) -> Tree:
-    """Return the rows of `new` where `mask` is true, and those of `old` elsewhere. The arrays have the mask's axes first."""
+    """Return the rows of `new` where `mask` is true, and those of `old` elsewhere. The arrays have the mask's axes first.
+
+    Arrays of `old` without these axes stay: some simulators have buffers that all rows share.
+    """
 
     def choose(new: Array, old: Array) -> Array:
+        if jnp.shape(old)[: mask.ndim] != mask.shape:
+            return old
         return jnp.where(mask.reshape(*mask.shape, *[1] * (max(new.ndim, old.ndim) - mask.ndim)), new, old)
 
     return jax.tree.map(choose, new, old)

@@ -12,7 +12,7 @@ from lare_rl.config.resolve import apply_defaults
 from lare_rl.config.settings import Settings
 from lare_rl.credit.methods import find_method
 from lare_rl.envs.families import load_env_spec
-from lare_rl.errors import install_command
+from lare_rl.errors import LareError, install_command
 from lare_rl.evaluation.episode_credit import EpisodeCredit, label_factors, load_episode_credit
 from lare_rl.evaluation.rollout import TeamSample, roll_out, sample_steps
 from lare_rl.evaluation.video import encode_gif, render_rollout
@@ -126,7 +126,12 @@ def render_agents(run: Run, max_tsne_points: int = MAX_TSNE_POINTS) -> Iterable[
         f"One episode of the first seed's policy, every agent a row. {sums}. A film shows the credit beside each agent as "
         "number and colour: blue for more, red for less."
     )
-    if (frames := render_rollout(run, rollout)) is not None:
+    try:
+        frames = render_rollout(run, rollout)
+    except LareError as error:  # some packages draw no pictures of their environments
+        frames = None
+        yield render_note(f"There is no film: {error}.")
+    if frames is not None:
         yield render_gif(encode_gif(frames), "one episode, with the credit of each agent")
     if run.functions:
         for team_index, sample in enumerate(sample_steps(run)):

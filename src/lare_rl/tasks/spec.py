@@ -79,10 +79,11 @@ class TaskSpec(CheckedModel):
     measures: tuple[str, ...] = ()
     """Keys of the last step's `info` whose values are averaged and reported in addition to the return."""
     arguments: dict[str, Any] = Field(default_factory=dict)
-    """Keyword arguments of the environment. Only for environments that are made from a module (`pettingzoo/...`)."""
+    """Keyword arguments of the environment. Only for families that have them (`pettingzoo/...`, `gymnax/...`, `jumanji/...` and
+    others)."""
     agents: tuple[str, ...] = ()
     """The names of the agents that this file describes, or patterns of names such as `prey_*`. By default all agents. Only for
-    environments whose agents have names (`pettingzoo/...`)."""
+    environments whose agents have names (`pettingzoo/...`, `jaxmarl/...`)."""
     judged_from: CreditScope = "observation"
     """Whether `phi` reads each agent's observation and action, or the global state and all actions of the team."""
     teams: tuple["TaskSpec", ...] = ()

@@ -1,0 +1,281 @@
+"""What the families of JAX environments share: their packages, actions, flat observations, and a single agent as a team."""
+
+import contextlib
+import importlib
+import io
+import math
+import sys
+import warnings
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from types import ModuleType
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
+
+from lare_rl.envs.env_errors import one_line_errors
+from lare_rl.envs.interface import EnvSpec, Team, Timestep
+from lare_rl.errors import LareError, did_you_mean, install_command, missing_extra_error
+from lare_rl.tasks.spec import TaskSpec
+
+__all__ = [
+    "Bounds",
+    "Choices",
+    "CountedState",
+    "agent_spec",
+    "agent_timestep",
+    "cast_like",
+    "construct",
+    "draw_states",
+    "find_measures",
+    "flat_size",
+    "flatten_tree",
+    "import_package",
+    "make_bounds",
+    "make_choices",
+    "raw_key",
+    "strong_types",
+    "unstack",
+]
+
+MAX_COMBINATIONS = 1024
+"""The largest number of combinations of several choices that become a single choice."""
+
+
+class CountedState(NamedTuple):
+    """A package's state, and the number of steps since the start of the episode."""
+
+    env: Any
+    steps: Int[Array, ""]
+
+
+# Packages
+
+
+def import_package(name: str, task: TaskSpec, extra: str | None = None) -> ModuleType:
+    """Import a package of an environment, without what it prints.
+
+    Raises:
+        LareError: it is not installed (the message names the extra), or cannot be imported.
+    """
+    extra = extra or task.family
+    try:
+        with _silence():
+            return importlib.import_module(name)
+    except ModuleNotFoundError as error:
+        if error.name in (name, name.partition(".")[0]):
+            raise missing_extra_error(f"environment {task.environment!r}", extra) from error
+        reason = error
+    except Exception as error:  # an old package may raise anything if a newer JAX has removed a name
+        reason = error
+    summary = " ".join(str(reason).split())
+    raise LareError(f"{name} cannot be imported: {summary} (try {install_command(extra)})") from reason
+
+
+@contextlib.contextmanager
+def _silence() -> Iterator[None]:
+    """Hide what packages print and warn of. JaxMARL prints to `sys.__stdout__`."""
+    originals, silence = (sys.__stdout__, sys.__stderr__), io.StringIO()
+    with (
+        contextlib.redirect_stdout(silence),
+        contextlib.redirect_stderr(silence),
+        warnings.catch_warnings(),
+    ):
+        warnings.simplefilter("ignore")
+        sys.__stdout__ = sys.__stderr__ = silence  # type: ignore[assignment]
+        try:
+            yield
+        finally:
+            sys.__stdout__, sys.__stderr__ = originals  # type: ignore[misc]
+
+
+def construct(
+    task: TaskSpec, names: Iterable[str], make: Callable[..., Any], arguments: Mapping[str, Any] | None = None
+) -> Any:
+    """Return what `make` returns for the environment's name and the arguments of the task, in place of which others can be passed.
+
+    Raises:
+        LareError: the name is not among the package's names, or `make` raises an error.
+    """
+    name, names = task.environment_name, list(names)
+    message = f"environment {task.environment!r} cannot be made"
+    if name not in names:
+        hint = did_you_mean(name, names) or f"; it has {', '.join(map(str, names))}"
+        raise LareError(f"{message}: {task.family} has no {name!r}{hint}")
+    with one_line_errors(message), _silence():
+        return make(name, **(task.arguments if arguments is None else arguments))
+
+
+# Values
+
+
+def raw_key(key: PRNGKeyArray) -> Array:
+    """Return a key as an array of integers, because checkpoints cannot store typed keys in an environment's state."""
+    return jax.random.key_data(key)
+
+
+def flatten_tree(tree: Any) -> Float[Array, " size"]:
+    """Return all arrays of a tree in one vector: leaf after leaf, and the entries of a leaf row by row."""
+    leaves = [jnp.ravel(jnp.asarray(leaf)).astype(jnp.float32) for leaf in jax.tree.leaves(tree)]
+    return jnp.concatenate(leaves) if leaves else jnp.zeros(0)
+
+
+def flat_size(tree: Any) -> int:
+    """Return the size of `flatten_tree`, from arrays or shapes."""
+    return sum(math.prod(leaf.shape) for leaf in jax.tree.leaves(tree))
+
+
+def strong_types(tree: Any) -> Any:
+    """Return a tree of arrays without weak types, which a compiled step would change."""
+    return jax.tree.map(lambda leaf: jnp.asarray(leaf, jnp.asarray(leaf).dtype), tree)
+
+
+def cast_like(tree: Any, reference: Any) -> Any:
+    """Return a tree with the types of another one of the same structure, so that a state has one type at all steps."""
+    return jax.tree.map(lambda leaf, other: jnp.asarray(leaf, jnp.asarray(other).dtype), tree, reference)
+
+
+def find_measures(task: TaskSpec, values: Mapping[str, Any]) -> tuple[str, ...]:
+    """Return the task's measures that are among a package's values and are numbers."""
+    return tuple(name for name in task.measures if name in values and math.prod(jnp.shape(values[name])) == 1)
+
+
+# Actions
+
+
+class Choices(NamedTuple):
+    """A discrete action. Several choices at a time are one choice: of all their combinations, the last choice changing fastest."""
+
+    sizes: tuple[int, ...]
+    """The number of values of each choice."""
+    shape: tuple[int, ...] = ()
+    """The shape of the environment's action."""
+    dtype: Any = jnp.int32
+
+    @property
+    def size(self) -> int:
+        return math.prod(self.sizes)
+
+    def decode(self, action: Float[Array, " size"]) -> Int[Array, "*shape"]:
+        """Return the environment's action of a one-hot vector."""
+        index = jnp.argmax(action)
+        if self.shape:
+            index = jnp.stack(jnp.unravel_index(index, self.sizes)).reshape(self.shape)
+        return index.astype(self.dtype)
+
+    def mask_combinations(self, mask: Bool[Array, "..."]) -> Bool[Array, " size"]:
+        """Return which combinations are available, from a mask of all combinations or of each choice."""
+        if mask.shape == self.sizes:
+            return mask.ravel()
+        combinations = jnp.ones((), bool)
+        for row, size in zip(mask, self.sizes, strict=True):
+            combinations = combinations[..., None] & row[:size]
+        return combinations.ravel()
+
+
+@dataclass(frozen=True, eq=False)
+class Bounds:
+    """A continuous action between bounds."""
+
+    low: Float[np.ndarray, " size"]
+    high: Float[np.ndarray, " size"]
+    shape: tuple[int, ...]
+    """The shape of the environment's action."""
+
+    @property
+    def size(self) -> int:
+        return len(self.low)
+
+    def decode(self, action: Float[Array, " size"]) -> Float[Array, "*shape"]:
+        """Return the environment's action of a vector."""
+        return action.reshape(self.shape)
+
+
+def make_choices(sizes: Sequence[int], shape: tuple[int, ...], environment: str, dtype: Any = jnp.int32) -> Choices:
+    """Make a discrete action. Raise `LareError` if its choices have too many combinations."""
+    choices = Choices(tuple(map(int, sizes)), shape, dtype)
+    if choices.size > MAX_COMBINATIONS:
+        raise LareError(
+            f"environment {environment!r} cannot be used: its {len(sizes)} choices at a time have {choices.size} combinations, "
+            f"more than {MAX_COMBINATIONS}"
+        )
+    return choices
+
+
+def make_bounds(low: Any, high: Any, shape: tuple[int, ...], environment: str) -> Bounds:
+    """Make a continuous action. Raise `LareError` if it has no bounds."""
+    low, high = (np.broadcast_to(np.asarray(bound, np.float32), shape).ravel().copy() for bound in (low, high))
+    if not (np.isfinite(low).all() and np.isfinite(high).all()):
+        raise LareError(f"environment {environment!r} cannot be used: its actions have no bounds")
+    return Bounds(low, high, shape)
+
+
+# A single agent
+
+
+def agent_spec(action: Choices | Bounds, *, observation_size: int, max_steps: int, **fields: Any) -> EnvSpec:
+    """Return the sizes and bounds of an environment of one agent. `fields` are further fields of `EnvSpec`."""
+    if isinstance(action, Bounds):
+        fields |= {"low": action.low[None], "high": action.high[None]}
+    return EnvSpec(
+        teams=(Team("agent", 0, 1),),
+        observation_size=observation_size,
+        action_size=action.size,
+        discrete=isinstance(action, Choices),
+        max_steps=max_steps,
+        is_jax=True,
+        **fields,
+    )
+
+
+def agent_timestep(
+    spec: EnvSpec,
+    observation: Float[Array, " observation"],
+    *,
+    reward: Any = 0.0,
+    terminated: Any = False,
+    truncated: Any = False,
+    available: Bool[Array, " action"] | None = None,
+    state: Float[Array, " state"] | None = None,
+    measures: Mapping[str, Any] | None = None,
+) -> Timestep:
+    """Return a timestep of one agent. By default all actions are available. If a mask has none, the first is."""
+    if available is None:
+        available = jnp.ones(spec.action_size, bool)
+    available = available.astype(bool)
+    available = available.at[0].set(available[0] | ~available.any())
+    values = measures or {}
+    return Timestep(
+        observation=observation[None],
+        state=jnp.zeros(0) if state is None else state,
+        available=available[None],
+        alive=jnp.ones(1, bool),
+        reward=jnp.asarray(reward, jnp.float32).reshape(1),
+        terminated=jnp.asarray(terminated, bool).reshape(()),
+        truncated=jnp.asarray(truncated, bool).reshape(()),
+        measures={name: jnp.asarray(values.get(name, 0.0), jnp.float32).reshape(()) for name in spec.measures},
+    )
+
+
+# Pictures
+
+
+def unstack(states: Any) -> list[Any]:
+    """Return the states of an episode (leading axis: steps) one by one, on the host."""
+    states = jax.device_get(states)
+    leaves, structure = jax.tree.flatten(states)
+    return [jax.tree.unflatten(structure, step) for step in zip(*leaves, strict=True)]
+
+
+def draw_states(environment: str, draw: Callable[[list[Any]], Sequence[Any]], states: Any) -> list[np.ndarray]:
+    """Return the pictures that a package draws of the states of an episode. Raise `LareError` if it cannot draw them here."""
+    with one_line_errors(f"environment {environment!r} cannot be drawn here", _render_hint), _silence():
+        return [np.asarray(picture)[..., :3].astype(np.uint8) for picture in draw(unstack(states))]
+
+
+def _render_hint(error: BaseException) -> str:
+    words = ("GL", "display", "renderer")
+    return " (without a screen, set MUJOCO_GL=egl)" if any(word in str(error) for word in words) else ""

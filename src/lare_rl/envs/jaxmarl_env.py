@@ -1,0 +1,238 @@
+"""Environments of JaxMARL: `jaxmarl/MPE_simple_spread_v3`. The adapter calls `step_env`, which does not reset."""
+
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, NamedTuple
+
+import gymnasium
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray, UInt8
+
+from lare_rl.envs.agent_arrays import Agent, AgentArrays, make_agent
+from lare_rl.envs.canvas import to_pixels
+from lare_rl.envs.env_errors import no_time_limit_error, one_line_errors
+from lare_rl.envs.interface import EnvSpec, Timestep
+from lare_rl.envs.jax_spaces import (
+    cast_like,
+    construct,
+    draw_states,
+    find_measures,
+    flat_size,
+    flatten_tree,
+    import_package,
+    raw_key,
+    strong_types,
+)
+from lare_rl.envs.pettingzoo_construct import group_by_team
+from lare_rl.errors import LareError, short_repr
+from lare_rl.tasks.spec import TaskSpec
+
+__all__ = ["JaxMARLEnv", "JaxMARLState", "make"]
+
+LIMITS = ("max_steps", "episode_length")
+"""JaxMARL's names of the time limit, as arguments and attributes."""
+ALL = "__all__"
+"""JaxMARL's key for the end of the episode."""
+WORLD_STATE = "world_state"
+"""JaxMARL's key for the global state among the observations."""
+RESETS_ITSELF = ("coin_game",)
+"""Environments whose steps put the next game's first observation in place of the last one."""
+
+
+def make(task: TaskSpec, **_: Any) -> "JaxMARLEnv":
+    """Make the environment of a task with the name `jaxmarl/ID`.
+
+    The task's arguments are arguments of `jaxmarl.make`. If the environment has a time limit, `max_episode_steps` sets it.
+
+    Raises:
+        LareError: JaxMARL is not installed, or the environment cannot be made, or it has no time limit.
+    """
+    jaxmarl = import_package("jaxmarl", task)
+    names = jaxmarl.registered_envs
+    if task.environment_name in RESETS_ITSELF:
+        raise LareError(
+            f"environment {task.environment!r} cannot be used: its steps hide the last observation of a game"
+        )
+    env = construct(task, names, jaxmarl.make)
+    limit_name = next((name for name in LIMITS if getattr(env, name, None)), None)
+    changes: dict[str, Any] = {}
+    if limit_name and task.max_episode_steps:
+        changes[limit_name] = task.max_episode_steps
+    if getattr(env, "auto_reset", False):  # multi-agent Brax resets inside its steps, unless it is told not to
+        changes["auto_reset"] = False
+    if changes:
+        env = construct(task, names, jaxmarl.make, changes | task.arguments)
+    limit = task.max_episode_steps or (getattr(env, limit_name) if limit_name else None)
+    if limit is None:
+        raise no_time_limit_error(task)
+    return JaxMARLEnv(env, task, int(limit))
+
+
+class JaxMARLState(NamedTuple):
+    """JaxMARL's state, the number of steps since the start of the episode, and which agents act."""
+
+    env: Any
+    steps: Int[Array, ""]
+    alive: Bool[Array, " agents"]
+
+
+class JaxMARLEnv:
+    """An environment of JaxMARL as a `JaxEnv`.
+
+    Agents are in the order of their teams, and their spaces are padded as in `AgentArrays`. JaxMARL does not tell a time limit from
+    another end: an episode that ends at `max_steps` is truncated, one that ends before is terminated. At the last step no agent
+    leaves, because `phi` may read what those that acted observe.
+    """
+
+    spec: EnvSpec
+
+    def __init__(self, env: Any, task: TaskSpec, max_steps: int):
+        self.env, self._name = env, task.environment
+        message = f"environment {self._name!r} cannot be used"
+        names, teams = group_by_team(list(env.agents), task)
+        with one_line_errors(message):
+            observations, state = jax.eval_shape(env.reset, jnp.zeros(2, jnp.uint32))
+            if not (isinstance(observations, Mapping) and set(names) <= set(observations)):
+                raise LareError(f"{message}: its observations are not a dictionary by agent")
+            agents = [_make_agent(name, env.action_space(name), flat_size(observations[name])) for name in names]
+            self.layout = AgentArrays(agents)
+            self._masks = _find_masks(env, state) if self.layout.discrete else None
+            actions = {agent.name: jnp.asarray(agent.action_space.sample()) for agent in agents}
+            infos = jax.eval_shape(env.step_env, jnp.zeros(2, jnp.uint32), state, actions)[-1]
+        self._from_observations = any(role.judged_from == "state" for role in (task, *task.teams))
+        low, high = self.layout.bounds
+        self.spec = EnvSpec(
+            teams=teams,
+            observation_size=self.layout.observation_size,
+            action_size=self.layout.action_size,
+            discrete=self.layout.discrete,
+            max_steps=max_steps,
+            state_size=jax.eval_shape(self._read_state, observations, state).shape[0],
+            low=low,
+            high=high,
+            agents_leave=True,  # no environment states that they do not
+            masks_actions=self._masks is not None or not self.layout.available.all(),
+            is_jax=True,
+            measures=find_measures(task, infos),
+        )
+
+    def reset(self, key: PRNGKeyArray) -> tuple[JaxMARLState, Timestep]:
+        observations, env_state = self.env.reset(raw_key(key))
+        alive = jnp.ones(self.spec.n_agents, bool)
+        state = JaxMARLState(strong_types(env_state), jnp.zeros((), jnp.int32), alive)
+        return state, self._make_timestep(observations, state, jnp.zeros(self.spec.n_agents), jnp.zeros((), bool), {})
+
+    def step(
+        self, state: JaxMARLState, action: Float[Array, "agents action"], key: PRNGKeyArray
+    ) -> tuple[JaxMARLState, Timestep]:
+        agents = self.layout.agents
+        actions = {agent.name: _decode(agent, action[index]) for index, agent in enumerate(agents)}
+        observations, env_state, rewards, dones, infos = self.env.step_env(raw_key(key), state.env, actions)
+        reward = jnp.stack([jnp.asarray(rewards[agent.name], jnp.float32).reshape(()) for agent in agents])
+        done = jnp.stack([jnp.asarray(dones[agent.name], bool).reshape(()) for agent in agents])
+        ended = jnp.asarray(dones[ALL], bool).reshape(())
+        alive = state.alive & (ended | ~done)
+        ended |= ~alive.any()
+        next_state = JaxMARLState(cast_like(env_state, state.env), state.steps + 1, alive)
+        return next_state, self._make_timestep(observations, next_state, reward * state.alive, ended, infos)
+
+    def _make_timestep(
+        self,
+        observations: Mapping[Any, Any],
+        state: JaxMARLState,
+        reward: Float[Array, " agents"],
+        ended: Bool[Array, ""],
+        infos: Mapping[str, Any],
+    ) -> Timestep:
+        at_limit = state.steps >= self.spec.max_steps
+        return Timestep(
+            observation=self._pad(observations) * state.alive[:, None],
+            state=self._read_state(observations, state.env),
+            available=self._read_masks(state),
+            alive=state.alive,
+            reward=reward,
+            terminated=ended & ~at_limit,
+            truncated=at_limit,
+            measures={name: jnp.asarray(infos.get(name, 0.0), jnp.float32).reshape(()) for name in self.spec.measures},
+        )
+
+    def _pad(self, observations: Mapping[Any, Any]) -> Float[Array, "agents observation"]:
+        """Return all observations in one array: padded, and with the agent's index if the agents' spaces differ."""
+        layout = self.layout
+        vectors = [flatten_tree(observations[agent.name]) for agent in layout.agents]
+        padded = jnp.stack([jnp.pad(vector, (0, layout.longest_observation - len(vector))) for vector in vectors])
+        return jnp.concatenate([padded, jnp.eye(len(vectors))], axis=1) if layout.adds_index else padded
+
+    def _read_state(self, observations: Mapping[Any, Any], state: Any) -> Float[Array, " state"]:
+        """Return the global state. Without one, return all observations if credit is assigned from the state."""
+        if WORLD_STATE in observations:
+            return flatten_tree(observations[WORLD_STATE])
+        if hasattr(self.env, "get_world_state"):
+            return flatten_tree(self.env.get_world_state(state))
+        return self._pad(observations).ravel() if self._from_observations else jnp.zeros(0)
+
+    def _read_masks(self, state: JaxMARLState) -> Bool[Array, "agents action"]:
+        available = jnp.asarray(self.layout.available)
+        if not self.layout.discrete:
+            return available
+        if self._masks is not None:
+            masks = self._masks(state.env)
+            rows = [jnp.asarray(masks[agent.name]).astype(bool).ravel() for agent in self.layout.agents]
+            available &= jnp.stack([jnp.pad(row, (0, available.shape[1] - len(row))) for row in rows])
+        first = jnp.arange(available.shape[1]) == 0
+        acts = state.alive & available.any(axis=1)
+        return jnp.where(acts[:, None], available, first)
+
+    def frames(
+        self, states: JaxMARLState, credit: Float[np.ndarray, "steps agents"] | None = None
+    ) -> list[UInt8[np.ndarray, "height width 3"]]:
+        """Return JaxMARL's pictures of a particle task, which do not show credit. Raise `LareError` for other environments."""
+        if not hasattr(self.env, "num_entities"):
+            raise LareError(f"environment {self._name!r} cannot be drawn: only JaxMARL's particle tasks (MPE_...) can")
+        return draw_states(self._name, self._draw, states.env)
+
+    def _draw(self, states: Sequence[Any]) -> list[np.ndarray]:
+        from jaxmarl.environments.mpe.mpe_visualizer import MPEVisualizer
+        from matplotlib import pyplot
+
+        visualizer, pictures = MPEVisualizer(self.env, list(states)), []
+        try:
+            for index in range(len(states)):
+                visualizer.update(index)
+                pictures.append(to_pixels(visualizer.fig))
+        finally:
+            pyplot.close(visualizer.fig)
+        return pictures
+
+
+def _make_agent(name: Any, space: Any, observation_size: int) -> Agent:
+    """Make an agent from JaxMARL's action space and the size of its observations, which its spaces may state wrongly."""
+    observation_space = gymnasium.spaces.Box(-np.inf, np.inf, (observation_size,), np.float32)
+    if hasattr(space, "n"):
+        return make_agent(name, observation_space, gymnasium.spaces.Discrete(int(space.n)))
+    if hasattr(space, "low"):
+        low, high = (np.broadcast_to(np.asarray(bound, np.float32), space.shape) for bound in (space.low, space.high))
+        return make_agent(name, observation_space, gymnasium.spaces.Box(low, high, dtype=np.float32))
+    raise LareError(f"the actions of {name} are {short_repr(space)}")
+
+
+def _decode(agent: Agent, action: Float[Array, " action"]) -> Array:
+    """Return the environment's action of a padded vector."""
+    action = action[: agent.action_size]
+    if agent.discrete:
+        return jnp.argmax(action).astype(jnp.int32)
+    return action.reshape(agent.action_space.shape or ())
+
+
+def _find_masks(env: Any, state: Any) -> Callable[[Any], Mapping[Any, Any]] | None:
+    """Return the function that returns the available actions by agent, if the environment has one."""
+    functions = [getattr(env, name, None) for name in ("get_avail_actions", "get_legal_moves")]
+    return next((function for function in functions if function and _is_implemented(function, state)), None)
+
+
+def _is_implemented(function: Callable[[Any], Any], state: Any) -> bool:
+    try:
+        return isinstance(jax.eval_shape(function, state), Mapping)
+    except NotImplementedError:  # of JaxMARL's base class
+        return False

@@ -1,0 +1,161 @@
+"""Environments of Jumanji: `jumanji/Snake-v1`. Jumanji resets only in wrappers, which the adapter does not use."""
+
+import inspect
+from collections.abc import Sequence
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, PRNGKeyArray, UInt8
+
+from lare_rl.envs.env_errors import no_time_limit_error, one_line_errors
+from lare_rl.envs.interface import Timestep
+from lare_rl.envs.jax_spaces import (
+    Bounds,
+    Choices,
+    CountedState,
+    agent_spec,
+    agent_timestep,
+    cast_like,
+    construct,
+    draw_states,
+    find_measures,
+    flat_size,
+    flatten_tree,
+    import_package,
+    make_bounds,
+    make_choices,
+    raw_key,
+    strong_types,
+)
+from lare_rl.errors import LareError, short_repr
+from lare_rl.tasks.spec import TaskSpec
+
+__all__ = ["JumanjiEnv", "make", "observed_arrays"]
+
+MASK = "action_mask"
+"""Jumanji's name of the mask of available actions in an observation."""
+LIMIT = "time_limit"
+"""Jumanji's name of the time limit, as an argument and an attribute."""
+
+
+def make(task: TaskSpec, **_: Any) -> "JumanjiEnv":
+    """Make the environment of a task with the name `jumanji/ID`.
+
+    The task's arguments are arguments of `jumanji.make`. If the environment has a time limit, `max_episode_steps` sets it.
+
+    Raises:
+        LareError: Jumanji is not installed, or the environment cannot be made, or it has several agents or no time limit.
+    """
+    jumanji = import_package("jumanji", task)
+    names = sorted(jumanji.registered_environments())
+    env = construct(task, names, jumanji.make)
+    if task.max_episode_steps and LIMIT in inspect.signature(type(env).__init__).parameters:
+        env = construct(task, names, jumanji.make, {LIMIT: task.max_episode_steps} | task.arguments)
+    limit = task.max_episode_steps or getattr(env, LIMIT, None)
+    if limit is None:
+        raise no_time_limit_error(task)
+    return JumanjiEnv(env, task, limit)
+
+
+class JumanjiEnv:
+    """An environment of Jumanji as a `JaxEnv`.
+
+    The observation is all arrays of Jumanji's observation but the mask, in the order of its fields, each row by row. Several choices
+    at a time are one choice of all their combinations. An episode that ends with a discount of 0 is terminated, as Jumanji says;
+    else it is truncated.
+    """
+
+    def __init__(self, env: Any, task: TaskSpec, max_steps: int):
+        self.env, self._name = env, task.environment
+        specs = import_package("jumanji.specs", task)
+        self._action = _read_action(env.action_spec, specs, task.environment)
+        with one_line_errors(f"environment {self._name!r} cannot be used"):
+            _, timestep = jax.eval_shape(env.reset, jnp.zeros(2, jnp.uint32))
+        if timestep.reward.shape:
+            raise LareError(
+                f"environment {self._name!r} cannot be used: each of its {len(timestep.reward)} agents has rewards, and LaRe's "
+                "adapter of Jumanji has one agent"
+            )
+        self.spec = agent_spec(
+            self._action,
+            observation_size=flat_size(_observed(timestep.observation)),
+            max_steps=max_steps,
+            masks_actions=_find_mask(timestep.observation) is not None and isinstance(self._action, Choices),
+            measures=find_measures(task, timestep.extras or {}),
+        )
+
+    def reset(self, key: PRNGKeyArray) -> tuple[CountedState, Timestep]:
+        state, timestep = self.env.reset(raw_key(key))
+        return CountedState(strong_types(state), jnp.zeros((), jnp.int32)), self._make_timestep(timestep, 0)
+
+    def step(
+        self, state: CountedState, action: Float[Array, "1 action"], key: PRNGKeyArray
+    ) -> tuple[CountedState, Timestep]:
+        """Make one step. The key is not used: Jumanji's state has its own."""
+        next_state, timestep = self.env.step(state.env, self._action.decode(action[0]))
+        steps = state.steps + 1
+        return CountedState(cast_like(next_state, state.env), steps), self._make_timestep(timestep, steps)
+
+    def _make_timestep(self, timestep: Any, steps: Any) -> Timestep:
+        is_terminal = timestep.last() & (timestep.discount == 0)
+        return agent_timestep(
+            self.spec,
+            flatten_tree(_observed(timestep.observation)),
+            reward=timestep.reward,
+            terminated=is_terminal,
+            truncated=(timestep.last() & ~is_terminal) | (steps >= self.spec.max_steps),
+            available=self._read_mask(timestep.observation),
+            measures=timestep.extras,
+        )
+
+    def _read_mask(self, observation: Any) -> Bool[Array, " action"] | None:
+        mask = _find_mask(observation)
+        return None if mask is None or isinstance(self._action, Bounds) else self._action.mask_combinations(mask)
+
+    def frames(
+        self, states: CountedState, credit: Float[np.ndarray, "steps agents"] | None = None
+    ) -> list[UInt8[np.ndarray, "height width 3"]]:
+        """Return Jumanji's pictures of states, which do not show credit. Raise `LareError` if it draws no such environment."""
+        return draw_states(self._name, self._draw, states.env)
+
+    def _draw(self, states: Sequence[Any]) -> list[np.ndarray]:
+        viewer = self.env.unwrapped._viewer
+        viewer._display = viewer._display_rgb_array  # the viewer was made to open windows
+        try:
+            return [np.array(viewer.render(state)) for state in states]
+        finally:
+            viewer.close()
+
+
+def observed_arrays(observation: Any) -> list[tuple[str, Any]]:
+    """Return the names and arrays of an observation, without the mask, in the order in which they are flattened."""
+    leaves = jax.tree_util.tree_leaves_with_path(observation)
+    return [
+        (jax.tree_util.keystr(path, simple=True, separator="."), leaf) for path, leaf in leaves if not _is_mask(path)
+    ]
+
+
+def _observed(observation: Any) -> list[Any]:
+    return [leaf for _, leaf in observed_arrays(observation)]
+
+
+def _find_mask(observation: Any) -> Any:
+    leaves = jax.tree_util.tree_leaves_with_path(observation)
+    return next((leaf for path, leaf in leaves if _is_mask(path)), None)
+
+
+def _is_mask(path: tuple[Any, ...]) -> bool:
+    return MASK in (getattr(path[-1], "name", None), getattr(path[-1], "key", None))
+
+
+def _read_action(spec: Any, specs: Any, environment: str) -> Choices | Bounds:
+    if isinstance(spec, specs.DiscreteArray):
+        return make_choices((spec.num_values,), (), environment, spec.dtype)
+    if isinstance(spec, specs.MultiDiscreteArray):
+        sizes = np.asarray(spec.num_values)
+        return make_choices(sizes.ravel().tolist(), sizes.shape, environment, spec.dtype)
+    if isinstance(spec, specs.BoundedArray) and np.issubdtype(spec.dtype, np.floating):
+        return make_bounds(spec.minimum, spec.maximum, tuple(spec.shape), environment)
+    raise LareError(f"environment {environment!r} cannot be used: its actions are {short_repr(spec)}")

@@ -1,0 +1,135 @@
+"""Environments of Brax and of MuJoCo Playground as `JaxEnv`s: both have the functions `reset(rng)` and `step(state, action)`."""
+
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int, PRNGKeyArray, UInt8
+
+from lare_rl.envs.env_errors import one_line_errors
+from lare_rl.envs.interface import Timestep
+from lare_rl.envs.jax_spaces import (
+    Bounds,
+    agent_spec,
+    agent_timestep,
+    cast_like,
+    draw_states,
+    find_measures,
+    flat_size,
+    flatten_tree,
+    raw_key,
+    strong_types,
+)
+from lare_rl.errors import LareError
+from lare_rl.tasks.spec import TaskSpec
+
+__all__ = ["RobotEnv", "RobotState"]
+
+OBSERVATION, PRIVILEGED = "state", "privileged_state"
+"""Keys of an observation that is a dictionary: what the policy observes, and what only a critic may."""
+
+
+class RobotState(NamedTuple):
+    """The package's state, the number of steps since the start of the episode, and the newest observation."""
+
+    env: Any
+    steps: Int[Array, ""]
+    observation: Float[Array, " observation"]
+    privileged: Float[Array, " state"]
+
+
+class RobotEnv:
+    """An environment of Brax or Playground as a `JaxEnv`.
+
+    The packages count steps and reset in wrappers, which this adapter does not use. An episode is truncated after `max_steps` steps.
+    It terminates where the package says `done`, and where the simulator diverges: the last observation and the reward of a diverged
+    step are the previous observation and 0, because a value that is not finite would spoil all later updates.
+    """
+
+    def __init__(
+        self,
+        env: Any,
+        task: TaskSpec,
+        action: Bounds,
+        max_steps: int,
+        draw: Callable[[list[Any]], Sequence[Any]],
+        action_repeat: int = 1,
+    ):
+        """Wrap an environment.
+
+        Args:
+            env: the package's environment, without wrappers.
+            task: the task.
+            action: the bounds of actions.
+            max_steps: the time limit, in steps of this environment.
+            draw: makes pictures of the package's states.
+            action_repeat: how often an action is repeated. The rewards of the repetitions are added up.
+        """
+        self.env, self._name, self._action, self._draw = env, task.environment, action, draw
+        self._action_repeat = action_repeat
+        with one_line_errors(f"environment {self._name!r} cannot be used"):
+            state = jax.eval_shape(env.reset, jnp.zeros(2, jnp.uint32))
+        if isinstance(state.obs, Mapping) and OBSERVATION not in state.obs:
+            keys = ", ".join(state.obs)
+            raise LareError(f"environment {self._name!r} cannot be used: it observes {keys}, but not {OBSERVATION!r}")
+        observation, privileged = _split_observation(state.obs)
+        self.spec = agent_spec(
+            action,
+            observation_size=flat_size(observation),
+            max_steps=max_steps,
+            state_size=flat_size(privileged),
+            measures=find_measures(task, state.metrics),
+        )
+
+    def reset(self, key: PRNGKeyArray) -> tuple[RobotState, Timestep]:
+        env_state = strong_types(self.env.reset(raw_key(key)))
+        observation, privileged = map(flatten_tree, _split_observation(env_state.obs))
+        state = RobotState(env_state, jnp.zeros((), jnp.int32), observation, privileged)
+        return state, agent_timestep(self.spec, observation, state=privileged)
+
+    def step(
+        self, state: RobotState, action: Float[Array, "1 action"], key: PRNGKeyArray
+    ) -> tuple[RobotState, Timestep]:
+        """Make one step. The key is not used: the package's state has its own."""
+        env_state, reward = state.env, jnp.zeros(())
+        for _ in range(self._action_repeat):
+            env_state = self.env.step(_copy(env_state), self._action.decode(action[0]))
+            reward += env_state.reward
+        observation, privileged = map(flatten_tree, _split_observation(env_state.obs))
+        is_finite = jnp.isfinite(observation).all() & jnp.isfinite(privileged).all() & jnp.isfinite(reward)
+        next_state = RobotState(
+            env=cast_like(env_state, state.env),
+            steps=state.steps + 1,
+            observation=jnp.where(is_finite, observation, state.observation),
+            privileged=jnp.where(is_finite, privileged, state.privileged),
+        )
+        timestep = agent_timestep(
+            self.spec,
+            next_state.observation,
+            reward=jnp.where(is_finite, reward, 0.0),
+            terminated=(env_state.done > 0) | ~is_finite,
+            truncated=next_state.steps >= self.spec.max_steps,
+            state=next_state.privileged,
+            measures=env_state.metrics,
+        )
+        return next_state, timestep
+
+    def frames(
+        self, states: RobotState, credit: Float[np.ndarray, "steps agents"] | None = None
+    ) -> list[UInt8[np.ndarray, "height width 3"]]:
+        """Return MuJoCo's pictures of states, which do not show credit. Raise `LareError` if nothing can be drawn here."""
+        return draw_states(self._name, self._draw, states.env)
+
+
+def _split_observation(observation: Any) -> tuple[Any, Any]:
+    """Return what the policy observes, and what only a critic may."""
+    if isinstance(observation, Mapping):
+        return observation[OBSERVATION], observation.get(PRIVILEGED, ())
+    return observation, ()
+
+
+def _copy(state: Any) -> Any:
+    """Return a state with new dictionaries, because the packages' steps write into those of the state before."""
+    return jax.tree.map(lambda leaf: leaf, state)

@@ -1,0 +1,114 @@
+"""Drafts the task file of an environment of another package in JAX: gymnax, Brax, MuJoCo Playground, Jumanji or JaxMARL."""
+
+import inspect
+import re
+from collections.abc import Iterable
+from importlib import import_module
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+
+from lare_rl.envs.interface import EnvSpec
+from lare_rl.envs.jaxmarl_env import JaxMARLEnv
+from lare_rl.envs.jumanji_env import JumanjiEnv, observed_arrays
+from lare_rl.envs.pettingzoo_construct import agent_kind
+from lare_rl.errors import LareError
+from lare_rl.new_task import draft
+from lare_rl.new_task.documentation import first_section, plain_lines, split_sections, write_texts
+from lare_rl.new_task.draft import Draft, count_entries, file_name, text_lines, warning_lines
+from lare_rl.new_task.many_agents import make_stub, write_team_drafts
+
+__all__ = ["draft_jax_task"]
+
+FIELD = re.compile(r"^- (observation|action|reward|episode termination|state)s?:", re.MULTILINE)
+"""The beginning of a section in Jumanji's documentation."""
+
+DEFAULT_LIMIT = 1000
+
+
+def draft_jax_task(environment_id: str) -> Draft:
+    """Draft a task file from an environment's documentation and sizes. Raises `LareError` if it cannot be made."""
+    family, _, name = environment_id.partition("/")
+    make = import_module(f"lare_rl.envs.{family}_env").make
+    stub = make_stub(name, environment_id)
+    has_limit = True
+    try:
+        env = make(stub)
+    except LareError as error:
+        try:
+            env = make(stub.model_copy(update={"max_episode_steps": DEFAULT_LIMIT}))
+        except LareError:
+            raise error from None
+        has_limit = False
+    texts, removed = _read_texts(env)
+    limit_lines = [] if has_limit else [draft.LIMIT_LINE]
+    if isinstance(env, JaxMARLEnv):
+        kinds = list(dict.fromkeys(agent_kind(agent.name) for agent in env.layout.agents))
+        if len(kinds) > 1:
+            stubs = tuple(make_stub(kind, environment_id, team=kind, agents=(kind, f"{kind}_[0-9]*")) for kind in kinds)
+            limit = {} if has_limit else {"max_episode_steps": DEFAULT_LIMIT}
+            env = make(make_stub(name, environment_id, teams=stubs, **limit))
+        return write_team_drafts(file_name(name), environment_id, env, texts, removed, limit_lines)
+    lines = [
+        *warning_lines(removed),
+        f'name = "{file_name(name)}"',
+        f'environment = "{environment_id}"',
+        f"observation_size = {env.spec.observation_size}",
+        f"action_size = {env.spec.action_size}",
+        draft.JUDGES_LINE,
+        draft.SCORE_LINE,
+        *limit_lines,
+        *text_lines(texts, {"observation": _describe_observation(env), "action": _describe_action(env.spec)}),
+    ]
+    missing = tuple(key for key in texts if not texts[key])
+    return Draft(file_name(name), "\n".join(lines) + "\n", missing, removed)
+
+
+def _read_texts(env: Any) -> tuple[dict[str, str], tuple[str, ...]]:
+    """Return the texts by their keys, and the removed lines, from the docstring of the package's class."""
+    documentation = inspect.cleandoc(vars(type(env.env)).get("__doc__") or "")
+    sections = split_sections(FIELD.sub(_heading, documentation))
+    return write_texts(
+        {
+            "description": plain_lines(sections[""]) + first_section(sections, "description"),
+            "observation": list(_without_masks(first_section(sections, "observation space", "observation"))),
+            "action": first_section(sections, "action space", "action"),
+        },
+        sections,
+    )
+
+
+def _heading(match: re.Match[str]) -> str:
+    """Return a heading in place of the beginning of a section."""
+    lead = "An episode ends:\n" if match[1] == "episode termination" else ""
+    return f"## {match[1]}\n{lead}"
+
+
+def _without_masks(lines: Iterable[str]) -> Iterable[str]:
+    """Yield the lines that are not about the mask of available actions, which is no entry of the observation."""
+    return (line for line in lines if "action_mask" not in line and not line.startswith("Observation"))
+
+
+def _describe_observation(env: Any) -> str:
+    """Return the number of entries and, if the observation has several arrays, which entries come from which."""
+    count = count_entries(env.spec.observation_size)
+    if not isinstance(env, JumanjiEnv):
+        return f"{count}."
+    _, timestep = jax.eval_shape(env.env.reset, jnp.zeros(2, jnp.uint32))
+    start, ranges = 0, []
+    for name, array in observed_arrays(timestep.observation):
+        entries = f"{start} to {start + array.size - 1}" if array.size > 1 else f"{start}"
+        shape = f" (shape {' by '.join(map(str, array.shape))}, row by row)" if len(array.shape) > 1 else ""
+        ranges.append(f"{entries}: {name}{shape}")
+        start += array.size
+    return f"{count}. {'; '.join(ranges)}."
+
+
+def _describe_action(spec: EnvSpec) -> str:
+    if spec.discrete:
+        return f"{count_entries(spec.action_size)}, all 0 but one: the action that is taken."
+    lows, highs = set(spec.low.ravel().tolist()), set(spec.high.ravel().tolist())
+    quantifier = "each " if spec.action_size > 1 else ""
+    bounds = f", {quantifier}between {lows.pop():g} and {highs.pop():g}" if len(lows) == len(highs) == 1 else ""
+    return f"{count_entries(spec.action_size)}{bounds}."
