@@ -163,7 +163,7 @@ def main(
     rows: tuple[str, ...] = tuple(ROWS),
     phases: bool = False,
     trace: str = "",
-    whole: tuple[int, ...] = (),
+    whole_runs: tuple[int, ...] = (),
     starts: tuple[str, ...] = (),
     out: str = "device",
 ) -> None:
@@ -173,7 +173,7 @@ def main(
         rows: the rows to time.
         phases: also time the parts of an iteration that the host drives.
         trace: a folder for a profile of three iterations of each row.
-        whole: also train CN-6 as a whole, with these numbers of seeds.
+        whole_runs: also train CN-6 as a whole, with these numbers of seeds.
         starts: the rows whose start is timed.
         out: the name of the file of results.
     """
@@ -186,7 +186,7 @@ def main(
             results[name] |= measure(row, Path(folder) / name, phases, trace)
             print(name, results[name], flush=True)
             write(out, results)
-        for seeds in whole:
+        for seeds in whole_runs:
             results[f"whole run of CN-6, {seeds} seeds"] = run_whole(seeds, Path(folder) / f"whole-{seeds}")
             print(seeds, results[f"whole run of CN-6, {seeds} seeds"], flush=True)
             write(out, results)

@@ -85,8 +85,8 @@ def make_train(n_updates: int, credit_method: str) -> Any:
         truncated = jax.vmap(env.is_truncated, (0, None))(next_state, env_params) & ~terminated
         done, return_ = terminated | truncated, return_ + reward
         log_prob = jnp.take_along_axis(log_probs, action[:, None], axis=1)[:, 0]
-        paid = jnp.where(done, return_, 0)  # the episodic setting: the return at the end, and nothing before
-        transition = Transition(obs, action, log_prob, value, paid, next_obs, terminated, truncated)
+        episodic_reward = jnp.where(done, return_, 0)  # the episodic setting: the return at the end, and nothing before
+        transition = Transition(obs, action, log_prob, value, episodic_reward, next_obs, terminated, truncated)
         first_obs, first_state = jax.vmap(env.reset_env, (0, None))(reset_keys, env_params)
 
         def restart(new: jax.Array, old: jax.Array) -> jax.Array:

@@ -24,8 +24,8 @@ def make_steps(key, agents=()):
     true_reward = jnp.concatenate([next_observation, action], axis=-1) @ WEIGHT
     last = jnp.broadcast_to((jnp.arange(N_STEPS) % LENGTH == LENGTH - 1)[:, None], (N_STEPS, N_ENVS))
     returns = true_reward.reshape(-1, LENGTH, *true_reward.shape[1:]).sum(axis=1).repeat(LENGTH, axis=0)
-    paid = jnp.where(last.reshape(*last.shape, *[1] * len(agents)), returns, 0)
-    return CreditSteps(observation, action, next_observation, paid, last, jnp.zeros_like(last)), true_reward
+    episodic_reward = jnp.where(last.reshape(*last.shape, *[1] * len(agents)), returns, 0)
+    return CreditSteps(observation, action, next_observation, episodic_reward, last, jnp.zeros_like(last)), true_reward
 
 
 def correlation(x, y):

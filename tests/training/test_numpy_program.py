@@ -40,8 +40,8 @@ def draw(*shape):
     ],
 )
 def test_program_equals_function(function, arguments):
-    fixed, *others = arguments
-    actual = to_numpy(function, fixed, *others)(fixed)(*others)
+    fixed, *inputs = arguments
+    actual = to_numpy(function, fixed, *inputs)(fixed)(*inputs)
     expected = function(*arguments)
     jax.tree.map(lambda x, y: np.testing.assert_allclose(x, y, rtol=1e-5, atol=1e-6), actual, expected)
     assert jax.tree.map(lambda x: (x.shape, x.dtype), actual) == jax.tree.map(lambda x: (x.shape, x.dtype), expected)

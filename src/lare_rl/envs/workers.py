@@ -57,26 +57,24 @@ def make_vec_env(maker: Maker, n: int) -> VecEnv:
 
     An environment that cannot be made in another process, such as one that the user's script registers, stays in this process.
     """
-    first = make_env_at(0, maker)
     n_saved = n - -(-n // n_cores())
-    if n_saved and n_saved * _measure_step_s(first) > MIN_SAVED_S:
+    if n_saved and n_saved * _measure_step_s(maker) > MIN_SAVED_S:
         with contextlib.suppress(LareError):
-            workers = SubprocVecEnv([maker] * n)
-            first.close()
-            return workers
-    return LocalVecEnv([lambda: first, *[maker] * (n - 1)])
+            return SubprocVecEnv([maker] * n)
+    return LocalVecEnv([maker] * n)
 
 
-def _measure_step_s(env: HostEnv) -> float:
+def _measure_step_s(maker: Maker) -> float:
     """Return the time that a step of an environment takes (s)."""
-    timestep, spec = env.reset(0), env.spec
-    start = time.perf_counter()
-    n_steps = 0
-    while n_steps < N_TIMED_STEPS and not (timestep.terminated or timestep.truncated):
-        first_available = np.eye(spec.action_size, dtype=np.float32)[np.argmax(timestep.available, axis=-1)]
-        timestep = env.step(first_available if spec.discrete else (spec.low + spec.high) / 2)
-        n_steps += 1
-    return (time.perf_counter() - start) / max(n_steps, 1)
+    with contextlib.closing(make_env_at(0, maker)) as env:
+        timestep, spec = env.reset(0), env.spec
+        start = time.perf_counter()
+        n_steps = 0
+        while n_steps < N_TIMED_STEPS and not (timestep.terminated or timestep.truncated):
+            first_available = np.eye(spec.action_size, dtype=np.float32)[np.argmax(timestep.available, axis=-1)]
+            timestep = env.step(first_available if spec.discrete else (spec.low + spec.high) / 2)
+            n_steps += 1
+        return (time.perf_counter() - start) / max(n_steps, 1)
 
 
 class _SharedArrays(NamedTuple):
