@@ -22,6 +22,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from functools import partial
 from multiprocessing import Pipe
 from multiprocessing.connection import Connection, wait
+from statistics import median
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -50,6 +51,8 @@ CLOSE_TIMEOUT_S = 2.0
 MIN_SAVED_S = 3e-4
 """Workers are used if they make a step of all environments at least this much faster. A call of all workers costs about as much."""
 N_TIMED_STEPS = 10
+MAX_WORKERS = mmap.ALLOCATIONGRANULARITY // np.dtype(np.int64).itemsize
+"""The first page of the shared file has room for a number of each."""
 
 
 def make_vec_env(maker: Maker, n: int) -> VecEnv:
@@ -67,14 +70,13 @@ def make_vec_env(maker: Maker, n: int) -> VecEnv:
 def _measure_step_s(maker: Maker) -> float:
     """Return the time that a step of an environment takes (s)."""
     with contextlib.closing(make_env_at(0, maker)) as env:
-        timestep, spec = env.reset(0), env.spec
-        start = time.perf_counter()
-        n_steps = 0
-        while n_steps < N_TIMED_STEPS and not (timestep.terminated or timestep.truncated):
+        timestep, spec, times = env.reset(0), env.spec, []
+        while len(times) < N_TIMED_STEPS and not (timestep.terminated or timestep.truncated):
             first_available = np.eye(spec.action_size, dtype=np.float32)[np.argmax(timestep.available, axis=-1)]
+            start = time.perf_counter()
             timestep = env.step(first_available if spec.discrete else (spec.low + spec.high) / 2)
-            n_steps += 1
-        return (time.perf_counter() - start) / max(n_steps, 1)
+            times.append(time.perf_counter() - start)
+        return median(times) if times else 0.0
 
 
 class _SharedArrays(NamedTuple):
@@ -103,7 +105,7 @@ class SubprocVecEnv(VecEnv):
         """
         self.timeout = timeout
         self._workers: list[_Worker] = []
-        n_envs, n_workers = len(makers), min(len(makers), processes or n_cores())
+        n_envs, n_workers = len(makers), min(len(makers), processes or n_cores(), MAX_WORKERS)
         try:
             with _shared_file() as file:
                 current = _map_current(file)
@@ -121,8 +123,10 @@ class SubprocVecEnv(VecEnv):
             for worker in self._workers:
                 worker.send("share", (specs[0], n_envs))
             self._receive("share")
-        except BaseException:
+        except BaseException as error:
             self._kill()
+            if isinstance(error, OSError):
+                raise LareError(f"worker processes cannot be started: {error}") from error
             raise
 
     @property
@@ -316,8 +320,16 @@ def _shared_file() -> Iterator[int]:
     """Yield the descriptor of a file without a name. It lasts as long as a process has mapped it."""
     directory = "/dev/shm" if os.path.isdir("/dev/shm") else None
     with tempfile.TemporaryFile(dir=directory) as file:
-        file.truncate(mmap.ALLOCATIONGRANULARITY)
+        _reserve(file.fileno(), mmap.ALLOCATIONGRANULARITY)
         yield file.fileno()
+
+
+def _reserve(file: int, size: int) -> None:
+    """Give a file at least this size. Raises `OSError` if there is no room: a mapped file without room would kill the process."""
+    if hasattr(os, "posix_fallocate"):
+        os.posix_fallocate(file, 0, size)
+    else:
+        os.ftruncate(file, size)
 
 
 def _map_current(file: int) -> Int[np.ndarray, " workers"]:
@@ -332,7 +344,7 @@ def _map_arrays(file: int, spec: EnvSpec, n: int) -> _SharedArrays:
     arrays = [np.zeros(n, bool), np.zeros(n, np.int64), action, *batch[:-1], *batch.measures.values()]
     starts = np.cumsum([0, *(-(-array.nbytes // 64) * 64 for array in arrays)])
     size = int(starts[-1])
-    os.ftruncate(file, mmap.ALLOCATIONGRANULARITY + size)
+    _reserve(file, mmap.ALLOCATIONGRANULARITY + size)
     memory = mmap.mmap(file, size, offset=mmap.ALLOCATIONGRANULARITY)
     where, seed, action, *columns = (
         np.ndarray(array.shape, array.dtype, memory, start)

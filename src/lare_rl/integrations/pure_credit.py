@@ -95,14 +95,14 @@ def pure_credit(
         action_size: the length of a continuous action, or the number of discrete actions.
         n_envs: the number of environments.
         n_steps: the steps of each environment that `observe` stores at a time.
-        max_steps: the length of the longest episode.
+        max_steps: the length of the longest episode. The decoder does not learn from longer ones.
         discrete: whether actions are discrete.
         agents: the number of agents of a team, which shares its return.
-        low: the bounds of continuous actions in the environment's units, which `phi` reads.
-        high: the same.
+        low: the lower bounds of continuous actions in the environment's units, which `phi` reads.
+        high: the upper bounds.
         judges: the observations of a step that factors and raw features are computed from: "before", "after" or "both".
         capacity: the number of steps that are stored.
-        fit_updates: gradient updates of the decoder in each `refit`. A closed form has none.
+        fit_updates: gradient updates of the decoder in each `refit`. Ignored for a closed form.
         settings: the settings of the decoder.
         scale_rewards: divide r_hat by the running root mean square of R/T.
 
@@ -110,6 +110,11 @@ def pure_credit(
         LareError: the arguments do not go together.
     """
     chosen, functions = find_method(method), () if phi is None else (phi,)
+    if phi is not None and tuple(phi.sizes) != (observation_size, action_size):
+        raise LareError(
+            f"phi reads observations and actions of the sizes {phi.sizes[0]} and {phi.sizes[1]}, not {observation_size} and "
+            f"{action_size}"
+        )
     if chosen.reward not in (Reward.PROXY, Reward.DESIGNED) or chosen.needs_whole_episodes:
         raise LareError(f"{method} does not compute the reward of a step from this step alone: use bayes or lare-bayes")
     if chosen.needs_phi and phi is None:
@@ -125,7 +130,7 @@ def pure_credit(
         high=np.broadcast_to(np.asarray(high, np.float32), shape),
         is_jax=True,
     )
-    algorithm = ALGORITHMS["ppo" if agents == 1 else "ippo"]  # of the columns that are stored, it reads none itself
+    algorithm = ALGORITHMS["ppo" if agents == 1 else "ippo"]  # on-policy, so that only what the decoder reads is stored
     config = TrainConfig(
         env=env,
         credit_scope="observation",
@@ -149,6 +154,10 @@ def pure_credit(
         return init_learner(key, config, lambda _: ())
 
     def observe(state: State, steps: CreditSteps) -> State:
+        if jnp.shape(steps.terminated) != (n_steps, n_envs):
+            raise LareError(
+                f"observe needs {n_steps} steps of {n_envs} environments, not {jnp.shape(steps.terminated)}"
+            )
         return store(state, _trajectory(steps, config), config, graphs)[0]
 
     def refit(state: State, key: PRNGKeyArray) -> State:
@@ -214,8 +223,8 @@ def _stored_steps(state: State, steps: Trajectory, factors: Array, config: Train
 def _make_learn_returns(config: TrainConfig) -> Callable[..., Any]:
     """Return `learn_returns` as a function that `vmap` can map at any time.
 
-    It calculates in float64, which must be enabled while it is traced. A user's `vmap` may trace it again later, when it is not. So
-    another axis is merged into the leading one, which `learn_returns` has anyway.
+    `learn_returns` must be traced with float64 enabled, but a user's `vmap` may trace it later, when it is not. So a mapped axis is
+    merged into the axis of seeds.
     """
 
     @jax.custom_batching.custom_vmap

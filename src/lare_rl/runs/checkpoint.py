@@ -16,7 +16,7 @@ import zlib
 from collections.abc import Iterator, Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any, Protocol, TypeVar, runtime_checkable
+from typing import Any, NamedTuple, Protocol, TypeVar, runtime_checkable
 
 import jax
 import numpy as np
@@ -29,12 +29,15 @@ from lare_rl.util.safe_io import read_json
 __all__ = [
     "DAMAGED_FILE_ERRORS",
     "STATE_FILE",
+    "Snapshot",
     "fill_template",
     "load",
     "named_leaves",
     "open_npz",
     "read_host_state",
     "save",
+    "take_snapshot",
+    "write",
 ]
 
 STATE_FILE = "state.npz"
@@ -82,21 +85,27 @@ class _Segment:
     """The number of rows, of each environment of each seed."""
 
 
-def save(directory: Path, learner: WithReplay, host: Mapping[str, Any], arrays: Mapping[str, np.ndarray]) -> None:
-    """Write a checkpoint.
+class Snapshot(NamedTuple):
+    """What a checkpoint adds and replaces, as NumPy arrays that nothing else changes."""
+
+    rows_file: str
+    rows: dict[str, np.ndarray]
+    state: dict[str, np.ndarray]
+    unused_files: list[str]
+    """Earlier files of rows that are not in use any more."""
+
+
+def take_snapshot(
+    directory: Path, learner: WithReplay, host: Mapping[str, Any], arrays: Mapping[str, np.ndarray]
+) -> Snapshot:
+    """Copy from the device what the next checkpoint will hold. The last one must have been written.
 
     Args:
         directory: the directory of the checkpoint.
         learner: the training state.
         host: other data to save, as JSON.
         arrays: other data to save, as arrays.
-
-    Raises:
-        LareError: it cannot be written.
     """
-    directory.mkdir(exist_ok=True)
-    for partial_file in directory.glob("*.new"):  # of a process that was killed while it wrote
-        partial_file.unlink(missing_ok=True)
     capacity, end = _capacity(learner), np.asarray(learner.replay.next_row)
     start, segments = np.zeros_like(end), []
     if (directory / STATE_FILE).exists():
@@ -108,18 +117,40 @@ def save(directory: Path, learner: WithReplay, host: Mapping[str, Any], arrays: 
     count = end - start + 1
     width = 1 << int(count.max() - 1).bit_length()  # few widths, few compilations
     rows = _read_rows(learner.replay.columns, (start[..., None] + np.arange(width)) % capacity)
-    segment_arrays = {name: np.asarray(values)[:, :, : count.max()] for name, values in rows.items()}
     number = segments[-1].number + 1 if segments else 0
-    write_arrays(directory / f"rows-{number}.npz", segment_arrays)
     segments.append(_Segment(number, start.tolist(), count.tolist()))
     in_use = [segment for segment in segments if np.any(np.add(segment.start, segment.count) > end - capacity)]
-    state = {name: np.asarray(leaf) for name, leaf in named_leaves(learner).items()} | dict(arrays)
+    state = {name: np.array(leaf) for name, leaf in named_leaves(learner).items()}
+    state |= {name: np.array(array) for name, array in arrays.items()}
     state["host"] = np.array(json.dumps(host))
     state["segments"] = np.array(json.dumps([asdict(segment) for segment in in_use]))
-    write_arrays(directory / STATE_FILE, state)
-    for segment in segments:
-        if segment not in in_use:  # not always the oldest ones: a segment from before a drop may reach further
-            (directory / f"rows-{segment.number}.npz").unlink(missing_ok=True)
+    return Snapshot(
+        rows_file=_rows_file(number),
+        rows={name: np.array(values[:, :, : count.max()]) for name, values in jax.device_get(rows).items()},
+        state=state,
+        # Not always the oldest ones: a segment from before a drop may reach further.
+        unused_files=[_rows_file(segment.number) for segment in segments if segment not in in_use],
+    )
+
+
+def write(directory: Path, snapshot: Snapshot) -> None:
+    """Write a checkpoint. Raises `LareError` if it cannot be written."""
+    directory.mkdir(exist_ok=True)
+    for partial_file in directory.glob("*.new"):  # of a process that was killed while it wrote
+        partial_file.unlink(missing_ok=True)
+    write_arrays(directory / snapshot.rows_file, snapshot.rows)
+    write_arrays(directory / STATE_FILE, snapshot.state)
+    for name in snapshot.unused_files:
+        (directory / name).unlink(missing_ok=True)
+
+
+def save(directory: Path, learner: WithReplay, host: Mapping[str, Any], arrays: Mapping[str, np.ndarray]) -> None:
+    """Take a snapshot and write it. The arguments and errors are those of both."""
+    write(directory, take_snapshot(directory, learner, host, arrays))
+
+
+def _rows_file(number: int) -> str:
+    return f"rows-{number}.npz"
 
 
 def load(directory: Path, template: State) -> tuple[State, dict[str, Any], dict[str, np.ndarray]]:
@@ -217,7 +248,7 @@ def _load_rows(learner: State, directory: Path, segments: list[_Segment]) -> Sta
     for name, column in columns.items():  # one after the other, so that only one is in memory twice
         buffer = np.zeros(column.shape, column.dtype)
         for segment in segments:
-            with open_npz(directory / f"rows-{segment.number}.npz") as saved:
+            with open_npz(directory / _rows_file(segment.number)) as saved:
                 values = saved[name]
             counts = np.asarray(segment.count)
             for env in np.ndindex(counts.shape):

@@ -25,9 +25,10 @@ MIN_FEATURES = 32
 def is_batching_faster(config: TrainConfig, n_seeds: int) -> bool:
     """Measure whether this device factorises the matrices of all fits faster at once than one after the other.
 
-    A core takes the same time for both. A card has room for all matrices at once.
+    On a CPU, it is never faster by much, and a choice by time would make runs differ. Besides, batched calls of LAPACK that run at
+    the same time may wait for each other for ever (jaxlib 0.10, `ParallelBatchMap`).
     """
-    if config.method.fit is None:
+    if config.method.fit is None or jax.default_backend() == "cpu":
         return False
     n_features = max(MIN_FEATURES, *(spec.basis.n_features for spec in config.credit_specs))
     n_fits = n_seeds * N_STARTS * len(ScoreType)

@@ -19,6 +19,7 @@ __all__ = ["cache_by_value", "clear_compile_cache"]
 MAX_ENTRIES = 64
 """A run needs about eight. The entries that were unused for the longest time are forgotten."""
 
+_MISSING = object()
 _entries: dict[Any, Any] = {}
 """From builder and arguments to result, the most recently used last."""
 
@@ -35,8 +36,8 @@ def cache_by_value(build: Callable[Args, Result]) -> Callable[Args, Result]:
         bound = signature.bind(*args, **kwargs)
         bound.apply_defaults()
         key = build, _static_key(bound.args), _static_key(bound.kwargs)
-        result = _entries.pop(key, None)
-        _entries[key] = result = build(*args, **kwargs) if result is None else result
+        result = _entries.pop(key, _MISSING)
+        _entries[key] = result = build(*args, **kwargs) if result is _MISSING else result
         while len(_entries) > MAX_ENTRIES:
             del _entries[next(iter(_entries))]
         return result

@@ -95,7 +95,8 @@ def fold_episodes(
         sample = episodes_in_order(buffer, since, start, n_episodes, rows)
         steps = replay.read(buffer, sample.steps)
         states = tuple(body(state, episode_batch(steps, sample, config, i)) for i, state in enumerate(states))
-        return start + jnp.sum(sample.episodes.mask > 0), states
+        n_read = jnp.sum(sample.episodes.mask > 0)
+        return start + jnp.maximum(n_read, 1), states  # an episode with too many steps is left out
 
     return jax.lax.while_loop(lambda carry: carry[0] < total, read_batch, (jnp.zeros_like(total), states))[1]
 

@@ -76,6 +76,7 @@ def _advance(session: Session, until: int, stop: threading.Event) -> None:
     if stop.is_set():
         _check_losses(session)
         session.save()
+        session.finish_saving()
         raise RunInterruptedError(f"stopped at step {session.step} of {session.settings.steps} and saved; {hint}")
     try:
         session.advance(until, stop.is_set)

@@ -138,7 +138,8 @@ def _find_operation(equation: JaxprEqn) -> Operation:
     if name in ELEMENTWISE and not (name == "div" and np.issubdtype(inputs[0].dtype, np.integer)):
         return ELEMENTWISE[name]
     if name in REDUCTIONS:
-        return partial(REDUCTIONS[name], axis=tuple(params["axes"]))
+        reduction, dtype = REDUCTIONS[name], equation.outvars[0].aval.dtype
+        return lambda x: reduction(x, axis=tuple(params["axes"])).astype(dtype)
     match name:
         case "broadcast_in_dim" if len(inputs) == 1:
             shape, dimensions = params["shape"], params["broadcast_dimensions"]
@@ -161,8 +162,8 @@ def _find_operation(equation: JaxprEqn) -> Operation:
             bounds = zip(params["start_indices"], params["limit_indices"], strides, strict=True)
             return partial(_take, index=tuple(slice(*bound) for bound in bounds))
         case "iota":
-            size, lead = params["shape"][params["dimension"]], len(params["shape"]) - params["dimension"] - 1
-            values = np.arange(size, dtype=params["dtype"]).reshape(-1, *[1] * lead)
+            size, n_trailing = params["shape"][params["dimension"]], len(params["shape"]) - params["dimension"] - 1
+            values = np.arange(size, dtype=params["dtype"]).reshape(-1, *[1] * n_trailing)
             return lambda: np.broadcast_to(values, params["shape"])
         case "argmax":
             return lambda x: np.argmax(x, axis=params["axes"][0]).astype(params["index_dtype"])
@@ -189,7 +190,7 @@ def _translate_product(equation: JaxprEqn, inputs: Sequence[int], registers: lis
         axes = [*batch, *free, *contracted] if is_left else [*batch, *contracted, *free]
         n_sum, lead = math.prod(shape[i] for i in contracted), [shape[i] for i in batch]
         new_shape = [*lead, -1, n_sum] if is_left else [*lead, n_sum, -1]
-        if axes != sorted(axes) or len(new_shape) != len(shape):
+        if axes != sorted(axes) or len(free) != 1 or len(contracted) != 1:
             register = _append(partial(_rearrange, axes=axes, shape=new_shape), (register,), registers, calls)
         matrices.append(register)
     result = _append(np.matmul, tuple(matrices), registers, calls)
@@ -217,7 +218,7 @@ ELEMENTWISE: dict[str, Operation] = {
     "abs": np.abs,
     "add": np.add,
     "add_any": np.add,
-    "and": np.logical_and,
+    "and": np.bitwise_and,
     "clamp": lambda low, x, high: np.minimum(np.maximum(x, low), high),
     "copy": lambda x: x,
     "cos": np.cos,
@@ -238,8 +239,8 @@ ELEMENTWISE: dict[str, Operation] = {
     "mul": np.multiply,
     "ne": np.not_equal,
     "neg": np.negative,
-    "not": np.logical_not,
-    "or": np.logical_or,
+    "not": np.invert,
+    "or": np.bitwise_or,
     "rsqrt": lambda x: 1 / np.sqrt(x),
     "sign": np.sign,
     "sin": np.sin,

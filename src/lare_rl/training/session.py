@@ -3,7 +3,7 @@
 import math
 import time
 from collections.abc import Callable, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -69,6 +69,10 @@ class Session:
 
     _unchecked: tuple[Any, Trajectory] | None = None
     """Whether all factors of the newest steps are finite, for each seed, and these steps."""
+    _writer: ThreadPoolExecutor = field(default_factory=lambda: ThreadPoolExecutor(1))
+    """Writes checkpoints."""
+    _saving: Future[None] | None = None
+    """The checkpoint that is being written."""
     _iteration_s: float = MAX_CALL_S
     """How long an iteration of the last compiled call has taken."""
 
@@ -219,14 +223,26 @@ class Session:
             save_best(self.run.checkpoint, self.best)
 
     def save(self) -> None:
-        """Write a checkpoint. Raises `LareError` if it cannot be written, or if a factor is not finite."""
+        """Write a checkpoint, while the run goes on. `finish_saving` waits until it is written.
+
+        Raises:
+            LareError: the last checkpoint could not be written, or a factor is not finite.
+        """
         self._check_factors()
+        self.finish_saving()
         digests = [function.digest for function in self.run.functions]
         host = {"step": self.step, "metrics_length": self.metrics_bytes, "fitted": self.first_fit_done}
         host |= {"function_sha256": digests, "batched": self.config.batched}
         arrays = {f"latest/{name}": np.asarray(values) for name, values in self.latest_metrics.items()}
         arrays |= {f"collector/{name}": values for name, values in self.collector.state_dict().items()}
-        checkpoint.save(self.run.checkpoint, self.learner, host, arrays)
+        snapshot = checkpoint.take_snapshot(self.run.checkpoint, self.learner, host, arrays)
+        self._saving = self._writer.submit(checkpoint.write, self.run.checkpoint, snapshot)
+
+    def finish_saving(self) -> None:
+        """Wait until the last checkpoint is written. Raises `LareError` if it cannot be written."""
+        if self._saving is not None:
+            saving, self._saving = self._saving, None
+            saving.result()
 
     def restore(self, host: dict[str, Any], arrays: dict[str, np.ndarray]) -> list[str]:
         """Restore everything but the learner from a checkpoint. Return messages for the user."""
@@ -240,11 +256,14 @@ class Session:
         if dropped.any():
             self.learner = _abandon_episodes(self.learner, jnp.asarray(dropped))
             self.save()  # now, because a new episode will overwrite rows that the checkpoint counts as saved
+            self.finish_saving()
         return messages
 
     def close(self) -> None:
-        """Close the environments."""
+        """Close the environments, and finish the last checkpoint. Raises `LareError` if it cannot be written."""
         self.collector.close()
+        self._writer.shutdown()
+        self.finish_saving()
 
 
 def start_session(run: Run) -> Session:
