@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any
 
 import lare_rl
-from learning import keep
+from learning_curves import keep
 
 SETTINGS: dict[str, dict[str, Any]] = {
     "HalfCheetah-v4": {"steps": 60_000, "seeds": 3},

@@ -16,7 +16,7 @@ import tyro
 
 from lare_rl.compare.bootstrap import mann_whitney, mann_whitney_u
 from lare_rl.compare.scores import last_quarter
-from learning import mean_and_spread, read
+from learning_curves import mean_and_spread, read
 
 
 def curves(directory: Path, key: str) -> list[dict[int, float]]:

@@ -11,7 +11,7 @@ from typing import Any
 
 import tyro
 
-from learning import mean_and_spread, read
+from learning_curves import mean_and_spread, read
 
 COLUMNS = ("credit/correlation", "credit/error", "credit/return_r2")
 

@@ -1,10 +1,10 @@
 """PPO in one compiled program, in the style of PureJaxRL, on an environment that pays its return at the end of an episode.
 
     pip install 'lare-rl[gymnax]'
-    python examples/purejax_ppo.py                     gymnax's CartPole-v1, 4 seeds at once
-    python examples/purejax_ppo.py --credit none       PPO on the return at the end
+    python examples/purejax_ppo.py
 
-The lines that end in "# credit" are all that assigns credit. Without them, PPO trains on the return at the end.
+It trains several seeds on gymnax's CartPole-v1 at once, without a language model. Without the lines that end in "# LaRe", PPO trains
+on the return at the end.
 """
 
 from itertools import pairwise
@@ -16,7 +16,7 @@ import jax.numpy as jnp
 import optax
 import tyro
 
-import lare_rl
+import lare_rl  # LaRe
 
 N_ENVS, N_STEPS, N_EPOCHS, N_MINIBATCHES = 16, 128, 4, 4
 GAMMA, LAMBDA, CLIP, ENTROPY = 0.99, 0.95, 0.2, 0.01
@@ -49,17 +49,13 @@ def apply_network(layers: list[tuple[jax.Array, jax.Array]], x: jax.Array) -> ja
     return x @ weight + bias
 
 
-def make_train(n_updates: int, credit_method: str) -> Any:
+def make_train(n_updates: int) -> Any:
     """Return the training of one seed: from a key to the mean return of the finished episodes at each update."""
     env, env_params = gymnax.make("CartPole-v1")
     n_obs, n_actions = env.observation_space(env_params).shape[0], env.action_space(env_params).n
     optimizer = optax.chain(optax.clip_by_global_norm(0.5), optax.adam(1e-3))
-    assigns_credit = credit_method != "none"
-    if assigns_credit:
-        credit = lare_rl.pure_credit(  # credit
-            credit_method, observation_size=n_obs, action_size=n_actions, discrete=True,
-            n_envs=N_ENVS, n_steps=N_STEPS, max_steps=MAX_STEPS, capacity=100_000,
-        )  # fmt: skip
+    sizes: Any = {"observation_size": n_obs, "action_size": n_actions, "discrete": True, "max_steps": MAX_STEPS}  # LaRe
+    credit = lare_rl.pure_credit("bayes", n_envs=N_ENVS, n_steps=N_STEPS, capacity=100_000, **sizes)  # LaRe
 
     def policy(params: Any, obs: jax.Array) -> tuple[jax.Array, jax.Array]:
         return jax.nn.log_softmax(apply_network(params["actor"], obs)), apply_network(params["critic"], obs)[..., 0]
@@ -95,20 +91,18 @@ def make_train(n_updates: int, credit_method: str) -> Any:
         carry = jax.tree.map(restart, (first_state, first_obs), (next_state, next_obs))
         return (*carry, jnp.where(done, 0, return_)), transition
 
-    def update(carry: Any, key: jax.Array) -> tuple[Any, jax.Array]:
-        params, opt_state, env_carry, credit_state = carry
-        rollout_key, fit_key, *epoch_keys = jax.random.split(key, 2 + N_EPOCHS)
+    def update(carry: dict[str, Any], key: jax.Array) -> tuple[dict[str, Any], jax.Array]:
+        params = carry["params"]
+        rollout_key, *epoch_keys = jax.random.split(key, 1 + N_EPOCHS)
         rollout_keys = jax.random.split(rollout_key, N_STEPS)
-        env_carry, steps = jax.lax.scan(lambda c, k: env_step(c, k, params), env_carry, rollout_keys)
+        env_carry, steps = jax.lax.scan(lambda c, k: env_step(c, k, params), carry["env"], rollout_keys)
         done = steps.terminated | steps.truncated
         mean_return = jnp.sum(steps.reward) / jnp.maximum(jnp.sum(done), 1)
-        if assigns_credit:
-            one_hot = jax.nn.one_hot(steps.action, n_actions)
-            credit_steps = lare_rl.CreditSteps(
-                steps.obs, one_hot, steps.next_obs, steps.reward, steps.terminated, steps.truncated
-            )
-            credit_state = credit.refit(credit.observe(credit_state, credit_steps), fit_key)  # credit
-            steps = steps._replace(reward=credit.reward(credit_state, credit_steps))  # credit
+        one_hot = jax.nn.one_hot(steps.action, n_actions)  # LaRe
+        data = steps.obs, one_hot, steps.next_obs, steps.reward, steps.terminated, steps.truncated  # LaRe
+        credit_state = credit.observe(carry["credit"], lare_rl.CreditSteps(*data))  # LaRe
+        credit_state = credit.refit(credit_state, jax.random.fold_in(key, 1))  # LaRe
+        steps = steps._replace(reward=credit.reward(credit_state, lare_rl.CreditSteps(*data)))  # LaRe
         _, next_value = policy(params, steps.next_obs)
         delta = steps.reward + GAMMA * jnp.where(steps.terminated, 0, next_value) - steps.value
         decay = GAMMA * LAMBDA * ~done
@@ -128,35 +122,36 @@ def make_train(n_updates: int, credit_method: str) -> Any:
 
         order = jnp.concatenate([jax.random.permutation(k, N_STEPS * N_ENVS) for k in epoch_keys])
         indices = order.reshape(N_EPOCHS * N_MINIBATCHES, -1)
-        (params, opt_state), _ = jax.lax.scan(minibatch, (params, opt_state), indices)
-        return (params, opt_state, env_carry, credit_state), mean_return
+        (params, opt_state), _ = jax.lax.scan(minibatch, (params, carry["optimizer"]), indices)
+        carry = carry | {"params": params, "optimizer": opt_state, "env": env_carry}
+        carry["credit"] = credit_state  # LaRe
+        return carry, mean_return
 
     def train(key: jax.Array) -> jax.Array:
-        actor_key, critic_key, env_key, credit_key, key = jax.random.split(key, 5)
+        actor_key, critic_key, env_key, key = jax.random.split(key, 4)
         params = {
             "actor": init_network(actor_key, (n_obs, 64, 64, n_actions)),
             "critic": init_network(critic_key, (n_obs, 64, 64, 1)),
         }
         obs, env_state = jax.vmap(env.reset_env, (0, None))(jax.random.split(env_key, N_ENVS), env_params)
-        credit_state = credit.init(credit_key) if assigns_credit else ()  # credit
-        carry = params, optimizer.init(params), (env_state, obs, jnp.zeros(N_ENVS)), credit_state
+        carry = {"params": params, "optimizer": optimizer.init(params), "env": (env_state, obs, jnp.zeros(N_ENVS))}
+        carry["credit"] = credit.init(jax.random.fold_in(key, 1))  # LaRe
         return jax.lax.scan(update, carry, jax.random.split(key, n_updates))[1]
 
     return train
 
 
-def main(updates: int = 100, seeds: int = 4, credit: str = "bayes") -> None:
-    """Train.
+def main(updates: int = 100, seeds: int = 4) -> jax.Array:
+    """Train. Return the mean return of each seed at each update.
 
     Args:
         updates: iterations of 2,048 steps.
         seeds: the number of seeds, trained at once by vmap.
-        credit: a method of LaRe, or "none".
     """
-    keys = jax.random.split(jax.random.key(0), seeds)
-    returns = jax.jit(jax.vmap(make_train(updates, credit)))(keys)
+    returns = jax.jit(jax.vmap(make_train(updates)))(jax.random.split(jax.random.key(0), seeds))
     for i in range(9, updates, 10):
         print(f"{(i + 1) * N_STEPS * N_ENVS:8,} steps: return {returns[:, i - 9 : i + 1].mean():.1f}")
+    return returns
 
 
 if __name__ == "__main__":

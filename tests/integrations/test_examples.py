@@ -49,9 +49,25 @@ def test_scripts_use_proxy_rewards(name, tmp_path):
     assert proxy[-1] != dense[-1]
 
 
-@pytest.mark.parametrize("name", SCRIPTS)
-def test_page_shows_added_lines(name):
-    page = (ROOT / "docs" / "plugs" / "cleanrl.md").read_text(encoding="utf-8")
+def test_purejax_ppo_learns_from_the_return_at_the_end(tmp_path):
+    """With the lines that LaRe adds, PPO learns; without them, it does not yet."""
+    pytest.importorskip("gymnax")
+    name = "purejax_ppo.py"
+    (tmp_path / name).write_text("".join(plain_lines(name)), encoding="utf-8")
+    plain, proxy = (
+        runpy.run_path(str(folder / name))["main"](30, seeds=1)[0, -5:].mean()
+        for folder in (tmp_path, ROOT / "examples")
+    )
+    assert plain < 60
+    assert proxy > 150
+
+
+@pytest.mark.parametrize(
+    ("name", "page"),
+    [("cleanrl_td3.py", "cleanrl.md"), ("cleanrl_ppo.py", "cleanrl.md"), ("purejax_ppo.py", "purejax.md")],
+)
+def test_page_shows_added_lines(name, page):
+    page = (ROOT / "docs" / "plugs" / page).read_text(encoding="utf-8")
     diffs = [block for block in re.findall(r"```diff\n(.*?)```", page, re.DOTALL) if f"+++ {name}" in block]
     without_marks = [line.replace(MARK, "") for line in read_lines(name)]
     diff = list(difflib.unified_diff(plain_lines(name), without_marks, f"{name} (plain)", name, n=1))

@@ -39,7 +39,8 @@ _SET_SCORE_TYPE = (
 
 MESSAGES = {
     "equal_returns": (
-        "There is nothing to explain: in all episodes the return is the same, or, if the score is a sum, the mean reward of a step."
+        "There is nothing to explain: in all episodes the return is the same or, if the score is a sum, the mean reward of a step is "
+        "the same."
     ),
     "score_type_is_certain": (
         "The score is treated as {this} over the steps of an episode: so far, this predicts returns better than {other}. "

@@ -49,7 +49,7 @@ class VecEnv(ABC):
         """Raise `EnvOutputError` if an episode is longer or shorter than the specification says."""
         max_steps, ended = self.spec.max_steps, self.batch.terminated | self.batch.truncated
         at_limit = self._length >= max_steps
-        invalid = where & ((at_limit != ended) if self.spec.fixed_length else (at_limit > ended))
+        invalid = where & ((at_limit != ended) if self.spec.fixed_length else (at_limit & ~ended))
         if invalid.any():
             index = int(np.argmax(invalid))
             length = int(self._length[index])

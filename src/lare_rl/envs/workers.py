@@ -351,5 +351,6 @@ def _map_arrays(file: int, spec: EnvSpec, n: int) -> _SharedArrays:
         for array, start in zip(arrays, starts[:-1].tolist(), strict=True)
     )
     n_measures = len(spec.measures)
-    measures = dict(zip(spec.measures, columns[len(columns) - n_measures :], strict=True))
-    return _SharedArrays(where, seed, action, Timestep(*columns[: len(columns) - n_measures], measures))
+    fields, measures = columns[: len(columns) - n_measures], columns[len(columns) - n_measures :]
+    timestep = Timestep(*fields, measures=dict(zip(spec.measures, measures, strict=True)))  # pyright: ignore[reportCallIssue]
+    return _SharedArrays(where, seed, action, timestep)

@@ -117,7 +117,7 @@ class VectorCredit(VectorWrapper, RecordConstructorArgs):
         """Which episodes ended with the last step. In NEXT_STEP mode the next call of `step` resets these environments."""
         self._observation: Any = None
 
-    def reset(
+    def reset(  # pyright: ignore[reportIncompatibleMethodOverride] - Gymnasium 1.3 and 1.4 have other types
         self, *, seed: int | list[int | None] | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Any, dict[str, Any]]:
         mask = (options or {}).get("reset_mask")  # read first, because Gymnasium removes it from the options

@@ -230,7 +230,8 @@ def _make_learn_returns(config: TrainConfig) -> Callable[..., Any]:
     @jax.custom_batching.custom_vmap
     def learn_returns(*inputs: Any) -> tuple[Any, ...]:
         with jax.enable_x64(True):
-            return episodes.learn_returns(*inputs, config)
+            decoders, buffer, n_learned = inputs
+            return episodes.learn_returns(decoders, buffer, n_learned, config)
 
     @learn_returns.def_vmap
     def _map_learn_returns(axis_size: int, is_mapped: Any, *inputs: Any) -> tuple[Any, Any]:

@@ -4,7 +4,9 @@ import contextlib
 
 import gymnasium
 
+from lare_rl.envs.families import FAMILIES
 from lare_rl.envs.gymnasium_env import make_gymnasium
+from lare_rl.errors import LareError
 from lare_rl.new_task import draft
 from lare_rl.new_task.documentation import first_section, plain_lines, split_sections, write_texts
 from lare_rl.new_task.draft import Draft, count_entries, file_name, text_lines, warning_lines
@@ -25,7 +27,7 @@ def draft_task(environment_id: str) -> Draft:
     """Draft a task file from an environment's documentation and spaces.
 
     Raises:
-        LareError: the environment cannot be made, or its spaces cannot be flattened.
+        LareError: the environment cannot be made, its spaces cannot be flattened, or its family has no drafts.
     """
     if environment_id.startswith(PETTINGZOO_PREFIX):
         from lare_rl.new_task.many_agents import draft_multi_agent_task
@@ -35,6 +37,8 @@ def draft_task(environment_id: str) -> Draft:
         from lare_rl.new_task.jax_env import draft_jax_task
 
         return draft_jax_task(environment_id)
+    if (family := environment_id.partition("/")[0]) in FAMILIES:
+        raise LareError(f"new-task cannot draft a task of {family}: write the task file by hand (docs/extending.md)")
     with contextlib.closing(make_gymnasium(environment_id)) as env:
         return _write_draft(environment_id, env)
 

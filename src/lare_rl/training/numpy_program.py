@@ -90,7 +90,7 @@ def _translate(closed: ClosedJaxpr, arguments: Sequence[int], registers: list[An
 
     def find(atom: Any) -> int:
         if isinstance(atom, Literal):
-            return _new_register(registers, np.asarray(atom.val, atom.aval.dtype))
+            return _new_register(registers, np.asarray(atom.val, _aval(atom).dtype))
         return register[atom]
 
     for equation in jaxpr.eqns:
@@ -99,6 +99,7 @@ def _translate(closed: ClosedJaxpr, arguments: Sequence[int], registers: list[An
         if equation.primitive.name == "dot_general":
             outputs = [_translate_product(equation, inputs, registers, calls)]
         elif equation.primitive.name in INLINED:
+            assert inner is not None
             outputs = _translate(inner, inputs, registers, calls)
         elif equation.primitive.name == "split":
             lead, stops = (slice(None),) * equation.params["axis"], np.cumsum(equation.params["sizes"]).tolist()
@@ -108,6 +109,11 @@ def _translate(closed: ClosedJaxpr, arguments: Sequence[int], registers: list[An
             outputs = [_append(_find_operation(equation), tuple(inputs), registers, calls)]
         register.update(zip(equation.outvars, outputs, strict=True))
     return [find(atom) for atom in jaxpr.outvars]
+
+
+def _aval(atom: Any) -> Any:
+    """Return the shape and type of a value of a program."""
+    return atom.aval
 
 
 def _remove_unused(calls: list[_Call], results: Sequence[int]) -> list[_Call]:
@@ -134,11 +140,11 @@ def _split_calls(calls: Sequence[_Call], arguments: Sequence[int]) -> tuple[list
 def _find_operation(equation: JaxprEqn) -> Operation:
     """Return the NumPy function of an operation."""
     name, params = equation.primitive.name, equation.params
-    inputs = [atom.aval for atom in equation.invars]
+    inputs = [_aval(atom) for atom in equation.invars]
     if name in ELEMENTWISE and not (name == "div" and np.issubdtype(inputs[0].dtype, np.integer)):
         return ELEMENTWISE[name]
     if name in REDUCTIONS:
-        reduction, dtype = REDUCTIONS[name], equation.outvars[0].aval.dtype
+        reduction, dtype = REDUCTIONS[name], _aval(equation.outvars[0]).dtype
         return lambda x: reduction(x, axis=tuple(params["axes"])).astype(dtype)
     match name:
         case "broadcast_in_dim" if len(inputs) == 1:
@@ -152,7 +158,7 @@ def _find_operation(equation: JaxprEqn) -> Operation:
         case "reshape" if params["dimensions"] is None:
             return lambda x: x.reshape(params["new_sizes"])
         case "squeeze":
-            return lambda x: x.reshape(equation.outvars[0].aval.shape)
+            return lambda x: x.reshape(_aval(equation.outvars[0]).shape)
         case "transpose":
             return lambda x: x.transpose(params["permutation"])
         case "concatenate":
@@ -185,7 +191,7 @@ def _translate_product(equation: JaxprEqn, inputs: Sequence[int], registers: lis
     for atom, register, contracted, batch, is_left in zip(
         equation.invars, inputs, sums, batches, (True, False), strict=True
     ):
-        shape = atom.aval.shape
+        shape = _aval(atom).shape
         free = [i for i in range(len(shape)) if i not in (*contracted, *batch)]
         axes = [*batch, *free, *contracted] if is_left else [*batch, *contracted, *free]
         n_sum, lead = math.prod(shape[i] for i in contracted), [shape[i] for i in batch]
@@ -194,7 +200,7 @@ def _translate_product(equation: JaxprEqn, inputs: Sequence[int], registers: lis
             register = _append(partial(_rearrange, axes=axes, shape=new_shape), (register,), registers, calls)
         matrices.append(register)
     result = _append(np.matmul, tuple(matrices), registers, calls)
-    shape = equation.outvars[0].aval.shape
+    shape = _aval(equation.outvars[0]).shape
     return _append(lambda x: x.reshape(shape), (result,), registers, calls)
 
 

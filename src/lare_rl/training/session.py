@@ -157,8 +157,9 @@ class Session:
 
         The steps of an iteration are checked in the next one, so that the host need not wait for the device.
         """
-        is_finite, steps = self._unchecked or (True, None)
-        self._unchecked = None
+        if self._unchecked is None:
+            return
+        (is_finite, steps), self._unchecked = self._unchecked, None
         if self.run.functions and not np.all(is_finite):
             compute_host_factors(self.run, self.config, steps)  # raises an error that names the factor
             raise LareError("a factor is not finite in the compiled function; the last checkpoint is whole")

@@ -66,7 +66,8 @@ class Registry(Mapping[str, T], Generic[T]):
         if name in self:
             return self._values[name]
         hint = did_you_mean(name, self._values)
-        raise LareError(f"no {self._kind} {name!r}{hint}; the {self._kind}s are {', '.join(self._values)}")
+        plugin = "" if os.environ.get("LARE_PLUGINS") else " (of a plugin: name its module in LARE_PLUGINS)"
+        raise LareError(f"no {self._kind} {name!r}{hint}; the {self._kind}s are {', '.join(self._values)}{plugin}")
 
     def __getitem__(self, name: str) -> T:
         if name not in self._values:

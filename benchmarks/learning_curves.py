@@ -1,8 +1,8 @@
 """Learning curves on MuJoCo: the methods side by side, 3 seeds, 100 thousand steps.
 
-    python benchmarks/learning.py run RUNS [TASK/LABEL ...]   train missing runs, resume the others
-    python benchmarks/learning.py keep RUNS                   copy finished runs to results/learning
-    python benchmarks/learning.py table                       from these: results/learning.json, docs/pictures, a table
+    python benchmarks/learning_curves.py run RUNS [TASK/LABEL ...]   train missing runs, resume the others
+    python benchmarks/learning_curves.py keep RUNS                   copy finished runs to results/learning
+    python benchmarks/learning_curves.py table                       from these: results/learning.json, docs/pictures, a table
 
 Every experiment is a run directory RUNS/TASK/LABEL; its settings and metrics are kept unchanged. The curve of SBX's TD3
 (`sbx_learning.py RUNS/TASK/sbx-dense`) is one of them. Two processes with one core each train 1.1 times as fast as one process
