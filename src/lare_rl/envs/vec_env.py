@@ -47,7 +47,7 @@ class VecEnv(ABC):
 
     def _check_lengths(self, where: Bool[np.ndarray, " n"]) -> None:
         """Raise `EnvOutputError` if an episode is longer or shorter than the specification says."""
-        max_steps, ended = self.spec.max_steps, self.batch.terminated | self.batch.truncated
+        max_steps, ended = self.spec.max_steps, np.logical_or(self.batch.terminated, self.batch.truncated)
         at_limit = self._length >= max_steps
         invalid = where & ((at_limit != ended) if self.spec.fixed_length else (at_limit & ~ended))
         if invalid.any():
