@@ -125,6 +125,15 @@ def test_resume_is_exact(build, task, changes, stop, phi, request, tmp_path):
     assert_equal_runs(resume_quietly(tmp_path / "run"), expected)
 
 
+def test_overlapped_collection_resumes_exactly(small, phi, tmp_path):
+    settings = small(algorithm="sac", method="lare-rrdu", overlap_collection=True)
+    expected = train_quietly(toy_spec(), settings, tmp_path / "complete", phi)
+    train_and_stop(toy_spec(), settings, tmp_path / "run", 156, phi)
+    assert_equal_runs(resume_quietly(tmp_path / "run"), expected)
+    with pytest.raises(LareError, match="overlap_collection"):
+        train_quietly(toy_spec(), small(algorithm="ppo", overlap_collection=True), tmp_path / "refused", phi)
+
+
 def test_resume_finished_run(dense_run, tmp_path):
     listener = MessageListener()
     run = resume_quietly(copy_run(dense_run, tmp_path / "run"), listeners=[listener])

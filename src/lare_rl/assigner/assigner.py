@@ -31,7 +31,7 @@ from lare_rl.assigner.assigner_config import (
 from lare_rl.assigner.decoder_learner import DecoderLearner
 from lare_rl.assigner.saving import AssignerState
 from lare_rl.assigner.store import Store
-from lare_rl.credit.decoder_settings import MULTI_AGENT_CREDIT, CreditSettings
+from lare_rl.credit.decoder_settings import CreditSettings, default_credit
 from lare_rl.credit.explanation_text import explanation_lines
 from lare_rl.credit.methods import Reward, find_method
 from lare_rl.credit.returns import estimate_score_type
@@ -90,7 +90,7 @@ class CreditAssigner:
             LareError: method, function, task and spaces do not go together.
         """
         task = None if task is None else resolve_task(task, playable=False)
-        settings = settings or (CreditSettings() if agents == 1 else MULTI_AGENT_CREDIT)
+        settings = settings or default_credit(agents)
         if settings.score == "auto" and task is not None and (score := find_score(task)) is not None:
             settings = settings.model_copy(update={"score": score})
         observation, action = resolve_layouts(task, {"observation": observation_space, "action": action_space})

@@ -6,7 +6,7 @@ from pydantic import Field
 
 from lare_rl.errors import CheckedModel
 
-__all__ = ["MULTI_AGENT_CREDIT", "RECENT_STEPS", "CreditSettings"]
+__all__ = ["MULTI_AGENT_CREDIT", "RECENT_STEPS", "CreditSettings", "default_credit"]
 
 RECENT_STEPS = 5000
 """Proxy rewards are compared with the true rewards over this number of newest steps of each agent."""
@@ -57,3 +57,8 @@ MULTI_AGENT_CREDIT = CreditSettings(
     divergence=1e-3,
 )
 """The default settings of decoders for many agents. The numbers are those of LaRe's published code, except VIB's divergence."""
+
+
+def default_credit(agents: int) -> CreditSettings:
+    """Return the default settings of a decoder for one agent or many."""
+    return CreditSettings() if agents == 1 else MULTI_AGENT_CREDIT

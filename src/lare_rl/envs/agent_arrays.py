@@ -9,6 +9,7 @@ import numpy as np
 from gymnasium.spaces import Box, Dict, Discrete
 from jaxtyping import Bool, Float
 
+from lare_rl.envs.interface import EnvSpec, Team
 from lare_rl.envs.spaces import check_spaces, finite_array, flatten_value
 from lare_rl.errors import LareError, short_repr
 
@@ -131,6 +132,20 @@ class AgentArrays:
                 low[index, : agent.action_size] = agent.action_space.low.ravel()
                 high[index, : agent.action_size] = agent.action_space.high.ravel()
         return low, high
+
+    def make_spec(self, teams: tuple[Team, ...], **fields: Any) -> EnvSpec:
+        """Return the sizes and bounds of an environment with these agents. `fields` are further fields of `EnvSpec`."""
+        low, high = self.bounds
+        return EnvSpec(
+            teams=teams,
+            observation_size=self.observation_size,
+            action_size=self.action_size,
+            discrete=self.discrete,
+            low=low,
+            high=high,
+            agents_leave=True,  # no environment states that they do not
+            **fields,
+        )
 
     def pad_observations(
         self, observations: Mapping[int, Float[np.ndarray, " _"]]

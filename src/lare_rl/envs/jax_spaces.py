@@ -37,6 +37,7 @@ __all__ = [
     "make_bounds",
     "make_choices",
     "raw_key",
+    "read_measures",
     "strong_types",
     "unstack",
 ]
@@ -95,7 +96,7 @@ def _silence() -> Iterator[None]:
 def construct(
     task: TaskSpec, names: Iterable[str], make: Callable[..., Any], arguments: Mapping[str, Any] | None = None
 ) -> Any:
-    """Return what `make` returns for the environment's name and the arguments of the task, in place of which others can be passed.
+    """Call `make` with the environment's name and the task's arguments, or with `arguments`. Return its result.
 
     Raises:
         LareError: the name is not among the package's names, or `make` raises an error.
@@ -141,6 +142,11 @@ def cast_like(tree: Any, reference: Any) -> Any:
 def find_measures(task: TaskSpec, values: Mapping[str, Any]) -> tuple[str, ...]:
     """Return the task's measures that are among a package's values and are numbers."""
     return tuple(name for name in task.measures if name in values and math.prod(jnp.shape(values[name])) == 1)
+
+
+def read_measures(spec: EnvSpec, values: Mapping[str, Any]) -> dict[str, Float[Array, ""]]:
+    """Return the measures of a step from a package's values, and 0 for those that it does not report."""
+    return {name: jnp.asarray(values.get(name, 0.0), jnp.float32).reshape(()) for name in spec.measures}
 
 
 # Actions
@@ -247,7 +253,6 @@ def agent_timestep(
         available = jnp.ones(spec.action_size, bool)
     available = available.astype(bool)
     available = available.at[0].set(available[0] | ~available.any())
-    values = measures or {}
     return Timestep(
         observation=observation[None],
         state=jnp.zeros(0) if state is None else state,
@@ -256,7 +261,7 @@ def agent_timestep(
         reward=jnp.asarray(reward, jnp.float32).reshape(1),
         terminated=jnp.asarray(terminated, bool).reshape(()),
         truncated=jnp.asarray(truncated, bool).reshape(()),
-        measures={name: jnp.asarray(values.get(name, 0.0), jnp.float32).reshape(()) for name in spec.measures},
+        measures=read_measures(spec, measures or {}),
     )
 
 

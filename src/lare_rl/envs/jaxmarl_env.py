@@ -22,6 +22,7 @@ from lare_rl.envs.jax_spaces import (
     flatten_tree,
     import_package,
     raw_key,
+    read_measures,
     strong_types,
 )
 from lare_rl.envs.pettingzoo_construct import group_by_team
@@ -82,7 +83,7 @@ class JaxMARLEnv:
 
     Agents are in the order of their teams, and their spaces are padded as in `AgentArrays`. JaxMARL does not tell a time limit from
     another end: an episode that ends at `max_steps` is truncated, one that ends before is terminated. At the last step no agent
-    leaves, because `phi` may read what those that acted observe.
+    leaves, because `phi` may read the observations of the agents that acted.
     """
 
     spec: EnvSpec
@@ -101,17 +102,10 @@ class JaxMARLEnv:
             actions = {agent.name: jnp.asarray(agent.action_space.sample()) for agent in agents}
             infos = jax.eval_shape(env.step_env, jnp.zeros(2, jnp.uint32), state, actions)[-1]
         self._from_observations = any(role.judged_from == "state" for role in (task, *task.teams))
-        low, high = self.layout.bounds
-        self.spec = EnvSpec(
-            teams=teams,
-            observation_size=self.layout.observation_size,
-            action_size=self.layout.action_size,
-            discrete=self.layout.discrete,
+        self.spec = self.layout.make_spec(
+            teams,
             max_steps=max_steps,
             state_size=jax.eval_shape(self._read_state, observations, state).shape[0],
-            low=low,
-            high=high,
-            agents_leave=True,  # no environment states that they do not
             masks_actions=self._masks is not None or not self.layout.available.all(),
             is_jax=True,
             measures=find_measures(task, infos),
@@ -154,7 +148,7 @@ class JaxMARLEnv:
             reward=reward,
             terminated=ended & ~at_limit,
             truncated=at_limit,
-            measures={name: jnp.asarray(infos.get(name, 0.0), jnp.float32).reshape(()) for name in self.spec.measures},
+            measures=read_measures(self.spec, infos),
         )
 
     def _pad(self, observations: Mapping[Any, Any]) -> Float[Array, "agents observation"]:

@@ -76,17 +76,10 @@ class ParallelHost:
         self._initialising = True  # the first reset shows whether there is a state, and whether `info` has masks
         first = self.reset(0)
         self._initialising = False
-        low, high = self.layout.bounds
-        self.spec = EnvSpec(
-            teams=teams,
-            observation_size=self.layout.observation_size,
-            action_size=self.layout.action_size,
-            discrete=self.layout.discrete,
+        self.spec = self.layout.make_spec(
+            teams,
             max_steps=max_steps,
             state_size=first.state.shape[-1],
-            low=low,
-            high=high,
-            agents_leave=True,  # no environment states that they do not
             masks_actions=self._masks_actions,
             measures=task.measures,
         )

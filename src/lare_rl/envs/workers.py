@@ -9,34 +9,33 @@ which one died.
 """
 
 import contextlib
-import mmap
+import math
 import os
 import pickle
 import signal
 import subprocess
 import sys
-import tempfile
 import threading
 import time
-from collections.abc import Iterator, Mapping, Sequence
-from functools import partial
+from collections.abc import Mapping, Sequence
+from functools import lru_cache, partial
 from multiprocessing import Pipe
 from multiprocessing.connection import Connection, wait
 from statistics import median
 from typing import Any, NamedTuple
 
 import numpy as np
-from jaxtyping import Bool, Float, Int, Shaped
+from jaxtyping import Bool, Int, Shaped
 
 from lare_rl.envs.env_errors import EnvOutputError, one_line_errors
-from lare_rl.envs.interface import EnvSpec, HostEnv, Timestep
+from lare_rl.envs.interface import HostEnv
+from lare_rl.envs.shared_arrays import MAX_WORKERS, SharedArrays, map_arrays, map_current, open_shared_file
 from lare_rl.envs.vec_env import (
     LocalVecEnv,
     Maker,
     VecEnv,
     call_env,
     check_same_sizes,
-    empty_batch,
     make_env_at,
     n_cores,
 )
@@ -51,8 +50,6 @@ CLOSE_TIMEOUT_S = 2.0
 MIN_SAVED_S = 3e-4
 """Workers are used if they make a step of all environments at least this much faster. A call of all workers costs about as much."""
 N_TIMED_STEPS = 10
-MAX_WORKERS = mmap.ALLOCATIONGRANULARITY // np.dtype(np.int64).itemsize
-"""The first page of the shared file has room for a number of each."""
 
 
 def make_vec_env(maker: Maker, n: int) -> VecEnv:
@@ -60,13 +57,14 @@ def make_vec_env(maker: Maker, n: int) -> VecEnv:
 
     An environment that cannot be made in another process, such as one that the user's script registers, stays in this process.
     """
-    n_saved = n - -(-n // n_cores())
+    n_saved = n - math.ceil(n / n_cores())
     if n_saved and n_saved * _measure_step_s(maker) > MIN_SAVED_S:
         with contextlib.suppress(LareError):
             return SubprocVecEnv([maker] * n)
     return LocalVecEnv([maker] * n)
 
 
+@lru_cache(maxsize=1)  # a run makes environments for training and for evaluations
 def _measure_step_s(maker: Maker) -> float:
     """Return the time that a step of an environment takes (s)."""
     with contextlib.closing(make_env_at(0, maker)) as env:
@@ -77,15 +75,6 @@ def _measure_step_s(maker: Maker) -> float:
             timestep = env.step(first_available if spec.discrete else (spec.low + spec.high) / 2)
             times.append(time.perf_counter() - start)
         return median(times) if times else 0.0
-
-
-class _SharedArrays(NamedTuple):
-    """The arrays of all environments, which this process and the workers read and write."""
-
-    where: Bool[np.ndarray, " n"]
-    seed: Int[np.ndarray, " n"]
-    action: Float[np.ndarray, "n agents action"]
-    batch: Timestep
 
 
 class SubprocVecEnv(VecEnv):
@@ -107,8 +96,8 @@ class SubprocVecEnv(VecEnv):
         self._workers: list[_Worker] = []
         n_envs, n_workers = len(makers), min(len(makers), processes or n_cores(), MAX_WORKERS)
         try:
-            with _shared_file() as file:
-                current = _map_current(file)
+            with open_shared_file() as file:
+                current = map_current(file)
                 for worker_index in range(n_workers):
                     env_indices = range(worker_index, n_envs, n_workers)
                     self._workers.append(_Worker(env_indices, file, current[worker_index : worker_index + 1]))
@@ -117,7 +106,7 @@ class SubprocVecEnv(VecEnv):
                 replies = {index: spec for specs in self._receive("make") for index, spec in specs.items()}
                 specs = [replies[index] for index in range(n_envs)]
                 check_same_sizes(specs)
-                self._shared = _map_arrays(file, specs[0], n_envs)
+                self._shared = map_arrays(file, specs[0], n_envs)
                 self._shared.batch.available[:] = True
             super().__init__(specs[0], self._shared.batch)
             for worker in self._workers:
@@ -136,8 +125,8 @@ class SubprocVecEnv(VecEnv):
     def _call(self, command: str, arguments: Shaped[np.ndarray, "n *rest"], where: Bool[np.ndarray, " n"]) -> None:
         if not self._workers:
             raise LareError("the worker processes have ended. Make the environments again.")
-        column = self._shared.seed if command == "reset" else self._shared.action
-        column[:], self._shared.where[:] = arguments, where
+        self._shared.arguments(command)[:] = arguments
+        self._shared.where[:] = where
         try:
             for worker in self._workers:
                 if where[worker.env_indices].any():
@@ -265,9 +254,9 @@ def _serve(connection_descriptor: int, file: int, worker_index: int) -> None:
     """Run a worker: make, reset and step environments, with a reply to each command, until the connection closes."""
     threading.Thread(target=_end_with_parent, daemon=True).start()
     connection = Connection(connection_descriptor)
-    current = _map_current(file)[worker_index : worker_index + 1]
+    current = map_current(file)[worker_index : worker_index + 1]
     envs: dict[int, HostEnv] = {}
-    shared: _SharedArrays | None = None
+    shared: SharedArrays | None = None
     with contextlib.suppress(EOFError, BrokenPipeError, ConnectionResetError):
         while True:
             command, argument = connection.recv()
@@ -279,7 +268,7 @@ def _serve(connection_descriptor: int, file: int, worker_index: int) -> None:
                         envs[index] = make_env_at(index, partial(_unpickle_and_make, pickled))
                     reply = {index: env.spec for index, env in envs.items()}
                 elif command == "share":
-                    shared = _map_arrays(file, *argument)
+                    shared = map_arrays(file, *argument)
                 else:
                     assert shared is not None
                     _call_envs(envs, command, shared, current)
@@ -291,8 +280,8 @@ def _serve(connection_descriptor: int, file: int, worker_index: int) -> None:
             env.close()
 
 
-def _call_envs(envs: Mapping[int, HostEnv], command: str, shared: _SharedArrays, current: Int[np.ndarray, "1"]) -> None:
-    arguments = shared.seed if command == "reset" else shared.action
+def _call_envs(envs: Mapping[int, HostEnv], command: str, shared: SharedArrays, current: Int[np.ndarray, "1"]) -> None:
+    arguments = shared.arguments(command)
     for index, env in envs.items():
         if shared.where[index]:
             current[0] = index
@@ -313,44 +302,3 @@ def _pickle(env_index: int, maker: Maker) -> bytes:
 
 def _unpickle_and_make(pickled: bytes) -> HostEnv:
     return pickle.loads(pickled)()
-
-
-@contextlib.contextmanager
-def _shared_file() -> Iterator[int]:
-    """Yield the descriptor of a file without a name. It lasts as long as a process has mapped it."""
-    directory = "/dev/shm" if os.path.isdir("/dev/shm") else None
-    with tempfile.TemporaryFile(dir=directory) as file:
-        _reserve(file.fileno(), mmap.ALLOCATIONGRANULARITY)
-        yield file.fileno()
-
-
-def _reserve(file: int, size: int) -> None:
-    """Give a file at least this size. Raises `OSError` if there is no room: a mapped file without room would kill the process."""
-    if hasattr(os, "posix_fallocate"):
-        os.posix_fallocate(file, 0, size)
-    else:
-        os.ftruncate(file, size)
-
-
-def _map_current(file: int) -> Int[np.ndarray, " workers"]:
-    """Map the first page of the file: the index of the environment that each worker calls now."""
-    return np.frombuffer(mmap.mmap(file, mmap.ALLOCATIONGRANULARITY), np.int64)
-
-
-def _map_arrays(file: int, spec: EnvSpec, n: int) -> _SharedArrays:
-    """Map the rest of the file: the arrays of `n` environments."""
-    batch = empty_batch(spec, n)
-    action = np.zeros((n, spec.n_agents, spec.action_size), spec.action_dtype)
-    arrays = [np.zeros(n, bool), np.zeros(n, np.int64), action, *batch[:-1], *batch.measures.values()]
-    starts = np.cumsum([0, *(-(-array.nbytes // 64) * 64 for array in arrays)])
-    size = int(starts[-1])
-    _reserve(file, mmap.ALLOCATIONGRANULARITY + size)
-    memory = mmap.mmap(file, size, offset=mmap.ALLOCATIONGRANULARITY)
-    where, seed, action, *columns = (
-        np.ndarray(array.shape, array.dtype, memory, start)
-        for array, start in zip(arrays, starts[:-1].tolist(), strict=True)
-    )
-    n_measures = len(spec.measures)
-    fields, measures = columns[: len(columns) - n_measures], columns[len(columns) - n_measures :]
-    timestep = Timestep(*fields, measures=dict(zip(spec.measures, measures, strict=True)))  # pyright: ignore[reportCallIssue]
-    return _SharedArrays(where, seed, action, timestep)

@@ -77,10 +77,10 @@ def evaluate_policy(run: Run, episodes: int, best: bool = False, deterministic: 
     if not isinstance(env, HostEnv):
         return DeviceCollector(env, config, run.seeds).evaluate(actor, episodes, number=1)
     env.close()
-    evaluations = []
+    make_host, evaluations = picklable_maker(task), []
     for n_done in range(0, episodes, MAX_OPEN_ENVS):
         n_episodes = min(MAX_OPEN_ENVS, episodes - n_done)
-        with make_vec_env(picklable_maker(task), n_episodes * len(run.seeds)) as envs:
+        with make_vec_env(make_host, n_episodes * len(run.seeds)) as envs:
             first = run.config.settings.evaluation_episodes + n_done
             policy = EvaluationPolicy(config, actor, run.seeds, n_episodes)
             evaluations.append(evaluate_on_host(envs, policy, run.seeds, n_episodes, first))

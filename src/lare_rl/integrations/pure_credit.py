@@ -19,7 +19,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
 from lare_rl.algorithms.registry import ALGORITHMS
-from lare_rl.credit.decoder_settings import MULTI_AGENT_CREDIT, CreditSettings
+from lare_rl.credit.decoder_settings import CreditSettings, default_credit
 from lare_rl.credit.methods import Reward, find_method
 from lare_rl.data.replay import StoredSteps, required_capacity
 from lare_rl.data.trajectory import Trajectory
@@ -138,7 +138,7 @@ def pure_credit(
         method=chosen,
         algorithm=algorithm,
         hyperparameters=algorithm.settings,
-        credit=settings or (CreditSettings() if agents == 1 else MULTI_AGENT_CREDIT),
+        credit=settings or default_credit(agents),
         scale_rewards=scale_rewards,
         n_factors=tuple(function.n_factors(judges) for function in functions),
         n_envs=n_envs,

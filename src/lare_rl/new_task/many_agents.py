@@ -37,7 +37,7 @@ TEAMS_COMMENT = [
 
 @runtime_checkable
 class Layouts(Protocol):
-    """An environment of many agents, with the layout of their arrays."""
+    """An environment of many agents, which has a layout of its arrays."""
 
     spec: EnvSpec
     layout: AgentArrays

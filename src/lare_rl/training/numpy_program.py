@@ -126,7 +126,7 @@ def _remove_unused(calls: list[_Call], results: Sequence[int]) -> list[_Call]:
 
 
 def _split_calls(calls: Sequence[_Call], arguments: Sequence[int]) -> tuple[list[_Call], list[_Call]]:
-    """Split calls into those that do not depend on these arguments, and those that do."""
+    """Return the calls that do not depend on these arguments, and the calls that depend on them."""
     changing, once, each_time = set(arguments), [], []
     for call in calls:
         if changing.isdisjoint(call.arguments):

@@ -69,8 +69,8 @@ class Session:
 
     _unchecked: tuple[Any, Trajectory] | None = None
     """Whether all factors of the newest steps are finite, for each seed, and these steps."""
-    _writer: ThreadPoolExecutor = field(default_factory=lambda: ThreadPoolExecutor(1))
-    """Writes checkpoints."""
+    _threads: ThreadPoolExecutor = field(default_factory=lambda: ThreadPoolExecutor(2))
+    """One writes checkpoints, and one updates while steps are collected."""
     _saving: Future[None] | None = None
     """The checkpoint that is being written."""
     _iteration_s: float = MAX_CALL_S
@@ -131,12 +131,10 @@ class Session:
         """
         if self.settings.overlap_collection:
             actor = jax.tree.map(jnp.copy, self.actor)  # the update reuses the memory of its learner
-            with ThreadPoolExecutor(
-                1
-            ) as executor:  # a call of an update returns when the device has nearly finished it
-                update = executor.submit(self._update, _empty_steps(self.config, len(self.run.seeds)), stop_requested)
-                steps = self.collector.collect(actor, self.step)
-                update.result()
+            # In a thread, because the call of an update returns when the device has nearly finished it.
+            update = self._threads.submit(self._update, _empty_steps(self.config, len(self.run.seeds)), stop_requested)
+            steps = self.collector.collect(actor, self.step)
+            update.result()
             self._store(steps)
         else:
             steps = self.collector.collect(self.actor, self.step)
@@ -237,7 +235,7 @@ class Session:
         arrays = {f"latest/{name}": np.asarray(values) for name, values in self.latest_metrics.items()}
         arrays |= {f"collector/{name}": values for name, values in self.collector.state_dict().items()}
         snapshot = checkpoint.take_snapshot(self.run.checkpoint, self.learner, host, arrays)
-        self._saving = self._writer.submit(checkpoint.write, self.run.checkpoint, snapshot)
+        self._saving = self._threads.submit(checkpoint.write, self.run.checkpoint, snapshot)
 
     def finish_saving(self) -> None:
         """Wait until the last checkpoint is written. Raises `LareError` if it cannot be written."""
@@ -263,7 +261,7 @@ class Session:
     def close(self) -> None:
         """Close the environments, and finish the last checkpoint. Raises `LareError` if it cannot be written."""
         self.collector.close()
-        self._writer.shutdown()
+        self._threads.shutdown()
         self.finish_saving()
 
 
