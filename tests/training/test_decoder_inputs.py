@@ -34,6 +34,7 @@ def flatten(action):
 SINGLE = [
     ("rrdu", "after", lambda o, a, n, z: [o, clip(a), o - n]),
     ("diaster", "after", lambda o, a, n, z: [o, clip(a)]),
+    ("rudder", "after", lambda o, a, n, z: [o, clip(a), o - n]),
     ("bayes", "before", lambda o, a, n, z: [o, clip(a)]),
     ("bayes", "both", lambda o, a, n, z: [o, n, clip(a)]),
     ("rd-linear", "after", lambda o, a, n, z: [n, clip(a)]),

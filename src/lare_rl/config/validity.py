@@ -54,5 +54,5 @@ def check_credit(
             f"{name} fits a weight to each of at most {MAX_RAW_FEATURES} raw features, and the task has {n_raw_features}: "
             "use lare-bayes, which fits weights to factors, or rrdu, a network"
         )
-    if method.decoder == "diaster" and not credit.hidden:
+    if method.decoder in ("diaster", "rudder") and not credit.hidden:
         raise LareError(f"{name} needs a hidden layer: the decoder has hidden = ()")

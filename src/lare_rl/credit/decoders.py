@@ -63,6 +63,7 @@ for _decoder in (
     Decoder("arel", "lare_rl.credit.arel:init_arel", whole_episodes=True),
     Decoder("stas", "lare_rl.credit.stas:init_stas", whole_episodes=True),
     Decoder("diaster", "lare_rl.credit.diaster:init_diaster", frozenset({"hidden"}), single_agent_only=True),
+    Decoder("rudder", "lare_rl.credit.rudder:init_rudder", frozenset({"hidden"}), single_agent_only=True),
     Decoder("linear", "lare_rl.credit.closed_form:init_linear_decoder", exportable=True),
     Decoder("additive", "lare_rl.credit.closed_form:init_linear_decoder", extended_basis=True, exportable=True),
 ):

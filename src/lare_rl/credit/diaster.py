@@ -5,15 +5,9 @@ add up to the return:
 
     (F[0:c] + F[c:T] - R)^2,    c uniform in {1, ..., T - 1}
 
-The reward of a step is the difference of F for two prefixes. A step model learns this difference from the step alone:
-
-    (r_hat(s_t, a_t) - (F[0:t+1] - F[0:t]))^2
-
-At the last step, the return R is known and replaces F[0:T]. F is a GRU (Cho et al., 2014) over the steps of a piece, with an initial
-state of zeros.
-
-The step model is in units of the scale, the root mean square of R/T. F is in units of L times the scale, where L is the number of
-steps of the longest episode, so that it is at most about 1. The step model therefore learns L times the differences of F.
+The reward of a step is the difference of F for two prefixes, F[0:t+1] - F[0:t]. A step model learns it from the step alone: see
+`step_targets.py`, also for the units. At the last step, the return R is known and replaces F[0:T]. F is a GRU (Cho et al., 2014) over
+the steps of a piece, with an initial state of zeros.
 """
 
 import equinox as eqx
@@ -23,6 +17,7 @@ from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
 from lare_rl.credit.decoder_network import DecoderOutput, DecoderShape
 from lare_rl.credit.decoder_settings import CreditSettings
+from lare_rl.credit.step_targets import step_loss
 from lare_rl.nn.networks import GRU, MLP, Linear
 
 __all__ = ["Diaster", "init_diaster"]
@@ -85,13 +80,10 @@ class Diaster(eqx.Module):
         f_first = jnp.take_along_axis(f_ends, jnp.minimum(cut - 1, last), axis=1)[:, 0]
         f_second = jnp.where(length > 1, jnp.take_along_axis(f_ends, last, axis=1)[:, 0], 0)
         piece_loss = (f_first + f_second - total) ** 2
-        # The step model learns from F, and F only from returns.
-        f_prefix = jax.lax.stop_gradient(self.piece_rewards(inputs, jnp.zeros_like(inputs[..., 0], bool)))
+        f_prefix = self.piece_rewards(inputs, jnp.zeros_like(inputs[..., 0], bool))
         f_prefix = jnp.where(t == last, total[:, None], f_prefix)
-        step_target = max_steps * jnp.diff(f_prefix, axis=1, prepend=0)
-        squared_error = (self.step_model(inputs)[..., 0] - step_target) ** 2
-        step_loss = jnp.sum((t < length[:, None]) * squared_error, axis=1) / jnp.maximum(length, 1)
-        return jnp.sum(mask * (piece_loss + step_loss)) / jnp.maximum(jnp.sum(mask > 0), 1)
+        loss = piece_loss + step_loss(self.step_model, inputs, f_prefix, length)
+        return jnp.sum(mask * loss) / jnp.maximum(jnp.sum(mask > 0), 1)
 
 
 def init_diaster(key: PRNGKeyArray, shape: DecoderShape, settings: CreditSettings) -> Diaster:

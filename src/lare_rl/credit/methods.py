@@ -29,7 +29,7 @@ class Fit(StrEnum):
     SAMPLED_STEPS_UNBIASED = "sampled steps, unbiased"
     """RRD-unbiased: as RRD, minus the variance that the sampling adds."""
     DECODER_LOSS = "the decoder's loss"
-    """Diaster: the `loss` of the decoder, on whole episodes (equations in `diaster.py`)."""
+    """Diaster and RUDDER: the `loss` of the decoder, on whole episodes (equations in `diaster.py` and `rudder.py`)."""
     EVIDENCE = "evidence"
     """In closed form, on all episodes (equations in `evidence.py`)."""
     SIGNS = "best signs"
@@ -235,6 +235,14 @@ for _method in (
         inputs=input_names.RAW,
         fit=Fit.SAMPLED_STEPS_UNBIASED,
         decoder="bottleneck",
+    ),
+    Method(
+        "rudder",
+        "differences between an LSTM's predictions of the return",
+        "Arjona-Medina et al., RUDDER, NeurIPS 2019",
+        inputs=input_names.RAW,
+        fit=Fit.DECODER_LOSS,
+        decoder="rudder",
     ),
     Method(
         "diaster",
