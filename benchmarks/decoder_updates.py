@@ -40,7 +40,7 @@ def make_config(name: str) -> TrainConfig:
     return TrainConfig(
         env=ENV.spec,
         credit_scope="observation",
-        factor_inputs="after",
+        scored_observation="after",
         method=find_method(name),
         algorithm=ippo,
         hyperparameters=ippo.settings,

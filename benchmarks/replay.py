@@ -43,7 +43,7 @@ STORED = (10_000, 100_000, 1_000_000)
 CONFIG = TrainConfig(
     env=EnvSpec((Team("agent", 0, 1),), observation_size=17, action_size=6, discrete=False, max_steps=EPISODE),
     credit_scope="observation",
-    factor_inputs="after",
+    scored_observation="after",
     method=find_method("lare-rrdu"),
     algorithm=ALGORITHMS["td3"],
     hyperparameters=TD3Settings(),

@@ -40,7 +40,7 @@ def first_column(table):
         ("train Task --evaluate-evry 9", ["'--evaluate-every'"]),
         ("train Task --td3.gamma high", ["'high'", "number"]),
         ("train Task --td3.gamma 3", ["td3.gamma = 3.0"]),
-        ("train Task --judges left", ["'left'", "before, after, both"]),
+        ("train Task --scored-observation left", ["'left'", "before, after, both"]),
         ("train Task --algorithm dqn", ["'dqn'", *ALGORITHMS]),
         ("train Task --seeds", ["--seeds"]),
         ("", ["--help"]),
@@ -62,7 +62,7 @@ def first_column(table):
         ("train CompetitivePP-6 --function phi.py", ["CompetitivePP-6-predator, CompetitivePP-6-prey", "1 were given"]),
         ("train CN-6 --method dense --credit.sum-form True", ["credit.sum_form", "dense"]),
         ("train CN-6 --ppo.clip 0.1", ["ppo.clip", "ippo.clip"]),
-        ("train Reacher-v4 --method dense --judges both", ["judges", "dense"]),
+        ("train Reacher-v4 --method dense --scored-observation both", ["scored_observation", "dense"]),
         ("train HalfCheetah-v4 --fit-every 2", ["fit_every", "lare-bayes"]),
         ("train Reacher-v4 --draw 1 --function phi.py", ["draw", "function"]),
         ("prompt Reacher", ["'Reacher-v4'", *shipped_tasks()]),
@@ -112,7 +112,13 @@ def test_help(command):
 
 def test_help_of_options(command):
     _, out, _ = command("train", "--help")
-    options = ("steps INT", "out DIR", "judges {before,after,both}", "credit.hidden [INT [INT ...]]", "td3.gamma FLOAT")
+    options = (
+        "steps INT",
+        "out DIR",
+        "scored-observation {before,after,both}",
+        "credit.hidden [INT [INT ...]]",
+        "td3.gamma FLOAT",
+    )
     assert all(f" --{option} " in out for option in options)
     # Lines of a docstring are joined.
     lines = {line.strip() for line in cli.train.__doc__.partition("Args:")[2].splitlines()} - {""}
@@ -123,7 +129,7 @@ def test_tasks(command):
     status, out, err = command("tasks")
     assert (status, err) == (0, "")
     head, *rows = [line.split() for line in out.splitlines()]
-    assert head == ["task", "observation", "action", "judges", "agents"]
+    assert head == ["task", "observation", "action", "scored_observation", "agents"]
     assert [row[0] for row in rows] == shipped_tasks()
     assert ["Reacher-v4", "11", "2", "before", "one"] in rows
     assert ["CN-30", "26", "5", "after", "many"] in rows
@@ -207,7 +213,7 @@ def test_verify_with_returns(command, phi, spec_file):
     assert float(r2[1]) > 0.9
     assert "\nFitted to all 30 episodes" in out
     assert "(before)" not in out
-    _, both, _ = command("verify", phi, "--task", spec_file(), "--fit", "30", "--judges", "both")
+    _, both, _ = command("verify", phi, "--task", spec_file(), "--fit", "30", "--scored-observation", "both")
     assert "before" in both.partition("Fitted to all 30 episodes")[2]
 
 

@@ -11,7 +11,7 @@ from lare_rl.envs.play import Episode, play_episodes
 from lare_rl.latent.design import DesignError, design, examine_reply
 from lare_rl.latent.function import LatentFunction
 from lare_rl.llm.recording import shipped_recordings
-from lare_rl.tasks.spec import FactorInputs, TaskSpec
+from lare_rl.tasks.spec import ScoredObservation, TaskSpec
 from lare_rl.util.statistics import column_correlations
 from paper.exhibits import Budget
 from paper.pages import Page, items, table
@@ -51,7 +51,7 @@ def make_page(budget: Budget, command: str) -> Page:
     for task in map(load_task, PRINTED):
         functions = designed(task, budget.functions)
         passed = [function for function in functions if function is not None]
-        entries = entries_cells(random_steps(task, budget.episodes), task.judges, passed)
+        entries = entries_cells(random_steps(task, budget.episodes), task.scored_observation, passed)
         alone = replies_cell(task, budget.functions)
         rows.append([task.name, *entries, alone, f"{len(passed)} of {len(functions)}"])
     head = (
@@ -89,7 +89,9 @@ def designed(task: TaskSpec, draws: int) -> list[LatentFunction | None]:
     return functions
 
 
-def entries_cells(steps: Steps, judges: FactorInputs, functions: Sequence[LatentFunction]) -> tuple[str, str]:
+def entries_cells(
+    steps: Steps, scored_observation: ScoredObservation, functions: Sequence[LatentFunction]
+) -> tuple[str, str]:
     """Correlations of states, and of the factors of each function."""
     state = np.abs(column_correlations(steps.after, steps.reward))
     state_cell = f"{np.nanmean(state):.2f} ({len(state)}), {np.nanmax(state):.2f}"
@@ -97,7 +99,9 @@ def entries_cells(steps: Steps, judges: FactorInputs, functions: Sequence[Latent
         return state_cell, "-"
     correlations = [
         np.abs(
-            column_correlations(function.step_factors(steps.before, steps.action, steps.after, judges), steps.reward)
+            column_correlations(
+                function.step_factors(steps.before, steps.action, steps.after, scored_observation), steps.reward
+            )
         )
         for function in functions
     ]

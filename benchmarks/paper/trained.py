@@ -121,7 +121,7 @@ def single_agent_notes(runs: Mapping[str, Run]) -> Iterator[str]:
                 f"RRD-unbiased have the loss of RD on {task}, whose episodes have {longest} steps; an update reads "
                 f"{credit.steps // drawn_steps} episodes, and {credit.steps // longest} for RD."
             )
-    before = [task for task, run in runs.items() if run.config.task.judges == "before"]
+    before = [task for task, run in runs.items() if run.config.task.scored_observation == "before"]
     exception = (
         f" {before[0]} is the exception: its own reward looks at the observation before the step." if before else ""
     )

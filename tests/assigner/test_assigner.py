@@ -437,7 +437,7 @@ NO_TASK = {"task": None, "observation_space": 2, "action_space": 1}
         ("rd", "factors", {}, "no phi"),
         ("lare-rd", "reward", {}, "'factors'.*'reward'"),
         ("lare-rd", "factors", NO_TASK, "task=task"),
-        ("llm-reward", "reward", {"judges": "both"}, "judges"),
+        ("llm-reward", "reward", {"scored_observation": "both"}, "scored_observation"),
         ("lare-rd-shared", "factors", {}, "single agent"),
     ],
 )
@@ -465,17 +465,18 @@ def test_task_with_discrete_actions():
     np.testing.assert_array_equal(credit.store.inputs[:2, 4:], np.eye(4)[[3, 0]])
 
 
-@pytest.mark.parametrize("judges", ["before", "after", "both"])
-def test_judges(judges, phi):
+@pytest.mark.parametrize("scored_observation", ["before", "after", "both"])
+def test_scored_observation(scored_observation, phi):
     (episode,) = random_episodes([4])
-    factors, raw = small_assigner("lare-rd", phi, judges=judges), small_assigner("bayes", judges=judges)
-    changes = small_assigner("rd", judges=judges)
+    factors = small_assigner("lare-rd", phi, scored_observation=scored_observation)
+    raw = small_assigner("bayes", scored_observation=scored_observation)
+    changes = small_assigner("rd", scored_observation=scored_observation)
     for credit in (factors, raw, changes):
         credit.add_episode(*episode)
         credit.learner.flush_inputs()
-    np.testing.assert_array_equal(factors.store.inputs[:4], phi.step_factors(*episode[:3], judges))
+    np.testing.assert_array_equal(factors.store.inputs[:4], phi.step_factors(*episode[:3], scored_observation))
     before, after = episode.observation, episode.next_observation
-    observations = {"before": [before], "after": [after], "both": [before, after]}[judges]
+    observations = {"before": [before], "after": [after], "both": [before, after]}[scored_observation]
     expected = np.concatenate([*observations, episode.action], axis=1)
     np.testing.assert_array_equal(raw.store.inputs[:4], expected)
     expected = np.concatenate([before, episode.action, before - after], axis=1)

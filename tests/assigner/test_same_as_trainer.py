@@ -29,9 +29,9 @@ PHI_ENV = replace(ONE_AGENT, observation_size=2, action_size=1, low=ONE_AGENT.lo
 
 def learn(method, env, phi=None):
     """Return a learner and an assigner that have learned from the same steps."""
-    judges = "after" if phi is None else toy_spec().judges
+    scored_observation = "after" if phi is None else toy_spec().scored_observation
     algorithm = "td3" if env.n_agents == 1 else "ippo"
-    config = small_config(method, algorithm, env, capacity=1000, factor_inputs=judges)
+    config = small_config(method, algorithm, env, capacity=1000, scored_observation=scored_observation)
     credit = CreditAssigner(
         method,
         phi,
@@ -56,7 +56,7 @@ def learn(method, env, phi=None):
         )
         factors = None
         if phi is not None:
-            factors = phi.step_factors(observation, action, next_observation, judges)[:, None, None]
+            factors = phi.step_factors(observation, action, next_observation, scored_observation)[:, None, None]
         learner = add_steps(learner, config, chunk, factors, learn=True)
         alive = chunk.timestep.alive[:, 0] if env.n_agents > 1 else None
         never = np.zeros(len(rows), bool)

@@ -109,6 +109,16 @@ def changed(**values):
     return change
 
 
+def test_load_reads_former_names(tmp_path, saved):
+    """The keys of tasks and assigners had other names."""
+    directory = shutil.copytree(saved, tmp_path / "copy")
+    text = (directory / TEXT_FILE).read_text()
+    former = text.replace("scored_observation", "judges").replace("credit_scope", "judged_from")
+    assert former.count("judge") == 3  # two in the task
+    (directory / TEXT_FILE).write_text(former)
+    assert CreditAssigner.load(directory).config == CreditAssigner.load(saved).config
+
+
 def without(name):
     def change(directory):
         with np.load(directory / ARRAYS_FILE) as arrays:

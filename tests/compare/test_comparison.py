@@ -175,6 +175,6 @@ def test_bad_runs(runs, metric, message, make_run):
 
 def test_two_tasks_with_one_name(make_run):
     first, second = make_run("a", [1.0]), make_run("b", [2.0], method="rd")
-    second = Run(second.directory, second.config.model_copy(update={"task": toy_spec(judges="after")}), ())
+    second = Run(second.directory, second.config.model_copy(update={"task": toy_spec(scored_observation="after")}), ())
     with pytest.raises(LareError, match=r"different tasks .*Chase"):
         compare(read([first, second]))

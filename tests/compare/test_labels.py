@@ -25,7 +25,7 @@ def sizes(runs):
 
 
 def test_task_defaults_do_not_split_labels():
-    """Reacher-v4 judges the observation before a step, Walker2d-v4 the one after it."""
+    """Reacher-v4 scores the observation before a step, Walker2d-v4 the one after it."""
     root = Path(__file__).parents[2] / "benchmarks" / "results" / "reproduce" / "laptop"
     methods = ("dense-td3", "rrdu-td3", "lare-rrdu-td3-draw0")
     results, _ = collect_results([root / task / method for method in methods for task in ("Reacher-v4", "Walker2d-v4")])
@@ -81,12 +81,16 @@ def test_directories_split_labels(make_run):
 def test_settings_without_effect_do_not_split_labels(make_run):
     runs = [
         make_run("a", [1.0], method="lare-rd"),
-        make_run("b", [2.0], method="lare-rd", judges=toy_spec().judges, seed=1),
+        make_run("b", [2.0], method="lare-rd", scored_observation=toy_spec().scored_observation, seed=1),
     ]
     assert sizes(runs) == {"lare-rd": 2}
-    runs = [make_run("c", [1.0]), make_run("d", [2.0], judges="after", credit={"hidden": (8,)}, draw=3, seed=1)]
+    runs = [
+        make_run("c", [1.0]),
+        make_run("d", [2.0], scored_observation="after", credit={"hidden": (8,)}, draw=3, seed=1),
+    ]
     assert sizes(runs) == {"dense": 2}
-    assert list(label_runs([make_run("e", [1.0], method="lare-rd", judges="after"), runs[0]])) == ["lare-rd", "dense"]
+    runs = [make_run("e", [1.0], method="lare-rd", scored_observation="after"), runs[0]]
+    assert list(label_runs(runs)) == ["lare-rd", "dense"]
 
 
 def test_steps_split_labels_if_step_sizes_are_annealed(make_run):

@@ -31,3 +31,12 @@ def test_migrate_through_all_formats():
     current = {"format": FORMAT, "settings": {"first_fit": None}}
     assert migrate(current) == current
     assert migrate(current | {"format": 4}) == current
+
+
+def test_migrate_renamed_keys():
+    old = {"settings": {"judges": None}, "task": {"judged_from": "state", "teams": [{"judges": "both"}]}}
+    new = {
+        "settings": {"scored_observation": None},
+        "task": {"credit_scope": "state", "teams": [{"scored_observation": "both"}]},
+    }
+    assert migrate({"format": 5, **old}) == {"format": FORMAT, **new}

@@ -27,7 +27,7 @@ def resolve_named(task, settings):
         ("Reacher-v4", {"algorithm": "vdn"}, ["vdn", "discrete", "Reacher-v4"]),
         ("CN-6", {"method": "stas", "rollout_steps": 10}, ["stas", "rollout_steps = 10", "25"]),
         ("CN-6", {"method": "diaster"}, ["diaster", "single agent", "6"]),
-        ("Reacher-v4", {"method": "llm-reward", "judges": "both"}, ["llm-reward", "judges"]),
+        ("Reacher-v4", {"method": "llm-reward", "scored_observation": "both"}, ["llm-reward", "scored_observation"]),
         ("Reacher-v4", {"method": "ircr", "scale_rewards": True}, ["scale_rewards", "ircr"]),
         ("Reacher-v4", {"method": "rrd", "credit": {"steps": 16}}, ["steps = 16", "drawn_steps = 64"]),
         ("CN-6", {"steps": 5000}, ["steps = 5000", "2050", "environments = 82", "4100 or 6150"]),
@@ -47,8 +47,8 @@ def test_resolve_refuses(task, settings, texts):
 def test_resolve_refuses_algorithm_and_method_of_other_tasks(echo):
     with pytest.raises(LareError, match=r"sac needs continuous actions.*ppo"):
         resolve(Settings(algorithm="sac"), pick_spec())
-    task = echo.model_copy(update={"judged_from": "state", "observation_size": 9, "action_size": 9})
-    with pytest.raises(LareError, match=r"lare-rd-shared.*global state"):
+    task = echo.model_copy(update={"credit_scope": "state", "observation_size": 9, "action_size": 9})
+    with pytest.raises(LareError, match=r"lare-rd-shared.*credit_scope = 'state'"):
         resolve(Settings(method="lare-rd-shared"), task)
 
 
@@ -126,8 +126,8 @@ def test_resolve_normalises_settings_without_effect():
     """Runs that are the same have the same settings."""
     fixed_length = [{"method": "lare-rd", "credit": {"score": score}} for score in ("auto", "sum", "average")]
     assert len({resolve_named("CN-6", settings) for settings in fixed_length}) == 1
-    assert resolve_named("Reacher-v4", {"method": "bayes", "judges": "before"}).judges is None
-    assert resolve_named("Reacher-v4", {"method": "bayes", "judges": "after"}).judges == "after"
+    assert resolve_named("Reacher-v4", {"method": "bayes", "scored_observation": "before"}).scored_observation is None
+    assert resolve_named("Reacher-v4", {"method": "bayes", "scored_observation": "after"}).scored_observation == "after"
     assert resolve_named("SMAX-2s3z", {"method": "rd"}).credit.score == "sum"
 
 
@@ -150,12 +150,12 @@ VALID = {"credit": CreditSettings(), "n_agents": 1, "n_raw_features": 9}
 @pytest.mark.parametrize(
     ("method", "changes", "texts"),
     [
-        ("llm-reward", {"factor_inputs": "both"}, ["judges", "'before' or 'after'"]),
+        ("llm-reward", {"scored_observation": "both"}, ["scored_observation", "'before' or 'after'"]),
         ("ircr", {"scale_rewards": True}, ["scale_rewards"]),
         ("diaster", {"n_agents": 3}, ["single agent", "3"]),
         ("arel", {"n_agents": 1, "fixed_length": True}, ["among agents"]),
         ("arel", {"n_agents": 3}, ["whole episodes"]),
-        ("stas", {"n_agents": 3, "team_level": True, "fixed_length": True}, ["global state"]),
+        ("stas", {"n_agents": 3, "team_level": True, "fixed_length": True}, ["credit_scope"]),
         ("rrd", {"credit": CreditSettings(steps=16)}, ["steps = 16", "drawn_steps = 64"]),
         ("bayes", {"n_raw_features": 7057}, ["1024", "7057", "rrdu"]),
         ("rd-linear", {"n_raw_features": 1025}, ["1024", "1025"]),

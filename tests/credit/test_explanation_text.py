@@ -115,14 +115,18 @@ def test_factor_before_and_after():
 
 def test_residual_values():
     values = find({}, raw_features=RAW_FEATURES)[-1].values
-    assert values == {"name": RAW_FEATURES[1], "correlation": -0.8, "judges": Finding("judges_may_be_wrong")}
-    assert find({}, BOTH_STATES, RAW_FEATURES)[-1].values["judges"] is None
+    assert values == {
+        "name": RAW_FEATURES[1],
+        "correlation": -0.8,
+        "scored_observation": Finding("scored_observation_may_be_wrong"),
+    }
+    assert find({}, BOTH_STATES, RAW_FEATURES)[-1].values["scored_observation"] is None
 
 
 ANYTHING = {
     **dict.fromkeys(("share", "slope", "std", "correlation"), 0.5),
     **dict.fromkeys(("n_episodes", "this", "other", "target", "largest", "features", "name", "raw", "effect"), "x"),
-    **dict.fromkeys(("states", "shape", "before", "after", "judges"), None),
+    **dict.fromkeys(("states", "shape", "before", "after", "scored_observation"), None),
 }
 
 

@@ -123,10 +123,10 @@ def test_score_of_a_task_comes_before_its_family():
 def test_tasks_that_agree():
     make_env(make_task(teams=make_teams(), measures=("caught",)))
     make_env(make_task(team="mouse"))
-    roles = [role.model_copy(update={"observation_size": 7, "judged_from": "state"}) for role in make_teams()]
+    roles = [role.model_copy(update={"observation_size": 7, "credit_scope": "state"}) for role in make_teams()]
     # The joint actions of two cats, and of three mice.
     roles = [role.model_copy(update={"action_size": size}) for role, size in zip(roles, (6, 9), strict=True)]
-    make_env(make_task(judged_from="state", teams=roles))
+    make_env(make_task(credit_scope="state", teams=roles))
 
 
 @pytest.mark.parametrize(
@@ -138,12 +138,18 @@ def test_tasks_that_agree():
         ({"team": "cat", "max_episode_steps": 10}, "max_episode_steps = 10, but 9"),
         ({"team": "cat", "measures": ("caught", "won")}, "no measure 'won'"),
         ({"team": "cat", "observation_size": 5}, "observation_size = 5, but .* observations of size 4"),
-        ({"team": "cat", "judged_from": "state"}, "observation_size = 4, but .* states of size 7"),
-        ({"team": "mouse", "judged_from": "state", "observation_size": 7, "action_size": 6}, "joint actions of size 9"),
+        ({"team": "cat", "credit_scope": "state"}, "observation_size = 4, but .* states of size 7"),
+        (
+            {"team": "mouse", "credit_scope": "state", "observation_size": 7, "action_size": 6},
+            "joint actions of size 9",
+        ),
         ({"teams": make_teams(action_size=2)}, "'Mouse': action_size = 2, but .* actions of size 3"),
-        ({"teams": make_teams(judges="after")}, "'Mouse': judges = 'after', but 'before' in 'Hunt'"),
+        (
+            {"teams": make_teams(scored_observation="after")},
+            "'Mouse': scored_observation = 'after', but 'before' in 'Hunt'",
+        ),
         ({"teams": make_teams(), "max_episode_steps": 9}, "'Cat': max_episode_steps = None, but 9 in 'Hunt'"),
-        ({"team": "cat", "judged_from": "state", "description": "No state."}, "has no global state"),
+        ({"team": "cat", "credit_scope": "state", "description": "No state."}, "has no global state"),
         ({"teams": make_teams(), "agents": ("a_*",)}, "agents has no effect on a task with teams"),
         ({"teams": make_teams(), "team": "cat"}, "team has no effect on a task with teams"),
         ({"teams": make_teams(teams=(make_task(team="mouse"),))}, "'Mouse' is a team of 'Hunt' and cannot have teams"),

@@ -49,7 +49,7 @@ def test_teams_and_padding():
     np.testing.assert_array_equal(timestep.observation[:, 16:], np.eye(4))
     assert not timestep.observation[0, 14:16].any()  # the good agent observes less
     assert env.spec.state_size == 0
-    assert make(tag_team("agent").model_copy(update={"judged_from": "state"})).spec.state_size == 80
+    assert make(tag_team("agent").model_copy(update={"credit_scope": "state"})).spec.state_size == 80
     with pytest.raises(LareError, match="adversary_0 is in no team"):
         make(family_task(TAG, agents=["agent_*"]))
 

@@ -56,8 +56,8 @@ def test_shipped_tasks():
 
 def test_task_file(spec_file):
     assert load_task(spec_file()) == toy_spec()
-    assert load_task(str(spec_file(judges=None, description="\n  Follow it. \n"))) == toy_spec(
-        judges="after", description="Follow it."
+    assert load_task(str(spec_file(scored_observation=None, description="\n  Follow it. \n"))) == toy_spec(
+        scored_observation="after", description="Follow it."
     )
 
 
@@ -73,9 +73,9 @@ def test_like_over_two_generations(spec_file, tmp_path):
     [
         ({"action": None, "observation": None}, "'observation', 'action' are missing"),
         ({"reward": "1 a step"}, "no key 'reward'"),
-        ({"judge": "after"}, "did you mean 'judges'"),
+        ({"scored_observations": "after"}, "did you mean 'scored_observation'"),
         ({"description": "  "}, "description = '  '"),
-        ({"judges": "during"}, "judges = 'during'"),
+        ({"scored_observation": "during"}, "scored_observation = 'during'"),
         ({"name": "a/b"}, "name = 'a/b'"),
         ({"action_size": 0}, "action_size = 0"),
         ({"like": ["PP-6"]}, r"like = \['PP-6'\] must be"),
@@ -138,13 +138,22 @@ def test_unknown_task(task, content):
 
 
 def test_teams_inherit_shared_keys(spec_file, tmp_path):
-    spec_file(team="first", environment=None, judges=None)
+    spec_file(team="first", environment=None, scored_observation=None)
     (tmp_path / "both.toml").write_text(
-        'like = "Reacher-v4"\nname = "Both"\nenvironment = "x/y"\nteams = ["chase.toml"]\njudges = "both"\n'
+        'like = "Reacher-v4"\nname = "Both"\nenvironment = "x/y"\nteams = ["chase.toml"]\nscored_observation = "both"\n'
         "arguments = { n = 3 }\n"
     )
     (role,) = read_task(tmp_path / "both.toml").teams
-    assert (role.environment, role.judges, role.arguments, role.team) == ("x/y", "both", {"n": 3}, "first")
+    assert (role.environment, role.scored_observation, role.arguments, role.team) == ("x/y", "both", {"n": 3}, "first")
+
+
+def test_former_names_of_keys(spec_file, tmp_path):
+    text = spec_file().read_text()
+    (tmp_path / "former.toml").write_text(text.replace("scored_observation", "judges") + '\njudged_from = "state"\n')
+    task = read_task(tmp_path / "former.toml")
+    assert task == toy_spec(credit_scope="state")
+    (tmp_path / "like.toml").write_text('like = "former.toml"\njudges = "both"\n')
+    assert read_task(tmp_path / "like.toml") == task.model_copy(update={"scored_observation": "both"})
 
 
 def test_like_keeps_teams(tmp_path):

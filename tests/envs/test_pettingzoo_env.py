@@ -203,10 +203,10 @@ def test_agents_that_left_may_still_be_listed():
 
 def test_observations_replace_a_missing_state():
     assert make_host().spec.state_size == 0
-    host = make(make_task(observation_size=4, action_size=6, judged_from="state"))
+    host = make(make_task(observation_size=4, action_size=6, credit_scope="state"))
     np.testing.assert_array_equal(host.reset(3).state, [3, 0, 3, 0])
     with pytest.raises(LareError, match="states of size 4"):
-        make_env(make_task(observation_size=5, action_size=6, judged_from="state"))
+        make_env(make_task(observation_size=5, action_size=6, credit_scope="state"))
 
 
 def test_previous_state_replaces_a_failed_one(caplog):
@@ -221,7 +221,7 @@ def test_previous_state_replaces_a_failed_one(caplog):
     (record,) = caplog.records
     assert "no hull" in record.getMessage()
     with pytest.raises(LareError, match="no hull"):
-        play(make_host(Falls(), judged_from="state"))
+        play(make_host(Falls(), credit_scope="state"))
 
 
 def test_measures_are_means_over_agents():

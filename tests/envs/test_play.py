@@ -80,7 +80,7 @@ def test_episode_has_a_row_for_each_agent_of_the_team():
 
 
 def test_episode_of_states_has_one_row_for_the_team():
-    episode = play_hunt(make_role("mouse", judged_from="state", observation_size=1, action_size=4))
+    episode = play_hunt(make_role("mouse", credit_scope="state", observation_size=1, action_size=4))
     assert episode.observation.tolist() == [[[0]], [[10]], [[20]]]
     assert episode.next_observation.tolist() == [[[10]], [[20]], [[30]]]
     assert episode.alive.tolist() == [[True]] * 3

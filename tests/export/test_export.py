@@ -73,15 +73,15 @@ MEDIAN = PHI.replace("np.sum(a", "np.median(a")
 def make_task(kind, method):
     match kind:
         case "ppo":
-            return pick_spec(judges="after" if method == "llm-reward" else "both")
+            return pick_spec(scored_observation="after" if method == "llm-reward" else "both")
         case "ippo" | "qmix" | "vdn":
             return echo_spec()
         case "ippo-state":
-            return echo_spec(judged_from="state", observation_size=9, action_size=9)
+            return echo_spec(credit_scope="state", observation_size=9, action_size=9)
         case "ippo-teams":
             return read_task("CompetitivePP-6")
         case _:
-            return toy_spec(judges="both" if method == "lare-signs" else "before")
+            return toy_spec(scored_observation="both" if method == "lare-signs" else "before")
 
 
 @pytest.fixture(scope="module")

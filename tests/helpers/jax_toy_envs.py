@@ -85,7 +85,7 @@ def echo_spec(**changes) -> TaskSpec:
         "environment": "echo/three",
         "observation_size": 4,
         "action_size": 3,
-        "judges": "before",
+        "scored_observation": "before",
         "description": "Do as you are told.",
         "observation": "0 to 2: what to do. 3: the time.",
         "action": "0 to 2: what is done.",

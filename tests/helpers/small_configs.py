@@ -58,7 +58,7 @@ def small_config(method, algorithm="td3", env=ONE_AGENT, **changes):
         "credit": CreditSettings(hidden=(8,), drawn_steps=4, steps=24),
         "scale_rewards": False,
         "n_factors": tuple(2 + i for i in range(len(env.teams))) if METHODS[method].needs_phi else (),
-        "factor_inputs": "after",
+        "scored_observation": "after",
         "n_envs": 1,
         "rollout_steps": 4,
         "capacity": 100,

@@ -62,7 +62,7 @@ def toy_spec(**changes) -> TaskSpec:
         "environment": "toys/Chase-v0",
         "observation_size": 2,
         "action_size": 1,
-        "judges": "before",
+        "scored_observation": "before",
         "description": "Follow the first entry.",
         "observation": "0: the target. 1: noise.",
         "action": "0: the guess.",

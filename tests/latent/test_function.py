@@ -39,18 +39,18 @@ def test_factors(function):
 
 
 @pytest.mark.parametrize(
-    ("factor_inputs", "columns", "expected"),
+    ("scored_observation", "columns", "expected"),
     [
         ("before", ["f_near", "f_effort"], [[-4, -9]]),
         ("after", ["f_near", "f_effort"], [[-1, -9]]),
         ("both", ["f_near (before)", "f_effort (before)", "f_near (after)", "f_effort (after)"], [[-4, -9, -1, -9]]),
     ],
 )
-def test_step_factors(function, factor_inputs, columns, expected):
-    factors = function.step_factors([[1, 0]], [[3]], [[2, 0]], factor_inputs)
+def test_step_factors(function, scored_observation, columns, expected):
+    factors = function.step_factors([[1, 0]], [[3]], [[2, 0]], scored_observation)
     np.testing.assert_array_equal(factors, expected)
-    assert function.factor_columns(factor_inputs) == columns
-    assert function.n_factors(factor_inputs) == len(columns)
+    assert function.factor_columns(scored_observation) == columns
+    assert function.n_factors(scored_observation) == len(columns)
 
 
 @pytest.mark.parametrize(

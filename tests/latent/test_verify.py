@@ -132,11 +132,11 @@ def test_random_steps_without_agents_that_have_left():
 
 
 @pytest.mark.parametrize(
-    ("judges", "counts"),
+    ("scored_observation", "counts"),
     [("before", [14, 14, 14, 14, 14]), ("after", [0, 14, 14, 14, 14, 14]), ("both", [7, 14, 14, 14, 14, 7])],
 )
-def test_random_steps_of_factor_inputs(judges, counts):
-    observation, _ = random_steps(toy_spec(**PARALLEL, judges=judges), 70)
+def test_random_steps_of_scored_observation(scored_observation, counts):
+    observation, _ = random_steps(toy_spec(**PARALLEL, scored_observation=scored_observation), 70)
     assert np.bincount(observation[:, 1].astype(int)).tolist() == counts
 
 

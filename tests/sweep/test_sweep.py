@@ -160,7 +160,7 @@ def test_tables_of_command(command, file, copying_python, tmp_path):
     assert error.splitlines()[-1].startswith("3 of 3: Reacher-v4/")
     with (root / "results.csv").open() as csv_file:
         table = list(csv.DictReader(csv_file))
-    assert list(table[0])[:8] == ["task", "run", "method", "algorithm", "judges", "draw", "seed", "step"]
+    assert list(table[0])[:8] == ["task", "run", "method", "algorithm", "scored_observation", "draw", "seed", "step"]
     assert [(row["method"], row["draw"], row["seed"], row["step"]) for row in table] == [
         (method, "0", seed, step)
         for method in ("dense", "lare-linear")

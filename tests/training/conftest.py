@@ -32,10 +32,10 @@ def dense_run(dense_training):
 
 @pytest.fixture(scope="session")
 def factor_run(small, phi, tmp_path_factory):
-    """A run of 240 steps with a latent function from a file, which judges the observations before and after a step."""
+    """A run of 240 steps with a latent function from a file, which scores the observations before and after a step."""
     directory = tmp_path_factory.mktemp("factors")
     phi.save(directory / "phi.py")
-    return train_quietly(toy_spec(), small(judges="both"), directory / "run", directory / "phi.py")
+    return train_quietly(toy_spec(), small(scored_observation="both"), directory / "run", directory / "phi.py")
 
 
 @pytest.fixture(scope="session")
@@ -59,7 +59,7 @@ def learned_training(phi, tmp_path_factory):
 def echo_settings(small_many):
     """An iteration has ten steps, an episode of echo three to six: iterations end in the middle of episodes."""
     changes = {"environments": 2, "rollout_steps": 10, "steps": 80, "evaluate_every": 20, "credit": QUICK_CREDIT}
-    return small_many(algorithm="ippo", method="lare-rd", judges="both", **changes)
+    return small_many(algorithm="ippo", method="lare-rd", scored_observation="both", **changes)
 
 
 @pytest.fixture(scope="session")

@@ -52,7 +52,7 @@ def test_advance_equals_host_iterations(algorithm, method, begin):
 
 
 def test_advance_stops_at_a_factor_that_is_not_finite(begin):
-    session = begin("ippo", "lare-bayes", judges="before")
+    session = begin("ippo", "lare-bayes", scored_observation="before")
     session.advance(20)
     envs = session.collector.envs
     observation = envs.timestep.observation.at[1].set(np.inf)

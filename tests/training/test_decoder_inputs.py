@@ -55,15 +55,15 @@ TEAM = [
 
 
 @pytest.mark.parametrize(
-    ("build", "observed", "method", "judges", "expected"),
+    ("build", "observed", "method", "scored_observation", "expected"),
     [
         *((small_config, "observation", *row) for row in SINGLE),
         *((MANY, "observation", *row) for row in AGENTS),
         *((partial(MANY, credit_scope="state"), "state", *row) for row in TEAM),
     ],
 )
-def test_decoder_inputs(build, observed, method, judges, expected):
-    config = build(method, factor_inputs=judges)
+def test_decoder_inputs(build, observed, method, scored_observation, expected):
+    config = build(method, scored_observation=scored_observation)
     steps = random_steps(config.env)
     before, after = (getattr(timestep, observed)[:, 0] for timestep in (steps.timestep, steps.next_timestep))
     expected = np.concatenate(expected(before, steps.action[:, 0], after, random_factors(config, steps)[:, 0]), axis=-1)

@@ -70,10 +70,10 @@ def test_method_trains_or_is_refused(algorithm, method_name, small, small_many, 
         assert lare_rl.write_report([run.directory]).read_text().count("<svg") >= 1
 
 
-@pytest.mark.parametrize(("judged_from", "method_name"), STATE_GRID)
-def test_method_with_agents_that_leave(judged_from, method_name, small_many, echo, tmp_path):
-    method, from_state = METHODS[method_name], judged_from == "state"
-    changes = {"judged_from": "state", "observation_size": 9, "action_size": 9} if from_state else {}
+@pytest.mark.parametrize(("credit_scope", "method_name"), STATE_GRID)
+def test_method_with_agents_that_leave(credit_scope, method_name, small_many, echo, tmp_path):
+    method, from_state = METHODS[method_name], credit_scope == "state"
+    changes = {"credit_scope": "state", "observation_size": 9, "action_size": 9} if from_state else {}
     task = echo.model_copy(update=changes)
     settings = small_many(
         method=method_name, algorithm="qmix", seeds=1, steps=100, rollout_steps=25, credit=QUICK_CREDIT

@@ -63,7 +63,7 @@ def test_particle_task_trains_with_recorded_functions(task, small_many, tmp_path
     ]
 
 
-def test_stored_factors_follow_judges(echo_run):
+def test_stored_factors_follow_scored_observation(echo_run):
     """A row has the factors of the observations before and after a step: the second factor is the time, 0 after an
     agent left."""
     config, learner, _, _ = load_learner(echo_run)
@@ -94,12 +94,12 @@ def test_create_run_with_one_function_per_team(tmp_path):
 
 def test_compute_factors_of_state(echo):
     """One row in each step: the global state, and all actions concatenated."""
-    task = echo.model_copy(update={"judged_from": "state", "observation_size": 9, "action_size": 9})
+    task = echo.model_copy(update={"credit_scope": "state", "observation_size": 9, "action_size": 9})
     source = "def evaluation_func(s, a):\n    return [np.sum(s * a, axis=1, keepdims=True), s[:, 0:1]]\n"
     graph, steps = verify_function(source, task).graph, random_steps(Echo.spec)
-    for judges in ("before", "after"):
-        config = small_config("lare-rd", "qmix", Echo.spec, credit_scope="state", factor_inputs=judges)
-        state = (steps.timestep if judges == "before" else steps.next_timestep).state
+    for scored_observation in ("before", "after"):
+        config = small_config("lare-rd", "qmix", Echo.spec, credit_scope="state", scored_observation=scored_observation)
+        state = (steps.timestep if scored_observation == "before" else steps.next_timestep).state
         expected = np.stack([(state * steps.action.reshape(state.shape)).sum(axis=-1), state[..., 0]], axis=-1)
         factors = compute_factors([graph], jax.tree.map(jnp.asarray, steps), config)
         np.testing.assert_allclose(factors[..., 0, :], expected, rtol=1e-5, atol=1e-6)

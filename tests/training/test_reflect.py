@@ -67,7 +67,7 @@ def test_assessment_describes_factors(episodes):
 
 @pytest.mark.long
 def test_assessment_distinguishes_observations(episodes):
-    ranges = assess(WRONG, episodes, toy_spec(judges="both")).ranges
+    ranges = assess(WRONG, episodes, toy_spec(scored_observation="both")).ranges
     assert [line.split(":")[0] for line in ranges] == ["- f_0 (before)", "- f_0 (after)"]
 
 

@@ -58,7 +58,7 @@ def phi_for(method, phi):
 def test_resume_after_kill_is_exact(small, phi, factor_run, tmp_path):
     """SIGKILL in another process, in the middle of an episode and between two checkpoints."""
     phi.save(tmp_path / "phi")
-    (tmp_path / "settings.json").write_text(small(judges="both").model_dump_json())
+    (tmp_path / "settings.json").write_text(small(scored_observation="both").model_dump_json())
     environment = os.environ | {"PYTHONPATH": os.pathsep.join([str(Path(__file__).parents[1]), *sys.path])}
     process = subprocess.run([sys.executable, "-c", KILLED], cwd=tmp_path, env=environment, capture_output=True)
     assert process.returncode == -signal.SIGKILL, process.stderr.decode()

@@ -124,7 +124,7 @@ def test_metrics(dense, dense_run, echo_run, tmp_path):
         train_quietly(toy_spec(measures=("nonsense",)), dense(), tmp_path / "run")
 
 
-def test_stored_factors_follow_judges(factor_run):
+def test_stored_factors_follow_scored_observation(factor_run):
     with np.load(factor_run.checkpoint / "rows-1.npz") as rows:
         assert rows["factors"].shape[-1] == 4
         observation, action, z = (rows[name][0, 0, :, 0] for name in ("observation", "action", "factors"))
@@ -154,7 +154,7 @@ def test_infinite_factor_stops_run(small, factor_run, phi, tmp_path, monkeypatch
     with monkeypatch.context() as patch:
         patch.setattr(HostCollector, "collect", collect_huge_observation)
         with pytest.raises(LareError, match=r"factor 'f_near' is -inf .*failed_batch.npz"):
-            train_quietly(toy_spec(), small(judges="both"), tmp_path / "run", phi)
+            train_quietly(toy_spec(), small(scored_observation="both"), tmp_path / "run", phi)
     with np.load(tmp_path / "run" / "failed_batch.npz") as batch:
         assert (batch["observation"].shape, batch["action"].shape) == ((24, 2), (24, 1))
         assert (batch["observation"] == np.float32(1e30)).any()

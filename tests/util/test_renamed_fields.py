@@ -1,8 +1,8 @@
-"""Names of arrays that earlier versions have saved."""
+"""Names of arrays and keys that earlier versions have saved."""
 
 import pytest
 
-from lare_rl.util.renamed_fields import rename_fields
+from lare_rl.util.renamed_fields import rename_fields, rename_keys
 
 
 @pytest.mark.parametrize(
@@ -32,3 +32,11 @@ from lare_rl.util.renamed_fields import rename_fields
 def test_rename_fields(old, new):
     assert rename_fields(old) == new
     assert rename_fields(new) == new
+
+
+def test_rename_keys():
+    assert rename_keys({"judges": "both", "name": "x"}) == {"scored_observation": "both", "name": "x"}
+    assert rename_keys({"judges": "both", "scored_observation": "after"}) == {
+        "judges": "both",
+        "scored_observation": "after",
+    }

@@ -39,7 +39,7 @@ from lare_rl.envs.families import find_score
 from lare_rl.envs.load import resolve_task
 from lare_rl.errors import LareError
 from lare_rl.latent.function import LatentFunction
-from lare_rl.tasks.spec import FactorInputs, TaskSpec
+from lare_rl.tasks.spec import ScoredObservation, TaskSpec
 
 __all__ = ["CreditAssigner"]
 
@@ -55,7 +55,7 @@ class CreditAssigner:
         task: TaskSpec | str | Path | None = None,
         observation_space: Space | None = None,
         action_space: Space | None = None,
-        judges: FactorInputs | None = None,
+        scored_observation: ScoredObservation | None = None,
         agents: int = 1,
         max_steps: int | None = None,
         capacity: int = 1_000_000,
@@ -70,11 +70,12 @@ class CreditAssigner:
         Args:
             method: the name of a method. `dense` and `episodic` assign no credit.
             phi: for the methods that need one: those whose names begin with `lare-`, and `llm-reward`.
-            task: the task that `phi` was designed for: a name, a path, or a spec. Spaces and `judges` are taken from it if you do not
-                give them.
+            task: the task that `phi` was designed for: a name, a path, or a spec. It decides spaces and
+                `scored_observation` if you do not give them.
             observation_space: the space of a single agent in a single environment, or the length of an observation.
             action_space: the same for actions. Actions are in the environment's units.
-            judges: the observations of a step that the factors and raw features are computed from: "before", "after" or "both".
+            scored_observation: the observations of a step that factors and raw features are computed from: "before", "after" or
+                "both".
             agents: the number of agents of a team, which shares its return. With several, all arrays have an axis of agents after
                 the axis of steps.
             max_steps: the length of the longest episode; needed for many agents.
@@ -101,7 +102,7 @@ class CreditAssigner:
                 task=task,
                 observation=observation,
                 action=action,
-                judges=judges or (task.judges if task is not None else "after"),
+                scored_observation=scored_observation or (task.scored_observation if task is not None else "after"),
                 agents=agents,
                 max_steps=max_steps,
                 capacity=capacity,
@@ -298,7 +299,7 @@ class CreditAssigner:
             if explanation is None:
                 return []
             assert self.learner.decoder is not None
-            factor_names = [] if config.phi is None else config.phi.factor_columns(config.judges)
+            factor_names = [] if config.phi is None else config.phi.factor_columns(config.scored_observation)
             raw_names = config.raw_feature_names(len(explanation.residual_correlation))
             return explanation_lines(explanation, estimate_score_type(self.learner.decoder), factor_names, raw_names)
 

@@ -19,7 +19,7 @@ from lare_rl.credit.methods import Method
 from lare_rl.envs.families import load_env_spec
 from lare_rl.errors import LareError, short_repr
 from lare_rl.latent.function import LatentFunction, check_task
-from lare_rl.tasks.spec import FactorInputs, TaskSpec
+from lare_rl.tasks.spec import ScoredObservation, TaskSpec
 
 __all__ = [
     "AssignerConfig",
@@ -44,7 +44,7 @@ class AssignerConfig:
     task: TaskSpec | None
     observation: SpaceLayout
     action: SpaceLayout
-    judges: FactorInputs
+    scored_observation: ScoredObservation
     agents: int
     max_steps: int | None
     capacity: int
@@ -63,7 +63,7 @@ class AssignerConfig:
     def spec(self) -> CreditSpec:
         """What is fitted to the returns."""
         sizes = {
-            "factors": self.phi.n_factors(self.judges) if self.phi is not None else 0,
+            "factors": self.phi.n_factors(self.scored_observation) if self.phi is not None else 0,
             "observation": self.observation.size,
             "action": self.action.size,
         }
@@ -71,7 +71,7 @@ class AssignerConfig:
             self.method,
             self.settings,
             sizes,
-            judges=self.judges,
+            scored_observation=self.scored_observation,
             single_agent=self.agents == 1,
             agents=self.agents,
             max_steps=self.max_steps or 1,
@@ -93,7 +93,7 @@ class AssignerConfig:
         """Compute the decoder's inputs for some steps, which are rows already. Raises `LareError` if a factor is not finite."""
         arrays = {"observation": observation, "action": action, "next_observation": next_observation}
         if self.phi is not None:
-            arrays["factors"] = self.phi.step_factors(observation, action, next_observation, self.judges)
+            arrays["factors"] = self.phi.step_factors(observation, action, next_observation, self.scored_observation)
         inputs = input_arrays(self.spec.inputs, arrays)
         return np.concatenate(inputs, axis=-1) if inputs else observation[..., :0]
 
@@ -178,7 +178,7 @@ def check_config(config: AssignerConfig) -> None:
         config.settings,
         n_agents=config.agents,
         n_raw_features=config.spec.basis.n_raw,
-        factor_inputs=config.judges,
+        scored_observation=config.scored_observation,
         scale_rewards=config.scale_rewards,
     )
     if config.agents > 1 and config.max_steps is None:

@@ -26,14 +26,23 @@ from lare_rl.latent.saved import load_function
 from lare_rl.runs.checkpoint import DAMAGED_FILE_ERRORS, fill_template, named_leaves, open_npz
 from lare_rl.tasks.spec import TaskSpec
 from lare_rl.util.files import write_arrays, write_atomically
-from lare_rl.util.renamed_fields import rename_fields
+from lare_rl.util.renamed_fields import rename_fields, rename_keys
 from lare_rl.util.safe_io import read_json, read_text
 
 __all__ = ["AssignerState", "get_state", "read_state", "report_damage", "restore", "write_state"]
 
 FORMAT = 1
 TEXT_FILE, ARRAYS_FILE, FUNCTION_FILE = "assigner.json", "state.npz", "phi.py"
-PLAIN_FIELDS = ("judges", "agents", "max_steps", "capacity", "seed", "fits_per_step", "scale_rewards", "forget")
+PLAIN_FIELDS = (
+    "scored_observation",
+    "agents",
+    "max_steps",
+    "capacity",
+    "seed",
+    "fits_per_step",
+    "scale_rewards",
+    "forget",
+)
 """The fields of a configuration that are JSON values."""
 LEARNED = "learned"
 """The names of the arrays of the decoder and the scale begin with it."""
@@ -103,11 +112,12 @@ def read_state(directory: Path) -> AssignerState:
     path = directory / TEXT_FILE
     with report_damage(directory):
         values = read_json(read_text(path))
+        values = rename_keys(values) if isinstance(values, dict) else {}
         with open_npz(directory / ARRAYS_FILE) as saved:
             arrays = {name: saved[name] for name in saved.files}
-        if not isinstance(values, dict) or values.get("format") != FORMAT:
+        if values.get("format") != FORMAT:
             raise LareError(f"{path} is not of format {FORMAT}: another version of LaRe has written it")
-        task = None if values["task"] is None else TaskSpec(**values["task"])
+        task = None if values["task"] is None else TaskSpec(**rename_keys(values["task"]))
         phi = None
         if task is not None and values["phi"]:
             sample = (arrays[PHI_SAMPLE[0]], arrays[PHI_SAMPLE[1]]) if set(PHI_SAMPLE) <= set(arrays) else None

@@ -11,7 +11,7 @@ from tyro.conf import Positional
 
 from lare_rl.cli.terminal import Data, Kind, Task, load_steps, print_line, print_progress, write_new_file
 from lare_rl.errors import LareError
-from lare_rl.tasks.spec import NO_ENVIRONMENT, FactorInputs
+from lare_rl.tasks.spec import NO_ENVIRONMENT, ScoredObservation
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -104,7 +104,7 @@ def verify(
     data: Data = None,
     fit: int = 0,
     policy: Annotated[Path | None, tyro.conf.arg(metavar="RUN")] = None,
-    judges: FactorInputs | None = None,
+    scored_observation: ScoredObservation | None = None,
 ) -> None:
     """Verify a function: it is read, never executed, and its factors must be finite. Prints the entries that each factor reads.
 
@@ -121,7 +121,7 @@ def verify(
         fit: number of episodes, 20 or more, whose returns the factors are fitted to: the first of --data, or episodes that are
             played with random actions, the same in every call.
         policy: a run whose policy plays the episodes for --fit, instead of random actions.
-        judges: which observation of a step the function judges, instead of the one that the task says.
+        scored_observation: the observation of a step that the function reads, instead of the task's.
     """
     from lare_rl.cli.design import load_policy
     from lare_rl.credit.explanation_text import MIN_EXPLAINED_EPISODES
@@ -137,7 +137,8 @@ def verify(
     if policy is not None and (not fit or data is not None):
         raise LareError("--policy plays the episodes for --fit: give --fit a number of episodes, and no --data")
     spec = load_task(task) if data is None else read_task(task)
-    spec = spec if judges is None else spec.model_copy(update={"judges": judges})
+    if scored_observation is not None:
+        spec = spec.model_copy(update={"scored_observation": scored_observation})
     play = load_policy(policy, spec)
     if changed:
         print_line("note    the source was changed after it was saved: its hash differs")

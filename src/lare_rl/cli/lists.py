@@ -16,13 +16,13 @@ def tasks() -> None:
 
     specs = [read_task(name) for name in shipped_tasks()]
     print_table(
-        ("task", "observation", "action", "judges", "agents"),
+        ("task", "observation", "action", "scored_observation", "agents"),
         (
             (
                 spec.name,
                 str(spec.observation_size),
                 str(spec.action_size),
-                spec.judges,
+                spec.scored_observation,
                 "of one team" if spec.team else "one" if has_single_agent(spec) else "many",
             )
             for spec in specs

@@ -12,7 +12,7 @@ from lare_rl.util.files import write_atomically
 
 __all__ = ["read_metric_rows", "write_table"]
 
-KEYS = ("task", "run", "method", "algorithm", "judges", "draw", "seed", "step")
+KEYS = ("task", "run", "method", "algorithm", "scored_observation", "draw", "seed", "step")
 """The first columns of the table."""
 
 
@@ -29,7 +29,7 @@ def read_metric_rows(directories: Iterable[Path]) -> list[dict[str, Any]]:
             "run": directory.name,
             "method": settings.method,
             "algorithm": settings.algorithm,
-            "judges": settings.factor_inputs(config.task),
+            "scored_observation": settings.choose_scored_observation(config.task),
             "draw": settings.draw,
         }
         rows += [keys | line for line in read_metrics(directory)]

@@ -15,8 +15,8 @@ __all__ = ["effective_settings", "needs_replay", "unused_names", "unused_setting
 def effective_settings(settings: ResolvedSettings) -> dict[str, Any]:
     """Return the settings that a run uses, by dotted names as on the command line."""
     values = settings.model_dump()
-    if settings.judges is None:
-        values["judges"] = "as the task says"
+    if settings.scored_observation is None:
+        values["scored_observation"] = "as the task says"
     values[settings.algorithm] = values.pop("hyperparameters")
     unused = unused_names(settings)
     return {name: value for name, value in _flatten(values) if not _is_under(name, unused)}
@@ -49,7 +49,7 @@ def unused_names(settings: ResolvedSettings) -> list[str]:
         "fit_every": method.uses_gradient and (on_policy or separate_fit),
         "fit_updates": method.uses_gradient and (on_policy or separate_fit),
         "first_fit": method.uses_gradient and on_policy and algorithm.multi_agent,
-        "judges": method.uses_factor_inputs,
+        "scored_observation": method.uses_scored_observation,
         "draw": method.needs_phi,
         "candidates": method.needs_phi,
         "capacity": needs_replay(settings),

@@ -1,18 +1,19 @@
 """Read config.json of earlier versions.
 
 When a setting gets another name or meaning, `FORMAT` is increased, and a new row of `_MIGRATIONS` converts the old form. So reports
-and comparisons of old runs are still possible. Their checkpoints are not migrated.
+and comparisons of old runs are still possible. Their checkpoints are read by `util/renamed_fields.py`, if only names differ.
 """
 
 from collections.abc import Callable, Mapping
 from typing import Any
 
 from lare_rl.errors import LareError
+from lare_rl.util.renamed_fields import rename_keys
 
 __all__ = ["FORMAT", "migrate"]
 
-FORMAT = 5
-"""The format of config.json and of the checkpoint. It is increased whenever their contents change."""
+FORMAT = 6
+"""The format of config.json. It is increased whenever its contents change."""
 
 
 def migrate(values: dict[str, Any]) -> dict[str, Any]:
@@ -47,5 +48,28 @@ def _from_4(values: dict[str, Any]) -> dict[str, Any]:
     return values | {"settings": {"first_fit": "published"} | settings}
 
 
-_MIGRATIONS: Mapping[int, Callable[[dict[str, Any]], dict[str, Any]]] = {2: _from_2, 3: _from_3, 4: _from_4}
+def _from_5(values: dict[str, Any]) -> dict[str, Any]:
+    # Keys of settings and tasks got other names.
+    settings, task = values.get("settings"), values.get("task")
+    if isinstance(settings, dict):
+        values = values | {"settings": rename_keys(settings)}
+    if isinstance(task, dict):
+        values = values | {"task": _rename_task_keys(task)}
+    return values
+
+
+def _rename_task_keys(task: dict[str, Any]) -> dict[str, Any]:
+    task = rename_keys(task)
+    teams = task.get("teams")
+    if isinstance(teams, list):
+        task["teams"] = [rename_keys(team) if isinstance(team, dict) else team for team in teams]
+    return task
+
+
+_MIGRATIONS: Mapping[int, Callable[[dict[str, Any]], dict[str, Any]]] = {
+    2: _from_2,
+    3: _from_3,
+    4: _from_4,
+    5: _from_5,
+}
 """Functions that convert a format to the next one."""

@@ -29,14 +29,14 @@ def resolve(settings: Settings, task: TaskSpec) -> ResolvedSettings:
     _check_algorithm(ALGORITHMS[choose_algorithm(settings.algorithm, env)], task, env)
     resolved = _normalise(apply_defaults(settings, env), task, env)
 
-    method, team_level = find_method(resolved.method), task.judged_from == "state"
+    method, team_level = find_method(resolved.method), task.credit_scope == "state"
     n_state_features = env.state_size + env.n_agents * env.action_size
     check_credit(
         method,
         resolved.credit,
         n_agents=env.n_agents,
         n_raw_features=n_state_features if team_level else env.observation_size + env.action_size,
-        factor_inputs=resolved.factor_inputs(task),
+        scored_observation=resolved.choose_scored_observation(task),
         team_level=team_level,
         fixed_length=env.fixed_length,
         scale_rewards=resolved.scale_rewards,
@@ -102,8 +102,8 @@ def apply_defaults(settings: Settings, env: EnvSpec) -> ResolvedSettings:
 def _normalise(resolved: ResolvedSettings, task: TaskSpec, env: EnvSpec) -> ResolvedSettings:
     """Give settings that make no difference one value, so that equal runs have equal settings."""
     changes = {}
-    if resolved.judges == task.judges:
-        changes["judges"] = None
+    if resolved.scored_observation == task.scored_observation:
+        changes["scored_observation"] = None
     if "first_fit" in unused_names(resolved):
         changes["first_fit"] = None
     score = resolved.credit.score

@@ -10,7 +10,7 @@ from lare_rl.credit.decoder_settings import CreditSettings
 from lare_rl.credit.methods import find_method
 from lare_rl.errors import CheckedModel
 from lare_rl.llm.prompts import N_CANDIDATES
-from lare_rl.tasks.spec import FactorInputs, TaskSpec
+from lare_rl.tasks.spec import ScoredObservation, TaskSpec
 
 __all__ = ["ResolvedSettings", "Settings"]
 
@@ -39,8 +39,9 @@ class _RunSettings(CheckedModel, Generic[Open]):
     """How many seeds to train, in lockstep in one process."""
     seed: Annotated[int, Field(ge=0, le=MAX_SEED)] = 0
     """The first seed; the others are the numbers after it."""
-    judges: FactorInputs | None = None
-    """By which observation a step is judged: the one before it, the one after it, or both. By default, as the task says."""
+    scored_observation: ScoredObservation | None = None
+    """The observations of a step that factors and raw features are computed from: before it, after it, or both. By default, the
+    task decides."""
     draw: Annotated[int, Field(ge=0)] = 0
     """Which recorded reply of the language model to take phi from (0 to 4); independent of the seed."""
     candidates: Count = N_CANDIDATES
@@ -126,7 +127,7 @@ class Settings(create_model("Settings", __base__=_Settings, __module__=__name__,
 
 
 class ResolvedSettings(_RunSettings[Never]):
-    """The settings that a run uses. No value is open, except for `judges`, which the task then decides."""
+    """The settings that a run uses. No value is open, except for `scored_observation`, which the task then decides."""
 
     model_config = ConfigDict(validate_default=True)  # an open value that is missing is an error
 
@@ -168,6 +169,6 @@ class ResolvedSettings(_RunSettings[Never]):
         """Steps of random actions before the first update."""
         return getattr(self.hyperparameters, "warmup", 0)
 
-    def factor_inputs(self, task: TaskSpec) -> FactorInputs:
+    def choose_scored_observation(self, task: TaskSpec) -> ScoredObservation:
         """Return which observations of a step phi reads."""
-        return self.judges or task.judges
+        return self.scored_observation or task.scored_observation

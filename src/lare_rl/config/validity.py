@@ -4,7 +4,7 @@ from lare_rl.credit.basis import MAX_RAW_FEATURES
 from lare_rl.credit.decoder_settings import CreditSettings
 from lare_rl.credit.methods import Fit, Method, Reward
 from lare_rl.errors import LareError
-from lare_rl.tasks.spec import FactorInputs
+from lare_rl.tasks.spec import ScoredObservation
 
 __all__ = ["check_credit"]
 
@@ -15,7 +15,7 @@ def check_credit(
     *,
     n_agents: int,
     n_raw_features: int,
-    factor_inputs: FactorInputs = "after",
+    scored_observation: ScoredObservation = "after",
     team_level: bool = False,
     fixed_length: bool = False,
     scale_rewards: bool = False,
@@ -27,14 +27,16 @@ def check_credit(
         credit: the settings of the decoder.
         n_agents: the number of agents.
         n_raw_features: entries of an observation (of the global state, if `team_level`) and of the actions with it.
-        factor_inputs: which observations of a step phi reads.
+        scored_observation: which observations of a step phi reads.
         team_level: whether credit is assigned to the team's global state instead of each agent.
         fixed_length: whether every episode has the same number of steps.
         scale_rewards: whether rewards are divided by the size of returns.
     """
     name = method.name
-    if method.reward is Reward.DESIGNED and factor_inputs == "both":
-        raise LareError(f"{name} is one reward for each step: set judges to 'before' or 'after', not to 'both'")
+    if method.reward is Reward.DESIGNED and scored_observation == "both":
+        raise LareError(
+            f"{name} is one reward for each step: set scored_observation to 'before' or 'after', not to 'both'"
+        )
     if scale_rewards and method.has_proxy_rewards and not method.calibrated:
         raise LareError(f"scale_rewards divides by the size of returns, and rewards of {name} are not in their unit")
     if method.single_agent_only and n_agents > 1:
@@ -42,7 +44,7 @@ def check_credit(
     if method.multi_agent_only and n_agents == 1:
         raise LareError(f"{name} assigns credit among agents, and the task has a single agent")
     if method.multi_agent_only and team_level:
-        raise LareError(f"{name} assigns credit among agents, and the task is judged from the global state")
+        raise LareError(f"{name} assigns credit among agents, and the task has credit_scope = 'state'")
     if method.needs_whole_episodes and not fixed_length:
         raise LareError(f"{name} reads whole episodes of one length: use it with `lare_rl.train` on particle tasks")
     if "drawn_steps" in method.settings and not fixed_length and credit.steps < credit.drawn_steps:

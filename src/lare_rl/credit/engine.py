@@ -30,7 +30,7 @@ from lare_rl.credit.returns import add_to_sums
 from lare_rl.credit.score_type import ScoreType, score_types_to_fit
 from lare_rl.envs.interface import alive_mean
 from lare_rl.nn.normalise import RunningMeanStd, Scale, min_max_scale, root_mean_square
-from lare_rl.tasks.spec import FactorInputs
+from lare_rl.tasks.spec import ScoredObservation
 
 __all__ = [
     "CreditSpec",
@@ -79,7 +79,7 @@ def credit_spec(
     settings: CreditSettings,
     sizes: Mapping[str, int],
     *,
-    judges: FactorInputs,
+    scored_observation: ScoredObservation,
     single_agent: bool,
     agents: int,
     max_steps: int,
@@ -92,14 +92,14 @@ def credit_spec(
         method: the method.
         settings: the settings of its decoder.
         sizes: the sizes of `factors`, `observation` (the state, for credit to whole teams) and `action`.
-        judges: which observations the task names.
+        scored_observation: which observations the task names.
         single_agent: whether the task has a single agent.
         agents: the number of proxy rewards of a step.
         max_steps: the number of steps of the longest episode.
         fixed_length: whether all episodes have the same length. A sum and a mean are then the same.
         scale_rewards: whether training rewards are divided by the scale of R/T.
     """
-    inputs = method.inputs.resolve(judges, single_agent=single_agent) if method.inputs is not None else ()
+    inputs = method.inputs.resolve(scored_observation, single_agent=single_agent) if method.inputs is not None else ()
     score_types = score_types_to_fit(settings.score, fixed_length) if "score" in method.settings else (ScoreType.SUM,)
     return CreditSpec(
         method=method,

@@ -86,13 +86,13 @@ MESSAGES = {
     ),
     "high_when_large": (
         "Returns are higher than the factors predict when {name} is large (correlation {correlation:+.2f}): a factor may be missing"
-        "{judges}."
+        "{scored_observation}."
     ),
     "high_when_small": (
         "Returns are higher than the factors predict when {name} is small (correlation {correlation:+.2f}): a factor may be missing"
-        "{judges}."
+        "{scored_observation}."
     ),
-    "judges_may_be_wrong": ", or the task's `judges` may be wrong",
+    "scored_observation_may_be_wrong": ", or the task's `scored_observation` may be wrong",
 }
 """The sentences, by the codes of the findings."""
 
@@ -192,8 +192,8 @@ def _residual_findings(explanation: Explanation, factors: Sequence[str], raw_fea
     if abs(correlation) <= STRIKING_CORRELATION:
         return []
     reads_both = any(name.endswith(" (after)") for name in factors)
-    judges = None if reads_both else Finding("judges_may_be_wrong")
-    values = {"name": raw_features[largest], "correlation": correlation, "judges": judges}
+    scored_observation = None if reads_both else Finding("scored_observation_may_be_wrong")
+    values = {"name": raw_features[largest], "correlation": correlation, "scored_observation": scored_observation}
     return [Finding("high_when_large" if correlation > 0 else "high_when_small", values)]
 
 

@@ -5,7 +5,7 @@
     action               a, as the policy's networks see it
     next_observation     s', after the action
     observation_change   s - s'
-    scored_observation   s, s' or both, as the task's `judges` says
+    scored_observation   s, s' or both: the task's key of this name decides
 
 The size of a decoder's input, and the input itself in NumPy, in JAX and in an exported graph, all follow from this tuple. If credit
 is assigned to whole teams, `observation` is the global state and `action` holds the actions of all agents.
@@ -16,7 +16,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from lare_rl.errors import LareError
-from lare_rl.tasks.spec import FactorInputs
+from lare_rl.tasks.spec import ScoredObservation, select_states
 
 __all__ = [
     "FACTORS",
@@ -31,11 +31,6 @@ __all__ = [
 ]
 
 _NAMES = ("factors", "observation", "action", "next_observation", "observation_change", "scored_observation")
-_SCORED_OBSERVATIONS = {
-    "before": ("observation",),
-    "after": ("next_observation",),
-    "both": ("observation", "next_observation"),
-}
 
 
 @dataclass(frozen=True)
@@ -53,14 +48,11 @@ class InputNames:
                     f"the inputs of a decoder are a tuple of names among {', '.join(_NAMES)}, and was given {names!r}"
                 )
 
-    def resolve(self, judges: FactorInputs = "after", *, single_agent: bool = True) -> tuple[str, ...]:
+    def resolve(self, scored_observation: ScoredObservation = "after", *, single_agent: bool = True) -> tuple[str, ...]:
         """Return the names of the inputs, with `scored_observation` replaced by the observations that a task names."""
         names = self.names if single_agent or self.names_of_many_agents is None else self.names_of_many_agents
-        return tuple(
-            name
-            for group in names
-            for name in (_SCORED_OBSERVATIONS[judges] if group == "scored_observation" else (group,))
-        )
+        scored = select_states(scored_observation, "observation", "next_observation")
+        return tuple(name for group in names for name in (scored if group == "scored_observation" else [group]))
 
     @property
     def has_factors(self) -> bool:
@@ -73,8 +65,8 @@ class InputNames:
         return self.names != ("factors",)
 
     @property
-    def depends_on_judges(self) -> bool:
-        """Whether the raw features depend on which observations the task's `judges` names."""
+    def depends_on_scored_observation(self) -> bool:
+        """Whether the raw features depend on which observations the task's `scored_observation` names."""
         return "scored_observation" in self.names
 
 

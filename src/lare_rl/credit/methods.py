@@ -116,9 +116,9 @@ class Method:
         return "reward" if self.reward is Reward.DESIGNED else "factors"
 
     @property
-    def uses_factor_inputs(self) -> bool:
-        """Whether it matters which observations the task's `judges` names."""
-        return self.needs_phi or (self.inputs is not None and self.inputs.depends_on_judges)
+    def uses_scored_observation(self) -> bool:
+        """Whether it matters which observations the task's `scored_observation` names."""
+        return self.needs_phi or (self.inputs is not None and self.inputs.depends_on_scored_observation)
 
     @property
     def uses_gradient(self) -> bool:

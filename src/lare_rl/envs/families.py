@@ -171,7 +171,7 @@ def _load_env_spec(task_json: str) -> EnvSpec:
 def check_logs(task: TaskSpec) -> None:
     """Raise `LareError` if a task with logs only has keys that need an environment."""
     _check_keys(task, _LOGS_ONLY)
-    defaults = {"teams": (), "team": None, "measures": (), "judged_from": "observation"}
+    defaults = {"teams": (), "team": None, "measures": (), "credit_scope": "observation"}
     for key, default in defaults.items():
         if getattr(task, key) != default:
             raise LareError(f"task {task.name!r}: {key} has no effect on logs. Remove it.")
@@ -234,9 +234,9 @@ def _check_spec(task: TaskSpec, spec: EnvSpec) -> None:
     for name in task.measures:
         if name not in spec.measures:
             raise fail(task, f"{env} has no measure {name!r}")
-    from_state = task.judged_from == "state"
+    from_state = task.credit_scope == "state"
     if from_state and not spec.state_size:
-        raise fail(task, f"judged_from = 'state', but {env} has no global state")
+        raise fail(task, f"credit_scope = 'state', but {env} has no global state")
     for role in task.roles:
         team = spec.teams[names.index(role.team)] if role.team in names else spec.teams[0]
         if from_state:

@@ -101,7 +101,7 @@ class JaxMARLEnv:
             self._masks = _find_masks(env, state) if self.layout.discrete else None
             actions = {agent.name: jnp.asarray(agent.action_space.sample()) for agent in agents}
             infos = jax.eval_shape(env.step_env, jnp.zeros(2, jnp.uint32), state, actions)[-1]
-        self._from_observations = any(role.judged_from == "state" for role in (task, *task.teams))
+        self._from_observations = any(role.credit_scope == "state" for role in (task, *task.teams))
         self.spec = self.layout.make_spec(
             teams,
             max_steps=max_steps,

@@ -7,6 +7,7 @@ from typing import Any
 
 from lare_rl.errors import LareError, did_you_mean, short_repr
 from lare_rl.tasks.spec import NO_ENVIRONMENT, SHARED_KEYS, TaskSpec
+from lare_rl.util.renamed_fields import rename_keys
 from lare_rl.util.safe_io import MAX_SETTINGS_BYTES, read_text, read_toml
 
 __all__ = ["check_environment", "load_task", "read_task", "resolve_task", "shipped_tasks"]
@@ -75,7 +76,7 @@ def check_environment(spec: TaskSpec) -> None:
 def _read_values(task: str, ancestors: tuple[str, ...] = ()) -> dict[str, Any]:
     """Return the keys of a task file. The task named by `like` provides missing keys, and `teams` become their values."""
     try:
-        values = read_toml(_read_file(task))
+        values = rename_keys(read_toml(_read_file(task)))
     except ValueError as error:  # TOMLDecodeError, or a number with too many digits
         hint = "; a text needs quotes" if str(error).startswith("Invalid value") else ""
         raise LareError(f"task {task!r} is not valid TOML: {error}{hint}") from error

@@ -69,7 +69,7 @@ class ParallelHost:
             raise env_errors.no_time_limit_error(task)
         self._available = self.layout.available
         self._masks_actions = any(agent.observes_mask for agent in agents) or not self._available.all()
-        self._credit_from_state = any(role.judged_from == "state" for role in (task, *task.teams))
+        self._credit_from_state = any(role.credit_scope == "state" for role in (task, *task.teams))
         self._state: np.ndarray | None = None
         self._state_failed = False
         self._alive = np.zeros(len(agents), bool)

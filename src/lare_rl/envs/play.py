@@ -88,7 +88,7 @@ def make_episode(
     measures: Mapping[str, float] | None = None,
 ) -> Episode:
     """Return the rows of a role, from all steps of an episode."""
-    team, scope = find_team(role, spec), role.judged_from
+    team, scope = find_team(role, spec), role.credit_scope
     observation, action = phi_inputs(scope, team, timestep, env_action)
     next_observation, _ = phi_inputs(scope, team, next_timestep, env_action)
     team_reward = np.asarray(team_mean(next_timestep.reward, timestep.alive, team))

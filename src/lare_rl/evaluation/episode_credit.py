@@ -59,7 +59,7 @@ def label_factors(run: Run, team_index: int = 0) -> list[FactorLabel]:
     if not run.functions:
         return []
     function = run.functions[team_index]
-    names = function.factor_columns(run.factor_inputs)
+    names = function.factor_columns(run.scored_observation)
     n_observations = len(names) // function.size
     return list(map(FactorLabel, names, function.meanings * n_observations, function.reads * n_observations))
 

@@ -5,7 +5,7 @@
     length [batch *one]                             T of the step's episode, if the score is a mean over its steps
     ->  r_hat [batch *agents]
 
-The graph has only the inputs that the method uses, and the graph of phi is a part of it. If credit is judged from the global state,
+The graph has only the inputs that the method uses, and the graph of phi is a part of it. If credit is assigned by the global state,
 `before` and `after` are states, `action` holds the actions of all agents side by side, and there is one r_hat for the team.
 """
 
@@ -106,7 +106,7 @@ class _StepInputs(dict[str, Any]):
         """Return the factors of a step, for each agent by itself."""
         assert self.phi is not None
         factors = []
-        for side in select_states(self.config.factor_inputs, "before", "after"):
+        for side in select_states(self.config.scored_observation, "before", "after"):
             nodes = {"observation": self[side].node, "action": self["env_action"].node}
             node = inline(current_builder(), self.phi, nodes, self.rows[0] if self.rows else None)["factors"]
             factors.append(Array(node, None))

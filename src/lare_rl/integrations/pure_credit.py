@@ -26,7 +26,7 @@ from lare_rl.data.trajectory import Trajectory
 from lare_rl.envs.interface import EnvSpec, Team, Timestep, to_env_action
 from lare_rl.errors import LareError
 from lare_rl.latent.function import LatentFunction
-from lare_rl.tasks.spec import FactorInputs
+from lare_rl.tasks.spec import ScoredObservation
 from lare_rl.training import episodes
 from lare_rl.training.decoder_fits import fit_repeatedly
 from lare_rl.training.factors import compute_factors
@@ -80,7 +80,7 @@ def pure_credit(
     agents: int = 1,
     low: Any = -1.0,
     high: Any = 1.0,
-    judges: FactorInputs = "after",
+    scored_observation: ScoredObservation = "after",
     capacity: int = 1_000_000,
     fit_updates: int = 500,
     settings: CreditSettings | None = None,
@@ -100,7 +100,7 @@ def pure_credit(
         agents: the number of agents of a team, which shares its return.
         low: the lower bounds of continuous actions in the environment's units, which `phi` reads.
         high: the upper bounds.
-        judges: the observations of a step that factors and raw features are computed from: "before", "after" or "both".
+        scored_observation: the observations of a step that factors and raw features are computed from: "before", "after" or "both".
         capacity: the number of steps that are stored.
         fit_updates: gradient updates of the decoder in each `refit`. Ignored for a closed form.
         settings: the settings of the decoder.
@@ -134,13 +134,13 @@ def pure_credit(
     config = TrainConfig(
         env=env,
         credit_scope="observation",
-        factor_inputs=judges,
+        scored_observation=scored_observation,
         method=chosen,
         algorithm=algorithm,
         hyperparameters=algorithm.settings,
         credit=settings or default_credit(agents),
         scale_rewards=scale_rewards,
-        n_factors=tuple(function.n_factors(judges) for function in functions),
+        n_factors=tuple(function.n_factors(scored_observation) for function in functions),
         n_envs=n_envs,
         rollout_steps=n_steps,
         capacity=max(capacity // n_envs, required_capacity(n_steps, max_steps)),

@@ -20,7 +20,7 @@ from lare_rl.llm.prompts import Kind
 from lare_rl.phi.graph import Graph
 from lare_rl.phi.names import factor_meanings, factor_names
 from lare_rl.phi.read import read
-from lare_rl.tasks.spec import FactorInputs, TaskSpec, require_role, select_states
+from lare_rl.tasks.spec import ScoredObservation, TaskSpec, require_role, select_states
 
 __all__ = [
     "CHANGED_SUFFIX", "HEADER_PREFIX", "LatentFunction", "check_task", "features_text", "function_from_verdict",
@@ -116,28 +116,28 @@ class LatentFunction:
         return factors[0] if single else factors
 
     def step_factors(
-        self, observation: Any, action: Any, next_observation: Any, factor_inputs: FactorInputs
+        self, observation: Any, action: Any, next_observation: Any, scored_observation: ScoredObservation
     ) -> Float[np.ndarray, "*batch factors"]:
-        """Compute the factors of steps from the observations that `factor_inputs` names. Arrays may have any batch axes.
+        """Compute the factors of steps from the observations that `scored_observation` names. Arrays may have any batch axes.
 
         For "both", the factors of both observations are concatenated.
 
         Raises:
-            LareError: as for `__call__`, or `factor_inputs` is not before, after or both.
+            LareError: as for `__call__`, or `scored_observation` is not before, after or both.
         """
-        if factor_inputs not in ("before", "after", "both"):
-            raise LareError(f"judges = {short_repr(factor_inputs)}: it is before, after or both")
-        observations = select_states(factor_inputs, observation, next_observation)
+        if scored_observation not in ("before", "after", "both"):
+            raise LareError(f"scored_observation = {short_repr(scored_observation)}: it is before, after or both")
+        observations = select_states(scored_observation, observation, next_observation)
         lead, actions = np.shape(action)[:-1], _to_rows(action)
         return np.concatenate([self(_to_rows(array), actions) for array in observations], axis=-1).reshape(*lead, -1)
 
-    def n_factors(self, factor_inputs: FactorInputs) -> int:
+    def n_factors(self, scored_observation: ScoredObservation) -> int:
         """Return the number of factors of `step_factors`."""
-        return 2 * self.size if factor_inputs == "both" else self.size
+        return 2 * self.size if scored_observation == "both" else self.size
 
-    def factor_columns(self, factor_inputs: FactorInputs) -> list[str]:
+    def factor_columns(self, scored_observation: ScoredObservation) -> list[str]:
         """Return the names of the factors of `step_factors`."""
-        if factor_inputs != "both":
+        if scored_observation != "both":
             return list(self.names)
         return [f"{name} ({side})" for side in ("before", "after") for name in self.names]
 

@@ -177,8 +177,8 @@ def sample_steps(task: TaskSpec, steps: Steps | None) -> Steps:
 def random_steps(task: TaskSpec, n_steps: int = N_SAMPLE_STEPS, seed: int = 0) -> Steps:
     """Play episodes by uniformly random actions, and return steps of them (the paper's pre-collected state-action pairs).
 
-    The task's `judges` selects the observations before or after a step, or both: half of the rows are then observations
-    before a step. If more steps were played than requested, the result is evenly spaced among them, from the first to the
+    The task's `scored_observation` selects the observations before or after a step, or both: half of the rows are then
+    observations before a step. If more steps were played than requested, the result is evenly spaced among them, from the first to the
     last. The arrays are cached, and therefore read-only.
     """
     return _random_steps(task.model_dump_json(), n_steps, seed)
@@ -189,15 +189,15 @@ def _random_steps(task_json: str, n_steps: int, seed: int) -> Steps:
     role = TaskSpec.model_validate_json(task_json)
     with contextlib.closing(make_host_env(role)) as env:
         team, rng = find_team(role, env.spec), np.random.default_rng(seed)
-        sides = select_states(role.judges, "before", "after")
+        sides = select_states(role.scored_observation, "before", "after")
         rows_by_side: dict[str, list[list[np.ndarray]]] = {side: [] for side in sides}
         n_rows, n_played = 0, 0
         for episode in itertools.count():
             for timestep, env_action, next_timestep in play_steps(env, None, rng, seed + episode):
-                acting = slice(None) if role.judged_from == "state" else timestep.alive[team.agents]
+                acting = slice(None) if role.credit_scope == "state" else timestep.alive[team.agents]
                 for side, rows in rows_by_side.items():
                     inputs = phi_inputs(
-                        role.judged_from, team, timestep if side == "before" else next_timestep, env_action
+                        role.credit_scope, team, timestep if side == "before" else next_timestep, env_action
                     )
                     rows.append([array[acting] for array in inputs])
                     n_rows += len(rows[-1][0])

@@ -28,7 +28,7 @@ def draft_log_task(source: Any) -> Draft:
         f'environment = "{NO_ENVIRONMENT}" # there are logs only; to train, the id of the environment that they come from',
         f"observation_size = {layouts['observation'].size}",
         f"action_size = {layouts['action'].size}",
-        'judges = "after"',
+        'scored_observation = "after"',
         SCORE_LINE,
         f"max_episode_steps = {limit}" if limit else LIMIT_LINE,
         *text_lines(texts, {key: _first_line(layout, key) for key, layout in layouts.items()}),

@@ -23,8 +23,8 @@ def logged_steps(source: Any, task: TaskSpec | str | Path, count: int = N_SAMPLE
 
     Args:
         source: as in `relabel`.
-        task: a name, a path, or a spec. Its `judges` says whether phi sees the observation before a step, the one after it, or
-            both. With both, the first half of the rows are observations before a step.
+        task: a name, a path, or a spec. Its `scored_observation` says whether phi sees the observation before a step, the one
+            after it, or both. With both, the first half of the rows are observations before a step.
         count: approximate number of steps. A shorter log has fewer.
 
     Returns:
@@ -37,7 +37,9 @@ def logged_steps(source: Any, task: TaskSpec | str | Path, count: int = N_SAMPLE
     observations, actions = [], []
     for episode in itertools.islice(open_log(source, task).episodes(), SAMPLED_EPISODES):
         steps = evenly_spaced(len(episode), count)
-        observations.append(select_states(task.judges, episode.observation[steps], episode.next_observation[steps]))
+        observations.append(
+            select_states(task.scored_observation, episode.observation[steps], episode.next_observation[steps])
+        )
         actions.append(episode.action[steps])
     sides = [np.concatenate(side) for side in zip(*observations, strict=True)]
     observation, action = np.concatenate(sides), np.concatenate(actions * len(sides))

@@ -11,9 +11,9 @@ from lare_rl.envs.spaces import OneHot
 from lare_rl.tasks.spec import FILL_IN
 
 __all__ = [
-    "JUDGES_LINE",
     "LIMIT_LINE",
     "MEASURES_LINE",
+    "SCORED_OBSERVATION_LINE",
     "SCORE_LINE",
     "Draft",
     "count_entries",
@@ -24,8 +24,9 @@ __all__ = [
     "warning_lines",
 ]
 
-JUDGES_LINE = (
-    'judges = "after" # the observation that shows what a step earned: "after" the action, "before" it, or "both"'
+SCORED_OBSERVATION_LINE = (
+    'scored_observation = "after" # the observation that shows what a step earned: "after" the action, "before" it, or '
+    '"both"'
 )
 SCORE_LINE = (
     '# score = "average" # only if episodes differ in length. "sum": steps or events add up; '

@@ -56,7 +56,7 @@ def draft_jax_task(environment_id: str) -> Draft:
         f'environment = "{environment_id}"',
         f"observation_size = {env.spec.observation_size}",
         f"action_size = {env.spec.action_size}",
-        draft.JUDGES_LINE,
+        draft.SCORED_OBSERVATION_LINE,
         draft.SCORE_LINE,
         *limit_lines,
         *text_lines(texts, {"observation": _describe_observation(env), "action": _describe_action(env.spec)}),

@@ -85,7 +85,7 @@ def write_team_drafts(
         f'environment = "{environment_id}"',
         f"observation_size = {env.spec.observation_size}",
         f"action_size = {env.spec.action_size}",
-        draft.JUDGES_LINE,
+        draft.SCORED_OBSERVATION_LINE,
     ]
     files = {}
     for team in env.spec.teams if several else ():

@@ -70,7 +70,7 @@ def _write_draft(environment_id: str, env: gymnasium.Env) -> Draft:
         f'environment = "{full_id}"',
         f"observation_size = {observation_size}",
         f"action_size = {action_size}",
-        draft.JUDGES_LINE,
+        draft.SCORED_OBSERVATION_LINE,
         draft.SCORE_LINE,
         draft.MEASURES_LINE,
         *([] if env.spec and env.spec.max_episode_steps else [draft.LIMIT_LINE]),

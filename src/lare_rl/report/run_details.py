@@ -110,7 +110,7 @@ def _render_factors(run: Run, credit: EpisodeCredit | None) -> Iterable[str]:
     yield render_factor_table(labels, np.full(len(labels), np.nan) if credit is None else credit.correlations)
     if credit is not None:
         yield draw_factors(credit.factors[:, 0], [label.name for label in labels])
-    yield render_note(f"phi judges the observation {_OBSERVATIONS[run.factor_inputs]} the step.")
+    yield render_note(f"phi scores the observation {_OBSERVATIONS[run.scored_observation]} the step.")
 
 
 def render_agents(run: Run, max_tsne_points: int = MAX_TSNE_POINTS) -> Iterable[str]:

@@ -23,7 +23,7 @@ from lare_rl.phi.graph import Graph
 from lare_rl.runs.checkpoint import STATE_FILE, read_host_state
 from lare_rl.runs.config_file import CONFIG, Config, make_config, read_config, write_config
 from lare_rl.runs.metrics_file import read_metrics
-from lare_rl.tasks.spec import FactorInputs, TaskSpec
+from lare_rl.tasks.spec import ScoredObservation, TaskSpec
 from lare_rl.tasks.trust import check_trusted
 
 __all__ = [
@@ -77,9 +77,9 @@ class Run:
         return self.config.settings.all_seeds
 
     @property
-    def factor_inputs(self) -> FactorInputs:
+    def scored_observation(self) -> ScoredObservation:
         """Which observations of a step phi reads: before it, after it, or both."""
-        return self.config.settings.factor_inputs(self.config.task)
+        return self.config.settings.choose_scored_observation(self.config.task)
 
     def seed_index(self, seed: int | None) -> int:
         """Return the index of one of the run's seeds; 0 for None. Raises `LareError` for another seed."""

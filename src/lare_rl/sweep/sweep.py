@@ -20,6 +20,7 @@ from lare_rl.errors import CheckedModel, LareError
 from lare_rl.sweep.jobs import Job, check_job, make_job
 from lare_rl.sweep.processes import train_in_processes, train_on_ray
 from lare_rl.training.loop import RunInterruptedError
+from lare_rl.util.renamed_fields import rename_keys
 from lare_rl.util.safe_io import MAX_SETTINGS_BYTES, read_text, read_toml
 
 __all__ = ["Resources", "Sweep", "read_sweep", "run_sweep"]
@@ -147,7 +148,9 @@ def _make_jobs(sweep: Sweep, path: Path) -> Iterator[Job]:
     for task, method, algorithm in product(tasks, sweep.methods, sweep.algorithms or (None,)):
         functions = [path.parent / function for function in sweep.functions.get(task.name, ())]
         for draw in sweep.draws if find_method(method).needs_phi and not functions else (0,):
-            settings = Settings(**{**sweep.settings, "method": method, "algorithm": algorithm, "draw": draw})
+            settings = Settings(
+                **{**rename_keys(sweep.settings), "method": method, "algorithm": algorithm, "draw": draw}
+            )
             try:
                 yield make_job(root, task, settings, functions)
             except LareError as error:

@@ -14,22 +14,22 @@ __all__ = [
     "PETTINGZOO_PREFIX",
     "SHARED_KEYS",
     "CreditScope",
-    "FactorInputs",
+    "ScoredObservation",
     "TaskSpec",
     "require_role",
     "select_states",
 ]
 
-FactorInputs = Literal["before", "after", "both"]
+ScoredObservation = Literal["before", "after", "both"]
 """The observations of a step that `phi` reads: before the action, after it, or both. For both, `phi` is called on each, and the
 factors are concatenated. So are the raw features of closed-form decoders."""
 
 State = TypeVar("State")
 
 
-def select_states(factor_inputs: FactorInputs, state: State, next_state: State) -> list[State]:
+def select_states(scored_observation: ScoredObservation, state: State, next_state: State) -> list[State]:
     """Return the states of a step that `phi` reads, in the order in which factors are concatenated."""
-    return {"before": [state], "after": [next_state], "both": [state, next_state]}[factor_inputs]
+    return {"before": [state], "after": [next_state], "both": [state, next_state]}[scored_observation]
 
 
 CreditScope = Literal["observation", "state"]
@@ -38,7 +38,7 @@ CreditScope = Literal["observation", "state"]
 PETTINGZOO_PREFIX = "pettingzoo/"
 """The prefix of the names of PettingZoo environments. The rest is MODULE:NAME."""
 
-SHARED_KEYS = ("environment", "arguments", "max_episode_steps", "judged_from", "judges")
+SHARED_KEYS = ("environment", "arguments", "max_episode_steps", "credit_scope", "scored_observation")
 """Keys that a team inherits from its task. The team's own file may repeat them, so that it can be used alone, but with the same
 values."""
 
@@ -63,8 +63,8 @@ class TaskSpec(CheckedModel):
     """The number of entries of an observation."""
     action_size: Annotated[int, Field(ge=1)]
     """The number of entries of a continuous action, or the number of discrete actions."""
-    judges: FactorInputs = "after"
-    """The observations of a step that `phi` reads: before the action, after it, or both."""
+    scored_observation: ScoredObservation = "after"
+    """The observations of a step that factors and raw features are computed from: before the action, after it, or both."""
     description: Annotated[str, Field(min_length=1)]
     """The task and its goal, without a word about the reward."""
     observation: Annotated[str, Field(min_length=1)]
@@ -84,7 +84,7 @@ class TaskSpec(CheckedModel):
     agents: tuple[str, ...] = ()
     """The names of the agents that this file describes, or patterns of names such as `prey_*`. By default all agents. Only for
     environments whose agents have names (`pettingzoo/...`, `jaxmarl/...`)."""
-    judged_from: CreditScope = "observation"
+    credit_scope: CreditScope = "observation"
     """Whether `phi` reads each agent's observation and action, or the global state and all actions of the team."""
     teams: tuple["TaskSpec", ...] = ()
     """One task for each team, with its own texts, if several teams learn separately. In TOML, the names of their files."""

@@ -40,8 +40,8 @@ def describe_returns(run: Run, learner: Learner, config: TrainConfig) -> list[st
     roles = run.config.task.roles
     for i, explanation in enumerate(explain_stored_returns(learner, config)):
         role, function = roles[i], run.functions[i] if run.functions else None
-        factor_names = [] if function is None else function.factor_columns(run.factor_inputs)
-        n_raw, has_both = len(explanation.residual_correlation), config.factor_inputs == "both"
+        factor_names = [] if function is None else function.factor_columns(run.scored_observation)
+        n_raw, has_both = len(explanation.residual_correlation), config.scored_observation == "both"
         raw_names = (
             []
             if config.team_level

@@ -42,7 +42,7 @@ def compute_factors(
     lead = steps.next_timestep.terminated.shape
     factors = jnp.zeros((*lead, config.credit_rows, max(config.n_factors, default=0)), jnp.float32)
     for i, (graph, team) in enumerate(zip(graphs, config.env.teams, strict=False)):
-        timesteps = select_states(config.factor_inputs, steps.timestep, steps.next_timestep)
+        timesteps = select_states(config.scored_observation, steps.timestep, steps.next_timestep)
         inputs = [phi_inputs(config.credit_scope, team, timestep, steps.env_action) for timestep in timesteps]
         columns = jnp.concatenate([_evaluate_graph(graph, *arrays) for arrays in inputs], axis=-1)
         factors = factors.at[..., config.team_rows(i), : columns.shape[-1]].set(columns)
@@ -74,7 +74,7 @@ def compute_host_factors(run: Run, config: TrainConfig, steps: Trajectory) -> Fl
         before, action = phi_inputs(config.credit_scope, team, steps.timestep, steps.env_action)
         after, _ = phi_inputs(config.credit_scope, team, steps.next_timestep, steps.env_action)
         try:
-            columns = function.step_factors(before, action, after, run.factor_inputs)
+            columns = function.step_factors(before, action, after, run.scored_observation)
         except LatentRewardError as error:
             path, batch = run.directory / FAILED_BATCH, {"observation": error.observation, "action": error.action}
             write_arrays(path, batch)

@@ -53,7 +53,7 @@ def choose_functions(
         for function, role in zip(functions, task.roles, strict=True):
             check_task(function, role)
     for function in functions:
-        _check_size(method, function.n_factors(settings.factor_inputs(task)))
+        _check_size(method, function.n_factors(settings.choose_scored_observation(task)))
     return tuple(functions)
 
 

@@ -104,17 +104,15 @@ def assess_function(function: LatentFunction, role: TaskSpec, episodes: Sequence
         raise LareError(f"{len(episodes)} episodes say too little of a function: {MIN_EXPLAINED_EPISODES} are needed")
     factors = [_compute_factors(function, role, episode) for episode in episodes]
     inputs = [
-        np.concatenate(
-            [z, *select_states(role.judges, episode.observation, episode.next_observation), episode.env_action], axis=-1
-        )
+        np.concatenate([z, *_scored_observations(role, episode), episode.env_action], axis=-1)
         for z, episode in zip(factors, episodes, strict=True)
     ]
     n_factors = factors[0].shape[-1]
     basis = Basis(n_factors, inputs[0].shape[-1] - n_factors, extended=True)
     alive, returns = [episode.alive for episode in episodes], np.array([episode.return_ for episode in episodes])
     fit = assess_factors(inputs, alive, returns, basis, role.score)
-    names = function.factor_columns(role.judges)
-    both = role.judges == "both"
+    names = function.factor_columns(role.scored_observation)
+    both = role.scored_observation == "both"
     raw_names = raw_feature_names(role.observation, role.action, basis.n_raw_used, role.action_size, both)
     valid_factors = np.concatenate([z[mask] for z, mask in zip(factors, alive, strict=True)])
     return FunctionAssessment(
@@ -126,13 +124,17 @@ def assess_function(function: LatentFunction, role: TaskSpec, episodes: Sequence
     )
 
 
+def _scored_observations(role: TaskSpec, episode: Episode) -> list[np.ndarray]:
+    return select_states(role.scored_observation, episode.observation, episode.next_observation)
+
+
 def _compute_factors(
     function: LatentFunction, role: TaskSpec, episode: Episode
 ) -> Float[np.ndarray, "steps rows factors"]:
     """Compute the factors of an episode's steps. They are 0 for agents that have left."""
     mask = episode.alive
     z = function.step_factors(
-        episode.observation[mask], episode.env_action[mask], episode.next_observation[mask], role.judges
+        episode.observation[mask], episode.env_action[mask], episode.next_observation[mask], role.scored_observation
     )
     factors = np.zeros((*mask.shape, z.shape[1]), np.float32)
     factors[mask] = z

@@ -39,14 +39,14 @@ def make_train_config(run: Run) -> TrainConfig:
     task, settings, env = run.config.task, run.config.settings, load_env_spec(run.config.task)
     return TrainConfig(
         env=env,
-        credit_scope=task.judged_from,
-        factor_inputs=run.factor_inputs,
+        credit_scope=task.credit_scope,
+        scored_observation=run.scored_observation,
         method=find_method(settings.method),
         algorithm=ALGORITHMS[settings.algorithm],
         hyperparameters=settings.hyperparameters,
         credit=settings.credit,
         scale_rewards=settings.scale_rewards,
-        n_factors=tuple(function.n_factors(run.factor_inputs) for function in run.functions),
+        n_factors=tuple(function.n_factors(run.scored_observation) for function in run.functions),
         n_envs=settings.environments,
         rollout_steps=settings.rollout_steps,
         capacity=replay_rows(settings, env.max_steps),

@@ -12,7 +12,7 @@ from lare_rl.credit.engine import CreditSpec, credit_spec
 from lare_rl.credit.methods import Method
 from lare_rl.credit.score_type import ScoreType
 from lare_rl.envs.interface import EnvSpec
-from lare_rl.tasks.spec import CreditScope, FactorInputs
+from lare_rl.tasks.spec import CreditScope, ScoredObservation
 
 
 @dataclass(frozen=True)
@@ -21,7 +21,7 @@ class TrainConfig:
 
     env: EnvSpec
     credit_scope: CreditScope
-    factor_inputs: FactorInputs
+    scored_observation: ScoredObservation
     method: Method
     algorithm: Algorithm
     hyperparameters: AlgorithmSettings
@@ -114,7 +114,7 @@ class TrainConfig:
                     "observation": self.observed_size,
                     "action": env.action_size * (env.n_agents if self.team_level else 1),
                 },
-                judges=self.factor_inputs,
+                scored_observation=self.scored_observation,
                 single_agent=env.n_agents == 1 and not self.team_level,
                 agents=1 if self.team_level else team.n_agents,
                 max_steps=env.max_steps,

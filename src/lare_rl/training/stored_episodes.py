@@ -72,7 +72,7 @@ def stored_role_episodes(run: Run, role: TaskSpec) -> list[Episode]:
     episodes = []
     for seed_index in range(len(run.seeds)):
         replay = select_seed(learner.replay, seed_index)
-        _check_columns(run, replay, "state" if role.judged_from == "state" else "observation", "action", "reward")
+        _check_columns(run, replay, "state" if role.credit_scope == "state" else "observation", "action", "reward")
         for env_index in range(config.n_envs):
             columns = _env_columns(replay, env_index)
             newest = list(_episode_rows(replay, env_index))[-n_newest:]

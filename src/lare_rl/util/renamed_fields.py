@@ -1,8 +1,13 @@
-"""Names of arrays in checkpoints and assigners that an earlier version has saved. A name is made of the fields of a state."""
+"""Names in files that an earlier version has written: of arrays in checkpoints and assigners, and of keys of tasks and settings."""
 
 import re
+from collections.abc import Mapping
+from typing import Any
 
-__all__ = ["rename_fields"]
+__all__ = ["rename_fields", "rename_keys"]
+
+_RENAMED_KEYS = {"judged_from": "credit_scope", "judges": "scored_observation"}
+"""From old to new keys of tasks, settings and assigners."""
 
 _RENAMED_FIELDS = {
     "average": "is_mean",
@@ -48,8 +53,13 @@ _RENAMED_PATHS = {
 """From patterns of old names to new names, in the order in which they are applied."""
 
 
+def rename_keys(values: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the values of a table under the present names of its keys. A key beside its old name is not overwritten."""
+    return {name if (new := _RENAMED_KEYS.get(name, name)) in values else new: value for name, value in values.items()}
+
+
 def rename_fields(name: str) -> str:
-    """Return the present name of an array, such as `.decoders[0].is_mean` for `.credit[0].average`."""
+    """Return the present name of an array: the fields of a state, such as `.decoders[0].is_mean` for `.credit[0].average`."""
     name = re.sub(r"(?<=\.)\w+", lambda match: _RENAMED_FIELDS.get(match.group(), match.group()), name)
     for pattern, new in _RENAMED_PATHS.items():
         name = re.sub(pattern, new, name)
