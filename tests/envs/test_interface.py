@@ -10,7 +10,7 @@ from hypothesis.extra import numpy as arrays
 
 from helpers.host_envs import ToyHostEnv
 from helpers.jax_toy_envs import Echo
-from lare_rl.envs.interface import EnvSpec, HostEnv, JaxEnv, Team, team_mean, to_env_action
+from lare_rl.envs.interface import EnvSpec, HostEnv, JaxEnv, Team, team_mean, to_env_action, to_package_action
 from lare_rl.envs.jax_on_host import JaxOnHost
 from lare_rl.envs.particles.particle_env import ParticleJaxEnv
 from lare_rl.envs.play import play_steps
@@ -57,6 +57,28 @@ def test_discrete_action_is_the_first_largest():
     env_action = to_env_action(action, DISCRETE)
     np.testing.assert_array_equal(env_action, np.eye(3)[[2, 1, 0, 2]])
     assert env_action.dtype == np.float32
+
+
+@pytest.mark.parametrize(
+    ("fields", "expected"),
+    [
+        ({}, [2, 3]),
+        ({"first_choice": -1}, [1, 2]),
+        ({"choice_sizes": (2, 3), "package_shape": (2,)}, [[0, 2], [1, 0]]),
+        ({"choice_sizes": (2, 3), "package_shape": (2, 1)}, [[[0], [2]], [[1], [0]]]),
+    ],
+)
+def test_package_action_of_choices(fields, expected):
+    spec = EnvSpec((Team("agent", 0, 1),), 1, 6, discrete=True, max_steps=1, **fields)
+    one_hot = np.eye(6, dtype=np.float32)[[2, 3]]
+    np.testing.assert_array_equal(to_package_action(one_hot, spec), expected)
+    np.testing.assert_array_equal(to_package_action(one_hot[1], spec), expected[1])
+
+
+@pytest.mark.parametrize(("shape", "expected"), [(None, (5, 4)), ((2, 2), (5, 2, 2))])
+def test_package_action_of_numbers(shape, expected):
+    spec = EnvSpec((Team("agent", 0, 1),), 1, 4, discrete=False, max_steps=1, package_shape=shape)
+    assert to_package_action(np.zeros((5, 4), np.float32), spec).shape == expected
 
 
 def test_continuous_action_is_scaled_to_the_bounds_of_each_agent():

@@ -7,6 +7,7 @@ import pytest
 
 from helpers.jax_families import check_arrays, family_task, play, skip_without, step_keys
 from lare_rl.envs.families import make_env
+from lare_rl.envs.interface import to_package_action
 from lare_rl.envs.jax_spaces import Choices
 from lare_rl.envs.jumanji_env import make
 from lare_rl.errors import LareError
@@ -59,7 +60,8 @@ def test_several_choices_are_one():
     first, actions, timesteps = play(env, 1, 2)
     state, timestep = env.env.reset(step_keys(1, 2)[0])
     np.testing.assert_array_equal(first.available[0, 0], timestep.observation.action_mask.ravel())
-    action = jnp.stack(jnp.divmod(actions[0, 0, 0].argmax(), 10))
+    action = to_package_action(actions[0, 0, 0], env.spec)
+    np.testing.assert_array_equal(action, divmod(actions[0, 0, 0].argmax(), 10))
     _, timestep = env.env.step(state, action)
     np.testing.assert_array_equal(timesteps.observation[0, 0, 0, :100], timestep.observation.grid.ravel())
     assert timesteps.reward[0, 0, 0] == timestep.reward

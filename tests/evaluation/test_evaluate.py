@@ -157,6 +157,14 @@ def test_load_policy(run):
         load_policy(run, 7)
 
 
+def test_policy_has_few_programs_for_all_sizes_of_a_batch(run):
+    policy, rows = load_policy(run), np.linspace(-1, 1, 66).reshape(33, 2)
+    single = [policy(row) for row in rows]
+    for n_rows in range(1, 34):
+        np.testing.assert_allclose(policy(rows[:n_rows]), single[:n_rows], rtol=1e-5)
+    assert len(policy._policies) == 7
+
+
 @pytest.mark.parametrize(
     ("observation", "words"),
     [("x", "no array"), (np.ones(3), "the shape is"), (np.full(2, np.nan), "not finite"), (np.ones((0, 2)), "shape")],

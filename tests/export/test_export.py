@@ -331,3 +331,7 @@ def test_invalid_inputs(export):
         policy(observation=np.zeros((5, 3)))
     with pytest.raises(ValueError, match=r"action .*\(batch, 1\)"):
         exported.reward(observation, 0.5, observation)
+    with pytest.raises(ValueError, match=r"same batch.*before \(4,\), action \(3,\)"):
+        exported.reward(np.zeros((4, 2)), np.zeros((3, 1)), np.zeros((4, 2)))
+    rows = exported.reward(np.zeros((4, 2)), np.zeros(1), np.zeros((4, 2)))  # one action for all steps
+    np.testing.assert_array_equal(rows, exported.reward(np.zeros((4, 2)), np.zeros((4, 1)), np.zeros((4, 2))))

@@ -1,7 +1,6 @@
 """The command `design`: a latent function from recorded replies or from a live model."""
 
 import sys
-from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -21,8 +20,7 @@ from lare_rl.cli.terminal import (
 from lare_rl.errors import CheckedModel, LareError
 
 if TYPE_CHECKING:
-    import numpy as np
-
+    from lare_rl.envs.play import Policy
     from lare_rl.latent.design import DesignError
     from lare_rl.latent.function import LatentFunction
     from lare_rl.tasks.spec import TaskSpec
@@ -140,7 +138,7 @@ def design(
         _save_function(function, out)
 
 
-def load_policy(run: Path | None, spec: "TaskSpec") -> "Callable[[np.ndarray], np.ndarray] | None":
+def load_policy(run: Path | None, spec: "TaskSpec") -> "Policy | None":
     """Load the policy of a run that is to play a task."""
     if run is None:
         return None

@@ -80,6 +80,7 @@ class GymnasiumEnv:
             low=action_space.low[None].astype(dtype),  # type: ignore[attr-defined]
             high=action_space.high[None].astype(dtype),  # type: ignore[attr-defined]
             measures=task.measures,
+            first_choice=int(action_space.start) if isinstance(action_space, OneHot) else 0,
         )
         self._state, self._alive = np.zeros(0, np.float32), np.ones(1, bool)
         self._available = np.ones((1, self.spec.action_size), bool)

@@ -10,7 +10,18 @@ from typing import Any, NamedTuple, Protocol, TypeVar, runtime_checkable
 import numpy as np
 from jaxtyping import Bool, Float
 
-__all__ = ["AnyArray", "EnvSpec", "HostEnv", "JaxEnv", "Team", "Timestep", "alive_mean", "team_mean", "to_env_action"]
+__all__ = [
+    "AnyArray",
+    "EnvSpec",
+    "HostEnv",
+    "JaxEnv",
+    "Team",
+    "Timestep",
+    "alive_mean",
+    "team_mean",
+    "to_env_action",
+    "to_package_action",
+]
 
 AnyArray = Any
 """A JAX array in compiled code, a NumPy array on the host. The type is `Any`, so that this module need not import JAX."""
@@ -63,6 +74,12 @@ class EnvSpec:
     """Whether the environment is a `JaxEnv`. Many copies of it are cheap."""
     measures: tuple[str, ...] = ()
     """The names of values at an episode's last step that are reported in addition to the return."""
+    first_choice: int = 0
+    """The number that the environment's package gives to the first discrete action."""
+    choice_sizes: tuple[int, ...] = ()
+    """The sizes of several choices at a time, if their combinations are the discrete actions."""
+    package_shape: tuple[int, ...] | None = None
+    """The shape of an action for the environment's package. By default, discrete actions are numbers, others rows of numbers."""
 
     @property
     def n_agents(self) -> int:
@@ -121,6 +138,20 @@ def to_env_action(
     clipped = xp.minimum(xp.maximum(action, -1), 1)  # np.clip takes ten times as long for small arrays
     scaled = spec.low + (clipped + 1) / 2 * (spec.high - spec.low)
     return xp.minimum(xp.maximum(scaled, spec.low), spec.high)  # rounding may exceed the bounds
+
+
+def to_package_action(action: Float[np.ndarray, "*batch action"], spec: EnvSpec) -> Any:
+    """Return actions of a single agent, in the environment's units, as the environment's package takes them in its own `step`.
+
+    A one-hot row becomes the number of its choice, or an array of numbers where there are several choices at a time.
+    """
+    if not spec.discrete:
+        return action if spec.package_shape is None else action.reshape(*action.shape[:-1], *spec.package_shape)
+    number = np.argmax(action, axis=-1)
+    if not spec.choice_sizes:
+        return number + spec.first_choice
+    numbers = np.stack(np.unravel_index(number, spec.choice_sizes), axis=-1)
+    return numbers.reshape(*number.shape, *(spec.package_shape or (-1,)))
 
 
 def _array_module(array: AnyArray) -> Any:

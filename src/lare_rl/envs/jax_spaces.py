@@ -226,6 +226,8 @@ def agent_spec(action: Choices | Bounds, *, observation_size: int, max_steps: in
     """Return the sizes and bounds of an environment of one agent. `fields` are further fields of `EnvSpec`."""
     if isinstance(action, Bounds):
         fields |= {"low": action.low[None], "high": action.high[None]}
+    elif action.shape:
+        fields |= {"choice_sizes": action.sizes}
     return EnvSpec(
         teams=(Team("agent", 0, 1),),
         observation_size=observation_size,
@@ -233,6 +235,7 @@ def agent_spec(action: Choices | Bounds, *, observation_size: int, max_steps: in
         discrete=isinstance(action, Choices),
         max_steps=max_steps,
         is_jax=True,
+        package_shape=action.shape,
         **fields,
     )
 

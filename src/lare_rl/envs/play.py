@@ -24,8 +24,9 @@ __all__ = [
     "sample_action",
 ]
 
-Policy = Callable[[np.ndarray], np.ndarray]
-"""A function from the observation of a single agent to its action, in the environment's units."""
+Policy = Callable[..., np.ndarray]
+"""A function from the observation of a single agent to its action, in the environment's units. If actions may be unavailable, its
+second argument is the mask of available actions."""
 
 
 @dataclass(frozen=True)
@@ -110,10 +111,15 @@ def play_steps(
     next_timestep, done = env.reset(seed), False
     while not done:
         timestep = next_timestep
-        action = sample_action(env.spec, timestep, rng) if policy is None else policy(timestep.observation[0])[None]
+        action = sample_action(env.spec, timestep, rng) if policy is None else _act(policy, env.spec, timestep)
         next_timestep = env.step(action)
         yield timestep, action, next_timestep
         done = bool(next_timestep.terminated or next_timestep.truncated)
+
+
+def _act(policy: Policy, spec: EnvSpec, timestep: Timestep) -> Float[np.ndarray, "1 action"]:
+    mask = [timestep.available[0]] if spec.masks_actions else []
+    return policy(timestep.observation[0], *mask)[None]
 
 
 def sample_action(spec: EnvSpec, timestep: Timestep, rng: np.random.Generator) -> Float[np.ndarray, "agents action"]:

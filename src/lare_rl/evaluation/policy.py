@@ -1,18 +1,15 @@
 """The policy of a run, to use in other programs."""
 
-from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import jax
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
-from lare_rl.envs.families import is_gymnasium, load_env_spec
-from lare_rl.envs.gymnasium_env import GymnasiumEnv
-from lare_rl.envs.interface import to_env_action
-from lare_rl.envs.spaces import OneHot
+from lare_rl.envs.families import load_env_spec
+from lare_rl.envs.interface import to_env_action, to_package_action
 from lare_rl.errors import LareError
 from lare_rl.runs.directory import Run, as_run
 from lare_rl.training.host_policy import HostPolicy, draw_noise, init_host_memory, make_policy
@@ -25,10 +22,12 @@ __all__ = ["RunPolicy", "load_policy"]
 def load_policy(
     run: Run | str | Path, seed: int | None = None, best: bool = False, deterministic: bool = False
 ) -> "RunPolicy":
-    """Load the policy of a seed: a function from an observation to an action of the environment, or from a batch to a batch.
+    """Load the policy of a seed: a function from an observation to an action, or from a batch to a batch.
 
-    It acts as in evaluations: PPO's choices are sampled, and all other actions are deterministic. Observations that are not one row
-    of numbers must be flattened first (`gymnasium.spaces.flatten`).
+    An action is what the environment's package takes in its own `step`: a discrete action is its number, or an array of numbers if
+    there are several choices at a time. The policy acts as in evaluations: PPO's choices are sampled, and all other actions are
+    deterministic. Observations that are not one row of numbers must be flattened first (`gymnasium.spaces.flatten`). Environments
+    in which actions may be unavailable (Jumanji's) also need the mask, `policy(observation, available)`.
 
     Args:
         run: the run, or its directory.
@@ -58,42 +57,41 @@ class RunPolicy:
         self._actor = jax.tree.map(lambda leaf: leaf[seed_index : seed_index + 1], actors)
         self._rng = numpy_generator(run.seeds[seed_index], Stream.EVALUATION_NOISE, 0)
         self._policies: dict[int, HostPolicy] = {}
-        """For each number of observations."""
-        self._choices: OneHot | None = None
-        if self._env.discrete and is_gymnasium(run.config.task):
-            with closing(GymnasiumEnv(run.config.task)) as env:
-                assert isinstance(env.environment.action_space, OneHot)
-                self._choices = env.environment.action_space
+        """For each number of rows, which is a power of 2."""
         self.reset()
 
     def reset(self) -> None:
         """Begin a new episode."""
         self._memory = init_host_memory(self._config, 1, 1)
 
-    def __call__(self, observation: Any) -> Any:
-        """Return the action for an observation (n,), or the actions for a batch (batch, n).
+    def __call__(self, observation: Any, available: Any = None) -> Any:
+        """Return the action for an observation (n,), or the actions for a batch (batch, n), for the environment's own `step`.
+
+        Args:
+            observation: the observation, or a batch.
+            available: which actions are available, (actions,) or (batch, actions). Needed if the environment has such masks.
 
         Raises:
-            LareError: observations have another size, or a policy with a memory is given a batch.
+            LareError: observations or masks have another size, or a policy with a memory is called with a batch.
         """
         rows, is_single = self._check_observation(observation)
-        actions = self._select_actions(rows)
-        if self._choices is not None:
-            actions = np.array([self._choices.to_discrete(action) for action in actions])
+        actions = to_package_action(self._select_actions(rows, available), self._env)
         return actions[0] if is_single else actions
 
-    def select_env_action(self, observation: Any) -> Float[np.ndarray, " action"]:
-        """Return the action for one observation in the environment's units. A discrete action is one-hot.
+    def select_env_action(self, observation: Any, available: Any = None) -> Float[np.ndarray, " action"]:
+        """Return the action for one observation in the environment's units. A discrete action is one-hot, as in `JaxEnv.step`.
 
         Raises:
-            LareError: observations have another size, or there are several.
+            LareError: the observation or the mask has another size, or there are several observations.
         """
         rows, is_single = self._check_observation(observation)
         if not is_single:
             raise LareError(f"select_env_action needs one observation, and was given {len(rows)}")
-        return self._select_actions(rows)[0]
+        return self._select_actions(rows, available)[0]
 
-    def _select_actions(self, rows: Float[np.ndarray, "batch observation"]) -> Float[np.ndarray, "batch action"]:
+    def _select_actions(
+        self, rows: Float[np.ndarray, "batch observation"], available: Any
+    ) -> Float[np.ndarray, "batch action"]:
         n_rows, has_memory = len(rows), bool(jax.tree.leaves(self._memory))
         if has_memory and n_rows > 1:
             name = self._config.algorithm.name
@@ -101,16 +99,37 @@ class RunPolicy:
                 f"the policy of {name} has a memory: give it one observation at a time, and call reset() between episodes"
             )
         greedy = self._config.greedy
-        if n_rows not in self._policies:
-            self._policies[n_rows] = make_policy(self._config, self._actor, n_rows, greedy=greedy)
-        action, self._memory = self._policies[n_rows](
-            self._memory if has_memory else init_host_memory(self._config, 1, n_rows),
-            rows[None, :, None],
-            np.ones((1, n_rows, 1, self._env.action_size), bool),
-            None if greedy else draw_noise(self._config, [self._rng], n_rows),
-            np.zeros((1, n_rows), bool),
+        mask = self._check_mask(available, n_rows)
+        noise = None if greedy else draw_noise(self._config, [self._rng], n_rows)
+        n_padded = 1 << (n_rows - 1).bit_length()  # each number of rows needs a program of its own
+        if n_padded not in self._policies:
+            self._policies[n_padded] = make_policy(self._config, self._actor, n_padded, greedy=greedy)
+        action, self._memory = self._policies[n_padded](
+            self._memory if has_memory else init_host_memory(self._config, 1, n_padded),
+            _pad(rows[None, :, None], n_padded),
+            _pad(mask[None, :, None], n_padded),
+            None if noise is None else _pad(noise, n_padded),
+            np.zeros((1, n_padded), bool),
         )
-        return to_env_action(action[0, :, 0], self._env)
+        return to_env_action(action[0, :n_rows, 0], self._env)
+
+    def _check_mask(self, available: Any, n_rows: int) -> Bool[np.ndarray, "batch action"]:
+        """Return the masks of all rows. As in training, the first action counts as available if a mask has none."""
+        size = self._env.action_size
+        if available is None:
+            if self._env.masks_actions:
+                raise LareError(
+                    f"some of the {size} actions may be unavailable: pass the mask too, as in policy(observation, available)"
+                )
+            return np.ones((n_rows, size), bool)
+        mask = np.asarray(available)
+        if mask.size != n_rows * size or mask.dtype.kind not in "biu":
+            raise LareError(
+                f"a mask has {size} booleans for each observation: the shape is {mask.shape}, the type {mask.dtype}"
+            )
+        mask = mask.reshape(n_rows, size).astype(bool)
+        mask[:, 0] |= ~mask.any(axis=-1)
+        return mask
 
     def _check_observation(self, observation: Any) -> tuple[Float[np.ndarray, "batch observation"], bool]:
         """Return observations as rows, and whether there is a single one."""
@@ -127,3 +146,8 @@ class RunPolicy:
         if not np.isfinite(rows).all():
             raise LareError("an observation holds a number that is not finite")
         return np.atleast_2d(rows), rows.ndim == 1
+
+
+def _pad(array: np.ndarray, n_rows: int) -> np.ndarray:
+    """Repeat the last row of an array [1 rows ...] until there are `n_rows`."""
+    return np.concatenate([array, np.repeat(array[:, -1:], n_rows - array.shape[1], axis=1)], axis=1)

@@ -116,9 +116,9 @@ def _play_and_draw(run: Run, policy: RunPolicy) -> Sequence[Frame]:
     env, states = make_host_env(run.config.task), []
     assert isinstance(env, JaxOnHost)
 
-    def act(observation: np.ndarray) -> np.ndarray:
+    def act(*inputs: np.ndarray) -> np.ndarray:
         states.append(env.state)
-        return policy.select_env_action(observation)
+        return policy.select_env_action(*inputs)
 
     for _ in play_steps(env, act, np.random.default_rng(0), _film_seed(run)):
         pass
@@ -134,10 +134,10 @@ def _play_and_render(run: Run, env: HostEnv, policy: RunPolicy, interval: int) -
     """Play an episode, and render every `interval`-th timestep at which the policy acts."""
     frames, steps = [], count()
 
-    def act(observation: np.ndarray) -> np.ndarray:
+    def act(*inputs: np.ndarray) -> np.ndarray:
         if next(steps) % interval == 0:
             frames.append(_render(env, run))
-        return policy.select_env_action(observation)
+        return policy.select_env_action(*inputs)
 
     for _ in play_steps(env, act, np.random.default_rng(0), _film_seed(run)):
         pass

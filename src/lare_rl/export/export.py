@@ -9,15 +9,11 @@ DIRECTORY/
 """
 
 import json
-from contextlib import closing
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from lare_rl.envs.families import is_gymnasium
-from lare_rl.envs.gymnasium_env import GymnasiumEnv
-from lare_rl.envs.spaces import OneHot
 from lare_rl.errors import LareError
 from lare_rl.export import exported
 from lare_rl.export.policy_graph import policy_graph
@@ -76,7 +72,7 @@ def export_run(run: Run | str | Path, out: str | Path, seed: int | None = None, 
         step = int(best_steps[seed_index])
     else:
         actors = compile_functions(config).get_actor(learner, step)
-    first_choice = _first_choice(run) if config.env.discrete and config.env.n_agents == 1 else 0
+    first_choice = config.env.first_choice
     graphs = {"policy": policy_graph(select_seed(actors, seed_index), config, first_choice)}
     credit = select_seed(learner.decoders, seed_index)
     no_reward_reason = missing_reward_reason(config.method)
@@ -109,15 +105,6 @@ def _write_directory(out: Path, graphs: dict[str, Graph], description: dict[str,
     for module in (exported, evaluate):
         source = Path(str(module.__file__))
         _write_bytes(out / source.name, source.read_bytes())
-
-
-def _first_choice(run: Run) -> int:
-    if not is_gymnasium(run.config.task):
-        return 0
-    with closing(GymnasiumEnv(run.config.task)) as env:
-        space = env.environment.action_space
-        assert isinstance(space, OneHot)
-        return int(space.start)
 
 
 def _describe_graph(graph: Graph) -> dict[str, Any]:

@@ -76,7 +76,7 @@ def load(name):
             raise ValueError(f"{name} needs the inputs {needed}: there is no input {', '.join(unknown)}")
         arrays = {key: _as_array(key, inputs[key], spec) for key, spec in description["inputs"].items()}
         single = all(arrays[key].ndim < len(spec["shape"]) for key, spec in description["inputs"].items())
-        rows = {key: array[None] if single else array for key, array in arrays.items()}
+        rows = {key: array[None] for key, array in arrays.items()} if single else _repeat_rows(arrays, description)
         outputs = _evaluate_module().evaluate(graph, rows)
         outputs = {key: outputs[key].astype(spec["type"]) for key, spec in description["outputs"].items()}
         return {key: array[0] if single else array for key, array in outputs.items()}
@@ -92,6 +92,18 @@ def _as_array(key, values, spec):
         expected = ", ".join(map(str, spec["shape"]))
         raise ValueError(f"{key} must have the shape ({expected}), and has {array.shape}")
     return array
+
+
+def _repeat_rows(arrays, description):
+    """Return all arrays with the same batch axes. A single row among batches, such as the length of an episode, is repeated."""
+    row_shapes = {key: spec["shape"][1:] for key, spec in description["inputs"].items()}
+    batches = {key: array.shape[: array.ndim - len(row_shapes[key])] for key, array in arrays.items()}
+    sizes = {batch for batch in batches.values() if batch}
+    if len(sizes) > 1:
+        listed = ", ".join(f"{key} {batch}" for key, batch in batches.items())
+        raise ValueError(f"all inputs must have the same batch, and the batches are: {listed}")
+    (batch,) = sizes
+    return {key: np.broadcast_to(array, (*batch, *row_shapes[key])) for key, array in arrays.items()}
 
 
 def reward(before, action, after, name="reward", **more):

@@ -55,7 +55,8 @@ def reflect(
         model: the model to ask.
         rounds: number of rounds.
         episodes: whole episodes, or a run whose stored episodes are used; by default, 40 are played.
-        policy: from one observation of a single agent to one action: plays the episodes instead of random actions.
+        policy: plays the episodes instead of random actions: a function from one observation of a single agent (and the mask of
+            available actions, if the environment has one) to one action.
         record: a file to record every exchange in; if the design was recorded, the same file.
         on_message: called with messages about the progress.
 

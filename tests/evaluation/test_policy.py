@@ -1,0 +1,78 @@
+"""The policy of a run whose environment has masks and several choices at a time."""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import lare_rl
+from helpers.toy_envs import toy_spec
+from lare_rl.envs.families import register_family
+from lare_rl.envs.jax_spaces import agent_spec, agent_timestep, make_choices
+from lare_rl.envs.play import play_episodes
+from lare_rl.errors import LareError
+from lare_rl.evaluation.policy import load_policy
+
+CHOICES = make_choices((2, 3), (2,), "dials/two")
+
+
+class DialsState(NamedTuple):
+    step: jax.Array
+
+
+class Dials:
+    """Two dials with 2 and 3 positions. Of the 6 combinations, only number `step` and the one after it are available."""
+
+    spec = agent_spec(CHOICES, observation_size=2, max_steps=4, masks_actions=True)
+
+    def reset(self, key):
+        return DialsState(jnp.array(0)), self.timestep(jnp.array(0), 0.0)
+
+    def step(self, state, action, key):
+        step = state.step + 1
+        return DialsState(step), self.timestep(step, action[0].argmax() == state.step)
+
+    def timestep(self, step, reward):
+        available = (jnp.arange(6) == step) | (jnp.arange(6) == step + 1)
+        observation = jnp.stack([step / 4, 1.0])
+        return agent_timestep(self.spec, observation, reward=reward, truncated=step >= 4, available=available)
+
+    def frames(self, states, credit=None):
+        return []
+
+
+register_family("dials", lambda task, **_: Dials())
+TASK = toy_spec(environment="dials/two", observation_size=2, action_size=6)
+
+
+@pytest.fixture(scope="module")
+def run(small, tmp_path_factory):
+    settings = small(method="dense", algorithm="ppo", steps=80, rollout_steps=40, evaluate_every=80)
+    return lare_rl.train(TASK, settings, out=tmp_path_factory.mktemp("dials") / "run", listeners=[])
+
+
+def test_actions_are_available_and_those_of_the_package(run):
+    policy, n_rows = load_policy(run), 200
+    mask = np.zeros((n_rows, 6), bool)
+    mask[:, [1, 5]] = True
+    actions = policy(np.ones((n_rows, 2)), mask)
+    assert {tuple(action) for action in actions.tolist()} == {(0, 1), (1, 2)}
+    assert policy(np.ones(2), np.arange(6) == 3).tolist() == [1, 0]
+    np.testing.assert_array_equal(policy.select_env_action(np.ones(2), np.arange(6) == 3), np.arange(6) == 3)
+    assert policy(np.ones(2), np.zeros(6, bool)).tolist() == [0, 0]  # as in training
+
+
+@pytest.mark.parametrize(
+    ("mask", "words"), [((), "pass the mask too"), ((np.ones(5, bool),), "6 booleans"), ((np.ones(6),), "float64")]
+)
+def test_mask_is_checked(run, mask, words):
+    with pytest.raises(LareError, match=words):
+        load_policy(run)(np.ones(2), *mask)
+
+
+def test_played_episodes_have_available_actions(run):
+    (episode,) = play_episodes(TASK, 1, load_policy(run).select_env_action)
+    choices = episode.env_action[:, 0].argmax(axis=-1)
+    assert np.isin(choices - np.arange(4), (0, 1)).all()
