@@ -66,6 +66,7 @@ def test_split_double_keeps_float64():
 @pytest.mark.parametrize("seed", range(4))
 def test_fit_signs_against_trying_all(seed):
     rows, length, returns = sample_episodes(seed=seed, noise=30.0)
+    returns += 8 * length  # no signs give this level: the fit must weigh it against the differences between episodes
     with jax.enable_x64(True):
         state = closed_form.fit_signs(add_episodes(init(PLAIN, 1), np.concatenate(rows), length, returns))
     means = np.stack([episode.mean(axis=0) for episode in rows])
@@ -110,6 +111,13 @@ def test_is_due(n_fitted, due):
     statistics = state.sufficient_statistics._replace(n_episodes=jnp.array([100.0, 0.0]))
     state = state._replace(sufficient_statistics=statistics, n_fitted=jnp.array(n_fitted))
     assert bool(closed_form.is_due(state)) == due
+
+
+def test_a_fit_is_due_after_the_sums_were_reset():
+    """The old weights do not match the newly standardised features, though no episode is new."""
+    state = closed_form.reset_statistics(init(PLAIN, 1)._replace(n_fitted=jnp.array(100.0)), observed(np.ones((9, 3))))
+    statistics = state.sufficient_statistics._replace(n_episodes=jnp.array([100.0, 0.0]))
+    assert closed_form.is_due(state._replace(sufficient_statistics=statistics))
 
 
 @pytest.mark.parametrize(("n_steps", "stale"), [(0.0, True), (66.0, True), (67.0, False)])

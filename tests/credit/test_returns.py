@@ -1,0 +1,52 @@
+"""When a score is treated as a mean, and from which episode on returns are predicted."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from lare_rl.credit import decomposition, returns
+from lare_rl.credit.decoder_settings import CreditSettings
+from lare_rl.credit.decomposition import CreditBatch
+from lare_rl.credit.methods import METHODS
+from lare_rl.credit.prequential import WINDOW, Predictions
+
+METHOD, SETTINGS, SCORE_TYPES = METHODS["rd-linear"], CreditSettings(), (0, 1)
+init = jax.jit(decomposition.init, static_argnums=range(1, 7))
+
+
+@jax.jit
+def fit(state):
+    return returns.fit_closed_form(state, METHOD, SCORE_TYPES)
+
+
+@jax.jit
+def learn(state, episode):
+    return fit(returns.predict_then_update(state, episode, SETTINGS))
+
+
+def untrained():
+    return init(jax.random.key(0), 2, METHOD, SETTINGS, 4, 1, SCORE_TYPES)
+
+
+@pytest.mark.parametrize(("ratio", "is_mean"), [(1.03, False), (0.97, False), (0.93, True)])
+def test_a_score_is_a_mean_if_that_predicts_clearly_better(ratio, is_mean):
+    """`ratio` is that of the squared errors: as a mean to as a sum."""
+    scores = np.random.default_rng(0).normal(size=WINDOW).astype(np.float32)
+    predicted = np.stack([scores + 1, scores + np.sqrt(ratio)], axis=1).astype(np.float32)
+    predictions = Predictions(jnp.float32(WINDOW), jnp.asarray(scores), jnp.asarray(predicted))
+    with jax.enable_x64(True):
+        assert bool(fit(untrained()._replace(score_type_predictions=predictions)).is_mean) == is_mean
+
+
+def test_returns_are_predicted_from_the_third_episode_on():
+    """From one episode, a closed form learns only its mean reward."""
+    state, counts = untrained(), []
+    for number in range(4):
+        rows = np.random.default_rng(number).normal(size=(4, 2)).astype(np.float32)
+        episode = CreditBatch(rows, np.zeros(4, int), np.array([4]), rows.mean(axis=1)[:1], mask=np.ones(1, np.float32))
+        with jax.enable_x64(True):
+            state = learn(state, episode)
+        assert state.score_type_predictions is not None
+        counts.append((int(state.predictions.n_episodes), int(state.score_type_predictions.n_episodes)))
+    assert counts == [(0, 0), (0, 0), (1, 1), (2, 2)]
