@@ -12,6 +12,7 @@ from lare_rl.credit import decomposition, descent
 from lare_rl.credit.arel import AREL
 from lare_rl.credit.decoder_settings import CreditSettings
 from lare_rl.credit.decomposition import CreditBatch
+from lare_rl.credit.lrr import LRR
 from lare_rl.credit.methods import METHODS, Fit
 from lare_rl.credit.stas import STAS
 from lare_rl.credit.step_decoders import Bottleneck, StepDecoder
@@ -22,6 +23,7 @@ ROWS = np.random.default_rng(0).normal(size=(EPISODES * STEPS, AGENTS, FEATURES)
 DECODERS = {
     "step": partial(StepDecoder, FEATURES, (8,), 2.0),
     "bottleneck": partial(Bottleneck, FEATURES, (16,), 2, (8,), 0.1, 2.0),
+    "lrr": partial(LRR, FEATURES, (8,), 2.0),
     "arel": partial(AREL, FEATURES, STEPS),
     "stas": partial(STAS, FEATURES, STEPS, AGENTS, 2.0),
 }
@@ -108,5 +110,5 @@ def test_must_learn_credit_among_agents_from_the_mean_return(name):
 
     r_hat, losses = train()
     assert float(losses[-5:].mean()) < float(losses[:5].mean())
-    if method.decoder == "step":
+    if method.decoder in ("step", "lrr"):
         assert np.corrcoef(np.ravel(r_hat), reward.ravel())[0, 1] > 0.9

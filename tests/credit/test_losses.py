@@ -42,6 +42,13 @@ def test_subsampling_variance_pinned(length, want):
     np.testing.assert_allclose(variance, [want], rtol=1e-6)
 
 
+def test_leave_one_out_likelihood_pinned():
+    """With a deviation of 2 at every step: e^2 / 8 + log 2. The second episode does not count."""
+    mean, target, weight = jnp.array([1.0, 9.0]), jnp.array([0.0, 2.0]), jnp.array([1.0, 0.0])
+    loss = losses.leave_one_out_likelihood(mean, target, weight, jnp.full(2, 0.25), jnp.full(2, jnp.log(2.0)))
+    assert float(loss) == pytest.approx(1 / 8 + np.log(2))
+
+
 def test_unbiased_squared_error_has_the_expectation_of_the_full_one():
     rng = np.random.default_rng(0)
     length, k, samples = 12, 5, 40_000

@@ -2,7 +2,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from lare_rl.nn.networks import MLP, adam_step, clip_gradient, init_adam, polyak_update
+from lare_rl.nn.networks import MLP, adam_step, clip_gradient, init_adam, polyak_update, smooth_clip
 
 
 def test_mlp_against_numpy():
@@ -32,3 +32,9 @@ def test_clip_gradient():
 def test_polyak_update():
     for tau, expected in [(0.0, 1.0), (0.25, 1.5), (1.0, 3.0)]:
         assert polyak_update({"a": jnp.array(1.0)}, {"a": jnp.array(3.0)}, tau) == {"a": expected}
+
+
+def test_smooth_clip():
+    x = jnp.array([-100.0, 0.1, 100.0])
+    np.testing.assert_allclose(smooth_clip(x, 5.0), [-5, 0.1, 5], rtol=1e-3)
+    assert float(jax.grad(lambda x: smooth_clip(x, 5.0))(8.0)) > 0.05

@@ -16,6 +16,8 @@ class DecoderOutput(NamedTuple):
     r_hat: Float[Array, "rows *agents"]
     penalty: Float[Array, "rows *agents"]
     """The mean of the penalty over the agents that are alive is added to the loss."""
+    log_std: Float[Array, "rows *agents"] | None = None
+    """The log standard deviation of the rewards, for `Fit.LIKELIHOOD`."""
 
 
 @runtime_checkable

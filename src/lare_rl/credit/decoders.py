@@ -60,6 +60,7 @@ for _decoder in (
         frozenset({"hidden", "encoder", "bottleneck", "divergence"}),
         exportable=True,
     ),
+    Decoder("lrr", "lare_rl.credit.lrr:init_lrr", frozenset({"hidden"})),
     Decoder("arel", "lare_rl.credit.arel:init_arel", whole_episodes=True),
     Decoder("stas", "lare_rl.credit.stas:init_stas", whole_episodes=True),
     Decoder("diaster", "lare_rl.credit.diaster:init_diaster", frozenset({"hidden"}), single_agent_only=True),

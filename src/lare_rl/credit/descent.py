@@ -71,14 +71,23 @@ def _mean_loss(
     fit: Fit,
     settings: CreditSettings,
 ) -> Float[Array, ""]:
-    """Return the loss of RD, RRD or RRD-unbiased: mean r_hat of an episode's steps against R/T, plus the decoder's penalty."""
+    """Return the loss of RD, RRD, RRD-unbiased or LRR: mean r_hat of an episode's steps against R/T, plus the decoder's penalty."""
     target, n_episodes = _targets(state, episodes, settings), len(episodes.length)
     weight = losses.episode_weight(episodes.length, episodes.mask, settings.sum_form)
     output = decode(network, state, episodes.inputs, settings, key)
-    r_hat, penalty = (agent_mean(values, episodes.alive) for values in output)
+    r_hat, penalty = (agent_mean(values, episodes.alive) for values in (output.r_hat, output.penalty))
     n_steps = jnp.minimum(episodes.length, len(r_hat) // n_episodes) if fit.samples_steps else episodes.length
-    mean = losses.episode_means(r_hat, episodes.episode_index, n_steps)
-    if fit is Fit.SAMPLED_STEPS_UNBIASED:
+
+    def means(values: Float[Array, " rows"]) -> Float[Array, " episodes"]:
+        return losses.episode_means(values, episodes.episode_index, n_steps)
+
+    mean = means(r_hat)
+    if fit is Fit.LIKELIHOOD:
+        assert output.log_std is not None
+        uncertainties = jnp.exp(-2 * output.log_std), output.log_std
+        precision, log_std = (means(agent_mean(values, episodes.alive)) for values in uncertainties)
+        loss = losses.leave_one_out_likelihood(mean, target, weight, precision, log_std)
+    elif fit is Fit.SAMPLED_STEPS_UNBIASED:
         variance = losses.subsampling_variance(r_hat.reshape(n_episodes, -1), episodes.length)
         loss = losses.unbiased_squared_error(mean, target, weight, variance)
     else:

@@ -10,7 +10,14 @@ and has the same minimiser if all episodes have the same length. `sum_form` fits
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
-__all__ = ["episode_means", "episode_weight", "squared_error", "subsampling_variance", "unbiased_squared_error"]
+__all__ = [
+    "episode_means",
+    "episode_weight",
+    "leave_one_out_likelihood",
+    "squared_error",
+    "subsampling_variance",
+    "unbiased_squared_error",
+]
 
 
 def episode_means(
@@ -57,6 +64,21 @@ def unbiased_squared_error(
     """Return the loss of RRD-unbiased: RRD's loss minus the `subsampling_variance`. Its expectation is RD's loss."""
     correction = jnp.sum(weight * variance) / jnp.maximum(jnp.sum(weight > 0), 1)
     return squared_error(mean, target, weight) - correction
+
+
+def leave_one_out_likelihood(
+    mean: Float[Array, " episodes"],
+    target: Float[Array, " episodes"],
+    weight: Float[Array, " episodes"],
+    precision: Float[Array, " episodes"],
+    log_std: Float[Array, " episodes"],
+) -> Float[Array, ""]:
+    """Return the negative log likelihood of LRR without its constant: the mean of w_b (mean_b - target_b)^2 p_b / 2 + l_b.
+
+    p_b = mean_t 1/sigma_t^2 and l_b = mean_t log sigma_t, over the steps of episode b. See `lrr.py`.
+    """
+    loss = weight * (mean - target) ** 2 * precision / 2 + jnp.where(weight > 0, log_std, 0)
+    return jnp.sum(loss) / jnp.maximum(jnp.sum(weight > 0), 1)
 
 
 def episode_weight(

@@ -28,6 +28,8 @@ class Fit(StrEnum):
     """RRD: K sampled steps of each episode."""
     SAMPLED_STEPS_UNBIASED = "sampled steps, unbiased"
     """RRD-unbiased: as RRD, minus the variance that the sampling adds."""
+    LIKELIHOOD = "likelihood of sampled steps"
+    """LRR: as RRD, but the likelihood of the return, under rewards whose uncertainty the decoder learns (equations in `lrr.py`)."""
     DECODER_LOSS = "the decoder's loss"
     """Diaster and RUDDER: the `loss` of the decoder, on whole episodes (equations in `diaster.py` and `rudder.py`)."""
     EVIDENCE = "evidence"
@@ -43,7 +45,7 @@ class Fit(StrEnum):
     @property
     def samples_steps(self) -> bool:
         """Whether an update reads K steps of each episode, and not all of them."""
-        return self in (Fit.SAMPLED_STEPS, Fit.SAMPLED_STEPS_UNBIASED)
+        return self in (Fit.SAMPLED_STEPS, Fit.SAMPLED_STEPS_UNBIASED, Fit.LIKELIHOOD)
 
     @property
     def separate(self) -> bool:
@@ -203,6 +205,14 @@ for _method in (
         f"{_RRD}; these inputs: this package",
         inputs=input_names.NEXT_OBSERVATION_ACTION,
         fit=Fit.SAMPLED_STEPS_UNBIASED,
+    ),
+    Method(
+        "lrr",
+        "likelihood of the return under Gaussian rewards, leaving out each step in turn",
+        "Xiao and Jiao, LRR, 2025",
+        inputs=input_names.RAW,
+        fit=Fit.LIKELIHOOD,
+        decoder="lrr",
     ),
     Method(
         "rd-linear",

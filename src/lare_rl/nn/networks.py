@@ -9,7 +9,17 @@ import jax.numpy as jnp
 import optax
 from jaxtyping import Array, Float, PRNGKeyArray
 
-__all__ = ["GRU", "MLP", "Linear", "adam_step", "clip_gradient", "init_adam", "init_orthogonal", "polyak_update"]
+__all__ = [
+    "GRU",
+    "MLP",
+    "Linear",
+    "adam_step",
+    "clip_gradient",
+    "init_adam",
+    "init_orthogonal",
+    "polyak_update",
+    "smooth_clip",
+]
 
 
 class Linear(eqx.Module):
@@ -109,6 +119,11 @@ def init_orthogonal(network: MLP, last_gain: float, *, key: PRNGKeyArray) -> MLP
     gains = (1.0,) * (len(network.layers) - 1) + (last_gain,)
     keys = jax.random.split(key, len(network.layers))
     return eqx.tree_at(lambda network: network.layers, network, tuple(map(init_layer, network.layers, gains, keys)))
+
+
+def smooth_clip(x: Float[Array, "*shape"], limit: float) -> Float[Array, "*shape"]:
+    """Return x bounded by ±limit, with a gradient everywhere. It is nearly x where x is far from the bounds."""
+    return limit * jnp.tanh(x / limit)
 
 
 Parameters = TypeVar("Parameters")

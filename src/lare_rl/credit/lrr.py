@@ -1,0 +1,53 @@
+"""LRR: likelihood reward redistribution (Xiao and Jiao, 2025, arXiv 2503.17409v1).
+
+The reward of a step is Gaussian, with a mean and a deviation that a network computes from the step. Leave-one-out: the return and the
+means of all other steps leave a reward for the step, whose likelihood is maximised:
+
+    r_t ~ N(mu_t, sigma_t^2)
+    -log p(R - sum_{j != t} mu_j)  =  (R - sum_j mu_j)^2 / (2 sigma_t^2) + log sigma_t + constant
+
+The mean over t is the loss of an episode (`losses.py`). With a constant sigma it is the squared error of RD, or of RRD if the sum is
+estimated from K sampled steps, as here. The algorithm is trained on mu_t.
+
+Only the abstract could be read, and these equations have all that it says: a distribution for each step whose parameters depend on
+state and action, leave-one-out, the whole trajectory, an uncertainty term, and the squared error as the case of a fixed uncertainty.
+Whether the paper takes the means of the other steps or samples of them is not known here. Version 2 of the paper is another method,
+with a Gaussian process.
+"""
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Float, PRNGKeyArray
+
+from lare_rl.credit.decoder_network import DecoderOutput, DecoderShape
+from lare_rl.credit.decoder_settings import CreditSettings
+from lare_rl.nn.networks import MLP, smooth_clip
+
+__all__ = ["LRR", "MAX_LOG_STD", "init_lrr"]
+
+MAX_LOG_STD = 5.0
+"""The deviation is between exp(-5) and exp(5), so that no likelihood is infinite."""
+
+
+class LRR(eqx.Module):
+    """An MLP with two outputs: mu times a gain, and log sigma.
+
+    sigma is in T times the unit of r_hat, because R is T times R/T.
+    """
+
+    mlp: MLP
+    gain: float = eqx.field(static=True)
+
+    def __init__(self, n_inputs: int, hidden: tuple[int, ...], gain: float, *, key: PRNGKeyArray):
+        self.gain = gain
+        self.mlp = MLP(n_inputs, hidden, 2, key=key)
+
+    def __call__(self, inputs: Float[Array, "rows *agents inputs"], key: PRNGKeyArray | None) -> DecoderOutput:
+        output = self.mlp(inputs)
+        log_std = smooth_clip(output[..., 1], MAX_LOG_STD)
+        return DecoderOutput(self.gain * output[..., 0], jnp.zeros_like(log_std), log_std)
+
+
+def init_lrr(key: PRNGKeyArray, shape: DecoderShape, settings: CreditSettings) -> LRR:
+    """Return an untrained `LRR`."""
+    return LRR(shape.n_inputs, settings.hidden, shape.gain, key=key)

@@ -1,0 +1,99 @@
+"""LRR against a slow NumPy twin, its special case, and what it must learn."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from lare_rl.credit import decomposition, descent
+from lare_rl.credit.decoder_settings import CreditSettings
+from lare_rl.credit.decomposition import CreditBatch
+from lare_rl.credit.methods import METHODS, Fit
+
+EPISODES, SAMPLED, FEATURES, LENGTH = 3, 4, 2, 8
+KEY = jax.random.key(0)
+SETTINGS = CreditSettings(hidden=(16,), learning_rate=3e-3)
+
+
+@pytest.fixture(scope="module")
+def state():
+    return decomposition.init(KEY, FEATURES, METHODS["lrr"], CreditSettings(hidden=(8,), normalise=False), LENGTH, 1)
+
+
+@pytest.fixture(scope="module")
+def batch():
+    rng = np.random.default_rng(0)
+    return CreditBatch(
+        inputs=jnp.asarray(rng.normal(size=(EPISODES * SAMPLED, 1, FEATURES)), jnp.float32),
+        episode_index=jnp.repeat(jnp.arange(EPISODES), SAMPLED),
+        length=jnp.full(EPISODES, LENGTH),
+        mean_reward=jnp.asarray(rng.normal(size=EPISODES), jnp.float32),
+        mask=jnp.array([1.0, 1.0, 0.0]),
+    )
+
+
+def loss(state, batch, fit):
+    return jax.jit(
+        lambda: descent.loss_and_gradient(state, batch, KEY, fit, CreditSettings(hidden=(8,), normalise=False))
+    )()
+
+
+def test_loss_against_numpy(state, batch):
+    """The return, and the other steps' means, leave a reward for each sampled step. Each sampled step stands for T / K steps."""
+    output = state.network(batch.inputs, None)
+    mu, log_std = (np.asarray(values).reshape(EPISODES, SAMPLED) for values in (output.r_hat, output.log_std))
+    want = []
+    for episode in range(2):  # the third is padding
+        total = float(batch.mean_reward[episode]) * LENGTH
+        for t in range(SAMPLED):
+            other_means = LENGTH / SAMPLED * mu[episode].sum() - mu[episode, t]
+            std = LENGTH * np.exp(log_std[episode, t])
+            density = np.exp(-(((total - other_means - mu[episode, t]) / std) ** 2) / 2) / (std * np.sqrt(2 * np.pi))
+            want.append(-np.log(density))
+    constant = np.log(LENGTH) + np.log(2 * np.pi) / 2
+    assert float(loss(state, batch, Fit.LIKELIHOOD)[0]) == pytest.approx(np.mean(want) - constant, rel=1e-4)
+
+
+def test_fixed_uncertainty_is_rrd(state, batch):
+    last = state.network.mlp.layers[-1]
+    fixed = eqx.tree_at(
+        lambda layer: (layer.weight, layer.bias), last, (last.weight.at[:, 1].set(0), last.bias.at[1].set(0))
+    )
+    network = eqx.tree_at(lambda network: network.mlp.layers[-1], state.network, fixed)
+    fixed_state = state._replace(network=network)
+    (likelihood, gradient), (error, rrd_gradient) = (
+        loss(fixed_state, batch, fit) for fit in (Fit.LIKELIHOOD, Fit.SAMPLED_STEPS)
+    )
+    assert float(likelihood) == pytest.approx(float(error) / 2, rel=1e-5)
+    for a, b in zip(*(leaves.mlp.layers[:-1] for leaves in (gradient, rrd_gradient)), strict=True):
+        np.testing.assert_allclose(a.weight, b.weight / 2, rtol=1e-4, atol=1e-6)
+
+
+def test_must_learn_rewards_and_where_they_are_uncertain():
+    """The mean reward is the first feature. Rewards are noisy where the second feature is positive."""
+    steps, n_episodes, updates = 3, 128, 500
+    rng = np.random.default_rng(0)
+    rows = rng.normal(size=(updates, n_episodes, steps, FEATURES)).astype(np.float32)
+    noise = 2 * rng.normal(size=rows.shape[:-1]) * (rows[..., 1] > 0)
+    mean_reward = jnp.asarray((rows[..., 0] + noise).mean(axis=-1), jnp.float32)
+    length, episode_index = jnp.full(n_episodes, steps), jnp.repeat(jnp.arange(n_episodes), steps)
+
+    def body(state, episodes):
+        x, target = episodes
+        batch = CreditBatch(x.reshape(-1, 1, FEATURES), episode_index, length, target, mask=jnp.ones(n_episodes))
+        return descent.update(state, batch, KEY, Fit.LIKELIHOOD, SETTINGS)[0], None
+
+    @jax.jit
+    def train():
+        state = decomposition.init(KEY, FEATURES, METHODS["lrr"], SETTINGS, steps, 1)
+        state = decomposition.observe_steps(state, jnp.asarray(rows[0]))
+        state = decomposition.observe_returns(state, mean_reward[0], length, jnp.ones(n_episodes, bool))
+        return jax.lax.scan(body, state, (jnp.asarray(rows), mean_reward))[0]
+
+    state = train()
+    x = jnp.asarray(rows[0].reshape(-1, FEATURES))
+    output = decomposition.decode(state.network, state, x, SETTINGS)
+    assert np.corrcoef(output.r_hat, x[:, 0])[0, 1] > 0.9
+    log_std = np.asarray(output.log_std)
+    assert log_std[x[:, 1] > 0.3].mean() > log_std[x[:, 1] < -0.3].mean() + 0.2
