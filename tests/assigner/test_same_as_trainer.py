@@ -21,17 +21,20 @@ from helpers.small_configs import (
 from helpers.toy_envs import toy_spec
 from lare_rl.assigner.assigner import CreditAssigner
 from lare_rl.credit.methods import METHODS
+from lare_rl.tasks.payments import PAID_AT_END, PaymentRule
 from lare_rl.training.rewards import rewards
 
 PHI_ENV = replace(ONE_AGENT, observation_size=2, action_size=1, low=ONE_AGENT.low[:, :1], high=ONE_AGENT.high[:, :1])
 """The sizes that `phi` is for. The bounds are -1 and 1, so that actions need no scaling."""
 
 
-def learn(method, env, phi=None):
+def learn(method, env, phi=None, payments=PAID_AT_END, exact="no"):
     """Return a learner and an assigner that have learned from the same steps."""
     scored_observation = "after" if phi is None else toy_spec().scored_observation
     algorithm = "td3" if env.n_agents == 1 else "ippo"
-    config = small_config(method, algorithm, env, capacity=1000, scored_observation=scored_observation)
+    config = small_config(
+        method, algorithm, env, capacity=1000, scored_observation=scored_observation, payments=payments
+    )
     credit = CreditAssigner(
         method,
         phi,
@@ -39,6 +42,7 @@ def learn(method, env, phi=None):
         observation_space=env.observation_size,
         action_space=env.action_size,
         settings=config.credit,
+        payments=payments,
         **({} if env.n_agents == 1 else {"agents": env.n_agents, "max_steps": env.max_steps}),
     )
     learner, steps = untrained_learner(config), random_steps(env, lengths=LENGTHS * 6)
@@ -66,11 +70,22 @@ def learn(method, env, phi=None):
     return learner, config, credit
 
 
+EVERY_5 = PaymentRule(period=5)
+
+
 @pytest.mark.parametrize(
-    ("method", "env"), [("lare-bayes", PHI_ENV), long_case("rd-linear", ONE_TEAM), long_case("ircr", ONE_AGENT)]
+    ("method", "env", "payments", "exact"),
+    [
+        ("lare-bayes", PHI_ENV, PAID_AT_END, "no"),
+        ("rd-linear", ONE_AGENT, EVERY_5, "spread"),
+        long_case("rd-linear", ONE_AGENT, PAID_AT_END, "last"),
+        long_case("rd-linear", ONE_TEAM, PAID_AT_END, "no"),
+        long_case("ircr", ONE_AGENT, EVERY_5, "no"),
+        long_case("rd-linear", ONE_AGENT, PaymentRule(period=4, window=6), "last"),
+    ],
 )
-def test_rewards_agree(method, env, phi):
-    learner, config, credit = learn(method, env, phi if METHODS[method].needs_phi else None)
+def test_rewards_agree(method, env, payments, exact, phi):
+    learner, config, credit = learn(method, env, phi if METHODS[method].needs_phi else None, payments, exact)
     expected = np.asarray(rewards(stored_steps(learner), reward_state(learner), config))
     expected = expected if env.n_agents > 1 else expected[..., 0]
     r_hat = credit.rewards_at(np.arange(credit.store.steps))

@@ -7,6 +7,7 @@ from hypothesis import strategies as st
 
 from lare_rl.assigner.store import Store
 from lare_rl.errors import LareError
+from lare_rl.tasks.payments import PaymentRule
 
 MOVES = st.lists(st.tuples(st.sampled_from(["add", "add", "add", "end", "drop"]), st.integers(0, 2)), max_size=60)
 
@@ -71,3 +72,33 @@ def test_lengths_of_a_running_episode_is_the_mean():
         store.end(0, 1.0)
     store.add(1)
     assert store.lengths(np.arange(10)).tolist() == [3] * 3 + [6] * 6 + [4]
+
+
+@pytest.mark.parametrize(
+    ("rule", "steps", "scores"),
+    [
+        (PaymentRule(period=2), [[0, 1], [2, 3], [4]], [3, 7, 5]),
+        (PaymentRule(nonzero=True), [[0], [1], [2], [3], [4]], [1, 2, 3, 4, 5]),
+        (PaymentRule(period=3, window=2), [[1, 2], [3, 4]], [6, 9]),
+        (PaymentRule(period=3, window=4), [[0, 1, 2], [1, 2, 3, 4]], [6, 9]),
+    ],
+    ids=str,
+)
+def test_payments_are_stored_as_episodes(rule, steps, scores):
+    reward, rows = np.arange(1.0, 6), np.zeros((5, 1), np.float32)
+    step_by_step, at_once = Store(9, (1,), payments=rule), Store(9, (1,), payments=rule)
+    numbers = step_by_step.add(5)
+    stored = list(step_by_step.extend(["a"] * 5, numbers, [rows] * 3, reward, np.arange(5) == 4))
+    assert [episode.steps.tolist() for episode in stored] == steps
+    assert [episode.score for episode in stored] == scores
+    assert not step_by_step.running
+    assert [episode.score for episode in at_once.add_paid_episode(at_once.add(5), reward)] == scores
+    np.testing.assert_array_equal(step_by_step.mean_reward, at_once.mean_reward)
+    assert step_by_step.length[4] == len(steps[-1])
+
+
+def test_end_needs_steps_that_are_not_paid():
+    store, rows = Store(9, (1,), payments=PaymentRule(period=2)), np.zeros((2, 1), np.float32)
+    list(store.extend(["a"] * 2, store.add(2), [rows] * 3, np.ones(2), np.zeros(2, bool)))
+    with pytest.raises(LareError, match="'a' was paid already"):
+        store.end("a", 1.0)

@@ -7,11 +7,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from helpers.replays import COLUMNS, extend, filled_replay, read, replay_columns, slow_replay, stream
-from lare_rl.data import replay
+from helpers.replays import COLUMNS, extend, filled_replay, read, replay_columns, slow_replay, slow_segments, stream
+from lare_rl.data import replay, sampling
 from lare_rl.data.replay import Index
 from lare_rl.data.trajectory import Trajectory
 from lare_rl.envs.interface import Timestep
+from lare_rl.tasks.payments import PaymentRule
 
 ENVS, LONGEST, CHUNKS = 3, 6, (1, 3, 7)
 CAPACITY = replay.required_capacity(max(CHUNKS), LONGEST)
@@ -53,6 +54,64 @@ def test_replay_matches_slow_twin(lengths_by_env, chunks):
         expected_length = np.where(is_finished, length, np.maximum(length, mean_length))
         np.testing.assert_array_equal(steps.length[at], expected_length)
     assert set(steps.next_columns) == {"observation", "state"}
+
+
+RULES = (
+    PaymentRule(period=1),
+    PaymentRule(period=3),
+    PaymentRule(nonzero=True),
+    PaymentRule(period=4, nonzero=True),
+    PaymentRule(period=4, window=2),
+    PaymentRule(nonzero=True, window=3),
+)
+
+
+@pytest.mark.parametrize("rule", RULES, ids=str)
+@given(data=st.data())
+@settings(max_examples=15, deadline=None)
+def test_segments_match_slow_twin(rule, data):
+    lengths_by_env = data.draw(st.lists(LENGTHS, min_size=ENVS, max_size=ENVS))
+    chunks = data.draw(st.lists(st.sampled_from(CHUNKS), min_size=1, max_size=8))
+    total, pays = sum(chunks), np.random.default_rng(data.draw(st.integers(0, 9))).random((ENVS, 200)) < 0.4
+    rows = [stream(lengths * (total + 1), env)[:total] for env, lengths in enumerate(lengths_by_env)]
+    rows = [[(*row[:2], row[2] * pays[env, i], row[3]) for i, row in enumerate(rows[env])] for env in range(ENVS)]
+    buffer = filled_replay(rows, chunks, CAPACITY, rule)
+    by_payment = replay.by_payment(buffer)
+    sample = sampling.episodes_in_order(
+        by_payment, jnp.zeros(ENVS, int), jnp.array(0), ENVS * total, ENVS * total * LONGEST
+    )
+    sample = jax.tree.map(np.asarray, sample)
+    read_rows = read(buffer, sample.steps)
+    observation, expected = np.asarray(read_rows.columns["observation"])[:, 0, 0], []
+    for env in range(ENVS):
+        finished, running = slow_replay(rows[env], chunks, CAPACITY)
+        segments = slow_segments([*finished, running], rule)
+        expected += segments
+        number = int(replay.oldest_transition(buffer)[env]) + np.arange(sum(map(len, [*finished, running])))
+        steps = jax.tree.map(np.asarray, read(buffer, Index(np.full(len(number), env), number)))
+        last = np.concatenate([np.arange(len(unpaid)) == len(unpaid) - 1 for _, unpaid, _ in segments] or [[]])
+        np.testing.assert_array_equal(steps.last[: len(last)], last)
+        np.testing.assert_array_equal(steps.finished, np.arange(len(number)) < len(last))
+        payments = [payment for payment, _, _ in segments]
+        np.testing.assert_allclose(steps.episodic_reward[steps.last], np.reshape(payments, (-1, 2)), rtol=1e-6)
+        assert not steps.episodic_reward[~steps.last].any()
+    assert int(np.sum(sample.episodes.mask)) == len(expected)
+    for i, (payment, _, paid_for) in enumerate(expected):
+        assert sample.episodes.length[i] == len(paid_for)
+        np.testing.assert_allclose(sample.episodes.mean_reward[i] * len(paid_for), payment, rtol=1e-5)
+        assert observation[sample.episode == i].tolist() == [step[0] for step in paid_for]
+
+
+def test_abandon_running_forgets_its_payments():
+    buffer = filled_replay([stream([2, 5])] * ENVS, [6], CAPACITY, PaymentRule(period=2))
+    assert replay.by_payment(buffer).episodes.tolist() == [3] * ENVS
+    abandoned = replay.abandon_running(buffer, jnp.array([True, False, True]))
+    assert replay.by_payment(abandoned).episodes.tolist() == [1, 3, 1]
+    longer = extend(
+        abandoned, *replay_columns([stream([7], env)[:3] for env in (7, 8, 9)]), payments=PaymentRule(period=2)
+    )
+    assert replay.by_payment(longer).episodes.tolist() == [2, 4, 2]
+    assert read(longer, replay.newest_steps(longer, 3)).last.tolist()[::2] == [[False, True, False]] * 2
 
 
 def test_extend_in_chunks():

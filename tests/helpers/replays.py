@@ -4,6 +4,7 @@ import jax
 import numpy as np
 
 from lare_rl.data import replay
+from lare_rl.tasks.payments import PAID_AT_END
 
 COLUMNS = {
     "observation": jax.ShapeDtypeStruct((2, 1), np.float32),
@@ -11,7 +12,7 @@ COLUMNS = {
     "action": jax.ShapeDtypeStruct((2, 1), np.float32),
     "terminated": jax.ShapeDtypeStruct((), np.bool_),
 }
-extend, read = jax.jit(replay.extend), jax.jit(replay.read)
+extend, read = jax.jit(replay.extend, static_argnames="payments"), jax.jit(replay.read)
 
 
 def stream(lengths, env=0):
@@ -43,10 +44,11 @@ def replay_columns(rows_by_env):
     return before, columns(next_observation), reward, ended
 
 
-def filled_replay(rows_by_env, chunks, capacity):
-    buffer, start = replay.init_replay(COLUMNS, len(rows_by_env), capacity, 2), 0
+def filled_replay(rows_by_env, chunks, capacity, payments=PAID_AT_END):
+    buffer, start = replay.init_replay(COLUMNS, len(rows_by_env), capacity, 2, payments), 0
     for count in chunks:
-        buffer = extend(buffer, *replay_columns([rows[start : start + count] for rows in rows_by_env]))
+        steps = replay_columns([rows[start : start + count] for rows in rows_by_env])
+        buffer = extend(buffer, *steps, payments=payments)
         start += count
     return buffer
 
@@ -66,3 +68,18 @@ def slow_replay(rows, chunks, capacity):
             episodes.pop(0)
             n_removable -= 1
     return episodes, running
+
+
+def slow_segments(episodes, rule):
+    """Return (payment, steps since the last payment, steps that it is for) of each payment in lists of steps."""
+    segments = []
+    for steps in episodes:
+        unpaid = []
+        for i, step in enumerate(steps):
+            unpaid.append(step)
+            at_time = rule.period is not None and (i + 1) % rule.period == 0
+            if step[3] or at_time or (rule.nonzero and step[2].any()):
+                paid_for = unpaid if rule.window is None else steps[max(0, i + 1 - rule.window) : i + 1]
+                segments.append((np.sum([step[2] for step in unpaid], axis=0), unpaid, paid_for))
+                unpaid = []
+    return segments

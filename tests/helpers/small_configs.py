@@ -161,6 +161,7 @@ def steps_as_stored(config, steps=None, factors=None):
         mean_reward=jnp.asarray(np.repeat(total / length[:, None], length, axis=0), jnp.float32),
         finished=jnp.ones(len(last), bool),
         last=jnp.asarray(last),
+        residual=None,
         length=jnp.asarray(np.repeat(length, length), jnp.int32),
     )
 
@@ -207,8 +208,7 @@ def learn_stored_returns(learner, config):
     arrays = jax.tree.map(lambda leaf: np.asarray(leaf)[None], (learner.decoders, learner.replay, learner.n_learned))
     with jax.enable_x64(True):
         learned = jitted(learn_returns, config)(*arrays)
-    decoders, n_learned = jax.tree.map(lambda leaf: leaf[0], learned)
-    return learner._replace(decoders=decoders, n_learned=n_learned)
+    return learners.with_learned_returns(learner, *jax.tree.map(lambda leaf: leaf[0], learned))
 
 
 def with_factor_decoders(learner, weights):

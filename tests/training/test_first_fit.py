@@ -39,7 +39,7 @@ from lare_rl.training.first_fit import PATIENCE, config_of_first_fit, fit_until_
 )
 def test_count_held_out(n_episodes, n_held_out):
     buffer = replay.init_replay({}, len(n_episodes), 100, 1)._replace(episodes=jnp.array(n_episodes))
-    assert first_fit._count_held_out(buffer).tolist() == n_held_out
+    assert first_fit._count_held_out(buffer, window=32).tolist() == n_held_out
 
 
 def stack_seeds(*seeds):

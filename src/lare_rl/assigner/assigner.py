@@ -39,6 +39,7 @@ from lare_rl.envs.families import find_score
 from lare_rl.envs.load import resolve_task
 from lare_rl.errors import LareError
 from lare_rl.latent.function import LatentFunction
+from lare_rl.tasks.payments import PAID_AT_END, PaymentRule
 from lare_rl.tasks.spec import ScoredObservation, TaskSpec
 
 __all__ = ["CreditAssigner"]
@@ -64,6 +65,7 @@ class CreditAssigner:
         fits_per_step: float = 1.0,
         scale_rewards: bool = False,
         forget: bool = True,
+        payments: PaymentRule | None = None,
     ):
         """Make an assigner without any steps.
 
@@ -86,6 +88,7 @@ class CreditAssigner:
             scale_rewards: divide r_hat by the running root mean square of R/T.
             forget: whether a closed-form fit may forget episodes whose steps are not stored any more. Use True in training, because
                 the policy changes, and False for a log, whose episodes all count the same.
+            payments: when the environment pays, if it pays before the end of an episode. The task's by default.
 
         Raises:
             LareError: method, function, task and spaces do not go together.
@@ -111,13 +114,15 @@ class CreditAssigner:
                 fits_per_step=fits_per_step,
                 scale_rewards=scale_rewards,
                 forget=forget,
+                payments=payments or (PAID_AT_END if task is None else task.payment_rule),
             )
         )
 
     def _init(self, config: AssignerConfig) -> None:
         check_config(config)
         self.config = config
-        self.store = Store(config.capacity, (*config.agent_axis, config.spec.basis.n_inputs), config.agents)
+        row_shape = (*config.agent_axis, config.spec.basis.n_inputs)
+        self.store = Store(config.capacity, row_shape, config.agents, config.payments)
         self.learner = DecoderLearner(config, self.store)
         self.lock = threading.RLock()
 
@@ -201,7 +206,10 @@ class CreditAssigner:
             if not np.isfinite(score):
                 raise LareError(f"the score is {score}: give a finite number")
             step_ids = self.learner.add_steps(*steps, alive)
-            self.learner.queue_episodes([self.store.add_episode(step_ids, score)])
+            if is_score:
+                self.learner.queue_episodes([self.store.add_episode(step_ids, score)])
+            else:
+                self.learner.queue_episodes(self.store.add_paid_episode(step_ids, rewards))
             self.learner.flush_large_queues()
             return step_ids
 

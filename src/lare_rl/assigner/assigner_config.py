@@ -16,9 +16,11 @@ from lare_rl.credit.engine import CreditSpec, credit_spec
 from lare_rl.credit.explanation_text import raw_feature_names
 from lare_rl.credit.input_names import input_arrays
 from lare_rl.credit.methods import Method
+from lare_rl.credit.prequential import SEGMENT_WINDOW, WINDOW
 from lare_rl.envs.families import load_env_spec
 from lare_rl.errors import LareError, short_repr
 from lare_rl.latent.function import LatentFunction, check_task
+from lare_rl.tasks.payments import PAID_AT_END, PaymentRule
 from lare_rl.tasks.spec import ScoredObservation, TaskSpec
 
 __all__ = [
@@ -53,6 +55,7 @@ class AssignerConfig:
     fits_per_step: float
     scale_rewards: bool
     forget: bool
+    payments: PaymentRule = PAID_AT_END
 
     @property
     def agent_axis(self) -> tuple[int, ...]:
@@ -75,9 +78,15 @@ class AssignerConfig:
             single_agent=self.agents == 1,
             agents=self.agents,
             max_steps=self.max_steps or 1,
+            window=WINDOW if self.payments.only_at_end else SEGMENT_WINDOW,
             fixed_length=False,
             scale_rewards=self.scale_rewards,
         )
+
+    @property
+    def is_exact(self) -> bool:
+        """Whether the proxy rewards of an episode are corrected to add up to its return."""
+        return self.settings.exact != "no" and "exact" in self.method.settings
 
     def raw_feature_names(self, n_features: int) -> list[str]:
         """Return names of the raw features; none if they are not entries of observations and the action."""
@@ -180,6 +189,7 @@ def check_config(config: AssignerConfig) -> None:
         n_raw_features=config.spec.basis.n_raw,
         scored_observation=config.scored_observation,
         scale_rewards=config.scale_rewards,
+        payments=config.payments,
     )
     if config.agents > 1 and config.max_steps is None:
         raise LareError("many agents need max_steps, the number of steps of the longest episode")

@@ -20,6 +20,7 @@ observe_steps = jax.jit(decomposition.observe_steps)
 observe_returns = jax.jit(decomposition.observe_returns)
 observe_scale = jax.jit(update_scale)
 predict_then_update = jax.jit(returns.predict_then_update, static_argnames="settings")
+predicted_returns = jax.jit(returns.predicted_returns, static_argnames="settings")
 add_episodes = jax.jit(returns.add_episodes)
 is_stale = jax.jit(returns.is_stale)
 reset_statistics = jax.jit(returns.reset_statistics)
@@ -76,16 +77,20 @@ def training_rewards(
     mean_reward: Float[Array, " rows"] | None,
     finished: Bool[Array, " rows"] | None,
     alive: Bool[Array, "rows agents"] | None,
+    last: Bool[Array, " rows"] | None,
+    residual: Float[Array, " rows"] | None,
     structure: Any,
     spec: CreditSpec,
 ) -> Float[Array, "rows agents"]:
-    """Return the rewards of steps by a flat state. `mean_reward` and `finished` are needed by methods that pay by the return."""
+    """Return the rewards of steps by a flat state. `engine.StepBatch` describes the arrays that may be None."""
     decoder, scale = jax.tree.unflatten(structure, leaves)
     steps = StepBatch(
         inputs=inputs,
         length=length,
         mean_reward=jnp.zeros(len(length)) if mean_reward is None else mean_reward,
         finished=jnp.ones(len(length), bool) if finished is None else finished,
+        last=last,
+        residual=residual,
     )
     alive = jnp.ones(inputs.shape[:-1], bool) if alive is None else alive
     return engine.training_rewards(decoder, scale, steps, spec, alive)

@@ -75,6 +75,8 @@ class DecoderLearner:
         self._is_fitted = False
         self._flat_cache: tuple[Any, Any, FlatState | None] = None, None, None
         """A decoder and a scale, and the leaves of both."""
+        self._residual_cache: tuple[Decomposition | None, dict[int, float]] = None, {}
+        """A decoder, and what its proxy rewards lack to the returns of episodes, by their numbers."""
 
     @property
     def is_fitted(self) -> bool:
@@ -212,11 +214,11 @@ class DecoderLearner:
     def _episode_batches(self, episodes: Sequence[StoredEpisode]) -> Iterator[CreditBatch]:
         """Yield batches of whole episodes. Rows are padded to one of two sizes, so that few programs are compiled."""
         lengths = [len(episode.steps) for episode in episodes]
-        longest = max(lengths, default=1)
+        longest, window = max(lengths, default=1), self.config.spec.window
         rows = padded_size(longest)
         if sum(lengths) > rows:
-            rows = padded_size(max(longest, min(MAX_CALL_ROWS // self.config.agents, prequential.WINDOW * longest)))
-        return batches.pack_in_order(self.store, episodes, prequential.WINDOW, rows)
+            rows = padded_size(max(longest, min(MAX_CALL_ROWS // self.config.agents, window * longest)))
+        return batches.pack_in_order(self.store, episodes, window, rows)
 
     def fit(self, n_updates: int) -> None:
         """Fit now, by this many gradient updates. A closed-form decoder is fitted once, whatever the number is."""
@@ -261,6 +263,8 @@ class DecoderLearner:
         length: Int[np.ndarray, " n"],
         alive: Bool[np.ndarray, "n *agents"] | None = None,
         rows: Int[np.ndarray, " n"] | None = None,
+        last: Bool[np.ndarray, " n"] | None = None,
+        residual: Float[np.ndarray, " n"] | None = None,
     ) -> Float[np.ndarray, "n *agents"]:
         """Return the rewards of steps; 0 while nothing has been fitted.
 
@@ -269,6 +273,8 @@ class DecoderLearner:
             length: T of each step's episode.
             alive: which agents acted; all by default.
             rows: the steps' rows in the store, for a method that pays by the return of a step's episode.
+            last: whether a step is the last one of its episode. Only for `exact`, like the next argument.
+            residual: the return of the step's episode, less the sum of its proxy rewards.
         """
         reward = np.zeros(inputs.shape[:-1], np.float32)
         if self.config.method.reward is Reward.PROXY and not self.is_fitted:
@@ -282,7 +288,9 @@ class DecoderLearner:
             size = padded_size(len(inputs[chunk]))
             padded_length = pad(length[chunk].astype(np.int32), size)
             padded_length[len(inputs[chunk]) :] = 1  # a score that is a mean is divided by T
-            arrays = (None if x is None else pad(x[chunk], size) for x in (mean_reward, finished, alive))
+            arrays = (
+                None if x is None else pad(x[chunk], size) for x in (mean_reward, finished, alive, last, residual)
+            )
             with on_cpu():
                 flat = self._flat_state()
                 r_hat = compiled.training_rewards(
@@ -302,7 +310,38 @@ class DecoderLearner:
         if len(rows) and step_ids.max() >= self.store.steps - self.n_pending_steps:
             self.flush_inputs()
         alive = None if self.store.alive is None else self.store.alive[rows]
-        return self.rewards(self.store.inputs[rows], self.store.lengths(rows), alive, rows)
+        last, residual = self._residuals(step_ids, rows) if self.config.is_exact and self.is_fitted else (None, None)
+        return self.rewards(self.store.inputs[rows], self.store.lengths(rows), alive, rows, last, residual)
+
+    def _residuals(
+        self, step_ids: Int[np.ndarray, " n"], rows: Int[np.ndarray, " n"]
+    ) -> tuple[Bool[np.ndarray, " n"], Float[np.ndarray, " n"]]:
+        """Return which steps are the last ones of their episodes, and the residuals of these. Those that are not used are 0."""
+        store = self.store
+        number = store.episode[rows]
+        stored = [store.episodes.get(k) for k in number.tolist()]
+        last = np.array([e is not None and e.steps[-1] == k for e, k in zip(stored, step_ids, strict=True)], bool)
+        is_used = last if self.config.settings.exact == "last" else np.array([e is not None for e in stored], bool)
+        numbers = np.unique(number[is_used])
+        residual = np.zeros(len(rows), np.float32)
+        residual[is_used] = self._episode_residuals(numbers.tolist())[np.searchsorted(numbers, number[is_used])]
+        return last, residual
+
+    def _episode_residuals(self, numbers: Sequence[int]) -> Float[np.ndarray, " episodes"]:
+        """Return the returns of episodes, less the sums of their proxy rewards by the newest decoder."""
+        if self._residual_cache[0] is not self.decoder:
+            self._residual_cache = self.decoder, {}
+        residuals = self._residual_cache[1]
+        new = [number for number in numbers if number not in residuals]
+        episodes = [self.store.episodes[number] for number in new]
+        predicted: list[float] = []
+        with on_cpu():
+            for batch in self._episode_batches(episodes):
+                sums = compiled.predicted_returns(self.decoder, batch, settings=self.config.settings)
+                predicted += np.asarray(sums)[np.asarray(batch.mask) > 0].tolist()
+        scores = [episode.score for episode in episodes]
+        residuals.update(zip(new, np.subtract(scores, predicted).tolist(), strict=True))
+        return np.array([residuals[number] for number in numbers], np.float32)
 
     def _flat_state(self) -> FlatState:
         """Return the parts of the decoder that compute rewards, and the scale, in flat form."""

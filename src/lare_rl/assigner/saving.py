@@ -9,7 +9,7 @@ DIRECTORY/
 import json
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -24,6 +24,7 @@ from lare_rl.credit.methods import find_method
 from lare_rl.errors import LareError, short_repr
 from lare_rl.latent.saved import load_function
 from lare_rl.runs.checkpoint import DAMAGED_FILE_ERRORS, fill_template, named_leaves, open_npz
+from lare_rl.tasks.payments import PaymentRule
 from lare_rl.tasks.spec import TaskSpec
 from lare_rl.util.files import write_arrays, write_atomically
 from lare_rl.util.renamed_fields import rename_fields, rename_keys
@@ -46,7 +47,7 @@ PLAIN_FIELDS = (
 """The fields of a configuration that are JSON values."""
 LEARNED = "learned"
 """The names of the arrays of the decoder and the scale begin with it."""
-STORE_ARRAYS = {"features": "inputs", "length": "length", "mean_reward": "mean_reward"}
+STORE_ARRAYS = {"features": "inputs", "length": "length", "mean_reward": "mean_reward", "episode": "episode"}
 """The arrays of a store by their names in the file."""
 PHI_SAMPLE = ("tried/observation", "tried/action")
 """The steps on which `phi` is verified when it is loaded, because there may be no environment."""
@@ -129,6 +130,7 @@ def read_state(directory: Path) -> AssignerState:
             observation=SpaceLayout(**values["observation"]),
             action=SpaceLayout(**values["action"]),
             settings=CreditSettings(**values["settings"]),
+            payments=PaymentRule(**values.get("payments", {})),
             **{name: values[name] for name in PLAIN_FIELDS},
         )
         return AssignerState(config, values["told"], values["fits"], arrays)
@@ -153,6 +155,7 @@ def _config_values(state: AssignerState) -> dict[str, Any]:
         "method": config.method.name,
         **{name: model and model.model_dump(mode="json") for name in models for model in [getattr(config, name)]},
         **{name: getattr(config, name) for name in PLAIN_FIELDS},
+        "payments": asdict(config.payments),
         "phi": config.phi is not None,
         "told": state.n_learned,
         "fits": state.n_updates,
@@ -176,11 +179,13 @@ def _restore_store(store: Store, arrays: dict[str, np.ndarray]) -> None:
     store.steps = int(arrays["steps"])
     rows = np.arange(max(0, store.steps - store.capacity), store.steps) % store.capacity
     for name, field in STORE_ARRAYS.items():
-        getattr(store, field)[rows] = arrays[name]
+        if name in arrays:  # earlier versions did not save every array
+            getattr(store, field)[rows] = arrays[name]
     if "alive" in arrays:
         store.alive = np.ones((store.capacity, store.agents), bool)
         store.alive[rows] = arrays["alive"]
     ends = np.cumsum(arrays["lengths"])
     first = store.ended - len(ends)
     for i, (end, length, score) in enumerate(zip(ends, arrays["lengths"], arrays["scores"], strict=True)):
-        store.restore_episode(first + i, StoredEpisode(arrays["episodes"][end - length : end], float(score)))
+        steps = arrays["episodes"][end - length : end]
+        store.restore_episode(first + i, StoredEpisode(steps, float(score)))

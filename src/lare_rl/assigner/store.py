@@ -2,7 +2,8 @@
 
 Steps of many environments arrive interleaved. The numbers of steps count up from 0 without end, and a step is stored in a ring buffer
 at its number modulo the capacity. An episode is stored as the numbers of its steps. When the ring buffer is full, new steps overwrite
-the oldest ones, whose episodes are removed.
+the oldest ones, whose episodes are removed. If the environment pays before the end of an episode, the steps that each payment is for
+are stored as an episode of their own.
 """
 
 import heapq
@@ -15,12 +16,13 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from lare_rl.errors import LareError
+from lare_rl.tasks.payments import PAID_AT_END, PaymentRule, is_paid
 
 __all__ = ["RunningEpisode", "Store", "StoredEpisode"]
 
 
 class StoredEpisode(NamedTuple):
-    """An episode that has ended."""
+    """An episode that has ended, or the steps that a payment is for."""
 
     steps: Int[np.ndarray, " steps"]
     """The numbers of its steps."""
@@ -33,8 +35,10 @@ class RunningEpisode:
     """An episode that has not ended."""
 
     steps: list[int] = field(default_factory=list)
+    n_paid: int = 0
+    """The number of steps up to the last payment."""
     return_: float = 0.0
-    """The sum of its rewards so far."""
+    """The sum of its rewards since the last payment."""
     last_observation: Float[np.ndarray, "*agents observation"] | None = None
     """The observation after its last step."""
 
@@ -47,17 +51,19 @@ class RunningEpisode:
 class Store:
     """Inputs of steps, and the episodes that they belong to."""
 
-    def __init__(self, capacity: int, row_shape: tuple[int, ...], agents: int = 1):
+    def __init__(self, capacity: int, row_shape: tuple[int, ...], agents: int = 1, payments: PaymentRule = PAID_AT_END):
         """Make an empty store. `row_shape` is the shape of a step's inputs: (inputs,), or (agents, inputs)."""
-        self.capacity, self.agents = capacity, agents
+        self.capacity, self.agents, self.payments = capacity, agents, payments
         self.inputs = np.zeros((capacity, *row_shape), np.float32)
         """The decoder's inputs for each step: [capacity *agents inputs]."""
         self.alive: Bool[np.ndarray, "capacity agents"] | None = None
         """Which agents acted. None: all of them."""
         self.length = np.zeros(capacity, np.int32)
-        """The length of each step's episode; 0 before it has ended."""
+        """The length of each step's episode; 0 before it is paid."""
         self.mean_reward = np.zeros(capacity, np.float32)
         """R/T of each step's episode."""
+        self.episode = np.full(capacity, -1, np.int64)
+        """The number of each step's episode; -1 before it is paid."""
         self.steps = 0
         """The number of steps that were ever added."""
         self.episodes: dict[int, StoredEpisode] = {}
@@ -88,6 +94,7 @@ class Store:
         while self.oldest and self.oldest[0][0] < self.steps - self.capacity:
             del self.episodes[heapq.heappop(self.oldest)[1]]
         self.length[step_ids % self.capacity] = 0
+        self.episode[step_ids % self.capacity] = -1
         if self.alive is None and alive is not None:
             self.alive = np.ones((self.capacity, self.agents), bool)
         if self.alive is not None:
@@ -102,7 +109,7 @@ class Store:
         reward: Float[np.ndarray, " n"],
         ended: Bool[np.ndarray, " n"],
     ) -> Iterator[StoredEpisode]:
-        """Add new steps to the running episodes of their environments. Yield each episode that ends.
+        """Add new steps to the running episodes of their environments. Yield each episode that is paid.
 
         `step_ids` are from `add`. `steps` are observations, actions and next observations. Raises `LareError` like `end`.
         """
@@ -112,8 +119,12 @@ class Store:
             episode.steps.append(int(step_ids[i]))
             episode.return_ += float(reward[i])
             episode.last_observation = next_observation[i]
-            if ended[i]:
-                yield self.end(env_id, episode.return_)
+            step, team_reward = len(episode.steps) - 1, np.reshape(reward[i], (1,))
+            if is_paid(self.payments, step, team_reward, bool(ended[i])):
+                payment = self._pay(episode, episode.return_)
+                if ended[i]:
+                    del self.running[env_id]
+                yield payment
 
     def find_running(self, env_id: Hashable) -> RunningEpisode:
         """Return the running episode of an environment. Raises `LareError` if there is none."""
@@ -125,15 +136,34 @@ class Store:
         return self.running[env_id]
 
     def end(self, env_id: Hashable, score: float) -> StoredEpisode:
-        """End the running episode of an environment, with `score` as its return.
+        """End the running episode of an environment, with `score` as its return, or as its last payment.
 
         Raises:
-            LareError: its first steps are not stored any more.
+            LareError: its first steps are not stored any more, or all of its steps have been paid for.
         """
-        return self.add_episode(np.array(self.running.pop(env_id).steps, np.int64), score)
+        episode = self.running.pop(env_id)
+        if len(episode.steps) == episode.n_paid:
+            raise LareError(
+                f"the last step of the environment {env_id!r} was paid already: end the episode with this step"
+            )
+        return self._pay(episode, score)
 
-    def add_episode(self, steps: Int[np.ndarray, " steps"], score: float) -> StoredEpisode:
-        """Store an episode that has just ended. Raises `LareError` like `end`."""
+    def _pay(self, episode: RunningEpisode, payment: float) -> StoredEpisode:
+        """Store the steps that a payment is for."""
+        since_last = np.array(episode.steps[episode.n_paid :], np.int64)
+        window = self.payments.window
+        episode.n_paid, episode.return_ = len(episode.steps), 0.0
+        return self.add_episode(
+            since_last if window is None else np.array(episode.steps[-window:], np.int64), payment, since_last
+        )
+
+    def add_episode(
+        self, steps: Int[np.ndarray, " steps"], score: float, since_last: Int[np.ndarray, " since"] | None = None
+    ) -> StoredEpisode:
+        """Store an episode that has just been paid. Raises `LareError` like `end`.
+
+        `since_last` are the steps since the last payment, if they are not the steps that this one is for.
+        """
         episode = StoredEpisode(steps, score)
         if self.steps - steps[0] > self.capacity:
             raise LareError(
@@ -143,10 +173,22 @@ class Store:
         self.restore_episode(self.ended, episode)
         self.ended += 1
         self.ended_steps += len(steps)
-        rows = episode.steps % self.capacity
-        self.length[rows] = len(rows)
-        self.mean_reward[rows] = score / len(rows)
+        rows = (steps if since_last is None else since_last) % self.capacity
+        self.episode[rows] = self.ended - 1
+        self.length[rows] = len(steps)
+        self.mean_reward[rows] = score / len(steps)
         return episode
+
+    def add_paid_episode(
+        self, steps: Int[np.ndarray, " steps"], reward: Float[np.ndarray, " steps"]
+    ) -> Iterator[StoredEpisode]:
+        """Store an episode that has just ended, by the reward of each of its steps. Yield the steps of each payment."""
+        episode = RunningEpisode()
+        for i, step_id in enumerate(steps.tolist()):
+            episode.steps.append(step_id)
+            episode.return_ += float(reward[i])
+            if is_paid(self.payments, i, reward[i : i + 1], i == len(steps) - 1):
+                yield self._pay(episode, episode.return_)
 
     def restore_episode(self, number: int, episode: StoredEpisode) -> None:
         """Store an episode under its number."""

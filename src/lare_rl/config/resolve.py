@@ -40,6 +40,7 @@ def resolve(settings: Settings, task: TaskSpec) -> ResolvedSettings:
         team_level=team_level,
         fixed_length=env.fixed_length,
         scale_rewards=resolved.scale_rewards,
+        payments=task.payment_rule,
     )
     if method.needs_whole_episodes and resolved.rollout_steps % env.max_steps:
         raise LareError(
@@ -47,6 +48,11 @@ def resolve(settings: Settings, task: TaskSpec) -> ResolvedSettings:
             f"{env.max_steps}"
         )
     consumes = ALGORITHMS[resolved.algorithm].consumes
+    if resolved.credit.exact != "no" and method.uses_gradient and consumes is not Consumes.ROLLOUTS:
+        raise LareError(
+            f"exact needs proxy rewards that stay the same during an iteration, and each update of {resolved.algorithm} changes those "
+            f"of {method.name}: use bayes or lare-bayes, or the algorithms ppo or ippo"
+        )
     if resolved.overlap_collection and (env.is_jax or consumes is not Consumes.TRANSITIONS):
         raise LareError(
             f"overlap_collection needs td3, ddpg or sac and an environment on the host: remove it for {resolved.algorithm} on "
@@ -107,7 +113,7 @@ def _normalise(resolved: ResolvedSettings, task: TaskSpec, env: EnvSpec) -> Reso
     if "first_fit" in unused_names(resolved):
         changes["first_fit"] = None
     score = resolved.credit.score
-    if env.fixed_length:  # sum and mean have the same decoder
+    if env.fixed_length and task.payment_rule.is_regular(env.max_steps):  # sum and mean have the same decoder
         score = "auto"
     elif score == "auto":
         score = find_score(task) or score

@@ -4,6 +4,7 @@ from lare_rl.credit.basis import MAX_RAW_FEATURES
 from lare_rl.credit.decoder_settings import CreditSettings
 from lare_rl.credit.methods import Fit, Method, Reward
 from lare_rl.errors import LareError
+from lare_rl.tasks.payments import PAID_AT_END, PaymentRule
 from lare_rl.tasks.spec import ScoredObservation
 
 __all__ = ["check_credit"]
@@ -19,6 +20,7 @@ def check_credit(
     team_level: bool = False,
     fixed_length: bool = False,
     scale_rewards: bool = False,
+    payments: PaymentRule = PAID_AT_END,
 ) -> None:
     """Raise `LareError` if a method or the settings of its decoder are impossible for a task.
 
@@ -31,6 +33,7 @@ def check_credit(
         team_level: whether credit is assigned to the team's global state instead of each agent.
         fixed_length: whether every episode has the same number of steps.
         scale_rewards: whether rewards are divided by the size of returns.
+        payments: when the environment pays.
     """
     name = method.name
     if method.reward is Reward.DESIGNED and scored_observation == "both":
@@ -47,6 +50,10 @@ def check_credit(
         raise LareError(f"{name} assigns credit among agents, and the task has credit_scope = 'state'")
     if method.needs_whole_episodes and not fixed_length:
         raise LareError(f"{name} reads whole episodes of one length: use it with `lare_rl.train` on particle tasks")
+    if method.needs_whole_episodes and not payments.only_at_end:
+        raise LareError(
+            f"{name} reads whole episodes, and the task pays before their end: use a method that reads steps"
+        )
     if "drawn_steps" in method.settings and not fixed_length and credit.steps < credit.drawn_steps:
         raise LareError(
             f"the decoder has steps = {credit.steps}, less than drawn_steps = {credit.drawn_steps} of one episode: use more steps"

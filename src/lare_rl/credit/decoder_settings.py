@@ -35,6 +35,9 @@ class CreditSettings(CheckedModel):
     score: Literal["auto", "sum", "average"] = "auto"
     """Whether the score of an episode is a sum over its steps, or an average or a grade, which does not grow with the number of
     steps. `auto`: the task's `score` or, without one, the type that has predicted returns better so far."""
+    exact: Literal["no", "last", "spread"] = "no"
+    """Whether the proxy rewards of an episode are corrected, so that they add up to its return: by adding the difference to the
+    reward of its last step, or by spreading it over its steps."""
     optimism: Annotated[float, Field(ge=0)] = 0.0
     """lare-bayes and other methods in closed form: the algorithm's reward is the proxy reward plus its posterior standard
     deviation times this factor. Uncertain steps thus look better."""

@@ -32,7 +32,7 @@ from lare_rl.credit.decoder_network import DecoderNetwork, DecoderOutput, Decode
 from lare_rl.credit.decoder_settings import CreditSettings
 from lare_rl.credit.decoders import DECODERS
 from lare_rl.credit.methods import Method
-from lare_rl.credit.prequential import Predictions, empty_predictions
+from lare_rl.credit.prequential import WINDOW, Predictions, empty_predictions
 from lare_rl.credit.score_type import ScoreType
 from lare_rl.errors import LareError, short_repr
 from lare_rl.nn.networks import init_adam
@@ -127,6 +127,7 @@ def init(
     max_steps: int,
     n_agents: int,
     score_types: tuple[int, ...] = (ScoreType.SUM,),
+    window: int = WINDOW,
 ) -> Decomposition:
     """Return the state with an untrained decoder. All other functions need the same `settings` and `score_types`.
 
@@ -138,6 +139,7 @@ def init(
         max_steps: the number of steps of the longest episode.
         n_agents: the number of agents of a step.
         score_types: the types that the score may have.
+        window: the number of last returns over which predictions of them are assessed.
     """
     basis = Basis(n_factors=0, n_raw=basis, extended=False) if isinstance(basis, int) else basis
     shape = DecoderShape(basis, max_steps, n_agents)
@@ -159,9 +161,9 @@ def init(
         scale=empty_scale(),
         return_scale=empty_scale(),
         is_mean=jnp.asarray(score_types == (ScoreType.MEAN,)),
-        predictions=empty_predictions(1),
+        predictions=empty_predictions(1, window),
         closed_form=closed,
-        score_type_predictions=empty_predictions(len(score_types)) if both else None,
+        score_type_predictions=empty_predictions(len(score_types), window) if both else None,
     )
 
 

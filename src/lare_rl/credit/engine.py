@@ -7,6 +7,9 @@ into the rewards that an algorithm is trained on:
     training reward    + optimism,  averaged over the agents if the method shares credit,  0 for agents that are not alive,
                        divided by the scale of R/T if that is asked for
 
+With `exact`, what the proxy rewards of an episode lack to its return, R - sum_t r_hat_t, is added to them: to that of the last step
+(RUDDER: Arjona-Medina et al., 2019), or divided among all steps. They then add up to the return whatever the decoder's error is.
+
 Batches have an axis of agents, of length 1 for a single agent. For credit to whole teams it has length 1 too.
 """
 
@@ -26,6 +29,7 @@ from lare_rl.credit.decomposition import CreditBatch, Decomposition
 from lare_rl.credit.explanation import Explanation, StepStatistics, add_steps, empty_step_statistics, explain
 from lare_rl.credit.input_names import input_size
 from lare_rl.credit.methods import Method, Reward
+from lare_rl.credit.prequential import WINDOW
 from lare_rl.credit.returns import add_to_sums
 from lare_rl.credit.score_type import ScoreType, score_types_to_fit
 from lare_rl.envs.interface import alive_mean
@@ -62,6 +66,8 @@ class CreditSpec:
     max_steps: int
     agents: int
     """The number of proxy rewards of a step."""
+    window: int = WINDOW
+    """The number of last returns over which predictions of them are assessed."""
     scale_rewards: bool = False
     """Whether training rewards are divided by the running root mean square of R/T."""
 
@@ -85,6 +91,7 @@ def credit_spec(
     max_steps: int,
     fixed_length: bool,
     scale_rewards: bool,
+    window: int = WINDOW,
 ) -> CreditSpec:
     """Return the spec of a method for one team. The arguments that a spec has too are described there.
 
@@ -109,6 +116,7 @@ def credit_spec(
         score_types=score_types,
         max_steps=max_steps,
         agents=agents,
+        window=window,
         scale_rewards=scale_rewards,
     )
 
@@ -117,7 +125,7 @@ def init_decoder(key: PRNGKeyArray, spec: CreditSpec) -> Decomposition | None:
     """Return an untrained decoder. Return None for a method that fits nothing."""
     if spec.method.reward is not Reward.PROXY:
         return None
-    sizes = {"max_steps": spec.max_steps, "n_agents": spec.agents}
+    sizes = {"max_steps": spec.max_steps, "n_agents": spec.agents, "window": spec.window}
     return decomposition.init(key, spec.basis, spec.method, spec.settings, score_types=spec.score_types, **sizes)
 
 
@@ -132,6 +140,10 @@ class StepBatch(NamedTuple):
     """R/T of the step's episode."""
     finished: Bool[Array, "*batch"]
     """Whether the step's episode has ended."""
+    last: Bool[Array, "*batch"] | None = None
+    """Whether the step is the last one of an episode that has ended. Only for `exact`."""
+    residual: Float[Array, "*batch"] | None = None
+    """R of the step's episode, less the sum of its proxy rewards; 0 if that is unknown. Only for `exact`."""
 
 
 def proxy_rewards(
@@ -166,9 +178,20 @@ def training_rewards(
 ) -> Float[Array, "*batch team"]:
     """Return the rewards that an algorithm is trained on, for each agent of the team. `alive` says which agents acted."""
     r_hat = jnp.broadcast_to(proxy_rewards(decoder, scale, steps, spec, optimistic=True), alive.shape)
+    if steps.residual is not None:
+        r_hat = r_hat + _correction(steps, spec.settings.exact)[..., None]
     if spec.method.shared:
         r_hat = jnp.broadcast_to(alive_mean(r_hat, alive)[..., None], alive.shape)
     return scale_and_mask(r_hat, scale, alive, scale_rewards=spec.scale_rewards)
+
+
+def _correction(steps: StepBatch, exact: str) -> Float[Array, "*batch"]:
+    """Return what is added to each step's proxy reward, so that those of an episode add up to its return."""
+    assert steps.residual is not None
+    assert steps.last is not None
+    if exact == "spread":
+        return steps.residual / steps.length
+    return jnp.where(steps.last, steps.residual, 0)
 
 
 def scale_and_mask(

@@ -57,13 +57,13 @@ class Fit(StrEnum):
         """The names of the `CreditSettings` that the fit reads."""
         match self:
             case Fit.DECODER_LOSS:
-                names = {"episodes"}
+                names = {"episodes", "exact"}
             case Fit.EVIDENCE:
-                names = {"score", "optimism"}
+                names = {"score", "optimism", "exact"}
             case Fit.SIGNS:
-                names = set()
+                names = {"exact"}
             case _:
-                names = {"score", "sum_form", "steps"} | ({"drawn_steps"} if self.samples_steps else set())
+                names = {"score", "sum_form", "steps", "exact"} | ({"drawn_steps"} if self.samples_steps else set())
         return frozenset(names if self.closed_form else names | {"learning_rate", "weight_decay", "normalise"})
 
 

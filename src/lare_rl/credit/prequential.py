@@ -12,10 +12,12 @@ from typing import NamedTuple
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-__all__ = ["WINDOW", "Predictions", "add_predictions", "empty_predictions", "r2", "squared_errors"]
+__all__ = ["SEGMENT_WINDOW", "WINDOW", "Predictions", "add_predictions", "empty_predictions", "r2", "squared_errors"]
 
 WINDOW = 32
 """R^2 is computed over this number of last episodes."""
+SEGMENT_WINDOW = 256
+"""The same for payments, if there are several in an episode."""
 MIN_R2_EPISODES = 8
 """With fewer episodes, R^2 is NaN."""
 
@@ -29,9 +31,9 @@ class Predictions(NamedTuple):
     predicted: Float[Array, "window decoders"]
 
 
-def empty_predictions(n_decoders: int) -> Predictions:
+def empty_predictions(n_decoders: int, window: int = WINDOW) -> Predictions:
     """Return the state before the first prediction."""
-    return Predictions(jnp.zeros(()), jnp.zeros(WINDOW), jnp.zeros((WINDOW, n_decoders)))
+    return Predictions(jnp.zeros(()), jnp.zeros(window), jnp.zeros((window, n_decoders)))
 
 
 def add_predictions(
@@ -40,9 +42,10 @@ def add_predictions(
     predicted: Float[Array, "episodes decoders"],
     mask: Bool[Array, " episodes"],
 ) -> Predictions:
-    """Add new episodes, at most `WINDOW` of them. Episodes where `mask` is false are ignored."""
-    slot = (predictions.n_episodes.astype(jnp.int32) + jnp.cumsum(mask) - 1) % WINDOW
-    slot = jnp.where(mask, slot, WINDOW)  # an index out of bounds, which is dropped
+    """Add new episodes, at most as many as the window has. Episodes where `mask` is false are ignored."""
+    window = len(predictions.returns)
+    slot = (predictions.n_episodes.astype(jnp.int32) + jnp.cumsum(mask) - 1) % window
+    slot = jnp.where(mask, slot, window)  # an index out of bounds, which is dropped
     return Predictions(
         predictions.n_episodes + jnp.sum(mask),
         predictions.returns.at[slot].set(returns.astype(jnp.float32), mode="drop"),
@@ -52,14 +55,14 @@ def add_predictions(
 
 def squared_errors(predictions: Predictions) -> Float[Array, " decoders"]:
     """Return sum_k (R_k - R_hat_k)^2 of each decoder."""
-    valid = jnp.arange(WINDOW) < predictions.n_episodes
+    valid = jnp.arange(len(predictions.returns)) < predictions.n_episodes
     errors = (predictions.returns[:, None] - predictions.predicted) ** 2
     return jnp.sum(jnp.where(valid[:, None], errors, 0), axis=0)
 
 
 def r2(predictions: Predictions) -> Float[Array, " decoders"]:
     """Return R^2 of each decoder, or NaN if there are too few episodes or all returns are equal."""
-    valid = jnp.arange(WINDOW) < predictions.n_episodes
+    valid = jnp.arange(len(predictions.returns)) < predictions.n_episodes
     count = jnp.sum(valid)
     mean = jnp.sum(jnp.where(valid, predictions.returns, 0)) / jnp.maximum(count, 1)
     total = jnp.sum(jnp.where(valid, (predictions.returns - mean) ** 2, 0))

@@ -35,6 +35,7 @@ __all__ = [
     "is_stale",
     "predict",
     "predict_then_update",
+    "predicted_returns",
     "reset_statistics",
     "reward_std",
 ]
@@ -66,13 +67,11 @@ def predict_then_update(state: Decomposition, episodes: CreditBatch, settings: C
 def predict(state: Decomposition, episodes: CreditBatch, settings: CreditSettings) -> Decomposition:
     """Store the returns of episodes, and the decoder's predictions of them before it is fitted to these episodes.
 
-    There may be at most `prequential.WINDOW` episodes. Episodes with mask 0 are ignored. Before the first fit, all are ignored.
+    There may be at most as many episodes as the window of `state.predictions` has. Episodes with mask 0 are ignored, and before the
+    first fit all of them.
     """
-    is_new = episodes.mask > 0
-    returns, n_episodes = episodes.mean_reward * episodes.length, len(episodes.length)
-    row_length = episodes.length[jnp.clip(episodes.episode_index, 0, n_episodes - 1)]
-    r_hat = agent_mean(decoder_rewards(state, episodes.inputs, settings, row_length), episodes.alive)
-    predicted = jax.ops.segment_sum(r_hat, episodes.episode_index, n_episodes)[:, None]
+    is_new, returns = episodes.mask > 0, episodes.mean_reward * episodes.length
+    predicted = predicted_returns(state, episodes, settings)[:, None]
     predictions = add_predictions(state.predictions, returns, predicted, is_new & is_fitted(state))
     state = state._replace(predictions=predictions)
     if state.score_type_predictions is None or state.closed_form is None:
@@ -83,6 +82,16 @@ def predict(state: Decomposition, episodes: CreditBatch, settings: CreditSetting
     was_fitted = state.closed_form.n_fitted > 1
     predictions = add_predictions(state.score_type_predictions, returns, predicted, is_new & was_fitted)
     return state._replace(score_type_predictions=predictions)
+
+
+def predicted_returns(
+    state: Decomposition, episodes: CreditBatch, settings: CreditSettings
+) -> Float[Array, " episodes"]:
+    """Return the sum of each episode's proxy rewards, which are the mean over the agents that are alive."""
+    n_episodes = len(episodes.length)
+    row_length = episodes.length[jnp.clip(episodes.episode_index, 0, n_episodes - 1)]
+    r_hat = agent_mean(decoder_rewards(state, episodes.inputs, settings, row_length), episodes.alive)
+    return jax.ops.segment_sum(r_hat, episodes.episode_index, n_episodes)
 
 
 def _mean_features(decoder: LinearDecoder, episodes: CreditBatch) -> Float[Array, "episodes features"]:

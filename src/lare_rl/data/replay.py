@@ -12,10 +12,15 @@ The caller chooses the columns: those that the algorithm and the decoder read. `
 row; the last row of an episode begins no transition. The numbers of rows, transitions and episodes count up from 0 without
 end, and each is stored at its number modulo the capacity. When no row is free, the oldest episode is removed. Every
 environment has its own rows. Everything here is for one seed; callers `vmap`.
+
+An environment that pays before the end of an episode has *segments*: each holds the steps that one payment is for. They are stored
+in the same form as episodes. `by_payment` returns the replay with its segments in place of its episodes, so that all functions
+that read episodes read segments.
 """
 
 from collections.abc import Mapping
-from typing import NamedTuple
+from functools import partial
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -23,11 +28,27 @@ import numpy as np
 from jax.typing import DTypeLike
 from jaxtyping import Array, Bool, Float, Int
 
+from lare_rl.tasks.payments import PAID_AT_END, PaymentRule, is_paid
+
 STEP_COLUMNS = ("observation", "state", "available", "alive")
 """Columns that exist before and after a step. The values after a step are in the next row."""
 
 Columns = Mapping[str, Array]
 """Arrays with rows first, by name."""
+
+
+class Segments(NamedTuple):
+    """The steps between payments. Each field but the last has the name and the form of the field of `Replay` for episodes."""
+
+    episode: Int[Array, "envs rows"]
+    first: Int[Array, "envs segments"]
+    episode_return: Float[Array, "envs segments teams"]
+    oldest: Int[Array, " envs"]
+    episodes: Int[Array, " envs"]
+    running: Bool[Array, " envs"]
+    first_paid: Int[Array, "envs segments"]
+    """Number of the first transition that the payment is for."""
+    predicted_return: Float[Array, "envs segments teams"] | None = None
 
 
 class Replay(NamedTuple):
@@ -52,6 +73,12 @@ class Replay(NamedTuple):
     """Episodes ever finished; also the number of the running one."""
     running: Bool[Array, " envs"]
     """Whether an episode has begun and not ended."""
+    first_paid: Int[Array, "envs episodes"] | None = None
+    """Number of the first transition that a payment is for. None means the first one of the episode."""
+    predicted_return: Float[Array, "envs episodes teams"] | None = None
+    """Sum of an episode's proxy rewards, or NaN if it has not been computed. None if nobody asks for it."""
+    segments: Segments | None = None
+    """None if each episode is paid once, at its end."""
 
 
 class Index(NamedTuple):
@@ -69,24 +96,48 @@ class StoredSteps(NamedTuple):
     next_columns: dict[str, Array]
     """The columns of `STEP_COLUMNS` that are stored, after the step."""
     episodic_reward: Float[Array, "*batch teams"]
-    """The whole return at the last step of a finished episode, else 0."""
+    """The whole return at the last step of a finished episode, else 0. With payments before the end, what is paid at this step.
+
+    Segments then take the place of episodes in the fields below, too."""
     mean_reward: Float[Array, "*batch teams"]
     """R/T of the step's episode; if it has not finished, of its steps so far."""
     finished: Bool[Array, "*batch"]
     """Whether the step's episode has finished."""
     last: Bool[Array, "*batch"]
     """Whether the step is the last one of a finished episode."""
+    residual: Float[Array, "*batch teams"] | None
+    """The return of the step's episode, less the sum of its proxy rewards; 0 if that is unknown. None if nobody asks for it."""
     length: Int[Array, "*batch"]
     """Steps of its episode; if that has not finished, at least the mean length of the finished ones."""
 
 
-def init_replay(columns: Mapping[str, jax.ShapeDtypeStruct], envs: int, capacity: int, teams: int) -> Replay:
+def init_replay(
+    columns: Mapping[str, jax.ShapeDtypeStruct],
+    envs: int,
+    capacity: int,
+    teams: int,
+    payments: PaymentRule = PAID_AT_END,
+    with_predictions: bool = False,
+) -> Replay:
     """Return an empty replay. `columns` are the shapes of a single row."""
     episodes = capacity // 2 + 1  # the shortest episode takes two rows; one more is running
 
     def zeros(*shape: int, dtype: DTypeLike = jnp.int32) -> Array:
         return jnp.zeros((envs, *shape), dtype)
 
+    def unknown(*shape: int) -> Array | None:
+        return jnp.full((envs, *shape), jnp.nan, jnp.float32) if with_predictions else None
+
+    segments = Segments(
+        episode=zeros(capacity),
+        first=zeros(capacity),
+        episode_return=zeros(capacity, teams, dtype=jnp.float32),
+        oldest=zeros(),
+        episodes=zeros(),
+        running=zeros(dtype=bool),
+        first_paid=zeros(capacity),
+        predicted_return=unknown(capacity, teams),
+    )
     return Replay(
         columns={name: zeros(capacity, *row.shape, dtype=row.dtype) for name, row in columns.items()},
         row=zeros(capacity),
@@ -98,7 +149,21 @@ def init_replay(columns: Mapping[str, jax.ShapeDtypeStruct], envs: int, capacity
         oldest=zeros(),
         episodes=zeros(),
         running=zeros(dtype=bool),
+        predicted_return=unknown(episodes, teams) if payments.only_at_end else None,
+        segments=None if payments.only_at_end else segments,
     )
+
+
+def by_payment(replay: Replay) -> Replay:
+    """Return the replay with its segments in place of its episodes. With one payment for each episode, return it unchanged."""
+    return replay if replay.segments is None else replay._replace(**replay.segments._asdict(), segments=None)
+
+
+def set_predicted_returns(replay: Replay, predicted: Float[Array, "*seeds envs episodes teams"] | None) -> Replay:
+    """Return the replay with these predicted returns of its episodes or, if it has segments, of its segments."""
+    if replay.segments is None:
+        return replay._replace(predicted_return=predicted)
+    return replay._replace(segments=replay.segments._replace(predicted_return=predicted))
 
 
 def capacity(replay: Replay) -> int:
@@ -129,6 +194,7 @@ def extend(
     next_columns: Mapping[str, Array | np.ndarray],
     team_reward: Float[Array | np.ndarray, "time envs teams"],
     ended: Bool[Array | np.ndarray, "time envs"],
+    payments: PaymentRule = PAID_AT_END,
 ) -> Replay:
     """Store consecutive steps.
 
@@ -138,9 +204,11 @@ def extend(
         next_columns: the columns of `STEP_COLUMNS`, after the steps.
         team_reward: the true reward of each team.
         ended: whether a step was the last of its episode.
+        payments: when the environment pays.
     """
     lead = jax.tree.map(jnp.asarray, (dict(columns), dict(next_columns), team_reward, ended))
-    return jax.vmap(_extend_env)(replay, *jax.tree.map(lambda rows: jnp.swapaxes(rows, 0, 1), lead))
+    extend_env = jax.vmap(partial(_extend_env, payments=payments))
+    return extend_env(replay, *jax.tree.map(lambda rows: jnp.swapaxes(rows, 0, 1), lead))
 
 
 def required_capacity(steps: int, longest: int) -> int:
@@ -154,34 +222,80 @@ def _extend_env(
     next_columns: Columns,
     team_reward: Float[Array, "time teams"],
     ended: Bool[Array, " time"],
+    payments: PaymentRule,
 ) -> Replay:
     """Store the steps of one environment, all at once. Remove the oldest episodes if their rows are needed."""
-    rows, slots, steps = replay.row.shape[0], replay.first.shape[0], ended.shape[0]
-    n_ended = jnp.cumsum(ended)
-    earlier = n_ended - ended  # episodes that have ended before each step
-    row = replay.next_row + jnp.arange(steps) + earlier
-    number, episode = replay.transitions + jnp.arange(steps), replay.episodes + earlier
+    rows, steps = replay.row.shape[0], ended.shape[0]
+    row = replay.next_row + jnp.arange(steps) + jnp.cumsum(ended) - ended
+    number = replay.transitions + jnp.arange(steps)
     oldest = _remove_oldest(replay, row[-1] + 1)
-    is_first = jnp.append(~replay.running, ended[:-1])
-    slot = episode % slots
-    first_slot = jnp.where(is_first, slot, slots)  # other steps get an index out of range, which is dropped
     stored = dict(replay.columns)
     for name, values in next_columns.items():  # first, because the next step of the same episode overwrites the row
         stored[name] = stored[name].at[(row + 1) % rows].set(values)
     for name, values in columns.items():
         stored[name] = stored[name].at[row % rows].set(values)
-    return Replay(
+    episodes = _extend_episodes(replay, number, team_reward, ended)
+    new = replay._replace(
         columns=stored,
         row=replay.row.at[number % rows].set(row),
-        episode=replay.episode.at[number % rows].set(episode),
-        first=replay.first.at[first_slot].set(number, mode="drop"),
-        episode_return=replay.episode_return.at[first_slot].set(0, mode="drop").at[slot].add(team_reward),
         next_row=row[-1] + 1 + ended[-1],
         transitions=replay.transitions + steps,
         oldest=oldest,
-        episodes=replay.episodes + n_ended[-1],
-        running=~ended[-1],
+        **episodes,
     )
+    return (
+        new
+        if replay.segments is None
+        else new._replace(segments=_extend_segments(new, replay.segments, team_reward, ended, payments))
+    )
+
+
+def _extend_episodes(
+    replay: Replay | Segments,
+    number: Int[Array, " time"],
+    team_reward: Float[Array, "time teams"],
+    ended: Bool[Array, " time"],
+) -> dict[str, Any]:
+    """Return the changed fields of the episodes, or of the segments, of one environment after new steps."""
+    slots, n_ended = replay.first.shape[0], jnp.cumsum(ended)
+    episode = replay.episodes + n_ended - ended
+    is_first = jnp.append(~replay.running, ended[:-1])
+    slot = episode % slots
+    first_slot = jnp.where(is_first, slot, slots)  # other steps get an index out of range, which is dropped
+    predicted = replay.predicted_return
+    return {
+        "episode": replay.episode.at[number % replay.episode.shape[0]].set(episode),
+        "first": replay.first.at[first_slot].set(number, mode="drop"),
+        "episode_return": replay.episode_return.at[first_slot].set(0, mode="drop").at[slot].add(team_reward),
+        "episodes": replay.episodes + n_ended[-1],
+        "running": ~ended[-1],
+        "predicted_return": None if predicted is None else predicted.at[first_slot].set(jnp.nan, mode="drop"),
+    }
+
+
+def _extend_segments(
+    replay: Replay,
+    segments: Segments,
+    team_reward: Float[Array, "time teams"],
+    ended: Bool[Array, " time"],
+    payments: PaymentRule,
+) -> Segments:
+    """Return the segments of one environment after new steps, which are already part of the replay's episodes."""
+    rows, slots = replay.row.shape[0], segments.first.shape[0]
+    number = replay.transitions - len(ended) + jnp.arange(len(ended))
+    begin = replay.first[replay.episode[number % rows] % replay.first.shape[0]]
+    pays = is_paid(payments, number - begin, team_reward, ended)
+    new = segments._replace(**_extend_episodes(segments, number, team_reward, pays))
+    slot = new.episode[number % rows] % slots
+    first_paid = new.first[slot] if payments.window is None else jnp.maximum(number + 1 - payments.window, begin)
+    new = new._replace(first_paid=new.first_paid.at[jnp.where(pays, slot, slots)].set(first_paid, mode="drop"))
+    oldest_step = replay.first[replay.oldest % replay.first.shape[0]]
+
+    def is_removed(oldest: Int[Array, ""]) -> Bool[Array, ""]:
+        # The fields before the new steps, which may have overwritten these segments.
+        return (oldest < segments.episodes) & (segments.first_paid[oldest % slots] < oldest_step)
+
+    return new._replace(oldest=jax.lax.while_loop(is_removed, lambda oldest: oldest + 1, segments.oldest))
 
 
 def _remove_oldest(replay: Replay, last: Int[Array, ""]) -> Int[Array, ""]:
@@ -201,18 +315,29 @@ def abandon_running(replay: Replay, abandoned: Bool[Array, " envs"]) -> Replay:
     first = jnp.take_along_axis(replay.first, slot, axis=1)
     row = jnp.take_along_axis(replay.row, first % capacity(replay), axis=1)[:, 0]
     removed = abandoned & replay.running
+    segments = replay.segments
+    if segments is not None:
+        segment = jnp.take_along_axis(segments.episode, first % capacity(replay), axis=1)[:, 0]
+        segments = segments._replace(
+            episodes=jnp.where(removed, segment, segments.episodes), running=segments.running & ~removed
+        )
     return replay._replace(
         transitions=jnp.where(removed, first[:, 0], replay.transitions),
         next_row=jnp.where(removed, row, replay.next_row),
         running=replay.running & ~removed,
+        segments=segments,
     )
 
 
 def hide_newest(replay: Replay, count: Int[Array, "*seeds envs"]) -> Replay:
-    """Return the replay as if the newest finished episodes of each environment, `count` of them, were still running.
+    """Return the replay as if the newest payments of each environment, `count` of them, had not been made yet.
 
-    Nothing is removed: the same columns with the earlier `episodes` and `running` show these episodes again.
+    Nothing is removed: the same columns with the earlier `episodes`, `running` and `segments` show these episodes again.
     """
+    if replay.segments is not None:
+        segments = replay.segments
+        episodes, running = segments.episodes - count, segments.running | (count > 0)
+        return replay._replace(segments=segments._replace(episodes=episodes, running=running))
     return replay._replace(episodes=replay.episodes - count, running=replay.running | (count > 0))
 
 
@@ -223,6 +348,7 @@ def flatten_envs(values: Array) -> Array:
 
 def read(replay: Replay, index: Index) -> StoredSteps:
     """Read the transitions at this index."""
+    replay = by_payment(replay)
     rows = capacity(replay)
     slots = replay.first.shape[-1]
     first_row = index.env * rows
@@ -234,6 +360,10 @@ def read(replay: Replay, index: Index) -> StoredSteps:
     end, finished = end_of_episode(replay, index.env, episode), episode < replay.episodes[index.env]
     return_, length = flatten_envs(replay.episode_return)[slot], end - flatten_envs(replay.first)[slot]
     last = (index.number + 1 == end) & finished
+    residual = None
+    if replay.predicted_return is not None:
+        difference = return_ - flatten_envs(replay.predicted_return)[slot]
+        residual = jnp.where(finished[..., None] & jnp.isfinite(difference), difference, 0)
     mean_length = jnp.sum(replay.transitions) // jnp.maximum(jnp.sum(replay.episodes), 1)
     columns = {name: flatten_envs(values) for name, values in replay.columns.items()}
     return StoredSteps(
@@ -243,6 +373,7 @@ def read(replay: Replay, index: Index) -> StoredSteps:
         mean_reward=return_ / jnp.maximum(length, 1)[..., None],
         finished=finished,
         last=last,
+        residual=residual,
         length=jnp.where(finished, length, jnp.maximum(length, mean_length)),
     )
 

@@ -90,7 +90,7 @@ def get_episodes(replay: Replay, index: Index) -> EpisodeSample:
     slots = replay.first.shape[-1]
     episode = replay.oldest[index.env] + index.number
     slot = episode % slots + index.env * slots
-    first = flatten_envs(replay.first)[slot]
+    first = flatten_envs(replay.first if replay.first_paid is None else replay.first_paid)[slot]
     length = jnp.maximum(end_of_episode(replay, index.env, episode) - first, 1)
     has_episodes = jnp.sum(n_finished(replay)) > 0
     return EpisodeSample(

@@ -21,7 +21,7 @@ from jaxtyping import Array, Bool, Float, PRNGKeyArray
 from lare_rl.algorithms.registry import ALGORITHMS
 from lare_rl.credit.decoder_settings import CreditSettings, default_credit
 from lare_rl.credit.methods import Reward, find_method
-from lare_rl.data.replay import StoredSteps, required_capacity
+from lare_rl.data.replay import StoredSteps, by_payment, required_capacity
 from lare_rl.data.trajectory import Trajectory
 from lare_rl.envs.interface import EnvSpec, Team, Timestep, to_env_action
 from lare_rl.errors import LareError
@@ -117,6 +117,8 @@ def pure_credit(
         )
     if chosen.reward not in (Reward.PROXY, Reward.DESIGNED) or chosen.needs_whole_episodes:
         raise LareError(f"{method} does not compute the reward of a step from this step alone: use bayes or lare-bayes")
+    if settings is not None and settings.exact != "no":
+        raise LareError("pure_credit computes the reward of a step from this step alone: leave out the setting exact")
     if chosen.needs_phi and phi is None:
         raise LareError(f"{method} needs a latent function: phi=...")
     shape = (agents, action_size)
@@ -206,7 +208,7 @@ def _trajectory(steps: CreditSteps, config: TrainConfig) -> Trajectory:
 def _stored_steps(state: State, steps: Trajectory, factors: Array, config: TrainConfig) -> StoredSteps:
     """Return steps in the form of the replay's. Their episodes are as long as the finished ones on average."""
     columns, next_columns = replay_columns(steps, factors, config)
-    lead, buffer = steps.next_timestep.terminated.shape, state.replay
+    lead, buffer = steps.next_timestep.terminated.shape, by_payment(state.replay)
     length = jnp.sum(buffer.transitions) // jnp.maximum(jnp.sum(buffer.episodes), 1)
     zeros = jnp.zeros((*lead, 1))
     return StoredSteps(
@@ -216,6 +218,7 @@ def _stored_steps(state: State, steps: Trajectory, factors: Array, config: Train
         mean_reward=zeros,
         finished=jnp.zeros(lead, bool),
         last=jnp.zeros(lead, bool),
+        residual=None,
         length=jnp.broadcast_to(length, lead),
     )
 
@@ -250,10 +253,10 @@ def _refit(state: State, key: PRNGKeyArray, learn_returns: Callable[..., Any], c
     if not state.decoders:
         return state
     inputs = jax.tree.map(lambda leaf: leaf[None], (state.decoders, state.replay, state.n_learned))
-    decoders, n_learned = jax.tree.map(lambda leaf: leaf[0], learn_returns(*inputs))
+    decoders, n_learned, _ = jax.tree.map(lambda leaf: leaf[0], learn_returns(*inputs))
     state = state._replace(decoders=decoders, n_learned=n_learned)
     if not config.method.uses_gradient:
         return state
-    has_episode = jnp.any(state.replay.episodes > 0)
+    has_episode = jnp.any(by_payment(state.replay).episodes > 0)
     fitted = jax.lax.cond(has_episode, lambda: fit_repeatedly(state, key, config)[0], lambda: state.decoders)
     return state._replace(decoders=fitted)

@@ -12,8 +12,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from jaxtyping import Float
 
 from lare_rl.assigner.assigner import CreditAssigner
+from lare_rl.assigner.assigner_config import AssignerConfig
 from lare_rl.credit.decoder_settings import CreditSettings
 from lare_rl.credit.methods import Reward, find_method
 from lare_rl.envs.load import resolve_task
@@ -21,6 +23,7 @@ from lare_rl.errors import LareError
 from lare_rl.latent.function import LatentFunction
 from lare_rl.logs.episode import LoggedEpisode, RelabelledEpisode
 from lare_rl.logs.log import Log, open_log
+from lare_rl.tasks.payments import is_paid
 from lare_rl.tasks.spec import TaskSpec
 from lare_rl.util.findings import Finding, render
 from lare_rl.util.statistics import correlation, r_squared
@@ -288,10 +291,29 @@ def _compute_rewards(
             if episode.complete and next(is_held_out):
                 counts.returns.append(float(episode.reward.sum()))
                 counts.predictions.append(float(reward.sum(dtype=np.float64)))
+            if episode.complete and credit.config.is_exact:
+                reward = _make_exact(reward, episode.reward, credit.config)
             yield RelabelledEpisode(episode, reward)
             listener("write", counts.episodes, size[0])
     if (counts.episodes, counts.steps) != size:
         raise LareError(f"{log.name} changed while it was read: it had {size[0]} episodes, and now {counts.episodes}")
+
+
+def _make_exact(
+    r_hat: Float[np.ndarray, " steps"], reward: Float[np.ndarray, " steps"], config: AssignerConfig
+) -> Float[np.ndarray, " steps"]:
+    """Return proxy rewards that add up to each payment."""
+    corrected, start = r_hat.copy(), 0
+    for i in range(len(r_hat)):
+        if is_paid(config.payments, i, reward[i : i + 1], i == len(r_hat) - 1):
+            paid_for = slice(start, i + 1)
+            residual = reward[paid_for].sum() - r_hat[paid_for].sum(dtype=np.float64)
+            if config.settings.exact == "last":
+                corrected[i] += residual
+            else:
+                corrected[paid_for] += residual / (i + 1 - start)
+            start = i + 1
+    return corrected
 
 
 def _batches(episodes: Iterator[LoggedEpisode]) -> Iterator[list[LoggedEpisode]]:

@@ -7,6 +7,7 @@ from typing import Annotated, Any, Literal, TypeVar
 from pydantic import ConfigDict, Field, field_validator, model_validator
 
 from lare_rl.errors import CheckedModel, LareError
+from lare_rl.tasks.payments import PaymentRule
 
 __all__ = [
     "FILL_IN",
@@ -38,9 +39,25 @@ CreditScope = Literal["observation", "state"]
 PETTINGZOO_PREFIX = "pettingzoo/"
 """The prefix of the names of PettingZoo environments. The rest is MODULE:NAME."""
 
-SHARED_KEYS = ("environment", "arguments", "max_episode_steps", "credit_scope", "scored_observation")
+SHARED_KEYS = (
+    "environment",
+    "arguments",
+    "max_episode_steps",
+    "credit_scope",
+    "scored_observation",
+    "payments",
+    "paid_for",
+)
 """Keys that a team inherits from its task. The team's own file may repeat them, so that it can be used alone, but with the same
 values."""
+
+
+class PaidSteps(CheckedModel):
+    """The value of `paid_for` for payments that are for a fixed number of steps."""
+
+    steps: Annotated[int, Field(ge=1)]
+    """The number of last steps that a payment is for."""
+
 
 NO_ENVIRONMENT = "none"
 """The value of `environment` for a task with logs only, whose environment is not available."""
@@ -76,6 +93,11 @@ class TaskSpec(CheckedModel):
     score: Literal["sum", "average"] | None = None
     """Whether the return of an episode is a sum over its steps, or an average or grade that does not grow with its length. By
     default, training determines which of them predicts returns better."""
+    payments: Literal["end", "nonzero"] | Annotated[int, Field(ge=1)] = "end"
+    """When the environment pays: once, at the end of an episode; with every reward that is not 0; or every so many steps and at the
+    end. Rewards between payments are added up."""
+    paid_for: Literal["since_last"] | PaidSteps = "since_last"
+    """The steps that a payment is for: all steps since the last payment, or `{ steps = 20 }`, the last 20 steps."""
     measures: tuple[str, ...] = ()
     """Keys of the last step's `info` whose values are averaged and reported in addition to the return."""
     arguments: dict[str, Any] = Field(default_factory=dict)
@@ -125,6 +147,15 @@ class TaskSpec(CheckedModel):
     def environment_name(self) -> str:
         """The part of `environment` after the first slash."""
         return self.environment.partition("/")[2]
+
+    @property
+    def payment_rule(self) -> PaymentRule:
+        """When the environment pays, and for which steps."""
+        return PaymentRule(
+            period=self.payments if isinstance(self.payments, int) else None,
+            nonzero=self.payments == "nonzero",
+            window=self.paid_for.steps if isinstance(self.paid_for, PaidSteps) else None,
+        )
 
     @property
     def roles(self) -> tuple["TaskSpec", ...]:

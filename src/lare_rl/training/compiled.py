@@ -20,7 +20,7 @@ from lare_rl.phi.graph import Graph
 from lare_rl.training import episodes, off_policy, on_policy, sequences
 from lare_rl.training.compile_cache import cache_by_value
 from lare_rl.training.decoder_fits import fit_seeds
-from lare_rl.training.learner import Learner, init_learner, store
+from lare_rl.training.learner import Learner, init_learner, store, with_learned_returns
 from lare_rl.training.rewards import assess
 from lare_rl.training.static_config import TrainConfig
 from lare_rl.training.streams import seed_keys
@@ -120,8 +120,8 @@ def compile_functions(config: TrainConfig, phi: Sequence[Graph] = ()) -> Compile
 
     def learn_returns(learner: Learner) -> Learner:
         with float64():
-            decoders, n_learned = jax.block_until_ready(learn(learner.decoders, learner.replay, learner.n_learned))
-        return learner._replace(decoders=decoders, n_learned=n_learned)
+            learned = jax.block_until_ready(learn(learner.decoders, learner.replay, learner.n_learned))
+        return with_learned_returns(learner, *learned)
 
     return CompiledFunctions(
         init=jax.jit(init),

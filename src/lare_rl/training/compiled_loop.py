@@ -19,7 +19,7 @@ from lare_rl.training.collect_device import VecEnvState
 from lare_rl.training.compile_cache import cache_by_value
 from lare_rl.training.compiled import keys_shape, learner_shape, training_module
 from lare_rl.training.decoder_fits import fit_seeds
-from lare_rl.training.learner import Learner, store
+from lare_rl.training.learner import Learner, store, with_learned_returns
 from lare_rl.training.static_config import TrainConfig
 from lare_rl.training.streams import Stream, seed_keys, stream_keys
 
@@ -128,7 +128,8 @@ def _iterate(
     learner, is_finite = jax.vmap(partial(store, config=config, phi=phi))(state.learner, steps)
     if learner.decoders:
         learn = partial(_learn_returns, config=config)
-        learner = jax.lax.cond(jnp.any(steps.ended), learn, lambda unchanged: unchanged, learner)
+        is_paid = jnp.any(steps.ended) | (not config.payments.only_at_end)
+        learner = jax.lax.cond(is_paid, learn, lambda unchanged: unchanged, learner)
 
     def update(learner: Learner, measured: Measured) -> tuple[Learner, Measured]:
         if config.fits_separately:
@@ -163,5 +164,5 @@ def _record(measured: Measured, metrics: Metrics, is_new: Bool[Array, ""]) -> Me
 
 def _learn_returns(learner: Learner, config: TrainConfig) -> Learner:
     with jax.enable_x64(True):
-        decoders, n_learned = episodes.learn_returns(learner.decoders, learner.replay, learner.n_learned, config)
-    return learner._replace(decoders=decoders, n_learned=n_learned)
+        learned = episodes.learn_returns(learner.decoders, learner.replay, learner.n_learned, config)
+    return with_learned_returns(learner, *learned)

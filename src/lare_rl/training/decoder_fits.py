@@ -25,15 +25,16 @@ fewer make the matrix products inefficient. On one core, 256 episodes of six age
 
 def sample_credit(buffer: Replay, key: PRNGKeyArray, updates: int, config: TrainConfig) -> CreditSample | None:
     """Draw the steps that each of some updates of the decoders reads. Return None for a method without such updates."""
-    fit, settings, longest = config.method.fit, config.credit, config.env.max_steps
+    fit, settings, longest = config.method.fit, config.credit, config.longest_segment
     if fit is None or not config.method.uses_gradient:
         return None
+    buffer = replay.by_payment(buffer)
     if fit is Fit.DECODER_LOSS:
         return sample_padded(buffer, key, updates, settings.episodes, longest)
     if fit.samples_steps:
-        count = max(1, settings.steps // (longest if config.env.fixed_length else settings.drawn_steps))
+        count = max(1, settings.steps // (longest if config.has_fixed_segments else settings.drawn_steps))
         return sample_drawn(buffer, key, updates, count, min(settings.drawn_steps, longest))
-    if config.env.fixed_length:
+    if config.has_fixed_segments:
         return sample_padded(buffer, key, updates, max(1, settings.steps // longest), longest)
     return sample_packed(buffer, key, updates, settings.steps, longest)
 
@@ -58,7 +59,7 @@ def _update_decoder(
     assert config.method.fit is not None
     n_rows, n_episodes = batch.inputs[..., 0].size, len(batch.length)
     n_chunks = 1
-    if not config.batched and config.env.fixed_length and n_rows > CHUNK_ROWS:
+    if not config.batched and config.has_fixed_segments and n_rows > CHUNK_ROWS:
         chunk_episodes = max(1, CHUNK_ROWS * n_episodes // n_rows)
         divisors = (n for n in range(1, n_episodes + 1) if n_episodes % n == 0)
         n_chunks = min(n for n in divisors if n_episodes // n <= chunk_episodes)

@@ -58,6 +58,8 @@ def step_batch(steps: StoredSteps, config: TrainConfig, team_index: int) -> Step
         length=steps.length,
         mean_reward=steps.mean_reward[..., team_index],
         finished=steps.finished,
+        last=steps.last,
+        residual=None if steps.residual is None else steps.residual[..., team_index],
     )
 
 

@@ -13,41 +13,78 @@ from typing import TypeVar
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Int
+from jaxtyping import Array, Bool, Float, Int
 
-from lare_rl.credit import closed_form, prequential, returns
+from lare_rl.credit import closed_form, returns
 from lare_rl.credit.decomposition import CreditBatch, Decomposition
 from lare_rl.credit.methods import Fit
 from lare_rl.data import replay
-from lare_rl.data.replay import Replay
+from lare_rl.data.replay import Index, Replay
 from lare_rl.data.sampling import count_episodes_since, episodes_in_order
 from lare_rl.nn.leading_axis import map_leading_axis
 from lare_rl.training.decoder_inputs import episode_batch
 from lare_rl.training.static_config import TrainConfig
 
-__all__ = ["Decoders", "fold_episodes", "learn_returns"]
+__all__ = ["Decoders", "PredictedReturns", "fold_episodes", "learn_returns", "predict_returns"]
 
 MAX_ROWS = 8000
 """The most rows of decoder inputs that are read at a time, unless a single episode has more."""
 
 Decoders = tuple[Decomposition, ...]
+PredictedReturns = Float[Array, "*seeds envs episodes teams"] | None
 State = TypeVar("State")
 
 
 def learn_returns(
     decoders: Decoders, buffer: Replay, n_learned: Int[Array, "seeds envs"], config: TrainConfig
-) -> tuple[Decoders, Int[Array, "seeds envs"]]:
+) -> tuple[Decoders, Int[Array, "seeds envs"], PredictedReturns]:
     """Let the decoders learn from episodes that have finished. Every array has a leading seed axis.
 
     Returns:
-        The decoders of each team, and how many episodes they have learned from.
+        The decoders of each team, how many episodes they have learned from, and the predicted returns of the replay.
     """
+    buffer = replay.by_payment(buffer)
     n_before = jnp.sum(n_learned, axis=1)
     n_new = jnp.sum(buffer.episodes, axis=1) - n_before
     is_due = n_new >= jnp.maximum(returns.MIN_GROWTH * n_before, 1)
     learn = partial(_learn_if_due, buffer=buffer, n_learned=n_learned, is_due=is_due, config=config)
-    decoders = jax.lax.cond(jnp.any(is_due), learn, lambda unchanged: unchanged, decoders)
-    return decoders, jnp.where(is_due[:, None], buffer.episodes, n_learned).astype(n_learned.dtype)
+    learned = jax.lax.cond(jnp.any(is_due), learn, lambda unchanged: unchanged, decoders)
+    n_now = jnp.where(is_due[:, None], buffer.episodes, n_learned).astype(n_learned.dtype)
+    predicted = buffer.predicted_return
+    if predicted is not None and config.predicts_ahead:
+        # A new fit changes the proxy rewards of all episodes.
+        is_new = jax.vmap(_is_refitted)(decoders[0], learned[0])[:, None]
+        since = jnp.where(is_new, buffer.oldest, jnp.where(is_due[:, None], n_learned, buffer.episodes))
+        predicted = jax.vmap(partial(predict_returns, config=config))(learned, buffer, since)
+    return learned, n_now, predicted
+
+
+def _is_refitted(before: Decomposition, after: Decomposition) -> Bool[Array, ""]:
+    assert before.closed_form is not None
+    assert after.closed_form is not None
+    return before.closed_form.n_fitted != after.closed_form.n_fitted
+
+
+def predict_returns(
+    decoders: Decoders, buffer: Replay, since: Int[Array, " envs"], config: TrainConfig
+) -> Float[Array, "envs episodes teams"]:
+    """Return the predicted returns of the replay of one seed, with those of the episodes from `since` on computed anew."""
+    buffer = replay.by_payment(buffer)
+    rows, slots = buffer.row.shape[-1], buffer.first.shape[-1]
+
+    def body(state: tuple[Decomposition, Array], episodes: CreditBatch, first: Index) -> tuple[Decomposition, Array]:
+        decoder, predicted = state
+        # The last step of what is paid is in the episode itself, which the first one need not be.
+        last = first.number + episodes.length - 1
+        slot = buffer.episode[first.env, last % rows] % slots
+        slot = jnp.where(episodes.mask > 0, slot, slots)  # an index out of range, which is dropped
+        values = returns.predicted_returns(decoder, episodes, config.credit)
+        return decoder, predicted.at[first.env, slot].set(values.astype(predicted.dtype), mode="drop")
+
+    assert buffer.predicted_return is not None
+    states = tuple((decoder, buffer.predicted_return[..., i]) for i, decoder in enumerate(decoders))
+    states = _fold(states, buffer, since, body, config, None)
+    return jnp.stack([predicted for _, predicted in states], axis=-1)
 
 
 def _learn_if_due(
@@ -74,7 +111,7 @@ def fold_episodes(
     since: Int[Array, " envs"],
     body: Callable[[State, CreditBatch], State],
     config: TrainConfig,
-    expected: int = prequential.WINDOW,
+    expected: int | None = None,
 ) -> tuple[State, ...]:
     """Apply `body` to each team's state (such as its decoder) and to batches of the finished episodes of one seed.
 
@@ -84,17 +121,34 @@ def fold_episodes(
         since: the number of the first episode, in each environment.
         body: the function from a state and a batch of whole episodes to the next state.
         config: the configuration of the run.
-        expected: about how many episodes there are.
+        expected: about how many episodes there are; None if they may be many.
     """
-    longest, n_episodes = config.env.max_steps, prequential.WINDOW
-    rows = max(1, min(expected, n_episodes, MAX_ROWS // (config.credit_rows * longest))) * longest
+
+    def without_index(state: State, episodes: CreditBatch, first: Index) -> State:
+        return body(state, episodes)
+
+    return _fold(states, buffer, since, without_index, config, expected)
+
+
+def _fold(
+    states: tuple[State, ...],
+    buffer: Replay,
+    since: Int[Array, " envs"],
+    body: Callable[[State, CreditBatch, Index], State],
+    config: TrainConfig,
+    expected: int | None,
+) -> tuple[State, ...]:
+    """Do as `fold_episodes`, with a `body` that also gets the first step of each episode."""
+    buffer, longest, n_episodes = replay.by_payment(buffer), config.longest_segment, config.credit_window
+    rows = max(1, min(expected or n_episodes, n_episodes, MAX_ROWS // (config.credit_rows * longest))) * longest
     total = jnp.sum(count_episodes_since(buffer, since))
 
     def read_batch(carry: tuple[Int[Array, ""], tuple[State, ...]]) -> tuple[Int[Array, ""], tuple[State, ...]]:
         start, states = carry
         sample = episodes_in_order(buffer, since, start, n_episodes, rows)
         steps = replay.read(buffer, sample.steps)
-        states = tuple(body(state, episode_batch(steps, sample, config, i)) for i, state in enumerate(states))
+        first = sample.episodes.first
+        states = tuple(body(state, episode_batch(steps, sample, config, i), first) for i, state in enumerate(states))
         n_read = jnp.sum(sample.episodes.mask > 0)
         return start + jnp.maximum(n_read, 1), states  # an episode with too many steps is left out
 
@@ -105,7 +159,7 @@ def _predict_then_update(
     decoders: Decoders, buffer: Replay, since: Int[Array, " envs"], config: TrainConfig
 ) -> Decoders:
     body = partial(returns.predict_then_update, settings=config.credit)
-    expected = config.n_envs * config.rollout_steps // config.env.max_steps
+    expected = config.n_envs * config.rollout_steps // config.longest_segment
     return fold_episodes(decoders, buffer, since, body, config, expected)
 
 

@@ -14,8 +14,8 @@ import numpy as np
 from jaxtyping import Array, Float, Int, Key
 
 from lare_rl.credit import returns
-from lare_rl.credit.prequential import WINDOW, empty_predictions, squared_errors
-from lare_rl.data.replay import Replay, hide_newest, n_finished
+from lare_rl.credit.prequential import empty_predictions, squared_errors
+from lare_rl.data.replay import Replay, by_payment, hide_newest, n_finished
 from lare_rl.nn.masks import select
 from lare_rl.nn.normalise import root_mean_square
 from lare_rl.training.episodes import Decoders, fold_episodes
@@ -43,12 +43,12 @@ class FirstFitStoppedError(Exception):
 
 def has_enough_episodes(learner: Learner) -> bool:
     """Return whether every seed has episodes to hold out."""
-    return int(jnp.min(jnp.sum(jax.vmap(n_finished)(learner.replay), axis=1))) >= MIN_FIRST_EPISODES
+    return int(jnp.min(jnp.sum(jax.vmap(n_finished)(by_payment(learner.replay)), axis=1))) >= MIN_FIRST_EPISODES
 
 
 def config_of_first_fit(config: TrainConfig) -> TrainConfig:
     """Return the configuration of the first fit: updates read fewer steps, and at least an episode."""
-    steps = max(config.credit.steps // BATCH_DIVISOR, config.env.max_steps)
+    steps = max(config.credit.steps // BATCH_DIVISOR, config.longest_segment)
     return replace(config, credit=config.credit.model_copy(update={"steps": min(steps, config.credit.steps)}))
 
 
@@ -71,11 +71,12 @@ def fit_until_converged(
     Raises:
         FirstFitStoppedError: the user has asked the run to stop.
     """
-    episodes, running = jnp.copy(learner.replay.episodes), jnp.copy(learner.replay.running)
-    n_hidden = jax.vmap(_count_held_out)(learner.replay)
+    hidden_fields = {name: getattr(learner.replay, name) for name in ("episodes", "running", "segments")}
+    unhidden, n_seeds = jax.tree.map(jnp.copy, hidden_fields), len(learner.n_learned)
+    n_hidden = jax.vmap(partial(_count_held_out, window=config.credit_window))(by_payment(learner.replay))
     compute_error = jax.jit(jax.vmap(partial(_held_out_error, config=config)))
-    best_decoders, best_error = jax.tree.map(jnp.copy, learner.decoders), np.full(len(episodes), np.inf)
-    rounds_without_gain = np.zeros(len(episodes), int)
+    best_decoders, best_error = jax.tree.map(jnp.copy, learner.decoders), np.full(n_seeds, np.inf)
+    rounds_without_gain = np.zeros(n_seeds, int)
     metrics: dict[str, Float[Array, " seeds"]] = {}
     for number in range(MAX_FIT_CALLS):
         if stop_requested():
@@ -83,7 +84,7 @@ def fit_until_converged(
         round_keys = jax.vmap(jax.random.fold_in, in_axes=(0, None))(keys, number)
         learner, metrics = fit(learner._replace(replay=hide_newest(learner.replay, n_hidden)), round_keys)
         # Copies, because the next round consumes its learner.
-        full = learner.replay._replace(episodes=jnp.copy(episodes), running=jnp.copy(running))
+        full = learner.replay._replace(**jax.tree.map(jnp.copy, unhidden))
         learner = learner._replace(replay=full)
         error = np.asarray(compute_error(learner.decoders, full, n_hidden))
         # How long a seed is fitted does not depend on the other seeds.
@@ -96,10 +97,10 @@ def fit_until_converged(
     return learner._replace(decoders=best_decoders), metrics
 
 
-def _count_held_out(replay: Replay) -> Int[Array, " envs"]:
+def _count_held_out(replay: Replay, window: int) -> Int[Array, " envs"]:
     """Return how many of each environment's newest episodes are held out: a fifth of all, from the last environments first."""
     available = n_finished(replay)
-    count = jnp.minimum(jnp.sum(available) // 5, WINDOW)
+    count = jnp.minimum(jnp.sum(available) // 5, window)
     in_later_envs = jnp.cumsum(available[::-1])[::-1] - available
     return jnp.clip(count - in_later_envs, 0, available)
 
@@ -108,7 +109,8 @@ def _held_out_error(
     decoders: Decoders, replay: Replay, n_hidden: Int[Array, " envs"], config: TrainConfig
 ) -> Float[Array, ""]:
     """Return the squared error of the returns of held-out episodes, summed over the teams, each in units of its returns."""
-    decoders = tuple(decoder._replace(predictions=empty_predictions(1)) for decoder in decoders)
+    empty = empty_predictions(1, config.credit_window)
+    decoders, replay = tuple(decoder._replace(predictions=empty) for decoder in decoders), by_payment(replay)
     predict = partial(returns.predict, settings=config.credit)
     decoders = fold_episodes(decoders, replay, replay.episodes - n_hidden, predict, config)
     errors = [

@@ -34,6 +34,7 @@ __all__ = [
     "replay_columns",
     "store",
     "store_with_factors",
+    "with_learned_returns",
 ]
 
 
@@ -48,7 +49,7 @@ class Learner(NamedTuple):
     """The scale of each team's R/T."""
     replay: Replay
     n_learned: Int[Array, " envs"]
-    """Finished episodes of each environment that the decoders have learned from."""
+    """Payments of each environment that the decoders have learned from: finished episodes, if each is paid once."""
 
 
 def init_decoders(keys: Sequence[PRNGKeyArray], config: TrainConfig) -> tuple[Decomposition, ...]:
@@ -65,7 +66,9 @@ def init_learner(key: PRNGKeyArray, config: TrainConfig, init_algorithm: Callabl
         algorithm=init_algorithm(algorithm_key),
         decoders=init_decoders(keys, config),
         scale=tuple(empty_scale() for _ in config.env.teams),
-        replay=replay.init_replay(config.columns, config.n_envs, config.capacity, n_teams),
+        replay=replay.init_replay(
+            config.columns, config.n_envs, config.capacity, n_teams, config.payments, config.is_exact
+        ),
         n_learned=jnp.zeros(config.n_envs, jnp.int32),
     )
 
@@ -87,15 +90,16 @@ def store_with_factors(
 ) -> Learner:
     """Put new steps into the replay and into the running statistics."""
     columns, next_columns = replay_columns(steps, factors, config)
-    buffer = replay.extend(learner.replay, columns, next_columns, _team_rewards(steps, config), steps.ended)
-    ended = jnp.asarray(steps.ended)
-    new_steps = replay.read(buffer, replay.newest_steps(buffer, len(ended)))
+    buffer = replay.extend(
+        learner.replay, columns, next_columns, _team_rewards(steps, config), steps.ended, config.payments
+    )
+    new_steps = replay.read(buffer, replay.newest_steps(buffer, len(steps.ended)))
     new_steps = jax.tree.map(lambda rows: jnp.swapaxes(rows, 0, 1), new_steps)
     scales = tuple(
-        update_scale(scale, new_steps.mean_reward[..., i].ravel(), ended.ravel())
+        update_scale(scale, new_steps.mean_reward[..., i].ravel(), new_steps.last.ravel())
         for i, scale in enumerate(learner.scale)
     )
-    decoders = tuple(_observe(decoder, new_steps, ended, config, i) for i, decoder in enumerate(learner.decoders))
+    decoders = tuple(_observe(decoder, new_steps, config, i) for i, decoder in enumerate(learner.decoders))
     return learner._replace(decoders=decoders, scale=scales, replay=buffer)
 
 
@@ -120,16 +124,28 @@ def _team_rewards(steps: Trajectory, config: TrainConfig) -> Float[Array, "time 
     return jnp.stack(rewards, axis=-1)
 
 
-def _observe(
-    decoder: Decomposition, steps: StoredSteps, ended: Bool[Array, "time envs"], config: TrainConfig, team_index: int
-) -> Decomposition:
-    """Add new steps, and the episodes that ended in them, to the statistics of a team's decoder."""
+def _observe(decoder: Decomposition, steps: StoredSteps, config: TrainConfig, team_index: int) -> Decomposition:
+    """Add new steps, and the episodes that were paid in them, to the statistics of a team's decoder."""
     rows, mask = decoder_inputs(steps, config, team_index), row_mask(steps, config, team_index)
     decoder = decomposition.observe_steps(decoder, rows, mask)
     mean_reward = steps.mean_reward[..., team_index].ravel()
-    return decomposition.observe_returns(decoder, mean_reward, steps.length.ravel(), ended.ravel())
+    return decomposition.observe_returns(decoder, mean_reward, steps.length.ravel(), steps.last.ravel())
+
+
+def with_learned_returns(
+    learner: Learner,
+    decoders: tuple[Decomposition, ...],
+    n_learned: Int[Array, "*seeds envs"],
+    predicted: Float[Array, "*seeds envs episodes teams"] | None,
+) -> Learner:
+    """Return the learner with the results of `learn_returns`."""
+    buffer = replay.set_predicted_returns(learner.replay, predicted)
+    return learner._replace(decoders=decoders, n_learned=n_learned, replay=buffer)
 
 
 def abandon_episodes(learner: Learner, abandoned: Bool[Array, " envs"]) -> Learner:
     """Return the learner without the running episodes of some environments."""
-    return learner._replace(replay=replay.abandon_running(learner.replay, abandoned))
+    buffer = replay.abandon_running(learner.replay, abandoned)
+    # Payments of these episodes may have been learned from.
+    n_learned = jnp.minimum(learner.n_learned, replay.by_payment(buffer).episodes)
+    return learner._replace(replay=buffer, n_learned=n_learned)

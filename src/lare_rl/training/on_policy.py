@@ -12,7 +12,9 @@ from jaxtyping import Array, Float, Int, Key, PRNGKeyArray, Scalar, Shaped
 
 from lare_rl.algorithms.batches import Rollout
 from lare_rl.data import replay
+from lare_rl.data.replay import Replay
 from lare_rl.data.trajectory import Trajectory
+from lare_rl.training.episodes import predict_returns
 from lare_rl.training.learner import Learner
 from lare_rl.training.memoryless import get_actor, init_memory
 from lare_rl.training.rewards import RewardState, rewards
@@ -72,9 +74,19 @@ def _train_seed(
     return learner._replace(algorithm=state), metrics
 
 
+def _with_predicted_returns(learner: Learner, config: TrainConfig) -> Replay:
+    """Return the replay with the sums of proxy rewards of all episodes that end in the newest steps."""
+    buffer = replay.by_payment(learner.replay)
+    first = (buffer.transitions - config.rollout_steps) % replay.capacity(buffer)
+    since = jnp.take_along_axis(buffer.episode, first[:, None], axis=1)[:, 0]
+    predicted = predict_returns(learner.decoders, buffer, since, config)
+    return replay.set_predicted_returns(learner.replay, predicted)
+
+
 def _rollout(learner: Learner, steps: Trajectory, config: TrainConfig) -> Rollout:
     """Return the newest steps with the method's rewards. Each agent of each environment is one actor of the rollout."""
-    stored = replay.read(learner.replay, replay.newest_steps(learner.replay, config.rollout_steps))
+    buffer = _with_predicted_returns(learner, config) if config.is_exact else learner.replay
+    stored = replay.read(buffer, replay.newest_steps(buffer, config.rollout_steps))
     reward = rewards(stored, RewardState(learner.decoders, learner.scale), config)  # [envs time agents]
     n_agents, agents_leave = config.env.n_agents, config.env.agents_leave
 

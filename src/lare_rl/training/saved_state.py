@@ -52,6 +52,7 @@ def make_train_config(run: Run) -> TrainConfig:
         capacity=replay_rows(settings, env.max_steps),
         steps=settings.steps,
         fit_updates=settings.fit_updates,
+        payments=task.payment_rule,
     )
 
 

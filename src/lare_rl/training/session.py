@@ -147,7 +147,7 @@ class Session:
         self._check_factors()
         self.learner, is_finite = self.functions.store(self.learner, steps)
         self._unchecked = is_finite, steps
-        if self.learner.decoders and np.any(steps.ended):
+        if self.learner.decoders and (np.any(steps.ended) or not self.config.payments.only_at_end):
             self.learner = self.functions.learn_returns(self.learner)
 
     def _check_factors(self) -> None:

@@ -10,8 +10,10 @@ from lare_rl.algorithms.registry import Algorithm, AlgorithmSettings, Consumes, 
 from lare_rl.credit.decoder_settings import CreditSettings
 from lare_rl.credit.engine import CreditSpec, credit_spec
 from lare_rl.credit.methods import Method
+from lare_rl.credit.prequential import SEGMENT_WINDOW, WINDOW
 from lare_rl.credit.score_type import ScoreType
 from lare_rl.envs.interface import EnvSpec
+from lare_rl.tasks.payments import PAID_AT_END, PaymentRule
 from lare_rl.tasks.spec import CreditScope, ScoredObservation
 
 
@@ -44,6 +46,8 @@ class TrainConfig:
     batched: bool = False
     """Whether the device is faster with much work at once (`batching.py`): the fits of all seeds, and resets with every step. It
     changes the last bits of a fit."""
+    payments: PaymentRule = PAID_AT_END
+    """When the environment pays."""
     deterministic: bool = False
     """Whether a policy acts without noise outside training, even if its algorithm says otherwise."""
 
@@ -97,6 +101,31 @@ class TrainConfig:
         return self.method.uses_gradient and not self.joint_fit
 
     @property
+    def longest_segment(self) -> int:
+        """The largest number of steps that a payment is for: `max_steps`, if an episode is paid once, at its end."""
+        return self.payments.longest_segment(self.env.max_steps)
+
+    @property
+    def is_exact(self) -> bool:
+        """Whether the proxy rewards of an episode are corrected to add up to its return."""
+        return self.credit.exact != "no" and "exact" in self.method.settings
+
+    @property
+    def predicts_ahead(self) -> bool:
+        """Whether the sums of proxy rewards are computed after each fit. For rollouts, they are computed with each update."""
+        return self.is_exact and self.algorithm.consumes is not Consumes.ROLLOUTS
+
+    @property
+    def credit_window(self) -> int:
+        """The number of last payments over which predictions of them are assessed."""
+        return WINDOW if self.payments.only_at_end else SEGMENT_WINDOW
+
+    @property
+    def has_fixed_segments(self) -> bool:
+        """Whether all payments are for the same number of steps."""
+        return self.env.fixed_length and self.payments.is_regular(self.env.max_steps)
+
+    @property
     def observed_size(self) -> int:
         """Size of the observation or of the global state that credit is assigned by."""
         return self.env.state_size if self.team_level else self.env.observation_size
@@ -117,8 +146,9 @@ class TrainConfig:
                 scored_observation=self.scored_observation,
                 single_agent=env.n_agents == 1 and not self.team_level,
                 agents=1 if self.team_level else team.n_agents,
-                max_steps=env.max_steps,
-                fixed_length=env.fixed_length,
+                max_steps=self.longest_segment,
+                window=self.credit_window,
+                fixed_length=self.has_fixed_segments,
                 scale_rewards=self.scale_rewards,
             )
             for team, n_factors in zip(env.teams, self.n_factors or (0,) * len(env.teams), strict=True)

@@ -1,0 +1,52 @@
+"""When an environment pays, and for which steps."""
+
+from dataclasses import dataclass
+from typing import Any
+
+__all__ = ["PAID_AT_END", "PaymentRule", "is_paid"]
+
+
+@dataclass(frozen=True)
+class PaymentRule:
+    """When an environment pays. At the end of an episode it always pays."""
+
+    period: int | None = None
+    """It pays after this number of steps again and again."""
+    nonzero: bool = False
+    """Every reward that is not 0 is a payment."""
+    window: int | None = None
+    """A payment is for this number of last steps of its episode. None means all steps since the last payment."""
+
+    @property
+    def only_at_end(self) -> bool:
+        """Whether an episode is paid once, for all of its steps."""
+        return self == PAID_AT_END
+
+    def longest_segment(self, max_steps: int) -> int:
+        """Return the largest number of steps that a payment is for, in episodes of at most `max_steps` steps."""
+        longest = min(max_steps, self.period or max_steps) if self.window is None else self.window
+        return min(max_steps, longest)
+
+    def is_regular(self, max_steps: int) -> bool:
+        """Whether all payments of an episode of `max_steps` steps are for the same number of steps."""
+        return not self.nonzero and self.window is None and max_steps % (self.period or max_steps) == 0
+
+
+PAID_AT_END = PaymentRule()
+
+
+def is_paid(rule: PaymentRule, step: Any, team_reward: Any, ended: Any) -> Any:
+    """Return at which steps an environment pays. The arrays are of NumPy or of JAX.
+
+    Args:
+        rule: when it pays.
+        step: [*batch] the index of the step in its episode, from 0.
+        team_reward: [*batch teams] the rewards.
+        ended: [*batch] whether the episode ended with this step.
+    """
+    pays = ended
+    if rule.period is not None:
+        pays = pays | ((step + 1) % rule.period == 0)
+    if rule.nonzero:
+        pays = pays | (team_reward != 0).any(axis=-1)
+    return pays
