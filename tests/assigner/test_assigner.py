@@ -526,3 +526,37 @@ def test_team_with_one_reward():
     assert credit.rewards_at([0, -1]).shape == (2, 3)
     with pytest.raises(LareError, match=r"\(2, 2\).*\(steps, 3, 2\)"):
         credit.add(**ROWS)
+
+
+SCORES = {
+    "largest": lambda rows: rows[:, 0].max(),
+    "smallest": lambda rows: rows[:, 1].min(),
+    "last": lambda rows: rows[-1, 0],
+    "ever above": lambda rows: float((rows[:, 0] > 0.9).any()),
+    "sum": lambda rows: rows[:, 0].sum(),
+}
+"""Scores of the observations after the steps of an episode."""
+
+
+@pytest.mark.parametrize("score", SCORES)
+def test_must_learn_scores_that_are_no_sum(score):
+    """The history predicts new scores, and is worse than sums nowhere. The steps that make the score get the rewards."""
+    sums, history = small_assigner("bayes"), small_assigner("bayes-history")
+    episodes = random_episodes([12] * 60)
+    for credit in (sums, history):
+        for episode in episodes:
+            rows = credit.add_episode(*episode[:3], SCORES[score](episode.next_observation))
+    r2 = [credit.metrics()["credit/return_r2"] for credit in (sums, history)]
+    if score == "sum":
+        assert min(r2) > 0.95
+        return
+    assert r2[1] > max(0.4, r2[0] + 0.2)
+    r_hat = history.rewards_at(rows)
+    begins = np.arange(len(rows)) == 0
+    np.testing.assert_allclose(history.rewards(*episodes[-1][:3], begins=begins), r_hat, rtol=1e-4, atol=1e-5)
+    with pytest.raises(LareError, match="begins"):
+        history.rewards(*episodes[-1][:3])
+    if score == "largest":
+        levels = np.maximum.accumulate(episodes[-1].next_observation[:, 0])
+        raises = np.append(True, np.diff(levels) > 0.05)
+        assert r_hat[raises].mean() > r_hat[~raises].mean() + 0.02

@@ -78,6 +78,9 @@ EVERY_5 = PaymentRule(period=5)
     [
         ("lare-bayes", PHI_ENV, PAID_AT_END, "no"),
         ("rd-linear", ONE_AGENT, EVERY_5, "spread"),
+        ("bayes-history", ONE_AGENT, EVERY_5, "no"),
+        long_case("lare-bayes-history", PHI_ENV, PAID_AT_END, "no"),
+        long_case("bayes-history", ONE_TEAM, PAID_AT_END, "no"),
         long_case("rd-linear", ONE_AGENT, PAID_AT_END, "last"),
         long_case("rd-linear", ONE_TEAM, PAID_AT_END, "no"),
         long_case("ircr", ONE_AGENT, EVERY_5, "no"),

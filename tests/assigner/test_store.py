@@ -92,7 +92,7 @@ def test_payments_are_stored_as_episodes(rule, steps, scores):
     assert [episode.steps.tolist() for episode in stored] == steps
     assert [episode.score for episode in stored] == scores
     assert not step_by_step.running
-    assert [episode.score for episode in at_once.add_paid_episode(at_once.add(5), reward)] == scores
+    assert [episode.score for episode in at_once.add_paid_episode(at_once.add(5), reward, rule)] == scores
     np.testing.assert_array_equal(step_by_step.mean_reward, at_once.mean_reward)
     assert step_by_step.length[4] == len(steps[-1])
 

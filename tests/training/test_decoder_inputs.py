@@ -88,5 +88,7 @@ def test_store_keeps_the_steps(config):
             assert set(values) == set(expected_values)
             for name, column in values.items():
                 np.testing.assert_array_equal(column, expected_values[name])
+        elif values is None:
+            assert expected_values is None
         else:
             np.testing.assert_allclose(values, expected_values, rtol=1e-4, atol=1e-6)

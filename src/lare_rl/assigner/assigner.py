@@ -207,9 +207,9 @@ class CreditAssigner:
                 raise LareError(f"the score is {score}: give a finite number")
             step_ids = self.learner.add_steps(*steps, alive)
             if is_score:
-                self.learner.queue_episodes([self.store.add_episode(step_ids, score)])
-            else:
-                self.learner.queue_episodes(self.store.add_paid_episode(step_ids, rewards))
+                rewards[-1] = score
+            rule = PAID_AT_END if is_score else self.config.payments
+            self.learner.queue_episodes(self.store.add_paid_episode(step_ids, rewards, rule))
             self.learner.flush_large_queues()
             return step_ids
 
@@ -266,12 +266,13 @@ class CreditAssigner:
             return reward
 
     def rewards(
-        self, observation: Any, action: Any, next_observation: Any, *, length: Any = None
+        self, observation: Any, action: Any, next_observation: Any, *, length: Any = None, begins: Any = None
     ) -> Float[np.ndarray, "n *agents"]:
         """Return r_hat of any steps by the newest decoder: (n,), for many agents (n, agents). The steps are not stored.
 
         `length` is T of each step's episode, (n,): if a score is a mean over steps, r_hat is divided by T. The default is the mean
-        length of the episodes so far.
+        length of the episodes so far. `begins`, (n,), is true for the first step of each episode, if the steps are those of whole
+        episodes, in order. Only methods that read the history of an episode need it.
 
         Raises:
             LareError: the method pays by the return of the step's episode (`ircr`), or shapes do not fit.
@@ -282,6 +283,10 @@ class CreditAssigner:
         with self.lock:
             self.learner.learn_if_due()
             inputs = self.config.compute_inputs(*self.config.to_rows(observation, action, next_observation))
+            if self.config.spec.basis.n_tracked:
+                if begins is None:
+                    raise LareError(f"{method.name} reads the history of an episode: give begins, or call rewards_at")
+                inputs = self.config.add_history(inputs, to_flags(begins, "begins", len(inputs)))
             length = np.full(len(inputs), self.store.mean_length) if length is None else np.asarray(length, np.int32)
             if length.shape != (len(inputs),):
                 raise LareError(f"length has the shape {length.shape}: give one number for each of {len(inputs)} steps")

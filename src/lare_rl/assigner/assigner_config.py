@@ -14,6 +14,7 @@ from lare_rl.config.validity import check_credit
 from lare_rl.credit.decoder_settings import CreditSettings
 from lare_rl.credit.engine import CreditSpec, credit_spec
 from lare_rl.credit.explanation_text import raw_feature_names
+from lare_rl.credit.history import next_history
 from lare_rl.credit.input_names import input_arrays
 from lare_rl.credit.methods import Method
 from lare_rl.credit.prequential import SEGMENT_WINDOW, WINDOW
@@ -99,12 +100,27 @@ class AssignerConfig:
     def compute_inputs(
         self, observation: np.ndarray, action: np.ndarray, next_observation: np.ndarray
     ) -> Float[np.ndarray, "n *agents inputs"]:
-        """Compute the decoder's inputs for some steps, which are rows already. Raises `LareError` if a factor is not finite."""
+        """Compute the decoder's inputs for some steps, which are rows already, without their history.
+
+        Raises `LareError` if a factor is not finite.
+        """
         arrays = {"observation": observation, "action": action, "next_observation": next_observation}
         if self.phi is not None:
             arrays["factors"] = self.phi.step_factors(observation, action, next_observation, self.scored_observation)
-        inputs = input_arrays(self.spec.inputs, arrays)
+        names = tuple(name for name in self.spec.inputs if name != "history")
+        inputs = input_arrays(names, arrays)
         return np.concatenate(inputs, axis=-1) if inputs else observation[..., :0]
+
+    def add_history(
+        self, inputs: Float[np.ndarray, "n *agents inputs"], begins: Bool[np.ndarray, " n"]
+    ) -> Float[np.ndarray, "n *agents all_inputs"]:
+        """Return the inputs of successive steps with their history. `begins` is true for the first step of each episode."""
+        entries = inputs[..., : self.spec.basis.n_tracked]
+        history = np.full((*entries.shape[:-1], 3, entries.shape[-1]), np.nan, np.float32)
+        for i in np.flatnonzero(~begins):
+            if i:
+                history[i] = next_history(history[i - 1], entries[i - 1])
+        return np.concatenate([inputs, history.reshape(*entries.shape[:-1], -1)], axis=-1)
 
     def to_rows(
         self, observation: Any, action: Any, next_observation: Any

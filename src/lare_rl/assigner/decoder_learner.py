@@ -26,6 +26,7 @@ from lare_rl.assigner.store import Store, StoredEpisode
 from lare_rl.credit import closed_form, decomposition, prequential, returns
 from lare_rl.credit.decomposition import CreditBatch, Decomposition
 from lare_rl.credit.explanation import Explanation
+from lare_rl.credit.history import next_history
 from lare_rl.credit.methods import Fit, Reward
 from lare_rl.nn.normalise import Scale, empty_scale
 from lare_rl.util.float64 import float64
@@ -123,7 +124,9 @@ class DecoderLearner:
         all_inputs = [self.config.compute_inputs(*(rows[chunk] for rows in steps)) for chunk in chunks]
         for chunk, inputs in zip(chunks, all_inputs, strict=True):
             rows = step_ids[chunk] % self.store.capacity
-            self.store.inputs[rows] = inputs
+            self.store.inputs[rows, ..., : inputs.shape[-1]] = inputs
+            if self.config.spec.basis.n_tracked:
+                self._fill_history(step_ids[chunk])
             alive = np.ones(inputs.shape[:-1], bool) if self.store.alive is None else self.store.alive[rows]
             if self.decoder is not None:
                 self._pending_inputs.append((inputs, alive))
@@ -134,6 +137,20 @@ class DecoderLearner:
         self.n_pending_steps = 0
         if sum(len(inputs) for inputs, _ in self._pending_inputs) >= MAX_PENDING_STEPS:
             self.flush_statistics()
+
+    def _fill_history(self, step_ids: Int[np.ndarray, " n"]) -> None:
+        """Compute the history of steps, whose other inputs are stored. Earlier steps of their episodes have theirs."""
+        store, basis = self.store, self.config.spec.basis
+        rows, size = step_ids % store.capacity, basis.n_standardised
+        previous = store.previous[rows]
+        for row, step in zip(rows.tolist(), previous.tolist(), strict=True):
+            history = store.inputs[row, ..., size:]
+            if step < 0:
+                history[...] = np.nan
+                continue
+            before = store.inputs[step % store.capacity]
+            last = before[..., size:].reshape(*before.shape[:-1], 3, basis.n_tracked)
+            history[...] = next_history(last, before[..., : basis.n_tracked]).reshape(history.shape)
 
     def flush_statistics(self) -> None:
         """Add pending inputs to the running statistics, and pending returns to the scales."""
@@ -373,7 +390,8 @@ class DecoderLearner:
         """Explain the stored returns by the inputs. Return None for a method without a decoder, and without episodes."""
         if self.decoder is None or not self.store.episodes:
             return None
-        basis = replace(self.config.spec.basis, extended=True)
+        # Shares are of factors and raw features alone.
+        basis = replace(self.config.spec.basis, extended=True, n_tracked=0)
         if not basis.n_features:
             return None
         with on_cpu(), float64():

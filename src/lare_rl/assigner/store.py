@@ -64,6 +64,8 @@ class Store:
         """R/T of each step's episode."""
         self.episode = np.full(capacity, -1, np.int64)
         """The number of each step's episode; -1 before it is paid."""
+        self.previous = np.full(capacity, -1, np.int64)
+        """The number of the step before each step since the last payment; -1 for the first one."""
         self.steps = 0
         """The number of steps that were ever added."""
         self.episodes: dict[int, StoredEpisode] = {}
@@ -95,6 +97,7 @@ class Store:
             del self.episodes[heapq.heappop(self.oldest)[1]]
         self.length[step_ids % self.capacity] = 0
         self.episode[step_ids % self.capacity] = -1
+        self.previous[step_ids % self.capacity] = -1
         if self.alive is None and alive is not None:
             self.alive = np.ones((self.capacity, self.agents), bool)
         if self.alive is not None:
@@ -116,8 +119,7 @@ class Store:
         observation, _, next_observation = steps
         for i, env_id in enumerate(env_ids):
             episode = self.get_running(env_id, observation[i])
-            episode.steps.append(int(step_ids[i]))
-            episode.return_ += float(reward[i])
+            self._append(episode, int(step_ids[i]), float(reward[i]))
             episode.last_observation = next_observation[i]
             step, team_reward = len(episode.steps) - 1, np.reshape(reward[i], (1,))
             if is_paid(self.payments, step, team_reward, bool(ended[i])):
@@ -125,6 +127,12 @@ class Store:
                 if ended[i]:
                     del self.running[env_id]
                 yield payment
+
+    def _append(self, episode: RunningEpisode, step_id: int, reward: float) -> None:
+        if len(episode.steps) > episode.n_paid:
+            self.previous[step_id % self.capacity] = episode.steps[-1]
+        episode.steps.append(step_id)
+        episode.return_ += reward
 
     def find_running(self, env_id: Hashable) -> RunningEpisode:
         """Return the running episode of an environment. Raises `LareError` if there is none."""
@@ -180,14 +188,13 @@ class Store:
         return episode
 
     def add_paid_episode(
-        self, steps: Int[np.ndarray, " steps"], reward: Float[np.ndarray, " steps"]
+        self, steps: Int[np.ndarray, " steps"], reward: Float[np.ndarray, " steps"], payments: PaymentRule
     ) -> Iterator[StoredEpisode]:
         """Store an episode that has just ended, by the reward of each of its steps. Yield the steps of each payment."""
         episode = RunningEpisode()
         for i, step_id in enumerate(steps.tolist()):
-            episode.steps.append(step_id)
-            episode.return_ += float(reward[i])
-            if is_paid(self.payments, i, reward[i : i + 1], i == len(steps) - 1):
+            self._append(episode, step_id, float(reward[i]))
+            if is_paid(payments, i, reward[i : i + 1], i == len(steps) - 1):
                 yield self._pay(episode, episode.return_)
 
     def restore_episode(self, number: int, episode: StoredEpisode) -> None:

@@ -9,6 +9,11 @@ With u = (x - mean) / std over all steps, where x is a factor or a raw feature:
     shapes of raw features   as those of the factors
     pairs of raw features    as those of the factors, if there are at most 12 raw features
 
+    extremes of factors      h(M) - h(M'),  M = max of u_i up to the step, M' before it;  minima and last values likewise (`history.py`)
+
+If the history of the episode is an input, the last group has, for each factor, its largest, smallest and last value, with h(M) = M and
+the shapes of M. Without factors, the raw features are tracked instead.
+
 Shapes are the first terms of the Fourier series of a function of one number, within four standard deviations of its mean.
 They can express "more is better up to this value", "near this value" or "beyond this value". Pairs express interactions, such as
 price times power. The returns decide which groups are needed (`evidence.py`).
@@ -23,7 +28,18 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-__all__ = ["HALF_PERIOD", "MAX_RAW_FEATURES", "N_FREQUENCIES", "Basis", "expand", "fourier_terms", "pair_products"]
+from lare_rl.credit.history import next_history
+
+__all__ = [
+    "HALF_PERIOD",
+    "MAX_RAW_FEATURES",
+    "N_FREQUENCIES",
+    "Basis",
+    "expand",
+    "expand_history",
+    "fourier_terms",
+    "pair_products",
+]
 
 N_FREQUENCIES = 3
 """The number of frequencies of a shape."""
@@ -31,6 +47,8 @@ HALF_PERIOD = 4.0
 """Shapes are constant beyond this number of standard deviations from the mean."""
 MAX_FEATURES = 512
 """The maximum number of features. If the shapes of raw features would exceed it, these get fewer frequencies, or none."""
+MAX_HISTORY_FEATURES = 192
+"""The maximum number of shapes of largest, smallest and last values."""
 MAX_PAIRED_RAW_FEATURES = 12
 """With more raw features, there are no pairs of them, because the number of pairs grows with the square."""
 MAX_RAW_FEATURES = 1024
@@ -45,10 +63,17 @@ class Basis:
     n_raw: int
     extended: bool
     """Whether shapes and pairs are added to the inputs."""
+    n_tracked: int = 0
+    """The number of first inputs whose history follows them in a row: all factors or, without factors, all raw features."""
 
     @property
     def n_inputs(self) -> int:
         """The size of an input row."""
+        return self.n_standardised + 3 * self.n_tracked
+
+    @property
+    def n_standardised(self) -> int:
+        """The number of inputs of a row without its history."""
         return self.n_factors + self.n_raw
 
     @property
@@ -62,6 +87,9 @@ class Basis:
         if self.extended:
             sizes["shapes of raw features"] = 2 * self.raw_frequencies * self.n_raw_used
             sizes["pairs of raw features"] = _n_pairs(self.n_raw_paired)
+        for name in ("maxima", "minima", "last values"):
+            sizes[f"{name} of tracked inputs"] = self.n_tracked
+            sizes[f"shapes of {name} of tracked inputs"] = 2 * self.history_frequencies * self.n_tracked
         return {name: size for name, size in sizes.items() if size}
 
     @property
@@ -80,6 +108,11 @@ class Basis:
         n_factor_features = self.n_factors * (1 + 2 * N_FREQUENCIES) + _n_pairs(self.n_factors)
         n_free = max(0, MAX_FEATURES - n_factor_features - self.n_raw)
         return min(N_FREQUENCIES, n_free // max(1, 2 * self.n_raw))
+
+    @property
+    def history_frequencies(self) -> int:
+        """The number of frequencies of the shape of a largest, smallest or last value."""
+        return min(N_FREQUENCIES, MAX_HISTORY_FEATURES // max(1, 6 * self.n_tracked))
 
     @property
     def n_features(self) -> int:
@@ -113,6 +146,21 @@ def expand(basis: Basis, u: Float[Array, "*batch inputs"]) -> Float[Array, "*bat
         ],
         axis=-1,
     )
+
+
+def expand_history(
+    basis: Basis, u: Float[Array, "*batch tracked"], history: Float[Array, "*batch 3 tracked"]
+) -> Float[Array, "*batch features"]:
+    """Return by how much a step changes the functions of largest, smallest and last values. Both arguments are standardised."""
+    features = []
+    for before, after in zip(
+        jnp.unstack(history, axis=-2), jnp.unstack(next_history(history, u), axis=-2), strict=True
+    ):
+        is_first, before = jnp.isnan(before), jnp.nan_to_num(before)
+        features.append(after - jnp.where(is_first, 0, before))
+        shapes, shapes_before = (fourier_terms(values, basis.history_frequencies) for values in (after, before))
+        features.append(shapes - jnp.where(jnp.tile(is_first, 2 * basis.history_frequencies), 0, shapes_before))
+    return jnp.concatenate(features, axis=-1)
 
 
 def pair_products(u: Float[Array, "*batch inputs"]) -> Float[Array, "*batch features"]:

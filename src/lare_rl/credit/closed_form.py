@@ -26,7 +26,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
 from lare_rl.credit import evidence
-from lare_rl.credit.basis import Basis, expand
+from lare_rl.credit.basis import Basis, expand, expand_history
 from lare_rl.credit.decoder_network import DecoderOutput, DecoderShape
 from lare_rl.credit.decoder_settings import CreditSettings
 from lare_rl.credit.evidence import Posterior, PosteriorSpread, SufficientStatistics
@@ -74,8 +74,17 @@ class LinearDecoder(eqx.Module):
 
     def features(self, rows: Float[Array, "*batch inputs"]) -> Float[Array, "*batch features"]:
         """Return f(u)."""
+        size, n_tracked = self.basis.n_standardised, self.basis.n_tracked
         varies = self.std > 0
-        return expand(self.basis, jnp.where(varies, (rows - self.mean) / jnp.where(varies, self.std, 1), 0))
+        std = jnp.where(varies, self.std, 1)
+        features = expand(self.basis, jnp.where(varies, (rows[..., :size] - self.mean) / std, 0))
+        if not n_tracked:
+            return features
+        tracked, varies = slice(n_tracked), varies[:n_tracked]
+        history = rows[..., size:].reshape(*rows.shape[:-1], 3, n_tracked)
+        history = jnp.where(varies, (history - self.mean[tracked]) / std[tracked], 0)
+        u = jnp.where(varies, (rows[..., tracked] - self.mean[tracked]) / std[tracked], 0)
+        return jnp.concatenate([features, expand_history(self.basis, u, history)], axis=-1)
 
 
 class ClosedForm(NamedTuple):
@@ -108,8 +117,8 @@ def init(basis: Basis, n_score_types: int, *, with_spread: bool = False) -> Clos
     return ClosedForm(
         decoder=LinearDecoder(
             basis=basis,
-            mean=jnp.zeros(basis.n_inputs),
-            std=jnp.ones(basis.n_inputs),
+            mean=jnp.zeros(basis.n_standardised),
+            std=jnp.ones(basis.n_standardised),
             weight=jnp.zeros((n_score_types, n_features)),
             bias=jnp.zeros(n_score_types),
         ),

@@ -157,7 +157,7 @@ def init(
     return Decomposition(
         network=network,
         optimizer=init_adam(network, settings.learning_rate) if method.uses_gradient else (),
-        statistics=empty_mean_std(basis.n_inputs),
+        statistics=empty_mean_std(basis.n_standardised),
         scale=empty_scale(),
         return_scale=empty_scale(),
         is_mean=jnp.asarray(score_types == (ScoreType.MEAN,)),
@@ -184,7 +184,9 @@ def observe_steps(
 
     Steps where `mask` is false are ignored.
     """
-    rows = inputs.reshape(-1, inputs.shape[-1])
+    rows = inputs.reshape(-1, inputs.shape[-1])[
+        :, : len(state.statistics.mean)
+    ]  # a history has no statistics of its own
     mask = None if mask is None else mask.ravel()
     return state._replace(statistics=update_mean_std(state.statistics, rows, mask))
 

@@ -27,7 +27,7 @@ from lare_rl.credit.closed_form import ClosedForm
 from lare_rl.credit.decoder_settings import CreditSettings
 from lare_rl.credit.decomposition import CreditBatch, Decomposition
 from lare_rl.credit.explanation import Explanation, StepStatistics, add_steps, empty_step_statistics, explain
-from lare_rl.credit.input_names import input_size
+from lare_rl.credit.input_names import input_size, tracked_size
 from lare_rl.credit.methods import Method, Reward
 from lare_rl.credit.prequential import WINDOW
 from lare_rl.credit.returns import add_to_sums
@@ -76,8 +76,9 @@ class CreditSpec:
         """The features that a closed-form decoder computes from a row of inputs."""
         sizes = dict(self.sizes)
         n_factors = sizes["factors"] if "factors" in self.inputs else 0
-        n_raw = input_size(tuple(name for name in self.inputs if name != "factors"), sizes)
-        return Basis(n_factors, n_raw, extended=self.method.extended_basis)
+        n_raw = input_size(tuple(name for name in self.inputs if name not in ("factors", "history")), sizes)
+        n_tracked = tracked_size(self.inputs, sizes)
+        return Basis(n_factors, n_raw, extended=self.method.extended_basis, n_tracked=n_tracked)
 
 
 def credit_spec(

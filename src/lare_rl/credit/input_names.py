@@ -5,6 +5,7 @@
     action               a, as the policy's networks see it
     next_observation     s', after the action
     observation_change   s - s'
+    history              largest, smallest and last value of each tracked entry in the steps of the episode before (`history.py`)
     scored_observation   s, s' or both: the task's key of this name decides
 
 The size of a decoder's input, and the input itself in NumPy, in JAX and in an exported graph, all follow from this tuple. If credit
@@ -21,21 +22,27 @@ from lare_rl.tasks.spec import ScoredObservation, select_states
 __all__ = [
     "FACTORS",
     "FACTORS_AND_SCORED",
+    "FACTORS_SCORED_AND_HISTORY",
     "NEXT_OBSERVATION_ACTION",
     "OBSERVATION_ACTION",
     "RAW",
     "SCORED",
+    "SCORED_AND_HISTORY",
     "InputNames",
     "input_arrays",
     "input_size",
+    "tracked_size",
 ]
 
-_NAMES = ("factors", "observation", "action", "next_observation", "observation_change", "scored_observation")
+_NAMES = (
+    *("factors", "observation", "action", "next_observation", "observation_change", "scored_observation"),
+    "history",
+)
 
 
 @dataclass(frozen=True)
 class InputNames:
-    """What a decoder reads of a step. Raises `LareError` if a name is not one of the six above."""
+    """What a decoder reads of a step. `history` must come last. Raises `LareError` if a name is not one of those above."""
 
     names: tuple[str, ...]
     names_of_many_agents: tuple[str, ...] | None = None
@@ -77,12 +84,22 @@ NEXT_OBSERVATION_ACTION = InputNames(("next_observation", "action"))
 SCORED = InputNames(("scored_observation", "action"))
 FACTORS = InputNames(("factors",))
 FACTORS_AND_SCORED = InputNames(("factors", "scored_observation", "action"))
+SCORED_AND_HISTORY = InputNames(("scored_observation", "action", "history"))
+FACTORS_SCORED_AND_HISTORY = InputNames(("factors", "scored_observation", "action", "history"))
 
 
 def input_size(inputs: tuple[str, ...], sizes: Mapping[str, int]) -> int:
     """Return how many numbers the inputs have, by the sizes of `factors`, `observation` and `action`."""
     same_size = {"next_observation": "observation", "observation_change": "observation"}
-    return sum(sizes[same_size.get(name, name)] for name in inputs)
+    history = 3 * tracked_size(inputs, sizes)
+    return history + sum(sizes[same_size.get(name, name)] for name in inputs if name != "history")
+
+
+def tracked_size(inputs: tuple[str, ...], sizes: Mapping[str, int]) -> int:
+    """Return the number of entries whose history is an input: the factors or, without factors, all other inputs."""
+    if "history" not in inputs:
+        return 0
+    return sizes["factors"] if "factors" in inputs else input_size(inputs[:-1], sizes)
 
 
 def input_arrays(inputs: tuple[str, ...], step: Mapping[str, Any]) -> list[Any]:

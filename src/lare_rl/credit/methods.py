@@ -303,6 +303,22 @@ for _method in (
         decoder="additive",
     ),
     Method(
+        "bayes-history",
+        "as bayes, and on the changes of largest, smallest and last values: for scores that are no sum",
+        _BAYES,
+        inputs=input_names.SCORED_AND_HISTORY,
+        fit=Fit.EVIDENCE,
+        decoder="additive",
+    ),
+    Method(
+        "lare-bayes-history",
+        "as lare-bayes, and on the changes of largest, smallest and last factors: for scores that are no sum",
+        _BAYES,
+        inputs=input_names.FACTORS_SCORED_AND_HISTORY,
+        fit=Fit.EVIDENCE,
+        decoder="additive",
+    ),
+    Method(
         "lare-signs",
         "without a reward model: the sum of the factors, with the best signs",
         _LARE,

@@ -211,6 +211,15 @@ def extend(
     return extend_env(replay, *jax.tree.map(lambda rows: jnp.swapaxes(rows, 0, 1), lead))
 
 
+def set_newest(replay: Replay, name: str, values: Array) -> Replay:
+    """Return the replay with these values of a column, [time envs ...], for the newest steps."""
+    rows = capacity(replay)
+    env, number = newest_steps(replay, len(values))
+    row = replay.row[env, number % rows] % rows
+    column = replay.columns[name].at[env, row].set(jnp.swapaxes(values, 0, 1))
+    return replay._replace(columns={**replay.columns, name: column})
+
+
 def required_capacity(steps: int, longest: int) -> int:
     """Return how many rows an environment needs for `steps` new steps and the running episode before them, at most."""
     return 2 * steps + longest

@@ -38,6 +38,8 @@ def missing_reward_reason(method: Method) -> str | None:
         return f"{method.name} trains on the rewards of the environment"
     if method.reward is Reward.UNIFORM:
         return f"{method.name} takes the reward of a step from the return of its episode"
+    if method.inputs is not None and "history" in method.inputs.names:
+        return f"{method.name} takes the reward of a step from the history of its episode"
     if method.reward is Reward.PROXY and not DECODERS[method.decoder].exportable:
         return f"the decoder of {method.name} ({method.decoder}) cannot be exported"
     return None

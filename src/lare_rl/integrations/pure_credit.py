@@ -115,7 +115,8 @@ def pure_credit(
             f"phi reads observations and actions of the sizes {phi.sizes[0]} and {phi.sizes[1]}, not {observation_size} and "
             f"{action_size}"
         )
-    if chosen.reward not in (Reward.PROXY, Reward.DESIGNED) or chosen.needs_whole_episodes:
+    needs_episode = chosen.needs_whole_episodes or (chosen.inputs is not None and "history" in chosen.inputs.names)
+    if chosen.reward not in (Reward.PROXY, Reward.DESIGNED) or needs_episode:
         raise LareError(f"{method} does not compute the reward of a step from this step alone: use bayes or lare-bayes")
     if settings is not None and settings.exact != "no":
         raise LareError("pure_credit computes the reward of a step from this step alone: leave out the setting exact")

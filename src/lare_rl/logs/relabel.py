@@ -4,6 +4,7 @@ The log is read twice as a stream. The first pass shows the episodes to a `Credi
 and writes them.
 """
 
+import itertools
 import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
@@ -12,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
 from lare_rl.assigner.assigner import CreditAssigner
 from lare_rl.assigner.assigner_config import AssignerConfig
@@ -283,6 +284,7 @@ def _compute_rewards(
             np.concatenate([episode.action for episode in batch]),
             np.concatenate([episode.next_observation for episode in batch]),
             length=np.repeat(lengths, lengths),
+            begins=np.concatenate([_segment_begins(episode.reward, credit.config) for episode in batch]),
         )
         for episode, reward in zip(batch, np.split(r_hat, np.cumsum(lengths)[:-1]), strict=True):
             counts.episodes += 1
@@ -299,20 +301,25 @@ def _compute_rewards(
         raise LareError(f"{log.name} changed while it was read: it had {size[0]} episodes, and now {counts.episodes}")
 
 
+def _segment_begins(reward: Float[np.ndarray, " steps"], config: AssignerConfig) -> Bool[np.ndarray, " steps"]:
+    """Return which steps of an episode are the first ones of a payment."""
+    n_steps = len(reward)
+    pays = is_paid(config.payments, np.arange(n_steps), reward[:, None], np.arange(n_steps) == n_steps - 1)
+    return np.append(True, pays[:-1])
+
+
 def _make_exact(
     r_hat: Float[np.ndarray, " steps"], reward: Float[np.ndarray, " steps"], config: AssignerConfig
 ) -> Float[np.ndarray, " steps"]:
     """Return proxy rewards that add up to each payment."""
-    corrected, start = r_hat.copy(), 0
-    for i in range(len(r_hat)):
-        if is_paid(config.payments, i, reward[i : i + 1], i == len(r_hat) - 1):
-            paid_for = slice(start, i + 1)
-            residual = reward[paid_for].sum() - r_hat[paid_for].sum(dtype=np.float64)
-            if config.settings.exact == "last":
-                corrected[i] += residual
-            else:
-                corrected[paid_for] += residual / (i + 1 - start)
-            start = i + 1
+    starts = np.flatnonzero(_segment_begins(reward, config))
+    corrected = r_hat.copy()
+    for start, end in itertools.pairwise([*starts, len(r_hat)]):
+        residual = reward[start:end].sum() - r_hat[start:end].sum(dtype=np.float64)
+        if config.settings.exact == "last":
+            corrected[end - 1] += residual
+        else:
+            corrected[start:end] += residual / (end - start)
     return corrected
 
 

@@ -14,19 +14,25 @@ from lare_rl.data.replay import StoredSteps
 from lare_rl.data.sampling import CreditSample
 from lare_rl.training.static_config import TrainConfig
 
-__all__ = ["alive_agents", "decoder_inputs", "episode_batch", "row_mask", "step_batch"]
+__all__ = ["alive_agents", "decoder_inputs", "episode_batch", "row_mask", "step_batch", "tracked_inputs"]
 
 
 def decoder_inputs(steps: StoredSteps, config: TrainConfig, team_index: int) -> Float[Array, "*batch rows inputs"]:
     """Return the inputs of a team's decoder for some steps."""
+    return _read_inputs(steps, config, team_index, config.credit_specs[team_index].inputs)
+
+
+def _read_inputs(
+    steps: StoredSteps, config: TrainConfig, team_index: int, names: tuple[str, ...]
+) -> Float[Array, "*batch rows inputs"]:
     spec, agents = config.credit_specs[team_index], config.team_rows(team_index)
-    if not spec.inputs:
+    if not names:
         return jnp.zeros((*steps.finished.shape, spec.agents, 0))
     columns, next_columns = steps.columns, steps.next_columns
     arrays = {}
-    if "factors" in spec.inputs:
+    if "factors" in names:
         arrays["factors"] = columns["factors"][..., agents, : config.n_factors[team_index]]
-    if "action" in spec.inputs:
+    if "action" in names:
         # A Gaussian may choose an action beyond the bounds. The environment then used the bound.
         action = jnp.clip(columns["action"], -1, 1)
         arrays["action"] = action.reshape(*action.shape[:-2], 1, -1) if config.team_level else action[..., agents, :]
@@ -34,7 +40,20 @@ def decoder_inputs(steps: StoredSteps, config: TrainConfig, team_index: int) -> 
     if observed in columns:
         arrays["observation"] = columns[observed][..., rows, :]
         arrays["next_observation"] = next_columns[observed][..., rows, :]
-    return jnp.concatenate(input_arrays(spec.inputs, arrays), axis=-1)
+    if "history" in names:
+        history = columns["history"][..., agents, :, : spec.basis.n_tracked]
+        arrays["history"] = history.reshape(*history.shape[:-2], -1)
+    return jnp.concatenate(input_arrays(names, arrays), axis=-1)
+
+
+def tracked_inputs(steps: StoredSteps, config: TrainConfig) -> Float[Array, "*batch rows entries"]:
+    """Return the entries whose history is stored, of all teams, padded to the largest number."""
+    entries = jnp.zeros((*steps.finished.shape, config.credit_rows, config.n_tracked))
+    for i, spec in enumerate(config.credit_specs):
+        n_tracked = spec.basis.n_tracked
+        inputs = _read_inputs(steps, config, i, spec.inputs[:-1])
+        entries = entries.at[..., config.team_rows(i), :n_tracked].set(inputs[..., :n_tracked])
+    return entries
 
 
 def alive_agents(steps: StoredSteps, config: TrainConfig) -> Bool[Array, "*batch agents"]:

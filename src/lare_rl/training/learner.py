@@ -16,13 +16,14 @@ from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 from lare_rl.credit import decomposition
 from lare_rl.credit.decomposition import Decomposition
 from lare_rl.credit.engine import init_decoder
+from lare_rl.credit.history import next_history, scan_history
 from lare_rl.data import replay
 from lare_rl.data.replay import STEP_COLUMNS, Replay, StoredSteps
 from lare_rl.data.trajectory import Trajectory
 from lare_rl.envs.interface import team_mean
 from lare_rl.nn.normalise import Scale, empty_scale, update_scale
 from lare_rl.phi.graph import Graph
-from lare_rl.training.decoder_inputs import decoder_inputs, row_mask
+from lare_rl.training.decoder_inputs import decoder_inputs, row_mask, tracked_inputs
 from lare_rl.training.factors import compute_factors
 from lare_rl.training.static_config import TrainConfig
 
@@ -93,6 +94,8 @@ def store_with_factors(
     buffer = replay.extend(
         learner.replay, columns, next_columns, _team_rewards(steps, config), steps.ended, config.payments
     )
+    if config.n_tracked:
+        buffer = _with_history(learner.replay, buffer, len(steps.ended), config)
     new_steps = replay.read(buffer, replay.newest_steps(buffer, len(steps.ended)))
     new_steps = jax.tree.map(lambda rows: jnp.swapaxes(rows, 0, 1), new_steps)
     scales = tuple(
@@ -101,6 +104,17 @@ def store_with_factors(
     )
     decoders = tuple(_observe(decoder, new_steps, config, i) for i, decoder in enumerate(learner.decoders))
     return learner._replace(decoders=decoders, scale=scales, replay=buffer)
+
+
+def _with_history(before: Replay, buffer: Replay, n_steps: int, config: TrainConfig) -> Replay:
+    """Return the replay with the history of its newest steps, which `before` does not have yet."""
+    last_step = replay.read(before, replay.newest_steps(before, 1))
+    new_steps = replay.read(buffer, replay.newest_steps(buffer, n_steps))
+    first = jnp.append(~replay.by_payment(before).running[:, None], new_steps.last[:, :-1], axis=1)
+    last_history = next_history(last_step.columns["history"][:, 0], tracked_inputs(last_step, config)[:, 0])
+    entries = jnp.swapaxes(tracked_inputs(new_steps, config), 0, 1)
+    history = scan_history(last_history, entries, jnp.broadcast_to(first.T[..., None], entries.shape[:-1]))
+    return replay.set_newest(buffer, "history", history)
 
 
 def replay_columns(steps: Trajectory, factors: Array, config: TrainConfig) -> tuple[dict[str, Any], dict[str, Any]]:
@@ -113,7 +127,7 @@ def replay_columns(steps: Trajectory, factors: Array, config: TrainConfig) -> tu
         "terminated": steps.next_timestep.terminated,
     }
     return (
-        {name: columns[name] for name in config.columns},
+        {name: columns[name] for name in config.columns if name in columns},
         {name: getattr(steps.next_timestep, name) for name in STEP_COLUMNS if name in config.columns},
     )
 

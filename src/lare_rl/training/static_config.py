@@ -126,6 +126,11 @@ class TrainConfig:
         return self.env.fixed_length and self.payments.is_regular(self.env.max_steps)
 
     @property
+    def n_tracked(self) -> int:
+        """The number of entries of a row whose history is stored; 0 for a method that does not read it."""
+        return max(spec.basis.n_tracked for spec in self.credit_specs)
+
+    @property
     def observed_size(self) -> int:
         """Size of the observation or of the global state that credit is assigned by."""
         return self.env.state_size if self.team_level else self.env.observation_size
@@ -168,7 +173,7 @@ class TrainConfig:
         env, consumes = self.env, self.algorithm.consumes
         is_replayed = consumes is not Consumes.ROLLOUTS
         inputs = self.credit_specs[0].inputs
-        has_raw_features = any(name != "factors" for name in inputs)
+        has_raw_features = any(name not in ("factors", "history") for name in inputs)
         observed = (env.n_agents, env.observation_size)
         actions = (env.n_agents, env.action_size)
         factors = (self.credit_rows, max(self.n_factors, default=0))
@@ -177,6 +182,7 @@ class TrainConfig:
             "observation": (is_replayed or (has_raw_features and not self.team_level), observed, np.float32),
             "action": (is_replayed or "action" in inputs, actions, np.float32),
             "factors": (self.method.needs_phi, factors, np.float32),
+            "history": (self.n_tracked > 0, (self.credit_rows, 3, self.n_tracked), np.float32),
             "reward": (True, (env.n_agents,), np.float32),
             "state": (env.state_size > 0 and reads_state, (env.state_size,), np.float32),
             "available": (env.masks_actions and consumes is Consumes.SEQUENCES, actions, np.bool_),

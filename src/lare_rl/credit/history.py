@@ -1,0 +1,50 @@
+"""The history of an episode, by which a score may depend on extremes and final values of its entries.
+
+A score may be no sum: the largest load of a day, the worst delay, whether a level was ever reached, the state at the end. With z_t an
+entry (a factor or a raw entry) and M_t its largest value up to step t,
+
+    g(max_t z_t) = sum_t g(M_t) - g(M_(t-1))
+
+for any function g. Likewise for smallest and last values. A step is therefore paid for how far it changes an extreme, or the value
+itself, and the payments of an episode add up to the score. The history of step t holds M_(t-1), the smallest value before, and
+z_(t-1). It begins anew with each payment. Before the first step, there is none (NaN), and g counts as 0.
+"""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float
+
+from lare_rl.envs.interface import AnyArray
+
+__all__ = ["next_history", "scan_history"]
+
+
+def next_history(
+    history: Float[AnyArray, "*batch 3 entries"], entries: Float[AnyArray, "*batch entries"]
+) -> Float[AnyArray, "*batch 3 entries"]:
+    """Return the history after a step: largest, smallest and last values. The arrays are of NumPy or of JAX."""
+    xp = jnp if isinstance(entries, jax.Array) else np
+    # fmax and fmin ignore NaN.
+    return xp.stack([xp.fmax(history[..., 0, :], entries), xp.fmin(history[..., 1, :], entries), entries], axis=-2)
+
+
+def scan_history(
+    before: Float[Array, "*batch 3 entries"],
+    entries: Float[Array, "time *batch entries"],
+    begins: Bool[Array, "time *batch"],
+) -> Float[Array, "time *batch 3 entries"]:
+    """Return the history of each of some successive steps.
+
+    Args:
+        before: the history of the first step, if it does not begin an episode.
+        entries: the entries that are tracked.
+        begins: whether a step is the first one of an episode, or of the steps of a payment.
+    """
+
+    def body(history: Array, step: tuple[Array, Array]) -> tuple[Array, Array]:
+        now, first = step
+        history = jnp.where(first[..., None, None], jnp.nan, history)
+        return next_history(history, now), history
+
+    return jax.lax.scan(body, before, (entries, begins))[1]
