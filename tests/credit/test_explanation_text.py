@@ -20,6 +20,7 @@ def explanation(**changes):
         "n_episodes": 40,
         "explains_mean_reward": False,
         "total_r2": 0.97,
+        "raw_feature_used": np.array([True, True]),
         "raw_feature_shares": np.zeros(2),
         "factors_r2": 0.9,
         "factor_varies": np.array([True, True]),
@@ -54,6 +55,8 @@ LACKING = NO_RESIDUAL | {"factors_r2": 0.8, "raw_feature_shares": np.array([0.02
         (ONE_VARIES, BOTH_STATES, [], f"{ABOUT} factor"),
         (ONE_VARIES, FACTORS, [], f"{ABOUT} unknown_factor factor"),
         ({}, [], [], "raw_features_explain"),
+        ({"raw_feature_used": np.array([True, False])}, [], RAW_FEATURES, "raw_features_explain unused_raw_features"),
+        (WELL_EXPLAINED | {"raw_feature_used": np.zeros(2, bool)}, FACTORS, [], f"{ABOUT} factor factor"),
         ({"n_episodes": 19}, FACTORS, RAW_FEATURES, ""),
         ({"n_episodes": 20}, [], [], "raw_features_explain"),
         ({"total_r2": np.nan}, FACTORS, RAW_FEATURES, "equal_returns"),
@@ -125,8 +128,11 @@ def test_residual_values():
 
 ANYTHING = {
     **dict.fromkeys(("share", "slope", "std", "correlation"), 0.5),
-    **dict.fromkeys(("n_episodes", "this", "other", "target", "largest", "features", "name", "raw", "effect"), "x"),
-    **dict.fromkeys(("states", "shape", "before", "after", "scored_observation"), None),
+    **dict.fromkeys(
+        ("n_episodes", "this", "other", "target", "largest", "features", "name", "names", "raw", "effect"), "x"
+    ),
+    **dict.fromkeys(("n_unused", "n_raw", "count"), 3),
+    **dict.fromkeys(("more", "states", "shape", "before", "after", "scored_observation"), None),
 }
 
 

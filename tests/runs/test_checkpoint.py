@@ -121,3 +121,19 @@ def test_replay_of_extended_run_may_be_larger(capacity, tmp_path):
     learner, _, _ = checkpoint.load(tmp_path / "checkpoint", template(1, 1, capacity))
     np.testing.assert_array_equal(learner.replay.columns["reward"][0, 0], [*range(1, 11), *[0] * (capacity - 10)])
     np.testing.assert_array_equal(learner.replay.row[0, 0], [*range(CAPACITY), *[0] * 4])
+
+
+def test_arrays_that_earlier_checkpoints_lack_are_zero():
+    class Closed(NamedTuple):
+        strengths: Any
+        weight: Any
+
+    class State(NamedTuple):
+        closed_form: Closed
+
+    state = State(Closed(Closed(jnp.ones(1), jnp.ones(3)), jnp.ones(2)))
+    filled = checkpoint.fill_template(state, {".closed_form.weight": np.full(2, 5.0, np.float32)})
+    assert filled.closed_form.weight.tolist() == [5, 5]
+    assert filled.closed_form.strengths.weight.tolist() == [0, 0, 0]
+    with pytest.raises(KeyError):
+        checkpoint.fill_template(state, {})

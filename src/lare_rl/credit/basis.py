@@ -125,6 +125,19 @@ class Basis:
         return np.repeat(np.arange(len(self.group_sizes)), list(self.group_sizes.values()))
 
     @property
+    def strength_index(self) -> Int[np.ndarray, " features"]:
+        """The index of each feature's strength (`relevance.py`): each raw feature has one, and its shapes have one.
+
+        All other features share the strength of their group.
+        """
+        index, n_strengths = [], 0
+        for name, size in self.group_sizes.items():
+            n_single = self.n_raw_used if name in ("raw features", "shapes of raw features") else 1
+            index.append(n_strengths + np.arange(size) % n_single)
+            n_strengths += n_single
+        return np.concatenate([np.zeros(0, int), *index])
+
+    @property
     def is_factor_feature(self) -> Bool[np.ndarray, " features"]:
         """Which features are functions of factors alone."""
         return np.repeat(["factors" in name for name in self.group_sizes], list(self.group_sizes.values()))

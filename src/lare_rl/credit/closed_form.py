@@ -25,7 +25,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
-from lare_rl.credit import evidence
+from lare_rl.credit import evidence, relevance
 from lare_rl.credit.basis import Basis, expand, expand_history
 from lare_rl.credit.decoder_network import DecoderOutput, DecoderShape
 from lare_rl.credit.decoder_settings import CreditSettings
@@ -36,6 +36,7 @@ from lare_rl.nn.normalise import RunningMeanStd, running_std
 __all__ = [
     "ClosedForm",
     "LinearDecoder",
+    "best_posterior",
     "fit",
     "fit_signs",
     "init",
@@ -99,7 +100,9 @@ class ClosedForm(NamedTuple):
     n_fitted: Float[Array, ""]
     """The number of episodes that the decoder is fitted to."""
     posterior: Posterior
-    """The posterior of each score type, along a leading axis."""
+    """The fit by groups of each score type, along a leading axis."""
+    strengths: Posterior
+    """The fit by strengths (`relevance.py`) of each score type, along a leading axis. The decoder has the weights of the better fit."""
     spread: PosteriorSpread | None
     """The spread of each score type, along a leading axis. Only present if rewards are optimistic."""
 
@@ -108,11 +111,13 @@ def init(basis: Basis, n_score_types: int, *, with_spread: bool = False) -> Clos
     """Return the state before the first episode."""
     n_features, zero = basis.n_features, jnp.zeros(())
     posterior = evidence.init_posterior(n_features, len(basis.group_sizes))
+    strengths = evidence.init_posterior(n_features, int(basis.strength_index.max(initial=-1)) + 1)
     spread = PosteriorSpread(
         root=jnp.zeros((n_features, n_features)), centre=jnp.zeros(n_features), centre_variance=zero
     )
-    posterior, spread = jax.tree.map(
-        lambda leaf: jnp.tile(leaf, (n_score_types, *[1] * leaf.ndim)), (posterior, spread if with_spread else None)
+    posterior, strengths, spread = jax.tree.map(
+        lambda leaf: jnp.tile(leaf, (n_score_types, *[1] * leaf.ndim)),
+        (posterior, strengths, spread if with_spread else None),
     )
     return ClosedForm(
         decoder=LinearDecoder(
@@ -126,6 +131,7 @@ def init(basis: Basis, n_score_types: int, *, with_spread: bool = False) -> Clos
         n_steps=zero,
         n_fitted=jnp.copy(zero),
         posterior=posterior,
+        strengths=strengths,
         spread=spread,
     )
 
@@ -174,23 +180,39 @@ def fit(
     state: ClosedForm, score_types: tuple[int, ...], max_rounds: int = MAX_EVIDENCE_ROUNDS, *, batched: bool = False
 ) -> ClosedForm:
     """Fit the decoder of each score type to the sums; of all types at once if `batched` is true."""
-    group_index, statistics = state.decoder.basis.group_index, to_float64(state.sufficient_statistics)
+    basis, statistics = state.decoder.basis, to_float64(state.sufficient_statistics)
+    group_index, strength_index = basis.group_index, basis.strength_index
 
-    def fit_score_type(args: tuple[Int[Array, ""], Posterior]) -> Posterior:
-        score_type, start = args
-        start = jax.tree.map(lambda leaf: leaf.astype(float), start)
-        return evidence.fit(statistics, score_type, group_index, start, max_rounds, batched=batched)
+    def fit_score_type(args: tuple[Int[Array, ""], Posterior, Posterior]) -> tuple[Posterior, Posterior]:
+        score_type, start, earlier = args
+        start, earlier = jax.tree.map(lambda leaf: leaf.astype(float), (start, earlier))
+        groups = evidence.fit(statistics, score_type, group_index, start, max_rounds, batched=batched)
+        if np.array_equal(group_index, strength_index):
+            return groups, groups
+        return groups, relevance.fit_strengths(
+            statistics, score_type, group_index, strength_index, groups, earlier, max_rounds
+        )
 
-    posteriors = map_leading_axis(fit_score_type, (jnp.asarray(score_types), state.posterior), batched=batched)
-    posterior = jax.tree.map(lambda leaf: leaf.astype(jnp.float32), posteriors)
-    state = _set_weights(state, posterior.weight, posterior.bias)._replace(posterior=posterior)
+    fits = map_leading_axis(
+        fit_score_type, (jnp.asarray(score_types), state.posterior, state.strengths), batched=batched
+    )
+    posterior, strengths = jax.tree.map(lambda leaf: leaf.astype(jnp.float32), fits)
+    state = state._replace(posterior=posterior, strengths=strengths)
+    best = relevance.select(fits[1], fits[0], group_index, strength_index)
+    state = _set_weights(state, best.weight, best.bias)
     if state.spread is None:
         return state
     spreads = [
-        evidence.posterior_spread(statistics, score_type, group_index, jax.tree.map(itemgetter(i), posteriors))
+        evidence.posterior_spread(statistics, score_type, strength_index, jax.tree.map(itemgetter(i), best))
         for i, score_type in enumerate(score_types)
     ]
     return state._replace(spread=jax.tree.map(lambda *leaves: jnp.stack(leaves).astype(jnp.float32), *spreads))
+
+
+def best_posterior(state: ClosedForm) -> Posterior:
+    """Return the fit of each score type that is used, with a precision for each strength."""
+    basis = state.decoder.basis
+    return relevance.select(state.strengths, state.posterior, basis.group_index, basis.strength_index)
 
 
 def fit_signs(state: ClosedForm) -> ClosedForm:

@@ -31,7 +31,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from lare_rl.credit import evidence
+from lare_rl.credit import evidence, relevance
 from lare_rl.credit.basis import N_FREQUENCIES, Basis
 from lare_rl.credit.evidence import Posterior, Regression, SufficientStatistics
 from lare_rl.credit.score_type import ScoreType
@@ -42,6 +42,10 @@ MAX_EXPLANATION_ROUNDS = 100
 """The maximum number of rounds of the evidence's fixed point. It is large because there is no earlier fit to start from."""
 MIN_MEAN_STD = 1e-5
 """The means of a standardised factor over episodes vary by more than rounding if their standard deviation exceeds this."""
+
+
+MIN_DETERMINED = 0.05
+"""A raw feature is switched off if the returns determine less than this part of one of its weights."""
 
 
 class StepStatistics(NamedTuple):
@@ -60,6 +64,8 @@ class Explanation(NamedTuple):
     """Whether R/T is explained, not R: the score is a sum, and episodes differ in length."""
     total_r2: Float[Array, ""]
     """R^2 of factors and raw features together. NaN if there are too few returns, or if they do not vary."""
+    raw_feature_used: Bool[Array, " raw"]
+    """Whether the returns depend on a raw feature. All are used unless each has a strength of its own (`relevance.py`)."""
     raw_feature_shares: Float[Array, " raw"]
     """The share of the variation that each raw feature explains, with its shapes and half of its pairs. It is a part of `total_r2`."""
     factors_r2: Float[Array, ""]
@@ -105,7 +111,7 @@ def explain(
 ) -> Explanation:
     """Explain returns by the features of a basis, from sums over episodes and over their steps. Call this within `float64()`."""
     is_factor, extended = basis.is_factor_feature, int(basis.extended)
-    full = _fit(statistics, score_type, basis.group_index)
+    full = _fit(statistics, score_type, basis.group_index, basis.strength_index)
     raw_single, raw_pairs = _input_shares(
         full.feature_shares[~is_factor],
         basis.n_raw_used,
@@ -117,6 +123,7 @@ def explain(
         n_episodes=statistics.n_episodes,
         explains_mean_reward=(score_type == ScoreType.SUM) & _lengths_differ(statistics),
         total_r2=full.r2,
+        raw_feature_used=_is_used(full, basis),
         raw_feature_shares=raw_single + raw_pairs,
         factors_r2=jnp.zeros(()),
         factor_varies=no_factor > 0,
@@ -130,7 +137,7 @@ def explain(
     if not is_factor.any():
         return explanation
     factor_statistics, group_index = _select(statistics, np.flatnonzero(is_factor)), basis.group_index[is_factor]
-    factors = _fit(factor_statistics, score_type, group_index)
+    factors = _fit(factor_statistics, score_type, group_index, group_index)
     single, pairs = _input_shares(
         factors.feature_shares, basis.n_factors, extended * N_FREQUENCIES, extended * basis.n_factors
     )
@@ -154,23 +161,49 @@ def explain(
 class _Fit(NamedTuple):
     problem: Regression
     posterior: Posterior
+    has_own_strengths: Bool[Array, ""]
+    """Whether each raw feature has a strength of its own. The posterior then has a precision for each."""
     r2: Float[Array, ""]
     feature_shares: Float[Array, " features"]
     """The share of the variation that each feature explains. The shares add up to `r2`."""
 
 
 def _fit(
-    statistics: SufficientStatistics, score_type: Int[Array, ""] | int, group_index: Int[np.ndarray, " features"]
+    statistics: SufficientStatistics,
+    score_type: Int[Array, ""] | int,
+    group_index: Int[np.ndarray, " features"],
+    strength_index: Int[np.ndarray, " features"],
 ) -> _Fit:
     problem = evidence.regression(statistics, score_type, group_index)
     start = evidence.init_posterior(len(group_index), int(group_index.max()) + 1)
     posterior = evidence.fit(statistics, score_type, group_index, start, MAX_EXPLANATION_ROUNDS)
+    has_own_strengths = jnp.array(False)
+    if not np.array_equal(group_index, strength_index):
+        groups, indices = posterior, (group_index, strength_index)
+        start = evidence.init_posterior(len(strength_index), int(strength_index.max()) + 1)
+        separate = relevance.fit_strengths(statistics, score_type, *indices, groups, start, MAX_EXPLANATION_ROUNDS)
+        has_own_strengths, posterior = (
+            relevance.is_better(separate, groups),
+            relevance.select(separate, groups, *indices),
+        )
     r2 = 1 - problem.dof / (problem.q * jnp.where(posterior.beta > 0, posterior.beta, 1))
     r2 = jnp.where((problem.dof > 1) & (problem.y_std > 0), jnp.clip(r2, 0, 1), jnp.nan)
     weight = posterior.weight / jnp.where(problem.y_std > 0, problem.y_std, 1)
     covariance = weight * (problem.s @ weight)
     total = jnp.sum(covariance)
-    return _Fit(problem, posterior, r2, feature_shares=r2 * covariance / jnp.where(total > 0, total, 1))
+    return _Fit(problem, posterior, has_own_strengths, r2, r2 * covariance / jnp.where(total > 0, total, 1))
+
+
+def _is_used(fit: _Fit, basis: Basis) -> Bool[Array, " raw"]:
+    """Return which raw features the returns determine to a part that is larger than `MIN_DETERMINED`."""
+    group_index, strength_index = basis.group_index, basis.strength_index
+    names, n_raw = list(basis.group_sizes), basis.n_raw_used
+    n_determined = jnp.zeros(n_raw)
+    for name in ("raw features", "shapes of raw features"):
+        if name in names:
+            first = int(strength_index[group_index == names.index(name)][0])
+            n_determined = n_determined + fit.posterior.n_determined[first : first + n_raw]
+    return ~fit.has_own_strengths | (n_determined > MIN_DETERMINED)
 
 
 def _lengths_differ(statistics: SufficientStatistics) -> Bool[Array, ""]:

@@ -31,6 +31,8 @@ STRIKING_CORRELATION = 0.3
 """A raw feature is reported if its correlation with the residual of the factors is larger."""
 N_LARGEST = 3
 """The number of raw features that are named."""
+N_UNUSED = 12
+"""The number of unused raw features that are named."""
 
 _SET_SCORE_TYPE = (
     'This may change. If you know which of them it is, set it: `score = "sum"` or `score = "average"` in the task file, '
@@ -84,6 +86,10 @@ MESSAGES = {
         "In a fit on factors and raw entries, these entries have the largest shares: {features}. phi may lack a factor that is "
         "computed from them."
     ),
+    "unused_raw_features": (
+        "{n_unused} of {n_raw} raw entries are switched off, because the returns do not depend on them: {names}{more}."
+    ),
+    "more_names": " and {count} more",
     "high_when_large": (
         "Returns are higher than the factors predict when {name} is large (correlation {correlation:+.2f}): a factor may be missing"
         "{scored_observation}."
@@ -151,7 +157,7 @@ def explanation_findings(
     if not factors:
         largest_features = Finding("largest", {"features": largest}) if largest else None
         values = {"share": float(explanation.total_r2), "target": target, "largest": largest_features}
-        return [*findings, Finding("raw_features_explain", values)]
+        return [*findings, Finding("raw_features_explain", values), *_unused_raw_features(explanation, raw_features)]
     added = float(explanation.total_r2) - factors_r2
     raw = Finding("raw_features_add", {"share": added}) if raw_features and added >= 0.01 else None
     findings.append(Finding("factors_explain", {"share": factors_r2, "target": target, "raw": raw}))
@@ -163,7 +169,17 @@ def explanation_findings(
         findings.append(Finding("phi_lacks_features", {"features": largest}))
     if raw_features and factors_r2 < COMPLETE_SHARE:
         findings += _residual_findings(explanation, factors, raw_features)
-    return findings
+    return findings + _unused_raw_features(explanation, raw_features)
+
+
+def _unused_raw_features(explanation: Explanation, names: Sequence[str]) -> list[Finding]:
+    """Report the raw features that are switched off, if they have names."""
+    unused = [name for name, used in zip(names, explanation.raw_feature_used, strict=False) if not used]
+    if not unused:
+        return []
+    more = Finding("more_names", {"count": len(unused) - N_UNUSED}) if len(unused) > N_UNUSED else None
+    values = {"n_unused": len(unused), "n_raw": len(names), "names": ", ".join(unused[:N_UNUSED]), "more": more}
+    return [Finding("unused_raw_features", values)]
 
 
 def _score_type(estimate: ScoreTypeEstimate) -> Finding:

@@ -190,7 +190,7 @@ def reward_std(
     spread = evidence.posterior_spread(
         closed_form.to_float64(state.closed_form.sufficient_statistics),
         jnp.asarray(score_types)[index],
-        state.network.basis.group_index,
-        jax.tree.map(lambda leaf: leaf[index].astype(float), state.closed_form.posterior),
+        state.network.basis.strength_index,
+        jax.tree.map(lambda leaf: leaf[index].astype(float), closed_form.best_posterior(state.closed_form)),
     )
     return evidence.posterior_std(spread, state.network.features(rows))

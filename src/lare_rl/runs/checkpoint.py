@@ -53,6 +53,9 @@ REPLAY = ".replay."
 SAVED_BY_ROW = f"{REPLAY}columns"
 """The path of the arrays that are saved by row."""
 
+NEW_STATE = ".closed_form.strengths."
+"""The path of arrays that earlier checkpoints do not have. Zeros mean that they have not been computed yet."""
+
 MAX_COUNT = 2**53
 
 
@@ -222,7 +225,10 @@ def fill_template(template: Template, arrays: Mapping[str, np.ndarray]) -> Templ
         if name.startswith(SAVED_BY_ROW):
             filled.append(leaf)
             continue
-        array = _pad_rows(arrays[name], leaf.shape) if name.startswith(REPLAY) else arrays[name]
+        if name not in arrays and NEW_STATE in name:
+            array = np.zeros(leaf.shape, leaf.dtype)
+        else:
+            array = _pad_rows(arrays[name], leaf.shape) if name.startswith(REPLAY) else arrays[name]
         if array.shape != leaf.shape:
             raise ValueError(f"{name} has shape {array.shape}, not {leaf.shape}")
         if array.dtype != leaf.dtype:

@@ -1,0 +1,92 @@
+"""A strength for each raw feature: automatic relevance determination.
+
+A fit by groups (`evidence.py`) has one precision for all raw features, and one for their shapes. If few of many raw features matter,
+these are shrunk too much, and the others too little. Here each raw feature has precisions of its own, one for the feature and one for
+its shapes (MacKay, 1994; Tipping, JMLR 1, 2001):
+
+    alpha_i = gamma_i / mu_i^2         (shapes: the sums over the shapes of the feature)
+
+A raw feature that has nothing to do with the score gets a large alpha: it is switched off. More precisions always allow a larger
+evidence, so the iteration starts from the precisions of the groups, and its result is only used if its log evidence is larger by
+`MIN_GAIN` for each additional precision. Otherwise the fit is that of the groups.
+"""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Int
+
+from lare_rl.credit import evidence
+from lare_rl.credit.evidence import Posterior, SufficientStatistics
+
+__all__ = ["MIN_GAIN", "fit_strengths", "is_better", "select"]
+
+MIN_GAIN = 0.5
+"""The least gain in log evidence for each additional precision. Of 0.1, 0.25, 0.5 and 1, the middle two predicted the rewards of
+later episodes best on eight scores (docs/closed-form.md)."""
+
+
+def fit_strengths(
+    statistics: SufficientStatistics,
+    score_type: Int[Array, ""] | int,
+    group_index: Int[np.ndarray, " features"],
+    strength_index: Int[np.ndarray, " features"],
+    groups: Posterior,
+    earlier: Posterior,
+    max_rounds: int,
+) -> Posterior:
+    """Return the fit with a precision for each strength, whether it is better than that by groups or not.
+
+    Args:
+        statistics: the sums over episodes.
+        score_type: a `ScoreType`.
+        group_index: the index of each feature's group.
+        strength_index: the index of each feature's strength.
+        groups: the fit by groups, from whose precisions the iteration starts.
+        earlier: an earlier result, or `evidence.init_posterior`. With `evidence.MANY_EPISODES_PER_FEATURE`, the iteration continues
+            from it instead.
+        max_rounds: the maximum number of rounds.
+    """
+    start = _expand_groups(groups, group_index, strength_index)
+    problem = evidence.regression(statistics, score_type, strength_index)
+    many = problem.dof >= evidence.MANY_EPISODES_PER_FEATURE * len(group_index)
+    continues = many & (earlier.beta > 0)
+    alpha, beta = (
+        jnp.where(continues, old, new) for old, new in ((earlier.alpha, start.alpha), (earlier.beta, start.beta))
+    )
+    posterior = evidence.fixed_point(problem, alpha, beta, max_rounds)
+    return evidence.to_return_units(statistics, problem, posterior, fallback=start)
+
+
+def is_better(strengths: Posterior, groups: Posterior) -> Bool[Array, "*score_types"]:
+    """Return whether the fit by strengths is used."""
+    n_more = strengths.alpha.shape[-1] - groups.alpha.shape[-1]
+    has_fit = strengths.beta > 0
+    return has_fit & (strengths.log_evidence > groups.log_evidence + MIN_GAIN * n_more)
+
+
+def select(
+    strengths: Posterior,
+    groups: Posterior,
+    group_index: Int[np.ndarray, " features"],
+    strength_index: Int[np.ndarray, " features"],
+) -> Posterior:
+    """Return the fit that is used, with a precision for each strength. The posteriors may have a leading axis of score types."""
+    is_used = is_better(strengths, groups)
+    return jax.tree.map(
+        lambda separate, shared: jnp.where(
+            is_used.reshape(*is_used.shape, *[1] * (separate.ndim - is_used.ndim)), separate, shared
+        ),
+        strengths,
+        _expand_groups(groups, group_index, strength_index),
+    )
+
+
+def _expand_groups(
+    groups: Posterior, group_index: Int[np.ndarray, " features"], strength_index: Int[np.ndarray, " features"]
+) -> Posterior:
+    """Return a fit by groups in the form of a fit by strengths: each strength has the precision of its group."""
+    group = np.zeros(int(strength_index.max(initial=-1)) + 1, int)
+    group[strength_index] = group_index
+    n_strengths = np.bincount(group, minlength=groups.alpha.shape[-1])
+    return groups._replace(alpha=groups.alpha[..., group], n_determined=(groups.n_determined / n_strengths)[..., group])
