@@ -233,7 +233,7 @@ def fill_template(template: Template, arrays: Mapping[str, np.ndarray]) -> Templ
             raise ValueError(f"{name} has shape {array.shape}, not {leaf.shape}")
         if array.dtype != leaf.dtype:
             raise ValueError(f"{name} holds {array.dtype}, not {leaf.dtype}")
-        filled.append(array if isinstance(leaf, np.ndarray) else jax.device_put(array))
+        filled.append(array if isinstance(leaf, np.ndarray) else _put_like(leaf, array))
     return jax.tree.unflatten(structure, filled)
 
 
@@ -262,8 +262,13 @@ def _load_rows(learner: State, directory: Path, segments: list[_Segment]) -> Sta
                 start, count = int(np.asarray(segment.start)[env]), int(counts[env])
                 rows = np.arange(start, start + count)[-capacity:]
                 buffer[(*env, rows % capacity)] = values[env][:count][-capacity:]
-        columns[name] = jax.device_put(buffer)
+        columns[name] = _put_like(column, buffer)
     return learner._replace(replay=learner.replay._replace(columns=columns))
+
+
+def _put_like(template: Any, array: np.ndarray) -> jax.Array:
+    """Copy an array to the devices that a shape names, or to JAX's default device."""
+    return jax.device_put(array, template.sharding if isinstance(template, jax.ShapeDtypeStruct) else None)
 
 
 @jax.jit

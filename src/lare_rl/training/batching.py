@@ -31,7 +31,7 @@ def is_batching_faster(config: TrainConfig, n_seeds: int) -> bool:
     if config.method.fit is None or jax.default_backend() == "cpu":
         return False
     n_features = max(MIN_FEATURES, *(spec.basis.n_features for spec in config.credit_specs))
-    n_fits = n_seeds * N_STARTS * len(ScoreType)
+    n_fits = n_seeds // config.n_devices * N_STARTS * len(ScoreType)
     with float64():
         matrices = jnp.asarray(np.eye(n_features) + np.full((n_fits, n_features, n_features), 0.5))
         one_after_the_other, at_once = (_measure_s(_factorise(batched), matrices) for batched in (False, True))

@@ -16,10 +16,11 @@ from lare_rl.nn.masks import select
 from lare_rl.training.compile_cache import cache_by_value
 from lare_rl.training.compiled import init_memory, policy_function
 from lare_rl.training.evaluation import EpisodeBatch, Evaluation
+from lare_rl.training.seed_axis import jit_over_seeds, seed_sharding
 from lare_rl.training.static_config import TrainConfig
 from lare_rl.training.streams import Stream, device_noise, stream_keys
 
-__all__ = ["DeviceCollector", "VecEnvState", "collect", "reset", "unroll_on_device"]
+__all__ = ["DeviceCollector", "VecEnvState", "collect", "is_reset_cheap", "reset", "unroll_on_device"]
 
 Act = Callable[..., tuple[Array, Any]]
 """From actor, memory, observation, available actions, noise and episode starts to the action and the new memory."""
@@ -45,7 +46,7 @@ class DeviceCollector:
     """The environments of a run, if they are pure functions: one compiled call makes an iteration's steps."""
 
     def __init__(self, env: JaxEnv, config: TrainConfig, seeds: Sequence[int]):
-        self.env, self._seeds = env, seeds
+        self.env, self._seeds, self._n_devices = env, seeds, config.n_devices
         self._reset, self._collect, self._evaluate = _jit_functions(env, config)
         self.envs: VecEnvState = self._reset(stream_keys(seeds, Stream.TRAINING_EPISODES, 0))
 
@@ -58,7 +59,7 @@ class DeviceCollector:
     def evaluate(self, actor: Any, n_episodes: int, number: int = 0) -> Evaluation:
         """Evaluate whole episodes. The same number gives the same initial states; the run's own evaluations use 0."""
         keys = stream_keys(self._seeds, Stream.EVALUATION_EPISODES, number)
-        return Evaluation(*jax.device_get(tuple(self._evaluate(actor, keys, n_episodes))))
+        return Evaluation(*jax.device_get(tuple(self._evaluate(actor, keys, n_episodes=n_episodes))))
 
     def state_dict(self) -> dict[str, np.ndarray]:
         """Return the arrays that `restore` needs."""
@@ -67,7 +68,8 @@ class DeviceCollector:
     def restore(self, arrays: dict[str, np.ndarray]) -> tuple[Bool[np.ndarray, "seeds envs"], list[str]]:
         """Restore the environments. Return which episodes were dropped, and messages: never any, as on the host."""
         leaves, structure = jax.tree.flatten(self.envs)
-        self.envs = jax.device_put(jax.tree.unflatten(structure, [arrays[str(i)] for i in range(len(leaves))]))
+        envs = jax.tree.unflatten(structure, [arrays[str(i)] for i in range(len(leaves))])
+        self.envs = jax.device_put(envs, seed_sharding(self._n_devices))
         return np.zeros(self.envs.episode_start.shape, bool), []
 
     def close(self) -> None:
@@ -102,10 +104,11 @@ def unroll_on_device(
 
 @cache_by_value
 def _jit_functions(env: JaxEnv, config: TrainConfig) -> tuple[Callable[..., Any], ...]:
+    jit = partial(jit_over_seeds, n_devices=config.n_devices)
     return (
-        jax.jit(partial(reset, env, n_envs=config.n_envs, config=config)),
-        jax.jit(partial(collect, env, config=config), donate_argnums=0),
-        jax.jit(partial(_evaluate, env, config=config), static_argnums=2),
+        jit(partial(reset, env, n_envs=config.n_envs, config=config)),
+        jit(partial(collect, env, config=config), donate=(0,)),
+        jit(partial(_evaluate, env, config=config), static=("n_episodes",)),
     )
 
 
@@ -149,7 +152,6 @@ def collect(
 ) -> tuple[VecEnvState, Trajectory]:
     """Make `rollout_steps` steps of every environment. When an episode ends, the next one begins."""
     act, n_envs = policy_function(config, greedy=False), config.n_envs
-    resets_always = config.batched and _reset_flops(env, envs.episode_start.size) < MAX_RESET_FLOPS
 
     def body(envs: VecEnvState, randomness: tuple[_Randomness, Key[Array, " seeds"]]) -> tuple[VecEnvState, Trajectory]:
         step_randomness, reset_keys = randomness
@@ -160,7 +162,7 @@ def collect(
             state, timestep = select(steps.ended, (fresh.state, fresh.timestep), (envs.state, envs.timestep))
             return VecEnvState(state, timestep, envs.memory, episode_start=steps.ended)
 
-        if resets_always:
+        if config.resets_with_steps:
             return reset_ended(envs), steps
         return jax.lax.cond(jnp.any(steps.ended), reset_ended, lambda envs: envs, envs), steps
 
@@ -171,15 +173,15 @@ def collect(
     return envs, jax.tree.map(lambda rows: jnp.swapaxes(rows, 0, 1), steps)
 
 
-def _reset_flops(env: JaxEnv, n_envs: int) -> float:
-    """Return the floating-point operations of a reset of all environments, as XLA estimates them."""
+def is_reset_cheap(env: JaxEnv, n_envs: int) -> bool:
+    """Whether a card should reset all environments with each step, by XLA's estimate of the operations."""
     keys = jax.eval_shape(lambda: jax.random.split(jax.random.key(0), n_envs))
     cost = jax.jit(jax.vmap(env.reset)).lower(keys).cost_analysis()
-    return float((cost or {}).get("flops", math.inf))
+    return float((cost or {}).get("flops", math.inf)) < MAX_RESET_FLOPS
 
 
 def _evaluate(
-    env: JaxEnv, actor: Any, keys: Key[Array, " seeds"], n_episodes: int, config: TrainConfig
+    env: JaxEnv, actor: Any, keys: Key[Array, " seeds"], *, n_episodes: int, config: TrainConfig
 ) -> tuple[Any, ...]:
     """Return the fields of an `Evaluation`."""
     steps, mask, _ = unroll_on_device(env, actor, keys, n_episodes, config, config.greedy)

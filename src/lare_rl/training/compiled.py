@@ -22,6 +22,7 @@ from lare_rl.training.compile_cache import cache_by_value
 from lare_rl.training.decoder_fits import fit_seeds
 from lare_rl.training.learner import Learner, init_learner, store, with_learned_returns
 from lare_rl.training.rewards import assess
+from lare_rl.training.seed_axis import jit_over_seeds, shape_over_seeds
 from lare_rl.training.static_config import TrainConfig
 from lare_rl.training.streams import seed_keys
 from lare_rl.util.float64 import float64
@@ -103,9 +104,10 @@ def policy_function(config: TrainConfig, greedy: bool) -> Callable[..., tuple[Ar
 @cache_by_value
 def compile_functions(config: TrainConfig, phi: Sequence[Graph] = ()) -> CompiledFunctions:
     """Return the compiled functions of a run. `phi` holds the graph of each team's phi; only `store` needs it."""
+    jit = partial(jit_over_seeds, n_devices=config.n_devices)
 
     def jit_store() -> Callable[..., Any]:
-        return jax.jit(jax.vmap(partial(store, config=config, phi=phi)), donate_argnums=0)
+        return jit(jax.vmap(partial(store, config=config, phi=phi)), donate=(0,))
 
     if phi:
         return compile_functions(config)._replace(store=jit_store())
@@ -116,7 +118,7 @@ def compile_functions(config: TrainConfig, phi: Sequence[Graph] = ()) -> Compile
         # (jaxlib 0.10, `ParallelBatchMap`).
         return jax.lax.map(lambda key: init_learner(key, config, partial(module.init, config=config)), keys)
 
-    learn = jax.jit(partial(episodes.learn_returns, config=config))
+    learn = jit(partial(episodes.learn_returns, config=config))
 
     def learn_returns(learner: Learner) -> Learner:
         with float64():
@@ -124,15 +126,15 @@ def compile_functions(config: TrainConfig, phi: Sequence[Graph] = ()) -> Compile
         return with_learned_returns(learner, *learned)
 
     return CompiledFunctions(
-        init=jax.jit(init),
+        init=jit(init),
         learn_returns=learn_returns,
         store=jit_store(),
-        fit=jax.jit(partial(fit_seeds, config=config), donate_argnums=0),
-        train_step=jax.jit(partial(module.train_step, config=config), donate_argnums=0),
-        assess=jax.jit(jax.vmap(partial(assess, config=config))),
+        fit=jit(partial(fit_seeds, config=config), donate=(0,)),
+        train_step=jit(partial(module.train_step, config=config), shared=(3,), donate=(0,)),
+        assess=jit(jax.vmap(partial(assess, config=config))),
         get_actor=partial(module.get_actor, config=config),
-        explore=jax.jit(policy_function(config, greedy=False)),
-        act=jax.jit(policy_function(config, greedy=True)),
+        explore=jit(policy_function(config, greedy=False)),
+        act=jit(policy_function(config, greedy=True)),
     )
 
 
@@ -144,12 +146,13 @@ def compile_ahead(
     The compiler needs hundreds of megabytes for a while. They are returned to the system before the replay is made.
     """
     functions = compile_functions(config, phi)
-    learner, steps = learner_shape(config, n_seeds), steps_shape(config, n_seeds)
+    learner = learner_shape(config, n_seeds)
+    steps, keys = shape_over_seeds((steps_shape(config, n_seeds), keys_shape(n_seeds)), config.n_devices)
     functions = functions._replace(assess=_compile(functions.assess, learner))
     if iterates_on_host:
         functions = functions._replace(
             store=_compile(functions.store, learner, steps),
-            train_step=_compile(functions.train_step, learner, steps, keys_shape(n_seeds), 0),
+            train_step=_compile(functions.train_step, learner, steps, keys, 0),
         )
     _free_memory()
     return functions
@@ -165,7 +168,7 @@ def init_seeds(functions: CompiledFunctions, keys: Key[Array, " seeds"]) -> Lear
 @cache_by_value
 def learner_shape(config: TrainConfig, n_seeds: int) -> Learner:
     """Return a learner with shapes instead of arrays."""
-    return jax.eval_shape(compile_functions(config).init, keys_shape(n_seeds))
+    return shape_over_seeds(jax.eval_shape(compile_functions(config).init, keys_shape(n_seeds)), config.n_devices)
 
 
 def keys_shape(n_seeds: int) -> Any:

@@ -20,13 +20,14 @@ from lare_rl.training.compile_cache import cache_by_value
 from lare_rl.training.compiled import keys_shape, learner_shape, training_module
 from lare_rl.training.decoder_fits import fit_seeds
 from lare_rl.training.learner import Learner, store, with_learned_returns
+from lare_rl.training.seed_axis import jit_over_seeds, shape_over_seeds
 from lare_rl.training.static_config import TrainConfig
 from lare_rl.training.streams import Stream, seed_keys, stream_keys
 
 __all__ = ["CompiledLoop", "LoopState", "compile_loop", "init_loop"]
 
 Metrics = dict[str, Float[Array, " seeds"]]
-Measured = tuple[Metrics, dict[str, Bool[Array, ""]]]
+Measured = tuple[Metrics, dict[str, Bool[Array, " seeds"]]]
 """Metrics, and which of them have been measured."""
 
 
@@ -37,7 +38,7 @@ class LoopState(NamedTuple):
     envs: VecEnvState
     metrics: Metrics
     """The metrics of the newest updates."""
-    is_measured: dict[str, Bool[Array, ""]]
+    is_measured: dict[str, Bool[Array, " seeds"]]
     """Which metrics have been measured."""
     steps: Trajectory
     """The newest steps, for the message about a factor that is not finite."""
@@ -50,7 +51,7 @@ class CompiledLoop(NamedTuple):
 
     run: Callable[[LoopState, Int[Array, " seeds"], Int[Array, ""], Int[Array, ""]], LoopState]
     """From the state, the seeds, the number of iterations before, and the number of iterations to make, to the new state. It
-    consumes its state. It stops after an iteration with a factor that is not finite."""
+    consumes its state. A device stops after an iteration with a factor that is not finite."""
     shape: LoopState
     """The state with shapes instead of arrays."""
 
@@ -78,21 +79,28 @@ def compile_loop(env: JaxEnv, config: TrainConfig, phi: Sequence[Graph], fit_eve
 
         return jax.lax.while_loop(is_running, body, (n_done, state))[1]
 
-    shape = _loop_shape(env, config, n_seeds)
-    seeds, number = jax.ShapeDtypeStruct((n_seeds,), int), jax.ShapeDtypeStruct((), int)
-    return CompiledLoop(jax.jit(loop, donate_argnums=0).lower(shape, seeds, number, number).compile(), shape)
+    shape, seeds = shape_over_seeds(
+        (_loop_shape(env, config, n_seeds), jax.ShapeDtypeStruct((n_seeds,), int)), config.n_devices
+    )
+    number = jax.ShapeDtypeStruct((), int)
+    jitted = jit_over_seeds(loop, config.n_devices, shared=(2, 3), donate=(0,))
+    return CompiledLoop(jitted.lower(shape, seeds, number, number).compile(), shape)
 
 
 def init_loop(loop: CompiledLoop, learner: Learner, envs: VecEnvState, metrics: Metrics) -> LoopState:
     """Return the state before an iteration. `metrics` are those of the newest updates, or empty before the first."""
-    empty = jax.tree.map(lambda shape: jnp.zeros(shape.shape, shape.dtype), loop.shape._replace(learner=(), envs=()))
+    shape = loop.shape
+
+    def fill(leaf: jax.ShapeDtypeStruct, value: int) -> Array:
+        return jnp.full(leaf.shape, value, leaf.dtype, device=leaf.sharding)
+
     return LoopState(
         learner=learner,
         envs=envs,
-        metrics={name: jnp.array(metrics.get(name, zero)) for name, zero in empty.metrics.items()},
-        is_measured={name: jnp.array(name in metrics) for name in empty.metrics},
-        steps=empty.steps,
-        is_finite=jnp.ones_like(empty.is_finite),
+        metrics={name: jnp.array(metrics.get(name, fill(leaf, 0))) for name, leaf in shape.metrics.items()},
+        is_measured={name: fill(leaf, name in metrics) for name, leaf in shape.is_measured.items()},
+        steps=jax.tree.map(lambda leaf: fill(leaf, 0), shape.steps),
+        is_finite=fill(shape.is_finite, True),
     )
 
 
@@ -105,7 +113,7 @@ def _loop_shape(env: JaxEnv, config: TrainConfig, n_seeds: int) -> LoopState:
         metrics = module.train_step(learner, steps, keys, start, config)[1]
         if config.fits_separately:
             metrics |= fit_seeds(learner, keys, config)[1]
-        is_measured = {name: jnp.array(False) for name in metrics}
+        is_measured = {name: jnp.zeros(n_seeds, bool) for name in metrics}
         return LoopState(learner, envs, metrics, is_measured, steps, jnp.ones(n_seeds, bool))
 
     return jax.eval_shape(measure_and_collect, learner_shape(config, n_seeds), keys_shape(n_seeds))
@@ -137,7 +145,7 @@ def _iterate(
             fit = partial(_fit, keys=keys, config=config)
             learner, measured = jax.lax.cond(iteration % fit_every == 0, fit, _unchanged, learner, measured)
         learner, metrics = module.train_step(learner, steps, seed_keys(seeds, env_steps + 1), env_steps, config)
-        is_new = jnp.any(metrics.get("algorithm/updates", jnp.ones(())) > 0)
+        is_new = metrics.get("algorithm/updates", jnp.ones(len(seeds))) > 0
         return learner, _record(measured, metrics, is_new)
 
     measured = state.metrics, state.is_measured
@@ -153,12 +161,13 @@ def _fit(
     learner: Learner, measured: Measured, keys: Key[Array, " seeds"], config: TrainConfig
 ) -> tuple[Learner, Measured]:
     learner, metrics = fit_seeds(learner, keys, config)
-    return learner, _record(measured, metrics, jnp.array(True))
+    return learner, _record(measured, metrics, jnp.ones(len(keys), bool))
 
 
-def _record(measured: Measured, metrics: Metrics, is_new: Bool[Array, ""]) -> Measured:
+def _record(measured: Measured, metrics: Metrics, is_new: Bool[Array, " seeds"]) -> Measured:
+    """Replace the metrics of the seeds that have new ones."""
     old, is_measured = measured
-    new = {name: jnp.where(is_new, values, old[name]) for name, values in metrics.items()}
+    new = {name: jnp.where(is_new | ~is_measured[name], values, old[name]) for name, values in metrics.items()}
     return old | new, is_measured | {name: is_measured[name] | is_new for name in metrics}
 
 

@@ -21,7 +21,7 @@ from lare_rl.training.compile_cache import cache_by_value
 from lare_rl.training.episodes import fold_episodes
 from lare_rl.training.learner import Learner
 from lare_rl.training.saved_state import load_learner
-from lare_rl.training.seed_axis import select_seed
+from lare_rl.training.seed_axis import first_shard, select_seed
 from lare_rl.training.static_config import TrainConfig
 from lare_rl.util.float64 import float64
 
@@ -47,7 +47,7 @@ def describe_returns(run: Run, learner: Learner, config: TrainConfig) -> list[st
             if config.team_level
             else raw_feature_names(role.observation, role.action, n_raw, role.action_size, has_both)
         )
-        score_type = returns.estimate_score_type(select_seed(learner.decoders[i]))
+        score_type = returns.estimate_score_type(select_seed(first_shard(learner.decoders[i])))
         prefix = f"{config.env.teams[i].name}: " if len(roles) > 1 else ""
         lines += [prefix + line for line in explanation_lines(explanation, score_type, factor_names, raw_names)]
     remarks = [f"of seed {run.seeds[0]} alone"] if len(run.seeds) > 1 else []
@@ -70,7 +70,8 @@ def explain_stored_returns(learner: Learner, config: TrainConfig) -> list[Explan
     if not learner.decoders or not has_features or n_stored < MIN_EXPLAINED_EPISODES:
         return []
     with float64():
-        explanations = _compile(config)(replay, tuple(decoder.is_mean for decoder in learner.decoders))
+        is_mean = tuple(decoder.is_mean for decoder in learner.decoders)
+        explanations = _compile(config)(*first_shard((replay, is_mean)))
         return jax.tree.map(np.asarray, explanations)
 
 

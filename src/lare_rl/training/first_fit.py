@@ -20,6 +20,7 @@ from lare_rl.nn.masks import select
 from lare_rl.nn.normalise import root_mean_square
 from lare_rl.training.episodes import Decoders, fold_episodes
 from lare_rl.training.learner import Learner
+from lare_rl.training.seed_axis import jit_over_seeds
 from lare_rl.training.static_config import TrainConfig
 
 __all__ = ["FirstFitStoppedError", "config_of_first_fit", "fit_until_converged", "has_enough_episodes"]
@@ -74,7 +75,7 @@ def fit_until_converged(
     hidden_fields = {name: getattr(learner.replay, name) for name in ("episodes", "running", "segments")}
     unhidden, n_seeds = jax.tree.map(jnp.copy, hidden_fields), len(learner.n_learned)
     n_hidden = jax.vmap(partial(_count_held_out, window=config.credit_window))(by_payment(learner.replay))
-    compute_error = jax.jit(jax.vmap(partial(_held_out_error, config=config)))
+    compute_error = jit_over_seeds(jax.vmap(partial(_held_out_error, config=config)), config.n_devices)
     best_decoders, best_error = jax.tree.map(jnp.copy, learner.decoders), np.full(n_seeds, np.inf)
     rounds_without_gain = np.zeros(n_seeds, int)
     metrics: dict[str, Float[Array, " seeds"]] = {}

@@ -14,6 +14,7 @@ from lare_rl.training import advice
 from lare_rl.training.explain import describe_returns
 from lare_rl.training.first_fit import FirstFitStoppedError
 from lare_rl.training.progress import Clock, Listener
+from lare_rl.training.seed_axis import first_shard
 from lare_rl.training.session import Session
 from lare_rl.training.unroll_host import DivergedError
 from lare_rl.util.findings import Finding, render
@@ -52,7 +53,7 @@ def run_session(session: Session, listeners: Sequence[Listener], stop: threading
         for listener in listeners:
             listener.on_step(session.step)
         if before <= settings.warmup < session.step:
-            report(advice.find_large_observations(run, session.learner.replay, session.config))
+            report(advice.find_large_observations(run, first_shard(session.learner.replay), session.config))
         is_last = session.step == settings.steps
         if not is_last and session.step % settings.evaluate_every:
             continue

@@ -56,13 +56,13 @@ def make_train_config(run: Run) -> TrainConfig:
     )
 
 
-def load_learner(run: Run) -> SavedState:
-    """Load the last checkpoint of a run.
+def load_learner(run: Run, n_devices: int = 1) -> SavedState:
+    """Load the last checkpoint of a run, with its seeds spread over devices.
 
     Raises:
         LareError: there is no checkpoint, it is damaged, or it is of a version of LaRe whose state has another structure.
     """
-    config = make_train_config(run)
+    config = replace(make_train_config(run), n_devices=n_devices)
     try:
         learner, host, arrays = checkpoint.load(run.checkpoint, learner_shape(config, len(run.seeds)))
         return SavedState(replace(config, batched=host.get("batched", False)), learner, host, arrays)

@@ -26,7 +26,7 @@ from lare_rl.runs.metric_names import ACTOR_SATURATION
 from lare_rl.tasks.spec import TaskSpec
 from lare_rl.training import advice, first_fit
 from lare_rl.training.batching import is_batching_faster
-from lare_rl.training.collect_device import DeviceCollector
+from lare_rl.training.collect_device import DeviceCollector, is_reset_cheap
 from lare_rl.training.collect_host import HostCollector, make_host_collector
 from lare_rl.training.compile_cache import cache_by_value
 from lare_rl.training.compiled import CompiledFunctions, compile_ahead, compile_functions, init_seeds, steps_shape
@@ -34,6 +34,7 @@ from lare_rl.training.compiled_loop import CompiledLoop, compile_loop, init_loop
 from lare_rl.training.factors import compute_host_factors
 from lare_rl.training.learner import Learner, abandon_episodes
 from lare_rl.training.saved_state import actor_shape, load_learner, make_train_config
+from lare_rl.training.seed_axis import count_seed_devices
 from lare_rl.training.static_config import TrainConfig
 from lare_rl.training.streams import Stream, seed_keys, stream_keys
 from lare_rl.util.float64 import one_blas_thread
@@ -121,7 +122,7 @@ class Session:
         self.learner, self.collector.envs = state.learner, state.envs
         self._unchecked = is_finite, state.steps
         self._check_factors()
-        self.latest_metrics |= {name: values for name, values in state.metrics.items() if is_measured[name]}
+        self.latest_metrics |= {name: values for name, values in state.metrics.items() if is_measured[name].any()}
         self.step += n_iterations * self.settings.iteration_steps
 
     def _iterate(self, stop_requested: Callable[[], bool]) -> None:
@@ -172,8 +173,11 @@ class Session:
         keys = seed_keys(jnp.asarray(self.run.seeds), self.step + 1)
         self.learner, metrics = self.functions.train_step(self.learner, steps, keys, self.step)
         n_updates = metrics.get("algorithm/updates")
-        if n_updates is None or np.any(np.asarray(n_updates) > 0):
-            self.latest_metrics |= metrics
+        if n_updates is not None:
+            is_new, old = n_updates > 0, self.latest_metrics
+            metrics = {name: jnp.where(is_new, values, old.get(name, values)) for name, values in metrics.items()}
+            metrics = metrics if np.any(is_new) else {}
+        self.latest_metrics |= metrics
 
     def fit(self, keys: Key[Array, " seeds"], stop_requested: Callable[[], bool]) -> None:
         """Fit the decoders. The first fit lasts until it brings no improvement."""
@@ -267,7 +271,7 @@ class Session:
 
 def start_session(run: Run) -> Session:
     """Return a session before its first step."""
-    config = make_train_config(run)
+    config = replace(make_train_config(run), n_devices=count_seed_devices(len(run.seeds)))
     config = replace(config, batched=is_batching_faster(config, len(run.seeds)))
     return _make_session(run, config, None)
 
@@ -278,7 +282,7 @@ def restore_session(run: Run) -> tuple[Session, list[str]]:
     Raises:
         LareError: there is no checkpoint, or it cannot be used.
     """
-    config, learner, host, arrays = load_learner(run)
+    config, learner, host, arrays = load_learner(run, count_seed_devices(len(run.seeds)))
     session = _make_session(run, config, learner)
     try:
         return session, session.restore(host, arrays)
@@ -293,8 +297,11 @@ def _make_session(run: Run, config: TrainConfig, learner: Learner | None) -> Ses
     """Compile the functions of a session and make its environments. Without a learner, start with an untrained one."""
     task, settings, n_seeds = run.config.task, run.config.settings, len(run.seeds)
     iterates_on_host = not config.env.is_jax or _has_first_fit(run, config)
-    functions = compile_ahead(config, run.graphs, n_seeds, iterates_on_host=iterates_on_host)
     env = _make_jax_env(task) if config.env.is_jax else None
+    if env is not None and config.batched:
+        n_envs = config.n_envs * n_seeds // config.n_devices
+        config = replace(config, resets_with_steps=is_reset_cheap(env, n_envs))
+    functions = compile_ahead(config, run.graphs, n_seeds, iterates_on_host=iterates_on_host)
     loop = None if env is None else compile_loop(env, config, run.graphs, settings.fit_every, n_seeds)
     learner = learner or init_seeds(functions, seed_keys(jnp.asarray(run.seeds), 0))
     if env is None:

@@ -44,8 +44,11 @@ class TrainConfig:
     """Updates of the decoder in an iteration that fits it. Unused if the decoder is updated with every update of the
     algorithm."""
     batched: bool = False
-    """Whether the device is faster with much work at once (`batching.py`): the fits of all seeds, and resets with every step. It
-    changes the last bits of a fit."""
+    """Whether the device is faster with much work at once (`batching.py`). It changes the last bits of a fit."""
+    resets_with_steps: bool = False
+    """Reset all environments with each step, and use the result where an episode has ended."""
+    n_devices: int = 1
+    """The number of devices over which the seeds are spread (`seed_axis.py`)."""
     payments: PaymentRule = PAID_AT_END
     """When the environment pays."""
     deterministic: bool = False
