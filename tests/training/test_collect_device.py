@@ -9,8 +9,10 @@ import numpy as np
 import pytest
 
 from helpers.jax_toy_envs import Echo
-from helpers.small_configs import SMALL_SETTINGS, small_config
+from helpers.small_configs import ONE_AGENT, SMALL_SETTINGS, small_config
 from lare_rl.algorithms.qmix import qmix
+from lare_rl.algorithms.td3 import TD3Settings
+from lare_rl.envs.interface import Timestep
 from lare_rl.training.collect_device import DeviceCollector, unroll_on_device
 from lare_rl.training.compiled import compile_functions
 from lare_rl.training.streams import Stream, stream_keys
@@ -138,6 +140,48 @@ def test_evaluate_initial_states_depend_on_number(learner):
     evaluations = [DeviceCollector(ENV, CONFIG, SEEDS).evaluate(learner[1], 5, number) for number in (0, 0, 1)]
     np.testing.assert_array_equal(evaluations[0].returns, evaluations[1].returns)
     assert not np.array_equal(evaluations[0].lengths, evaluations[2].lengths)
+
+
+class Still:
+    """A toy of a single agent whose steps change nothing."""
+
+    spec = ONE_AGENT
+
+    def reset(self, key):
+        zeros = jnp.zeros((1, 3))
+        timestep = Timestep(
+            observation=zeros,
+            state=jnp.zeros(0),
+            available=jnp.ones((1, 2), bool),
+            alive=jnp.ones(1, bool),
+            reward=jnp.zeros(1),
+            terminated=jnp.array(False),
+            truncated=jnp.array(False),
+            measures={},
+        )
+        return (), timestep
+
+    def step(self, state, action, key):
+        return self.reset(key)
+
+    def frames(self, states, credit=None):
+        return []
+
+
+def test_collect_acts_at_random_during_the_warmup():
+    """Without exploration noise, the policy acts the same in every step."""
+    hyperparameters = TD3Settings(hidden=(8,), warmup=400, exploration_noise=0.0)
+    config = small_config("dense", env=ONE_AGENT, n_envs=4, rollout_steps=100, hyperparameters=hyperparameters)
+    actor = make_actor(config=config)[1]
+    warmup, trained = (DeviceCollector(Still(), config, SEEDS).collect(actor, step) for step in (0, 400))
+    action = np.asarray(warmup.action).reshape(2, -1)
+    np.testing.assert_array_less(np.abs(action), 1)
+    for deciles in np.quantile(action, np.linspace(0.1, 0.9, 9), axis=1).T:
+        np.testing.assert_allclose(deciles, np.linspace(-0.8, 0.8, 9), atol=0.15)
+    assert abs(np.corrcoef(action)[0, 1]) < 0.15
+    np.testing.assert_allclose(
+        trained.action, np.broadcast_to(trained.action[:, :1, :1], trained.action.shape), atol=1e-6
+    )
 
 
 @pytest.mark.parametrize(("step", "epsilon"), [(0, 1.0), (SMALL_SETTINGS["qmix"].epsilon_steps, 0.05)])

@@ -11,7 +11,7 @@ from lare_rl.config.resolve import resolve
 from lare_rl.errors import LareError
 from lare_rl.latent.function import verify_function
 from lare_rl.runs.directory import create_run
-from lare_rl.training.session import start_session
+from lare_rl.training import session
 
 
 @pytest.fixture(scope="module")
@@ -23,13 +23,13 @@ def begin(small_many, tmp_path_factory):
         changes = {"environments": 2, "rollout_steps": 10, "steps": 80, "evaluate_every": 80, "fit_every": 2}
         settings = small_many(algorithm=algorithm, method=method, credit=QUICK_CREDIT, **changes, **more)
         directory = tmp_path_factory.mktemp("loop") / "run"
-        return start_session(create_run(directory, echo_spec(), resolve(settings, echo_spec()), [function]))
+        return session.start_session(create_run(directory, echo_spec(), resolve(settings, echo_spec()), [function]))
 
     return begin
 
 
-def assert_equal_sessions(session, other):
-    states = [(s.learner, s.collector.envs, s.latest_metrics) for s in (session, other)]
+def assert_equal_sessions(training, other):
+    states = [(s.learner, s.collector.envs, s.latest_metrics) for s in (training, other)]
     for (path, leaf), (_, other_leaf) in zip(*map(jax.tree_util.tree_leaves_with_path, states), strict=True):
         if jax.dtypes.issubdtype(leaf.dtype, jax.dtypes.prng_key):
             leaf, other_leaf = map(jax.random.key_data, (leaf, other_leaf))
@@ -40,7 +40,8 @@ def assert_equal_sessions(session, other):
     ("algorithm", "method"),
     [("ippo", "lare-bayes"), long_case("ippo", "lare-rd"), ("qmix", "lare-rd"), long_case("qmix", "bayes")],
 )
-def test_advance_equals_host_iterations(algorithm, method, begin):
+def test_advance_equals_host_iterations(algorithm, method, begin, monkeypatch):
+    monkeypatch.setattr(session, "MAX_CALL_S", 1e6)
     compiled, host = begin(algorithm, method), begin(algorithm, method)
     host.loop = None
     for _ in range(4):
@@ -52,11 +53,11 @@ def test_advance_equals_host_iterations(algorithm, method, begin):
 
 
 def test_advance_stops_at_a_factor_that_is_not_finite(begin):
-    session = begin("ippo", "lare-bayes", scored_observation="before")
-    session.advance(20)
-    envs = session.collector.envs
+    training = begin("ippo", "lare-bayes", scored_observation="before")
+    training.advance(20)
+    envs = training.collector.envs
     observation = envs.timestep.observation.at[1].set(np.inf)
-    session.collector.envs = envs._replace(timestep=envs.timestep._replace(observation=observation))
+    training.collector.envs = envs._replace(timestep=envs.timestep._replace(observation=observation))
     with pytest.raises(LareError, match=r"factor .*failed_batch.npz"):
-        session.advance(80)
-    assert session.step == 20
+        training.advance(80)
+    assert training.step == 20

@@ -8,8 +8,9 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Key
+from jaxtyping import Array, Bool, Float, Int, Key
 
+from lare_rl.algorithms.registry import Noise
 from lare_rl.data.trajectory import Trajectory
 from lare_rl.envs.interface import JaxEnv, Timestep, team_mean, to_env_action
 from lare_rl.nn.masks import select
@@ -51,9 +52,9 @@ class DeviceCollector:
         self.envs: VecEnvState = self._reset(stream_keys(seeds, Stream.TRAINING_EPISODES, 0))
 
     def collect(self, actor: Any, step: int) -> Trajectory:
-        """Return the steps of the iteration that begins at `step`."""
+        """Return the steps of the iteration that begins at `step`. During the warmup, actions are random."""
         keys = stream_keys(self._seeds, Stream.EXPLORATION, step)
-        self.envs, steps = self._collect(self.envs, actor, keys)
+        self.envs, steps = self._collect(self.envs, actor, keys, step)
         return steps
 
     def evaluate(self, actor: Any, n_episodes: int, number: int = 0) -> Evaluation:
@@ -107,7 +108,7 @@ def _jit_functions(env: JaxEnv, config: TrainConfig) -> tuple[Callable[..., Any]
     jit = partial(jit_over_seeds, n_devices=config.n_devices)
     return (
         jit(partial(reset, env, n_envs=config.n_envs, config=config)),
-        jit(partial(collect, env, config=config), donate=(0,)),
+        jit(partial(collect, env, config=config), shared=(3,), donate=(0,)),
         jit(partial(_evaluate, env, config=config), static=("n_episodes",)),
     )
 
@@ -128,6 +129,7 @@ class _Randomness(NamedTuple):
 
 
 def _draw(keys: Key[Array, " seeds"], n_envs: int, config: TrainConfig, greedy: bool) -> _Randomness:
+    """Draw the random numbers of a step."""
     noise_keys, env_keys = jnp.unstack(_split_keys(keys, 2), axis=1)
     noise, shape = None, (n_envs, config.env.n_agents, config.noise_size)
     if not greedy:
@@ -148,10 +150,18 @@ def _step(
 
 
 def collect(
-    env: JaxEnv, envs: VecEnvState, actor: Any, keys: Key[Array, " seeds"], config: TrainConfig
+    env: JaxEnv,
+    envs: VecEnvState,
+    actor: Any,
+    keys: Key[Array, " seeds"],
+    env_steps: int | Int[Array, ""],
+    config: TrainConfig,
 ) -> tuple[VecEnvState, Trajectory]:
-    """Make `rollout_steps` steps of every environment. When an episode ends, the next one begins."""
-    act, n_envs = policy_function(config, greedy=False), config.n_envs
+    """Make `rollout_steps` steps of every environment. When an episode ends, the next one begins.
+
+    `env_steps` is the number of steps before. During the warmup, actions are random.
+    """
+    act, n_envs = _exploration_policy(env_steps, config), config.n_envs
 
     def body(envs: VecEnvState, randomness: tuple[_Randomness, Key[Array, " seeds"]]) -> tuple[VecEnvState, Trajectory]:
         step_randomness, reset_keys = randomness
@@ -171,6 +181,21 @@ def collect(
     randomness = jax.vmap(lambda keys_t: _draw(keys_t, n_envs, config, greedy=False))(step_keys)
     envs, steps = jax.lax.scan(body, envs, (randomness, reset_keys))
     return envs, jax.tree.map(lambda rows: jnp.swapaxes(rows, 0, 1), steps)
+
+
+def _exploration_policy(env_steps: int | Int[Array, ""], config: TrainConfig) -> Act:
+    """Return the policy that collects. During the warmup, its actions are random: evenly distributed between the bounds."""
+    policy = policy_function(config, greedy=False)
+    if not config.warmup:
+        return policy
+    assert config.noise is Noise.NORMAL
+
+    def act(actor: Any, memory: Any, observation: Array, available: Array, noise: Array, is_new: Array) -> Any:
+        action, memory = policy(actor, memory, observation, available, noise, is_new)
+        uniform = jax.lax.erf(noise / math.sqrt(2))  # the distribution function of the noise, scaled to -1 to 1
+        return jnp.where(env_steps < config.warmup, uniform, action), memory
+
+    return act
 
 
 def is_reset_cheap(env: JaxEnv, n_envs: int) -> bool:

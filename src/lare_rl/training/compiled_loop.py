@@ -109,7 +109,7 @@ def _loop_shape(env: JaxEnv, config: TrainConfig, n_seeds: int) -> LoopState:
 
     def measure_and_collect(learner: Learner, keys: Key[Array, " seeds"]) -> LoopState:
         envs, actor = collect_device.reset(env, keys, config.n_envs, config), module.get_actor(learner, start, config)
-        _, steps = collect_device.collect(env, envs, actor, keys, config)
+        _, steps = collect_device.collect(env, envs, actor, keys, start, config)
         metrics = module.train_step(learner, steps, keys, start, config)[1]
         if config.fits_separately:
             metrics |= fit_seeds(learner, keys, config)[1]
@@ -132,7 +132,7 @@ def _iterate(
     module, env_steps = training_module(config), iteration * config.rollout_steps * config.n_envs
     actor = module.get_actor(state.learner, env_steps, config)
     keys = stream_keys(seeds, Stream.EXPLORATION, env_steps)
-    envs, steps = collect_device.collect(env, state.envs, actor, keys, config)
+    envs, steps = collect_device.collect(env, state.envs, actor, keys, env_steps, config)
     learner, is_finite = jax.vmap(partial(store, config=config, phi=phi))(state.learner, steps)
     if learner.decoders:
         learn = partial(_learn_returns, config=config)
