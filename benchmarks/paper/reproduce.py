@@ -9,7 +9,8 @@ from lare_rl.compare.bootstrap import load_rliable
 from lare_rl.compare.metric_tables import read_metric_rows, write_table
 from lare_rl.errors import LareError
 from lare_rl.sweep.jobs import Job, check_job
-from lare_rl.sweep.sweep import Resources, run_sweep
+from lare_rl.sweep.resources import Resources
+from lare_rl.sweep.sweep import run_sweep
 from paper import correlations, regret, trained
 from paper.exhibits import Budget, budgets, exhibit_jobs, exhibits
 from paper.pages import Page, write_page

@@ -2,7 +2,6 @@
 
 import csv
 import json
-import os
 import re
 import shutil
 import signal
@@ -21,8 +20,9 @@ from lare_rl.errors import LareError
 from lare_rl.latent.function import verify_function
 from lare_rl.runs.config_file import make_config
 from lare_rl.sweep.jobs import job_to_json, train_job
-from lare_rl.sweep.processes import RunningProcesses, assign_cores, train_in_process
-from lare_rl.sweep.sweep import Resources, read_sweep, run_sweep
+from lare_rl.sweep.processes import RunningProcesses, train_in_process
+from lare_rl.sweep.resources import Slot
+from lare_rl.sweep.sweep import read_sweep, run_sweep
 from lare_rl.training.loop import RunInterruptedError
 
 FILE = """
@@ -106,14 +106,6 @@ def test_jobs_of_file(file, tmp_path, command):
     assert re.search(r"1 processes with 1000 cores each need 1000 cores, and \d+ are usable", error)
     file.write_text(FILE.replace("[settings]", "[settings]\ncandidates = 1").replace("[0, 3]", "[0]"))
     assert read_sweep(file)[1][1].directory.name == "lare-linear-td3-draw0-candidates1"
-
-
-def test_assign_cores():
-    with pytest.raises(LareError, match=r"1000 processes with 3 cores each need 3000 cores"):
-        assign_cores(1000, 3)
-    usable = sorted(os.sched_getaffinity(0))
-    assert assign_cores(len(usable), 1) == [[core_id] for core_id in usable]
-    assert assign_cores(1, len(usable)) == [usable]
 
 
 def test_finished_runs_are_skipped_and_others_continue(file, copying_python):
@@ -249,7 +241,7 @@ def test_killed_sweep_saves_its_run(file, tmp_path):
 def test_error_of_process(file):
     job = read_sweep(file)[1][0]
     job.directory.mkdir(parents=True)  # as if another sweep had just started it
-    error = train_in_process(job, [], RunningProcesses())
+    error = train_in_process(job, Slot([], {}), RunningProcesses())
     assert error.startswith(f"{job.directory} exists")
     assert error.endswith("dense-td3.log)")
 
@@ -270,13 +262,13 @@ def test_end_of_process(file, python_script, script, error):
     log.parent.mkdir(parents=True)
     log.write_text("step 100 of 200: all is well\n")
     python_script(script)
-    assert train_in_process(job, [], RunningProcesses()) == f"{error} ({log})"
+    assert train_in_process(job, Slot([], {}), RunningProcesses()) == f"{error} ({log})"
 
 
 def test_no_process_after_stop(file):
     running = RunningProcesses()
     running.stop()
-    assert "not started" in train_in_process(read_sweep(file)[1][0], [], running)
+    assert "not started" in train_in_process(read_sweep(file)[1][0], Slot([], {}), running)
 
 
 @pytest.mark.parametrize(
@@ -352,8 +344,3 @@ def test_directory_of_another_run(file):
     (jobs[1].directory / "thesis.tex").write_text("")
     with pytest.raises(LareError, match="lare-linear-td3-draw0 exists, and is not a run"):
         read_sweep(file)
-
-
-def test_resources_are_checked():
-    with pytest.raises(LareError, match="cores = 0"):
-        Resources(cores=0)

@@ -27,15 +27,15 @@ def sweep(
     """Train the runs that a TOML file lists and that are not finished yet. All metrics go to results.csv and .parquet.
 
     Args:
-        file: lists tasks, methods, algorithms, draws and settings, and how many processes run at a time, on how many cores each
-            (docs/sweeps.md).
+        file: lists tasks, methods, algorithms, draws and settings, and how many processes run at a time, on how many cores and
+            cards each (docs/sweeps.md).
         ray: the address of a Ray cluster to train on instead of this machine, or local (needs the extra lare-rl[ray]).
         check: only check the file, list its runs and how far they are, and train nothing.
     """
     from lare_rl.cli.sweep_progress import show_progress
     from lare_rl.compare.metric_tables import read_metric_rows, write_table
     from lare_rl.config.effective import warmup_warning
-    from lare_rl.sweep.processes import assign_cores
+    from lare_rl.sweep.resources import assign_slots
     from lare_rl.sweep.sweep import read_sweep, run_sweep
 
     resources, jobs = read_sweep(file)
@@ -45,7 +45,7 @@ def sweep(
     if check:
         if ray is None:
             try:
-                assign_cores(resources.processes, resources.cores)
+                assign_slots(resources)
             except LareError as error:  # the sweep may be meant for another machine
                 print_progress(f"{error}: the sweep would not begin on this machine")
         for job in jobs:
@@ -116,6 +116,7 @@ def reproduce(
     out: Path = Path("results"),
     processes: int = 1,
     cores: int = 1,
+    cards: float | None = None,
     ray: Ray = None,
 ) -> None:
     """Reproduce a figure or table of the LaRe paper: train its runs, and write a page that compares the results. Needs a checkout.
@@ -128,17 +129,18 @@ def reproduce(
         out: the directory of the pages: OUT/BUDGET/NAME.md, with its pictures and all metrics.
         processes: number of runs at a time.
         cores: number of cores for each run.
+        cards: number of cards (accelerators) for each run; less than 1 if runs share a card. By default, an equal share.
         ray: the address of a Ray cluster to train on instead of this machine, or local (needs the extra lare-rl[ray]).
     """
     from lare_rl.cli.sweep_progress import show_progress
-    from lare_rl.sweep.sweep import Resources
+    from lare_rl.sweep.resources import Resources
     from lare_rl.training.loop import RunInterruptedError
 
     paper = _import_from_checkout("reproduce")
     if exhibit is None:
         print_table(("exhibit", "of the paper", "what it shows"), paper.listed())
         return
-    resources = Resources(processes=processes, cores=cores)
+    resources = Resources(processes=processes, cores=cores, cards=cards)
 
     def write_page(name: str) -> None:
         print_line(f"wrote {paper.reproduce(name, budget, resources, runs, out, ray, show_progress)}")

@@ -1,4 +1,4 @@
-"""Training of jobs: on this machine, each in its own process and on its own cores, or on a Ray cluster.
+"""Training of jobs: on this machine, each in its own process, on its own cores and cards, or on a Ray cluster.
 
 A process ends when its parent ends.
 """
@@ -20,39 +20,40 @@ from typing import Any
 from lare_rl.errors import LareError, missing_extra_error
 from lare_rl.runs.directory import RunBusyError
 from lare_rl.sweep.jobs import Job, job_to_json, train_job
+from lare_rl.sweep.resources import PREALLOCATE, Resources, Slot, assign_slots
 
-__all__ = ["RunningProcesses", "assign_cores", "train_in_process", "train_in_processes", "train_on_ray"]
+__all__ = ["RunningProcesses", "train_in_process", "train_in_processes", "train_on_ray"]
 
 LOCK_TIMEOUT_S = 60.0
 """Time to wait for an earlier process that is still saving the run."""
 
 
 def train_in_processes(
-    jobs: Sequence[Job], processes: int, cores: int, listener: Callable[[str], None]
+    jobs: Sequence[Job], resources: Resources, listener: Callable[[str], None]
 ) -> Generator[tuple[Job, str | None], None, None]:
-    """Train `processes` jobs at a time, each on `cores` cores. Yield each job when it ends, and its error or None.
+    """Train several jobs at a time. Yield each job when it ends, and its error or None.
 
     Closing the generator stops all jobs. Running jobs save a checkpoint first.
 
     Raises:
-        LareError: there are not enough cores.
+        LareError: there are not enough cores or cards.
     """
-    free_cores: queue.Queue[list[int]] = queue.Queue()
-    for core_ids in assign_cores(processes, cores):
-        free_cores.put(core_ids)
+    free_slots: queue.Queue[Slot] = queue.Queue()
+    for slot in assign_slots(resources):
+        free_slots.put(slot)
     running = RunningProcesses()
 
     def train(job: Job) -> str | None:
-        core_ids = free_cores.get()
+        slot = free_slots.get()
         try:
             listener(f"{job.name} begins" + (f" again at step {job.step()}" if job.started else ""))
-            return train_in_process(job, core_ids, running)
+            return train_in_process(job, slot, running)
         except (LareError, OSError) as error:  # only this run fails; the others continue
             return str(error)
         finally:
-            free_cores.put(core_ids)
+            free_slots.put(slot)
 
-    pool = ThreadPoolExecutor(processes)
+    pool = ThreadPoolExecutor(resources.processes)
     futures = {pool.submit(train, job): job for job in jobs}
     try:
         yield from ((futures[future], future.result()) for future in as_completed(futures))
@@ -92,34 +93,23 @@ class RunningProcesses:
                 process.send_signal(signal.SIGINT)
 
 
-def assign_cores(processes: int, cores: int) -> list[list[int]]:
-    """Return the cores of each process, or an empty list for each if the system cannot tell which cores are usable.
-
-    Raises:
-        LareError: there are not enough cores.
-    """
-    if not hasattr(os, "sched_getaffinity"):
-        return [[] for _ in range(processes)]
-    usable = sorted(os.sched_getaffinity(0))
-    if processes * cores > len(usable):
-        raise LareError(
-            f"{processes} processes with {cores} cores each need {processes * cores} cores, and {len(usable)} are usable here: "
-            "lower processes or cores"
-        )
-    return [usable[start : start + cores] for start in range(0, processes * cores, cores)]
-
-
-def train_in_process(job: Job, core_ids: list[int], running: RunningProcesses) -> str | None:
+def train_in_process(job: Job, slot: Slot, running: RunningProcesses) -> str | None:
     """Train one job in a new process, which writes its output to RUN.log. Return the error, or None."""
     job.directory.parent.mkdir(parents=True, exist_ok=True)
     log = job.directory.with_name(job.directory.name + ".log")
-    request = json.dumps({"job": job_to_json(job), "cores": core_ids})
+    request = json.dumps({"job": job_to_json(job), "cores": slot.cores})
     with log.open("a", encoding="utf-8") as file:
         log_start = file.tell()
         command = [sys.executable, "-P", "-m", "lare_rl.sweep.processes"]
         # In its own session, so that Ctrl-C reaches it only once, through this process.
         process = running.start(
-            command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=file, text=True, start_new_session=True
+            command,
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            stderr=file,
+            text=True,
+            start_new_session=True,
+            env=os.environ | slot.variables,
         )
         if process is None:
             return "it was not started, because the sweep was stopped"
@@ -148,8 +138,10 @@ def train_in_process(job: Job, core_ids: list[int], running: RunningProcesses) -
     return f"{error} ({log})"
 
 
-def train_on_ray(jobs: Sequence[Job], cores: int, address: str) -> Generator[tuple[Job, str | None], None, None]:
-    """Train jobs on a Ray cluster, each on `cores` cores. Yield each job when it ends, and its error or None.
+def train_on_ray(
+    jobs: Sequence[Job], resources: Resources, address: str
+) -> Generator[tuple[Job, str | None], None, None]:
+    """Train jobs on a Ray cluster, each on its cores and cards. Yield each job when it ends, and its error or None.
 
     All machines must share the directory of the runs.
 
@@ -167,7 +159,14 @@ def train_on_ray(jobs: Sequence[Job], cores: int, address: str) -> Generator[tup
     except (ConnectionError, ValueError, RuntimeError) as error:
         raise LareError(f"there is no Ray cluster at {address}: {error}") from error
     try:
-        remote = ray.remote(num_cpus=cores, max_calls=1)(train_job)
+        cards = resources.cards or 0
+        variables = {PREALLOCATE: "false"} if 0 < cards < 1 else {}
+        options: dict[str, Any] = {
+            "num_cpus": resources.cores,
+            "num_gpus": cards,
+            "runtime_env": {"env_vars": variables},
+        }
+        remote = ray.remote(**options, max_calls=1)(train_job)
         pending = {remote.remote(job_to_json(job)): job for job in jobs}
         while pending:
             (task,), _ = ray.wait(list(pending), num_returns=1)

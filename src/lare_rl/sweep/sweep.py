@@ -16,26 +16,18 @@ from lare_rl.config.effective import unused_settings
 from lare_rl.config.settings import Settings
 from lare_rl.credit.methods import find_method
 from lare_rl.envs.load import load_task
-from lare_rl.errors import CheckedModel, LareError
+from lare_rl.errors import LareError
 from lare_rl.sweep.jobs import Job, check_job, make_job
 from lare_rl.sweep.processes import train_in_processes, train_on_ray
+from lare_rl.sweep.resources import Resources
 from lare_rl.training.loop import RunInterruptedError
 from lare_rl.util.renamed_fields import rename_keys
 from lare_rl.util.safe_io import MAX_SETTINGS_BYTES, read_text, read_toml
 
-__all__ = ["Resources", "Sweep", "read_sweep", "run_sweep"]
+__all__ = ["Sweep", "read_sweep", "run_sweep"]
 
 Texts = Annotated[tuple[str, ...], Field(min_length=1)]
 Draws = Annotated[tuple[Annotated[int, Field(ge=0)], ...], Field(min_length=1)]
-
-
-class Resources(CheckedModel):
-    """The part of the machine that runs use."""
-
-    processes: Annotated[int, Field(ge=1)] = 1
-    """Runs at a time."""
-    cores: Annotated[int, Field(ge=1)] = 1
-    """Cores of each run."""
 
 
 class Sweep(Resources):
@@ -102,17 +94,14 @@ def run_sweep(
 
     Raises:
         RunInterruptedError: the user stopped it.
-        LareError: there are not enough cores, or Ray is not available.
+        LareError: there are not enough cores or cards, or Ray is not available.
     """
     todo = [job for job in jobs if not job.done]
     n_done = len(jobs) - len(todo)
     listener(f"{len(jobs)} runs, {n_done} of them done")
     if not todo:
         return []
-    if ray is None:
-        results = train_in_processes(todo, resources.processes, resources.cores, listener)
-    else:
-        results = train_on_ray(todo, resources.cores, ray)
+    results = train_in_processes(todo, resources, listener) if ray is None else train_on_ray(todo, resources, ray)
     failed = []
     try:
         with contextlib.closing(results):

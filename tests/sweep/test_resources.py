@@ -1,0 +1,71 @@
+"""Cores and cards, divided among processes."""
+
+import os
+
+import pytest
+
+from lare_rl.errors import LareError
+from lare_rl.sweep import resources
+from lare_rl.sweep.resources import Resources, Slot, assign_cards, assign_cores, assign_slots
+
+FIRST, SECOND = resources.VISIBLE_CARDS
+
+
+def visible(variables):
+    """Return the cards of each process."""
+    assert all(process[FIRST] == process[SECOND] for process in variables)
+    return [process[FIRST] for process in variables]
+
+
+def test_assign_cores():
+    with pytest.raises(LareError, match=r"1000 processes with 3 cores each need 3000 cores"):
+        assign_cores(1000, 3)
+    usable = sorted(os.sched_getaffinity(0))
+    assert assign_cores(len(usable), 1) == [[core_id] for core_id in usable]
+    assert assign_cores(1, len(usable)) == [usable]
+
+
+@pytest.mark.parametrize(
+    ("processes", "cards", "expected"),
+    [
+        (2, None, ["0,1", "2,3"]),
+        (3, None, ["0", "1", "2"]),
+        (6, None, ["0", "1", "2", "3", "0", "1"]),
+        (2, 1.0, ["0", "1"]),
+        (5, 0.5, ["0", "1", "2", "3", "0"]),
+        (2, 0.0, ["", ""]),
+    ],
+)
+def test_assign_cards(processes, cards, expected):
+    variables = assign_cards(processes, cards, 4, {})
+    assert visible(variables) == expected
+    is_shared = processes > 4 or cards == 0.5
+    assert all((process.get(resources.PREALLOCATE) == "false") == is_shared for process in variables)
+
+
+def test_assign_cards_of_the_user():
+    environment = {FIRST: "5,7", SECOND: "5,7", resources.PREALLOCATE: "true"}
+    variables = assign_cards(3, None, 2, environment)
+    assert visible(variables) == ["5", "7", "5"]
+    assert all(resources.PREALLOCATE not in process for process in variables)
+
+
+@pytest.mark.parametrize(("processes", "cards", "n_cards"), [(3, 2.0, 4), (9, 0.5, 4), (1, 1.0, 0)])
+def test_too_few_cards(processes, cards, n_cards):
+    with pytest.raises(LareError, match=f"{processes} processes .* the {n_cards} cards"):
+        assign_cards(processes, cards, n_cards, {})
+
+
+def test_slots_without_cards(monkeypatch):
+    """On a machine without cards, processes have no variables. A single process does not even ask for cards."""
+    monkeypatch.setenv("JAX_PLATFORMS", "cpu")
+    with pytest.raises(LareError, match="the 0 cards"):
+        assign_slots(Resources(cards=1))
+    assert assign_cards(2, None, 0, {}) == [{}, {}]
+    monkeypatch.setattr(resources, "_count_cards", lambda: pytest.fail("asked"))
+    assert assign_slots(Resources()) == [Slot(assign_cores(1, 1)[0], {})]
+
+
+def test_resources_are_checked():
+    with pytest.raises(LareError, match="cores = 0"):
+        Resources(cores=0)
