@@ -5,7 +5,7 @@ Collection, factors, replay, fits, relabelling and updates are one program, so n
 
 from collections.abc import Callable, Sequence
 from functools import partial
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -91,7 +91,7 @@ def init_loop(loop: CompiledLoop, learner: Learner, envs: VecEnvState, metrics: 
     """Return the state before an iteration. `metrics` are those of the newest updates, or empty before the first."""
     shape = loop.shape
 
-    def fill(leaf: jax.ShapeDtypeStruct, value: int) -> Array:
+    def fill(leaf: Any, value: int) -> Array:
         return jnp.full(leaf.shape, value, leaf.dtype, device=leaf.sharding)
 
     return LoopState(

@@ -36,7 +36,7 @@ def jit_over_seeds(
     shared: Sequence[int] = (),
     static: Sequence[str] = (),
     donate: Sequence[int] = (),
-) -> Callable[..., Any]:
+) -> jax.stages.Wrapped:
     """Compile a function of arrays with a leading seed axis. Each device runs it for its own seeds.
 
     Args:
