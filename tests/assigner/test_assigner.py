@@ -8,7 +8,15 @@ import jax
 import numpy as np
 import pytest
 
-from helpers.assigner_episodes import TASK, Episode, add_episode, random_episode, random_episodes, small_assigner
+from helpers.assigner_episodes import (
+    SMALL_CREDIT,
+    TASK,
+    Episode,
+    add_episode,
+    random_episode,
+    random_episodes,
+    small_assigner,
+)
 from helpers.long_tests import long_case
 from helpers.toy_envs import pick_spec
 from lare_rl.assigner.assigner import CreditAssigner
@@ -560,3 +568,47 @@ def test_must_learn_scores_that_are_no_sum(score):
         levels = np.maximum.accumulate(episodes[-1].next_observation[:, 0])
         raises = np.append(True, np.diff(levels) > 0.05)
         assert r_hat[raises].mean() > r_hat[~raises].mean() + 0.02
+
+
+@pytest.mark.parametrize("method", ["bayes", "rd"])
+def test_must_not_credit_steps_for_the_level(method, tmp_path):
+    """Easy levels have larger returns and another state. With groups, the state gets no credit."""
+    rng, names = np.random.default_rng(0), ("easy", "hard", "night")
+    settings = SMALL_CREDIT.model_copy(update={"learning_rate": 0.01, "steps": 100})
+    grouped, blind = (small_assigner(method, groups=groups, settings=settings) for groups in (True, False))
+    episodes = random_episodes([10] * 90)
+    for i, episode in enumerate(episodes):
+        level = i % 3
+        shift = np.float32([0, 0.4 * (level - 1)])
+        steps = episode.observation + shift, episode.action, episode.next_observation + shift
+        score = episode.next_observation[:, 0].sum() + 20 * (1 - level) + 0.1 * rng.normal()
+        grouped.add_episode(*steps, score, group=names[level])
+        blind.add_episode(*steps, score)
+    for credit in (grouped, blind):
+        credit.fit(800)
+    states, action = np.float32([[0, -0.5], [0, 0.5]]), np.zeros((2, 1), np.float32)
+    credited = [abs(np.diff(credit.rewards(states, action, states))[0]) for credit in (grouped, blind)]
+    assert credited[1] > 1.0
+    assert credited[0] < 0.4 * credited[1]
+    if method == "bayes":
+        assert grouped.metrics()["credit/return_r2"] > 0.95
+        grouped.save(tmp_path / "saved")
+        loaded = CreditAssigner.load(tmp_path / "saved")
+        assert loaded.group_names == {"easy": 0, "hard": 1, "night": 2}
+        assert [e.level for e in loaded.store.episodes.values()] == [e.level for e in grouped.store.episodes.values()]
+        np.testing.assert_array_equal(loaded.rewards(states, action, states), grouped.rewards(states, action, states))
+
+
+def test_groups_that_do_not_fit_are_refused():
+    episode = random_episode(5, np.random.default_rng(0))
+    with pytest.raises(LareError, match="groups=True"):
+        small_assigner().add_episode(*episode, group="easy")
+    credit = small_assigner(groups=True)
+    with pytest.raises(LareError, match="needs group"):
+        credit.add_episode(*episode)
+    with pytest.raises(LareError, match=r"2 entries.* 5 steps"):
+        credit.add(*episode, np.zeros(5, bool), np.zeros(5, bool), group=["a", "b"])
+    for i in range(64):
+        credit.add_episode(*episode, group=f"g{i}")
+    with pytest.raises(LareError, match=r"more than 64 groups.*'new'"):
+        credit.add_episode(*episode, group="new")

@@ -28,13 +28,14 @@ PHI_ENV = replace(ONE_AGENT, observation_size=2, action_size=1, low=ONE_AGENT.lo
 """The sizes that `phi` is for. The bounds are -1 and 1, so that actions need no scaling."""
 
 
-def learn(method, env, phi=None, payments=PAID_AT_END, exact="no"):
+def learn(method, env, phi=None, payments=PAID_AT_END, exact="no", group=None):
     """Return a learner and an assigner that have learned from the same steps."""
     scored_observation = "after" if phi is None else toy_spec().scored_observation
     algorithm = "td3" if env.n_agents == 1 else "ippo"
     config = small_config(
         method, algorithm, env, capacity=1000, scored_observation=scored_observation, payments=payments
     )
+    config = replace(config, credit=config.credit.model_copy(update={"exact": exact}), group=group)
     credit = CreditAssigner(
         method,
         phi,
@@ -43,9 +44,16 @@ def learn(method, env, phi=None, payments=PAID_AT_END, exact="no"):
         action_space=env.action_size,
         settings=config.credit,
         payments=payments,
+        groups=group is not None,
         **({} if env.n_agents == 1 else {"agents": env.n_agents, "max_steps": env.max_steps}),
     )
     learner, steps = untrained_learner(config), random_steps(env, lengths=LENGTHS * 6)
+    episode = np.cumsum(steps.ended[:, 0]) - steps.ended[:, 0]
+    level = np.where(episode % 3 == 0, 0, 1)  # in the order in which an assigner counts its groups
+    if group is not None:
+        measures = {group: np.where(steps.ended, level[:, None], 0).astype(np.float32)}  # known at the last step alone
+        reward = steps.next_timestep.reward + 3 * level[:, None, None].astype(np.float32)
+        steps = steps._replace(next_timestep=steps.next_timestep._replace(measures=measures, reward=reward))
     agent = 0 if env.n_agents == 1 else slice(None)
     for rows in np.array_split(np.arange(len(steps.ended)), 12):
         chunk = jax.tree.map(lambda leaf, rows=rows: leaf[rows], steps)
@@ -65,7 +73,10 @@ def learn(method, env, phi=None, payments=PAID_AT_END, exact="no"):
         alive = chunk.timestep.alive[:, 0] if env.n_agents > 1 else None
         never = np.zeros(len(rows), bool)
         ended, env_ids = chunk.ended[:, 0], [0] * len(rows)
-        credit.add(observation, action, next_observation, reward, never, ended, env_ids=env_ids, alive=alive)
+        groups = None if group is None else [f"level {k}" for k in level[rows]]
+        credit.add(
+            *(observation, action, next_observation, reward, never, ended), env_ids=env_ids, alive=alive, group=groups
+        )
         credit.rewards_at([])  # the trainer learns after each chunk
     return learner, config, credit
 
@@ -96,3 +107,14 @@ def test_rewards_agree(method, env, payments, exact, phi):
     assert np.abs(expected).max() > 0
     if learner.decoders:
         assert credit.learner.n_learned == int(learner.n_learned.sum())
+
+
+@pytest.mark.parametrize("method", ["rd-linear", "bayes"])
+def test_rewards_agree_with_groups(method):
+    learner, config, credit = learn(method, ONE_AGENT, group="map")
+    expected = np.asarray(rewards(stored_steps(learner), reward_state(learner), config))[..., 0]
+    r_hat = credit.rewards_at(np.arange(credit.store.steps))
+    np.testing.assert_allclose(r_hat, expected, rtol=1e-4, atol=1e-5 * np.abs(expected).max())
+    intercept = np.asarray(learner.decoders[0].closed_form.intercept)[0]
+    assert intercept[1] - intercept[0] > 1.0
+    assert not intercept[2:].any()

@@ -10,7 +10,7 @@ from hypothesis.extra.numpy import arrays
 from lare_rl.credit.basis import Basis, expand_history, fourier_terms
 from lare_rl.credit.history import next_history, scan_history
 
-VALUES = arrays(np.float32, (7, 2), elements=st.floats(-3, 3, width=32))
+VALUES = arrays(np.float32, (7, 2), elements=st.floats(-3, 3, width=32, allow_subnormal=False))
 BEGINS = st.lists(st.booleans(), min_size=7, max_size=7)
 
 

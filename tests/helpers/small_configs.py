@@ -162,6 +162,7 @@ def steps_as_stored(config, steps=None, factors=None):
         finished=jnp.ones(len(last), bool),
         last=jnp.asarray(last),
         residual=None,
+        level=None,
         length=jnp.asarray(np.repeat(length, length), jnp.int32),
     )
 

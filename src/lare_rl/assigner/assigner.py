@@ -12,6 +12,7 @@ samples steps, because stored proxy rewards would be those of an older decoder.
 
 import threading
 from collections.abc import Hashable, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -40,7 +41,7 @@ from lare_rl.envs.load import resolve_task
 from lare_rl.errors import LareError
 from lare_rl.latent.function import LatentFunction
 from lare_rl.tasks.payments import PAID_AT_END, PaymentRule
-from lare_rl.tasks.spec import ScoredObservation, TaskSpec
+from lare_rl.tasks.spec import MAX_LEVELS, ScoredObservation, TaskSpec
 
 __all__ = ["CreditAssigner"]
 
@@ -66,6 +67,7 @@ class CreditAssigner:
         scale_rewards: bool = False,
         forget: bool = True,
         payments: PaymentRule | None = None,
+        groups: bool | None = None,
     ):
         """Make an assigner without any steps.
 
@@ -89,6 +91,8 @@ class CreditAssigner:
             forget: whether a closed-form fit may forget episodes whose steps are not stored any more. Use True in training, because
                 the policy changes, and False for a log, whose episodes all count the same.
             payments: when the environment pays, if it pays before the end of an episode. The task's by default.
+            groups: whether returns of episodes of the same group share an intercept: levels, maps, weather, demand. `add` and
+                `add_episode` then need `group`. The default is whether the task has `group`.
 
         Raises:
             LareError: method, function, task and spaces do not go together.
@@ -115,6 +119,7 @@ class CreditAssigner:
                 scale_rewards=scale_rewards,
                 forget=forget,
                 payments=payments or (PAID_AT_END if task is None else task.payment_rule),
+                groups=(task is not None and task.group is not None) if groups is None else groups,
             )
         )
 
@@ -122,7 +127,9 @@ class CreditAssigner:
         check_config(config)
         self.config = config
         row_shape = (*config.agent_axis, config.spec.basis.n_inputs)
-        self.store = Store(config.capacity, row_shape, config.agents, config.payments)
+        self.store = Store(config.capacity, row_shape, config.agents, config.payments, has_levels=config.groups)
+        self.group_names: dict[Hashable, int] = {}
+        """The number of each group."""
         self.learner = DecoderLearner(config, self.store)
         self.lock = threading.RLock()
 
@@ -138,6 +145,7 @@ class CreditAssigner:
         env_ids: Sequence[Hashable] | None = None,
         valid: Any = None,
         alive: Any = None,
+        group: Sequence[Hashable] | None = None,
         lanes: Sequence[Hashable] | None = None,
     ) -> Int[np.ndarray, " steps"]:
         """Add one step of each of several environments.
@@ -156,6 +164,7 @@ class CreditAssigner:
             env_ids: the environment of each row, as any hashable value; 0 to n - 1 by default.
             valid: (n,), false for a row that is not a step, such as the call after an end in which a vector environment resets.
             alive: (n, agents), which agents acted; all by default.
+            group: the group of each row's episode, as a text or a number, if the assigner has groups. At most 64 may differ.
             lanes: the earlier name of `env_ids`.
 
         Returns:
@@ -181,12 +190,21 @@ class CreditAssigner:
             if len(rows):
                 step_ids[rows] = self.learner.add_steps(*steps, None if alive is None else alive[rows])
                 env_ids = [ids[row] for row in rows.tolist()]
-                self.learner.queue_episodes(self.store.extend(env_ids, step_ids[rows], steps, team_reward, ended))
+                level = self._levels(group, n_rows)[rows]
+                paid_episodes = self.store.extend(env_ids, step_ids[rows], steps, team_reward, ended, level)
+                self.learner.queue_episodes(paid_episodes)
                 self.learner.flush_large_queues()
             return step_ids
 
     def add_episode(
-        self, observation: Any, action: Any, next_observation: Any, reward: Any, *, alive: Any = None
+        self,
+        observation: Any,
+        action: Any,
+        next_observation: Any,
+        reward: Any,
+        *,
+        alive: Any = None,
+        group: Hashable = None,
     ) -> Int[np.ndarray, " steps"]:
         """Add a whole episode that has ended. `reward` is the reward of each step, (T,), or the score, a single number.
 
@@ -209,9 +227,25 @@ class CreditAssigner:
             if is_score:
                 rewards[-1] = score
             rule = PAID_AT_END if is_score else self.config.payments
-            self.learner.queue_episodes(self.store.add_paid_episode(step_ids, rewards, rule))
+            (level,) = self._levels(None if group is None else [group], 1).tolist()
+            self.learner.queue_episodes(self.store.add_paid_episode(step_ids, rewards, rule, level))
             self.learner.flush_large_queues()
             return step_ids
+
+    def _levels(self, group: Sequence[Hashable] | None, n_rows: int) -> Int[np.ndarray, " n"]:
+        """Return the number of each row's group. Raises `LareError` if there are too many groups, or if they do not fit."""
+        if (group is not None) != self.config.groups:
+            needs = "needs group" if self.config.groups else "has no groups: leave group out, or set groups=True"
+            raise LareError(f"this assigner {needs}")
+        if group is None:
+            return np.zeros(n_rows, np.int32)
+        if len(group) != n_rows:
+            raise LareError(f"group has {len(group)} entries, but there are {n_rows} steps")
+        new = [name for name in dict.fromkeys(group) if name not in self.group_names]
+        if len(self.group_names) + len(new) > MAX_LEVELS:
+            raise LareError(f"there are more than {MAX_LEVELS} groups, of which {new[-1]!r} is one: merge some of them")
+        self.group_names |= {name: len(self.group_names) + i for i, name in enumerate(new)}
+        return np.array([self.group_names[name] for name in group], np.int32)
 
     def end(self, env_id: Hashable, score: float | None = None) -> None:
         """End the episode of an environment, with `score` as its return, or else the sum of its rewards.
@@ -347,7 +381,9 @@ class CreditAssigner:
     def get_state(self, *, episodes: bool) -> AssignerState:
         """Return the state, as plain data. `__setstate__` restores it. Steps and episodes are in it if `episodes` is true."""
         with self.lock:
-            return saving.get_state(self.config, self.learner, episodes=episodes)
+            state = saving.get_state(self.config, self.learner, episodes=episodes)
+            names = (name if isinstance(name, str | int | float) else str(name) for name in self.group_names)
+            return replace(state, group_names=tuple(names))
 
     def __getstate__(self) -> AssignerState:
         """Return the state for another process, or for a model's file: decoder and `phi`, without steps and episodes."""
@@ -355,4 +391,5 @@ class CreditAssigner:
 
     def __setstate__(self, state: AssignerState) -> None:
         self._init(state.config)
+        self.group_names = {name: i for i, name in enumerate(state.group_names)}
         saving.restore(self.learner, state)

@@ -22,7 +22,7 @@ from lare_rl.envs.families import load_env_spec
 from lare_rl.errors import LareError, short_repr
 from lare_rl.latent.function import LatentFunction, check_task
 from lare_rl.tasks.payments import PAID_AT_END, PaymentRule
-from lare_rl.tasks.spec import ScoredObservation, TaskSpec
+from lare_rl.tasks.spec import MAX_LEVELS, ScoredObservation, TaskSpec
 
 __all__ = [
     "AssignerConfig",
@@ -57,6 +57,7 @@ class AssignerConfig:
     scale_rewards: bool
     forget: bool
     payments: PaymentRule = PAID_AT_END
+    groups: bool = False
 
     @property
     def agent_axis(self) -> tuple[int, ...]:
@@ -80,9 +81,15 @@ class AssignerConfig:
             agents=self.agents,
             max_steps=self.max_steps or 1,
             window=WINDOW if self.payments.only_at_end else SEGMENT_WINDOW,
+            n_levels=self.n_levels,
             fixed_length=False,
             scale_rewards=self.scale_rewards,
         )
+
+    @property
+    def n_levels(self) -> int:
+        """The number of groups that episodes may belong to."""
+        return MAX_LEVELS if self.groups else 0
 
     @property
     def is_exact(self) -> bool:

@@ -78,11 +78,14 @@ def _gather(store: Store, episodes: Sequence[StoredEpisode], layout: Layout, n_s
     rows = steps % store.capacity
     length, score = np.ones(n_slots, np.int32), np.zeros(n_slots)
     length[:count], score[:count] = _lengths(episodes), [episode.score for episode in episodes]
+    level = np.zeros(n_slots, np.int32)
+    level[:count] = [episode.level for episode in episodes]
     return CreditBatch(
         inputs=store.inputs[rows],  # pyright: ignore[reportArgumentType]
         episode_index=layout.slot.ravel().astype(np.int32),
         length=length,  # pyright: ignore[reportArgumentType]
         mean_reward=(score / length).astype(np.float32),  # pyright: ignore[reportArgumentType]
+        level=level if store.has_levels else None,  # pyright: ignore[reportArgumentType]
         mask=(np.arange(n_slots) < count).astype(np.float32),  # pyright: ignore[reportArgumentType]
         alive=None if store.alive is None else store.alive[rows],  # pyright: ignore[reportArgumentType]
     )

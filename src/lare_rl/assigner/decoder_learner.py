@@ -68,8 +68,8 @@ class DecoderLearner:
         """Number, observation, action and next observation of steps that have no inputs yet."""
         self._pending_inputs: list[tuple[np.ndarray, np.ndarray]] = []
         """Inputs of steps that are not in the running statistics yet, and which agents acted."""
-        self._pending_returns: list[tuple[float, int]] = []
-        """R/T and T of episodes that are not in the scales yet."""
+        self._pending_returns: list[tuple[float, int, int]] = []
+        """R/T, T and level of episodes that are not in the scales yet."""
         self._pending_episodes: list[list[StoredEpisode]] = []
         """Episodes that the decoder has not learned from yet. Episodes that ended in one call are together."""
         self._pending_updates = 0.0
@@ -105,7 +105,7 @@ class DecoderLearner:
             if not batch:
                 self._pending_episodes.append(batch)
             batch.append(episode)
-            self._pending_returns.append((episode.score / len(episode.steps), len(episode.steps)))
+            self._pending_returns.append((episode.score / len(episode.steps), len(episode.steps), episode.level))
 
     def flush_large_queues(self) -> None:
         """Process the queues that have become long."""
@@ -168,14 +168,15 @@ class DecoderLearner:
     def _flush_returns(self) -> None:
         if not self._pending_returns:
             return
-        mean_reward, length = np.array(self._pending_returns).T
+        mean_reward, length, level = np.array(self._pending_returns).T
         self._pending_returns.clear()
         size = padded_size(len(mean_reward))
         mask = np.arange(size) < len(mean_reward)
         mean_reward, length = pad(mean_reward.astype(np.float32), size), pad(length.astype(np.int32), size)
+        level = pad(level.astype(np.int32), size) if self.config.n_levels else None
         with on_cpu():
             if self.decoder is not None:
-                self.decoder = compiled.observe_returns(self.decoder, mean_reward, length, mask)
+                self.decoder = compiled.observe_returns(self.decoder, mean_reward, length, mask, level)
             self.scale = compiled.observe_scale(self.scale, mean_reward, mask)
 
     def learn_if_due(self) -> None:
@@ -391,7 +392,7 @@ class DecoderLearner:
         if self.decoder is None or not self.store.episodes:
             return None
         # Shares are of factors and raw features alone.
-        basis = replace(self.config.spec.basis, extended=True, n_tracked=0)
+        basis = replace(self.config.spec.basis, extended=True, n_tracked=0, n_levels=0)
         if not basis.n_features:
             return None
         with on_cpu(), float64():

@@ -61,6 +61,8 @@ class AssignerState:
     n_learned: int
     n_updates: int
     arrays: dict[str, np.ndarray]
+    group_names: tuple[str | float, ...] = ()
+    """The groups in the order of their numbers, as texts or numbers."""
 
 
 def get_state(config: AssignerConfig, learner: DecoderLearner, *, episodes: bool) -> AssignerState:
@@ -131,9 +133,10 @@ def read_state(directory: Path) -> AssignerState:
             action=SpaceLayout(**values["action"]),
             settings=CreditSettings(**values["settings"]),
             payments=PaymentRule(**values.get("payments", {})),
+            groups=values.get("groups", False),
             **{name: values[name] for name in PLAIN_FIELDS},
         )
-        return AssignerState(config, values["told"], values["fits"], arrays)
+        return AssignerState(config, values["told"], values["fits"], arrays, tuple(values.get("group_names", ())))
 
 
 @contextmanager
@@ -156,6 +159,8 @@ def _config_values(state: AssignerState) -> dict[str, Any]:
         **{name: model and model.model_dump(mode="json") for name in models for model in [getattr(config, name)]},
         **{name: getattr(config, name) for name in PLAIN_FIELDS},
         "payments": asdict(config.payments),
+        "groups": config.groups,
+        "group_names": list(state.group_names),
         "phi": config.phi is not None,
         "told": state.n_learned,
         "fits": state.n_updates,
@@ -172,6 +177,7 @@ def _store_arrays(store: Store) -> dict[str, np.ndarray]:
         "episodes": np.concatenate([np.zeros(0, np.int64), *(episode.steps for episode in episodes)]),
         "lengths": np.array([len(episode.steps) for episode in episodes], np.int64),
         "scores": np.array([episode.score for episode in episodes], np.float64),
+        "levels": np.array([episode.level for episode in episodes], np.int64),
     }
 
 
@@ -186,6 +192,7 @@ def _restore_store(store: Store, arrays: dict[str, np.ndarray]) -> None:
         store.alive[rows] = arrays["alive"]
     ends = np.cumsum(arrays["lengths"])
     first = store.ended - len(ends)
+    levels = arrays.get("levels", np.zeros(len(ends), np.int64)).tolist()
     for i, (end, length, score) in enumerate(zip(ends, arrays["lengths"], arrays["scores"], strict=True)):
         steps = arrays["episodes"][end - length : end]
-        store.restore_episode(first + i, StoredEpisode(steps, float(score)))
+        store.restore_episode(first + i, StoredEpisode(steps, float(score), levels[i]))

@@ -28,6 +28,8 @@ class StoredEpisode(NamedTuple):
     """The numbers of its steps."""
     score: float
     """Its return R."""
+    level: int = 0
+    """The number of its group."""
 
 
 @dataclass
@@ -35,6 +37,8 @@ class RunningEpisode:
     """An episode that has not ended."""
 
     steps: list[int] = field(default_factory=list)
+    level: int = 0
+    """The number of its group."""
     n_paid: int = 0
     """The number of steps up to the last payment."""
     return_: float = 0.0
@@ -51,9 +55,17 @@ class RunningEpisode:
 class Store:
     """Inputs of steps, and the episodes that they belong to."""
 
-    def __init__(self, capacity: int, row_shape: tuple[int, ...], agents: int = 1, payments: PaymentRule = PAID_AT_END):
+    def __init__(
+        self,
+        capacity: int,
+        row_shape: tuple[int, ...],
+        agents: int = 1,
+        payments: PaymentRule = PAID_AT_END,
+        *,
+        has_levels: bool = False,
+    ):
         """Make an empty store. `row_shape` is the shape of a step's inputs: (inputs,), or (agents, inputs)."""
-        self.capacity, self.agents, self.payments = capacity, agents, payments
+        self.capacity, self.agents, self.payments, self.has_levels = capacity, agents, payments, has_levels
         self.inputs = np.zeros((capacity, *row_shape), np.float32)
         """The decoder's inputs for each step: [capacity *agents inputs]."""
         self.alive: Bool[np.ndarray, "capacity agents"] | None = None
@@ -111,6 +123,7 @@ class Store:
         steps: Sequence[np.ndarray],
         reward: Float[np.ndarray, " n"],
         ended: Bool[np.ndarray, " n"],
+        level: Int[np.ndarray, " n"] | None = None,
     ) -> Iterator[StoredEpisode]:
         """Add new steps to the running episodes of their environments. Yield each episode that is paid.
 
@@ -120,6 +133,7 @@ class Store:
         for i, env_id in enumerate(env_ids):
             episode = self.get_running(env_id, observation[i])
             self._append(episode, int(step_ids[i]), float(reward[i]))
+            episode.level = 0 if level is None else int(level[i])
             episode.last_observation = next_observation[i]
             step, team_reward = len(episode.steps) - 1, np.reshape(reward[i], (1,))
             if is_paid(self.payments, step, team_reward, bool(ended[i])):
@@ -161,18 +175,15 @@ class Store:
         since_last = np.array(episode.steps[episode.n_paid :], np.int64)
         window = self.payments.window
         episode.n_paid, episode.return_ = len(episode.steps), 0.0
-        return self.add_episode(
-            since_last if window is None else np.array(episode.steps[-window:], np.int64), payment, since_last
-        )
+        steps = since_last if window is None else np.array(episode.steps[-window:], np.int64)
+        return self._store(StoredEpisode(steps, payment, episode.level), since_last)
 
-    def add_episode(
-        self, steps: Int[np.ndarray, " steps"], score: float, since_last: Int[np.ndarray, " since"] | None = None
-    ) -> StoredEpisode:
+    def _store(self, episode: StoredEpisode, since_last: Int[np.ndarray, " since"]) -> StoredEpisode:
         """Store an episode that has just been paid. Raises `LareError` like `end`.
 
-        `since_last` are the steps since the last payment, if they are not the steps that this one is for.
+        `since_last` are the steps since the last payment, which need not be the steps that this one is for.
         """
-        episode = StoredEpisode(steps, score)
+        steps = episode.steps
         if self.steps - steps[0] > self.capacity:
             raise LareError(
                 f"an episode of {len(steps)} steps has ended, and its first steps are not stored any more: "
@@ -181,17 +192,21 @@ class Store:
         self.restore_episode(self.ended, episode)
         self.ended += 1
         self.ended_steps += len(steps)
-        rows = (steps if since_last is None else since_last) % self.capacity
+        rows = since_last % self.capacity
         self.episode[rows] = self.ended - 1
         self.length[rows] = len(steps)
-        self.mean_reward[rows] = score / len(steps)
+        self.mean_reward[rows] = episode.score / len(steps)
         return episode
 
     def add_paid_episode(
-        self, steps: Int[np.ndarray, " steps"], reward: Float[np.ndarray, " steps"], payments: PaymentRule
+        self,
+        steps: Int[np.ndarray, " steps"],
+        reward: Float[np.ndarray, " steps"],
+        payments: PaymentRule,
+        level: int = 0,
     ) -> Iterator[StoredEpisode]:
         """Store an episode that has just ended, by the reward of each of its steps. Yield the steps of each payment."""
-        episode = RunningEpisode()
+        episode = RunningEpisode(level=level)
         for i, step_id in enumerate(steps.tolist()):
             self._append(episode, step_id, float(reward[i]))
             if is_paid(payments, i, reward[i : i + 1], i == len(steps) - 1):

@@ -65,6 +65,8 @@ class Basis:
     """Whether shapes and pairs are added to the inputs."""
     n_tracked: int = 0
     """The number of first inputs whose history follows them in a row: all factors or, without factors, all raw features."""
+    n_levels: int = 0
+    """The number of levels that episodes may belong to. Each has an intercept, which is no feature of a step (`closed_form.py`)."""
 
     @property
     def n_inputs(self) -> int:
@@ -118,6 +120,22 @@ class Basis:
     def n_features(self) -> int:
         """The total number of features."""
         return sum(self.group_sizes.values())
+
+    @property
+    def n_columns(self) -> int:
+        """The number of weights of a fit: those of the features, and an intercept for each level."""
+        return self.n_features + self.n_levels
+
+    @property
+    def column_group_index(self) -> Int[np.ndarray, " columns"]:
+        """The index of each weight's group. The intercepts are the last group."""
+        return np.append(self.group_index, np.full(self.n_levels, len(self.group_sizes)))
+
+    @property
+    def column_strength_index(self) -> Int[np.ndarray, " columns"]:
+        """The index of each weight's strength. The intercepts share the last one."""
+        index = self.strength_index
+        return np.append(index, np.full(self.n_levels, index.max(initial=-1) + 1))
 
     @property
     def group_index(self) -> Int[np.ndarray, " features"]:

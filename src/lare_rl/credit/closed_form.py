@@ -7,6 +7,13 @@ without a reward model, w are signs instead:
 
     w = argmin sum_k T_k (R_k/T_k - w . m_k)^2  over  w in {-1, 1}^d,    b = 0,    f(u) = x
 
+Episodes may belong to levels, which differ in difficulty: maps, weather, demand. A fit then has a random intercept for each level,
+whose strength is set by the evidence as that of a group of features is:
+
+    y_k = b + c_level(k) + w . m_k + noise,     c ~ N(0, 1 / alpha_levels)
+
+The intercept takes part in the prediction of a return, but no step is paid for it: an easy level does not credit what happens on it.
+
 The features depend on the mean and the std that standardise u. If these changed with every step, the sums over earlier steps would
 be wrong, so they are kept constant for a while. Whenever the number of steps has grown by a half, they are updated and all stored
 episodes are summed again. Each step is summed three times on average, however many steps there are.
@@ -103,18 +110,18 @@ class ClosedForm(NamedTuple):
     """The fit by groups of each score type, along a leading axis."""
     strengths: Posterior
     """The fit by strengths (`relevance.py`) of each score type, along a leading axis. The decoder has the weights of the better fit."""
+    intercept: Float[Array, "score_types levels"]
+    """The intercept of each level, for each score type: part of R/T for a score that is a sum, of R for one that is a mean."""
     spread: PosteriorSpread | None
     """The spread of each score type, along a leading axis. Only present if rewards are optimistic."""
 
 
 def init(basis: Basis, n_score_types: int, *, with_spread: bool = False) -> ClosedForm:
     """Return the state before the first episode."""
-    n_features, zero = basis.n_features, jnp.zeros(())
-    posterior = evidence.init_posterior(n_features, len(basis.group_sizes))
-    strengths = evidence.init_posterior(n_features, int(basis.strength_index.max(initial=-1)) + 1)
-    spread = PosteriorSpread(
-        root=jnp.zeros((n_features, n_features)), centre=jnp.zeros(n_features), centre_variance=zero
-    )
+    n_features, n_columns, zero = basis.n_features, basis.n_columns, jnp.zeros(())
+    posterior = evidence.init_posterior(n_columns, int(basis.column_group_index.max(initial=-1)) + 1)
+    strengths = evidence.init_posterior(n_columns, int(basis.column_strength_index.max(initial=-1)) + 1)
+    spread = PosteriorSpread(root=jnp.zeros((n_columns, n_columns)), centre=jnp.zeros(n_columns), centre_variance=zero)
     posterior, strengths, spread = jax.tree.map(
         lambda leaf: jnp.tile(leaf, (n_score_types, *[1] * leaf.ndim)),
         (posterior, strengths, spread if with_spread else None),
@@ -127,11 +134,12 @@ def init(basis: Basis, n_score_types: int, *, with_spread: bool = False) -> Clos
             weight=jnp.zeros((n_score_types, n_features)),
             bias=jnp.zeros(n_score_types),
         ),
-        sufficient_statistics=split_double(evidence.empty_statistics(n_features)),
+        sufficient_statistics=split_double(evidence.empty_statistics(n_columns)),
         n_steps=zero,
         n_fitted=jnp.copy(zero),
         posterior=posterior,
         strengths=strengths,
+        intercept=jnp.zeros((n_score_types, basis.n_levels)),
         spread=spread,
     )
 
@@ -181,7 +189,7 @@ def fit(
 ) -> ClosedForm:
     """Fit the decoder of each score type to the sums; of all types at once if `batched` is true."""
     basis, statistics = state.decoder.basis, to_float64(state.sufficient_statistics)
-    group_index, strength_index = basis.group_index, basis.strength_index
+    group_index, strength_index = basis.column_group_index, basis.column_strength_index
 
     def fit_score_type(args: tuple[Int[Array, ""], Posterior, Posterior]) -> tuple[Posterior, Posterior]:
         score_type, start, earlier = args
@@ -199,7 +207,10 @@ def fit(
     posterior, strengths = jax.tree.map(lambda leaf: leaf.astype(jnp.float32), fits)
     state = state._replace(posterior=posterior, strengths=strengths)
     best = relevance.select(fits[1], fits[0], group_index, strength_index)
-    state = _set_weights(state, best.weight, best.bias)
+    n_features = basis.n_features
+    state = _set_weights(state, best.weight[:, :n_features], best.bias)._replace(
+        intercept=best.weight[:, n_features:].astype(jnp.float32)
+    )
     if state.spread is None:
         return state
     spreads = [
@@ -212,7 +223,7 @@ def fit(
 def best_posterior(state: ClosedForm) -> Posterior:
     """Return the fit of each score type that is used, with a precision for each strength."""
     basis = state.decoder.basis
-    return relevance.select(state.strengths, state.posterior, basis.group_index, basis.strength_index)
+    return relevance.select(state.strengths, state.posterior, basis.column_group_index, basis.column_strength_index)
 
 
 def fit_signs(state: ClosedForm) -> ClosedForm:

@@ -31,6 +31,7 @@ from lare_rl.credit.closed_form import ClosedForm, LinearDecoder
 from lare_rl.credit.decoder_network import DecoderNetwork, DecoderOutput, DecoderShape
 from lare_rl.credit.decoder_settings import CreditSettings
 from lare_rl.credit.decoders import DECODERS
+from lare_rl.credit.levels import LevelMeans, add_returns, empty_level_means, level_offsets
 from lare_rl.credit.methods import Method
 from lare_rl.credit.prequential import WINDOW, Predictions, empty_predictions
 from lare_rl.credit.score_type import ScoreType
@@ -57,6 +58,7 @@ __all__ = [
     "init",
     "is_normalised",
     "is_optimistic",
+    "level_returns",
     "normalise_inputs",
     "observe_returns",
     "observe_steps",
@@ -84,6 +86,8 @@ class CreditBatch(NamedTuple):
     """1 for an episode, 0 for padding."""
     alive: Bool[Array, "rows *agents"] | None = None
     """Which agents acted. None means all."""
+    level: Int[Array, " episodes"] | None = None
+    """The level of each episode. None if levels make no difference."""
 
 
 def valid_rows(episodes: CreditBatch) -> Bool[Array, "rows *agents"]:
@@ -115,6 +119,8 @@ class Decomposition(NamedTuple):
     """Predictions of returns by the current decoder."""
     closed_form: ClosedForm | None
     """Present for a decoder in closed form, and for any decoder if the score type must be determined."""
+    levels: LevelMeans | None
+    """Means of R/T by level. Present for a decoder that is fitted by gradient descent, if episodes have levels."""
     score_type_predictions: Predictions | None
     """Predictions of returns by closed-form fits of both score types. Present if the score type must be determined."""
 
@@ -163,6 +169,7 @@ def init(
         is_mean=jnp.asarray(score_types == (ScoreType.MEAN,)),
         predictions=empty_predictions(1, window),
         closed_form=closed,
+        levels=empty_level_means(basis.n_levels) if basis.n_levels and method.uses_gradient else None,
         score_type_predictions=empty_predictions(len(score_types), window) if both else None,
     )
 
@@ -196,15 +203,29 @@ def observe_returns(
     mean_reward: Float[Array, " batch"],
     length: Int[Array, " batch"],
     finished: Bool[Array, " batch"],
+    level: Int[Array, " batch"] | None = None,
 ) -> Decomposition:
-    """Add newly finished episodes, as R/T and T, to the scales. Add each episode exactly once.
+    """Add newly finished episodes, as R/T and T, to the scales and to the means of their levels. Add each episode exactly once.
 
     Episodes where `finished` is false are ignored.
     """
+    if state.levels is not None and level is not None:
+        state = state._replace(levels=add_returns(state.levels, level, mean_reward, finished))
     return state._replace(
         scale=update_scale(state.scale, mean_reward, finished),
         return_scale=update_scale(state.return_scale, mean_reward * length, finished),
     )
+
+
+def level_returns(state: Decomposition, episodes: CreditBatch) -> Float[Array, " episodes"]:
+    """Return the part of each episode's return that its level explains, and that no step is paid for."""
+    if episodes.level is None:
+        return jnp.zeros(len(episodes.length))
+    if state.levels is not None:
+        return level_offsets(state.levels)[episodes.level] * episodes.length
+    assert state.closed_form is not None
+    index = score_type_index(state, len(state.closed_form.intercept))
+    return state.closed_form.intercept[index][episodes.level] * jnp.where(state.is_mean, 1, episodes.length)
 
 
 def is_normalised(state: Decomposition, settings: CreditSettings) -> bool:

@@ -10,7 +10,15 @@ from jaxtyping import Array, Float, PRNGKeyArray
 from lare_rl.credit import losses
 from lare_rl.credit.decoder_network import DecoderNetwork
 from lare_rl.credit.decoder_settings import CreditSettings
-from lare_rl.credit.decomposition import CreditBatch, Decomposition, agent_mean, decode, normalise_inputs, reward_unit
+from lare_rl.credit.decomposition import (
+    CreditBatch,
+    Decomposition,
+    agent_mean,
+    decode,
+    level_returns,
+    normalise_inputs,
+    reward_unit,
+)
 from lare_rl.credit.methods import Fit
 from lare_rl.nn.networks import adam_step
 
@@ -108,5 +116,8 @@ def _decoder_loss(
 
 
 def _targets(state: Decomposition, episodes: CreditBatch, settings: CreditSettings) -> Float[Array, " episodes"]:
-    """Return R/T of each episode, or R if the score is a mean, in the decoder's unit."""
-    return episodes.mean_reward * jnp.where(state.is_mean, episodes.length, 1) / reward_unit(state, settings)
+    """Return R/T of each episode, or R if the score is a mean, in the decoder's unit, without what its level explains."""
+    mean_reward = episodes.mean_reward
+    if episodes.level is not None:
+        mean_reward = mean_reward - level_returns(state, episodes) / jnp.maximum(episodes.length, 1)
+    return mean_reward * jnp.where(state.is_mean, episodes.length, 1) / reward_unit(state, settings)

@@ -28,7 +28,7 @@ from lare_rl.credit.decoder_settings import CreditSettings
 from lare_rl.credit.decomposition import CreditBatch, Decomposition
 from lare_rl.credit.explanation import Explanation, StepStatistics, add_steps, empty_step_statistics, explain
 from lare_rl.credit.input_names import input_size, tracked_size
-from lare_rl.credit.methods import Method, Reward
+from lare_rl.credit.methods import Fit, Method, Reward
 from lare_rl.credit.prequential import WINDOW
 from lare_rl.credit.returns import add_to_sums
 from lare_rl.credit.score_type import ScoreType, score_types_to_fit
@@ -68,6 +68,8 @@ class CreditSpec:
     """The number of proxy rewards of a step."""
     window: int = WINDOW
     """The number of last returns over which predictions of them are assessed."""
+    n_levels: int = 0
+    """The number of levels that episodes may belong to."""
     scale_rewards: bool = False
     """Whether training rewards are divided by the running root mean square of R/T."""
 
@@ -78,7 +80,8 @@ class CreditSpec:
         n_factors = sizes["factors"] if "factors" in self.inputs else 0
         n_raw = input_size(tuple(name for name in self.inputs if name not in ("factors", "history")), sizes)
         n_tracked = tracked_size(self.inputs, sizes)
-        return Basis(n_factors, n_raw, extended=self.method.extended_basis, n_tracked=n_tracked)
+        n_levels = 0 if self.method.fit is Fit.SIGNS else self.n_levels
+        return Basis(n_factors, n_raw, extended=self.method.extended_basis, n_tracked=n_tracked, n_levels=n_levels)
 
 
 def credit_spec(
@@ -93,6 +96,7 @@ def credit_spec(
     fixed_length: bool,
     scale_rewards: bool,
     window: int = WINDOW,
+    n_levels: int = 0,
 ) -> CreditSpec:
     """Return the spec of a method for one team. The arguments that a spec has too are described there.
 
@@ -118,6 +122,7 @@ def credit_spec(
         max_steps=max_steps,
         agents=agents,
         window=window,
+        n_levels=n_levels,
         scale_rewards=scale_rewards,
     )
 
@@ -217,7 +222,7 @@ def init_explanation(statistics: RunningMeanStd, basis: Basis) -> ExplanationSta
 
 
 def add_to_explanation(state: ExplanationState, episodes: CreditBatch) -> ExplanationState:
-    """Add whole episodes to the sums. Call this with float64 enabled."""
+    """Add whole episodes to the sums, without their levels. Call this with float64 enabled."""
     decoder = state.closed_form.decoder
     rows = decomposition.valid_rows(episodes)
     steps = add_steps(state.steps, decoder.features(episodes.inputs), rows, decoder.basis)

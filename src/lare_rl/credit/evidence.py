@@ -349,6 +349,7 @@ def posterior_spread(
 
 
 def posterior_std(spread: PosteriorSpread, features: Float[Array, "*batch features"]) -> Float[Array, "*batch"]:
-    """Return the posterior standard deviation of b + w . f, in the unit of y."""
-    distance = (features - spread.centre) @ spread.root.T
+    """Return the posterior standard deviation of b + w . f, in the unit of y. Weights beyond those of the features are ignored."""
+    n_features = features.shape[-1]
+    distance = (features - spread.centre[..., :n_features]) @ spread.root[..., :n_features].T
     return jnp.sqrt(jnp.sum(distance**2, axis=-1) + spread.centre_variance)

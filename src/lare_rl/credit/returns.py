@@ -19,6 +19,7 @@ from lare_rl.credit.decomposition import (
     agent_mean,
     agent_shares,
     decoder_rewards,
+    level_returns,
     score_type_index,
 )
 from lare_rl.credit.methods import Fit, Method
@@ -71,13 +72,15 @@ def predict(state: Decomposition, episodes: CreditBatch, settings: CreditSetting
     first fit all of them.
     """
     is_new, returns = episodes.mask > 0, episodes.mean_reward * episodes.length
-    predicted = predicted_returns(state, episodes, settings)[:, None]
+    predicted = (predicted_returns(state, episodes, settings) + level_returns(state, episodes))[:, None]
     predictions = add_predictions(state.predictions, returns, predicted, is_new & is_fitted(state))
     state = state._replace(predictions=predictions)
     if state.score_type_predictions is None or state.closed_form is None:
         return state
     decoder = state.closed_form.decoder
     predicted = _mean_features(decoder, episodes) @ decoder.weight.T + decoder.bias
+    if episodes.level is not None:
+        predicted = predicted + state.closed_form.intercept[:, episodes.level].T
     predicted = predicted * jnp.stack([episodes.length, jnp.ones_like(episodes.length)], axis=1)
     was_fitted = state.closed_form.n_fitted > 1
     predictions = add_predictions(state.score_type_predictions, returns, predicted, is_new & was_fitted)
@@ -105,6 +108,16 @@ def _mean_features(decoder: LinearDecoder, episodes: CreditBatch) -> Float[Array
     return total / jnp.maximum(episodes.length, 1)[:, None]
 
 
+def _columns(decoder: LinearDecoder, episodes: CreditBatch) -> Float[Array, "episodes columns"]:
+    """Return the mean features of each episode, and which level it has."""
+    features, n_levels = _mean_features(decoder, episodes), decoder.basis.n_levels
+    if not n_levels:
+        return features
+    assert episodes.level is not None
+    one_hot = jax.nn.one_hot(episodes.level, n_levels, dtype=features.dtype)
+    return jnp.concatenate([features, one_hot], axis=1)
+
+
 def is_stale(state: Decomposition) -> Bool[Array, ""]:
     """Return whether the features in the sums were standardised by outdated statistics."""
     assert state.closed_form is not None
@@ -127,7 +140,7 @@ def add_to_sums(closed: ClosedForm, episodes: CreditBatch) -> ClosedForm:
     """Add whole episodes to the sums, in float64 if that is enabled. Episodes whose mask is 0 are ignored."""
     statistics = evidence.add_episodes(
         closed_form.to_float64(closed.sufficient_statistics),
-        _mean_features(closed.decoder, episodes),
+        _columns(closed.decoder, episodes),
         episodes.mean_reward * episodes.length,
         jnp.where(episodes.mask > 0, episodes.length, 0),
     )
@@ -190,7 +203,7 @@ def reward_std(
     spread = evidence.posterior_spread(
         closed_form.to_float64(state.closed_form.sufficient_statistics),
         jnp.asarray(score_types)[index],
-        state.network.basis.strength_index,
+        state.network.basis.column_strength_index,
         jax.tree.map(lambda leaf: leaf[index].astype(float), closed_form.best_posterior(state.closed_form)),
     )
     return evidence.posterior_std(spread, state.network.features(rows))

@@ -49,6 +49,7 @@ class Segments(NamedTuple):
     first_paid: Int[Array, "envs segments"]
     """Number of the first transition that the payment is for."""
     predicted_return: Float[Array, "envs segments teams"] | None = None
+    level: Int[Array, "envs segments"] | None = None
 
 
 class Replay(NamedTuple):
@@ -77,6 +78,8 @@ class Replay(NamedTuple):
     """Number of the first transition that a payment is for. None means the first one of the episode."""
     predicted_return: Float[Array, "envs episodes teams"] | None = None
     """Sum of an episode's proxy rewards, or NaN if it has not been computed. None if nobody asks for it."""
+    level: Int[Array, "envs episodes"] | None = None
+    """The level that an episode belongs to. None if there are none."""
     segments: Segments | None = None
     """None if each episode is paid once, at its end."""
 
@@ -107,6 +110,8 @@ class StoredSteps(NamedTuple):
     """Whether the step is the last one of a finished episode."""
     residual: Float[Array, "*batch teams"] | None
     """The return of the step's episode, less the sum of its proxy rewards; 0 if that is unknown. None if nobody asks for it."""
+    level: Int[Array, "*batch"] | None
+    """The level of the step's episode. Valid at the last step."""
     length: Int[Array, "*batch"]
     """Steps of its episode; if that has not finished, at least the mean length of the finished ones."""
 
@@ -118,6 +123,7 @@ def init_replay(
     teams: int,
     payments: PaymentRule = PAID_AT_END,
     with_predictions: bool = False,
+    with_levels: bool = False,
 ) -> Replay:
     """Return an empty replay. `columns` are the shapes of a single row."""
     episodes = capacity // 2 + 1  # the shortest episode takes two rows; one more is running
@@ -137,6 +143,7 @@ def init_replay(
         running=zeros(dtype=bool),
         first_paid=zeros(capacity),
         predicted_return=unknown(capacity, teams),
+        level=zeros(capacity) if with_levels else None,
     )
     return Replay(
         columns={name: zeros(capacity, *row.shape, dtype=row.dtype) for name, row in columns.items()},
@@ -150,6 +157,7 @@ def init_replay(
         episodes=zeros(),
         running=zeros(dtype=bool),
         predicted_return=unknown(episodes, teams) if payments.only_at_end else None,
+        level=zeros(episodes) if with_levels and payments.only_at_end else None,
         segments=None if payments.only_at_end else segments,
     )
 
@@ -195,6 +203,7 @@ def extend(
     team_reward: Float[Array | np.ndarray, "time envs teams"],
     ended: Bool[Array | np.ndarray, "time envs"],
     payments: PaymentRule = PAID_AT_END,
+    level: Int[Array | np.ndarray, "time envs"] | None = None,
 ) -> Replay:
     """Store consecutive steps.
 
@@ -205,8 +214,9 @@ def extend(
         team_reward: the true reward of each team.
         ended: whether a step was the last of its episode.
         payments: when the environment pays.
+        level: the level of each step's episode.
     """
-    lead = jax.tree.map(jnp.asarray, (dict(columns), dict(next_columns), team_reward, ended))
+    lead = jax.tree.map(jnp.asarray, (dict(columns), dict(next_columns), team_reward, ended, level))
     extend_env = jax.vmap(partial(_extend_env, payments=payments))
     return extend_env(replay, *jax.tree.map(lambda rows: jnp.swapaxes(rows, 0, 1), lead))
 
@@ -231,6 +241,7 @@ def _extend_env(
     next_columns: Columns,
     team_reward: Float[Array, "time teams"],
     ended: Bool[Array, " time"],
+    level: Int[Array, " time"] | None,
     payments: PaymentRule,
 ) -> Replay:
     """Store the steps of one environment, all at once. Remove the oldest episodes if their rows are needed."""
@@ -243,7 +254,7 @@ def _extend_env(
         stored[name] = stored[name].at[(row + 1) % rows].set(values)
     for name, values in columns.items():
         stored[name] = stored[name].at[row % rows].set(values)
-    episodes = _extend_episodes(replay, number, team_reward, ended)
+    episodes = _extend_episodes(replay, number, team_reward, ended, level)
     new = replay._replace(
         columns=stored,
         row=replay.row.at[number % rows].set(row),
@@ -252,11 +263,9 @@ def _extend_env(
         oldest=oldest,
         **episodes,
     )
-    return (
-        new
-        if replay.segments is None
-        else new._replace(segments=_extend_segments(new, replay.segments, team_reward, ended, payments))
-    )
+    if replay.segments is None:
+        return new
+    return new._replace(segments=_extend_segments(new, replay.segments, team_reward, ended, level, payments))
 
 
 def _extend_episodes(
@@ -264,6 +273,7 @@ def _extend_episodes(
     number: Int[Array, " time"],
     team_reward: Float[Array, "time teams"],
     ended: Bool[Array, " time"],
+    level: Int[Array, " time"] | None,
 ) -> dict[str, Any]:
     """Return the changed fields of the episodes, or of the segments, of one environment after new steps."""
     slots, n_ended = replay.first.shape[0], jnp.cumsum(ended)
@@ -271,7 +281,9 @@ def _extend_episodes(
     is_first = jnp.append(~replay.running, ended[:-1])
     slot = episode % slots
     first_slot = jnp.where(is_first, slot, slots)  # other steps get an index out of range, which is dropped
-    predicted = replay.predicted_return
+    predicted, levels = replay.predicted_return, replay.level
+    if levels is not None and level is not None:
+        levels = levels.at[jnp.where(ended, slot, slots)].set(level, mode="drop")
     return {
         "episode": replay.episode.at[number % replay.episode.shape[0]].set(episode),
         "first": replay.first.at[first_slot].set(number, mode="drop"),
@@ -279,6 +291,7 @@ def _extend_episodes(
         "episodes": replay.episodes + n_ended[-1],
         "running": ~ended[-1],
         "predicted_return": None if predicted is None else predicted.at[first_slot].set(jnp.nan, mode="drop"),
+        "level": levels,
     }
 
 
@@ -287,6 +300,7 @@ def _extend_segments(
     segments: Segments,
     team_reward: Float[Array, "time teams"],
     ended: Bool[Array, " time"],
+    level: Int[Array, " time"] | None,
     payments: PaymentRule,
 ) -> Segments:
     """Return the segments of one environment after new steps, which are already part of the replay's episodes."""
@@ -294,7 +308,7 @@ def _extend_segments(
     number = replay.transitions - len(ended) + jnp.arange(len(ended))
     begin = replay.first[replay.episode[number % rows] % replay.first.shape[0]]
     pays = is_paid(payments, number - begin, team_reward, ended)
-    new = segments._replace(**_extend_episodes(segments, number, team_reward, pays))
+    new = segments._replace(**_extend_episodes(segments, number, team_reward, pays, level))
     slot = new.episode[number % rows] % slots
     first_paid = new.first[slot] if payments.window is None else jnp.maximum(number + 1 - payments.window, begin)
     new = new._replace(first_paid=new.first_paid.at[jnp.where(pays, slot, slots)].set(first_paid, mode="drop"))
@@ -383,6 +397,7 @@ def read(replay: Replay, index: Index) -> StoredSteps:
         finished=finished,
         last=last,
         residual=residual,
+        level=None if replay.level is None else flatten_envs(replay.level)[slot],
         length=jnp.where(finished, length, jnp.maximum(length, mean_length)),
     )
 

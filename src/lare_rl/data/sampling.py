@@ -42,6 +42,8 @@ class EpisodeSample(NamedTuple):
     """R/T."""
     mask: Float[Array, "*batch"]
     """1, or 0 for an entry without an episode."""
+    level: Int[Array, "*batch"] | None = None
+    """The level of each. None if there are none."""
 
 
 class CreditSample(NamedTuple):
@@ -98,6 +100,7 @@ def get_episodes(replay: Replay, index: Index) -> EpisodeSample:
         length=length,
         mean_reward=flatten_envs(replay.episode_return)[slot] / length[..., None],
         mask=jnp.broadcast_to(has_episodes.astype(jnp.float32), first.shape),
+        level=None if replay.level is None else flatten_envs(replay.level)[slot],
     )
 
 

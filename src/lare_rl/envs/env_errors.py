@@ -6,11 +6,12 @@ from collections.abc import Callable, Iterable, Iterator, Mapping
 from typing import Any
 
 import numpy as np
+from jaxtyping import Float
 
 from lare_rl.errors import LareError, short_repr
 from lare_rl.tasks.spec import TaskSpec
 
-__all__ = ["EnvOutputError", "as_lare_error", "no_time_limit_error", "one_line_errors", "read_measure", "to_float"]
+__all__ = ["EnvOutputError", "as_lare_error", "no_time_limit_error", "one_line_errors", "read_measures", "to_float"]
 
 
 class EnvOutputError(LareError):
@@ -60,7 +61,25 @@ def to_float(value: Any) -> float:
         raise ValueError(f"is {short_repr(value)}, which is not a number") from None
 
 
-def read_measure(infos: Iterable[Mapping[Any, Any]], name: str) -> float:
+def read_measures(
+    infos: Iterable[Mapping[Any, Any]], task: TaskSpec, *, last: bool
+) -> dict[str, Float[np.ndarray, ""]]:
+    """Return the measures of the task from the `info` of a step: the means over the agents that report them.
+
+    They are 0 before the last step, except the group of the episode, if it is reported.
+
+    Raises:
+        LareError: a measure of the last step is missing, or is not a number.
+    """
+    infos = list(infos)
+    measures = {}
+    for name in task.info_keys:
+        is_read = last or (name == task.group and any(name in info for info in infos))
+        measures[name] = np.array(_read_measure(infos, name) if is_read else 0, np.float32)
+    return measures
+
+
+def _read_measure(infos: Iterable[Mapping[Any, Any]], name: str) -> float:
     """Return a measure of the task from the last step's `info`: the mean over the agents that report it.
 
     Raises:

@@ -231,7 +231,7 @@ def _check_spec(task: TaskSpec, spec: EnvSpec) -> None:
         raise fail(task, f"team = {task.team!r}, but the teams of {env} are {', '.join(names)}")
     if task.max_episode_steps not in (None, spec.max_steps):
         raise fail(task, f"max_episode_steps = {task.max_episode_steps}, but {spec.max_steps} in {env}. Remove it.")
-    for name in task.measures:
+    for name in task.info_keys:
         if name not in spec.measures:
             raise fail(task, f"{env} has no measure {name!r}")
     from_state = task.credit_scope == "state"

@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Float
 
 from lare_rl.envs import mujoco_rewards
-from lare_rl.envs.env_errors import EnvOutputError, no_time_limit_error, one_line_errors, read_measure, to_float
+from lare_rl.envs.env_errors import EnvOutputError, no_time_limit_error, one_line_errors, read_measures, to_float
 from lare_rl.envs.interface import EnvSpec, Team, Timestep
 from lare_rl.envs.spaces import OneHot, check_spaces, finite_array, flatten_spaces
 from lare_rl.errors import LareError, short_repr
@@ -64,7 +64,7 @@ class GymnasiumEnv:
         Raises:
             LareError: the environment cannot be made, or has no time limit.
         """
-        self._name = task.environment
+        self._name, self._task = task.environment, task
         self.environment = make_gymnasium(task.environment, task.max_episode_steps, **kwargs)
         if not (self.environment.spec and self.environment.spec.max_episode_steps):
             self.close()
@@ -79,7 +79,7 @@ class GymnasiumEnv:
             max_steps=self.environment.spec.max_episode_steps,
             low=action_space.low[None].astype(dtype),  # type: ignore[attr-defined]
             high=action_space.high[None].astype(dtype),  # type: ignore[attr-defined]
-            measures=task.measures,
+            measures=task.info_keys,
             first_choice=int(action_space.start) if isinstance(action_space, OneHot) else 0,
         )
         self._state, self._alive = np.zeros(0, np.float32), np.ones(1, bool)
@@ -117,7 +117,7 @@ class GymnasiumEnv:
             reward=reward[None],
             terminated=np.bool_(terminated),
             truncated=np.bool_(truncated),
-            measures={key: np.float32(read_measure([info], key) if last else 0) for key in self.spec.measures},
+            measures=read_measures([info], self._task, last=last),
         )
 
     def render(self) -> Any:

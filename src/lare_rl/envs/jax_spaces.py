@@ -141,7 +141,7 @@ def cast_like(tree: Any, reference: Any) -> Any:
 
 def find_measures(task: TaskSpec, values: Mapping[str, Any]) -> tuple[str, ...]:
     """Return the task's measures that are among a package's values and are numbers."""
-    return tuple(name for name in task.measures if name in values and math.prod(jnp.shape(values[name])) == 1)
+    return tuple(name for name in task.info_keys if name in values and math.prod(jnp.shape(values[name])) == 1)
 
 
 def read_measures(spec: EnvSpec, values: Mapping[str, Any]) -> dict[str, Float[Array, ""]]:

@@ -13,7 +13,7 @@ from jaxtyping import Bool, Float
 
 from lare_rl.envs import env_errors
 from lare_rl.envs.agent_arrays import Agent, AgentArrays, make_agent
-from lare_rl.envs.env_errors import EnvOutputError, one_line_errors, read_measure, to_float
+from lare_rl.envs.env_errors import EnvOutputError, one_line_errors, read_measures, to_float
 from lare_rl.envs.interface import EnvSpec, Timestep
 from lare_rl.envs.pettingzoo_construct import find_time_limit, group_by_team, make_parallel_env
 from lare_rl.envs.spaces import finite_array
@@ -81,7 +81,7 @@ class ParallelHost:
             max_steps=max_steps,
             state_size=first.state.shape[-1],
             masks_actions=self._masks_actions,
-            measures=task.measures,
+            measures=task.info_keys,
         )
 
     def reset(self, seed: int) -> Timestep:
@@ -215,9 +215,7 @@ class ParallelHost:
             reward=reward.astype(np.float32),
             terminated=np.array(terminated),
             truncated=np.array(truncated),
-            measures={
-                name: np.array(read_measure(reports, name) if last else 0, np.float32) for name in self._task.measures
-            },
+            measures=read_measures(reports, self._task, last=last),
         )
 
     def _check_masks_are_known(self, agent: Agent) -> None:

@@ -220,6 +220,7 @@ def _stored_steps(state: State, steps: Trajectory, factors: Array, config: Train
         finished=jnp.zeros(lead, bool),
         last=jnp.zeros(lead, bool),
         residual=None,
+        level=None,
         length=jnp.broadcast_to(length, lead),
     )
 

@@ -11,6 +11,7 @@ from lare_rl.tasks.payments import PaymentRule
 
 __all__ = [
     "FILL_IN",
+    "MAX_LEVELS",
     "NO_ENVIRONMENT",
     "PETTINGZOO_PREFIX",
     "SHARED_KEYS",
@@ -47,6 +48,7 @@ SHARED_KEYS = (
     "scored_observation",
     "payments",
     "paid_for",
+    "group",
 )
 """Keys that a team inherits from its task. The team's own file may repeat them, so that it can be used alone, but with the same
 values."""
@@ -58,6 +60,9 @@ class PaidSteps(CheckedModel):
     steps: Annotated[int, Field(ge=1)]
     """The number of last steps that a payment is for."""
 
+
+MAX_LEVELS = 64
+"""The number of levels that `group` may tell apart."""
 
 NO_ENVIRONMENT = "none"
 """The value of `environment` for a task with logs only, whose environment is not available."""
@@ -98,6 +103,9 @@ class TaskSpec(CheckedModel):
     end. Rewards between payments are added up."""
     paid_for: Literal["since_last"] | PaidSteps = "since_last"
     """The steps that a payment is for: all steps since the last payment, or `{ steps = 20 }`, the last 20 steps."""
+    group: str | None = None
+    """The key of `info` that tells the group of an episode, a whole number from 0 to 63: its level, map, weather or demand. Returns of
+    episodes of the same group share an intercept, so that an easy level does not credit what happens on it."""
     measures: tuple[str, ...] = ()
     """Keys of the last step's `info` whose values are averaged and reported in addition to the return."""
     arguments: dict[str, Any] = Field(default_factory=dict)
@@ -156,6 +164,11 @@ class TaskSpec(CheckedModel):
             nonzero=self.payments == "nonzero",
             window=self.paid_for.steps if isinstance(self.paid_for, PaidSteps) else None,
         )
+
+    @property
+    def info_keys(self) -> tuple[str, ...]:
+        """The keys of the last step's `info` that are read."""
+        return self.measures if self.group in (None, *self.measures) else (*self.measures, str(self.group))
 
     @property
     def roles(self) -> tuple["TaskSpec", ...]:

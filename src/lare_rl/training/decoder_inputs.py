@@ -92,4 +92,5 @@ def episode_batch(steps: StoredSteps, sample: CreditSample, config: TrainConfig,
         mean_reward=episodes.mean_reward[..., team_index],
         mask=episodes.mask,
         alive=row_mask(steps, config, team_index),
+        level=episodes.level,
     )

@@ -68,7 +68,13 @@ def init_learner(key: PRNGKeyArray, config: TrainConfig, init_algorithm: Callabl
         decoders=init_decoders(keys, config),
         scale=tuple(empty_scale() for _ in config.env.teams),
         replay=replay.init_replay(
-            config.columns, config.n_envs, config.capacity, n_teams, config.payments, config.is_exact
+            config.columns,
+            config.n_envs,
+            config.capacity,
+            n_teams,
+            config.payments,
+            config.is_exact,
+            config.n_levels > 0,
         ),
         n_learned=jnp.zeros(config.n_envs, jnp.int32),
     )
@@ -91,9 +97,8 @@ def store_with_factors(
 ) -> Learner:
     """Put new steps into the replay and into the running statistics."""
     columns, next_columns = replay_columns(steps, factors, config)
-    buffer = replay.extend(
-        learner.replay, columns, next_columns, _team_rewards(steps, config), steps.ended, config.payments
-    )
+    team_reward, level = _team_rewards(steps, config), _levels(steps, config)
+    buffer = replay.extend(learner.replay, columns, next_columns, team_reward, steps.ended, config.payments, level)
     if config.n_tracked:
         buffer = _with_history(learner.replay, buffer, len(steps.ended), config)
     new_steps = replay.read(buffer, replay.newest_steps(buffer, len(steps.ended)))
@@ -138,12 +143,20 @@ def _team_rewards(steps: Trajectory, config: TrainConfig) -> Float[Array, "time 
     return jnp.stack(rewards, axis=-1)
 
 
+def _levels(steps: Trajectory, config: TrainConfig) -> Int[Array, "time envs"] | None:
+    """Return the level of each step's episode, which is valid at the steps that are paid."""
+    if config.group is None:
+        return None
+    return jnp.clip(jnp.asarray(steps.next_timestep.measures[config.group]).astype(jnp.int32), 0, config.n_levels - 1)
+
+
 def _observe(decoder: Decomposition, steps: StoredSteps, config: TrainConfig, team_index: int) -> Decomposition:
     """Add new steps, and the episodes that were paid in them, to the statistics of a team's decoder."""
     rows, mask = decoder_inputs(steps, config, team_index), row_mask(steps, config, team_index)
     decoder = decomposition.observe_steps(decoder, rows, mask)
-    mean_reward = steps.mean_reward[..., team_index].ravel()
-    return decomposition.observe_returns(decoder, mean_reward, steps.length.ravel(), steps.last.ravel())
+    mean_reward, level = steps.mean_reward[..., team_index].ravel(), steps.level
+    level = None if level is None else level.ravel()
+    return decomposition.observe_returns(decoder, mean_reward, steps.length.ravel(), steps.last.ravel(), level)
 
 
 def with_learned_returns(

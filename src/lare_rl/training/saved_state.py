@@ -53,6 +53,7 @@ def make_train_config(run: Run) -> TrainConfig:
         steps=settings.steps,
         fit_updates=settings.fit_updates,
         payments=task.payment_rule,
+        group=task.group,
     )
 
 

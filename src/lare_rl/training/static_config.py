@@ -14,7 +14,7 @@ from lare_rl.credit.prequential import SEGMENT_WINDOW, WINDOW
 from lare_rl.credit.score_type import ScoreType
 from lare_rl.envs.interface import EnvSpec
 from lare_rl.tasks.payments import PAID_AT_END, PaymentRule
-from lare_rl.tasks.spec import CreditScope, ScoredObservation
+from lare_rl.tasks.spec import MAX_LEVELS, CreditScope, ScoredObservation
 
 
 @dataclass(frozen=True)
@@ -51,6 +51,8 @@ class TrainConfig:
     """The number of devices over which the seeds are spread (`seed_axis.py`)."""
     payments: PaymentRule = PAID_AT_END
     """When the environment pays."""
+    group: str | None = None
+    """The measure that tells the level of an episode."""
     deterministic: bool = False
     """Whether a policy acts without noise outside training, even if its algorithm says otherwise."""
 
@@ -109,6 +111,11 @@ class TrainConfig:
         return self.payments.longest_segment(self.env.max_steps)
 
     @property
+    def n_levels(self) -> int:
+        """The number of levels that episodes may belong to."""
+        return 0 if self.group is None else MAX_LEVELS
+
+    @property
     def is_exact(self) -> bool:
         """Whether the proxy rewards of an episode are corrected to add up to its return."""
         return self.credit.exact != "no" and "exact" in self.method.settings
@@ -156,6 +163,7 @@ class TrainConfig:
                 agents=1 if self.team_level else team.n_agents,
                 max_steps=self.longest_segment,
                 window=self.credit_window,
+                n_levels=self.n_levels,
                 fixed_length=self.has_fixed_segments,
                 scale_rewards=self.scale_rewards,
             )

@@ -1,0 +1,63 @@
+"""Means of returns by level, for decoders that are fitted by gradient descent.
+
+Episodes may belong to levels, which differ in difficulty. A decoder is then fitted to R/T less the offset of the episode's level,
+
+    d_g = s_g (mean_g - mean),    s_g = between / (between + within / n_g)
+
+with mean_g the mean of R/T over the n_g episodes of level g, and the variances within and between levels by the method of moments.
+The factor s_g shrinks the means of levels with few episodes (random effects: Searle, Casella and McCulloch, 1992).
+"""
+
+from typing import NamedTuple
+
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
+
+__all__ = ["LevelMeans", "add_returns", "empty_level_means", "level_offsets"]
+
+
+class LevelMeans(NamedTuple):
+    """The number, the mean and the sum of squared deviations of R/T in each level."""
+
+    n_episodes: Float[Array, " levels"]
+    mean: Float[Array, " levels"]
+    sum_squares: Float[Array, " levels"]
+
+
+def empty_level_means(n_levels: int) -> LevelMeans:
+    """Return the state before the first episode."""
+    return LevelMeans(*(jnp.zeros(n_levels) for _ in LevelMeans._fields))
+
+
+def add_returns(
+    means: LevelMeans, level: Int[Array, " batch"], mean_reward: Float[Array, " batch"], mask: Bool[Array, " batch"]
+) -> LevelMeans:
+    """Add the episodes where `mask` is true (Chan, Golub and LeVeque, 1983)."""
+    n_levels = len(means.mean)
+    slot = jnp.where(mask, level, n_levels)  # an index out of range, which is dropped
+
+    def sums(values: Float[Array, " batch"]) -> Float[Array, " levels"]:
+        return jnp.zeros(n_levels).at[slot].add(values, mode="drop")
+
+    n_new = sums(jnp.ones_like(mean_reward))
+    mean = sums(mean_reward) / jnp.maximum(n_new, 1)
+    squares = sums((mean_reward - mean[jnp.minimum(slot, n_levels - 1)]) ** 2)
+    n_episodes, difference = means.n_episodes + n_new, mean - means.mean
+    fraction = n_new / jnp.maximum(n_episodes, 1)
+    return LevelMeans(
+        n_episodes,
+        means.mean + fraction * difference,
+        means.sum_squares + squares + difference**2 * means.n_episodes * fraction,
+    )
+
+
+def level_offsets(means: LevelMeans) -> Float[Array, " levels"]:
+    """Return d_g of each level; 0 for a level without episodes, and while there are fewer than two levels."""
+    n, total = means.n_episodes, jnp.sum(means.n_episodes)
+    n_levels = jnp.sum(n > 0)
+    mean = jnp.sum(n * means.mean) / jnp.maximum(total, 1)
+    within = jnp.sum(means.sum_squares) / jnp.maximum(total - n_levels, 1)
+    size = jnp.maximum(total - jnp.sum(n**2) / jnp.maximum(total, 1), 1e-6)
+    between = jnp.maximum(jnp.sum(n * (means.mean - mean) ** 2) - (n_levels - 1) * within, 0) / size
+    shrinkage = between / jnp.maximum(between + within / jnp.maximum(n, 1), 1e-30)
+    return jnp.where((n > 0) & (n_levels > 1), shrinkage * (means.mean - mean), 0)

@@ -1,0 +1,44 @@
+"""Levels of episodes: intercepts that no step is paid for."""
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from lare_rl.credit.levels import add_returns, empty_level_means, level_offsets
+
+
+def sample(counts, between, within, seed=0):
+    random = np.random.default_rng(seed)
+    effects = between * random.normal(size=len(counts))
+    level = np.repeat(np.arange(len(counts)), counts)
+    order = random.permutation(len(level))
+    return level[order], (5 + effects[level] + within * random.normal(size=len(level)))[order]
+
+
+def numpy_offsets(level, y, n_levels):
+    """The equations as they are written."""
+    n = np.bincount(level, minlength=n_levels)
+    means = np.array([y[level == g].mean() if (level == g).any() else 0 for g in range(n_levels)])
+    total, used = n.sum(), (n > 0).sum()
+    within = sum(((y[level == g] - means[g]) ** 2).sum() for g in range(n_levels)) / max(total - used, 1)
+    between = max((n * (means - y.mean()) ** 2).sum() - (used - 1) * within, 0) / (total - (n**2).sum() / total)
+    shrinkage = between / (between + within / np.maximum(n, 1))
+    return np.where(n > 0, shrinkage * (means - y.mean()), 0)
+
+
+@pytest.mark.parametrize("n_chunks", [1, 4])
+def test_offsets_against_numpy(n_chunks):
+    level, y = sample([3, 12, 0, 30], between=2.0, within=1.0)
+    means = empty_level_means(4)
+    for chunk in np.array_split(np.arange(len(y)), n_chunks):
+        mask = np.append(np.ones(len(chunk), bool), False)  # the last row is ignored
+        rows = jnp.append(y[chunk], 1e6).astype(jnp.float32)
+        means = add_returns(means, jnp.append(level[chunk], 0), rows, jnp.asarray(mask))
+    np.testing.assert_allclose(level_offsets(means), numpy_offsets(level, y, 4), rtol=1e-3, atol=1e-4)
+
+
+def test_equal_levels_have_small_offsets():
+    level, y = sample([20] * 8, between=0.0, within=1.0)
+    means = add_returns(empty_level_means(8), jnp.asarray(level), jnp.asarray(y), jnp.ones(len(y), bool))
+    assert np.abs(level_offsets(means)).max() < 0.2
+    assert not np.asarray(level_offsets(empty_level_means(3))).any()
