@@ -39,6 +39,9 @@ def parse(changes, layout=LAYOUT):
         ({"rewards": np.full(3, "1")}, "rewards must be numbers"),
         ({"score": np.ones(3)}, "score must be a single number"),
         ({"score": np.array(1e200)}, r"score has a number .* larger than 1e\+18"),
+        ({"group": np.ones(2)}, "group must be a text or a number"),
+        ({"group": np.array([None, 1], object)}, "group must be a text or a number"),
+        ({"group": np.nan}, "group must be a text or a number"),
         ({"paid": np.ones(2)}, "paid must have one number"),
         ({"terminations": np.zeros(2, bool)}, "terminations must have one flag for each of 3 steps"),
         ({"truncations": np.full(3, 2)}, "truncations must be true or false"),
@@ -125,3 +128,10 @@ def test_any_arrays_are_parsed_or_refused(task, values, size, choices, good):
         message = str(error)
     assert message.startswith("a.npz")
     assert "\n" not in message
+
+
+@pytest.mark.parametrize("group", ["map 3", np.array("map 3"), np.full(3, "map 3")])
+def test_group_of_an_episode(group):
+    assert parse({"group": group}).group == "map 3"
+    assert parse({}).group is None
+    assert infer_layout("a.npz", GOOD | {"group": group}, None).has_groups

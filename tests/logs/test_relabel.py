@@ -43,6 +43,30 @@ def test_linear_score(folder, tmp_path):
         assert all(np.array_equal(new[key], old[key]) for key in ("observations", "actions", "terminations"))
 
 
+@pytest.mark.parametrize("parquet", [False, True])
+def test_groups_share_an_intercept(parquet, tmp_path):
+    """Returns of the group "hard" are lower, and so is the second entry, which no step is paid for."""
+    pyarrow, episodes = pytest.importorskip("pyarrow"), list(logged_episodes(120))
+    names = ["easy" if number % 2 else "hard" for number in range(len(episodes))]
+    for name, episode in zip(names, episodes, strict=True):
+        steps = len(episode["actions"])
+        shift = -1 if name == "hard" else 1
+        episode["observations"] = episode["observations"] + np.float32([0, shift])
+        episode |= {"score": np.array(episode["rewards"].sum() + 5 * steps * shift), "group": np.array(name)}
+        del episode["rewards"]
+    source = episodes
+    if parquet:
+        rows = [{key: value.tolist() for key, value in episode.items()} for episode in episodes]
+        pyarrow.parquet.write_table(pyarrow.Table.from_pylist(rows), tmp_path / "log.parquet")
+        source = tmp_path / "log.parquet"
+    result = lare_rl.relabel(source, tmp_path / "new")
+    assert result.return_r2 > 0.98
+    if not parquet:
+        new = read_directory(tmp_path / "new")
+        means = [np.mean([e["rewards"].mean() for e in new if e["group"] == name]) for name in ("easy", "hard")]
+        assert abs(means[0] - means[1]) < 1.5  # without groups: about 10
+
+
 def test_score_of_noise(tmp_path):
     result = lare_rl.relabel(list(logged_episodes(200, noise=True)), tmp_path / "new")
     assert result.return_r2 < 0.1

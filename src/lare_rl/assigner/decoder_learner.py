@@ -15,6 +15,7 @@ from math import inf
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
@@ -321,6 +322,13 @@ class DecoderLearner:
                 )
             reward[chunk] = np.asarray(r_hat)[: len(inputs[chunk])].reshape(reward[chunk].shape)
         return reward
+
+    def level_return(self, level: int, length: int) -> float:
+        """Return the part of the return of an episode that its group explains."""
+        if self.decoder is None or not self.config.n_levels or not self.is_fitted:
+            return 0.0
+        with on_cpu():
+            return float(decomposition.level_returns(self.decoder, jnp.array([level]), jnp.array([length]))[0])
 
     def rewards_at(self, step_ids: Int[np.ndarray, " n"]) -> Float[np.ndarray, "n *agents"]:
         """Return the rewards of stored steps. Raises `LareError` if a step is not stored."""

@@ -217,15 +217,17 @@ def observe_returns(
     )
 
 
-def level_returns(state: Decomposition, episodes: CreditBatch) -> Float[Array, " episodes"]:
-    """Return the part of each episode's return that its level explains, and that no step is paid for."""
-    if episodes.level is None:
-        return jnp.zeros(len(episodes.length))
+def level_returns(
+    state: Decomposition, level: Int[Array, " episodes"] | None, length: Int[Array, " episodes"]
+) -> Float[Array, " episodes"]:
+    """Return the part of each episode's return that its level explains, and that no step is paid for; 0 without levels."""
+    if level is None:
+        return jnp.zeros(length.shape)
     if state.levels is not None:
-        return level_offsets(state.levels)[episodes.level] * episodes.length
+        return level_offsets(state.levels)[level] * length
     assert state.closed_form is not None
     index = score_type_index(state, len(state.closed_form.intercept))
-    return state.closed_form.intercept[index][episodes.level] * jnp.where(state.is_mean, 1, episodes.length)
+    return state.closed_form.intercept[index][level] * jnp.where(state.is_mean, 1, length)
 
 
 def is_normalised(state: Decomposition, settings: CreditSettings) -> bool:

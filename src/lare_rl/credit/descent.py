@@ -119,5 +119,7 @@ def _targets(state: Decomposition, episodes: CreditBatch, settings: CreditSettin
     """Return R/T of each episode, or R if the score is a mean, in the decoder's unit, without what its level explains."""
     mean_reward = episodes.mean_reward
     if episodes.level is not None:
-        mean_reward = mean_reward - level_returns(state, episodes) / jnp.maximum(episodes.length, 1)
+        mean_reward = mean_reward - level_returns(state, episodes.level, episodes.length) / jnp.maximum(
+            episodes.length, 1
+        )
     return mean_reward * jnp.where(state.is_mean, episodes.length, 1) / reward_unit(state, settings)

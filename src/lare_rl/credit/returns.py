@@ -72,7 +72,9 @@ def predict(state: Decomposition, episodes: CreditBatch, settings: CreditSetting
     first fit all of them.
     """
     is_new, returns = episodes.mask > 0, episodes.mean_reward * episodes.length
-    predicted = (predicted_returns(state, episodes, settings) + level_returns(state, episodes))[:, None]
+    predicted = (predicted_returns(state, episodes, settings) + level_returns(state, episodes.level, episodes.length))[
+        :, None
+    ]
     predictions = add_predictions(state.predictions, returns, predicted, is_new & is_fitted(state))
     state = state._replace(predictions=predictions)
     if state.score_type_predictions is None or state.closed_form is None:

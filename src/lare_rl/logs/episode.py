@@ -1,5 +1,6 @@
 """One episode of a log. No log is trusted: a value that does not fit raises a `LareError` that names the file and the key."""
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple
@@ -15,7 +16,7 @@ __all__ = ["KEYS", "LogLayout", "LoggedEpisode", "RelabelledEpisode", "infer_lay
 
 KEYS = (
     *("observations", "actions", "rewards", "score", "next_observations"),
-    *("terminations", "truncations", "cut", "paid"),
+    *("terminations", "truncations", "cut", "paid", "group"),
 )
 """The arrays of an episode that are read. The key `paid` has the rewards before the log was relabelled."""
 MAX_MAGNITUDE = 1e18
@@ -35,6 +36,8 @@ class LoggedEpisode:
     """The original reward of each step. A score is the reward of the last step."""
     complete: bool
     """Whether the episode was played to its end. Only then is its return known."""
+    group: str | float | None
+    """The group of the episode, such as its map. None if the log does not tell it."""
     contents: Any = field(repr=False)
     """The episode as it was read, to write it again: a mapping of arrays, or a table."""
 
@@ -57,6 +60,8 @@ class LogLayout:
     action: SpaceLayout
     max_episode_steps: int | None = None
     """The time limit; None if it is unknown."""
+    has_groups: bool = False
+    """Whether episodes have a `group`."""
 
 
 def infer_layout(name: str, values: Mapping[str, Any], role: TaskSpec | None) -> LogLayout:
@@ -84,7 +89,8 @@ def infer_layout(name: str, values: Mapping[str, Any], role: TaskSpec | None) ->
             layouts[kind] = SpaceLayout(kind="choices", choices=(sizes[kind],), first=(0,))
         else:
             layouts[kind] = SpaceLayout(kind="numbers", shape=array.shape[1:])
-    return LogLayout(**layouts, max_episode_steps=None if role is None else role.max_episode_steps)
+    max_episode_steps = None if role is None else role.max_episode_steps
+    return LogLayout(**layouts, max_episode_steps=max_episode_steps, has_groups="group" in values)
 
 
 def parse_episode(name: str, values: Mapping[str, Any], layout: LogLayout, contents: Any) -> LoggedEpisode:
@@ -94,7 +100,7 @@ def parse_episode(name: str, values: Mapping[str, Any], layout: LogLayout, conte
         name: name of the file, or of the episode in it.
         values: `observations` (T + 1, ...) or, with `next_observations` (T, ...), (T, ...); `actions` (T, ...); `rewards` (T,) or
             `score`, a single number. Optional: `terminations` and `truncations`, (T,) or one flag; `cut`, one flag; `paid` (T,),
-            the rewards before the log was relabelled.
+            the rewards before the log was relabelled; `group`, a text or a number.
         layout: the layout of the log.
         contents: what to write again, with new rewards.
 
@@ -130,6 +136,7 @@ def parse_episode(name: str, values: Mapping[str, Any], layout: LogLayout, conte
         next_observation=next_observation,
         reward=_original_reward(name, values, n_steps),
         complete=_is_complete(name, values, n_steps, layout.max_episode_steps),
+        group=_group(name, values, n_steps),
         contents=contents,
     )
 
@@ -174,6 +181,20 @@ def _original_reward(name: str, values: Mapping[str, Any], n_steps: int) -> Floa
     reward = reward.astype(np.float64)
     _check_numbers(where, np.asarray(np.abs(reward).sum()))
     return reward if shape else np.append(np.zeros(n_steps - 1), reward)
+
+
+def _group(name: str, values: Mapping[str, Any], n_steps: int) -> str | float | None:
+    """Return the group of an episode. If there is one for each step, it is that of the last step."""
+    if "group" not in values:
+        return None
+    groups = np.asarray(values["group"])
+    if groups.shape not in ((), (1,), (n_steps,)) or groups.dtype.kind not in "biufUO":
+        raise LareError(f"{name}: group must be a text or a number, and is {short_repr(values['group'])}")
+    group = np.atleast_1d(groups)[-1]
+    group = group.item() if isinstance(group, np.generic) else group
+    if not isinstance(group, str | int | float) or math.isnan(group if not isinstance(group, str) else 0):
+        raise LareError(f"{name}: group must be a text or a number, and is {short_repr(group)}")
+    return group
 
 
 def _is_complete(name: str, values: Mapping[str, Any], n_steps: int, max_episode_steps: int | None) -> bool:

@@ -40,6 +40,8 @@ UPDATES = 10_000
 """Gradient updates of a decoder."""
 MIN_HELD_OUT = 8
 """The least number of held-out episodes for statistics of their returns."""
+UNSEEN = -1
+"""The number of a group without an episode that was learned from."""
 MIN_R2 = 0.1
 """Below this R², the rewards come with a warning."""
 
@@ -234,6 +236,7 @@ def _create_assigner(
         seed=seed,
         fits_per_step=0.0,
         forget=False,
+        groups=log.layout.has_groups,
     )
     bytes_per_step = (
         4 * create(capacity=1).config.spec.basis.n_inputs + 16
@@ -250,7 +253,8 @@ def _fit(
         if episode.complete and not next(is_held_out):
             n_fitted += 1
             try:
-                credit.add_episode(episode.observation, episode.action, episode.next_observation, episode.reward)
+                steps = episode.observation, episode.action, episode.next_observation, episode.reward
+                credit.add_episode(*steps, group=episode.group)
                 credit.fit_pending()
             except LareError as error:
                 raise LareError(f"{episode.name}: {error}") from error
@@ -292,7 +296,9 @@ def _compute_rewards(
             counts.cut += not episode.complete
             if episode.complete and next(is_held_out):
                 counts.returns.append(float(episode.reward.sum()))
-                counts.predictions.append(float(reward.sum(dtype=np.float64)))
+                level = 0 if episode.group is None else credit.group_names.get(episode.group, UNSEEN)
+                level_return = 0.0 if level == UNSEEN else credit.learner.level_return(level, len(episode))
+                counts.predictions.append(float(reward.sum(dtype=np.float64)) + level_return)
             if episode.complete and credit.config.is_exact:
                 reward = _make_exact(reward, episode.reward, credit.config)
             yield RelabelledEpisode(episode, reward)

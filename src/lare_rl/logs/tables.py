@@ -149,7 +149,7 @@ def _is_list(kind: pa.DataType) -> bool:
 
 def _read_arrays(name: str, table: pa.Table) -> dict[str, np.ndarray]:
     """Return the columns of an episode as arrays. If rows are steps, its score is that of the last step."""
-    arrays = {key: _read_column(f"{name}: {key}", table.column(key)) for key in KEYS if key in table.column_names}
+    arrays = {key: _read_column(name, key, table.column(key)) for key in KEYS if key in table.column_names}
     if _rows_are_episodes(table.schema):
         return {key: array[0] for key, array in arrays.items()}
     if "score" in arrays and arrays["score"].ndim:
@@ -157,8 +157,9 @@ def _read_arrays(name: str, table: pa.Table) -> dict[str, np.ndarray]:
     return arrays
 
 
-def _read_column(where: str, column: pa.ChunkedArray) -> np.ndarray:
-    """Return a column of numbers (T,), or of nested lists of equal length (T, n, ...)."""
+def _read_column(name: str, key: str, column: pa.ChunkedArray) -> np.ndarray:
+    """Return a column of numbers (T,), or of nested lists of equal length (T, n, ...). A group may be a text."""
+    where = f"{name}: {key}"
     values = column.combine_chunks()
     if isinstance(values, pa.ExtensionArray):  # an array of fixed shape in a Hugging Face data set
         values = values.storage
@@ -173,6 +174,8 @@ def _read_column(where: str, column: pa.ChunkedArray) -> np.ndarray:
             raise LareError(f"{where} must be lists of one length, without gaps")
         shape.append(size)
         values = inner
+    if key == "group" and not shape and pa.types.is_string(values.type):
+        return np.array(values.to_pylist())
     if not (pa.types.is_integer(values.type) or pa.types.is_floating(values.type) or pa.types.is_boolean(values.type)):
         raise LareError(f"{where} must be numbers, and is {column.type}")
     return values.to_numpy(zero_copy_only=False).reshape(len(column), *shape)
