@@ -61,7 +61,7 @@ class AssignerState:
     n_learned: int
     n_updates: int
     arrays: dict[str, np.ndarray]
-    group_names: tuple[str | float, ...] = ()
+    group_names: tuple[str | int | float, ...] = ()
     """The groups in the order of their numbers, as texts or numbers."""
 
 

@@ -36,7 +36,7 @@ class LoggedEpisode:
     """The original reward of each step. A score is the reward of the last step."""
     complete: bool
     """Whether the episode was played to its end. Only then is its return known."""
-    group: str | float | None
+    group: str | int | float | None
     """The group of the episode, such as its map. None if the log does not tell it."""
     contents: Any = field(repr=False)
     """The episode as it was read, to write it again: a mapping of arrays, or a table."""
@@ -183,7 +183,7 @@ def _original_reward(name: str, values: Mapping[str, Any], n_steps: int) -> Floa
     return reward if shape else np.append(np.zeros(n_steps - 1), reward)
 
 
-def _group(name: str, values: Mapping[str, Any], n_steps: int) -> str | float | None:
+def _group(name: str, values: Mapping[str, Any], n_steps: int) -> str | int | float | None:
     """Return the group of an episode. If there is one for each step, it is that of the last step."""
     if "group" not in values:
         return None
