@@ -242,10 +242,10 @@ def _make_learn_returns(config: TrainConfig) -> Callable[..., Any]:
     def _map_learn_returns(axis_size: int, is_mapped: Any, *inputs: Any) -> tuple[Any, Any]:
         def merge(leaf: Array, mapped: bool) -> Array:
             leaf = leaf if mapped else jnp.broadcast_to(leaf, (axis_size, *leaf.shape))
-            return leaf.reshape(-1, *leaf.shape[2:])
+            return leaf.reshape(leaf.shape[0] * leaf.shape[1], *leaf.shape[2:])  # -1 fails for an array without entries
 
         learned = learn_returns(*jax.tree.map(merge, list(inputs), is_mapped))
-        learned = jax.tree.map(lambda leaf: leaf.reshape(axis_size, -1, *leaf.shape[1:]), learned)
+        learned = jax.tree.map(lambda leaf: leaf.reshape(axis_size, len(leaf) // axis_size, *leaf.shape[1:]), learned)
         return learned, jax.tree.map(lambda _: True, learned)
 
     return learn_returns
