@@ -1,4 +1,4 @@
-"""Step rewards are learned from returns alone, at any scale."""
+"""Step rewards are learned from returns alone, at any scale; their units, optimism, and the rows of a batch."""
 
 from functools import partial
 
@@ -10,13 +10,15 @@ import pytest
 from lare_rl.credit import decomposition, descent
 from lare_rl.credit.decoder_settings import CreditSettings
 from lare_rl.credit.decomposition import CreditBatch
+from lare_rl.credit.evidence import PosteriorSpread
 from lare_rl.credit.methods import METHODS, Fit
 
 EPISODES, STEPS, FEATURES = 64, 10, 3
 KEY = jax.random.key(3)
-init = jax.jit(decomposition.init, static_argnums=range(1, 6))
+init = jax.jit(decomposition.init, static_argnums=range(1, 7))
 update = jax.jit(descent.update, static_argnames=("fit", "settings"))
 proxy_rewards = jax.jit(decomposition.decoder_rewards, static_argnames="settings")
+optimistic_rewards = jax.jit(decomposition.optimistic_rewards, static_argnames="settings")
 
 
 @partial(jax.jit, static_argnames=("fit", "settings"))
@@ -83,6 +85,49 @@ def test_scales_of_rewards_and_features_do_not_matter():
         np.testing.assert_allclose(losses, scaled_losses, rtol=1e-2, atol=1e-3)
         unit = scale if name == "reward_scale" else 1.0
         np.testing.assert_allclose(r_hat, scaled_r_hat / unit, rtol=2e-2, atol=2e-2)
+
+
+@pytest.mark.parametrize("score_type", [0, 1])
+def test_unit_of_proxy_rewards(score_type):
+    """A decoder's output is in units of R/T. If the score is a mean, it is in units of R, and a step gets a T-th of it."""
+    settings, length = CreditSettings(hidden=(8,)), np.array([2, 4, 8])
+    mean_reward, rows = np.array([3.0, -1.0, 0.5], np.float32), np.eye(FEATURES, dtype=np.float32)
+    state = init(KEY, FEATURES, METHODS["rd"], settings, STEPS, 1, (score_type,))
+    state = observe(state, rows, mean_reward, length)
+    output = decomposition.decode(state.network, state, jnp.asarray(rows), settings).r_hat
+    unit = np.sqrt(np.mean((mean_reward * (length if score_type else 1)) ** 2)) / (length if score_type else 1)
+    np.testing.assert_allclose(proxy_rewards(state, rows, settings, length), unit * output, rtol=1e-5)
+
+
+@pytest.mark.parametrize("score_type", [0, 1])
+def test_optimism_adds_deviations_of_a_step(score_type):
+    settings, length = CreditSettings(optimism=2.0), np.array([2, 4, 8])
+    state = init(KEY, FEATURES, METHODS["rd-linear"], settings, STEPS, 1, (score_type,))
+    assert state.closed_form is not None
+    root = np.diag([1.0, 10.0, 100.0]).astype(np.float32)
+    spread = PosteriorSpread(root[None], centre=np.zeros((1, FEATURES)), centre_variance=np.zeros(1))
+    state = state._replace(closed_form=state.closed_form._replace(spread=spread))
+    optimistic = optimistic_rewards(state, np.eye(FEATURES, dtype=np.float32), settings, length)
+    deviation = np.array([1.0, 10.0, 100.0]) / (length if score_type else 1)
+    np.testing.assert_allclose(optimistic, 2 * deviation, rtol=1e-5)  # of a decoder whose weights are 0
+
+
+@pytest.mark.parametrize("agents", [None, 2])
+def test_valid_rows(agents):
+    """Episode 1 is padding, and so are rows of episode 2, which does not exist. An agent that has left has no row."""
+    lead = (6,) if agents is None else (6, agents)
+    alive = None if agents is None else np.array([[True, False], *[[True, True]] * 5])
+    batch = CreditBatch(
+        inputs=np.zeros((*lead, FEATURES), np.float32),
+        episode_index=np.array([0, 0, 1, 1, 2, 3]),
+        length=np.array([2, 2]),
+        mean_reward=np.zeros(2, np.float32),
+        mask=np.array([1.0, 0.0], np.float32),
+        alive=alive,
+    )
+    rows = [True, True, False, False, False, False]
+    want = rows if agents is None else [[True, False], [True, True], *[[False, False]] * 4]
+    np.testing.assert_array_equal(jax.jit(decomposition.valid_rows)(batch), want)
 
 
 def test_decoder_of_many_agents_soon_reaches_the_size_of_rare_rewards():

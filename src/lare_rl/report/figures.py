@@ -172,7 +172,7 @@ def draw_credit(
     proxy: Float[np.ndarray, " steps"],
     uncertainty: Float[np.ndarray, " steps"] | None = None,
 ) -> str:
-    """Draw the proxy rewards of an episode over the steps, with a band of one standard deviation (`uncertainty`).
+    """Draw the proxy rewards of an episode over the steps, with a band of ± `uncertainty`.
 
     If true rewards are known, they are drawn too, and a scatter plot has a point for each step.
     """
