@@ -58,6 +58,15 @@ def test_score_type(score, other, score_type):
     assert assess_factors(inputs, alive, returns, BASIS, other).r2 < estimated.r2
 
 
+def test_score_type_of_noise_is_not_certain():
+    """Nothing predicts these scores: the errors of both types differ by 1%."""
+    inputs, alive, _ = sample_episodes()
+    scores = np.random.default_rng(3).normal(size=len(inputs))
+    estimate = assess_factors(inputs, alive, scores, BASIS).score_type
+    assert estimate is not None
+    assert not estimate.is_certain
+
+
 def test_length_r2():
     inputs, alive, returns = sample_episodes()
     length = np.array([len(episode) for episode in inputs])
