@@ -10,6 +10,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from helpers.small_configs import SMALL_SETTINGS, small_config
 from helpers.toy_envs import toy_spec
 from lare_rl.envs.env_errors import EnvOutputError
 from lare_rl.envs.families import make_host_env
@@ -17,7 +18,8 @@ from lare_rl.envs.gymnasium_env import GymnasiumEnv
 from lare_rl.envs.interface import EnvSpec, Team, to_env_action
 from lare_rl.envs.vec_env import LocalVecEnv
 from lare_rl.envs.workers import SubprocVecEnv
-from lare_rl.training.collect_host import HostVecEnv
+from lare_rl.training import collect_host
+from lare_rl.training.collect_host import HostCollector, HostVecEnv
 from lare_rl.training.streams import Stream, episode_seed
 from lare_rl.training.unroll_host import DivergedError, evaluate_on_host, record_on_host
 
@@ -282,6 +284,21 @@ def test_evaluate_episodes_of_different_lengths(wrap):
     batch = record_on_host(envs, proportional(0.0), [0], [1, 2, 3])
     np.testing.assert_array_equal(batch.mask.sum(axis=0), [[3, 1, 7]])
     np.testing.assert_array_equal((batch.steps.next_timestep.reward[..., 0] * batch.mask).sum(axis=0), [[3, 1, 7]])
+
+
+def test_actions_are_random_until_the_end_of_the_warmup(monkeypatch):
+    settings = SMALL_SETTINGS["td3"].model_copy(update={"warmup": 8})
+    envs = local_envs(2)
+    config = small_config("dense", env=envs.spec, hyperparameters=settings)
+    monkeypatch.setattr(
+        collect_host,
+        "make_policy",
+        lambda *arguments, **options: lambda memory, *inputs: (np.full((2, 1, 1, 1), 0.5, np.float32), memory),
+    )
+    collector = HostCollector(envs, local_envs(2), config, (0, 1))
+    warmup, first = (collector.collect(None, step).action for step in (4, 8))
+    assert len(np.unique(warmup)) == warmup.size == 8
+    assert (first == 0.5).all()
 
 
 # Faults.

@@ -9,6 +9,7 @@ import pytest
 
 from helpers.small_configs import (
     ONE_AGENT,
+    SMALL_SETTINGS,
     SUM_CREDIT,
     add_steps,
     jitted,
@@ -48,7 +49,9 @@ def test_train_step_relabels_by_the_newest_decoder():
 
 def test_train_step_updates_once_for_each_step(monkeypatch):
     envs = 2
-    config, steps, batches = small_config("dense", rollout_steps=3, n_envs=envs), random_steps(envs=envs), []
+    settings = SMALL_SETTINGS["td3"].model_copy(update={"warmup": 4})
+    config = small_config("dense", rollout_steps=3, n_envs=envs, hyperparameters=settings)
+    steps, batches = random_steps(envs=envs), []
     steps.next_timestep.terminated[tuple(np.argwhere(steps.ended)[::2].T)] = True
     learner, td3_update = add_steps(untrained_learner(config), config, steps), td3.update
 
@@ -57,7 +60,7 @@ def test_train_step_updates_once_for_each_step(monkeypatch):
         return td3_update(state, batch, key, update_index, settings)
 
     monkeypatch.setattr(td3, "update", update)
-    off_policy._train_seed(learner, jax.random.key(0), jnp.array(10), config)
+    off_policy._train_seed(learner, jax.random.key(0), jnp.array(14), config)
     jax.effects_barrier()
     assert sorted(int(update_index) for update_index, *_ in batches) == list(range(10, 10 + 3 * envs))
 
