@@ -79,9 +79,9 @@ def test_linear_rewards(basis, score_type):
 def test_slopes_of_a_mean_are_those_of_a_sum_divided_by_the_length():
     u, length = np.random.default_rng(0).normal(size=(40 * 8, 5)), np.full(40, 8)
     reward = u @ [2.0, -1.0, 0, 0, 0] + np.random.default_rng(1).normal(size=len(u))
-    of_sum, of_mean = (explain_rewards(PLAIN, u, length, reward, score_type) for score_type in (0, 1))
-    np.testing.assert_allclose(8 * of_mean.slope, of_sum.slope, rtol=1e-4)
-    np.testing.assert_allclose(8**2 * of_mean.slope_covariance, of_sum.slope_covariance, rtol=1e-3, atol=1e-9)
+    sum_score, mean_score = (explain_rewards(PLAIN, u, length, reward, score_type) for score_type in (0, 1))
+    np.testing.assert_allclose(8 * mean_score.slope, sum_score.slope, rtol=1e-4)
+    np.testing.assert_allclose(8**2 * mean_score.slope_covariance, sum_score.slope_covariance, rtol=1e-3, atol=1e-9)
 
 
 def test_residual_correlates_with_the_missing_raw_feature():
