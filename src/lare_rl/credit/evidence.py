@@ -28,6 +28,7 @@ A score may instead be a mean over the steps: R_k = b + w . m_k + N(0, 1 / (beta
 and the same S. The reward of a step is then (b + w . f) / T.
 """
 
+from functools import partial
 from typing import NamedTuple
 
 import jax
@@ -36,11 +37,24 @@ import numpy as np
 from jax.scipy.linalg import solve_triangular
 from jaxtyping import Array, Bool, Float, Int
 
+from lare_rl.credit.precisions import (
+    JITTER,
+    TOLERANCE,
+    Backend,
+    Posterior,
+    Regression,
+    clip_precisions,
+    dense_moments,
+    equal_shares,
+    inverse_root,
+    next_posterior,
+)
 from lare_rl.nn.leading_axis import map_leading_axis
 
 __all__ = [
     "Posterior",
     "PosteriorSpread",
+    "Regression",
     "SufficientStatistics",
     "add_episodes",
     "empty_statistics",
@@ -55,20 +69,20 @@ __all__ = [
     "to_return_units",
 ]
 
-PRIOR_RANGE = 1e6
-"""A group may explain at most this many times more, or less, of the returns than its equal share. Without a limit, a group that was
-switched off could not be switched on again."""
-JITTER = 1e-10
-"""This fraction of the diagonal of S is added to S, so that S can be factorised if features are collinear."""
-TOLERANCE = 1e-3
-"""The iteration to the fixed point ends when a round changes the log evidence by less than this."""
 FIRST_GROUP_GAIN, OTHER_GROUPS_LOSS, LOW_NOISE = 100, 1e4, 1e-6
 """The third start of a fit: the first group may explain `FIRST_GROUP_GAIN` times its equal share, each other group its equal share
 divided by `OTHER_GROUPS_LOSS`, and the noise `LOW_NOISE` times the variance of the returns."""
 MANY_EPISODES_PER_FEATURE = 2
 """With more episodes than this for each feature, a fit only continues from the earlier one."""
-MIN_NOISE = 1e-10
-"""The smallest variance of the noise, relative to that of the returns. Float32 features and returns cannot resolve less."""
+
+
+def _add_groups(
+    values: Float[Array, " features"], group_index: Int[np.ndarray, " features"], n_groups: int
+) -> Float[Array, " groups"]:
+    return jnp.zeros(n_groups).at[group_index].add(values)
+
+
+JAX = Backend(jnp, _add_groups, partial(solve_triangular, lower=True))
 
 
 class SufficientStatistics(NamedTuple):
@@ -79,21 +93,6 @@ class SufficientStatistics(NamedTuple):
     mean: Float[Array, " features_and_targets"]
     products: Float[Array, "features_and_targets features_and_targets"]
     """sum_k T_k (v_k - mean)(v_k - mean)^T"""
-
-
-class Posterior(NamedTuple):
-    """The posterior of the weights, without their covariance, which `posterior_spread` computes."""
-
-    weight: Float[Array, " features"]
-    bias: Float[Array, ""]
-    alpha: Float[Array, " groups"]
-    """The precision of the weights of each group, in units of the standard deviation of y."""
-    beta: Float[Array, ""]
-    """The precision of a step's noise, in the same unit."""
-    n_determined: Float[Array, " groups"]
-    """gamma: how many features of each group the data determine."""
-    log_evidence: Float[Array, ""]
-    """The log evidence, up to a constant that does not depend on groups and precisions."""
 
 
 def empty_statistics(n_features: int) -> SufficientStatistics:
@@ -135,22 +134,6 @@ def init_posterior(n_features: int, n_groups: int) -> Posterior:
     return Posterior(jnp.zeros(n_features), bias=zero, alpha=groups, beta=zero, n_determined=groups, log_evidence=zero)
 
 
-class Regression(NamedTuple):
-    """A regression problem. S, p and q are those of the equations above, with y in units of its standard deviation."""
-
-    s: Float[Array, "features features"]
-    p: Float[Array, " features"]
-    q: Float[Array, ""]
-    dof: Float[Array, ""]
-    """N - 1 degrees of freedom, for N episodes."""
-    y_mean: Float[Array, ""]
-    y_std: Float[Array, ""]
-    group_index: Int[np.ndarray, " features"]
-    """The index of each feature's group."""
-    equal_alpha: Float[Array, " groups"]
-    """The alpha of each group by which all groups explain equal parts of the returns, and together half of them."""
-
-
 def regression(
     statistics: SufficientStatistics, score_type: Int[Array, ""] | int, group_index: Int[np.ndarray, " features"]
 ) -> Regression:
@@ -163,8 +146,6 @@ def regression(
     y_std = jnp.where(y_std > 1e-6 * jnp.abs(y_mean), y_std, 0)  # a constant may vary by this much in float32
     s = statistics.products[:n_features, :n_features]
     s = s + JITTER * jnp.diag(jnp.diagonal(s))
-    n_groups = int(group_index.max()) + 1
-    trace = _group_sums(jnp.diagonal(s), group_index, n_groups)
     return Regression(
         s=s,
         p=statistics.products[:n_features, column] / jnp.where(y_std > 0, y_std, 1),
@@ -173,7 +154,7 @@ def regression(
         y_mean=y_mean,
         y_std=y_std,
         group_index=group_index,
-        equal_alpha=jnp.where(trace > 0, 2 * n_groups * trace / n_steps, 1),
+        equal_alpha=equal_shares(JAX, jnp.diagonal(s), n_steps, group_index),
     )
 
 
@@ -263,57 +244,8 @@ def fixed_point(
     return jax.lax.while_loop(is_unsettled, body, state)[2]
 
 
-def _clip_precisions(
-    problem: Regression, alpha: Float[Array, " groups"], beta: Float[Array, ""]
-) -> tuple[Float[Array, " groups"], Float[Array, ""]]:
-    """Clip precisions to a range that float32 can represent."""
-    noise_only = jnp.maximum(problem.dof, 1) / problem.q  # beta if all variation is noise
-    alpha = jnp.clip(alpha, problem.equal_alpha / PRIOR_RANGE, problem.equal_alpha * PRIOR_RANGE)
-    return alpha, jnp.clip(beta, noise_only / 2, noise_only / MIN_NOISE)
-
-
-def _inverse_root(
-    problem: Regression, alpha: Float[Array, " groups"], beta: Float[Array, ""]
-) -> tuple[Float[Array, "features features"], Float[Array, ""]]:
-    """Return L with L^T L = Sigma, and log det Sigma^-1."""
-    precision = beta * problem.s + jnp.diag(alpha[problem.group_index])
-    scale = jnp.sqrt(jnp.diagonal(precision))  # a diagonal of ones makes the factorisation accurate
-    factor = jnp.linalg.cholesky(precision / jnp.outer(scale, scale))
-    root = solve_triangular(factor, jnp.diag(1 / scale), lower=True)
-    return root, 2 * jnp.sum(jnp.log(jnp.diagonal(factor)) + jnp.log(scale))
-
-
 def _round(problem: Regression, alpha: Float[Array, " groups"], beta: Float[Array, ""]) -> Posterior:
-    """Compute the posterior under some precisions, and the precisions that follow from it."""
-    alpha, beta = _clip_precisions(problem, alpha, beta)
-    root, log_det = _inverse_root(problem, alpha, beta)
-    weight = beta * ((root @ problem.p) @ root)
-    residual = problem.q - 2 * weight @ problem.p + weight @ problem.s @ weight
-    residual = jnp.maximum(residual, MIN_NOISE * problem.q)
-    n_groups = len(alpha)
-    size = _group_sums(jnp.ones_like(weight), problem.group_index, n_groups)
-    variance = _group_sums(jnp.sum(root**2, axis=0), problem.group_index, n_groups)  # tr Sigma_gg
-    n_determined = jnp.clip(size - alpha * variance, 0, size)
-    squares = _group_sums(weight**2, problem.group_index, n_groups)  # |mu_g|^2
-    log_evidence = 0.5 * (
-        problem.dof * jnp.log(beta) + size @ jnp.log(alpha) - log_det - beta * residual - alpha @ squares
-    )
-    noise_dof = jnp.maximum(problem.dof - jnp.sum(n_determined), 0.5)
-    alpha, beta = _clip_precisions(problem, n_determined / jnp.maximum(squares, 1e-30), noise_dof / residual)
-    return Posterior(
-        weight=weight,
-        bias=jnp.zeros(()),
-        alpha=alpha,
-        beta=beta,
-        n_determined=n_determined,
-        log_evidence=log_evidence,
-    )
-
-
-def _group_sums(
-    values: Float[Array, " features"], group_index: Int[np.ndarray, " features"], n_groups: int
-) -> Float[Array, " groups"]:
-    return jnp.zeros(n_groups).at[group_index].add(values)
+    return next_posterior(JAX, problem, alpha, beta, partial(dense_moments, JAX, problem))
 
 
 class PosteriorSpread(NamedTuple):
@@ -338,8 +270,8 @@ def posterior_spread(
     The weight of a feature without data has its prior standard deviation.
     """
     problem = regression(statistics, score_type, group_index)
-    alpha, beta = _clip_precisions(problem, posterior.alpha, posterior.beta)
-    root, _ = _inverse_root(problem, alpha, beta)
+    alpha, beta = clip_precisions(JAX, problem, posterior.alpha, posterior.beta)
+    root, _ = inverse_root(JAX, beta * problem.s + jnp.diag(alpha[group_index]))
     spread = PosteriorSpread(
         root=problem.y_std * root,
         centre=statistics.mean[: len(group_index)],

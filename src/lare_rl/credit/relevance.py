@@ -18,6 +18,7 @@ from jaxtyping import Array, Bool, Int
 
 from lare_rl.credit import evidence
 from lare_rl.credit.evidence import Posterior, SufficientStatistics
+from lare_rl.credit.precisions import expand_groups
 
 __all__ = ["MIN_GAIN", "fit_strengths", "is_better", "select"]
 
@@ -47,7 +48,7 @@ def fit_strengths(
             from it instead.
         max_rounds: the maximum number of rounds.
     """
-    start = _expand_groups(groups, group_index, strength_index)
+    start = expand_groups(groups, group_index, strength_index)
     problem = evidence.regression(statistics, score_type, strength_index)
     many = problem.dof >= evidence.MANY_EPISODES_PER_FEATURE * len(group_index)
     continues = many & (earlier.beta > 0)
@@ -78,15 +79,5 @@ def select(
             is_used.reshape(*is_used.shape, *[1] * (separate.ndim - is_used.ndim)), separate, shared
         ),
         strengths,
-        _expand_groups(groups, group_index, strength_index),
+        expand_groups(groups, group_index, strength_index),
     )
-
-
-def _expand_groups(
-    groups: Posterior, group_index: Int[np.ndarray, " features"], strength_index: Int[np.ndarray, " features"]
-) -> Posterior:
-    """Return a fit by groups in the form of a fit by strengths: each strength has the precision of its group."""
-    group = np.zeros(int(strength_index.max(initial=-1)) + 1, int)
-    group[strength_index] = group_index
-    n_strengths = np.bincount(group, minlength=groups.alpha.shape[-1])
-    return groups._replace(alpha=groups.alpha[..., group], n_determined=(groups.n_determined / n_strengths)[..., group])

@@ -1,0 +1,175 @@
+"""One round of the evidence's fixed point (`evidence.py`), for arrays of NumPy and of JAX.
+
+The equations are those of `evidence.py`. Here they have no loop and no array library of their own: the caller gives a `Backend`, and the
+`Moments` of the posterior, which a special structure of the features may allow to compute faster than `dense_moments` does.
+"""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import numpy as np
+from jaxtyping import Float, Int
+
+__all__ = [
+    "JITTER",
+    "MIN_NOISE",
+    "NUMPY",
+    "TOLERANCE",
+    "Backend",
+    "Moments",
+    "Posterior",
+    "Regression",
+    "clip_precisions",
+    "dense_moments",
+    "equal_shares",
+    "expand_groups",
+    "inverse_root",
+    "next_posterior",
+]
+
+PRIOR_RANGE = 1e6
+"""A group may explain at most this many times more, or less, of the returns than its equal share. Without a limit, a group that was
+switched off could not be switched on again."""
+JITTER = 1e-10
+"""This fraction of the diagonal of S is added to S, so that S can be factorised if features are collinear."""
+TOLERANCE = 1e-3
+"""The iteration to the fixed point ends when a round changes the log evidence by less than this."""
+MIN_NOISE = 1e-10
+"""The smallest variance of the noise, relative to that of the returns. Float32 features and returns cannot resolve less."""
+
+Array = Any
+"""An array of NumPy or of JAX. (jaxtyping's `Array` would import JAX.)"""
+
+
+class Backend(NamedTuple):
+    """An array library, and the two functions that NumPy and JAX name differently."""
+
+    xp: Any
+    """`numpy` or `jax.numpy`."""
+    group_sums: Callable[[Array, Array, int], Array]
+    """(values, group_index, n_groups) -> the sum of the values of each group."""
+    solve_lower: Callable[[Array, Array], Array]
+    """(L, B) -> L^-1 B for a lower triangle L."""
+
+
+NUMPY = Backend(np, lambda values, group_index, n_groups: np.bincount(group_index, values, n_groups), np.linalg.solve)
+
+
+class Posterior(NamedTuple):
+    """The posterior of the weights, without their covariance, which `evidence.posterior_spread` computes."""
+
+    weight: Float[Array, "*batch features"]
+    bias: Float[Array, "*batch"]
+    alpha: Float[Array, "*batch groups"]
+    """The precision of the weights of each group, in units of the standard deviation of y."""
+    beta: Float[Array, "*batch"]
+    """The precision of a step's noise, in the same unit."""
+    n_determined: Float[Array, "*batch groups"]
+    """gamma: how many features of each group the data determine."""
+    log_evidence: Float[Array, "*batch"]
+    """The log evidence, up to a constant that does not depend on groups and precisions."""
+
+
+class Regression(NamedTuple):
+    """A regression problem. S, p and q are those of `evidence.py`, with y in units of its standard deviation."""
+
+    s: Float[Array, "features features"]
+    p: Float[Array, " features"]
+    q: Float[Array, ""]
+    dof: Float[Array, ""]
+    """N - 1 degrees of freedom, for N episodes."""
+    y_mean: Float[Array, ""]
+    y_std: Float[Array, ""]
+    group_index: Int[np.ndarray, " features"]
+    """The index of each feature's group."""
+    equal_alpha: Float[Array, " groups"]
+    """The alpha of each group by which all groups explain equal parts of the returns, and together half of them."""
+
+
+class Moments(NamedTuple):
+    """What a round needs of a posterior under some precisions."""
+
+    weight: Float[Array, " features"]
+    variance: Float[Array, " features"]
+    """The diagonal of Sigma."""
+    log_det: Float[Array, ""]
+    """log det Sigma^-1."""
+    residual: Float[Array, ""]
+    """q - 2 mu . p + mu . S mu."""
+
+
+def equal_shares(
+    backend: Backend, diagonal: Float[Array, " features"], q: Any, group_index: Int[np.ndarray, " features"]
+) -> Float[Array, " groups"]:
+    """Return `Regression.equal_alpha` from the diagonal of S."""
+    n_groups = int(group_index.max()) + 1
+    trace = backend.group_sums(diagonal, group_index, n_groups)
+    return backend.xp.where(trace > 0, 2 * n_groups * trace / q, 1)
+
+
+def clip_precisions(
+    backend: Backend, problem: Regression, alpha: Float[Array, " groups"], beta: Any
+) -> tuple[Float[Array, " groups"], Any]:
+    """Clip precisions to a range that float32 can represent."""
+    xp = backend.xp
+    noise_only = xp.maximum(problem.dof, 1) / problem.q  # beta if all variation is noise
+    alpha = xp.clip(alpha, problem.equal_alpha / PRIOR_RANGE, problem.equal_alpha * PRIOR_RANGE)
+    return alpha, xp.clip(beta, noise_only / 2, noise_only / MIN_NOISE)
+
+
+def inverse_root(backend: Backend, precision: Float[Array, "n n"]) -> tuple[Float[Array, "n n"], Any]:
+    """Return L with L^T L the inverse of a precision matrix, and the log of the matrix's determinant."""
+    xp = backend.xp
+    scale = xp.sqrt(xp.diagonal(precision))  # a diagonal of ones makes the factorisation accurate
+    factor = xp.linalg.cholesky(precision / xp.outer(scale, scale))
+    root = backend.solve_lower(factor, xp.diag(1 / scale))
+    return root, 2 * xp.sum(xp.log(xp.diagonal(factor)) + xp.log(scale))
+
+
+def dense_moments(backend: Backend, problem: Regression, alpha: Float[Array, " groups"], beta: Any) -> Moments:
+    """Return the moments of the posterior under some precisions, from the whole matrix S."""
+    xp = backend.xp
+    root, log_det = inverse_root(backend, beta * problem.s + xp.diag(alpha[problem.group_index]))
+    weight = beta * ((root @ problem.p) @ root)
+    residual = problem.q - 2 * weight @ problem.p + weight @ problem.s @ weight
+    return Moments(weight, xp.sum(root**2, axis=0), log_det, residual)
+
+
+def next_posterior(
+    backend: Backend,
+    problem: Regression,
+    alpha: Float[Array, " groups"],
+    beta: Any,
+    moments: Callable[[Float[Array, " groups"], Any], Moments],
+) -> Posterior:
+    """Compute the posterior under some precisions, and the precisions that follow from it."""
+    xp, group_index, n_groups = backend.xp, problem.group_index, len(alpha)
+    alpha, beta = clip_precisions(backend, problem, alpha, beta)
+    weight, variance, log_det, residual = moments(alpha, beta)
+    residual = xp.maximum(residual, MIN_NOISE * problem.q)
+    size = backend.group_sums(xp.ones_like(weight), group_index, n_groups)
+    n_determined = xp.clip(size - alpha * backend.group_sums(variance, group_index, n_groups), 0, size)
+    squares = backend.group_sums(weight**2, group_index, n_groups)  # |mu_g|^2
+    log_evidence = 0.5 * (
+        problem.dof * xp.log(beta) + size @ xp.log(alpha) - log_det - beta * residual - alpha @ squares
+    )
+    noise_dof = xp.maximum(problem.dof - xp.sum(n_determined), 0.5)
+    alpha, beta = clip_precisions(backend, problem, n_determined / xp.maximum(squares, 1e-30), noise_dof / residual)
+    return Posterior(
+        weight=weight,
+        bias=xp.zeros(()),
+        alpha=alpha,
+        beta=beta,
+        n_determined=n_determined,
+        log_evidence=log_evidence,
+    )
+
+
+def expand_groups(
+    groups: Posterior, group_index: Int[np.ndarray, " features"], strength_index: Int[np.ndarray, " features"]
+) -> Posterior:
+    """Return a fit by groups in the form of a fit by strengths (`relevance.py`): each strength has the precision of its group."""
+    group = np.zeros(int(strength_index.max(initial=-1)) + 1, int)
+    group[strength_index] = group_index
+    n_strengths = np.bincount(group, minlength=groups.alpha.shape[-1])
+    return groups._replace(alpha=groups.alpha[..., group], n_determined=(groups.n_determined / n_strengths)[..., group])
