@@ -612,3 +612,23 @@ def test_groups_that_do_not_fit_are_refused():
         credit.add_episode(*episode, group=f"g{i}")
     with pytest.raises(LareError, match=r"more than 64 groups.*'new'"):
         credit.add_episode(*episode, group="new")
+
+
+def test_must_learn_what_wins():
+    """Steps that raise the odds of a win are paid for it, and chances are predicted better than by a sum."""
+    rng = np.random.default_rng(0)
+    sums, odds = (
+        small_assigner("bayes", settings=SMALL_CREDIT.model_copy(update={"score": s})) for s in ("sum", "binary")
+    )
+    lengths = rng.integers(4, 20, 300).tolist()
+    for episode in random_episodes(lengths):
+        log_odds = 3 * episode.next_observation[:, 0].sum() - 2
+        for credit in (sums, odds):
+            rows = credit.add_episode(*episode[:3], float(rng.random() < 1 / (1 + np.exp(-log_odds))))
+    gain = [credit.metrics()["credit/gain"] for credit in (sums, odds)]
+    assert (sums.score_type, odds.score_type) == ("sum", "log odds")
+    assert gain[1] > gain[0]
+    assert gain[1] > 5 * odds.metrics()["credit/gain_error"]
+    correlation = np.corrcoef(odds.rewards_at(rows), episode.next_observation[:, 0])[0, 1]
+    assert correlation > 0.95
+    assert any("log odds" in line for line in odds.explanation())

@@ -28,14 +28,14 @@ PHI_ENV = replace(ONE_AGENT, observation_size=2, action_size=1, low=ONE_AGENT.lo
 """The sizes that `phi` is for. The bounds are -1 and 1, so that actions need no scaling."""
 
 
-def learn(method, env, phi=None, payments=PAID_AT_END, exact="no", group=None):
+def learn(method, env, phi=None, payments=PAID_AT_END, exact="no", group=None, score="auto"):
     """Return a learner and an assigner that have learned from the same steps."""
     scored_observation = "after" if phi is None else toy_spec().scored_observation
     algorithm = "td3" if env.n_agents == 1 else "ippo"
     config = small_config(
         method, algorithm, env, capacity=1000, scored_observation=scored_observation, payments=payments
     )
-    config = replace(config, credit=config.credit.model_copy(update={"exact": exact}), group=group)
+    config = replace(config, credit=config.credit.model_copy(update={"exact": exact, "score": score}), group=group)
     credit = CreditAssigner(
         method,
         phi,
@@ -107,6 +107,17 @@ def test_rewards_agree(method, env, payments, exact, phi):
     assert np.abs(expected).max() > 0
     if learner.decoders:
         assert credit.learner.n_learned == int(learner.n_learned.sum())
+
+
+def test_rewards_agree_if_the_score_is_won_or_lost():
+    learner, config, credit = learn("bayes", ONE_AGENT, score="binary", group="map")
+    expected = np.asarray(rewards(stored_steps(learner), reward_state(learner), config))[..., 0]
+    r_hat = credit.rewards_at(np.arange(credit.store.steps))
+    np.testing.assert_allclose(r_hat, expected, rtol=1e-3, atol=1e-4 * np.abs(expected).max())
+    trained, assigned = learner.decoders[0].closed_form.log_odds, credit.learner.decoder.closed_form.log_odds
+    assert trained.n_episodes == assigned.n_episodes
+    np.testing.assert_allclose(trained.posterior.weight, assigned.posterior.weight, rtol=1e-3, atol=1e-4)
+    assert np.abs(assigned.posterior.weight).max() > 0
 
 
 @pytest.mark.parametrize("method", ["rd-linear", "bayes"])

@@ -10,6 +10,7 @@ import pytest
 from lare_rl.credit import closed_form, evidence
 from lare_rl.credit.basis import Basis, expand
 from lare_rl.credit.closed_form import LinearDecoder
+from lare_rl.credit.score_type import ScoreType
 from lare_rl.nn.normalise import empty_mean_std, update_mean_std
 
 PLAIN = Basis(3, 0, extended=False)
@@ -68,7 +69,9 @@ def test_fit_signs_against_trying_all(seed):
     rows, length, returns = sample_episodes(seed=seed, noise=30.0)
     returns += 8 * length  # no signs give this level: the fit must weigh it against the differences between episodes
     with jax.enable_x64(True):
-        state = closed_form.fit_signs(add_episodes(init(PLAIN, 1), np.concatenate(rows), length, returns))
+        state = closed_form.fit_signs(
+            add_episodes(init(PLAIN, (ScoreType.SUM,)), np.concatenate(rows), length, returns)
+        )
     means = np.stack([episode.mean(axis=0) for episode in rows])
     errors = {
         signs: (length * (means @ signs - returns / length) ** 2).sum()
@@ -81,7 +84,7 @@ def test_fit_signs_against_trying_all(seed):
 def fitted_rewards(basis, rows, length, returns, score_types):
     """Return the fit in closed form to some episodes, and r_hat of their steps if the score is a sum."""
     with jax.enable_x64(True):
-        state = closed_form.reset_statistics(init(basis, len(score_types)), observed(rows))
+        state = closed_form.reset_statistics(init(basis, score_types), observed(rows))
         state = fit(add_episodes(state, rows, length, returns), score_types, max_rounds=60)
         return state, closed_form.select_score_type(state.decoder, 0)(jnp.asarray(rows, jnp.float32)).r_hat
 
@@ -106,7 +109,7 @@ def test_fit_recovers_a_product_of_raw_features(n_factors):
 
 @pytest.mark.parametrize(("n_fitted", "due"), [(0.0, True), (95.0, True), (96.0, False)])
 def test_is_due(n_fitted, due):
-    state = init(PLAIN, 1)
+    state = init(PLAIN, (ScoreType.SUM,))
     assert not closed_form.is_due(state)
     statistics = state.sufficient_statistics._replace(n_episodes=jnp.array([100.0, 0.0]))
     state = state._replace(sufficient_statistics=statistics, n_fitted=jnp.array(n_fitted))
@@ -115,12 +118,14 @@ def test_is_due(n_fitted, due):
 
 def test_a_fit_is_due_after_the_sums_were_reset():
     """The old weights do not match the newly standardised features, though no episode is new."""
-    state = closed_form.reset_statistics(init(PLAIN, 1)._replace(n_fitted=jnp.array(100.0)), observed(np.ones((9, 3))))
+    state = closed_form.reset_statistics(
+        init(PLAIN, (ScoreType.SUM,))._replace(n_fitted=jnp.array(100.0)), observed(np.ones((9, 3)))
+    )
     statistics = state.sufficient_statistics._replace(n_episodes=jnp.array([100.0, 0.0]))
     assert closed_form.is_due(state._replace(sufficient_statistics=statistics))
 
 
 @pytest.mark.parametrize(("n_steps", "stale"), [(0.0, True), (66.0, True), (67.0, False)])
 def test_is_stale(n_steps, stale):
-    state = init(PLAIN, 1)._replace(n_steps=jnp.array(n_steps))
+    state = init(PLAIN, (ScoreType.SUM,))._replace(n_steps=jnp.array(n_steps))
     assert bool(closed_form.is_stale(state, observed(np.ones((100, 3))))) == stale

@@ -2,7 +2,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from lare_rl.credit.prequential import WINDOW, add_predictions, empty_predictions, r2, squared_errors
+from lare_rl.credit.prequential import WINDOW, add_predictions, empty_predictions, gain, r2, squared_errors
 
 
 def sample_predictions(count):
@@ -41,3 +41,37 @@ def test_masked_episodes_are_ignored():
 @pytest.mark.parametrize("returns", [np.arange(7.0), np.full(20, 3.1)], ids=["few", "equal"])
 def test_r2_is_nan(returns):
     assert np.isnan(r2(add(empty_predictions(1), returns, np.zeros((len(returns), 1))))).all()
+
+
+def test_gain_against_numpy():
+    rng = np.random.default_rng(0)
+    level = rng.integers(0, 3, 25)
+    level[7] = 5  # alone in its level
+    returns = (level + rng.normal(size=25)).astype(np.float32)
+    predicted = (returns + rng.normal(size=25)).astype(np.float32)
+    predictions = add_predictions(
+        empty_predictions(1), *map(jnp.asarray, (returns, predicted[:, None], np.ones(25, bool), level))
+    )
+    peers = [[i for i in range(25) if i != k and (k == 7 or level[i] == level[k])] for k in range(25)]
+    baseline = np.array([(returns[k] - returns[peers[k]].mean()) ** 2 for k in range(25)])
+    error = (returns - predicted) ** 2
+    want = 1 - error.sum() / baseline.sum()
+    std_error = np.sqrt(((baseline - error - want * baseline) ** 2).sum()) / baseline.sum()
+    np.testing.assert_allclose(gain(predictions), (want, std_error), rtol=1e-4)
+
+
+def test_gain_covers_the_true_gain():
+    """Chance explains most of a won or lost score: the gain is small, and its standard error says how well it is known."""
+    rng, gains = np.random.default_rng(1), []
+    for _ in range(200):
+        chance = rng.choice([0.3, 0.7], 256)
+        won = (rng.random(256) < chance).astype(np.float32)
+        predictions = add(empty_predictions(1, 256), won, chance[:, None].astype(np.float32))
+        gains.append(gain(predictions))
+    gains = np.array(gains)
+    np.testing.assert_allclose(gains[:, 0].mean(), 0.16, atol=0.01)
+    np.testing.assert_allclose(gains[:, 1].mean(), gains[:, 0].std(), rtol=0.2)
+
+
+def test_gain_is_nan_with_few_episodes():
+    assert np.isnan(gain(add(empty_predictions(1), *map(np.float32, ([1, 2], [[1], [2]]))))).all()

@@ -34,7 +34,9 @@ def test_a_score_is_a_mean_if_that_predicts_clearly_better(ratio, is_mean):
     """`ratio` is that of the squared errors: as a mean to as a sum."""
     scores = np.random.default_rng(0).normal(size=WINDOW).astype(np.float32)
     predicted = np.stack([scores + 1, scores + np.sqrt(ratio)], axis=1).astype(np.float32)
-    predictions = Predictions(jnp.float32(WINDOW), jnp.asarray(scores), jnp.asarray(predicted))
+    predictions = Predictions(
+        jnp.float32(WINDOW), jnp.asarray(scores), jnp.asarray(predicted), jnp.zeros(WINDOW, jnp.int32)
+    )
     with jax.enable_x64(True):
         assert bool(fit(untrained()._replace(score_type_predictions=predictions)).is_mean) == is_mean
 

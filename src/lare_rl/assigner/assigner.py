@@ -352,9 +352,11 @@ class CreditAssigner:
 
     @property
     def score_type(self) -> str:
-        """How the score is modelled: as the `sum` or the `average` over an episode's steps."""
+        """How the score is modelled: as the `sum` or the `average` over an episode's steps, or by the `log odds` that they add."""
         decoder = self.learner.decoder
-        return "average" if decoder is not None and bool(decoder.is_mean) else "sum"
+        if decoder is None or not (decoder.is_mean | decoder.is_log_odds):
+            return "sum"
+        return "average" if bool(decoder.is_mean) else "log odds"
 
     form = score_type  # the earlier name
 

@@ -17,7 +17,7 @@ from lare_rl.credit.explanation_text import raw_feature_names
 from lare_rl.credit.history import next_history
 from lare_rl.credit.input_names import input_arrays
 from lare_rl.credit.methods import Method
-from lare_rl.credit.prequential import SEGMENT_WINDOW, WINDOW
+from lare_rl.credit.score_type import prediction_window
 from lare_rl.envs.families import load_env_spec
 from lare_rl.errors import LareError, short_repr
 from lare_rl.latent.function import LatentFunction, check_task
@@ -80,7 +80,7 @@ class AssignerConfig:
             single_agent=self.agents == 1,
             agents=self.agents,
             max_steps=self.max_steps or 1,
-            window=WINDOW if self.payments.only_at_end else SEGMENT_WINDOW,
+            window=prediction_window(self.payments, self.settings.score),
             n_levels=self.n_levels,
             fixed_length=False,
             scale_rewards=self.scale_rewards,

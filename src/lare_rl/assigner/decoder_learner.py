@@ -385,10 +385,15 @@ class DecoderLearner:
     def metrics(self) -> dict[str, float]:
         """Return metrics that need no true rewards. Returns are predicted before they are learned from."""
         self.learn_returns()
-        with on_cpu():
-            return_r2 = float("nan") if self.decoder is None else float(prequential.r2(self.decoder.predictions)[0])
+        r2 = gain = gain_error = float("nan")
+        if self.decoder is not None:
+            with on_cpu():
+                predictions = self.decoder.predictions
+                r2, gain, gain_error = map(float, (prequential.r2(predictions)[0], *prequential.gain(predictions)))
         return {
-            "credit/return_r2": return_r2,
+            "credit/return_r2": r2,
+            "credit/gain": gain,
+            "credit/gain_error": gain_error,
             "credit/episodes": float(self.store.ended),
             "credit/dropped": float(self.store.dropped),
             "credit/fits": float(self.n_updates),

@@ -32,11 +32,13 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
-from lare_rl.credit import evidence, relevance
+from lare_rl.credit import evidence, logistic, relevance
 from lare_rl.credit.basis import Basis, expand, expand_history
 from lare_rl.credit.decoder_network import DecoderOutput, DecoderShape
 from lare_rl.credit.decoder_settings import CreditSettings
 from lare_rl.credit.evidence import Posterior, PosteriorSpread, SufficientStatistics
+from lare_rl.credit.logistic import LogOddsFit
+from lare_rl.credit.score_type import ScoreType
 from lare_rl.nn.leading_axis import map_leading_axis
 from lare_rl.nn.normalise import RunningMeanStd, running_std
 
@@ -107,25 +109,31 @@ class ClosedForm(NamedTuple):
     n_fitted: Float[Array, ""]
     """The number of episodes that the decoder is fitted to."""
     posterior: Posterior
-    """The fit by groups of each score type, along a leading axis."""
+    """The fit by groups of each score type but log odds, along a leading axis."""
     strengths: Posterior
-    """The fit by strengths (`relevance.py`) of each score type, along a leading axis. The decoder has the weights of the better fit."""
+    """The fit by strengths (`relevance.py`) of the same score types. The decoder has the weights of the better fit."""
     intercept: Float[Array, "score_types levels"]
-    """The intercept of each level, for each score type: part of R/T for a score that is a sum, of R for one that is a mean."""
+    """The intercept of each level, for each score type: part of R/T for a score that is a sum, else of R."""
+    start_value: Float[Array, " score_types"]
+    """The part of R that neither steps nor levels explain, for each score type; 0 if the bias of the decoder includes it."""
+    log_odds: LogOddsFit | None
+    """The fit of log odds. Only present if the score may be of this type, which is then the last of the decoder's score types."""
     spread: PosteriorSpread | None
     """The spread of each score type, along a leading axis. Only present if rewards are optimistic."""
 
 
-def init(basis: Basis, n_score_types: int, *, with_spread: bool = False) -> ClosedForm:
+def init(basis: Basis, score_types: tuple[int, ...], *, with_spread: bool = False) -> ClosedForm:
     """Return the state before the first episode."""
+    is_binary = ScoreType.LOG_ODDS in score_types
+    n_score_types = len(score_types)
     n_features, n_columns, zero = basis.n_features, basis.n_columns, jnp.zeros(())
     posterior = evidence.init_posterior(n_columns, int(basis.column_group_index.max(initial=-1)) + 1)
     strengths = evidence.init_posterior(n_columns, int(basis.column_strength_index.max(initial=-1)) + 1)
     spread = PosteriorSpread(root=jnp.zeros((n_columns, n_columns)), centre=jnp.zeros(n_columns), centre_variance=zero)
-    posterior, strengths, spread = jax.tree.map(
-        lambda leaf: jnp.tile(leaf, (n_score_types, *[1] * leaf.ndim)),
-        (posterior, strengths, spread if with_spread else None),
+    posterior, strengths = jax.tree.map(
+        lambda leaf: jnp.tile(leaf, (n_score_types - is_binary, *[1] * leaf.ndim)), (posterior, strengths)
     )
+    spread = jax.tree.map(lambda leaf: jnp.tile(leaf, (n_score_types, *[1] * leaf.ndim)), spread)
     return ClosedForm(
         decoder=LinearDecoder(
             basis=basis,
@@ -140,7 +148,9 @@ def init(basis: Basis, n_score_types: int, *, with_spread: bool = False) -> Clos
         posterior=posterior,
         strengths=strengths,
         intercept=jnp.zeros((n_score_types, basis.n_levels)),
-        spread=spread,
+        start_value=jnp.zeros(n_score_types),
+        log_odds=logistic.init(n_columns, basis.column_group_index) if is_binary else None,
+        spread=spread if with_spread else None,
     )
 
 
@@ -176,6 +186,7 @@ def reset_statistics(state: ClosedForm, statistics: RunningMeanStd) -> ClosedFor
         sufficient_statistics=jax.tree.map(jnp.zeros_like, state.sufficient_statistics),
         n_steps=statistics.n_rows,
         n_fitted=jnp.zeros_like(state.n_fitted),
+        log_odds=None if state.log_odds is None else logistic.remove_episodes(state.log_odds),
     )
 
 
@@ -187,7 +198,8 @@ def is_due(state: ClosedForm) -> Bool[Array, ""]:
 def fit(
     state: ClosedForm, score_types: tuple[int, ...], max_rounds: int = MAX_EVIDENCE_ROUNDS, *, batched: bool = False
 ) -> ClosedForm:
-    """Fit the decoder of each score type to the sums; of all types at once if `batched` is true."""
+    """Fit the decoder of each score type. If `batched` is true, sums and means are fitted at once."""
+    linear_types = tuple(score_type for score_type in score_types if score_type != ScoreType.LOG_ODDS)
     basis, statistics = state.decoder.basis, to_float64(state.sufficient_statistics)
     group_index, strength_index = basis.column_group_index, basis.column_strength_index
 
@@ -202,26 +214,34 @@ def fit(
         )
 
     fits = map_leading_axis(
-        fit_score_type, (jnp.asarray(score_types), state.posterior, state.strengths), batched=batched
+        fit_score_type, (jnp.asarray(linear_types), state.posterior, state.strengths), batched=batched
     )
     posterior, strengths = jax.tree.map(lambda leaf: leaf.astype(jnp.float32), fits)
     state = state._replace(posterior=posterior, strengths=strengths)
     best = relevance.select(fits[1], fits[0], group_index, strength_index)
+    weight, bias, start_value = best.weight, best.bias, jnp.zeros_like(best.bias)
+    if state.log_odds is not None:
+        state = state._replace(log_odds=logistic.fit(state.log_odds, group_index, max_rounds))
+        level, slope = logistic.to_returns(state.log_odds)
+        weight = jnp.concatenate([weight, slope * state.log_odds.posterior.weight[None]])
+        bias, start_value = jnp.append(bias, 0), jnp.append(start_value, level)
     n_features = basis.n_features
-    state = _set_weights(state, best.weight[:, :n_features], best.bias)._replace(
-        intercept=best.weight[:, n_features:].astype(jnp.float32)
+    state = _set_weights(state, weight[:, :n_features], bias)._replace(
+        intercept=weight[:, n_features:].astype(jnp.float32), start_value=start_value.astype(jnp.float32)
     )
     if state.spread is None:
         return state
     spreads = [
         evidence.posterior_spread(statistics, score_type, strength_index, jax.tree.map(itemgetter(i), best))
-        for i, score_type in enumerate(score_types)
+        for i, score_type in enumerate(linear_types)
     ]
+    if state.log_odds is not None:
+        spreads.append(logistic.spread(state.log_odds))
     return state._replace(spread=jax.tree.map(lambda *leaves: jnp.stack(leaves).astype(jnp.float32), *spreads))
 
 
 def best_posterior(state: ClosedForm) -> Posterior:
-    """Return the fit of each score type that is used, with a precision for each strength."""
+    """Return the fit that is used of each score type but log odds, with a precision for each strength."""
     basis = state.decoder.basis
     return relevance.select(state.strengths, state.posterior, basis.column_group_index, basis.column_strength_index)
 
@@ -253,4 +273,4 @@ def select_score_type(decoder: LinearDecoder, index: Int[Array, ""] | int) -> Li
 
 def init_linear_decoder(key: PRNGKeyArray, shape: DecoderShape, settings: CreditSettings) -> LinearDecoder:
     """Return the decoder before the first fit. `key` and `settings` are not used."""
-    return select_score_type(init(shape.basis, 1).decoder, 0)
+    return select_score_type(init(shape.basis, (ScoreType.SUM,)).decoder, 0)

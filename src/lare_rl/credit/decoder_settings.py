@@ -32,9 +32,10 @@ class CreditSettings(CheckedModel):
     total. On particle tasks, whose episodes all have T = 25 steps: steps / T episodes, even if only K steps of each are drawn."""
     episodes: Annotated[int, Field(ge=1)] = 8
     """diaster and rudder (single agents): whole episodes in one update of the decoder."""
-    score: Literal["auto", "sum", "average"] = "auto"
-    """Whether the score of an episode is a sum over its steps, or an average or a grade, which does not grow with the number of
-    steps. `auto`: the task's `score` or, without one, the type that has predicted returns better so far."""
+    score: Literal["auto", "sum", "average", "binary"] = "auto"
+    """Whether the score of an episode is a sum over its steps; an average or a grade, which does not grow with the number of steps;
+    or binary: won or lost. `auto`: the task's `score` or, without one, a sum or an average, whichever has predicted returns better
+    so far."""
     exact: Literal["no", "last", "spread"] = "no"
     """Whether the proxy rewards of an episode are corrected, so that they add up to its return: by adding the difference to the
     reward of its last step, or by spreading it over its steps."""

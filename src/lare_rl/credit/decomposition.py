@@ -115,6 +115,8 @@ class Decomposition(NamedTuple):
     """The scale of R."""
     is_mean: Bool[Array, ""]
     """Whether the score is treated as a mean over the steps. r_hat is then the output of the decoder, divided by T."""
+    is_log_odds: Bool[Array, ""]
+    """Whether steps are paid for what they add to the log odds of the higher score."""
     predictions: Predictions
     """Predictions of returns by the current decoder."""
     closed_form: ClosedForm | None
@@ -122,7 +124,7 @@ class Decomposition(NamedTuple):
     levels: LevelMeans | None
     """Means of R/T by level. Present for a decoder that is fitted by gradient descent, if episodes have levels."""
     score_type_predictions: Predictions | None
-    """Predictions of returns by closed-form fits of both score types. Present if the score type must be determined."""
+    """Predictions of returns by closed-form fits of all score types. Present if the score type must be determined."""
 
 
 def init(
@@ -156,10 +158,10 @@ def init(
                 f"the decoder {method.decoder!r} holds {short_repr(leaf)}, which cannot be trained: it may have arrays and static "
                 "fields; instead of eqx.nn.MLP, which holds functions, use lare_rl.nn.networks.MLP"
             )
-    both = len(score_types) > 1
+    several = len(score_types) > 1
     closed = None
-    if both or not method.uses_gradient:
-        closed = closed_form.init(basis, len(score_types), with_spread=is_optimistic(method, settings))
+    if several or not method.uses_gradient:
+        closed = closed_form.init(basis, score_types, with_spread=is_optimistic(method, settings))
     return Decomposition(
         network=network,
         optimizer=init_adam(network, settings.learning_rate) if method.uses_gradient else (),
@@ -167,10 +169,11 @@ def init(
         scale=empty_scale(),
         return_scale=empty_scale(),
         is_mean=jnp.asarray(score_types == (ScoreType.MEAN,)),
+        is_log_odds=jnp.asarray(False),
         predictions=empty_predictions(1, window),
         closed_form=closed,
         levels=empty_level_means(basis.n_levels) if basis.n_levels and method.uses_gradient else None,
-        score_type_predictions=empty_predictions(len(score_types), window) if both else None,
+        score_type_predictions=empty_predictions(len(score_types), window) if several else None,
     )
 
 
@@ -181,7 +184,9 @@ def is_optimistic(method: Method, settings: CreditSettings) -> bool:
 
 def score_type_index(state: Decomposition, n_score_types: int) -> Int[Array, ""] | int:
     """Return the position of the used score type in the list of fitted score types."""
-    return state.is_mean.astype(int) if n_score_types > 1 else 0
+    if n_score_types == 1:
+        return 0
+    return jnp.where(state.is_log_odds, n_score_types - 1, state.is_mean.astype(int))
 
 
 def observe_steps(
@@ -220,14 +225,17 @@ def observe_returns(
 def level_returns(
     state: Decomposition, level: Int[Array, " episodes"] | None, length: Int[Array, " episodes"]
 ) -> Float[Array, " episodes"]:
-    """Return the part of each episode's return that its level explains, and that no step is paid for; 0 without levels."""
-    if level is None:
-        return jnp.zeros(length.shape)
-    if state.levels is not None:
+    """Return the part of each episode's return that its level explains, or that is the same for all, and that no step is paid for."""
+    if state.levels is not None and level is not None:
         return level_offsets(state.levels)[level] * length
-    assert state.closed_form is not None
-    index = score_type_index(state, len(state.closed_form.intercept))
-    return state.closed_form.intercept[index][level] * jnp.where(state.is_mean, 1, length)
+    if state.closed_form is None or not isinstance(state.network, LinearDecoder):
+        return jnp.zeros(length.shape)
+    index = score_type_index(state, len(state.closed_form.start_value))
+    start_value = jnp.broadcast_to(state.closed_form.start_value[index], length.shape)
+    if level is None:
+        return start_value
+    unit = jnp.where(state.is_mean | state.is_log_odds, 1, length)
+    return start_value + state.closed_form.intercept[index][level] * unit
 
 
 def is_normalised(state: Decomposition, settings: CreditSettings) -> bool:

@@ -112,7 +112,9 @@ def credit_spec(
         scale_rewards: whether training rewards are divided by the scale of R/T.
     """
     inputs = method.inputs.resolve(scored_observation, single_agent=single_agent) if method.inputs is not None else ()
-    score_types = score_types_to_fit(settings.score, fixed_length) if "score" in method.settings else (ScoreType.SUM,)
+    score_types = (ScoreType.SUM,)
+    if "score" in method.settings:
+        score_types = score_types_to_fit(settings.score, fixed_length, closed_form=not method.uses_gradient)
     return CreditSpec(
         method=method,
         settings=settings,
@@ -217,7 +219,7 @@ class ExplanationState(NamedTuple):
 
 def init_explanation(statistics: RunningMeanStd, basis: Basis) -> ExplanationState:
     """Return empty sums. `statistics` standardise the inputs, and the features of `basis` explain the returns."""
-    closed = closed_form.reset_statistics(closed_form.init(basis, 1), statistics)
+    closed = closed_form.reset_statistics(closed_form.init(basis, (ScoreType.SUM,)), statistics)
     return ExplanationState(closed, empty_step_statistics(basis))
 
 

@@ -52,6 +52,7 @@ from lare_rl.credit.precisions import (
 from lare_rl.nn.leading_axis import map_leading_axis
 
 __all__ = [
+    "JAX",
     "Posterior",
     "PosteriorSpread",
     "Regression",

@@ -52,6 +52,10 @@ MESSAGES = {
         "The score is treated as {this} over the steps of an episode: so far, {other} predicts returns about as well. "
         f"{_SET_SCORE_TYPE}"
     ),
+    "score_is_log_odds": (
+        "Steps are paid for what they add to the log odds of the higher score: so far, this predicts returns better than a sum. The "
+        "shares and effects below are those of a sum."
+    ),
     "sum": "a sum",
     "mean": "an average",
     "returns": "the returns of {n_episodes} episodes",
@@ -183,6 +187,8 @@ def _unused_raw_features(explanation: Explanation, names: Sequence[str]) -> list
 
 
 def _score_type(estimate: ScoreTypeEstimate) -> Finding:
+    if estimate.score_type is ScoreType.LOG_ODDS:
+        return Finding("score_is_log_odds")
     types = Finding("sum"), Finding("mean")
     this, other = types if estimate.score_type == ScoreType.SUM else types[::-1]
     code = "score_type_is_certain" if estimate.is_certain else "score_type_is_uncertain"

@@ -62,11 +62,11 @@ def assess_factors(
         alive: for each episode, which agents acted at each step.
         returns: R of each episode.
         basis: the features that are computed from the inputs.
-        score: `sum` or `average`, if the type of the score is known.
+        score: `sum` or `average`, if the type of the score is known, or `binary`, which says nothing about these two.
     """
     length = np.array([len(episode) for episode in inputs])
     lengths_differ = len(set(length)) > 1
-    score_types = score_types_to_fit(score or "auto", fixed_length=not lengths_differ)
+    score_types = score_types_to_fit(score or "auto", fixed_length=not lengths_differ, closed_form=False)
     with float64():
         features, step_statistics = mean_features(inputs, alive, basis)
         predict = partial(predict_returns, returns=returns, length=length, basis=basis)

@@ -14,6 +14,7 @@ __all__ = [
     "JITTER",
     "MIN_NOISE",
     "NUMPY",
+    "PRIOR_RANGE",
     "TOLERANCE",
     "Backend",
     "Moments",

@@ -10,7 +10,7 @@ import numpy as np
 import optax
 from jaxtyping import Array, Bool, Float
 
-from lare_rl.credit import closed_form, evidence
+from lare_rl.credit import closed_form, evidence, logistic
 from lare_rl.credit.closed_form import ClosedForm, LinearDecoder
 from lare_rl.credit.decoder_settings import CreditSettings
 from lare_rl.credit.decomposition import (
@@ -72,21 +72,40 @@ def predict(state: Decomposition, episodes: CreditBatch, settings: CreditSetting
     first fit all of them.
     """
     is_new, returns = episodes.mask > 0, episodes.mean_reward * episodes.length
-    predicted = (predicted_returns(state, episodes, settings) + level_returns(state, episodes.level, episodes.length))[
-        :, None
-    ]
-    predictions = add_predictions(state.predictions, returns, predicted, is_new & is_fitted(state))
-    state = state._replace(predictions=predictions)
-    if state.score_type_predictions is None or state.closed_form is None:
-        return state
-    decoder = state.closed_form.decoder
-    predicted = _mean_features(decoder, episodes) @ decoder.weight.T + decoder.bias
-    if episodes.level is not None:
-        predicted = predicted + state.closed_form.intercept[:, episodes.level].T
-    predicted = predicted * jnp.stack([episodes.length, jnp.ones_like(episodes.length)], axis=1)
-    was_fitted = state.closed_form.n_fitted > 1
-    predictions = add_predictions(state.score_type_predictions, returns, predicted, is_new & was_fitted)
-    return state._replace(score_type_predictions=predictions)
+    predicted = predicted_returns(state, episodes, settings) + level_returns(state, episodes.level, episodes.length)
+    closed = state.closed_form
+    if state.score_type_predictions is not None and closed is not None:
+        by_score_type = _predict_by_score_type(closed, episodes)
+        score_type_predictions = add_predictions(
+            state.score_type_predictions, returns, by_score_type, is_new & (closed.n_fitted > 1), episodes.level
+        )
+        state = state._replace(score_type_predictions=score_type_predictions)
+        predicted = jnp.where(state.is_log_odds, by_score_type[:, -1], predicted)
+    is_predicted = is_new & is_fitted(state)
+    predictions = add_predictions(state.predictions, returns, predicted[:, None], is_predicted, episodes.level)
+    return state._replace(predictions=predictions)
+
+
+def _predict_by_score_type(closed: ClosedForm, episodes: CreditBatch) -> Float[Array, "episodes score_types"]:
+    """Return the returns of episodes as each score type predicts them: as a sum, as a mean, and by the log odds."""
+    decoder, columns = closed.decoder, _columns(closed.decoder, episodes)
+    n_linear = len(closed.posterior.bias)
+    weights = jnp.concatenate([decoder.weight, closed.intercept], axis=1)
+    predicted = columns @ weights[:n_linear].T + decoder.bias[:n_linear]
+    units = jnp.stack([episodes.length, jnp.ones_like(episodes.length)], axis=1)
+    predicted = predicted * units[:, :n_linear]
+    if closed.log_odds is None:
+        return predicted
+    expected = logistic.predict(closed.log_odds, _episode_sums(closed.decoder, columns, episodes))
+    return jnp.concatenate([predicted, expected[:, None]], axis=1)
+
+
+def _episode_sums(
+    decoder: LinearDecoder, columns: Float[Array, "episodes columns"], episodes: CreditBatch
+) -> Float[Array, "episodes columns"]:
+    """Return the sums of the features of each episode, from their means, and which level it has."""
+    is_feature = np.arange(columns.shape[1]) < decoder.basis.n_features
+    return columns * jnp.where(is_feature, episodes.length[:, None], 1)
 
 
 def predicted_returns(
@@ -140,13 +159,19 @@ def add_episodes(state: Decomposition, episodes: CreditBatch) -> Decomposition:
 
 def add_to_sums(closed: ClosedForm, episodes: CreditBatch) -> ClosedForm:
     """Add whole episodes to the sums, in float64 if that is enabled. Episodes whose mask is 0 are ignored."""
-    statistics = evidence.add_episodes(
-        closed_form.to_float64(closed.sufficient_statistics),
+    columns, returns, mask = (
         _columns(closed.decoder, episodes),
         episodes.mean_reward * episodes.length,
-        jnp.where(episodes.mask > 0, episodes.length, 0),
+        episodes.mask > 0,
     )
-    return closed._replace(sufficient_statistics=closed_form.split_double(statistics))
+    statistics = evidence.add_episodes(
+        closed_form.to_float64(closed.sufficient_statistics), columns, returns, jnp.where(mask, episodes.length, 0)
+    )
+    log_odds = closed.log_odds
+    if log_odds is not None:
+        sums = _episode_sums(closed.decoder, columns, episodes)
+        log_odds = logistic.add_episodes(log_odds, sums, returns, mask)
+    return closed._replace(sufficient_statistics=closed_form.split_double(statistics), log_odds=log_odds)
 
 
 def fit_closed_form(
@@ -163,8 +188,12 @@ def fit_closed_form(
         closed = closed_form.fit(state.closed_form, score_types, batched=batched)
     state = state._replace(closed_form=closed)
     if state.score_type_predictions is not None:
-        sum_error, mean_error = _score_type_errors(state.score_type_predictions)
-        state = state._replace(is_mean=mean_error < MAX_ERROR_RATIO * sum_error)
+        errors = _score_type_errors(state.score_type_predictions)
+        is_log_odds = jnp.asarray(False)
+        if score_types[-1] == ScoreType.LOG_ODDS:
+            is_log_odds, errors = errors[-1] < jnp.min(errors[:-1]), errors[:-1]
+        is_mean = (errors[1] < MAX_ERROR_RATIO * errors[0]) & ~is_log_odds if len(errors) > 1 else state.is_mean
+        state = state._replace(is_mean=is_mean, is_log_odds=is_log_odds)
     if not method.uses_gradient:
         index = score_type_index(state, len(score_types))
         state = state._replace(network=closed_form.select_score_type(closed.decoder, index))
@@ -174,16 +203,17 @@ def fit_closed_form(
 def estimate_score_type(state: Decomposition) -> ScoreTypeEstimate | None:
     """Return the score type that the decoder uses, or None if the settings give it or it makes no difference.
 
-    It makes no difference as long as all episodes have the same length.
+    A sum and a mean make no difference as long as all episodes have the same length.
     """
     if state.score_type_predictions is None:
         return None
     errors = np.asarray(_score_type_errors(state.score_type_predictions))
-    if np.isclose(*errors, rtol=1e-3):
+    index = int(score_type_index(state, len(errors)))
+    score_type = ScoreType.LOG_ODDS if bool(state.is_log_odds) else ScoreType(index)
+    other_errors = np.delete(errors, index)
+    if np.allclose(errors[index], other_errors, rtol=1e-3):
         return None
-    score_type = ScoreType(int(state.is_mean))
-    is_certain = errors[score_type] < MAX_ERROR_RATIO * errors[1 - score_type]
-    return ScoreTypeEstimate(score_type, is_certain=bool(is_certain))
+    return ScoreTypeEstimate(score_type, is_certain=bool(errors[index] < MAX_ERROR_RATIO * other_errors.min()))
 
 
 @jax.jit
@@ -201,11 +231,16 @@ def reward_std(
     """
     assert state.closed_form is not None
     assert isinstance(state.network, LinearDecoder)
-    index = score_type_index(state, len(score_types))
+    features, n_linear = state.network.features(rows), len(state.closed_form.posterior.bias)
+    index = state.is_mean.astype(int) if n_linear > 1 else 0
     spread = evidence.posterior_spread(
         closed_form.to_float64(state.closed_form.sufficient_statistics),
         jnp.asarray(score_types)[index],
         state.network.basis.column_strength_index,
         jax.tree.map(lambda leaf: leaf[index].astype(float), closed_form.best_posterior(state.closed_form)),
     )
-    return evidence.posterior_std(spread, state.network.features(rows))
+    std = evidence.posterior_std(spread, features)
+    if state.closed_form.log_odds is None:
+        return std
+    log_odds_std = evidence.posterior_std(logistic.spread(state.closed_form.log_odds), features)
+    return jnp.where(state.is_log_odds, log_odds_std, std)

@@ -1,9 +1,12 @@
-"""How the score of an episode follows from its steps: a sum over them, or a mean."""
+"""How the score of an episode follows from its steps: a sum over them, a mean, or a success whose odds they change."""
 
 from enum import IntEnum
 from typing import NamedTuple
 
-__all__ = ["ScoreType", "ScoreTypeEstimate", "score_types_to_fit"]
+from lare_rl.credit.prequential import SEGMENT_WINDOW, WINDOW
+from lare_rl.tasks.payments import PaymentRule
+
+__all__ = ["ScoreType", "ScoreTypeEstimate", "prediction_window", "score_types_to_fit"]
 
 
 class ScoreType(IntEnum):
@@ -13,6 +16,8 @@ class ScoreType(IntEnum):
     """The score grows with the number of steps."""
     MEAN = 1
     """The score is a mean or a grade, which does not grow with the number of steps."""
+    LOG_ODDS = 2
+    """The score has two values, and the log odds of the higher one are a sum over the steps (`logistic.py`)."""
 
 
 class ScoreTypeEstimate(NamedTuple):
@@ -23,8 +28,20 @@ class ScoreTypeEstimate(NamedTuple):
     """Whether this type predicts the returns clearly better than the other one."""
 
 
-def score_types_to_fit(score: str, fixed_length: bool) -> tuple[ScoreType, ...]:
-    """Return the types to fit, by the setting `score`: both if it is "auto" and episodes differ in length, else one."""
-    if score == "auto":
-        return (ScoreType.SUM,) if fixed_length else (ScoreType.SUM, ScoreType.MEAN)
-    return (ScoreType.SUM,) if score == "sum" else (ScoreType.MEAN,)
+def score_types_to_fit(score: str, fixed_length: bool, *, closed_form: bool) -> tuple[ScoreType, ...]:
+    """Return the types to fit, in the order of their values.
+
+    Args:
+        score: the setting of this name.
+        fixed_length: whether all episodes have the same length. A sum and a mean are then the same.
+        closed_form: whether the decoder is fitted in closed form. Only then can the score be log odds.
+    """
+    if score in ("sum", "average"):
+        return (ScoreType.SUM,) if score == "sum" else (ScoreType.MEAN,)
+    linear = (ScoreType.SUM,) if fixed_length else (ScoreType.SUM, ScoreType.MEAN)
+    return (*linear, ScoreType.LOG_ODDS) if score == "binary" and closed_form else linear
+
+
+def prediction_window(payments: PaymentRule, score: str) -> int:
+    """Return the number of last returns over which predictions of them are assessed: more if a single return says little."""
+    return WINDOW if payments.only_at_end and score != "binary" else SEGMENT_WINDOW

@@ -53,8 +53,11 @@ REPLAY = ".replay."
 SAVED_BY_ROW = f"{REPLAY}columns"
 """The path of the arrays that are saved by row."""
 
-NEW_STATE = ".closed_form.strengths."
-"""The path of arrays that earlier checkpoints do not have. Zeros mean that they have not been computed yet."""
+NEW_STATE = (
+    *(".closed_form.strengths.", ".closed_form.intercept", ".closed_form.start_value"),
+    *(".is_log_odds", ".predictions.level", ".score_type_predictions.level"),
+)
+"""Paths of arrays that earlier checkpoints do not have. Zeros mean that they have not been computed yet, or make no difference."""
 
 MAX_COUNT = 2**53
 
@@ -225,7 +228,7 @@ def fill_template(template: Template, arrays: Mapping[str, np.ndarray]) -> Templ
         if name.startswith(SAVED_BY_ROW):
             filled.append(leaf)
             continue
-        if name not in arrays and NEW_STATE in name:
+        if name not in arrays and any(path in name for path in NEW_STATE):
             array = np.zeros(leaf.shape, leaf.dtype)
         else:
             array = _pad_rows(arrays[name], leaf.shape) if name.startswith(REPLAY) else arrays[name]

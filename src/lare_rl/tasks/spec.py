@@ -95,9 +95,9 @@ class TaskSpec(CheckedModel):
     """What each entry of the action means."""
     max_episode_steps: Annotated[int | None, Field(ge=1)] = None
     """The time limit (steps) of an environment without its own limit, or of the episodes of logs."""
-    score: Literal["sum", "average"] | None = None
-    """Whether the return of an episode is a sum over its steps, or an average or grade that does not grow with its length. By
-    default, training determines which of them predicts returns better."""
+    score: Literal["sum", "average", "binary"] | None = None
+    """Whether the return of an episode is a sum over its steps; an average or grade that does not grow with its length; or binary, won
+    or lost. By default, training determines whether a sum or an average predicts returns better."""
     payments: Literal["end", "nonzero"] | Annotated[int, Field(ge=1)] = "end"
     """When the environment pays: once, at the end of an episode; with every reward that is not 0; or every so many steps and at the
     end. Rewards between payments are added up."""

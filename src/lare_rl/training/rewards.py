@@ -82,8 +82,10 @@ def assess(learner: Learner, config: TrainConfig) -> dict[str, Float[Array, ""]]
         )
         if (decoder := state.decoder(i)) is not None:
             metrics[-1]["credit/return_r2"] = prequential.r2(decoder.predictions)[0]
+            metrics[-1]["credit/gain"], metrics[-1]["credit/gain_error"] = prequential.gain(decoder.predictions)
             if decoder.score_type_predictions is not None:
                 metrics[-1]["credit/average"] = decoder.is_mean.astype(jnp.float32)
+                metrics[-1]["credit/log_odds"] = decoder.is_log_odds.astype(jnp.float32)
     return team_metrics(metrics, config)
 
 

@@ -10,8 +10,7 @@ from lare_rl.algorithms.registry import Algorithm, AlgorithmSettings, Consumes, 
 from lare_rl.credit.decoder_settings import CreditSettings
 from lare_rl.credit.engine import CreditSpec, credit_spec
 from lare_rl.credit.methods import Method
-from lare_rl.credit.prequential import SEGMENT_WINDOW, WINDOW
-from lare_rl.credit.score_type import ScoreType
+from lare_rl.credit.score_type import ScoreType, prediction_window
 from lare_rl.envs.interface import EnvSpec
 from lare_rl.tasks.payments import PAID_AT_END, PaymentRule
 from lare_rl.tasks.spec import MAX_LEVELS, CreditScope, ScoredObservation
@@ -128,7 +127,7 @@ class TrainConfig:
     @property
     def credit_window(self) -> int:
         """The number of last payments over which predictions of them are assessed."""
-        return WINDOW if self.payments.only_at_end else SEGMENT_WINDOW
+        return prediction_window(self.payments, self.credit.score)
 
     @property
     def has_fixed_segments(self) -> bool:
