@@ -31,7 +31,7 @@ def slow_fit(x, won, rounds):
     """The equations of the module, episode by episode, in NumPy."""
     n, size = x.shape
     trace = ((x - x.mean(axis=0)) ** 2).sum(axis=0)
-    alpha = np.array([2 * trace[GROUP_INDEX == group].sum() / n for group in (0, 1)])
+    alpha = np.array([2 * trace[group == GROUP_INDEX].sum() / n for group in (0, 1)])
     bounds = alpha / 1e6, alpha * 1e6
     xi = np.ones(n)
     for _ in range(rounds):
@@ -50,7 +50,7 @@ def slow_fit(x, won, rounds):
             variance = difference @ sigma @ difference + 1 / noise.sum()
             xi[k] = np.sqrt((target_mean + difference @ weight) ** 2 + variance)
         for group in (0, 1):
-            members = GROUP_INDEX == group
+            members = group == GROUP_INDEX
             determined = members.sum() - alpha[group] * np.diag(sigma)[members].sum()
             alpha[group] = np.clip(determined / (weight[members] ** 2).sum(), bounds[0][group], bounds[1][group])
     return weight, target_mean - x_mean @ weight, alpha
