@@ -570,6 +570,28 @@ def test_must_learn_scores_that_are_no_sum(score):
         assert r_hat[raises].mean() > r_hat[~raises].mean() + 0.02
 
 
+def test_must_learn_the_value_of_events_in_order():
+    """A door opens only after the key is found. Key and door are paid when they happen, and each episode gets its return."""
+    rng, credit = np.random.default_rng(0), small_assigner("bayes-progress")
+    rewards = {"key": [], "door": [], "other": []}
+    for k in range(80):
+        events = np.zeros((10, 2), np.float32)
+        key, door = rng.integers(1, 10, 2)
+        events[key:, 0], events[door:, 1] = 1, float(key < door)
+        won = float(key < door and rng.random() < 0.8)
+        before = np.concatenate([np.zeros((1, 2), np.float32), events[:-1]])
+        r_hat = credit.rewards_at(credit.add_episode(before, np.zeros((10, 1), np.float32), events, won))
+        np.testing.assert_allclose(r_hat.sum(), won if credit.learner.is_fitted else 0, atol=1e-4)
+        if k > 40 and key < door < 9:
+            rewards["key"].append(r_hat[key])
+            rewards["door"].append(r_hat[door])
+            rewards["other"] += np.delete(r_hat[:-1], [0, key, door]).tolist()
+    key, door, other = (float(np.mean(values)) for values in rewards.values())
+    assert door > 0.3
+    assert key > 0.05
+    assert abs(other) < 0.05
+
+
 @pytest.mark.parametrize("method", ["bayes", "rd"])
 def test_must_not_credit_steps_for_the_level(method, tmp_path):
     """Easy levels have larger returns and another state. With groups, the state gets no credit."""

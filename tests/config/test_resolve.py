@@ -57,7 +57,7 @@ def test_resolve_defaults(echo):
         (
             toy_spec(),
             {"algorithm": "td3", "method": "lare-bayes", "steps": 1_000_000, "evaluate_every": 5000, "environments": 1}
-            | {"rollout_steps": 50, "capacity": 1_000_000, "credit": CreditSettings()},
+            | {"rollout_steps": 50, "capacity": 1_000_000, "credit": CreditSettings(exact="no")},
         ),
         (
             pick_spec(),
@@ -68,7 +68,7 @@ def test_resolve_defaults(echo):
             read_task("CN-6"),
             {"algorithm": "ippo", "method": "lare-bayes", "steps": 2_050_000, "environments": 82, "rollout_steps": 25}
             | {"evaluate_every": 20_500, "evaluation_episodes": 50, "fit_every": 10, "fit_updates": 50}
-            | {"credit": MULTI_AGENT_CREDIT, "first_fit": None},
+            | {"credit": MULTI_AGENT_CREDIT.model_copy(update={"exact": "no"}), "first_fit": None},
         ),
         (
             echo,
@@ -94,7 +94,7 @@ def test_resolve_completes_credit(task, default):
     """A set value replaces the algorithm's, even if it is the default of the class."""
     changes = {"learning_rate": 0.5, "hidden": (256, 256)}
     for credit in (changes, CreditSettings(**changes)):
-        assert resolve_named(task, {"credit": credit}).credit == default.model_copy(update=changes)
+        assert resolve_named(task, {"credit": credit}).credit == default.model_copy(update=changes | {"exact": "no"})
 
 
 def test_resolve_fit_updates():

@@ -5,11 +5,13 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from lare_rl.credit import decomposition, returns
+from lare_rl.credit import closed_form, decomposition, returns
+from lare_rl.credit.basis import Basis
 from lare_rl.credit.decoder_settings import CreditSettings
 from lare_rl.credit.decomposition import CreditBatch
 from lare_rl.credit.methods import METHODS
 from lare_rl.credit.prequential import WINDOW, Predictions
+from lare_rl.util.float64 import float64
 
 METHOD, SETTINGS, SCORE_TYPES = METHODS["rd-linear"], CreditSettings(), (0, 1)
 init = jax.jit(decomposition.init, static_argnums=range(1, 7))
@@ -52,3 +54,34 @@ def test_returns_are_predicted_from_the_third_episode_on():
         assert state.score_type_predictions is not None
         counts.append((int(state.predictions.n_episodes), int(state.score_type_predictions.n_episodes)))
     assert counts == [(0, 0), (0, 0), (1, 1), (2, 2)]
+
+
+def test_prefixes_are_summed_like_separate_cases():
+    """The sums over prefixes equal those of every prefix as a case of its own, whatever the packing of the rows is."""
+    rng, lengths = np.random.default_rng(0), [3, 1, 4]
+    decoder = init(
+        jax.random.key(0), Basis(2, 1, extended=False, n_levels=2, prefixes=True), METHODS["rd-linear"], SETTINGS, 4, 1
+    )
+    rows = rng.normal(size=(10, 3)).astype(np.float32)
+    scores, level = np.float32([2, -1, 5]), np.int32([1, 0, 1])
+    batch = CreditBatch(
+        inputs=jnp.asarray(rows)[:, None],
+        episode_index=jnp.asarray([0] * 3 + [1] + [2] * 4 + [3] * 2),
+        length=jnp.asarray(lengths),
+        mean_reward=jnp.asarray(scores / np.float32(lengths)),
+        mask=jnp.asarray([1.0, 0.0, 1.0]),
+        level=jnp.asarray(level),
+    )
+    with float64():
+        state = returns.add_episodes(decoder, batch)
+        statistics = jax.tree.map(np.asarray, closed_form.to_float64(state.closed_form.sufficient_statistics))
+    cases = []
+    for first, k in ((0, 0), (4, 2)):
+        for t in range(1, lengths[k] + 1):
+            one_hot = np.eye(2)[level[k]]
+            cases.append(np.concatenate([rows[first : first + t].sum(axis=0), [t], one_hot, [scores[k]] * 2]))
+    cases = np.array(cases, np.float64)
+    assert statistics.n_episodes == 2
+    assert statistics.n_steps == 7
+    np.testing.assert_allclose(statistics.mean, cases.mean(axis=0), rtol=1e-5, atol=1e-6)
+    np.testing.assert_allclose(statistics.products, np.cov(cases.T, bias=True) * 7, rtol=1e-4, atol=1e-5)

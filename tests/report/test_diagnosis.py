@@ -1,6 +1,7 @@
 """The findings about made-up runs."""
 
 from collections import defaultdict
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -8,6 +9,7 @@ import pytest
 from lare_rl.report.diagnosis import diagnose
 from lare_rl.report.messages import MESSAGES
 from lare_rl.report.run_summary import RunSummary
+from lare_rl.report.score_use import ScoreUse
 from lare_rl.util.findings import Finding, render
 
 STEPS = np.arange(1, 9) * 1000.0
@@ -145,6 +147,14 @@ def test_little_explained_values(facts, cause, remedy, method):
     assert finding.values["method"] == method
     assert finding.values["cause"] == Finding(cause)
     assert finding.values["remedy"] == Finding(remedy, {"task": "Toy"})
+
+
+def test_small_r2_of_a_binary_score_is_no_alarm():
+    use = ScoreUse(form="form_log_odds", is_binary=True, gain=0.07, gain_error=0.02)
+    assert "explains_little" not in find(FLAT - 51, return_r2=0.06, score_use=use)
+    assert find(FLAT - 51, return_r2=0.06, score_use=use)["score_use"].values["trust"].code == "trust_part"
+    doubtful = replace(use, gain_error=0.05)
+    assert {"explains_little", "score_use"} <= set(find(FLAT - 51, return_r2=0.06, score_use=doubtful))
 
 
 def test_next_step_values():

@@ -101,6 +101,7 @@ class CreditAssigner:
         settings = settings or default_credit(agents)
         if settings.score == "auto" and task is not None and (score := find_score(task)) is not None:
             settings = settings.model_copy(update={"score": score})
+        settings = settings.model_copy(update={"exact": find_method(method).choose_exact(settings.exact)})
         observation, action = resolve_layouts(task, {"observation": observation_space, "action": action_space})
         self._init(
             AssignerConfig(

@@ -94,7 +94,7 @@ class AssignerConfig:
     @property
     def is_exact(self) -> bool:
         """Whether the proxy rewards of an episode are corrected to add up to its return."""
-        return self.settings.exact != "no" and "exact" in self.method.settings
+        return self.settings.exact in ("last", "spread") and "exact" in self.method.settings
 
     def raw_feature_names(self, n_features: int) -> list[str]:
         """Return names of the raw features; none if they are not entries of observations and the action."""

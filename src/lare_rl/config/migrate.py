@@ -12,7 +12,7 @@ from lare_rl.util.renamed_fields import rename_keys
 
 __all__ = ["FORMAT", "migrate"]
 
-FORMAT = 6
+FORMAT = 7
 """The format of config.json. It is increased whenever its contents change."""
 
 
@@ -58,6 +58,14 @@ def _from_5(values: dict[str, Any]) -> dict[str, Any]:
     return values
 
 
+def _from_6(values: dict[str, Any]) -> dict[str, Any]:
+    # No proxy rewards were exact.
+    settings = values.get("settings")
+    if not isinstance(settings, dict) or not isinstance(settings.get("credit"), dict):
+        return values
+    return values | {"settings": settings | {"credit": {"exact": "no"} | settings["credit"]}}
+
+
 def _rename_task_keys(task: dict[str, Any]) -> dict[str, Any]:
     task = rename_keys(task)
     teams = task.get("teams")
@@ -71,5 +79,6 @@ _MIGRATIONS: Mapping[int, Callable[[dict[str, Any]], dict[str, Any]]] = {
     3: _from_3,
     4: _from_4,
     5: _from_5,
+    6: _from_6,
 }
 """Functions that convert a format to the next one."""

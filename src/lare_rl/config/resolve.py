@@ -112,12 +112,13 @@ def _normalise(resolved: ResolvedSettings, task: TaskSpec, env: EnvSpec) -> Reso
         changes["scored_observation"] = None
     if "first_fit" in unused_names(resolved):
         changes["first_fit"] = None
-    score = resolved.credit.score
-    if env.fixed_length and task.payment_rule.is_regular(env.max_steps):  # sum and mean have the same decoder
-        score = "auto"
-    elif score == "auto":
+    score, method = resolved.credit.score, find_method(resolved.method)
+    if score == "auto":
         score = find_score(task) or score
-    changes["credit"] = resolved.credit.model_copy(update={"score": score})
+    if score != "binary" and env.fixed_length and task.payment_rule.is_regular(env.max_steps):
+        score = "auto"  # sum and mean have the same decoder
+    credit = {"score": score, "exact": method.choose_exact(resolved.credit.exact)}
+    changes["credit"] = resolved.credit.model_copy(update=credit)
     return resolved.model_copy(update=changes)
 
 

@@ -58,7 +58,7 @@ def check_credit(
         raise LareError(
             f"the decoder has steps = {credit.steps}, less than drawn_steps = {credit.drawn_steps} of one episode: use more steps"
         )
-    if method.fit is Fit.EVIDENCE and not method.needs_phi and n_raw_features > MAX_RAW_FEATURES:
+    if method.fit in (Fit.EVIDENCE, Fit.PREFIX_EVIDENCE) and not method.needs_phi and n_raw_features > MAX_RAW_FEATURES:
         raise LareError(
             f"{name} fits a weight to each of at most {MAX_RAW_FEATURES} raw features, and the task has {n_raw_features}: "
             "use lare-bayes, which fits weights to factors, or rrdu, a network"

@@ -67,6 +67,8 @@ class Basis:
     """The number of first inputs whose history follows them in a row: all factors or, without factors, all raw features."""
     n_levels: int = 0
     """The number of levels that episodes may belong to. Each has an intercept, which is no feature of a step (`closed_form.py`)."""
+    prefixes: bool = False
+    """Whether returns are fitted to prefixes of episodes. The number of steps so far then has a weight too."""
 
     @property
     def n_inputs(self) -> int:
@@ -123,19 +125,23 @@ class Basis:
 
     @property
     def n_columns(self) -> int:
-        """The number of weights of a fit: those of the features, and an intercept for each level."""
-        return self.n_features + self.n_levels
+        """The number of weights of a fit: those of the features, of the time if there are prefixes, and an intercept for each level."""
+        return self.n_features + self.prefixes + self.n_levels
 
     @property
     def column_group_index(self) -> Int[np.ndarray, " columns"]:
-        """The index of each weight's group. The intercepts are the last group."""
-        return np.append(self.group_index, np.full(self.n_levels, len(self.group_sizes)))
+        """The index of each weight's group. The time is a group, and the intercepts are the last one."""
+        return self._append_columns(self.group_index)
 
     @property
     def column_strength_index(self) -> Int[np.ndarray, " columns"]:
-        """The index of each weight's strength. The intercepts share the last one."""
-        index = self.strength_index
-        return np.append(index, np.full(self.n_levels, index.max(initial=-1) + 1))
+        """The index of each weight's strength. The time has one, and the intercepts share the last one."""
+        return self._append_columns(self.strength_index)
+
+    def _append_columns(self, index: Int[np.ndarray, " features"]) -> Int[np.ndarray, " columns"]:
+        for n_new in (int(self.prefixes), self.n_levels):
+            index = np.append(index, np.full(n_new, index.max(initial=-1) + 1))
+        return index
 
     @property
     def group_index(self) -> Int[np.ndarray, " features"]:

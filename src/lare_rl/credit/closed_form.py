@@ -219,15 +219,17 @@ def fit(
     posterior, strengths = jax.tree.map(lambda leaf: leaf.astype(jnp.float32), fits)
     state = state._replace(posterior=posterior, strengths=strengths)
     best = relevance.select(fits[1], fits[0], group_index, strength_index)
-    weight, bias, start_value = best.weight, best.bias, jnp.zeros_like(best.bias)
+    n_features, weight, bias, start_value = basis.n_features, best.weight, best.bias, jnp.zeros_like(best.bias)
+    if basis.prefixes:  # the value before the first step is no reward, and time is
+        bias, start_value = best.weight[:, n_features], best.bias
     if state.log_odds is not None:
         state = state._replace(log_odds=logistic.fit(state.log_odds, group_index, max_rounds))
         level, slope = logistic.to_returns(state.log_odds)
         weight = jnp.concatenate([weight, slope * state.log_odds.posterior.weight[None]])
         bias, start_value = jnp.append(bias, 0), jnp.append(start_value, level)
-    n_features = basis.n_features
     state = _set_weights(state, weight[:, :n_features], bias)._replace(
-        intercept=weight[:, n_features:].astype(jnp.float32), start_value=start_value.astype(jnp.float32)
+        intercept=weight[:, basis.n_columns - basis.n_levels :].astype(jnp.float32),
+        start_value=start_value.astype(jnp.float32),
     )
     if state.spread is None:
         return state

@@ -36,9 +36,10 @@ class CreditSettings(CheckedModel):
     """Whether the score of an episode is a sum over its steps; an average or a grade, which does not grow with the number of steps;
     or binary: won or lost. `auto`: the task's `score` or, without one, a sum or an average, whichever has predicted returns better
     so far."""
-    exact: Literal["no", "last", "spread"] = "no"
+    exact: Literal["auto", "no", "last", "spread"] = "auto"
     """Whether the proxy rewards of an episode are corrected, so that they add up to its return: by adding the difference to the
-    reward of its last step, or by spreading it over its steps."""
+    reward of its last step, or by spreading it over its steps. `auto`: `last` for bayes-progress and lare-bayes-progress, else
+    `no`."""
     optimism: Annotated[float, Field(ge=0)] = 0.0
     """lare-bayes and other methods in closed form: the algorithm's reward is the proxy reward plus its posterior standard
     deviation times this factor. Uncertain steps thus look better."""

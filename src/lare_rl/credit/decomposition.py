@@ -234,7 +234,8 @@ def level_returns(
     start_value = jnp.broadcast_to(state.closed_form.start_value[index], length.shape)
     if level is None:
         return start_value
-    unit = jnp.where(state.is_mean | state.is_log_odds, 1, length)
+    per_step = ~(state.is_mean | state.is_log_odds | state.closed_form.decoder.basis.prefixes)
+    unit = jnp.where(per_step, length, 1)
     return start_value + state.closed_form.intercept[index][level] * unit
 
 

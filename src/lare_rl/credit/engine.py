@@ -81,7 +81,14 @@ class CreditSpec:
         n_raw = input_size(tuple(name for name in self.inputs if name not in ("factors", "history")), sizes)
         n_tracked = tracked_size(self.inputs, sizes)
         n_levels = 0 if self.method.fit is Fit.SIGNS else self.n_levels
-        return Basis(n_factors, n_raw, extended=self.method.extended_basis, n_tracked=n_tracked, n_levels=n_levels)
+        return Basis(
+            n_factors,
+            n_raw,
+            extended=self.method.extended_basis,
+            n_tracked=n_tracked,
+            n_levels=n_levels,
+            prefixes=self.method.fit is Fit.PREFIX_EVIDENCE,
+        )
 
 
 def credit_spec(

@@ -58,6 +58,7 @@ __all__ = [
     "Regression",
     "SufficientStatistics",
     "add_episodes",
+    "add_prefixes",
     "empty_statistics",
     "fit",
     "fixed_point",
@@ -114,6 +115,33 @@ def add_episodes(
     """
     weight = length.astype(statistics.mean.dtype)
     v = jnp.concatenate([mean_features, (returns / jnp.maximum(weight, 1))[:, None], returns[:, None]], axis=1)
+    return _add_cases(statistics, v, weight, jnp.sum(length > 0))
+
+
+def add_prefixes(
+    statistics: SufficientStatistics,
+    features: Float[Array, "rows features"],
+    returns: Float[Array, " rows"],
+    mask: Bool[Array, " rows"],
+    n_episodes: Int[Array, ""],
+) -> SufficientStatistics:
+    """Add the prefixes of some episodes, each with the return of its whole episode. Rows where `mask` is false are ignored.
+
+    Every prefix counts the same. Only the number of episodes counts as the number of cases, because the prefixes of an episode have
+    the same noise. Treat the score as a mean, so that the regression is of R, not of R/T.
+    """
+    weight = mask.astype(statistics.mean.dtype)
+    v = jnp.concatenate([features, returns[:, None], returns[:, None]], axis=1)
+    return _add_cases(statistics, v, weight, n_episodes)
+
+
+def _add_cases(
+    statistics: SufficientStatistics,
+    v: Float[Array, "cases features_and_targets"],
+    weight: Float[Array, " cases"],
+    n_episodes: Int[Array, ""],
+) -> SufficientStatistics:
+    """Add cases with their weights. Those of weight 0 are padding."""
     n_new = jnp.sum(weight)
     mean = weight @ v / jnp.maximum(n_new, 1)
     centred = jnp.where(weight[:, None] > 0, v - mean, 0)
@@ -121,7 +149,7 @@ def add_episodes(
     fraction = n_new / jnp.maximum(n_steps, 1)
     between = jnp.outer(difference, difference) * statistics.n_steps * fraction
     return SufficientStatistics(
-        n_episodes=statistics.n_episodes + jnp.sum(length > 0),
+        n_episodes=statistics.n_episodes + n_episodes,
         n_steps=n_steps,
         mean=statistics.mean + fraction * difference,
         products=statistics.products + (weight[:, None] * centred).T @ centred + between,

@@ -34,13 +34,15 @@ class Fit(StrEnum):
     """Diaster and RUDDER: the `loss` of the decoder, on whole episodes (equations in `diaster.py` and `rudder.py`)."""
     EVIDENCE = "evidence"
     """In closed form, on all episodes (equations in `evidence.py`)."""
+    PREFIX_EVIDENCE = "evidence of prefixes"
+    """In closed form, on all prefixes of all episodes: a step is paid the change of the expected return (`returns.py`)."""
     SIGNS = "best signs"
     """In closed form: the best signs of a sum of the factors (equation in `closed_form.py`)."""
 
     @property
     def closed_form(self) -> bool:
         """Whether the fit needs no gradient descent."""
-        return self in (Fit.EVIDENCE, Fit.SIGNS)
+        return self in (Fit.EVIDENCE, Fit.PREFIX_EVIDENCE, Fit.SIGNS)
 
     @property
     def samples_steps(self) -> bool:
@@ -60,7 +62,7 @@ class Fit(StrEnum):
                 names = {"episodes", "exact"}
             case Fit.EVIDENCE:
                 names = {"score", "optimism", "exact"}
-            case Fit.SIGNS:
+            case Fit.PREFIX_EVIDENCE | Fit.SIGNS:
                 names = {"exact"}
             case _:
                 names = {"score", "sum_form", "steps", "exact"} | ({"drawn_steps"} if self.samples_steps else set())
@@ -132,6 +134,12 @@ class Method:
         """The names of the `CreditSettings` that the method reads."""
         return frozenset() if self.fit is None else self.fit.settings | DECODERS[self.decoder].settings
 
+    def choose_exact(self, exact: str) -> str:
+        """Return how proxy rewards are made exact, by the setting `exact`."""
+        if exact != "auto":
+            return exact
+        return "last" if self.fit is Fit.PREFIX_EVIDENCE else "no"
+
     @property
     def extended_basis(self) -> bool:
         """Whether its closed-form decoder has shapes and pairs of its inputs as features."""
@@ -179,6 +187,7 @@ _LARE = "Qu et al., LaRe, AAAI 2025"
 _RD = "Efroni et al., AAAI 2021; Arjona-Medina et al., RUDDER, 2019"
 _RRD = "Ren et al., RRD, ICLR 2022"
 _BAYES = "this package, docs/closed-form.md; Efroni et al., AAAI 2021; MacKay, 1992"
+_PROGRESS = "this package, docs/closed-form.md; Ng et al., ICML 1999 (rewards that are differences of values)"
 _VIB = "Alemi et al., ICLR 2017; LaRe, appendix F.2"
 
 for _method in (
@@ -316,6 +325,22 @@ for _method in (
         _BAYES,
         inputs=input_names.FACTORS_SCORED_AND_HISTORY,
         fit=Fit.EVIDENCE,
+        decoder="additive",
+    ),
+    Method(
+        "bayes-progress",
+        "changes of the expected return, as the history of an episode predicts it: for scores that are no sum",
+        _PROGRESS,
+        inputs=input_names.SCORED_AND_HISTORY,
+        fit=Fit.PREFIX_EVIDENCE,
+        decoder="additive",
+    ),
+    Method(
+        "lare-bayes-progress",
+        "as bayes-progress, from latent rewards and raw entries",
+        _PROGRESS,
+        inputs=input_names.FACTORS_SCORED_AND_HISTORY,
+        fit=Fit.PREFIX_EVIDENCE,
         decoder="additive",
     ),
     Method(

@@ -1,5 +1,12 @@
 """Learning from whole episodes: their returns are predicted, then added to sums, then fitted in closed form.
 
+If the fit is to prefixes, the return R_k of an episode is regressed on the sums of features up to each of its steps,
+
+    R_k = V_0 + sum_{s <= t} (b + w . f_ks) + noise,      t = 1, ..., T_k
+
+so that the right side is the expected return V_t after t steps, and the reward b + w . f_t of a step is its change V_t - V_(t-1). With
+the history of an episode among the inputs, sums of features are counts, extremes and last values up to t.
+
 All decoders predict returns. The sums are only needed for a fit in closed form. Such a fit is the decoder itself, or it determines
 the type of the score.
 """
@@ -120,13 +127,35 @@ def predicted_returns(
 
 def _mean_features(decoder: LinearDecoder, episodes: CreditBatch) -> Float[Array, "episodes features"]:
     """Return the mean of a linear decoder's features over the steps of each episode, and over the agents that are alive."""
-    features = decoder.features(episodes.inputs)
-    if features.ndim == 3:
-        n_agents = features.shape[1]
-        share = jnp.full(features.shape[:2], 1 / n_agents) if episodes.alive is None else agent_shares(episodes.alive)
-        features = jnp.einsum("raf,ra->rf", features, share)
+    features = _team_features(decoder, episodes)
     total = jax.ops.segment_sum(features.astype(float), episodes.episode_index, len(episodes.length))
     return total / jnp.maximum(episodes.length, 1)[:, None]
+
+
+def _team_features(decoder: LinearDecoder, episodes: CreditBatch) -> Float[Array, "rows features"]:
+    """Return a linear decoder's features of each step: their mean over the agents that are alive."""
+    features = decoder.features(episodes.inputs)
+    if features.ndim == 2:
+        return features
+    n_agents = features.shape[1]
+    share = jnp.full(features.shape[:2], 1 / n_agents) if episodes.alive is None else agent_shares(episodes.alive)
+    return jnp.einsum("raf,ra->rf", features, share)
+
+
+def _prefix_columns(decoder: LinearDecoder, episodes: CreditBatch) -> Float[Array, "rows columns"]:
+    """Return the sum of the features up to each step, the number of these steps, and which level the episode has."""
+    features, n_rows = _team_features(decoder, episodes).astype(float), len(episodes.episode_index)
+    row = jnp.arange(n_rows)
+    index = jnp.minimum(episodes.episode_index, len(episodes.length) - 1)
+    first = jax.ops.segment_min(row, episodes.episode_index, len(episodes.length))[index]
+    first = jnp.clip(first, 0, n_rows - 1)
+    total = jnp.cumsum(features, axis=0)
+    before = total - features
+    columns = [total - before[first], (row - first + 1.0)[:, None]]
+    if decoder.basis.n_levels:
+        assert episodes.level is not None
+        columns.append(jax.nn.one_hot(episodes.level[index], decoder.basis.n_levels, dtype=features.dtype))
+    return jnp.concatenate(columns, axis=1)
 
 
 def _columns(decoder: LinearDecoder, episodes: CreditBatch) -> Float[Array, "episodes columns"]:
@@ -159,14 +188,16 @@ def add_episodes(state: Decomposition, episodes: CreditBatch) -> Decomposition:
 
 def add_to_sums(closed: ClosedForm, episodes: CreditBatch) -> ClosedForm:
     """Add whole episodes to the sums, in float64 if that is enabled. Episodes whose mask is 0 are ignored."""
-    columns, returns, mask = (
-        _columns(closed.decoder, episodes),
-        episodes.mean_reward * episodes.length,
-        episodes.mask > 0,
-    )
-    statistics = evidence.add_episodes(
-        closed_form.to_float64(closed.sufficient_statistics), columns, returns, jnp.where(mask, episodes.length, 0)
-    )
+    statistics = closed_form.to_float64(closed.sufficient_statistics)
+    returns, mask = episodes.mean_reward * episodes.length, episodes.mask > 0
+    if closed.decoder.basis.prefixes:
+        index = jnp.minimum(episodes.episode_index, len(mask) - 1)
+        is_step = (episodes.episode_index < len(mask)) & mask[index]
+        columns = _prefix_columns(closed.decoder, episodes)
+        statistics = evidence.add_prefixes(statistics, columns, returns[index], is_step, jnp.sum(mask))
+        return closed._replace(sufficient_statistics=closed_form.split_double(statistics))
+    columns = _columns(closed.decoder, episodes)
+    statistics = evidence.add_episodes(statistics, columns, returns, jnp.where(mask, episodes.length, 0))
     log_odds = closed.log_odds
     if log_odds is not None:
         sums = _episode_sums(closed.decoder, columns, episodes)
@@ -227,7 +258,7 @@ def reward_std(
 ) -> Float[Array, " rows"]:
     """Return the posterior standard deviation of r_hat, or of T r_hat if the score is a mean.
 
-    The method's fit must be `Fit.EVIDENCE`. Call this within `float64()`.
+    The method's fit must be `Fit.EVIDENCE` or `Fit.PREFIX_EVIDENCE`. Call this within `float64()`.
     """
     assert state.closed_form is not None
     assert isinstance(state.network, LinearDecoder)
@@ -239,6 +270,9 @@ def reward_std(
         state.network.basis.column_strength_index,
         jax.tree.map(lambda leaf: leaf[index].astype(float), closed_form.best_posterior(state.closed_form)),
     )
+    if state.network.basis.prefixes:  # the value before the first step is no part of a reward, and time is
+        features = jnp.append(features, jnp.ones((*features.shape[:-1], 1)), axis=-1)
+        spread = spread._replace(centre=jnp.zeros_like(spread.centre), centre_variance=jnp.zeros(()))
     std = evidence.posterior_std(spread, features)
     if state.closed_form.log_odds is None:
         return std

@@ -73,7 +73,7 @@ def load_episode_credit(run: Run) -> EpisodeCredit | None:
         return None
     steps, training_reward = jax.jit(partial(_read_rewards, config=config))(learner, index)
     uncertainty = None
-    if learner.decoders and config.method.fit is Fit.EVIDENCE and config.credit_rows == 1:
+    if learner.decoders and config.method.fit in (Fit.EVIDENCE, Fit.PREFIX_EVIDENCE) and config.credit_rows == 1:
         with float64():
             std = np.asarray(jax.jit(partial(_posterior_std, config=config))(learner.decoders[0], steps))
         uncertainty = 2 * std / np.where(learner.decoders[0].is_mean, steps.length, 1)

@@ -118,7 +118,7 @@ def pure_credit(
     needs_episode = chosen.needs_whole_episodes or (chosen.inputs is not None and "history" in chosen.inputs.names)
     if chosen.reward not in (Reward.PROXY, Reward.DESIGNED) or needs_episode:
         raise LareError(f"{method} does not compute the reward of a step from this step alone: use bayes or lare-bayes")
-    if settings is not None and settings.exact != "no":
+    if settings is not None and settings.exact not in ("auto", "no"):
         raise LareError("pure_credit computes the reward of a step from this step alone: leave out the setting exact")
     if chosen.needs_phi and phi is None:
         raise LareError(f"{method} needs a latent function: phi=...")

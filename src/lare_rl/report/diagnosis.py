@@ -110,6 +110,10 @@ def _proxy_rewards(run: RunSummary) -> Finding | None:
     return Finding("explained", values)
 
 
+def _score_use(run: RunSummary) -> Finding | None:
+    return None if run.score_use is None else run.score_use.finding()
+
+
 def _explains_little(run: RunSummary) -> Finding | None:
     if not run.explains_little:
         return None
@@ -205,6 +209,7 @@ _RULES: tuple[tuple[Rule, ...], ...] = (
     (_outcome,),
     (_episodic_comparison,),
     (_proxy_rewards,),
+    (_score_use,),
     (_explains_little, _is_rising, _one_seed_was_better, _has_fallen, _is_stuck, _needs_training, _needs_baseline),
     (_single_seed,),
 )

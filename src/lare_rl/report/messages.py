@@ -41,6 +41,32 @@ MESSAGES = {
         "Its proxy rewards, from {inputs}, usually explain {amount} of the score (median R² of returns: {r2:.2f}), but not the last "
         "episodes (R² {last_r2:.2f}): perhaps the policy has changed, and the decoder has not adapted yet."
     ),
+    "score_use": "The score was taken as {form}{period}{groups}{exact}. {trust}",
+    "form_sum": "a sum over the steps",
+    "form_mean": "an average over the steps",
+    "form_log_odds": "won or lost, by the log odds that steps add",
+    "form_history": "a sum over the steps of functions of entries and of their extremes",
+    "form_progress": "the sum of the changes of its expected value",
+    "period": ", paid every {period} steps",
+    "period_nonzero": ", paid with every reward that is not 0",
+    "with_groups": ", with an intercept for each group of episodes",
+    "exact_last": "; what rewards lack to it is paid at the last step",
+    "exact_spread": "; what rewards lack to it is spread over the steps",
+    "trust_nothing": (
+        "Do not trust the credit: returns are not predicted better than by {baseline} (squared error removed: {gain:.0%} ± "
+        "{error:.0%})."
+    ),
+    "trust_part": (
+        "Trust the credit in part: predictions of returns remove {gain:.0%} ± {error:.0%} of the squared error of {baseline}.{chance}"
+    ),
+    "trust_sums": (
+        "The credit of whole episodes can be trusted: predictions of returns remove {gain:.0%} ± {error:.0%} of the squared error of "
+        "{baseline}."
+    ),
+    "mean_return": "their mean",
+    "mean_of_group": "the mean of their group",
+    "mean_of_payments": "the mean payment",
+    "chance_remains": " The rest may be chance: one outcome of each episode cannot tell.",
     "factors": "factors",
     "raw_features": "raw entries",
     "all_inputs": "factors and raw entries",

@@ -11,6 +11,7 @@ from jaxtyping import Float
 from lare_rl.credit.methods import find_method
 from lare_rl.envs.load import shipped_tasks
 from lare_rl.report.figures import Curve
+from lare_rl.report.score_use import ScoreUse, summarise_score_use
 from lare_rl.runs.directory import Run
 from lare_rl.runs.metric_names import ACTOR_SATURATION, RETURN, RETURN_R2, RETURN_STD, SUMMED_RETURN
 from lare_rl.training.advice import describe_untrained
@@ -78,6 +79,8 @@ class RunSummary:
     """R^2 of the last returns, predicted before anything was fitted to them. None if the method predicts none."""
     median_r2: float | None = None
     """The median of `return_r2` over all evaluations and seeds."""
+    score_use: ScoreUse | None = None
+    """How the score was taken. None for a method whose rewards do not add up to returns."""
     sees_factors: bool = False
     """Whether the decoder's inputs include the factors of phi."""
     sees_raw_features: bool = True
@@ -198,7 +201,12 @@ class RunSummary:
 
     @property
     def explains_little(self) -> bool:
-        """Whether proxy rewards explain next to nothing of the returns, neither at the end nor in most evaluations."""
+        """Whether proxy rewards explain next to nothing of the returns, neither at the end nor in most evaluations.
+
+        R^2 does not tell if the score is won or lost, because it is small however good the credit is.
+        """
+        if self.score_use is not None and self.score_use.is_binary:
+            return not self.score_use.is_clear
         r2s = [r2 for r2 in (self.return_r2, self.median_r2) if r2 is not None]
         return self.return_r2 is not None and max(r2s) < LITTLE_R2
 
@@ -224,6 +232,7 @@ def summarise_run(
         episodic_return=episodic_return,
         return_r2=None if r2s is None else _last_mean(r2s),
         median_r2=None if r2s is None or not len(_finite(r2s)) else float(np.median(_finite(r2s))),
+        score_use=summarise_score_use(method, settings, task, _score_metrics(reported)),
         sees_factors=method.inputs is not None and method.inputs.has_factors,
         sees_raw_features=method.inputs is None or method.inputs.has_raw_features,
         many_agents=SUMMED_RETURN in reported.metrics[-1],
@@ -243,6 +252,15 @@ def _episode_error(reported: ReportedRun) -> float:
         return 0.0
     n_free = max(1, reported.run.config.settings.evaluation_episodes - 1)  # the deviations have n in the denominator
     return math.sqrt(np.mean(stds**2) / n_free / len(stds))
+
+
+def _score_metrics(reported: ReportedRun) -> dict[str, float | None]:
+    """Return the last metrics about the score: means over the seeds, and the standard error of the mean gain."""
+    curves = {key: reported.curve(f"credit/{key}") for key in ("average", "log_odds", "gain", "gain_error")}
+    values = {key: None if curve is None else _last_mean(curve[1]) for key, curve in curves.items()}
+    if values["gain_error"] is not None:
+        values["gain_error"] /= math.sqrt(len(reported.run.seeds))
+    return values
 
 
 def _last_mean(values: Float[np.ndarray, "seeds evaluations"]) -> float | None:

@@ -1,0 +1,92 @@
+"""How a run took the score of its task, and whether its credit can be trusted."""
+
+import math
+from dataclasses import dataclass
+
+from lare_rl.config.settings import ResolvedSettings
+from lare_rl.credit.methods import Fit, Method
+from lare_rl.tasks.spec import TaskSpec
+from lare_rl.util.findings import Finding
+
+__all__ = ["CLEAR_GAIN", "ScoreUse", "summarise_score_use"]
+
+CLEAR_ERRORS = 2
+"""Predictions are better than the mean return if their gain exceeds this number of its standard errors."""
+CLEAR_GAIN = 0.8
+"""Predictions leave little of the score if they remove a larger share of the squared error of the mean return."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class ScoreUse:
+    """The form in which a method explains the score, and how much better than a mean it predicts returns."""
+
+    form: str
+    """The code of a message."""
+    is_binary: bool = False
+    period: int | str | None = None
+    """When the environment pays before the end of an episode: the number of steps, or "nonzero"."""
+    has_groups: bool = False
+    exact: str = "no"
+    gain: float = math.nan
+    gain_error: float = math.nan
+
+    @property
+    def is_clear(self) -> bool:
+        """Whether returns are predicted clearly better than by their mean."""
+        return self.gain > CLEAR_ERRORS * self.gain_error
+
+    def finding(self) -> Finding | None:
+        """Return the finding about the score; None while too few returns have been predicted."""
+        if not math.isfinite(self.gain):
+            return None
+        baseline = Finding("mean_of_payments" if self.period else "mean_of_group" if self.has_groups else "mean_return")
+        trust = "trust_nothing" if not self.is_clear else "trust_sums" if self.gain > CLEAR_GAIN else "trust_part"
+        chance = Finding("chance_remains") if self.is_binary and trust == "trust_part" else None
+        values = {"gain": self.gain, "error": self.gain_error, "baseline": baseline, "chance": chance}
+        period = None if self.period is None else Finding(_PERIODS.get(self.period, "period"), {"period": self.period})
+        return Finding(
+            "score_use",
+            {
+                "form": Finding(self.form),
+                "period": period,
+                "groups": Finding("with_groups") if self.has_groups else None,
+                "exact": None if self.exact == "no" else Finding(f"exact_{self.exact}"),
+                "trust": Finding(trust, values),
+            },
+        )
+
+
+_PERIODS = {"nonzero": "period_nonzero"}
+
+
+def summarise_score_use(
+    method: Method, settings: ResolvedSettings, task: TaskSpec, values: dict[str, float | None]
+) -> ScoreUse | None:
+    """Return how a run took the score. None for a method whose rewards do not add up to returns.
+
+    Args:
+        method: the method.
+        settings: the settings of the run.
+        task: the task of the run.
+        values: the last metrics `average`, `log_odds`, `gain` and `gain_error`, or None where they are missing.
+    """
+    if method.fit is None:
+        return None
+    gain, error = values["gain"], values["gain_error"]
+    is_mean = (values["average"] or 0) > 0.5 or settings.credit.score == "average"
+    form = "form_mean" if is_mean else "form_sum"
+    if method.fit is Fit.PREFIX_EVIDENCE:
+        form = "form_progress"
+    elif (values["log_odds"] or 0) > 0.5:
+        form = "form_log_odds"
+    elif method.inputs is not None and "history" in method.inputs.names:
+        form = "form_history"
+    return ScoreUse(
+        form=form,
+        is_binary=settings.credit.score == "binary",
+        period=None if task.payments == "end" else task.payments,
+        has_groups=task.group is not None,
+        exact=settings.credit.exact if settings.credit.exact in ("last", "spread") else "no",
+        gain=math.nan if gain is None else gain,
+        gain_error=math.nan if error is None else error,
+    )
