@@ -1,0 +1,169 @@
+"""Training on scores of different kinds, ten seeds for each row.
+
+    PYTHONPATH=benchmarks python -m scores.training KIND --out RUNS
+
+Kinds: `not-a-sum` (the corridor's scores), `binary` (won or lost by chance), `payments` (PP-6 paid every step, every 5 steps, and at
+the end), `exact` (PP-6, rewards that add up exactly), `groups` (CN-6 in levels), `rivals` (published methods on CN-6 and PP-6). Runs
+that exist in RUNS are not trained again. `late` is the mean return of the evaluations after three quarters of the steps, and `area`
+that of all evaluations, which also says how fast a method learns.
+"""
+
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any, Literal, NamedTuple
+
+import numpy as np
+import tyro
+
+import lare_rl
+from lare_rl.compare.bootstrap import bootstrap, interquartile_means, mann_whitney, probability_of_improvement
+from lare_rl.envs.load import read_task
+from lare_rl.runs.directory import open_run
+from lare_rl.tasks.spec import TaskSpec
+from measure import write
+from scores.environments import corridor_task, level_task
+
+PARTICLE_STEPS, CORRIDOR_STEPS = 205_000, 60_000
+Kind = Literal["not-a-sum", "binary", "payments", "exact", "groups", "rivals"]
+
+
+class Row(NamedTuple):
+    """A row of a table: what is trained on what."""
+
+    table: str
+    label: str
+    task: TaskSpec
+    settings: dict[str, Any]
+    is_baseline: bool = False
+
+
+def corridor(score: str, methods: tuple[str, ...], baseline: str, **settings: Any) -> Iterator[Row]:
+    for method in methods:
+        values = {"method": method, "algorithm": "ppo", "steps": CORRIDOR_STEPS, "environments": 20, **settings}
+        yield Row(score, method, corridor_task(score), values, method == baseline)
+
+
+def not_a_sum() -> Iterator[Row]:
+    methods = "episodic", "rrdu", "rudder", "bayes", "bayes-history", "bayes-progress"
+    for score in ("sum", "highest", "last", "door"):
+        yield from corridor(score, methods, "bayes")
+
+
+def binary() -> Iterator[Row]:
+    yield from corridor("odds", ("episodic", "rrdu", "bayes", "bayes-progress"), "bayes")
+    settings = {"method": "bayes", "algorithm": "ppo", "steps": CORRIDOR_STEPS, "environments": 20}
+    yield Row("odds", "bayes, binary", corridor_task("odds", score="binary"), settings)
+
+
+def particle(table: str, label: str, task: TaskSpec, method: str, baseline: bool = False, **settings: Any) -> Row:
+    return Row(table, label, task, {"method": method, "steps": PARTICLE_STEPS, **settings}, baseline)
+
+
+def payments() -> Iterator[Row]:
+    task = read_task("PP-6")
+    for period in (1, 5, 25):
+        often = task if period == 25 else task.model_copy(update={"payments": period})
+        for method in ("episodic", "bayes"):
+            yield particle(f"PP-6, paid every {period}", method, often, method, method == "episodic")
+
+
+def exact() -> Iterator[Row]:
+    for method in ("bayes", "bayes-history"):
+        for choice in ("no", "last", "spread"):
+            credit = {"exact": choice}
+            yield particle(f"PP-6, {method}", choice, read_task("PP-6"), method, choice == "no", credit=credit)
+
+
+def groups() -> Iterator[Row]:
+    for method in ("bayes", "lare-bayes"):
+        for grouped in (False, True):
+            label, task = "with groups" if grouped else "without", level_task("CN-6", grouped=grouped)
+            yield particle(f"CN-6 in levels, {method}", label, task, method, not grouped)
+
+
+def rivals() -> Iterator[Row]:
+    methods = "episodic", "dense", "rd", "rrdu", "lrr", "grd", "tar2", "arel", "stas", "bayes", "lare-rd", "lare-bayes"
+    for name in ("CN-6", "PP-6"):
+        for method in methods:
+            yield particle(name, method, read_task(name), method, method == "rrdu")
+
+
+KINDS: dict[str, Callable[[], Iterator[Row]]] = {
+    "not-a-sum": not_a_sum,
+    "binary": binary,
+    "payments": payments,
+    "exact": exact,
+    "groups": groups,
+    "rivals": rivals,
+}
+
+
+def mean_returns(directory: Path, after: float) -> list[float]:
+    """Return the mean return of each seed's evaluations after this share of the steps."""
+    run = open_run(directory)
+    lines = run.metrics()
+    first = after * max(line["step"] for line in lines)
+    return [
+        float(np.mean([x["evaluation/return"] for x in lines if x["seed"] == seed and x["step"] > first]))
+        for seed in run.seeds
+    ]
+
+
+def main(kind: Kind, out: Path = Path("runs/scores"), seeds: int = 10, only: tuple[str, ...] = ()) -> None:
+    """Train and tabulate.
+
+    Args:
+        kind: the rows.
+        out: the directory of the runs.
+        seeds: seeds 0 to N - 1.
+        only: labels of rows; all by default.
+    """
+    rows = [row for row in KINDS[kind]() if not only or row.label in only]
+    scores: dict[str, dict[str, list[float]]] = {}
+    for row in rows:
+        directory = out / kind / row.table.replace(" ", "") / row.label.replace(" ", "")
+        if not (directory / "metrics.jsonl").exists():
+            lare_rl.train(row.task, lare_rl.Settings(**row.settings, seeds=seeds), out=directory)
+        for measure, after in (("late", 0.75), ("area", 0.0)):
+            returns = mean_returns(directory, after)
+            scores.setdefault(f"{row.table}, {measure}", {})[row.label] = returns
+            print(row.table, row.label, measure, np.round(np.mean(returns), 3), np.round(returns, 2), flush=True)
+    baselines = {
+        f"{row.table}, {measure}": row.label for row in rows if row.is_baseline for measure in ("late", "area")
+    }
+    write(
+        f"scores_{kind}",
+        {
+            "command": f"PYTHONPATH=benchmarks python -m scores.training {kind} --seeds {seeds}",
+            "seeds": list(range(seeds)),
+            "tables": {
+                table: {
+                    label: describe(values, labels.get(baselines.get(table, ""))) for label, values in labels.items()
+                }
+                for table, labels in scores.items()
+            },
+        },
+    )
+
+
+def describe(values: list[float], baseline: list[float] | None) -> dict[str, Any]:
+    """Return the statistics of a row, and its probability of improvement over the baseline."""
+    array = np.array(values)[:, None]
+    iqm = bootstrap(array[..., None], interquartile_means)[0]
+    row = {
+        "n": len(values),
+        "mean": float(array.mean()),
+        "std": float(array.std(ddof=1)),
+        "iqm": iqm.value,
+        "iqm 95%": [iqm.low, iqm.high],
+        "returns": values,
+    }
+    if baseline is not None and baseline is not values:
+        other = np.array(baseline)[:, None]
+        row["above baseline"] = probability_of_improvement(array, other)
+        row["p"] = min(mann_whitney([(array[:, 0], other[:, 0])]))
+    return row
+
+
+if __name__ == "__main__":
+    tyro.cli(main, description=__doc__)
