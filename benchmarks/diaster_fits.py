@@ -23,7 +23,7 @@ from lare_rl.runs.directory import open_run
 from lare_rl.training.decoder_fits import fit_repeatedly
 from lare_rl.training.decoder_inputs import decoder_inputs
 from lare_rl.training.learner import Learner, init_decoders
-from lare_rl.training.rewards import RewardState, team_proxy_rewards
+from lare_rl.training.rewards import team_proxy_rewards
 from lare_rl.training.saved_state import load_learner
 from lare_rl.training.seed_axis import select_seed
 from lare_rl.training.static_config import TrainConfig
@@ -39,7 +39,7 @@ def untrained(learner: Learner, config: TrainConfig, key: jax.Array) -> Learner:
     stored_replay = learner.replay
     valid = replay.read(stored_replay, replay.newest_steps(stored_replay, int(replay.n_transitions(stored_replay)[0])))
     credit = decomposition.observe_steps(credit, decoder_inputs(valid, config, 0))
-    return learner._replace(decoders=(credit._replace(scale=learner.scale[0]),))
+    return learner._replace(decoders=(credit._replace(scale=learner.decoders[0].scale),))
 
 
 def curve(learner: Learner, config: TrainConfig, fits: tuple[int, ...], seed: int) -> list[dict[str, float]]:
@@ -56,7 +56,7 @@ def curve(learner: Learner, config: TrainConfig, fits: tuple[int, ...], seed: in
             credit, _ = fit_some(learner, jax.random.key(1000 * seed + done), config=config)
             learner = learner._replace(decoders=credit)
             done += AT_A_TIME
-        r_hat = team_proxy_rewards(recent, RewardState(learner.decoders, learner.scale), config, 0)[:, 0]
+        r_hat = team_proxy_rewards(recent, learner.reward_state, config, 0)[:, 0]
         accuracies.append(
             {
                 "fits": done,

@@ -87,7 +87,7 @@ def main(directories: list[str]) -> None:
         run = open_run(directory)
         config, everyone, _, _ = load_learner(run)
         learner = select_seed(everyone)
-        (scale_state,) = learner.scale
+        scale_state = learner.decoders[0].scale
         unit = scale_state._replace(mean_square=jnp.ones(()))
         assert config.method.fit is not None
         cases = {

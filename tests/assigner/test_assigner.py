@@ -66,6 +66,7 @@ def test_rewards_of_every_method(method, function):
     np.testing.assert_allclose(credit.rewards_at(first), np.broadcast_to(before, 10), rtol=1e-5)
     assert credit.rewards_at([[-1, -1]]).tolist() == [[0.0, 0.0]]
     assert credit.rewards_at([]).shape == (0,)
+    assert credit.rewards_at(5).shape == ()
     assert np.isnan(credit.metrics()["credit/return_r2"])
     assert credit.explanation() == []
     assert credit.learner.n_updates == 0
@@ -135,7 +136,7 @@ def test_rewards_can_be_scaled_and_optimistic():
     assert (optimistic > plain).all()
 
 
-@pytest.mark.parametrize("steps", [[0.5], [-2], ["0"], [True]])
+@pytest.mark.parametrize("steps", [[0.5], [-2], ["0"], [True], 0.5, None, [[0], [1, 2]]])
 def test_rewards_at_refuses_what_is_no_step_number(steps):
     with pytest.raises(LareError, match="numbers"):
         small_assigner().rewards_at(steps)

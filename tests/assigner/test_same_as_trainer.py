@@ -13,7 +13,6 @@ from helpers.small_configs import (
     ONE_TEAM,
     add_steps,
     random_steps,
-    reward_state,
     small_config,
     stored_steps,
     untrained_learner,
@@ -103,7 +102,7 @@ EVERY_5 = PaymentRule(period=5)
 )
 def test_rewards_agree(method, env, payments, exact, phi):
     learner, config, credit = learn(method, env, phi if METHODS[method].needs_phi else None, payments, exact)
-    expected = np.asarray(rewards(stored_steps(learner), reward_state(learner), config))
+    expected = np.asarray(rewards(stored_steps(learner), learner.reward_state, config))
     expected = expected if env.n_agents > 1 else expected[..., 0]
     r_hat = credit.rewards_at(np.arange(credit.store.steps))
     np.testing.assert_allclose(r_hat, expected, rtol=1e-4, atol=1e-5 * np.abs(expected).max())
@@ -126,7 +125,7 @@ def test_rewards_agree_if_the_score_is_won_or_lost():
 @pytest.mark.parametrize("method", ["rd-linear", "bayes"])
 def test_rewards_agree_with_groups(method):
     learner, config, credit = learn(method, ONE_AGENT, group="map")
-    expected = np.asarray(rewards(stored_steps(learner), reward_state(learner), config))[..., 0]
+    expected = np.asarray(rewards(stored_steps(learner), learner.reward_state, config))[..., 0]
     r_hat = credit.rewards_at(np.arange(credit.store.steps))
     np.testing.assert_allclose(r_hat, expected, rtol=1e-4, atol=1e-5 * np.abs(expected).max())
     intercept = np.asarray(learner.decoders[0].closed_form.intercept)[0]

@@ -10,7 +10,7 @@ from lare_rl.util.findings import Finding, render
 
 FACTORS, RAW_FEATURES = ["speed", "cost"], ["entry 0", "entry 1 (the foot)"]
 BOTH_STATES = ["speed (before)", "speed (after)"]
-WELL_EXPLAINED = {"factors_r2": 0.99, "total_r2": 0.99}
+WELL_EXPLAINED = {"factors_r2": 0.99, "total_r2": 0.99, "factor_shares": np.array([0.34, 0.65])}
 ONE_VARIES = WELL_EXPLAINED | {"factor_varies": np.array([True, False])}
 NO_RESIDUAL = {"residual_correlation": np.zeros(2)}
 
@@ -78,6 +78,13 @@ def test_shares():
     assert largest == [{"name": RAW_FEATURES[1], "share": 0.77}, {"name": RAW_FEATURES[0], "share": 0.2}]
 
 
+def test_shares_add_up():
+    shares = {"factors_r2": 0.905, "total_r2": 0.931, "factor_shares": np.array([0.2545, 0.6505])}
+    about, _, *factors = find(shares, raw_features=RAW_FEATURES)[:4]
+    assert (about.values["share"], about.values["raw"].values["share"]) == (0.90, 0.03)  # and 7% is not explained
+    assert [factor.values["share"] for factor in factors] == [0.65, 0.25]
+
+
 def test_score_type():
     for score_type, this, other in ((ScoreType.SUM, "sum", "mean"), (ScoreType.MEAN, "mean", "sum")):
         for is_certain, code in ((True, "score_type_is_certain"), (False, "score_type_is_uncertain")):
@@ -107,7 +114,7 @@ def test_shapes_of_effects(changes, shapes):
 def test_factor_before_and_after():
     covariance = np.array([[0.01, -0.0098], [-0.0098, 0.01]])
     values = find(WELL_EXPLAINED | {"slope_covariance": covariance}, BOTH_STATES)[2].values
-    assert (values["name"], values["share"]) == ("speed", 0.9)
+    assert (values["name"], values["share"]) == ("speed", 0.99)
     assert values["effect"].values == pytest.approx({"slope": 3.0, "std": 0.02})
     assert values["states"].values["after"].values == pytest.approx({"slope": 2.0, "std": 0.1})
     for slope, cancels in (([-20.5, 20.1], True), ([-0.15, 0.15], False), ([-20.5, 17.0], False)):

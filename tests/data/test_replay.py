@@ -28,7 +28,10 @@ def test_replay_matches_slow_twin(lengths_by_env, chunks):
     number = np.asarray(replay.oldest_transition(buffer))[:, None] + np.arange(CAPACITY)
     index = Index(np.repeat(np.arange(ENVS)[:, None], CAPACITY, axis=1), number)
     steps = jax.tree.map(np.asarray, read(buffer, index))
-    mean_length = ENVS * total // max(1, sum(row[3] for env_rows in rows for row in env_rows))
+    # The number of the last step that ended an episode is the number of steps of finished episodes.
+    ends = [[i + 1 for i, row in enumerate(env_rows) if row[3]] for env_rows in rows]
+    mean_length = sum(env_ends[-1] for env_ends in ends if env_ends) // max(1, sum(map(len, ends)))
+    assert replay.mean_length(buffer) == max(1, mean_length)
     n_transitions, n_finished = np.asarray(replay.n_transitions(buffer)), np.asarray(replay.n_finished(buffer))
     for env in range(ENVS):
         finished, running = slow_replay(rows[env], chunks, CAPACITY)

@@ -31,7 +31,7 @@ from lare_rl.phi.evaluate import evaluate
 from lare_rl.training import learner as learners
 from lare_rl.training import on_policy
 from lare_rl.training.compiled import compile_functions, init_memory
-from lare_rl.training.rewards import RewardState, rewards
+from lare_rl.training.rewards import rewards
 from lare_rl.training.saved_state import load_learner
 from lare_rl.training.seed_axis import select_seed
 
@@ -158,7 +158,7 @@ def test_export_agrees_with_jax(kind, method, export_run):
     steps = jax.tree.map(lambda leaf: np.concatenate(np.swapaxes(leaf, 0, 1)), steps)
     # Exported rewards are in the unit of the true rewards, before they are scaled.
     unscaled = replace(config, scale_rewards=False)
-    expected = np.asarray(rewards(stored, RewardState(seed_learner.decoders, seed_learner.scale), unscaled))
+    expected = np.asarray(rewards(stored, seed_learner.reward_state, unscaled))
     for team_index, name in enumerate(names):
         check_reward(exported, name, config, steps, np.asarray(stored.length, np.float32), expected, team_index)
 

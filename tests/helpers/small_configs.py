@@ -21,7 +21,6 @@ from lare_rl.envs.interface import EnvSpec, Team, Timestep, to_env_action
 from lare_rl.training import learner as learners
 from lare_rl.training.compiled import training_module
 from lare_rl.training.episodes import learn_returns
-from lare_rl.training.rewards import RewardState
 from lare_rl.training.static_config import TrainConfig
 
 LENGTHS = (5, 12, 3, 9, 12)
@@ -236,7 +235,3 @@ def stored_steps(learner):
 
 
 read = jax.jit(replay.read)
-
-
-def reward_state(learner):
-    return RewardState(learner.decoders, learner.scale)

@@ -68,6 +68,38 @@ def test_phi_is_part_of_the_program(phi):
     assert "callback" not in str(jax.make_jaxpr(credit.observe)(state, steps))
 
 
+def test_invalid_factors_are_counted_and_not_used(phi):
+    """A step is invalid where the observation is NaN. `lare-linear` reads factors alone."""
+    credit = pure_credit("lare-linear", phi, **SIZES)
+    is_invalid = (
+        jnp.zeros((N_STEPS, N_ENVS), bool).at[[3, 9, 14], [0, 1, 2]].set(True)
+    )  # 9: the last step of an episode
+
+    def steps_of(key):
+        steps, true_reward = make_steps(key)
+        return steps._replace(
+            next_observation=jnp.where(is_invalid[..., None], jnp.nan, steps.next_observation)
+        ), true_reward
+
+    def run(key):
+        def body(state, key):
+            return credit.refit(credit.observe(state, steps_of(key)[0]), key), None
+
+        return jax.lax.scan(body, credit.init(key), jax.random.split(key, 30))[0]
+
+    state = jax.jit(run)(jax.random.key(0))
+    assert int(state.n_invalid) == 90
+    steps, _ = steps_of(jax.random.key(1))
+    r_hat = np.asarray(credit.reward(state, steps))
+    assert (r_hat[is_invalid] == 0).all()
+    valid, _ = make_steps(jax.random.key(1))
+    expected = np.asarray(credit.reward(state, valid))
+    np.testing.assert_array_equal(r_hat[~is_invalid], expected[~is_invalid])
+    assert np.isfinite(expected).all()
+    returns = float(state.learner.replay.episode_return.max())
+    assert returns != 0  # the reward of an invalid last step counts
+
+
 def test_functions_are_mapped_over_seeds():
     """`vmap` and `shard_map` give what single calls give."""
     credit = pure_credit("bayes", **SIZES)

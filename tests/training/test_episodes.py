@@ -20,7 +20,6 @@ from helpers.small_configs import (
     learner_with_episodes,
     random_factors,
     random_steps,
-    reward_state,
     small_config,
     stored_steps,
     untrained_learner,
@@ -227,7 +226,7 @@ def test_proxy_rewards_of_the_right_score_type_add_up_to_the_return(score, setti
     config = small_config("lare-linear", capacity=2000, credit=CreditSettings(score=setting))
     steps, factors, step_score, lengths = scored_episodes(config, score)
     learner = list(learn_in_chunks(config, steps, factors, 6))[-1]
-    r_hat = np.asarray(jitted(rewards, config)(stored_steps(learner), reward_state(learner)))[:, 0]
+    r_hat = np.asarray(jitted(rewards, config)(stored_steps(learner), learner.reward_state))[:, 0]
     ends = np.cumsum(lengths)
     total = np.array([episode.sum() for episode in np.split(r_hat, ends[:-1])])
     score_of_episode = steps.next_timestep.reward[ends - 1, 0, 0]

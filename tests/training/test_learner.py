@@ -22,7 +22,6 @@ from helpers.small_configs import (
     random_factors,
     random_steps,
     read,
-    reward_state,
     small_config,
     steps_as_stored,
     stored_steps,
@@ -32,6 +31,7 @@ from helpers.small_configs import (
 )
 from lare_rl.credit import closed_form, returns
 from lare_rl.credit.decoder_settings import CreditSettings
+from lare_rl.credit.engine import return_scale
 from lare_rl.credit.methods import METHODS, Fit
 from lare_rl.data import replay
 from lare_rl.data.sampling import sample_drawn
@@ -72,8 +72,7 @@ def test_store_updates_statistics():
     np.testing.assert_allclose(learner.decoders[0].statistics.mean, factors.mean(axis=(0, 1, 2)), rtol=1e-4)
     assert float(learner.decoders[0].statistics.n_rows) == TOTAL
     means = [episode.mean() for episode in np.split(steps.next_timestep.reward.ravel(), ENDS)]
-    assert float(learner.scale[0].mean_square) == pytest.approx(np.mean(np.square(means)), rel=1e-4)
-    np.testing.assert_array_equal(learner.scale[0], learner.decoders[0].scale)
+    assert float(learner.decoders[0].scale.mean_square) == pytest.approx(np.mean(np.square(means)), rel=1e-4)
 
 
 @pytest.mark.long
@@ -92,7 +91,7 @@ def test_unbiased_loss_has_the_expectation_of_the_full_loss(n_steps):
         _, metrics = jitted(fit_decoders, config)(learner.decoders, learner.replay, first, jax.random.key(0))
         losses[name] = float(metrics["credit/loss"])
     steps, unit = stored_steps(learner), float(root_mean_square(learner.decoders[0].scale))
-    r_hat = np.asarray(jitted(proxy_rewards, config)(steps, reward_state(learner)))[:, 0] / unit
+    r_hat = np.asarray(jitted(proxy_rewards, config)(steps, learner.reward_state))[:, 0] / unit
     r = np.asarray(steps.columns["reward"])[:, 0] / unit
     errors = [(a.mean() - b.mean()) ** 2 for a, b in zip(np.split(r_hat, ENDS), np.split(r, ENDS), strict=True)]
     chosen = np.bincount(np.searchsorted(ENDS, draws.episodes.first.number[0], side="right"), minlength=5) / 40_000
@@ -124,8 +123,8 @@ def test_fit_ignores_padding(method):
 def test_rewards(method, scale_rewards):
     config = small_config(method, scale_rewards=scale_rewards)
     learner, steps = learner_with_episodes(config), random_steps()
-    unit = root_mean_square(learner.scale[0]) if scale_rewards else 1
-    reward = jitted(rewards, config)(stored_steps(learner), reward_state(learner))
+    unit = root_mean_square(return_scale(learner.reward_state[0])) if scale_rewards else 1
+    reward = jitted(rewards, config)(stored_steps(learner), learner.reward_state)
     assert reward.shape == (TOTAL, 1)
     reward = np.asarray(reward)[:, 0] * unit
     match method:
@@ -134,7 +133,7 @@ def test_rewards(method, scale_rewards):
         case "llm-reward":
             np.testing.assert_allclose(reward, random_factors(config, steps)[:, 0, 0, 0], rtol=1e-5)
         case _:
-            r_hat = jitted(proxy_rewards, config)(stored_steps(learner), reward_state(learner))
+            r_hat = jitted(proxy_rewards, config)(stored_steps(learner), learner.reward_state)
             np.testing.assert_allclose(reward, r_hat[:, 0], rtol=1e-5)
             assert reward.std() > 0
 
@@ -148,7 +147,7 @@ def with_running_episode(config):
 def test_ircr_pays_half_until_an_episode_ends():
     config = small_config("ircr")
     learner, _ = with_running_episode(config)
-    reward = jitted(rewards, config)(stored_steps(learner), reward_state(learner))[:, 0]
+    reward = jitted(rewards, config)(stored_steps(learner), learner.reward_state)[:, 0]
     np.testing.assert_array_equal(reward[-2:], [0.5, 0.5])
     assert float(reward[0]) != 0.5
 
@@ -218,7 +217,6 @@ def test_two_environments_equal_one_twice_as_long(method):
     first = add_steps(untrained_learner(wide), wide, steps, factors)
     second = add_steps(untrained_learner(long), long, jax.tree.map(join_envs, steps), join_envs(factors))
     assert_close(first.decoders, second.decoders, 1e-3, 1e-4)
-    assert_close(first.scale, second.scale)
     number = jnp.broadcast_to(jnp.arange(TOTAL), (2, TOTAL))
     env = jnp.broadcast_to(jnp.arange(2)[:, None], (2, TOTAL))
     r_hats = []
@@ -226,7 +224,7 @@ def test_two_environments_equal_one_twice_as_long(method):
         (first, wide, replay.Index(env, number)),
         (second, long, replay.Index(0 * env, number + TOTAL * env)),
     ):
-        r_hats.append(jitted(rewards, config)(read(learner.replay, index), reward_state(learner)))
+        r_hats.append(jitted(rewards, config)(read(learner.replay, index), learner.reward_state))
     assert_close(*r_hats, 1e-3, 1e-4)
 
 
@@ -237,10 +235,9 @@ def test_teams_have_separate_decoders_and_returns():
     config, steps = TEAMS("lare-rd"), random_steps(TWO_TEAMS)
     learner = learner_with_episodes(config)
     assert [credit.statistics.mean.shape for credit in learner.decoders] == [(2,), (3,)]
-    for i, (credit, team) in enumerate(zip(learner.decoders, TWO_TEAMS.teams, strict=True)):
+    for credit, team in zip(learner.decoders, TWO_TEAMS.teams, strict=True):
         means = np.array([episode.mean() for episode in np.split(team_rewards(steps, team), ENDS)])
         assert float(credit.scale.mean_square) == pytest.approx(float((means**2).mean()), rel=1e-4)
-        np.testing.assert_array_equal(credit.scale, learner.scale[i])
     updated, _ = update_once(learner, config)
     for before, after in zip(learner.decoders, updated, strict=True):
         assert not jax.tree.all(jax.tree.map(jnp.array_equal, before.network, after.network))
@@ -250,7 +247,7 @@ def test_teams_have_separate_decoders_and_returns():
 def test_rewards_of_teams(method):
     config, steps = TEAMS(method), random_steps(TWO_TEAMS)
     learner, alive = learner_with_episodes(config), steps.timestep.alive[:, 0]
-    reward = np.asarray(jitted(rewards, config)(stored_steps(learner), reward_state(learner)))
+    reward = np.asarray(jitted(rewards, config)(stored_steps(learner), learner.reward_state))
     assert not alive.all()
     for team in TWO_TEAMS.teams:
         episode_rewards = np.split(team_rewards(steps, team), ENDS)
@@ -274,7 +271,7 @@ def test_rewards_of_each_agent_and_shared_among_agents_that_are_alive():
         add_steps(untrained_learner(config), config, steps, number[..., None], learn=False), [1.0, -1.0]
     )
     r_hat, alive = number[:, 0] * np.repeat([1.0, -1.0], [3, 2]), steps.timestep.alive[:, 0]
-    stored, state = stored_steps(learner), reward_state(learner)
+    stored, state = stored_steps(learner), learner.reward_state
     np.testing.assert_array_equal(jitted(rewards, config)(stored, state), r_hat * alive)
     shared = replace(config, method=replace(config.method, shared=True))
     reward = np.asarray(jitted(rewards, shared)(stored, state))
@@ -366,10 +363,10 @@ def test_values_of_dead_agents_change_nothing(method):
     results = []
     for trajectory, z in ((steps, factors), (changed, np.where(dead[..., None], 99, factors).astype(np.float32))):
         learner = add_steps(untrained_learner(config), config, trajectory, z)
-        reward = jitted(rewards, config)(stored_steps(learner), reward_state(learner))
+        reward = jitted(rewards, config)(stored_steps(learner), learner.reward_state)
         assert not np.asarray(reward)[dead[:, 0]].any()
         update = update_once(learner, config) if config.method.uses_gradient else ()
-        results.append((learner.decoders, learner.scale, reward, update, jitted(assess, config)(learner)))
+        results.append((learner.reward_state, reward, update, jitted(assess, config)(learner)))
     assert_close(*results)
 
 
@@ -384,7 +381,7 @@ def team_level_config(method, **changes):
 def test_team_level_rewards_are_the_same_for_all_alive_agents(method):
     config = team_level_config(method, n_factors=(2,) if method[0] == "l" else ())
     learner, alive = learner_with_episodes(config), random_steps(ONE_TEAM).timestep.alive[:, 0]
-    reward = np.asarray(jitted(rewards, config)(stored_steps(learner), reward_state(learner)))
+    reward = np.asarray(jitted(rewards, config)(stored_steps(learner), learner.reward_state))
     team_reward = reward.sum(axis=1) / np.maximum(alive.sum(axis=1), 1)
     np.testing.assert_allclose(reward, team_reward[:, None] * alive, rtol=1e-5, atol=1e-6)
     assert team_reward[alive.any(axis=1)].std() > 0
@@ -412,7 +409,7 @@ def test_optimism_adds_deviations_to_training_rewards_only(env, score):
     algorithm = "td3" if env is ONE_AGENT else "ippo"
     config = small_config("lare-bayes", algorithm, env, credit=CreditSettings(score=score, optimism=2.0))
     learner = learner_with_episodes(config)
-    steps, state = stored_steps(learner), reward_state(learner)
+    steps, state = stored_steps(learner), learner.reward_state
     alive = np.asarray(alive_agents(steps, config))
     before = np.where(alive, jitted(proxy_rewards, config)(steps, state), 0)
     after = np.asarray(jitted(rewards, config)(steps, state))
@@ -430,5 +427,5 @@ def test_optimism_adds_deviations_to_training_rewards_only(env, score):
 def test_optimism_before_two_returns():
     config = small_config("bayes", credit=CreditSettings(optimism=2.0))
     learner = untrained_learner(config)
-    reward = jitted(rewards, config)(steps_as_stored(config), reward_state(learner))
+    reward = jitted(rewards, config)(steps_as_stored(config), learner.reward_state)
     np.testing.assert_array_equal(reward, 0)

@@ -17,7 +17,6 @@ from helpers.small_configs import (
     random_factors,
     random_steps,
     read,
-    reward_state,
     small_config,
     store_seeds,
     untrained_learner,
@@ -26,7 +25,7 @@ from lare_rl.algorithms.td3 import td3
 from lare_rl.credit.decoder_settings import CreditSettings
 from lare_rl.training import off_policy
 from lare_rl.training.compiled import compile_functions
-from lare_rl.training.rewards import RewardState, rewards
+from lare_rl.training.rewards import rewards
 
 
 def test_train_step_relabels_by_the_newest_decoder():
@@ -39,7 +38,7 @@ def test_train_step_relabels_by_the_newest_decoder():
     steps, losses = read(learner.replay, jax.tree.map(lambda leaf: leaf[0], sample.batch)), []
     update = jax.jit(partial(td3.update, settings=config.hyperparameters))
     for decoders in (learner.decoders, updated.decoders):
-        reward = jitted(rewards, config)(steps, RewardState(decoders, learner.scale))
+        reward = jitted(rewards, config)(steps, decoders)
         _, key = jax.random.split(jax.random.split(noise_key, 1)[0])
         _, update_metrics = update(learner.algorithm, off_policy._transitions(steps, reward), key, jnp.array(0))
         losses.append(float(update_metrics["critic/loss"]))
@@ -85,7 +84,7 @@ def test_scale_rewards_divides_by_the_scale_of_returns():
     plain, scaled = small_config("dense"), small_config("dense", scale_rewards=True)
     learner = learner_with_episodes(plain)
     steps = read(learner.replay, off_policy._sample(learner.replay, jax.random.key(0), 1, plain).batch)
-    reward, scaled_reward = (jitted(rewards, config)(steps, reward_state(learner)) for config in (plain, scaled))
+    reward, scaled_reward = (jitted(rewards, config)(steps, learner.reward_state) for config in (plain, scaled))
     np.testing.assert_allclose(scaled_reward, reward / jnp.sqrt(learner.scale[0].mean_square), rtol=1e-5)
 
 

@@ -14,7 +14,6 @@ from helpers.small_configs import (
     add_steps,
     jitted,
     random_steps,
-    reward_state,
     small_config,
     stored_steps,
     untrained_learner,
@@ -59,7 +58,7 @@ def test_exact_rewards_add_up_to_payments(method, algorithm, env, exact, payment
     else:
         steps = stored_steps(learner)
     r_hat, inexact = (
-        np.asarray(rewards(values, reward_state(learner), config), np.float64)
+        np.asarray(rewards(values, learner.reward_state, config), np.float64)
         for values in (steps, steps._replace(residual=None))
     )
     alive = np.asarray(steps.columns.get("alive", np.ones((len(r_hat), env.n_agents), bool)))

@@ -2,7 +2,7 @@
 
 import pytest
 
-from lare_rl.util.renamed_fields import rename_fields, rename_keys
+from lare_rl.util.renamed_fields import rename_fields, rename_keys, rename_options
 
 
 @pytest.mark.parametrize(
@@ -40,3 +40,9 @@ def test_rename_keys():
         "judges": "both",
         "scored_observation": "after",
     }
+
+
+def test_rename_options():
+    arguments = ["verify", "phi.py", "--judges", "both", "--judges=after", "--fit=4", "x=1=2"]
+    new = ["verify", "phi.py", "--scored-observation", "both", "--scored-observation=after", "--fit=4", "x=1=2"]
+    assert rename_options(arguments) == new

@@ -8,6 +8,7 @@ from lare_rl.util.statistics import (
     format_plus_minus,
     grouped_standard_error,
     r_squared,
+    round_shares,
     sample_std,
     standard_error,
 )
@@ -61,3 +62,17 @@ def test_format_plus_minus(mean, std, text):
 def test_format_mean_std():
     assert format_mean_std(np.array([70.0, 72.0])) == "71.00 ± 1.41"
     assert format_mean_std(np.array([70.0])) == "70.00"
+
+
+@pytest.mark.parametrize(
+    ("shares", "total", "rounded"),
+    [
+        ([1 / 3, 1 / 3, 1 / 3], 1.0, [0.34, 0.33, 0.33]),
+        ([0.005, 0.995], 1.0, [0.01, 0.99]),
+        ([0.905, 0.004, 0.091], 1.0, [0.91, 0.0, 0.09]),
+        ([0.256, -0.104, 0.448], 0.6, [0.26, -0.11, 0.45]),
+        ([], 0.0, []),
+    ],
+)
+def test_round_shares(shares, total, rounded):
+    assert round_shares(shares, total) == pytest.approx(rounded)

@@ -228,7 +228,10 @@ def to_flags(values: Any, name: str, n_rows: int) -> Bool[np.ndarray, " steps"]:
 
 def to_step_ids(steps: Any) -> Int[np.ndarray, "*shape"]:
     """Return numbers of steps as an array. Raises `LareError` for anything else."""
-    step_ids = np.asarray(steps)
+    try:
+        step_ids = np.asarray(steps)
+    except ValueError:  # lists of different lengths
+        step_ids = np.array("")
     if step_ids.size and (step_ids.dtype.kind not in "iu" or step_ids.min() < -1):
         raise LareError(f"steps are {short_repr(steps)}: give numbers that `add` has returned, or -1")
     return step_ids.astype(np.int64)

@@ -8,9 +8,9 @@ from jaxtyping import Int
 
 from lare_rl.assigner import compiled_functions as compiled
 from lare_rl.assigner.store import Store, StoredEpisode
+from lare_rl.credit.batch_plan import plan_batch
 from lare_rl.credit.decomposition import CreditBatch
 from lare_rl.credit.engine import CreditSpec
-from lare_rl.credit.methods import Fit
 from lare_rl.data.layouts import Layout, lay_out_packed, lay_out_padded, lay_out_sampled
 
 __all__ = ["pack_in_order", "sample_batch"]
@@ -23,18 +23,17 @@ def sample_batch(store: Store, spec: CreditSpec, random: np.random.Generator, lo
     """
     settings, fit = spec.settings, spec.method.fit
     assert fit is not None
-    if fit is Fit.DECODER_LOSS:
-        episodes = _sample_episodes(store, settings.episodes, random)
-        return _gather(store, episodes, lay_out_padded(_lengths(episodes), longest), len(episodes))
-    if fit.samples_steps:
-        episodes = _sample_episodes(store, max(1, settings.steps // settings.drawn_steps), random)
-        length = _lengths(episodes)
-        key = jax.random.key(int(random.integers(2**31)))
-        step = np.asarray(compiled.sample_steps(key, length.astype(np.int32), steps=settings.drawn_steps))
-        return _gather(store, episodes, lay_out_sampled(length, step), len(episodes))
-    n_slots = max(1, settings.steps // 2)
-    episodes = _sample_episodes(store, max(1, settings.steps // store.mean_length), random)[:n_slots]
-    return _pack(store, episodes, n_slots, max(settings.steps, longest))
+    plan = plan_batch(fit, settings, longest, fixed_length=False)
+    if plan.layout == "packed":
+        episodes = _sample_episodes(store, max(1, settings.steps // store.mean_length), random)[: plan.episodes]
+        return _pack(store, episodes, plan.episodes, plan.rows)
+    episodes = _sample_episodes(store, plan.episodes, random)
+    length = _lengths(episodes)
+    if plan.layout == "padded":
+        return _gather(store, episodes, lay_out_padded(length, plan.rows), len(episodes))
+    key = jax.random.key(int(random.integers(2**31)))
+    step = np.asarray(compiled.sample_steps(key, length.astype(np.int32), steps=plan.rows))
+    return _gather(store, episodes, lay_out_sampled(length, step), len(episodes))
 
 
 def pack_in_order(store: Store, episodes: Sequence[StoredEpisode], n_slots: int, rows: int) -> Iterator[CreditBatch]:

@@ -62,7 +62,7 @@ def fit_by_gradient(
 
 
 class FlatState(NamedTuple):
-    """A flattened decoder and scale. Flattening them anew for every call would take longer than the call."""
+    """A flattened `RewardSource`. Flattening it anew for every call would take longer than the call."""
 
     leaves: list[Array]
     structure: Any
@@ -83,7 +83,7 @@ def training_rewards(
     spec: CreditSpec,
 ) -> Float[Array, "rows agents"]:
     """Return the rewards of steps by a flat state. `engine.StepBatch` describes the arrays that may be None."""
-    decoder, scale = jax.tree.unflatten(structure, leaves)
+    source = jax.tree.unflatten(structure, leaves)
     steps = StepBatch(
         inputs=inputs,
         length=length,
@@ -93,7 +93,7 @@ def training_rewards(
         residual=residual,
     )
     alive = jnp.ones(inputs.shape[:-1], bool) if alive is None else alive
-    return engine.training_rewards(decoder, scale, steps, spec, alive)
+    return engine.training_rewards(source, steps, spec, alive)
 
 
 def on_cpu() -> AbstractContextManager:

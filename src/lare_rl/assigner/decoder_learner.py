@@ -29,7 +29,7 @@ from lare_rl.credit.decomposition import CreditBatch, Decomposition
 from lare_rl.credit.explanation import Explanation
 from lare_rl.credit.history import next_history
 from lare_rl.credit.methods import Fit, Reward
-from lare_rl.nn.normalise import Scale, empty_scale
+from lare_rl.nn.normalise import empty_scale
 from lare_rl.util.float64 import float64
 
 __all__ = ["CHUNK_UPDATES", "DecoderLearner"]
@@ -54,8 +54,8 @@ class DecoderLearner:
         with on_cpu():
             self.decoder: Decomposition | None = compiled.init_decoder(jax.random.key(config.seed), spec=config.spec)
         """None for a method that has no decoder."""
-        self.scale: Scale = empty_scale()
-        """The scale of R/T."""
+        self.scale = empty_scale() if self.decoder is None else None
+        """The scale of R/T, if there is no decoder. A decoder has its own."""
         self.n_learned = 0
         """Episodes that the decoder has learned from."""
         self.n_updates = 0
@@ -75,8 +75,8 @@ class DecoderLearner:
         """Episodes that the decoder has not learned from yet. Episodes that ended in one call are together."""
         self._pending_updates = 0.0
         self._is_fitted = False
-        self._flat_cache: tuple[Any, Any, FlatState | None] = None, None, None
-        """A decoder and a scale, and the leaves of both."""
+        self._flat_cache: tuple[Any, FlatState | None] = None, None
+        """A decoder or a scale, and its leaves."""
         self._residual_cache: tuple[Decomposition | None, dict[int, float]] = None, {}
         """A decoder, and what its proxy rewards lack to the returns of episodes, by their numbers."""
 
@@ -178,7 +178,8 @@ class DecoderLearner:
         with on_cpu():
             if self.decoder is not None:
                 self.decoder = compiled.observe_returns(self.decoder, mean_reward, length, mask, level)
-            self.scale = compiled.observe_scale(self.scale, mean_reward, mask)
+            else:
+                self.scale = compiled.observe_scale(self.scale, mean_reward, mask)
 
     def learn_if_due(self) -> None:
         """Add pending returns to the scales, and let the decoder learn if there are enough new episodes."""
@@ -370,16 +371,17 @@ class DecoderLearner:
         return np.array([residuals[number] for number in numbers], np.float32)
 
     def _flat_state(self) -> FlatState:
-        """Return the parts of the decoder that compute rewards, and the scale, in flat form."""
-        decoder, scale, flat = self._flat_cache
-        if flat is None or decoder is not self.decoder or scale is not self.scale:
-            reward_state = self.decoder
-            if reward_state is not None:
-                reward_state = reward_state._replace(optimizer=(), score_type_predictions=None)
+        """Return what rewards are computed from, in flat form."""
+        cached, flat = self._flat_cache
+        newest = self.scale if self.decoder is None else self.decoder
+        if flat is None or cached is not newest:
+            source = newest
+            if isinstance(source, Decomposition):
+                source = source._replace(optimizer=(), score_type_predictions=None)
                 if not decomposition.is_optimistic(self.config.method, self.config.settings):
-                    reward_state = reward_state._replace(closed_form=None)
-            flat = FlatState(*jax.tree.flatten((reward_state, self.scale)))
-            self._flat_cache = self.decoder, self.scale, flat
+                    source = source._replace(closed_form=None)
+            flat = FlatState(*jax.tree.flatten(source))
+            self._flat_cache = newest, flat
         return flat
 
     def metrics(self) -> dict[str, float]:

@@ -20,6 +20,7 @@ from tyro.constructors import (
 )
 
 from lare_rl.errors import CheckedModel, LareError, did_you_mean, model_keys, nested_model
+from lare_rl.util.renamed_fields import rename_options
 
 __all__ = ["parse"]
 
@@ -35,7 +36,7 @@ def parse(
     Raises:
         LareError: the arguments cannot be read.
     """
-    name, *options = arguments or [""]
+    name, *options = rename_options(arguments) or [""]
     if name in ("-h", "--help"):
         deferred = {name: _defer(command) for name, command in commands.items()}
         with _RULES:

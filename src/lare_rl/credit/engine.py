@@ -39,6 +39,7 @@ from lare_rl.tasks.spec import ScoredObservation
 __all__ = [
     "CreditSpec",
     "ExplanationState",
+    "RewardSource",
     "StepBatch",
     "add_to_explanation",
     "credit_spec",
@@ -46,6 +47,7 @@ __all__ = [
     "init_decoder",
     "init_explanation",
     "proxy_rewards",
+    "return_scale",
     "scale_and_mask",
     "training_rewards",
 ]
@@ -161,43 +163,47 @@ class StepBatch(NamedTuple):
     """R of the step's episode, less the sum of its proxy rewards; 0 if that is unknown. Only for `exact`."""
 
 
+RewardSource = Decomposition | Scale
+"""A decoder; for a method that fits nothing, the scale of R/T."""
+
+
+def return_scale(source: RewardSource) -> Scale:
+    """Return the scale of R/T."""
+    return source.scale if isinstance(source, Decomposition) else source
+
+
 def proxy_rewards(
-    decoder: Decomposition | None, scale: Scale, steps: StepBatch, spec: CreditSpec, *, optimistic: bool = False
+    source: RewardSource, steps: StepBatch, spec: CreditSpec, *, optimistic: bool = False
 ) -> Float[Array, "*batch agents"]:
     """Return r_hat of each agent, in the unit of the true rewards if the method's rewards have one.
 
-    `decoder` is None for a method that has none. `scale` is the scale of R/T. If `optimistic`, the optimism that the settings ask
-    for is added.
+    If `optimistic`, the optimism that the settings ask for is added.
     """
     match spec.method.reward:
         case Reward.DESIGNED:
             return steps.inputs[..., 0]
         case Reward.UNIFORM:
             # The return of a running episode is not known yet.
-            share = jnp.where(steps.finished, min_max_scale(scale, steps.mean_reward), 0.5)
+            share = jnp.where(steps.finished, min_max_scale(return_scale(source), steps.mean_reward), 0.5)
             return jnp.broadcast_to(share[..., None], steps.inputs.shape[:-1])
-    assert decoder is not None
+    assert isinstance(source, Decomposition)
     rows = steps.inputs.reshape(-1, *steps.inputs.shape[-2:])
     with_optimism = optimistic and decomposition.is_optimistic(spec.method, spec.settings)
     compute = decomposition.optimistic_rewards if with_optimism else decomposition.decoder_rewards
-    r_hat = compute(decoder, rows, spec.settings, steps.length.ravel())
+    r_hat = compute(source, rows, spec.settings, steps.length.ravel())
     return r_hat.reshape(steps.inputs.shape[:-1])
 
 
 def training_rewards(
-    decoder: Decomposition | None,
-    scale: Scale,
-    steps: StepBatch,
-    spec: CreditSpec,
-    alive: Bool[Array, "*batch team"],
+    source: RewardSource, steps: StepBatch, spec: CreditSpec, alive: Bool[Array, "*batch team"]
 ) -> Float[Array, "*batch team"]:
     """Return the rewards that an algorithm is trained on, for each agent of the team. `alive` says which agents acted."""
-    r_hat = jnp.broadcast_to(proxy_rewards(decoder, scale, steps, spec, optimistic=True), alive.shape)
+    r_hat = jnp.broadcast_to(proxy_rewards(source, steps, spec, optimistic=True), alive.shape)
     if steps.residual is not None:
         r_hat = r_hat + _correction(steps, spec.settings.exact)[..., None]
     if spec.method.shared:
         r_hat = jnp.broadcast_to(alive_mean(r_hat, alive)[..., None], alive.shape)
-    return scale_and_mask(r_hat, scale, alive, scale_rewards=spec.scale_rewards)
+    return scale_and_mask(r_hat, return_scale(source), alive, scale_rewards=spec.scale_rewards)
 
 
 def _correction(steps: StepBatch, exact: str) -> Float[Array, "*batch"]:

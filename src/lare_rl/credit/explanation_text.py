@@ -8,6 +8,7 @@ import numpy as np
 from lare_rl.credit.explanation import Explanation
 from lare_rl.credit.score_type import ScoreType, ScoreTypeEstimate
 from lare_rl.util.findings import Finding, render
+from lare_rl.util.statistics import round_shares
 
 __all__ = ["MESSAGES", "MIN_EXPLAINED_EPISODES", "explanation_findings", "explanation_lines", "raw_feature_names"]
 
@@ -163,12 +164,13 @@ def explanation_findings(
         values = {"share": float(explanation.total_r2), "target": target, "largest": largest_features}
         return [*findings, Finding("raw_features_explain", values), *_unused_raw_features(explanation, raw_features)]
     added = float(explanation.total_r2) - factors_r2
-    raw = Finding("raw_features_add", {"share": added}) if raw_features and added >= 0.01 else None
-    findings.append(Finding("factors_explain", {"share": factors_r2, "target": target, "raw": raw}))
+    shares = round_shares([factors_r2, added, 1 - factors_r2 - added])
+    raw = Finding("raw_features_add", {"share": shares[1]}) if raw_features and added >= 0.01 else None
+    findings.append(Finding("factors_explain", {"share": shares[0], "target": target, "raw": raw}))
     if factors_r2 < LITTLE_SHARE:
         findings.append(Finding("phi_explains_little"))
     else:
-        findings += [Finding("about_factors"), *_factor_findings(explanation, factors)]
+        findings += [Finding("about_factors"), *_factor_findings(explanation, factors, shares[0])]
     if largest and added > LARGE_SHARE:
         findings.append(Finding("phi_lacks_features", {"features": largest}))
     if raw_features and factors_r2 < COMPLETE_SHARE:
@@ -219,22 +221,26 @@ def _residual_findings(explanation: Explanation, factors: Sequence[str], raw_fea
     return [Finding("high_when_large" if correlation > 0 else "high_when_small", values)]
 
 
-def _factor_findings(explanation: Explanation, names: Sequence[str]) -> list[Finding]:
-    """Report each factor, in order of their shares. The values of a factor before and after a step are reported together."""
+def _factor_findings(explanation: Explanation, names: Sequence[str], total: float) -> list[Finding]:
+    """Report each factor, in order of their shares, which add up to `total`.
+
+    The values of a factor before and after a step are reported together.
+    """
     indices: dict[str, list[int]] = {}
     for i, name in enumerate(names):
         indices.setdefault(name.removesuffix(" (before)").removesuffix(" (after)"), []).append(i)
-    shares = np.asarray(explanation.factor_shares)
-    order = sorted(indices, key=lambda name: -abs(float(shares[indices[name]].sum())))
-    findings = [_factor(explanation, name, indices[name]) for name in order]
+    varied = {name: [i for i in numbers if explanation.factor_varies[i]] for name, numbers in indices.items()}
+    shares = {name: float(explanation.factor_shares[numbers].sum()) for name, numbers in varied.items() if numbers}
+    rounded = dict(zip(shares, round_shares(list(shares.values()), total), strict=True))
+    order = sorted(indices, key=lambda name: -abs(float(explanation.factor_shares[indices[name]].sum())))
+    findings = [_factor(explanation, name, indices[name], varied[name], rounded.get(name, 0.0)) for name in order]
     if any(len(pair) == 2 and explanation.factor_varies[pair].all() for pair in indices.values()):
         findings.append(Finding("about_states"))
     return findings
 
 
-def _factor(explanation: Explanation, name: str, indices: list[int]) -> Finding:
-    """Report a factor with one index or two: before and after the step."""
-    varied = [i for i in indices if explanation.factor_varies[i]]
+def _factor(explanation: Explanation, name: str, indices: list[int], varied: list[int], share: float) -> Finding:
+    """Report a factor with one index or two, before and after the step, of which some have varied."""
     if not varied:
         return Finding("unknown_factor", {"name": name, "effect": Finding("equal_means")})
     states = None
@@ -244,7 +250,7 @@ def _factor(explanation: Explanation, name: str, indices: list[int]) -> Finding:
     shapes = (_effect_shape(explanation, i) for i in varied)
     values = {
         "name": name,
-        "share": float(explanation.factor_shares[varied].sum()),
+        "share": share,
         "effect": Finding("change_pays") if _change_pays(explanation, varied) else _effect(explanation, varied),
         "states": states,
         "shape": next((shape for shape in shapes if shape is not None), None),

@@ -196,6 +196,13 @@ def n_finished(replay: Replay) -> Int[Array, " envs"]:
     return replay.episodes - replay.oldest
 
 
+def mean_length(replay: Replay) -> Int[Array, ""]:
+    """Return the mean number of steps of the episodes that have ever finished; 1 before the first."""
+    first_running = jnp.take_along_axis(replay.first, (replay.episodes % replay.first.shape[-1])[:, None], axis=1)[:, 0]
+    n_steps = jnp.where(replay.running, first_running, replay.transitions)
+    return jnp.maximum(jnp.sum(n_steps) // jnp.maximum(jnp.sum(replay.episodes), 1), 1)
+
+
 def extend(
     replay: Replay,
     columns: Mapping[str, Array | np.ndarray],
@@ -387,7 +394,6 @@ def read(replay: Replay, index: Index) -> StoredSteps:
     if replay.predicted_return is not None:
         difference = return_ - flatten_envs(replay.predicted_return)[slot]
         residual = jnp.where(finished[..., None] & jnp.isfinite(difference), difference, 0)
-    mean_length = jnp.sum(replay.transitions) // jnp.maximum(jnp.sum(replay.episodes), 1)
     columns = {name: flatten_envs(values) for name, values in replay.columns.items()}
     return StoredSteps(
         columns={name: values[here] for name, values in columns.items()},
@@ -398,7 +404,7 @@ def read(replay: Replay, index: Index) -> StoredSteps:
         last=last,
         residual=residual,
         level=None if replay.level is None else flatten_envs(replay.level)[slot],
-        length=jnp.where(finished, length, jnp.maximum(length, mean_length)),
+        length=jnp.where(finished, length, jnp.maximum(length, mean_length(replay))),
     )
 
 

@@ -18,7 +18,7 @@ from lare_rl.data.replay import Index, StoredSteps
 from lare_rl.runs.directory import Run
 from lare_rl.training.decoder_inputs import decoder_inputs
 from lare_rl.training.learner import Learner
-from lare_rl.training.rewards import RewardState, rewards
+from lare_rl.training.rewards import rewards
 from lare_rl.training.saved_state import load_learner
 from lare_rl.training.seed_axis import select_seed
 from lare_rl.training.static_config import TrainConfig
@@ -104,7 +104,7 @@ def _read_rewards(
 ) -> tuple[StoredSteps, Float[Array, "steps agents"]]:
     """Read steps of one seed's replay, and compute their training rewards."""
     steps = replay.read(learner.replay, index)
-    return steps, rewards(steps, RewardState(learner.decoders, learner.scale), config)
+    return steps, rewards(steps, learner.reward_state, config)
 
 
 def _posterior_std(decoder: Decomposition, steps: StoredSteps, config: TrainConfig) -> Float[Array, " steps"]:

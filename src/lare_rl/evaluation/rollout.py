@@ -23,7 +23,7 @@ from lare_rl.training.evaluation import EpisodeBatch
 from lare_rl.training.factors import compute_host_factors
 from lare_rl.training.host_policy import EvaluationPolicy
 from lare_rl.training.learner import Learner, store_with_factors
-from lare_rl.training.rewards import RewardState, rewards
+from lare_rl.training.rewards import rewards
 from lare_rl.training.saved_state import load_learner
 from lare_rl.training.seed_axis import select_seed
 from lare_rl.training.static_config import TrainConfig
@@ -141,7 +141,7 @@ def compute_training_rewards(
     def compute(steps: Trajectory, factors: Array) -> Array:
         filled = store_with_factors(learner._replace(replay=buffer), steps, factors, config).replay
         stored = replay.read(filled, replay.newest_steps(filled, n_steps))
-        return jnp.swapaxes(rewards(stored, RewardState(learner.decoders, learner.scale), config), 0, 1)
+        return jnp.swapaxes(rewards(stored, learner.reward_state, config), 0, 1)
 
     return np.asarray(compute(jax.tree.map(jnp.asarray, steps), jnp.asarray(factors)))
 

@@ -8,6 +8,7 @@
     r_hat = credit.reward(state, steps)                                             # [n_steps n_envs]
 
 All shapes are fixed. The functions can be jitted, and mapped by `vmap`, `scan` and `shard_map`. The state is a pytree of arrays.
+`state.n_invalid` should stay 0: it counts the steps for which `phi` gave a number that is not finite.
 """
 
 from collections.abc import Callable
@@ -16,28 +17,27 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, PRNGKeyArray
+from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
 from lare_rl.algorithms.registry import ALGORITHMS
 from lare_rl.credit.decoder_settings import CreditSettings, default_credit
-from lare_rl.credit.methods import Reward, find_method
-from lare_rl.data.replay import StoredSteps, by_payment, required_capacity
+from lare_rl.credit.methods import Method, Reward, find_method
+from lare_rl.data.replay import StoredSteps, by_payment, mean_length, required_capacity
 from lare_rl.data.trajectory import Trajectory
 from lare_rl.envs.interface import EnvSpec, Team, Timestep, to_env_action
 from lare_rl.errors import LareError
 from lare_rl.latent.function import LatentFunction
+from lare_rl.phi.graph import Graph
 from lare_rl.tasks.spec import ScoredObservation
 from lare_rl.training import episodes
 from lare_rl.training.decoder_fits import fit_repeatedly
 from lare_rl.training.factors import compute_factors
-from lare_rl.training.learner import Learner, init_learner, replay_columns, store
-from lare_rl.training.rewards import RewardState, rewards
+from lare_rl.training.learner import Learner, init_learner, replay_columns, store_with_factors
+from lare_rl.training.rewards import rewards
 from lare_rl.training.static_config import TrainConfig
+from lare_rl.util.float64 import float64
 
-__all__ = ["CreditSteps", "PureCredit", "pure_credit"]
-
-State = Learner
-"""The state of credit assignment: stored steps, and the decoder."""
+__all__ = ["CreditSteps", "PureCredit", "PureCreditState", "pure_credit"]
 
 
 class CreditSteps(NamedTuple):
@@ -54,16 +54,26 @@ class CreditSteps(NamedTuple):
     truncated: Bool[Array, "time envs"]
 
 
+class PureCreditState(NamedTuple):
+    """The state of credit assignment."""
+
+    learner: Learner
+    """The stored steps, and the decoder."""
+    n_invalid: Int[Array, ""]
+    """For how many steps of an agent `phi` has given a factor that is not finite. The decoder does not read them, and their proxy
+    rewards are 0."""
+
+
 class PureCredit(NamedTuple):
     """The functions."""
 
-    init: Callable[[PRNGKeyArray], State]
+    init: Callable[[PRNGKeyArray], PureCreditState]
     """Return the state before the first step."""
-    observe: Callable[[State, CreditSteps], State]
+    observe: Callable[[PureCreditState, CreditSteps], PureCreditState]
     """Store the next `n_steps` steps of each environment."""
-    refit: Callable[[State, PRNGKeyArray], State]
+    refit: Callable[[PureCreditState, PRNGKeyArray], PureCreditState]
     """Fit the decoder to the episodes that have finished. A fit in closed form is only made when there are enough new ones."""
-    reward: Callable[[State, CreditSteps], Float[Array, "time envs *agents"]]
+    reward: Callable[[PureCreditState, CreditSteps], Float[Array, "time envs *agents"]]
     """Return the proxy rewards of any steps, by the decoder's newest fit. Before the first fit, they are nearly 0."""
 
 
@@ -109,19 +119,9 @@ def pure_credit(
     Raises:
         LareError: the arguments do not go together.
     """
-    chosen, functions = find_method(method), () if phi is None else (phi,)
-    if phi is not None and tuple(phi.sizes) != (observation_size, action_size):
-        raise LareError(
-            f"phi reads observations and actions of the sizes {phi.sizes[0]} and {phi.sizes[1]}, not {observation_size} and "
-            f"{action_size}"
-        )
-    needs_episode = chosen.needs_whole_episodes or (chosen.inputs is not None and "history" in chosen.inputs.names)
-    if chosen.reward not in (Reward.PROXY, Reward.DESIGNED) or needs_episode:
-        raise LareError(f"{method} does not compute the reward of a step from this step alone: use bayes or lare-bayes")
-    if settings is not None and settings.exact not in ("auto", "no"):
-        raise LareError("pure_credit computes the reward of a step from this step alone: leave out the setting exact")
-    if chosen.needs_phi and phi is None:
-        raise LareError(f"{method} needs a latent function: phi=...")
+    chosen = find_method(method)
+    _check_arguments(chosen, phi, settings, (observation_size, action_size))
+    phi = phi if chosen.needs_phi else None
     shape = (agents, action_size)
     env = EnvSpec(
         teams=(Team("agent", 0, agents),),
@@ -129,6 +129,7 @@ def pure_credit(
         action_size=action_size,
         discrete=discrete,
         max_steps=max_steps,
+        agents_leave=phi is not None,  # steps with an invalid factor are stored as steps of agents that have left
         low=np.broadcast_to(np.asarray(low, np.float32), shape),
         high=np.broadcast_to(np.asarray(high, np.float32), shape),
         is_jax=True,
@@ -143,36 +144,72 @@ def pure_credit(
         hyperparameters=algorithm.settings,
         credit=settings or default_credit(agents),
         scale_rewards=scale_rewards,
-        n_factors=tuple(function.n_factors(scored_observation) for function in functions),
+        n_factors=() if phi is None else (phi.n_factors(scored_observation),),
         n_envs=n_envs,
         rollout_steps=n_steps,
         capacity=max(capacity // n_envs, required_capacity(n_steps, max_steps)),
         steps=0,
         fit_updates=fit_updates,
     )
-    graphs = tuple(function.graph for function in functions)
+    return _make_functions(config, () if phi is None else (phi.graph,))
+
+
+def _check_arguments(
+    method: Method, phi: LatentFunction | None, settings: CreditSettings | None, sizes: tuple[int, int]
+) -> None:
+    """Raise `LareError` if the arguments do not go together. `sizes` are those of an observation and an action."""
+    if phi is not None and tuple(phi.sizes) != sizes:
+        raise LareError(
+            f"phi reads observations and actions of the sizes {phi.sizes[0]} and {phi.sizes[1]}, not {sizes[0]} and {sizes[1]}"
+        )
+    needs_episode = method.needs_whole_episodes or (method.inputs is not None and "history" in method.inputs.names)
+    if method.reward not in (Reward.PROXY, Reward.DESIGNED) or needs_episode:
+        raise LareError(
+            f"{method.name} does not compute the reward of a step from this step alone: use bayes or lare-bayes"
+        )
+    if settings is not None and settings.exact not in ("auto", "no"):
+        raise LareError("pure_credit computes the reward of a step from this step alone: leave out the setting exact")
+    if method.needs_phi and phi is None:
+        raise LareError(f"{method.name} needs a latent function: phi=...")
+
+
+def _make_functions(config: TrainConfig, phi: tuple[Graph, ...]) -> PureCredit:
     learn_returns = _make_learn_returns(config)
+    batch_shape = (config.rollout_steps, config.n_envs)
 
-    def init(key: PRNGKeyArray) -> State:
-        return init_learner(key, config, lambda _: ())
+    def init(key: PRNGKeyArray) -> PureCreditState:
+        return PureCreditState(init_learner(key, config, lambda _: ()), jnp.zeros((), jnp.int32))
 
-    def observe(state: State, steps: CreditSteps) -> State:
-        if jnp.shape(steps.terminated) != (n_steps, n_envs):
+    def observe(state: PureCreditState, steps: CreditSteps) -> PureCreditState:
+        if jnp.shape(steps.terminated) != batch_shape:
             raise LareError(
-                f"observe needs {n_steps} steps of {n_envs} environments, not {jnp.shape(steps.terminated)}"
+                f"observe needs {batch_shape[0]} steps of {batch_shape[1]} environments, not {jnp.shape(steps.terminated)}"
             )
-        return store(state, _trajectory(steps, config), config, graphs)[0]
-
-    def refit(state: State, key: PRNGKeyArray) -> State:
-        return _refit(state, key, learn_returns, config)
-
-    def reward(state: State, steps: CreditSteps) -> Float[Array, "time envs *agents"]:
         trajectory = _trajectory(steps, config)
-        stored = _stored_steps(state, trajectory, compute_factors(graphs, trajectory, config), config)
-        r_hat = rewards(stored, RewardState(state.decoders, state.scale), config)
-        return r_hat if agents > 1 else r_hat[..., 0]
+        factors, is_valid = _valid_factors(phi, trajectory, config)
+        learner = store_with_factors(state.learner, trajectory, factors, config, is_valid)
+        return PureCreditState(learner, state.n_invalid + jnp.sum(~is_valid))
+
+    def refit(state: PureCreditState, key: PRNGKeyArray) -> PureCreditState:
+        return state._replace(learner=_refit(state.learner, key, learn_returns, config))
+
+    def reward(state: PureCreditState, steps: CreditSteps) -> Float[Array, "time envs *agents"]:
+        trajectory = _trajectory(steps, config)
+        factors, is_valid = _valid_factors(phi, trajectory, config)
+        columns = replay_columns(trajectory, factors, config, is_valid)
+        r_hat = rewards(_stored_steps(state.learner, *columns), state.learner.reward_state, config)
+        return r_hat if config.env.n_agents > 1 else r_hat[..., 0]
 
     return PureCredit(init, observe, refit, reward)
+
+
+def _valid_factors(
+    phi: tuple[Graph, ...], steps: Trajectory, config: TrainConfig
+) -> tuple[Float[Array, "time envs agents factors"], Bool[Array, "time envs agents"]]:
+    """Return the factors of steps, and for which steps of an agent all of them are finite. The others are 0."""
+    factors = compute_factors(phi, steps, config)
+    is_valid = jnp.all(jnp.isfinite(factors), axis=-1)
+    return jnp.where(is_valid[..., None], factors, 0), is_valid
 
 
 def _trajectory(steps: CreditSteps, config: TrainConfig) -> Trajectory:
@@ -206,11 +243,9 @@ def _trajectory(steps: CreditSteps, config: TrainConfig) -> Trajectory:
     )
 
 
-def _stored_steps(state: State, steps: Trajectory, factors: Array, config: TrainConfig) -> StoredSteps:
+def _stored_steps(learner: Learner, columns: dict[str, Any], next_columns: dict[str, Any]) -> StoredSteps:
     """Return steps in the form of the replay's. Their episodes are as long as the finished ones on average."""
-    columns, next_columns = replay_columns(steps, factors, config)
-    lead, buffer = steps.next_timestep.terminated.shape, by_payment(state.replay)
-    length = jnp.sum(buffer.transitions) // jnp.maximum(jnp.sum(buffer.episodes), 1)
+    lead = columns["reward"].shape[:2]
     zeros = jnp.zeros((*lead, 1))
     return StoredSteps(
         columns=columns,
@@ -221,7 +256,7 @@ def _stored_steps(state: State, steps: Trajectory, factors: Array, config: Train
         last=jnp.zeros(lead, bool),
         residual=None,
         level=None,
-        length=jnp.broadcast_to(length, lead),
+        length=jnp.broadcast_to(mean_length(by_payment(learner.replay)), lead),
     )
 
 
@@ -234,7 +269,7 @@ def _make_learn_returns(config: TrainConfig) -> Callable[..., Any]:
 
     @jax.custom_batching.custom_vmap
     def learn_returns(*inputs: Any) -> tuple[Any, ...]:
-        with jax.enable_x64(True):
+        with float64():
             decoders, buffer, n_learned = inputs
             return episodes.learn_returns(decoders, buffer, n_learned, config)
 
@@ -251,14 +286,14 @@ def _make_learn_returns(config: TrainConfig) -> Callable[..., Any]:
     return learn_returns
 
 
-def _refit(state: State, key: PRNGKeyArray, learn_returns: Callable[..., Any], config: TrainConfig) -> State:
-    if not state.decoders:
-        return state
-    inputs = jax.tree.map(lambda leaf: leaf[None], (state.decoders, state.replay, state.n_learned))
+def _refit(learner: Learner, key: PRNGKeyArray, learn_returns: Callable[..., Any], config: TrainConfig) -> Learner:
+    if not learner.decoders:
+        return learner
+    inputs = jax.tree.map(lambda leaf: leaf[None], (learner.decoders, learner.replay, learner.n_learned))
     decoders, n_learned, _ = jax.tree.map(lambda leaf: leaf[0], learn_returns(*inputs))
-    state = state._replace(decoders=decoders, n_learned=n_learned)
+    learner = learner._replace(decoders=decoders, n_learned=n_learned)
     if not config.method.uses_gradient:
-        return state
-    has_episode = jnp.any(by_payment(state.replay).episodes > 0)
-    fitted = jax.lax.cond(has_episode, lambda: fit_repeatedly(state, key, config)[0], lambda: state.decoders)
-    return state._replace(decoders=fitted)
+        return learner
+    has_episode = jnp.any(by_payment(learner.replay).episodes > 0)
+    fitted = jax.lax.cond(has_episode, lambda: fit_repeatedly(learner, key, config)[0], lambda: learner.decoders)
+    return learner._replace(decoders=fitted)

@@ -14,19 +14,20 @@ from jaxtyping import Array, Bool, Float, Int, Key
 from lare_rl.data.trajectory import Trajectory
 from lare_rl.envs.interface import JaxEnv
 from lare_rl.phi.graph import Graph
-from lare_rl.training import collect_device, episodes
+from lare_rl.training import collect_device, episodes, iteration
 from lare_rl.training.collect_device import VecEnvState
 from lare_rl.training.compile_cache import cache_by_value
 from lare_rl.training.compiled import keys_shape, learner_shape, training_module
 from lare_rl.training.decoder_fits import fit_seeds
+from lare_rl.training.iteration import IterationFunctions, Metrics, when_compiled
 from lare_rl.training.learner import Learner, store, with_learned_returns
 from lare_rl.training.seed_axis import jit_over_seeds, shape_over_seeds
 from lare_rl.training.static_config import TrainConfig
-from lare_rl.training.streams import Stream, seed_keys, stream_keys
+from lare_rl.training.streams import Stream, stream_keys
+from lare_rl.util.float64 import float64
 
 __all__ = ["CompiledLoop", "LoopState", "compile_loop", "init_loop"]
 
-Metrics = dict[str, Float[Array, " seeds"]]
 Measured = tuple[Metrics, dict[str, Bool[Array, " seeds"]]]
 """Metrics, and which of them have been measured."""
 
@@ -122,56 +123,48 @@ def _loop_shape(env: JaxEnv, config: TrainConfig, n_seeds: int) -> LoopState:
 def _iterate(
     state: LoopState,
     seeds: Int[Array, " seeds"],
-    iteration: Int[Array, ""],
+    number: Int[Array, ""],
     env: JaxEnv,
     config: TrainConfig,
     phi: Sequence[Graph],
     fit_every: int,
 ) -> LoopState:
     """Make one iteration of Algorithm 1 of the LaRe paper."""
-    module, env_steps = training_module(config), iteration * config.rollout_steps * config.n_envs
+    module, env_steps = training_module(config), number * config.rollout_steps * config.n_envs
+    functions = IterationFunctions(
+        store=jax.vmap(partial(store, config=config, phi=phi)),
+        learn_returns=partial(_learn_returns, config=config),
+        fit=partial(fit_seeds, config=config),
+        train_step=partial(module.train_step, config=config),
+    )
     actor = module.get_actor(state.learner, env_steps, config)
     keys = stream_keys(seeds, Stream.EXPLORATION, env_steps)
     envs, steps = collect_device.collect(env, state.envs, actor, keys, env_steps, config)
-    learner, is_finite = jax.vmap(partial(store, config=config, phi=phi))(state.learner, steps)
-    if learner.decoders:
-        learn = partial(_learn_returns, config=config)
-        is_paid = jnp.any(steps.ended) | (not config.payments.only_at_end)
-        learner = jax.lax.cond(is_paid, learn, lambda unchanged: unchanged, learner)
-
-    def update(learner: Learner, measured: Measured) -> tuple[Learner, Measured]:
-        if config.fits_separately:
-            keys = stream_keys(seeds, Stream.FIT, env_steps)
-            fit = partial(_fit, keys=keys, config=config)
-            learner, measured = jax.lax.cond(iteration % fit_every == 0, fit, _unchanged, learner, measured)
-        learner, metrics = module.train_step(learner, steps, seed_keys(seeds, env_steps + 1), env_steps, config)
-        is_new = metrics.get("algorithm/updates", jnp.ones(len(seeds))) > 0
-        return learner, _record(measured, metrics, is_new)
-
-    measured = state.metrics, state.is_measured
-    learner, (metrics, is_measured) = jax.lax.cond(env_steps >= config.warmup, update, _unchanged, learner, measured)
+    learner, is_finite = iteration.store_steps(state.learner, steps, functions, when_compiled, config)
+    learner, (metrics, is_measured) = iteration.update(
+        learner=learner,
+        measured=(state.metrics, state.is_measured),
+        steps=steps,
+        seeds=seeds,
+        env_steps=env_steps,
+        functions=functions,
+        when=when_compiled,
+        record=_record,
+        config=config,
+        fit_every=fit_every,
+    )
     return LoopState(learner, envs, metrics, is_measured, steps, is_finite)
 
 
-def _unchanged(learner: Learner, measured: Measured) -> tuple[Learner, Measured]:
-    return learner, measured
-
-
-def _fit(
-    learner: Learner, measured: Measured, keys: Key[Array, " seeds"], config: TrainConfig
-) -> tuple[Learner, Measured]:
-    learner, metrics = fit_seeds(learner, keys, config)
-    return learner, _record(measured, metrics, jnp.ones(len(keys), bool))
-
-
-def _record(measured: Measured, metrics: Metrics, is_new: Bool[Array, " seeds"]) -> Measured:
+def _record(measured: Measured, metrics: Metrics, n_updates: Float[Array, " seeds"] | None) -> Measured:
     """Replace the metrics of the seeds that have new ones."""
     old, is_measured = measured
+    is_new = jnp.ones_like(next(iter(is_measured.values()))) if n_updates is None else n_updates > 0
     new = {name: jnp.where(is_new | ~is_measured[name], values, old[name]) for name, values in metrics.items()}
     return old | new, is_measured | {name: is_measured[name] | is_new for name in metrics}
 
 
 def _learn_returns(learner: Learner, config: TrainConfig) -> Learner:
-    with jax.enable_x64(True):
+    with float64():
         learned = episodes.learn_returns(learner.decoders, learner.replay, learner.n_learned, config)
     return with_learned_returns(learner, *learned)

@@ -5,8 +5,8 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Key, PRNGKeyArray
 
 from lare_rl.credit import descent
+from lare_rl.credit.batch_plan import plan_batch
 from lare_rl.credit.decomposition import CreditBatch, Decomposition
-from lare_rl.credit.methods import Fit
 from lare_rl.data import replay
 from lare_rl.data.replay import Replay
 from lare_rl.data.sampling import CreditSample, sample_drawn, sample_packed, sample_padded
@@ -25,18 +25,18 @@ fewer make the matrix products inefficient. On one core, 256 episodes of six age
 
 def sample_credit(buffer: Replay, key: PRNGKeyArray, updates: int, config: TrainConfig) -> CreditSample | None:
     """Draw the steps that each of some updates of the decoders reads. Return None for a method without such updates."""
-    fit, settings, longest = config.method.fit, config.credit, config.longest_segment
+    fit, longest = config.method.fit, config.longest_segment
     if fit is None or not config.method.uses_gradient:
         return None
     buffer = replay.by_payment(buffer)
-    if fit is Fit.DECODER_LOSS:
-        return sample_padded(buffer, key, updates, settings.episodes, longest)
-    if fit.samples_steps:
-        count = max(1, settings.steps // (longest if config.has_fixed_segments else settings.drawn_steps))
-        return sample_drawn(buffer, key, updates, count, min(settings.drawn_steps, longest))
-    if config.has_fixed_segments:
-        return sample_padded(buffer, key, updates, max(1, settings.steps // longest), longest)
-    return sample_packed(buffer, key, updates, settings.steps, longest)
+    plan = plan_batch(fit, config.credit, longest, fixed_length=config.has_fixed_segments)
+    match plan.layout:
+        case "sampled":
+            return sample_drawn(buffer, key, updates, plan.episodes, plan.rows)
+        case "padded":
+            return sample_padded(buffer, key, updates, plan.episodes, plan.rows)
+        case "packed":
+            return sample_packed(buffer, key, updates, config.credit.steps, longest)
 
 
 def fit_decoders(

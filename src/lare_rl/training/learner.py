@@ -15,7 +15,7 @@ from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
 from lare_rl.credit import decomposition
 from lare_rl.credit.decomposition import Decomposition
-from lare_rl.credit.engine import init_decoder
+from lare_rl.credit.engine import RewardSource, init_decoder
 from lare_rl.credit.history import next_history, scan_history
 from lare_rl.data import replay
 from lare_rl.data.replay import STEP_COLUMNS, Replay, StoredSteps
@@ -47,10 +47,15 @@ class Learner(NamedTuple):
     decoders: tuple[Decomposition, ...]
     """The decoders, one for each team; empty for a method that fits nothing."""
     scale: tuple[Scale, ...]
-    """The scale of each team's R/T."""
+    """The scale of each team's R/T, for a method that fits nothing. A decoder has its own."""
     replay: Replay
     n_learned: Int[Array, " envs"]
     """Payments of each environment that the decoders have learned from: finished episodes, if each is paid once."""
+
+    @property
+    def reward_state(self) -> tuple[RewardSource, ...]:
+        """What the rewards of each team are computed from."""
+        return self.decoders or self.scale
 
 
 def init_decoders(keys: Sequence[PRNGKeyArray], config: TrainConfig) -> tuple[Decomposition, ...]:
@@ -63,10 +68,11 @@ def init_learner(key: PRNGKeyArray, config: TrainConfig, init_algorithm: Callabl
     """Return an untrained learner."""
     n_teams = len(config.env.teams)
     algorithm_key, *keys = jax.random.split(key, 1 + n_teams)
+    decoders = init_decoders(keys, config)
     return Learner(
         algorithm=init_algorithm(algorithm_key),
-        decoders=init_decoders(keys, config),
-        scale=tuple(empty_scale() for _ in config.env.teams),
+        decoders=decoders,
+        scale=() if decoders else tuple(empty_scale() for _ in config.env.teams),
         replay=replay.init_replay(
             config.columns,
             config.n_envs,
@@ -93,10 +99,17 @@ def store(
 
 
 def store_with_factors(
-    learner: Learner, steps: Trajectory, factors: Float[Array, "time envs rows factors"], config: TrainConfig
+    learner: Learner,
+    steps: Trajectory,
+    factors: Float[Array, "time envs rows factors"],
+    config: TrainConfig,
+    scored: Bool[Array, "time envs agents"] | None = None,
 ) -> Learner:
-    """Put new steps into the replay and into the running statistics."""
-    columns, next_columns = replay_columns(steps, factors, config)
+    """Put new steps into the replay and into the running statistics.
+
+    The decoders do not read the steps of agents where `scored` is false. The rewards of these steps count.
+    """
+    columns, next_columns = replay_columns(steps, factors, config, scored)
     team_reward, level = _team_rewards(steps, config), _levels(steps, config)
     buffer = replay.extend(learner.replay, columns, next_columns, team_reward, steps.ended, config.payments, level)
     if config.n_tracked:
@@ -122,8 +135,13 @@ def _with_history(before: Replay, buffer: Replay, n_steps: int, config: TrainCon
     return replay.set_newest(buffer, "history", history)
 
 
-def replay_columns(steps: Trajectory, factors: Array, config: TrainConfig) -> tuple[dict[str, Any], dict[str, Any]]:
-    """Return the replay's columns for new steps, and the columns of `STEP_COLUMNS` after the steps."""
+def replay_columns(
+    steps: Trajectory, factors: Array, config: TrainConfig, scored: Bool[Array, "time envs agents"] | None = None
+) -> tuple[dict[str, Any], dict[str, Any]]:
+    """Return the replay's columns for new steps, and the columns of `STEP_COLUMNS` after the steps.
+
+    The column `alive` is false where `scored` is.
+    """
     columns = {
         **{name: getattr(steps.timestep, name) for name in STEP_COLUMNS},
         "action": steps.action,
@@ -131,6 +149,8 @@ def replay_columns(steps: Trajectory, factors: Array, config: TrainConfig) -> tu
         "reward": steps.next_timestep.reward,
         "terminated": steps.next_timestep.terminated,
     }
+    if scored is not None:
+        columns["alive"] &= scored
     return (
         {name: columns[name] for name in config.columns if name in columns},
         {name: getattr(steps.next_timestep, name) for name in STEP_COLUMNS if name in config.columns},

@@ -20,7 +20,7 @@ from lare_rl.data.trajectory import Trajectory
 from lare_rl.training.decoder_fits import fit_decoders, sample_credit
 from lare_rl.training.learner import Learner
 from lare_rl.training.memoryless import get_actor, init_memory
-from lare_rl.training.rewards import RewardState, rewards
+from lare_rl.training.rewards import rewards
 from lare_rl.training.static_config import TrainConfig
 
 __all__ = ["act", "get_actor", "init", "init_memory", "train_step"]
@@ -84,7 +84,7 @@ def _train_seed(
         if sample.credit is not None:
             decoders, metrics = fit_decoders(decoders, buffer, sample.credit, fit_key, config)
         steps = replay.read(buffer, sample.batch)
-        reward = rewards(steps, RewardState(decoders, learner.scale), config)
+        reward = rewards(steps, decoders or learner.scale, config)
         batch = _transitions(steps, reward)
         state, algorithm_metrics = algorithm.update(state, batch, key, update_index, settings)
         return (state, decoders), metrics | algorithm_metrics

@@ -17,7 +17,7 @@ from lare_rl.data.trajectory import Trajectory
 from lare_rl.training.episodes import predict_returns
 from lare_rl.training.learner import Learner
 from lare_rl.training.memoryless import get_actor, init_memory
-from lare_rl.training.rewards import RewardState, rewards
+from lare_rl.training.rewards import rewards
 from lare_rl.training.static_config import TrainConfig
 
 __all__ = ["act", "get_actor", "init", "init_memory", "policy_input", "train_step"]
@@ -87,7 +87,7 @@ def _rollout(learner: Learner, steps: Trajectory, config: TrainConfig) -> Rollou
     """Return the newest steps with the method's rewards. Each agent of each environment is one actor of the rollout."""
     buffer = _with_predicted_returns(learner, config) if config.is_exact else learner.replay
     stored = replay.read(buffer, replay.newest_steps(buffer, config.rollout_steps))
-    reward = rewards(stored, RewardState(learner.decoders, learner.scale), config)  # [envs time agents]
+    reward = rewards(stored, learner.reward_state, config)  # [envs time agents]
     n_agents, agents_leave = config.env.n_agents, config.env.agents_leave
 
     def for_each_agent(values: Array) -> Float[Array, "time envs agents"]:

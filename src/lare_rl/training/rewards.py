@@ -1,18 +1,15 @@
 """The rewards that the algorithm is trained on, and how close they are to the true ones."""
 
-from typing import NamedTuple
-
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from lare_rl.credit import accuracy, engine, prequential
 from lare_rl.credit.decoder_settings import RECENT_STEPS
-from lare_rl.credit.decomposition import Decomposition
+from lare_rl.credit.engine import RewardSource
 from lare_rl.credit.methods import Reward
 from lare_rl.data import replay
 from lare_rl.data.replay import StoredSteps
 from lare_rl.envs.interface import team_mean
-from lare_rl.nn.normalise import Scale
 from lare_rl.training.decoder_inputs import alive_agents, step_batch
 from lare_rl.training.learner import Learner
 from lare_rl.training.static_config import TrainConfig
@@ -20,15 +17,8 @@ from lare_rl.training.static_config import TrainConfig
 __all__ = ["RewardState", "assess", "rewards", "team_metrics", "team_proxy_rewards"]
 
 
-class RewardState(NamedTuple):
-    """The decoders and reward scales of all teams: all that is needed to compute rewards."""
-
-    decoders: tuple[Decomposition, ...]
-    scale: tuple[Scale, ...]
-
-    def decoder(self, team_index: int) -> Decomposition | None:
-        """Return a team's decoder; None for a method that fits nothing."""
-        return self.decoders[team_index] if self.decoders else None
+RewardState = tuple[RewardSource, ...]
+"""Each team's decoder, or scale of R/T: all that is needed to compute rewards."""
 
 
 def rewards(steps: StoredSteps, state: RewardState, config: TrainConfig) -> Float[Array, "*batch agents"]:
@@ -36,14 +26,15 @@ def rewards(steps: StoredSteps, state: RewardState, config: TrainConfig) -> Floa
     alive = alive_agents(steps, config)
     team_rewards = []
     for i, team in enumerate(config.env.teams):
-        scale, team_alive = state.scale[i], alive[..., team.agents]
+        team_alive = alive[..., team.agents]
         if config.method.has_proxy_rewards:
             batch, spec = step_batch(steps, config, i), config.credit_specs[i]
-            team_rewards.append(engine.training_rewards(state.decoder(i), scale, batch, spec, team_alive))
+            team_rewards.append(engine.training_rewards(state[i], batch, spec, team_alive))
             continue
         is_dense = config.method.reward is Reward.TRUE
         reward = steps.columns["reward"][..., team.agents] if is_dense else steps.episodic_reward[..., i, None]
         reward = jnp.broadcast_to(reward, team_alive.shape)
+        scale = engine.return_scale(state[i])
         team_rewards.append(engine.scale_and_mask(reward, scale, team_alive, scale_rewards=config.scale_rewards))
     return jnp.concatenate(team_rewards, axis=-1)
 
@@ -53,7 +44,7 @@ def team_proxy_rewards(
 ) -> Float[Array, "*batch rows"]:
     """Return r_hat of a team, without optimism: one for each of its agents, or one for all if credit goes to whole teams."""
     batch, spec = step_batch(steps, config, team_index), config.credit_specs[team_index]
-    return engine.proxy_rewards(state.decoder(team_index), state.scale[team_index], batch, spec)
+    return engine.proxy_rewards(state[team_index], batch, spec)
 
 
 def assess(learner: Learner, config: TrainConfig) -> dict[str, Float[Array, ""]]:
@@ -67,7 +58,7 @@ def assess(learner: Learner, config: TrainConfig) -> dict[str, Float[Array, ""]]
     oldest = replay.oldest_transition(buffer)[:, None]
     is_stored = (index.number >= oldest)[..., None]
     steps = replay.read(buffer, index._replace(number=jnp.maximum(index.number, oldest)))
-    alive, state = alive_agents(steps, config), RewardState(learner.decoders, learner.scale)
+    alive, state = alive_agents(steps, config), learner.reward_state
     metrics = []
     for i, team in enumerate(config.env.teams):
         reward, mask = steps.columns["reward"][..., team.agents], is_stored & alive[..., team.agents]
@@ -80,7 +71,8 @@ def assess(learner: Learner, config: TrainConfig) -> dict[str, Float[Array, ""]]
                 r_hat.ravel(), reward.ravel(), last.ravel(), mask.ravel(), calibrated=config.method.calibrated
             )
         )
-        if (decoder := state.decoder(i)) is not None:
+        if learner.decoders:
+            decoder = learner.decoders[i]
             metrics[-1]["credit/return_r2"] = prequential.r2(decoder.predictions)[0]
             metrics[-1]["credit/gain"], metrics[-1]["credit/gain_error"] = prequential.gain(decoder.predictions)
             if decoder.score_type_predictions is not None:

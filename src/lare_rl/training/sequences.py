@@ -177,7 +177,7 @@ def _update_seed(
         sample = jax.tree.map(lambda leaf: leaf[0], samples)
         decoders, metrics = fit_decoders(decoders, learner.replay, sample, fit_key, config)
     state, settings = learner.algorithm, _settings(config)
-    batch = _sequences(learner.replay, episodes, n_steps, RewardState(decoders, learner.scale), state.states, config)
+    batch = _sequences(learner.replay, episodes, n_steps, decoders or learner.scale, state.states, config)
     n_episodes = number * settings.update_every
     copy_target = n_episodes // settings.target_every > (n_episodes - settings.update_every) // settings.target_every
     algorithm, algorithm_metrics = config.algorithm.load().update(state.qmix, batch, copy_target, settings)

@@ -1,10 +1,10 @@
 """A running training: the training state, its environments, and the functions that advance it by one iteration."""
 
-import math
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
+from functools import partial
 from typing import Any
 
 import jax
@@ -24,19 +24,21 @@ from lare_rl.runs.best_policy import BEST_FILE, BestPolicy, empty_best, load_bes
 from lare_rl.runs.directory import Run
 from lare_rl.runs.metric_names import ACTOR_SATURATION
 from lare_rl.tasks.spec import TaskSpec
-from lare_rl.training import advice, first_fit
+from lare_rl.training import advice, first_fit, iteration
 from lare_rl.training.batching import is_batching_faster
 from lare_rl.training.collect_device import DeviceCollector, is_reset_cheap
 from lare_rl.training.collect_host import HostCollector, make_host_collector
 from lare_rl.training.compile_cache import cache_by_value
 from lare_rl.training.compiled import CompiledFunctions, compile_ahead, compile_functions, init_seeds, steps_shape
 from lare_rl.training.compiled_loop import CompiledLoop, compile_loop, init_loop
+from lare_rl.training.evaluation import metrics_lines
 from lare_rl.training.factors import compute_host_factors
+from lare_rl.training.iteration import IterationFunctions, Metrics, when_on_host
 from lare_rl.training.learner import Learner, abandon_episodes
 from lare_rl.training.saved_state import actor_shape, load_learner, make_train_config
 from lare_rl.training.seed_axis import count_seed_devices
 from lare_rl.training.static_config import TrainConfig
-from lare_rl.training.streams import Stream, seed_keys, stream_keys
+from lare_rl.training.streams import seed_keys
 from lare_rl.util.float64 import one_blas_thread
 
 __all__ = ["Session", "restore_session", "start_session"]
@@ -62,7 +64,7 @@ class Session:
     """The size of metrics.jsonl in bytes at this state."""
     first_fit_done: bool = False
     """Whether the decoders' first fit has been made."""
-    latest_metrics: dict[str, Float[Array, " seeds"]] = field(default_factory=dict)
+    latest_metrics: Metrics = field(default_factory=dict)
     """The metrics of the last updates."""
     best: BestPolicy | None = None
     """The best evaluations so far. None before the first evaluation, and if several teams learn, whose returns depend on each
@@ -133,9 +135,10 @@ class Session:
         if self.settings.overlap_collection:
             actor = jax.tree.map(jnp.copy, self.actor)  # the update reuses the memory of its learner
             # In a thread, because the call of an update returns when the device has nearly finished it.
-            update = self._threads.submit(self._update, _empty_steps(self.config, len(self.run.seeds)), stop_requested)
+            stored_only = _empty_steps(self.config, len(self.run.seeds))
+            updating = self._threads.submit(self._update, stored_only, stop_requested)
             steps = self.collector.collect(actor, self.step)
-            update.result()
+            updating.result()
             self._store(steps)
         else:
             steps = self.collector.collect(self.actor, self.step)
@@ -144,12 +147,10 @@ class Session:
         self.step += self.settings.iteration_steps
 
     def _store(self, steps: Trajectory) -> None:
-        """Store new steps, and let the decoders learn from episodes that have finished."""
         self._check_factors()
-        self.learner, is_finite = self.functions.store(self.learner, steps)
+        functions = self._iteration_functions(lambda: False)
+        self.learner, is_finite = iteration.store_steps(self.learner, steps, functions, when_on_host, self.config)
         self._unchecked = is_finite, steps
-        if self.learner.decoders and (np.any(steps.ended) or not self.config.payments.only_at_end):
-            self.learner = self.functions.learn_returns(self.learner)
 
     def _check_factors(self) -> None:
         """Raise `LareError` if a factor of the newest steps is not finite.
@@ -164,32 +165,34 @@ class Session:
             raise LareError("a factor is not finite in the compiled function; the last checkpoint is whole")
 
     def _update(self, steps: Trajectory, stop_requested: Callable[[], bool]) -> None:
-        """Fit the decoders if they have updates of their own that are due, and update the algorithm."""
-        if self.step < self.config.warmup:
-            return
-        iteration = self.step // self.settings.iteration_steps
-        if self.config.fits_separately and iteration % self.settings.fit_every == 0:
-            self.fit(stream_keys(self.run.seeds, Stream.FIT, self.step), stop_requested)
-        keys = seed_keys(jnp.asarray(self.run.seeds), self.step + 1)
-        self.learner, metrics = self.functions.train_step(self.learner, steps, keys, self.step)
-        n_updates = metrics.get("algorithm/updates")
-        if n_updates is not None:
-            is_new, old = n_updates > 0, self.latest_metrics
-            metrics = {name: jnp.where(is_new, values, old.get(name, values)) for name, values in metrics.items()}
-            metrics = metrics if np.any(is_new) else {}
-        self.latest_metrics |= metrics
+        self.learner, self.latest_metrics = iteration.update(
+            learner=self.learner,
+            measured=self.latest_metrics,
+            steps=steps,
+            seeds=jnp.asarray(self.run.seeds),
+            env_steps=self.step,
+            functions=self._iteration_functions(stop_requested),
+            when=when_on_host,
+            record=_record,
+            config=self.config,
+            fit_every=self.settings.fit_every,
+        )
 
-    def fit(self, keys: Key[Array, " seeds"], stop_requested: Callable[[], bool]) -> None:
+    def _iteration_functions(self, stop_requested: Callable[[], bool]) -> IterationFunctions:
+        functions = self.functions
+        fit = partial(self._fit, stop_requested=stop_requested)
+        return IterationFunctions(functions.store, functions.learn_returns, fit, functions.train_step)
+
+    def _fit(
+        self, learner: Learner, keys: Key[Array, " seeds"], stop_requested: Callable[[], bool]
+    ) -> tuple[Learner, Metrics]:
         """Fit the decoders. The first fit lasts until it brings no improvement."""
-        if self._is_before_first_fit and first_fit.has_enough_episodes(self.learner):
-            fit = compile_functions(first_fit.config_of_first_fit(self.config)).fit
-            self.learner, metrics = first_fit.fit_until_converged(
-                self.learner, fit, keys, self.config, stop_requested=stop_requested
-            )
-            self.first_fit_done = True
-        else:
-            self.learner, metrics = self.functions.fit(self.learner, keys)
-        self.latest_metrics |= metrics
+        if not (self._is_before_first_fit and first_fit.has_enough_episodes(learner)):
+            return self.functions.fit(learner, keys)
+        fit = compile_functions(first_fit.config_of_first_fit(self.config)).fit
+        fitted = first_fit.fit_until_converged(learner, fit, keys, self.config, stop_requested=stop_requested)
+        self.first_fit_done = True
+        return fitted
 
     def evaluate(self, rate: float) -> list[dict[str, Any]]:
         """Evaluate, always from the same initial states, and keep the best policies. `rate` is in steps per second.
@@ -204,7 +207,7 @@ class Session:
         metrics = evaluation.metrics(self.config.env) | self.functions.assess(self.learner) | self.latest_metrics
         if self.step > self.config.warmup and isinstance(self.settings.hyperparameters, OffPolicySettings):
             metrics |= {ACTOR_SATURATION: advice.saturation(self.greedy_actions(advice.N_PROBE_STATES))}
-        return _metrics_lines(self.run.seeds, self.step, metrics, rate)
+        return metrics_lines(self.run.seeds, self.step, metrics, rate)
 
     def greedy_actions(self, n_states: int) -> Float[np.ndarray, "seeds states action"]:
         """Return an off-policy algorithm's actions without noise in the newest states of the first environment.
@@ -341,17 +344,16 @@ def _read_first_env(
 _abandon_episodes = jax.jit(jax.vmap(abandon_episodes))
 
 
+def _record(old: Metrics, metrics: Metrics, n_updates: Float[Array, " seeds"] | None) -> Metrics:
+    """Replace the metrics of the seeds that have new ones."""
+    if n_updates is None:
+        return old | metrics
+    is_new = n_updates > 0
+    if not np.any(is_new):
+        return old
+    return old | {name: jnp.where(is_new, values, old.get(name, values)) for name, values in metrics.items()}
+
+
 def _select_prefix(arrays: dict[str, np.ndarray], prefix: str) -> dict[str, np.ndarray]:
     """Return the arrays whose names begin with a prefix, by the rest of their names."""
     return {name.removeprefix(prefix): values for name, values in arrays.items() if name.startswith(prefix)}
-
-
-def _metrics_lines(seeds: Sequence[int], step: int, metrics: Mapping[str, Any], rate: float) -> list[dict[str, Any]]:
-    """Return one line of metrics.jsonl for each seed, from arrays with one number for each seed."""
-    lines = []
-    for seed_index, seed in enumerate(seeds):
-        numbers = {name: float(np.asarray(values)[seed_index]) for name, values in metrics.items()}
-        # JSON has no NaN: a correlation with a value that never varies is null.
-        valid = {name: value if math.isfinite(value) else None for name, value in numbers.items()}
-        lines.append({"step": step, "seed": seed, **valid, "time/steps_per_second": round(rate, 1)})
-    return lines

@@ -13,7 +13,7 @@ __all__ = ["float64", "one_blas_thread"]
 
 @contextlib.contextmanager
 def float64() -> Iterator[None]:
-    """Let JAX calculate in float64, and linear algebra use one thread. Wait for results before the block ends."""
+    """Let JAX calculate or trace in float64, and linear algebra use one thread. Wait for results before the block ends."""
     with jax.enable_x64(True), one_blas_thread():
         yield
 

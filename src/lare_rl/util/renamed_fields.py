@@ -1,13 +1,16 @@
 """Names in files that an earlier version has written: of arrays in checkpoints and assigners, and of keys of tasks and settings."""
 
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
-__all__ = ["rename_fields", "rename_keys"]
+__all__ = ["rename_fields", "rename_keys", "rename_options"]
 
 _RENAMED_KEYS = {"judged_from": "credit_scope", "judges": "scored_observation"}
 """From old to new keys of tasks, settings and assigners."""
+
+_RENAMED_OPTIONS = {"--judges": "--scored-observation"}
+"""From old to new options of the command line."""
 
 _RENAMED_FIELDS = {
     "average": "is_mean",
@@ -56,6 +59,12 @@ _RENAMED_PATHS = {
 def rename_keys(values: Mapping[str, Any]) -> dict[str, Any]:
     """Return the values of a table under the present names of its keys. A key beside its old name is not overwritten."""
     return {name if (new := _RENAMED_KEYS.get(name, name)) in values else new: value for name, value in values.items()}
+
+
+def rename_options(arguments: Sequence[str]) -> list[str]:
+    """Return arguments of the command line under the present names of options."""
+    split = (argument.partition("=") for argument in arguments)
+    return [_RENAMED_OPTIONS.get(name, name) + equals + value for name, equals, value in split]
 
 
 def rename_fields(name: str) -> str:

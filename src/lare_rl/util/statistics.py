@@ -1,6 +1,7 @@
 """Statistics of a few numbers, such as the returns of some seeds or episodes, and their texts."""
 
 import math
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -15,6 +16,7 @@ __all__ = [
     "format_rounded",
     "grouped_standard_error",
     "r_squared",
+    "round_shares",
     "sample_std",
     "standard_error",
 ]
@@ -50,6 +52,15 @@ def grouped_standard_error(group_means: Float[np.ndarray, " groups"], error_with
         error_within: the standard error of the mean of all values, by their deviations from the means of their groups.
     """
     return max(error_within, standard_error(group_means))
+
+
+def round_shares(shares: Sequence[float], total: float = 1.0) -> list[float]:
+    """Round shares to whole percents that add up to `total`, by the largest remainder. `total` is a whole percent."""
+    percents = 100 * np.asarray(shares, np.float64)
+    rounded = np.floor(percents).astype(int)
+    n_missing = round(100 * total) - int(rounded.sum())
+    rounded[np.argsort(rounded - percents, kind="stable")[: max(0, n_missing)]] += 1
+    return (rounded / 100).tolist()
 
 
 def correlation(x: Float[np.ndarray, " values"], y: Float[np.ndarray, " values"]) -> float:

@@ -1,0 +1,25 @@
+"""The layout and the size of a decoder's batch."""
+
+import pytest
+
+from lare_rl.credit.batch_plan import BatchPlan, plan_batch
+from lare_rl.credit.decoder_settings import CreditSettings
+from lare_rl.credit.methods import Fit
+
+
+@pytest.mark.parametrize(
+    ("fit", "longest", "fixed_length", "plan"),
+    [
+        (Fit.DECODER_LOSS, 50, False, BatchPlan("padded", 7, 50)),
+        (Fit.SAMPLED_STEPS, 50, False, BatchPlan("sampled", 12, 8)),
+        (Fit.SAMPLED_STEPS_UNBIASED, 50, True, BatchPlan("sampled", 2, 8)),
+        (Fit.SAMPLED_STEPS, 5, False, BatchPlan("sampled", 12, 5)),
+        (Fit.SAMPLED_STEPS, 500, True, BatchPlan("sampled", 1, 8)),
+        (Fit.ALL_STEPS, 50, True, BatchPlan("padded", 2, 50)),
+        (Fit.ALL_STEPS, 50, False, BatchPlan("packed", 50, 100)),
+        (Fit.ALL_STEPS, 500, False, BatchPlan("packed", 50, 500)),
+    ],
+)
+def test_plan_batch(fit, longest, fixed_length, plan):
+    settings = CreditSettings(steps=100, drawn_steps=8, episodes=7)
+    assert plan_batch(fit, settings, longest, fixed_length=fixed_length) == plan
