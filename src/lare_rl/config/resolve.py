@@ -41,6 +41,7 @@ def resolve(settings: Settings, task: TaskSpec) -> ResolvedSettings:
         fixed_length=env.fixed_length,
         scale_rewards=resolved.scale_rewards,
         payments=task.payment_rule,
+        discrete_actions=env.discrete,
     )
     if method.needs_whole_episodes and resolved.rollout_steps % env.max_steps:
         raise LareError(

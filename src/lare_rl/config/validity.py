@@ -2,6 +2,7 @@
 
 from lare_rl.credit.basis import MAX_RAW_FEATURES
 from lare_rl.credit.decoder_settings import CreditSettings
+from lare_rl.credit.decoders import DECODERS
 from lare_rl.credit.methods import Fit, Method, Reward
 from lare_rl.errors import LareError
 from lare_rl.tasks.payments import PAID_AT_END, PaymentRule
@@ -21,6 +22,7 @@ def check_credit(
     fixed_length: bool = False,
     scale_rewards: bool = False,
     payments: PaymentRule = PAID_AT_END,
+    discrete_actions: bool = True,
 ) -> None:
     """Raise `LareError` if a method or the settings of its decoder are impossible for a task.
 
@@ -34,6 +36,7 @@ def check_credit(
         fixed_length: whether every episode has the same number of steps.
         scale_rewards: whether rewards are divided by the size of returns.
         payments: when the environment pays.
+        discrete_actions: whether the actions are discrete.
     """
     name = method.name
     if method.reward is Reward.DESIGNED and scored_observation == "both":
@@ -54,6 +57,8 @@ def check_credit(
         raise LareError(
             f"{name} reads whole episodes, and the task pays before their end: use a method that reads steps"
         )
+    if DECODERS[method.decoder].predicts_actions and not discrete_actions:
+        raise LareError(f"{name} learns which of its actions an agent took, and the task has continuous ones: use stas")
     if "drawn_steps" in method.settings and not fixed_length and credit.steps < credit.drawn_steps:
         raise LareError(
             f"the decoder has steps = {credit.steps}, less than drawn_steps = {credit.drawn_steps} of one episode: use more steps"
