@@ -23,6 +23,7 @@ def check_credit(
     scale_rewards: bool = False,
     payments: PaymentRule = PAID_AT_END,
     discrete_actions: bool = True,
+    max_steps: int | None = None,
 ) -> None:
     """Raise `LareError` if a method or the settings of its decoder are impossible for a task.
 
@@ -37,6 +38,7 @@ def check_credit(
         scale_rewards: whether rewards are divided by the size of returns.
         payments: when the environment pays.
         discrete_actions: whether the actions are discrete.
+        max_steps: the number of steps of the longest episode, if that is known.
     """
     name = method.name
     if method.reward is Reward.DESIGNED and scored_observation == "both":
@@ -59,6 +61,12 @@ def check_credit(
         )
     if DECODERS[method.decoder].predicts_actions and not discrete_actions:
         raise LareError(f"{name} learns which of its actions an agent took, and the task has continuous ones: use stas")
+    longest = DECODERS[method.decoder].longest_segment
+    if longest is not None and max_steps is not None and payments.longest_segment(max_steps) > longest:
+        raise LareError(
+            f"{name} reads at most {longest} steps of one payment, and the task pays for up to "
+            f"{payments.longest_segment(max_steps)}: use rudder, or payments"
+        )
     if "drawn_steps" in method.settings and not fixed_length and credit.steps < credit.drawn_steps:
         raise LareError(
             f"the decoder has steps = {credit.steps}, less than drawn_steps = {credit.drawn_steps} of one episode: use more steps"
@@ -68,5 +76,5 @@ def check_credit(
             f"{name} fits a weight to each of at most {MAX_RAW_FEATURES} raw features, and the task has {n_raw_features}: "
             "use lare-bayes, which fits weights to factors, or rrdu, a network"
         )
-    if method.decoder in ("diaster", "rudder") and not credit.hidden:
+    if method.decoder in ("diaster", "rudder", "rbt") and not credit.hidden:
         raise LareError(f"{name} needs a hidden layer: the decoder has hidden = ()")

@@ -33,7 +33,7 @@ class CreditSettings(CheckedModel):
     """Steps in one update of the decoder: K steps from each of steps / K episodes, or whole episodes with about this many steps in
     total. On particle tasks, whose episodes all have T = 25 steps: steps / T episodes, even if only K steps of each are drawn."""
     episodes: Annotated[int, Field(ge=1)] = 8
-    """diaster, rudder and grd (single agents): whole episodes in one update of the decoder."""
+    """diaster, rudder, grd and rbt (single agents): whole episodes in one update of the decoder."""
     score: Literal["auto", "sum", "average"] = "auto"
     """Whether the score of an episode is a sum over its steps, or an average or a grade, which does not grow with the number of
     steps. `auto`: the task's `score` or, without one, the type that has predicted returns better so far."""

@@ -31,7 +31,7 @@ class Fit(StrEnum):
     LIKELIHOOD = "likelihood of sampled steps"
     """LRR: as RRD, but the likelihood of the return, under rewards whose uncertainty the decoder learns (equations in `lrr.py`)."""
     DECODER_LOSS = "the decoder's loss"
-    """Diaster, RUDDER and GRD: the `loss` of the decoder, on whole episodes (equations in `diaster.py`, `rudder.py`, `grd.py`)."""
+    """Diaster, RUDDER, GRD and RBT: the `loss` of the decoder, on whole episodes (equations in the files of these names)."""
     EVIDENCE = "evidence"
     """In closed form, on all episodes (equations in `evidence.py`)."""
     SIGNS = "best signs"
@@ -277,6 +277,14 @@ for _method in (
         inputs=input_names.TRANSITION,
         fit=Fit.DECODER_LOSS,
         decoder="grd",
+    ),
+    Method(
+        "rbt",
+        "a transformer over the steps of one payment, which attend to each other in both directions",
+        "Tang et al., RBT, TMLR 2025",
+        inputs=input_names.TRANSITION,
+        fit=Fit.DECODER_LOSS,
+        decoder="rbt",
     ),
     Method(
         "arel",
