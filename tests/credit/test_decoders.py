@@ -16,6 +16,7 @@ from lare_rl.credit.lrr import LRR
 from lare_rl.credit.methods import METHODS, Fit
 from lare_rl.credit.stas import STAS
 from lare_rl.credit.step_decoders import Bottleneck, StepDecoder
+from lare_rl.credit.tar2 import TAR2
 
 EPISODES, STEPS, AGENTS, FEATURES = 4, 5, 3, 6
 KEY = jax.random.key(1)
@@ -26,6 +27,7 @@ DECODERS = {
     "lrr": partial(LRR, FEATURES, (8,), 2.0),
     "arel": partial(AREL, FEATURES, STEPS),
     "stas": partial(STAS, FEATURES, STEPS, AGENTS, 2.0),
+    "tar2": partial(TAR2, 4, 2, STEPS, AGENTS, 2.0),
 }
 
 
@@ -47,11 +49,13 @@ def test_outputs(name):
         assert result.r_hat.shape == result.penalty.shape == (EPISODES * STEPS, AGENTS)
         assert np.isfinite(result.r_hat).all()
         assert (np.asarray(result.penalty) >= 0).all()
-    assert (np.abs(first.r_hat - second.r_hat).max() > 1e-6) == (name in ("bottleneck", "stas"))
+    assert (np.abs(first.r_hat - second.r_hat).max() > 1e-6) == (name in ("bottleneck", "stas", "tar2"))
     np.testing.assert_array_equal(decode(decoder, ROWS).r_hat, output.r_hat)
-    # Credit is causal: neither later steps nor other episodes matter.
+    # Credit is causal: neither later steps nor other episodes matter. Contributions of TAR2 depend on the outcome.
     changed = episodes(ROWS).copy()
-    changed[:, 3:], changed[1] = 7.0, -7.0
+    if name != "tar2":
+        changed[:, 3:] = 7.0
+    changed[1] = -7.0
     before, after = episodes(output.r_hat), episodes(decode(decoder, changed.reshape(ROWS.shape)).r_hat)
     np.testing.assert_allclose(before[[0, 2, 3], :3], after[[0, 2, 3], :3], rtol=1e-4, atol=1e-5)
     assert np.abs(before[1] - after[1]).max() > 1e-4
@@ -102,7 +106,8 @@ def test_must_learn_credit_among_agents_from_the_mean_return(name):
 
     @jax.jit
     def train():
-        state = decomposition.init(KEY, 2, method, settings, STEPS, AGENTS)
+        inputs = ("observation", 1), ("action", 1)
+        state = decomposition.init(KEY, 2, method, settings, STEPS, AGENTS, inputs=inputs)
         state = decomposition.observe_steps(state, jnp.asarray(rows))
         state = decomposition.observe_returns(state, jnp.asarray(mean_reward), length, jnp.ones(n_episodes, bool))
         state, losses = jax.lax.scan(body, state, jax.random.split(jax.random.key(0), n_updates))

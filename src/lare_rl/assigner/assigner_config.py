@@ -213,6 +213,7 @@ def check_config(config: AssignerConfig) -> None:
         scored_observation=config.scored_observation,
         scale_rewards=config.scale_rewards,
         payments=config.payments,
+        max_steps=config.max_steps,
     )
     if config.agents > 1 and config.max_steps is None:
         raise LareError("many agents need max_steps, the number of steps of the longest episode")

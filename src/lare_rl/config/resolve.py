@@ -41,6 +41,8 @@ def resolve(settings: Settings, task: TaskSpec) -> ResolvedSettings:
         fixed_length=env.fixed_length,
         scale_rewards=resolved.scale_rewards,
         payments=task.payment_rule,
+        discrete_actions=env.discrete,
+        max_steps=env.max_steps,
     )
     if method.needs_whole_episodes and resolved.rollout_steps % env.max_steps:
         raise LareError(

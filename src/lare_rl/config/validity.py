@@ -2,6 +2,7 @@
 
 from lare_rl.credit.basis import MAX_RAW_FEATURES
 from lare_rl.credit.decoder_settings import CreditSettings
+from lare_rl.credit.decoders import DECODERS
 from lare_rl.credit.methods import Fit, Method, Reward
 from lare_rl.errors import LareError
 from lare_rl.tasks.payments import PAID_AT_END, PaymentRule
@@ -21,6 +22,8 @@ def check_credit(
     fixed_length: bool = False,
     scale_rewards: bool = False,
     payments: PaymentRule = PAID_AT_END,
+    discrete_actions: bool = True,
+    max_steps: int | None = None,
 ) -> None:
     """Raise `LareError` if a method or the settings of its decoder are impossible for a task.
 
@@ -34,6 +37,8 @@ def check_credit(
         fixed_length: whether every episode has the same number of steps.
         scale_rewards: whether rewards are divided by the size of returns.
         payments: when the environment pays.
+        discrete_actions: whether the actions are discrete.
+        max_steps: the number of steps of the longest episode, if that is known.
     """
     name = method.name
     if method.reward is Reward.DESIGNED and scored_observation == "both":
@@ -54,6 +59,14 @@ def check_credit(
         raise LareError(
             f"{name} reads whole episodes, and the task pays before their end: use a method that reads steps"
         )
+    if DECODERS[method.decoder].predicts_actions and not discrete_actions:
+        raise LareError(f"{name} learns which of its actions an agent took, and the task has continuous ones: use stas")
+    longest = DECODERS[method.decoder].longest_segment
+    if longest is not None and max_steps is not None and payments.longest_segment(max_steps) > longest:
+        raise LareError(
+            f"{name} reads at most {longest} steps of one payment, and the task pays for up to "
+            f"{payments.longest_segment(max_steps)}: use rudder, or payments"
+        )
     if "drawn_steps" in method.settings and not fixed_length and credit.steps < credit.drawn_steps:
         raise LareError(
             f"the decoder has steps = {credit.steps}, less than drawn_steps = {credit.drawn_steps} of one episode: use more steps"
@@ -63,5 +76,5 @@ def check_credit(
             f"{name} fits a weight to each of at most {MAX_RAW_FEATURES} raw features, and the task has {n_raw_features}: "
             "use lare-bayes, which fits weights to factors, or rrdu, a network"
         )
-    if method.decoder in ("diaster", "rudder") and not credit.hidden:
+    if method.decoder in ("diaster", "rudder", "rbt") and not credit.hidden:
         raise LareError(f"{name} needs a hidden layer: the decoder has hidden = ()")

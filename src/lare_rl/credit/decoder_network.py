@@ -6,6 +6,7 @@ from typing import NamedTuple, Protocol, runtime_checkable
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from lare_rl.credit.basis import Basis
+from lare_rl.errors import LareError
 
 __all__ = ["DecoderNetwork", "DecoderOutput", "DecoderShape"]
 
@@ -45,6 +46,14 @@ class DecoderShape(NamedTuple):
     max_steps: int
     """The number of steps of the longest episode."""
     n_agents: int
+    inputs: tuple[tuple[str, int], ...] = ()
+    """The name and the size of each input, in the order of the columns."""
+
+    def sizes(self, *names: str) -> list[int]:
+        """Return the sizes of the inputs. Raises `LareError` if their names, in order, are not `names`."""
+        if tuple(name for name, _ in self.inputs) != names:
+            raise LareError(f"this decoder reads the inputs {', '.join(names)}, and its method has {dict(self.inputs)}")
+        return [size for _, size in self.inputs]
 
     @property
     def n_inputs(self) -> int:

@@ -11,6 +11,8 @@ __all__ = ["MULTI_AGENT_CREDIT", "RECENT_STEPS", "CreditSettings", "default_cred
 RECENT_STEPS = 5000
 """Proxy rewards are compared with the true rewards over this number of newest steps of each agent."""
 
+_Weight = Annotated[float, Field(ge=0)]
+
 
 class CreditSettings(CheckedModel):
     """How the decoder is fitted."""
@@ -31,7 +33,7 @@ class CreditSettings(CheckedModel):
     """Steps in one update of the decoder: K steps from each of steps / K episodes, or whole episodes with about this many steps in
     total. On particle tasks, whose episodes all have T = 25 steps: steps / T episodes, even if only K steps of each are drawn."""
     episodes: Annotated[int, Field(ge=1)] = 8
-    """diaster and rudder (single agents): whole episodes in one update of the decoder."""
+    """diaster, rudder, grd and rbt (single agents): whole episodes in one update of the decoder."""
     score: Literal["auto", "sum", "average", "binary"] = "auto"
     """Whether the score of an episode is a sum over its steps; an average or a grade, which does not grow with the number of steps;
     or binary: won or lost. `auto`: the task's `score` or, without one, a sum or an average, whichever has predicted returns better
@@ -49,6 +51,9 @@ class CreditSettings(CheckedModel):
     """Size of the code in the middle of VIB."""
     divergence: Annotated[float, Field(ge=0)] = 5e-3
     """Weight of the code's divergence relative to the squared error of the mean (with `sum_form`: T^2 times as much)."""
+    sparsity: tuple[_Weight, _Weight, _Weight, _Weight, _Weight] = (1e-5, 1e-5, 1e-5, 1e-6, 1e-5)
+    """grd: weights of the sparsity of five groups of causes: those in the state and in the action for the reward; those in the
+    state for its other entries, for the entry itself, and in the action for the next state."""
 
 
 MULTI_AGENT_CREDIT = CreditSettings(

@@ -18,7 +18,7 @@ if TYPE_CHECKING:  # importing JAX takes longer than all else that the command l
     from lare_rl.credit.decoder_network import DecoderNetwork, DecoderShape
     from lare_rl.credit.decoder_settings import CreditSettings
 
-__all__ = ["DECODERS", "Decoder", "register_decoder"]
+__all__ = ["DECODERS", "RBT_STEPS", "Decoder", "register_decoder"]
 
 
 @dataclass(frozen=True)
@@ -35,6 +35,12 @@ class Decoder:
     single_agent_only: bool = False
     extended_basis: bool = False
     """Whether a closed-form decoder has shapes and pairs of its inputs as features (`basis.py`)."""
+    pays_shares: bool = False
+    """Whether its outputs are contributions, and each agent is paid its share of the return at each step (`shares.py`)."""
+    predicts_actions: bool = False
+    """Whether it learns to predict which action an agent took, which must then be discrete."""
+    longest_segment: int | None = None
+    """The largest number of steps of a payment that it reads. None means any number."""
     exportable: bool = False
     """Whether `lare-rl export` can write its rewards (`export/reward_graph.py`)."""
 
@@ -43,6 +49,9 @@ class Decoder:
         init = resolve_name(self.init) if isinstance(self.init, str) else self.init
         return init(key, shape, settings)
 
+
+RBT_STEPS = 512
+"""The largest number of steps of a payment for RBT: half of the 1,024 tokens that the authors' transformer reads."""
 
 DECODERS = Registry[Decoder]("decoder")
 
@@ -63,8 +72,13 @@ for _decoder in (
     Decoder("lrr", "lare_rl.credit.lrr:init_lrr", frozenset({"hidden"})),
     Decoder("arel", "lare_rl.credit.arel:init_arel", whole_episodes=True),
     Decoder("stas", "lare_rl.credit.stas:init_stas", whole_episodes=True),
+    Decoder("tar2", "lare_rl.credit.tar2:init_tar2", whole_episodes=True, pays_shares=True, predicts_actions=True),
     Decoder("diaster", "lare_rl.credit.diaster:init_diaster", frozenset({"hidden"}), single_agent_only=True),
     Decoder("rudder", "lare_rl.credit.rudder:init_rudder", frozenset({"hidden"}), single_agent_only=True),
+    Decoder("grd", "lare_rl.credit.grd:init_grd", frozenset({"hidden", "sparsity"}), single_agent_only=True),
+    Decoder(
+        "rbt", "lare_rl.credit.rbt:init_rbt", frozenset({"hidden"}), single_agent_only=True, longest_segment=RBT_STEPS
+    ),
     Decoder("linear", "lare_rl.credit.closed_form:init_linear_decoder", exportable=True),
     Decoder("additive", "lare_rl.credit.closed_form:init_linear_decoder", extended_basis=True, exportable=True),
 ):

@@ -136,6 +136,7 @@ def init(
     n_agents: int,
     score_types: tuple[int, ...] = (ScoreType.SUM,),
     window: int = WINDOW,
+    inputs: tuple[tuple[str, int], ...] = (),
 ) -> Decomposition:
     """Return the state with an untrained decoder. All other functions need the same `settings` and `score_types`.
 
@@ -148,9 +149,10 @@ def init(
         n_agents: the number of agents of a step.
         score_types: the types that the score may have.
         window: the number of last returns over which predictions of them are assessed.
+        inputs: the name and the size of each input. Only for decoders that tell their inputs apart.
     """
     basis = Basis(n_factors=0, n_raw=basis, extended=False) if isinstance(basis, int) else basis
-    shape = DecoderShape(basis, max_steps, n_agents)
+    shape = DecoderShape(basis, max_steps, n_agents, inputs)
     network = DECODERS[method.decoder].init_network(key, shape, settings)
     for leaf in jax.tree.leaves(network):
         if not eqx.is_array_like(leaf):

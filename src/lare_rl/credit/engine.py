@@ -9,6 +9,7 @@ into the rewards that an algorithm is trained on:
 
 With `exact`, what the proxy rewards of an episode lack to its return, R - sum_t r_hat_t, is added to them: to that of the last step
 (RUDDER: Arjona-Medina et al., 2019), or divided among all steps. They then add up to the return whatever the decoder's error is.
+TAR2 pays shares of the return instead (`shares.py`), which add up to it, too.
 
 Batches have an axis of agents, of length 1 for a single agent. For credit to whole teams it has length 1 too.
 """
@@ -27,11 +28,12 @@ from lare_rl.credit.closed_form import ClosedForm
 from lare_rl.credit.decoder_settings import CreditSettings
 from lare_rl.credit.decomposition import CreditBatch, Decomposition
 from lare_rl.credit.explanation import Explanation, StepStatistics, add_steps, empty_step_statistics, explain
-from lare_rl.credit.input_names import input_size, tracked_size
+from lare_rl.credit.input_names import input_size, input_sizes, tracked_size
 from lare_rl.credit.methods import Fit, Method, Reward
 from lare_rl.credit.prequential import WINDOW
 from lare_rl.credit.returns import add_to_sums
 from lare_rl.credit.score_type import ScoreType, score_types_to_fit
+from lare_rl.credit.shares import return_shares
 from lare_rl.envs.interface import alive_mean
 from lare_rl.nn.normalise import RunningMeanStd, Scale, min_max_scale, root_mean_square
 from lare_rl.tasks.spec import ScoredObservation
@@ -142,8 +144,17 @@ def init_decoder(key: PRNGKeyArray, spec: CreditSpec) -> Decomposition | None:
     """Return an untrained decoder. Return None for a method that fits nothing."""
     if spec.method.reward is not Reward.PROXY:
         return None
-    sizes = {"max_steps": spec.max_steps, "n_agents": spec.agents, "window": spec.window}
-    return decomposition.init(key, spec.basis, spec.method, spec.settings, score_types=spec.score_types, **sizes)
+    return decomposition.init(
+        key,
+        spec.basis,
+        spec.method,
+        spec.settings,
+        max_steps=spec.max_steps,
+        n_agents=spec.agents,
+        score_types=spec.score_types,
+        window=spec.window,
+        inputs=input_sizes(spec.inputs, dict(spec.sizes)),
+    )
 
 
 class StepBatch(NamedTuple):
@@ -161,6 +172,8 @@ class StepBatch(NamedTuple):
     """Whether the step is the last one of an episode that has ended. Only for `exact`."""
     residual: Float[Array, "*batch"] | None = None
     """R of the step's episode, less the sum of its proxy rewards; 0 if that is unknown. Only for `exact`."""
+    alive: Bool[Array, "*batch agents"] | None = None
+    """Which agents acted. None means all. Only for methods that pay shares of the return."""
 
 
 RewardSource = Decomposition | Scale
@@ -191,7 +204,21 @@ def proxy_rewards(
     with_optimism = optimistic and decomposition.is_optimistic(spec.method, spec.settings)
     compute = decomposition.optimistic_rewards if with_optimism else decomposition.decoder_rewards
     r_hat = compute(source, rows, spec.settings, steps.length.ravel())
-    return r_hat.reshape(steps.inputs.shape[:-1])
+    r_hat = r_hat.reshape(steps.inputs.shape[:-1])
+    return _pay_shares(r_hat, steps, spec.max_steps) if spec.method.pays_shares else r_hat
+
+
+def _pay_shares(
+    r_hat: Float[Array, "*batch agents"], steps: StepBatch, max_steps: int
+) -> Float[Array, "*batch agents"]:
+    """Return each agent's share of the return of its episode. All episodes have `max_steps` steps, and are whole.
+
+    The mean over the agents that are alive is the share of the step, and R is the sum of these means.
+    """
+    alive = jnp.ones(r_hat.shape, bool) if steps.alive is None else steps.alive
+    shares = return_shares(*(values.reshape(-1, max_steps, values.shape[-1]) for values in (r_hat, alive)))
+    total = steps.mean_reward * steps.length * jnp.sum(alive, axis=-1)
+    return jnp.where(steps.finished[..., None], shares.reshape(r_hat.shape) * total[..., None], r_hat)
 
 
 def training_rewards(

@@ -28,9 +28,11 @@ __all__ = [
     "RAW",
     "SCORED",
     "SCORED_AND_HISTORY",
+    "TRANSITION",
     "InputNames",
     "input_arrays",
     "input_size",
+    "input_sizes",
     "tracked_size",
 ]
 
@@ -80,6 +82,7 @@ class InputNames:
 RAW = InputNames(("observation", "action", "observation_change"), ("next_observation",))
 """As published for RD and RRD."""
 OBSERVATION_ACTION = InputNames(("observation", "action"))
+TRANSITION = InputNames(("observation", "action", "next_observation"))
 NEXT_OBSERVATION_ACTION = InputNames(("next_observation", "action"))
 SCORED = InputNames(("scored_observation", "action"))
 FACTORS = InputNames(("factors",))
@@ -88,11 +91,16 @@ SCORED_AND_HISTORY = InputNames(("scored_observation", "action", "history"))
 FACTORS_SCORED_AND_HISTORY = InputNames(("factors", "scored_observation", "action", "history"))
 
 
-def input_size(inputs: tuple[str, ...], sizes: Mapping[str, int]) -> int:
-    """Return how many numbers the inputs have, by the sizes of `factors`, `observation` and `action`."""
+def input_sizes(inputs: tuple[str, ...], sizes: Mapping[str, int]) -> tuple[tuple[str, int], ...]:
+    """Return the name of each input and how many numbers it has, by the sizes of `factors`, `observation` and `action`."""
     same_size = {"next_observation": "observation", "observation_change": "observation"}
     history = 3 * tracked_size(inputs, sizes)
-    return history + sum(sizes[same_size.get(name, name)] for name in inputs if name != "history")
+    return tuple((name, history if name == "history" else sizes[same_size.get(name, name)]) for name in inputs)
+
+
+def input_size(inputs: tuple[str, ...], sizes: Mapping[str, int]) -> int:
+    """Return how many numbers the inputs have together."""
+    return sum(size for _, size in input_sizes(inputs, sizes))
 
 
 def tracked_size(inputs: tuple[str, ...], sizes: Mapping[str, int]) -> int:

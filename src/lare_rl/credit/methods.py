@@ -31,7 +31,7 @@ class Fit(StrEnum):
     LIKELIHOOD = "likelihood of sampled steps"
     """LRR: as RRD, but the likelihood of the return, under rewards whose uncertainty the decoder learns (equations in `lrr.py`)."""
     DECODER_LOSS = "the decoder's loss"
-    """Diaster and RUDDER: the `loss` of the decoder, on whole episodes (equations in `diaster.py` and `rudder.py`)."""
+    """Diaster, RUDDER, GRD and RBT: the `loss` of the decoder, on whole episodes (equations in the files of these names)."""
     EVIDENCE = "evidence"
     """In closed form, on all episodes (equations in `evidence.py`)."""
     PREFIX_EVIDENCE = "evidence of prefixes"
@@ -132,7 +132,15 @@ class Method:
     @property
     def settings(self) -> frozenset[str]:
         """The names of the `CreditSettings` that the method reads."""
-        return frozenset() if self.fit is None else self.fit.settings | DECODERS[self.decoder].settings
+        if self.fit is None:
+            return frozenset()
+        names = self.fit.settings | DECODERS[self.decoder].settings
+        return names - {"exact"} if self.pays_shares else names
+
+    @property
+    def pays_shares(self) -> bool:
+        """Whether the rewards of an episode are shares of its return, so that they always add up to it."""
+        return DECODERS[self.decoder].pays_shares
 
     def choose_exact(self, exact: str) -> str:
         """Return how proxy rewards are made exact, by the setting `exact`."""
@@ -272,6 +280,22 @@ for _method in (
         decoder="diaster",
     ),
     Method(
+        "grd",
+        "a causal model: learned masks choose the entries of state and action that cause the reward",
+        "Zhang et al., GRD, NeurIPS 2023",
+        inputs=input_names.TRANSITION,
+        fit=Fit.DECODER_LOSS,
+        decoder="grd",
+    ),
+    Method(
+        "rbt",
+        "a transformer over the steps of one payment, which attend to each other in both directions",
+        "Tang et al., RBT, TMLR 2025",
+        inputs=input_names.TRANSITION,
+        fit=Fit.DECODER_LOSS,
+        decoder="rbt",
+    ),
+    Method(
         "arel",
         "attention over time and agents, one reward a step",
         "Xiao et al., AREL, AAMAS 2022",
@@ -286,6 +310,14 @@ for _method in (
         inputs=input_names.OBSERVATION_ACTION,
         fit=Fit.ALL_STEPS,
         decoder="stas",
+    ),
+    Method(
+        "tar2",
+        "attention over time, Shapley values over agents; each step and agent gets a share of the return itself",
+        "Kapoor et al., TAR2, 2025",
+        inputs=input_names.OBSERVATION_ACTION,
+        fit=Fit.ALL_STEPS,
+        decoder="tar2",
     ),
     Method("lare-rd", "return decomposition on latent rewards", _LARE, inputs=input_names.FACTORS, fit=Fit.ALL_STEPS),
     Method(

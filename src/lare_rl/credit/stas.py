@@ -21,7 +21,7 @@ from lare_rl.credit.decoder_settings import CreditSettings
 from lare_rl.nn.attention import LayerNorm, attend, causal_mask
 from lare_rl.nn.networks import MLP, Linear
 
-__all__ = ["STAS", "Coalitions", "TimeLayer", "dropout", "init_stas"]
+__all__ = ["REWARD_SAMPLES", "STAS", "Coalitions", "TimeLayer", "dropout", "gelu", "init_stas"]
 
 SIZE, HEADS, LAYERS, COALITIONS = 128, 4, 3, 5
 """The width of a token, the number of heads, of layers over time, and of sampled coalitions."""
@@ -38,13 +38,13 @@ def dropout(x: Float[Array, "..."], key: PRNGKeyArray | None) -> Float[Array, ".
     return 2 * x * coins[: x.size].reshape(x.shape)
 
 
-def _gelu(x: Float[Array, "..."]) -> Float[Array, "..."]:
+def gelu(x: Float[Array, "..."]) -> Float[Array, "..."]:
     """Return the exact GELU: x times the probability that a standard normal variable is below x (Hendrycks and Gimpel, 2016)."""
     return jax.nn.gelu(x, approximate=False)
 
 
 def _split_heads(x: Float[Array, "*batch size"]) -> Float[Array, "*batch heads head_size"]:
-    return x.reshape(*x.shape[:-1], HEADS, SIZE // HEADS)
+    return x.reshape(*x.shape[:-1], HEADS, x.shape[-1] // HEADS)
 
 
 class TimeLayer(eqx.Module):
@@ -57,11 +57,11 @@ class TimeLayer(eqx.Module):
     feed_forward: MLP
     norms: tuple[LayerNorm, LayerNorm]
 
-    def __init__(self, *, key: PRNGKeyArray):
+    def __init__(self, size: int = SIZE, *, key: PRNGKeyArray):
         *keys, last_key = jax.random.split(key, 5)
-        self.query, self.key, self.value, self.merge = (Linear(SIZE, SIZE, key=key) for key in keys)
-        self.feed_forward = MLP(SIZE, (SIZE,), SIZE, key=last_key, activation=_gelu)
-        self.norms = LayerNorm(SIZE, 1e-12), LayerNorm(SIZE, 1e-12)
+        self.query, self.key, self.value, self.merge = (Linear(size, size, key=key) for key in keys)
+        self.feed_forward = MLP(size, (size,), size, key=last_key, activation=gelu)
+        self.norms = LayerNorm(size, 1e-12), LayerNorm(size, 1e-12)
 
     def __call__(
         self, x: Float[Array, "*batch steps size"], key: PRNGKeyArray | None
@@ -83,10 +83,10 @@ class Coalitions(eqx.Module):
     value: Linear
     merge: Linear
 
-    def __init__(self, agents: int, *, key: PRNGKeyArray):
+    def __init__(self, agents: int, size: int = SIZE, *, key: PRNGKeyArray):
         query_key, *keys = jax.random.split(key, 4)
-        self.query = eqx.filter_vmap(lambda key: Linear(SIZE, SIZE, key=key))(jax.random.split(query_key, agents))
-        self.key, self.value, self.merge = (Linear(SIZE, SIZE, key=key) for key in keys)
+        self.query = eqx.filter_vmap(lambda key: Linear(size, size, key=key))(jax.random.split(query_key, agents))
+        self.key, self.value, self.merge = (Linear(size, size, key=key) for key in keys)
 
     def __call__(
         self, x: Float[Array, "*batch agents size"], key: PRNGKeyArray, dropout_key: PRNGKeyArray | None
@@ -103,7 +103,7 @@ class Coalitions(eqx.Module):
             partial(dropout, key=dropout_keys[0]),
         )
         merged = dropout(self.merge(attention), dropout_keys[1])
-        return jnp.mean(merged.reshape(*x.shape[:-2], COALITIONS, agents, SIZE), axis=-3)
+        return jnp.mean(merged.reshape(*x.shape[:-2], COALITIONS, *x.shape[-2:]), axis=-3)
 
 
 class STAS(eqx.Module):

@@ -79,6 +79,7 @@ def step_batch(steps: StoredSteps, config: TrainConfig, team_index: int) -> Step
         finished=steps.finished,
         last=steps.last,
         residual=None if steps.residual is None else steps.residual[..., team_index],
+        alive=row_mask(steps, config, team_index),
     )
 
 

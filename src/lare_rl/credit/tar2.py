@@ -1,0 +1,107 @@
+"""TAR2: temporal-agent reward redistribution (Kapoor et al., 2025, arXiv 2502.04864).
+
+Three times, causal attention over the steps of each agent is followed by attention over the agents of each step under random
+coalitions, both as in STAS. The outputs of all layers, h, and the outcome of the episode give contributions. Their sum is fitted to
+the return. The states and the past must tell which action an agent takes next:
+
+    c_{i,t} = MLP([h_{i,t}, mean_j h_{j,T-1}]),    no gradient through the second one
+    p(a_{i,t}) = softmax(MLP([mean_j e_{j,t}, h_{i,t-1}])),    h_{i,-1} = 0
+    (sum_{i,t} c_{i,t} - R)^2 - 0.05 mean_{i,t} log p(a_{i,t})
+
+e is the embedding of an observation and its position. The rewards of an episode are not c, but shares of the return: see `shares.py`.
+
+The network, the loss and the settings are those of the authors' code (github.com/AdityaKapoor74/MARL_Agent_Temporal_Credit_Assignment,
+`TARR_v2` at commit 2708495; the commit after it leaves out the outcome, as an ablation). The text of the paper could not be read, but
+for its abstract. docs/deviations.md lists the differences.
+"""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float, PRNGKeyArray
+
+from lare_rl.credit.decoder_network import DecoderOutput, DecoderShape
+from lare_rl.credit.decoder_settings import CreditSettings
+from lare_rl.credit.stas import REWARD_SAMPLES, Coalitions, TimeLayer, gelu
+from lare_rl.nn.networks import MLP, Linear
+
+__all__ = ["TAR2", "init_tar2"]
+
+SIZE, LAYERS = 64, 3
+"""The width of a token, and the number of pairs of layers."""
+ACTION_WEIGHT = 0.05
+"""The weight of the predicted actions beside the squared error."""
+
+
+class TAR2(eqx.Module):
+    """The authors' network, layer by layer. Its inputs are an observation and a one-hot action."""
+
+    embed_observation: Linear
+    embed_action: Linear
+    position: Float[Array, "steps size"]
+    agent_numbers: Float[Array, "layers agents size"]
+    """Embeddings of agent numbers, which are assigned at random."""
+    time_layers: tuple[TimeLayer, ...]
+    agent_layers: tuple[Coalitions, ...]
+    contribution_model: MLP
+    action_model: MLP
+    gain: float = eqx.field(static=True)
+
+    def __init__(
+        self, n_observations: int, n_actions: int, max_steps: int, n_agents: int, gain: float, *, key: PRNGKeyArray
+    ):
+        self.gain = gain
+        keys = jax.random.split(key, 8)
+        self.embed_observation = Linear(n_observations, SIZE, key=keys[0])
+        self.embed_action = Linear(n_actions, SIZE, key=keys[1])
+        self.position = jax.random.normal(keys[2], (max_steps, SIZE))
+        self.agent_numbers = jax.random.normal(keys[3], (LAYERS, n_agents, SIZE))
+        self.time_layers = tuple(TimeLayer(SIZE, key=key) for key in jax.random.split(keys[4], LAYERS))
+        self.agent_layers = tuple(Coalitions(n_agents, SIZE, key=key) for key in jax.random.split(keys[5], LAYERS))
+        self.contribution_model = MLP(2 * LAYERS * SIZE, (SIZE,), 1, key=keys[6], activation=gelu)
+        self.action_model = MLP((1 + LAYERS) * SIZE, (SIZE,), n_actions, key=keys[7], activation=gelu)
+
+    def __call__(self, inputs: Float[Array, "rows agents inputs"], key: PRNGKeyArray | None) -> DecoderOutput:
+        """Return the contributions. Without a key, they are the mean over fixed samples of coalitions and agent numbers."""
+        shape = -1, len(self.position), inputs.shape[1]
+        observation, action = jnp.split(inputs, [self.embed_observation.weight.shape[0]], axis=-1)
+        state = self.embed_observation(observation).reshape(*shape, SIZE) + self.position[:, None]
+        tokens = state + self.embed_action(action).reshape(*shape, SIZE)
+        if key is None:
+            sample_keys = jax.random.split(jax.random.key(jnp.uint32(0)), REWARD_SAMPLES)
+            samples = jax.lax.map(lambda key: self._contributions(self._attend(tokens, key)), sample_keys)
+            r_hat = self.gain * jnp.mean(samples, axis=0).reshape(inputs.shape[:2])
+            return DecoderOutput(r_hat, jnp.zeros_like(r_hat))
+        h = self._attend(tokens, key)
+        past = jnp.pad(h[:, :-1], ((0, 0), (1, 0), (0, 0), (0, 0)))
+        mean_state = jnp.broadcast_to(jnp.mean(state, axis=2, keepdims=True), state.shape)
+        log_p = jax.nn.log_softmax(self.action_model(jnp.concatenate([mean_state, past], axis=-1)))
+        # Standardised or not, the largest entry of a one-hot action is the one of the action that was taken.
+        chosen = jnp.argmax(action, axis=-1).reshape(*shape, 1)
+        penalty = -ACTION_WEIGHT * jnp.take_along_axis(log_p, chosen, axis=-1)
+        r_hat = self.gain * self._contributions(h)
+        return DecoderOutput(r_hat.reshape(inputs.shape[:2]), penalty.reshape(inputs.shape[:2]))
+
+    def _attend(
+        self, x: Float[Array, "episodes steps agents size"], key: PRNGKeyArray
+    ) -> Float[Array, "episodes steps agents stacked"]:
+        """Return the outputs of all layers, for one sample of coalitions and of agent numbers for each layer."""
+        outputs = []
+        layers = self.time_layers, self.agent_layers, self.agent_numbers, jax.random.split(key, LAYERS)
+        for time_layer, agent_layer, numbers, layer_key in zip(*layers, strict=True):
+            coalitions_key, order_key = jax.random.split(layer_key)
+            x = jnp.swapaxes(time_layer(jnp.swapaxes(x, 1, 2), None), 1, 2)
+            order = jax.random.permutation(order_key, len(numbers))
+            x = agent_layer(x + numbers[order], coalitions_key, None)
+            outputs.append(x)
+        return jnp.concatenate(outputs, axis=-1)
+
+    def _contributions(self, h: Float[Array, "episodes steps agents stacked"]) -> Float[Array, "episodes steps agents"]:
+        outcome = jax.lax.stop_gradient(jnp.mean(h[:, -1:], axis=2, keepdims=True))
+        return self.contribution_model(jnp.concatenate([h, jnp.broadcast_to(outcome, h.shape)], axis=-1))[..., 0]
+
+
+def init_tar2(key: PRNGKeyArray, shape: DecoderShape, settings: CreditSettings) -> TAR2:
+    """Return an untrained `TAR2`. `settings` is not used. Raises `LareError` if its inputs are not observation and action."""
+    n_observations, n_actions = shape.sizes("observation", "action")
+    return TAR2(n_observations, n_actions, shape.max_steps, shape.n_agents, shape.gain, key=key)

@@ -1,0 +1,169 @@
+"""GRD against a slow NumPy twin, its samples of masks, and what it must learn."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from lare_rl.credit import grd, input_names
+from lare_rl.credit.basis import Basis
+from lare_rl.credit.decoder_network import DecoderShape
+from lare_rl.credit.decoder_settings import CreditSettings
+from lare_rl.credit.grd import GRD, causes, init_grd, sample_mask
+from lare_rl.errors import LareError
+from lare_rl.nn.networks import adam_step, init_adam
+
+EPISODES, STEPS, STATES, ACTIONS = 4, 6, 3, 2
+LENGTH = np.array([6, 4, 2, 1])
+LAMBDAS = (0.1, 0.2, 0.3, 0.4, 0.5)
+KEY = jax.random.key(0)
+
+
+@pytest.fixture(scope="module")
+def decoder():
+    return GRD(STATES, ACTIONS, (5,), LAMBDAS, key=KEY)
+
+
+@pytest.fixture(scope="module")
+def rows():
+    return np.random.default_rng(0).normal(size=(EPISODES, STEPS, 2 * STATES + ACTIONS)).astype(np.float32)
+
+
+def numpy_mlp(mlp, x):
+    first, second = mlp.layers
+    hidden = np.maximum(x @ np.asarray(first.weight) + np.asarray(first.bias), 0)
+    return hidden @ np.asarray(second.weight) + np.asarray(second.bias)
+
+
+def numpy_log_density(decoder, row, state_mask, action_mask):
+    """Return log p of each entry of the next state of one step, one entry after the other."""
+    state, action, next_state = np.split(row.astype(float), [STATES, STATES + ACTIONS])
+    log_densities = []
+    for i in range(STATES):
+        output = numpy_mlp(decoder.dynamics, np.concatenate([state * state_mask[:, i], action * action_mask[:, i]]))
+        weight, mean, std = np.exp(output[:3]), output[3:6], np.exp(5 * np.tanh(output[6:] / 5))
+        density = np.exp(-(((next_state[i] - mean) / std) ** 2) / 2) / (std * np.sqrt(2 * np.pi))
+        log_densities.append(np.log(weight / weight.sum() @ density))
+    return np.array(log_densities)
+
+
+def negative_log_absence(logits):
+    """Return the mean of -log P(C = 0): the cross entropy of two classes, of which the second one is the label."""
+    probability = np.exp(logits) / np.exp(logits).sum(axis=-1, keepdims=True)
+    return -np.log(probability[..., 1]).mean()
+
+
+@pytest.mark.parametrize("threshold", [0.0, 1e9])
+def test_loss_against_numpy(decoder, rows, threshold, monkeypatch):
+    """The third episode is padding. Below the threshold of a loss, sparsity counts."""
+    monkeypatch.setattr(grd, "REWARD_THRESHOLD", threshold)
+    monkeypatch.setattr(grd, "DYNAMICS_THRESHOLD", threshold)
+    target, mask, key = np.array([1.0, -0.5, 2.0, 0.3], np.float32), np.array([1.0, 1, 0, 1]), jax.random.key(3)
+    keys = jax.random.split(key, 5)
+    logits = decoder.state_reward, decoder.action_reward, decoder.state_state, decoder.action_state
+    masks = [np.asarray(sample_mask(*pair)) for pair in zip(logits, (keys[0], keys[1], keys[3], keys[4]), strict=True)]
+    causes_of_reward = np.concatenate(masks[:2])
+    errors = []
+    for i in (0, 1, 3):
+        r_hat = [
+            numpy_mlp(decoder.reward_model, causes_of_reward * x[: STATES + ACTIONS])[0] for x in rows[i, : LENGTH[i]]
+        ]
+        errors.append((np.mean(r_hat) - target[i]) ** 2)
+    valid = (np.arange(STEPS) < LENGTH[:, None]) & (mask > 0)[:, None]
+    row_index = jax.random.choice(keys[2], EPISODES * STEPS, (256,), p=valid.ravel() / valid.sum())
+    log_density = np.mean(
+        [numpy_log_density(decoder, rows.reshape(-1, 8)[i], *masks[2:]) for i in np.asarray(row_index)]
+    )
+    want = np.mean(errors) - log_density
+    if threshold:
+        itself, ss = np.eye(STATES, dtype=bool), np.asarray(decoder.state_state)
+        groups = decoder.state_reward, decoder.action_reward, ss[~itself], ss[itself], decoder.action_state
+        want += sum(lam * negative_log_absence(np.asarray(group)) for lam, group in zip(LAMBDAS, groups, strict=True))
+    loss = jax.jit(lambda *args: decoder.loss(*args))(rows, jnp.asarray(LENGTH), target, mask, key)
+    assert float(loss) == pytest.approx(want, rel=1e-4)
+
+
+def test_rewards_are_those_of_the_causes(decoder, rows):
+    mask = np.concatenate([causes(decoder.state_reward), causes(decoder.action_reward)])
+    assert 0 < mask.sum() < STATES + ACTIONS
+    want = numpy_mlp(decoder.reward_model, mask * rows[..., : STATES + ACTIONS])[..., 0]
+    np.testing.assert_allclose(decoder(jnp.asarray(rows), None).r_hat, want, rtol=1e-4, atol=1e-5)
+
+
+def test_samples_of_masks():
+    """They are 0 or 1, with the probabilities of a softmax. The gradient is that of the soft sample."""
+    logits = jnp.array([[1.0, 0.0], [-2.0, 0.5]])
+    samples = np.asarray(jax.vmap(lambda key: sample_mask(logits, key))(jax.random.split(KEY, 4000)))
+    assert set(np.unique(np.round(samples, 6))) == {0, 1}
+    np.testing.assert_allclose(samples.mean(axis=0), 1 / (1 + np.exp([-1, 2.5])), atol=0.03)
+    near = jnp.array([-float(jax.random.logistic(KEY, (1,))[0]) + 0.002, 0.0])[None]  # (d + noise) / 0.01 = 0.2
+    gradient = jax.grad(lambda logits: sample_mask(logits, KEY)[0])(near)
+    soft = 1 / (1 + np.exp(-0.2))
+    np.testing.assert_allclose(gradient[0], [soft * (1 - soft) / 0.01, -soft * (1 - soft) / 0.01], rtol=1e-2)
+
+
+def test_gradient_ignores_padding(decoder, rows):
+    @jax.jit
+    def gradient(rows):
+        args = rows, jnp.asarray(LENGTH), jnp.ones(EPISODES), jnp.ones(EPISODES), jax.random.key(1)
+        return jax.grad(lambda decoder: decoder.loss(*args))(decoder)
+
+    padded = np.where(np.arange(STEPS)[:, None] < LENGTH[:, None, None], rows, np.float32(99.0))
+    for a, b in zip(*map(jax.tree.leaves, (gradient(rows), gradient(padded))), strict=True):
+        np.testing.assert_allclose(a, b, rtol=1e-4, atol=1e-6)
+
+
+def test_loss_without_episodes_is_finite(decoder, rows):
+    args = jnp.asarray(rows), jnp.asarray(LENGTH), jnp.ones(EPISODES), jnp.zeros(EPISODES), KEY
+    loss, gradient = jax.jit(jax.value_and_grad(lambda decoder: decoder.loss(*args)))(decoder)
+    assert float(loss) == pytest.approx(
+        0.1 * negative_log_absence(decoder.state_reward) + 0.2 * negative_log_absence(decoder.action_reward)
+    )
+    assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(gradient))
+
+
+def test_must_learn_causes(monkeypatch):
+    """The reward is caused by the first entries of state and action, and the next state by the second ones."""
+    monkeypatch.setattr(grd, "DYNAMICS_STEPS", 32)
+    monkeypatch.setattr(grd, "REWARD_THRESHOLD", np.inf)  # a network that ignores an entry does not need its mask
+    monkeypatch.setattr(grd, "DYNAMICS_THRESHOLD", np.inf)
+    decoder = GRD(STATES, ACTIONS, (16,), (0.03,) * 5, key=KEY)
+    x = np.random.default_rng(1).normal(size=(1000, 16, STEPS, STATES + ACTIONS)).astype(np.float32)
+    reward = 2 * x[..., 0] - x[..., STATES]
+    rows = np.concatenate([x, np.repeat(x[..., 1:2] + x[..., STATES + 1 : STATES + 2], STATES, axis=-1)], axis=-1)
+    length = jnp.full(16, STEPS)
+
+    def body(state, inputs):
+        (decoder, optimizer), (rows, target, key) = state, inputs
+        gradient = jax.grad(lambda d: d.loss(rows, length, target, jnp.ones(16), key))(decoder)
+        return adam_step(decoder, gradient, optimizer, 1e-2), None
+
+    @jax.jit
+    def train(decoder, *inputs):
+        return jax.lax.scan(body, (decoder, init_adam(decoder, 1e-2)), inputs)[0][0]
+
+    decoder = train(decoder, rows, reward.mean(axis=-1), jax.random.split(KEY, len(rows)))
+    assert causes(decoder.state_reward).tolist() == [True, False, False]
+    assert causes(decoder.action_reward).tolist() == [True, False]
+    r_hat = np.asarray(decoder(jnp.asarray(rows[0]), None).r_hat)
+    assert np.corrcoef(r_hat.ravel(), reward[0].ravel())[0, 1] > 0.9
+    from_state, from_action = causes(decoder.state_state), causes(decoder.action_state)
+    assert not from_state[::2].any()
+    assert not from_action[0].any()
+    assert from_state[1].any()
+    assert from_action[1].any()
+
+
+def test_inputs_of_another_order_are_refused():
+    shape = DecoderShape(
+        Basis(0, 8, extended=False), STEPS, 1, (("action", 2), ("observation", 3), ("next_observation", 3))
+    )
+    with pytest.raises(LareError, match=r"reads the inputs observation, action, next_observation, .*'action': 2"):
+        init_grd(KEY, shape, CreditSettings())
+
+
+def test_input_sizes():
+    sizes = {"observation": 3, "action": 2, "factors": 4}
+    names = input_names.TRANSITION.resolve()
+    assert input_names.input_sizes(names, sizes) == (("observation", 3), ("action", 2), ("next_observation", 3))
+    assert input_names.input_sizes(("factors", "history"), sizes) == (("factors", 4), ("history", 12))

@@ -1,0 +1,102 @@
+"""Shares of the return: against a slow NumPy twin, and their sum."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from lare_rl.credit import engine
+from lare_rl.credit.decoder_settings import CreditSettings
+from lare_rl.credit.engine import StepBatch
+from lare_rl.credit.methods import METHODS
+from lare_rl.credit.shares import return_shares
+from lare_rl.nn.normalise import empty_scale
+
+EPISODES, STEPS, AGENTS = 3, 4, 3
+shares_of = jax.jit(return_shares)
+
+
+def numpy_weights(values):
+    excess = np.asarray(values, float) - np.min(values)
+    return excess / excess.sum() if excess.sum() > 0 else np.full(len(values), 1 / len(values))
+
+
+def numpy_shares(contributions, alive):
+    """Return the shares of one episode, one step after the other."""
+    shares = np.zeros(contributions.shape)
+    acted = [t for t in range(len(alive)) if alive[t].any()]
+    weights = numpy_weights([contributions[t][alive[t]].sum() for t in acted])
+    for t, weight in zip(acted, weights, strict=True):
+        shares[t, alive[t]] = weight * numpy_weights(contributions[t][alive[t]])
+    return shares
+
+
+def test_shares_against_numpy():
+    rng = np.random.default_rng(0)
+    contributions = rng.normal(size=(EPISODES, STEPS, AGENTS)).astype(np.float32)
+    alive = rng.uniform(size=contributions.shape) < 0.6
+    alive[0], alive[1, 0], alive[1, 1] = True, False, [True, False, False]
+    want = [numpy_shares(*pair) for pair in zip(contributions, alive, strict=True)]
+    np.testing.assert_allclose(shares_of(contributions, alive), want, rtol=1e-4, atol=1e-6)
+
+
+numbers = st.one_of(st.sampled_from((0.0, 1e-20, -1e-38)), st.floats(-1e6, 1e6, width=32))
+
+
+@given(st.lists(numbers, min_size=12, max_size=12), st.lists(st.booleans(), min_size=12, max_size=12))
+def test_shares_add_up(contributions, alive):
+    """They are never negative, and add up to 1, also if all contributions are equal. Agents that have left have none."""
+    contributions, alive = (np.reshape(x, (1, 4, 3)) for x in (np.float32(contributions), alive))
+    shares = np.asarray(shares_of(contributions, alive))
+    assert (shares >= 0).all()
+    assert not shares[~alive].any()
+    assert shares.sum() == pytest.approx(float(alive.any()), abs=1e-5)
+
+
+def test_rewards_add_up_to_the_return():
+    """The mean over the agents that are alive, summed over the steps, is the return, whatever the decoder gives."""
+    spec = engine.credit_spec(
+        METHODS["tar2"],
+        CreditSettings(),
+        {"observation": 2, "action": 2},
+        scored_observation="after",
+        single_agent=False,
+        agents=AGENTS,
+        max_steps=STEPS,
+        fixed_length=True,
+        scale_rewards=False,
+    )
+    rng = np.random.default_rng(0)
+    alive = np.ones((2, 2 * STEPS, AGENTS), bool)
+    alive[0, 2:STEPS, 1] = alive[1, 1:STEPS, :2] = False
+    returns = np.repeat(rng.normal(size=(2, 2)), STEPS, axis=1).astype(
+        np.float32
+    )  # two environments, two episodes each
+    finished = np.ones(returns.shape, bool)
+    finished[1, STEPS:] = False
+    steps = StepBatch(
+        inputs=jnp.asarray(rng.normal(size=(2, 2 * STEPS, AGENTS, 4)), jnp.float32),
+        length=jnp.full(returns.shape, STEPS),
+        mean_reward=jnp.asarray(returns / STEPS),
+        finished=jnp.asarray(finished),
+        alive=jnp.asarray(alive),
+    )
+
+    @jax.jit
+    def compute():
+        decoder = engine.init_decoder(jax.random.key(0), spec)
+        return (
+            engine.training_rewards(decoder, empty_scale(), steps, spec, steps.alive),
+            engine.proxy_rewards(decoder, empty_scale(), steps._replace(finished=jnp.zeros_like(steps.finished)), spec),
+        )
+
+    rewards, contributions = map(np.asarray, compute())
+    step_rewards = np.sum(rewards * alive, axis=-1) / np.maximum(alive.sum(axis=-1), 1)
+    np.testing.assert_allclose(
+        step_rewards.reshape(4, STEPS).sum(axis=1)[:3], returns.reshape(4, STEPS)[:3, 0], rtol=1e-4, atol=1e-6
+    )
+    want = numpy_shares(contributions[0, :STEPS], alive[0, :STEPS]) * alive[0, :STEPS].sum(axis=1, keepdims=True)
+    np.testing.assert_allclose(rewards[0, :STEPS], want * returns[0, 0], rtol=1e-3, atol=1e-5)
+    np.testing.assert_array_equal(rewards[1, STEPS:], contributions[1, STEPS:])  # its return is not known yet

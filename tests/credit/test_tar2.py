@@ -1,0 +1,148 @@
+"""TAR2 against a slow NumPy twin, and what it must learn."""
+
+import math
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from helpers.numpy_attention import numpy_attention, numpy_layer_norm, numpy_linear
+from lare_rl.config.validity import check_credit
+from lare_rl.credit.decoder_settings import CreditSettings
+from lare_rl.credit.methods import METHODS
+from lare_rl.credit.shares import return_shares
+from lare_rl.credit.tar2 import TAR2
+from lare_rl.errors import LareError
+from lare_rl.nn.networks import adam_step, init_adam
+
+EPISODES, STEPS, AGENTS, OBSERVATIONS, ACTIONS, GAIN = 2, 4, 3, 5, 2, 2.0
+KEY = jax.random.key(1)
+
+
+@pytest.fixture(scope="module")
+def decoder():
+    return TAR2(OBSERVATIONS, ACTIONS, STEPS, AGENTS, GAIN, key=jax.random.key(0))
+
+
+@pytest.fixture(scope="module")
+def rows():
+    rng = np.random.default_rng(0)
+    action = np.eye(ACTIONS)[rng.integers(ACTIONS, size=(EPISODES * STEPS, AGENTS))]
+    observation = rng.normal(size=(EPISODES * STEPS, AGENTS, OBSERVATIONS))
+    return np.concatenate([observation, action], axis=-1).astype(np.float32)
+
+
+def numpy_gelu(x):
+    return x * 0.5 * (1 + np.vectorize(math.erf)(x / np.sqrt(2)))
+
+
+def numpy_mlp(mlp, x):
+    first, second = mlp.layers
+    return numpy_linear(second, numpy_gelu(numpy_linear(first, x)))
+
+
+def numpy_time_layer(layer, x):
+    projected = [numpy_linear(linear, x).reshape(STEPS, 4, 16) for linear in (layer.query, layer.key, layer.value)]
+    a = numpy_linear(layer.merge, numpy_attention(*projected, np.tri(STEPS, dtype=bool)))
+    first, second = layer.feed_forward.layers
+    hidden = numpy_gelu(numpy_linear(first, numpy_layer_norm(x + a, 1e-12)))
+    return numpy_layer_norm(numpy_linear(second, hidden) + 2 * a, 1e-12)
+
+
+def numpy_agent_layer(layer, x, masks):
+    query = np.stack([x[i] @ layer.query.weight[i] + layer.query.bias[i] for i in range(AGENTS)])
+    projected = query, numpy_linear(layer.key, x), numpy_linear(layer.value, x)
+    projected = [values.reshape(AGENTS, 4, 16) for values in projected]
+    return np.mean([numpy_linear(layer.merge, numpy_attention(*projected, mask)) for mask in masks], axis=0)
+
+
+def numpy_output(decoder, episode, key):
+    """Return the contributions and the log probability of each action, of one episode (steps, agents, inputs)."""
+    observation, action = np.split(episode, [OBSERVATIONS], axis=-1)
+    state = numpy_linear(decoder.embed_observation, observation) + np.asarray(decoder.position)[:, None]
+    x, outputs = state + numpy_linear(decoder.embed_action, action), []
+    for i, layer_key in enumerate(jax.random.split(key, 3)):
+        mask_key, order_key = jax.random.split(layer_key)
+        x = np.stack([numpy_time_layer(decoder.time_layers[i], x[:, agent]) for agent in range(AGENTS)], axis=1)
+        x = x + np.asarray(decoder.agent_numbers)[i][np.asarray(jax.random.permutation(order_key, AGENTS))]
+        masks = np.asarray(jax.random.bernoulli(mask_key, 0.5, (5, AGENTS, AGENTS))) | np.eye(AGENTS, dtype=bool)
+        x = np.stack([numpy_agent_layer(decoder.agent_layers[i], step, masks) for step in x])
+        outputs.append(x)
+    h = np.concatenate(outputs, axis=-1)
+    outcome = np.broadcast_to(h[-1].mean(axis=0), h.shape)
+    contributions = numpy_mlp(decoder.contribution_model, np.concatenate([h, outcome], axis=-1))[..., 0]
+    past = np.concatenate([np.zeros_like(h[:1]), h[:-1]])
+    mean_state = np.broadcast_to(state.mean(axis=1, keepdims=True), state.shape)
+    logits = numpy_mlp(decoder.action_model, np.concatenate([mean_state, past], axis=-1))
+    log_p = logits - np.log(np.exp(logits).sum(axis=-1, keepdims=True))
+    return contributions, (log_p * action).sum(axis=-1)
+
+
+def test_output_against_numpy(decoder, rows):
+    output = jax.jit(lambda rows: decoder(rows, KEY))(rows)
+    want = [numpy_output(decoder, episode, KEY) for episode in rows.reshape(EPISODES, STEPS, AGENTS, -1)]
+    contributions, log_p = (np.concatenate(values) for values in zip(*want, strict=True))
+    np.testing.assert_allclose(output.r_hat, GAIN * contributions, rtol=1e-3, atol=1e-4)
+    np.testing.assert_allclose(output.penalty, -0.05 * log_p, rtol=1e-3, atol=1e-5)
+
+
+def test_contributions_are_a_mean_over_samples(decoder, rows):
+    keys = jax.random.split(jax.random.key(jnp.uint32(0)), 8)
+    output, samples = jax.jit(
+        lambda rows: (decoder(rows, None), jax.lax.map(lambda key: decoder(rows, key).r_hat, keys))
+    )(rows)
+    np.testing.assert_allclose(output.r_hat, samples.mean(axis=0), rtol=1e-4, atol=1e-5)
+    assert not np.asarray(output.penalty).any()
+
+
+def test_must_learn_contributions_and_actions():
+    """The reward of an agent is its first entry. It acts by the sign of the mean second entry. Only returns are observed."""
+    decoder = TAR2(2, 2, STEPS, AGENTS, 1.0, key=jax.random.key(0))
+    observation = np.random.default_rng(0).normal(size=(120, 32, STEPS, AGENTS, 2))
+    chosen = (observation[..., 1].mean(axis=-1, keepdims=True) > 0).astype(int).repeat(AGENTS, axis=-1)
+    episodes = np.concatenate([observation, np.eye(2)[chosen]], axis=-1).astype(np.float32)
+    reward = observation[..., 0]
+
+    def loss(decoder, rows, target, key):
+        output = decoder(rows.reshape(-1, AGENTS, 4), key)
+        mean = jnp.mean(output.r_hat.reshape(len(target), -1), axis=1)
+        return jnp.mean((mean - target) ** 2) + jnp.mean(output.penalty)
+
+    def body(state, inputs):
+        decoder, optimizer = state
+        return adam_step(decoder, jax.grad(loss)(decoder, *inputs), optimizer, 1e-3), None
+
+    @jax.jit
+    def train(decoder, *inputs):
+        decoder = jax.lax.scan(body, (decoder, init_adam(decoder, 1e-3)), inputs)[0][0]
+        rows = jnp.asarray(episodes[0]).reshape(-1, AGENTS, 4)
+        return decoder(rows, None).r_hat, decoder(rows, KEY).penalty
+
+    target = (4 * reward.mean(axis=(2, 3))).astype(np.float32)
+    r_hat, penalty = map(np.asarray, train(decoder, episodes, target, jax.random.split(KEY, len(episodes))))
+    r_hat = r_hat.reshape(32, STEPS, AGENTS)
+    assert np.corrcoef(r_hat.ravel(), reward[0].ravel())[0, 1] > 0.8
+    assert penalty.mean() < 0.05 * 0.6 * np.log(2)
+    shares = np.asarray(return_shares(jnp.asarray(r_hat), jnp.ones(r_hat.shape, bool)))
+    assert np.corrcoef(shares.ravel(), reward[0].ravel())[0, 1] > 0.4
+
+
+@pytest.mark.parametrize(
+    ("changes", "words"),
+    [
+        ({"n_agents": 1}, "among agents"),
+        ({"fixed_length": False}, "whole episodes of one length"),
+        ({"discrete_actions": False}, "tar2 learns which .* continuous .*: use stas"),
+    ],
+)
+def test_refusals(changes, words):
+    args = {"n_agents": 3, "n_raw_features": 7, "fixed_length": True} | changes
+    with pytest.raises(LareError, match=words):
+        check_credit(METHODS["tar2"], CreditSettings(), **args)
+
+
+def test_exact_is_no_setting():
+    """Shares add up to the return already."""
+    assert "exact" in METHODS["stas"].settings
+    assert "exact" not in METHODS["tar2"].settings
