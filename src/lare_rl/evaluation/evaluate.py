@@ -9,20 +9,19 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
-from lare_rl.envs.families import make_env, make_host_env, picklable_maker
-from lare_rl.envs.interface import HostEnv
+from lare_rl.envs.families import load_env_spec, make_env, make_host_env
+from lare_rl.envs.interface import JaxEnv
 from lare_rl.envs.load import check_environment
+from lare_rl.envs.placement import make_vec_env, n_open_envs
 from lare_rl.envs.play import Episode, play_episode
-from lare_rl.envs.workers import make_vec_env
 from lare_rl.errors import LareError
 from lare_rl.runs.directory import Run, as_run
 from lare_rl.tasks.spec import TaskSpec
 from lare_rl.tasks.trust import untrusted_module
 from lare_rl.training.collect_device import DeviceCollector
+from lare_rl.training.evaluate_host import evaluate_policy_on_host
 from lare_rl.training.evaluation import Evaluation, concatenate
-from lare_rl.training.host_policy import EvaluationPolicy
 from lare_rl.training.saved_state import load_actor
-from lare_rl.training.unroll_host import evaluate_on_host
 from lare_rl.util.statistics import grouped_standard_error, standard_error
 
 __all__ = [
@@ -73,17 +72,16 @@ def evaluate_policy(run: Run, episodes: int, best: bool = False, deterministic: 
     check_environment(task)
     config, actor, _ = load_actor(run, best)
     config = replace(config, deterministic=deterministic)
-    env = make_env(task)
-    if not isinstance(env, HostEnv):
+    if load_env_spec(task).is_jax:
+        env = make_env(task)
+        assert isinstance(env, JaxEnv)
         return DeviceCollector(env, config, run.seeds).evaluate(actor, episodes, number=1)
-    env.close()
-    make_host, evaluations = picklable_maker(task), []
+    evaluations = []
     for n_done in range(0, episodes, MAX_OPEN_ENVS):
         n_episodes = min(MAX_OPEN_ENVS, episodes - n_done)
-        with make_vec_env(make_host, n_episodes * len(run.seeds)) as envs:
+        with make_vec_env(task, n_open_envs(task, len(run.seeds), n_episodes) * len(run.seeds)) as envs:
             first = run.config.settings.evaluation_episodes + n_done
-            policy = EvaluationPolicy(config, actor, run.seeds, n_episodes)
-            evaluations.append(evaluate_on_host(envs, policy, run.seeds, n_episodes, first))
+            evaluations.append(evaluate_policy_on_host(envs, config, actor, run.seeds, n_episodes, first))
     return concatenate(evaluations)
 
 

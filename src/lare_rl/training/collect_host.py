@@ -15,17 +15,17 @@ from jaxtyping import Bool, Float, Int
 
 from lare_rl.data.trajectory import Trajectory
 from lare_rl.envs.env_errors import EnvOutputError
-from lare_rl.envs.families import picklable_maker
 from lare_rl.envs.interface import EnvSpec, Timestep, to_env_action
+from lare_rl.envs.placement import make_vec_env, n_open_envs
 from lare_rl.envs.vec_env import VecEnv
-from lare_rl.envs.workers import SubprocVecEnv, make_vec_env
 from lare_rl.errors import LareError
 from lare_rl.tasks.spec import TaskSpec
+from lare_rl.training.evaluate_host import evaluate_policy_on_host
 from lare_rl.training.evaluation import Evaluation
-from lare_rl.training.host_policy import EvaluationPolicy, init_host_memory, make_policy
+from lare_rl.training.host_policy import init_host_memory, make_policy
 from lare_rl.training.static_config import TrainConfig
 from lare_rl.training.streams import Stream, episode_seed, host_noise, numpy_generator
-from lare_rl.training.unroll_host import add_seed_axis, check_finite, evaluate_on_host
+from lare_rl.training.unroll_host import add_seed_axis, check_finite
 
 __all__ = ["HostCollector", "HostVecEnv", "make_host_collector"]
 
@@ -202,8 +202,7 @@ class HostCollector:
 
     def evaluate(self, actor: Any, n_episodes: int) -> Evaluation:
         """Evaluate whole episodes of the policy, always from the same initial states."""
-        policy = EvaluationPolicy(self._config, actor, self._seeds, n_episodes)
-        return evaluate_on_host(self._evaluation_envs, policy, self._seeds, n_episodes)
+        return evaluate_policy_on_host(self._evaluation_envs, self._config, actor, self._seeds, n_episodes)
 
     def state_dict(self) -> dict[str, np.ndarray]:
         """Return the arrays that `restore` needs: seeds and actions of the running episodes, and the actors' memory."""
@@ -226,10 +225,9 @@ def make_host_collector(
     task: TaskSpec, config: TrainConfig, seeds: Sequence[int], n_evaluation_episodes: int
 ) -> HostCollector:
     """Make a collector with a task's environments. If a seed has several, they step in worker processes."""
-    make_env, n_seeds = picklable_maker(task), len(seeds)
-    n_envs = n_seeds * config.n_envs
-    envs = make_vec_env(make_env, n_envs) if config.n_envs == 1 else SubprocVecEnv([make_env] * n_envs)
-    evaluation_envs = make_vec_env(make_env, n_seeds * n_evaluation_episodes)
+    n_seeds = len(seeds)
+    envs = make_vec_env(task, n_seeds * config.n_envs, parallel=config.n_envs > 1)
+    evaluation_envs = make_vec_env(task, n_seeds * n_open_envs(task, n_seeds, n_evaluation_episodes))
     return HostCollector(envs, evaluation_envs, config, seeds)
 
 
