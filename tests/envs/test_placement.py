@@ -9,7 +9,7 @@ import pytest
 
 from helpers.single_instance import N_STEPS, simulations, single_spec
 from helpers.toy_envs import toy_spec
-from lare_rl.envs import placement
+from lare_rl.envs import placement, workers
 from lare_rl.envs.families import load_env_spec, make_host_env
 from lare_rl.envs.placement import SeparateEnv, make_vec_env, measure_step_s, n_open_envs, needs_process
 from lare_rl.envs.play import play_episodes
@@ -107,6 +107,16 @@ def test_hang_is_an_error_of_one_line(monkeypatch):
         env.reset(0)
         with pytest.raises(LareError, match=r"did not reply for 0.5 s in step; .*timeout in the task file"):
             env.step(np.float32([[0, 0, 1]]))
+
+
+def test_hang_ends_soon_after_a_request_to_stop(monkeypatch):
+    monkeypatch.setenv("STALL", "1")
+    monkeypatch.setattr(workers, "STOP_TIMEOUT_S", 0.5)
+    with make_vec_env(single_spec("Stalls", processes="separate"), 1) as envs:
+        envs.reset(np.ones(1, bool), np.zeros(1, int))
+        envs.stop_requested = lambda: True
+        with pytest.raises(LareError, match=r"did not reply for 0.5 s in step"):
+            envs.step(np.float32([[[0, 0, 1]]]))
 
 
 def test_idle_process_that_died_is_replaced():

@@ -27,6 +27,11 @@ __all__ = ["SubprocVecEnv", "close_idle_workers", "make_vec_env"]
 MIN_SAVED_S = 3e-4
 """Workers are used if they make a step of all environments at least this much faster. A call of all workers costs about as much."""
 
+STOP_TIMEOUT_S = 20.0
+"""The time within which an environment must reply once the user has asked the run to stop."""
+POLL_S = 1.0
+"""How often this process looks whether the user has asked the run to stop (s)."""
+
 _idle_workers: defaultdict[str, list[Worker]] = defaultdict(list)
 """Workers that wait for the next batch of environments, by the key of their environment."""
 
@@ -83,6 +88,7 @@ class SubprocVecEnv(VecEnv):
         """
         self.timeout = timeout
         self._timeout_hint, self._reuse_key = timeout_hint, reuse_key
+        self.stop_requested = lambda: False
         self._workers: list[Worker] = []
         n_envs, n_workers = len(makers), min(len(makers), processes or n_cores(), MAX_WORKERS)
         if reuse_key and n_workers < n_envs:
@@ -155,15 +161,15 @@ class SubprocVecEnv(VecEnv):
         """Return all workers that are busy, with their replies."""
         replies = []
         while busy := [worker for worker in self._workers if worker.is_busy]:
-            deadline = min(worker.last_active for worker in busy) + self.timeout
-            ready = wait([worker.connection for worker in busy], max(0.0, deadline - time.monotonic()))
+            timeout = min(self.timeout, STOP_TIMEOUT_S) if self.stop_requested() else self.timeout
+            deadline = min(worker.last_active for worker in busy) + timeout
+            wait_s = min(POLL_S, max(0.0, deadline - time.monotonic()))
+            ready = wait([worker.connection for worker in busy], wait_s)
             for worker in busy:
                 if worker.connection in ready:
                     replies.append((worker, worker.receive()))
-                elif worker.measure_idle_s() > self.timeout:
-                    raise LareError(
-                        f"{worker.label} did not reply for {self.timeout:g} s in {command}{self._timeout_hint}"
-                    )
+                elif worker.measure_idle_s() > timeout:
+                    raise LareError(f"{worker.label} did not reply for {timeout:g} s in {command}{self._timeout_hint}")
         return replies
 
     def close(self) -> None:

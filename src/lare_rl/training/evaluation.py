@@ -1,6 +1,7 @@
 """Whole episodes of a policy, and what an evaluation measures of them."""
 
-from collections.abc import Sequence
+import math
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -11,7 +12,7 @@ from jaxtyping import Bool, Float, Int
 from lare_rl.data.trajectory import Trajectory
 from lare_rl.envs.interface import AnyArray, EnvSpec
 
-__all__ = ["EpisodeBatch", "Evaluation", "concatenate"]
+__all__ = ["EpisodeBatch", "Evaluation", "concatenate", "metrics_lines"]
 
 
 class EpisodeBatch(NamedTuple):
@@ -60,3 +61,14 @@ def concatenate(evaluations: Sequence[Evaluation]) -> Evaluation:
     """Concatenate the episodes of evaluations of the same seeds."""
     fields = [(result.returns, result.summed_returns, result.lengths, result.measures) for result in evaluations]
     return Evaluation(*jax.tree.map(lambda *arrays: np.concatenate(arrays, axis=1), *fields))
+
+
+def metrics_lines(seeds: Sequence[int], step: int, metrics: Mapping[str, Any], rate: float) -> list[dict[str, Any]]:
+    """Return one line of metrics.jsonl for each seed, from arrays with one number for each seed."""
+    lines = []
+    for seed_index, seed in enumerate(seeds):
+        numbers = {name: float(np.asarray(values)[seed_index]) for name, values in metrics.items()}
+        # JSON has no NaN: a correlation with a value that never varies is null.
+        valid = {name: value if math.isfinite(value) else None for name, value in numbers.items()}
+        lines.append({"step": step, "seed": seed, **valid, "time/steps_per_second": round(rate, 1)})
+    return lines

@@ -1,8 +1,7 @@
 """A running training: the training state, its environments, and the functions that advance it by one iteration."""
 
-import math
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
 from typing import Any
@@ -22,7 +21,7 @@ from lare_rl.errors import LareError
 from lare_rl.runs import checkpoint
 from lare_rl.runs.best_policy import BEST_FILE, BestPolicy, empty_best, load_best, save_best, update_best
 from lare_rl.runs.directory import Run
-from lare_rl.runs.metric_names import ACTOR_SATURATION
+from lare_rl.runs.metric_names import ACTOR_SATURATION, LIKELIEST_RETURN
 from lare_rl.tasks.spec import TaskSpec
 from lare_rl.training import advice, first_fit
 from lare_rl.training.batching import is_batching_faster
@@ -31,6 +30,7 @@ from lare_rl.training.collect_host import HostCollector, make_host_collector
 from lare_rl.training.compile_cache import cache_by_value
 from lare_rl.training.compiled import CompiledFunctions, compile_ahead, compile_functions, init_seeds, steps_shape
 from lare_rl.training.compiled_loop import CompiledLoop, compile_loop, init_loop
+from lare_rl.training.evaluation import metrics_lines
 from lare_rl.training.factors import compute_host_factors
 from lare_rl.training.learner import Learner, abandon_episodes
 from lare_rl.training.saved_state import actor_shape, load_learner, make_train_config
@@ -202,9 +202,12 @@ class Session:
         if len(self.config.env.teams) == 1:
             self._keep_best(evaluation.returns[..., 0].mean(axis=1))
         metrics = evaluation.metrics(self.config.env) | self.functions.assess(self.learner) | self.latest_metrics
+        if self.step == self.settings.steps and not self.config.greedy and isinstance(self.collector, HostCollector):
+            likeliest = self.collector.evaluate(self.actor, self.settings.evaluation_episodes, deterministic=True)
+            metrics[LIKELIEST_RETURN] = likeliest.returns[..., 0].mean(axis=1)
         if self.step > self.config.warmup and isinstance(self.settings.hyperparameters, OffPolicySettings):
             metrics |= {ACTOR_SATURATION: advice.saturation(self.greedy_actions(advice.N_PROBE_STATES))}
-        return _metrics_lines(self.run.seeds, self.step, metrics, rate)
+        return metrics_lines(self.run.seeds, self.step, metrics, rate)
 
     def greedy_actions(self, n_states: int) -> Float[np.ndarray, "seeds states action"]:
         """Return an off-policy algorithm's actions without noise in the newest states of the first environment.
@@ -344,14 +347,3 @@ _abandon_episodes = jax.jit(jax.vmap(abandon_episodes))
 def _select_prefix(arrays: dict[str, np.ndarray], prefix: str) -> dict[str, np.ndarray]:
     """Return the arrays whose names begin with a prefix, by the rest of their names."""
     return {name.removeprefix(prefix): values for name, values in arrays.items() if name.startswith(prefix)}
-
-
-def _metrics_lines(seeds: Sequence[int], step: int, metrics: Mapping[str, Any], rate: float) -> list[dict[str, Any]]:
-    """Return one line of metrics.jsonl for each seed, from arrays with one number for each seed."""
-    lines = []
-    for seed_index, seed in enumerate(seeds):
-        numbers = {name: float(np.asarray(values)[seed_index]) for name, values in metrics.items()}
-        # JSON has no NaN: a correlation with a value that never varies is null.
-        valid = {name: value if math.isfinite(value) else None for name, value in numbers.items()}
-        lines.append({"step": step, "seed": seed, **valid, "time/steps_per_second": round(rate, 1)})
-    return lines
