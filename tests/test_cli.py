@@ -3,6 +3,8 @@
 import json
 import re
 import shutil
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -112,17 +114,31 @@ def test_help(command):
 
 def test_help_of_options(command):
     _, out, _ = command("train", "--help")
-    options = (
+    options = [
         "steps INT",
         "out DIR",
         "scored-observation {before,after,both}",
         "credit.hidden [INT [INT ...]]",
-        "td3.gamma FLOAT",
-    )
+    ]
     assert all(f" --{option} " in out for option in options)
+    assert not any(f" --{name}." in out for name in ALGORITHMS)
+    for name in ("--algorithm sac", "--algorithm=sac"):
+        _, longer, _ = command("train", *name.split(), "--help")
+        assert " --sac.gamma FLOAT " in longer
+        assert " --td3." not in longer
     # Lines of a docstring are joined.
     lines = {line.strip() for line in cli.train.__doc__.partition("Args:")[2].splitlines()} - {""}
     assert lines.isdisjoint(line.strip(" |│") for line in out.splitlines())
+
+
+def test_a_typo_in_a_task_file_is_reported_before_slow_imports(spec_file):
+    path = spec_file(observation=None, observatoin="typo")
+    for arguments in (["train", path], ["verify", "phi.py", "--task", path]):
+        program = f"import sys; sys.argv = {['lare-rl', *map(str, arguments)]}; from lare_rl.cli import main\n"
+        program += "try: main()\nfinally: print(sorted({'jax', 'gymnasium', 'numpy'} & set(sys.modules)))"
+        process = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True)
+        assert "there is no key 'observatoin'" in process.stderr
+        assert process.stdout == "[]\n"
 
 
 def test_tasks(command):

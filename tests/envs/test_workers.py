@@ -118,7 +118,7 @@ def test_length_of_an_episode_is_checked(make_vec_env, changes, words):
     [
         ("itself", "the battery is empty"),
         ("exit", "environment 1 failed in step: the window is closed"),
-        ("make", "environment 1 cannot be made: no asset"),
+        ("make", "environment 1 cannot be made: no asset track.bin"),
         ("output", "the reward is nan"),
     ],
 )

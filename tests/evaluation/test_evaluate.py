@@ -10,12 +10,14 @@ import pytest
 from PIL import Image
 
 import lare_rl
-from helpers.toy_envs import Chase, toy_spec
+from helpers.toy_envs import Chase, pick_spec, toy_spec
 from lare_rl.envs.families import make_host_env
 from lare_rl.envs.vec_env import LocalVecEnv
 from lare_rl.errors import LareError
+from lare_rl.evaluation import evaluate as module
 from lare_rl.evaluation.evaluate import (
     MAX_OPEN_ENVS,
+    MIN_RANDOM_EPISODES,
     RANDOM_EPISODES,
     evaluate_run,
     gain_over_random,
@@ -24,6 +26,7 @@ from lare_rl.evaluation.evaluate import (
 )
 from lare_rl.evaluation.policy import load_policy
 from lare_rl.evaluation.video import check_video_path, record_video, write_video
+from lare_rl.runs.metric_names import LIKELIEST_RETURN
 from lare_rl.training.compiled import compile_functions
 from lare_rl.training.host_policy import EvaluationPolicy
 from lare_rl.training.saved_state import load_learner
@@ -111,7 +114,36 @@ def test_random_play_is_bounded():
     assert len(play_random(TASK, limit_s=60.0)) == RANDOM_EPISODES
     assert not FilmedChase.open_envs
     assert len(measure_random_returns(toy_spec(environment="no-such-environment"))) == 0
-    assert play_random(TASK, limit_s=-1.0) == []
+
+
+def test_random_play_that_takes_long(monkeypatch):
+    """It has a few episodes more than the limit of time allows, unless they take minutes."""
+    assert len(play_random(TASK, limit_s=-1.0)) == MIN_RANDOM_EPISODES
+    numbers = []
+    play_random(TASK, 3, on_episode=numbers.append)
+    assert numbers == [1, 2, 3]
+    monkeypatch.setattr(module, "MAX_RANDOM_PLAY_S", -1.0)
+    assert play_random(TASK) == []
+
+
+def test_most_likely_actions_beside_sampled_ones(small, tmp_path, command):
+    """Of a policy over choices: at the last evaluation, and by `lare-rl evaluate`, with the difference from random actions."""
+    run = lare_rl.train(
+        pick_spec(), small(algorithm="ppo", method="bayes", steps=120), out=tmp_path / "run", listeners=[]
+    )
+    has_likeliest = [LIKELIEST_RETURN in line for line in run.metrics()]
+    assert has_likeliest == [False, False, True, True]
+    status, out, err = command("evaluate", run.directory, "--episodes", 4)
+    lines = out.splitlines()
+    assert (status, err) == (0, "")
+    likeliest = evaluate_run(run, 4, deterministic=True)["Pick"]
+    (index,) = (i for i, line in enumerate(lines) if "most likely" in line)
+    assert [format_mean_std(row) in line for row, line in zip(likeliest, lines[index + 1 :], strict=False)] == [
+        True
+    ] * 2
+    assert any(line.startswith("random actions: return") and "over 10 episodes" in line for line in lines)
+    assert any(line.startswith("difference: ") for line in lines)
+    assert "most likely" not in command("evaluate", run.directory, "--episodes", 1, "--deterministic")[1]
 
 
 def test_measures_of_random_play(run, command):

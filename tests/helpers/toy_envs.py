@@ -121,5 +121,6 @@ class Forgetful(Chase):
 
 
 gymnasium.register("toys/Pick-v0", entry_point=Pick, max_episode_steps=20)
+gymnasium.register("toys/Endless-v0", entry_point=Pick)
 gymnasium.register("toys/Broken-v0", entry_point=Broken, max_episode_steps=20)
 gymnasium.register("toys/Forgetful-v0", entry_point=Forgetful, max_episode_steps=20)

@@ -89,6 +89,9 @@ def test_outcome_values():
     assert (reached["return_"], reached["steps"]) == (71, 8000)
     assert reached["std"].values["std"] == pytest.approx(np.sqrt(2))
     assert reached["seeds"].values["n_seeds"] == 2
+    assert reached["likeliest"] is None
+    sampled = find(RISING_2, likeliest_return=80.0)["learned"]
+    assert "the most likely action gets 80" in render(sampled, MESSAGES)
     assert (baseline["return_"], baseline["std"], baseline["n_episodes"]) == (0, 1, 3)
     assert baseline["initial"].values["returns"] == (3, 4)
 

@@ -29,7 +29,9 @@ from helpers.training_runs import (
 from lare_rl.credit.methods import METHODS
 from lare_rl.errors import LareError
 from lare_rl.latent.function import verify_function
+from lare_rl.runs.checkpoint import read_host_state
 from lare_rl.runs.directory import open_run
+from lare_rl.training import loop
 from lare_rl.training.loop import RunInterruptedError
 from lare_rl.training.saved_state import load_learner
 
@@ -66,6 +68,16 @@ def test_resume_after_kill_is_exact(small, phi, factor_run, tmp_path):
     with (tmp_path / "killed" / "metrics.jsonl").open("a") as file:  # written after the checkpoint: it comes again
         file.write('{"step": 180, "seed": 0}\n{"ste')
     assert_equal_runs(resume_quietly(tmp_path / "killed"), factor_run)
+
+
+def test_checkpoint_by_time(dense, dense_run, tmp_path, monkeypatch):
+    """A crash between two evaluations costs only the steps since the newest checkpoint, and the continuation is exact."""
+    monkeypatch.setattr(loop, "CHECKPOINT_S", 0.0)
+    with pytest.raises(ZeroDivisionError):
+        train_quietly(CHASE, dense(), tmp_path / "run", listeners=[AtStep(108, lambda: 1 / 0)])
+    assert [line["step"] for line in open_run(tmp_path / "run").metrics()] == [60, 60]
+    assert read_host_state(tmp_path / "run" / "checkpoint")["step"] == 96
+    assert_equal_runs(resume_quietly(tmp_path / "run"), dense_run)
 
 
 @pytest.mark.parametrize("number", [long_case(signal.SIGINT), signal.SIGTERM])

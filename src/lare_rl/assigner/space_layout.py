@@ -92,7 +92,10 @@ class SpaceLayout(CheckedModel):
     def _check_rows(self, array: Shaped[np.ndarray, "*shape"], name: str) -> Float[np.ndarray, "*batch size"]:
         """Return values that are rows already."""
         if array.ndim == 0 or array.shape[-1] != self.size:
-            raise LareError(f"{name} has the shape {array.shape}: give rows of {self.size} numbers")
+            hint = ""
+            if name == "action" and array.dtype.kind in "iu" and self.kind == "numbers":
+                hint = f", or for a choice, make the assigner with action_space=gymnasium.spaces.Discrete({self.size})"
+            raise LareError(f"{name} has the shape {array.shape}: give rows of {self.size} numbers{hint}")
         return _to_float32(array)
 
 

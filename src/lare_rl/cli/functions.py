@@ -9,7 +9,16 @@ from typing import TYPE_CHECKING, Annotated
 import tyro
 from tyro.conf import Positional
 
-from lare_rl.cli.terminal import Data, Kind, Task, load_steps, print_line, print_progress, write_new_file
+from lare_rl.cli.terminal import (
+    Data,
+    EpisodeProgress,
+    Kind,
+    Task,
+    load_steps,
+    print_line,
+    print_progress,
+    write_new_file,
+)
 from lare_rl.errors import LareError
 from lare_rl.tasks.spec import NO_ENVIRONMENT, ScoredObservation
 
@@ -123,9 +132,11 @@ def verify(
         policy: a run whose policy plays the episodes for --fit, instead of random actions.
         scored_observation: the observation of a step that the function reads, instead of the task's.
     """
+    from lare_rl.envs.load import load_task, read_task
+
+    read_task(task)  # a typo is reported before the slow imports
     from lare_rl.cli.design import load_policy
     from lare_rl.credit.explanation_text import MIN_EXPLAINED_EPISODES
-    from lare_rl.envs.load import load_task, read_task
     from lare_rl.latent.function import function_from_verdict
     from lare_rl.latent.saved import read_source
     from lare_rl.latent.verify import verify as verify_source
@@ -177,7 +188,7 @@ def _load_episodes(role: "TaskSpec", data: str | None, n_episodes: int, policy: 
     from lare_rl.envs.play import play_episodes
 
     print_progress(f"playing {n_episodes} episodes by {'random actions' if policy is None else 'the policy'}")
-    return play_episodes(role, n_episodes, policy)
+    return play_episodes(role, n_episodes, policy, on_episode=EpisodeProgress(n_episodes))
 
 
 def _print_assessment(function: "LatentFunction", role: "TaskSpec", episodes: "Sequence[Episode]") -> None:

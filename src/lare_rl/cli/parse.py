@@ -6,6 +6,7 @@ import inspect
 import io
 import itertools
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextvars import ContextVar
 from types import NoneType
 from typing import Annotated, Any, Literal, get_args, get_origin
 
@@ -19,6 +20,7 @@ from tyro.constructors import (
     StructTypeInfo,
 )
 
+from lare_rl.algorithms.registry import ALGORITHMS
 from lare_rl.errors import CheckedModel, LareError, did_you_mean, model_keys, nested_model
 from lare_rl.util.renamed_fields import rename_options
 
@@ -45,7 +47,7 @@ def parse(
         problem = f"there is no command {name!r}{did_you_mean(name, commands)}" if name else "there is no command"
         raise LareError(f"{problem}; see lare-rl --help")
     prog = f"lare-rl {name}"
-    with _RULES, contextlib.redirect_stderr(io.StringIO()) as stderr:
+    with _RULES, _hide(_hidden_algorithms(options)), contextlib.redirect_stderr(io.StringIO()) as stderr:
         try:
             command, unknown = tyro.cli(_defer(commands[name]), prog=prog, args=options, return_unknown_args=True)
         except LareError as error:
@@ -58,6 +60,27 @@ def parse(
         hint = did_you_mean(unknown[0], _option_names(commands[name]))
         raise LareError(f"unrecognized options: {', '.join(unknown)}{hint}; see {prog} --help")
     return command
+
+
+_hidden_groups: ContextVar[frozenset[str]] = ContextVar("hidden_groups", default=frozenset())
+"""The names of options with settings of their own that the help leaves out."""
+
+
+@contextlib.contextmanager
+def _hide(names: frozenset[str]) -> Iterator[None]:
+    token = _hidden_groups.set(names)
+    try:
+        yield
+    finally:
+        _hidden_groups.reset(token)
+
+
+def _hidden_algorithms(options: Sequence[str]) -> frozenset[str]:
+    """Return the algorithms whose hyperparameters a requested help leaves out: all but the one of --algorithm."""
+    if not {"-h", "--help"} & set(options):
+        return frozenset()  # their options can be set
+    _, _, name = " ".join(options).replace("=", " ").partition("--algorithm ")
+    return frozenset(ALGORITHMS) - {name.partition(" ")[0]}
 
 
 def _first_paragraph(box: str) -> str:
@@ -106,9 +129,12 @@ def _read_model(info: StructTypeInfo) -> StructConstructorSpec | None:
     fields = []
     for name, field in info.type.model_fields.items():
         default, doc = None if may_be_none else getattr(info.default, name), field.description
-        if kind := nested_model(field):
+        if model := nested_model(field):
+            kind = model
+            if name in _hidden_groups.get():
+                kind = Annotated[kind, tyro.conf.Suppress]
             default = tyro.MISSING if default is None else default
-            doc = doc or inspect.cleandoc(kind.__doc__ or "").split("\n\n")[0]
+            doc = doc or inspect.cleandoc(model.__doc__ or "").split("\n\n")[0]
         else:
             annotation: Any = field.annotation
             if field.metadata:

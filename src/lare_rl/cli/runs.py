@@ -2,6 +2,7 @@
 
 import os
 import sys
+import time
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -9,7 +10,14 @@ from typing import TYPE_CHECKING, Annotated
 import tyro
 from tyro.conf import Positional
 
-from lare_rl.cli.terminal import RunDirectories, RunDirectory, print_line, print_progress, print_table
+from lare_rl.cli.terminal import (
+    EpisodeProgress,
+    RunDirectories,
+    RunDirectory,
+    print_line,
+    print_progress,
+    print_table,
+)
 from lare_rl.config.effective import unused_settings
 from lare_rl.config.settings import ResolvedSettings, Settings
 from lare_rl.errors import LareError, install_command
@@ -38,6 +46,8 @@ def train(
 ) -> None:
     """Train on a task's episodic rewards. Ctrl-C saves and stops; --resume continues.
 
+    The help lists the hyperparameters of an algorithm if it is named, as in lare-rl train --algorithm ppo --help.
+
     Args:
         task: a shipped name (see `lare-rl tasks`), or the path of a task file. Not given with --resume.
         function: a latent function (.py), or a reply with one (.json), to use instead of a recorded one; verified before it is
@@ -50,6 +60,10 @@ def train(
         mlflow: send the metrics of each seed to an experiment of MLflow too (needs the extra lare-rl[mlflow]).
         watch: write verdict and curves to watch.html in the run directory after every evaluation, and open it in the browser.
     """
+    if task is not None:
+        from lare_rl.envs.load import read_task
+
+        read_task(task)  # a typo is reported before the slow imports
     import lare_rl
     from lare_rl.runs.directory import open_run
 
@@ -131,7 +145,8 @@ def evaluate(
     """Evaluate the policy of a run by its true return, from initial states that no evaluation of the run has used.
 
     Prints the mean return of the policy with its standard deviation, and the same of as many episodes of random actions, at
-    least ten (fewer if they take long), from other initial states than the policy's.
+    least ten (at least five if they take longer than the policy's), from other initial states, and the difference with its
+    standard error. A policy that samples its actions also plays the most likely ones.
 
     Args:
         run: a run directory.
@@ -142,7 +157,7 @@ def evaluate(
     """
     from lare_rl.algorithms.registry import ALGORITHMS
     from lare_rl.envs.families import load_env_spec
-    from lare_rl.evaluation.evaluate import RANDOM_EPISODES, evaluate_policy, play_random
+    from lare_rl.evaluation.evaluate import RANDOM_EPISODES, RANDOM_PLAY_LIMIT_S, evaluate_policy, play_random
     from lare_rl.evaluation.video import check_video_path, record_video
     from lare_rl.runs.directory import open_run
     from lare_rl.training.explain import explain_run
@@ -158,29 +173,34 @@ def evaluate(
             print_progress("filming an episode; without a graphics card that may take minutes")
         record_video(opened, video, best, deterministic)
         print_line(f"wrote {video}")
+    start = time.monotonic()
     evaluation = evaluate_policy(opened, episodes, best, deterministic)
+    policy_s, n_random = time.monotonic() - start, max(episodes, RANDOM_EPISODES)
+    samples = not (deterministic or ALGORITHMS[settings.algorithm].greedy(env_spec.discrete))
+    likeliest = evaluate_policy(opened, episodes, best, deterministic=True) if samples else None
     best_steps = load_actor(opened, best=True)[2].tolist() if best else None
-    random_episodes = play_random(task, max(episodes, RANDOM_EPISODES)) if len(task.roles) == 1 else []
+    random_episodes = []
+    if len(task.roles) == 1:
+        random_episodes = play_random(task, n_random, max(policy_s, RANDOM_PLAY_LIMIT_S), EpisodeProgress(n_random))
     for line in _describe_evaluation(opened, evaluation, random_episodes, best_steps):
         print_line(line)
-    if not (deterministic or ALGORITHMS[settings.algorithm].greedy(env_spec.discrete)):
-        print_line("The policy samples its actions, as in training; --deterministic plays the most likely ones.")
+    if likeliest is not None:
+        print_line(
+            "The policy samples its actions, as in training. The most likely ones (--deterministic), from the same states:"
+        )
+        for line in _describe_returns(opened, likeliest, best_steps):
+            print_line(line)
     if explanation := explain_run(opened):
         print_line(f"Credit, judged on the stored training episodes of seed {opened.seeds[0]}:")
     for line in explanation:
         print_line(line)
 
 
-def _describe_evaluation(
-    run: "Run", evaluation: "Evaluation", random_episodes: "Sequence[Episode]", best_steps: "Sequence[int] | None"
-) -> Iterator[str]:
-    """Yield the returns and measures of each seed, and of random actions. `best_steps` are the steps of the best policies."""
-    import numpy as np
-
+def _describe_returns(run: "Run", evaluation: "Evaluation", best_steps: "Sequence[int] | None") -> Iterator[str]:
+    """Yield the returns of each seed. `best_steps` are the steps of the best policies."""
     from lare_rl.envs.families import load_env_spec
-    from lare_rl.evaluation.evaluate import gain_over_random
     from lare_rl.util.findings import format_value
-    from lare_rl.util.statistics import format_mean_std, format_plus_minus
+    from lare_rl.util.statistics import format_mean_std
 
     roles, has_many_agents = run.config.task.roles, load_env_spec(run.config.task).n_agents > 1
     for team_index, role in enumerate(roles):
@@ -196,9 +216,22 @@ def _describe_evaluation(
                 sums = evaluation.summed_returns[seed_index, :, team_index]
                 line += f"; summed over the agents {format_mean_std(sums)}"
             yield line
+
+
+def _describe_evaluation(
+    run: "Run", evaluation: "Evaluation", random_episodes: "Sequence[Episode]", best_steps: "Sequence[int] | None"
+) -> Iterator[str]:
+    """Yield the returns and measures of each seed, and of random actions. `best_steps` are the steps of the best policies."""
+    import numpy as np
+
+    from lare_rl.evaluation.evaluate import gain_over_random
+    from lare_rl.util.findings import format_value
+    from lare_rl.util.statistics import format_mean_std, format_plus_minus
+
+    yield from _describe_returns(run, evaluation, best_steps)
     if random_episodes:
         returns = np.array([episode.return_ for episode in random_episodes])
-        yield f"random actions: return {format_mean_std(returns)} over {len(random_episodes)} episodes"
+        yield f"random actions: return {format_mean_std(returns)} over {format_value(len(returns), 'count episode')}"
         if (gain := gain_over_random(evaluation.returns[:, :, 0], returns)) is not None:
             yield f"difference: {format_plus_minus(*gain)} (± is its standard error)"
     for name, seed_values in evaluation.measures.items():

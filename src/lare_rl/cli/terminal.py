@@ -1,6 +1,7 @@
 """What the commands share: types of their arguments, and functions that print."""
 
 import sys
+import time
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
@@ -9,6 +10,7 @@ import tyro
 from tyro.conf import Positional
 
 from lare_rl.errors import LareError
+from lare_rl.util.durations import format_seconds
 from lare_rl.util.sanitize import one_line, sanitize
 
 if TYPE_CHECKING:
@@ -23,6 +25,8 @@ RunDirectories = Annotated[
 Kind = Literal["factors", "reward"]
 Data = Annotated[str | None, tyro.conf.arg(metavar="DATASET")]
 
+PROGRESS_S = 20.0
+"""Seconds between two lines of progress."""
 _TABLE_WIDTH = 200
 """Characters in a line of a table, where the output is not a terminal."""
 
@@ -47,6 +51,22 @@ def print_table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> None:
 def print_progress(text: str) -> None:
     """Print a message to stderr, so that stdout holds only the result."""
     sys.stderr.write(sanitize(text) + "\n")
+
+
+class EpisodeProgress:
+    """Prints how many episodes have been played and the time left: after the first and then every `PROGRESS_S`, if they take long."""
+
+    def __init__(self, n_episodes: int):
+        self._n_episodes = n_episodes
+        self._start = self._line_time = time.monotonic()
+
+    def __call__(self, n_done: int) -> None:
+        now = time.monotonic()
+        seconds_left = (self._n_episodes - n_done) * (now - self._start) / n_done
+        wait_s = PROGRESS_S if self._line_time > self._start else 1.0
+        if now - self._line_time > wait_s and seconds_left > 1:
+            self._line_time = now
+            print_progress(f"played {n_done} of {self._n_episodes} episodes, {format_seconds(seconds_left)} left")
 
 
 def print_error(error: Exception) -> None:

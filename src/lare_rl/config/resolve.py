@@ -11,10 +11,16 @@ from lare_rl.credit.methods import find_method
 from lare_rl.data.replay import required_capacity
 from lare_rl.envs.families import find_score, load_env_spec
 from lare_rl.envs.interface import EnvSpec
+from lare_rl.envs.placement import SLOW_STEP_S, measure_step_s
 from lare_rl.errors import LareError
 from lare_rl.tasks.spec import TaskSpec
 
 __all__ = ["apply_defaults", "choose_algorithm", "replay_rows", "resolve"]
+
+
+TRAINING_SHARE = 10
+"""For each step of evaluations, there are about as many steps of training, if they are slow."""
+MIN_EVALUATION_EPISODES = 3
 
 
 def resolve(settings: Settings, task: TaskSpec) -> ResolvedSettings:
@@ -28,6 +34,10 @@ def resolve(settings: Settings, task: TaskSpec) -> ResolvedSettings:
     env = load_env_spec(task)
     _check_algorithm(ALGORITHMS[choose_algorithm(settings.algorithm, env)], task, env)
     resolved = _normalise(apply_defaults(settings, env), task, env)
+    if settings.evaluation_episodes is None and not env.is_jax and measure_step_s(task) > SLOW_STEP_S:
+        n_episodes = resolved.evaluate_every // (TRAINING_SHARE * env.max_steps)
+        n_episodes = min(resolved.evaluation_episodes, max(MIN_EVALUATION_EPISODES, n_episodes))
+        resolved = resolved.model_copy(update={"evaluation_episodes": n_episodes})
 
     method, team_level = find_method(resolved.method), task.credit_scope == "state"
     n_state_features = env.state_size + env.n_agents * env.action_size

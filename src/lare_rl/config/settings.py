@@ -51,8 +51,8 @@ class _RunSettings(CheckedModel, Generic[Open]):
     for ippo and 8 for qmix."""
     rollout_steps: Count | Open = OPEN
     """Steps of each copy in an iteration, which collects, stores, fits and updates. By default 50 for algorithms that consume
-    transitions or sequences, and 2000 over all copies for ppo; for ippo an episode on particle tasks, and on other tasks 2050 over
-    all copies in JAX, 2000 on the host."""
+    transitions or sequences. For ppo 2000 over all copies, rounded to episodes of the maximum length; for ippo an episode on particle
+    tasks, and on other tasks 2050 over all copies in JAX, 2000 on the host."""
     fit_every: Count | Open = OPEN
     """For ppo and ippo, and for every algorithm with diaster or rudder: iterations between two fits of the decoder. By default 10 for
     ippo, else 1."""
@@ -66,7 +66,8 @@ class _RunSettings(CheckedModel, Generic[Open]):
     """Environment steps between two evaluations; the last step is followed by one, too. A checkpoint is written at each. By default
     5000 for td3, ddpg and sac, about 10,000 for qmix, 10 iterations for ippo, and 5 iterations for ppo."""
     evaluation_episodes: Count | Open = OPEN
-    """Episodes in one evaluation. By default 10; in JAX, 50 for ippo and 32 for qmix."""
+    """Episodes in one evaluation. By default 10; in JAX, 50 for ippo and 32 for qmix. On the host, if a step takes more than 2 ms, as
+    many as take a tenth of the steps between two evaluations, but from 3 to 10."""
     capacity: Annotated[int, Field(ge=4)] | Open = OPEN
     """Rows in the replay of a seed; an episode of T steps takes T + 1. By default 1,000,000; 15,000 of the longest episodes for
     ippo, and 5000 for qmix."""

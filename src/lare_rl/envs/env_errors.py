@@ -14,6 +14,10 @@ from lare_rl.tasks.spec import TaskSpec
 __all__ = ["EnvOutputError", "as_lare_error", "no_time_limit_error", "one_line_errors", "read_measures", "to_float"]
 
 
+MAX_ERROR = 300
+"""Characters of an environment's error that a message quotes."""
+
+
 class EnvOutputError(LareError):
     """An environment returned a value that cannot be used for training."""
 
@@ -22,12 +26,13 @@ class EnvOutputError(LareError):
 
 
 def as_lare_error(message: str, error: BaseException, hint: str = "") -> LareError:
-    """Return `message`, the first line of the error, and the hint as a `LareError`. Return a `LareError` unchanged."""
+    """Return `message`, the error in one line, and the hint as a `LareError`. Return a `LareError` unchanged."""
     if isinstance(error, LareError):
         return error
     logging.getLogger(__name__).debug("%s", message, exc_info=error)
-    lines = str(error).strip().splitlines() or [type(error).__name__]
-    return LareError(f"{message}: {lines[0]}{hint}")
+    text = " ".join(str(error).split()) or type(error).__name__
+    text = text if len(text) <= MAX_ERROR else f"{text[:MAX_ERROR]}..."
+    return LareError(f"{message}: {text}{hint}")
 
 
 @contextlib.contextmanager

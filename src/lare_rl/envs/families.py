@@ -119,7 +119,19 @@ def make_env(task: TaskSpec, **kwargs: Any) -> JaxEnv | HostEnv:
 
 
 def make_host_env(task: TaskSpec, **kwargs: Any) -> HostEnv:
-    """Make a task's environment as a `HostEnv`, even if it is a `JaxEnv`. See `make_env`."""
+    """Make a task's environment as a `HostEnv`, even if it is a `JaxEnv`. See `make_env`.
+
+    If it needs a process of its own, it gets one, except with `kwargs`, because a worker draws no films.
+    """
+    from lare_rl.envs import placement  # it imports this module
+
+    if not kwargs and placement.runs_separately(task):
+        return placement.SeparateEnv(task)
+    return _make_here(task, **kwargs)
+
+
+def _make_here(task: TaskSpec, **kwargs: Any) -> HostEnv:
+    """Make a task's environment as a `HostEnv` in this process."""
     env = make_env(task, **kwargs)
     if isinstance(env, HostEnv):
         return env
@@ -129,7 +141,7 @@ def make_host_env(task: TaskSpec, **kwargs: Any) -> HostEnv:
 
 
 def picklable_maker(task: TaskSpec) -> Callable[[], HostEnv]:
-    """Return `make_host_env` of a task for another process, which first imports the module of the task's family."""
+    """Return a function that makes a task's environment in another process, which first imports the module of its family."""
     maker = _find_family(task).maker
     return partial(_import_and_make, maker.partition(":")[0] if isinstance(maker, str) else maker.__module__, task)
 
@@ -142,7 +154,7 @@ def _import_and_make(module: str, task: TaskSpec) -> HostEnv:
             f"{task.environment}: a worker process cannot import the script that registers {task.family!r}. "
             "Move the family into a module of its own."
         )
-    return make_host_env(task)
+    return _make_here(task)
 
 
 def has_single_agent(task: TaskSpec) -> bool:
@@ -162,7 +174,8 @@ def load_env_spec(task: TaskSpec) -> EnvSpec:
 
 @functools.lru_cache(maxsize=64)
 def _load_env_spec(task_json: str) -> EnvSpec:
-    env = make_env(TaskSpec.model_validate_json(task_json))
+    task = TaskSpec.model_validate_json(task_json)
+    env = make_host_env(task) if task.processes == "separate" else make_env(task)
     if isinstance(env, HostEnv):
         env.close()
     return env.spec

@@ -14,6 +14,7 @@ from lare_rl.tasks.spec import CreditScope, TaskSpec
 
 __all__ = [
     "Episode",
+    "EpisodeListener",
     "Policy",
     "find_team",
     "make_episode",
@@ -27,6 +28,9 @@ __all__ = [
 Policy = Callable[..., np.ndarray]
 """A function from the observation of a single agent to its action, in the environment's units. If actions may be unavailable, its
 second argument is the mask of available actions."""
+
+EpisodeListener = Callable[[int], None]
+"""A function that is called with the number of episodes after each of them."""
 
 
 @dataclass(frozen=True)
@@ -66,11 +70,21 @@ def phi_inputs(credit_scope: CreditScope, team: Team, timestep: Timestep, env_ac
     return timestep.state[..., None, :], team_action.reshape(*team_action.shape[:-2], 1, -1)
 
 
-def play_episodes(role: TaskSpec, n_episodes: int, policy: Policy | None = None, seed: int = 0) -> list[Episode]:
+def play_episodes(
+    role: TaskSpec,
+    n_episodes: int,
+    policy: Policy | None = None,
+    seed: int = 0,
+    on_episode: EpisodeListener = lambda n_done: None,
+) -> list[Episode]:
     """Play episodes under a policy of a single agent, or under uniformly random actions."""
+    episodes = []
     with contextlib.closing(make_host_env(role)) as env:
         rng = np.random.default_rng(seed)
-        return [play_episode(env, role, policy, rng, seed + number) for number in range(n_episodes)]
+        for number in range(n_episodes):
+            episodes.append(play_episode(env, role, policy, rng, seed + number))
+            on_episode(len(episodes))
+    return episodes
 
 
 def play_episode(env: HostEnv, role: TaskSpec, policy: Policy | None, rng: np.random.Generator, seed: int) -> Episode:

@@ -29,6 +29,8 @@ class VecEnv(ABC):
         """The last timestep of each environment."""
         self._length = np.zeros(len(batch.terminated), int)
         """The steps of each environment's running episode."""
+        self.stop_requested: Callable[[], bool] = lambda: False
+        """Whether the user wants to stop. Environments in other processes must then reply soon."""
 
     def reset(self, where: Bool[np.ndarray, " n"], seeds: Integer[np.ndarray, " n"]) -> Timestep:
         self._call("reset", seeds, where)

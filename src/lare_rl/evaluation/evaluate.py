@@ -9,23 +9,23 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
-from lare_rl.envs.families import make_env, make_host_env, picklable_maker
-from lare_rl.envs.interface import HostEnv
+from lare_rl.envs.families import load_env_spec, make_env, make_host_env
+from lare_rl.envs.interface import JaxEnv
 from lare_rl.envs.load import check_environment
-from lare_rl.envs.play import Episode, play_episode
-from lare_rl.envs.workers import make_vec_env
+from lare_rl.envs.placement import make_vec_env, n_open_envs
+from lare_rl.envs.play import Episode, EpisodeListener, play_episode
 from lare_rl.errors import LareError
 from lare_rl.runs.directory import Run, as_run
 from lare_rl.tasks.spec import TaskSpec
 from lare_rl.tasks.trust import untrusted_module
 from lare_rl.training.collect_device import DeviceCollector
+from lare_rl.training.evaluate_host import evaluate_policy_on_host
 from lare_rl.training.evaluation import Evaluation, concatenate
-from lare_rl.training.host_policy import EvaluationPolicy
 from lare_rl.training.saved_state import load_actor
-from lare_rl.training.unroll_host import evaluate_on_host
 from lare_rl.util.statistics import grouped_standard_error, standard_error
 
 __all__ = [
+    "MIN_RANDOM_EPISODES",
     "RANDOM_EPISODES",
     "evaluate_policy",
     "evaluate_run",
@@ -38,8 +38,10 @@ MAX_OPEN_ENVS = 20
 """Environments of a seed that are open at the same time."""
 RANDOM_EPISODES = 10
 """The default number of episodes with random actions."""
-RANDOM_PLAY_LIMIT_S = 5.0
-"""Seconds after which no other episode of random actions begins."""
+MIN_RANDOM_EPISODES = 5
+"""Fewer episodes with random actions are played only if they take minutes."""
+RANDOM_PLAY_LIMIT_S, MAX_RANDOM_PLAY_S = 5.0, 120.0
+"""Seconds after which no other episode of random actions begins: if there are enough, and in any case."""
 
 
 def evaluate_run(
@@ -73,17 +75,16 @@ def evaluate_policy(run: Run, episodes: int, best: bool = False, deterministic: 
     check_environment(task)
     config, actor, _ = load_actor(run, best)
     config = replace(config, deterministic=deterministic)
-    env = make_env(task)
-    if not isinstance(env, HostEnv):
+    if load_env_spec(task).is_jax:
+        env = make_env(task)
+        assert isinstance(env, JaxEnv)
         return DeviceCollector(env, config, run.seeds).evaluate(actor, episodes, number=1)
-    env.close()
-    make_host, evaluations = picklable_maker(task), []
+    evaluations = []
     for n_done in range(0, episodes, MAX_OPEN_ENVS):
         n_episodes = min(MAX_OPEN_ENVS, episodes - n_done)
-        with make_vec_env(make_host, n_episodes * len(run.seeds)) as envs:
+        with make_vec_env(task, n_open_envs(task, len(run.seeds), n_episodes) * len(run.seeds)) as envs:
             first = run.config.settings.evaluation_episodes + n_done
-            policy = EvaluationPolicy(config, actor, run.seeds, n_episodes)
-            evaluations.append(evaluate_on_host(envs, policy, run.seeds, n_episodes, first))
+            evaluations.append(evaluate_policy_on_host(envs, config, actor, run.seeds, n_episodes, first))
     return concatenate(evaluations)
 
 
@@ -109,17 +110,29 @@ def measure_random_returns(task: TaskSpec) -> Float[np.ndarray, " episodes"]:
 
 
 def play_random(
-    task: TaskSpec, n_episodes: int = RANDOM_EPISODES, limit_s: float = RANDOM_PLAY_LIMIT_S
+    task: TaskSpec,
+    n_episodes: int = RANDOM_EPISODES,
+    limit_s: float = RANDOM_PLAY_LIMIT_S,
+    on_episode: EpisodeListener | None = None,
 ) -> list[Episode]:
-    """Play `n_episodes` episodes of random actions, or fewer if `limit_s` seconds have passed: no episode begins after that.
+    """Play `n_episodes` episodes of random actions, or fewer if they take long.
+
+    After `limit_s` seconds there are `MIN_RANDOM_EPISODES`, because fewer have no useful deviation, and after `MAX_RANDOM_PLAY_S`
+    none begins.
 
     The list is empty if the environment does not run, or if its module must not be imported for a report.
     """
     episodes: list[Episode] = []
-    deadline = time.monotonic() + limit_s
-    if untrusted_module(task) is None:
-        with suppress(LareError), closing(make_host_env(task.roles[0])) as env:
-            while len(episodes) < n_episodes and time.monotonic() < deadline:
-                random = np.random.default_rng(len(episodes))
-                episodes.append(play_episode(env, task.roles[0], None, random, len(episodes)))
+    start = time.monotonic()
+    if untrusted_module(task) is not None:
+        return episodes
+    with suppress(LareError), closing(make_host_env(task.roles[0])) as env:
+        while len(episodes) < n_episodes:
+            seconds = time.monotonic() - start
+            if seconds >= (limit_s if len(episodes) >= MIN_RANDOM_EPISODES else MAX_RANDOM_PLAY_S):
+                break
+            random = np.random.default_rng(len(episodes))
+            episodes.append(play_episode(env, task.roles[0], None, random, len(episodes)))
+            if on_episode is not None:
+                on_episode(len(episodes))
     return episodes

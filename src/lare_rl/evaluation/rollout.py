@@ -1,6 +1,5 @@
 """New episodes of a run's policy, with the credit of each agent, and samples of their steps."""
 
-from contextlib import closing
 from dataclasses import dataclass
 from functools import partial
 from typing import Any
@@ -12,10 +11,10 @@ from jaxtyping import Array, Bool, Float
 
 from lare_rl.data import replay
 from lare_rl.data.trajectory import Trajectory
-from lare_rl.envs.families import make_env, make_host_env
-from lare_rl.envs.interface import HostEnv, JaxEnv, Team
+from lare_rl.envs.families import make_env
+from lare_rl.envs.interface import JaxEnv, Team
+from lare_rl.envs.placement import make_vec_env
 from lare_rl.envs.play import phi_inputs
-from lare_rl.envs.vec_env import LocalVecEnv
 from lare_rl.runs.directory import Run
 from lare_rl.training.collect_device import unroll_on_device
 from lare_rl.training.compiled import training_module
@@ -91,12 +90,12 @@ def roll_out(run: Run, n_episodes: int = 1, *, random: bool = False, key: int = 
     )
     if random:
         actor = jax.tree.map(jnp.zeros_like, actor)  # networks of zeros have no preference
-    env = make_env(run.config.task)
-    if isinstance(env, HostEnv):
-        env.close()
-        batch = _unroll_on_host(run, config, actor, n_episodes)
-    else:
+    if config.env.is_jax:
+        env = make_env(run.config.task)
+        assert isinstance(env, JaxEnv)
         batch = unroll_policy(env, config, actor, n_episodes, key)
+    else:
+        batch = _unroll_on_host(run, config, actor, n_episodes)
     factors = compute_host_factors(run, config, batch.steps)
     has_proxy = config.method.has_proxy_rewards
     return Rollout(
@@ -121,7 +120,7 @@ def _unroll_on_host(run: Run, config: TrainConfig, actor: Any, n_episodes: int) 
     seeds = run.seeds[:1]
     policy = EvaluationPolicy(config, actor, seeds, n_episodes, greedy=False)
     episode_seeds = [episode_seed(seeds[0], Stream.TRAINING_EPISODES, number) for number in range(n_episodes)]
-    with closing(LocalVecEnv([partial(make_host_env, run.config.task)] * n_episodes)) as envs:
+    with make_vec_env(run.config.task, n_episodes) as envs:
         return _drop_seed_axis(record_on_host(envs, policy, seeds, episode_seeds))
 
 

@@ -74,10 +74,10 @@ def record_video(run: Run, path: str | Path, best: bool = False, deterministic: 
 
 def render_rollout(run: Run, rollout: Rollout) -> list[Frame] | None:
     """Render the first episode with each agent's credit. Return None for an environment that cannot be drawn."""
-    env = make_env(run.config.task)
-    if not isinstance(env, JaxEnv):
-        env.close()
+    if not load_env_spec(run.config.task).is_jax:
         return None
+    env = make_env(run.config.task)
+    assert isinstance(env, JaxEnv)
     return env.frames(rollout.select_episode(rollout.state), rollout.select_episode(rollout.credit))
 
 

@@ -62,6 +62,7 @@ def _outcome(run: RunSummary) -> Finding:
         "std": Finding("std", {"std": std}) if std else None,
         "steps": int(run.steps[-1]),
         "seeds": seeds if run.n_seeds > 1 else None,
+        "likeliest": None if run.likeliest_return is None else Finding("likeliest", {"return_": run.likeliest_return}),
     }
     if not len(run.random_returns):
         return Finding("outcome_unknown", {"reached": Finding("reached", reached)})

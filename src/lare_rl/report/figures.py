@@ -109,7 +109,7 @@ def draw_curves(
         axes.plot(steps, mean, color=colour, linestyle=line, label=name)
         if len(values) > 1 or episode_std is not None:
             std = values.std(axis=0, ddof=1) if len(values) > 1 or episode_std is None else episode_std[1][0]
-            axes.fill_between(steps, mean - std, mean + std, color=colour, alpha=0.18, linewidth=0)
+            axes.fill_between(steps, mean - std, mean + std, color=colour, alpha=0.22, linewidth=0.7)
     if bottom is not None or (lowest_bottom is not None and axes.get_ylim()[0] < lowest_bottom):
         axes.set_ylim(bottom=lowest_bottom if bottom is None else bottom)
     for name, value in (reference_lines or {}).items():

@@ -23,7 +23,8 @@ MESSAGES = {
         "{baseline}."
     ),
     "not_learned": "It has not learned yet. {reached}; {baseline}.",
-    "reached": "The return is {return_:score}{std} after {steps:,} steps{seeds}",
+    "reached": "The return is {return_:score}{std} after {steps:,} steps{seeds}{likeliest}",
+    "likeliest": ", by sampled actions as in training; the most likely action gets {return_:score}",
     "std": " ± {std:score}",
     "over_seeds": " (mean over {n_seeds} seeds)",
     "baseline": "random actions get {return_:score} ± {std:score} in {n_episodes:count episode}{initial}",

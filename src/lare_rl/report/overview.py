@@ -114,7 +114,10 @@ def _charts(task: TaskSpec) -> Iterable[_Chart]:
     """Yield the charts of a task, one for each team if there are several."""
     charts = (
         _Chart(RETURN, "true return", "return"),
-        *(_Chart(f"evaluation/{measure}", measure, measure) for measure in task.measures),
+        *(
+            _Chart(f"evaluation/{measure}", words, words)
+            for measure, words in zip(task.measures, (name.replace("_", " ") for name in task.measures), strict=True)
+        ),
         _Chart(CREDIT_ERROR, "mean |proxy - true reward|", "reward", bottom=0.0),
         _Chart(CREDIT_CORRELATION, "correlation of proxy and true reward", "correlation"),
         _Chart(RETURN_R2, "R² of returns, predicted before they were learned from", "R²", lowest_bottom=-1.0),

@@ -13,7 +13,7 @@ from lare_rl.envs.load import shipped_tasks
 from lare_rl.report.figures import Curve
 from lare_rl.report.score_use import ScoreUse, summarise_score_use
 from lare_rl.runs.directory import Run
-from lare_rl.runs.metric_names import ACTOR_SATURATION, RETURN, RETURN_R2, RETURN_STD, SUMMED_RETURN
+from lare_rl.runs.metric_names import ACTOR_SATURATION, LIKELIEST_RETURN, RETURN, RETURN_R2, RETURN_STD, SUMMED_RETURN
 from lare_rl.training.advice import describe_untrained
 from lare_rl.util.statistics import grouped_standard_error, sample_std, standard_error
 
@@ -71,6 +71,8 @@ class RunSummary:
     """True returns of random actions. Empty if they are unknown."""
     initial_returns: Float[np.ndarray, " seeds"] | None = None
     """The returns of the policies before their first update, or None if they were not evaluated."""
+    likeliest_return: float | None = None
+    """The final return of the most likely actions, or None if the policy does not sample, or it was not measured."""
     episode_error: float = 0.0
     """The standard error of the mean final return, from episode to episode of the last evaluation."""
     episodic_return: float | None = None
@@ -218,6 +220,7 @@ def summarise_run(
     if (curve := reported.curve(RETURN)) is None:
         return None
     steps, returns = curve
+    likeliest = reported.curve(LIKELIEST_RETURN)
     _, r2s = reported.curve(RETURN_R2) or (None, None)
     run, task, settings = reported.run, reported.run.config.task, reported.run.config.settings
     method = find_method(settings.method)
@@ -226,8 +229,10 @@ def summarise_run(
     return RunSummary(
         steps=steps,
         returns=returns,
-        random_returns=random_returns,
+        # One episode has no deviation, so nothing can be compared with it.
+        random_returns=random_returns if len(random_returns) > 1 else np.zeros(0),
         initial_returns=initial_returns if np.isfinite(initial_returns).all() else None,
+        likeliest_return=_last_mean(likeliest[1][:, -1:]) if likeliest else None,
         episode_error=_episode_error(reported),
         episodic_return=episodic_return,
         return_r2=None if r2s is None else _last_mean(r2s),

@@ -49,6 +49,8 @@ SHARED_KEYS = (
     "payments",
     "paid_for",
     "group",
+    "processes",
+    "timeout",
 )
 """Keys that a team inherits from its task. The team's own file may repeat them, so that it can be used alone, but with the same
 values."""
@@ -108,6 +110,12 @@ class TaskSpec(CheckedModel):
     episodes of the same group share an intercept, so that an easy level does not credit what happens on it."""
     measures: tuple[str, ...] = ()
     """Keys of the last step's `info` whose values are averaged and reported in addition to the return."""
+    processes: Literal["auto", "separate"] = "auto"
+    """`separate`: every environment needs a process of its own, because its simulator allows a single simulation in a process. `auto`: so
+    does an environment of a package that LaRe does not know, if its steps are slow, or if a second one in its process fails, hangs or
+    changes the first."""
+    timeout: Annotated[float, Field(gt=0, allow_inf_nan=False)] = 120.0
+    """The time (s) within which an environment in a process of its own must reply. After it, the run stops with a message."""
     arguments: dict[str, Any] = Field(default_factory=dict)
     """Keyword arguments of the environment. Only for families that have them (`pettingzoo/...`, `gymnax/...`, `jumanji/...` and
     others)."""

@@ -73,6 +73,9 @@ class DeviceCollector:
         self.envs = jax.device_put(envs, seed_sharding(self._n_devices))
         return np.zeros(self.envs.episode_start.shape, bool), []
 
+    def watch(self, on_step: Callable[[int], None], stop_requested: Callable[[], bool]) -> None:
+        """Do nothing: one compiled call makes all steps of an iteration."""
+
     def close(self) -> None:
         """Do nothing: there is nothing to close."""
 

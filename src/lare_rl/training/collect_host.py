@@ -7,6 +7,7 @@ simulator: reset with the seed, play the actions, and compare the observation bi
 """
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from typing import Any
 
 import jax
@@ -15,17 +16,17 @@ from jaxtyping import Bool, Float, Int
 
 from lare_rl.data.trajectory import Trajectory
 from lare_rl.envs.env_errors import EnvOutputError
-from lare_rl.envs.families import picklable_maker
 from lare_rl.envs.interface import EnvSpec, Timestep, to_env_action
+from lare_rl.envs.placement import make_vec_env, n_open_envs
 from lare_rl.envs.vec_env import VecEnv
-from lare_rl.envs.workers import SubprocVecEnv, make_vec_env
 from lare_rl.errors import LareError
 from lare_rl.tasks.spec import TaskSpec
+from lare_rl.training.evaluate_host import evaluate_policy_on_host
 from lare_rl.training.evaluation import Evaluation
-from lare_rl.training.host_policy import EvaluationPolicy, init_host_memory, make_policy
+from lare_rl.training.host_policy import init_host_memory, make_policy
 from lare_rl.training.static_config import TrainConfig
 from lare_rl.training.streams import Stream, episode_seed, host_noise, numpy_generator
-from lare_rl.training.unroll_host import add_seed_axis, check_finite, evaluate_on_host
+from lare_rl.training.unroll_host import add_seed_axis, check_finite
 
 __all__ = ["HostCollector", "HostVecEnv", "make_host_collector"]
 
@@ -41,7 +42,7 @@ class HostVecEnv:
 
     def __init__(self, envs: VecEnv, seeds: Sequence[int], n_envs: int):
         self.shape = len(seeds), n_envs
-        self._envs, self._seeds, self._n_envs = envs, list(seeds), n_envs
+        self.envs, self._seeds, self._n_envs = envs, list(seeds), n_envs
         self._spec = envs.spec
         self._episode = np.full(len(seeds) * n_envs, -1)
         """The number of each environment's running episode."""
@@ -57,20 +58,25 @@ class HostVecEnv:
         self._episode[where] += 1
         for index in np.flatnonzero(where):
             self._actions[index] = []
-        self._call(lambda: self._envs.reset(where, self._episode_seeds()))
+        self._call(lambda: self.envs.reset(where, self._episode_seeds()))
         self._episode_start = self._episode_start | where.reshape(self.shape)
 
     def collect(
-        self, policy: Callable[..., Any], noise: Float[np.ndarray, "time seeds envs agents noise"]
+        self,
+        policy: Callable[..., Any],
+        noise: Float[np.ndarray, "time seeds envs agents noise"],
+        on_step: Callable[[int], None] = lambda n_steps: None,
     ) -> Trajectory:
         """Let a policy act for as many steps as there is noise. When an episode ends, the next one begins.
 
-        The policy is a function from a timestep, noise, and which episodes have just begun, to the action.
+        The policy is a function from a timestep, noise, and which episodes have just begun, to the action. `on_step` is called with the
+        number of steps of each seed.
         """
         steps = _empty_trajectory(self._spec, self._timestep, len(noise))
         try:
             for t, noise_t in enumerate(noise):
                 self._collect_step(policy, noise_t, steps, t)
+                on_step((t + 1) * self._n_envs)
         except LareError:
             check_finite(steps.action, self._seeds)  # such actions may be the reason
             raise
@@ -92,7 +98,7 @@ class HostVecEnv:
         rows = env_action.reshape(-1, *env_action.shape[2:])
         for actions, row in zip(self._actions, rows, strict=True):
             actions.append(row)
-        self._call(lambda: self._envs.step(rows))
+        self._call(lambda: self.envs.step(rows))
         _write_timestep(steps.next_timestep, t, self._timestep)
         self._episode_start = np.zeros(self.shape, bool)
         ended = np.logical_or(self._timestep.terminated, self._timestep.truncated)
@@ -104,7 +110,7 @@ class HostVecEnv:
         arrays = {"episode": self._episode.copy(), "new": self._episode_start}
         for index, actions in enumerate(self._actions):
             arrays[f"actions{index}"] = np.reshape(actions, (-1, self._spec.n_agents, self._spec.action_size))
-            arrays[f"observation{index}"] = self._envs.batch.observation[index].copy()
+            arrays[f"observation{index}"] = self.envs.batch.observation[index].copy()
         return arrays
 
     def restore(self, arrays: dict[str, np.ndarray]) -> tuple[Bool[np.ndarray, "seeds envs"], list[str]]:
@@ -120,15 +126,15 @@ class HostVecEnv:
         indices = range(len(self._episode))
         actions = [arrays[f"actions{index}"] for index in indices]
         idle = np.zeros((self._spec.n_agents, self._spec.action_size), np.float32)  # of environments that do not step
-        self._call(lambda: self._envs.reset(np.ones(len(indices), bool), self._episode_seeds()))
+        self._call(lambda: self.envs.reset(np.ones(len(indices), bool), self._episode_seeds()))
         ended_early = np.zeros(len(indices), bool)
         for t in range(max(map(len, actions))):
             where = np.array([t < len(rows) for rows in actions]) & ~ended_early
             action_t = np.stack([rows[min(t, len(rows) - 1)] if len(rows) else idle for rows in actions])
-            timestep = self._call(lambda action=action_t, where=where: self._envs.step(action, where))
+            timestep = self._call(lambda action=action_t, where=where: self.envs.step(action, where))
             ended_early |= where & (timestep.terminated | timestep.truncated)
         self._actions, self._episode_start = [list(rows) for rows in actions], arrays["new"].copy()
-        same = [np.array_equal(self._envs.batch.observation[index], arrays[f"observation{index}"]) for index in indices]
+        same = [np.array_equal(self.envs.batch.observation[index], arrays[f"observation{index}"]) for index in indices]
         dropped = ended_early | ~np.array(same)
         messages = [
             f"episode {self._episode[index]} of seed {self._seed(index)} was dropped after {len(actions[index])} steps: "
@@ -141,7 +147,7 @@ class HostVecEnv:
 
     def close(self) -> None:
         """Close the environments."""
-        self._envs.close()
+        self.envs.close()
 
     def _seed(self, env_index: int) -> int:
         return self._seeds[env_index // self._n_envs]
@@ -179,16 +185,30 @@ class HostCollector:
         self._config, self._seeds = config, list(seeds)
         self._envs, self._evaluation_envs = HostVecEnv(envs, seeds, config.n_envs), evaluation_envs
         self._memory = init_host_memory(config, *self._envs.shape)
+        self._step, self._on_step = 0, _ignore_step
         self._envs.reset()
+
+    def watch(self, on_step: Callable[[int], None], stop_requested: Callable[[], bool]) -> None:
+        """Call `on_step` with the number of steps of each seed while environments step, also during evaluations.
+
+        Once the user has asked the run to stop, environments in other processes must reply soon.
+        """
+        self._on_step = on_step
+        self._envs.envs.stop_requested = self._evaluation_envs.stop_requested = stop_requested
 
     def collect(self, actor: Any, step: int) -> Trajectory:
         """Return the steps of the iteration that begins at `step`. During the warmup, actions are random."""
         config, rngs = self._config, [numpy_generator(seed, Stream.EXPLORATION, step) for seed in self._seeds]
+
+        def report(n_steps: int) -> None:
+            self._step = step + n_steps
+            self._on_step(self._step)
+
         shape = config.rollout_steps, config.n_envs, config.env.n_agents
         if step < config.warmup:
             uniform = [rng.uniform(-1, 1, (*shape, config.env.action_size)) for rng in rngs]
             action = np.stack(uniform, axis=1).astype(np.float32)
-            return self._envs.collect(lambda timestep, action_t, episode_start: action_t, action)
+            return self._envs.collect(lambda timestep, action_t, episode_start: action_t, action, report)
         policy = make_policy(config, actor, config.n_envs, greedy=False)
         noise = np.stack([host_noise(rng, config.noise, (*shape, config.noise_size)) for rng in rngs], axis=1)
 
@@ -198,12 +218,17 @@ class HostCollector:
             )
             return action
 
-        return self._envs.collect(explore, noise)
+        return self._envs.collect(explore, noise, report)
 
-    def evaluate(self, actor: Any, n_episodes: int) -> Evaluation:
-        """Evaluate whole episodes of the policy, always from the same initial states."""
-        policy = EvaluationPolicy(self._config, actor, self._seeds, n_episodes)
-        return evaluate_on_host(self._evaluation_envs, policy, self._seeds, n_episodes)
+    def evaluate(self, actor: Any, n_episodes: int, deterministic: bool = False) -> Evaluation:
+        """Evaluate whole episodes of the policy, always from the same initial states. If `deterministic`, by its likeliest actions."""
+
+        def report() -> None:
+            self._on_step(self._step)
+
+        envs, config = self._evaluation_envs, self._config
+        config = replace(config, deterministic=True) if deterministic else config
+        return evaluate_policy_on_host(envs, config, actor, self._seeds, n_episodes, on_step=report)
 
     def state_dict(self) -> dict[str, np.ndarray]:
         """Return the arrays that `restore` needs: seeds and actions of the running episodes, and the actors' memory."""
@@ -222,14 +247,16 @@ class HostCollector:
         self._evaluation_envs.close()
 
 
+def _ignore_step(step: int) -> None: ...
+
+
 def make_host_collector(
     task: TaskSpec, config: TrainConfig, seeds: Sequence[int], n_evaluation_episodes: int
 ) -> HostCollector:
     """Make a collector with a task's environments. If a seed has several, they step in worker processes."""
-    make_env, n_seeds = picklable_maker(task), len(seeds)
-    n_envs = n_seeds * config.n_envs
-    envs = make_vec_env(make_env, n_envs) if config.n_envs == 1 else SubprocVecEnv([make_env] * n_envs)
-    evaluation_envs = make_vec_env(make_env, n_seeds * n_evaluation_episodes)
+    n_seeds = len(seeds)
+    envs = make_vec_env(task, n_seeds * config.n_envs, parallel=config.n_envs > 1)
+    evaluation_envs = make_vec_env(task, n_seeds * n_open_envs(task, n_seeds, n_evaluation_episodes))
     return HostCollector(envs, evaluation_envs, config, seeds)
 
 

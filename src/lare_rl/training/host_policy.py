@@ -9,7 +9,7 @@ from typing import Any
 
 import jax
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 
 from lare_rl.envs.interface import Timestep
 from lare_rl.training.compile_cache import cache_by_value
@@ -63,13 +63,21 @@ def _translate_policy(
 class EvaluationPolicy:
     """The policy of all seeds for whole episodes, which all begin with its first call. It holds the memory of the actors.
 
-    It acts without noise if `greedy` is true; by default as in evaluations, where only PPO's policy has noise.
+    It acts without noise if `greedy` is true; by default as in evaluations, where only PPO's policy has noise. `noise_rows` says which
+    rows of the noise of how many episodes these episodes get, by default all.
     """
 
     def __init__(
-        self, config: TrainConfig, actor: Any, seeds: Sequence[int], n_episodes: int, greedy: bool | None = None
+        self,
+        config: TrainConfig,
+        actor: Any,
+        seeds: Sequence[int],
+        n_episodes: int,
+        greedy: bool | None = None,
+        noise_rows: tuple[int, Int[np.ndarray, " episodes"]] | None = None,
     ):
-        self._config, self._n_episodes = config, n_episodes
+        self._config = config
+        self._n_noise_rows, self._noise_rows = noise_rows or (n_episodes, np.arange(n_episodes))
         self._greedy = config.greedy if greedy is None else greedy
         self._policy = make_policy(config, actor, n_episodes, greedy=self._greedy)
         self._memory = init_host_memory(config, len(seeds), n_episodes)
@@ -78,7 +86,9 @@ class EvaluationPolicy:
     def __call__(
         self, timestep: Timestep, episode_start: Bool[np.ndarray, "seeds envs"]
     ) -> Float[np.ndarray, "seeds envs agents action"]:
-        noise = None if self._greedy else draw_noise(self._config, self._rngs, self._n_episodes)
+        noise = None
+        if not self._greedy:
+            noise = draw_noise(self._config, self._rngs, self._n_noise_rows)[:, self._noise_rows]
         action, self._memory = self._policy(
             self._memory, timestep.observation, timestep.available, noise, episode_start
         )

@@ -1,7 +1,8 @@
 """The outer loop of Algorithm 1 of the LaRe paper: iterations, evaluations, checkpoints, and messages for the user."""
 
 import threading
-from collections.abc import Iterable, Sequence
+import time
+from collections.abc import Callable, Iterable, Sequence
 from typing import Any
 
 import numpy as np
@@ -21,6 +22,11 @@ from lare_rl.util.findings import Finding, render
 
 __all__ = ["RunInterruptedError", "run_session"]
 
+CHECKPOINT_S = 300.0
+"""Seconds after which a checkpoint is written between two evaluations: what a crash may cost."""
+PROGRESS_S = 1.0
+"""Listeners hear of steps inside an iteration at most this often (s)."""
+
 
 class RunInterruptedError(LareError):
     """The user stopped a run. It was saved."""
@@ -36,8 +42,9 @@ def run_session(session: Session, listeners: Sequence[Listener], stop: threading
         DivergedError: a policy or a loss is not finite any more.
     """
     run, settings = session.run, session.settings
-    clock, explained = Clock(session.step), False
+    clock, explained, saved_at = Clock(session.step), False, time.monotonic()
     returns: list[np.ndarray] = []
+    session.collector.watch(_limit_rate(lambda step: [listener.on_step(step) for listener in listeners]), stop.is_set)
 
     def say(lines: Iterable[str]) -> None:
         for line in lines:
@@ -56,8 +63,13 @@ def run_session(session: Session, listeners: Sequence[Listener], stop: threading
             report(advice.find_large_observations(run, first_shard(session.learner.replay), session.config))
         is_last = session.step == settings.steps
         if not is_last and session.step % settings.evaluate_every:
+            if time.monotonic() - saved_at > CHECKPOINT_S:
+                _check_losses(session)
+                session.save()
+                saved_at = time.monotonic()
             continue
         lines = _evaluate(session, clock.measure_rate(session.step))
+        saved_at = time.monotonic()
         for listener in listeners:
             listener.on_evaluation(lines)
         if "critic/loss" in lines[0]:
@@ -69,6 +81,19 @@ def run_session(session: Session, listeners: Sequence[Listener], stop: threading
             explained = bool(sentences)
         if is_last:
             report(_final_findings(session, lines))
+
+
+def _limit_rate(call: Callable[[int], object]) -> Callable[[int], None]:
+    """Return a function that passes on at most one call in `PROGRESS_S`."""
+    called_at = time.monotonic()
+
+    def call_rarely(step: int) -> None:
+        nonlocal called_at
+        if time.monotonic() - called_at > PROGRESS_S:
+            called_at = time.monotonic()
+            call(step)
+
+    return call_rarely
 
 
 def _advance(session: Session, until: int, stop: threading.Event) -> None:

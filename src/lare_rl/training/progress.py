@@ -1,6 +1,5 @@
 """Listeners of a run: a live line on a terminal, plain lines elsewhere, and TensorBoard events."""
 
-import math
 import time
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -10,9 +9,13 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
 from lare_rl.errors import missing_extra_error
+from lare_rl.util.durations import format_seconds
 from lare_rl.util.sanitize import sanitize
 
 __all__ = ["Clock", "Listener", "MetricLines", "TensorBoard", "Terminal", "import_summary_writer", "known_numbers"]
+
+LINE_S = 60.0
+"""Where there is no terminal, a line is printed at least this often (s) while environments step."""
 
 MetricLines = Sequence[Mapping[str, Any]]
 """One mapping for each seed, as in metrics.jsonl."""
@@ -31,7 +34,7 @@ class Listener(Protocol):
         """Training begins at `step` (above 0 if a run is resumed), and will end at `steps`."""
 
     def on_step(self, step: int) -> None:
-        """Iterations have been made: some steps, and their updates."""
+        """Steps have been made: after an iteration and its updates, and once a second while a long one collects on the host."""
 
     def on_evaluation(self, metrics: MetricLines) -> None:
         """An evaluation has been made. Its lines of metrics.jsonl and the checkpoint have been written."""
@@ -44,15 +47,19 @@ class Listener(Protocol):
 
 
 class Terminal(Listener):
-    """A live line if the console is a terminal, else a plain line for each evaluation."""
+    """A live line if the console is a terminal, else a plain line for each evaluation and each minute."""
 
     def __init__(self, console: Console | None = None):
         self._console = console or Console(stderr=True)
         self._progress: Progress | None = None
         self._steps = 0
+        self._has_evaluation = False
+        self._line_step, self._line_time = 0, time.monotonic()
+        """Step and time of the last line."""
 
     def on_start(self, name: str, step: int, steps: int) -> None:
         self._steps = steps
+        self._line_step, self._line_time = step, time.monotonic()
         if self._console.is_terminal:
             columns = (
                 TextColumn(name),
@@ -68,15 +75,28 @@ class Terminal(Listener):
 
     def on_step(self, step: int) -> None:
         if self._progress:
-            self._progress.update(self._progress.task_ids[0], completed=step)
+            figures = {} if self._has_evaluation else {"figures": "before the first evaluation"}
+            self._progress.update(self._progress.task_ids[0], completed=step, **figures)
+        elif (seconds := time.monotonic() - self._line_time) > LINE_S:
+            n_steps, text = step - self._line_step, f"step {step:>{len(str(self._steps))}} of {self._steps}"
+            if n_steps:
+                self.on_message(f"{text}: {n_steps / seconds:.3g} steps/s{self._time_left(step, n_steps / seconds)}")
+            else:
+                self.on_message(f"{text}: evaluating")
+            self._line_step, self._line_time = step, time.monotonic()
 
     def on_evaluation(self, metrics: MetricLines) -> None:
+        self._has_evaluation = True
+        self._line_step, self._line_time = metrics[0]["step"], time.monotonic()
         if self._progress:
             self._progress.update(self._progress.task_ids[0], figures=_summarise(metrics))
         else:
             step, steps = metrics[0]["step"], self._steps
+            # Updates take most of the time, so the rate before the first one is no estimate.
+            is_trained = _mean(metrics, "critic/loss") is not None
+            rate = (_mean(metrics, "time/steps_per_second") or 0.0) if is_trained else 0.0
             self.on_message(
-                f"step {step:>{len(str(steps))}} of {steps}: {_summarise(metrics)}{self._time_left(step, metrics)}"
+                f"step {step:>{len(str(steps))}} of {steps}: {_summarise(metrics)}{self._time_left(step, rate)}"
             )
 
     def on_message(self, message: str) -> None:
@@ -86,17 +106,16 @@ class Terminal(Listener):
         if self._progress:
             self._progress.stop()
 
-    def _time_left(self, step: int, metrics: MetricLines) -> str:
-        rate = _mean(metrics, "time/steps_per_second")
-        # Updates take most of the time, so the rate before the first one is no estimate.
-        if not rate or _mean(metrics, "critic/loss") is None or step >= self._steps:
+    def _time_left(self, step: int, rate: float) -> str:
+        """Return the time left at a rate (steps/s), after a comma. Empty if it is unknown, or at the end."""
+        if not rate or step >= self._steps:
             return ""
-        seconds = (self._steps - step) / rate
-        return f", {seconds:.0f} s left" if seconds < 60 else f", {math.ceil(seconds / 60)} min left"
+        return f", {format_seconds((self._steps - step) / rate)} left"
 
 
 _SUMMARY = {
     "evaluation/return": "return {:.1f}",
+    "evaluation/likeliest_return": "likeliest actions {:.1f}",
     "evaluation/won": "won {:.2f}",
     "credit/error": "credit error {:.3g}",
     "credit/correlation": "correlation {:.2f}",

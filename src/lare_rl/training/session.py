@@ -22,7 +22,7 @@ from lare_rl.errors import LareError
 from lare_rl.runs import checkpoint
 from lare_rl.runs.best_policy import BEST_FILE, BestPolicy, empty_best, load_best, save_best, update_best
 from lare_rl.runs.directory import Run
-from lare_rl.runs.metric_names import ACTOR_SATURATION
+from lare_rl.runs.metric_names import ACTOR_SATURATION, LIKELIEST_RETURN
 from lare_rl.tasks.spec import TaskSpec
 from lare_rl.training import advice, first_fit, iteration
 from lare_rl.training.batching import is_batching_faster
@@ -205,6 +205,9 @@ class Session:
         if len(self.config.env.teams) == 1:
             self._keep_best(evaluation.returns[..., 0].mean(axis=1))
         metrics = evaluation.metrics(self.config.env) | self.functions.assess(self.learner) | self.latest_metrics
+        if self.step == self.settings.steps and not self.config.greedy and isinstance(self.collector, HostCollector):
+            likeliest = self.collector.evaluate(self.actor, self.settings.evaluation_episodes, deterministic=True)
+            metrics[LIKELIEST_RETURN] = likeliest.returns[..., 0].mean(axis=1)
         if self.step > self.config.warmup and isinstance(self.settings.hyperparameters, OffPolicySettings):
             metrics |= {ACTOR_SATURATION: advice.saturation(self.greedy_actions(advice.N_PROBE_STATES))}
         return metrics_lines(self.run.seeds, self.step, metrics, rate)

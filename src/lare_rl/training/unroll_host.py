@@ -36,15 +36,19 @@ def unroll_on_host(
 ) -> Iterator[tuple[Trajectory, Bool[np.ndarray, "seeds episodes"]]]:
     """Play one episode in each environment, all in lockstep.
 
-    The environments of the first seed come first, then those of the second, and so on, and so do their `episode_seeds`.
+    The environments of the first seed come first, then those of the second, and so on, and so do their `episode_seeds`. If there are
+    fewer episodes than environments, the last environments of each seed play none.
 
     Yields:
         The next step of each environment, without the axis of time, and whether its episode had not ended before. The next
         step overwrites `next_timestep`.
     """
-    shape = len(seeds), len(episode_seeds) // len(seeds)
-    running, episode_start = np.ones(shape, bool), np.ones(shape, bool)
-    envs.reset(running.ravel(), np.array(episode_seeds))
+    shape = len(seeds), len(envs.batch.terminated) // len(seeds)
+    env_seeds, running = np.zeros(shape, np.int64), np.zeros(shape, bool)
+    n_playing = len(episode_seeds) // len(seeds)
+    running[:, :n_playing], env_seeds[:, :n_playing] = True, np.reshape(episode_seeds, (len(seeds), n_playing))
+    episode_start = np.ones(shape, bool)
+    envs.reset(running.ravel(), env_seeds.ravel())
     next_timestep = add_seed_axis(envs.batch, shape)
     while running.any():
         timestep = jax.tree.map(np.copy, next_timestep)
@@ -67,14 +71,15 @@ def record_on_host(envs: VecEnv, policy: Policy, seeds: Sequence[int], episode_s
 
 
 def evaluate_on_host(envs: VecEnv, policy: Policy, seeds: Sequence[int], n_episodes: int, first: int = 0) -> Evaluation:
-    """Evaluate one episode in each environment, each from a different initial state.
+    """Evaluate one episode in each of the first `n_episodes` environments of each seed, each from a different initial state.
 
     The initial states depend only on the seed and on the episode's number, which counts from `first`. So every evaluation of a
     run begins from the same ones, and no training episode does.
     """
     numbers = range(first, first + n_episodes)
     episode_seeds = [episode_seed(seed, Stream.EVALUATION_EPISODES, number) for seed in seeds for number in numbers]
-    spec, shape = envs.spec, (len(seeds), n_episodes)
+    spec, width = envs.spec, len(envs.batch.terminated) // len(seeds)
+    shape = len(seeds), width
     returns, summed_returns = np.zeros((*shape, len(spec.teams))), np.zeros((*shape, len(spec.teams)))
     lengths = np.zeros(shape, int)
     measures = {name: np.full(shape, np.nan) for name in spec.measures}
@@ -89,9 +94,17 @@ def evaluate_on_host(envs: VecEnv, policy: Policy, seeds: Sequence[int], n_episo
             for name, values in measures.items():
                 values[ended] = next_timestep.measures[name][ended]
     except EnvOutputError as error:
-        where = "" if error.env_index is None else f", in an evaluation of seed {seeds[error.env_index // n_episodes]}"
+        where = "" if error.env_index is None else f", in an evaluation of seed {seeds[error.env_index // width]}"
         raise EnvOutputError(f"{error}{where}") from None
-    return Evaluation(returns, summed_returns, lengths, measures)
+    results = Evaluation(returns, summed_returns, lengths, measures)
+    return results if width == n_episodes else _select_episodes(results, n_episodes)
+
+
+def _select_episodes(results: Evaluation, n_episodes: int) -> Evaluation:
+    """Return the first episodes of each seed."""
+    measures = {name: values[:, :n_episodes] for name, values in results.measures.items()}
+    arrays = results.returns, results.summed_returns, results.lengths
+    return Evaluation(*(array[:, :n_episodes] for array in arrays), measures)
 
 
 def add_seed_axis(timestep: Timestep, shape: tuple[int, int]) -> Timestep:

@@ -45,11 +45,16 @@ class PPOSettings(AlgorithmSettings):
     """Normalise the networks' observations by their running mean and standard deviation."""
 
 
+def _whole_episodes(env: "EnvSpec", n_steps: int) -> int:
+    """Return the multiple of an episode's maximum length that is nearest to a number of steps; this number for long episodes."""
+    return round(n_steps / env.max_steps) * env.max_steps or max(1, n_steps)
+
+
 def _ppo_defaults(env: "EnvSpec", environments: int) -> dict[str, Any]:
     environments = environments or 1
     return {
         "environments": environments,
-        "rollout_steps": max(1, 2000 // environments),
+        "rollout_steps": _whole_episodes(env, 2000 // environments),
         "fit_updates": 500,
         "evaluate_iterations": 5,
         "capacity": 1_000_000,

@@ -1,0 +1,178 @@
+"""Which process an environment runs in: this one, or one of its own, which is watched and kept for the next use.
+
+Many simulators allow a single simulation in a process (libsumo is one), and a run needs two environments at least: for training
+and for evaluations. The key `processes` of a task says so. If it is "auto", the first two environments of a package that LaRe
+does not know are tried in a worker process.
+"""
+
+import contextlib
+import logging
+import time
+from functools import lru_cache
+from statistics import median
+
+import gymnasium
+import numpy as np
+from jaxtyping import Float
+
+from lare_rl.envs.families import FAMILIES, is_gymnasium, load_env_spec, make_host_env, picklable_maker
+from lare_rl.envs.interface import HostEnv, Timestep
+from lare_rl.envs.second_instance import fixed_action
+from lare_rl.envs.vec_env import VecEnv, n_cores
+from lare_rl.envs.workers import SubprocVecEnv
+from lare_rl.envs.workers import make_vec_env as make_local_or_parallel
+from lare_rl.errors import LareError
+from lare_rl.tasks.spec import PETTINGZOO_PREFIX, TaskSpec
+
+__all__ = [
+    "SLOW_STEP_S",
+    "SeparateEnv",
+    "make_vec_env",
+    "measure_step_s",
+    "n_open_envs",
+    "needs_process",
+    "runs_separately",
+]
+
+SLOW_STEP_S = 2e-3
+"""An environment of an unknown package gets a process of its own if a step takes longer. A call of a worker takes a tenth of this."""
+SLOW_START_S = 2.0
+"""The same, if making it and the first reset take longer."""
+SECOND_TIMEOUT_S = 30.0
+"""If a second environment hangs for so long beside a first one that started fast, each needs a process of its own."""
+N_TIMED_STEPS = 10
+
+_log = logging.getLogger(__name__)
+
+_FAMILIAR_PACKAGES = {"gymnasium", "gymnasium_robotics", "lare_rl", "mpe2", "pettingzoo", "minigrid", "ale_py"}
+"""Packages whose environments do not disturb each other. Environments of others are tried."""
+
+_separate_tasks: dict[str, bool] = {}
+"""Whether the environments of a task run in processes of their own, by the task's JSON, as far as it has been tried."""
+
+
+class SeparateEnv:
+    """A `HostEnv` in a worker process. `close` keeps the process for the next environment of the same task.
+
+    Raises `LareError` if the environment cannot be made, dies, or does not reply within the task's `timeout`.
+    """
+
+    def __init__(self, task: TaskSpec):
+        self.envs = _make_separate(task, 1)
+        self.spec = self.envs.spec
+
+    def reset(self, seed: int) -> Timestep:
+        return _select_row(self.envs.reset(np.ones(1, bool), np.array([seed])))
+
+    def step(self, action: Float[np.ndarray, "agents action"]) -> Timestep:
+        return _select_row(self.envs.step(action[None]))
+
+    def render(self) -> None:
+        raise LareError("an environment in a process of its own cannot be drawn")
+
+    def close(self) -> None:
+        self.envs.close()
+
+
+def make_vec_env(task: TaskSpec, n: int, parallel: bool = False) -> VecEnv:
+    """Make `n` environments of a task: each in a process of its own if it needs that, else where they step fastest.
+
+    If `parallel`, they are in worker processes in any case.
+    """
+    if needs_process(task):
+        return _make_separate(task, n)
+    maker = picklable_maker(task)
+    if parallel:
+        return SubprocVecEnv([maker] * n)
+    return make_local_or_parallel(maker, n, measure_step_s(task) if n > 1 else 0.0)
+
+
+def n_open_envs(task: TaskSpec, n_seeds: int, n_episodes: int) -> int:
+    """Return how many environments of each seed play the episodes of an evaluation at the same time."""
+    return min(n_episodes, max(1, n_cores() // n_seeds)) if needs_process(task) else n_episodes
+
+
+def runs_separately(task: TaskSpec) -> bool:
+    """Return whether a task's environments need processes of their own, as far as this is known without trying."""
+    return task.processes == "separate" or _separate_tasks.get(task.model_dump_json(), False)
+
+
+def needs_process(task: TaskSpec) -> bool:
+    """Return whether each environment of a task needs a process of its own. It is found out at most once in this process."""
+    if task.processes == "separate":
+        return True
+    key = task.model_dump_json()
+    if key not in _separate_tasks:
+        package = None if load_env_spec(task).is_jax else _find_package(task)
+        _separate_tasks[key] = package not in (None, *_FAMILIAR_PACKAGES) and _try_second(task)
+    return _separate_tasks[key]
+
+
+def _try_second(task: TaskSpec) -> bool:
+    """Return whether environments are slow, or disturb each other in one process. Try them in a worker process."""
+    start = time.perf_counter()
+    try:
+        env = SeparateEnv(task)
+    except LareError:  # another process cannot make it, because the user's script registers it
+        return False
+    try:
+        step_s = _time_steps(env)
+        if step_s > SLOW_STEP_S or time.perf_counter() - start > SLOW_START_S:
+            problem = f"a step takes {1000 * step_s:.0f} ms, or a start some seconds"
+        else:
+            problem = env.envs.find_interference(picklable_maker(task), SECOND_TIMEOUT_S)
+    except LareError as error:
+        problem = str(error)
+    env.close()
+    _log.info("%s: %s", task.environment, problem or "two environments can share a process")
+    return problem is not None
+
+
+def measure_step_s(task: TaskSpec) -> float:
+    """Return the time that a step of a task's environment takes (s). It is measured once in this process."""
+    needs_process(task)
+    return _measure_task(task.model_dump_json())
+
+
+@lru_cache(maxsize=64)
+def _measure_task(task_json: str) -> float:
+    with contextlib.closing(make_host_env(TaskSpec.model_validate_json(task_json))) as env:
+        return _time_steps(env)
+
+
+def _time_steps(env: HostEnv) -> float:
+    """Return the median time of the first steps of an episode (s)."""
+    timestep, times = env.reset(0), []
+    while len(times) < N_TIMED_STEPS and not (timestep.terminated or timestep.truncated):
+        action = fixed_action(env.spec, timestep)
+        start = time.perf_counter()
+        timestep = env.step(action)
+        times.append(time.perf_counter() - start)
+    return median(times) if times else 0.0
+
+
+def _make_separate(task: TaskSpec, n: int) -> SubprocVecEnv:
+    hint = "; if it needs longer, set timeout in the task file"
+    key = task.model_dump_json()
+    return SubprocVecEnv([picklable_maker(task)] * n, n, task.timeout, timeout_hint=hint, reuse_key=key)
+
+
+def _select_row(batch: Timestep) -> Timestep:
+    *columns, measures = batch
+    return Timestep(*(column[0].copy() for column in columns), {name: value[0] for name, value in measures.items()})
+
+
+def _find_package(task: TaskSpec) -> str | None:
+    """Return the package of a task's environment, or None if another process could not import it."""
+    module, _, name = task.environment.rpartition(":")
+    if is_gymnasium(task):
+        entry_point = gymnasium.registry[name].entry_point if name in gymnasium.registry else None
+        if isinstance(entry_point, str):
+            module = module or entry_point.partition(":")[0]
+    elif task.environment.startswith(PETTINGZOO_PREFIX):
+        module = task.environment_name.partition(":")[0]
+    else:
+        maker = FAMILIES[task.family].maker
+        module = maker if isinstance(maker, str) else maker.__module__
+    package = module.partition(":")[0].partition(".")[0]
+    return None if package in ("", "__main__") else package

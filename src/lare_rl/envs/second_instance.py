@@ -1,0 +1,55 @@
+"""Whether two environments in one process disturb each other. Some simulators allow a single simulation in a process."""
+
+import contextlib
+from collections.abc import Iterator
+
+import numpy as np
+from jaxtyping import Float
+
+from lare_rl.envs.env_errors import one_line_errors
+from lare_rl.envs.interface import EnvSpec, HostEnv, Timestep
+from lare_rl.envs.vec_env import Maker
+from lare_rl.errors import LareError
+
+__all__ = ["find_interference", "fixed_action"]
+
+N_STEPS = 3
+
+
+def find_interference(env: HostEnv, maker: Maker) -> str | None:
+    """Make a second environment in this process, and step both by turns. Return what goes wrong, or None."""
+    alone = [observation.copy() for observation in _play(env)]
+    same_again = _are_equal(alone, list(_play(env)))
+    observations = []
+    try:
+        with one_line_errors("a second environment fails in the same process"):
+            with contextlib.closing(maker()) as second:
+                for observation, _ in zip(_play(env), _play(second, seed=1), strict=False):
+                    observations.append(observation.copy())
+            list(_play(env))  # closing the second may end the first
+    except LareError as error:
+        return str(error)
+    if same_again and not _are_equal(alone[: len(observations)], observations):
+        return "a second environment in the same process changes the observations of the first"
+    return None
+
+
+def fixed_action(spec: EnvSpec, timestep: Timestep) -> Float[np.ndarray, "agents action"]:
+    """Return the first available discrete action, or the middle of continuous actions."""
+    first_available = np.eye(spec.action_size, dtype=np.float32)[np.argmax(timestep.available, axis=-1)]
+    return first_available if spec.discrete else (spec.low + spec.high) / 2
+
+
+def _play(env: HostEnv, seed: int = 0) -> Iterator[np.ndarray]:
+    """Yield the observations of the first steps of an episode, by the same action."""
+    timestep = env.reset(seed)
+    yield timestep.observation
+    for _ in range(N_STEPS):
+        if timestep.terminated or timestep.truncated:
+            return
+        timestep = env.step(fixed_action(env.spec, timestep))
+        yield timestep.observation
+
+
+def _are_equal(first: list[np.ndarray], second: list[np.ndarray]) -> bool:
+    return len(first) == len(second) and all(map(np.array_equal, first, second))

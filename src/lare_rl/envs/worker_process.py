@@ -1,0 +1,208 @@
+"""A worker process that steps environments: `Worker` is the parent's side, `_serve` is what runs in the process.
+
+Workers are new processes, never forks, because JAX runs threads in the parent. They are not started by `multiprocessing`, which
+would run the user's script again in each of them. The functions that make environments are pickled, so they must be importable.
+Actions and timesteps lie in shared memory, so that a step sends only a short message to a worker.
+"""
+
+import contextlib
+import os
+import pickle
+import signal
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Iterable, Mapping, Sequence
+from functools import partial
+from multiprocessing import Pipe
+from multiprocessing.connection import Connection
+from multiprocessing.reduction import recv_handle, send_handle
+from typing import Any, NamedTuple
+
+import numpy as np
+from jaxtyping import Int
+
+from lare_rl.envs.env_errors import EnvOutputError, one_line_errors
+from lare_rl.envs.interface import EnvSpec, HostEnv
+from lare_rl.envs.second_instance import find_interference
+from lare_rl.envs.shared_arrays import SharedArrays, map_arrays, map_current
+from lare_rl.envs.vec_env import Maker, call_env, make_env_at
+from lare_rl.errors import LareError
+
+__all__ = ["Worker", "end_workers", "pickle_maker"]
+
+PROGRAM = "import sys; from lare_rl.envs.worker_process import _serve; _serve(int(sys.argv[1]))"
+
+CLOSE_TIMEOUT_S = 2.0
+"""Workers must close their environments within this time."""
+
+
+class _Failure(NamedTuple):
+    """An error that a worker sends instead of a reply. Exceptions with attributes cannot be pickled reliably."""
+
+    message: str
+    env_index: int | None
+
+    def to_error(self) -> LareError:
+        if self.env_index is None:
+            return LareError(self.message)
+        error = EnvOutputError(self.message)
+        error.env_index = self.env_index
+        return error
+
+
+class Worker:
+    """A worker process and its environments, from the parent's side."""
+
+    def __init__(self):
+        self.env_indices: Sequence[int] = ()
+        self.specs: tuple[EnvSpec, ...] = ()
+        """The specifications of its environments, once they are made."""
+        self.is_busy = False
+        """Whether a reply is pending."""
+        self.last_active, self._last_index = time.monotonic(), 0
+        self._current = np.zeros(1, np.int64)
+        self.connection, worker_end = Pipe()
+        # The same import paths as in this process, and one thread, so that other workers can use the other cores.
+        paths = os.pathsep.join(path or os.getcwd() for path in sys.path)
+        variables = {"OMP_NUM_THREADS": "1"} | os.environ | {"PYTHONPATH": paths}
+        with worker_end:
+            self.process = subprocess.Popen(
+                [sys.executable, "-P", "-c", PROGRAM, str(worker_end.fileno())],
+                stdin=subprocess.PIPE,
+                pass_fds=[worker_end.fileno()],
+                env=variables,
+                start_new_session=True,  # Ctrl-C must reach only the parent
+            )
+
+    def attach(self, env_indices: Sequence[int], file: int, worker_index: int) -> None:
+        """Number the environments anew, and use the memory of another file."""
+        self.env_indices, self._current = env_indices, map_current(file)[worker_index : worker_index + 1]
+        self._current[0] = env_indices[0]
+        self.send("attach", (worker_index, tuple(env_indices)))
+        try:
+            send_handle(self.connection, file, self.process.pid)
+        except OSError:
+            raise self._make_death_error() from None
+        self.is_busy = False  # this command has no reply
+
+    @property
+    def label(self) -> str:
+        """The environment that should reply and the process, for error messages."""
+        return f"environment {self._current[0]} (in worker process {self.process.pid})"
+
+    def measure_idle_s(self) -> float:
+        """Return for how long the worker has been seen at the same environment (s)."""
+        if self._current[0] != self._last_index:
+            self.last_active, self._last_index = time.monotonic(), int(self._current[0])
+        return time.monotonic() - self.last_active
+
+    def send(self, command: str, argument: Any = None) -> None:
+        self.is_busy, self.last_active = True, time.monotonic()
+        try:
+            self.connection.send((command, argument))
+        except OSError:
+            raise self._make_death_error() from None
+
+    def receive(self) -> Any:
+        try:
+            reply = self.connection.recv()
+        except (EOFError, OSError):
+            raise self._make_death_error() from None
+        self.is_busy = False
+        if isinstance(reply, _Failure):
+            raise reply.to_error()
+        return reply
+
+    def _make_death_error(self) -> LareError:
+        with contextlib.suppress(subprocess.TimeoutExpired):
+            self.process.wait(CLOSE_TIMEOUT_S)
+        status = self.process.returncode
+        if status is None:
+            return LareError(f"{self.label} closed its connection")
+        reason = f"signal {signal.Signals(-status).name}" if status < 0 else f"exit status {status}"
+        return LareError(f"{self.label} died: {reason}")
+
+    def kill(self) -> None:
+        self.connection.close()
+        self.process.kill()
+        self.process.wait()
+        assert self.process.stdin is not None
+        self.process.stdin.close()
+
+
+def end_workers(workers: Iterable[Worker]) -> None:
+    """Let workers close their environments, and kill those that take too long."""
+    workers = list(workers)
+    for worker in workers:
+        worker.connection.close()  # asks the worker to end
+    deadline = time.monotonic() + CLOSE_TIMEOUT_S
+    for worker in workers:
+        with contextlib.suppress(subprocess.TimeoutExpired):
+            worker.process.wait(max(0.0, deadline - time.monotonic()))
+        worker.kill()
+
+
+def pickle_maker(env_index: int, maker: Maker) -> bytes:
+    """Return what the commands "make" and "second" need. Raises `LareError` if the maker cannot be pickled."""
+    with one_line_errors(f"environment {env_index} cannot be sent to a worker process"):
+        return pickle.dumps(maker)
+
+
+def _serve(connection_descriptor: int) -> None:
+    """Run a worker: make, reset and step environments, with a reply to each command, until the connection closes."""
+    threading.Thread(target=_end_with_parent, daemon=True).start()
+    connection = Connection(connection_descriptor)
+    envs: dict[int, HostEnv] = {}
+    file, current, shared = -1, np.zeros(1, np.int64), None
+    with contextlib.suppress(EOFError, BrokenPipeError, ConnectionResetError):
+        while True:
+            command, argument = connection.recv()
+            if command == "attach":
+                worker_index, env_indices = argument
+                if file >= 0:
+                    os.close(file)
+                file, shared = recv_handle(connection), None
+                current = map_current(file)[worker_index : worker_index + 1]
+                envs = dict(zip(env_indices, envs.values(), strict=False))  # before "make", there are none
+                continue
+            reply = None
+            try:
+                if command == "make":
+                    for index, pickled in argument.items():
+                        current[0] = index
+                        envs[index] = make_env_at(index, partial(_unpickle_and_make, pickled))
+                    reply = tuple(env.spec for env in envs.values())
+                elif command == "share":
+                    shared = map_arrays(file, *argument)
+                elif command == "second":
+                    reply = find_interference(next(iter(envs.values())), partial(_unpickle_and_make, argument))
+                else:
+                    assert shared is not None
+                    _call_envs(envs, command, shared, current)
+            except LareError as error:
+                reply = _Failure(str(error), error.env_index if isinstance(error, EnvOutputError) else None)
+            connection.send(reply)
+    for env in envs.values():
+        with contextlib.suppress(Exception):
+            env.close()
+
+
+def _call_envs(envs: Mapping[int, HostEnv], command: str, shared: SharedArrays, current: Int[np.ndarray, "1"]) -> None:
+    arguments = shared.arguments(command)
+    for index, env in envs.items():
+        if shared.where[index]:
+            current[0] = index
+            call_env(index, env, command, np.copy(arguments[index]), shared.batch)
+
+
+def _end_with_parent() -> None:
+    """Exit when standard input closes, which happens whenever the parent ends. A step that hangs would not notice this."""
+    while os.read(0, 1):
+        pass
+    os._exit(0)
+
+
+def _unpickle_and_make(pickled: bytes) -> HostEnv:
+    return pickle.loads(pickled)()

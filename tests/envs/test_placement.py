@@ -1,0 +1,144 @@
+"""Simulators that allow one simulation in a process get processes of their own, which are watched and kept."""
+
+import contextlib
+import os
+import signal
+
+import numpy as np
+import pytest
+
+from helpers.single_instance import N_STEPS, simulations, single_spec
+from helpers.toy_envs import toy_spec
+from lare_rl.envs import placement, workers
+from lare_rl.envs.families import load_env_spec, make_host_env
+from lare_rl.envs.placement import SeparateEnv, make_vec_env, measure_step_s, n_open_envs, needs_process
+from lare_rl.envs.play import play_episodes
+from lare_rl.envs.vec_env import LocalVecEnv
+from lare_rl.envs.workers import close_idle_workers
+from lare_rl.errors import LareError
+from lare_rl.latent.verify import random_steps
+
+
+@pytest.fixture(autouse=True)
+def no_idle_workers():
+    yield
+    close_idle_workers()
+
+
+@pytest.fixture
+def starts(tmp_path, monkeypatch):
+    """Return a function that returns the processes in which simulations have started."""
+    path = tmp_path / "starts"
+    monkeypatch.setenv("STARTS_FILE", str(path))
+    return lambda: list(map(int, path.read_text().split()))
+
+
+def step_all(envs):
+    n = len(envs.batch.terminated)
+    observation = envs.reset(np.ones(n, bool), np.arange(n)).observation.copy()
+    return observation, envs.step(np.tile(np.eye(1, 3, dtype=np.float32), (n, 1, 1))).observation.copy()
+
+
+@pytest.mark.parametrize(
+    ("name", "separate"), [("Fails", True), ("Hangs", True), ("Shares", True), ("Slow", True), ("Many", False)]
+)
+def test_a_second_simulation_is_tried(name, separate, monkeypatch):
+    monkeypatch.setattr(placement, "SECOND_TIMEOUT_S", 2.0)
+    task = single_spec(name)
+    assert needs_process(task) == separate
+    assert not simulations
+    with make_vec_env(task, 3) as envs:
+        assert not separate or len(set(envs.pids)) == 3
+        observation, moved = step_all(envs)
+    np.testing.assert_allclose(moved, 0.9 * observation - 0.1, rtol=1e-5)
+    assert (measure_step_s(task) > 0.004) == (name == "Slow")
+
+
+def test_familiar_packages_and_scripts_share_a_process(monkeypatch):
+    monkeypatch.setattr(placement, "_try_second", lambda task: pytest.fail("tried"))
+    pendulum = toy_spec(name="p", environment="Pendulum-v1", observation_size=3)
+    spread = toy_spec(
+        name="s", environment="pettingzoo/mpe2.simple_spread_v3:parallel_env", observation_size=18, action_size=5
+    )
+    for task in (toy_spec(), pendulum, spread):  # the class of the toy is registered by this process
+        assert not needs_process(task)
+    with make_vec_env(toy_spec(), 1) as envs:
+        assert isinstance(envs, LocalVecEnv)
+
+
+def test_an_environment_that_only_this_process_has(monkeypatch):
+    monkeypatch.setattr(placement, "_find_package", lambda task: "script")
+    assert not needs_process(toy_spec(name="another", max_episode_steps=7))
+
+
+def test_separate_by_the_task_file_starts_once(starts, tmp_path):
+    """The first look at the spaces, the steps for verification, a measurement, episodes and a batch share one simulation."""
+    task = single_spec("Fails", processes="separate")
+    assert load_env_spec(task).max_steps == N_STEPS
+    random_steps(task)
+    assert measure_step_s(task) > 0
+    episodes = play_episodes(task, 2)
+    assert [len(episode.reward) for episode in episodes] == [N_STEPS] * 2
+    with make_vec_env(task, 1) as training:
+        assert starts() == training.pids
+        with make_vec_env(task, 2) as evaluation:
+            assert starts() == training.pids + evaluation.pids
+    assert os.getpid() not in starts()
+    close_idle_workers()
+    assert len(starts()) == 3
+
+
+def test_separate_environment_equals_local():
+    with contextlib.closing(SeparateEnv(single_spec("Many"))) as remote:
+        with contextlib.closing(make_host_env(single_spec("Many"))) as local:
+            assert not isinstance(local, SeparateEnv)
+            for env_step in (lambda env: env.reset(3), lambda env: env.step(np.float32([[0, 0, 1]]))):
+                first, second = env_step(remote), env_step(local)
+                for name in first._fields:
+                    np.testing.assert_array_equal(getattr(first, name), getattr(second, name))
+        with pytest.raises(LareError, match="cannot be drawn"):
+            remote.render()
+
+
+def test_hang_is_an_error_of_one_line(monkeypatch):
+    monkeypatch.setenv("STALL", "1")
+    task = single_spec("Stalls", processes="separate", timeout=0.5)
+    with contextlib.closing(make_host_env(task)) as env:
+        env.reset(0)
+        with pytest.raises(LareError, match=r"did not reply for 0.5 s in step; .*timeout in the task file"):
+            env.step(np.float32([[0, 0, 1]]))
+
+
+def test_hang_ends_soon_after_a_request_to_stop(monkeypatch):
+    monkeypatch.setenv("STALL", "1")
+    monkeypatch.setattr(workers, "STOP_TIMEOUT_S", 0.5)
+    with make_vec_env(single_spec("Stalls", processes="separate"), 1) as envs:
+        envs.reset(np.ones(1, bool), np.zeros(1, int))
+        envs.stop_requested = lambda: True
+        with pytest.raises(LareError, match=r"did not reply for 0.5 s in step"):
+            envs.step(np.float32([[[0, 0, 1]]]))
+
+
+def test_idle_process_that_died_is_replaced():
+    task = single_spec("Many", processes="separate")
+    with make_vec_env(task, 1) as envs:
+        (pid,) = envs.pids
+    os.kill(pid, signal.SIGKILL)
+    os.waitid(os.P_PID, pid, os.WEXITED | os.WNOWAIT)
+    with make_vec_env(task, 1) as envs:
+        assert envs.pids != [pid]
+        step_all(envs)
+
+
+def test_few_simulations_are_open_at_a_time(monkeypatch):
+    monkeypatch.setattr(placement, "n_cores", lambda: 4)
+    separate = single_spec("Many", processes="separate")
+    assert [n_open_envs(separate, n_seeds, 10) for n_seeds in (1, 2, 3, 9)] == [4, 2, 1, 1]
+    assert n_open_envs(separate, 1, 3) == 3
+    assert n_open_envs(toy_spec(), 2, 10) == 10
+
+
+@pytest.mark.parametrize(("key", "value"), [("processes", "own"), ("timeout", 0), ("timeout", float("inf"))])
+def test_bad_keys(key, value):
+    with pytest.raises(LareError, match=key):
+        single_spec("Many", **{key: value})
