@@ -159,11 +159,11 @@ register_family("corridor", Corridor, single_agent=True)
 register_family("levels", LevelEnv, score="sum")
 
 
-def corridor_task(score: str, **keys: Any) -> TaskSpec:
+def corridor_task(name: str, **keys: Any) -> TaskSpec:
     """Return the task of one of `SCORES`."""
     return TaskSpec(
-        name=f"Corridor-{score}",
-        environment=f"corridor/{score}",
+        name=f"Corridor-{name}",
+        environment=f"corridor/{name}",
         description="An agent walks along a corridor with a key and a door.",
         observation="0: the position\n1: has the key\n2: the door is open\n3: the time",
         action="left, stay or right",

@@ -23,7 +23,8 @@ from lare_rl.tasks.spec import TaskSpec
 from measure import write
 from scores.environments import corridor_task, level_task
 
-PARTICLE_STEPS, CORRIDOR_STEPS = 205_000, 60_000
+PARTICLE_STEPS = 205_000
+CORRIDOR: dict[str, Any] = {"algorithm": "ppo", "steps": 60_000, "environments": 20}
 Kind = Literal["not-a-sum", "binary", "payments", "exact", "groups", "rivals"]
 
 
@@ -37,10 +38,9 @@ class Row(NamedTuple):
     is_baseline: bool = False
 
 
-def corridor(score: str, methods: tuple[str, ...], baseline: str, **settings: Any) -> Iterator[Row]:
+def corridor(score: str, methods: tuple[str, ...], baseline: str) -> Iterator[Row]:
     for method in methods:
-        values = {"method": method, "algorithm": "ppo", "steps": CORRIDOR_STEPS, "environments": 20, **settings}
-        yield Row(score, method, corridor_task(score), values, method == baseline)
+        yield Row(score, method, corridor_task(score), {"method": method, **CORRIDOR}, method == baseline)
 
 
 def not_a_sum() -> Iterator[Row]:
@@ -51,8 +51,7 @@ def not_a_sum() -> Iterator[Row]:
 
 def binary() -> Iterator[Row]:
     yield from corridor("odds", ("episodic", "rrdu", "bayes", "bayes-progress"), "bayes")
-    settings = {"method": "bayes", "algorithm": "ppo", "steps": CORRIDOR_STEPS, "environments": 20}
-    yield Row("odds", "bayes, binary", corridor_task("odds", score="binary"), settings)
+    yield Row("odds", "bayes, binary", corridor_task("odds", score="binary"), {"method": "bayes", **CORRIDOR})
 
 
 def particle(table: str, label: str, task: TaskSpec, method: str, baseline: bool = False, **settings: Any) -> Row:

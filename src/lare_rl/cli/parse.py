@@ -130,7 +130,7 @@ def _read_model(info: StructTypeInfo) -> StructConstructorSpec | None:
     for name, field in info.type.model_fields.items():
         default, doc = None if may_be_none else getattr(info.default, name), field.description
         if model := nested_model(field):
-            kind = model
+            kind: Any = model
             if name in _hidden_groups.get():
                 kind = Annotated[kind, tyro.conf.Suppress]
             default = tyro.MISSING if default is None else default

@@ -223,9 +223,10 @@ def fit(
     if basis.prefixes:  # the value before the first step is no reward, and time is
         bias, start_value = best.weight[:, n_features], best.bias
     if state.log_odds is not None:
-        state = state._replace(log_odds=logistic.fit(state.log_odds, group_index, max_rounds))
-        level, slope = logistic.to_returns(state.log_odds)
-        weight = jnp.concatenate([weight, slope * state.log_odds.posterior.weight[None]])
+        log_odds = logistic.fit(state.log_odds, group_index, max_rounds)
+        state = state._replace(log_odds=log_odds)
+        level, slope = logistic.to_returns(log_odds)
+        weight = jnp.concatenate([weight, slope * log_odds.posterior.weight[None]])
         bias, start_value = jnp.append(bias, 0), jnp.append(start_value, level)
     state = _set_weights(state, weight[:, :n_features], bias)._replace(
         intercept=weight[:, basis.n_columns - basis.n_levels :].astype(jnp.float32),

@@ -158,8 +158,9 @@ def _make_separate(task: TaskSpec, n: int) -> SubprocVecEnv:
 
 
 def _select_row(batch: Timestep) -> Timestep:
-    *columns, measures = batch
-    return Timestep(*(column[0].copy() for column in columns), {name: value[0] for name, value in measures.items()})
+    measures = {name: value[0] for name, value in batch.measures.items()}
+    columns = {name: value[0].copy() for name, value in batch._asdict().items() if name != "measures"}
+    return Timestep(**columns, measures=measures)
 
 
 def _find_package(task: TaskSpec) -> str | None:

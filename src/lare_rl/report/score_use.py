@@ -43,7 +43,8 @@ class ScoreUse:
         trust = "trust_nothing" if not self.is_clear else "trust_sums" if self.gain > CLEAR_GAIN else "trust_part"
         chance = Finding("chance_remains") if self.is_binary and trust == "trust_part" else None
         values = {"gain": self.gain, "error": self.gain_error, "baseline": baseline, "chance": chance}
-        period = None if self.period is None else Finding(_PERIODS.get(self.period, "period"), {"period": self.period})
+        period_code = "period_nonzero" if self.period == "nonzero" else "period"
+        period = None if self.period is None else Finding(period_code, {"period": self.period})
         return Finding(
             "score_use",
             {
@@ -54,9 +55,6 @@ class ScoreUse:
                 "trust": Finding(trust, values),
             },
         )
-
-
-_PERIODS = {"nonzero": "period_nonzero"}
 
 
 def summarise_score_use(
