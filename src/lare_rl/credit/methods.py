@@ -281,7 +281,7 @@ for _method in (
     ),
     Method(
         "grd",
-        "a causal model: learned masks choose the entries of state and action that cause the reward",
+        "a causal model, in which learned masks choose the causes of the reward",
         "Zhang et al., GRD, NeurIPS 2023",
         inputs=input_names.TRANSITION,
         fit=Fit.DECODER_LOSS,
@@ -289,7 +289,7 @@ for _method in (
     ),
     Method(
         "rbt",
-        "a transformer over the steps of one payment, which attend to each other in both directions",
+        "a transformer over all steps that one payment is for",
         "Tang et al., RBT, TMLR 2025",
         inputs=input_names.TRANSITION,
         fit=Fit.DECODER_LOSS,
@@ -313,7 +313,7 @@ for _method in (
     ),
     Method(
         "tar2",
-        "attention over time, Shapley values over agents; each step and agent gets a share of the return itself",
+        "attention over time and agents; each is paid a share of the return itself",
         "Kapoor et al., TAR2, 2025",
         inputs=input_names.OBSERVATION_ACTION,
         fit=Fit.ALL_STEPS,

@@ -62,8 +62,8 @@ class Block(eqx.Module):
         self, x: Float[Array, "episodes tokens size"], key: PRNGKeyArray | None
     ) -> Float[Array, "episodes tokens size"]:
         keys = (None,) * 3 if key is None else jax.random.split(key, 3)
-        query, key_rows, value = jnp.split(self.projections(self.norms[0](x))[..., None, :], 3, axis=-1)
-        attended = attend(query, key_rows, value, causal_mask(x.shape[1]), partial(_dropout, key=keys[0]))
+        query, projected_key, value = jnp.split(self.projections(self.norms[0](x))[..., None, :], 3, axis=-1)
+        attended = attend(query, projected_key, value, causal_mask(x.shape[1]), partial(_dropout, key=keys[0]))
         x = x + _dropout(self.merge(attended), keys[1])
         return x + _dropout(self.feed_forward(self.norms[1](x)), keys[2])
 
