@@ -101,7 +101,7 @@ def test_separate_environment_equals_local():
 
 
 def test_hang_is_an_error_of_one_line(monkeypatch):
-    monkeypatch.setenv("STALL", "1")
+    monkeypatch.setenv("STALL", __file__)
     task = single_spec("Stalls", processes="separate", timeout=0.5)
     with contextlib.closing(make_host_env(task)) as env:
         env.reset(0)
@@ -110,7 +110,7 @@ def test_hang_is_an_error_of_one_line(monkeypatch):
 
 
 def test_hang_ends_soon_after_a_request_to_stop(monkeypatch):
-    monkeypatch.setenv("STALL", "1")
+    monkeypatch.setenv("STALL", __file__)
     monkeypatch.setattr(workers, "STOP_TIMEOUT_S", 0.5)
     with make_vec_env(single_spec("Stalls", processes="separate"), 1) as envs:
         envs.reset(np.ones(1, bool), np.zeros(1, int))

@@ -59,6 +59,8 @@ class Worker:
         self.env_indices: Sequence[int] = ()
         self.specs: tuple[EnvSpec, ...] = ()
         """The specifications of its environments, once they are made."""
+        self.make_s = 0.0
+        """How long it took to make them (s)."""
         self.is_busy = False
         """Whether a reply is pending."""
         self.last_active, self._last_index = time.monotonic(), 0
@@ -170,10 +172,11 @@ def _serve(connection_descriptor: int) -> None:
             reply = None
             try:
                 if command == "make":
+                    start = time.perf_counter()
                     for index, pickled in argument.items():
                         current[0] = index
                         envs[index] = make_env_at(index, partial(_unpickle_and_make, pickled))
-                    reply = tuple(env.spec for env in envs.values())
+                    reply = tuple(env.spec for env in envs.values()), time.perf_counter() - start
                 elif command == "share":
                     shared = map_arrays(file, *argument)
                 elif command == "second":

@@ -103,7 +103,7 @@ class SubprocVecEnv(VecEnv):
                     if not worker.specs:
                         worker.send("make", {index: pickle_maker(index, makers[index]) for index in worker.env_indices})
                 for worker, reply in self._receive("make"):
-                    worker.specs = reply
+                    worker.specs, worker.make_s = reply
                 by_index = {
                     i: spec
                     for worker in self._workers
@@ -126,6 +126,11 @@ class SubprocVecEnv(VecEnv):
     @property
     def pids(self) -> list[int]:
         return [worker.process.pid for worker in self._workers]
+
+    @property
+    def make_s(self) -> float:
+        """How long it took to make the environments (s), where it took longest."""
+        return max(worker.make_s for worker in self._workers)
 
     def find_interference(self, maker: Maker, timeout: float) -> str | None:
         """Make a second environment beside the only one, in its process. Return what goes wrong within `timeout` (s), or None.
