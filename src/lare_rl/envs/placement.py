@@ -157,7 +157,8 @@ def _make_separate(task: TaskSpec, n: int) -> SubprocVecEnv:
 
 def _select_row(batch: Timestep) -> Timestep:
     *columns, measures = batch
-    return Timestep(*(column[0].copy() for column in columns), {name: value[0] for name, value in measures.items()})
+    new_measures = {name: value[0] for name, value in measures.items()}
+    return Timestep(*(column[0].copy() for column in columns), measures=new_measures)  # pyright: ignore[reportCallIssue]
 
 
 def _find_package(task: TaskSpec) -> str | None:

@@ -135,18 +135,17 @@ class SubprocVecEnv(VecEnv):
     def find_interference(self, maker: Maker, timeout: float) -> str | None:
         """Make a second environment beside the only one, in its process. Return what goes wrong within `timeout` (s), or None.
 
+        The batch ends then, because the process may not be what it was.
+
         Raises:
-            LareError: the process died or hangs. The batch has then ended.
+            LareError: the process died or hangs.
         """
-        self.timeout, old_timeout = timeout, self.timeout
+        self.timeout = timeout
         try:
             self._workers[0].send("second", pickle_maker(0, maker))
             return self._receive("a second environment")[0][1]
-        except BaseException:
-            self._kill()
-            raise
         finally:
-            self.timeout = old_timeout
+            self._kill()
 
     def _call(self, command: str, arguments: Shaped[np.ndarray, "n *rest"], where: Bool[np.ndarray, " n"]) -> None:
         if not self._workers:

@@ -103,8 +103,12 @@ def evaluate_on_host(envs: VecEnv, policy: Policy, seeds: Sequence[int], n_episo
 def _select_episodes(results: Evaluation, n_episodes: int) -> Evaluation:
     """Return the first episodes of each seed."""
     measures = {name: values[:, :n_episodes] for name, values in results.measures.items()}
-    arrays = results.returns, results.summed_returns, results.lengths
-    return Evaluation(*(array[:, :n_episodes] for array in arrays), measures)
+    return Evaluation(
+        returns=results.returns[:, :n_episodes],
+        summed_returns=results.summed_returns[:, :n_episodes],
+        lengths=results.lengths[:, :n_episodes],
+        measures=measures,
+    )
 
 
 def add_seed_axis(timestep: Timestep, shape: tuple[int, int]) -> Timestep:
