@@ -132,6 +132,15 @@ class SubprocVecEnv(VecEnv):
         """How long it took to make the environments (s), where it took longest."""
         return max(worker.make_s for worker in self._workers)
 
+    def measure_step_s(self) -> float:
+        """Return the time that a step of the first environment takes (s), in its process. Raises `LareError` like `step`."""
+        try:
+            self._workers[0].send("time steps")
+            return self._receive("step")[0][1]
+        except BaseException:
+            self._kill()
+            raise
+
     def find_interference(self, maker: Maker, timeout: float) -> str | None:
         """Make a second environment beside the only one, in its process. Return what goes wrong within `timeout` (s), or None.
 
