@@ -172,7 +172,7 @@ def measure_run(task: TaskSpec, settings: Settings) -> dict[str, Any]:
     }
 
 
-def main(steps: int = 4000, method: str = "bayes") -> None:
+def main(steps: int = 2000, method: str = "bayes") -> None:
     """Measure.
 
     Args:
@@ -180,9 +180,9 @@ def main(steps: int = 4000, method: str = "bayes") -> None:
         method: how credit is assigned.
     """
     runs = {
-        "ppo": ("Choice", 3, {"algorithm": "ppo"}),
-        "td3": ("Torque", 2, {"algorithm": "td3", "td3": {"warmup": 1000}}),
-        "td3, overlap_collection": ("Torque", 2, {"td3": {"warmup": 1000}, "overlap_collection": True}),
+        "ppo": ("Choice", 3, {"algorithm": "ppo", "rollout_steps": steps // 2}),
+        "td3": ("Torque", 2, {"algorithm": "td3", "td3": {"warmup": steps // 2}}),
+        "td3, overlap_collection": ("Torque", 2, {"td3": {"warmup": steps // 2}, "overlap_collection": True}),
     }
     results = {}
     for name, (task_name, action_size, changes) in runs.items():
