@@ -5,6 +5,7 @@ import re
 import shutil
 import subprocess
 import sys
+import time
 from pathlib import Path
 
 import pytest
@@ -12,6 +13,7 @@ import pytest
 from helpers.toy_envs import PHI
 from lare_rl import cli
 from lare_rl.algorithms.registry import ALGORITHMS
+from lare_rl.cli.terminal import EpisodeProgress
 from lare_rl.credit.methods import METHODS
 from lare_rl.envs.load import read_task, shipped_tasks
 from lare_rl.llm.prompts import candidate
@@ -139,6 +141,22 @@ def test_a_typo_in_a_task_file_is_reported_before_slow_imports(spec_file):
         process = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True)
         assert "there is no key 'observatoin'" in process.stderr
         assert process.stdout == "[]\n"
+
+
+def test_progress_of_episodes(monkeypatch, capsys):
+    """After the first episode that takes long, then every 20 seconds, and not when it is nearly over."""
+    now = [0.0]
+    monkeypatch.setattr(time, "monotonic", lambda: now[0])
+    report = EpisodeProgress(20)
+    for n_done in range(1, 21):
+        now[0] += 9.0
+        report(n_done)
+    lines = capsys.readouterr().err.splitlines()
+    assert lines[:2] == ["played 1 of 20 episodes, 3 min left", "played 4 of 20 episodes, 3 min left"]
+    assert len(lines) == 7
+    quick = EpisodeProgress(20)
+    quick(20)
+    assert capsys.readouterr().err == ""
 
 
 def test_tasks(command):

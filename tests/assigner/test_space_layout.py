@@ -107,3 +107,12 @@ def test_rows_refuses(space, values, message):
 def test_make_layout_refuses(space, message):
     with pytest.raises(LareError, match=message):
         make_layout(space, "observation_space")
+
+
+def test_a_choice_for_rows_of_numbers():
+    """The message names the space that the assigner needs."""
+    layout = make_layout(6, "action_space")
+    with pytest.raises(LareError, match=r"rows of 6 numbers.*action_space=gymnasium.spaces.Discrete\(6\)"):
+        layout.rows(np.int64(3), "action")
+    with pytest.raises(LareError, match=r"rows of 6 numbers$"):
+        layout.rows(0.5, "action")

@@ -1,4 +1,7 @@
-"""A simulator that allows one simulation in a process, as libsumo does. `fault` says what a second one does."""
+"""A simulator that allows one simulation in a process, as libsumo does. `fault` says what a second one does.
+
+One that stalls does so in each step while there is a file with the name in the variable STALL.
+"""
 
 import os
 import time
@@ -40,7 +43,7 @@ class SingleInstance(gymnasium.Env):
 
     def step(self, action):
         time.sleep(self.step_s)
-        if self.fault == "stalls" and os.environ.get("STALL"):
+        if self.fault == "stalls" and os.path.exists(os.environ.get("STALL", "")):
             time.sleep(600)
         mover = simulations[-1] if self.fault == "shares" else self  # the state belongs to the newest simulation
         mover.position = np.float32(0.9 * mover.position + 0.1 * (int(action) - 1))

@@ -1,6 +1,9 @@
 """Signals that stop a run."""
 
 import signal
+import subprocess
+import sys
+import threading
 import time
 
 import pytest
@@ -21,3 +24,36 @@ def test_second_signal_ends_process(monkeypatch, capfd):
         with pytest.raises(KeyboardInterrupt):
             signal.raise_signal(signal.SIGINT)
     assert signal.getsignal(signal.SIGINT) is handler
+
+
+PROGRAM = """
+import hashlib, lare_rl.training.process as process
+process.SAME_REQUEST_S, process.UNRESPONSIVE_S = 0.2, 0.2
+with process.catch_stop_signals():
+    print("ready", flush=True)
+    hashlib.pbkdf2_hmac("sha256", b"", b"", 10**9)  # hangs in C
+"""
+
+
+def test_second_signal_ends_process_that_hangs_in_c():
+    """The handler of the first signal is never called, because Python calls handlers in the main thread."""
+    process = subprocess.Popen([sys.executable, "-c", PROGRAM], stdout=subprocess.PIPE)
+    try:
+        assert process.stdout.readline() == b"ready\n"
+        for pause_s in (0.5, 0.0):
+            process.send_signal(signal.SIGTERM)
+            time.sleep(pause_s)
+        assert process.wait(30) == 130
+    finally:
+        process.kill()
+        process.stdout.close()
+
+
+def test_watching_ends_with_the_context():
+    n_threads = threading.active_count()
+    with catch_stop_signals():
+        assert threading.active_count() == n_threads + 1
+    assert signal.set_wakeup_fd(-1) == -1
+    for thread in threading.enumerate()[n_threads:]:
+        thread.join(10)
+    assert threading.active_count() == n_threads

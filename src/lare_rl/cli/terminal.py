@@ -25,8 +25,8 @@ RunDirectories = Annotated[
 Kind = Literal["factors", "reward"]
 Data = Annotated[str | None, tyro.conf.arg(metavar="DATASET")]
 
-PROGRESS_S = 20.0
-"""Seconds between two lines of progress."""
+FIRST_PROGRESS_S, PROGRESS_S = 5.0, 20.0
+"""Seconds before the first line of progress, and between two lines."""
 _TABLE_WIDTH = 200
 """Characters in a line of a table, where the output is not a terminal."""
 
@@ -63,7 +63,7 @@ class EpisodeProgress:
     def __call__(self, n_done: int) -> None:
         now = time.monotonic()
         seconds_left = (self._n_episodes - n_done) * (now - self._start) / n_done
-        wait_s = PROGRESS_S if self._line_time > self._start else 1.0
+        wait_s = PROGRESS_S if self._line_time > self._start else FIRST_PROGRESS_S
         if now - self._line_time > wait_s and seconds_left > 1:
             self._line_time = now
             print_progress(f"played {n_done} of {self._n_episodes} episodes, {format_seconds(seconds_left)} left")

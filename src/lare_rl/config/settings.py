@@ -63,7 +63,8 @@ class _RunSettings(CheckedModel, Generic[Open]):
     """For ippo: how long the decoder's first fit lasts. held-out (the default): until the error on held-out episodes stops falling.
     published: fit_updates, as in every later fit."""
     evaluate_every: Count | Open = OPEN
-    """Environment steps between two evaluations; the last step is followed by one, too. A checkpoint is written at each. By default
+    """Environment steps between two evaluations; the last step is followed by one, too. A checkpoint is written at each, and after five
+    minutes without one. By default
     5000 for td3, ddpg and sac, about 10,000 for qmix, 10 iterations for ippo, and 5 iterations for ppo."""
     evaluation_episodes: Count | Open = OPEN
     """Episodes in one evaluation. By default 10; in JAX, 50 for ippo and 32 for qmix. On the host, if a step takes more than 2 ms, as

@@ -7,17 +7,15 @@ does not know are tried in a worker process.
 
 import contextlib
 import logging
-import time
 from functools import lru_cache
-from statistics import median
 
 import gymnasium
 import numpy as np
 from jaxtyping import Float
 
 from lare_rl.envs.families import FAMILIES, is_gymnasium, load_env_spec, make_host_env, picklable_maker
-from lare_rl.envs.interface import HostEnv, Timestep
-from lare_rl.envs.second_instance import fixed_action
+from lare_rl.envs.interface import Timestep
+from lare_rl.envs.trials import time_steps
 from lare_rl.envs.vec_env import VecEnv, n_cores
 from lare_rl.envs.workers import SubprocVecEnv
 from lare_rl.envs.workers import make_vec_env as make_local_or_parallel
@@ -37,10 +35,9 @@ __all__ = [
 SLOW_STEP_S = 2e-3
 """An environment of an unknown package gets a process of its own if a step takes longer. A call of a worker takes a tenth of this."""
 SLOW_START_S = 2.0
-"""The same, if making it and the first reset take longer."""
+"""The same, if making it takes longer, so that it is not made twice to try that."""
 SECOND_TIMEOUT_S = 30.0
 """If a second environment hangs for so long beside a first one that started fast, each needs a process of its own."""
-N_TIMED_STEPS = 10
 
 _log = logging.getLogger(__name__)
 
@@ -110,15 +107,14 @@ def needs_process(task: TaskSpec) -> bool:
 
 def _try_second(task: TaskSpec) -> bool:
     """Return whether environments are slow, or disturb each other in one process. Try them in a worker process."""
-    start = time.perf_counter()
     try:
         env = SeparateEnv(task)
     except LareError:  # another process cannot make it, because the user's script registers it
         return False
     try:
-        step_s = _time_steps(env)
-        if step_s > SLOW_STEP_S or time.perf_counter() - start > SLOW_START_S:
-            problem = f"a step takes {1000 * step_s:.0f} ms, or a start some seconds"
+        step_s = env.envs.measure_step_s()
+        if step_s > SLOW_STEP_S or env.envs.make_s > SLOW_START_S:
+            problem = f"a step takes {1000 * step_s:.2g} ms, a start {env.envs.make_s:.2g} s"
         else:
             problem = env.envs.find_interference(picklable_maker(task), SECOND_TIMEOUT_S)
     except LareError as error:
@@ -130,25 +126,14 @@ def _try_second(task: TaskSpec) -> bool:
 
 def measure_step_s(task: TaskSpec) -> float:
     """Return the time that a step of a task's environment takes (s). It is measured once in this process."""
-    needs_process(task)
+    needs_process(task)  # this decides in which process it is made
     return _measure_task(task.model_dump_json())
 
 
 @lru_cache(maxsize=64)
 def _measure_task(task_json: str) -> float:
     with contextlib.closing(make_host_env(TaskSpec.model_validate_json(task_json))) as env:
-        return _time_steps(env)
-
-
-def _time_steps(env: HostEnv) -> float:
-    """Return the median time of the first steps of an episode (s)."""
-    timestep, times = env.reset(0), []
-    while len(times) < N_TIMED_STEPS and not (timestep.terminated or timestep.truncated):
-        action = fixed_action(env.spec, timestep)
-        start = time.perf_counter()
-        timestep = env.step(action)
-        times.append(time.perf_counter() - start)
-    return median(times) if times else 0.0
+        return env.envs.measure_step_s() if isinstance(env, SeparateEnv) else time_steps(env)
 
 
 def _make_separate(task: TaskSpec, n: int) -> SubprocVecEnv:

@@ -25,8 +25,8 @@ from jaxtyping import Int
 
 from lare_rl.envs.env_errors import EnvOutputError, one_line_errors
 from lare_rl.envs.interface import EnvSpec, HostEnv
-from lare_rl.envs.second_instance import find_interference
 from lare_rl.envs.shared_arrays import SharedArrays, map_arrays, map_current
+from lare_rl.envs.trials import find_interference, time_steps
 from lare_rl.envs.vec_env import Maker, call_env, make_env_at
 from lare_rl.errors import LareError
 
@@ -59,6 +59,8 @@ class Worker:
         self.env_indices: Sequence[int] = ()
         self.specs: tuple[EnvSpec, ...] = ()
         """The specifications of its environments, once they are made."""
+        self.make_s = 0.0
+        """How long it took to make them (s)."""
         self.is_busy = False
         """Whether a reply is pending."""
         self.last_active, self._last_index = time.monotonic(), 0
@@ -170,12 +172,15 @@ def _serve(connection_descriptor: int) -> None:
             reply = None
             try:
                 if command == "make":
+                    start = time.perf_counter()
                     for index, pickled in argument.items():
                         current[0] = index
                         envs[index] = make_env_at(index, partial(_unpickle_and_make, pickled))
-                    reply = tuple(env.spec for env in envs.values())
+                    reply = tuple(env.spec for env in envs.values()), time.perf_counter() - start
                 elif command == "share":
                     shared = map_arrays(file, *argument)
+                elif command == "time steps":
+                    reply = time_steps(next(iter(envs.values())))
                 elif command == "second":
                     reply = find_interference(next(iter(envs.values())), partial(_unpickle_and_make, argument))
                 else:

@@ -103,7 +103,7 @@ class SubprocVecEnv(VecEnv):
                     if not worker.specs:
                         worker.send("make", {index: pickle_maker(index, makers[index]) for index in worker.env_indices})
                 for worker, reply in self._receive("make"):
-                    worker.specs = reply
+                    worker.specs, worker.make_s = reply
                 by_index = {
                     i: spec
                     for worker in self._workers
@@ -127,21 +127,34 @@ class SubprocVecEnv(VecEnv):
     def pids(self) -> list[int]:
         return [worker.process.pid for worker in self._workers]
 
-    def find_interference(self, maker: Maker, timeout: float) -> str | None:
-        """Make a second environment beside the only one, in its process. Return what goes wrong within `timeout` (s), or None.
+    @property
+    def make_s(self) -> float:
+        """How long it took to make the environments (s), where it took longest."""
+        return max(worker.make_s for worker in self._workers)
 
-        Raises:
-            LareError: the process died or hangs. The batch has then ended.
-        """
-        self.timeout, old_timeout = timeout, self.timeout
+    def measure_step_s(self) -> float:
+        """Return the time that a step of the first environment takes (s), in its process. Raises `LareError` like `step`."""
         try:
-            self._workers[0].send("second", pickle_maker(0, maker))
-            return self._receive("a second environment")[0][1]
+            self._workers[0].send("time steps")
+            return self._receive("step")[0][1]
         except BaseException:
             self._kill()
             raise
+
+    def find_interference(self, maker: Maker, timeout: float) -> str | None:
+        """Make a second environment beside the only one, in its process. Return what goes wrong within `timeout` (s), or None.
+
+        The batch ends then, because the process may not be what it was.
+
+        Raises:
+            LareError: the process died or hangs.
+        """
+        self.timeout = timeout
+        try:
+            self._workers[0].send("second", pickle_maker(0, maker))
+            return self._receive("a second environment")[0][1]
         finally:
-            self.timeout = old_timeout
+            self._kill()
 
     def _call(self, command: str, arguments: Shaped[np.ndarray, "n *rest"], where: Bool[np.ndarray, " n"]) -> None:
         if not self._workers:

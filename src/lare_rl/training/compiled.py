@@ -52,6 +52,8 @@ class CompiledFunctions(NamedTuple):
     """Store new steps. Also return whether all factors of each seed are finite."""
     learn_returns: Callable[[Learner], Learner]
     """Let the decoders learn from finished episodes."""
+    compile_learning: Callable[[Learner], None]
+    """Compile `learn_returns` for a learner of these shapes, also in another thread."""
     fit: Callable[[Learner, Key[Array, " seeds"]], tuple[Learner, Metrics]]
     """Make the decoders' own gradient updates. Return the mean of each metric."""
     train_step: Callable[..., tuple[Learner, Metrics]]
@@ -125,9 +127,14 @@ def compile_functions(config: TrainConfig, phi: Sequence[Graph] = ()) -> Compile
             learned = jax.block_until_ready(learn(learner.decoders, learner.replay, learner.n_learned))
         return with_learned_returns(learner, *learned)
 
+    def compile_learning(learner: Learner) -> None:
+        with jax.enable_x64(True):  # as in `learn_returns`, whose limit of threads would be that of all threads
+            learn.lower(learner.decoders, learner.replay, learner.n_learned).compile()
+
     return CompiledFunctions(
         init=jit(init),
         learn_returns=learn_returns,
+        compile_learning=compile_learning,
         store=jit_store(),
         fit=jit(partial(fit_seeds, config=config), donate=(0,)),
         train_step=jit(partial(module.train_step, config=config), shared=(3,), donate=(0,)),

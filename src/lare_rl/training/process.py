@@ -3,6 +3,7 @@
 import contextlib
 import os
 import signal
+import socket
 import threading
 import time
 from collections.abc import Iterator
@@ -15,8 +16,13 @@ from lare_rl.runs.directory import Run
 
 __all__ = ["catch_stop_signals", "report_full_memory"]
 
+STOP_SIGNALS = signal.SIGINT, signal.SIGTERM
+
 SAME_REQUEST_S = 1.0
 """Signals less than this many seconds apart count as one: a terminal and a parent process may each send one."""
+
+UNRESPONSIVE_S = 10.0
+"""The process ends if the main thread has not reacted to the second signal for so long (s): a simulator in C may hang in it."""
 
 
 @contextlib.contextmanager
@@ -54,9 +60,47 @@ def catch_stop_signals() -> Iterator[threading.Event]:
         with contextlib.suppress(OSError):
             os.write(2, b"\nstopping after this iteration (a second Ctrl-C or SIGTERM ends it at once)\n")
 
-    old_handlers = {number: signal.signal(number, handle) for number in (signal.SIGINT, signal.SIGTERM)}
+    old_handlers = {number: signal.signal(number, handle) for number in STOP_SIGNALS}
     try:
-        yield stop
+        with _end_unresponsive_process():
+            yield stop
     finally:
         for number, handler in old_handlers.items():
             signal.signal(number, handler)
+
+
+@contextlib.contextmanager
+def _end_unresponsive_process() -> Iterator[None]:
+    """End the process if the main thread does not react to the second signal.
+
+    Python calls its handlers in the main thread, between two steps of the interpreter. So they are not called while a simulator
+    hangs in C. A thread reads the numbers of the signals, which Python writes at once.
+    """
+    receiver, sender = socket.socketpair()
+    sender.setblocking(False)
+    old_descriptor = signal.set_wakeup_fd(sender.fileno(), warn_on_full_buffer=False)
+    threading.Thread(target=_wait_for_second_signal, args=(receiver,), daemon=True).start()
+    try:
+        yield
+    finally:
+        signal.set_wakeup_fd(old_descriptor)
+        sender.close()
+
+
+def _wait_for_second_signal(receiver: socket.socket) -> None:
+    """Wait until the sender is closed, or end the process some seconds after the second request to stop."""
+    first_request = None
+    with receiver:
+        while number := receiver.recv(1):
+            if number[0] not in STOP_SIGNALS:
+                continue
+            if first_request is None:
+                first_request = time.monotonic()
+            elif time.monotonic() - first_request > SAME_REQUEST_S:
+                break
+        receiver.settimeout(UNRESPONSIVE_S)
+        try:
+            while receiver.recv(1):
+                pass
+        except TimeoutError:
+            os._exit(130)

@@ -75,8 +75,9 @@ class Terminal(Listener):
 
     def on_step(self, step: int) -> None:
         if self._progress:
-            figures = {} if self._has_evaluation else {"figures": "before the first evaluation"}
-            self._progress.update(self._progress.task_ids[0], completed=step, **figures)  # pyright: ignore[reportArgumentType]
+            self._progress.update(self._progress.task_ids[0], completed=step)
+            if not self._has_evaluation:
+                self._progress.update(self._progress.task_ids[0], figures="before the first evaluation")
         elif (seconds := time.monotonic() - self._line_time) > LINE_S:
             n_steps, text = step - self._line_step, f"step {step:>{len(str(self._steps))}} of {self._steps}"
             if n_steps:

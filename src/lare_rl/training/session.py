@@ -29,7 +29,14 @@ from lare_rl.training.batching import is_batching_faster
 from lare_rl.training.collect_device import DeviceCollector, is_reset_cheap
 from lare_rl.training.collect_host import HostCollector, make_host_collector
 from lare_rl.training.compile_cache import cache_by_value
-from lare_rl.training.compiled import CompiledFunctions, compile_ahead, compile_functions, init_seeds, steps_shape
+from lare_rl.training.compiled import (
+    CompiledFunctions,
+    compile_ahead,
+    compile_functions,
+    init_seeds,
+    learner_shape,
+    steps_shape,
+)
 from lare_rl.training.compiled_loop import CompiledLoop, compile_loop, init_loop
 from lare_rl.training.evaluation import metrics_lines
 from lare_rl.training.factors import compute_host_factors
@@ -72,8 +79,8 @@ class Session:
 
     _unchecked: tuple[Any, Trajectory] | None = None
     """Whether all factors of the newest steps are finite, for each seed, and these steps."""
-    _threads: ThreadPoolExecutor = field(default_factory=lambda: ThreadPoolExecutor(2))
-    """One writes checkpoints, and one updates while steps are collected."""
+    _threads: ThreadPoolExecutor = field(default_factory=lambda: ThreadPoolExecutor(3))
+    """They write checkpoints, update while steps are collected, and compile."""
     _saving: Future[None] | None = None
     """The checkpoint that is being written."""
     _iteration_s: float = MAX_CALL_S
@@ -177,6 +184,10 @@ class Session:
             config=self.config,
             fit_every=self.settings.fit_every,
         )
+
+    def compile_while_collecting(self) -> None:
+        """Compile in a thread what the first finished episodes need. Until then, the processor often waits for a simulator."""
+        self._threads.submit(self.functions.compile_learning, learner_shape(self.config, len(self.run.seeds)))
 
     def _iteration_functions(self, stop_requested: Callable[[], bool]) -> IterationFunctions:
         functions = self.functions
@@ -314,7 +325,10 @@ def _make_session(run: Run, config: TrainConfig, learner: Learner | None) -> Ses
         collector = make_host_collector(task, config, run.seeds, settings.evaluation_episodes)
     else:
         collector = DeviceCollector(env, config, run.seeds)
-    return Session(run, config, functions, learner, collector, loop)
+    session = Session(run, config, functions, learner, collector, loop)
+    if env is None and learner.decoders:
+        session.compile_while_collecting()
+    return session
 
 
 def _has_first_fit(run: Run, config: TrainConfig) -> bool:

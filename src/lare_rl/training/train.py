@@ -8,6 +8,7 @@ from lare_rl.config.effective import unused_settings, warmup_warning
 from lare_rl.config.resolve import resolve
 from lare_rl.config.settings import Settings
 from lare_rl.envs.load import resolve_task
+from lare_rl.envs.workers import close_idle_workers
 from lare_rl.errors import LareError, short_repr
 from lare_rl.runs.directory import Run, as_run, create_run, default_directory, extend_run, lock_run
 from lare_rl.runs.metrics_file import truncate_metrics
@@ -158,6 +159,7 @@ def _finish(
         for listener in listeners:
             listener.on_stop()
         session.close()
+        close_idle_workers()
     return run
 
 

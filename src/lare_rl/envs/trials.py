@@ -1,6 +1,10 @@
-"""Whether two environments in one process disturb each other. Some simulators allow a single simulation in a process."""
+"""What a few steps say about an environment: how long they take, and whether a second environment in its process disturbs it.
+
+Some simulators allow a single simulation in a process.
+"""
 
 import contextlib
+import time
 from collections.abc import Iterator
 
 import numpy as np
@@ -11,9 +15,21 @@ from lare_rl.envs.interface import EnvSpec, HostEnv, Timestep
 from lare_rl.envs.vec_env import Maker
 from lare_rl.errors import LareError
 
-__all__ = ["find_interference", "fixed_action"]
+__all__ = ["find_interference", "fixed_action", "time_steps"]
 
-N_STEPS = 3
+N_TIMED_STEPS = 10
+N_COMPARED_STEPS = 3
+
+
+def time_steps(env: HostEnv) -> float:
+    """Return the shortest time of the first steps of an episode (s): other processes may interrupt the others."""
+    timestep, times = env.reset(0), []
+    while len(times) < N_TIMED_STEPS and not (timestep.terminated or timestep.truncated):
+        action = fixed_action(env.spec, timestep)
+        start = time.perf_counter()
+        timestep = env.step(action)
+        times.append(time.perf_counter() - start)
+    return min(times, default=0.0)
 
 
 def find_interference(env: HostEnv, maker: Maker) -> str | None:
@@ -44,7 +60,7 @@ def _play(env: HostEnv, seed: int = 0) -> Iterator[np.ndarray]:
     """Yield the observations of the first steps of an episode, by the same action."""
     timestep = env.reset(seed)
     yield timestep.observation
-    for _ in range(N_STEPS):
+    for _ in range(N_COMPARED_STEPS):
         if timestep.terminated or timestep.truncated:
             return
         timestep = env.step(fixed_action(env.spec, timestep))

@@ -1,0 +1,79 @@
+"""Runs whose environments are in processes of their own."""
+
+import os
+
+import pytest
+
+from helpers.listeners import AtStep, MessageListener, metrics_without_times
+from helpers.single_instance import N_STEPS, simulations, single_spec
+from helpers.training_runs import assert_equal_runs, resume_quietly, train_and_stop, train_quietly
+from lare_rl.envs import placement
+from lare_rl.envs.workers import _idle_workers
+from lare_rl.errors import LareError
+from lare_rl.evaluation.evaluate import evaluate_run
+from lare_rl.runs.directory import open_run
+from lare_rl.training import loop
+
+SEPARATE = single_spec("Fails", processes="separate")
+
+
+@pytest.fixture
+def settings(small):
+    return small(
+        algorithm="ppo", method="bayes", steps=60, rollout_steps=10, evaluate_every=30, evaluation_episodes=3, seeds=2
+    )
+
+
+@pytest.fixture(autouse=True)
+def two_cores(monkeypatch):
+    monkeypatch.setattr(placement, "SLOW_STEP_S", 1.0)  # however loaded the machine is
+    monkeypatch.setattr(placement, "n_cores", lambda: 2)
+
+
+def test_run_equals_one_in_a_single_process(settings, tmp_path, monkeypatch):
+    """Also after a stop. Each simulation is started once: the training environment and one for evaluations, of each seed."""
+    local = train_quietly(single_spec("Many"), settings, tmp_path / "local")
+    monkeypatch.setenv("STARTS_FILE", str(tmp_path / "starts"))
+    run = train_quietly(SEPARATE, settings, tmp_path / "separate")
+    pids = (tmp_path / "starts").read_text().split()
+    assert len(pids) == len(set(pids)) == 4
+    assert not simulations
+    assert not any(_idle_workers.values())
+    assert metrics_without_times(run) == metrics_without_times(local)
+    train_and_stop(SEPARATE, settings, tmp_path / "stopped", 40)
+    assert_equal_runs(resume_quietly(tmp_path / "stopped"), run)
+    assert evaluate_run(run, 3)["Fails"].tolist() == evaluate_run(local, 3)["Many"].tolist()
+
+
+def test_hang_during_training(settings, tmp_path):
+    """It is an error of one line, and the run continues from its last checkpoint."""
+    task = single_spec("Stalls", processes="separate", timeout=0.5)
+    stall = AtStep(50, lambda: (tmp_path / "stall").touch())
+    os.environ["STALL"] = str(tmp_path / "stall")
+    try:
+        with pytest.raises(LareError, match=r"environment 0 .* did not reply for 0.5 s in step; .* timeout") as error:
+            train_quietly(task, settings, tmp_path / "run", listeners=[stall])
+    finally:
+        del os.environ["STALL"]
+    assert "\n" not in str(error.value)
+    assert [line["step"] for line in open_run(tmp_path / "run").metrics()] == [30, 30]
+    resumed = resume_quietly(tmp_path / "run")
+    assert [line["step"] for line in resumed.metrics()] == [30, 30, 60, 60]
+
+
+def test_listeners_hear_of_steps_inside_an_iteration(settings, tmp_path, monkeypatch):
+    class Steps(MessageListener):
+        def __init__(self):
+            super().__init__()
+            self.steps = []
+
+        def on_step(self, step):
+            self.steps.append(step)
+
+    monkeypatch.setattr(loop, "PROGRESS_S", -1.0)
+    listener = Steps()
+    train_quietly(single_spec("Many"), settings, tmp_path / "run", listeners=[listener])
+    iterations = [step for step in listener.steps if step <= 10]
+    assert iterations == [*range(1, 11), 10]
+    evaluation = [index for index, step in enumerate(listener.steps) if step == 30]
+    assert len(evaluation) == 1 + 1 + N_STEPS  # the last step, the iteration, and each step of the evaluation
