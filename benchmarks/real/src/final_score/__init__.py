@@ -9,7 +9,12 @@ import gymnasium
 
 __all__ = ["TASKS"]
 
-TASKS = {"JobShop": ("final_score.jobshop:JobShop", 400), "Traffic": ("final_score.traffic:Traffic", 360), "Wheat": ("final_score.wheat:Wheat", 30)}
+TASKS = {
+    "Grid": ("final_score.grid:Grid", 48),
+    "JobShop": ("final_score.jobshop:JobShop", 400),
+    "Traffic": ("final_score.traffic:Traffic", 360),
+    "Wheat": ("final_score.wheat:Wheat", 30),
+}
 """Entry point and longest episode (steps) of each Gymnasium task."""
 
 for _name, (_entry_point, _max_steps) in TASKS.items():
