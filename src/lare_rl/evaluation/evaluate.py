@@ -77,7 +77,7 @@ def evaluate_policy(run: Run, episodes: int, best: bool = False, deterministic: 
     if not isinstance(env, HostEnv):
         return DeviceCollector(env, config, run.seeds).evaluate(actor, episodes, number=1)
     env.close()
-    make_host, evaluations = picklable_maker(task), []
+    make_host, evaluations = picklable_maker(task.evaluation_task), []
     for n_done in range(0, episodes, MAX_OPEN_ENVS):
         n_episodes = min(MAX_OPEN_ENVS, episodes - n_done)
         with make_vec_env(make_host, n_episodes * len(run.seeds)) as envs:
@@ -111,11 +111,11 @@ def measure_random_returns(task: TaskSpec) -> Float[np.ndarray, " episodes"]:
 def play_random(
     task: TaskSpec, n_episodes: int = RANDOM_EPISODES, limit_s: float = RANDOM_PLAY_LIMIT_S
 ) -> list[Episode]:
-    """Play `n_episodes` episodes of random actions, or fewer if `limit_s` seconds have passed: no episode begins after that.
+    """Play `n_episodes` episodes of random actions in the environment of evaluations. No episode begins after `limit_s` seconds.
 
     The list is empty if the environment does not run, or if its module must not be imported for a report.
     """
-    episodes: list[Episode] = []
+    task, episodes = task.evaluation_task, list[Episode]()
     deadline = time.monotonic() + limit_s
     if untrusted_module(task) is None:
         with suppress(LareError), closing(make_host_env(task.roles[0])) as env:

@@ -225,11 +225,11 @@ class HostCollector:
 def make_host_collector(
     task: TaskSpec, config: TrainConfig, seeds: Sequence[int], n_evaluation_episodes: int
 ) -> HostCollector:
-    """Make a collector with a task's environments. If a seed has several, they step in worker processes."""
+    """Make a collector with a task's environments. If a seed has several to train in, they step in worker processes."""
     make_env, n_seeds = picklable_maker(task), len(seeds)
     n_envs = n_seeds * config.n_envs
     envs = make_vec_env(make_env, n_envs) if config.n_envs == 1 else SubprocVecEnv([make_env] * n_envs)
-    evaluation_envs = make_vec_env(make_env, n_seeds * n_evaluation_episodes)
+    evaluation_envs = make_vec_env(picklable_maker(task.evaluation_task), n_seeds * n_evaluation_episodes)
     return HostCollector(envs, evaluation_envs, config, seeds)
 
 
