@@ -11,7 +11,7 @@ from lare_rl.errors import LareError
 from lare_rl.sweep.jobs import Job, check_job
 from lare_rl.sweep.resources import Resources
 from lare_rl.sweep.sweep import run_sweep
-from paper import correlations, regret, trained
+from paper import correlations, real, regret, trained
 from paper.exhibits import Budget, budgets, exhibit_jobs, exhibits
 from paper.pages import Page, write_page
 
@@ -21,6 +21,9 @@ UNTRAINED: dict[str, tuple[str, str, Callable[[Budget, str], Page]]] = {
 }
 """Exhibits that need no training: place in the paper, title, and the page."""
 
+REAL = "real"
+"""The name of the study of five tasks of real simulators, which is no exhibit of the paper."""
+
 Watching = Callable[[Sequence[Job]], AbstractContextManager[Callable[[str], None]]]
 """Shows the progress of jobs; yields the function that prints messages."""
 
@@ -29,6 +32,7 @@ def listed() -> Iterator[tuple[str, str, str]]:
     """Name, place in the paper, and title of every exhibit."""
     yield from ((name, exhibit.source, exhibit.title) for name, exhibit in exhibits().items())
     yield from ((name, source, title) for name, (source, title, _) in UNTRAINED.items())
+    yield REAL, real.SOURCE, real.TITLE
 
 
 def quiet(jobs: Sequence[Job]) -> AbstractContextManager[Callable[[str], None]]:
@@ -66,8 +70,8 @@ def reproduce(
         make_page = UNTRAINED[name][-1]
         return write_page(make_page(shared_budget, command), folder)
     load_rliable()
-    exhibit = exhibits()[name]
-    jobs = exhibit_jobs(exhibit, budget, root / budget)
+    is_real, directory = name == REAL, root / budget
+    jobs = real.plan_jobs(budget, directory / REAL) if is_real else exhibit_jobs(exhibits()[name], budget, directory)
     all_jobs = [job for task_jobs in jobs.values() for contender_jobs in task_jobs.values() for job in contender_jobs]
     for job in all_jobs:
         check_job(job)
@@ -76,8 +80,10 @@ def reproduce(
     if failed:
         failed_names = ", ".join(job.name for job in failed)
         raise LareError(f"{len(failed)} of {len(all_jobs)} runs failed, so there is no page: {failed_names}")
-    page = trained.make_page(name, exhibit, shared_budget, jobs, command)
     write_table(read_metric_rows(job.directory for job in all_jobs), folder / name)
+    if is_real:
+        return write_page(real.make_page(budget, jobs, command), folder)
+    page = trained.make_page(name, exhibits()[name], shared_budget, jobs, command)
     return write_page(page, folder)
 
 

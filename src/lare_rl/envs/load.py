@@ -69,8 +69,10 @@ def check_environment(spec: TaskSpec) -> None:
 
     if spec.environment == NO_ENVIRONMENT:
         check_logs(spec)
-    else:
-        load_env_spec(spec)
+        return
+    load_env_spec(spec)
+    if spec.evaluation_environment is not None:
+        load_env_spec(spec.evaluation_task)
 
 
 def _read_values(task: str, ancestors: tuple[str, ...] = ()) -> dict[str, Any]:

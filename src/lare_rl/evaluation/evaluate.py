@@ -79,7 +79,7 @@ def evaluate_policy(run: Run, episodes: int, best: bool = False, deterministic: 
         env = make_env(task)
         assert isinstance(env, JaxEnv)
         return DeviceCollector(env, config, run.seeds).evaluate(actor, episodes, number=1)
-    evaluations = []
+    task, evaluations = task.evaluation_task, []
     for n_done in range(0, episodes, MAX_OPEN_ENVS):
         n_episodes = min(MAX_OPEN_ENVS, episodes - n_done)
         with make_vec_env(task, n_open_envs(task, len(run.seeds), n_episodes) * len(run.seeds)) as envs:
@@ -115,14 +115,14 @@ def play_random(
     limit_s: float = RANDOM_PLAY_LIMIT_S,
     on_episode: EpisodeListener | None = None,
 ) -> list[Episode]:
-    """Play `n_episodes` episodes of random actions, or fewer if they take long.
+    """Play `n_episodes` episodes of random actions in the environment of evaluations, or fewer if they take long.
 
     After `limit_s` seconds there are `MIN_RANDOM_EPISODES`, because fewer have no useful deviation, and after `MAX_RANDOM_PLAY_S`
     none begins.
 
     The list is empty if the environment does not run, or if its module must not be imported for a report.
     """
-    episodes: list[Episode] = []
+    task, episodes = task.evaluation_task, list[Episode]()
     start = time.monotonic()
     if untrusted_module(task) is not None:
         return episodes

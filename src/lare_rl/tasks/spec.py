@@ -42,6 +42,7 @@ PETTINGZOO_PREFIX = "pettingzoo/"
 
 SHARED_KEYS = (
     "environment",
+    "evaluation_environment",
     "arguments",
     "max_episode_steps",
     "credit_scope",
@@ -83,6 +84,9 @@ class TaskSpec(CheckedModel):
     environment: Annotated[str, Field(min_length=1)]
     """A Gymnasium id (`module:id` first imports the module that registers it), or the name of another family's environment, such as
     `particles/CN-6`, or `none` if there are only logs. Functions are then designed and logs relabelled, but nothing is trained."""
+    evaluation_environment: str | None = None
+    """The environment that policies are evaluated in, such as held-out maps, years or demand. It is of the same module, and has the
+    same sizes. By default, `environment`. Only for environments on the host."""
     observation_size: Annotated[int, Field(ge=1)]
     """The number of entries of an observation."""
     action_size: Annotated[int, Field(ge=1)]
@@ -154,6 +158,26 @@ class TaskSpec(CheckedModel):
                 )
         return self
 
+    @model_validator(mode="after")
+    def _check_evaluation_environment(self) -> "TaskSpec":
+        # A run's files may name any module, and only that of `environment` is checked before it is imported.
+        other = self.evaluation_environment
+        if other is not None and _module(other) != _module(self.environment):
+            raise ValueError(
+                f"evaluation_environment = {other!r} is not of the module of environment = {self.environment!r}"
+            )
+        return self
+
+    @property
+    def evaluation_task(self) -> "TaskSpec":
+        """This task in the environment that policies are evaluated in."""
+        if self.evaluation_environment is None:
+            return self
+        values = {"environment": self.evaluation_environment, "evaluation_environment": None}
+        return self.model_copy(
+            update={**values, "teams": tuple(team.model_copy(update=values) for team in self.teams)}
+        )
+
     @property
     def family(self) -> str:
         """The part of `environment` before the first slash, or "" without a slash."""
@@ -187,6 +211,12 @@ class TaskSpec(CheckedModel):
     def digest(self) -> str:
         """SHA-256 of all values."""
         return hashlib.sha256(self.model_dump_json().encode()).hexdigest()
+
+
+def _module(environment: str) -> tuple[bool, str]:
+    """Return whether an environment is PettingZoo's, and the module that its name imports, or ""."""
+    module, colon, _ = environment.removeprefix(PETTINGZOO_PREFIX).partition(":")
+    return environment.startswith(PETTINGZOO_PREFIX), module if colon else ""
 
 
 def require_role(spec: TaskSpec) -> TaskSpec:

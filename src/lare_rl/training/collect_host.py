@@ -256,7 +256,7 @@ def make_host_collector(
     """Make a collector with a task's environments. If a seed has several, they step in worker processes."""
     n_seeds = len(seeds)
     envs = make_vec_env(task, n_seeds * config.n_envs, parallel=config.n_envs > 1)
-    evaluation_envs = make_vec_env(task, n_seeds * n_open_envs(task, n_seeds, n_evaluation_episodes))
+    evaluation_envs = make_vec_env(task.evaluation_task, n_seeds * n_open_envs(task, n_seeds, n_evaluation_episodes))
     return HostCollector(envs, evaluation_envs, config, seeds)
 
 

@@ -10,6 +10,7 @@ import gymnasium
 __all__ = ["TASKS"]
 
 TASKS = {
+    "Grid": ("final_score.grid:Grid", 48),
     "JobShop": ("final_score.jobshop:JobShop", 400),
     "Traffic": ("final_score.traffic:Traffic", 360),
     "Wheat": ("final_score.wheat:Wheat", 30),
