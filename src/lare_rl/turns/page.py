@@ -132,7 +132,9 @@ def _describe_features(features: Mapping[str, float]) -> str:
 def _render_effects(credit: CreditedTurns) -> str:
     rows = []
     for effect in sorted(credit.effects, key=lambda effect: -abs(effect.first * effect.frequency)):
-        pairs = ((getattr(effect, name), getattr(effect, f"{name}_deviation")) for name in ("first", "lasting", "further"))
+        pairs = (
+            (getattr(effect, name), getattr(effect, f"{name}_deviation")) for name in ("first", "lasting", "further")
+        )
         numbers = (f"{number:+.3f} ± {deviation:.3f}" for number, deviation in pairs)
         name = effect.name if effect.unit == 1 else f"{effect.name} ({effect.unit:.3g})"
         rows.append((name, f"{effect.frequency:.0%}", *numbers))
