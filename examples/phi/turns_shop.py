@@ -10,7 +10,7 @@ def turn_events(tool, arguments, result, text):
     agreed = tool == "" and any(
         answer.strip().startswith(yes) for yes in ("yes", "ok", "sure", "please do", "that is fine")
     )
-    asked = tool == "" and "?" in words
+    is_question = tool == "" and "?" in words
     return {
         "customer found": tool == "find_customer" and "customer_id" in answer,
         "customer not found": tool == "find_customer" and "customer_id" not in answer,
@@ -18,7 +18,7 @@ def turn_events(tool, arguments, result, text):
         "order is delivered": tool == "get_order" and '"delivered"' in answer,
         "variant available": tool == "get_variants" and '"available": true' in answer,
         "nothing available": tool == "get_variants" and '"available": true' not in answer,
-        "asks for consent": asked
+        "asks for consent": is_question
         and any(word in words for word in ("shall i", "would you like", "confirm", "do you want")),
         "customer agrees": agreed,
         "customer objects": tool == "" and answer.strip().startswith("no"),

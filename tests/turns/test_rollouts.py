@@ -85,8 +85,8 @@ def test_numbers_of_the_user_come_on_top_and_win():
 
 
 def test_content_may_be_a_list():
-    parts = [{"type": "text", "text": "a"}, {"type": "image_url", "image_url": {}}, {"type": "text", "text": "b"}]
-    (turn,) = split_turns([{"role": "assistant", "content": parts}], "it")
+    contents = [{"type": "text", "text": "a"}, {"type": "image_url", "image_url": {}}, {"type": "text", "text": "b"}]
+    (turn,) = split_turns([{"role": "assistant", "content": contents}], "it")
     assert turn.text == "a\nb"
 
 

@@ -73,9 +73,9 @@ def test_advantages_are_discounted_sums(lambda_):
     change = np.random.default_rng(1).normal(size=len(table.features))
     result = advantages(table, change, lambda_)
     for k in range(len(table.length)):
-        own_change = change[rows_of(table, k)]
+        rollout_change = change[rows_of(table, k)]
         for t in range(table.length[k]):
-            expected = sum(lambda_**i * own_change[t + i] for i in range(table.length[k] - t))
+            expected = sum(lambda_**i * rollout_change[t + i] for i in range(table.length[k] - t))
             assert result[rows_of(table, k)][t] == pytest.approx(expected)
 
 
@@ -89,9 +89,9 @@ def test_values_leave_out_the_rollout_itself():
     base = fit.mean + (x - fit.x_mean) @ fit.weight
     weight = len(table.length) / len(x)
     for k in range(len(table.length)):
-        others = (table.group[index] == table.group[k]) & (index != k)
-        residual = weight * (table.outcome[index] - base)[others].sum()
-        intercept = residual / (weight * others.sum() + ALPHA / BETA)
+        in_group = (table.group[index] == table.group[k]) & (index != k)
+        residual = weight * (table.outcome[index] - base)[in_group].sum()
+        intercept = residual / (weight * in_group.sum() + ALPHA / BETA)
         np.testing.assert_allclose(result[rows_of(table, k)], base[rows_of(table, k)] + intercept)
 
 

@@ -152,8 +152,8 @@ class Elimination(NamedTuple):
     @property
     def variance(self) -> Float[np.ndarray, " features_and_groups"]:
         """The posterior variance of v and of b."""
-        of_groups = 1 / self.group_precision + np.sum((self.group_row @ self.root.T) ** 2, axis=1)
-        return np.concatenate([np.sum(self.root[:, :-1] ** 2, axis=0), of_groups])
+        group_variance = 1 / self.group_precision + np.sum((self.group_row @ self.root.T) ** 2, axis=1)
+        return np.concatenate([np.sum(self.root[:, :-1] ** 2, axis=0), group_variance])
 
 
 def eliminate_groups(sums: GroupSums, alpha: Float[np.ndarray, " strengths"], beta: float) -> Elimination:
