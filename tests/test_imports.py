@@ -19,7 +19,7 @@ MODULES = {
 
 ROOMS = """
 _version errors util nn tasks envs new_task data llm phi latent credit algorithms config runs training assigner integrations
-logs evaluation report compare sweep export cli __main__
+logs evaluation report compare sweep export turns cli __main__
 """.split()
 """A room imports itself and the rooms before it."""
 
@@ -85,7 +85,7 @@ MAX_MODULES = {"--help": 450, "train --help": 450, "methods": 510, "tasks": 620}
 """The largest number of modules that are imported after each of these commands, one after the other."""
 WITHOUT_JAX = """
 lare_rl lare_rl.latent.verify lare_rl.phi.read lare_rl.latent.design lare_rl.envs.load lare_rl.tasks.spec lare_rl.envs.pettingzoo_env
-lare_rl.envs.workers
+lare_rl.envs.workers lare_rl.turns.credit lare_rl.turns.files
 """.split()
 PROGRAM = """
 import contextlib, importlib, io, json, sys

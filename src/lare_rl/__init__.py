@@ -38,6 +38,7 @@ if TYPE_CHECKING:
     from lare_rl.training.stored_episodes import stored_episodes as stored_episodes
     from lare_rl.training.train import resume as resume
     from lare_rl.training.train import train as train
+    from lare_rl.turns.credit import TurnCredit as TurnCredit
 
 
 def _read_sources() -> dict[str, tuple[str, str]]:

@@ -21,6 +21,7 @@ __all__ = [
     "Posterior",
     "Regression",
     "clip_precisions",
+    "count_determined",
     "dense_moments",
     "equal_shares",
     "expand_groups",
@@ -136,6 +137,20 @@ def dense_moments(backend: Backend, problem: Regression, alpha: Float[Array, " g
     return Moments(weight, xp.sum(root**2, axis=0), log_det, residual)
 
 
+def count_determined(
+    backend: Backend,
+    group_index: Int[np.ndarray, " features"],
+    alpha: Float[Array, " groups"],
+    weight: Float[Array, " features"],
+    variance: Float[Array, " features"],
+) -> tuple[Float[Array, " groups"], Float[Array, " groups"], Float[Array, " groups"]]:
+    """Return n_g, gamma_g and |mu_g|^2 of each group."""
+    xp, n_groups = backend.xp, len(alpha)
+    size = backend.group_sums(xp.ones_like(weight), group_index, n_groups)
+    n_determined = xp.clip(size - alpha * backend.group_sums(variance, group_index, n_groups), 0, size)
+    return size, n_determined, backend.group_sums(weight**2, group_index, n_groups)
+
+
 def next_posterior(
     backend: Backend,
     problem: Regression,
@@ -144,13 +159,11 @@ def next_posterior(
     moments: Callable[[Float[Array, " groups"], Any], Moments],
 ) -> Posterior:
     """Compute the posterior under some precisions, and the precisions that follow from it."""
-    xp, group_index, n_groups = backend.xp, problem.group_index, len(alpha)
+    xp = backend.xp
     alpha, beta = clip_precisions(backend, problem, alpha, beta)
     weight, variance, log_det, residual = moments(alpha, beta)
     residual = xp.maximum(residual, MIN_NOISE * problem.q)
-    size = backend.group_sums(xp.ones_like(weight), group_index, n_groups)
-    n_determined = xp.clip(size - alpha * backend.group_sums(variance, group_index, n_groups), 0, size)
-    squares = backend.group_sums(weight**2, group_index, n_groups)  # |mu_g|^2
+    size, n_determined, squares = count_determined(backend, problem.group_index, alpha, weight, variance)
     log_evidence = 0.5 * (
         problem.dof * xp.log(beta) + size @ xp.log(alpha) - log_det - beta * residual - alpha @ squares
     )

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from importlib.resources import files
 from pathlib import Path
+from typing import Literal
 
 from lare_rl.errors import CheckedModel, LareError
 from lare_rl.llm.key import redact_key
@@ -13,7 +14,18 @@ from lare_rl.llm.prompts import Kind, Message, Stage
 from lare_rl.util.files import replace_file
 from lare_rl.util.safe_io import read_json
 
-__all__ = ["SHIPPED_RECORDINGS", "Exchange", "RecordedModel", "Recorder", "read_recording", "shipped_recordings"]
+__all__ = [
+    "SHIPPED_RECORDINGS",
+    "Exchange",
+    "RecordedModel",
+    "Recorder",
+    "RecordingKind",
+    "read_recording",
+    "shipped_recordings",
+]
+
+RecordingKind = Kind | Literal["events"]
+"""What a recorded function returns: factors or a reward of a step, or the events of a turn (`lare_rl.turns`)."""
 
 SHIPPED_RECORDINGS = files("lare_rl.llm") / "recordings"
 
@@ -30,7 +42,7 @@ class Recording(CheckedModel):
     """One complete sample of a model: its candidates, their combination, and corrections if they were needed."""
 
     task: str
-    kind: Kind
+    kind: RecordingKind
     draw: int
     model: str
     recorded: str
@@ -38,7 +50,7 @@ class Recording(CheckedModel):
     exchanges: list[Exchange]
 
 
-def shipped_recordings(kind: Kind, draw: int) -> list[Recording]:
+def shipped_recordings(kind: RecordingKind, draw: int) -> list[Recording]:
     """Return the recordings of that kind and draw that come with the package, in the order of their tasks' names.
 
     Raises:
@@ -119,7 +131,7 @@ class Recorder:
     """
 
     task: str
-    kind: Kind
+    kind: RecordingKind
     temperature: float | None = None
     path: Path | None = None
     exchanges: list[Exchange] = field(default_factory=list)

@@ -37,7 +37,7 @@ from lare_rl.phi.values import (
 )
 from lare_rl.util.sanitize import first_invisible
 
-__all__ = ["FUNCTION_NAME", "parse", "read"]
+__all__ = ["FUNCTION_NAME", "error_text", "parse", "read"]
 
 _PARSING = threading.Lock()
 """`threading.stack_size` is for the whole process. Before Python 3.11.8 and 3.12.2, parsers in two threads may also miscount
@@ -102,20 +102,21 @@ def read(source: str, observation_size: int, action_size: int, max_factors: int 
     except RefusedError as refusal:
         code, message, line = refusal.code, str(refusal), refusal.line or interpreter.line
     except PYTHON_ERRORS as error:
-        code, message, line = "E-RUN", _error_text(error), interpreter.line
+        code, message, line = "E-RUN", error_text(error), interpreter.line
     except (ReturnSignal, BreakSignal, ContinueSignal):
         code, message = "E-SYNTAX", "return outside a function, or break or continue outside a loop"
         line = interpreter.line
     except (RecursionError, MemoryError):
         code, message, line = "E-COST", "the code is nested too deeply", interpreter.line
     except Exception as error:  # no text may stop the process that reads it
-        code, message, line = "E-BUG", f"an error of LaRe, please report it: {_error_text(error)}", interpreter.line
+        code, message, line = "E-BUG", f"an error of LaRe, please report it: {error_text(error)}", interpreter.line
     first = f"{code} line {line}: {' '.join(message[:MAX_MESSAGE_LENGTH].split())}"
     further = [] if tree is None else _unavailable_names(tree, interpreter.module)
     raise RefusedError(code, "\n".join(dict.fromkeys([first, *further])), line) from None
 
 
-def _error_text(error: Exception) -> str:
+def error_text(error: Exception) -> str:
+    """Return the message of an error that a program raised."""
     if isinstance(error, NameError):
         return f"{error} is not defined, or not available"
     return str(error) if isinstance(error, ProgramError) else f"{type(error).__name__}: {error}"

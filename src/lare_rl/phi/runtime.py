@@ -20,13 +20,13 @@ __all__ = ["Meter", "Runtime", "builtin", "check_key", "check_number", "check_te
 class Meter:
     """Counts the steps of a program."""
 
-    def __init__(self) -> None:
-        self.steps = 0
+    def __init__(self, max_steps: int = MAX_STEPS) -> None:
+        self.steps, self.max_steps = 0, max_steps
 
     def pay(self, steps: int = 1) -> None:
         self.steps += max(steps, 0)
-        if self.steps > MAX_STEPS:
-            raise RefusedError("E-COST", f"the program takes more than {MAX_STEPS} steps")
+        if self.steps > self.max_steps:
+            raise RefusedError("E-COST", f"the program takes more than {self.max_steps} steps")
 
     def pay_for_list(self, values: Sequence[Any] | int) -> Any:
         """Pay for a new list with these entries, or of this length, and return it."""

@@ -1,0 +1,1 @@
+"""Benchmarks of the credit for turns: task families with exact values, baselines, learning curves, trust, cost."""

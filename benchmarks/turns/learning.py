@@ -1,0 +1,200 @@
+"""Learning curves of small policies, trained with each kind of credit for turns.
+
+    PYTHONPATH=benchmarks python -m turns.learning --seeds 10 --updates 40
+
+128 rollouts per update (16 tasks, 8 of each), Adam with a learning rate of 0.1, and the exact success rate after every fifth update. All
+kinds of credit see the same outcomes; the exact ones also know the task. `events`: all features of the testbeds. `generic`: the name of
+the tool, whether it failed or had no effect, whether it is the tool of the turn before, tokens. `tool x error`: the same, with one
+feature for the failures of each tool, as messages alone give.
+"""
+
+import argparse
+from collections.abc import Callable
+from functools import partial
+
+import numpy as np
+from jaxtyping import Float
+
+from lare_rl.turns.credit import TurnCredit
+from lare_rl.turns.features import TurnTable
+from lare_rl.turns.value import advantages, changes
+from measure import write
+from turns import key_door, tool_use
+from turns.baselines import gigpo, grpo, summed_credit
+from turns.finite_task import GROUP_SIZE, FiniteTask, Rollouts
+
+__all__ = ["TASKS", "make_table", "train"]
+
+TASKS = {"tool use": tool_use, "key and door": key_door}
+N_GROUPS, LEARNING_RATE, EVERY = 16, 0.1, 5
+ROLLOUTS = N_GROUPS * GROUP_SIZE
+Turns = Float[np.ndarray, "rollouts turns"]
+Credit = Callable[[FiniteTask, Rollouts, Float[np.ndarray, "inputs actions"]], Turns]
+"""(task, rollouts, policy) -> the advantage of each turn."""
+
+
+def make_table(task: FiniteTask, rollouts: Rollouts, features: str = "events") -> TurnTable:
+    """Return rollouts as turns, with some of their features."""
+    names, rows = task.names, rollouts.features[rollouts.mask].astype(float)
+    n_tools = len(task.rules.tools)
+    if features != "events":
+        columns = [*range(n_tools + 2), len(names) - 1]
+        names, rows = tuple(names[i] for i in columns), rows[:, columns]
+    if features == "tool x error":
+        failures = rows[:, :n_tools] * rows[:, n_tools : n_tools + 1]
+        rows = np.concatenate([rows[:, :n_tools], failures, rows[:, n_tools + 1 :]], axis=1)
+        names = (*names[:n_tools], *(f"{name} fails" for name in names[:n_tools]), *names[n_tools + 1 :])
+    return TurnTable(names, rows, rollouts.length, rollouts.outcome, rollouts.group, rollouts.truncated)
+
+
+class Progress:
+    """The credit of `TurnCredit`, and the lambdas that it used."""
+
+    def __init__(self, features: str, lambda_: float | None, *, logistic: bool = False):
+        self.features = features
+        self.credit = TurnCredit(lambda_, logistic=logistic)
+        self.lambdas: list[float] = []
+
+    def __call__(self, task: FiniteTask, rollouts: Rollouts, theta: Float[np.ndarray, "inputs actions"]) -> Turns:
+        result = self.credit.assign(make_table(task, rollouts, self.features))
+        self.lambdas.append(result.lambda_)
+        advantage = np.zeros(rollouts.mask.shape)
+        advantage[rollouts.mask] = np.concatenate(result.advantage)
+        return advantage
+
+
+def exact_value(task: FiniteTask, rollouts: Rollouts, theta: Float[np.ndarray, "inputs actions"]) -> Turns:
+    """Return generalized advantages of the exact values, lambda 0.8: what a perfect critic would give."""
+    table, value = make_table(task, rollouts), task.truth(theta, rollouts).value
+    advantage = np.zeros(rollouts.mask.shape)
+    advantage[rollouts.mask] = advantages(table, changes(table, value[rollouts.mask].astype(float)), 0.8)
+    return advantage
+
+
+def without_policy(credit: Callable[[FiniteTask, Rollouts], Turns]) -> Credit:
+    return lambda task, rollouts, theta: credit(task, rollouts)
+
+
+METHODS: dict[str, Callable[[], Credit]] = {
+    "GRPO": lambda: without_policy(grpo),
+    "GiGPO": lambda: without_policy(gigpo),
+    "sums (a warning)": lambda: without_policy(summed_credit),
+    **{
+        f"{name}, {features}": partial(Progress, features, lambda_)
+        for features in ("events", "tool x error", "generic")
+        for name, lambda_ in (("progress 0.8", 0.8), ("progress, guarded", None))
+    },
+    "progress 0, events": partial(Progress, "events", 0.0),
+    "progress 0.8, logistic, events": partial(Progress, "events", 0.8, logistic=True),
+    "exact values, 0.8": lambda: exact_value,
+    "exact advantages": lambda: lambda task, rollouts, theta: task.truth(theta, rollouts).advantage,
+}
+
+
+def train(name: str, credit: Credit, seed: int, updates: int) -> Float[np.ndarray, " evaluations"]:
+    """Return the success rates of a policy before training and after every fifth update."""
+    module = TASKS[name]
+    task = make_task(name)
+    theta, random = module.starting_policy(task).astype(float), np.random.default_rng([seed, 77])
+    mean, square = np.zeros_like(theta), np.zeros_like(theta)
+    curve = [task.success_rate(theta)]
+    for update in range(1, updates + 1):
+        rollouts = task.play(theta, random, N_GROUPS)
+        gradient = task.gradient(theta, rollouts, credit(task, rollouts, theta))
+        mean, square = 0.9 * mean + 0.1 * gradient, 0.98 * square + 0.02 * gradient**2
+        step = mean / (1 - 0.9**update) / (np.sqrt(square / (1 - 0.98**update)) + 1e-6)
+        theta = theta + LEARNING_RATE * step
+        if update % EVERY == 0:
+            curve.append(task.success_rate(theta))
+    return np.array(curve)
+
+
+_MADE: dict[str, FiniteTask] = {}
+
+
+def make_task(name: str) -> FiniteTask:
+    """Return a testbed. Its tables are built once."""
+    if name not in _MADE:
+        _MADE[name] = TASKS[name].make_task()
+    return _MADE[name]
+
+
+def rollouts_to_reach(curve: Float[np.ndarray, " evaluations"], level: float) -> float | None:
+    """Return after how many rollouts the mean curve reaches a success rate, linear between evaluations, or None if it does not."""
+    above = np.flatnonzero(curve >= level)
+    if not len(above):
+        return None
+    i = int(above[0])
+    if i == 0:
+        return 0.0
+    fraction = (level - curve[i - 1]) / (curve[i] - curve[i - 1])
+    return float((i - 1 + fraction) * EVERY * ROLLOUTS)
+
+
+def summarise(
+    curves: Float[np.ndarray, "seeds evaluations"], reference: Float[np.ndarray, "seeds evaluations"]
+) -> dict:
+    """Return success rates, areas and speeds of some seeds, beside those of GRPO with the same seeds."""
+    n_seeds, n = curves.shape
+    error = lambda values: float(values.std(ddof=1) / np.sqrt(n_seeds))  # noqa: E731
+    area = (curves - reference).mean(axis=1)
+    result = {
+        "rollouts": (EVERY * ROLLOUTS * np.arange(n)).tolist(),
+        "success": curves.mean(axis=0).round(4).tolist(),
+        "success_error": [round(error(column), 4) for column in curves.T],
+        "area": float(curves.mean()),
+        "area_minus_grpo": float(area.mean()),
+        "area_minus_grpo_error": error(area),
+        "lowest_difference_in_errors": float(
+            np.min((curves - reference).mean(0)[1:] / [error(c) for c in reference.T[1:]])
+        ),
+        "curves": curves.round(4).tolist(),
+    }
+    for i in (n // 2, n - 1):
+        level = float(reference.mean(axis=0)[i])
+        rollouts = rollouts_to_reach(curves.mean(axis=0), level)
+        speed = None if rollouts is None else rollouts_to_reach(reference.mean(axis=0), level) / max(rollouts, 1)
+        result[f"speed_to_grpo_at_{i * EVERY * ROLLOUTS}"] = speed
+    return result
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--seeds", type=int, default=10)
+    parser.add_argument("--updates", type=int, default=40)
+    parser.add_argument("--methods", default="", help="only methods whose name has this text")
+    options = parser.parse_args()
+    figures = {}
+    for name in TASKS:
+        figures[name] = {}
+        curves = {}
+        for method, make_credit in METHODS.items():
+            if method != "GRPO" and options.methods not in method:
+                continue
+            credit_of_seeds = [make_credit() for _ in range(options.seeds)]
+            curves[method] = np.array(
+                [train(name, credit, seed, options.updates) for seed, credit in enumerate(credit_of_seeds)]
+            )
+            row = summarise(curves[method], curves["GRPO"])
+            if isinstance(credit_of_seeds[0], Progress):
+                lambdas = np.array([credit.lambdas for credit in credit_of_seeds])
+                row["share_of_lambda"] = {str(value): float(np.mean(lambdas == value)) for value in (0.8, 0.95, 1.0)}
+            figures[name][method] = row
+            speeds = [
+                value if value is None else round(value, 2) for key, value in row.items() if key.startswith("speed")
+            ]
+            print(
+                f"{name:13} {method:32} {[round(row['success'][i], 3) for i in (2, 4, 8) if i < len(row['success'])]} "
+                f"area {row['area']:.3f} ({row['area_minus_grpo']:+.3f} ± {row['area_minus_grpo_error']:.3f}), speed {speeds}, "
+                f"lowest {row['lowest_difference_in_errors']:.1f} {row.get('share_of_lambda', '')}",
+                flush=True,
+            )
+    if not options.methods:
+        command = f"PYTHONPATH=benchmarks python -m turns.learning --seeds {options.seeds} --updates {options.updates}"
+        write(
+            "turns_learning", {"command": command, "seeds": options.seeds, "updates": options.updates, "tasks": figures}
+        )
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,168 @@
+"""Reads a phi over turns: a program that looks at one call of a tool, and names what happened.
+
+    def turn_events(tool, arguments, result, text):
+        return {"tests pass": tool == "test" and "passed" in result.lower()}
+
+The language is that of `read.py`, without arrays. `tool`, `result` and `text` are texts, and `arguments` is a dictionary. In addition,
+`find_numbers(text)` returns the numbers in a text. The program is carried out anew for each call, so that it can keep nothing.
+"""
+
+import ast
+import math
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+from lare_rl.phi.builder import Builder, building
+from lare_rl.phi.interpreter import Interpreter
+from lare_rl.phi.limits import MAX_FACTORS, MAX_INT_BITS, MAX_MESSAGE_LENGTH, MAX_TEXT_LENGTH, RefusedError
+from lare_rl.phi.read import error_text, parse
+from lare_rl.phi.runtime import Meter
+from lare_rl.phi.values import (
+    PYTHON_ERRORS,
+    Bound,
+    BreakSignal,
+    ContinueSignal,
+    Function,
+    ReturnSignal,
+    describe,
+)
+from lare_rl.util.sanitize import one_line
+
+__all__ = ["TURN_FUNCTION_NAME", "TurnProgram", "read_turn_program", "shorten"]
+
+TURN_FUNCTION_NAME = "turn_events"
+"""The name of the function that a program must define."""
+MAX_STEPS = 150_000
+"""Steps for one call. A method of a text takes a step for each of its characters."""
+MAX_NAME = 60
+"""Characters of the name of an event."""
+MAX_EVENT = 1e6
+"""The largest number of an event."""
+MAX_ARGUMENTS = 100
+"""Entries of the arguments, and of each list or dictionary within them."""
+MAX_ARGUMENT_DEPTH = 4
+MAX_NUMBERS = 1000
+MAX_NUMBER = 1e300
+CUT = "\n... (the middle of a long text is left out) ...\n"
+NUMBER = re.compile(r"(?<![\w.])[-+]?\d{1,300}(?:\.\d{1,300})?(?!\d)")
+
+
+@dataclass(frozen=True)
+class TurnProgram:
+    """A program that was read."""
+
+    source: str
+    tree: ast.Module
+
+    def events(self, tool: str, arguments: Mapping[str, Any], result: str, text: str) -> dict[str, float]:
+        """Return the events of one call: names and numbers.
+
+        Args:
+            tool: the name of the tool; empty if none was called.
+            arguments: the arguments of the call.
+            result: what the tool answered, or without a tool what the user did.
+            text: what the assistant said.
+
+        Raises:
+            RefusedError: the program fails, costs too much, or returns something else. The message has a line for its author.
+        """
+        with building(builder := Builder()):
+            interpreter = Interpreter(builder, has_yield="yield" in self.source)
+            interpreter.meter = Meter(MAX_STEPS)
+            interpreter.module["find_numbers"] = Bound(lambda value: _find_numbers(interpreter.meter, value))
+            inputs = [shorten(tool), _copy_argument(dict(arguments)), shorten(result), shorten(text)]
+            try:
+                interpreter.run(self.tree.body, interpreter.module)
+                function = interpreter.module.get(TURN_FUNCTION_NAME)
+                if not isinstance(function, Function):
+                    form = f"{TURN_FUNCTION_NAME}(tool, arguments, result, text)"
+                    raise RefusedError("E-FORM", f"there is no function {form}")
+                return _check_events(interpreter.call(function, inputs, {}))
+            except RefusedError as refusal:
+                code, message, line = refusal.code, str(refusal), refusal.line or interpreter.line
+            except PYTHON_ERRORS as error:
+                code, message, line = "E-RUN", error_text(error), interpreter.line
+            except (ReturnSignal, BreakSignal, ContinueSignal):
+                code, message = "E-SYNTAX", "return outside a function, or break or continue outside a loop"
+                line = interpreter.line
+            except (RecursionError, MemoryError):
+                code, message, line = "E-COST", "the code is nested too deeply", interpreter.line
+            except Exception as error:  # no text may stop the process that reads it
+                code, message, line = (
+                    "E-BUG",
+                    f"an error of LaRe, please report it: {error_text(error)}",
+                    interpreter.line,
+                )
+        raise RefusedError(code, f"{code} line {line}: {' '.join(message[:MAX_MESSAGE_LENGTH].split())}", line)
+
+
+def read_turn_program(source: str) -> TurnProgram:
+    """Parse a program. What it does is known only when it reads turns.
+
+    Raises:
+        RefusedError: the text is not Python, or too long.
+    """
+    try:
+        return TurnProgram(source, parse(source))
+    except RefusedError as refusal:
+        message = f"{refusal.code} line {refusal.line or 1}: {refusal}"
+        raise RefusedError(refusal.code, message, refusal.line) from None
+
+
+def shorten(text: str, length: int = MAX_TEXT_LENGTH) -> str:
+    """Return a text whose middle is left out if it is longer than a program may read."""
+    if len(text) <= length:
+        return text
+    half = (length - len(CUT)) // 2
+    return text[:half] + CUT + text[len(text) - half :]
+
+
+def _copy_argument(value: Any, depth: int = 0) -> Any:
+    """Return an argument of a tool as a value of a program: texts, numbers, lists and dictionaries of bounded size."""
+    if isinstance(value, str):
+        return shorten(value)
+    if isinstance(value, bool) or value is None:
+        return value
+    if isinstance(value, int):
+        return value if value.bit_length() <= MAX_INT_BITS else MAX_NUMBER if value > 0 else -MAX_NUMBER
+    if isinstance(value, float):
+        return min(max(value, -MAX_NUMBER), MAX_NUMBER) if not math.isnan(value) else 0.0
+    if depth == MAX_ARGUMENT_DEPTH:
+        return "..."
+    if isinstance(value, Mapping):
+        entries = list(value.items())[:MAX_ARGUMENTS]
+        return {shorten(str(key), MAX_NAME * 4): _copy_argument(item, depth + 1) for key, item in entries}
+    if isinstance(value, list | tuple):
+        return [_copy_argument(item, depth + 1) for item in value[:MAX_ARGUMENTS]]
+    return "..."
+
+
+def _find_numbers(meter: Meter, text: Any) -> list[float]:
+    """Return the numbers in a text, in their order: 3, -1.5, +7, and the 20 of 20%. Digits after a letter are none."""
+    if not isinstance(text, str):
+        raise TypeError(f"find_numbers takes a text, not {describe(text)}")
+    meter.pay(len(text))
+    numbers = [float(match[0]) for match in NUMBER.finditer(text)][:MAX_NUMBERS]
+    return meter.pay_for_list(numbers)
+
+
+def _check_events(events: Any) -> dict[str, float]:
+    """Return the events of a program as numbers."""
+    if type(events) is not dict:
+        raise RefusedError("E-FORM", f"{TURN_FUNCTION_NAME} must return a dictionary of events, not {describe(events)}")
+    if not 1 <= len(events) <= MAX_FACTORS:
+        raise RefusedError("E-FORM", f"{TURN_FUNCTION_NAME} must return 1 to {MAX_FACTORS} events, not {len(events)}")
+    result = {}
+    for name, value in events.items():
+        if not isinstance(name, str) or not 0 < len(name) <= MAX_NAME or name != one_line(name):
+            raise RefusedError(
+                "E-FORM", f"the name of an event must be a text of 1 to {MAX_NAME} characters, in one line"
+            )
+        if not isinstance(value, bool | int | float):
+            raise RefusedError("E-FORM", f"the event {name!r} must be a number or a truth value, not {describe(value)}")
+        if not abs(value) <= MAX_EVENT:
+            raise RefusedError("E-FORM", f"the event {name!r} must be a number of at most {MAX_EVENT:g}")
+        result[name] = float(value)
+    return result

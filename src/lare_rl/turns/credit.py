@@ -1,0 +1,194 @@
+"""`TurnCredit`: the credit of each turn of some rollouts, from their outcomes alone."""
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from functools import partial
+from typing import Any, NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+
+from lare_rl.errors import LareError, short_repr
+from lare_rl.turns import trust as trust_rules
+from lare_rl.turns.features import COUNT, HAPPENED, LAST, Prefixes, TurnTable, build_prefixes, tabulate
+from lare_rl.turns.regression import PrefixFit
+from lare_rl.turns.rollouts import Phi, read_rollouts
+from lare_rl.turns.trust import BROADCAST, Errors, Trust
+from lare_rl.turns.value import advantages, changes, deviations, fit_prefixes, held_out_values, values
+from lare_rl.turns.words import MESSAGES
+from lare_rl.util.findings import Finding, render
+
+__all__ = ["CreditedTurns", "FeatureEffect", "TurnCredit"]
+
+TurnValues = list[Float[np.ndarray, " _"]]
+"""One array for each rollout, with one number for each of its turns."""
+
+
+class FeatureEffect(NamedTuple):
+    """How a feature of a turn changes the value, in the unit of outcomes (of log odds if values are logistic).
+
+    The feature is taken to be `unit`. Each effect has its posterior standard deviation.
+    """
+
+    name: str
+    unit: float
+    """The mean of the feature in the turns where it is not 0."""
+    frequency: float
+    """The share of these turns."""
+    first: float
+    """The change of value by the first turn with the feature."""
+    first_deviation: float
+    lasting: float
+    """What remains of it after further turns without the feature."""
+    lasting_deviation: float
+    further: float
+    """What each further turn with the feature adds."""
+    further_deviation: float
+
+
+@dataclass(frozen=True)
+class CreditedTurns:
+    """The credit of the turns of some rollouts."""
+
+    advantage: TurnValues
+    """A_t, to train with: generalized advantages of the values."""
+    progress: TurnValues
+    """The change of value that a turn made, to read: the progress of a rollout adds up to its outcome minus its first value."""
+    deviation: TurnValues
+    """The posterior standard deviation of the progress. It is too small where features miss what matters."""
+    value: TurnValues
+    """V_t, the expected outcome before the turn."""
+    lambda_: float
+    """The lambda that was used: 1 is GRPO's advantage, the outcome minus the mean of the group."""
+    trust: Trust
+    """The gain, its standard error, and the surprise at the end, over the latest calls."""
+    effects: tuple[FeatureEffect, ...]
+    """Of each feature of a turn."""
+    reason: Finding
+    """Why this lambda was used."""
+
+    @property
+    def gain(self) -> float:
+        """The share of the squared error of GRPO's baseline that the values remove."""
+        return self.trust.gain
+
+    @property
+    def surprise(self) -> float:
+        """The mean of the outcome minus the value before the last turn of agents that stopped by themselves."""
+        return self.trust.surprise
+
+    @property
+    def words(self) -> list[str]:
+        """What lambda was used and why, and the features that matter most, as sentences."""
+        return [render(finding, MESSAGES) for finding in self.findings]
+
+    @property
+    def findings(self) -> list[Finding]:
+        """The same as findings, whose sentences are in `turns/words.py`."""
+        clear = [effect for effect in self.effects if abs(effect.first) > CLEAR * effect.first_deviation]
+        clear.sort(key=lambda effect: -abs(effect.first * effect.frequency))
+        return [
+            Finding("lambda", {"lambda_": self.lambda_, "reason": self.reason}),
+            *(Finding("effect", effect._asdict()) for effect in clear[:MAX_SENTENCES]),
+        ]
+
+
+CLEAR = 2.0
+"""An effect of more than this many deviations is described in words."""
+MAX_SENTENCES = 8
+"""The largest number of features that are described in words."""
+
+
+class TurnCredit:
+    """Gives credit to the turns of agents, from the outcomes of their rollouts.
+
+    The values of prefixes are fitted anew to the rollouts of each call. Only their errors are remembered, for some calls.
+    """
+
+    def __init__(
+        self,
+        lambda_: float | Any = None,
+        *,
+        window: int = 5,
+        logistic: bool = False,
+        phi: Phi | None = None,
+    ):
+        """Make an object that has seen no rollouts.
+
+        Args:
+            lambda_: of generalized advantages, 0 to 1. If it is None, it follows from the trust in the values: 0.8, 0.95 or 1.
+            window: the number of calls over which trust is measured.
+            logistic: whether the log odds are linear in the features, instead of the value. Outcomes must be between 0 and 1.
+            phi: a function from a turn to numbers with names, such as `load_turn_phi` reads. It needs rollouts with messages.
+
+        Raises:
+            LareError: a value is out of its range.
+        """
+        if lambda_ is not None and not (isinstance(lambda_, int | float) and 0 <= lambda_ <= 1):
+            raise LareError(f"lambda_ must be None or a number from 0 to 1, and is {short_repr(lambda_)}")
+        if not isinstance(window, int) or window < 1:
+            raise LareError(f"window must be a whole number of calls, at least 1, and is {short_repr(window)}")
+        self.lambda_, self.window, self.logistic, self.phi = lambda_, window, logistic, phi
+        self._errors: tuple[Errors, ...] = ()
+
+    def __call__(self, rollouts: Iterable[Mapping[str, Any]] | Any) -> CreditedTurns:
+        """Return the credit of the turns of some rollouts (`turns/rollouts.py` has their form).
+
+        Raises:
+            LareError: there is no rollout, or a rollout is malformed.
+        """
+        checked = read_rollouts(rollouts, self.phi)
+        if not checked:
+            raise LareError("there are no rollouts: credit needs some, and several of each group")
+        return self.assign(tabulate(checked))
+
+    def assign(self, table: TurnTable) -> CreditedTurns:
+        """Return the credit of turns that are arrays already.
+
+        Raises:
+            LareError: the values are logistic, and an outcome is not between 0 and 1.
+        """
+        if self.logistic and not np.all((table.outcome >= 0) & (table.outcome <= 1)):
+            raise LareError("logistic values need outcomes between 0 and 1: use logistic=False, or scale the outcomes")
+        prefixes = build_prefixes(table)
+        x = prefixes.features
+        fit = fit_prefixes(table, x, is_logistic=self.logistic)
+        value = values(table, x, fit)
+        progress = changes(table, value)
+        errors = trust_rules.measure_errors(table, held_out_values(table, x, fit))
+        self._errors = (*self._errors, errors)[-self.window :]
+        trust = trust_rules.summarise(self._errors)
+        lambda_, reason = trust_rules.choose_lambda(trust)
+        if self.lambda_ is not None:
+            lambda_, reason = self.lambda_, Finding("chosen", {"measured": reason})
+        if self.lambda_ is None and lambda_ == BROADCAST:
+            advantage = (table.outcome - trust_rules.group_means(table))[table.rollout_index]
+        else:
+            advantage = advantages(table, progress, lambda_)
+        split = partial(np.split, indices_or_sections=table.first[1:])
+        return CreditedTurns(
+            advantage=split(advantage),
+            progress=split(progress),
+            deviation=split(deviations(table, x, fit)),
+            value=split(value),
+            lambda_=float(lambda_),
+            trust=trust,
+            effects=_describe_effects(table, prefixes, fit),
+            reason=reason,
+        )
+
+
+def _describe_effects(table: TurnTable, prefixes: Prefixes, fit: PrefixFit) -> tuple[FeatureEffect, ...]:
+    """Return the effect of each feature of a turn, from the weights of its count, its indicator and its last value."""
+    effects = []
+    for i, name in enumerate(table.names):
+        column = table.features[:, i]
+        is_nonzero = column != 0
+        unit = float(column[is_nonzero].mean()) if is_nonzero.any() else 1.0
+        size = np.where(prefixes.kind == HAPPENED, 1.0, unit) * (prefixes.feature_index == i)
+        numbers = []
+        for kinds in ((COUNT, HAPPENED, LAST), (COUNT, HAPPENED), (COUNT,)):
+            row = size * np.isin(prefixes.kind, kinds)
+            numbers += [float(row @ fit.weight), float(np.linalg.norm(fit.root[:, :-1] @ row))]
+        effects.append(FeatureEffect(name, unit, float(is_nonzero.mean()), *numbers))
+    return tuple(effects)

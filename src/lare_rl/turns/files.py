@@ -1,0 +1,68 @@
+"""Files of rollouts: one JSON object in each line, and the same with the credit of each turn."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+from lare_rl.errors import LareError
+from lare_rl.turns.credit import CreditedTurns
+from lare_rl.util.files import write_atomically
+from lare_rl.util.safe_io import read_json
+
+__all__ = ["MAX_LINE_BYTES", "read_rollout_file", "write_credit_file"]
+
+MAX_LINE_BYTES = 64 << 20
+"""The largest size of a rollout."""
+DIGITS = 6
+
+
+def read_rollout_file(path: Path) -> list[dict[str, Any]]:
+    """Return the rollouts of a JSONL file. Empty lines are ignored.
+
+    Raises:
+        LareError: the file cannot be read, or a line is not a JSON object. The message names the line.
+    """
+    rollouts = []
+    try:
+        if path.exists() and not path.is_file():
+            raise LareError(f"{path} is not a file")
+        with path.open("rb") as file:
+            for number in range(1, 1 << 62):
+                line = file.readline(MAX_LINE_BYTES + 1)
+                if not line:
+                    break
+                if len(line) > MAX_LINE_BYTES:
+                    raise LareError(f"{path}, line {number}: it is larger than {MAX_LINE_BYTES >> 20} MB")
+                if line.strip():
+                    rollouts.append(_read_line(line, f"{path}, line {number}"))
+    except OSError as error:
+        raise LareError(f"{path} cannot be read: {error.strerror or error}") from error
+    if not rollouts:
+        raise LareError(f"{path} has no rollouts: one JSON object in each line is needed, with messages and an outcome")
+    return rollouts
+
+
+def _read_line(line: bytes, where: str) -> dict[str, Any]:
+    try:
+        value = read_json(line.decode("utf-8-sig"))
+    except ValueError as error:  # UnicodeDecodeError is one
+        raise LareError(f"{where} is not JSON: {' '.join(str(error).split())}") from None
+    if not isinstance(value, dict):
+        raise LareError(f"{where} is not a JSON object with messages or turns, and an outcome")
+    return value
+
+
+def write_credit_file(path: Path, rollouts: list[dict[str, Any]], credit: CreditedTurns) -> None:
+    """Write the rollouts with a key `credit`: advantage, progress, deviation and value, one number for each turn.
+
+    Raises:
+        LareError: the file cannot be written. An older file is left unchanged.
+    """
+    lines = []
+    for k, rollout in enumerate(rollouts):
+        arrays = {name: getattr(credit, name)[k] for name in ("advantage", "progress", "deviation", "value")}
+        numbers = {name: [round(float(number), DIGITS) for number in array] for name, array in arrays.items()}
+        lines.append(json.dumps({**rollout, "credit": {**numbers, "lambda": credit.lambda_}}, ensure_ascii=False))
+    # A text of a rollout may have half of a surrogate pair, which is valid in JSON, but not in UTF-8.
+    content = "".join(f"{line}\n" for line in lines).encode("utf-8", "backslashreplace")
+    write_atomically(path, lambda file: file.write(content))

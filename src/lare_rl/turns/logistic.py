@@ -1,0 +1,85 @@
+"""The same value of a prefix with a logistic likelihood, for outcomes between 0 and 1.
+
+    P(R_k = 1) = s(eta),    eta = m + b_group(k) + v . x_kt,    s the logistic function
+
+Laplace's approximation: Newton's method to the most likely (v, m, b), where each step is the weighted regression of `regression.py` on
+the working response eta + (y - p) / (p (1 - p)), with the weights w p (1 - p) and noise of variance 1. The precisions alpha follow
+the same rule, alpha_i = gamma_i / mu_i^2.
+"""
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from lare_rl.credit.precisions import NUMPY, TOLERANCE, count_determined
+from lare_rl.turns.regression import Elimination, PrefixFit, eliminate_groups, sum_up
+
+__all__ = ["fit_logistic", "logistic"]
+
+MAX_ROUNDS = 25
+FIRST_STEPS, NEXT_STEPS = 8, 2
+"""Newton's steps in the first round, and in each round after a change of the precisions."""
+MAX_LOG_ODDS = 30.0
+MAX_STEP = 5.0
+"""The largest change of the log odds of a prefix in one step."""
+WEAKEST, STRONGEST = 1e-4, 1e5
+"""The smallest and the largest precision of a feature, relative to its first one."""
+MIN_CURVATURE = 1e-6
+
+
+def logistic(log_odds: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
+    """Return 1 / (1 + exp(-x)), without overflow."""
+    return 1 / (1 + np.exp(-np.clip(log_odds, -MAX_LOG_ODDS, MAX_LOG_ODDS)))
+
+
+def fit_logistic(
+    x: Float[np.ndarray, "prefixes features"],
+    y: Float[np.ndarray, " prefixes"],
+    weight: Float[np.ndarray, " prefixes"],
+    group: Int[np.ndarray, " prefixes"],
+    n_cases: int,
+) -> PrefixFit:
+    """Return the posterior of the log odds. The arguments are those of `fit_linear`; y is between 0 and 1."""
+    n_groups = int(group.max()) + 1
+    rate = np.clip(weight @ y / weight.sum(), 0.02, 0.98)
+    eta = np.full(len(y), np.log(rate / (1 - rate)))
+    alpha, previous = None, -np.inf
+    for i in range(MAX_ROUNDS):
+        for _ in range(NEXT_STEPS if i else FIRST_STEPS):
+            p = logistic(eta)
+            curvature = np.maximum(p * (1 - p), MIN_CURVATURE)
+            sums = sum_up(x, eta + (y - p) / curvature, weight * curvature, group, n_groups, n_cases, unit=1.0)
+            if alpha is None:
+                first = np.append(np.diagonal(sums.problem.s) / sums.problem.q * x.shape[1], 1.0) + 1e-12
+                alpha = first
+            posterior = eliminate_groups(sums, alpha, 1.0)
+            mean = float(sums.problem.y_mean + posterior.weight[-1])
+            step = mean + (x - sums.x_mean) @ posterior.weight[:-1] + posterior.intercept[group] - eta
+            largest = np.abs(step).max()
+            eta = eta + step * min(1.0, MAX_STEP / max(largest, 1e-12))
+            if largest < 1e-3:
+                break
+        solution = np.concatenate([posterior.weight[:-1], posterior.intercept])
+        index = sums.problem.group_index
+        size, n_determined, squares = count_determined(NUMPY, index, alpha, solution, posterior.variance)
+        p = np.clip(logistic(eta), 1e-12, 1 - 1e-12)
+        log_likelihood = weight @ (y * np.log(p) + (1 - y) * np.log(1 - p))
+        log_evidence = log_likelihood + 0.5 * (size @ np.log(alpha) - alpha @ squares - posterior.log_det)
+        if abs(log_evidence - previous) <= 10 * TOLERANCE:
+            break
+        previous = log_evidence
+        alpha = np.clip(n_determined / np.maximum(squares, 1e-30), first * WEAKEST, first * STRONGEST)
+    return _to_fit(sums.x_mean, mean, posterior)
+
+
+def _to_fit(x_mean: Float[np.ndarray, " features"], mean: float, posterior: Elimination) -> PrefixFit:
+    return PrefixFit(
+        x_mean=x_mean,
+        weight=posterior.weight[:-1],
+        mean=mean,
+        intercept=posterior.intercept,
+        root=posterior.root,
+        group_row=posterior.group_row,
+        group_precision=posterior.group_precision,
+        noise=1.0,
+        is_logistic=True,
+    )

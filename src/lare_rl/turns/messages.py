@@ -1,0 +1,193 @@
+"""Turns in messages, in the form of OpenAI's chat completions, and their features without any knowledge of the task.
+
+| feature | |
+|---|---|
+| `call NAME` | calls of the tool |
+| `NAME fails` | of these calls, those whose result looks like an error |
+| `repeats a call` | calls with the name and the arguments of an earlier one in the same rollout |
+| `repeats a result` | results with the text of an earlier one in the same rollout |
+| `no tool` | 1 if no tool is called |
+| `tokens` | the length of the assistant's message, in hundreds of tokens of four characters |
+"""
+
+import json
+from collections import defaultdict
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from lare_rl.errors import LareError, short_repr
+from lare_rl.util.safe_io import read_json
+from lare_rl.util.sanitize import one_line
+
+__all__ = ["Call", "Turn", "looks_like_error", "message_features", "split_turns"]
+
+MAX_MESSAGES = 20_000
+MAX_CALLS = 64
+"""The largest number of calls in a turn."""
+MAX_TOOL_NAME = 60
+CHARACTERS_PER_TOKEN, TOKENS_UNIT = 4, 100
+
+
+@dataclass(frozen=True)
+class Call:
+    """A call of a tool, and its result."""
+
+    tool: str
+    arguments: str
+    """As the assistant wrote them: usually JSON."""
+    result: str
+    failed: bool
+
+
+@dataclass(frozen=True)
+class Turn:
+    """An assistant's message with the messages that answer it."""
+
+    text: str
+    """What the assistant says, without its calls."""
+    calls: tuple[Call, ...]
+    reply: str
+    """The texts of the answers that are not results of calls, such as those of a game that speaks as the user."""
+
+
+def split_turns(messages: Any, where: str) -> list[Turn]:
+    """Return the turns of a conversation. What comes before the assistant's first message is ignored.
+
+    Raises:
+        LareError: a message is malformed.
+    """
+    if not isinstance(messages, Sequence) or isinstance(messages, str | bytes):
+        raise LareError(f"{where}: messages must be a list, and is {short_repr(messages)}")
+    if len(messages) > MAX_MESSAGES:
+        raise LareError(f"{where} has {len(messages)} messages: at most {MAX_MESSAGES} are accepted")
+    spans: list[list[tuple[int, Mapping[str, Any]]]] = []
+    for i, message in enumerate(messages):
+        if not isinstance(message, Mapping) or not isinstance(message.get("role"), str):
+            raise LareError(f"{where}: messages[{i}] must be a mapping with a role, and is {short_repr(message)}")
+        if message["role"] == "assistant":
+            spans.append([])
+        if spans:
+            spans[-1].append((i, message))
+    return [_read_turn(span, where) for span in spans]
+
+
+def _read_turn(span: Sequence[tuple[int, Mapping[str, Any]]], where: str) -> Turn:
+    i, message = span[0]
+    calls = _read_calls(message, f"{where}: messages[{i}]")
+    results: dict[Any, tuple[str, bool]] = {}
+    replies = []
+    for j, answer in span[1:]:
+        text = _read_text(answer.get("content"), f"{where}: messages[{j}]")
+        if answer["role"] == "tool":
+            # Without an identifier, results are in the order of the calls.
+            key = answer.get("tool_call_id")
+            is_hashable = isinstance(key, str | int)
+            results[key if is_hashable else len(results)] = text, _failed(answer, text)
+        else:
+            replies.append(text)
+    if len(calls) < len(results):
+        extra = len(results) - len(calls)
+        calls = [*calls, *[("unknown", "", None)] * extra]
+    matched = []
+    unused = dict(results)
+    for _, _, identifier in calls:
+        matched.append(unused.pop(identifier, None) if identifier is not None else None)
+    rest = iter(unused.values())
+    matched = [result if result is not None else next(rest, ("", False)) for result in matched]
+    return Turn(
+        text=_read_text(message.get("content"), f"{where}: messages[{i}]"),
+        calls=tuple(
+            Call(tool, arguments, *result) for (tool, arguments, _), result in zip(calls, matched, strict=True)
+        ),
+        reply="\n".join(replies),
+    )
+
+
+def _read_calls(message: Mapping[str, Any], where: str) -> list[tuple[str, str, str | int | None]]:
+    """Return the name, the arguments and the identifier of each call of an assistant's message."""
+    calls = message.get("tool_calls")
+    if calls is None:
+        return []
+    if not isinstance(calls, Sequence) or isinstance(calls, str | bytes):
+        raise LareError(f"{where}: tool_calls must be a list, and is {short_repr(calls)}")
+    if len(calls) > MAX_CALLS:
+        raise LareError(f"{where} has {len(calls)} calls: at most {MAX_CALLS} are accepted")
+    result = []
+    for k, call in enumerate(calls):
+        function = call.get("function", call) if isinstance(call, Mapping) else None
+        name = function.get("name") if isinstance(function, Mapping) else None
+        if not isinstance(name, str) or not name.strip():
+            raise LareError(f"{where}: tool_calls[{k}] must have a function with a name, and is {short_repr(call)}")
+        assert isinstance(function, Mapping)
+        identifier = call.get("id")
+        arguments = function.get("arguments", "")
+        if not isinstance(arguments, str):
+            arguments = _to_json(arguments, f"{where}: tool_calls[{k}]")
+        name = one_line(name)[:MAX_TOOL_NAME]
+        result.append((name, arguments, identifier if isinstance(identifier, str | int) else None))
+    return result
+
+
+def _to_json(value: Any, where: str) -> str:
+    try:
+        return json.dumps(value, sort_keys=True)
+    except (TypeError, ValueError, RecursionError):
+        raise LareError(f"{where} has arguments that are not JSON: {short_repr(value)}") from None
+
+
+def _read_text(content: Any, where: str) -> str:
+    """Return the text of a message: a string, or a list of parts with texts. Images and the like are ignored."""
+    if content is None:
+        return ""
+    if isinstance(content, str):
+        return content
+    if not isinstance(content, Sequence) or isinstance(content, bytes):
+        raise LareError(f"{where}: content must be a text or a list of parts, and is {short_repr(content)}")
+    texts = (item.get("text") if isinstance(item, Mapping) else item for item in content)
+    return "\n".join(text for text in texts if isinstance(text, str))
+
+
+def _failed(answer: Mapping[str, Any], text: str) -> bool:
+    """Return whether a tool's message reports an error."""
+    flag = answer.get("is_error")
+    if isinstance(flag, bool):
+        return flag
+    return answer.get("status") == "error" or looks_like_error(text)
+
+
+def looks_like_error(text: str) -> bool:
+    """Return whether a tool's result begins like an error, has a traceback, or is a JSON object with an `error`."""
+    start = text[:10_000].strip().lower()
+    if start.startswith(("error", "exception", "fatal", "traceback")) or "traceback (most recent call last)" in start:
+        return True
+    if start.startswith("{") and '"error"' in start:
+        try:
+            value = read_json(text)
+        except ValueError:
+            return False
+        return isinstance(value, dict) and bool(value.get("error"))
+    return False
+
+
+def message_features(turns: Sequence[Turn]) -> list[dict[str, float]]:
+    """Return the features of the turns of one rollout that need no knowledge of the task."""
+    earlier_calls: set[tuple[str, str]] = set()
+    earlier_results: set[str] = set()
+    rows = []
+    for turn in turns:
+        row: defaultdict[str, float] = defaultdict(float)
+        for call in turn.calls:
+            row[f"call {call.tool}"] += 1
+            row[f"{call.tool} fails"] += call.failed
+            row["repeats a call"] += (call.tool, call.arguments) in earlier_calls
+            earlier_calls.add((call.tool, call.arguments))
+        for result in [*(call.result for call in turn.calls), turn.reply]:
+            if result:
+                row["repeats a result"] += result in earlier_results
+                earlier_results.add(result)
+        row["no tool"] += not turn.calls
+        length = len(turn.text) + sum(len(call.tool) + len(call.arguments) for call in turn.calls)
+        row["tokens"] += length / CHARACTERS_PER_TOKEN / TOKENS_UNIT
+        rows.append({name: float(value) for name, value in row.items()})
+    return rows

@@ -1,0 +1,142 @@
+"""The report of credited rollouts: a few of them as strips of turns, what features are worth, and how far to trust it."""
+
+from collections.abc import Mapping, Sequence
+from html import escape
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from lare_rl.report.figures import COLOURS, make_figure, to_svg
+from lare_rl.report.html import render_note, render_table, write_page
+from lare_rl.turns.credit import CreditedTurns
+from lare_rl.turns.messages import Turn, split_turns
+from lare_rl.turns.rollouts import Rollout
+from lare_rl.turns.words import MESSAGES
+from lare_rl.util.findings import render
+from lare_rl.util.provenance import code_version
+from lare_rl.util.sanitize import one_line
+
+__all__ = ["choose_rollouts", "write_turn_report"]
+
+N_STRIPS = 6
+"""The number of rollouts that are drawn."""
+MAX_TURNS = 60
+"""The largest number of turns of a strip."""
+MAX_WORDS = 90
+"""Characters of a turn's text, and of its features."""
+
+NOTE_SUMS = (
+    "Progress is the change of the expected outcome that a turn made. It is not a score whose sum predicts the outcome, as the proxy "
+    "rewards of lare-rl relabel are: such scores are for rewards, and must not be used as advantages of turns."
+)
+NOTE_DEVIATIONS = (
+    "Bars of two deviations contain the exact change of value in about half of the turns only, because they do not know of what the "
+    "features miss. A bar that does not touch 0 usually has the right sign."
+)
+
+
+def write_turn_report(
+    path: Path, rollouts: Sequence[Mapping[str, Any]], checked: Sequence[Rollout], credit: CreditedTurns
+) -> Path:
+    """Write one self-contained HTML file.
+
+    Args:
+        path: the file.
+        rollouts: the rollouts as they were read.
+        checked: the same, checked (`read_rollouts`).
+        credit: their credit.
+
+    Raises:
+        LareError: the file cannot be written. An older file is left unchanged.
+    """
+    title = f"Credit for {sum(len(rollout.turns) for rollout in checked):,} turns of {len(checked):,} rollouts"
+    outcome = np.array([rollout.outcome for rollout in checked])
+    trust, *effects = (render(finding, MESSAGES, "html") for finding in credit.findings)
+    body = [
+        f"<h1>{escape(title)}</h1>",
+        f'<div class="verdict"><p>{trust}</p></div>',
+        render_note(f"Outcomes: mean {outcome.mean():.3g}, from {outcome.min():.3g} to {outcome.max():.3g}."),
+        "<h2>What matters</h2>",
+        "<ul>" + "".join(f"<li>{line}</li>" for line in effects) + "</ul>"
+        if effects
+        else render_note("No feature of a turn changes the value clearly."),
+        _render_effects(credit),
+        "<h2>Some rollouts</h2>",
+        render_note(NOTE_DEVIATIONS),
+    ]
+    for k in choose_rollouts(checked, credit):
+        body += _render_rollout(k, rollouts[k], checked[k], credit)
+    body += [render_note(NOTE_SUMS), render_note(f"Written by LaRe {code_version()}.")]
+    return write_page(path, title, "\n".join(body))
+
+
+def choose_rollouts(checked: Sequence[Rollout], credit: CreditedTurns) -> list[int]:
+    """Return rollouts to draw: by turns one with the best and one with the worst outcome, those with the clearest turns first."""
+    clarity = [
+        float(np.max(np.abs(progress[:-1]) - 2 * deviation[:-1], initial=-np.inf))
+        for progress, deviation in zip(credit.progress, credit.deviation, strict=True)
+    ]
+    middle = np.median([rollout.outcome for rollout in checked])
+    order = sorted(range(len(checked)), key=lambda k: -clarity[k])
+    high = [k for k in order if checked[k].outcome > middle][: N_STRIPS // 2]
+    low = [k for k in order if k not in high][: N_STRIPS - len(high)]
+    mixed = [k for pair in zip(high, low, strict=False) for k in pair]
+    return mixed + [k for k in high + low if k not in mixed]
+
+
+def _render_rollout(k: int, rollout: Mapping[str, Any], checked: Rollout, credit: CreditedTurns) -> list[str]:
+    group = f", group {one_line(checked.group)[:MAX_WORDS]}" if checked.group else ""
+    ending = ", cut off" if checked.truncated else ""
+    value = credit.value[k]
+    rows = []
+    messages = rollout.get("messages")
+    turns = [None] * len(value) if messages is None else split_turns(messages, f"rollout {k}")
+    for t, (features, turn) in enumerate(zip(checked.turns, turns, strict=True)):
+        progress, deviation = credit.progress[k][t], credit.deviation[k][t]
+        numbers = f"{value[t]:.2f}", f"{progress:+.3f} ± {deviation:.3f}", f"{credit.advantage[k][t]:+.3f}"
+        rows.append((str(t + 1), _describe_turn(turn), _describe_features(features), *numbers))
+    header = ("turn", "the assistant", "features", "value before", "progress", "advantage")
+    table = render_table(header, rows[:MAX_TURNS], numbers=(0, 3, 4, 5))
+    return [
+        f"<h3>Rollout {k}{escape(group)}: outcome {checked.outcome:g}{ending}</h3>",
+        _draw_strip(credit.progress[k][:MAX_TURNS], credit.deviation[k][:MAX_TURNS]),
+        f"<details><summary>The turns</summary>{table}</details>",
+    ]
+
+
+def _draw_strip(progress: np.ndarray, deviation: np.ndarray) -> str:
+    """Draw the progress of each turn as a bar, with two deviations."""
+    figure, (axes,) = make_figure(height=1.9)
+    turns = np.arange(1, len(progress) + 1)
+    colours = np.where(progress >= 0, COLOURS[0], COLOURS[1])
+    axes.bar(turns, progress, color=colours, yerr=2 * deviation, error_kw={"elinewidth": 1, "ecolor": "#777777"})
+    axes.axhline(0, color="#777777", linewidth=0.8)
+    axes.set(xlabel="turn", ylabel="progress", xlim=(0.4, len(progress) + 0.6))
+    axes.xaxis.get_major_locator().set_params(integer=True)
+    return to_svg(figure)
+
+
+def _describe_turn(turn: Turn | None) -> str:
+    if turn is None:
+        return "-"
+    calls = ", ".join(f"{call.tool}({call.arguments})" for call in turn.calls)
+    return one_line(calls or turn.text)[:MAX_WORDS] or "-"
+
+
+def _describe_features(features: Mapping[str, float]) -> str:
+    texts = (name if value == 1 else f"{name} {value:.3g}" for name, value in features.items() if value)
+    return ", ".join(texts)[:MAX_WORDS] or "-"
+
+
+def _render_effects(credit: CreditedTurns) -> str:
+    rows = []
+    for effect in sorted(credit.effects, key=lambda effect: -abs(effect.first * effect.frequency)):
+        pairs = (
+            (getattr(effect, name), getattr(effect, f"{name}_deviation")) for name in ("first", "lasting", "further")
+        )
+        numbers = (f"{number:+.3f} ± {deviation:.3f}" for number, deviation in pairs)
+        name = effect.name if effect.unit == 1 else f"{effect.name} ({effect.unit:.3g})"
+        rows.append((name, f"{effect.frequency:.0%}", *numbers))
+    header = ("feature of a turn", "turns with it", "the first one", "what lasts of it", "each further one")
+    return render_table(header, rows, numbers=(1, 2, 3, 4))

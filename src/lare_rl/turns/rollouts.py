@@ -1,0 +1,123 @@
+"""Rollouts of agents that talk: how they are read and checked.
+
+A rollout is a mapping:
+
+    {"messages": [...],             # in the form of OpenAI's chat completions
+     "turns": [{"tests pass": 1}],  # optional numbers of each turn, from the environment; without messages, the turns themselves
+     "outcome": 1.0,
+     "group": "task-17",            # optional: rollouts of the same task
+     "truncated": False}            # optional: whether it was cut off, so that the agent did not stop by itself
+
+Other keys are ignored. A turn is an assistant's message with the messages that answer it, up to the next assistant's message.
+"""
+
+import math
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from lare_rl.errors import LareError, short_repr
+from lare_rl.turns.messages import Turn, message_features, split_turns
+from lare_rl.util.sanitize import one_line
+
+__all__ = ["MAX_NUMBER", "Phi", "Rollout", "read_rollout", "read_rollouts"]
+
+MAX_NUMBER = 1e9
+"""The largest number of a turn, and the largest outcome. Sums of squares of larger numbers lose their digits."""
+MAX_TURNS = 10_000
+MAX_NAME = 80
+
+Phi = Callable[[Turn], Mapping[str, float]]
+"""A function that names events of a turn, and gives a number to each of them."""
+
+
+@dataclass(frozen=True)
+class Rollout:
+    """A checked rollout."""
+
+    turns: tuple[Mapping[str, float], ...]
+    """The features of each turn."""
+    outcome: float
+    group: str
+    truncated: bool = False
+
+
+def read_rollouts(rollouts: Any, phi: Phi | None = None) -> list[Rollout]:
+    """Check rollouts and return them.
+
+    Raises:
+        LareError: a rollout is malformed. The message names it, starting with rollout 0.
+    """
+    if isinstance(rollouts, Mapping | str | bytes) or not isinstance(rollouts, Iterable):
+        raise LareError(f"rollouts must be a list of mappings, and not {short_repr(rollouts)}")
+    return [read_rollout(rollout, f"rollout {number}", phi) for number, rollout in enumerate(rollouts)]
+
+
+def read_rollout(rollout: Any, where: str, phi: Phi | None = None) -> Rollout:
+    """Check one rollout and return it. `where` names it in messages."""
+    if not isinstance(rollout, Mapping):
+        raise LareError(
+            f"{where} must be a mapping with an outcome and messages or turns, and is {short_repr(rollout)}"
+        )
+    outcome = _read_number(rollout.get("outcome"), f"{where}: outcome")
+    group = rollout.get("group", "")
+    if not isinstance(group, str | int) or isinstance(group, bool):
+        raise LareError(f"{where}: group must be a text or a whole number, and is {short_repr(group)}")
+    truncated = rollout.get("truncated", False)
+    if not isinstance(truncated, bool):
+        raise LareError(f"{where}: truncated must be true or false, and is {short_repr(truncated)}")
+    numbers = _read_numbers(rollout.get("turns"), where)
+    messages = rollout.get("messages")
+    if messages is None:
+        if numbers is None:
+            raise LareError(f"{where} has neither messages nor turns")
+        if phi is not None:
+            raise LareError(f"{where} has no messages, which a phi needs")
+        features = numbers
+    else:
+        turns = split_turns(messages, where)
+        if numbers is not None and len(numbers) != len(turns):
+            raise LareError(
+                f"{where} has {len(turns)} messages of the assistant, but numbers of {len(numbers)} turns: one entry of "
+                "turns is needed for each message of the assistant"
+            )
+        features = message_features(turns)
+        if phi is not None:
+            features = [{**row, **phi(turn)} for row, turn in zip(features, turns, strict=True)]
+        if numbers is not None:
+            features = [{**row, **extra} for row, extra in zip(features, numbers, strict=True)]
+    if not features:
+        raise LareError(f"{where} has no turn: the assistant says nothing")
+    return Rollout(tuple(features), outcome, str(group), truncated)
+
+
+def _read_numbers(turns: Any, where: str) -> list[dict[str, float]] | None:
+    if turns is None:
+        return None
+    if not isinstance(turns, Sequence) or isinstance(turns, str | bytes):
+        raise LareError(f"{where}: turns must be a list with the numbers of each turn, and is {short_repr(turns)}")
+    if len(turns) > MAX_TURNS:
+        raise LareError(f"{where} has {len(turns)} turns: at most {MAX_TURNS} are accepted")
+    rows = []
+    for t, turn in enumerate(turns):
+        if not isinstance(turn, Mapping):
+            raise LareError(f"{where}: turns[{t}] must map names to numbers, and is {short_repr(turn)}")
+        row = {}
+        for name, value in turn.items():
+            if not isinstance(name, str) or not 0 < len(name) <= MAX_NAME or name != one_line(name):
+                raise LareError(
+                    f"{where}: turns[{t}] has the name {short_repr(name)}: a text of 1 to {MAX_NAME} characters in one line is needed"
+                )
+            row[name] = _read_number(value, f"{where}: turns[{t}][{name!r}]")
+        rows.append(row)
+    return rows
+
+
+def _read_number(value: Any, where: str) -> float:
+    try:
+        number = float(value) if not isinstance(value, str | bytes) else math.nan
+    except (TypeError, ValueError, OverflowError):
+        number = math.nan
+    if not abs(number) <= MAX_NUMBER:
+        raise LareError(f"{where} must be a number of at most {MAX_NUMBER:g}, and is {short_repr(value)}")
+    return number

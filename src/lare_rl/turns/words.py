@@ -1,0 +1,32 @@
+"""The sentences of `CreditedTurns.findings`, by the codes of its findings (`util/findings.py`)."""
+
+__all__ = ["MESSAGES"]
+
+MESSAGES = {
+    "lambda": "Lambda {lambda_:g} was used: {reason}.",
+    "chosen": "it was set by the caller. The measurement says: {measured}",
+    "unknown": (
+        "there are {n_rollouts:count rollout} with a spread of outcomes of {outcome_std:.2g}, from which nothing can be said about the "
+        "values; the advantage is the outcome minus the mean of its group, as in GRPO"
+    ),
+    "harmful": (
+        "values of prefixes predict outcomes worse than the mean of the group does (gain {gain:.1%} ± {gain_error:.1%}); the advantage is "
+        "the outcome minus that mean, as in GRPO"
+    ),
+    "small_gain": (
+        "values of prefixes remove {gain:.1%} ± {gain_error:.1%} of the squared error of the group's mean, which is too little to trust "
+        "them. More rollouts help, and features of events: what happened in a turn"
+    ),
+    "surprised": (
+        "values of prefixes remove {gain:.1%} ± {gain_error:.1%} of the squared error of the group's mean, but outcomes are "
+        "{surprise:+.2f} above the values when agents stop: the features miss an event before the end"
+    ),
+    "trusted": (
+        "values of prefixes remove {gain:.1%} ± {gain_error:.1%} of the squared error of the group's mean, and outcomes differ from them "
+        "by {surprise:+.2f} when agents stop"
+    ),
+    "effect": (
+        "The first `{name}` changes the value by {first:+.3f} ± {first_deviation:.3f}, of which {lasting:+.3f} ± {lasting_deviation:.3f} "
+        "lasts. Each further one adds {further:+.3f} ± {further_deviation:.3f}."
+    ),
+}

@@ -1,0 +1,114 @@
+"""The command `turn-credit`: files of rollouts, the page, and mistakes of one line."""
+
+import json
+
+import pytest
+
+from helpers.turn_toys import sample_table, table_rollouts
+from lare_rl import cli
+from lare_rl.errors import LareError
+from lare_rl.turns.credit import TurnCredit
+from lare_rl.turns.features import tabulate
+from lare_rl.turns.files import read_rollout_file, write_credit_file
+from lare_rl.turns.page import choose_rollouts, write_turn_report
+from lare_rl.turns.rollouts import read_rollouts
+
+PHI = "def turn_events(tool, arguments, result, text):\n    return {'works': 'ok' in result}\n"
+
+
+@pytest.fixture
+def rollouts():
+    """Return rollouts with messages, in which a tool works or fails."""
+    result = []
+    for k, plain in enumerate(table_rollouts(sample_table(n_groups=8))):
+        messages = [{"role": "user", "content": "<b>Go</b>"}]
+        for turn in plain["turns"]:
+            answer = "ok" if turn["event 0"] else "nothing"
+            call = {"id": "1", "function": {"name": "try", "arguments": "{}"}}
+            messages += [{"role": "assistant", "content": None, "tool_calls": [call]}]
+            messages += [{"role": "tool", "tool_call_id": "1", "content": answer}]
+        result.append({**plain, "messages": messages, "note": k})
+    return result
+
+
+@pytest.fixture
+def file(tmp_path, rollouts):
+    path = tmp_path / "rollouts.jsonl"
+    path.write_text("\n\n".join(map(json.dumps, rollouts)) + "\n")
+    return path
+
+
+def run(monkeypatch, capsys, *arguments):
+    monkeypatch.setattr("sys.argv", ["lare-rl", "turn-credit", *map(str, arguments)])
+    status = 0
+    try:
+        cli.main()
+    except SystemExit as exit_:
+        status = exit_.code
+    captured = capsys.readouterr()
+    return status, captured.out, captured.err
+
+
+def test_command(monkeypatch, capsys, tmp_path, file, rollouts):
+    out, page, phi = tmp_path / "credited.jsonl", tmp_path / "page.html", tmp_path / "phi.py"
+    phi.write_text(PHI)
+    status, text, _ = run(monkeypatch, capsys, file, "--out", out, "--report", page, "--function", phi)
+    assert status == 0
+    assert text.startswith("Lambda ")
+    credited = [json.loads(line) for line in out.read_text().splitlines()]
+    for before, after in zip(rollouts, credited, strict=True):
+        credit = after.pop("credit")
+        assert after == before
+        assert all(
+            len(credit[name]) == len(before["turns"]) for name in ("advantage", "progress", "deviation", "value")
+        )
+        assert sum(credit["progress"]) == pytest.approx(before["outcome"] - credit["value"][0], abs=1e-4)
+    html = page.read_text()
+    assert "works" in html
+    assert html.count("<svg") == 6
+    status, _, error = run(monkeypatch, capsys, file, "--out", out)
+    assert (status, "--overwrite" in error) == (2, True)
+
+
+@pytest.mark.parametrize(
+    ("content", "words"),
+    [
+        ("", ["no rollouts"]),
+        ("{}\n[1]\n", ["line 2", "JSON object"]),
+        ('{"a": \n', ["line 1", "not JSON"]),
+        (b"\xff\xfe{}\n", ["line 1", "not JSON"]),
+        ("[" * 100_000, ["line 1", "not JSON"]),
+    ],
+)
+def test_bad_files(tmp_path, content, words):
+    path = tmp_path / "bad.jsonl"
+    path.write_bytes(content if isinstance(content, bytes) else content.encode())
+    with pytest.raises(LareError) as error:
+        read_rollout_file(path)
+    assert all(word in str(error.value) for word in words)
+    assert "\n" not in str(error.value)
+
+
+def test_missing_files(monkeypatch, capsys, tmp_path, file):
+    status, _, error = run(monkeypatch, capsys, tmp_path / "none.jsonl", "--out", tmp_path / "out.jsonl")
+    assert (status, error.count("\n")) == (2, 1)
+    status, _, error = run(monkeypatch, capsys, file, "--out", tmp_path / "none" / "out.jsonl")
+    assert (status, "no folder" in error) == (2, True)
+
+
+def test_half_characters_are_written(tmp_path):
+    rollouts = [{"turns": [{}], "outcome": 1, "note": "\ud800"}]
+    result = TurnCredit()(rollouts)
+    write_credit_file(tmp_path / "out.jsonl", rollouts, result)
+    assert json.loads((tmp_path / "out.jsonl").read_text())["note"] == "\ud800"
+
+
+def test_page_escapes_texts(tmp_path):
+    rollouts = [{"turns": [{"<script>": k % 2}], "outcome": k % 2, "group": "<i>"} for k in range(20)]
+    checked = read_rollouts(rollouts)
+    result = TurnCredit().assign(tabulate(checked))
+    html = write_turn_report(tmp_path / "page.html", rollouts, checked, result).read_text()
+    assert "<script>" not in html
+    assert "<i>" not in html
+    outcomes = [checked[k].outcome for k in choose_rollouts(checked, result)]
+    assert outcomes == [1, 0, 1, 0, 1, 0]

@@ -1,0 +1,171 @@
+"""`TurnCredit`: exact sums, symmetry, the choice of lambda, what it says, and that it needs NumPy only."""
+
+import subprocess
+import sys
+from itertools import product
+
+import numpy as np
+import pytest
+
+import lare_rl
+from helpers.turn_toys import sample_table, table_rollouts
+from lare_rl.errors import LareError
+from lare_rl.turns.trust import Errors, Trust, choose_lambda, group_means, summarise
+
+
+@pytest.fixture
+def rollouts():
+    return table_rollouts(sample_table(n_groups=20))
+
+
+@pytest.mark.parametrize("logistic", [False, True])
+def test_progress_adds_up_exactly(rollouts, logistic):
+    for rollout in rollouts:
+        rollout["outcome"] = float(rollout["outcome"] > 0.2)
+    result = lare_rl.TurnCredit(logistic=logistic)(rollouts)
+    for rollout, progress, value in zip(rollouts, result.progress, result.value, strict=True):
+        assert progress.sum() == pytest.approx(rollout["outcome"] - value[0], abs=1e-12)
+        assert len(progress) == len(rollout["turns"])
+
+
+def test_order_of_rollouts_does_not_matter(rollouts):
+    order = np.random.default_rng(0).permutation(len(rollouts))
+    first = lare_rl.TurnCredit()(rollouts)
+    second = lare_rl.TurnCredit()([rollouts[k] for k in order])
+    assert first.lambda_ == second.lambda_
+    for position, k in enumerate(order):
+        np.testing.assert_allclose(first.advantage[k], second.advantage[position], rtol=1e-6, atol=1e-9)
+        np.testing.assert_allclose(first.deviation[k], second.deviation[position], rtol=1e-6, atol=1e-9)
+
+
+def test_units_of_outcomes_and_names_of_groups_do_not_matter(rollouts):
+    scaled = [
+        {**rollout, "outcome": 100 * rollout["outcome"] - 7, "group": f"task {rollout['group']}"}
+        for rollout in rollouts
+    ]
+    first, second = lare_rl.TurnCredit()(rollouts), lare_rl.TurnCredit()(scaled)
+    for k in range(len(rollouts)):
+        np.testing.assert_allclose(100 * first.advantage[k], second.advantage[k], rtol=1e-6, atol=1e-7)
+
+
+def test_an_event_that_matters_gets_the_credit(rollouts):
+    result = lare_rl.TurnCredit()(rollouts)
+    effects = {effect.name: effect for effect in result.effects}
+    # Less than its effect of 0.4 on the outcome, because the event might have followed later anyway.
+    assert 0.1 < effects["event 0"].first < 0.4
+    assert all(abs(effects[name].first) < 0.1 for name in ("event 1", "event 2"))
+    assert any("`event 0`" in line for line in result.words)
+    assert result.gain > 0
+    assert result.lambda_ == 0.8
+
+
+def test_a_fixed_lambda_is_used(rollouts):
+    result = lare_rl.TurnCredit(0.5)(rollouts)
+    assert result.lambda_ == 0.5
+    assert "set by the caller" in result.words[0]
+    assert result.advantage[0][-1] == pytest.approx(result.progress[0][-1])
+
+
+def test_few_rollouts_get_the_outcome_minus_the_mean_of_their_group():
+    table = sample_table(n_groups=2, group_size=3)
+    result = lare_rl.TurnCredit()(table_rollouts(table))
+    assert result.lambda_ == 1
+    for k, advantage in enumerate(result.advantage):
+        np.testing.assert_allclose(advantage, (table.outcome - group_means(table))[k])
+
+
+def test_one_rollout_and_equal_outcomes_get_no_advantage():
+    rollout = {"turns": [{"a": 1}, {}], "outcome": 1.0}
+    for rollouts in ([rollout], [rollout] * 40):
+        result = lare_rl.TurnCredit()(rollouts)
+        np.testing.assert_allclose(np.concatenate(result.advantage), 0, atol=1e-12)
+        np.testing.assert_allclose(np.concatenate(result.progress), 0, atol=1e-12)
+
+
+def test_trust_is_measured_over_the_window():
+    credit = lare_rl.TurnCredit(window=2)
+    tables = [table_rollouts(sample_table(seed=seed)) for seed in range(3)]
+    sizes = [credit(rollouts).trust.n_rollouts for rollouts in tables]
+    assert sizes == [24, 48, 48]
+
+
+def test_noise_is_not_trusted():
+    table = sample_table(n_groups=40, effect=0.0)
+    result = lare_rl.TurnCredit()(table_rollouts(table))
+    assert result.lambda_ > 0.9
+
+
+@pytest.mark.parametrize(
+    ("gain", "surprise", "lambda_", "code"),
+    [
+        (0.2, 0.0, 0.8, "trusted"),
+        (0.2, 0.2, 0.95, "surprised"),
+        (0.02, 0.0, 0.95, "small_gain"),
+        (-0.1, 0.0, 1.0, "harmful"),
+        (np.nan, 0.0, 1.0, "unknown"),
+    ],
+)
+def test_choice_of_lambda(gain, surprise, lambda_, code):
+    trust = Trust(gain=gain, gain_error=0.02, surprise=surprise, outcome_std=0.5, n_rollouts=100)
+    chosen, finding = choose_lambda(trust)
+    assert (chosen, finding.code) == (lambda_, code)
+
+
+def test_gain_is_a_ratio_of_sums():
+    random = np.random.default_rng(0)
+    baseline = random.random(50)
+    errors = [Errors(0.3 * baseline[:20], baseline[:20], np.ones(3), random.random(20)),
+              Errors(0.3 * baseline[20:], baseline[20:], np.zeros(1), random.random(30))]  # fmt: skip
+    trust = summarise(errors)
+    assert trust.gain == pytest.approx(0.3)
+    assert trust.gain_error == pytest.approx(0, abs=1e-12)
+    assert trust.surprise == pytest.approx(0.75)
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        ({"lambda_": 1.5}, ["lambda_", "0 to 1", "1.5"]),
+        ({"lambda_": "high"}, ["lambda_", "'high'"]),
+        ({"window": 0}, ["window", "at least 1"]),
+    ],
+)
+def test_bad_options(options, words):
+    with pytest.raises(LareError) as error:
+        lare_rl.TurnCredit(**options)
+    assert all(word in str(error.value) for word in words)
+
+
+def test_logistic_values_need_probabilities(rollouts):
+    with pytest.raises(LareError, match="between 0 and 1"):
+        lare_rl.TurnCredit(logistic=True)([{**rollouts[0], "outcome": 3.0}, rollouts[1]])
+
+
+def test_no_rollouts():
+    with pytest.raises(LareError, match="no rollouts"):
+        lare_rl.TurnCredit()([])
+
+
+PROGRAM = """
+import sys
+for name in ("jax", "equinox", "torch", "scipy", "gymnasium", "matplotlib"):
+    sys.modules[name] = None
+import lare_rl
+turns = [{"a": 1}, {"b": 2}]
+result = lare_rl.TurnCredit()([{"turns": turns, "outcome": k % 3, "group": k // 4} for k in range(40)])
+print(len(result.advantage), result.lambda_)
+"""
+
+
+def test_it_needs_neither_jax_nor_torch():
+    process = subprocess.run([sys.executable, "-c", PROGRAM], capture_output=True, text=True, check=True)
+    assert process.stdout.startswith("40 ")
+
+
+@pytest.mark.parametrize(("logistic", "n_features"), list(product([False, True], [0, 5])))
+def test_degenerate_features(logistic, n_features):
+    # Features that never vary, that copy each other, or that are missing.
+    turn = {f"x{i}": 1.0 for i in range(n_features)}
+    rollouts = [{"turns": [turn] * (1 + k % 3), "outcome": float(k % 2), "group": k // 4} for k in range(32)]
+    result = lare_rl.TurnCredit(logistic=logistic)(rollouts)
+    assert np.isfinite(np.concatenate([*result.advantage, *result.deviation, *result.value])).all()

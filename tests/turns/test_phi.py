@@ -1,0 +1,140 @@
+"""A phi over turns: reading, checks, the request, the design, and the two tool sets."""
+
+import json
+from pathlib import Path
+
+import pytest
+
+import lare_rl
+from lare_rl.errors import LareError
+from lare_rl.llm.recording import SHIPPED_RECORDINGS, RecordedModel, read_recording
+from lare_rl.turns.design import design_turn_phi, examine_turn_reply
+from lare_rl.turns.messages import Call, Turn
+from lare_rl.turns.phi import find_problems, load_turn_phi, read_turn_phi
+from lare_rl.turns.prompt import choose_examples, turn_request
+from lare_rl.turns.tool_sets import TOOL_SETS, load_tool_set
+
+ROOT = Path(__file__).parents[2]
+SOURCE = (
+    "def turn_events(tool, arguments, result, text):\n    return {'passes': 'passed' in result, 'n': len(arguments)}\n"
+)
+PASSED = Turn("", (Call("test", '{"a": 1}', "3 passed", False), Call("test", "not JSON", "2 passed", False)), "")
+FAILED = Turn("I give up", (), "")
+
+
+class ScriptedModel:
+    """Replies with the given texts, and remembers the requests."""
+
+    name = "scripted"
+
+    def __init__(self, *replies):
+        self.replies, self.requests = list(replies), []
+
+    def reply(self, messages, sample):
+        self.requests.append(messages)
+        return self.replies.pop(0)
+
+
+def reply_with(source):
+    return json.dumps({"Understand": "", "Analyze": "", "Functions": source})
+
+
+def test_events_of_calls_add_up():
+    assert read_turn_phi(SOURCE)(PASSED) == {"passes": 2, "n": 2}
+    assert read_turn_phi(SOURCE)(FAILED) == {"passes": 0, "n": 0}
+
+
+def test_credit_uses_the_events():
+    messages = [
+        {"role": "assistant", "tool_calls": [{"id": "1", "function": {"name": "test", "arguments": "{}"}}]},
+        {"role": "tool", "tool_call_id": "1", "content": "3 passed"},
+        {"role": "assistant", "content": "Done."},
+    ]
+    bad = [*messages[:1], {**messages[1], "content": "3 failed"}, messages[2]]
+    rollouts = [{"messages": messages if k % 2 else bad, "outcome": k % 2, "group": k // 4} for k in range(40)]
+    result = lare_rl.TurnCredit(phi=read_turn_phi(SOURCE))(rollouts)
+    effects = {effect.name: effect.first for effect in result.effects}
+    assert effects["passes"] > 0.3
+    with pytest.raises(LareError, match="no messages"):
+        lare_rl.TurnCredit(phi=read_turn_phi(SOURCE))([{"turns": [{}], "outcome": 1}])
+
+
+@pytest.mark.parametrize(
+    ("source", "words"),
+    [
+        ("def turn_events(", ["E-SYNTAX"]),
+        (SOURCE.replace("len(arguments)", "1 / len(arguments)"), ["E-RUN"]),
+        (
+            "def turn_events(tool, arguments, result, text):\n    return {'a' if tool else 'b': 1}\n",
+            ["E-NAMES", "a, b"],
+        ),
+        ("def turn_events(tool, arguments, result, text):\n    return {'a': 1}\n", ["E-CONSTANT"]),
+    ],
+)
+def test_problems(source, words):
+    problems = find_problems(source, [Turn("", PASSED.calls[:1], ""), FAILED])
+    assert all(word in problems for word in words), problems
+    assert find_problems(SOURCE, [PASSED, FAILED]) == ""
+
+
+def test_files(tmp_path):
+    path = tmp_path / "phi.py"
+    path.write_text(SOURCE)
+    assert load_turn_phi(path).source == SOURCE
+    path.write_text("x = 1")
+    with pytest.raises(LareError, match="turn_events"):
+        load_turn_phi(path)
+    with pytest.raises(LareError, match="cannot be read"):
+        load_turn_phi(tmp_path / "none.py")
+
+
+def test_design_corrects_until_a_program_passes():
+    model = ScriptedModel("no JSON", reply_with("x = 1"), reply_with(SOURCE))
+    designed = design_turn_phi("Repair it.", [{"name": "test"}], [PASSED, FAILED], model)
+    assert designed.phi.source.strip() == SOURCE.strip()
+    assert "not one JSON object" in model.requests[1][-1]["content"]
+    assert "E-FORM" in model.requests[2][-1]["content"]
+    assert [exchange.stage for exchange in designed.recorder.exchanges] == ["candidate", "correct", "correct"]
+
+
+def test_design_gives_up():
+    with pytest.raises(LareError, match="none of 5 attempts"):
+        design_turn_phi("Repair it.", [{"name": "test"}], [PASSED, FAILED], ScriptedModel(*["?"] * 5))
+    with pytest.raises(LareError, match="there is none"):
+        design_turn_phi("Repair it.", [{"name": "test"}], [], ScriptedModel())
+
+
+def test_request_has_tools_and_turns():
+    system, user = turn_request("Repair it.", [{"function": {"name": "test", "description": "Run."}}], [PASSED])
+    assert "find_numbers" in system["content"]
+    assert all(text in user["content"] for text in ("Repair it.", "## test\nRun.", '"3 passed"', "not JSON"))
+    with pytest.raises(LareError, match="function with a name"):
+        turn_request("Repair it.", [{}], [])
+
+
+def test_examples_are_of_different_tools():
+    turns = [Turn("", (Call("a", "", str(i % 2), False),), "") for i in range(9)] + [FAILED, PASSED]
+    assert choose_examples(turns, 3) == [turns[0], FAILED, PASSED]
+    assert len(choose_examples(turns, 99)) == 4
+
+
+@pytest.mark.parametrize("name", TOOL_SETS)
+def test_tool_sets(name):
+    tool_set = load_tool_set(name)
+    assert len(tool_set.examples) == 5
+    phi = load_turn_phi(ROOT / "examples" / "phi" / f"turns_{name}.py")
+    assert find_problems(phi.source, tool_set.turns) == ""
+
+
+@pytest.mark.parametrize("name", TOOL_SETS)
+def test_recorded_replies(name):
+    folder = SHIPPED_RECORDINGS / "events"
+    for path in folder.iterdir() if folder.is_dir() else ():
+        if not path.name.startswith(f"{name}."):
+            continue
+        recording = read_recording(path.read_text(encoding="utf-8"), path.name)
+        tool_set = load_tool_set(name)
+        model = RecordedModel([recording], name)
+        designed = design_turn_phi(tool_set.goal, tool_set.tools, tool_set.turns, model, examples=tool_set.examples)
+        assert examine_turn_reply(recording.exchanges[-1].replies[0], tool_set.turns)[1] == ""
+        assert designed.model == f"{recording.model}, recorded {recording.recorded}, draw {recording.draw}"

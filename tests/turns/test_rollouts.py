@@ -1,0 +1,223 @@
+"""How rollouts are read: features of messages, bad inputs by what the message must contain, foreign input."""
+
+import json
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+import lare_rl
+from lare_rl.errors import LareError
+from lare_rl.turns.features import MAX_FEATURES, tabulate
+from lare_rl.turns.messages import looks_like_error, split_turns
+from lare_rl.turns.rollouts import read_rollout, read_rollouts
+
+
+def call(name, arguments="{}", identifier="1"):
+    return {"id": identifier, "type": "function", "function": {"name": name, "arguments": arguments}}
+
+
+def assistant(text="", *calls):
+    return (
+        {"role": "assistant", "content": text, "tool_calls": list(calls)}
+        if calls
+        else {"role": "assistant", "content": text}
+    )
+
+
+def tool(text, identifier="1"):
+    return {"role": "tool", "tool_call_id": identifier, "content": text}
+
+
+MESSAGES = [
+    {"role": "system", "content": "You repair programs."},
+    {"role": "user", "content": "Repair it."},
+    assistant("Let me see.", call("read", '{"file": "a.py"}')),
+    tool("def f(): pass"),
+    assistant("", call("test", "{}", "1"), call("read", '{"file": "a.py"}', "2")),
+    tool("def f(): pass", "2"),  # results may come in any order
+    tool("Traceback (most recent call last): ...", "1"),
+    assistant("Done."),
+]
+
+
+def test_features_of_messages():
+    rollout = read_rollout({"messages": MESSAGES, "outcome": 1}, "it")
+    first, second, third = rollout.turns
+    assert first["call read"] == 1
+    assert first["repeats a call"] == first["repeats a result"] == first["no tool"] == 0
+    assert first["tokens"] == pytest.approx((len("Let me see.") + len("read") + len('{"file": "a.py"}')) / 400)
+    assert second["test fails"] == 1
+    assert second["read fails"] == 0
+    assert second["repeats a call"] == second["repeats a result"] == 1
+    assert third["no tool"] == 1
+
+
+def test_turns_of_messages():
+    turns = split_turns(MESSAGES, "it")
+    assert [len(turn.calls) for turn in turns] == [1, 2, 0]
+    assert turns[1].calls[1].result == "def f(): pass"
+    assert turns[1].calls[0].failed
+
+
+def test_results_without_identifiers_are_in_the_order_of_calls():
+    answers = [{"role": "tool", "content": "first"}, {"role": "tool", "content": "second"}]
+    (turn,) = split_turns([assistant("", call("a"), call("b", "{}", "2")), *answers], "it")
+    assert [item.result for item in turn.calls] == ["first", "second"]
+
+
+def test_replies_of_the_user_belong_to_the_turn():
+    turns = split_turns([assistant("open door"), {"role": "user", "content": "It is locked."}] * 2, "it")
+    assert [turn.reply for turn in turns] == ["It is locked."] * 2
+    rollout = read_rollout(
+        {"messages": [assistant("open"), {"role": "user", "content": "No."}] * 2, "outcome": 0}, "it"
+    )
+    assert [turn["repeats a result"] for turn in rollout.turns] == [0, 1]
+
+
+def test_numbers_of_the_user_come_on_top_and_win():
+    numbers = [{"tests pass": 1, "tokens": 7}, {}, {}]
+    rollout = read_rollout({"messages": MESSAGES, "turns": numbers, "outcome": 1}, "it")
+    assert rollout.turns[0]["tests pass"] == 1
+    assert rollout.turns[0]["tokens"] == 7
+    assert "call read" in rollout.turns[0]
+
+
+def test_content_may_be_a_list():
+    contents = [{"type": "text", "text": "a"}, {"type": "image_url", "image_url": {}}, {"type": "text", "text": "b"}]
+    (turn,) = split_turns([{"role": "assistant", "content": contents}], "it")
+    assert turn.text == "a\nb"
+
+
+@pytest.mark.parametrize(
+    ("text", "failed"),
+    [
+        ("Error: no such file", True),
+        ("  ERROR", True),
+        ("ran 3 tests\nTraceback (most recent call last):\n", True),
+        ('{"error": "no such city"}', True),
+        ('{"error": null, "value": 3}', False),
+        ("0 errors", False),
+        ("", False),
+        ("{" * 500, False),
+    ],
+)
+def test_results_that_look_like_errors(text, failed):
+    assert looks_like_error(text) == failed
+
+
+def test_flags_of_errors_win():
+    flagged = {**tool("Error, as you asked"), "is_error": False}
+    (turn,) = split_turns([assistant("", call("say")), flagged], "it")
+    assert not turn.calls[0].failed
+
+
+def test_only_the_most_frequent_features_are_used():
+    turns = [{"often": 1, f"name {i}": 1} for i in range(3 * MAX_FEATURES)]
+    table = tabulate(read_rollouts([{"turns": turns, "outcome": 0}]))
+    assert len(table.names) == MAX_FEATURES
+    assert "often" in table.names
+
+
+OUTCOME = {"outcome": 1}
+BAD = [
+    (3, ["rollout 0", "mapping", "3"]),
+    ({}, ["rollout 0", "outcome", "None"]),
+    ({"outcome": "good"}, ["outcome", "'good'"]),
+    ({"outcome": float("nan")}, ["outcome", "nan"]),
+    ({"outcome": 1e300}, ["outcome", "1e+09"]),
+    (OUTCOME, ["neither messages nor turns"]),
+    ({**OUTCOME, "turns": []}, ["no turn"]),
+    ({**OUTCOME, "turns": 3}, ["turns must be a list"]),
+    ({**OUTCOME, "turns": [3]}, ["turns[0]", "3"]),
+    ({**OUTCOME, "turns": [{"a": "b"}]}, ["turns[0]['a']", "'b'"]),
+    ({**OUTCOME, "turns": [{"a": float("inf")}]}, ["turns[0]['a']", "inf"]),
+    ({**OUTCOME, "turns": [{"": 1}]}, ["turns[0]", "''"]),
+    ({**OUTCOME, "turns": [{"a\nb": 1}]}, ["turns[0]", "one line"]),
+    ({**OUTCOME, "turns": [{}], "group": [1]}, ["group", "[1]"]),
+    ({**OUTCOME, "turns": [{}], "truncated": "no"}, ["truncated", "'no'"]),
+    ({**OUTCOME, "messages": "hello"}, ["messages must be a list", "'hello'"]),
+    ({**OUTCOME, "messages": [3]}, ["messages[0]", "role"]),
+    ({**OUTCOME, "messages": [{"role": "user", "content": "hi"}]}, ["no turn"]),
+    ({**OUTCOME, "messages": [{"role": "assistant", "content": 3}]}, ["messages[0]", "content", "3"]),
+    ({**OUTCOME, "messages": [{"role": "assistant", "tool_calls": 3}]}, ["messages[0]", "tool_calls", "3"]),
+    ({**OUTCOME, "messages": [{"role": "assistant", "tool_calls": [{}]}]}, ["tool_calls[0]", "name"]),
+    ({**OUTCOME, "messages": MESSAGES, "turns": [{}]}, ["3 messages of the assistant", "1 turn"]),
+]
+
+
+@pytest.mark.parametrize(("rollout", "words"), BAD, ids=range(len(BAD)))
+def test_bad_rollouts(rollout, words):
+    with pytest.raises(LareError) as error:
+        read_rollouts([rollout])
+    assert all(word in str(error.value) for word in words), str(error.value)
+    assert "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize("rollouts", [3, None, "text", {"outcome": 1}])
+def test_rollouts_must_be_a_list(rollouts):
+    with pytest.raises(LareError, match="list of mappings"):
+        read_rollouts(rollouts)
+
+
+VALUES = st.recursive(
+    st.none() | st.booleans() | st.integers() | st.floats() | st.text(max_size=5),
+    lambda inner: st.lists(inner, max_size=3) | st.dictionaries(st.text(max_size=5), inner, max_size=3),
+    max_leaves=8,
+)
+ROLES = st.sampled_from(["assistant", "tool", "user", "system"]) | VALUES
+MESSAGE = st.fixed_dictionaries(
+    {"role": ROLES}, optional={"content": VALUES, "tool_calls": VALUES | st.lists(VALUES), "tool_call_id": VALUES}
+)
+ROLLOUT = st.fixed_dictionaries(
+    {"outcome": st.floats(-2, 2) | VALUES},
+    optional={
+        "messages": st.lists(MESSAGE | VALUES, max_size=5) | VALUES,
+        "turns": st.lists(st.dictionaries(st.text(max_size=3), st.floats(-1e9, 1e9), max_size=3) | VALUES, max_size=5),
+        "group": st.text(max_size=2) | VALUES,
+        "truncated": st.booleans() | VALUES,
+    },
+)
+
+
+@settings(max_examples=300, deadline=None)
+@given(st.lists(ROLLOUT | VALUES, max_size=4))
+def test_foreign_rollouts_give_numbers_or_one_line(rollouts):
+    message, result = "", None
+    try:
+        result = lare_rl.TurnCredit()(rollouts)
+    except LareError as error:
+        message = str(error)
+    assert "\n" not in message
+    if result is None:
+        return
+    assert len(result.advantage) == len(rollouts)
+    assert np.isfinite(np.concatenate([*result.advantage, *result.progress, *result.deviation])).all()
+    json.dumps(result.words)
+
+
+NUMBERS = st.dictionaries(st.sampled_from("abc"), st.floats(-1e9, 1e9) | st.sampled_from([0.0, 1.0]), max_size=3)
+
+
+@settings(max_examples=100, deadline=None)
+@given(
+    st.lists(
+        st.tuples(st.lists(NUMBERS, min_size=1, max_size=6), st.floats(-1e6, 1e6), st.integers(0, 3)),
+        min_size=1,
+        max_size=12,
+    ),
+    st.booleans(),
+)
+def test_any_numbers_give_exact_sums(rollouts, is_binary):
+    outcomes = [float(outcome > 0) if is_binary else outcome for _, outcome, _ in rollouts]
+    result = lare_rl.TurnCredit(0.8, logistic=is_binary)(
+        [
+            {"turns": turns, "outcome": outcome, "group": group}
+            for (turns, _, group), outcome in zip(rollouts, outcomes, strict=True)
+        ]
+    )
+    scale = 1 + max(map(abs, outcomes))
+    for outcome, progress, value in zip(outcomes, result.progress, result.value, strict=True):
+        assert np.isfinite(value).all()
+        assert progress.sum() == pytest.approx(outcome - value[0], abs=1e-6 * scale)

@@ -1,0 +1,160 @@
+"""Values, changes, advantages and deviations against slow twins."""
+
+import numpy as np
+import pytest
+
+from helpers.turn_toys import dense_posterior, sample_table, slow_prefix
+from lare_rl.turns.features import build_prefixes
+from lare_rl.turns.logistic import logistic
+from lare_rl.turns.regression import PrefixFit
+from lare_rl.turns.value import advantages, changes, deviations, fit_prefixes, held_out_values, values
+
+ALPHA, BETA = 2.0, 5.0
+
+
+def rows_of(table, k):
+    return slice(table.first[k], table.first[k] + table.length[k])
+
+
+def simple_fit(table, x, alpha=ALPHA, beta=BETA, skip=None):
+    """Return the posterior under equal precisions from one large matrix, without one rollout."""
+    index = table.rollout_index
+    weight = np.where(index == skip, 0.0, len(table.length) / len(x))
+    group = table.group[index]
+    mean, covariance, _ = dense_posterior(x, table.outcome[index], weight, group, np.full(x.shape[1] + 1, alpha), beta)
+    return mean, covariance
+
+
+def linear_fit(table, x):
+    """Return the same posterior as a `PrefixFit`."""
+    mean, covariance = simple_fit(table, x)
+    n = x.shape[1]
+    x_mean = x.mean(axis=0)
+    shift = np.eye(n + 1)
+    shift[n, :n] = x_mean  # (v, m) -> (v, m + v . x_mean)
+    weight = len(table.length) / len(x)
+    index = table.rollout_index
+    counts = np.bincount(table.group[index]) * weight
+    sums = np.array([x[table.group[index] == g].sum(axis=0) for g in range(len(counts))]) * weight
+    precision = BETA * counts + ALPHA
+    rows = BETA * np.column_stack([sums - counts[:, None] * x_mean, counts]) / precision[:, None]
+    return PrefixFit(
+        x_mean=x_mean,
+        weight=mean[:n],
+        mean=float(mean[n] + mean[:n] @ x_mean),
+        intercept=mean[n + 1 :],
+        root=np.linalg.cholesky(shift @ covariance[: n + 1, : n + 1] @ shift.T).T,
+        group_row=rows,
+        group_precision=precision,
+        noise=1 / BETA,
+        is_logistic=False,
+    )
+
+
+def test_prefixes_are_as_the_equation_says():
+    table = sample_table()
+    prefixes = build_prefixes(table)
+    slow = np.concatenate(
+        [[slow_prefix(table.features[rows_of(table, k)], t) for t in range(n)] for k, n in enumerate(table.length)]
+    )
+    np.testing.assert_array_equal(prefixes.features, slow[:, np.ptp(slow, axis=0) > 0])
+
+
+def test_changes_add_up_to_the_outcome_minus_the_first_value():
+    table = sample_table()
+    value = np.random.default_rng(1).normal(size=len(table.features))
+    sums = np.bincount(table.rollout_index, changes(table, value))
+    np.testing.assert_allclose(sums, table.outcome - value[table.first])
+
+
+@pytest.mark.parametrize("lambda_", [0.0, 0.8, 1.0])
+def test_advantages_are_discounted_sums(lambda_):
+    table = sample_table()
+    change = np.random.default_rng(1).normal(size=len(table.features))
+    result = advantages(table, change, lambda_)
+    for k in range(len(table.length)):
+        rollout_change = change[rows_of(table, k)]
+        for t in range(table.length[k]):
+            expected = sum(lambda_**i * rollout_change[t + i] for i in range(table.length[k] - t))
+            assert result[rows_of(table, k)][t] == pytest.approx(expected)
+
+
+def test_values_leave_out_the_rollout_itself():
+    # The intercept is that of a regression in which the rollout has no weight, with the same v and m.
+    table = sample_table()
+    x = build_prefixes(table).features
+    fit = linear_fit(table, x)
+    result = values(table, x, fit)
+    index = table.rollout_index
+    base = fit.mean + (x - fit.x_mean) @ fit.weight
+    weight = len(table.length) / len(x)
+    for k in range(len(table.length)):
+        in_group = (table.group[index] == table.group[k]) & (index != k)
+        residual = weight * (table.outcome[index] - base)[in_group].sum()
+        intercept = residual / (weight * in_group.sum() + ALPHA / BETA)
+        np.testing.assert_allclose(result[rows_of(table, k)], base[rows_of(table, k)] + intercept)
+
+
+def test_held_out_values_are_those_of_a_fit_without_the_rollout():
+    table = sample_table()
+    x = build_prefixes(table).features
+    result = held_out_values(table, x, linear_fit(table, x))
+    for k in range(len(table.length)):
+        mean, _ = simple_fit(table, x, skip=k)
+        n = x.shape[1]
+        expected = x[rows_of(table, k)] @ mean[:n] + mean[n] + mean[n + 1 + table.group[k]]
+        np.testing.assert_allclose(result[rows_of(table, k)], expected, rtol=1e-6, atol=1e-8)
+
+
+def test_deviations_are_those_of_the_posterior():
+    table = sample_table()
+    x = build_prefixes(table).features
+    _, covariance = simple_fit(table, x)
+    result = deviations(table, x, linear_fit(table, x))
+    n_groups = table.group.max() + 1
+    for k in range(len(table.length)):
+        rows = x[rows_of(table, k)]
+        last = np.concatenate([rows[-1], [1.0], np.eye(n_groups)[table.group[k]]])
+        steps = [np.concatenate([step, np.zeros(1 + n_groups)]) for step in np.diff(rows, axis=0)]
+        expected = [np.sqrt(row @ covariance @ row) for row in [*steps, last]]
+        np.testing.assert_allclose(result[rows_of(table, k)], expected, rtol=1e-6)
+
+
+def test_logistic_values_are_probabilities_and_follow_the_outcomes():
+    random = np.random.default_rng(0)
+    table = sample_table(n_groups=40)
+    index = table.rollout_index
+    happened = np.bincount(index, table.features[:, 0]) > 0
+    chance = logistic(2.0 * happened - 1 + random.normal(size=40)[table.group])
+    table = table._replace(outcome=(random.random(len(chance)) < chance).astype(float))
+    x = build_prefixes(table).features
+    fit = fit_prefixes(table, x, is_logistic=True)
+    value = values(table, x, fit)
+    assert (value > 0).all()
+    assert (value < 1).all()
+    # The gradient of the posterior is 0 in the direction of m: the weighted residuals add up to 0.
+    eta = fit.mean + (x - fit.x_mean) @ fit.weight + fit.intercept[table.group][index]
+    assert abs(np.mean(table.outcome[index] - logistic(eta))) < 1e-3
+    linear = values(table, x, fit_prefixes(table, x))
+    assert np.corrcoef(value, linear)[0, 1] > 0.9
+    assert np.isfinite(deviations(table, x, fit)).all()
+
+
+def test_held_out_logistic_values_are_near_those_of_a_fit_without_the_rollout():
+    table = sample_table(n_groups=30, seed=3)
+    table = table._replace(outcome=(table.outcome > np.median(table.outcome)).astype(float))
+    x = build_prefixes(table).features
+    fit = fit_prefixes(table, x, is_logistic=True)
+    held_out = held_out_values(table, x, fit)
+    rows = rows_of(table, 0)
+    without = ~np.isin(np.arange(len(x)), np.arange(len(x))[rows])
+    smaller = table._replace(
+        features=table.features[without],
+        length=table.length[1:],
+        outcome=table.outcome[1:],
+        group=table.group[1:],
+        truncated=table.truncated[1:],
+    )
+    again = fit_prefixes(smaller, x[without], is_logistic=True)
+    expected = logistic(again.mean + (x[rows] - again.x_mean) @ again.weight + again.intercept[table.group[0]])
+    np.testing.assert_allclose(held_out[rows], expected, atol=0.05)
