@@ -108,7 +108,9 @@ def mean_returns(directory: Path, after: float) -> list[float]:
     ]
 
 
-def main(kind: tyro.conf.Positional[Kind], out: Path = Path("runs/scores"), seeds: int = 10, only: tuple[str, ...] = ()) -> None:
+def main(
+    kind: tyro.conf.Positional[Kind], out: Path = Path("runs/scores"), seeds: int = 10, only: tuple[str, ...] = ()
+) -> None:
     """Train and tabulate.
 
     Args:

@@ -174,9 +174,7 @@ class TaskSpec(CheckedModel):
         if self.evaluation_environment is None:
             return self
         values = {"environment": self.evaluation_environment, "evaluation_environment": None}
-        return self.model_copy(
-            update={**values, "teams": tuple(team.model_copy(update=values) for team in self.teams)}
-        )
+        return self.model_copy(update={**values, "teams": tuple(team.model_copy(update=values) for team in self.teams)})
 
     @property
     def family(self) -> str:
