@@ -3,7 +3,7 @@
     PYTHONPATH=benchmarks python -m scores.training KIND --out RUNS
 
 Kinds: `not-a-sum` (the corridor's scores), `binary` (won or lost by chance), `payments` (PP-6 paid every step, every 5 steps, and at
-the end), `exact` (PP-6, rewards that add up exactly), `groups` (CN-6 in levels), `rivals` (published methods on CN-6 and PP-6). Runs
+the end), `exact` (PP-6, rewards that add up exactly), `groups` (CN-6 in levels), `published` (published methods on CN-6 and PP-6). Runs
 that exist in RUNS are not trained again. `late` is the mean return of the evaluations after three quarters of the steps, and `area`
 that of all evaluations, which also says how fast a method learns.
 """
@@ -25,7 +25,7 @@ from scores.environments import corridor_task, level_task
 
 PARTICLE_STEPS = 205_000
 CORRIDOR: dict[str, Any] = {"algorithm": "ppo", "steps": 60_000, "environments": 20}
-Kind = Literal["not-a-sum", "binary", "payments", "exact", "groups", "rivals"]
+Kind = Literal["not-a-sum", "binary", "payments", "exact", "groups", "published"]
 
 
 class Row(NamedTuple):
@@ -80,7 +80,7 @@ def groups() -> Iterator[Row]:
             yield particle(f"CN-6 in levels, {method}", label, task, method, not grouped)
 
 
-def rivals() -> Iterator[Row]:
+def published_methods() -> Iterator[Row]:
     methods = "episodic", "dense", "rd", "rrdu", "lrr", "grd", "tar2", "arel", "stas", "bayes", "lare-rd", "lare-bayes"
     for name in ("CN-6", "PP-6"):
         for method in methods:
@@ -93,7 +93,7 @@ KINDS: dict[str, Callable[[], Iterator[Row]]] = {
     "payments": payments,
     "exact": exact,
     "groups": groups,
-    "rivals": rivals,
+    "published": published_methods,
 }
 
 

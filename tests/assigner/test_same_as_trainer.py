@@ -113,7 +113,7 @@ def test_rewards_agree(method, env, payments, exact, phi):
 
 def test_rewards_agree_if_the_score_is_won_or_lost():
     learner, config, credit = learn("bayes", ONE_AGENT, score="binary", group="map")
-    expected = np.asarray(rewards(stored_steps(learner), reward_state(learner), config))[..., 0]
+    expected = np.asarray(rewards(stored_steps(learner), learner.reward_state, config))[..., 0]
     r_hat = credit.rewards_at(np.arange(credit.store.steps))
     np.testing.assert_allclose(r_hat, expected, rtol=1e-3, atol=1e-4 * np.abs(expected).max())
     trained, assigned = learner.decoders[0].closed_form.log_odds, credit.learner.decoder.closed_form.log_odds

@@ -12,7 +12,6 @@ from lare_rl.credit.decoder_settings import CreditSettings
 from lare_rl.credit.engine import StepBatch
 from lare_rl.credit.methods import METHODS
 from lare_rl.credit.shares import return_shares
-from lare_rl.nn.normalise import empty_scale
 
 EPISODES, STEPS, AGENTS = 3, 4, 3
 shares_of = jax.jit(return_shares)
@@ -82,7 +81,7 @@ def test_rewards_add_up_to_the_return():
     @jax.jit
     def compute(steps):
         decoder = decomposition.init(jax.random.key(0), 4, METHODS["rd"], CreditSettings(hidden=(4,)), STEPS, AGENTS)
-        return engine.training_rewards(decoder, empty_scale(), steps, spec, steps.alive)
+        return engine.training_rewards(decoder, steps, spec, steps.alive)
 
     rewards, contributions = np.asarray(compute(jax.tree.map(lambda *pair: jnp.stack(pair), steps, unfinished)))
     step_rewards = rewards.sum(axis=-1) / np.maximum(alive.sum(axis=-1), 1)

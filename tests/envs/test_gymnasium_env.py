@@ -179,7 +179,7 @@ def test_measures_are_those_of_the_last_step():
         ({"info": None}, "info None, which is not a dictionary"),
         ({"terminated": np.array([True, False])}, "failed in step: The truth value"),
         ({"reset": [0.5, 0.25]}, "info 0.25, which is not a dictionary"),
-        ({"fail_in": "reset", "error": OSError("no asset\ntrack.bin")}, "reset: no asset$"),
+        ({"fail_in": "reset", "error": OSError("no asset\ntrack.bin")}, "reset: no asset track.bin$"),
         ({"fail_in": "step", "error": ZeroDivisionError()}, "step: ZeroDivisionError$"),
         ({"fail_in": "step", "error": SystemExit(0)}, "step: 0$"),
         ({"fail_in": "step", "error": LareError("no battery")}, "^no battery$"),

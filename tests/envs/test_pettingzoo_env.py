@@ -340,7 +340,7 @@ def test_agents_with_different_spaces(data, sizes, discrete):
     [
         ("nowhere:parallel_env", r"No module named 'nowhere' .*PYTHONPATH"),
         ("helpers.parallel_toy_envs:Toi", "did you mean 'Toy'"),
-        ("helpers.parallel_toy_envs:raises", "no asset$"),
+        ("helpers.parallel_toy_envs:raises", "no asset track.bin$"),
         ("helpers.parallel_toy_envs:nothing", "3 is not a ParallelEnv: it has no possible_agents"),
         ("mpe2.simple_spread_v3:env", "AECEnv"),
         ("helpers.parallel_toy_envs", "MODULE:NAME"),

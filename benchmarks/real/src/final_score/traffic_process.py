@@ -33,8 +33,8 @@ class TrafficProcess(gymnasium.Env):
         self._demand, self._trips = (Path(self._folder.name) / name for name in ("demand.rou.xml", "trips.xml"))
         self._begin = NETS[net]
         nets = Path(sumo_rl.__file__).parent / "nets" / "RESCO" / net
-        self._usual_demand, self._net = nets / f"{net}.rou.xml", nets / f"{net}.net.xml"
-        write_demand(self._usual_demand, self._demand, days[0], self._begin)
+        self._default_demand, self._net = nets / f"{net}.rou.xml", nets / f"{net}.net.xml"
+        write_demand(self._default_demand, self._demand, days[0], self._begin)
         output = f"--no-step-log --tripinfo-output {self._trips}"
         unfinished = "--tripinfo-output.write-unfinished true --tripinfo-output.write-undeparted true"
         self._sumo = sumo_rl.SumoEnvironment(
@@ -68,7 +68,7 @@ class TrafficProcess(gymnasium.Env):
         super().reset(seed=seed)
         day, sumo_seed = int(self.np_random.choice(self._days)), int(self.np_random.integers(1 << 30))
         self._day = int((options or {}).get("day", day))
-        write_demand(self._usual_demand, self._demand, self._day, self._begin)
+        write_demand(self._default_demand, self._demand, self._day, self._begin)
         observation, _ = self._sumo.reset(seed=sumo_seed)
         self._n_steps = 0
         return self._observe(observation), {"day": self._day}
@@ -117,12 +117,12 @@ class TrafficProcess(gymnasium.Env):
         return np.clip(np.append(observation, time), 0.0, 1.0).astype(np.float32)
 
 
-def write_demand(usual: Path, file: Path, day: int, begin: int) -> None:
+def write_demand(default: Path, file: Path, day: int, begin: int) -> None:
     """Write the trips of a day: 80 to 110% as many as in RESCO's hour, drawn from it with replacement, each some minutes earlier or
     later.
     """
     random = np.random.default_rng([48, day])
-    root = ET.parse(usual).getroot()
+    root = ET.parse(default).getroot()
     trips = root.findall("trip")
     for trip in trips:
         root.remove(trip)
