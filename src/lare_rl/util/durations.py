@@ -8,7 +8,7 @@ __all__ = ["format_seconds"]
 def format_seconds(seconds: float) -> str:
     """Return a duration: "20 s", "4 min" or "2.2 h".
 
-    >>> format_seconds(200)
+    >>> format_seconds(200.0)
     '4 min'
     """
     if seconds < 60:
