@@ -24,7 +24,7 @@ def test_an_episode_does_not_depend_on_the_number_of_environments(deterministic)
     config = replace(small_config("dense", "ppo", load_env_spec(pick_spec())), deterministic=deterministic)
     functions = compile_functions(config)
     actor = functions.get_actor(init_seeds(functions, seed_keys(jnp.array(SEEDS), 0)), 0)
-    n_calls = []
+    n_calls, n_done = [], []
     results = []
     for width in (5, 2, 1):
         with LocalVecEnv([maker] * (len(SEEDS) * width)) as envs:
@@ -33,8 +33,11 @@ def test_an_episode_does_not_depend_on_the_number_of_environments(deterministic)
             def count():
                 n_calls[-1] += 1
 
-            results.append(evaluate_policy_on_host(envs, config, actor, SEEDS, 5, first=1, on_step=count))
+            results.append(
+                evaluate_policy_on_host(envs, config, actor, SEEDS, 5, first=1, on_step=count, on_episode=n_done.append)
+            )
     assert n_calls == [20, 60, 100]
+    assert n_done == [5, 2, 4, 5, 1, 2, 3, 4, 5]
     assert results[0].returns.shape == (2, 5, 1)
     assert len(np.unique(results[0].returns)) > 2
     for result in results[1:]:

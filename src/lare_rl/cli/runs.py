@@ -174,10 +174,10 @@ def evaluate(
         record_video(opened, video, best, deterministic)
         print_line(f"wrote {video}")
     start = time.monotonic()
-    evaluation = evaluate_policy(opened, episodes, best, deterministic)
+    evaluation = evaluate_policy(opened, episodes, best, deterministic, EpisodeProgress(episodes))
     policy_s, n_random = time.monotonic() - start, max(episodes, RANDOM_EPISODES)
     samples = not (deterministic or ALGORITHMS[settings.algorithm].greedy(env_spec.discrete))
-    likeliest = evaluate_policy(opened, episodes, best, deterministic=True) if samples else None
+    likeliest = evaluate_policy(opened, episodes, best, True, EpisodeProgress(episodes)) if samples else None
     best_steps = load_actor(opened, best=True)[2].tolist() if best else None
     random_episodes = []
     if len(task.roles) == 1:

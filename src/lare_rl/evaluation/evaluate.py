@@ -67,8 +67,17 @@ def evaluate_run(
     return {role.name: returns[..., team_index] for team_index, role in enumerate(run.config.task.roles)}
 
 
-def evaluate_policy(run: Run, episodes: int, best: bool = False, deterministic: bool = False) -> Evaluation:
-    """Return all measurements of the episodes of `evaluate_run`, which has the same arguments and errors."""
+def evaluate_policy(
+    run: Run,
+    episodes: int,
+    best: bool = False,
+    deterministic: bool = False,
+    on_episode: EpisodeListener = lambda n_done: None,
+) -> Evaluation:
+    """Return all measurements of the episodes of `evaluate_run`, which has the same arguments and errors.
+
+    On the host, `on_episode` is called with the number of episodes of each seed, when some have ended.
+    """
     if not isinstance(episodes, int) or episodes < 1:
         raise LareError(f"episodes = {episodes}: a whole number, 1 or more")
     task = run.config.task
@@ -84,7 +93,13 @@ def evaluate_policy(run: Run, episodes: int, best: bool = False, deterministic: 
         n_episodes = min(MAX_OPEN_ENVS, episodes - n_done)
         with make_vec_env(task, n_open_envs(task, len(run.seeds), n_episodes) * len(run.seeds)) as envs:
             first = run.config.settings.evaluation_episodes + n_done
-            evaluations.append(evaluate_policy_on_host(envs, config, actor, run.seeds, n_episodes, first))
+
+            def report(n_done: int, n_before: int = n_done) -> None:
+                on_episode(n_before + n_done)
+
+            evaluations.append(
+                evaluate_policy_on_host(envs, config, actor, run.seeds, n_episodes, first, on_episode=report)
+            )
     return concatenate(evaluations)
 
 

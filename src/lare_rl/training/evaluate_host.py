@@ -5,6 +5,7 @@ from typing import Any
 
 import numpy as np
 
+from lare_rl.envs.play import EpisodeListener
 from lare_rl.envs.vec_env import VecEnv
 from lare_rl.training.evaluation import Evaluation, concatenate
 from lare_rl.training.host_policy import EvaluationPolicy
@@ -22,6 +23,7 @@ def evaluate_policy_on_host(
     n_episodes: int,
     first: int = 0,
     on_step: Callable[[], None] = lambda: None,
+    on_episode: EpisodeListener = lambda n_done: None,
 ) -> Evaluation:
     """Evaluate `n_episodes` of each seed's policy. If there are fewer environments, some episodes begin after others.
 
@@ -35,6 +37,7 @@ def evaluate_policy_on_host(
         n_episodes: the number of episodes of each seed.
         first: the number of the first episode, which determines its initial state.
         on_step: called before each step of the environments.
+        on_episode: called with the number of episodes of each seed, when some have ended.
     """
     width, evaluations = len(envs.batch.terminated) // len(seeds), []
     for start in range(0, n_episodes, width):
@@ -47,4 +50,5 @@ def evaluate_policy_on_host(
 
         n_playing = min(width, n_episodes - start)
         evaluations.append(evaluate_on_host(envs, act, seeds, n_playing, first + start))
+        on_episode(start + n_playing)
     return concatenate(evaluations)
