@@ -112,10 +112,9 @@ def test_rewards_agree(method, env, payments, exact, phi):
         assert credit.learner.n_learned == int(learner.n_learned.sum())
 
 
-<<<<<<< HEAD
 def test_rewards_agree_if_the_score_is_won_or_lost():
     learner, config, credit = learn("bayes", ONE_AGENT, score="binary", group="map")
-    expected = np.asarray(rewards(stored_steps(learner), learner.reward_state, config))[..., 0]
+    expected = np.asarray(jitted(rewards, config)(stored_steps(learner), learner.reward_state))[..., 0]
     r_hat = credit.rewards_at(np.arange(credit.store.steps))
     np.testing.assert_allclose(r_hat, expected, rtol=1e-3, atol=1e-4 * np.abs(expected).max())
     trained, assigned = learner.decoders[0].closed_form.log_odds, credit.learner.decoder.closed_form.log_odds
@@ -124,10 +123,7 @@ def test_rewards_agree_if_the_score_is_won_or_lost():
     assert np.abs(assigned.posterior.weight).max() > 0
 
 
-@pytest.mark.parametrize("method", ["rd-linear", "bayes"])
-=======
 @pytest.mark.parametrize("method", [long_case("rd-linear"), "bayes"])
->>>>>>> a37bcdf2 (Docstrings leave out arguments that their names explain)
 def test_rewards_agree_with_groups(method):
     learner, config, credit = learn(method, ONE_AGENT, group="map")
     expected = np.asarray(jitted(rewards, config)(stored_steps(learner), learner.reward_state))[..., 0]
