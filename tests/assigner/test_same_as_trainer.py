@@ -12,6 +12,7 @@ from helpers.small_configs import (
     ONE_AGENT,
     ONE_TEAM,
     add_steps,
+    jitted,
     random_steps,
     small_config,
     stored_steps,
@@ -102,7 +103,7 @@ EVERY_5 = PaymentRule(period=5)
 )
 def test_rewards_agree(method, env, payments, exact, phi):
     learner, config, credit = learn(method, env, phi if METHODS[method].needs_phi else None, payments, exact)
-    expected = np.asarray(rewards(stored_steps(learner), learner.reward_state, config))
+    expected = np.asarray(jitted(rewards, config)(stored_steps(learner), learner.reward_state))
     expected = expected if env.n_agents > 1 else expected[..., 0]
     r_hat = credit.rewards_at(np.arange(credit.store.steps))
     np.testing.assert_allclose(r_hat, expected, rtol=1e-4, atol=1e-5 * np.abs(expected).max())
@@ -113,7 +114,7 @@ def test_rewards_agree(method, env, payments, exact, phi):
 
 def test_rewards_agree_if_the_score_is_won_or_lost():
     learner, config, credit = learn("bayes", ONE_AGENT, score="binary", group="map")
-    expected = np.asarray(rewards(stored_steps(learner), learner.reward_state, config))[..., 0]
+    expected = np.asarray(jitted(rewards, config)(stored_steps(learner), learner.reward_state))[..., 0]
     r_hat = credit.rewards_at(np.arange(credit.store.steps))
     np.testing.assert_allclose(r_hat, expected, rtol=1e-3, atol=1e-4 * np.abs(expected).max())
     trained, assigned = learner.decoders[0].closed_form.log_odds, credit.learner.decoder.closed_form.log_odds
@@ -122,10 +123,10 @@ def test_rewards_agree_if_the_score_is_won_or_lost():
     assert np.abs(assigned.posterior.weight).max() > 0
 
 
-@pytest.mark.parametrize("method", ["rd-linear", "bayes"])
+@pytest.mark.parametrize("method", [long_case("rd-linear"), "bayes"])
 def test_rewards_agree_with_groups(method):
     learner, config, credit = learn(method, ONE_AGENT, group="map")
-    expected = np.asarray(rewards(stored_steps(learner), learner.reward_state, config))[..., 0]
+    expected = np.asarray(jitted(rewards, config)(stored_steps(learner), learner.reward_state))[..., 0]
     r_hat = credit.rewards_at(np.arange(credit.store.steps))
     np.testing.assert_allclose(r_hat, expected, rtol=1e-4, atol=1e-5 * np.abs(expected).max())
     intercept = np.asarray(learner.decoders[0].closed_form.intercept)[0]

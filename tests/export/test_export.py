@@ -58,7 +58,6 @@ CASES = [
 NO_REWARD = {
     "dense": "rewards of the environment",
     "ircr": "return of its episode",
-    "diaster": "cannot be exported",
 }
 """Why there is no reward function."""
 
@@ -208,11 +207,7 @@ def policy_case(config, actor):
     if env.discrete and not config.greedy:
         policy_input = on_policy.policy_input(jnp.asarray(observation)[None], config)
 
-        @jax.vmap
-        def logits(actor, policy_input, available):
-            return actor.policy.logits(ppo.normalise(policy_input, actor.observations), available)
-
-        expected["logits"] = np.asarray(logits(actor, policy_input, available[None]))[0]
+        expected["logits"] = np.asarray(jax.vmap(ppo.logits)(actor, policy_input, available[None]))[0]
     action = np.asarray(action)[0]
     expected["action"] = np.argmax(action, axis=-1) if env.discrete else to_env_action(action, env)
     if env.n_agents == 1:

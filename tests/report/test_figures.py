@@ -56,3 +56,12 @@ def test_panels_share_legend_and_labels():
 def test_credit_without_true_rewards():
     assert ">true reward</text>" not in draw_credit(None, X)
     assert ">true reward</text>" in draw_credit(X, X, uncertainty=X)
+
+
+def test_band_of_a_curve():
+    """It is the deviation over seeds; with one seed, that over the episodes of each evaluation."""
+    stds, two_seeds = {"a": (X, np.full((2, 3), 9.0))}, np.array([X, X + 1])
+    assert draw_curves({"a": (X, two_seeds)}, "r", episode_stds=stds) == draw_curves({"a": (X, two_seeds)}, "r")
+    half = {"a": (X, np.full((1, 3), np.sqrt(0.5)))}
+    means = draw_curves({"a": (X, X[None] + 0.5)}, "r", episode_stds=half)
+    assert means == draw_curves({"a": (X, two_seeds)}, "r")

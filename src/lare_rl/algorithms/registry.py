@@ -8,7 +8,7 @@ used: listing the algorithms does not import JAX. The training loop calls these 
     ROLLOUTS       init, get_actor, act, explore, update     as in `ppo/ppo.py`
     SEQUENCES      init, get_actor, act, init_memory, epsilon, update     as in `qmix/qmix.py`; the settings derive from `QMIXSettings`
 
-`lare-rl export` needs a function `policy_graph(observation, actor, config)` if the actor is of a type of its own.
+`lare-rl export` also writes the result of `logits(actor, observation, available)`, if the module has this function.
 """
 
 from collections.abc import Callable

@@ -291,7 +291,6 @@ class DecoderLearner:
         Args:
             inputs: the decoder's inputs.
             length: T of each step's episode.
-            alive: which agents acted; all by default.
             rows: the steps' rows in the store, for a method that pays by the return of a step's episode.
             last: whether a step is the last one of its episode. Only for `exact`, like the next argument.
             residual: the return of the step's episode, less the sum of its proxy rewards.

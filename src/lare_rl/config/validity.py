@@ -28,15 +28,11 @@ def check_credit(
     """Raise `LareError` if a method or the settings of its decoder are impossible for a task.
 
     Args:
-        method: how credit is assigned.
-        credit: the settings of the decoder.
-        n_agents: the number of agents.
         n_raw_features: entries of an observation (of the global state, if `team_level`) and of the actions with it.
         scored_observation: which observations of a step phi reads.
         team_level: whether credit is assigned to the team's global state instead of each agent.
         fixed_length: whether every episode has the same number of steps.
         scale_rewards: whether rewards are divided by the size of returns.
-        payments: when the environment pays.
         discrete_actions: whether the actions are discrete.
         max_steps: the number of steps of the longest episode, if that is known.
     """

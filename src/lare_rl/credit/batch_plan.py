@@ -26,7 +26,6 @@ def plan_batch(fit: Fit, settings: CreditSettings, longest: int, *, fixed_length
 
     Args:
         fit: the fit, by gradient descent.
-        settings: the settings of the decoder.
         longest: the largest number of steps of an episode.
         fixed_length: whether all episodes have this length.
     """

@@ -32,7 +32,6 @@ class DecoderNetwork(Protocol):
         """Return the proxy rewards of some steps.
 
         Args:
-            inputs: the inputs at each step.
             key: the random key of an update of the decoder. Rewards for the algorithm are computed without a key.
         """
         ...

@@ -41,8 +41,6 @@ class Decoder:
     """Whether it learns to predict which action an agent took, which must then be discrete."""
     longest_segment: int | None = None
     """The largest number of steps of a payment that it reads. None means any number."""
-    exportable: bool = False
-    """Whether `lare-rl export` can write its rewards (`export/reward_graph.py`)."""
 
     def init_network(self, key: "PRNGKeyArray", shape: "DecoderShape", settings: "CreditSettings") -> "DecoderNetwork":
         """Return an untrained decoder."""
@@ -62,12 +60,11 @@ def register_decoder(decoder: Decoder) -> None:
 
 
 for _decoder in (
-    Decoder("step", "lare_rl.credit.step_decoders:init_step_decoder", frozenset({"hidden"}), exportable=True),
+    Decoder("step", "lare_rl.credit.step_decoders:init_step_decoder", frozenset({"hidden"})),
     Decoder(
         "bottleneck",
         "lare_rl.credit.step_decoders:init_bottleneck",
         frozenset({"hidden", "encoder", "bottleneck", "divergence"}),
-        exportable=True,
     ),
     Decoder("lrr", "lare_rl.credit.lrr:init_lrr", frozenset({"hidden"})),
     Decoder("arel", "lare_rl.credit.arel:init_arel", whole_episodes=True),
@@ -79,7 +76,7 @@ for _decoder in (
     Decoder(
         "rbt", "lare_rl.credit.rbt:init_rbt", frozenset({"hidden"}), single_agent_only=True, longest_segment=RBT_STEPS
     ),
-    Decoder("linear", "lare_rl.credit.closed_form:init_linear_decoder", exportable=True),
-    Decoder("additive", "lare_rl.credit.closed_form:init_linear_decoder", extended_basis=True, exportable=True),
+    Decoder("linear", "lare_rl.credit.closed_form:init_linear_decoder"),
+    Decoder("additive", "lare_rl.credit.closed_form:init_linear_decoder", extended_basis=True),
 ):
     register_decoder(_decoder)

@@ -143,7 +143,6 @@ def init(
     Args:
         key: the random key of the weights.
         basis: the features that a decoder in closed form computes, or the number of inputs, which are used unchanged.
-        method: the method.
         settings: the settings of the decoder and its fit.
         max_steps: the number of steps of the longest episode.
         n_agents: the number of agents of a step.

@@ -67,7 +67,6 @@ class Diaster(eqx.Module):
 
         Args:
             inputs: the inputs at the steps. Steps beyond an episode's length are padding.
-            length: T of each episode.
             target: R/T in units of the scale.
             mask: 1 for an episode, 0 for padding.
             key: the random key of the cuts.

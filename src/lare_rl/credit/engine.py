@@ -112,8 +112,6 @@ def credit_spec(
     """Return the spec of a method for one team. The arguments that a spec has too are described there.
 
     Args:
-        method: the method.
-        settings: the settings of its decoder.
         sizes: the sizes of `factors`, `observation` (the state, for credit to whole teams) and `action`.
         scored_observation: which observations the task names.
         single_agent: whether the task has a single agent.

@@ -204,8 +204,6 @@ def fit(
     largest evidence wins. With `MANY_EPISODES_PER_FEATURE`, the second and the third iteration have a single round.
 
     Args:
-        statistics: the sums over episodes.
-        score_type: a `ScoreType`.
         group_index: the index of each feature's group.
         start: an earlier fit, whose precisions start the iteration, or `init_posterior`.
         max_rounds: the maximum number of rounds of each iteration.

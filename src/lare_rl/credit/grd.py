@@ -136,7 +136,6 @@ class GRD(eqx.Module):
 
         Args:
             inputs: s, a and the next s at the steps. Steps beyond an episode's length are padding.
-            length: T of each episode.
             target: R/T in units of the scale.
             mask: 1 for an episode, 0 for padding.
             key: the random key of the masks, and of the steps whose next states are predicted.

@@ -99,7 +99,6 @@ def fit(state: LogOddsFit, group_index: Int[np.ndarray, " columns"], max_rounds:
     Args:
         state: the episodes, and the last fit.
         group_index: the index of each column's group.
-        max_rounds: the maximum number of rounds.
     """
     valid, low, high = _values(state)
     n_episodes, n_groups = jnp.maximum(jnp.sum(valid), 1), int(group_index.max()) + 1

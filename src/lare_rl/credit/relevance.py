@@ -39,14 +39,11 @@ def fit_strengths(
     """Return the fit with a precision for each strength, whether it is better than that by groups or not.
 
     Args:
-        statistics: the sums over episodes.
-        score_type: a `ScoreType`.
         group_index: the index of each feature's group.
         strength_index: the index of each feature's strength.
         groups: the fit by groups, from whose precisions the iteration starts.
         earlier: an earlier result, or `evidence.init_posterior`. With `evidence.MANY_EPISODES_PER_FEATURE`, the iteration continues
             from it instead.
-        max_rounds: the maximum number of rounds.
     """
     start = expand_groups(groups, group_index, strength_index)
     problem = evidence.regression(statistics, score_type, strength_index)

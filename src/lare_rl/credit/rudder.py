@@ -92,10 +92,8 @@ class RUDDER(eqx.Module):
 
         Args:
             inputs: the inputs at the steps. Steps beyond an episode's length are padding.
-            length: T of each episode.
             target: R/T in units of the scale.
             mask: 1 for an episode, 0 for padding.
-            key: not used.
         """
         max_steps, n_steps = inputs.shape[1], jnp.maximum(length, 1)
         total = target * length / max_steps  # R in the unit of g

@@ -220,7 +220,6 @@ def extend(
         next_columns: the columns of `STEP_COLUMNS`, after the steps.
         team_reward: the true reward of each team.
         ended: whether a step was the last of its episode.
-        payments: when the environment pays.
         level: the level of each step's episode.
     """
     lead = jax.tree.map(jnp.asarray, (dict(columns), dict(next_columns), team_reward, ended, level))

@@ -33,7 +33,6 @@ class EpisodicReward(gymnasium.Wrapper, RecordConstructorArgs):
         """Wrap an environment.
 
         Args:
-            env: the environment.
             score: a key of the last step's `info` with the score of the episode, which replaces the sum of rewards.
         """
         RecordConstructorArgs.__init__(self, score=score)

@@ -96,7 +96,6 @@ def make_env(task: TaskSpec, **kwargs: Any) -> JaxEnv | HostEnv:
     """Make a task's environment.
 
     Args:
-        task: the task.
         kwargs: arguments for the family's maker, such as `render_mode`.
 
     Raises:

@@ -61,7 +61,6 @@ class RobotEnv:
 
         Args:
             env: the package's environment, without wrappers.
-            task: the task.
             action: the bounds of actions.
             max_steps: the time limit, in steps of this environment.
             draw: makes pictures of the package's states.

@@ -54,8 +54,6 @@ def check_spaces(owner: Any, observation: gymnasium.Space, action: gymnasium.Spa
 
     Args:
         owner: the name of the environment or agent, for the message.
-        observation: the observation space.
-        action: the action space.
 
     Raises:
         LareError: a space cannot be used.

@@ -43,7 +43,6 @@ def make_vec_env(maker: Maker, n: int, step_s: float) -> VecEnv:
 
     Args:
         maker: the function that makes one of them.
-        n: the number of environments.
         step_s: how long a step of one of them takes (s).
     """
     n_saved = n - math.ceil(n / n_cores())

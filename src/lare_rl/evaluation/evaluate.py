@@ -54,7 +54,6 @@ def evaluate_run(
     of the mean over its agents.
 
     Args:
-        run: the run, or its directory.
         episodes: the number of episodes of each seed.
         best: play the policy of each seed's best evaluation, instead of the last policy.
         deterministic: always take the most likely action, where evaluations sample it.

@@ -30,7 +30,6 @@ def load_policy(
     in which actions may be unavailable (Jumanji's) also need the mask, `policy(observation, available)`.
 
     Args:
-        run: the run, or its directory.
         seed: one of the run's seeds; the default is the first.
         best: load the policy of the seed's best evaluation, instead of the last policy.
         deterministic: always take the most likely choice, which PPO's policy samples otherwise.

@@ -79,7 +79,6 @@ def roll_out(run: Run, n_episodes: int = 1, *, random: bool = False, key: int = 
 
     Args:
         run: the run, which must have a checkpoint.
-        n_episodes: the number of episodes.
         random: whether to play random actions.
         key: the random key of an environment of pure functions.
     """

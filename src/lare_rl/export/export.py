@@ -53,8 +53,6 @@ def export_run(run: Run | str | Path, out: str | Path, seed: int | None = None, 
     of the last checkpoint's decoder, in the unit of the true rewards.
 
     Args:
-        run: the run, or its directory.
-        out: the directory.
         seed: one of the run's seeds; the default is the first.
         best: write the policy of the seed's best evaluation, instead of the last policy. Proxy rewards are always the last ones.
 

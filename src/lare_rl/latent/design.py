@@ -196,7 +196,6 @@ def design(
             nothing is combined.
         pre_verification: without it (the paper's ablation), the first function that can be read is accepted.
         record: the file to which every exchange is written, from the first reply on.
-        on_message: called with messages about the progress.
         steps: observations (n, observation size) and actions (n, action size) that functions are tried on if there is no
             environment, as `lare_rl.logged_steps` reads them from a data set.
 

@@ -195,8 +195,6 @@ def verify_function(
     """Verify a source, and return its function.
 
     Args:
-        source: Python code.
-        task: the task of the function.
         kind: whether the function returns factors or one reward.
         steps: the steps that it is tried on, as in `verify`.
         path: the file of the source, for the error message.

@@ -46,11 +46,9 @@ def improve(
     Args:
         function: a verified function. New exchanges are appended to its exchanges.
         task: the task that the function is designed for.
-        model: the language model to ask.
         assess: assesses a function by the returns of some episodes, the same ones in each call. It may raise `LareError`.
         rounds: how often the model is asked for a better function.
         record: the file to which every exchange is written. If the design had a file, it is this file.
-        on_message: called with messages about the progress.
     """
     exchanges = [Exchange(**exchange) for exchange in function.exchanges]
     recorder = Recorder(task.name, function.kind, getattr(model, "temperature", None), record, exchanges)

@@ -71,7 +71,6 @@ def verify(source: str, task: TaskSpec, kind: Kind = "factors", steps: Steps | N
     """Verify a source.
 
     Args:
-        source: Python code.
         task: the task, which determines the sizes of observations and actions.
         kind: whether the function must return factors or one reward.
         steps: observations (n, observation size) and actions (n, action size) that it is tried on if there is no environment;

@@ -68,8 +68,6 @@ def infer_layout(name: str, values: Mapping[str, Any], role: TaskSpec | None) ->
     """Infer the layout of a log without spaces from its first episode.
 
     Args:
-        name: name of the episode.
-        values: arrays of the episode.
         role: the task of the log, which has the sizes of one-hot observations and actions, and the time limit.
 
     Raises:
@@ -101,7 +99,6 @@ def parse_episode(name: str, values: Mapping[str, Any], layout: LogLayout, conte
         values: `observations` (T + 1, ...) or, with `next_observations` (T, ...), (T, ...); `actions` (T, ...); `rewards` (T,) or
             `score`, a single number. Optional: `terminations` and `truncations`, (T,) or one flag; `cut`, one flag; `paid` (T,),
             the rewards before the log was relabelled; `group`, a text or a number.
-        layout: the layout of the log.
         contents: what to write again, with new rewards.
 
     Raises:

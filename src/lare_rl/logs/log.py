@@ -40,7 +40,6 @@ class Log(ABC):
         Args:
             out: a path, or an id.
             episodes: the episodes in order. They are consumed as they are written.
-            overwrite: replace `out` if it exists.
             comment: a sentence about the new rewards, for formats with a description.
 
         Returns:

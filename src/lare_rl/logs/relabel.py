@@ -147,13 +147,10 @@ def relabel(
         task: a name, a path, or a spec: the task that `phi` was designed for. It has the time limit and the number of discrete
             actions.
         hold_out: share of the complete episodes that are held out of the fit, to measure how well returns are predicted.
-        settings: settings of the decoder.
         updates: number of gradient updates of the decoder. A closed-form decoder has none.
         memory: approximate limit of the memory for the decoder's inputs, in GiB. A closed-form fit uses all episodes, other fits
             use the last episodes that fit into it.
         seed: seed of the choice of held-out episodes and of the decoder's initial weights.
-        overwrite: replace `out` if it exists.
-        listener: called with the progress.
 
     Raises:
         LareError: the log is damaged or empty, `out` cannot be written or exists, or method, function and task do not fit together.

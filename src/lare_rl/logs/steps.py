@@ -22,7 +22,6 @@ def logged_steps(source: Any, task: TaskSpec | str | Path, count: int = N_SAMPLE
     """Return steps at even distances in the first episodes of a log, for `steps=` of `design`, `load_function` and `verified`.
 
     Args:
-        source: as in `relabel`.
         task: a name, a path, or a spec. Its `scored_observation` says whether phi sees the observation before a step, the one
             after it, or both. With both, the first half of the rows are observations before a step.
         count: approximate number of steps. A shorter log has fewer.

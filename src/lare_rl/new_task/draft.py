@@ -83,7 +83,6 @@ def text_lines(texts: Mapping[str, str], first_lines: Mapping[str, str]) -> list
     """Return the texts of a task file in TOML. Missing texts are marked.
 
     Args:
-        texts: the texts by their keys.
         first_lines: lines to put before the texts. They are left out where a text begins in the same way.
     """
     lines = []

@@ -73,10 +73,7 @@ def write_team_drafts(
     """Write a task file and, if there are several teams, one for each of them.
 
     Args:
-        name: the name of the task.
-        environment_id: the name of the environment.
         env: the environment, made for a task with these teams.
-        texts: the texts by their keys.
         removed: the lines that were removed from the texts.
         more_lines: further lines of the task file.
     """

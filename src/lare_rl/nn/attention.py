@@ -36,9 +36,6 @@ def attend(
     """Return softmax(Q K^T / sqrt(size)) V of each head, concatenated over heads (Vaswani et al., 2017, Eq. 1).
 
     Args:
-        query: Q of each head.
-        key: K of each head.
-        value: V of each head.
         mask: which tokens each query attends to.
         dropout: a function that is applied to the attention weights.
     """

@@ -107,9 +107,7 @@ def init_orthogonal(network: MLP, last_gain: float, *, key: PRNGKeyArray) -> MLP
     """Return the network with zero biases and orthogonal weights (Saxe et al., 2014).
 
     Args:
-        network: the network.
         last_gain: the gain of the last layer. The other layers have gain 1.
-        key: the random key.
     """
 
     def init_layer(layer: Linear, gain: float, layer_key: PRNGKeyArray) -> Linear:

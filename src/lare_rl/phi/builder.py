@@ -282,8 +282,6 @@ def inline(builder: Builder, graph: Graph, inputs: Mapping[str, int], rows: int 
     """Add all operations of a graph to a builder, and return the nodes of its outputs.
 
     Args:
-        builder: the builder of the outer graph.
-        graph: the inner graph.
         inputs: for each input of the inner graph, a node of the outer graph.
         rows: if set, the nodes in `inputs` have an axis of this length in front, the inner graph is computed for each of these
             rows, and the outputs have this axis too.

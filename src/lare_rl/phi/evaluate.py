@@ -28,7 +28,6 @@ def evaluate(graph: Graph, inputs: Mapping[str, Any], xp: Any = np, dtype: Any =
     """Compute the outputs of a graph, each of shape (*batch, *row).
 
     Args:
-        graph: the graph.
         inputs: for each of its inputs, an array of shape (*batch, *row).
         xp: `numpy` or `jax.numpy`.
         dtype: the type of floating-point numbers. Integers are int64 for float64, else int32.
@@ -52,7 +51,6 @@ def compute(node: Node, x: Sequence[Any], batch: tuple[int, ...], xp: Any = np, 
     """Compute the result of one operation.
 
     Args:
-        node: the operation.
         x: the results of its inputs, each of shape (*batch, *row); constants have the shape of their row.
         batch: the batch axes.
         xp: `numpy` or `jax.numpy`.

@@ -95,8 +95,6 @@ def draw_curves(
     """Draw means over seeds as lines, with the standard deviation over seeds as a band.
 
     Args:
-        curves: the curves, by name.
-        y_label: the label of the y axis.
         bottom: the lower end of the y axis.
         lowest_bottom: the lower end of the y axis where values are smaller than this.
         reference_lines: values that are drawn as dotted lines, by name.
@@ -130,11 +128,7 @@ def draw_bands(
     """Draw curves with an interval at every point.
 
     Args:
-        bands: the curves, by name.
-        x_label: the label of the x axis.
-        y_label: the label of the y axis.
         x_is_steps: whether x counts environment steps. If not, y is a fraction of runs that changes at each x, drawn as stairs.
-        log_scale: whether the y axis is logarithmic.
     """
     figure, (axes,) = make_figure()
     _draw_bands_on(axes, bands, x_is_steps)

@@ -63,7 +63,6 @@ def summarise_score_use(
     """Return how a run took the score. None for a method whose rewards do not add up to returns.
 
     Args:
-        method: the method.
         settings: the settings of the run.
         task: the task of the run.
         values: the last metrics `average`, `log_odds`, `gain` and `gain_error`, or None where they are missing.

@@ -65,9 +65,7 @@ def load_best(directory: Path, actor_shape: Any, n_seeds: int) -> BestPolicy:
     """Read the best policies from a checkpoint's directory.
 
     Args:
-        directory: the directory of the checkpoint.
         actor_shape: an actor, whose leaves may be shapes.
-        n_seeds: the number of seeds.
 
     Raises:
         LareError: there is no such file, or it has another structure.

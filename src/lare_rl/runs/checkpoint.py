@@ -107,8 +107,6 @@ def take_snapshot(
     """Copy from the device what the next checkpoint will hold. The last one must have been written.
 
     Args:
-        directory: the directory of the checkpoint.
-        learner: the training state.
         host: other data to save, as JSON.
         arrays: other data to save, as arrays.
     """
@@ -163,7 +161,6 @@ def load(directory: Path, template: State) -> tuple[State, dict[str, Any], dict[
     """Read a checkpoint.
 
     Args:
-        directory: the directory of the checkpoint.
         template: a training state of the same structure, whose leaves may be shapes.
 
     Returns:

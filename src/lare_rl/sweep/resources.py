@@ -73,9 +73,7 @@ def assign_cards(
     """Return the environment variables that choose the cards of each process.
 
     Args:
-        processes: the number of processes.
         cards: the cards of each process; by default an equal share.
-        n_cards: the number of cards.
         environment: the variables of this process, which may choose some of the machine's cards.
 
     Raises:

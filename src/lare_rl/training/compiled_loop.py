@@ -62,11 +62,8 @@ def compile_loop(env: JaxEnv, config: TrainConfig, phi: Sequence[Graph], fit_eve
     """Compile the iterations of a run.
 
     Args:
-        env: the environment.
-        config: the configuration of the run.
         phi: the graph of each team's phi.
         fit_every: the decoders make gradient updates of their own in every iteration whose number is a multiple of this.
-        n_seeds: the number of seeds.
     """
 
     def loop(

@@ -116,11 +116,8 @@ def fold_episodes(
     """Apply `body` to each team's state (such as its decoder) and to batches of the finished episodes of one seed.
 
     Args:
-        states: one state for each team.
-        buffer: the replay.
         since: the number of the first episode, in each environment.
         body: the function from a state and a batch of whole episodes to the next state.
-        config: the configuration of the run.
         expected: about how many episodes there are; None if they may be many.
     """
 

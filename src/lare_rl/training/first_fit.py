@@ -66,7 +66,6 @@ def fit_until_converged(
         learner: the learner of all seeds, with enough episodes.
         fit: one round of updates. It consumes its learner.
         keys: random keys; the keys of each round are derived from them.
-        config: the configuration of the run.
         stop_requested: whether the user has asked the run to stop.
 
     Raises:

@@ -70,15 +70,11 @@ def update(
     """Fit the decoders if they have updates of their own that are due, and update the algorithm. Do nothing during the warmup.
 
     Args:
-        learner: the training state.
         measured: the metrics of earlier updates.
         steps: the newest steps, which have been stored.
-        seeds: the seeds.
         env_steps: the number of environment steps before these.
-        functions: the functions of the run.
         when: how conditions are evaluated.
         record: adds metrics to `measured`.
-        config: the configuration of the run.
         fit_every: the decoders make updates of their own in each iteration whose number is a multiple of this.
     """
     iteration = env_steps // (config.rollout_steps * config.n_envs)

@@ -2,6 +2,9 @@
 
 A policy on the host is called once for each step. For a small network, most of the time of a compiled call is spent in waking up XLA's
 threads. The same operations in NumPy take a fraction of the time. The results agree except for rounding.
+
+Arrays that are not NumPy's can take the place of NumPy's arrays, with functions that have the names of NumPy's: `lare-rl export`
+computes the nodes of a graph like this.
 """
 
 import math
@@ -13,9 +16,11 @@ import jax
 import numpy as np
 from jax.extend.core import ClosedJaxpr, Jaxpr, JaxprEqn, Literal
 
-__all__ = ["UnsupportedOperationError", "to_numpy"]
+__all__ = ["UnsupportedOperationError", "apply", "to_numpy"]
 
 Operation = Callable[..., Any]
+Library = Callable[[str], Operation]
+"""From a name of NumPy to the function. Raises `UnsupportedOperationError` if there is none."""
 
 
 class UnsupportedOperationError(Exception):
@@ -45,15 +50,9 @@ def to_numpy(function: Callable[..., Any], fixed: Any, *shapes: Any) -> Callable
     Raises:
         UnsupportedOperationError: the function has an operation that is not translated.
     """
-    closed, result_shape = jax.make_jaxpr(function, return_shape=True)(fixed, *shapes)
-    registers: list[Any] = []
-    calls: list[_Call] = []
-    arguments = [_new_register(registers) for _ in closed.jaxpr.invars]
-    results = _translate(closed, arguments, registers, calls)
-    calls = _remove_unused(calls, results)
+    arguments, registers, calls, results, structure = _trace(function, (fixed, *shapes), _numpy_function)
     n_fixed = len(jax.tree.leaves(fixed))
     once, each_time = _split_calls(calls, arguments[n_fixed:])
-    structure = jax.tree.structure(result_shape)
 
     def bind(fixed: Any) -> Callable[..., Any]:
         bound = registers.copy()
@@ -71,6 +70,36 @@ def to_numpy(function: Callable[..., Any], fixed: Any, *shapes: Any) -> Callable
     return bind
 
 
+def apply(function: Callable[..., Any], shapes: Any, values: Any, library: Library) -> Any:
+    """Call a function of JAX with arrays of another kind.
+
+    Args:
+        function: a function of one pytree of arrays, as for `to_numpy`.
+        shapes: the shapes and types of the arrays.
+        library: the functions of these arrays.
+
+    Raises:
+        UnsupportedOperationError: the function has an operation that is not translated.
+    """
+    _, registers, calls, results, structure = _trace(function, (shapes,), library)
+    leaves = jax.tree.leaves(values)
+    registers[: len(leaves)] = leaves
+    _run(calls, registers)
+    return jax.tree.unflatten(structure, [registers[i] for i in results])
+
+
+def _trace(
+    function: Callable[..., Any], shapes: tuple[Any, ...], library: Library
+) -> tuple[list[int], list[Any], list[_Call], list[int], Any]:
+    """Return the registers of the arguments, all registers, the calls, the registers of the results, and their structure."""
+    closed, result_shape = jax.make_jaxpr(function, return_shape=True)(*shapes)
+    registers: list[Any] = []
+    calls: list[_Call] = []
+    arguments = [_new_register(registers) for _ in closed.jaxpr.invars]
+    results = _Translator(library, registers, calls).translate(closed, arguments)
+    return arguments, registers, _remove_unused(calls, results), results, jax.tree.structure(result_shape)
+
+
 def _run(calls: Sequence[_Call], values: list[Any]) -> None:
     with np.errstate(all="ignore"):
         for operation, inputs, result in calls:
@@ -82,33 +111,71 @@ def _new_register(registers: list[Any], value: Any = None) -> int:
     return len(registers) - 1
 
 
-def _translate(closed: ClosedJaxpr, arguments: Sequence[int], registers: list[Any], calls: list[_Call]) -> list[int]:
-    """Append the calls of a program. Return the registers of its results."""
-    jaxpr: Jaxpr = closed.jaxpr
-    constants = [_new_register(registers, np.asarray(value)) for value in closed.consts]
-    register = dict(zip([*jaxpr.constvars, *jaxpr.invars], [*constants, *arguments], strict=True))
+class _Translator(NamedTuple):
+    """Appends the calls of programs."""
 
-    def find(atom: Any) -> int:
-        if isinstance(atom, Literal):
-            return _new_register(registers, np.asarray(atom.val, _aval(atom).dtype))
-        return register[atom]
+    library: Library
+    registers: list[Any]
+    calls: list[_Call]
 
-    for equation in jaxpr.eqns:
-        inputs = [find(atom) for atom in equation.invars]
-        inner = equation.params.get("jaxpr", equation.params.get("call_jaxpr"))
-        if equation.primitive.name == "dot_general":
-            outputs = [_translate_product(equation, inputs, registers, calls)]
-        elif equation.primitive.name in INLINED:
-            assert inner is not None
-            outputs = _translate(inner, inputs, registers, calls)
-        elif equation.primitive.name == "split":
-            lead, stops = (slice(None),) * equation.params["axis"], np.cumsum(equation.params["sizes"]).tolist()
-            slices = [(*lead, slice(start, stop)) for start, stop in zip([0, *stops], stops, strict=False)]
-            outputs = [_append(partial(_take, index=index), tuple(inputs), registers, calls) for index in slices]
-        else:
-            outputs = [_append(_find_operation(equation), tuple(inputs), registers, calls)]
-        register.update(zip(equation.outvars, outputs, strict=True))
-    return [find(atom) for atom in jaxpr.outvars]
+    def translate(self, closed: ClosedJaxpr, arguments: Sequence[int]) -> list[int]:
+        """Append the calls of a program. Return the registers of its results."""
+        jaxpr: Jaxpr = closed.jaxpr
+        constants = [_new_register(self.registers, np.asarray(value)) for value in closed.consts]
+        register = dict(zip([*jaxpr.constvars, *jaxpr.invars], [*constants, *arguments], strict=True))
+
+        def find(atom: Any) -> int:
+            if isinstance(atom, Literal):
+                return _new_register(self.registers, np.asarray(atom.val, _aval(atom).dtype))
+            return register[atom]
+
+        for equation in jaxpr.eqns:
+            inputs = [find(atom) for atom in equation.invars]
+            results = [_aval(atom) for atom in equation.outvars]
+            if equation.primitive.name == "concatenate":
+                inputs = [i for i, atom in zip(inputs, equation.invars, strict=True) if math.prod(_aval(atom).shape)]
+            inner = equation.params.get("jaxpr", equation.params.get("call_jaxpr"))
+            if not any(math.prod(result.shape) for result in results):  # other libraries may have no empty arrays
+                outputs = [_new_register(self.registers, np.zeros(result.shape, result.dtype)) for result in results]
+            elif equation.primitive.name == "dot_general":
+                outputs = [self._append_product(equation, inputs)]
+            elif equation.primitive.name in INLINED:
+                assert inner is not None
+                outputs = self.translate(inner, inputs)
+            elif equation.primitive.name == "split":
+                lead, stops = (slice(None),) * equation.params["axis"], np.cumsum(equation.params["sizes"]).tolist()
+                slices = [(*lead, slice(start, stop)) for start, stop in zip([0, *stops], stops, strict=False)]
+                outputs = [self._append(partial(_take, index=index), *inputs) for index in slices]
+            else:
+                outputs = [self._append(_find_operation(equation, self.library), *inputs)]
+            register.update(zip(equation.outvars, outputs, strict=True))
+        return [find(atom) for atom in jaxpr.outvars]
+
+    def _append(self, operation: Operation, *arguments: int) -> int:
+        result = _new_register(self.registers)
+        self.calls.append(_Call(operation, arguments, result))
+        return result
+
+    def _append_product(self, equation: JaxprEqn, inputs: Sequence[int]) -> int:
+        """Append a product over the contracted axes, as a batch of matrix products. Return the register of its result."""
+        sums, batches = equation.params["dimension_numbers"]
+        transpose, reshape = self.library("transpose"), self.library("reshape")
+        matrices = []
+        for atom, register, contracted, batch, is_left in zip(
+            equation.invars, inputs, sums, batches, (True, False), strict=True
+        ):
+            shape = _aval(atom).shape
+            free = [i for i in range(len(shape)) if i not in (*contracted, *batch)]
+            axes = [*batch, *free, *contracted] if is_left else [*batch, *contracted, *free]
+            n_sum, lead = math.prod(shape[i] for i in contracted), [shape[i] for i in batch]
+            new_shape = [*lead, -1, n_sum] if is_left else [*lead, n_sum, -1]
+            if axes != sorted(axes) or len(free) != 1 or len(contracted) != 1:
+                register = self._append(
+                    lambda x, axes=axes, shape=new_shape: reshape(transpose(x, axes), shape), register
+                )
+            matrices.append(register)
+        shape = _aval(equation.outvars[0]).shape
+        return self._append(lambda x: reshape(x, shape), self._append(self.library("matmul"), *matrices))
 
 
 def _aval(atom: Any) -> Any:
@@ -137,129 +204,112 @@ def _split_calls(calls: Sequence[_Call], arguments: Sequence[int]) -> tuple[list
     return once, each_time
 
 
-def _find_operation(equation: JaxprEqn) -> Operation:
+def _find_operation(equation: JaxprEqn, library: Library) -> Operation:
     """Return the NumPy function of an operation."""
     name, params = equation.primitive.name, equation.params
-    inputs = [_aval(atom) for atom in equation.invars]
+    inputs, result = [_aval(atom) for atom in equation.invars], _aval(equation.outvars[0])
     if name in ELEMENTWISE and not (name == "div" and np.issubdtype(inputs[0].dtype, np.integer)):
-        return ELEMENTWISE[name]
+        return library(ELEMENTWISE[name])
+    reshape, astype = library("reshape"), library("astype")
     if name in REDUCTIONS:
-        reduction, dtype = REDUCTIONS[name], _aval(equation.outvars[0]).dtype
-        return lambda x: reduction(x, axis=tuple(params["axes"])).astype(dtype)
+        reduction = library(REDUCTIONS[name])
+        return lambda x: astype(reduction(x, axis=tuple(params["axes"])), result.dtype)
     match name:
         case "broadcast_in_dim" if len(inputs) == 1:
-            shape, dimensions = params["shape"], params["broadcast_dimensions"]
-            expanded = [1] * len(shape)
-            for size, dimension in zip(inputs[0].shape, dimensions, strict=True):
+            shape, expanded, broadcast_to = params["shape"], [1] * len(params["shape"]), library("broadcast_to")
+            for size, dimension in zip(inputs[0].shape, params["broadcast_dimensions"], strict=True):
                 expanded[dimension] = size
-            return lambda x: np.broadcast_to(x.reshape(expanded), shape)
+            return lambda x: broadcast_to(reshape(x, expanded), shape)
+        case "clamp":
+            maximum, minimum = library("maximum"), library("minimum")
+            return lambda low, x, high: minimum(maximum(x, low), high)
+        case "copy" | "stop_gradient":
+            return lambda x: x
+        case "logistic":
+            exp, negative, add, divide = map(library, ("exp", "negative", "add", "divide"))
+            return lambda x: divide(1, add(1, exp(negative(x))))
+        case "rsqrt":
+            sqrt, divide = library("sqrt"), library("divide")
+            return lambda x: divide(1, sqrt(x))
+        case "integer_pow":
+            power = library("power")
+            return lambda x: power(x, params["y"])
         case "convert_element_type":
-            return lambda x: x.astype(params["new_dtype"])
+            return lambda x: astype(x, params["new_dtype"])
         case "reshape" if params["dimensions"] is None:
-            return lambda x: x.reshape(params["new_sizes"])
+            return lambda x: reshape(x, params["new_sizes"])
         case "squeeze":
-            return lambda x: x.reshape(_aval(equation.outvars[0]).shape)
+            return lambda x: reshape(x, result.shape)
         case "transpose":
-            return lambda x: x.transpose(params["permutation"])
+            transpose = library("transpose")
+            return lambda x: transpose(x, params["permutation"])
         case "concatenate":
-            return lambda *arrays: np.concatenate(arrays, axis=params["dimension"])
+            concatenate = library("concatenate")
+            return lambda *arrays: concatenate(arrays, axis=params["dimension"])
         case "slice":
             strides = params["strides"] or (1,) * len(params["start_indices"])
             bounds = zip(params["start_indices"], params["limit_indices"], strides, strict=True)
             return partial(_take, index=tuple(slice(*bound) for bound in bounds))
+        case "gather":
+            return partial(library("gather"), equation)
         case "iota":
             size, n_trailing = params["shape"][params["dimension"]], len(params["shape"]) - params["dimension"] - 1
             values = np.arange(size, dtype=params["dtype"]).reshape(-1, *[1] * n_trailing)
             return lambda: np.broadcast_to(values, params["shape"])
         case "argmax":
-            return lambda x: np.argmax(x, axis=params["axes"][0]).astype(params["index_dtype"])
-        case "integer_pow":
-            return lambda x: x ** params["y"]
+            argmax = library("argmax")
+            return lambda x: astype(argmax(x, axis=params["axes"][0]), params["index_dtype"])
         case "select_n" if len(inputs) == 3:
-            return lambda condition, if_false, if_true: np.where(condition, if_true, if_false)
+            where = library("where")
+            return lambda condition, if_false, if_true: where(condition, if_true, if_false)
     raise UnsupportedOperationError(name)
 
 
-def _take(x: np.ndarray, index: tuple[slice, ...]) -> np.ndarray:
+def _take(x: Any, index: tuple[slice, ...]) -> Any:
     return x[index]
 
 
-def _translate_product(equation: JaxprEqn, inputs: Sequence[int], registers: list[Any], calls: list[_Call]) -> int:
-    """Append a product over the contracted axes, as a batch of matrix products. Return the register of its result."""
-    sums, batches = equation.params["dimension_numbers"]
-    matrices = []
-    for atom, register, contracted, batch, is_left in zip(
-        equation.invars, inputs, sums, batches, (True, False), strict=True
-    ):
-        shape = _aval(atom).shape
-        free = [i for i in range(len(shape)) if i not in (*contracted, *batch)]
-        axes = [*batch, *free, *contracted] if is_left else [*batch, *contracted, *free]
-        n_sum, lead = math.prod(shape[i] for i in contracted), [shape[i] for i in batch]
-        new_shape = [*lead, -1, n_sum] if is_left else [*lead, n_sum, -1]
-        if axes != sorted(axes) or len(free) != 1 or len(contracted) != 1:
-            register = _append(partial(_rearrange, axes=axes, shape=new_shape), (register,), registers, calls)
-        matrices.append(register)
-    result = _append(np.matmul, tuple(matrices), registers, calls)
-    shape = _aval(equation.outvars[0]).shape
-    return _append(lambda x: x.reshape(shape), (result,), registers, calls)
+def _numpy_function(name: str) -> Operation:
+    """Return a function of NumPy. The methods of an array take less time than functions of the same name."""
+    function = METHODS.get(name) or getattr(np, name, None)
+    if function is None:
+        raise UnsupportedOperationError(name)
+    return function
 
 
-def _append(operation: Operation, arguments: tuple[int, ...], registers: list[Any], calls: list[_Call]) -> int:
-    result = _new_register(registers)
-    calls.append(_Call(operation, arguments, result))
-    return result
-
-
-def _rearrange(x: np.ndarray, axes: Sequence[int], shape: Sequence[int]) -> np.ndarray:
-    return x.transpose(axes).reshape(shape)
-
-
-def _logistic(x: np.ndarray) -> np.ndarray:
-    return 1 / (1 + np.exp(-x))
-
-
+METHODS: dict[str, Operation] = {
+    "astype": lambda x, dtype: x.astype(dtype),
+    "reshape": lambda x, shape: x.reshape(shape),
+    "transpose": lambda x, axes: x.transpose(axes),
+}
 INLINED = ("jit", "pjit", "closed_call", "custom_jvp_call", "custom_vjp_call")
 """Operations that call another program."""
-ELEMENTWISE: dict[str, Operation] = {
-    "abs": np.abs,
-    "add": np.add,
-    "add_any": np.add,
-    "and": np.bitwise_and,
-    "clamp": lambda low, x, high: np.minimum(np.maximum(x, low), high),
-    "copy": lambda x: x,
-    "cos": np.cos,
-    "div": np.divide,
-    "eq": np.equal,
-    "exp": np.exp,
-    "expm1": np.expm1,
-    "ge": np.greater_equal,
-    "gt": np.greater,
-    "is_finite": np.isfinite,
-    "le": np.less_equal,
-    "log": np.log,
-    "log1p": np.log1p,
-    "logistic": _logistic,
-    "lt": np.less,
-    "max": np.maximum,
-    "min": np.minimum,
-    "mul": np.multiply,
-    "ne": np.not_equal,
-    "neg": np.negative,
-    "not": np.invert,
-    "or": np.bitwise_or,
-    "rsqrt": lambda x: 1 / np.sqrt(x),
-    "sign": np.sign,
-    "sin": np.sin,
-    "sqrt": np.sqrt,
-    "square": np.square,
-    "stop_gradient": lambda x: x,
-    "sub": np.subtract,
-    "tanh": np.tanh,
+ELEMENTWISE = {
+    **{name: name for name in "abs cos exp expm1 log log1p sign sin sqrt square tanh".split()},
+    "add": "add",
+    "add_any": "add",
+    "and": "bitwise_and",
+    "div": "divide",
+    "eq": "equal",
+    "ge": "greater_equal",
+    "gt": "greater",
+    "is_finite": "isfinite",
+    "le": "less_equal",
+    "lt": "less",
+    "max": "maximum",
+    "min": "minimum",
+    "mul": "multiply",
+    "ne": "not_equal",
+    "neg": "negative",
+    "not": "invert",
+    "or": "bitwise_or",
+    "sub": "subtract",
 }
-REDUCTIONS: dict[str, Operation] = {
-    "reduce_and": np.all,
-    "reduce_max": np.max,
-    "reduce_min": np.min,
-    "reduce_or": np.any,
-    "reduce_sum": np.sum,
+"""From operations on each number to functions of NumPy."""
+REDUCTIONS = {
+    "reduce_and": "all",
+    "reduce_max": "max",
+    "reduce_min": "min",
+    "reduce_or": "any",
+    "reduce_sum": "sum",
 }

@@ -52,13 +52,10 @@ def reflect(
     Args:
         function: a function from `lare_rl.design`, or written by hand.
         task: the task of the function: a name, a path, or a spec.
-        model: the model to ask.
-        rounds: number of rounds.
         episodes: whole episodes, or a run whose stored episodes are used; by default, 40 are played.
         policy: plays the episodes instead of random actions: a function from one observation of a single agent (and the mask of
             available actions, if the environment has one) to one action.
         record: a file to record every exchange in; if the design was recorded, the same file.
-        on_message: called with messages about the progress.
 
     Raises:
         LareError: `rounds` is less than 1, or each team of the task has its own function.

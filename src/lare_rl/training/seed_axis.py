@@ -41,7 +41,6 @@ def jit_over_seeds(
 
     Args:
         function: all arrays of its result have a leading seed axis.
-        n_devices: the number of devices.
         shared: the numbers of the arguments without a seed axis.
         static: the names of the keyword arguments that are compiled into the program.
         donate: the numbers of the arguments whose memory the result may use.

@@ -99,7 +99,6 @@ class Session:
         """Make iterations: one on the host, or several in one compiled call, but none beyond step `until`.
 
         Args:
-            until: the step of the next evaluation.
             stop_requested: whether the user has asked the run to stop.
 
         Raises:

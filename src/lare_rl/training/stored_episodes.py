@@ -39,7 +39,6 @@ def stored_episodes(run: Run | str | Path, seed: int | None = None) -> list[Log]
     With many agents, the first three have an axis of agents after the axis of steps. Observations are flattened.
 
     Args:
-        run: the run, or its directory.
         seed: one of the run's seeds; the first by default.
 
     Raises:

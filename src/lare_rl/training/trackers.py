@@ -58,7 +58,6 @@ class MLflow(Listener):
         """Begin or continue an experiment.
 
         Args:
-            experiment: the name of the experiment.
             tracking_uri: the server or the directory; the default is MLflow's own setting.
             parameters: parameters that are saved with every run.
 

@@ -74,7 +74,6 @@ def resume(
     On the CPU, the metrics are the same, bit for bit, as those of a run that was never stopped (except the times).
 
     Args:
-        run: the run, or its directory.
         steps: a new number of environment steps of each seed, to extend the run. Schedules over the whole run (`ppo.anneal`)
             then go by the new number.
         tensorboard: also write TensorBoard events. A run that has some always continues them.

@@ -62,7 +62,6 @@ def read_json(text: str | bytes, strict: bool = True) -> Any:
     """Parse a JSON text.
 
     Args:
-        text: the text.
         strict: if false, strings may contain line breaks.
 
     Raises:

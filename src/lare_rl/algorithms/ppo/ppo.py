@@ -37,6 +37,7 @@ __all__ = [
     "explore",
     "get_actor",
     "init",
+    "logits",
     "minibatch_indices",
     "normalise",
     "policy_objective",
@@ -111,6 +112,11 @@ def get_actor(state: PPO) -> Actor:
 def normalise(observation: Observation, observations: RunningMeanStd | None) -> Observation:
     """Return observations as the networks receive them: normalised, if there are statistics."""
     return observation if observations is None else standardise_if_observed(observations, observation)
+
+
+def logits(actor: Actor, observation: Observation, available: Available) -> Action:
+    """Return the logit of each choice."""
+    return actor.policy.logits(normalise(observation, actor.observations), available)
 
 
 def act(actor: Actor, observation: Observation, available: Available) -> Action:

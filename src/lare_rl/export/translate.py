@@ -1,0 +1,68 @@
+"""Functions of JAX as operations of a graph: that of the `building` block around the calls. An array has the axes of one row."""
+
+from collections.abc import Callable
+from functools import partial
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from lare_rl.errors import LareError
+from lare_rl.phi.arrays import Array, as_array
+from lare_rl.phi.builder import current_builder
+from lare_rl.phi.graph import Graph, Kind
+from lare_rl.phi.numpy_functions import FUNCTIONS, call_numpy
+from lare_rl.training.numpy_program import Operation, UnsupportedOperationError, apply
+
+__all__ = ["compute", "finish", "graph_input"]
+
+DTYPES = {"float": np.float32, "int": np.int32, "bool": np.bool_}
+"""The types of JAX for kinds of numbers."""
+
+
+def graph_input(name: str, shape: tuple[int, ...], kind: Kind = "float") -> Array:
+    """Add an input to the graph."""
+    return Array(current_builder().input(name, shape, kind), None)
+
+
+def finish(**outputs: Any) -> Graph:
+    """Return the graph of these outputs."""
+    return current_builder().finish({name: as_array(array).node for name, array in outputs.items()})
+
+
+def compute(function: Callable[[dict[str, Any]], Any], arrays: dict[str, Array]) -> Any:
+    """Add the operations of a function of JAX, from arrays by name to a pytree of arrays. Return its results.
+
+    Raises:
+        LareError: a graph cannot have one of its operations.
+    """
+    shapes = {name: jax.ShapeDtypeStruct(array.row_shape, DTYPES[array.kind]) for name, array in arrays.items()}
+    try:
+        return apply(function, shapes, arrays, _find_function)
+    except UnsupportedOperationError as error:
+        raise LareError(
+            f"a function of this run cannot be exported: a graph has no operation {str(error)!r}"
+        ) from error
+
+
+def _find_function(name: str) -> Operation:
+    if name == "gather":
+        return _gather
+    if name not in FUNCTIONS:
+        raise UnsupportedOperationError(name)
+    return partial(_call, name)
+
+
+def _call(name: str, *args: Any, **kwargs: Any) -> Any:
+    return call_numpy(name, args, kwargs)
+
+
+def _gather(equation: Any, x: Any, indices: Any) -> Array:
+    """Take numbers at fixed positions. JAX itself moves the positions as it would move the numbers."""
+    array, index = as_array(x), as_array(indices).constant
+    if index is None:
+        raise UnsupportedOperationError("gather")
+    positions = jnp.arange(np.prod(array.row_shape)).reshape(array.row_shape)
+    moved = equation.primitive.bind(positions, jnp.asarray(index, jnp.int32), **equation.params)
+    return Array(current_builder().gather(array.node, np.asarray(moved)), None)
