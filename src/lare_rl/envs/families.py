@@ -112,7 +112,9 @@ def make_env(task: TaskSpec, **kwargs: Any) -> JaxEnv | HostEnv:
     try:
         _check_spec(task, env.spec)
         if task.evaluation_environment is not None and not isinstance(env, HostEnv):
-            raise LareError(f"task {task.name!r}: evaluation_environment has no effect on {task.environment}. Remove it.")
+            raise LareError(
+                f"task {task.name!r}: evaluation_environment has no effect on {task.environment}. Remove it."
+            )
     except LareError:
         if isinstance(env, HostEnv):
             env.close()

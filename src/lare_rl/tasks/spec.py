@@ -162,13 +162,11 @@ class TaskSpec(CheckedModel):
 
     @property
     def evaluation_task(self) -> "TaskSpec":
-        """This task in the environment that policies are evaluated in."""
+        """The same task in the environment that policies are evaluated in."""
         if self.evaluation_environment is None:
             return self
         values = {"environment": self.evaluation_environment, "evaluation_environment": None}
-        return self.model_copy(
-            update={**values, "teams": tuple(team.model_copy(update=values) for team in self.teams)}
-        )
+        return self.model_copy(update={**values, "teams": tuple(team.model_copy(update=values) for team in self.teams)})
 
     @property
     def family(self) -> str:
