@@ -42,3 +42,18 @@ def test_example_of_a_library(name, library, arguments):
     compile(path.read_text(encoding="utf-8"), name, "exec")
     pytest.importorskip(library)
     assert np.isfinite(runpy.run_path(str(path))["main"](**arguments)).all()
+
+
+@pytest.mark.filterwarnings("ignore")  # of the simulators
+@pytest.mark.parametrize(
+    ("name", "simulator", "arguments"),
+    [
+        ("wheat_sb3.py", "pcse", {"steps": 405, "episodes": 1}),
+        ("traffic_sb3.py", "libsumo", {"steps": 360, "episodes": 1}),
+    ],
+)
+def test_example_of_a_score_at_the_end(name, simulator, arguments):
+    path = EXAMPLES / name
+    compile(path.read_text(encoding="utf-8"), name, "exec")
+    pytest.importorskip(simulator)
+    assert np.isfinite(runpy.run_path(str(path))["main"](**arguments)).all()

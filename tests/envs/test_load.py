@@ -210,3 +210,34 @@ def test_require_role():
 def test_team_of_another_environment():
     with pytest.raises(LareError, match="Cat is not a team of a/b"):
         toy_spec(environment="a/b", teams=(toy_spec(name="Cat", team="cat", environment="c/d"),))
+
+
+gymnasium.register("toys/LongChase-v0", entry_point=Chase, max_episode_steps=30)
+
+
+def test_evaluation_environment():
+    task = toy_spec(evaluation_environment="toys/LongChase-v0")
+    check_environment(task)
+    assert task.evaluation_task == toy_spec(environment="toys/LongChase-v0")
+    assert load_env_spec(task.evaluation_task).max_steps == 30
+    assert toy_spec().evaluation_task == toy_spec()
+
+
+@pytest.mark.parametrize(
+    ("changes", "content"),
+    [
+        ({"evaluation_environment": "other:Chase-v0"}, "'other:Chase-v0' is not of the module"),
+        ({"evaluation_environment": "pettingzoo/toys:chase"}, "is not of the module"),
+        ({"evaluation_environment": "toys/Missing-v0"}, "'toys/Missing-v0' cannot be made"),
+        ({"evaluation_environment": "CartPole-v1"}, "observations of size 4"),
+    ],
+)
+def test_wrong_evaluation_environment(changes, content):
+    with pytest.raises(LareError, match=content):
+        check_environment(toy_spec(**changes))
+
+
+def test_evaluation_environment_is_for_the_host():
+    task = read_task("CN-6").model_copy(update={"evaluation_environment": "particles/CN-6"})
+    with pytest.raises(LareError, match="evaluation_environment has no effect on particles/CN-6"):
+        load_env_spec(task)

@@ -223,3 +223,13 @@ def test_policy_with_discrete_actions(small, tmp_path):
     assert set(load_policy(run, deterministic=True)(batch)) == {np.argmax(np.bincount(choices))}
     sampled, likeliest = (evaluate_run(run, 4, deterministic=flag)["Chase"] for flag in (False, True))
     assert not np.array_equal(sampled, likeliest)
+
+
+def test_policies_and_random_actions_are_evaluated_in_the_evaluation_environment(small, tmp_path):
+    gymnasium.register("toys/FarChase-v0", entry_point=lambda: Chase(scale=1000.0), max_episode_steps=20)
+    task = toy_spec(evaluation_environment="toys/FarChase-v0")
+    run = lare_rl.train(task, small(method="dense", steps=60), out=tmp_path / "run", listeners=[])
+    evaluations = [line["evaluation/return"] for line in run.metrics()]
+    assert max(evaluations) < -500  # a thousand times the training rewards
+    assert evaluate_run(run, 2)["Chase"].max() < -500
+    assert max(measure_random_returns(task)) < -500

@@ -170,7 +170,7 @@ class TaskSpec(CheckedModel):
 
     @property
     def evaluation_task(self) -> "TaskSpec":
-        """Return the task in the environment that policies are evaluated in."""
+        """The same task in the environment that policies are evaluated in."""
         if self.evaluation_environment is None:
             return self
         values = {"environment": self.evaluation_environment, "evaluation_environment": None}

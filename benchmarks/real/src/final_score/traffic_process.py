@@ -117,12 +117,12 @@ class TrafficProcess(gymnasium.Env):
         return np.clip(np.append(observation, time), 0.0, 1.0).astype(np.float32)
 
 
-def write_demand(default: Path, file: Path, day: int, begin: int) -> None:
+def write_demand(trip_file: Path, file: Path, day: int, begin: int) -> None:
     """Write the trips of a day: 80 to 110% as many as in RESCO's hour, drawn from it with replacement, each some minutes earlier or
     later.
     """
     random = np.random.default_rng([48, day])
-    root = ET.parse(default).getroot()
+    root = ET.parse(trip_file).getroot()
     trips = root.findall("trip")
     for trip in trips:
         root.remove(trip)

@@ -34,9 +34,9 @@ class Trains(ParallelEnv):
 
     Args:
         split: which maps are played: 1,000 or 100 others.
-        pay: "end" pays each train Flatland's reward at the end: minus the time steps by which it is late, with more for a train that
-            never left; "proxy" pays a tenth of the cells by which a train came closer to its target, in each step. The proxy does not
-            add up to the score.
+        pay: "end" pays each train Flatland's reward at the end: minus the time steps by which it is late, or minus those of its
+            whole journey if it never left; "proxy" pays a tenth of the cells by which a train came closer to its target, in each
+            step. The proxy does not add up to the score.
         render_mode: "rgb_array" or None.
     """
 

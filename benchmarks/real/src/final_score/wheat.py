@@ -120,10 +120,14 @@ class Wheat(gymnasium.Env):
         return (GRAIN_PRICE * self._grain() - costs) / UNIT
 
     def _read_model(self) -> None:
-        """Read the variables of the crop. After harvest the crop has none, and the last ones stay."""
+        """Read the variables of the crop. A crop that was harvested during the week has none: its last grain is in the output, and the
+        other variables stay.
+        """
         for name in self._values:
             if (value := self._model.get_variable(name)) is not None:
                 self._values[name] = float(value)
+        if self._model.flag_terminate:
+            self._values["WSO"] = max(day["WSO"] or 0.0 for day in self._model.get_output())
 
     def _observe(self) -> np.ndarray:
         week = [weather()(self._model.day - datetime.timedelta(days=days)) for days in range(7)]

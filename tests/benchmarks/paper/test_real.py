@@ -1,0 +1,63 @@
+"""The study of real simulators: its plan, and its page from invented metrics, with the job shop, whose simulator is installed."""
+
+import pytest
+
+from helpers.untrained_runs import write_run
+from lare_rl.errors import LareError
+from lare_rl.runs.metric_names import RETURN
+from lare_rl.sweep import processes
+from lare_rl.sweep.resources import Resources
+from paper import real
+from paper.reproduce import reproduce
+
+STUDY = real.read_study()
+
+
+@pytest.fixture
+def only_jobshop(monkeypatch):
+    pytest.importorskip("jumanji")
+    study = STUDY.model_copy(update={"tasks": {"jobshop": STUDY.tasks["jobshop"]}})
+    monkeypatch.setattr(real, "read_study", lambda: study)
+
+
+def invented_training(job, cores, running):
+    value = float(len(job.directory.name))
+    steps = (job.resolved.steps // 2, job.resolved.steps)
+    metrics = [{"step": step, "seed": seed, RETURN: value} for step in steps for seed in job.resolved.all_seeds]
+    write_run(job.directory, job.task, job.resolved, metrics)
+
+
+@pytest.mark.usefixtures("only_jobshop")
+def test_page(monkeypatch, tmp_path):
+    monkeypatch.setattr(processes, "train_in_process", invented_training)
+    page = reproduce("real", "smoke", Resources(), tmp_path / "runs", tmp_path / "out")
+    text = page.read_text()
+    assert text.startswith(f"# {real.TITLE}\n\nBy `lare-rl reproduce real --budget smoke`. 1 seeds.")
+    assert all(f"| {label} | " in text for label in (*STUDY.methods, "random", "rule: most work remaining"))
+    assert "it runs, and learns nothing" in text
+    assert (page.parent / "real-jobshop.svg").is_file()
+
+
+@pytest.mark.usefixtures("only_jobshop")
+def test_plan(tmp_path):
+    jobs = real.plan_jobs("laptop", tmp_path)["jobshop"]
+    assert list(jobs) == list(STUDY.methods)
+    assert [list(job.resolved.all_seeds) for job in jobs["LaRe, closed form"]] == [list(range(5)), list(range(5, 10))]
+    assert len({job.directory for group in jobs.values() for job in group}) == 2 * len(jobs)
+    (dense, _), (published, _) = jobs["dense proxy"], jobs["LaRe as published"]
+    assert (dense.task.name, dense.task.evaluation_environment) == ("JobShopProxy", "final_score:JobShopTest-v0")
+    assert not published.resolved.credit.normalise  # and the task scores the observation before the step anyway
+
+
+def test_missing_package(monkeypatch, tmp_path):
+    monkeypatch.setattr(real, "find_spec", lambda name: None)
+    with pytest.raises(LareError, match="pip install -e 'benchmarks/real"):
+        real.plan_jobs("smoke", tmp_path)
+
+
+def test_merge_settings():
+    assert real.merge_settings({"a": 1, "sac": {"x": 1, "y": 2}}, {"b": 3, "sac": {"y": 4}}) == {
+        "a": 1,
+        "b": 3,
+        "sac": {"x": 1, "y": 4},
+    }
