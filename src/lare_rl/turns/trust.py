@@ -36,10 +36,11 @@ __all__ = [
 
 TRUSTING, CAREFUL, BROADCAST = 0.8, 0.95, 1.0
 """The values of lambda."""
-MIN_GAIN_Z = 3.0
+MIN_GAIN_Z = 2.0
 """Lambda 0.8 needs a gain of more than this many standard errors."""
-MAX_SURPRISE = 0.25
-"""Lambda 0.8 needs a surprise below this, in standard deviations of outcomes."""
+MAX_SURPRISE, SURPRISE_PER_GAIN = 0.25, 0.05
+"""Lambda 0.8 needs a surprise below the first, in standard deviations of outcomes, and below the second times the standard errors of the
+gain: the less certain the gain, the smaller the surprise must be. These limits were chosen on the two testbeds of `benchmarks/turns`."""
 MAX_LOSS_Z = 2.0
 """With a negative gain of more than this many standard errors, the values are not used."""
 MIN_ROLLOUTS = 16
@@ -113,6 +114,7 @@ def choose_lambda(trust: Trust) -> tuple[float, Finding]:
         return BROADCAST, Finding("harmful", values)
     if trust.gain <= MIN_GAIN_Z * trust.gain_error:
         return CAREFUL, Finding("small_gain", values)
-    if trust.surprise > MAX_SURPRISE * trust.outcome_std:
+    certainty = trust.gain / max(trust.gain_error, 1e-12)
+    if trust.surprise > min(MAX_SURPRISE, SURPRISE_PER_GAIN * certainty) * trust.outcome_std:
         return CAREFUL, Finding("surprised", values)
     return TRUSTING, Finding("trusted", values)

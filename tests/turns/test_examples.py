@@ -1,0 +1,182 @@
+"""The single files for trainers of language models, on the data types of the libraries, where these are installed."""
+
+import asyncio
+import inspect
+import runpy
+import sys
+from pathlib import Path
+from types import ModuleType, SimpleNamespace
+
+import numpy as np
+import pytest
+
+EXAMPLES = Path(__file__).parents[2] / "examples"
+
+
+def load(name):
+    return SimpleNamespace(**runpy.run_path(str(EXAMPLES / name)))
+
+
+@pytest.mark.parametrize("name", ["turn_credit_prime_rl.py", "turn_credit_trl.py"])
+def test_examples_are_python(name):
+    compile((EXAMPLES / name).read_text(encoding="utf-8"), name, "exec")
+
+
+def make_messages(passes):
+    call = {"id": "1", "name": "test", "arguments": "{}"}
+    return [
+        {"role": "user", "content": "Repair it."},
+        {"role": "assistant", "content": "", "tool_calls": [call]},
+        {"role": "tool", "tool_call_id": "1", "content": "3 passed" if passes else "3 failed"},
+        {"role": "assistant", "content": "Done."},
+    ]
+
+
+class FakeMessage(SimpleNamespace):
+    def model_dump(self, exclude_none=False):
+        return vars(self)
+
+
+def fake_trace(passes):
+    """Return an object with what the example reads of a trace of verifiers."""
+    nodes = [
+        SimpleNamespace(
+            message=FakeMessage(**message),
+            token_ids=[0, 1, 2],
+            mask=[message["role"] == "assistant" and i > 0 for i in range(3)],
+            advantages=None,
+        )
+        for message in make_messages(passes)
+    ]
+    return SimpleNamespace(
+        nodes=nodes, info={}, reward=float(passes), is_truncated=False, num_branches=1, has_error=False
+    )
+
+
+def assign_advantages(trace, values):
+    """Assign one value for each sampled token, as prime-rl does."""
+    counts = [sum(node.mask) for node in trace.nodes]
+    values = [values] * sum(counts) if isinstance(values, float) else values
+    assert len(values) == sum(counts)
+    for node, piece in zip(trace.nodes, np.split(np.array(values), np.cumsum(counts)[:-1]), strict=True):
+        if any(node.mask):
+            node.advantages = piece.tolist()
+
+
+@pytest.fixture
+def fake_prime_rl(monkeypatch):
+    class Algorithm:
+        def __init__(self, config, policy_pool):
+            self.config = config
+
+    base = SimpleNamespace(
+        Algorithm=Algorithm, iter_trainable_traces=lambda episodes: [(e, trace) for e in episodes for trace in e.traces]
+    )
+    modules = {
+        "prime_rl": {},
+        "prime_rl.orchestrator": {},
+        "prime_rl.orchestrator.algo": {"ALGORITHM_CLASSES": {"grpo": Algorithm}},
+        "prime_rl.orchestrator.algo.base": vars(base),
+        "prime_rl.orchestrator.algo.routing": {"assign_advantages": assign_advantages},
+    }
+    for name, values in modules.items():
+        module = ModuleType(name)
+        vars(module).update(values)
+        monkeypatch.setitem(sys.modules, name, module)
+    sys.modules["prime_rl.orchestrator"].algo = sys.modules["prime_rl.orchestrator.algo"]
+    return sys.modules["prime_rl.orchestrator.algo"]
+
+
+def test_prime_rl_algorithm(fake_prime_rl):
+    load("turn_credit_prime_rl.py").register()
+    algorithm = fake_prime_rl.ALGORITHM_CLASSES["grpo"](None, None)
+    for _ in range(6):
+        traces = [fake_trace(k % 2 == 0) for k in range(8)]
+        traces[7].num_branches = 2
+        asyncio.run(algorithm.score_group([SimpleNamespace(traces=traces)]))
+    for trace in traces[:7]:
+        sampled = [node.advantages for node in trace.nodes if any(node.mask)]
+        assert [len(values) for values in sampled] == [2, 2]
+        assert [values[0] for values in sampled] == pytest.approx(trace.info["turn_advantages"])
+        assert np.sign(sampled[0][0]) == (1 if trace.reward else -1)
+    assert [node.advantages for node in traces[7].nodes if any(node.mask)] == [[-0.5, -0.5]] * 2
+
+
+def test_traces_of_verifiers():
+    vf = pytest.importorskip("verifiers.v1")
+    graph, types = pytest.importorskip("verifiers.v1.graph"), pytest.importorskip("verifiers.v1.types")
+    example = load("turn_credit_prime_rl.py")
+    kinds = {"user": types.UserMessage, "assistant": types.AssistantMessage, "tool": types.ToolMessage}
+    nodes = []
+    for i, message in enumerate(make_messages(True)):
+        is_sampled = message["role"] == "assistant"
+        nodes.append(
+            graph.MessageNode(
+                parent=i - 1 if i else None,
+                message=kinds[message["role"]](**message),
+                sampled=is_sampled,
+                token_ids=[0, 1, 2],
+                mask=[False, is_sampled, is_sampled],
+            )
+        )
+    trace = vf.Trace.model_construct(nodes=nodes, rewards={}, info={}, calls=[], stop_condition=None, errors=[])
+    assert example.is_linear(trace)
+    assert example.token_advantages(trace, [0.5, -1.0]) == [0.5, 0.5, -1.0, -1.0]
+    messages = example.trace_rollout(SimpleNamespace(nodes=nodes, reward=1.0, info={}, is_truncated=False), "a")[
+        "messages"
+    ]
+    assert messages[1]["tool_calls"][0]["name"] == "test"
+
+
+@pytest.mark.filterwarnings("ignore")  # of the library
+def test_trl_trainer(monkeypatch):
+    torch = pytest.importorskip("torch")
+    pytest.importorskip("trl", reason="TRL is not installed")
+    example = load("turn_credit_trl.py")
+    mask = torch.tensor([1, 1, 0, 0, 1, 0])
+    assert example.spread_over_tokens([0.5, -1.0], mask).tolist() == [0.5, 0.5, 0, 0, -1.0, 0]
+    assert example.spread_over_tokens([0.5], mask) is None
+
+    from trl import GRPOTrainer
+
+    for name, parameters in {
+        "_generate_and_score_completions": ["self", "inputs"],
+        "_calculate_rewards": ["self", "inputs", "prompts", "completions", "completion_ids_list"],
+    }.items():
+        assert list(inspect.signature(getattr(GRPOTrainer, name)).parameters) == parameters
+    source = inspect.getsource(GRPOTrainer._compute_loss)
+    assert "advantages.dim() == 1" in source
+    assert '"tool_mask"' in source
+
+    prompts = [[{"role": "user", "content": str(k // 8)}] for k in range(32)]
+    completions = [make_messages(k % 2)[1:] for k in range(32)]
+
+    class Parent:
+        """Does what GRPOTrainer does with these two methods, without a model."""
+
+        def _calculate_rewards(self, inputs, prompts, completions, completion_ids_list):
+            return torch.tensor([[float(k % 2)] for k in range(len(prompts))])
+
+        def _generate_and_score_completions(self, inputs):
+            rewards = self._calculate_rewards(inputs, prompts, completions, None)
+            ones = torch.ones(len(inputs), 6, dtype=torch.long)
+            return {
+                "advantages": rewards[:, 0] - rewards.mean(),
+                "completion_mask": ones,
+                "tool_mask": mask.repeat(len(inputs), 1),
+            }
+
+    for name in ("_calculate_rewards", "_generate_and_score_completions"):
+        monkeypatch.setattr(GRPOTrainer, name, getattr(Parent, name))
+    trainer = object.__new__(example.TurnCreditGRPOTrainer)
+    trainer.turn_credit = example.TurnCredit()
+    trainer.accelerator = SimpleNamespace(process_index=0)
+    trainer.reward_weights = torch.ones(1)
+    trainer.scale_rewards = "none"
+    trainer.model = SimpleNamespace(training=True)
+    output = trainer._generate_and_score_completions([{"prompt": prompt} for prompt in prompts])
+    advantages = output["advantages"]
+    assert advantages.shape == (32, 6)
+    assert (advantages[:, [2, 3, 5]] == 0).all()
+    assert (advantages[1::2, 0] > 0).all()
+    assert (advantages[0::2, 0] < 0).all()
