@@ -4,7 +4,7 @@
 
     trainer = TurnCreditGRPOTrainer(model=..., reward_funcs=..., environment_factory=..., args=GRPOConfig(...), train_dataset=...)
 
-Copy this file into your project. Read against TRL 1.10.0.dev0 (24 July 2026) and run with the version that tests/test_examples.py names.
+Copy this file into your project. Read against TRL 1.10.0.dev0 (24 July 2026), and tested with 1.16.0.
 The prompts must be conversations, and the completions must have tools: only then does TRL know turns. Numbers of turns from your
 environment are an extra field `turns` of the inputs, such as a `rollout_func` returns: a list with a mapping for each turn. With several
 processes, values are fitted to the rollouts of each process.

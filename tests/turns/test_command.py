@@ -38,8 +38,8 @@ def file(tmp_path, rollouts):
     return path
 
 
-def run(monkeypatch, capsys, *arguments):
-    monkeypatch.setattr("sys.argv", ["lare-rl", "turn-credit", *map(str, arguments)])
+def run(monkeypatch, capsys, *arguments, command="turn-credit"):
+    monkeypatch.setattr("sys.argv", ["lare-rl", command, *map(str, arguments)])
     status = 0
     try:
         cli.main()
@@ -94,6 +94,37 @@ def test_missing_files(monkeypatch, capsys, tmp_path, file):
     assert (status, error.count("\n")) == (2, 1)
     status, _, error = run(monkeypatch, capsys, file, "--out", tmp_path / "none" / "out.jsonl")
     assert (status, "no folder" in error) == (2, True)
+
+
+def test_turn_phi_prints_the_request(monkeypatch, capsys, tmp_path, file):
+    tools = tmp_path / "tools.json"
+    tools.write_text('[{"type": "function", "function": {"name": "try", "description": "Tries."}}]')
+    options = ["--tools", tools, "--goal", "Make it work."]
+    status, text, _ = run(monkeypatch, capsys, file, *options, command="turn-phi")
+    assert status == 0
+    assert all(
+        words in text for words in ("--- system ---", "find_numbers", "Make it work.", "## try\nTries.", '"nothing"')
+    )
+    tools.write_text("{}")
+    status, _, error = run(monkeypatch, capsys, file, *options, command="turn-phi")
+    assert (status, "list of tools" in error) == (2, True)
+
+
+def test_turn_phi_asks_a_model(monkeypatch, capsys, tmp_path, file):
+    reply = json.dumps({"Understand": "", "Analyze": "", "Functions": PHI})
+    monkeypatch.setattr("lare_rl.llm.live.LiveModel.reply", lambda self, messages, sample: reply)
+    monkeypatch.setattr("lare_rl.llm.live.LiveModel.__post_init__", lambda self: None)
+    tools, out = tmp_path / "tools.json", tmp_path / "new.py"
+    tools.write_text('[{"name": "try"}]')
+    options = ["--tools", tools, "--goal", "Make it work.", "--model", "some", "--out", out]
+    status, _, _ = run(monkeypatch, capsys, file, *options, command="turn-phi")
+    assert status == 0
+    assert out.read_text().endswith(PHI)
+    assert json.loads(out.with_suffix(".json").read_text())["kind"] == "events"
+    status, _, error = run(monkeypatch, capsys, file, "--out", tmp_path / "c.jsonl", "--function", out)
+    assert (status, error) == (0, "")
+    status, _, error = run(monkeypatch, capsys, file, *options, command="turn-phi")
+    assert (status, "exists" in error) == (2, True)
 
 
 def test_half_characters_are_written(tmp_path):

@@ -126,7 +126,7 @@ def test_gain_is_a_ratio_of_sums():
     ("options", "words"),
     [
         ({"lambda_": 1.5}, ["lambda_", "0 to 1", "1.5"]),
-        ({"lambda_": "high"}, ["lambda_", "'high'"]),
+        ({"lambda_": float("nan")}, ["lambda_", "nan"]),
         ({"window": 0}, ["window", "at least 1"]),
     ],
 )

@@ -17,7 +17,7 @@ from lare_rl.cli.parse import parse
 from lare_rl.cli.runs import cross_play, evaluate, export, report, train
 from lare_rl.cli.studies import compare, reproduce, sweep
 from lare_rl.cli.terminal import print_error, print_line
-from lare_rl.cli.turns import turn_credit
+from lare_rl.cli.turns import turn_credit, turn_phi
 from lare_rl.errors import LareError
 from lare_rl.util import compilation
 from lare_rl.util.provenance import code_version
@@ -36,6 +36,7 @@ COMMANDS = {
     "verify": verify,
     "relabel": relabel,
     "turn-credit": turn_credit,
+    "turn-phi": turn_phi,
     "train": train,
     "evaluate": evaluate,
     "sweep": sweep,

@@ -1,4 +1,4 @@
-"""The command `turn-credit`: credit for the turns of agents that talk."""
+"""The commands `turn-credit` and `turn-phi`: credit for the turns of agents that talk, and the events of their turns."""
 
 from pathlib import Path
 from typing import Annotated
@@ -6,7 +6,9 @@ from typing import Annotated
 import tyro
 from tyro.conf import Positional
 
-from lare_rl.cli.terminal import print_line
+from lare_rl.cli.design import DEFAULT_LIVE, LiveOptions
+from lare_rl.cli.terminal import print_line, print_progress, write_new_file
+from lare_rl.util.sanitize import one_line
 
 
 def turn_credit(
@@ -61,3 +63,59 @@ def turn_credit(
         from lare_rl.turns.page import write_turn_report
 
         print_line(f"wrote {write_turn_report(report, contents, checked, result)}")
+
+
+def turn_phi(
+    rollouts: Annotated[Positional[Path], tyro.conf.arg(metavar="ROLLOUTS")],
+    tools: Annotated[Path, tyro.conf.arg(metavar="TOOLS")],
+    goal: str,
+    model: str | None = None,
+    live: Annotated[LiveOptions, tyro.conf.arg(name="")] = DEFAULT_LIVE,
+    out: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None,
+) -> None:
+    """Let a language model write a phi over turns, which names the events of each turn for `turn-credit --function`.
+
+    Without --model, prints the request that a model gets: you can ask a model of your choice by hand. With it, the function is checked on
+    the turns of ROLLOUTS and corrected until it passes. A live model needs the extra lare-rl[llm]; its key comes from the environment
+    variable OPENAI_API_KEY (see `lare-rl design --help`).
+
+    Args:
+        rollouts: a JSONL file of rollouts with messages.
+        tools: a JSON file: the list of tools in the form of OpenAI's chat completions.
+        goal: what the agent is to do, in a few sentences.
+        model: the name of a model behind an OpenAI-compatible endpoint.
+        live: options of the model.
+        out: a .py file to write, with the model's replies in a .json beside it; they must not exist. The default is to print the function.
+    """
+    from lare_rl.errors import LareError
+    from lare_rl.llm.budget import Budget
+    from lare_rl.llm.live import LiveModel
+    from lare_rl.turns.design import design_turn_phi
+    from lare_rl.turns.files import read_rollout_file, read_tool_file
+    from lare_rl.turns.messages import split_turns
+    from lare_rl.turns.prompt import choose_examples, turn_request
+
+    descriptions, turns = read_tool_file(tools), []
+    for number, rollout in enumerate(read_rollout_file(rollouts)):
+        turns += split_turns(rollout.get("messages"), f"{rollouts}, rollout {number}")
+    if not turns:
+        raise LareError(f"{rollouts} has no message of an assistant")
+    if model is None:
+        for message in turn_request(goal, descriptions, choose_examples(turns)):
+            print_line(f"--- {message['role']} ---\n{message['content']}\n")
+        return
+    record = None if out is None else out.with_suffix(".json")
+    for path in (out, record):
+        if path is not None and (path.exists() or not path.parent.is_dir()):
+            raise LareError(f"{path} exists, or its folder does not: choose another --out")
+    budget = Budget(requests=live.requests, tokens=live.budget, seconds=60 * live.minutes)
+    live_model = LiveModel(model, live.base_url, live.temperature, budget, on_message=print_progress)
+    try:
+        designed = design_turn_phi(goal, descriptions, turns, live_model, record=record)
+    finally:
+        print_progress(f"{live_model.name}: {budget.summary(live.price)}")
+    if out is None:
+        print_line(designed.phi.source)
+        return
+    write_new_file(out, f"# A phi over turns, by {one_line(designed.model)}.\n{designed.phi.source}\n", "--out")
+    print_line(f"wrote {out} and {record}")

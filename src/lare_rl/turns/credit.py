@@ -1,6 +1,6 @@
 """`TurnCredit`: the credit of each turn of some rollouts, from their outcomes alone."""
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
 from dataclasses import dataclass
 from functools import cache, partial
 from typing import Any, NamedTuple
@@ -108,7 +108,7 @@ class TurnCredit:
 
     def __init__(
         self,
-        lambda_: float | Any = None,
+        lambda_: float | None = None,
         *,
         window: int = 5,
         logistic: bool = False,
@@ -132,7 +132,7 @@ class TurnCredit:
         self.lambda_, self.window, self.logistic, self.phi = lambda_, window, logistic, phi
         self._errors: tuple[Errors, ...] = ()
 
-    def __call__(self, rollouts: Iterable[Mapping[str, Any]] | Any) -> CreditedTurns:
+    def __call__(self, rollouts: Iterable[Any]) -> CreditedTurns:
         """Return the credit of the turns of some rollouts (`turns/rollouts.py` has their form).
 
         Raises:

@@ -7,9 +7,9 @@ from typing import Any
 from lare_rl.errors import LareError
 from lare_rl.turns.credit import CreditedTurns
 from lare_rl.util.files import write_atomically
-from lare_rl.util.safe_io import read_json
+from lare_rl.util.safe_io import read_json, read_text
 
-__all__ = ["MAX_LINE_BYTES", "read_rollout_file", "write_credit_file"]
+__all__ = ["MAX_LINE_BYTES", "read_rollout_file", "read_tool_file", "write_credit_file"]
 
 MAX_LINE_BYTES = 64 << 20
 """The largest size of a rollout."""
@@ -50,6 +50,21 @@ def _read_line(line: bytes, where: str) -> dict[str, Any]:
     if not isinstance(value, dict):
         raise LareError(f"{where} is not a JSON object with messages or turns, and an outcome")
     return value
+
+
+def read_tool_file(path: Path) -> list[dict[str, Any]]:
+    """Return the descriptions of tools in a JSON file.
+
+    Raises:
+        LareError: the file cannot be read, or is not a list of tools in the form of OpenAI's chat completions.
+    """
+    try:
+        tools = read_json(read_text(path))
+    except ValueError as error:
+        raise LareError(f"{path} is not JSON: {' '.join(str(error).split())}") from None
+    if not isinstance(tools, list) or not tools or not all(isinstance(tool, dict) for tool in tools):
+        raise LareError(f"{path} is not a list of tools: the form is that of `tools` in OpenAI's chat completions")
+    return tools
 
 
 def write_credit_file(path: Path, rollouts: list[dict[str, Any]], credit: CreditedTurns) -> None:

@@ -25,6 +25,8 @@ MAX_TURNS = 60
 """The largest number of turns of a strip."""
 MAX_WORDS = 90
 """Characters of a turn's text, and of its features."""
+SMALL = 0.0005
+"""Smaller effects are shown as 0: the evidence has switched the feature off."""
 
 NOTE_SUMS = (
     "Progress is the change of the expected outcome that a turn made. It is not a score whose sum predicts the outcome, as the proxy "
@@ -135,7 +137,10 @@ def _render_effects(credit: CreditedTurns) -> str:
         pairs = (
             (getattr(effect, name), getattr(effect, f"{name}_deviation")) for name in ("first", "lasting", "further")
         )
-        numbers = (f"{number:+.3f} ± {deviation:.3f}" for number, deviation in pairs)
+        numbers = (
+            "0" if max(abs(number), deviation) < SMALL else f"{number:+.3f} ± {deviation:.3f}"
+            for number, deviation in pairs
+        )
         name = effect.name if effect.unit == 1 else f"{effect.name} ({effect.unit:.3g})"
         rows.append((name, f"{effect.frequency:.0%}", *numbers))
     header = ("feature of a turn", "turns with it", "the first one", "what lasts of it", "each further one")

@@ -110,7 +110,8 @@ def held_out_values(
         index = table.first[rollouts][:, None] + np.arange(size)
         block = rows[index]
         covariance = block @ block.swapaxes(1, 2) + 1 / fit.group_precision[table.group[rollouts]][:, None, None]
-        system = np.eye(size) - covariance * predictions.curvature[index][:, None, :]
+        # The only rollout of all determines m alone: without this, the system would be singular.
+        system = (1 + 1e-9) * np.eye(size) - covariance * predictions.curvature[index][:, None, :]
         change = np.linalg.solve(system, covariance @ predictions.score[index][..., None])
         eta[index] = predictions.eta[index] - change[..., 0]
     return logistic(eta) if fit.is_logistic else eta

@@ -1,0 +1,81 @@
+"""One round of the evidence, in NumPy and in JAX."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from lare_rl.credit import evidence
+from lare_rl.credit.precisions import (
+    NUMPY,
+    Posterior,
+    Regression,
+    clip_precisions,
+    dense_moments,
+    equal_shares,
+    expand_groups,
+    next_posterior,
+)
+
+GROUP_INDEX = np.array([0, 0, 1, 2, 2])
+
+
+@pytest.fixture
+def problem():
+    random = np.random.default_rng(0)
+    x = random.normal(size=(40, 5))
+    y = x @ random.normal(size=5) + random.normal(size=40)
+    x, y = x - x.mean(axis=0), (y - y.mean()) / y.std()
+    s = x.T @ x
+    shares = equal_shares(NUMPY, np.diagonal(s), 40.0, GROUP_INDEX)
+    return Regression(s, x.T @ y, np.array(40.0), np.array(39.0), np.array(0.0), np.array(1.0), GROUP_INDEX, shares)
+
+
+def run_rounds(backend, problem, n_rounds):
+    alpha, beta = problem.equal_alpha, 2 * problem.dof / problem.q
+    for _ in range(n_rounds):
+        posterior = next_posterior(backend, problem, alpha, beta, lambda a, b: dense_moments(backend, problem, a, b))
+        alpha, beta = posterior.alpha, posterior.beta
+    return posterior
+
+
+def test_rounds_of_numpy_and_jax_are_the_same(problem):
+    numpy_posterior = run_rounds(NUMPY, problem, 20)
+    with jax.enable_x64(True):
+        in_jax = jax.tree.map(jnp.asarray, problem._replace(group_index=None))._replace(group_index=GROUP_INDEX)
+        jax_posterior = run_rounds(evidence.JAX, in_jax, 20)
+        for name in Posterior._fields:
+            np.testing.assert_allclose(
+                getattr(numpy_posterior, name), getattr(jax_posterior, name), rtol=1e-9, atol=1e-12
+            )
+
+
+def test_moments_are_those_of_the_inverse(problem):
+    alpha, beta = np.array([1.0, 2.0, 3.0]), 5.0
+    moments = dense_moments(NUMPY, problem, alpha, beta)
+    precision = beta * problem.s + np.diag(alpha[GROUP_INDEX])
+    mean = beta * np.linalg.solve(precision, problem.p)
+    np.testing.assert_allclose(moments.weight, mean)
+    np.testing.assert_allclose(moments.variance, np.diagonal(np.linalg.inv(precision)))
+    assert moments.log_det == pytest.approx(np.linalg.slogdet(precision)[1])
+    assert moments.residual == pytest.approx(problem.q - 2 * mean @ problem.p + mean @ problem.s @ mean)
+
+
+def test_equal_shares_explain_half_of_the_returns(problem):
+    # The prior variance of y: the sum over groups of trace S / (alpha N), 1/2 in total.
+    trace = np.bincount(GROUP_INDEX, np.diagonal(problem.s))
+    np.testing.assert_allclose(trace / problem.equal_alpha / problem.q, [1 / 6] * 3)
+
+
+def test_precisions_are_clipped(problem):
+    alpha, beta = clip_precisions(NUMPY, problem, np.array([0.0, np.inf, 1.0]), 0.0)
+    assert alpha[0] == problem.equal_alpha[0] / 1e6
+    assert alpha[1] == problem.equal_alpha[1] * 1e6
+    assert beta == problem.dof / problem.q / 2
+
+
+def test_strengths_start_from_their_groups(problem):
+    groups = run_rounds(NUMPY, problem, 3)
+    strengths = expand_groups(groups, GROUP_INDEX, np.arange(5))
+    np.testing.assert_array_equal(strengths.alpha, groups.alpha[GROUP_INDEX])
+    assert strengths.n_determined.sum() == pytest.approx(groups.n_determined.sum())
