@@ -17,9 +17,9 @@ from lare_rl.training.saved_state import load_learner
 
 KINDS = [("td3", "arel"), ("ippo", "diaster"), long_case("sac", "diaster"), long_case("ippo", "arel")]
 GRID = KINDS + [long_case("td3", method) for method in METHODS if method != "arel"]
-GRID += [long_case("ippo", method) for method in ("dense", "episodic", "rrdu", "lare-rd-shared", "lare-bayes")]
+GRID += [long_case("ippo", method) for method in ("dense", "episodic", "rrdu", "lare-rd-shared", "lare-bayes", "tar2")]
 GRID += [long_case("qmix", method) for method in ("lare-rd", "dense", "ircr", "rrdu", "diaster", "lare-bayes")]
-GRID += [long_case("qmix", method) for method in ("llm-reward", "stas", "tar2")]
+GRID += [long_case("qmix", method) for method in ("llm-reward", "stas")]
 GRID += [long_case("ppo", method) for method in ("arel", "lare-linear", "dense", "rrdu", "diaster")]
 GRID += [long_case("ddpg", "rrdu"), long_case("sac", "lare-rrdu"), long_case("vdn", "lare-rd")]
 """The first tier has what the other whole runs have not: a decoder's own loss, whole episodes, two teams, refusals. In

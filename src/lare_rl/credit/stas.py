@@ -94,7 +94,8 @@ class Coalitions(eqx.Module):
         agents = x.shape[-2]
         dropout_keys = (None,) * 2 if dropout_key is None else jax.random.split(dropout_key)
         query = _split_heads(jnp.einsum("...ad,ade->...ae", x, self.query.weight) + self.query.bias)
-        mask = jax.random.bernoulli(key, 0.5, (COALITIONS, agents, agents)) | jnp.eye(agents, dtype=bool)
+        # Returns are predicted where float64 is on. A probability in float32 has the same coins there.
+        mask = jax.random.bernoulli(key, jnp.float32(0.5), (COALITIONS, agents, agents)) | jnp.eye(agents, dtype=bool)
         attention = attend(
             jnp.tile(query, (COALITIONS, 1, 1)),  # each agent needs a query for each coalition
             _split_heads(self.key(x)),
