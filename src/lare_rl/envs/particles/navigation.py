@@ -14,8 +14,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 
+from lare_rl.envs.interface import Team
 from lare_rl.envs.particles import views
-from lare_rl.envs.particles.task import ParticleTask, Team
+from lare_rl.envs.particles.task import ParticleTask
 from lare_rl.envs.particles.world import State, World, at_rest
 
 __all__ = ["SIZES", "Size", "make_layouts", "navigation"]

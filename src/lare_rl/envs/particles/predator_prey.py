@@ -16,9 +16,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int, PRNGKeyArray
 
+from lare_rl.envs.interface import Team
 from lare_rl.envs.particles import views
 from lare_rl.envs.particles.prey import Layers, sample_actions, shipped_prey
-from lare_rl.envs.particles.task import ParticleTask, Team
+from lare_rl.envs.particles.task import ParticleTask
 from lare_rl.envs.particles.world import State, World, at_rest
 
 __all__ = [
