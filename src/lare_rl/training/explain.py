@@ -25,7 +25,7 @@ from lare_rl.training.seed_axis import first_shard, select_seed
 from lare_rl.training.static_config import TrainConfig
 from lare_rl.util.float64 import float64
 
-__all__ = ["describe_returns", "explain_run", "explain_stored_returns"]
+__all__ = ["compile_explanation", "describe_returns", "explain_run", "explain_stored_returns"]
 
 
 def explain_run(run: Run) -> list[str]:
@@ -73,6 +73,17 @@ def explain_stored_returns(learner: Learner, config: TrainConfig) -> list[Explan
         is_mean = tuple(decoder.is_mean for decoder in learner.decoders)
         explanations = _compile(config)(*first_shard((replay, is_mean)))
         return jax.tree.map(np.asarray, explanations)
+
+
+def compile_explanation(learner: Learner, config: TrainConfig) -> None:
+    """Compile `explain_stored_returns` for a learner of these shapes, on one device, also in another thread."""
+    config, replay = _explanation_config(config), by_payment(learner.replay)
+    if not learner.decoders or not all(spec.basis.n_features for spec in config.credit_specs):
+        return
+    inputs = replay, tuple(decoder.is_mean for decoder in learner.decoders)
+    shapes = jax.tree.map(lambda leaf: jax.ShapeDtypeStruct(leaf.shape, leaf.dtype), inputs)
+    with jax.enable_x64(True):
+        _compile(config).lower(*shapes).compile()
 
 
 def _explanation_config(config: TrainConfig) -> TrainConfig:
