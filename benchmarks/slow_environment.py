@@ -112,24 +112,26 @@ MEASURED = {
 
 
 class Halves:
-    """A listener that notes the times when half of the steps are done and evaluated, and then clears a stopwatch."""
+    """A listener that notes the times at the beginning of the second half and at its end. The former clears a stopwatch."""
 
     def __init__(self, stopwatch: Stopwatch):
         self.stopwatch = stopwatch
-        self.cpu, self.wall = [time.process_time()], [time.perf_counter()]
+        self.n_evaluations, self.cpu = 0, [time.process_time()]
 
     def on_start(self, name: str, step: int, steps: int) -> None: ...
-    def on_step(self, step: int) -> None: ...
     def on_message(self, message: str) -> None: ...
 
-    def on_evaluation(self, metrics: Any) -> None:
-        if len(self.cpu) == 1:
+    def on_step(self, step: int) -> None:
+        if self.n_evaluations == 1 and len(self.cpu) == 1:
             self.stopwatch.cpu.clear()
             self.stopwatch.wall.clear()
-        self.cpu.append(time.process_time())
-        self.wall.append(time.perf_counter())
+            self.cpu.append(time.process_time())
 
-    def on_stop(self) -> None: ...
+    def on_evaluation(self, metrics: Any) -> None:
+        self.n_evaluations += 1
+
+    def on_stop(self) -> None:
+        self.cpu.append(time.process_time())
 
 
 def measure_alone(task: TaskSpec) -> float:
