@@ -55,7 +55,8 @@ class Slow(gymnasium.Env):
         until = time.thread_time() + STEP_S
         while time.thread_time() < until:
             pass
-        self.position = np.float32(0.9 * self.position + 0.1 * (int(action) - 1 if self.choices else float(action[0])))
+        push = int(action) - 1 if self.choices else float(action[0])
+        self.position = (0.9 * self.position + 0.1 * push).astype(np.float32)
         return self.position, -float(np.abs(self.position[:2]).sum()), False, False, {}
 
 
@@ -157,7 +158,7 @@ def measure_run(task: TaskSpec, settings: Settings) -> dict[str, Any]:
     finally:
         for restore in undo:
             restore()
-    n_steps = int(settings.steps) // 2
+    n_steps = (settings.steps or 0) // 2
     ms = {label: 1000 * seconds / n_steps for label, seconds in stopwatch.cpu.items()}
     iterating_s = sum(stopwatch.wall[label] for label in ("collecting", "storing", "updating"))
     rate, alone = n_steps / iterating_s, measure_alone(task)

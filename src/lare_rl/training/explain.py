@@ -1,8 +1,8 @@
 """Explain a run's stored returns by its factors, whatever decoder the run trains with."""
 
-from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
+from typing import Any
 
 import jax
 import numpy as np
@@ -100,7 +100,8 @@ def _explanation_config(config: TrainConfig) -> TrainConfig:
 
 
 @cache_by_value
-def _compile(config: TrainConfig) -> Callable[..., list[Explanation]]:
+def _compile(config: TrainConfig) -> Any:
+    """Return the compiled `_explain_first_seed`."""
     return jax.jit(partial(_explain_first_seed, config=config))
 
 
