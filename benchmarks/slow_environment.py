@@ -55,7 +55,8 @@ class Slow(gymnasium.Env):
         until = time.thread_time() + STEP_S
         while time.thread_time() < until:
             pass
-        self.position = np.float32(0.9 * self.position + 0.1 * (int(action) - 1 if self.choices else float(action[0])))
+        push = int(action) - 1 if self.choices else float(action[0])
+        self.position = (0.9 * self.position + 0.1 * push).astype(np.float32)
         return self.position, -float(np.abs(self.position[:2]).sum()), False, False, {}
 
 
@@ -112,24 +113,26 @@ MEASURED = {
 
 
 class Halves:
-    """A listener that notes the times when half of the steps are done and evaluated, and then clears a stopwatch."""
+    """A listener that notes the times at the beginning of the second half and at its end. The former clears a stopwatch."""
 
     def __init__(self, stopwatch: Stopwatch):
         self.stopwatch = stopwatch
-        self.cpu, self.wall = [time.process_time()], [time.perf_counter()]
+        self.n_evaluations, self.cpu = 0, [time.process_time()]
 
     def on_start(self, name: str, step: int, steps: int) -> None: ...
-    def on_step(self, step: int) -> None: ...
     def on_message(self, message: str) -> None: ...
 
-    def on_evaluation(self, metrics: Any) -> None:
-        if len(self.cpu) == 1:
+    def on_step(self, step: int) -> None:
+        if self.n_evaluations == 1 and len(self.cpu) == 1:
             self.stopwatch.cpu.clear()
             self.stopwatch.wall.clear()
-        self.cpu.append(time.process_time())
-        self.wall.append(time.perf_counter())
+            self.cpu.append(time.process_time())
 
-    def on_stop(self) -> None: ...
+    def on_evaluation(self, metrics: Any) -> None:
+        self.n_evaluations += 1
+
+    def on_stop(self) -> None:
+        self.cpu.append(time.process_time())
 
 
 def measure_alone(task: TaskSpec) -> float:
@@ -155,7 +158,7 @@ def measure_run(task: TaskSpec, settings: Settings) -> dict[str, Any]:
     finally:
         for restore in undo:
             restore()
-    n_steps = int(settings.steps) // 2
+    n_steps = (settings.steps or 0) // 2
     ms = {label: 1000 * seconds / n_steps for label, seconds in stopwatch.cpu.items()}
     iterating_s = sum(stopwatch.wall[label] for label in ("collecting", "storing", "updating"))
     rate, alone = n_steps / iterating_s, measure_alone(task)

@@ -8,7 +8,10 @@ from helpers.listeners import MessageListener
 from helpers.toy_envs import toy_spec
 from helpers.training_runs import train_quietly
 from lare_rl.latent.function import verify_function
-from lare_rl.training.explain import explain_run
+from lare_rl.training.compile_cache import clear_compile_cache
+from lare_rl.training.compiled import learner_shape
+from lare_rl.training.explain import compile_explanation, explain_run, explain_stored_returns
+from lare_rl.training.saved_state import load_learner
 
 SOURCE = "def evaluation_func(o, a):\n    return [o[:, 0:1] * a[:, 0:1], o[:, 1:2]]\n"
 
@@ -24,6 +27,26 @@ def check_explanation(run, messages):
 
 def test_explain_run(learned_training):
     check_explanation(*learned_training)
+
+
+def test_explanation_is_compiled_from_shapes(learned_training):
+    """As a thread does while steps are collected. The first explanation then compiles nothing."""
+    run, _ = learned_training
+    config, learner, _, _ = load_learner(run)
+    clear_compile_cache()
+    compile_explanation(learner_shape(config, len(run.seeds)), config)
+    compiled = []
+
+    def listen(event, seconds, **_):
+        if "backend_compile" in event:
+            compiled.append(event)
+
+    jax.monitoring.register_event_duration_secs_listener(listen)
+    try:
+        assert explain_stored_returns(learner, config)
+    finally:
+        jax.monitoring.unregister_event_duration_listener(listen)
+    assert compiled == []
 
 
 @pytest.mark.long

@@ -1,8 +1,8 @@
 """Explain a run's stored returns by its factors, whatever decoder the run trains with."""
 
-from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
+from typing import Any
 
 import jax
 import numpy as np
@@ -25,7 +25,7 @@ from lare_rl.training.seed_axis import first_shard, select_seed
 from lare_rl.training.static_config import TrainConfig
 from lare_rl.util.float64 import float64
 
-__all__ = ["describe_returns", "explain_run", "explain_stored_returns"]
+__all__ = ["compile_explanation", "describe_returns", "explain_run", "explain_stored_returns"]
 
 
 def explain_run(run: Run) -> list[str]:
@@ -75,6 +75,17 @@ def explain_stored_returns(learner: Learner, config: TrainConfig) -> list[Explan
         return jax.tree.map(np.asarray, explanations)
 
 
+def compile_explanation(learner: Learner, config: TrainConfig) -> None:
+    """Compile `explain_stored_returns` for a learner of these shapes, on one device, also in another thread."""
+    config, replay = _explanation_config(config), by_payment(learner.replay)
+    if not learner.decoders or not all(spec.basis.n_features for spec in config.credit_specs):
+        return
+    inputs = replay, tuple(decoder.is_mean for decoder in learner.decoders)
+    shapes = jax.tree.map(lambda leaf: jax.ShapeDtypeStruct(leaf.shape, leaf.dtype), inputs)
+    with jax.enable_x64(True):
+        _compile(config).lower(*shapes).compile()
+
+
 def _explanation_config(config: TrainConfig) -> TrainConfig:
     """Return the run's configuration with a closed-form method, whose inputs are in the columns of the run's replay."""
     observed = "state" if config.team_level else "observation"
@@ -89,7 +100,8 @@ def _explanation_config(config: TrainConfig) -> TrainConfig:
 
 
 @cache_by_value
-def _compile(config: TrainConfig) -> Callable[..., list[Explanation]]:
+def _compile(config: TrainConfig) -> Any:
+    """Return the compiled `_explain_first_seed`."""
     return jax.jit(partial(_explain_first_seed, config=config))
 
 

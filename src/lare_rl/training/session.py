@@ -39,6 +39,7 @@ from lare_rl.training.compiled import (
 )
 from lare_rl.training.compiled_loop import CompiledLoop, compile_loop, init_loop
 from lare_rl.training.evaluation import metrics_lines
+from lare_rl.training.explain import compile_explanation
 from lare_rl.training.factors import compute_host_factors
 from lare_rl.training.iteration import IterationFunctions, Metrics, when_on_host
 from lare_rl.training.learner import Learner, abandon_episodes
@@ -185,8 +186,11 @@ class Session:
         )
 
     def compile_while_collecting(self) -> None:
-        """Compile in a thread what the first finished episodes need. Until then, the processor often waits for a simulator."""
-        self._threads.submit(self.functions.compile_learning, learner_shape(self.config, len(self.run.seeds)))
+        """Compile in threads what the first finished episodes need. Until then, the processor often waits for a simulator."""
+        shape = learner_shape(self.config, len(self.run.seeds))
+        self._threads.submit(self.functions.compile_learning, shape)
+        if self.config.n_devices == 1:
+            self._threads.submit(compile_explanation, shape, self.config)
 
     def _iteration_functions(self, stop_requested: Callable[[], bool]) -> IterationFunctions:
         functions = self.functions
