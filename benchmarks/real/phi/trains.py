@@ -6,7 +6,7 @@ def evaluation_func(observation, action):
     waits, moves, stands, arrived = (observation[:, i : i + 1] for i in range(4))
     slack, early, distance = observation[:, 5:6], observation[:, 6:7], observation[:, 7:8]
     branches = np.reshape(observation[:, 8:23], (-1, 3, 5))
-    exists, detour, oncoming = branches[:, :, 0], branches[:, :, 1], branches[:, :, 3]
+    exists, oncoming = branches[:, :, 0], branches[:, :, 3]
     on_the_way = 1 - arrived
     # 1. the train has arrived
     f_arrived = arrived
@@ -22,6 +22,4 @@ def evaluation_func(observation, action):
     f_stands = -stands
     # 7. trains come towards it on all branches: it is blocked or will be
     f_blocked = -on_the_way * np.where(np.sum(exists * (oncoming <= 0), axis=1, keepdims=True) < 1, 1.0, 0.0)
-    # 8. the shortest way on is a detour
-    f_detour = -on_the_way * np.min(np.where(exists > 0, detour, 1.0), axis=1, keepdims=True)
-    return [f_arrived, f_distance, f_late, f_moves, f_dawdles, f_stands, f_blocked, f_detour]
+    return [f_arrived, f_distance, f_late, f_moves, f_dawdles, f_stands, f_blocked]
