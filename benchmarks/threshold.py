@@ -63,9 +63,8 @@ def assess(method: str, episodes: list, test: list) -> dict[str, float]:
     phi = {"bayes": lambda: None, "lare-bayes": lambda: lare_rl.design(TASK), "terms": load_terms}[method]()
     credit = lare_rl.CreditAssigner("lare-bayes" if phi is not None else "bayes", phi, task=TASK)
     for episode in episodes:
-        credit.add_episode(
-            *(episode[k] for k in ("observation", "action", "next_observation")), float(episode["reward"].sum())
-        )
+        steps = episode["observation"], episode["action"], episode["next_observation"]
+        credit.add_episode(*steps, float(episode["reward"].sum()))
     credit.fit()
     arrays = {k: np.concatenate([episode[k] for episode in test]) for k in test[0]}
     r_hat = credit.rewards(arrays["observation"], arrays["action"], arrays["next_observation"])

@@ -26,10 +26,10 @@ def main(steps: int = 14_400, episodes: int = 4) -> tuple[float, float]:
     test = make_task("traffic", "test")
     policy = play_scores(test, lambda env: lambda obs: model.predict(obs, deterministic=True)[0], episodes)
     rule = play_scores(test, final_score.traffic.longest_queue, episodes)
-    results = tuple(float(np.mean([score for score, _ in scores])) for scores in (policy, rule))
+    means = [float(np.mean([score for score, _ in scores])) for scores in (policy, rule)]
     env.close()
     test.close()
-    return results
+    return means[0], means[1]
 
 
 if __name__ == "__main__":

@@ -66,7 +66,7 @@ def make_algorithm() -> type:
             for trace in traces:
                 assign_advantages(trace, trace.reward - mean)
             for trace, advantage in zip(linear, advantages, strict=True):
-                assign_advantages(trace, token_advantages(trace, advantage))
+                assign_advantages(trace, token_advantages(trace, advantage.tolist()))
                 trace.info["turn_advantages"] = [float(value) for value in advantage]
 
     return TurnCreditAlgorithm

@@ -55,10 +55,11 @@ def _fit(
     shares = equal_shares(NUMPY, np.diagonal(s), total, group_index)
     problem = Regression(s, p, total, np.asarray(len(y) - 1.0), np.zeros(()), y_std, group_index, shares)
     alpha, beta = shares, 2 * problem.dof / total
+    weight = np.zeros(x.shape[1])
     for _ in range(ROUNDS):
         posterior = next_posterior(NUMPY, problem, alpha, beta, lambda a, b: dense_moments(NUMPY, problem, a, b))
-        alpha, beta = posterior.alpha, posterior.beta
-    return y_std * posterior.weight
+        weight, alpha, beta = posterior.weight, posterior.alpha, posterior.beta
+    return y_std * weight
 
 
 def _means(values: Float[np.ndarray, " n"], group: Int[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:

@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from lare_rl.credit.precisions import NUMPY, TOLERANCE, count_determined
-from lare_rl.turns.regression import Elimination, PrefixFit, eliminate_groups, sum_up
+from lare_rl.turns.regression import Elimination, GroupSums, PrefixFit, eliminate_groups, sum_up
 
 __all__ = ["fit_logistic", "logistic"]
 
@@ -42,33 +42,38 @@ def fit_logistic(
     n_groups = int(group.max()) + 1
     rate = np.clip(weight @ y / weight.sum(), 0.02, 0.98)
     eta = np.full(len(y), np.log(rate / (1 - rate)))
-    alpha, previous = None, -np.inf
-    for i in range(MAX_ROUNDS):
-        for _ in range(NEXT_STEPS if i else FIRST_STEPS):
-            p = logistic(eta)
-            curvature = np.maximum(p * (1 - p), MIN_CURVATURE)
-            sums = sum_up(x, eta + (y - p) / curvature, weight * curvature, group, n_groups, n_cases, unit=1.0)
-            if alpha is None:
-                first = np.append(np.diagonal(sums.problem.s) / sums.problem.q * x.shape[1], 1.0) + 1e-12
-                alpha = first
+
+    def regress() -> GroupSums:
+        p = logistic(eta)
+        curvature = np.maximum(p * (1 - p), MIN_CURVATURE)
+        return sum_up(x, eta + (y - p) / curvature, weight * curvature, group, n_groups, n_cases, unit=1.0)
+
+    sums = regress()
+    first = np.append(np.diagonal(sums.problem.s) / sums.problem.q * x.shape[1], 1.0) + 1e-12
+    alpha, previous, n_rounds = first, -np.inf, 0
+    while True:
+        n_rounds, n_steps = n_rounds + 1, 0
+        while True:
+            n_steps += 1
             posterior = eliminate_groups(sums, alpha, 1.0)
             mean = float(sums.problem.y_mean + posterior.weight[-1])
             step = mean + (x - sums.x_mean) @ posterior.weight[:-1] + posterior.intercept[group] - eta
             largest = np.abs(step).max()
             eta = eta + step * min(1.0, MAX_STEP / max(largest, 1e-12))
-            if largest < 1e-3:
+            if largest < 1e-3 or n_steps == (FIRST_STEPS if n_rounds == 1 else NEXT_STEPS):
                 break
+            sums = regress()
         solution = np.concatenate([posterior.weight[:-1], posterior.intercept])
         index = sums.problem.group_index
         size, n_determined, squares = count_determined(NUMPY, index, alpha, solution, posterior.variance)
         p = np.clip(logistic(eta), 1e-12, 1 - 1e-12)
         log_likelihood = weight @ (y * np.log(p) + (1 - y) * np.log(1 - p))
         log_evidence = log_likelihood + 0.5 * (size @ np.log(alpha) - alpha @ squares - posterior.log_det)
-        if abs(log_evidence - previous) <= 10 * TOLERANCE:
-            break
+        if abs(log_evidence - previous) <= 10 * TOLERANCE or n_rounds == MAX_ROUNDS:
+            return _to_fit(sums.x_mean, mean, posterior)
         previous = log_evidence
         alpha = np.clip(n_determined / np.maximum(squares, 1e-30), first * WEAKEST, first * STRONGEST)
-    return _to_fit(sums.x_mean, mean, posterior)
+        sums = regress()
 
 
 def _to_fit(x_mean: Float[np.ndarray, " features"], mean: float, posterior: Elimination) -> PrefixFit:

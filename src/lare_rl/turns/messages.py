@@ -89,16 +89,17 @@ def _read_turn(span: Sequence[tuple[int, Mapping[str, Any]]], where: str) -> Tur
     if len(calls) < len(results):
         extra = len(results) - len(calls)
         calls = [*calls, *[("unknown", "", None)] * extra]
-    matched = []
     unused = dict(results)
-    for _, _, identifier in calls:
-        matched.append(unused.pop(identifier, None) if identifier is not None else None)
-    rest = iter(unused.values())
-    matched = [result if result is not None else next(rest, ("", False)) for result in matched]
+    by_identifier = [unused.pop(identifier, None) if identifier is not None else None for _, _, identifier in calls]
+    rest, no_result = iter(unused.values()), ("", False)
+    matched: list[tuple[str, bool]] = [
+        result if result is not None else next(rest, no_result) for result in by_identifier
+    ]
     return Turn(
         text=_read_text(message.get("content"), f"{where}: messages[{i}]"),
         calls=tuple(
-            Call(tool, arguments, *result) for (tool, arguments, _), result in zip(calls, matched, strict=True)
+            Call(tool, arguments, result, failed)
+            for (tool, arguments, _), (result, failed) in zip(calls, matched, strict=True)
         ),
         reply="\n".join(replies),
     )

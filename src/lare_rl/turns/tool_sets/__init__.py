@@ -32,6 +32,6 @@ class ToolSet(NamedTuple):
 
 def load_tool_set(name: str) -> ToolSet:
     """Return one of `TOOL_SETS`."""
-    values = read_json((files(__package__) / f"{name}.json").read_text(encoding="utf-8"))
+    values = read_json((files(__name__) / f"{name}.json").read_text(encoding="utf-8"))
     turns = split_turns(values["messages"], name)
     return ToolSet(values["goal"], values["tools"], turns, [turns[index] for index in values["examples"]])
