@@ -32,7 +32,7 @@ class TrafficProcess(gymnasium.Env):
         self._folder = tempfile.TemporaryDirectory(prefix="final-score-")
         self._demand, self._trips = (Path(self._folder.name) / name for name in ("demand.rou.xml", "trips.xml"))
         self._begin = NETS[net]
-        nets = Path(sumo_rl.__file__).parent / "nets" / "RESCO" / net
+        nets = Path(str(sumo_rl.__file__)).parent / "nets" / "RESCO" / net
         self._default_demand, self._net = nets / f"{net}.rou.xml", nets / f"{net}.net.xml"
         write_demand(self._default_demand, self._demand, days[0], self._begin)
         output = f"--no-step-log --tripinfo-output {self._trips}"
