@@ -9,8 +9,10 @@ feature for the failures of each tool, as messages alone give.
 """
 
 import argparse
+import json
 from collections.abc import Callable
 from functools import partial
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -27,6 +29,7 @@ from turns.finite_task import GROUP_SIZE, FiniteTask, Rollouts
 __all__ = ["TASKS", "make_table", "train"]
 
 TASKS = {"tool use": tool_use, "key and door": key_door}
+OUT = Path(__file__).parents[1] / "results" / "turns_learning.json"
 N_GROUPS, LEARNING_RATE, EVERY = 16, 0.1, 5
 ROLLOUTS = N_GROUPS * GROUP_SIZE
 Turns = Float[np.ndarray, "rollouts turns"]
@@ -164,30 +167,27 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--seeds", type=int, default=10)
     parser.add_argument("--updates", type=int, default=40)
-    parser.add_argument("--methods", default="", help="only methods whose name has this text")
+    parser.add_argument("--methods", nargs="*", default=list(METHODS), help="only these; they are added to the results")
     options = parser.parse_args()
-    figures: dict[str, dict[str, Any]] = {name: {} for name in TASKS}
-    reference = {}
     command = f"PYTHONPATH=benchmarks python -m turns.learning --seeds {options.seeds} --updates {options.updates}"
-    for method, make_credit in METHODS.items():
-        if method != "GRPO" and options.methods not in method:
-            continue
+    figures: dict[str, dict[str, Any]] = {name: {} for name in TASKS}
+    if OUT.exists() and (earlier := json.loads(OUT.read_text()))["command"] == command:
+        figures = earlier["tasks"]
+    for method in options.methods:
         for name in TASKS:
-            credit_of_seeds = [make_credit() for _ in range(options.seeds)]
+            credit_of_seeds = [METHODS[method]() for _ in range(options.seeds)]
             curves = np.array(
                 [train(name, credit, seed, options.updates) for seed, credit in enumerate(credit_of_seeds)]
             )
-            row = summarise(curves, reference.setdefault(name, curves))
+            reference = np.array(figures[name]["GRPO"]["curves"]) if method != "GRPO" else curves
+            row = summarise(curves, reference)
             if isinstance(credit_of_seeds[0], Progress):
                 lambdas = np.array([credit.lambdas for credit in credit_of_seeds])
                 row["share_of_lambda"] = {str(value): float(np.mean(lambdas == value)) for value in (0.8, 0.95, 1.0)}
             figures[name][method] = row
             print(name, method, {key: row[key] for key in row if key not in ("curves", "rollouts")}, flush=True)
-        if not options.methods:  # after each method, because the whole takes some minutes
-            write(
-                "turns_learning",
-                {"command": command, "seeds": options.seeds, "updates": options.updates, "tasks": figures},
-            )
+        # After each method, because the whole takes some minutes.
+        write(OUT.stem, {"command": command, "seeds": options.seeds, "updates": options.updates, "tasks": figures})
 
 
 if __name__ == "__main__":

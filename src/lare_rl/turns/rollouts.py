@@ -24,6 +24,8 @@ __all__ = ["MAX_NUMBER", "Phi", "Rollout", "read_rollout", "read_rollouts"]
 
 MAX_NUMBER = 1e9
 """The largest number of a turn, and the largest outcome. Sums of squares of larger numbers lose their digits."""
+MIN_NUMBER = 1e-9
+"""Smaller numbers are read as 0: their squares would be too small for a fit."""
 MAX_TURNS = 10_000
 MAX_NAME = 80
 
@@ -120,4 +122,4 @@ def _read_number(value: Any, where: str) -> float:
         number = math.nan
     if not abs(number) <= MAX_NUMBER:
         raise LareError(f"{where} must be a number of at most {MAX_NUMBER:g}, and is {short_repr(value)}")
-    return number
+    return number if abs(number) >= MIN_NUMBER else 0.0
