@@ -10,7 +10,7 @@ from typing import Literal
 
 from lare_rl.errors import CheckedModel, LareError
 from lare_rl.llm.key import redact_key
-from lare_rl.llm.prompts import Kind, Message, Stage
+from lare_rl.llm.prompts import Message, Stage
 from lare_rl.util.files import replace_file
 from lare_rl.util.safe_io import read_json
 
@@ -24,7 +24,7 @@ __all__ = [
     "shipped_recordings",
 ]
 
-RecordingKind = Kind | Literal["events"]
+RecordingKind = Literal["factors", "reward", "events"]
 """What a recorded function returns: factors or a reward of a step, or the events of a turn (`lare_rl.turns`)."""
 
 SHIPPED_RECORDINGS = files("lare_rl.llm") / "recordings"
