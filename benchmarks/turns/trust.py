@@ -11,6 +11,7 @@ in standard errors with the correlation of the changes, over data sets. `cost`: 
 import argparse
 import time
 from statistics import median
+from typing import Any
 
 import numpy as np
 
@@ -23,7 +24,7 @@ SIZES = (64, 128, 256, 512, 1024)
 LARGE_CHANGE = 0.05
 
 
-def measure_data_set(name: str, size: int, seed: int, features: str) -> dict[str, float | str | int]:
+def measure_data_set(name: str, size: int, seed: int, features: str) -> dict[str, Any]:
     """Return how good the credit of some rollouts is."""
     task = make_task(name)
     theta = TASKS[name].starting_policy(task)
