@@ -158,7 +158,8 @@ def summarise(
     for i in (n // 2, n - 1):
         level = float(reference.mean(axis=0)[i])
         rollouts = rollouts_to_reach(curves.mean(axis=0), level)
-        speed = None if rollouts is None else rollouts_to_reach(reference.mean(axis=0), level) / max(rollouts, 1)
+        reference_rollouts = rollouts_to_reach(reference.mean(axis=0), level)
+        speed = None if rollouts is None or reference_rollouts is None else reference_rollouts / max(rollouts, 1)
         result[f"speed_to_grpo_at_{i * EVERY * ROLLOUTS}"] = speed
     return result
 
@@ -181,8 +182,8 @@ def main() -> None:
             )
             reference = np.array(figures[name]["GRPO"]["curves"]) if method != "GRPO" else curves
             row = summarise(curves, reference)
-            if isinstance(credit_of_seeds[0], Progress):
-                lambdas = np.array([credit.lambdas for credit in credit_of_seeds])
+            lambdas = np.array([credit.lambdas for credit in credit_of_seeds if isinstance(credit, Progress)])
+            if len(lambdas):
                 row["share_of_lambda"] = {str(value): float(np.mean(lambdas == value)) for value in (0.8, 0.95, 1.0)}
             figures[name][method] = row
             print(name, method, {key: row[key] for key in row if key not in ("curves", "rollouts")}, flush=True)
