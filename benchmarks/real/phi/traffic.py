@@ -17,8 +17,8 @@ def evaluation_func(observation, action):
     f_density = -np.sum(density, axis=1, keepdims=True)
     # 5. vehicles that move
     f_flow = np.sum(np.maximum(density - queue, 0.0), axis=1, keepdims=True)
-    # 6. the phase has just begun: time was lost by a switch
-    f_switch = observation[:, 3:4] - 1
+    # 6. time was lost by a switch
+    f_switch = -observation[:, 3:4]
     # 7. a lane that is nearly full blocks what is behind it
     f_spillback = -np.sum(np.maximum(density - 0.7, 0.0), axis=1, keepdims=True)
     return [f_red_queue, f_green_queue, f_longest_queue, f_density, f_flow, f_switch, f_spillback]

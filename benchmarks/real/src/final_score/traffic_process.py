@@ -70,10 +70,11 @@ class TrafficProcess(gymnasium.Env):
         self._day = int((options or {}).get("day", day))
         write_demand(self._default_demand, self._demand, self._day, self._begin)
         observation, _ = self._sumo.reset(seed=sumo_seed)
-        self._n_steps = 0
+        self._n_steps, self._switched = 0, False
         return self._observe(observation), {"day": self._day}
 
     def step(self, action: Any):
+        self._switched = self._signal.green_phase != int(action)
         observation, proxy, _, ended, _ = self._sumo.step(int(action))
         self._n_steps += 1
         score, info = 0.0, {"proxy": float(proxy)}
@@ -113,8 +114,10 @@ class TrafficProcess(gymnasium.Env):
         self._folder.cleanup()
 
     def _observe(self, observation: np.ndarray) -> np.ndarray:
-        time = self._n_steps * SECONDS_PER_STEP / HOUR
-        return np.clip(np.append(observation, time), 0.0, 1.0).astype(np.float32)
+        entries = np.append(observation, self._n_steps * SECONDS_PER_STEP / HOUR)
+        # sumo-rl says here whether the phase may be switched, which is so at every decision.
+        entries[self.action_space.n] = self._switched
+        return np.clip(entries, 0.0, 1.0).astype(np.float32)
 
 
 def write_demand(trip_file: Path, file: Path, day: int, begin: int) -> None:
