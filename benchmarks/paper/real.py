@@ -8,6 +8,7 @@ import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import closing
 from dataclasses import replace
+from importlib.metadata import version
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
@@ -34,6 +35,14 @@ __all__ = ["SOURCE", "TITLE", "Study", "make_page", "plan_jobs", "read_study"]
 
 TITLE = "Scores that exist only at the end"
 SOURCE = "none: ours"
+SIMULATORS = {
+    "wheat": "pcse",
+    "traffic": "eclipse-sumo",
+    "jobshop": "jumanji",
+    "trains": "flatland-rl",
+    "grid": "grid2op",
+}
+"""The distribution of the simulator of each task."""
 FOLDER = Path(__file__).parents[1] / "real"
 
 
@@ -195,4 +204,5 @@ def _describe_runs(jobs: Jobs) -> str:
     machines = sorted({run.config.machine for run in runs})
     n_seeds = len({seed for run in runs for seed in run.seeds})
     lare = ", ".join(sorted({run.config.lare for run in runs}))
-    return f"{n_seeds} seeds. LaRe {lare}; {', '.join(versions)}; {'; '.join(machines)}."
+    simulators = [f"{name} {version(name)}" for task, name in SIMULATORS.items() if task in jobs]
+    return f"Seeds: {n_seeds}. LaRe {lare}; {', '.join([*versions, *simulators])}; {'; '.join(machines)}."

@@ -32,7 +32,8 @@ def test_page(monkeypatch, tmp_path):
     monkeypatch.setattr(processes, "train_in_process", invented_training)
     page = reproduce("real", "smoke", Resources(), tmp_path / "runs", tmp_path / "out")
     text = page.read_text()
-    assert text.startswith(f"# {real.TITLE}\n\nBy `lare-rl reproduce real --budget smoke`. 1 seeds.")
+    assert text.startswith(f"# {real.TITLE}\n\nBy `lare-rl reproduce real --budget smoke`. Seeds: 1. LaRe ")
+    assert ", jumanji 1" in text
     assert all(f"| {label} | " in text for label in (*STUDY.methods, "random", "rule: most work remaining"))
     assert "it runs, and learns nothing" in text
     assert (page.parent / "real-jobshop.svg").is_file()
