@@ -10,7 +10,7 @@ from final_score.play import list_rules, play_scores
 
 SUMS = ("wheat", "jobshop")
 """The tasks whose proxy adds up to the score, or to the score less 100."""
-EPISODES = {"wheat": 4, "traffic": 1, "jobshop": 12, "trains": 6, "grid": 4}
+EPISODES = {"wheat": 4, "traffic": 1, "jobshop": 12, "trains": 4, "grid": 2}
 
 
 def step(env, action):

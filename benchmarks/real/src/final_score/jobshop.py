@@ -120,8 +120,8 @@ class JobShop(gymnasium.Env):
         return np.array([jobs[np.argmin(key)] for key in keys])
 
     def _job_features(self, jobs: np.ndarray) -> tuple[np.ndarray, ...]:
-        """Return for each job: duration of its next operation, work after it, number of operations after it, work that waits for or is
-        still to come on the machine after it, and whether that machine is free now.
+        """Return for each job: duration of its next operation, work after it, number of operations after it, work that waits at the
+        machine after it, and whether that machine is free now.
         """
         next_operation = self._open[jobs].argmax(axis=1)
         duration = self._durations[jobs, next_operation]
