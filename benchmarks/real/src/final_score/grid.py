@@ -128,7 +128,8 @@ class Grid(gymnasium.Env):
             colour = "tab:red" if loading > 1 else "tab:orange" if loading > 0.8 else "tab:green"
             style = "-" if observation.line_status[line] else ":"
             axes.plot(*ends.T, color=colour, linewidth=1 + 2 * loading, linestyle=style)
-            axes.text(*ends.mean(axis=0), f"{100 * loading:.0f}%", fontsize=7)
+            x, y = ends.mean(axis=0).tolist()
+            axes.text(x, y, f"{100 * loading:.0f}%", fontsize=7)
         axes.scatter(*positions.T, s=160, color="tab:blue", zorder=3)
         axes.set(title=f"week {self._week}, day {self._day}, {self._n_steps * HOURS_PER_STEP:.1f} h", aspect="equal")
         axes.axis("off")
