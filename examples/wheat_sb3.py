@@ -27,8 +27,7 @@ def main(steps: int = 4_000, episodes: int = 28) -> tuple[float, float]:
     test = make_task("wheat", "test")
     policy = play_scores(test, lambda env: lambda obs: model.predict(obs, deterministic=True)[0], episodes)
     rule = play_scores(test, final_score.wheat.three_dates, episodes)
-    means = [float(np.mean([score for score, _ in scores])) for scores in (policy, rule)]
-    return means[0], means[1]
+    return float(np.mean([score for score, _ in policy])), float(np.mean([score for score, _ in rule]))
 
 
 if __name__ == "__main__":

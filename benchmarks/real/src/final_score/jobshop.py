@@ -79,12 +79,10 @@ class JobShop(gymnasium.Env):
         figure = new_figure()
         axes = figure.subplots()
         times = np.asarray(self._state.scheduled_times)
-        for job, operation in np.argwhere(times >= 0):
-            width, machine = self._durations[job, operation], self._machines[job, operation]
-            axes.barh(machine, width, 0.8, times[job, operation], color=f"C{job % 10}", edgecolor="white")
-            axes.text(
-                float(times[job, operation] + width / 2), float(machine), str(job), ha="center", va="center", fontsize=6
-            )
+        for job, operation in np.argwhere(times >= 0).tolist():
+            start, width, machine = (int(table[job, operation]) for table in (times, self._durations, self._machines))
+            axes.barh(machine, width, 0.8, start, color=f"C{job % 10}", edgecolor="white")
+            axes.text(start + width / 2, machine, str(job), ha="center", va="center", fontsize=6)
         axes.axvline(self._bound, color="black", linestyle="--", linewidth=1)
         axes.set(xlim=(0, 1.6 * self._bound), ylim=(-0.5, N_MACHINES - 0.5), xlabel="time", ylabel="machine")
         return to_pixels(figure)
@@ -190,7 +188,7 @@ def shop() -> tuple[Callable[[bool, int], Any], Callable[[Any, np.ndarray], Any]
     """Return compiled functions: the first state of an instance, and the state after a time unit."""
     import jax
     import jax.numpy as jnp
-    from jumanji.environments.packing.job_shop import JobShop as Shop
+    from jumanji.environments.packing.job_shop.env import JobShop as Shop
     from jumanji.environments.packing.job_shop.generator import Generator
     from jumanji.environments.packing.job_shop.types import State
 

@@ -37,7 +37,7 @@ class TrafficProcess(gymnasium.Env):
         write_demand(self._default_demand, self._demand, days[0], self._begin)
         output = f"--no-step-log --tripinfo-output {self._trips}"
         unfinished = "--tripinfo-output.write-unfinished true --tripinfo-output.write-undeparted true"
-        self._sumo = sumo_rl.SumoEnvironment(
+        self._sumo: Any = sumo_rl.SumoEnvironment(
             net_file=str(self._net),
             route_file=str(self._demand),
             single_agent=True,
@@ -116,7 +116,7 @@ class TrafficProcess(gymnasium.Env):
     def _observe(self, observation: np.ndarray) -> np.ndarray:
         entries = np.append(observation, self._n_steps * SECONDS_PER_STEP / HOUR)
         # sumo-rl says here whether the phase may be switched, which is so at every decision.
-        entries[self.action_space.n] = self._switched
+        entries[self._signal.num_green_phases] = self._switched
         return np.clip(entries, 0.0, 1.0).astype(np.float32)
 
 
