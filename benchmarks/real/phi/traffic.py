@@ -1,59 +1,56 @@
 # lare: task: Traffic
 # lare: kind: factors
 # lare: model: Claude (Anthropic), recorded 2026-11-28, draw 0
-# lare: sha256: a38ec678e0e82b5794661ac9dfb8cea9cf8ce1185aff9765549224b4e671191c
+# lare: sha256: c428e3aeebb078335c3ac353a42d84038e6bdcca87b692cc47ce87fc7227b132
 # lare: passed: read, finite
 import numpy as np
 
 def evaluation_func(observation, action):
-    observation = np.asarray(observation, dtype=float)
-    action = np.asarray(action, dtype=float)
+    obs = np.asarray(observation, dtype=np.float64)
+    act = np.asarray(action, dtype=np.float64)
 
-    can_switch = (observation[:, 3:4] > 0.5).astype(float)
-    density = np.clip(observation[:, 4:11], 0.0, 1.0)
-    queue = np.clip(observation[:, 11:18], 0.0, 1.0)
+    phase = obs[:, 0:3]
+    density = np.clip(obs[:, 4:11], 0.0, 1.0)
+    queue = np.clip(obs[:, 11:18], 0.0, 1.0)
 
-    # rows: phases, columns: lanes; 1 where the lane is green in the phase
+    # rows: phases 0, 1, 2; columns: lanes 0 to 6; 1 where the lane has green
     green = np.array([
         [1.0, 1.0, 1.0, 1.0, 0.0, 1.0, 1.0],
         [1.0, 1.0, 1.0, 1.0, 0.0, 0.0, 0.0],
         [0.0, 0.0, 0.0, 1.0, 1.0, 1.0, 0.0]
     ])
+    n_lanes = 7.0
+    chosen = np.argmax(act[:, 0:3], axis=1)
+    current = np.argmax(phase, axis=1)
+    green_chosen = green[chosen]
 
-    # phase that will really be in force: a switch takes effect only if it is allowed
-    current = np.argmax(observation[:, 0:3], axis=1)
-    chosen = np.argmax(action[:, 0:3], axis=1)
-    switched = (chosen != current).astype(float).reshape(-1, 1) * can_switch
-    in_force = np.where(switched[:, 0] > 0.5, chosen, current)
-    green_lanes = green[in_force]
+    # demand of each lane: standing vehicles count fully, moving ones half
+    moving = np.maximum(density - queue, 0.0)
+    demand = queue + 0.5 * moving
 
-    mean_density = np.mean(density, axis=1, keepdims=True)
-
-    # 1. standing vehicles on all lanes: the direct source of delay
+    # 1: standing vehicles over all lanes, the direct source of delay
     total_queue = -np.mean(queue, axis=1, keepdims=True)
 
-    # 2. all vehicles still before the junction, slow ones included
-    total_density = -mean_density
+    # 2: all vehicles that are still in front of the junction, standing or slow
+    total_density = -np.mean(density, axis=1, keepdims=True)
 
-    # 3. the worst lane: no direction may be starved
+    # 3: longest single queue, so that no direction is starved
     worst_queue = -np.max(queue, axis=1, keepdims=True)
 
-    # 4. standing vehicles that the phase in force keeps at red
-    held_at_red = -np.sum(queue * (1.0 - green_lanes), axis=1, keepdims=True) / 7.0
+    # 4: demand that the chosen phase leaves at red
+    red_demand = -np.sum(demand * (1.0 - green_chosen), axis=1, keepdims=True) / n_lanes
 
-    # 5. demand served by the phase in force, compared with the best phase;
-    #    a standing vehicle counts 1, a moving one 0.5
-    demand = 0.5 * (queue + density)
-    served = np.sum(demand * green_lanes, axis=1, keepdims=True)
-    best = np.max(np.dot(demand, green.T), axis=1, keepdims=True)
-    phase_choice = np.clip((served - best) / 7.0, -1.0, 0.0)
+    # 5: demand that gets green, short of the most that any one phase could serve
+    served = np.sum(demand * green_chosen, axis=1, keepdims=True)
+    best_served = np.max(np.matmul(demand, green.T), axis=1, keepdims=True)
+    phase_shortfall = np.minimum(served - best_served, 0.0) / n_lanes
 
-    # 6. flow lost to yellow by a switch (2 of 10 seconds), weighed with the traffic it slows
-    switch_loss = -0.2 * switched * mean_density
+    # 6: time lost to yellow when the chosen phase is not the present one
+    switch_cost = -(chosen != current).astype(np.float64).reshape(-1, 1)
 
-    # 7. share of the vehicles present that stands: how freely the traffic flows, whatever the demand
+    # 7: share of the present vehicles that stand, independent of the level of demand
     sum_queue = np.sum(queue, axis=1, keepdims=True)
-    sum_density = np.sum(density, axis=1, keepdims=True)
-    standing_share = -np.clip(sum_queue / (sum_density + 0.1), 0.0, 1.0)
+    sum_all = np.sum(queue + moving, axis=1, keepdims=True)
+    standing_share = -sum_queue / (sum_all + 0.1)
 
-    return [total_queue, total_density, worst_queue, held_at_red, phase_choice, switch_loss, standing_share]
+    return [total_queue, total_density, worst_queue, red_demand, phase_shortfall, switch_cost, standing_share]
