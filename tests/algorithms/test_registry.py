@@ -31,7 +31,7 @@ register_algorithm(replace(ALGORITHMS["td3"], name="quiet", settings=settings, m
 PROGRAM = """
 import sys
 import lare_rl.cli
-for arguments in (["algorithms"], ["train", "--help"]):
+for arguments in (["algorithms"], ["train", "--algorithm", "quiet", "--help"]):
     sys.argv[1:] = arguments
     try:
         lare_rl.cli.main()

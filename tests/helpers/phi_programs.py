@@ -57,7 +57,8 @@ def repaired_programs() -> list[dict[str, str]]:
 def recorded_programs() -> list[Program]:
     """Every function in the shipped recordings."""
     programs = []
-    for path in sorted(Path(str(SHIPPED_RECORDINGS)).glob("*/*.json")):
+    folder = Path(str(SHIPPED_RECORDINGS))
+    for path in sorted([*folder.glob("factors/*.json"), *folder.glob("reward/*.json")]):
         task = path.name.partition(".draw")[0]
         if task in shipped_tasks():
             role = read_task(task)

@@ -11,7 +11,8 @@ from lare_rl.latent.verify import Check, random_steps, sample_steps, verify
 from lare_rl.llm.recording import SHIPPED_RECORDINGS, read_recording
 from lare_rl.llm.reply import parse_reply
 
-RECORDINGS = sorted(f"{kind.name}/{entry.name}" for kind in SHIPPED_RECORDINGS.iterdir() for entry in kind.iterdir())
+KINDS = SHIPPED_RECORDINGS / "factors", SHIPPED_RECORDINGS / "reward"
+RECORDINGS = sorted(f"{kind.name}/{entry.name}" for kind in KINDS for entry in kind.iterdir())
 SHORT = ("reward/HalfCheetah-v4.draw0.json", "reward/Reacher-v4.draw0.json", "factors/Reacher-v4.draw2.json")
 
 
