@@ -128,7 +128,8 @@ class Page:
                 assert re.search(rf"^{target}:", (ROOT / "Makefile").read_text(), re.MULTILINE)
             case ["pip", "install", *packages]:
                 project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
-                extras = {f"lare-rl[{name}]" for name in project["optional-dependencies"]}
+                names = project["optional-dependencies"]
+                extras = {"-e", *(f"lare-rl[{name}]" for name in names), *(f".[{name}]" for name in names)}
                 developed = " ".join(project["optional-dependencies"]["dev"])
                 assert all(package in extras or package in developed for package in packages)
             case ["python", path, *_] | [".venv/bin/python", "-m", "pytest", path]:
@@ -271,6 +272,8 @@ PREPARE = {
 }
 """What the reader of a page already has."""
 
+NEEDS = {"docs/jax-environments.md": "gymnax"}
+"""Pages that need a package which cannot be installed beside those of development."""
 EXCERPTS = {"docs/plugs/others.md": ("tianshou_td3.py", "skrl_td3.py", "rllib_ppo.py")}
 """Pages whose snippets are lines of examples, which `test_examples.py` runs if the library is installed."""
 
@@ -296,6 +299,8 @@ def small_runs(monkeypatch):
 @pytest.mark.parametrize("name", [name for name in PAGES_WITH_BLOCKS if name not in EXCERPTS])
 def test_page(name, command, monkeypatch, tmp_path):
     monkeypatch.delitem(sys.modules, "exported", raising=False)  # of another page
+    if name in NEEDS:
+        pytest.importorskip(NEEDS[name], exc_type=ImportError)
     page = Page(command, monkeypatch, tmp_path)
     PREPARE.get(name, lambda page: None)(page)
     for language, text in blocks(ROOT / name):
