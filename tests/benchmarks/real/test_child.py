@@ -1,5 +1,7 @@
 """Environments in processes of their own, with an environment of Gymnasium."""
 
+import signal
+
 import numpy as np
 import pytest
 
@@ -45,7 +47,8 @@ def test_dead_process(cart):
 
 
 def test_hanging_process(cart, monkeypatch):
-    monkeypatch.setattr(child, "TIMEOUT_S", 0.0)
+    monkeypatch.setattr(child, "TIMEOUT_S", 0.2)
+    cart._process.send_signal(signal.SIGSTOP)
     with pytest.raises(TimeoutError, match="no answer"):
         cart.reset(seed=1)
     assert cart._process.poll() is not None
