@@ -240,7 +240,7 @@ def _factor_findings(explanation: Explanation, names: Sequence[str], total: floa
 
 
 def _factor(explanation: Explanation, name: str, indices: list[int], varied: list[int], share: float) -> Finding:
-    """Report a factor with one index or two, before and after the step, of which some have varied."""
+    """Report a factor. It has one index, or two: before and after the step. `varied` holds the indices whose values varied."""
     if not varied:
         return Finding("unknown_factor", {"name": name, "effect": Finding("equal_means")})
     states = None

@@ -28,7 +28,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from lare_rl.credit import evidence
 from lare_rl.credit.evidence import JAX, PosteriorSpread
-from lare_rl.credit.precisions import JITTER, PRIOR_RANGE, Posterior, inverse_root
+from lare_rl.credit.precisions import JITTER, PRIOR_RANGE, Posterior, count_determined, inverse_root
 
 __all__ = ["WINDOW", "LogOddsFit", "add_episodes", "fit", "init", "predict", "remove_episodes", "spread", "to_returns"]
 
@@ -126,10 +126,7 @@ def fit(state: LogOddsFit, group_index: Int[np.ndarray, " columns"], max_rounds:
         weight = (root @ (weighted.T @ (target - target_mean))) @ root
         eta = target_mean + difference @ weight
         variance = jnp.sum((difference @ root.T) ** 2, axis=1) + 1 / total
-        size = JAX.group_sums(jnp.ones_like(weight), group_index, n_groups)
-        squares = JAX.group_sums(weight**2, group_index, n_groups)  # |mu_g|^2
-        n_determined = size - alpha * JAX.group_sums(jnp.sum(root**2, axis=0), group_index, n_groups)
-        n_determined = jnp.clip(n_determined, 0, size)
+        size, n_determined, squares = count_determined(JAX, group_index, alpha, weight, jnp.sum(root**2, axis=0))
         likelihood = jnp.sum(jnp.where(valid, jax.nn.log_sigmoid((2 * won - 1) * eta), 0))
         posterior = Posterior(
             weight=weight,

@@ -37,7 +37,7 @@ from lare_rl.phi.values import (
 )
 from lare_rl.util.sanitize import first_invisible
 
-__all__ = ["FUNCTION_NAME", "error_text", "parse", "read"]
+__all__ = ["FUNCTION_NAME", "describe_failure", "parse", "read"]
 
 _PARSING = threading.Lock()
 """`threading.stack_size` is for the whole process. Before Python 3.11.8 and 3.12.2, parsers in two threads may also miscount
@@ -99,20 +99,27 @@ def read(source: str, observation_size: int, action_size: int, max_factors: int 
             tree = parse(source)
             interpreter.run(tree.body, interpreter.module)
             return _build_graph(interpreter, observation_size, action_size, max_factors)
-    except RefusedError as refusal:
-        code, message, line = refusal.code, str(refusal), refusal.line or interpreter.line
-    except PYTHON_ERRORS as error:
-        code, message, line = "E-RUN", error_text(error), interpreter.line
-    except (ReturnSignal, BreakSignal, ContinueSignal):
-        code, message = "E-SYNTAX", "return outside a function, or break or continue outside a loop"
-        line = interpreter.line
-    except (RecursionError, MemoryError):
-        code, message, line = "E-COST", "the code is nested too deeply", interpreter.line
     except Exception as error:  # no text may stop the process that reads it
-        code, message, line = "E-BUG", f"an error of LaRe, please report it: {error_text(error)}", interpreter.line
+        code, message, line = describe_failure(error, interpreter)
     first = f"{code} line {line}: {' '.join(message[:MAX_MESSAGE_LENGTH].split())}"
     further = [] if tree is None else _unavailable_names(tree, interpreter.module)
     raise RefusedError(code, "\n".join(dict.fromkeys([first, *further])), line) from None
+
+
+def describe_failure(error: Exception, interpreter: Interpreter) -> tuple[str, str, int | None]:
+    """Return the rule, the message and the line of what stopped a program."""
+    line = interpreter.line
+    match error:
+        case RefusedError():
+            return error.code, str(error), error.line or line
+        case _ if isinstance(error, PYTHON_ERRORS):
+            return "E-RUN", error_text(error), line
+        case ReturnSignal() | BreakSignal() | ContinueSignal():
+            return "E-SYNTAX", "return outside a function, or break or continue outside a loop", line
+        case RecursionError() | MemoryError():
+            return "E-COST", "the code is nested too deeply", line
+        case _:
+            return "E-BUG", f"an error of LaRe, please report it: {error_text(error)}", line
 
 
 def error_text(error: Exception) -> str:

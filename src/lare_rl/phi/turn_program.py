@@ -17,15 +17,11 @@ from typing import Any
 from lare_rl.phi.builder import Builder, building
 from lare_rl.phi.interpreter import Interpreter
 from lare_rl.phi.limits import MAX_FACTORS, MAX_INT_BITS, MAX_MESSAGE_LENGTH, MAX_TEXT_LENGTH, RefusedError
-from lare_rl.phi.read import error_text, parse
+from lare_rl.phi.read import describe_failure, parse
 from lare_rl.phi.runtime import Meter
 from lare_rl.phi.values import (
-    PYTHON_ERRORS,
     Bound,
-    BreakSignal,
-    ContinueSignal,
     Function,
-    ReturnSignal,
     describe,
 )
 from lare_rl.util.sanitize import one_line
@@ -80,21 +76,8 @@ class TurnProgram:
                     form = f"{TURN_FUNCTION_NAME}(tool, arguments, result, text)"
                     raise RefusedError("E-FORM", f"there is no function {form}")
                 return _check_events(interpreter.call(function, inputs, {}))
-            except RefusedError as refusal:
-                code, message, line = refusal.code, str(refusal), refusal.line or interpreter.line
-            except PYTHON_ERRORS as error:
-                code, message, line = "E-RUN", error_text(error), interpreter.line
-            except (ReturnSignal, BreakSignal, ContinueSignal):
-                code, message = "E-SYNTAX", "return outside a function, or break or continue outside a loop"
-                line = interpreter.line
-            except (RecursionError, MemoryError):
-                code, message, line = "E-COST", "the code is nested too deeply", interpreter.line
             except Exception as error:  # no text may stop the process that reads it
-                code, message, line = (
-                    "E-BUG",
-                    f"an error of LaRe, please report it: {error_text(error)}",
-                    interpreter.line,
-                )
+                code, message, line = describe_failure(error, interpreter)
         raise RefusedError(code, f"{code} line {line}: {' '.join(message[:MAX_MESSAGE_LENGTH].split())}", line)
 
 
