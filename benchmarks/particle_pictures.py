@@ -1,4 +1,4 @@
-"""The pictures of docs/particle-tasks.md.
+"""The pictures of docs/reference/particle-tasks.md.
 
 python benchmarks/particle_pictures.py
 """

@@ -4,7 +4,7 @@
 
 Random actions, episodes of 25 steps, all observations and rewards computed. Our environment steps whole batches of worlds in one
 compiled call. mpe2, the maintained package of the multi-agent particle environments, steps one world with the same numbers of
-agents and landmarks. Its task differs slightly from ours (see `docs/particle-tasks.md`), but the work is the same.
+agents and landmarks. Its task differs slightly from ours (see `docs/reference/particle-tasks.md`), but the work is the same.
 """
 
 import warnings

@@ -72,7 +72,7 @@ def python_reference(sources: dict[str, tuple[str, str]]) -> str:
     """Every public name, by its docstring; of a class, its settings, and the members that the page of the API speaks of."""
     import lare_rl
 
-    spoken_of = (ROOT / "docs" / "api.md").read_text(encoding="utf-8")
+    spoken_of = (ROOT / "docs/how-to/python.md").read_text(encoding="utf-8")
     lines = ["# Every function", ""]
     for name, (module, source_name) in sorted(sources.items(), key=lambda item: item[0].lower()):
         public = getattr(lare_rl, name)
@@ -95,5 +95,12 @@ def command_line_reference(commands: Any) -> str:
         call = [sys.executable, "-c", "from lare_rl.cli import main; main()", name, "--help"]
         environment = os.environ | {"COLUMNS": "110", "NO_COLOR": "1", "PYTHONPATH": str(ROOT / "src")}
         printed = subprocess.run(call, capture_output=True, text=True, check=True, env=environment).stdout
-        lines += [f"## lare {name}", "", "```text", printed.replace("usage: -c", "usage: lare").strip(), "```", ""]
+        lines += [
+            f"## lare-rl {name}",
+            "",
+            "```text",
+            printed.replace("usage: -c", "usage: lare-rl").strip(),
+            "```",
+            "",
+        ]
     return "\n".join(lines)

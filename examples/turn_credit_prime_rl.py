@@ -6,7 +6,7 @@ Copy this file into your project, and start the orchestrator by it instead of by
 
 Nothing else changes: the configuration says `type = "grpo"`. Read against prime-rl 559b447 and verifiers a60a606 (22 August 2026). Numbers
 of turns from your environment are taken from `trace.info["turns"]`: a list with a mapping from names to numbers for each turn. They matter
-most (docs/turn-credit.md).
+most (docs/tutorials/agents-that-talk.md).
 """
 
 from collections import deque

@@ -160,8 +160,8 @@ def block(page, language, number):
     return [text for name, text in blocks(ROOT / page) if name == language][number]
 
 
-PENDULUM = block("docs/bring-your-own-task.md", "python", 0)
-STUDY = block("docs/sweeps.md", "toml", 0).replace("processes = 2", "processes = 1")
+PENDULUM = block("docs/tutorials/your-own-environment.md", "python", 0)
+STUDY = block("docs/how-to/sweeps.md", "toml", 0).replace("processes = 2", "processes = 1")
 API_NAMES = """
 import gymnasium, numpy as np
 envs = gymnasium.make_vec('Reacher-v4', num_envs=4)
@@ -184,7 +184,9 @@ def to_reply(source):
 def write_study(page):
     """Write the files that the study names. Its runs are not trained."""
     page.write("study.toml", shorten(STUDY))
-    page.write("my-task.toml", block("docs/bring-your-own-task.md", "toml", 0).replace('"Pendulum"', '"MyTask"'))
+    page.write(
+        "my-task.toml", block("docs/tutorials/your-own-environment.md", "toml", 0).replace('"Pendulum"', '"MyTask"')
+    )
     page.write("phi.py", PENDULUM)
     page.patch.setattr(processes, "train_in_process", invent_run)
 
@@ -258,23 +260,25 @@ def prepare_plugin(page):
 
 PREPARE = {
     "README.md": write_readme_study,
-    "docs/api.md": prepare_api,
-    "docs/bring-your-own-task.md": lambda page: page.serve(PENDULUM),
-    "docs/export.md": export_policy,
-    "docs/extending.md": prepare_plugin,
-    "docs/jax-environments.md": lambda page: page.write("pendulum.toml", block("docs/jax-environments.md", "toml", 0)),
-    "docs/logs.md": write_logs,
-    "docs/plugs/sb3.md": lambda page: lare_rl.design("Reacher-v4").save(page.directory / "phi.py"),
-    "docs/reproduce.md": write_study,
-    "docs/runs.md": train_run,
-    "docs/starcraft.md": write_study,
-    "docs/sweeps.md": write_study,
+    "docs/how-to/python.md": prepare_api,
+    "docs/tutorials/your-own-environment.md": lambda page: page.serve(PENDULUM),
+    "docs/how-to/export.md": export_policy,
+    "docs/how-to/extend.md": prepare_plugin,
+    "docs/how-to/jax-environments.md": lambda page: page.write(
+        "pendulum.toml", block("docs/how-to/jax-environments.md", "toml", 0)
+    ),
+    "docs/tutorials/your-own-logs.md": write_logs,
+    "docs/how-to/libraries/sb3.md": lambda page: lare_rl.design("Reacher-v4").save(page.directory / "phi.py"),
+    "docs/how-to/reproduce.md": write_study,
+    "docs/how-to/runs.md": train_run,
+    "docs/reference/starcraft.md": write_study,
+    "docs/how-to/sweeps.md": write_study,
 }
 """What the reader of a page already has."""
 
-NEEDS = {"docs/jax-environments.md": "gymnax"}
+NEEDS = {"docs/how-to/jax-environments.md": "gymnax"}
 """Pages that need a package which cannot be installed beside those of development."""
-EXCERPTS = {"docs/plugs/others.md": ("tianshou_td3.py", "skrl_td3.py", "rllib_ppo.py")}
+EXCERPTS = {"docs/how-to/libraries/others.md": ("tianshou_td3.py", "skrl_td3.py", "rllib_ppo.py")}
 """Pages whose snippets are lines of examples, which `test_examples.py` runs if the library is installed."""
 
 
@@ -318,7 +322,7 @@ def test_excerpts_are_in_their_examples(name, examples):
 def test_task_files(tmp_path):
     """One agent, many agents, and two teams, where the page leaves out the texts."""
     for number in range(4):
-        text = block("docs/bring-your-own-task.md", "toml", number)
+        text = block("docs/tutorials/your-own-environment.md", "toml", number)
         if "description = " not in text:
             text += "".join(f'{key} = "text"\n' for key in ("description", "observation", "action"))
         name = tomllib.loads(text)["name"]
@@ -333,7 +337,7 @@ def test_task_files(tmp_path):
 def test_study_and_exhibit(monkeypatch, tmp_path):
     write_study(Page(None, monkeypatch, tmp_path))
     assert len(read_sweep(tmp_path / "study.toml")[1]) == 2 * (2 + 2 + 3 + 1)
-    exhibit = Exhibit(**read_toml(block("docs/reproduce.md", "toml", 0)))
+    exhibit = Exhibit(**read_toml(block("docs/how-to/reproduce.md", "toml", 0)))
     assert list(exhibit.contenders) == ["64 units", "256 units"]
 
 

@@ -47,7 +47,7 @@ ALWAYS = (
     "(the paper normalises nothing).",
     "The recorded replies come from Claude (in November 2026); the paper's come from GPT-4o.",
     "The seed of training and the draw of the language model are independent; in the paper they change together.",
-    "All differences from the published code are in `docs/deviations.md`, `docs/return-decomposition.md` and `docs/td3.md`.",
+    "All differences from the published code are in `docs/reference/differences.md`.",
 )
 """Differences from the paper's protocol."""
 

@@ -67,7 +67,7 @@ def test_purejax_ppo_learns_from_the_return_at_the_end(tmp_path):
     [("cleanrl_td3.py", "cleanrl.md"), ("cleanrl_ppo.py", "cleanrl.md"), ("purejax_ppo.py", "purejax.md")],
 )
 def test_page_shows_added_lines(name, page):
-    page = (ROOT / "docs" / "plugs" / page).read_text(encoding="utf-8")
+    page = (ROOT / "docs/how-to/libraries" / page).read_text(encoding="utf-8")
     diffs = [block for block in re.findall(r"```diff\n(.*?)```", page, re.DOTALL) if f"+++ {name}" in block]
     without_marks = [line.replace(MARK, "") for line in read_lines(name)]
     diff = list(difflib.unified_diff(plain_lines(name), without_marks, f"{name} (plain)", name, n=1))

@@ -94,4 +94,4 @@ def test_other_paths_are_refused(name, hint, tmp_path):
     (tmp_path / "results.csv").touch()
     with pytest.raises(LareError, match=f"{name} is not a run") as error:
         find_run_directories([tmp_path / name])
-    assert ("docs/sweeps.md" in str(error.value)) == hint
+    assert ("docs/how-to/sweeps.md" in str(error.value)) == hint

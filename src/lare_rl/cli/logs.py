@@ -28,7 +28,7 @@ def relabel(
     """Give the steps of logged episodes rewards that add up to the episodes' returns, and report how well they predict returns.
 
     Writes the same data with the new rewards; the old rewards are kept beside them, as `paid`. No simulator is needed
-    (docs/logs.md).
+    (docs/tutorials/your-own-logs.md).
 
     Args:
         dataset: a directory of .npz or Parquet files, a Parquet file, a Hugging Face data set on the disk, or the id of a local

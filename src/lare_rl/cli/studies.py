@@ -28,7 +28,7 @@ def sweep(
 
     Args:
         file: lists tasks, methods, algorithms, draws and settings, and how many processes run at a time, on how many cores and
-            cards each (docs/sweeps.md).
+            cards each (docs/how-to/sweeps.md).
         ray: the address of a Ray cluster to train on instead of this machine, or local (needs the extra lare-rl[ray]).
         check: only check the file, list its runs and how far they are, and train nothing.
     """
@@ -80,7 +80,7 @@ def compare(
 
     Args:
         runs: run directories, directories that contain some, such as that of a sweep, or .csv files with results of other programs
-            (docs/sweeps.md). The first method is the baseline that the others are compared with.
+            (docs/how-to/sweeps.md). The first method is the baseline that the others are compared with.
         metric: the key of metrics.jsonl to compare.
         at: the step at which runs are compared; by default the last one at which all were evaluated.
         late: compare means over the evaluations after three quarters of the steps, which vary less than the last one.

@@ -194,8 +194,10 @@ def find_method(name: str) -> Method:
 _LARE = "Qu et al., LaRe, AAAI 2025"
 _RD = "Efroni et al., AAAI 2021; Arjona-Medina et al., RUDDER, 2019"
 _RRD = "Ren et al., RRD, ICLR 2022"
-_BAYES = "this package, docs/closed-form.md; Efroni et al., AAAI 2021; MacKay, 1992"
-_PROGRESS = "this package, docs/closed-form.md; Ng et al., ICML 1999 (rewards that are differences of values)"
+_BAYES = "this package, docs/explanation/closed-form.md; Efroni et al., AAAI 2021; MacKay, 1992"
+_PROGRESS = (
+    "this package, docs/explanation/closed-form.md; Ng et al., ICML 1999 (rewards that are differences of values)"
+)
 _VIB = "Alemi et al., ICLR 2017; LaRe, appendix F.2"
 
 for _method in (

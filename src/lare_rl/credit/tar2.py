@@ -12,7 +12,7 @@ e is the embedding of an observation and its position. The rewards of an episode
 
 The network, the loss and the settings are those of the authors' code (github.com/AdityaKapoor74/MARL_Agent_Temporal_Credit_Assignment,
 `TARR_v2` at commit 2708495; the commit after it leaves out the outcome, as an ablation). The text of the paper could not be read, but
-for its abstract. docs/deviations.md lists the differences.
+for its abstract. docs/reference/differences.md lists the differences.
 """
 
 import equinox as eqx

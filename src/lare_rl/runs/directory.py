@@ -245,7 +245,7 @@ def find_run_directories(paths: Sequence[Path]) -> list[Path]:
         # A name that begins with a dot is the directory of a run that was killed before it was complete.
         configs = [config for depth in ("", "[!.]*/", "[!.]*/[!.]*/") for config in path.glob(depth + CONFIG)]
         if not configs:
-            hint = "; give the directory of a run (lare-rl compare also reads .csv files: docs/sweeps.md)"
+            hint = "; give the directory of a run (lare-rl compare also reads .csv files: docs/how-to/sweeps.md)"
             raise LareError(f"{path} is not a run, and contains none{hint if path.is_file() else ''}")
         for config in sorted(configs):
             directories.setdefault(config.parent.resolve(), config.parent)
