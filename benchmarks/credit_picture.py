@@ -1,7 +1,9 @@
 """The README's picture: the true rewards of an episode of CN-6 beside those that were recovered from totals.
 
-lare-rl train CN-6 --steps 205000 --out RUN
-python benchmarks/credit_picture.py RUN      draws docs/pictures/credit.svg
+    lare-rl train CN-6 --steps 205000 --out RUN
+    python benchmarks/credit_picture.py RUN
+
+It is written to docs/pictures/credit.svg.
 """
 
 from pathlib import Path
