@@ -9,7 +9,7 @@ In the corridor, a key lies at the left end, and a door at the right end opens o
     highest   the largest position, less 0.02 for each move
     last      how close the last position is to 0.5
     door      1 if the door was opened, else 0
-    odds      1 with the probability sigmoid(6 mean position - 1), else 0
+    odds      1 with the probability sigmoid(4 mean position - 3), else 0
 """
 
 from typing import Any, NamedTuple
@@ -85,7 +85,7 @@ class Corridor:
             "highest": state.highest - 0.02 * state.n_moves,
             "last": 1 - jnp.abs(position - 0.5),
             "door": state.is_open.astype(jnp.float32),
-            "odds": (jax.random.uniform(key) < jax.nn.sigmoid(6 * mean - 1)).astype(jnp.float32),
+            "odds": (jax.random.uniform(key) < jax.nn.sigmoid(4 * mean - 3)).astype(jnp.float32),
         }[self.score]
         return state, self._make_timestep(state, jnp.where(state.time == MAX_STEPS, score, 0))
 

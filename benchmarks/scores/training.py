@@ -24,7 +24,7 @@ from measure import write
 from scores.environments import corridor_task, level_task
 
 PARTICLE_STEPS = 205_000
-CORRIDOR: dict[str, Any] = {"algorithm": "ppo", "steps": 64_000, "environments": 20}
+CORRIDOR: dict[str, Any] = {"algorithm": "ppo", "steps": 64_000, "environments": 20, "evaluation_episodes": 100}
 Kind = Literal["not-a-sum", "binary", "payments", "exact", "groups", "published"]
 
 
