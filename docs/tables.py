@@ -35,7 +35,7 @@ NOTE = "<!-- Made from the code by `python docs/tables.py`. -->"
 
 def make_pages() -> dict[Path, str]:
     """Return the text of every page with a table from the code."""
-    pages = {REFERENCE / name: f"{NOTE}\n\n{page()}\n" for name, page in PAGES.items()}
+    pages = {REFERENCE / name: with_note(make_page()) for name, make_page in PAGES.items()}
     for name, tables in TABLES.items():
         text = (REFERENCE / name).read_text(encoding="utf-8")
         for title, make_table in tables.items():
@@ -48,6 +48,12 @@ def make_pages() -> dict[Path, str]:
                 raise ValueError(f"{name} has {count} tables {title!r}")
         pages[REFERENCE / name] = text
     return pages
+
+
+def with_note(page: str) -> str:
+    """Return a page with a comment after its title, for those who want to edit it."""
+    title, text = page.split("\n", 1)
+    return f"{title}\n\n{NOTE}\n{text}\n"
 
 
 def outdated(pages: dict[Path, str]) -> list[str]:

@@ -99,6 +99,8 @@ def is_sentence(template: str) -> bool:
 
 def sentence(template: str, catalogue: Mapping[str, str]) -> str:
     """Return a template for a reader: its placeholders as N, …, a name in italics or, in commands, in capital letters."""
+    if (match := re.fullmatch(r"\{(\w+)\}(\.?)", template)) and match[1] in catalogue:
+        return sentence(catalogue[match[1]], catalogue) + match[2]
     texts = re.split(r"(`[^`]*`)", template)
     return " ".join(
         "".join(command(text) if text.startswith("`") else prose(text, catalogue) for text in texts).split()

@@ -18,7 +18,7 @@ softplus(d) is -log of the probability that C is 0: it asks for sparsity. As lon
 threshold (1e-4 of the rewards, 1/2 of the next states), the sparsity at its right is left out.
 
 The equations and settings are those of the authors' code (github.com/ReedZyd/grd_neurips, commit 406b010). The text of the paper
-could not be read. docs/explanation/credit.md lists the differences. Masks of next states do not change r_hat. In the paper they
+could not be read. docs/reference/differences.md lists the differences. Masks of next states do not change r_hat. In the paper they
 choose the entries that the policy sees, which is not done here.
 """
 

@@ -11,7 +11,7 @@ all activations dropped in an update. It cannot judge a single stored step, so t
 `step_targets.py`. r_t is in units of the scale, the root mean square of R/T.
 
 The equations and settings are those of the authors' code (github.com/Tang-Yuting/RLBR, commit fac908f); of the text of the paper only
-the abstract could be read. docs/explanation/credit.md lists the differences.
+the abstract could be read. docs/reference/differences.md lists the differences.
 """
 
 from functools import partial

@@ -38,8 +38,10 @@ CONDITIONS: dict[str, dict[str, str]] = {
         "explained": f"Always, if returns are predicted. *Nearly all*: R² is above {HIGH_R2}. *Next to nothing*: below {LITTLE_R2}. "
         "*A part*: between.",
         "decoder_is_outdated": f"The last R² is below {LITTLE_R2}, but the median over the run is not.",
-        "score_use": f"Always, if at least 8 returns were predicted. Trust: `credit/gain` is larger than {CLEAR_ERRORS} of its standard "
-        f"errors. Trust in whole episodes: it is above {CLEAR_GAIN:.0%}.",
+        "score_use": "Always, if at least 8 returns were predicted. It ends with a sentence about trust.",
+        "trust_nothing": f"`credit/gain` is not larger than {CLEAR_ERRORS} of its standard errors.",
+        "trust_part": f"It is larger, but not above {CLEAR_GAIN:.0%}.",
+        "trust_sums": f"It is larger, and above {CLEAR_GAIN:.0%}.",
     },
     "The next step": {
         "explains_little": f"R² is below {LITTLE_R2} at the end and in most evaluations. The decoder is a closed form.",
