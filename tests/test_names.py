@@ -42,7 +42,7 @@ def is_banned(name: str) -> bool:
 
 def test_no_identifier_is_banned():
     counts = {}
-    for folder in ("src", "tests", "benchmarks", "examples"):
+    for folder in ("src", "tests", "benchmarks", "examples", "docs"):
         for path in sorted((ROOT / folder).rglob("*.py")):
             if path.is_relative_to(WRITTEN_BY_MODELS):
                 continue

@@ -271,6 +271,7 @@ PREPARE = {
     "docs/how-to/libraries/sb3.md": lambda page: lare_rl.design("Reacher-v4").save(page.directory / "phi.py"),
     "docs/how-to/reproduce.md": write_study,
     "docs/how-to/runs.md": train_run,
+    "docs/reference/files.md": train_run,
     "docs/reference/starcraft.md": write_study,
     "docs/how-to/sweeps.md": write_study,
 }

@@ -21,6 +21,7 @@ from lare_rl.cli.terminal import (
 from lare_rl.config.effective import unused_settings
 from lare_rl.config.settings import ResolvedSettings, Settings
 from lare_rl.errors import LareError, install_command
+from lare_rl.util.variables import read_variable
 
 if TYPE_CHECKING:
     from lare_rl.envs.play import Episode
@@ -244,7 +245,7 @@ def _describe_evaluation(
 
 def _render_without_screen() -> None:
     """Let MuJoCo render without a screen."""
-    if sys.platform == "linux" and not {"DISPLAY", "WAYLAND_DISPLAY"} & set(os.environ):
+    if sys.platform == "linux" and not (read_variable("DISPLAY") or read_variable("WAYLAND_DISPLAY")):
         os.environ.setdefault("MUJOCO_GL", "egl")
 
 

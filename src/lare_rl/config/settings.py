@@ -54,11 +54,11 @@ class _RunSettings(CheckedModel, Generic[Open]):
     transitions or sequences. For ppo 2000 over all copies, rounded to episodes of the maximum length; for ippo an episode on particle
     tasks, and on other tasks 2050 over all copies in JAX, 2000 on the host."""
     fit_every: Count | Open = OPEN
-    """For ppo and ippo, and for every algorithm with diaster or rudder: iterations between two fits of the decoder. By default 10 for
-    ippo, else 1."""
+    """For ppo and ippo, and for every algorithm with diaster, rudder, grd or rbt: iterations between two fits of the decoder. By
+    default 10 for ippo, else 1."""
     fit_updates: Count | Open = OPEN
-    """For the same algorithms: gradient steps of the decoder in each fit. By default 500 for ppo and 50 for ippo; with diaster and
-    rudder, one for every 50 environment steps."""
+    """For the same algorithms: gradient steps of the decoder in each fit. By default 500 for ppo and 50 for ippo; with diaster, rudder,
+    grd and rbt, one for every 50 environment steps."""
     first_fit: Literal["held-out", "published"] | None = None
     """For ippo: how long the decoder's first fit lasts. held-out (the default): until the error on held-out episodes stops falling.
     published: fit_updates, as in every later fit."""

@@ -1,6 +1,5 @@
 """Gymnasium environments: one team of one agent, on the host."""
 
-import os
 import warnings
 from typing import Any
 
@@ -14,6 +13,7 @@ from lare_rl.envs.interface import EnvSpec, Team, Timestep
 from lare_rl.envs.spaces import OneHot, check_spaces, finite_array, flatten_spaces
 from lare_rl.errors import LareError, short_repr
 from lare_rl.tasks.spec import TaskSpec
+from lare_rl.util.variables import read_variable
 
 __all__ = ["GymnasiumEnv", "make_gymnasium"]
 
@@ -28,7 +28,7 @@ def make_gymnasium(name: str, max_episode_steps: int | None = None, **kwargs: An
     """
 
     def make_hint(error: BaseException) -> str:
-        if isinstance(error, AttributeError) and (library := os.environ.get("MUJOCO_GL")):
+        if isinstance(error, AttributeError) and (library := read_variable("MUJOCO_GL")):
             return f" (is MUJOCO_GL={library} installed?)"
         if isinstance(error, gymnasium.error.NameNotFound) and ":" not in name:
             return f" (for an environment of your own, write MODULE:{name}, where MODULE registers it)"

@@ -5,7 +5,6 @@ SMAC's maps must be installed separately.
 """
 
 import importlib
-import os
 import warnings
 from collections.abc import Callable
 from importlib.util import find_spec
@@ -19,6 +18,7 @@ from lare_rl.envs.env_errors import one_line_errors
 from lare_rl.envs.interface import EnvSpec, Team, Timestep
 from lare_rl.errors import LareError
 from lare_rl.tasks.spec import TaskSpec
+from lare_rl.util.variables import read_variable
 
 __all__ = ["StarCraft", "make"]
 
@@ -148,7 +148,7 @@ def _find_game() -> Callable[..., Any]:
             "SMAC is not installed: pip install git+https://github.com/oxwhirl/smacv2.git"
             " (the package that PyPI calls smac is another project)"
         )
-    folder = Path(os.environ.get("SC2PATH", "~/StarCraftII")).expanduser()
+    folder = Path(read_variable("SC2PATH") or "~/StarCraftII").expanduser()
     if not folder.is_dir():
         raise LareError(
             f"StarCraft II is not at {folder}. Set SC2PATH to its folder, with SMAC's maps in Maps/SMAC_Maps."

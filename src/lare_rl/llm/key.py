@@ -1,8 +1,9 @@
 """The key of a model: read from the environment, sent in the header of a request, and removed from every text that is saved."""
 
 import functools
-import os
 import re
+
+from lare_rl.util.variables import read_variable
 
 __all__ = ["KEY_VARIABLE", "api_key", "redact_key"]
 
@@ -14,7 +15,7 @@ _MIN_KEY_LENGTH = 8
 
 def api_key() -> str:
     """Return the key, or an empty text."""
-    return os.environ.get(KEY_VARIABLE, "").strip()
+    return read_variable(KEY_VARIABLE)
 
 
 def redact_key(text: str) -> str:

@@ -9,7 +9,6 @@
 `reply` reads every reply, however its structure was requested.
 """
 
-import os
 import re
 import time
 from collections.abc import Callable, Sequence
@@ -31,6 +30,7 @@ from lare_rl.llm.key import KEY_VARIABLE, api_key, redact_key
 from lare_rl.llm.prompts import Message
 from lare_rl.util.safe_io import read_json
 from lare_rl.util.sanitize import one_line
+from lare_rl.util.variables import read_variable
 
 __all__ = ["LiveModel", "ModelError"]
 
@@ -109,7 +109,7 @@ class LiveModel:
             raise ModelError(f"{self.name!a} is not the name of a model")
         if not re.fullmatch(r"[!-~]*", api_key()):
             raise ModelError(f"the environment variable {KEY_VARIABLE} holds characters that no key can have")
-        self.base_url = self.base_url or os.environ.get("OPENAI_BASE_URL")
+        self.base_url = self.base_url or read_variable("OPENAI_BASE_URL") or None
         if not api_key() and self.base_url is None:
             raise ModelError(
                 f"to ask {self.name!r}, put a key into the environment variable {KEY_VARIABLE}, or name a server of "

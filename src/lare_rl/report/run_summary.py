@@ -17,7 +17,16 @@ from lare_rl.runs.metric_names import ACTOR_SATURATION, LIKELIEST_RETURN, RETURN
 from lare_rl.training.advice import describe_untrained
 from lare_rl.util.statistics import grouped_standard_error, sample_std, standard_error
 
-__all__ = ["CLEAR_ERRORS", "LITTLE_R2", "MIN_EVALUATIONS", "ReportedRun", "RunSummary", "summarise_run"]
+__all__ = [
+    "CLEAR_ERRORS",
+    "LITTLE_R2",
+    "MIN_EVALUATIONS",
+    "POSSIBLE_ERRORS",
+    "SEED_STDS",
+    "ReportedRun",
+    "RunSummary",
+    "summarise_run",
+]
 
 CLEAR_ERRORS, POSSIBLE_ERRORS = 2, 1
 """A difference is clear, or possible, if it exceeds this number of its standard errors."""

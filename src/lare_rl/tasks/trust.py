@@ -1,6 +1,5 @@
 """Decides which modules an environment's name may import. A task file can run code, and a run directory may be untrusted."""
 
-import os
 import site
 import sys
 import sysconfig
@@ -9,6 +8,7 @@ from pathlib import Path
 
 from lare_rl.errors import LareError
 from lare_rl.tasks.spec import PETTINGZOO_PREFIX, TaskSpec
+from lare_rl.util.variables import read_variable
 
 __all__ = ["TRUST_VARIABLE", "check_trusted", "untrusted_module"]
 
@@ -22,7 +22,7 @@ def untrusted_module(task: TaskSpec) -> str | None:
     Return None without such a module, and for a module that this process has imported or that the user trusts.
     """
     module, colon, _ = task.environment.removeprefix(PETTINGZOO_PREFIX).partition(":")
-    trusted = [name.strip() for name in os.environ.get(TRUST_VARIABLE, "").split(",")]
+    trusted = [name.strip() for name in read_variable(TRUST_VARIABLE).split(",")]
     return module if colon and module not in sys.modules and module not in trusted else None
 
 

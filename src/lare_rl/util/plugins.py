@@ -9,7 +9,6 @@ The environment variable `LARE_PLUGINS` names further modules, separated by comm
 imported when a name is not registered, or when all registered names are listed.
 """
 
-import os
 from collections.abc import Iterator, Mapping
 from functools import cache
 from importlib import import_module
@@ -17,6 +16,7 @@ from importlib.metadata import entry_points
 from typing import Generic, TypeVar
 
 from lare_rl.errors import LareError, did_you_mean
+from lare_rl.util.variables import read_variable
 
 __all__ = ["Registry", "load_plugins"]
 
@@ -27,7 +27,7 @@ T = TypeVar("T")
 def load_plugins() -> None:
     """Import all plugins. Later calls do nothing. Raises `LareError` if a plugin cannot be imported."""
     modules = {entry.name: entry.module for entry in entry_points(group="lare_rl.plugins")}
-    names = filter(None, map(str.strip, os.environ.get("LARE_PLUGINS", "").split(",")))
+    names = filter(None, map(str.strip, read_variable("LARE_PLUGINS").split(",")))
     for plugin, module in (modules | {name: name for name in names}).items():
         try:
             import_module(module)
@@ -66,7 +66,7 @@ class Registry(Mapping[str, T], Generic[T]):
         if name in self:
             return self._values[name]
         hint = did_you_mean(name, self._values)
-        plugin = "" if os.environ.get("LARE_PLUGINS") else " (of a plugin: name its module in LARE_PLUGINS)"
+        plugin = "" if read_variable("LARE_PLUGINS") else " (of a plugin: name its module in LARE_PLUGINS)"
         raise LareError(f"no {self._kind} {name!r}{hint}; the {self._kind}s are {', '.join(self._values)}{plugin}")
 
     def __getitem__(self, name: str) -> T:

@@ -1,0 +1,221 @@
+"""The tables of methods, of algorithms and of built-in tasks."""
+
+import ast
+import inspect
+import itertools
+import re
+from enum import StrEnum
+from textwrap import dedent
+
+from lare_rl.algorithms.registry import ALGORITHMS, Algorithm
+from lare_rl.credit.input_names import InputNames
+from lare_rl.credit.methods import METHODS, Fit, Method
+from lare_rl.envs.load import read_task, shipped_tasks
+from lare_rl.envs.particles.catalogue import find_particle_task
+from lare_rl.envs.smax.scenarios import find_scenario
+from lare_rl.llm.recording import SHIPPED_RECORDINGS
+from lare_rl.tasks.spec import TaskSpec
+from reference_tables.cells import NONE, code, docstring_text, table
+
+__all__ = ["algorithms_table", "built_in_tasks_page", "methods_page"]
+
+SYMBOLS = {
+    "factors": "z",
+    "observation": "s",
+    "action": "a",
+    "next_observation": "s'",
+    "observation_change": "s - s'",
+    "scored_observation": "s\\*",
+    "history": "h",
+}
+
+FAMILIES = {
+    "": "MuJoCo",
+    "lare": "MuJoCo with other rewards",
+    "particles": "Particles",
+    "smax": "SMAX",
+    "smac": "SMAC",
+    "playground": "MuJoCo Playground",
+    "jumanji": "Jumanji",
+}
+
+DISCRETE = ("particles", "smax", "smac", "jumanji")
+"""The families whose actions are choices."""
+
+
+def methods_page() -> str:
+    """Return the page about the methods."""
+    groups: dict[str, list[Method]] = {
+        "No decoder": [method for method in METHODS.values() if method.fit is None],
+        "Closed forms with phi": [],
+        "Closed forms without phi": [],
+        "Gradient descent with phi": [],
+        "Gradient descent without phi": [],
+    }
+    for method in METHODS.values():
+        if method.fit is not None:
+            fit = "Gradient descent" if method.uses_gradient else "Closed forms"
+            groups[f"{fit} {'with' if method.needs_phi else 'without'} phi"].append(method)
+    lines = [
+        "# Methods",
+        "A method is a decoder's inputs, a fit and a decoder. `--method NAME` chooses it. The equations are in "
+        "[credit.md](../explanation/credit.md), [closed-form.md](../explanation/closed-form.md) and "
+        "[many-agents.md](../explanation/many-agents.md).",
+        "Inputs: z, the factors of `phi`; s and s', the observations before and after the step; s\\*, the observation that the task's "
+        "`scored_observation` names; a, the action; h, largest, smallest and last values of the entries so far.",
+    ]
+    for title, methods in groups.items():
+        rows = (
+            (
+                code(method.name),
+                docstring_text(method.summary),
+                agents_text(method),
+                inputs(method),
+                fit_text(method),
+                link(method.source),
+            )
+            for method in methods
+        )
+        header = ("method", "what it is", "agents", "inputs", "fitted to", "source")
+        if title == "No decoder":
+            header, rows = (
+                ("method", "what the algorithm is trained on", "source"),
+                ((code(m.name), m.summary, link(m.source)) for m in methods),
+            )
+        lines += [f"## {title}", table(header, rows)]
+    lines += ["## Fits", table(("fitted to", "meaning"), enum_rows(Fit))]
+    return "\n\n".join(lines)
+
+
+def agents_text(method: Method) -> str:
+    return "many" if method.multi_agent_only else "one" if method.single_agent_only else "any"
+
+
+def inputs(method: Method) -> str:
+    """Return the inputs for one agent and, if they differ, for many."""
+    if method.inputs is None:
+        return NONE
+    single, many = symbols(method.inputs, True), symbols(method.inputs, False)
+    if single == many or method.single_agent_only:
+        return single
+    return many if method.multi_agent_only else f"{single}; many agents: {many}"
+
+
+def symbols(names: InputNames, single_agent: bool) -> str:
+    chosen = names.names if single_agent or names.names_of_many_agents is None else names.names_of_many_agents
+    return ", ".join(SYMBOLS[name] for name in chosen)
+
+
+def fit_text(method: Method) -> str:
+    return NONE if method.fit is None else method.fit.value
+
+
+def link(source: str) -> str:
+    """Return a source with a link to the page that it names."""
+    return source.replace(
+        "this package, docs/explanation/closed-form.md", "[LaRe](../explanation/closed-form.md)"
+    ).replace("this package", "LaRe")
+
+
+def enum_rows(enum: type[StrEnum]) -> list[tuple[str, str]]:
+    """Return each value of an enumeration with its docstring."""
+    body = ast.parse(dedent(inspect.getsource(enum))).body[0].body  # pyright: ignore[reportAttributeAccessIssue]
+    rows = []
+    for statement, docstring in itertools.pairwise(body):
+        match statement, docstring:
+            case ast.Assign(value=ast.Constant(value=value)), ast.Expr(value=ast.Constant(value=text)):
+                rows.append((str(value), docstring_text(text)))
+    return rows
+
+
+def algorithms_table() -> str:
+    """Return the table of algorithms."""
+    rows = (
+        (code(name), str(algorithm.consumes), *abilities(algorithm), algorithm.summary, algorithm.source)
+        for name, algorithm in ALGORITHMS.items()
+    )
+    return table(("algorithm", "consumes", "agents", "actions", "what it is", "source"), rows)
+
+
+def abilities(algorithm: Algorithm) -> tuple[str, str]:
+    agents = "one" if not algorithm.multi_agent else "any" if algorithm.single_agent else "many"
+    actions = "discrete" if not algorithm.continuous else "any" if algorithm.discrete else "continuous"
+    return agents, actions
+
+
+def built_in_tasks_page() -> str:
+    """Return the page about the tasks that come with the package."""
+    specs = [read_task(name) for name in sorted(shipped_tasks(), key=natural_order)]
+    lines = [
+        "# Built-in tasks",
+        "`lare-rl tasks` lists these names. Sizes are those that `phi` reads: of one agent or, if credit is assigned by the global "
+        "state, of the state and of all actions together. A recorded task needs no language model: `phi` is computed from saved "
+        "replies, and `--draw` chooses among them.",
+    ]
+    for family, title in FAMILIES.items():
+        rows = (
+            (
+                code(spec.name),
+                agents(spec),
+                observation(spec),
+                action(spec),
+                spec.scored_observation,
+                recordings(spec, specs),
+            )
+            for spec in specs
+            if spec.family == family
+        )
+        header = ("task", "agents", "observation", "action", "scored observation", "recorded replies")
+        lines += [f"## {title}", table(header, rows)]
+    return "\n\n".join(lines)
+
+
+def agents(spec: TaskSpec) -> str:
+    """Return the number of agents that learn."""
+    match spec.family:
+        case "particles":
+            teams = {team.name: team.n_agents for team in find_particle_task(spec.environment_name).teams}
+            return str(teams[spec.team]) if spec.team else " + ".join(map(str, teams.values()))
+        case "smax" | "smac":
+            return str(find_scenario(spec.environment_name).n_allies)
+    return "1"
+
+
+def observation(spec: TaskSpec) -> str:
+    return f"{spec.observation_size}, of the state" if spec.credit_scope == "state" else str(spec.observation_size)
+
+
+def action(spec: TaskSpec) -> str:
+    if spec.credit_scope == "state":
+        return f"{spec.action_size}, of all agents"
+    noun = "choice" if spec.family in DISCRETE else "number"
+    return f"{spec.action_size} {noun}{'' if spec.action_size == 1 else 's'}"
+
+
+def recordings(spec: TaskSpec, specs: list[TaskSpec]) -> str:
+    """Return what recorded replies there are, for the task or for another with the same texts."""
+    if spec.teams:
+        return "those of its teams"
+    sources = [spec, *(other for other in specs if other is not spec and texts(other) == texts(spec))]
+    counts = {source.name: count_draws(source.name) for source in sources}
+    name = next((name for name, draws in counts.items() if any(draws.values())), spec.name)
+    cell = ", ".join(f"{count} {kind}" for kind, count in counts[name].items() if count)
+    return (cell if name == spec.name else f"{cell} (`{name}`)") or NONE
+
+
+def texts(spec: TaskSpec) -> tuple[str, ...]:
+    return spec.description, spec.observation, spec.action
+
+
+def count_draws(name: str) -> dict[str, int]:
+    """Return the number of recorded functions of a task, by their kind."""
+    folders = {"phi": "factors", "reward": "reward"}
+    return {
+        kind: sum(entry.name.startswith(f"{name}.draw") for entry in (SHIPPED_RECORDINGS / folder).iterdir())
+        for kind, folder in folders.items()
+    }
+
+
+def natural_order(name: str) -> list[str | int]:
+    """Return a key that sorts CN-6 before CN-15."""
+    return [int(text) if text.isdigit() else text for text in re.split(r"(\d+)", name)]

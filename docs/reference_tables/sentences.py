@@ -1,0 +1,167 @@
+"""The tables of metrics, of findings, of environment variables, and of the functions that phi may call."""
+
+import functools
+import inspect
+import re
+from collections.abc import Iterable, Mapping
+
+from lare_rl.compare.messages import MESSAGES as COMPARISON
+from lare_rl.credit.explanation_text import MESSAGES as EXPLANATION
+from lare_rl.logs.relabel import MESSAGES as LOGS
+from lare_rl.phi import numpy_functions
+from lare_rl.phi.numpy_functions import FUNCTIONS
+from lare_rl.phi.python_functions import BUILTINS
+from lare_rl.report.conditions import CONDITIONS
+from lare_rl.report.messages import MESSAGES as REPORT
+from lare_rl.runs.metric_names import METRIC_GROUPS
+from lare_rl.training.advice import MESSAGES as TRAINING
+from lare_rl.turns.words import MESSAGES as TURNS
+from lare_rl.util.variables import VARIABLE_GROUPS
+from reference_tables.cells import code, codes, table
+
+__all__ = ["findings_page", "functions_table", "metrics_page", "variables_page"]
+
+CATALOGUES = {
+    "While a run trains": TRAINING,
+    "What the returns say": EXPLANATION,
+    "Comparisons": COMPARISON,
+    "Logs": LOGS,
+    "Turns of agents that talk": TURNS,
+}
+
+LEGENDS = ("columns", "intervals", "curves", "over_tasks")
+"""Sentences that explain tables and figures, and are no findings."""
+
+COUNTS = ("count", "needed", "repetitions")
+"""Placeholders of numbers, beside those that begin with `n_`."""
+
+VARIANT = re.compile(r"^(?!linalg).*\.(outer|reduce|accumulate)$")
+"""The names of variants of elementwise functions, such as `add.reduce`."""
+
+PLACEHOLDER = re.compile(r"(?P<before>.?)\{(?P<name>\w+)(?P<format>:[^}]*)?\}(?=(?P<after>.?))")
+
+
+def metrics_page() -> str:
+    """Return the page about the metrics."""
+    lines = [
+        "# Metrics",
+        "`metrics.jsonl` has one line for each seed and evaluation. A value that is not known yet is left out, or null. Keys are "
+        "stable. If several teams learn, a key belongs to the first team, and `KEY_TEAM` to each team. A task's own `measures` are "
+        "`evaluation/NAME`. `CreditAssigner.metrics()` returns those about credit.",
+        "All evaluations of a seed play the same initial states, which differ from those of training episodes. Off-policy algorithms "
+        "and continuous PPO are evaluated without noise. Discrete PPO and IPPO sample their actions, as in training.",
+    ]
+    for title, metrics in METRIC_GROUPS.items():
+        lines += [f"## {title}", table(("key", "meaning"), ((code(name), text) for name, text in metrics.items()))]
+    lines += [
+        "## Which credit metric to trust",
+        "`credit/correlation` and `credit/error` look at steps of episodes that the decoder was fitted to. `credit/return_r2` "
+        "does not. It tests the sum of the proxy rewards of an episode, and neither single steps nor the division among agents. If "
+        "episodes differ in length and returns depend on it, R² is near 1 whatever the features are. True rewards are used for these "
+        "metrics only.",
+    ]
+    return "\n\n".join(lines)
+
+
+def findings_page() -> str:
+    """Return the page about the sentences of reports and of commands."""
+    lines = [
+        "# Findings",
+        "Reports and commands say what they found in whole sentences. Each sentence has a code. In this page N is a number, a word in "
+        "italics a name, and … another sentence of the table.",
+        "## The diagnosis of a run",
+        "`lare-rl report` begins with these sentences, at most one of each group. The final return is the mean over the seeds at the "
+        "last evaluation. Its standard error is the larger of two: that over the seeds, and that over the episodes of the last "
+        "evaluation. The usual change is the median difference between evaluations that follow each other, in the last half of the "
+        "run.",
+    ]
+    for title, conditions in CONDITIONS.items():
+        rows = ((code(name), sentence(REPORT[name], REPORT), text) for name, text in conditions.items())
+        lines += [f"### {title}", table(("code", "sentence", "when"), rows)]
+    for title, catalogue in CATALOGUES.items():
+        rows = (
+            (code(name), sentence(text, catalogue)) for name, text in catalogue.items() if is_finding(name, text, title)
+        )
+        lines += [f"## {title}", table(("code", "sentence"), rows)]
+    return "\n\n".join(lines)
+
+
+def is_finding(name: str, template: str, title: str) -> bool:
+    """Whether a template is a whole sentence, or a reason in one. Others are parts of sentences."""
+    if title == "Turns of agents that talk":
+        return True
+    return name not in LEGENDS and is_sentence(template)
+
+
+def is_sentence(template: str) -> bool:
+    return template.rstrip("}").endswith((".", ":")) or re.search(r"[.:]\{\w+\}$", template) is not None
+
+
+def sentence(template: str, catalogue: Mapping[str, str]) -> str:
+    """Return a template for a reader: its placeholders as N, …, a name in italics or, in commands, in capital letters."""
+    if (match := re.fullmatch(r"\{(\w+)\}(\.?)", template)) and match[1] in catalogue:
+        return sentence(catalogue[match[1]], catalogue) + match[2]
+    texts = re.split(r"(`[^`]*`)", template)
+    return " ".join(
+        "".join(command(text) if text.startswith("`") else prose(text, catalogue) for text in texts).split()
+    )
+
+
+def command(text: str) -> str:
+    capitals = PLACEHOLDER.sub(lambda match: match["before"] + match["name"].upper(), text)
+    return capitals.replace("DIRECTORY", "RUN")
+
+
+def prose(text: str, catalogue: Mapping[str, str]) -> str:
+    def replace(match: re.Match[str]) -> str:
+        before, name = match["before"], match["name"]
+        if match["format"] or name.startswith("n_") or name in COUNTS:
+            return f"{before}N"
+        if before.isalnum() or (before and before in ".)") or match["after"].isalnum():  # an optional addition
+            return before
+        return f"{before}…" if name in catalogue else f"{before}*{name.replace('_', ' ')}*"
+
+    text = re.sub(r"(?<=\})\{\w+\}", "", text)  # additions to a placeholder
+    return re.sub(r"…(; …)+\.?", "…", PLACEHOLDER.sub(replace, text))
+
+
+def variables_page() -> str:
+    """Return the page about environment variables."""
+    lines = [
+        "# Environment variables",
+        "LaRe reads these variables. JAX, Weights & Biases, MLflow and Hugging Face also read variables of their own.",
+    ]
+    for title, variables in VARIABLE_GROUPS.items():
+        lines += [
+            f"## {title}",
+            table(("variable", "meaning"), ((code(name), text) for name, text in variables.items())),
+        ]
+    return "\n\n".join(lines)
+
+
+def functions_table() -> str:
+    """Return the table of functions that a phi may call."""
+    modules = {name: getattr(numpy_functions, name) for name in numpy_functions.__all__}
+    rows = []
+    for name, module in modules.items():
+        if inspect.ismodule(module):
+            functions = (key for key, function in FUNCTIONS.items() if defining_module(function) == module.__name__)
+            rows.append((name, codes(sorted(name for name in functions if not VARIANT.search(name)))))
+    names = plain_names(BUILTINS)
+    rows.append(("Python", codes(name for name in names if "." not in name)))
+    packages = dict.fromkeys(name.partition(".")[0] for name in names if "." in name)
+    rows += [
+        (package, codes(name.partition(".")[2] for name in names if name.startswith(f"{package}.")))
+        for package in packages
+    ]
+    return table(("group", "functions"), [row for row in rows if row[1]])
+
+
+def defining_module(function: object) -> str:
+    while isinstance(function, functools.partial):
+        function = function.func
+    return getattr(function, "__module__", "")
+
+
+def plain_names(names: Iterable[str]) -> list[str]:
+    return sorted(name for name in names if not re.match(r"[A-Z]|np\.", name))

@@ -1,0 +1,129 @@
+"""The tables of task keys and of settings."""
+
+from collections.abc import Iterable
+from types import SimpleNamespace
+
+from lare_rl.algorithms.registry import ALGORITHMS
+from lare_rl.config.settings import Settings
+from lare_rl.credit.decoder_settings import MULTI_AGENT_CREDIT, CreditSettings
+from lare_rl.credit.methods import METHODS
+from lare_rl.tasks.spec import TaskSpec
+from reference_tables.cells import code, codes, default, docstring_text, kind, table
+
+__all__ = ["settings_page", "tasks_page"]
+
+TASK_GROUPS = {
+    "The environment": "name environment evaluation_environment observation_size action_size max_episode_steps arguments agents processes "
+    "timeout",
+    "Texts for the language model": "description observation action",
+    "What an episode is paid for": "score payments paid_for group",
+    "What phi and the decoder read": "scored_observation credit_scope",
+    "Teams and measures": "teams team measures",
+}
+
+RUN_GROUPS = {
+    "What is trained": "method algorithm steps seeds seed",
+    "The latent function": "scored_observation draw candidates",
+    "Collection": "environments rollout_steps capacity overlap_collection scale_rewards",
+    "Fits of the decoder": "fit_every fit_updates first_fit",
+    "Evaluation": "evaluate_every evaluation_episodes",
+}
+
+ALGORITHM_GROUPS = {"TD3, DDPG and SAC": "td3 ddpg sac", "PPO and IPPO": "ppo ippo", "QMIX and VDN": "qmix vdn"}
+
+
+def tasks_page() -> str:
+    """Return the page about the keys of a task file."""
+    check_complete(TASK_GROUPS.values(), TaskSpec.model_fields)
+    lines = [
+        "# Keys of a task file",
+        "A task file is TOML. In Python, the keys are the fields of `lare_rl.TaskSpec`. [Your own "
+        "environment](../tutorials/your-own-environment.md) writes such a file step by step.",
+        'One more key, `like = "NAME"`, takes all keys that a file leaves out from a built-in task or from another file.',
+    ]
+    for title, names in TASK_GROUPS.items():
+        rows = []
+        for name in names.split():
+            field = TaskSpec.model_fields[name]
+            value = "required" if field.is_required() else default(field.get_default(call_default_factory=True))
+            rows.append((code(name), kind(field), value, docstring_text(field.description)))
+        lines += [f"## {title}", table(("key", "value", "default", "meaning"), rows)]
+    return "\n\n".join(lines)
+
+
+def settings_page() -> str:
+    """Return the page about the settings of a run, of the algorithms and of the decoder."""
+    check_complete(RUN_GROUPS.values(), set(Settings.model_fields) - {*ALGORITHMS, "credit"})
+    check_complete(ALGORITHM_GROUPS.values(), ALGORITHMS)
+    lines = [
+        "# Settings",
+        "A setting `evaluate_every` is `--evaluate-every` on the command line, `Settings(evaluate_every=...)` in Python and "
+        "`evaluate_every` in a sweep file. A setting of an algorithm has its name in front: `--td3.warmup`, "
+        '`Settings(td3={"warmup": 1000})`. A setting of the decoder is under `credit`: `--credit.drawn-steps`.',
+        "If a default is -, the task and the algorithm decide. `config.json` has the values that a run used.",
+    ]
+    for title, names in RUN_GROUPS.items():
+        fields = {name: Settings.model_fields[name] for name in names.split()}
+        rows = (
+            (code(name), default(field.default), docstring_text(field.description)) for name, field in fields.items()
+        )
+        lines += [f"## {title}", table(("setting", "default", "meaning"), rows)]
+    for title, names in ALGORITHM_GROUPS.items():
+        lines += [f"## {title}", algorithm_table(names.split())]
+    lines += ["## The decoder (`credit`)", credit_table()]
+    return "\n\n".join(lines)
+
+
+def algorithm_table(names: list[str]) -> str:
+    """Return the settings of several algorithms, with a column of defaults for each."""
+    settings = [ALGORITHMS[name].settings for name in names]
+    fields = {field: info for values in settings for field, info in type(values).model_fields.items()}
+    rows = (
+        (
+            code(name),
+            *(default(getattr(values, name, None)) for values in settings),
+            docstring_text(field.description),
+        )
+        for name, field in fields.items()
+    )
+    return table(("setting", *map(code, names), "meaning"), rows)
+
+
+def credit_table() -> str:
+    """Return the settings of the decoder."""
+    changes = ALGORITHMS["qmix"].run_defaults(SimpleNamespace(is_jax=True, max_steps=1), 0)["credit"]
+    columns = (CreditSettings(), MULTI_AGENT_CREDIT, MULTI_AGENT_CREDIT.model_copy(update=changes))
+    rows = (
+        (
+            code(name),
+            *(default(getattr(values, name)) for values in columns),
+            readers(name),
+            docstring_text(field.description),
+        )
+        for name, field in CreditSettings.model_fields.items()
+    )
+    return table(("setting", "one agent", "many agents", "`qmix`, `vdn`", "read by", "meaning"), rows)
+
+
+def readers(name: str) -> str:
+    """Return the methods that read a setting of the decoder, in the shortest way."""
+    all_fits = [method for method in METHODS.values() if method.fit is not None]
+    groups = {
+        "all": all_fits,
+        "gradient descent": [method for method in all_fits if method.uses_gradient],
+        "closed forms": [method for method in all_fits if not method.uses_gradient],
+    }
+    reading = {method.name for method in all_fits if name in method.settings}
+    texts = [codes(sorted(reading))]
+    for group, methods in groups.items():
+        missing = {method.name for method in methods} - reading
+        if reading <= {method.name for method in methods}:
+            texts.append(f"{group}, but not {codes(sorted(missing))}" if missing else group)
+    return min(texts, key=len)
+
+
+def check_complete(groups: Iterable[str], names: Iterable[str]) -> None:
+    """Raise `ValueError` unless the groups have each name once."""
+    grouped = sorted(" ".join(groups).split())
+    if grouped != sorted(names):
+        raise ValueError(f"the groups have {grouped}, and the code has {sorted(names)}")

@@ -1,0 +1,64 @@
+"""When a diagnosis makes each of its findings. docs/reference/findings.md is made from this table."""
+
+from lare_rl.report.diagnosis import (
+    BETTER_FRACTION,
+    EVALUATION_STDS,
+    FALL_FRACTION,
+    HIGH_R2,
+    STUCK_FRACTION,
+)
+from lare_rl.report.run_summary import CLEAR_ERRORS, LITTLE_R2, MIN_EVALUATIONS, POSSIBLE_ERRORS, SEED_STDS
+from lare_rl.report.score_use import CLEAR_GAIN
+
+__all__ = ["CONDITIONS"]
+
+CONDITIONS: dict[str, dict[str, str]] = {
+    "Findings that stand alone": {
+        "no_return": "The last evaluation has no finite return.",
+        "untrained": "The policy was never updated.",
+        "equal_returns": "All episodes have the same return.",
+    },
+    "The outcome": {
+        "learned": f"The final return is above random actions by {CLEAR_ERRORS} standard errors, and above the policy before training by "
+        f"{CLEAR_ERRORS} standard errors.",
+        "some_seeds_learned": "The mean over the seeds is not that high, but at least one seed is above random actions by "
+        f"{SEED_STDS} standard deviations of their returns, and above its own policy before training.",
+        "may_beat_random": f"The final return is above random actions by {POSSIBLE_ERRORS} standard error, and not by {CLEAR_ERRORS}.",
+        "may_beat_initial_policy": "The same for the policy before training.",
+        "worse_than_random": f"The final return is below random actions by {CLEAR_ERRORS} standard errors.",
+        "not_learned": "None of these.",
+        "outcome_unknown": "There are no returns of random actions to compare with.",
+    },
+    "The comparison with a run of `episodic`": {
+        "above_episodic": f"The difference is larger than {CLEAR_ERRORS} of its standard errors.",
+        "like_episodic": "The difference is smaller.",
+        "below_episodic": "The difference is larger, and negative.",
+    },
+    "The proxy rewards": {
+        "explained": f"Always, if returns are predicted. *Nearly all*: R² is above {HIGH_R2}. *Next to nothing*: below {LITTLE_R2}. "
+        "*A part*: between.",
+        "decoder_is_outdated": f"The last R² is below {LITTLE_R2}, but the median over the run is not.",
+        "score_use": "Always, if at least 8 returns were predicted. It ends with a sentence about trust.",
+        "trust_nothing": f"`credit/gain` is not larger than {CLEAR_ERRORS} of its standard errors.",
+        "trust_part": f"It is larger, but not above {CLEAR_GAIN:.0%}.",
+        "trust_sums": f"It is larger, and above {CLEAR_GAIN:.0%}.",
+    },
+    "The next step": {
+        "explains_little": f"R² is below {LITTLE_R2} at the end and in most evaluations. The decoder is a closed form.",
+        "try_closed_form": "The same, with a decoder that is fitted by gradient descent.",
+        "is_rising": "The mean of the last quarter of the evaluations is above that of the quarter before by more than the usual change, "
+        "and by more than a standard error. Within the last quarter, the return rose by more than half of the usual change.",
+        "one_seed_was_better": "The final return does not beat random actions, but an evaluation of one seed did by "
+        f"{EVALUATION_STDS} standard deviations of their returns.",
+        "has_fallen": f"The best evaluation is above the last quarter by {CLEAR_ERRORS} standard errors, by {FALL_FRACTION:.0%} of what "
+        "was learned, and by twice the usual change.",
+        "is_stuck": "The final return does not beat random actions. The last `actor/saturation` is 1, or the last "
+        f"{MIN_EVALUATIONS} returns of every seed differ by less than {STUCK_FRACTION:.0%} of the standard deviation of random actions' "
+        "returns.",
+        "needs_training": "It has not learned, and no finding above explains why.",
+        "needs_baseline": "It learned a task of your own. The best evaluation is named if it is better by "
+        f"{BETTER_FRACTION:.0%} of what was learned.",
+        "single_seed": "The run has one seed.",
+    },
+}
+"""The condition of each finding, by subject."""

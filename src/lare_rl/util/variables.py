@@ -1,0 +1,48 @@
+"""The environment variables that LaRe reads. docs/reference/environment-variables.md is made from this table."""
+
+import os
+
+__all__ = ["VARIABLES", "VARIABLE_GROUPS", "read_variable"]
+
+VARIABLE_GROUPS: dict[str, dict[str, str]] = {
+    "LaRe": {
+        "LARE_TRUST": "Modules, separated by commas, that a run directory or another file may import. Without it, a command that reads "
+        "such a file imports installed packages only, and `lare-rl report` imports none.",
+        "LARE_PLUGINS": "Modules, separated by commas, whose import registers methods, decoders, algorithms or families.",
+        "LARE_CACHE": "The directory of compiled programs. By default, the user's cache directory. `off`: none.",
+    },
+    "Language model": {
+        "OPENAI_API_KEY": "The key of the model. It is sent in the header of a request, and written nowhere. A server of your own may "
+        "need none.",
+        "OPENAI_BASE_URL": "The address of the model's server, without `--base-url`. By default, OpenAI's.",
+    },
+    "Simulators": {
+        "MUJOCO_GL": "How MuJoCo draws films: `egl`, `osmesa` or `glfw`. On Linux without a screen, LaRe sets `egl`.",
+        "DISPLAY": "The screen, under X11.",
+        "WAYLAND_DISPLAY": "The screen, under Wayland.",
+        "SC2PATH": "The folder of StarCraft II, for SMAC. By default, `~/StarCraftII`.",
+    },
+    "Processors": {
+        "JAX_COMPILATION_CACHE_DIR": "JAX's own cache of compiled programs. If it is set, LaRe keeps none.",
+        "OMP_NUM_THREADS": "Threads of the numerical libraries in a process. By default, 1 in worker processes of environments.",
+        "CUDA_VISIBLE_DEVICES": "The accelerators of NVIDIA that a process sees. A sweep divides these among its runs.",
+        "HIP_VISIBLE_DEVICES": "The same for AMD.",
+        "XLA_PYTHON_CLIENT_PREALLOCATE": "`false`: JAX takes memory of an accelerator only as it is needed. A sweep sets this if runs "
+        "share an accelerator.",
+    },
+}
+"""What each variable means, by subject."""
+
+VARIABLES = {name: meaning for group in VARIABLE_GROUPS.values() for name, meaning in group.items()}
+"""What each variable means."""
+
+
+def read_variable(name: str) -> str:
+    """Return the value of an environment variable without surrounding spaces, or an empty text if it is not set.
+
+    Raises:
+        KeyError: the variable is not in `VARIABLES`.
+    """
+    if name not in VARIABLES:
+        raise KeyError(name)
+    return os.environ.get(name, "").strip()
