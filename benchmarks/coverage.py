@@ -13,7 +13,7 @@ from collections.abc import Callable
 import numpy as np
 from jaxtyping import Float
 
-from lare_rl.compare.bootstrap import REPETITIONS, interquartile_means
+from lare_rl.compare.bootstrap import REPETITIONS, interquartile_mean
 from measure import write
 
 CASES = 5000
@@ -36,7 +36,7 @@ def coverage(draw_scores: Scores, true: float, seeds: int, random: np.random.Gen
         draw_scores(random, (CASES, seeds)), draw_scores(random, (CASES, seeds)), strict=True
     ):
         means, other_means = (
-            interquartile_means(group[random.integers(0, seeds, (seeds, REPETITIONS))][:, None])
+            interquartile_mean(group[random.integers(0, seeds, (seeds, REPETITIONS))].T[..., None])
             for group in (scores, other_scores)
         )
         mean_hits += holds(means, true)

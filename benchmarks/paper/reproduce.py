@@ -5,7 +5,6 @@ from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
 from tempfile import TemporaryFile
 
-from lare_rl.compare.bootstrap import load_rliable
 from lare_rl.compare.metric_tables import read_metric_rows, write_table
 from lare_rl.errors import LareError
 from lare_rl.sweep.jobs import Job, check_job
@@ -58,7 +57,7 @@ def reproduce(
         out: the directory for pages, OUT/BUDGET/NAME.md. All metrics of the runs are there too, as NAME.csv.
 
     Raises:
-        LareError: there is no such exhibit, rliable is not installed, or one of the runs failed.
+        LareError: there is no such exhibit, or one of the runs failed.
     """
     shared_budget, command = budgets()[budget], f"lare-rl reproduce {name} --budget {budget}"
     names = [exhibit_name for exhibit_name, _, _ in listed()]
@@ -69,7 +68,6 @@ def reproduce(
     if name in UNTRAINED:
         make_page = UNTRAINED[name][-1]
         return write_page(make_page(shared_budget, command), folder)
-    load_rliable()
     is_real, directory = name == REAL, root / budget
     jobs = real.plan_jobs(budget, directory / REAL) if is_real else exhibit_jobs(exhibits()[name], budget, directory)
     all_jobs = [job for task_jobs in jobs.values() for contender_jobs in task_jobs.values() for job in contender_jobs]

@@ -16,7 +16,8 @@ import numpy as np
 import tyro
 
 import lare_rl
-from lare_rl.compare.bootstrap import bootstrap, interquartile_means, mann_whitney, probability_of_improvement
+from lare_rl.compare.bootstrap import estimate, interquartile_mean, probability_of_improvement
+from lare_rl.compare.rank_test import mann_whitney
 from lare_rl.envs.load import read_task
 from lare_rl.runs.directory import open_run
 from lare_rl.tasks.spec import TaskSpec
@@ -150,7 +151,7 @@ def main(
 def describe(values: list[float], baseline: list[float] | None) -> dict[str, Any]:
     """Return the statistics of a row, and its probability of improvement over the baseline."""
     array = np.array(values)[:, None]
-    iqm = bootstrap(array[..., None], interquartile_means)[0]
+    iqm = estimate(interquartile_mean, array)
     row = {
         "n": len(values),
         "mean": float(array.mean()),
@@ -161,7 +162,7 @@ def describe(values: list[float], baseline: list[float] | None) -> dict[str, Any
     }
     if baseline is not None and baseline is not values:
         other = np.array(baseline)[:, None]
-        row["above baseline"] = probability_of_improvement(array, other)
+        row["above baseline"] = float(probability_of_improvement(array, other))
         row["p"] = min(mann_whitney([(array[:, 0], other[:, 0])]))
     return row
 

@@ -7,13 +7,7 @@ import pytest
 
 from helpers.toy_envs import toy_spec
 from lare_rl.compare import bootstrap
-from lare_rl.compare.bootstrap import (
-    Estimate,
-    interquartile_means,
-    load_rliable,
-    mann_whitney,
-    probability_of_improvement,
-)
+from lare_rl.compare.bootstrap import Estimate
 from lare_rl.compare.comparison import compare, compare_over_tasks, compare_tasks
 from lare_rl.compare.labels import label_runs
 from lare_rl.compare.results import read_run_results
@@ -49,40 +43,6 @@ def test_compare_by_hand(make_run):
     profile = comparison.profiles["dense"]
     np.testing.assert_allclose(profile.value, [np.mean(np.array(values) > x) for x in profile.x])
     assert compare(read(runs)).rows == comparison.rows  # the bootstrap is deterministic
-
-
-@pytest.mark.parametrize(("n_runs", "n_tasks"), [(1, 1), (3, 1), (3, 2), (8, 3)])
-def test_statistics_are_those_of_rliable(n_runs, n_tasks):
-    random = np.random.default_rng(0)
-    load_rliable()
-    from rliable import metrics
-
-    scores = random.normal(size=(n_runs, n_tasks, 7))
-    expected = [metrics.aggregate_iqm(scores[..., step]) for step in range(7)]
-    np.testing.assert_allclose(interquartile_means(scores), expected)
-    scores, baseline = (random.integers(0, 5, (n, n_tasks)).astype(float) for n in (n_runs, 4))  # with ties
-    expected = metrics.probability_of_improvement(scores, baseline)
-    assert probability_of_improvement(scores, baseline) == pytest.approx(expected)
-
-
-def test_mann_whitney_by_hand():
-    """By the tables of Mann and Whitney: of 3 against 3, all nine pairs 1 in 20, eight or more 2 in 20."""
-    low, high = np.array([1.0, 2, 3]), np.array([4.0, 5, 6])
-    assert mann_whitney([(high, low)]) == pytest.approx((1 / 20, 1))
-    assert mann_whitney([(np.array([3.0, 5, 6]), np.array([1.0, 2, 4]))])[0] == pytest.approx(2 / 20)
-    assert mann_whitney([(low, high)]) == pytest.approx((1, 1 / 20))
-    assert mann_whitney([(high, low), (high, low)])[0] == pytest.approx(1 / 400)
-    assert min(mann_whitney([(low, low)])) > 0.5
-
-
-def test_intervals_contain_true_mean():
-    """Of 10 normal numbers, in most of 60 cases. The bootstrap's intervals of few numbers are a little too narrow."""
-    random = np.random.default_rng(0)
-    n_inside = 0
-    for _ in range(60):
-        (estimate,) = bootstrap.bootstrap(random.normal(size=(10, 1)), lambda scores: np.array([scores.mean()]))
-        n_inside += estimate.low <= 0 <= estimate.high
-    assert 46 <= n_inside <= 60
 
 
 def test_draws_and_seeds(make_run):

@@ -17,7 +17,7 @@ import lare_rl
 from helpers import host_envs
 from helpers.host_envs import ToyHostEnv
 from helpers.toy_envs import toy_spec
-from lare_rl.envs import families
+from lare_rl.envs import families, worker_process
 from lare_rl.envs.families import picklable_maker
 from lare_rl.envs.pettingzoo_env import make
 from lare_rl.envs.vec_env import LocalVecEnv
@@ -148,6 +148,12 @@ def test_worker_that_fails(fault, timeout, message):
     assert not any(map(is_running, pids))
     with pytest.raises(LareError, match="the worker processes have ended"):
         envs.step(np.zeros((4, 2, 2), np.float32))
+
+
+def test_worker_that_does_not_start(monkeypatch):
+    monkeypatch.setattr(worker_process, "PROGRAM", "raise SystemExit(7)")
+    with pytest.raises(LareError, match=r"^environment 0 \(in worker process \d+\) died: exit status 7$"):
+        SubprocVecEnv([ToyHostEnv])
 
 
 def test_worker_that_is_killed_between_steps():

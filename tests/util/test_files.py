@@ -1,8 +1,11 @@
 """Files that are replaced as a whole."""
 
+from pathlib import Path
+
 import pytest
 
 from lare_rl.errors import LareError
+from lare_rl.util import files
 from lare_rl.util.files import write_atomically
 
 
@@ -32,3 +35,28 @@ def test_two_writers(tmp_path):
 
     write_atomically(path, write)
     assert [(file.name, file.read_bytes()) for file in tmp_path.iterdir()] == [("table.csv", b"first and last")]
+
+
+@pytest.mark.parametrize("n_refused", [0, 2, 100])
+def test_file_that_another_process_reads(n_refused, tmp_path, monkeypatch):
+    """Windows refuses to replace it. After some attempts the error is the user's."""
+    calls, path = [], tmp_path / "file"
+    path.write_bytes(b"old")
+    replace = Path.replace
+
+    def refuse(new, target):
+        calls.append(target)
+        if len(calls) <= n_refused:
+            raise PermissionError(13, "Access is denied")
+        return replace(new, target)
+
+    monkeypatch.setattr(Path, "replace", refuse)
+    monkeypatch.setattr(files, "RETRY_S", (0.0, 0.0, 0.0))
+    if n_refused == 100:
+        with pytest.raises(LareError, match="Access is denied"):
+            write_atomically(path, lambda file: file.write(b"new"))
+    else:
+        write_atomically(path, lambda file: file.write(b"new"))
+    assert path.read_bytes() == (b"old" if n_refused == 100 else b"new")
+    assert len(calls) == min(n_refused + 1, 4)
+    assert list(tmp_path.iterdir()) == [path]

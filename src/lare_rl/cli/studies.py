@@ -169,7 +169,7 @@ def _import_from_checkout(module: str) -> ModuleType:
     if not (_BENCHMARKS / "paper" / f"{module}.py").is_file():
         raise LareError(
             "lare-rl reproduce needs a checkout, which describes the exhibits: clone the repository, and install it there by "
-            "pip install -e '.[statistics]'"
+            "pip install -e '.[all]'"
         )
     if str(_BENCHMARKS) not in sys.path:
         sys.path.append(str(_BENCHMARKS))

@@ -1,39 +1,41 @@
-"""Estimates with 95% intervals, by the stratified bootstrap of rliable (Agarwal et al., "Deep RL at the edge of the statistical
-precipice", NeurIPS 2021), and the exact test of Mann and Whitney (1947).
+"""Statistics of few runs, with 95% intervals by the stratified bootstrap (Agarwal et al., "Deep Reinforcement Learning at the Edge of
+the Statistical Precipice", NeurIPS 2021, sections 4.1 to 4.3).
+
+`scores[..., n, m]` is the score of run n on task m. Each statistic is a pure function over the last two axes.
 """
 
-import contextlib
-import itertools
-import warnings
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
+from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
-from lare_rl.errors import missing_extra_error
-from lare_rl.util.statistics import Band, format_rounded
+from lare_rl.util.statistics import format_rounded
 
 __all__ = [
     "REPETITIONS",
     "Estimate",
+    "Intervals",
     "OtherScores",
     "Scores",
     "bootstrap",
-    "bootstrap_band",
-    "interquartile_means",
-    "load_rliable",
-    "mann_whitney",
-    "mann_whitney_u",
+    "estimate",
+    "interquartile_mean",
+    "performance_profile",
     "probability_of_improvement",
 ]
 
 REPETITIONS = 2000
 """Number of bootstrap samples."""
 
-Scores = Float[np.ndarray, "runs tasks *steps"]
-OtherScores = Float[np.ndarray, "other_runs tasks *steps"]
+CHUNK = 100
+"""Samples that are in memory at a time."""
+
+PERCENTILES = 2.5, 97.5
+
+Scores = Float[np.ndarray, "*batch runs tasks"]
+OtherScores = Float[np.ndarray, "*batch other_runs tasks"]
 
 
 @dataclass(frozen=True)
@@ -51,90 +53,80 @@ class Estimate:
         return "{} [{}, {}]".format(*texts)
 
 
-def bootstrap(
-    scores: Scores | tuple[Scores, OtherScores], function: Callable[..., Float[np.ndarray, "*values"]]
-) -> list[Estimate]:
-    """Estimate the values of a function of scores, with intervals by resampling the runs of each task.
+class Intervals(NamedTuple):
+    """Numbers and their 95% intervals."""
 
-    If there are two arrays of scores, the function takes both, and the runs of each are resampled. The random numbers are always
-    the same.
+    value: Float[np.ndarray, "*values"]
+    low: Float[np.ndarray, "*values"]
+    high: Float[np.ndarray, "*values"]
+
+
+def interquartile_mean(scores: Scores) -> Float[np.ndarray, "*batch"]:
+    """Return the mean of the middle half of the scores of all runs and tasks.
+
+        IQM = mean of x_(k + 1) .. x_(N M - k),   k = floor(N M / 4)
+
+    x_(i) is the i-th smallest of the N M scores.
     """
-    library = load_rliable()
-    with warnings.catch_warnings(), _seeded_numpy(0):
-        warnings.simplefilter("ignore")  # rliable's dependencies warn about each other
-        points, intervals = library.get_interval_estimates({"": scores}, function, reps=REPETITIONS)
-    values, (low, high) = np.atleast_1d(points[""]), np.reshape(intervals[""], (2, -1))
-    return [Estimate(*map(float, numbers)) for numbers in zip(values, low, high, strict=True)]
+    ascending = np.sort(scores.reshape(*scores.shape[:-2], -1), axis=-1)
+    cut = ascending.shape[-1] // 4
+    return ascending[..., cut : ascending.shape[-1] - cut].mean(axis=-1)
 
 
-def bootstrap_band(
-    x: Float[np.ndarray, " points"], scores: Scores, function: Callable[..., Float[np.ndarray, " points"]]
-) -> Band:
-    """Estimate the curve of a function of scores."""
-    curve = bootstrap(scores, function)
-    return Band(x, *np.transpose([(estimate.value, estimate.low, estimate.high) for estimate in curve]))
+def performance_profile(
+    scores: Scores, thresholds: Float[np.ndarray, " thresholds"]
+) -> Float[np.ndarray, "*batch thresholds"]:
+    """Return the share of runs that score more than each threshold.
 
-
-# A bootstrap calls these functions thousands of times, and the checks of the same functions in rliable take most of their time.
-
-
-def interquartile_means(scores: Scores) -> Float[np.ndarray, " steps"]:
-    """Return the mean of the middle half of all runs and tasks, at every step: `aggregate_iqm` of rliable."""
-    ascending = np.sort(scores.reshape(-1, scores.shape[-1]), axis=0)
-    cut = len(ascending) // 4
-    return ascending[cut : len(ascending) - cut].mean(axis=0)
-
-
-def probability_of_improvement(scores: Scores, baseline: OtherScores) -> float:
-    """Return the share of pairs of runs on a task in which the run scores more than the baseline. A tie counts half."""
-    return float(np.mean((scores[:, None] > baseline) + 0.5 * (scores[:, None] == baseline)))
-
-
-def mann_whitney_u(a: Float[np.ndarray, " a"], b: Float[np.ndarray, " b"]) -> float:
-    """Return the number of pairs in which a is larger than b. A tie counts half."""
-    return float(np.sum(a[:, None] > b) + 0.5 * np.sum(a[:, None] == b))
-
-
-def mann_whitney(tasks: Sequence[tuple[Float[np.ndarray, " _"], Float[np.ndarray, " _"]]]) -> tuple[float, float]:
-    """Return two probabilities: that U is at least as large by chance, and that it is at most as large.
-
-        U = sum over tasks and over all pairs of [a > b] + [a = b] / 2
-
-    `tasks` has the values a and b of each task. If they had the same distribution, all ways to split them into two groups would
-    be equally likely.
+    F(tau) = 1 / (N M) * sum over n and m of [x_nm > tau]
     """
-    u, probabilities = 0.0, {0.0: 1.0}  # the distribution of U over the tasks so far
-    for a, b in tasks:
-        u += mann_whitney_u(a, b)
-        values = np.concatenate([a, b])
-        splits = [list(split) for split in itertools.combinations(range(len(values)), len(a))]
-        task_us = [mann_whitney_u(values[split], np.delete(values, split)) for split in splits]
-        convolved: dict[float, float] = {}
-        for (total, probability), task_u in itertools.product(probabilities.items(), task_us):
-            convolved[total + task_u] = convolved.get(total + task_u, 0.0) + probability / len(splits)
-        probabilities = convolved
-    at_least = sum(probability for total, probability in probabilities.items() if total >= u)
-    at_most = sum(probability for total, probability in probabilities.items() if total <= u)
-    return min(1.0, at_least), min(1.0, at_most)
+    return np.mean(scores[..., None] > thresholds, axis=(-3, -2))
 
 
-def load_rliable() -> Any:
-    """Import the library. Raises `LareError` if it is not installed."""
-    try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")
-            from rliable import library
-    except ImportError:
-        raise missing_extra_error("a comparison", "statistics") from None
-    return library
+def probability_of_improvement(scores: Scores, baseline: OtherScores) -> Float[np.ndarray, "*batch"]:
+    """Return the share of pairs of runs on a task in which the run scores more than the baseline.
+
+    P(X > Y) = 1 / M * sum over m of 1 / (N K) * sum over n and k of ([x_nm > y_km] + [x_nm = y_km] / 2)
+    """
+    x, y = scores[..., :, None, :], baseline[..., None, :, :]
+    return np.mean((x > y) + 0.5 * (x == y), axis=(-3, -2, -1))
 
 
-@contextlib.contextmanager
-def _seeded_numpy(seed: int) -> Iterator[None]:
-    """Seed NumPy's global random numbers for a while. Rliable draws from them even if it is given a random state."""
-    state = np.random.get_state()
-    np.random.seed(seed)
-    try:
-        yield
-    finally:
-        np.random.set_state(state)
+def estimate(function: Callable[..., Float[np.ndarray, "*batch"]], *scores: Float[np.ndarray, "_ _"]) -> Estimate:
+    """Estimate one number, which `function` computes of the last two axes of each of `scores`."""
+    return Estimate(*map(float, bootstrap(function, *scores)))
+
+
+def bootstrap(function: Callable[..., Float[np.ndarray, "*_"]], *scores: Float[np.ndarray, "*_"]) -> Intervals:
+    """Estimate the values of a function of scores. Their intervals are percentiles over samples of the runs.
+
+        x*_nm = x_(i_nm) m,   i_nm uniform in 1 .. N, independent for each run n and task m
+
+    A sample of a learning curve has whole runs: further axes of `scores` share the draws. The draws are always the same.
+
+    Args:
+        function: one of the statistics above, or a combination of them. The first axis of its arguments is the sample.
+        scores: the runs of each array are drawn independently.
+    """
+    random = np.random.RandomState(0)  # NumPy keeps the stream of this generator unchanged
+    samples = []
+    for start in range(0, REPETITIONS, CHUNK):
+        draws = [_draw_runs(random, scores) for _ in range(min(CHUNK, REPETITIONS - start))]
+        samples.append(function(*map(_take_runs, scores, zip(*draws, strict=True))))
+    low, high = np.percentile(np.concatenate(samples), PERCENTILES, axis=0)
+    return Intervals(function(*(array[None] for array in scores))[0], low, high)
+
+
+def _draw_runs(
+    random: np.random.RandomState, scores: tuple[Float[np.ndarray, "*_"], ...]
+) -> list[Int[np.ndarray, "_ _"]]:
+    """Draw the indices of as many runs as each array has, on each task."""
+    return [random.randint(array.shape[-2], size=array.shape[-2:]) for array in scores]
+
+
+def _take_runs(
+    scores: Float[np.ndarray, "*batch runs tasks"], draws: tuple[Int[np.ndarray, "runs tasks"], ...]
+) -> Float[np.ndarray, "samples *batch runs tasks"]:
+    index = np.stack(draws)
+    index = index.reshape(len(draws), *(scores.ndim - 2) * [1], *scores.shape[-2:])
+    return np.take_along_axis(scores[None], index, axis=-2)

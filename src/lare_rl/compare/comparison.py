@@ -15,11 +15,12 @@ from lare_rl.compare.bootstrap import (
     OtherScores,
     Scores,
     bootstrap,
-    bootstrap_band,
-    interquartile_means,
-    mann_whitney,
+    estimate,
+    interquartile_mean,
+    performance_profile,
     probability_of_improvement,
 )
+from lare_rl.compare.rank_test import mann_whitney
 from lare_rl.compare.results import Results
 from lare_rl.compare.scores import Group, group_results
 from lare_rl.evaluation.reference_returns import REFERENCE_RETURNS
@@ -110,21 +111,21 @@ def compare(
     All labels have the same tasks. `step` and `late` choose what a score is (`group_results`).
 
     Raises:
-        LareError: some results are missing, or rliable is not installed.
+        LareError: some results are missing.
     """
     groups = group_results(results, metric, step, late)
     final = {group.label: group.final_scores.mean(axis=0) for group in groups}
     baseline = final[groups[0].label]
     steps = np.array(groups[0].steps, float)
     thresholds = np.linspace(min(map(np.min, final.values())), max(map(np.max, final.values())), 101)
-
-    def shares_above(scores: Scores) -> np.ndarray:
-        return np.mean(scores[..., None] > thresholds, axis=(0, 1))
-
+    curves = {group.label: np.moveaxis(group.scores.mean(axis=0), -1, 0) for group in groups}
     return Comparison(
         rows=tuple(_make_row(group, None if group is groups[0] else baseline) for group in groups),
-        curves={group.label: bootstrap_band(steps, group.scores.mean(axis=0), interquartile_means) for group in groups},
-        profiles={label: bootstrap_band(thresholds, scores, shares_above) for label, scores in final.items()},
+        curves={label: Band(steps, *bootstrap(interquartile_mean, scores)) for label, scores in curves.items()},
+        profiles={
+            label: Band(thresholds, *bootstrap(lambda sample: performance_profile(sample, thresholds), scores))
+            for label, scores in final.items()
+        },
         groups={group.label: group for group in groups},
         metric=metric,
         step=step,
@@ -170,21 +171,18 @@ def compare_over_tasks(comparisons: Sequence[Comparison]) -> list[OverallRow]:
 def _make_row(group: Group, baseline: Scores | None) -> Row:
     scores = group.final_scores.mean(axis=0)
     seed_means = scores.mean(axis=1)
-    (iqm,) = bootstrap(scores[..., None], interquartile_means)
     draw_mean = difference = improvement = p_value = None
     if len(group.draws) > 1:
-        (draw_mean,) = bootstrap(group.final_scores.mean(axis=1), lambda draws: np.array([np.mean(draws)]))
+        draw_mean = estimate(lambda draws: draws.mean(axis=(-2, -1)), group.final_scores.mean(axis=1))
     if baseline is not None and min(len(scores), len(baseline)) > 1:
-        (difference,) = bootstrap(
-            (scores, baseline), lambda a, b: interquartile_means(a[..., None]) - interquartile_means(b[..., None])
-        )
+        difference = estimate(lambda a, b: interquartile_mean(a) - interquartile_mean(b), scores, baseline)
     if baseline is not None:
         improvement, p_value = _improvement(scores, baseline)
     return Row(
         label=group.label,
         n_seeds=len(group.seeds),
         n_draws=len(group.draws),
-        iqm=iqm,
+        iqm=estimate(interquartile_mean, scores),
         mean=float(np.mean(seed_means)),
         std=sample_std(seed_means) if len(seed_means) > 1 else None,
         draw_mean=draw_mean,
@@ -198,7 +196,7 @@ def _improvement(scores: Scores, baseline: OtherScores) -> tuple[Estimate | None
     """Return `Row.improvement` and `Row.p_value`."""
     if min(len(scores), len(baseline)) < 2:
         return None, None
-    (improvement,) = bootstrap((scores, baseline), lambda a, b: np.array([probability_of_improvement(a, b)]))
+    improvement = estimate(probability_of_improvement, scores, baseline)
     if math.comb(len(scores) + len(baseline), len(scores)) > MAX_SPLITS:
         return improvement, None
     return improvement, min(mann_whitney(list(zip(scores.T, baseline.T, strict=True))))

@@ -37,7 +37,7 @@ def read_metric_rows(directories: Iterable[Path]) -> list[dict[str, Any]]:
 
 
 def write_table(rows: Sequence[dict[str, Any]], path: Path) -> list[Path]:
-    """Write PATH.csv and, with the extra `statistics`, PATH.parquet. Return the paths of the files."""
+    """Write PATH.csv and, with the extra `parquet`, PATH.parquet. Return the paths of the files."""
     names = [*KEYS, *sorted({name for row in rows for name in row} - {*KEYS})]
     text = io.StringIO()
     writer = csv.DictWriter(text, names)

@@ -1,4 +1,4 @@
-"""The page of a comparison: its tables, and the figures that the authors of rliable recommend."""
+"""The page of a comparison: its tables, and the figures that Agarwal et al. (2021) recommend."""
 
 from collections.abc import Iterable, Iterator, Sequence
 from html import escape

@@ -3,9 +3,11 @@
 import contextlib
 import mmap
 import os
+import sys
 import tempfile
 from collections.abc import Iterator
 from typing import NamedTuple
+from uuid import uuid4
 
 import numpy as np
 from jaxtyping import Bool, Float, Int, Shaped
@@ -13,10 +15,10 @@ from jaxtyping import Bool, Float, Int, Shaped
 from lare_rl.envs.interface import EnvSpec, Timestep
 from lare_rl.envs.vec_env import empty_batch
 
-__all__ = ["MAX_WORKERS", "SharedArrays", "map_arrays", "map_current", "open_shared_file"]
+__all__ = ["MAX_WORKERS", "SharedArrays", "map_arrays", "map_current", "open_directory", "open_shared_memory"]
 
-MAX_WORKERS = mmap.ALLOCATIONGRANULARITY // np.dtype(np.int64).itemsize
-"""The first page of the shared file has room for a number of each."""
+MAX_WORKERS = mmap.PAGESIZE // np.dtype(np.int64).itemsize
+"""A page of the shared memory has room for a number of each."""
 
 
 class SharedArrays(NamedTuple):
@@ -33,36 +35,47 @@ class SharedArrays(NamedTuple):
 
 
 @contextlib.contextmanager
-def open_shared_file() -> Iterator[int]:
-    """Yield the descriptor of a file without a name. It lasts as long as a process has mapped it."""
-    directory = "/dev/shm" if os.path.isdir("/dev/shm") else None
-    with tempfile.TemporaryFile(dir=directory) as file:
-        _reserve(file.fileno(), mmap.ALLOCATIONGRANULARITY)
-        yield file.fileno()
+def open_directory() -> Iterator[str]:
+    """Yield a new directory, in memory if the system has such a file system."""
+    memory = "/dev/shm"
+    with tempfile.TemporaryDirectory(prefix="lare-", dir=memory if os.path.isdir(memory) else None) as directory:
+        yield directory
 
 
-def _reserve(file: int, size: int) -> None:
-    """Give a file at least this size. Raises `OSError` if there is no room: a mapped file without room would kill the process."""
-    if hasattr(os, "posix_fallocate"):
-        os.posix_fallocate(file, 0, size)
-    else:
-        os.ftruncate(file, size)
+@contextlib.contextmanager
+def open_shared_memory() -> Iterator[str]:
+    """Yield the beginning of names of memory. What is mapped until the end lasts as long as a process has mapped it."""
+    if sys.platform == "win32":
+        yield f"lare-{uuid4().hex}-"
+        return
+    with open_directory() as directory:
+        yield f"{directory}/"
 
 
-def map_current(file: int) -> Int[np.ndarray, " workers"]:
-    """Map the first page of the file: the index of the environment that each worker calls now."""
-    return np.frombuffer(mmap.mmap(file, mmap.ALLOCATIONGRANULARITY), np.int64)
+def _map(name: str, size: int) -> mmap.mmap:
+    """Map memory by its name. Raises `OSError` if there is no room: a mapped file without room would kill the process."""
+    if sys.platform == "win32":
+        return mmap.mmap(-1, size, tagname=name)
+    with open(name, "a+b") as file:
+        if hasattr(os, "posix_fallocate"):
+            os.posix_fallocate(file.fileno(), 0, size)
+        else:
+            file.truncate(size)
+        return mmap.mmap(file.fileno(), size)
 
 
-def map_arrays(file: int, spec: EnvSpec, n: int) -> SharedArrays:
-    """Map the rest of the file: the arrays of `n` environments."""
+def map_current(prefix: str) -> Int[np.ndarray, " workers"]:
+    """Map a page of the memory with these names: the index of the environment that each worker calls now."""
+    return np.frombuffer(_map(prefix + "current", mmap.PAGESIZE), np.int64)
+
+
+def map_arrays(prefix: str, spec: EnvSpec, n: int) -> SharedArrays:
+    """Map the rest of the memory with these names: the arrays of `n` environments."""
     batch = empty_batch(spec, n)
     action = np.zeros((n, spec.n_agents, spec.action_size), spec.action_dtype)
     arrays = [np.zeros(n, bool), np.zeros(n, np.int64), action, *batch[:-1], *batch.measures.values()]
     starts = np.cumsum([0, *(-(-array.nbytes // 64) * 64 for array in arrays)])
-    size = int(starts[-1])
-    _reserve(file, mmap.ALLOCATIONGRANULARITY + size)
-    memory = mmap.mmap(file, size, offset=mmap.ALLOCATIONGRANULARITY)
+    memory = _map(prefix + "arrays", int(starts[-1]))
     where, seed, action, *columns = (
         np.ndarray(array.shape, array.dtype, memory, start)
         for array, start in zip(arrays, starts[:-1].tolist(), strict=True)

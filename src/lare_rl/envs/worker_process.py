@@ -15,9 +15,7 @@ import threading
 import time
 from collections.abc import Iterable, Mapping, Sequence
 from functools import partial
-from multiprocessing import Pipe
 from multiprocessing.connection import Connection
-from multiprocessing.reduction import recv_handle, send_handle
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -28,11 +26,13 @@ from lare_rl.envs.interface import EnvSpec, HostEnv
 from lare_rl.envs.shared_arrays import SharedArrays, map_arrays, map_current
 from lare_rl.envs.trials import find_interference, time_steps
 from lare_rl.envs.vec_env import Maker, call_env, make_env_at
+from lare_rl.envs.worker_connection import connect, listen, open_address
 from lare_rl.errors import LareError
+from lare_rl.util.processes import own_session
 
 __all__ = ["Worker", "end_workers", "pickle_maker"]
 
-PROGRAM = "import sys; from lare_rl.envs.worker_process import _serve; _serve(int(sys.argv[1]))"
+PROGRAM = "import sys; from lare_rl.envs.worker_process import _serve; _serve(sys.argv[1])"
 
 CLOSE_TIMEOUT_S = 2.0
 """Workers must close their environments within this time."""
@@ -65,28 +65,32 @@ class Worker:
         """Whether a reply is pending."""
         self.last_active, self._last_index = time.monotonic(), 0
         self._current = np.zeros(1, np.int64)
-        self.connection, worker_end = Pipe()
+        self.connection: Connection
+        """From `attach` on."""
+        self._is_connected, self._stack = False, contextlib.ExitStack()
+        self._address = self._stack.enter_context(open_address())
         # The same import paths as in this process, and one thread, so that other workers can use the other cores.
         paths = os.pathsep.join(path or os.getcwd() for path in sys.path)
         variables = {"OMP_NUM_THREADS": "1"} | os.environ | {"PYTHONPATH": paths}
-        with worker_end:
-            self.process = subprocess.Popen(
-                [sys.executable, "-P", "-c", PROGRAM, str(worker_end.fileno())],
-                stdin=subprocess.PIPE,
-                pass_fds=[worker_end.fileno()],
-                env=variables,
-                start_new_session=True,  # Ctrl-C must reach only the parent
-            )
+        self.process = subprocess.Popen(
+            [sys.executable, "-P", "-c", PROGRAM, self._address],
+            stdin=subprocess.PIPE,
+            env=variables,
+            **own_session(),
+        )
 
-    def attach(self, env_indices: Sequence[int], file: int, worker_index: int) -> None:
-        """Number the environments anew, and use the memory of another file."""
-        self.env_indices, self._current = env_indices, map_current(file)[worker_index : worker_index + 1]
+    def attach(self, env_indices: Sequence[int], memory: str, worker_index: int) -> None:
+        """Number the environments anew, and use other memory."""
+        self.env_indices, self._current = env_indices, map_current(memory)[worker_index : worker_index + 1]
         self._current[0] = env_indices[0]
-        self.send("attach", (worker_index, tuple(env_indices)))
-        try:
-            send_handle(self.connection, file, self.process.pid)
-        except OSError:
-            raise self._make_death_error() from None
+        if not self._is_connected:
+            try:
+                self.connection = connect(self._address, self.process)
+            except OSError:
+                raise self._make_death_error() from None
+            self._is_connected = True
+            self._stack.close()
+        self.send("attach", (worker_index, tuple(env_indices), memory))
         self.is_busy = False  # this command has no reply
 
     @property
@@ -126,8 +130,14 @@ class Worker:
         reason = f"signal {signal.Signals(-status).name}" if status < 0 else f"exit status {status}"
         return LareError(f"{self.label} died: {reason}")
 
+    def close_connection(self) -> None:
+        """Ask the worker to end."""
+        self._stack.close()
+        if self._is_connected:
+            self.connection.close()
+
     def kill(self) -> None:
-        self.connection.close()
+        self.close_connection()
         self.process.kill()
         self.process.wait()
         assert self.process.stdin is not None
@@ -138,7 +148,7 @@ def end_workers(workers: Iterable[Worker]) -> None:
     """Let workers close their environments, and kill those that take too long."""
     workers = list(workers)
     for worker in workers:
-        worker.connection.close()  # asks the worker to end
+        worker.close_connection()
     deadline = time.monotonic() + CLOSE_TIMEOUT_S
     for worker in workers:
         with contextlib.suppress(subprocess.TimeoutExpired):
@@ -152,21 +162,18 @@ def pickle_maker(env_index: int, maker: Maker) -> bytes:
         return pickle.dumps(maker)
 
 
-def _serve(connection_descriptor: int) -> None:
+def _serve(address: str) -> None:
     """Run a worker: make, reset and step environments, with a reply to each command, until the connection closes."""
     threading.Thread(target=_end_with_parent, daemon=True).start()
-    connection = Connection(connection_descriptor)
+    connection = listen(address)
     envs: dict[int, HostEnv] = {}
-    file, current, shared = -1, np.zeros(1, np.int64), None
+    memory, current, shared = "", np.zeros(1, np.int64), None
     with contextlib.suppress(EOFError, BrokenPipeError, ConnectionResetError):
         while True:
             command, argument = connection.recv()
             if command == "attach":
-                worker_index, env_indices = argument
-                if file >= 0:
-                    os.close(file)
-                file, shared = recv_handle(connection), None
-                current = map_current(file)[worker_index : worker_index + 1]
+                worker_index, env_indices, memory = argument
+                current, shared = map_current(memory)[worker_index : worker_index + 1], None
                 envs = dict(zip(env_indices, envs.values(), strict=False))  # before "make", there are none
                 continue
             reply = None
@@ -178,7 +185,7 @@ def _serve(connection_descriptor: int) -> None:
                         envs[index] = make_env_at(index, partial(_unpickle_and_make, pickled))
                     reply = tuple(env.spec for env in envs.values()), time.perf_counter() - start
                 elif command == "share":
-                    shared = map_arrays(file, *argument)
+                    shared = map_arrays(memory, *argument)
                 elif command == "time steps":
                     reply = time_steps(next(iter(envs.values())))
                 elif command == "second":

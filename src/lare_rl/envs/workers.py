@@ -17,7 +17,7 @@ import numpy as np
 from jaxtyping import Bool, Shaped
 
 from lare_rl.envs.interface import EnvSpec
-from lare_rl.envs.shared_arrays import MAX_WORKERS, map_arrays, open_shared_file
+from lare_rl.envs.shared_arrays import MAX_WORKERS, map_arrays, open_shared_memory
 from lare_rl.envs.vec_env import LocalVecEnv, Maker, VecEnv, check_same_sizes, n_cores
 from lare_rl.envs.worker_process import Worker, end_workers, pickle_maker
 from lare_rl.errors import LareError
@@ -93,11 +93,11 @@ class SubprocVecEnv(VecEnv):
         if reuse_key and n_workers < n_envs:
             raise LareError(f"{n_envs} environments need a process each, and a batch has at most {MAX_WORKERS}")
         try:
-            with open_shared_file() as file:
-                for worker_index in range(n_workers):
-                    worker = _find_idle_worker(reuse_key) or Worker()
-                    self._workers.append(worker)
-                    worker.attach(range(worker_index, n_envs, n_workers), file, worker_index)
+            with open_shared_memory() as memory:
+                for _ in range(n_workers):
+                    self._workers.append(_find_idle_worker(reuse_key) or Worker())
+                for worker_index, worker in enumerate(self._workers):
+                    worker.attach(range(worker_index, n_envs, n_workers), memory, worker_index)
                 for worker in self._workers:
                     if not worker.specs:
                         worker.send("make", {index: pickle_maker(index, makers[index]) for index in worker.env_indices})
@@ -110,12 +110,12 @@ class SubprocVecEnv(VecEnv):
                 }
                 specs: list[EnvSpec] = [by_index[index] for index in range(n_envs)]
                 check_same_sizes(specs)
-                self._shared = map_arrays(file, specs[0], n_envs)
+                self._shared = map_arrays(memory, specs[0], n_envs)
                 self._shared.batch.available[:] = True
-            super().__init__(specs[0], self._shared.batch)
-            for worker in self._workers:
-                worker.send("share", (specs[0], n_envs))
-            self._receive("share")
+                super().__init__(specs[0], self._shared.batch)
+                for worker in self._workers:
+                    worker.send("share", (specs[0], n_envs))
+                self._receive("share")
         except BaseException as error:
             self._kill()
             if isinstance(error, OSError):

@@ -25,6 +25,7 @@ from lare_rl.runs.config_file import CONFIG, Config, make_config, read_config, w
 from lare_rl.runs.metrics_file import read_metrics
 from lare_rl.tasks.spec import ScoredObservation, TaskSpec
 from lare_rl.tasks.trust import check_trusted
+from lare_rl.util.locks import try_lock
 
 __all__ = [
     "CHECKPOINT",
@@ -209,23 +210,14 @@ def function_paths(directory: Path, config: Config) -> list[tuple[TaskSpec, Path
 
 @contextlib.contextmanager
 def lock_run(run: Run) -> Iterator[None]:
-    """Keep a second process from training in the same directory, if the system has file locks.
+    """Keep a second process from training in the same directory, if the file system has locks.
 
     Raises:
         RunBusyError: another process trains in it.
     """
-    try:
-        import fcntl
-    except ImportError:
-        yield
-        return
-    with (run.directory / "lock").open("w") as file:
-        try:
-            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
-            raise RunBusyError(f"another process is training in {run.directory}") from None
-        except OSError:  # some network file systems have no locks
-            pass
+    with (run.directory / "lock").open("wb") as file:
+        if not try_lock(file):
+            raise RunBusyError(f"another process is training in {run.directory}")
         yield
 
 

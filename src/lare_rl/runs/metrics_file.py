@@ -47,7 +47,7 @@ def append_metrics(directory: Path, lines: Sequence[dict[str, Any]]) -> int:
     """Append lines to metrics.jsonl, and return the new size of the file in bytes."""
     path = directory / METRICS
     try:
-        with path.open("a", encoding="utf-8") as file:
+        with path.open("a", encoding="utf-8", newline="\n") as file:
             file.write("".join(json.dumps(line) + "\n" for line in lines))
             file.flush()
             os.fsync(file.fileno())

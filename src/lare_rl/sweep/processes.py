@@ -3,6 +3,7 @@
 A process ends when its parent ends.
 """
 
+import _thread
 import contextlib
 import json
 import logging
@@ -21,6 +22,7 @@ from lare_rl.errors import LareError, missing_extra_error
 from lare_rl.runs.directory import RunBusyError
 from lare_rl.sweep.jobs import Job, job_to_json, train_job
 from lare_rl.sweep.resources import PREALLOCATE, Resources, Slot, assign_slots
+from lare_rl.util.processes import own_session
 
 __all__ = ["RunningProcesses", "train_in_process", "train_in_processes", "train_on_ray"]
 
@@ -86,11 +88,13 @@ class RunningProcesses:
             self._processes.discard(process)
 
     def stop(self) -> None:
-        """Interrupt all processes, so that they save and end."""
+        """Close the standard input of all processes, so that they save and end."""
         with self._lock:
             self._stopped = True
             for process in self._processes:
-                process.send_signal(signal.SIGINT)
+                assert process.stdin is not None
+                with contextlib.suppress(OSError):
+                    process.stdin.close()
 
 
 def train_in_process(job: Job, slot: Slot, running: RunningProcesses) -> str | None:
@@ -107,8 +111,8 @@ def train_in_process(job: Job, slot: Slot, running: RunningProcesses) -> str | N
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             stderr=file,
-            text=True,
-            start_new_session=True,
+            encoding="utf-8",
+            **own_session(),
             env=os.environ | slot.variables,
         )
         if process is None:
@@ -117,13 +121,14 @@ def train_in_process(job: Job, slot: Slot, running: RunningProcesses) -> str | N
         assert process.stdout is not None
         error = ""
         try:
-            with contextlib.suppress(BrokenPipeError), process.stdin:  # stdin stays open as long as this process lives
-                with contextlib.suppress(BrokenPipeError):
-                    process.stdin.write(request + "\n")
-                    process.stdin.flush()
-                error = process.stdout.read().strip()
-                process.wait()
+            with contextlib.suppress(OSError, ValueError):  # the process has ended, or `stop` has closed its input
+                process.stdin.write(request + "\n")
+                process.stdin.flush()
+            error = process.stdout.read().strip()
+            process.wait()
         finally:
+            with contextlib.suppress(OSError):
+                process.stdin.close()
             process.stdout.close()
             running.remove(process)
     if process.returncode == 0:
@@ -187,9 +192,12 @@ def main() -> None:
     """
     # Before training begins, there is nothing to save.
     signal.signal(signal.SIGINT, lambda number, frame: os._exit(130))
-    parent = os.fdopen(os.dup(sys.stdout.fileno()), "w")
+    parent = os.fdopen(os.dup(sys.stdout.fileno()), "w", encoding="utf-8")
     os.dup2(sys.stderr.fileno(), sys.stdout.fileno())
-    request = json.loads(sys.stdin.readline())
+    line = sys.stdin.readline()
+    if not line:  # it was stopped already
+        sys.exit(130)
+    request = json.loads(line)
     threading.Thread(target=_interrupt_at_end_of_input, daemon=True).start()
     if request["cores"]:
         os.sched_setaffinity(0, request["cores"])
@@ -207,7 +215,7 @@ def _interrupt_at_end_of_input() -> None:
     """Save and stop, as after Ctrl-C, when the parent has ended."""
     while os.read(0, 1):  # not through Python's buffer, whose lock would still be held at exit
         pass
-    os.kill(os.getpid(), signal.SIGINT)
+    _thread.interrupt_main()
 
 
 def _train_when_free(job: dict[str, Any]) -> None:

@@ -106,5 +106,5 @@ def _card_variables(process: int, share: float, n_cards: int, environment: Mappi
 
 def _count_cards() -> int:
     """Return the number of cards that JAX sees. Another process asks it, because JAX reserves memory of the cards."""
-    process = subprocess.run([sys.executable, "-P", "-c", COUNT_CARDS], capture_output=True, text=True)
+    process = subprocess.run([sys.executable, "-P", "-c", COUNT_CARDS], capture_output=True, encoding="utf-8")
     return int(process.stdout) if process.stdout.strip().isdecimal() else 0

@@ -1,7 +1,6 @@
 """The functions of a run, compiled, with a leading seed axis on every array but the number of steps done."""
 
 import contextlib
-import ctypes
 from collections.abc import Callable, Sequence
 from functools import partial
 from types import ModuleType
@@ -216,5 +215,7 @@ def _compile(function: Any, *shapes: Any) -> Any:
 
 def _free_memory() -> None:
     """Return memory that the compiler has freed to the system. Otherwise, glibc keeps it for the process."""
-    with contextlib.suppress(OSError, AttributeError):  # another C library may not have this function
+    with contextlib.suppress(ImportError, OSError, TypeError, AttributeError):  # only glibc has it
+        import ctypes
+
         ctypes.CDLL(None).malloc_trim(0)

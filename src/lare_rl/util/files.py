@@ -1,6 +1,8 @@
 """Files that are replaced as a whole. If the process is killed, or the disk is full, the old file stays."""
 
+import contextlib
 import os
+import time
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
@@ -9,6 +11,10 @@ from uuid import uuid4
 from lare_rl.errors import LareError
 
 __all__ = ["replace_file", "write_arrays", "write_atomically"]
+
+
+RETRY_S = 0.01, 0.03, 0.1, 0.3, 1.0
+"""Windows does not replace a file that another process reads just now. The moments after which it is tried again (s)."""
 
 
 def write_atomically(path: Path, write: Callable[[Any], object]) -> None:
@@ -39,7 +45,16 @@ def replace_file(path: Path, write: Callable[[Any], object]) -> None:
             write(file)
             file.flush()
             os.fsync(file.fileno())
-        new.replace(path)
+        _move(new, path)
     except BaseException:  # an interruption must not leave the new file either
         new.unlink(missing_ok=True)
         raise
+
+
+def _move(new: Path, path: Path) -> None:
+    for pause_s in RETRY_S:
+        with contextlib.suppress(PermissionError):
+            new.replace(path)
+            return
+        time.sleep(pause_s)
+    new.replace(path)

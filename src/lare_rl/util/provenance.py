@@ -27,7 +27,7 @@ def _git(directory: Path, *arguments: str) -> str:
     """Return the output of git, or an empty text if it fails."""
     try:
         process = subprocess.run(
-            ("git", *arguments), cwd=directory, capture_output=True, text=True, timeout=5, check=True
+            ("git", *arguments), cwd=directory, capture_output=True, encoding="utf-8", timeout=5, check=True
         )
     except (OSError, subprocess.SubprocessError):
         return ""

@@ -1,0 +1,147 @@
+"""The statistics of few runs: by loops in plain Python, and by the numbers of rliable."""
+
+import itertools
+
+import numpy as np
+import pytest
+
+from lare_rl.compare import bootstrap
+from lare_rl.compare.bootstrap import (
+    Estimate,
+    estimate,
+    interquartile_mean,
+    performance_profile,
+    probability_of_improvement,
+)
+from lare_rl.compare.rank_test import mann_whitney
+
+SCORES = np.array([[4.0, 0.5], [2.0, 2.5], [7.0, 1.5], [1.0, 3.0], [9.0, 1.5]])
+BASELINE = np.array([[3.0, 1.5], [2.0, 0.0], [5.0, 2.0]])
+THRESHOLDS = np.array([1.0, 2.0, 4.0])
+
+
+def profile(scores):
+    return performance_profile(scores, THRESHOLDS)
+
+
+def difference(scores, baseline):
+    return interquartile_mean(scores) - interquartile_mean(baseline)
+
+
+def slow_interquartile_mean(scores):
+    numbers = sorted(number for run in scores.tolist() for number in run)
+    middle = [number for i, number in enumerate(numbers) if len(numbers) // 4 <= i < len(numbers) - len(numbers) // 4]
+    return sum(middle) / len(middle)
+
+
+def slow_profile(scores):
+    return [sum(number > tau for run in scores for number in run) / scores.size for tau in THRESHOLDS]
+
+
+def slow_improvement(scores, baseline):
+    wins = [
+        1.0 if x > y else 0.5 if x == y else 0.0
+        for task in range(scores.shape[1])
+        for x, y in itertools.product(scores[:, task], baseline[:, task])
+    ]
+    return sum(wins) / len(wins)
+
+
+def slow_difference(scores, baseline):
+    return slow_interquartile_mean(scores) - slow_interquartile_mean(baseline)
+
+
+def slow_bootstrap(function, *scores, repetitions):
+    random = np.random.RandomState(0)
+    values = []
+    for _ in range(repetitions):
+        sample = []
+        for array in scores:
+            index = random.randint(len(array), size=array.shape)
+            sample.append(np.array([[array[i, task] for task, i in enumerate(row)] for row in index]))
+        values.append(function(*sample))
+    return np.array(values)
+
+
+@pytest.mark.parametrize(
+    ("function", "slow", "scores"),
+    [
+        (interquartile_mean, slow_interquartile_mean, [SCORES]),
+        (profile, slow_profile, [SCORES]),
+        (probability_of_improvement, slow_improvement, [SCORES, BASELINE]),
+        (difference, slow_difference, [SCORES, BASELINE]),
+    ],
+)
+@pytest.mark.parametrize("repetitions", [1, 150])
+def test_slow_twin(function, slow, scores, repetitions, monkeypatch):
+    """One of the numbers of samples is no multiple of a chunk."""
+    monkeypatch.setattr(bootstrap, "REPETITIONS", repetitions)
+    value, low, high = bootstrap.bootstrap(function, *scores)
+    np.testing.assert_allclose(value, slow(*scores))
+    samples = slow_bootstrap(slow, *scores, repetitions=repetitions)
+    np.testing.assert_allclose((low, high), np.quantile(samples, (0.025, 0.975), axis=0))
+
+
+@pytest.mark.parametrize("n_runs", range(1, 10))
+def test_interquartile_mean_of_any_number_of_runs(n_runs):
+    scores = np.random.default_rng(n_runs).normal(size=(2, 4, n_runs, 3))
+    slow = [[slow_interquartile_mean(scores[i, j]) for j in range(4)] for i in range(2)]
+    np.testing.assert_allclose(interquartile_mean(scores), slow)
+
+
+# The numbers of rliable 1.2.0. For the first, `pip install 'rliable==1.2.0' 'pandas<3'`, and in Python
+#     import numpy as np
+#     from rliable import library, metrics
+#     np.random.seed(0)
+#     library.get_interval_estimates({"": SCORES}, lambda x: np.array([metrics.aggregate_iqm(x)]), reps=2000)
+# and for the others, with the seed set before each of them,
+#     {"": SCORES}, lambda x: library.score_distributions(x, THRESHOLDS)
+#     {"": (SCORES, BASELINE)}, lambda x, y: np.array([metrics.probability_of_improvement(x, y)])
+#     {"": (SCORES, BASELINE)}, lambda x, y: np.array([metrics.aggregate_iqm(x) - metrics.aggregate_iqm(y)])
+@pytest.mark.parametrize(
+    ("function", "scores", "value", "low", "high"),
+    [
+        (interquartile_mean, [SCORES], 2.4166666666666665, 1.4166666666666667, 4.416666666666667),
+        (profile, [SCORES], [0.8, 0.5, 0.2], [0.5, 0.2, 0.0], [1.0, 0.8, 0.4]),
+        (probability_of_improvement, [SCORES, BASELINE], 0.6166666666666667, 0.31666666666666665, 0.9),
+        (difference, [SCORES, BASELINE], 0.2916666666666665, -1.0833333333333333, 2.3343749999999943),
+    ],
+)
+def test_numbers_of_rliable(function, scores, value, low, high, monkeypatch):
+    monkeypatch.setattr(bootstrap, "REPETITIONS", 2000)
+    intervals = bootstrap.bootstrap(function, *scores)
+    for numbers, expected in zip(intervals, (value, low, high), strict=True):
+        np.testing.assert_allclose(numbers, expected, rtol=1e-12, atol=1e-14)
+
+
+def test_curves_share_the_draws_of_runs():
+    """The interval at each step is the interval of the scores at this step alone."""
+    curves = np.random.default_rng(0).normal(size=(6, 5, 2))
+    together = bootstrap.bootstrap(interquartile_mean, curves)
+    alone = [bootstrap.bootstrap(interquartile_mean, scores) for scores in curves]
+    np.testing.assert_array_equal(together, np.transpose(alone))
+
+
+def test_intervals_contain_true_mean(monkeypatch):
+    """Of 10 normal numbers, in most of 60 cases. The bootstrap's intervals of few numbers are a little too narrow."""
+    monkeypatch.setattr(bootstrap, "REPETITIONS", 300)
+    random = np.random.default_rng(0)
+    n_inside = 0
+    for _ in range(60):
+        mean = estimate(lambda scores: scores.mean(axis=(-2, -1)), random.normal(size=(10, 1)))
+        n_inside += mean.low <= 0 <= mean.high
+    assert 46 <= n_inside <= 60
+
+
+def test_single_run_has_no_width():
+    assert estimate(interquartile_mean, np.array([[3.0]])) == Estimate(3.0, 3.0, 3.0)
+
+
+def test_mann_whitney_by_hand():
+    """By the tables of Mann and Whitney: of 3 against 3, all nine pairs 1 in 20, eight or more 2 in 20."""
+    low, high = np.array([1.0, 2, 3]), np.array([4.0, 5, 6])
+    assert mann_whitney([(high, low)]) == pytest.approx((1 / 20, 1))
+    assert mann_whitney([(np.array([3.0, 5, 6]), np.array([1.0, 2, 4]))])[0] == pytest.approx(2 / 20)
+    assert mann_whitney([(low, high)]) == pytest.approx((1, 1 / 20))
+    assert mann_whitney([(high, low), (high, low)])[0] == pytest.approx(1 / 400)
+    assert min(mann_whitney([(low, low)])) > 0.5

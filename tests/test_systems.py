@@ -1,0 +1,121 @@
+"""From recorded replies to a report on a system without the modules, functions, signals and folders that only POSIX has."""
+
+import os
+import subprocess
+import sys
+import textwrap
+from pathlib import Path
+
+import pytest
+
+import lare_rl
+
+PROGRAM = """
+import sys
+from lare_rl.cli import main
+for command in sys.argv[1:]:
+    sys.argv = ["lare-rl", *command.split()]
+    try:
+        main()
+    except SystemExit as exit:
+        raise SystemExit(f"{command}: status {exit.code}") from exit
+"""
+PHI = """
+    def evaluation_func(observation, action):
+        return [observation[:, :1], action[:, :1] ** 2]
+"""
+STUDY = """
+    tasks = ["pendulum.toml"]
+    methods = ["episodic"]
+    settings = { steps = 200, evaluation_episodes = 1, td3 = { warmup = 100 } }
+"""
+LOST = """
+import ctypes, os, signal, sys
+for name in ("fcntl", "grp", "pwd", "resource", "termios"):
+    try:
+        __import__(name)
+    except ImportError:
+        pass
+    else:
+        raise SystemExit(name)
+assert not hasattr(os, "fork") and not hasattr(signal, "SIGKILL") and not os.path.isdir("/dev/shm")
+for call, error in ((lambda: ctypes.CDLL(None), TypeError), (lambda: open("/proc/cpuinfo"), FileNotFoundError)):
+    try:
+        call()
+    except error:
+        continue
+    raise SystemExit("the call worked")
+with open("file", "w") as file:
+    assert file.encoding.lower() not in ("utf-8", "utf8")
+    try:
+        os.replace("file", "other")
+    except PermissionError:
+        sys.exit()
+raise SystemExit("an open file was moved")
+"""
+
+
+@pytest.fixture
+def run_elsewhere(tmp_path):
+    """Return a function that runs a Python program on the other system, in an empty folder."""
+    folders = Path(__file__).parent / "helpers" / "other_system", Path(lare_rl.__file__).parents[1]
+    environment = {
+        "PYTHONPATH": os.pathsep.join(map(str, folders)),
+        "PYTHONUTF8": "0",
+        "PYTHONCOERCECLOCALE": "0",
+        "LC_ALL": "C",
+        "LARE_CACHE": "off",  # the lock of its folder is another one on Linux
+    }
+
+    def run(program, *arguments):
+        process = subprocess.run(
+            [sys.executable, "-c", program, *arguments],
+            cwd=tmp_path,
+            env=os.environ | environment,
+            capture_output=True,
+            encoding="utf-8",
+        )
+        assert process.returncode == 0, process.stdout + process.stderr
+        return process.stdout
+
+    return run
+
+
+def test_other_system(run_elsewhere):
+    run_elsewhere(LOST)
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="this is the other system")
+def test_host_environment_in_worker_processes(run_elsewhere, tmp_path):
+    for name, text in (("phi.py", PHI), ("study.toml", STUDY)):
+        (tmp_path / name).write_text(textwrap.dedent(text), encoding="utf-8")
+    run_elsewhere(PROGRAM, "new-task Pendulum-v1 --out pendulum.toml")
+    task = tmp_path / "pendulum.toml"
+    task.write_text('processes = "separate"\n' + task.read_text(encoding="utf-8"), encoding="utf-8")
+    output = run_elsewhere(
+        PROGRAM,
+        "verify phi.py --task pendulum.toml",
+        "train pendulum.toml --function phi.py --steps 400 --environments 2 --evaluate-every 200 --evaluation-episodes 2 "
+        "--td3.warmup 200 --out run",
+        "train --resume run --steps 600",
+        "evaluate run --episodes 2",
+        "report run",
+        "compare run",
+        "sweep study.toml",
+    )
+    assert "over 2 episodes" in output
+    assert (tmp_path / "run" / "report.html").stat().st_size > 10_000
+    assert (tmp_path / "runs" / "study" / "results.csv").is_file()
+
+
+def test_compiled_environment(run_elsewhere, tmp_path):
+    run_elsewhere(
+        PROGRAM,
+        "design CN-6 --out phi.py",
+        "verify phi.py --task CN-6",
+        "train CN-6 --function phi.py --steps 100 --environments 2 --evaluate-every 50 --evaluation-episodes 2 --out run",
+        "train --resume run --steps 150",
+        "evaluate run --episodes 2",
+        "report run",
+    )
+    assert (tmp_path / "run" / "report.html").stat().st_size > 10_000
