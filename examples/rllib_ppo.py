@@ -17,7 +17,7 @@ and the assigner is in this one. With runners, RLlib stops, because they do not 
 `PayCredit` has a copy of the assigner that received no steps, and raises `LareError`. `num_envs_per_env_runner` may be
 any number.
 
-With a latent function (docs/tutorials/your-own-environment.md), create the assigner like this:
+With a latent function (docs/how-to/write-phi.md), create the assigner like this:
 
     task = lare_rl.load_task("pendulum.toml")
     credit = lare_rl.CreditAssigner("lare-bayes", lare_rl.load_function("phi.py", task), task=task)

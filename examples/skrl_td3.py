@@ -13,7 +13,7 @@ sampled, it asks the assigner for the current proxy rewards of these steps.
   resets as if they were steps.
 * The memory asks by observations and actions, not by numbers of steps. The method `ircr` needs numbers.
 
-With a latent function (docs/tutorials/your-own-environment.md), create the assigner like this:
+With a latent function (docs/how-to/write-phi.md), create the assigner like this:
 
     task = lare_rl.load_task("pendulum.toml")
     credit = lare_rl.CreditAssigner("lare-bayes", lare_rl.load_function("phi.py", task), task=task)

@@ -12,7 +12,7 @@ reads rewards. The rewards of the environment are not kept.
   and no row is a reset. A time limit ends an episode like any other.
 * n-step returns: `CreditReplayBuffer(..., n_step=n)`, with the algorithm's `n_step_return_horizon`.
 
-With a latent function (docs/tutorials/your-own-environment.md), create the assigner like this:
+With a latent function (docs/how-to/write-phi.md), create the assigner like this:
 
     task = lare_rl.load_task("pendulum.toml")
     credit = lare_rl.CreditAssigner("lare-bayes", lare_rl.load_function("phi.py", task), task=task)

@@ -57,10 +57,13 @@ SELF_HOSTED = re.compile(r"http://localhost:(11434|8000)/v1")
 CUTS = {
     r"HalfCheetah-v4": "Reacher-v4",
     r"--steps 100000": "--steps 200 --td3.warmup 100 --evaluation-episodes 1",
-    r"--resume runs/lare --steps 200000": "--resume runs/lare --steps 400",
-    r"--steps 20000 --td3.warmup 1000": "--steps 400 --td3.warmup 100 --evaluation-episodes 1",
+    r"--resume runs/lare --steps 200000": "--resume runs/lare --steps 600",
+    r"--steps 20000 --td3.warmup [12]000": "--steps 400 --td3.warmup 100 --evaluation-episodes 1",
     r"--steps 40000": "--steps 600",
+    r"--resume runs/first --steps 205000": "--resume runs/first --steps 400",
     r"steps=(100|20)_000": "steps=400, evaluation_episodes=1",
+    r"learn\(10_000": "learn(1100",
+    r"learning_starts=2000": "learning_starts=1000",
     r"--seeds 3|seeds=3": lambda match: match[0].replace("3", "2"),
     r"(lare-rl train (CN|PP|CompetitivePP|TriangleArea)-?6?.*)": r"\1 --steps 200 --environments 4 --evaluation-episodes 1",
     r"(lare-rl train spread.toml.*)": r"\1 --steps 2000 --evaluation-episodes 1",
@@ -161,6 +164,7 @@ def block(page, language, number):
 
 
 PENDULUM = block("docs/tutorials/your-own-environment.md", "python", 0)
+PENDULUM_TASK = block("docs/tutorials/your-own-environment.md", "toml", 0)
 STUDY = block("docs/how-to/sweeps.md", "toml", 0).replace("processes = 2", "processes = 1")
 API_NAMES = """
 import gymnasium, numpy as np
@@ -184,11 +188,33 @@ def to_reply(source):
 def write_study(page):
     """Write the files that the study names. Its runs are not trained."""
     page.write("study.toml", shorten(STUDY))
-    page.write(
-        "my-task.toml", block("docs/tutorials/your-own-environment.md", "toml", 0).replace('"Pendulum"', '"MyTask"')
-    )
+    page.write("my-task.toml", PENDULUM_TASK.replace('"Pendulum"', '"MyTask"'))
     page.write("phi.py", PENDULUM)
     page.patch.setattr(processes, "train_in_process", invent_run)
+
+
+def write_pendulum(page):
+    """Write the task and the function of the tutorial."""
+    page.write("pendulum.toml", PENDULUM_TASK)
+    page.write("phi.py", PENDULUM)
+
+
+def design_pendulum(page):
+    """Write the function, which the reader saves, and start the model that the page asks."""
+    page.write("phi.py", PENDULUM)
+    page.serve(PENDULUM)
+
+
+def train_pendulum(page):
+    write_pendulum(page)
+    settings = lare_rl.Settings(steps=400, evaluation_episodes=1, td3={"warmup": 200})
+    lare_rl.train(
+        "pendulum.toml",
+        settings,
+        function=lare_rl.load_function("phi.py", "pendulum.toml"),
+        out="runs/pendulum",
+        listeners=[],
+    )
 
 
 def write_readme_study(page):
@@ -261,7 +287,10 @@ def prepare_plugin(page):
 PREPARE = {
     "README.md": write_readme_study,
     "docs/how-to/python.md": prepare_api,
-    "docs/tutorials/your-own-environment.md": lambda page: page.serve(PENDULUM),
+    "docs/tutorials/your-own-environment.md": design_pendulum,
+    "docs/how-to/scores.md": write_pendulum,
+    "docs/how-to/write-phi.md": write_pendulum,
+    "docs/how-to/poor-policies.md": train_pendulum,
     "docs/how-to/export.md": export_policy,
     "docs/how-to/extend.md": prepare_plugin,
     "docs/how-to/jax-environments.md": lambda page: page.write(
@@ -322,8 +351,7 @@ def test_excerpts_are_in_their_examples(name, examples):
 
 def test_task_files(tmp_path):
     """One agent, many agents, and two teams, where the page leaves out the texts."""
-    for number in range(4):
-        text = block("docs/tutorials/your-own-environment.md", "toml", number)
+    for text in (PENDULUM_TASK, *(block("docs/how-to/many-agents.md", "toml", number) for number in range(3))):
         if "description = " not in text:
             text += "".join(f'{key} = "text"\n' for key in ("description", "observation", "action"))
         name = tomllib.loads(text)["name"]

@@ -107,7 +107,7 @@ MESSAGES = {
         "The proxy rewards predict returns well, so the algorithm, or the number of steps, may be the limit{agents}{rule}. "
     ),
     "among_agents": ", or how the rewards are divided among the agents, which returns do not show",
-    "own_rule": " (a rule of your own can tell: docs/tutorials/your-own-environment.md, section 4)",
+    "own_rule": " (a rule of your own can tell: docs/how-to/poor-policies.md)",
     "evaluate_more": "`lare-rl evaluate {directory} --episodes 50` tells more exactly; then ",
     "products_need_phi": (
         " If state and action have more than {n_features} entries together, a score that depends on products of them, such as price "

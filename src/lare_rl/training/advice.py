@@ -46,11 +46,11 @@ MESSAGES = {
     "normalise": ", or set --{algorithm}.normalise-observations True",
     "use ppo": ", or use --algorithm ppo, which normalises observations",
     "saturated policies": "{policies} chooses the same action in every state, with each entry at a bound. If the task needs more "
-    "than that, the policy is stuck, and more steps seldom help: see docs/tutorials/your-own-environment.md, section 4.",
+    "than that, the policy is stuck, and more steps seldom help: see docs/how-to/poor-policies.md.",
     "one policy": "The policy",
     "policies of seeds": "The policy of {noun} {seeds}",
     "constant returns": "The last {n_evaluations} evaluations of every seed have the same return: the policy does not change what "
-    "it does. If this return is not a good one, the policy is stuck: see docs/tutorials/your-own-environment.md, section 4.",
+    "it does. If this return is not a good one, the policy is stuck: see docs/how-to/poor-policies.md.",
 }
 
 
