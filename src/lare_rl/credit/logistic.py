@@ -11,7 +11,8 @@ Jordan, *Bayesian parameter estimation via variational methods*, Statistics and 
 
 Under the bound, w is the weight of a regression of z on x in which episode k has the noise precision lambda_k. So each round is a
 round of `evidence.py` with known noise, and none makes the bound worse. Unlike Laplace's approximation it needs no step size, even
-if the episodes can be separated.
+if the episodes can be separated. `turns/logistic.py` keeps Laplace's approximation, because it leaves out single rollouts by a step of
+Newton's method, which needs the curvature of the likelihood, not of the bound.
 
 The fit reads the last `WINDOW` episodes, because it needs their features again in each round, and not only sums over them.
 

@@ -4,7 +4,8 @@
 
 Laplace's approximation: Newton's method to the most likely (v, m, b), where each step is the weighted regression of `regression.py` on
 the working response eta + (y - p) / (p (1 - p)), with the weights w p (1 - p) and noise of variance 1. The precisions alpha follow
-the same rule, alpha_i = gamma_i / mu_i^2.
+the same rule, alpha_i = gamma_i / mu_i^2. The bound of `credit/logistic.py` does not replace it: `value.py` leaves out single rollouts
+by a step of Newton's method, which needs the curvature of the likelihood, not of the bound.
 """
 
 import numpy as np
