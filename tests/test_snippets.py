@@ -374,5 +374,5 @@ def test_notebook(tmp_path):
     environment = os.environ | {"STEPS": "1000", "MPLBACKEND": "module://matplotlib_inline.backend_inline"}
     command = [sys.executable, "-c", RUN_NOTEBOOK, str(ROOT / "examples" / "first_run.ipynb")]
     done = subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, text=True)
-    assert (done.returncode, done.stdout) == (0, "7\n"), done.stderr[-2000:]
+    assert (done.returncode, done.stdout) == (0, "6\n"), done.stderr[-2000:]
     assert (tmp_path / "report.html").is_file()
