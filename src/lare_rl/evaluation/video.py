@@ -12,14 +12,13 @@ from typing import Any
 import jax
 import numpy as np
 from jaxtyping import UInt8
-from PIL import Image
 
 from lare_rl.envs.families import load_env_spec, make_env, make_host_env
 from lare_rl.envs.gymnasium_env import GymnasiumEnv
 from lare_rl.envs.interface import HostEnv, JaxEnv
 from lare_rl.envs.jax_on_host import JaxOnHost
 from lare_rl.envs.play import play_steps
-from lare_rl.errors import LareError
+from lare_rl.errors import LareError, missing_extra_error
 from lare_rl.evaluation.policy import RunPolicy
 from lare_rl.evaluation.rollout import Rollout, roll_out
 from lare_rl.runs.directory import Run
@@ -40,7 +39,9 @@ Frame = UInt8[np.ndarray, "height width 3"]
 
 
 def record_video(run: Run, path: str | Path, best: bool = False, deterministic: bool = False) -> None:
-    """Film one episode of the first seed's policy, the last or the best, as a .gif, or as an .mp4 with the extra `lare-rl[video]`.
+    """Film one episode of the first seed's policy, the last or the best.
+
+    A .gif needs the extra `lare-rl[report]`, an .mp4 the extra `lare-rl[video]`.
 
     A film of a particle task shows each agent's credit, as number and colour.
 
@@ -81,12 +82,15 @@ def render_rollout(run: Run, rollout: Rollout) -> list[Frame] | None:
     return env.frames(rollout.select_episode(rollout.state), rollout.select_episode(rollout.credit))
 
 
-def encode_gif(frames: Iterable[Frame]) -> bytes:
-    """Return frames of many agents as an animated GIF."""
+def encode_gif(frames: Iterable[Frame], frame_seconds: float = 1 / FRAMES_PER_SECOND) -> bytes:
+    """Return an animated GIF of frames that are shown for `frame_seconds` each. The default is that of films of many agents."""
+    try:
+        from PIL import Image
+    except ImportError as missing:
+        raise missing_extra_error("a film", "report") from missing
     buffer = BytesIO()
     first, *rest = map(Image.fromarray, frames)
-    duration_ms = 1000 // FRAMES_PER_SECOND
-    first.save(buffer, format="GIF", save_all=True, append_images=rest, duration=duration_ms, loop=0)
+    first.save(buffer, format="GIF", save_all=True, append_images=rest, duration=int(1000 * frame_seconds), loop=0)
     return buffer.getvalue()
 
 
@@ -100,14 +104,15 @@ def check_video_path(path: Path) -> None:
 
 def write_video(path: Path, frames: Sequence[Frame], frame_seconds: float) -> None:
     """Write frames that are shown for `frame_seconds` each. Raise `LareError` if that fails."""
-    import imageio.v3 as imageio
-
-    is_gif = path.suffix == ".gif"
-    timing: dict[str, Any] = {"duration": 1000 * frame_seconds, "loop": 0} if is_gif else {"fps": 1 / frame_seconds}
     try:
-        imageio.imwrite(path, list(frames), **timing)
+        if path.suffix == ".gif":
+            path.write_bytes(encode_gif(frames, frame_seconds))
+            return
+        import imageio.v3 as imageio
+
+        imageio.imwrite(path, list(frames), fps=1 / frame_seconds)
     except (OSError, ValueError, ImportError, TypeError) as error:
-        hint = ".gif always works, .mp4 needs lare-rl[video]"
+        hint = ".gif needs lare-rl[report], .mp4 needs lare-rl[video]"
         raise LareError(f"the video {path} cannot be written: {error}; {hint}") from error
 
 

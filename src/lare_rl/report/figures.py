@@ -7,15 +7,20 @@ from collections.abc import Mapping, Sequence
 from itertools import cycle, product
 from typing import Any
 
-import matplotlib
 import numpy as np
 from jaxtyping import Float
-from matplotlib.axes import Axes
-from matplotlib.cm import ScalarMappable
-from matplotlib.colors import Normalize
-from matplotlib.figure import Figure
 
+from lare_rl.errors import missing_extra_error
 from lare_rl.util.statistics import Band
+
+try:
+    import matplotlib
+    from matplotlib.axes import Axes
+    from matplotlib.cm import ScalarMappable
+    from matplotlib.colors import Normalize
+    from matplotlib.figure import Figure
+except ImportError as missing:
+    raise missing_extra_error("a figure", "report") from missing
 
 __all__ = [
     "COLOURS",
