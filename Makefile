@@ -15,7 +15,7 @@ CREATE := $(PYTHON) -m venv $(VENV)
 INSTALL := $(BIN)/python -m pip install --quiet --no-compile $(PINS)
 endif
 
-.PHONY: demo test test-long check docs site setup constraints clean
+.PHONY: demo test test-short test-long check docs site setup constraints clean
 
 demo: $(VENV)/demo ## Train HalfCheetah on episodic rewards with recorded replies, draw the report, open it
 	@if [ -e $(DEMO) ]; then $(BIN)/lare-rl train --resume $(DEMO); \
@@ -27,6 +27,10 @@ demo: $(VENV)/demo ## Train HalfCheetah on episodic rewards with recorded replie
 
 test: check ## Lint, format, types, tests
 	$(BIN)/python -m pytest -n 2 --dist worksteal
+
+test-short: $(VENV)/test ## Some of the tests, with little installed
+	$(BIN)/python -m pytest -n 2 --dist worksteal tests/config tests/data tests/envs/test_gymnasium_env.py tests/envs/test_mujoco_warnings.py \
+		tests/latent tests/report tests/runs tests/test_cli.py tests/training/test_train.py
 
 test-long: setup ## The tests that repeat others with further algorithms, methods and tasks
 	$(BIN)/python -m pytest -n 2 --dist worksteal -m long
@@ -49,8 +53,13 @@ setup: $(VENV)/installed
 $(VENV)/installed: pyproject.toml $(CONSTRAINTS) | $(BIN)/python
 	$(INSTALL) 'pip>=25.1' # the first that reads dependency groups
 	$(INSTALL) --editable . --group dev
-	@touch $(VENV)/demo $@
+	@touch $(VENV)/demo $(VENV)/test $@
 	@echo "set up; to use it: source $(BIN)/activate"
+
+$(VENV)/test: pyproject.toml $(CONSTRAINTS) | $(BIN)/python
+	$(INSTALL) 'pip>=25.1'
+	$(INSTALL) --editable . --group test
+	@touch $(VENV)/demo $@
 
 $(VENV)/demo: pyproject.toml $(CONSTRAINTS) | $(BIN)/python
 	$(INSTALL) --editable '.[mujoco,report]'
@@ -65,4 +74,4 @@ constraints: ## Write the newest versions that fit into constraints.txt (needs u
 		--no-emit-package lare-rl --custom-compile-command "make constraints" --output-file constraints.txt
 
 clean:
-	rm -rf $(VENV) site .pytest_cache .ruff_cache .hypothesis
+	rm -rf $(VENV) $(VENV)-* site .pytest_cache .ruff_cache .hypothesis

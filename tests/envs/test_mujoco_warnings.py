@@ -26,7 +26,7 @@ def test_only_deprecations_are_dropped():
         warn("attribute 'settotalmass' is deprecated")
         warn("the timestep is too large")
 
-    with pytest.warns(UserWarning) as warned, mujoco_warnings(NAMES[0]):
+    with pytest.warns(UserWarning, match="timestep") as warned, mujoco_warnings(NAMES[0]):
         warn_twice()
     assert [str(warning.message) for warning in warned] == [
         f"MuJoCo, environment {NAMES[0]!r}: the timestep is too large"
