@@ -3,16 +3,34 @@
 PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
+CONSTRAINTS ?= constraints.txt
+DEMO := runs/demo
 
-.PHONY: demo test test-long check docs site setup clean
+PINS := $(addprefix --constraint ,$(CONSTRAINTS))
+ifneq ($(shell command -v uv),)
+CREATE := uv venv --quiet --seed --python $(PYTHON) $(VENV)
+INSTALL := uv pip install --quiet --python $(BIN)/python $(PINS)
+else
+CREATE := $(PYTHON) -m venv $(VENV)
+INSTALL := $(BIN)/python -m pip install --quiet --no-compile $(PINS)
+endif
 
-demo: setup ## Train HalfCheetah on episodic rewards with recorded replies, and draw the report
-	@if [ -e runs/demo ]; then $(BIN)/lare-rl train --resume runs/demo; \
-	else $(BIN)/lare-rl train HalfCheetah-v4 --steps 60000 --out runs/demo; fi
-	@$(BIN)/lare-rl report runs/demo
+.PHONY: demo test test-short test-long check docs site setup constraints clean
+
+demo: $(VENV)/demo ## Train HalfCheetah on episodic rewards with recorded replies, draw the report, open it
+	@if [ -e $(DEMO) ]; then $(BIN)/lare-rl train --resume $(DEMO); \
+	else $(BIN)/lare-rl train HalfCheetah-v4 --steps 30000 --out $(DEMO); fi
+	@$(BIN)/lare-rl report $(DEMO)
+	@if [ -n "$$DISPLAY$$WAYLAND_DISPLAY" ] || [ "$$(uname)" = Darwin ]; \
+	then $(BIN)/python -m webbrowser "file://$$PWD/$(DEMO)/report.html"; \
+	else echo "to see it, open $(DEMO)/report.html in a browser"; fi
 
 test: check ## Lint, format, types, tests
 	$(BIN)/python -m pytest -n 2 --dist worksteal
+
+test-short: $(VENV)/test ## Some of the tests, with little installed
+	$(BIN)/python -m pytest -n 2 --dist worksteal tests/config tests/data tests/envs/test_gymnasium_env.py tests/envs/test_mujoco_warnings.py \
+		tests/latent tests/report tests/runs tests/test_cli.py tests/training/test_train.py
 
 test-long: setup ## The tests that repeat others with further algorithms, methods and tasks
 	$(BIN)/python -m pytest -n 2 --dist worksteal -m long
@@ -32,13 +50,28 @@ site: setup
 
 setup: $(VENV)/installed
 
-$(VENV)/installed: pyproject.toml
-	$(PYTHON) -c 'import sys; sys.exit(None if sys.version_info >= (3, 11) else "LaRe needs Python 3.11 or later; name one: make PYTHON=python3.12")'
-	$(PYTHON) -m venv $(VENV)
-	$(BIN)/python -m pip install --quiet --upgrade pip
-	$(BIN)/python -m pip install --quiet --editable '.[dev]'
-	@touch $@
+$(VENV)/installed: pyproject.toml $(CONSTRAINTS) | $(BIN)/python
+	$(INSTALL) 'pip>=25.1' # the first that reads dependency groups
+	$(INSTALL) --editable . --group dev
+	@touch $(VENV)/demo $(VENV)/test $@
 	@echo "set up; to use it: source $(BIN)/activate"
 
+$(VENV)/test: pyproject.toml $(CONSTRAINTS) | $(BIN)/python
+	$(INSTALL) 'pip>=25.1'
+	$(INSTALL) --editable . --group test
+	@touch $(VENV)/demo $@
+
+$(VENV)/demo: pyproject.toml $(CONSTRAINTS) | $(BIN)/python
+	$(INSTALL) --editable '.[mujoco,report]'
+	@touch $@
+
+$(BIN)/python:
+	$(PYTHON) -c 'import sys; sys.exit(None if sys.version_info >= (3, 11) else "LaRe needs Python 3.11 or later; name one: make PYTHON=python3.12")'
+	$(CREATE)
+
+constraints: ## Write the newest versions that fit into constraints.txt (needs uv)
+	echo "--editable ." | uv pip compile - --quiet --universal --python-version 3.11 --group dev --upgrade --no-annotate \
+		--no-emit-package lare-rl --custom-compile-command "make constraints" --output-file constraints.txt
+
 clean:
-	rm -rf $(VENV) site .pytest_cache .ruff_cache .hypothesis
+	rm -rf $(VENV) $(VENV)-* site .pytest_cache .ruff_cache .hypothesis

@@ -69,7 +69,7 @@ def first_column(table):
         ("train Reacher-v4 --method dense --scored-observation both", ["scored_observation", "dense"]),
         ("train HalfCheetah-v4 --fit-every 2", ["fit_every", "lare-bayes"]),
         ("train Reacher-v4 --draw 1 --function phi.py", ["draw", "function"]),
-        ("prompt Reacher", ["'Reacher-v4'", *shipped_tasks()]),
+        ("prompt Reacher", ["'Reacher-v5'", *shipped_tasks()]),
         ("prompt CompetitivePP-6", ["CompetitivePP-6-predator, CompetitivePP-6-prey"]),
         ("verify none.py --task Reacher-v4", ["none.py does not exist"]),
         ("design CompetitivePP-6", ["CompetitivePP-6-predator, CompetitivePP-6-prey"]),

@@ -1,15 +1,30 @@
 """Errors for optional libraries that are not installed."""
 
 import importlib
+import re
+import subprocess
 import sys
 import tomllib
+from itertools import chain
 from pathlib import Path
 
 import pytest
 
 from lare_rl.errors import LareError, install_command
 
-PROJECT = tomllib.loads((Path(__file__).parents[1] / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+PYPROJECT = tomllib.loads((Path(__file__).parents[1] / "pyproject.toml").read_text(encoding="utf-8"))
+PROJECT = PYPROJECT["project"]
+LIGHT = """
+import sys
+for name in ("mujoco", "matplotlib", "PIL", "imageio", "torch", "openai", "pettingzoo"):
+    sys.modules[name] = None
+import numpy as np
+import lare_rl, lare_rl.evaluation.video, lare_rl.training.train, lare_rl.cli.design, lare_rl.cli.runs
+lare_rl.load_task("CN-6")
+credit = lare_rl.CreditAssigner("bayes", observation_space=3, action_space=1)
+steps = credit.add_episode(np.ones((5, 3)), np.ones((5, 1)), np.ones((5, 3)), reward=1.0)
+print(credit.rewards_at(steps).shape)
+"""
 
 
 @pytest.mark.parametrize(
@@ -18,7 +33,12 @@ PROJECT = tomllib.loads((Path(__file__).parents[1] / "pyproject.toml").read_text
         ("lare_rl.integrations.sb3", "stable_baselines3", "lare_rl.integrations.sb3", "sb3"),
         ("lare_rl.integrations.torchrl", "torchrl", "lare_rl.integrations.torchrl", "torchrl"),
         ("lare_rl.integrations.pettingzoo", "pettingzoo", "lare_rl.integrations.pettingzoo", "pettingzoo"),
-        ("lare_rl.envs.particles.parallel_env", "pettingzoo", "lare_rl.envs.particles.parallel_env", "particles"),
+        ("lare_rl.envs.particles.parallel_env", "pettingzoo", "lare_rl.envs.particles.parallel_env", "pettingzoo"),
+        ("lare_rl.report.charts", "PIL", "a report", "report"),
+        ("lare_rl.report.figures", "matplotlib", "a figure", "report"),
+        ("lare_rl.envs.canvas", "matplotlib", "a picture", "report"),
+        ("lare_rl.envs.particles.drawing", "matplotlib", "a picture", "report"),
+        ("lare_rl.envs.smax.drawing", "matplotlib", "a picture", "report"),
         ("lare_rl.logs.tables", "pyarrow", "a Parquet file", "parquet"),
         ("lare_rl.logs.huggingface", "datasets", "a Hugging Face data set", "datasets"),
         ("lare_rl.logs.minari", "minari", "a Minari data set", "minari"),
@@ -40,3 +60,17 @@ def test_install_command(tmp_path):
     assert install_command("llm", tmp_path / "src" / "lare_rl") == f"pip install --editable '{tmp_path}[llm]'"
     assert install_command("llm", tmp_path / "site-packages" / "lare") == "pip install 'lare-rl[llm]'"
     assert install_command("llm", tmp_path / "other" / "src" / "lare") == "pip install 'lare-rl[llm]'"
+
+
+def test_core_needs_no_extra():
+    process = subprocess.run([sys.executable, "-c", LIGHT], capture_output=True, text=True)
+    assert (process.returncode, process.stdout) == (0, "(5,)\n"), process.stderr
+
+
+def test_extras_that_contain_others():
+    """Requirements of LaRe's own extras, in `all` and in the groups for development, name extras that exist."""
+    requirements = [*PROJECT["optional-dependencies"]["all"], *chain(*PYPROJECT["dependency-groups"].values())]
+    matches = [re.fullmatch(r"lare-rl\[(.*)\]", text) for text in requirements if isinstance(text, str)]
+    names = {name for match in matches if match for name in match[1].split(",")}
+    assert len(names) > 10
+    assert names <= set(PROJECT["optional-dependencies"])

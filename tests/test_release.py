@@ -58,7 +58,9 @@ def test_released_files(built):
         assert line in metadata
     with tarfile.open(sdist) as archive:
         names = {name.partition("/")[2] for name in archive.getnames()}
-    needed = "pyproject.toml README.md LICENSE CITATION.cff Makefile tests/conftest.py src/lare_rl/py.typed"
+    needed = (
+        "pyproject.toml constraints.txt README.md LICENSE CITATION.cff Makefile tests/conftest.py src/lare_rl/py.typed"
+    )
     assert set(needed.split()) <= names
     assert not any(name.startswith("benchmarks/results") for name in names)
 

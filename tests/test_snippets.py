@@ -130,10 +130,10 @@ class Page:
             case ["make", target]:
                 assert re.search(rf"^{target}:", (ROOT / "Makefile").read_text(), re.MULTILINE)
             case ["pip", "install", *packages]:
-                project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
-                names = project["optional-dependencies"]
+                pyproject = tomllib.loads((ROOT / "pyproject.toml").read_text())
+                names = pyproject["project"]["optional-dependencies"]
                 extras = {"-e", *(f"lare-rl[{name}]" for name in names), *(f".[{name}]" for name in names)}
-                developed = " ".join(project["optional-dependencies"]["dev"])
+                developed = str(pyproject["dependency-groups"]["dev"])
                 assert all(package in extras or package in developed for package in packages)
             case ["python", path, *_] | [".venv/bin/python", "-m", "pytest", path]:
                 assert (ROOT / path).exists()

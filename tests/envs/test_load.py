@@ -14,11 +14,12 @@ from lare_rl.errors import LareError
 from lare_rl.tasks.spec import require_role, select_states
 
 NAMES = (
-    "CN-15, CN-30, CN-6, CartpoleSwingup, CheetahRun, CompetitivePP-6, CompetitivePP-6-predator, "
-    "CompetitivePP-6-prey, Game2048-v1, HalfCheetah-v4, HalfCheetahFoot-v4, HalfCheetahSaturating-v4, "
+    "Ant-v5, CN-15, CN-30, CN-6, CartpoleSwingup, CheetahRun, CompetitivePP-6, CompetitivePP-6-predator, "
+    "CompetitivePP-6-prey, Game2048-v1, HalfCheetah-v4, HalfCheetah-v5, HalfCheetahFoot-v4, HalfCheetahSaturating-v4, "
     "HalfCheetahSparse-v4, HalfCheetahTarget-v4, HalfCheetahThreshold-v4, "
-    "HumanoidStandup-v4, Knapsack-v1, PP-15, PP-30, PP-6, Reacher-v4, SMAC-1c3s5z, SMAC-2s3z, SMAC-3s_vs_5z, "
-    "SMAX-1c3s5z, SMAX-2s3z, SMAX-3s_vs_5z, Snake-v1, TriangleArea, Walker2d-v4, "
+    "Hopper-v5, HumanoidStandup-v4, HumanoidStandup-v5, Knapsack-v1, PP-15, PP-30, PP-6, Reacher-v4, Reacher-v5, "
+    "SMAC-1c3s5z, SMAC-2s3z, SMAC-3s_vs_5z, "
+    "SMAX-1c3s5z, SMAX-2s3z, SMAX-3s_vs_5z, Snake-v1, TriangleArea, Walker2d-v4, Walker2d-v5, "
     "Walker2dFoot-v4, Walker2dSaturating-v4, Walker2dTarget-v4, Walker2dThreshold-v4, WalkerRun"
 )
 OPTIONAL = {"smac": "no package", "playground": "mujoco_playground", "jumanji": "jumanji"}
@@ -81,7 +82,7 @@ def test_like_over_two_generations(spec_file, tmp_path):
         ({"like": ["PP-6"]}, r"like = \['PP-6'\] must be"),
         ({"teams": "PP-6"}, "teams = 'PP-6' must be"),
         ({"teams": [3]}, r"teams = \[3\] must be"),
-        ({"like": "Reacher"}, "did you mean 'Reacher-v4'"),
+        ({"like": "Reacher"}, "did you mean 'Reacher-v5'"),
         ({"environment": "CartPole-v1", "observation_size": 4}, "action_size = 1, but .* actions of size 2"),
         ({"environment": "misfits/Board-v0"}, "action space of misfits/Board-v0"),
         ({"environment": "misfits/Unbounded-v0"}, "no bounds"),

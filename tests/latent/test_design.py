@@ -50,7 +50,7 @@ class ScriptedModel:
         return self.replies.pop(0)
 
 
-UNRECORDED = ("Snake-v1", "Game2048-v1")
+UNRECORDED = ("Ant-v5", "Game2048-v1", "Hopper-v5", "HumanoidStandup-v5", "Reacher-v5", "Snake-v1")
 """Tasks without recorded replies, besides those of StarCraft."""
 QUICK_TASKS = ("CompetitivePP-6", "HalfCheetah-v4", "Reacher-v4", "TriangleArea")
 
@@ -77,6 +77,17 @@ def test_shipped_task(name):
     assert [exchange["stage"] for exchange in function.exchanges] == ["candidate", "combine"]
     assert function.size == len(set(function.names)) > 1
     assert all(check.passed for check in function.checks)
+
+
+@pytest.mark.parametrize("body", ["HalfCheetah", "Walker2d"])
+def test_versions_with_the_same_observation_share_their_recordings(body):
+    assert design(f"{body}-v5").source == design(f"{body}-v4").source
+
+
+@pytest.mark.parametrize("name", ["Ant-v5", "Hopper-v5"])
+def test_task_without_recordings(name):
+    with pytest.raises(LareError, match=f"task '{name}'.*--model.*--function.*--method bayes"):
+        design(name)
 
 
 def test_draws_and_kinds():

@@ -11,6 +11,8 @@ from lare_rl.config.resolve import resolve
 from lare_rl.config.settings import Settings
 from lare_rl.errors import LareError
 from lare_rl.latent.function import verify_function
+from lare_rl.runs import config_file
+from lare_rl.runs.config_file import make_config
 from lare_rl.runs.directory import RunBusyError, as_run, create_run, find_run_directories, lock_run, open_run
 from lare_rl.runs.metrics_file import append_metrics, read_metrics, truncate_metrics
 
@@ -26,6 +28,12 @@ def test_open_run_equals_created(run):
     assert opened.config == run.config
     assert opened.function.digest == run.function.digest
     assert as_run(run) is run
+
+
+def test_config_names_versions_of_installed_packages(run, monkeypatch):
+    assert {"jax", "python"} < set(run.config.versions)
+    monkeypatch.setattr(config_file, "VERSIONED_PACKAGES", ("jax", "no-such-extra"))
+    assert set(make_config(run.config.task, run.config.settings, []).versions) == {"jax", "python"}
 
 
 def test_function_that_was_replaced_during_run(run):

@@ -281,7 +281,7 @@ def test_no_process_after_stop(file):
         (('["Reacher-v4"]', "[]"), r"tasks = \[\]"),
         (("seeds = 2", "seed = -1"), "seed = -1"),
         (("steps = 200", "steps = 201"), "on Reacher-v4, steps = 201"),
-        (('["Reacher-v4"]', '["Reacher-v5"]'), "'Reacher-v5'"),
+        (('["Reacher-v4"]', '["Reacher-v5"]'), "no recorded reply .* 'Reacher-v5'"),
         (("rollout_steps = 50", 'method = "rd"'), "method .*methods = "),
         (("[settings]", '[functions]\nReacher = ["phi.py"]\n[settings]'), "functions of Reacher,"),
         (('["Reacher-v4"]', '["Reacher-v4", "Reacher-v4"]'), "Reacher-v4/dense-td3 .*twice"),

@@ -4,9 +4,15 @@ from collections.abc import Callable
 
 import numpy as np
 from jaxtyping import UInt8
-from matplotlib.axes import Axes
-from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.figure import Figure
+
+from lare_rl.errors import missing_extra_error
+
+try:
+    from matplotlib.axes import Axes
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+except ImportError as missing:
+    raise missing_extra_error("a picture", "report") from missing
 
 __all__ = ["blank_figure", "paint_frames", "to_pixels"]
 

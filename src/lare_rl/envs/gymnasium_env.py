@@ -10,6 +10,7 @@ from jaxtyping import Float
 from lare_rl.envs import mujoco_rewards
 from lare_rl.envs.env_errors import EnvOutputError, no_time_limit_error, one_line_errors, read_measures, to_float
 from lare_rl.envs.interface import EnvSpec, Team, Timestep
+from lare_rl.envs.mujoco_warnings import mujoco_warnings
 from lare_rl.envs.spaces import OneHot, check_spaces, finite_array, flatten_spaces
 from lare_rl.errors import LareError, short_repr
 from lare_rl.tasks.spec import TaskSpec
@@ -44,7 +45,8 @@ def make_gymnasium(name: str, max_episode_steps: int | None = None, **kwargs: An
         # The user chooses the version: scores of v4 and v5 cannot be compared.
         warnings.filterwarnings("ignore", message=".*is out of date.*", category=DeprecationWarning)
         warnings.filterwarnings("ignore", message=".*Using the latest versioned environment.*")
-        env = gymnasium.make(name, max_episode_steps=max_episode_steps, **kwargs)
+        with mujoco_warnings(name):
+            env = gymnasium.make(name, max_episode_steps=max_episode_steps, **kwargs)
         try:
             check_spaces(name, env.observation_space, env.action_space)
             if len(env.action_space.shape or ()) > 1:

@@ -8,7 +8,6 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray, UInt8
 
-from lare_rl.envs.canvas import to_pixels
 from lare_rl.envs.env_errors import one_line_errors
 from lare_rl.envs.interface import Timestep
 from lare_rl.envs.jax_spaces import (
@@ -105,6 +104,8 @@ class GymnaxEnv:
     def _draw(self, states: Sequence[Any]) -> list[np.ndarray]:
         from gymnax.visualize import Visualizer
         from matplotlib import pyplot
+
+        from lare_rl.envs.canvas import to_pixels
 
         pictures = []
         visualizer = Visualizer(self.env, self.params, states)

@@ -10,7 +10,6 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray, UInt8
 
 from lare_rl.envs.agent_arrays import Agent, AgentArrays, make_agent
-from lare_rl.envs.canvas import to_pixels
 from lare_rl.envs.env_errors import no_time_limit_error, one_line_errors
 from lare_rl.envs.interface import EnvSpec, Timestep
 from lare_rl.envs.jax_spaces import (
@@ -189,6 +188,8 @@ class JaxMARLEnv:
     def _draw(self, states: Sequence[Any]) -> list[np.ndarray]:
         from jaxmarl.environments.mpe.mpe_visualizer import MPEVisualizer
         from matplotlib import pyplot
+
+        from lare_rl.envs.canvas import to_pixels
 
         visualizer, pictures = MPEVisualizer(self.env, list(states)), []
         try:

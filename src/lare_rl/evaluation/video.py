@@ -2,7 +2,7 @@
 
 import math
 import warnings
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from contextlib import closing
 from io import BytesIO
 from itertools import count
@@ -12,14 +12,13 @@ from typing import Any
 import jax
 import numpy as np
 from jaxtyping import UInt8
-from PIL import Image
 
 from lare_rl.envs.families import load_env_spec, make_env, make_host_env
 from lare_rl.envs.gymnasium_env import GymnasiumEnv
 from lare_rl.envs.interface import HostEnv, JaxEnv
 from lare_rl.envs.jax_on_host import JaxOnHost
 from lare_rl.envs.play import play_steps
-from lare_rl.errors import LareError
+from lare_rl.errors import LareError, missing_extra_error
 from lare_rl.evaluation.policy import RunPolicy
 from lare_rl.evaluation.rollout import Rollout, roll_out
 from lare_rl.runs.directory import Run
@@ -42,7 +41,9 @@ Frame = UInt8[np.ndarray, "height width 3"]
 
 
 def record_video(run: Run, path: str | Path, best: bool = False, deterministic: bool = False) -> None:
-    """Film one episode of the first seed's policy, the last or the best, as a .gif, or as an .mp4 with the extra `lare-rl[video]`.
+    """Film one episode of the first seed's policy, the last or the best.
+
+    A .gif needs the extra `lare-rl[report]`, an .mp4 the extra `lare-rl[video]`.
 
     A film of a particle task shows each agent's credit, as number and colour.
 
@@ -106,26 +107,30 @@ def render_rollout(run: Run, rollout: Rollout) -> list[Frame] | None:
 
 def encode_film(frames: Sequence[Frame], frame_seconds: float, max_bytes: int) -> bytes:
     """Return an animated WebP of a small film. It ends early where it would be larger than `max_bytes`."""
-    images = [Image.fromarray(frame) for frame in frames]
+    images = _to_images(frames)
     for image in images:
         image.thumbnail((FILM_WIDTH, FILM_WIDTH))
     while True:
-        file = BytesIO()
-        first, *rest = images
-        duration_ms = round(1000 * frame_seconds)
-        first.save(
-            file,
-            "WEBP",
-            save_all=True,
-            append_images=rest,
-            duration=duration_ms,
-            loop=0,
-            quality=FILM_QUALITY,
-            method=4,
-        )
-        if file.tell() <= max_bytes or not rest:
-            return file.getvalue()
-        images = images[: max(1, int(0.95 * len(images) * max_bytes / file.tell()))]
+        film = _encode(images, "WEBP", frame_seconds, quality=FILM_QUALITY, method=4)
+        if len(film) <= max_bytes or len(images) == 1:
+            return film
+        images = images[: max(1, int(0.95 * len(images) * max_bytes / len(film)))]
+
+
+def _to_images(frames: Iterable[Frame]) -> list[Any]:
+    try:
+        from PIL import Image
+    except ImportError as missing:
+        raise missing_extra_error("a film", "report") from missing
+    return [Image.fromarray(frame) for frame in frames]
+
+
+def _encode(images: Sequence[Any], file_format: str, frame_seconds: float, **options: Any) -> bytes:
+    """Return an animation that repeats."""
+    buffer, duration_ms = BytesIO(), round(1000 * frame_seconds)
+    first, *rest = images
+    first.save(buffer, file_format, save_all=True, append_images=rest, duration=duration_ms, loop=0, **options)
+    return buffer.getvalue()
 
 
 def check_video_path(path: Path) -> None:
@@ -138,14 +143,15 @@ def check_video_path(path: Path) -> None:
 
 def write_video(path: Path, frames: Sequence[Frame], frame_seconds: float) -> None:
     """Write frames that are shown for `frame_seconds` each. Raise `LareError` if that fails."""
-    import imageio.v3 as imageio
-
-    is_gif = path.suffix == ".gif"
-    timing: dict[str, Any] = {"duration": 1000 * frame_seconds, "loop": 0} if is_gif else {"fps": 1 / frame_seconds}
     try:
-        imageio.imwrite(path, list(frames), **timing)
+        if path.suffix == ".gif":
+            path.write_bytes(_encode(_to_images(frames), "GIF", frame_seconds))
+            return
+        import imageio.v3 as imageio
+
+        imageio.imwrite(path, list(frames), fps=1 / frame_seconds)
     except (OSError, ValueError, ImportError, TypeError) as error:
-        hint = ".gif always works, .mp4 needs lare-rl[video]"
+        hint = ".gif needs lare-rl[report], .mp4 needs lare-rl[video]"
         raise LareError(f"the video {path} cannot be written: {error}; {hint}") from error
 
 

@@ -116,8 +116,8 @@ class RecordedModel:
                 self.name = f"{recording.model}, recorded {recording.recorded}, draw {recording.draw}"
                 return replies[sample]
         raise LareError(
-            f"no recorded reply fits this request for task {self.task!r} (reply {sample + 1}); only shipped tasks have them, for "
-            "their exact texts. Ask a model (lare-rl design TASK --model NAME --out phi.py), train with a function of your own "
+            f"no recorded reply fits this request for task {self.task!r} (reply {sample + 1}); most shipped tasks have "
+            "them, for their exact texts. Ask a model (lare-rl design TASK --model NAME --out phi.py), train with a function of your own "
             "(--function phi.py; in a sweep file, the table [functions]), or by a method that needs none (--method bayes)"
         )
 

@@ -14,10 +14,15 @@ from itertools import pairwise
 
 import numpy as np
 from jaxtyping import Float, UInt8
-from PIL import Image, ImageDraw
 
+from lare_rl.errors import missing_extra_error
 from lare_rl.util.findings import format_value
 from lare_rl.util.statistics import sample_std
+
+try:
+    from PIL import Image, ImageDraw
+except ImportError as missing:
+    raise missing_extra_error("a report", "report") from missing
 
 __all__ = [
     "N_COLOURS",

@@ -5,16 +5,20 @@ import math
 import textwrap
 from collections.abc import Mapping
 from itertools import cycle, product
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
+from lare_rl.errors import missing_extra_error
 from lare_rl.report.charts import Curve
 from lare_rl.util.statistics import Band
 
-if TYPE_CHECKING:
+try:
+    import matplotlib
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
+except ImportError as missing:
+    raise missing_extra_error("a figure", "report") from missing
 
 __all__ = [
     "COLOURS",
@@ -47,10 +51,8 @@ MAX_LEGEND_WIDTH, MAX_HALF_WIDTH = 66, 34
 """Characters in a line of a legend, and in a line of a legend with two columns."""
 
 
-def to_svg(figure: "Figure") -> str:
+def to_svg(figure: Figure) -> str:
     """Return a figure as an <svg> element, for use within an HTML page."""
-    import matplotlib
-
     text = io.StringIO()
     with matplotlib.rc_context(_STYLE):
         figure.savefig(text, format="svg", bbox_inches="tight", metadata={"Date": None}, transparent=True)
@@ -64,11 +66,8 @@ def add_white_background(svg: str) -> str:
     return f'{tag}{end}<rect width="100%" height="100%" fill="#ffffff"/>{rest}'
 
 
-def make_figure(rows: int = 1, height: float = 3.4, columns: int = 1) -> tuple["Figure", np.ndarray]:
+def make_figure(rows: int = 1, height: float = 3.4, columns: int = 1) -> tuple[Figure, np.ndarray]:
     """Make a figure and its axes, row by row. All share x, and axes side by side also share y."""
-    import matplotlib
-    from matplotlib.figure import Figure
-
     with matplotlib.rc_context(_STYLE):
         figure = Figure(figsize=(6.4, height), layout="constrained")
         return figure, figure.subplots(rows, columns, sharex=True, sharey=columns > 1, squeeze=False).ravel()
@@ -123,7 +122,7 @@ def draw_band_panels(panels: Mapping[str, Mapping[str, Band]], x_label: str, y_l
     return to_svg(figure)
 
 
-def _draw_bands_on(axes: "Axes", bands: Mapping[str, Band], x_is_steps: bool) -> None:
+def _draw_bands_on(axes: Axes, bands: Mapping[str, Band], x_is_steps: bool) -> None:
     for (line, colour), (name, (x, y, low, high)) in zip(cycle(_LINES), bands.items(), strict=False):
         axes.plot(x, y, color=colour, linestyle=line, label=name, drawstyle="default" if x_is_steps else "steps-post")
         axes.fill_between(x, low, high, color=colour, alpha=0.18, linewidth=0, step=None if x_is_steps else "post")
@@ -135,7 +134,7 @@ def _format_steps(x: float, _: Any) -> str:
     return f"{x / 1e6:g}M" if x >= 1e6 else f"{x / 1e3:g}k" if x else "0"
 
 
-def _add_legend(axes: "Axes") -> None:
+def _add_legend(axes: Axes) -> None:
     """Add a legend in two columns, or in one if names are long: a legend wider than the figure would squeeze the curves."""
     handles, labels = axes.get_legend_handles_labels()
     labels = [textwrap.fill(label, MAX_LEGEND_WIDTH) for label in labels]

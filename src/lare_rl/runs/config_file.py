@@ -3,7 +3,8 @@
 import os
 import platform
 from collections.abc import Sequence
-from importlib.metadata import version
+from contextlib import suppress
+from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
 import jax
@@ -57,9 +58,17 @@ def make_config(task: TaskSpec, settings: ResolvedSettings, functions: Sequence[
         task_sha256=task.digest,
         longest_episode=load_env_spec(task).max_steps,
         function_sha256=tuple(function.digest for function in functions),
-        versions={name: version(name) for name in VERSIONED_PACKAGES} | {"python": platform.python_version()},
+        versions=_find_versions(),
         machine=f"{platform.system()} {platform.machine()}, {_describe_cores()}, {jax.default_backend()}",
     )
+
+
+def _find_versions() -> dict[str, str]:
+    versions = {"python": platform.python_version()}
+    for name in VERSIONED_PACKAGES:
+        with suppress(PackageNotFoundError):  # an extra that is not installed
+            versions[name] = version(name)
+    return versions
 
 
 def _describe_cores() -> str:

@@ -2,13 +2,18 @@
 
 import numpy as np
 from jaxtyping import Float, UInt8
-from matplotlib import colormaps
-from matplotlib.axes import Axes
-from matplotlib.figure import Figure
-from matplotlib.patches import Circle, Rectangle
 
 from lare_rl.envs.canvas import blank_figure, paint_frames
 from lare_rl.envs.particles.task import ParticleTask
+from lare_rl.errors import missing_extra_error
+
+try:
+    from matplotlib import colormaps
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+    from matplotlib.patches import Circle, Rectangle
+except ImportError as missing:
+    raise missing_extra_error("a picture", "report") from missing
 
 __all__ = ["draw_frames", "draw_state"]
 

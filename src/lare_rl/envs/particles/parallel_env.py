@@ -10,9 +10,7 @@ import numpy as np
 from gymnasium.spaces import Box, Discrete, Space
 from jaxtyping import Array, Float, Int, PRNGKeyArray
 
-from lare_rl.envs.canvas import to_pixels
 from lare_rl.envs.particles.catalogue import find_particle_task
-from lare_rl.envs.particles.drawing import draw_state
 from lare_rl.envs.particles.task import MAX_STEPS, N_ACTIONS, ParticleTask
 from lare_rl.envs.particles.world import State
 from lare_rl.errors import LareError, missing_extra_error
@@ -20,7 +18,7 @@ from lare_rl.errors import LareError, missing_extra_error
 try:
     from pettingzoo import ParallelEnv
 except ImportError:
-    raise missing_extra_error("lare_rl.envs.particles.parallel_env", "particles") from None
+    raise missing_extra_error("lare_rl.envs.particles.parallel_env", "pettingzoo") from None
 
 __all__ = ["ParticleEnv"]
 
@@ -103,6 +101,9 @@ class ParticleEnv(ParallelEnv[str, Any, Any]):
         return observations, rewards, dict.fromkeys(acted, False), dict.fromkeys(acted, ended), infos
 
     def render(self) -> np.ndarray:
+        from lare_rl.envs.canvas import to_pixels
+        from lare_rl.envs.particles.drawing import draw_state
+
         return to_pixels(draw_state(self.task, np.asarray(self._world_state().position)))
 
     def state(self) -> np.ndarray:

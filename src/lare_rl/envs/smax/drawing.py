@@ -6,13 +6,18 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, UInt8
-from matplotlib.axes import Axes
-from matplotlib.figure import Figure
-from matplotlib.patches import Circle, Rectangle, Wedge
 
 from lare_rl.envs.canvas import blank_figure, paint_frames
 from lare_rl.envs.smax.battle import FIELD, Battle, attack_target
 from lare_rl.envs.smax.scenarios import Scenario
+from lare_rl.errors import missing_extra_error
+
+try:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+    from matplotlib.patches import Circle, Rectangle, Wedge
+except ImportError as missing:
+    raise missing_extra_error("a picture", "report") from missing
 
 __all__ = ["draw_frames", "draw_state", "find_hits"]
 

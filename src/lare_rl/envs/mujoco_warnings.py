@@ -1,0 +1,44 @@
+"""MuJoCo's warnings about the models of Gymnasium's environments.
+
+MuJoCo prints a warning, and appends it to a file MUJOCO_LOG.TXT in the working directory. Later versions warn so whenever a
+half cheetah is made: its model, a file of Gymnasium, uses an attribute that MuJoCo will remove. A user cannot change that.
+"""
+
+import contextlib
+import warnings
+from collections.abc import Iterator
+
+import gymnasium
+
+from lare_rl.errors import missing_extra_error
+
+__all__ = ["mujoco_warnings"]
+
+
+@contextlib.contextmanager
+def mujoco_warnings(name: str) -> Iterator[None]:
+    """Make an environment in this block. If it is one of Gymnasium's for MuJoCo, warnings of MuJoCo become warnings of Python.
+
+    Warnings of deprecated attributes are dropped.
+
+    Raises:
+        LareError: MuJoCo is not installed.
+    """
+    spec = gymnasium.registry.get(name)
+    if spec is None or not str(spec.entry_point).startswith("gymnasium.envs.mujoco"):
+        yield
+        return
+    try:
+        import mujoco
+    except ImportError as missing:
+        raise missing_extra_error(f"environment {name!r}", "mujoco") from missing
+    messages: list[str] = []
+    previous = mujoco.get_mju_user_warning()
+    mujoco.set_mju_user_warning(messages.append)
+    try:
+        yield
+    finally:
+        mujoco.set_mju_user_warning(previous)
+    for message in messages:
+        if "deprecated" not in message:
+            warnings.warn(f"MuJoCo, environment {name!r}: {message.strip()}", stacklevel=3)
