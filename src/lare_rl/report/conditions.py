@@ -2,6 +2,7 @@
 
 from lare_rl.report.diagnosis import (
     BETTER_FRACTION,
+    CLOSE_CORRELATION,
     EVALUATION_STDS,
     FALL_FRACTION,
     HIGH_R2,
@@ -38,6 +39,8 @@ CONDITIONS: dict[str, dict[str, str]] = {
         "explained": f"Always, if returns are predicted. *Nearly all*: R² is above {HIGH_R2}. *Next to nothing*: below {LITTLE_R2}. "
         "*A part*: between.",
         "decoder_is_outdated": f"The last R² is below {LITTLE_R2}, but the median over the run is not.",
+        "steps_agree": f"True rewards are known, and the correlation of proxy and true rewards is above {CLOSE_CORRELATION}.",
+        "single_steps": "True rewards are known, and the correlation is lower.",
         "score_use": "Always, if at least 8 returns were predicted. It ends with a sentence about trust.",
         "trust_nothing": f"`credit/gain` is not larger than {CLEAR_ERRORS} of its standard errors.",
         "trust_part": f"It is larger, but not above {CLEAR_GAIN:.0%}.",
