@@ -8,6 +8,7 @@ import pytest
 
 import lare_rl
 from helpers.toy_logs import logged_episodes
+from lare_rl.sweep.sweep import read_sweep
 
 EXAMPLES = Path(__file__).parents[1] / "examples"
 
@@ -16,6 +17,11 @@ EXAMPLES = Path(__file__).parents[1] / "examples"
 @pytest.mark.filterwarnings("ignore:.*HalfCheetah-v4 is out of date")
 def test_own_loop():
     assert runpy.run_path(str(EXAMPLES / "own_loop.py"))["main"](episodes=10) > 0.5
+
+
+def test_study():
+    _, jobs = read_sweep(EXAMPLES / "study.toml")
+    assert [job.directory.name for job in jobs] == ["dense-td3", "bayes-td3", "lare-bayes-td3-draw0"]
 
 
 def test_offline_td3_bc(tmp_path):

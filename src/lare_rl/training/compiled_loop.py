@@ -77,10 +77,11 @@ def compile_loop(env: JaxEnv, config: TrainConfig, phi: Sequence[Graph], fit_eve
 
         return jax.lax.while_loop(is_running, body, (n_done, state))[1]
 
+    dtype = jnp.result_type(int)
     shape, seeds = shape_over_seeds(
-        (_loop_shape(env, config, n_seeds), jax.ShapeDtypeStruct((n_seeds,), int)), config.n_devices
+        (_loop_shape(env, config, n_seeds), jax.ShapeDtypeStruct((n_seeds,), dtype)), config.n_devices
     )
-    number = jax.ShapeDtypeStruct((), int)
+    number = jax.ShapeDtypeStruct((), dtype)
     jitted = jit_over_seeds(loop, config.n_devices, shared=(2, 3), donate=(0,))
     return CompiledLoop(jitted.lower(shape, seeds, number, number).compile(), shape)
 
