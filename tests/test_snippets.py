@@ -133,7 +133,7 @@ class Page:
                 pyproject = tomllib.loads((ROOT / "pyproject.toml").read_text())
                 names = pyproject["project"]["optional-dependencies"]
                 extras = {"-e", *(f"lare-rl[{name}]" for name in names), *(f".[{name}]" for name in names)}
-                developed = str(pyproject["dependency-groups"]["dev"])
+                developed = str(pyproject["dependency-groups"])
                 assert all(package in extras or package in developed for package in packages)
             case ["python", path, *_] | [".venv/bin/python", "-m", "pytest", path]:
                 assert (ROOT / path).exists()
