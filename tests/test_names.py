@@ -14,7 +14,6 @@ BANNED = set(
 GENITIVE = re.compile(r"^_?of_\w+$")
 EXCEPTIONS: dict[str, int] = {
     "src/lare_rl/phi/numpy_functions/tables.py": 3,
-    "src/lare_rl/report/figures.py": 1,
 }
 """How many banned identifiers a file may have. These numbers may only fall."""
 

@@ -1,5 +1,6 @@
 """Rollouts, samples, cross-play, films and reports of runs with many agents."""
 
+import re
 from functools import partial
 
 import jax
@@ -8,6 +9,7 @@ import numpy as np
 import pytest
 
 import lare_rl
+from helpers.markup import check_markup
 from lare_rl.envs.families import make_env
 from lare_rl.envs.interface import Team, team_mean
 from lare_rl.errors import LareError
@@ -15,8 +17,8 @@ from lare_rl.evaluation.cross_play import combine_policies, cross_play
 from lare_rl.evaluation.policy import load_policy
 from lare_rl.evaluation.rollout import N_SAMPLE_EPISODES, roll_out, sample_steps
 from lare_rl.evaluation.video import record_video, render_rollout
+from lare_rl.report import run_details
 from lare_rl.report.overview import render_learning_curves
-from lare_rl.report.run_details import render_agents
 from lare_rl.report.run_summary import ReportedRun
 from lare_rl.training.collect_device import unroll_on_device
 from lare_rl.training.compiled import training_module
@@ -53,7 +55,8 @@ def test_rollout_without_proxy_rewards(small_many, tmp_path):
     assert rollout.training_reward is None
     np.testing.assert_array_equal(rollout.credit, rollout.reward)
     page = lare_rl.write_report(run, tmp_path / "report.html").read_text()
-    assert "proxy" not in page.split("Who got which credit when")[1].split("Settings")[0]
+    assert page.count('class="strip"') == 1
+    assert page.count("data:image/webp") == 1
 
 
 def test_sample_steps(runs):
@@ -118,19 +121,17 @@ def test_single_agent_functions_refuse_many_agents(runs, tmp_path):
         load_policy(runs[0])
 
 
-def test_report(runs):
-    details = "\n".join(render_agents(runs[0], max_tsne_points=50))
-    for text in (
-        "Who got which credit when",
-        "The factors of CompetitivePP-6-predator",
-        "The latent function of CompetitivePP-6-prey",
-        ">true reward<",
-        ">proxy reward<",
-    ):
-        assert text in details
-    assert details.count("data:image/gif;base64,") == 1
-    assert details.count("t-SNE of steps of agents") == 2
-    assert ">nan<" not in details
-    curves = "\n".join(render_learning_curves(runs[0].config.task, [ReportedRun("a", runs[0])], np.zeros(0)))
-    assert "True return, team of prey" in curves
-    assert "Correlation of proxy and true reward, team of predator" in curves
+def test_report(runs, monkeypatch):
+    monkeypatch.setattr(run_details, "MAX_TSNE_POINTS", 50)
+    run = runs[0]
+    details = "\n".join(run_details.render_details(run, rollout=roll_out(run)))
+    check_markup(details.replace('href="#', 'href="'))
+    assert "nan" not in details
+    for role in run.config.task.roles:
+        assert details.count(f"<summary>The latent function of {role.name}</summary>") == 1
+    assert details.count('class="strip"') == 2  # true and proxy rewards
+    assert details.count("t-SNE") == 4
+    curves = "\n".join(render_learning_curves(run.config.task, [ReportedRun("a", run)], np.zeros(0)))
+    titles = re.findall(r"team of (\w+)</", curves)
+    assert set(titles) == {"predator", "prey"}
+    assert len(titles) == curves.count('class="chart')

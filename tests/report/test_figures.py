@@ -8,20 +8,11 @@ from lare_rl.report.figures import (
     add_white_background,
     draw_band_panels,
     draw_bands,
-    draw_credit,
     draw_curves,
-    visible_steps,
 )
 from lare_rl.util.statistics import Band
 
 X = np.arange(3.0)
-
-
-@pytest.mark.parametrize(
-    ("length", "first", "end"), [(1, 0, 1), (30, 0, 30), (100, 0, 100), (101, 0, 100), (1000, 450, 550)]
-)
-def test_visible_steps(length, first, end):
-    assert visible_steps(length) == slice(first, end)
 
 
 def test_long_legend_makes_figure_higher():
@@ -51,17 +42,3 @@ def test_panels_share_legend_and_labels():
     svg = draw_band_panels(panels, "environment steps", "true return")
     for text in (*panels, "one", "other", "environment steps", "true return"):
         assert svg.count(f">{text}</text>") == 1, text
-
-
-def test_credit_without_true_rewards():
-    assert ">true reward</text>" not in draw_credit(None, X)
-    assert ">true reward</text>" in draw_credit(X, X, uncertainty=X)
-
-
-def test_band_of_a_curve():
-    """It is the deviation over seeds; with one seed, that over the episodes of each evaluation."""
-    stds, two_seeds = {"a": (X, np.full((2, 3), 9.0))}, np.array([X, X + 1])
-    assert draw_curves({"a": (X, two_seeds)}, "r", episode_stds=stds) == draw_curves({"a": (X, two_seeds)}, "r")
-    half = {"a": (X, np.full((1, 3), np.sqrt(0.5)))}
-    means = draw_curves({"a": (X, X[None] + 0.5)}, "r", episode_stds=half)
-    assert means == draw_curves({"a": (X, two_seeds)}, "r")

@@ -1,18 +1,23 @@
 """The pages, and how they look in a browser."""
 
+import os
 import re
 import shutil
 import subprocess
 import webbrowser
 
 import gymnasium
+import numpy as np
 import pytest
-from PIL import Image
 
 import lare_rl
+from helpers.markup import check_markup
 from helpers.toy_envs import Chase, toy_spec
-from lare_rl.report.html import render_lines, render_table
+from lare_rl.evaluation.video import encode_film
+from lare_rl.report.html import render_table
 from lare_rl.report.live_page import LivePage
+from lare_rl.report.overview import compare_runs, sort_runs, summarise_runs
+from lare_rl.report.run_summary import ReportedRun
 
 CHROMIUM = next(
     (path for name in ("chromium", "chromium-browser", "google-chrome") if (path := shutil.which(name))), None
@@ -37,39 +42,116 @@ def runs(small, phi, tmp_path_factory):
     ]
 
 
-def test_sections_of_report(runs, make_run, tmp_path):
-    episodic = make_run("a", [-5.0, -6.0], method="episodic")
-    page = lare_rl.write_report([runs[0], episodic], tmp_path / "report.html").read_text()
-    diagnoses = re.findall(r'<p class="verdict"><strong>(.*?)\.</strong> (.*?)</p>', page)
-    assert [name for name, _ in diagnoses] == ["lare-bayes", "episodic"]
-    # The first run is compared with the second one, which was trained on the return of the episode alone.
-    assert ["return of the episode alone" in text for _, text in diagnoses] == [True, False]
+def page_of(sources, tmp_path, **options):
+    page = lare_rl.write_report(sources, tmp_path / "report.html", **options).read_text()
+    check_markup(page[page.index("<body>") : page.index("</html>")])
+    return page
+
+
+def columns(page):
+    """The cells of each column of each table, without the header."""
+    for table in re.findall(r"<table>(.*?)</table>", page, re.DOTALL):
+        rows = [re.findall(r"<td[^>]*>(.*?)</td>", row) for row in table.split("</tr>")[1:]]
+        yield from zip(*filter(None, rows), strict=True)
+
+
+def n_lines(chart, style):
+    return len(re.findall(rf'<polyline class="{style}"', chart))
+
+
+def test_sections_of_report(runs, tmp_path):
+    page = page_of(runs[0], tmp_path)
     sections = (
-        "verdict",
-        "<table>",
-        "<svg",
-        "lare-bayes on Chase",
-        "Credit over one episode",
-        "The factors",
+        'class="headline"',
+        'class="tiles"',
+        'class="chart',
+        'class="strip"',
         "The latent function",
-        "Settings",
-        "episodic on Chase",
-        "no checkpoint",
+        "config.json",
     )
     positions = [page.index(section) for section in sections]
     assert positions == sorted(positions)
-    assert "<code>" in page
-    assert 'src="data:image/gif' not in page
+    assert page.count("<dt>") == 4  # the numbers of the header
+    assert 'src="data:image/webp' not in page
+    assert all(any(cell not in ("", "-") for cell in column) for column in columns(page))
+    assert "<script" not in page
+    assert len(page) < 600_000
+    first_chart = page[page.index('class="chart') :].partition("</svg>")[0]
+    assert n_lines(first_chart, "c0 thin") == len(runs[0].seeds)
+    assert n_lines(first_chart, "c0") == n_lines(first_chart, "grey dashed") == 1
+    assert "<title>step" in first_chart
 
 
-def test_report_names_and_film(runs, make_run, tmp_path):
-    first, second = make_run("a", [1.0]), make_run("b", [1.0], method="rd")
-    Image.new("RGB", (8, 8)).save(runs[0].directory / "film.gif")
-    page = lare_rl.write_report([runs[0], second, first.directory, first], tmp_path / "report.html").read_text()
-    names = re.findall(r'<p class="verdict"><strong>(.*?)\.</strong>', page)
-    assert names == ["lare-bayes", "rd", "dense (a) #3", "dense (a) #4"]
-    assert page.count('src="data:image/gif;base64,') == 1
-    (runs[0].directory / "film.gif").unlink()
+def test_film(runs, tmp_path):
+    """It is in the page if it is newer than the checkpoint, and small."""
+    film = runs[0].directory / "film.webp"
+    film.write_bytes(encode_film([np.zeros((300, 300, 3), np.uint8)] * 2, 0.1, 10_000))
+    assert page_of(runs[0], tmp_path).count('src="data:image/webp;base64,') == 1
+    assert "data:image/webp" not in page_of(runs[0], tmp_path, film=False)
+    os.utime(film, (0, 0))
+    assert "data:image/webp" not in page_of(runs[0], tmp_path)
+    film.unlink()
+
+
+def test_report_of_several_runs(make_run, tmp_path):
+    """A sentence compares them, the best ones have colours, and only settings that differ are listed."""
+    runs = [
+        make_run(f"run{i}", [10.0 * i, 10.0 * i + 1], method=method)
+        for i, method in enumerate(["dense", "rd", "ircr", "rrd", "bayes", "episodic"])
+    ]
+    page = page_of(runs, tmp_path)
+    comparison = page[page.index('class="headline"') :].partition("<ul")[0]
+    names = ["episodic", "bayes", "rrd", "ircr", "rd"]
+    positions = [comparison.index(f"{name} {50.5 - 10 * i:.3g}") for i, name in enumerate(names)]
+    assert positions == sorted(positions)
+    assert "-" not in comparison
+    assert "1.00" in comparison  # the probability that the best run wins
+    chart = page[page.index('class="chart') :].partition("</svg>")[0]
+    assert [n_lines(chart, style) for style in ("c0", "c1", "c2", "c3", "grey other")] == [1, 1, 1, 1, 2]
+    settings = page[page.index("differ between") :].partition("</table>")[0]
+    assert "method" in settings
+    assert "evaluation_episodes" not in settings
+    assert page.count("<summary>All settings") == 1
+
+
+def test_runs_that_cannot_be_told_apart(make_run):
+    """The best run must win nearly all pairs of seeds."""
+
+    def headline(*returns):
+        runs = [ReportedRun(str(i), make_run(f"{i} {returns}", values)) for i, values in enumerate(returns)]
+        return compare_runs(sort_runs(runs))[0]
+
+    best = headline([1.0, 2.0, 3.0], [4.0, 5.0, 6.0])
+    assert (best.code, best.values["best"]) == ("is_best", "1")
+    assert headline([1.0, 2.0, 9.0], [4.0, 5.0, 6.0]).code == "none_is_best"
+    assert headline([1.0], [4.0]).code == "none_is_best"
+    assert compare_runs([ReportedRun("a", make_run("a", [1.0]))]) == []
+
+
+def test_names_of_runs(make_run, tmp_path):
+    first, second = make_run("a", [1.0]), make_run("<b>", [2.0], method="rd")
+    page = page_of([second, first.directory, first], tmp_path)
+    assert re.findall(r"<summary>(.*?): ", page) == ["rd", "dense (a) #2", "dense (a) #3"]
+    page = page_of([first, make_run("<b>c", [2.0])], tmp_path)
+    assert "<b>" not in page
+    assert "&lt;b&gt;c" in page
+
+
+def test_comparison_with_the_return_of_the_episode_alone(make_run):
+    runs = [
+        ReportedRun(method, make_run(method, [value, value + 1], method=method))
+        for method, value in [("rd", 9.0), ("episodic", 1.0)]
+    ]
+    first, second = summarise_runs(runs, np.zeros(0))
+    assert (first.episodic_return, second.episodic_return) == (1.5, None)
+
+
+def test_training_time(make_run):
+    reported = ReportedRun("a", make_run("a", [1.0]))
+    assert reported.training_seconds() is None
+    for line in reported.metrics:
+        line["time/steps_per_second"] = line["step"] / 10
+    assert reported.training_seconds() == pytest.approx(50 / 5 + 50 / 10)
 
 
 def test_report_errors(make_run, tmp_path):
@@ -84,18 +166,18 @@ def test_report_errors(make_run, tmp_path):
 
 
 def test_unknown_step_rewards(runs, tmp_path):
-    """If only the last step has a reward, there is no error, no correlation, and no curve of true rewards."""
+    """If only the last step has a reward, there is no error, no correlation, and no picture of true rewards."""
     about_true_rewards = (
-        "credit error",
-        "Correlation: Pearson",
-        "true reward</text>",
+        "|proxy - true reward|",
+        "Correlation of",
+        ">true reward</li>",
         "correlation with the true reward",
     )
 
     def texts_in_report(run):
-        page = lare_rl.write_report(run, tmp_path / "report.html").read_text()
+        page = page_of(run, tmp_path)
         assert "R² of returns" in page
-        assert "proxy reward" in page
+        assert ">proxy reward</li>" in page
         return [text for text in about_true_rewards if text in page]
 
     assert [texts_in_report(run) for run in runs] == [list(about_true_rewards), []]
@@ -113,27 +195,27 @@ def test_live_page(make_run, monkeypatch):
     assert "Step 0 of 100" in path.read_text()
     shutil.copy(trained.directory / "metrics.jsonl", run.directory)
     page.on_evaluation([])
-    for text in ('<meta http-equiv="refresh" content="10">', "Step 100 of 100", "<svg", 'class="verdict"'):
+    for text in ('<meta http-equiv="refresh" content="10">', "Step 100 of 100", "<svg", 'class="headline"'):
         assert text in path.read_text()
     page.on_stop()
     assert "refresh" not in path.read_text()
 
 
-def test_html_is_escaped():
-    assert render_table(("<a>",), [("<b>",)], numbers=[0]).count("&lt;") == 2
-    assert (
-        render_lines(["<x>", "- <y>", "- z", "w"])
-        == "<p>&lt;x&gt;</p>\n<ul><li>&lt;y&gt;</li><li>z</li></ul>\n<p>w</p>"
-    )
+def test_tables_have_no_empty_columns():
+    table = render_table(("<a>", "b", "c"), [("<b>", "", "-"), ("", "-", "1")], numbers=[2])
+    assert re.findall(r"<th[^>]*>(.*?)</th>", table) == ["&lt;a&gt;", "c"]
+    assert table.count("&lt;") == 2
 
 
 @pytest.mark.skipif(CHROMIUM is None, reason="there is no Chromium")
 @pytest.mark.parametrize(("width", "columns"), [(390, 1), pytest.param(1280, 2, marks=pytest.mark.long)])
 def test_page_fits_phone_and_desktop(runs, tmp_path, width, columns):
-    """Nothing is wider than the screen, and curves stand side by side where there is room."""
+    """Nothing is wider than the screen, no text is smaller than 11 pixels, and curves stand side by side where there is room."""
     page = lare_rl.write_report(runs[0], tmp_path / "report.html")
     probe = (
-        "<script>document.title = JSON.stringify([document.documentElement.scrollWidth, "
+        "<script>document.querySelectorAll('details').forEach(fold => fold.open = true);"
+        "const sizes = [...document.body.querySelectorAll('*')].map(node => parseFloat(getComputedStyle(node).fontSize));"
+        "document.title = JSON.stringify([document.documentElement.scrollWidth, Math.floor(Math.min(...sizes)), "
         "getComputedStyle(document.querySelector('.figures')).gridTemplateColumns.split(' ').length])</script>"
     )
     (tmp_path / "probe.html").write_text(page.read_text().replace("</body>", f"{probe}</body>"))
@@ -145,6 +227,8 @@ def test_page_fits_phone_and_desktop(runs, tmp_path, width, columns):
     flags = "--headless --no-sandbox --disable-gpu --allow-file-access-from-files --virtual-time-budget=5000 --dump-dom"
     command = [CHROMIUM, *flags.split(), f"--user-data-dir={tmp_path / 'profile'}", frame.as_uri()]
     result = subprocess.run(command, capture_output=True, text=True, check=True)
-    match = re.search(r"\[(\d+),(\d+)\]", result.stdout)
+    match = re.search(r"\[(\d+),(\d+),(\d+)\]", result.stdout)
     assert match, result.stdout + result.stderr
-    assert (int(match[1]) <= width, int(match[2])) == (True, columns)
+    assert int(match[1]) <= width
+    assert int(match[2]) >= 11
+    assert int(match[3]) == columns

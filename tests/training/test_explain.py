@@ -22,7 +22,8 @@ def check_explanation(run, messages):
     assert messages[-len(lines) :] == lines
     assert (f"not the decoder of {method}" in lines[0]) == (method != "lare-bayes")
     assert ("The factors explain" in " ".join(lines)) == (method != "rrdu")
-    assert "What the returns say" in lare_rl.write_report([run.directory]).read_text()
+    bars = lare_rl.write_report([run.directory]).read_text().partition('<ul class="bars">')[2].partition("</ul>")[0]
+    assert "<li" in bars
 
 
 def test_explain_run(learned_training):

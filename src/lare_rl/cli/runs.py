@@ -248,14 +248,14 @@ def _render_without_screen() -> None:
         os.environ.setdefault("MUJOCO_GL", "egl")
 
 
-def report(runs: RunDirectories, out: Path | None = None, film: bool = False) -> None:
+def report(runs: RunDirectories, out: Path | None = None, film: bool = True) -> None:
     """Draw a report of one or more runs: one self-contained HTML file.
 
     Args:
         runs: run directories, or directories that contain some, such as that of a sweep; their learning curves are drawn in one
             chart, named by method.
         out: the file to write; the default is report.html in the (first) run's directory.
-        film: film an episode of each run too, and show it in the page. Without a graphics card that may take minutes.
+        film: show a film of the policy, or of the best of many, where its environment can be drawn.
     """
     from lare_rl.report.report import write_report
     from lare_rl.runs.config_file import read_config

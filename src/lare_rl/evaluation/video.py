@@ -2,7 +2,7 @@
 
 import math
 import warnings
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from contextlib import closing
 from io import BytesIO
 from itertools import count
@@ -25,16 +25,18 @@ from lare_rl.evaluation.rollout import Rollout, roll_out
 from lare_rl.runs.directory import Run
 from lare_rl.training.streams import Stream, episode_seed
 
-__all__ = ["check_video_path", "encode_gif", "record_video", "render_rollout", "write_video"]
+__all__ = ["check_video_path", "encode_film", "record_frames", "record_video", "render_rollout", "write_video"]
 
 FRAMES_PER_SECOND = 8
 """The frame rate of a film of many agents."""
-MAX_GIF_FRAMES_PER_SECOND = 25
+MAX_GIF_FRAMES_PER_SECOND = 25.0
 """Browsers play a GIF at 50 frames a second at most, and a frame may take long without a graphics card."""
 MAX_DRAWINGS = 200
 """The most pictures of a film of a single agent in JAX, whose package may need a second for each."""
 FRAME_SIZE = {"width": 320, "height": 320}
 """Pixels of a MuJoCo film. The default, 480 by 480, takes twice the time and space."""
+FILM_WIDTH, FILM_QUALITY = 240, 55
+"""Pixels and quality of a film in a page."""
 
 Frame = UInt8[np.ndarray, "height width 3"]
 
@@ -49,27 +51,48 @@ def record_video(run: Run, path: str | Path, best: bool = False, deterministic: 
     """
     path = Path(path)
     check_video_path(path)
+    max_rate = MAX_GIF_FRAMES_PER_SECOND if path.suffix == ".gif" else math.inf
+    write_video(path, *record_frames(run, best, deterministic, max_rate=max_rate))
+
+
+def record_frames(
+    run: Run,
+    best: bool = False,
+    deterministic: bool = False,
+    *,
+    max_rate: float = MAX_GIF_FRAMES_PER_SECOND,
+    max_frames: int | None = None,
+    rollout: Rollout | None = None,
+) -> tuple[list[Frame], float]:
+    """Return the frames of one episode, as `record_video` shows it, and the seconds for which each is shown.
+
+    Args:
+        max_rate: the largest number of frames in a second.
+        max_frames: the largest number of frames. A longer film ends early.
+        rollout: an episode of many agents that has been played already.
+
+    Raises:
+        LareError: the environment cannot be drawn on this machine.
+    """
     spec = load_env_spec(run.config.task)
     if spec.n_agents > 1:
         if best or deterministic:
             raise LareError(
                 "many agents are filmed as they act in training, with their credit: leave best and deterministic out"
             )
-        frames = render_rollout(run, roll_out(run))
+        frames = render_rollout(run, rollout or roll_out(run))
         if frames is None:
             raise LareError(f"{run.config.task.name} steps on the host, where only single agents are filmed")
-        write_video(path, frames, 1 / FRAMES_PER_SECOND)
-        return
+        return frames[:max_frames], 1 / FRAMES_PER_SECOND
+    policy = RunPolicy(run, 0, best, deterministic)
     if spec.is_jax:
-        write_video(path, _play_and_draw(run, RunPolicy(run, 0, best, deterministic)), 1 / MAX_GIF_FRAMES_PER_SECOND)
-        return
+        return _play_and_draw(run, policy, min(max_frames or MAX_DRAWINGS, MAX_DRAWINGS)), 1 / MAX_GIF_FRAMES_PER_SECOND
     camera = {"camera_name": "track", **FRAME_SIZE} if _has_tracking_camera(run) else {}
     with closing(make_host_env(run.config.task, render_mode="rgb_array", **camera)) as env:
         assert isinstance(env, GymnasiumEnv)
         fps = env.environment.metadata.get("render_fps", 30)
-        interval = max(1, round(fps / MAX_GIF_FRAMES_PER_SECOND)) if path.suffix == ".gif" else 1
-        frames = _play_and_render(run, env, RunPolicy(run, 0, best, deterministic), interval)
-        write_video(path, frames, interval / fps)
+        interval = max(1, round(fps / max_rate))
+        return _play_and_render(run, env, policy, interval, max_frames), interval / fps
 
 
 def render_rollout(run: Run, rollout: Rollout) -> list[Frame] | None:
@@ -81,13 +104,28 @@ def render_rollout(run: Run, rollout: Rollout) -> list[Frame] | None:
     return env.frames(rollout.select_episode(rollout.state), rollout.select_episode(rollout.credit))
 
 
-def encode_gif(frames: Iterable[Frame]) -> bytes:
-    """Return frames of many agents as an animated GIF."""
-    buffer = BytesIO()
-    first, *rest = map(Image.fromarray, frames)
-    duration_ms = 1000 // FRAMES_PER_SECOND
-    first.save(buffer, format="GIF", save_all=True, append_images=rest, duration=duration_ms, loop=0)
-    return buffer.getvalue()
+def encode_film(frames: Sequence[Frame], frame_seconds: float, max_bytes: int) -> bytes:
+    """Return an animated WebP of a small film. It ends early where it would be larger than `max_bytes`."""
+    images = [Image.fromarray(frame) for frame in frames]
+    for image in images:
+        image.thumbnail((FILM_WIDTH, FILM_WIDTH))
+    while True:
+        file = BytesIO()
+        first, *rest = images
+        duration_ms = round(1000 * frame_seconds)
+        first.save(
+            file,
+            "WEBP",
+            save_all=True,
+            append_images=rest,
+            duration=duration_ms,
+            loop=0,
+            quality=FILM_QUALITY,
+            method=4,
+        )
+        if file.tell() <= max_bytes or not rest:
+            return file.getvalue()
+        images = images[: max(1, int(0.95 * len(images) * max_bytes / file.tell()))]
 
 
 def check_video_path(path: Path) -> None:
@@ -111,7 +149,7 @@ def write_video(path: Path, frames: Sequence[Frame], frame_seconds: float) -> No
         raise LareError(f"the video {path} cannot be written: {error}; {hint}") from error
 
 
-def _play_and_draw(run: Run, policy: RunPolicy) -> Sequence[Frame]:
+def _play_and_draw(run: Run, policy: RunPolicy, max_frames: int) -> list[Frame]:
     """Play an episode of an environment of pure functions, and draw the states in which the policy acts, or some of many."""
     env, states = make_host_env(run.config.task), []
     assert isinstance(env, JaxOnHost)
@@ -122,7 +160,7 @@ def _play_and_draw(run: Run, policy: RunPolicy) -> Sequence[Frame]:
 
     for _ in play_steps(env, act, np.random.default_rng(0), _film_seed(run)):
         pass
-    states = states[:: math.ceil(len(states) / MAX_DRAWINGS)]
+    states = states[:: math.ceil(len(states) / max_frames)]
     return env.env.frames(jax.tree.map(lambda *leaves: np.stack(leaves), *states))
 
 
@@ -130,8 +168,8 @@ def _film_seed(run: Run) -> int:
     return episode_seed(run.seeds[0], Stream.EVALUATION_EPISODES, 0)
 
 
-def _play_and_render(run: Run, env: HostEnv, policy: RunPolicy, interval: int) -> list[Frame]:
-    """Play an episode, and render every `interval`-th timestep at which the policy acts."""
+def _play_and_render(run: Run, env: HostEnv, policy: RunPolicy, interval: int, max_frames: int | None) -> list[Frame]:
+    """Play an episode, and render every `interval`-th timestep at which the policy acts. It ends after `max_frames`."""
     frames, steps = [], count()
 
     def act(*inputs: np.ndarray) -> np.ndarray:
@@ -140,7 +178,8 @@ def _play_and_render(run: Run, env: HostEnv, policy: RunPolicy, interval: int) -
         return policy.select_env_action(*inputs)
 
     for _ in play_steps(env, act, np.random.default_rng(0), _film_seed(run)):
-        pass
+        if len(frames) == max_frames:
+            break
     return frames
 
 

@@ -13,7 +13,15 @@ from lare_rl.report.run_summary import CLEAR_ERRORS, LITTLE_R2, MIN_EVALUATIONS,
 from lare_rl.util.findings import Finding
 from lare_rl.util.statistics import sample_std
 
-__all__ = ["diagnose"]
+__all__ = ["CREDIT_CODES", "NEXT_CODES", "diagnose"]
+
+CREDIT_CODES = ("explained", "decoder_is_outdated", "score_use", "single_steps")
+"""Findings about the quality of the credit."""
+NEXT_CODES = (
+    "explains_little", "try_closed_form", "is_rising", "one_seed_was_better", "has_fallen", "is_stuck", "needs_training",
+    "needs_baseline",
+)  # fmt: skip
+"""Findings that recommend what to do next."""
 
 HIGH_R2 = 0.8
 """Proxy rewards explain nearly all of the score if R^2 of the returns is higher."""
@@ -115,6 +123,12 @@ def _score_use(run: RunSummary) -> Finding | None:
     return None if run.score_use is None else run.score_use.finding()
 
 
+def _single_steps(run: RunSummary) -> Finding | None:
+    if run.credit_error is None or run.credit_correlation is None:
+        return None
+    return Finding("single_steps", {"error": run.credit_error, "correlation": run.credit_correlation})
+
+
 def _explains_little(run: RunSummary) -> Finding | None:
     if not run.explains_little:
         return None
@@ -211,6 +225,7 @@ _RULES: tuple[tuple[Rule, ...], ...] = (
     (_episodic_comparison,),
     (_proxy_rewards,),
     (_score_use,),
+    (_single_steps,),
     (_explains_little, _is_rising, _one_seed_was_better, _has_fallen, _is_stuck, _needs_training, _needs_baseline),
     (_single_seed,),
 )

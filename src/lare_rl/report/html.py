@@ -4,26 +4,24 @@ import base64
 from collections.abc import Iterable, Sequence
 from html import escape
 from importlib.resources import files
-from itertools import groupby
 from pathlib import Path
-
-import numpy as np
-from jaxtyping import Float
 
 from lare_rl.errors import LareError
 from lare_rl.latent.function import LatentFunction
 from lare_rl.util.files import replace_file
 
 __all__ = [
-    "render_factor_table",
+    "render_film",
+    "render_fold",
     "render_function",
-    "render_gif",
-    "render_lines",
     "render_note",
     "render_table",
+    "render_tiles",
     "write_page",
 ]
 
+_EMPTY = ("", "-")
+"""Texts of cells that say nothing."""
 _PAGE = """<!doctype html>
 <html lang="en">
 <head>
@@ -57,11 +55,13 @@ def write_page(path: Path, title: str, body: str, refresh: int | None = None) ->
 
 
 def render_table(header: Sequence[str], rows: Iterable[Sequence[str]], numbers: Sequence[int] = ()) -> str:
-    """Return an HTML table of escaped cells. The columns in `numbers` are formatted as numbers."""
+    """Return an HTML table of escaped cells without its empty columns. The columns in `numbers` are formatted as numbers."""
+    rows = list(rows)
+    columns = [i for i in range(len(header)) if not rows or any(row[i] not in _EMPTY for row in rows)]
 
     def render_cells(tag: str, cells: Sequence[str]) -> str:
-        classes = (' class="number"' if column in numbers else "" for column in range(len(cells)))
-        return "".join(f"<{tag}{class_}>{escape(cell)}</{tag}>" for class_, cell in zip(classes, cells, strict=True))
+        classes = {i: ' class="number"' if i in numbers else "" for i in columns}
+        return "".join(f"<{tag}{classes[i]}>{escape(cells[i])}</{tag}>" for i in columns)
 
     body = "\n".join(f"<tr>{render_cells('td', row)}</tr>" for row in rows)
     return f'<div class="wide"><table><tr>{render_cells("th", header)}</tr>\n{body}\n</table></div>'
@@ -72,31 +72,26 @@ def render_note(text: str) -> str:
     return f'<p class="note">{escape(text)}</p>'
 
 
-def render_lines(lines: Iterable[str]) -> str:
-    """Return a paragraph for each line, and lists of the lines that begin with a dash."""
-    blocks = []
-    for is_list, group in groupby(lines, key=lambda line: line.startswith("- ")):
-        if is_list:
-            blocks.append("<ul>" + "".join(f"<li>{escape(line[2:])}</li>" for line in group) + "</ul>")
-        else:
-            blocks += [f"<p>{escape(line)}</p>" for line in group]
-    return "\n".join(blocks)
+def render_fold(title: str, sections: Iterable[str], is_open: bool = False) -> str:
+    """Return sections under a title that opens them; nothing if they are empty."""
+    content = "\n".join(filter(None, sections))
+    opened = " open" if is_open else ""
+    return f"<details{opened}><summary>{escape(title)}</summary>\n{content}\n</details>" if content else ""
 
 
-def render_gif(data: bytes, description: str) -> str:
-    """Return an image that holds its data."""
-    content = base64.b64encode(data).decode()
-    return f'<img class="film" alt="{escape(description)}" src="data:image/gif;base64,{content}">'
+def render_tiles(tiles: Iterable[tuple[str, str, str]]) -> str:
+    """Return a row of large numbers, each with its title and a remark."""
+    items = (
+        f"<div><dt>{escape(title)}</dt><dd>{escape(number)}<small>{escape(remark)}</small></dd></div>"
+        for title, number, remark in tiles
+    )
+    return f'<dl class="tiles">{"".join(items)}</dl>'
 
 
-def render_factor_table(labels: Sequence[tuple[str, str, str]], correlations: Float[np.ndarray, " factors"]) -> str:
-    """Return a table of factors (name, meaning, entries) and, if any is known, of their correlations with the true reward."""
-    header = ("factor", "meaning, by the comments in phi", "entries that it reads")
-    if np.isnan(correlations).all():
-        return render_table(header, labels)
-    texts = ("-" if np.isnan(correlation) else f"{correlation:.2f}" for correlation in correlations)
-    rows = [(*label, text) for label, text in zip(labels, texts, strict=True)]
-    return render_table((*header, "correlation with the true reward"), rows, numbers=(len(header),))
+def render_film(film: bytes, description: str) -> str:
+    """Return an animated WebP that holds its data."""
+    content = base64.b64encode(film).decode()
+    return f'<img class="film" alt="{escape(description)}" src="data:image/webp;base64,{content}">'
 
 
 def render_function(function: LatentFunction) -> str:

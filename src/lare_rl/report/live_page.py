@@ -10,7 +10,7 @@ import numpy as np
 from lare_rl.errors import LareError
 from lare_rl.evaluation.evaluate import measure_random_returns
 from lare_rl.report.html import render_note, write_page
-from lare_rl.report.overview import render_diagnoses, render_learning_curves
+from lare_rl.report.overview import render_learning_curves, render_verdict, summarise_runs
 from lare_rl.report.run_summary import ReportedRun
 from lare_rl.runs.directory import open_without_functions
 from lare_rl.training.progress import MetricLines
@@ -60,9 +60,10 @@ class LivePage:
                 self._random_returns = measure_random_returns(task)
             reported = ReportedRun(settings.method, run)
             title = f"{task.name}: {settings.method}"
-            sections = [f"<h1>{escape(title)}</h1>"]
+            sections = [] if reported.metrics else [f"<h1>{escape(title)}</h1>"]
             if reported.metrics:
-                sections += render_diagnoses([reported], self._random_returns)
+                (summary,) = summarise_runs([reported], self._random_returns)
+                sections += render_verdict(reported, summary)
                 sections += render_learning_curves(task, [reported], self._random_returns)
             step = reported.metrics[-1]["step"] if reported.metrics else 0
             state = f"reloaded every {REFRESH_S} seconds" if self._is_running else "not running"

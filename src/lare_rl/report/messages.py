@@ -1,28 +1,35 @@
-"""The sentences of a run's diagnosis, by the codes of its findings (`util/findings.py`). Commands are in backticks."""
+"""The sentences of a report, by the codes of its findings (`util/findings.py`). Commands are in backticks."""
 
-__all__ = ["MESSAGES"]
+__all__ = ["MESSAGES", "WORDS"]
 
 MESSAGES = {
     # Findings that stand alone
-    "no_return": "Nothing can be said: the last evaluation gave no return.",
-    "untrained": "Nothing was learned: {reason}.",
+    "headline_no_return": "Nothing can be said",
+    "no_return": "The last evaluation gave no return.",
+    "headline_untrained": "Nothing was learned",
+    "untrained": "The reason: {reason}.",
+    "headline_equal_returns": "Nothing can be learned",
     "equal_returns": (
-        "Nothing can be learned: all episodes, of the policy and of random actions, have the return {return_:score}. Next: does the "
-        "environment give rewards, and does it before its time limit (`max_episode_steps`)?"
+        "All episodes, of the policy and of random actions, have the return {return_:score}. Next: does the environment give "
+        "rewards, and does it before its time limit (`max_episode_steps`)?"
     ),
     # The outcome
+    "headline_outcome_unknown": "Trained",
     "outcome_unknown": "{reached}.",
-    "learned": "It learned. {reached}; {baseline}.",
-    "some_seeds_learned": "It learned with {n_learned} of {n_seeds} seeds. {reached}; {baseline}.",
-    "worse_than_random": "It got worse than random actions. {reached}; {baseline}.",
-    "may_beat_random": (
-        "It may have learned, but the difference from random actions is less than two standard errors. {reached}; {baseline}."
-    ),
+    "headline_learned": "It learned",
+    "learned": "{reached}; {baseline}.",
+    "headline_some_seeds_learned": "It learned with {n_learned} of {n_seeds} seeds",
+    "some_seeds_learned": "{reached}; {baseline}.",
+    "headline_worse_than_random": "It got worse than random actions",
+    "worse_than_random": "{reached}; {baseline}.",
+    "headline_may_beat_random": "It may have learned",
+    "may_beat_random": "The difference from random actions is less than two standard errors. {reached}; {baseline}.",
+    "headline_may_beat_initial_policy": "It may have learned",
     "may_beat_initial_policy": (
-        "It may have learned, but the difference from the policy before training is less than two standard errors. {reached}; "
-        "{baseline}."
+        "The difference from the policy before training is less than two standard errors. {reached}; {baseline}."
     ),
-    "not_learned": "It has not learned yet. {reached}; {baseline}.",
+    "headline_not_learned": "It has not learned yet",
+    "not_learned": "{reached}; {baseline}.",
     "reached": "The return is {return_:score}{std} after {steps:,} steps{seeds}{likeliest}",
     "likeliest": ", by sampled actions as in training; the most likely action gets {return_:score}",
     "std": " ± {std:score}",
@@ -33,6 +40,19 @@ MESSAGES = {
     "above_episodic": "That is more than training on the return of the episode alone gives here ({return_:score}).",
     "like_episodic": "That is about as much as training on the return of the episode alone gives here ({return_:score}).",
     "below_episodic": "That is less than training on the return of the episode alone gives here ({return_:score}).",
+    # Several runs
+    "is_best": "{best} ends highest",
+    "none_is_best": "No run is clearly the best",
+    "not_comparable": "There is no return to compare",
+    "ranking": "Final returns: {runs}{more}{seeds}.",
+    "ranked": "{name} {return_:score}{seeds}",
+    "seeds": " ({n_seeds:count seed})",
+    "seeds_each": " (means over {n_seeds:count seed} each)",
+    "and_more": ", and {count} more down to {last:score}",
+    "improvement": (
+        "A seed of {best} ends above a seed of {second} with probability {probability:.2f} (from {n_pairs:count pair} of seeds)."
+    ),
+    "different_steps": "The runs ended at different steps, from {least:,} to {most:,}.",
     # The proxy rewards
     "explained": (
         "Its proxy rewards, from {inputs}, explain {amount} of the score: R² of the last returns, before they were learned from, is "
@@ -41,6 +61,10 @@ MESSAGES = {
     "decoder_is_outdated": (
         "Its proxy rewards, from {inputs}, usually explain {amount} of the score (median R² of returns: {r2:.2f}), but not the last "
         "episodes (R² {last_r2:.2f}): perhaps the policy has changed, and the decoder has not adapted yet."
+    ),
+    "single_steps": (
+        "In single steps, proxy and true rewards correlate with {correlation:.2f} and differ by {error:score} on average. Returns "
+        "are sums over episodes: several rewards of single steps may give the same sums."
     ),
     "score_use": "The score was taken as {form}{period}{groups}{exact}. {trust}",
     "form_sum": "a sum over the steps",
@@ -120,3 +144,33 @@ MESSAGES = {
     ),
     "single_seed": "One seed says little: another one may reach a different return (`--seeds 3`).",
 }
+
+WORDS = {
+    "return": (
+        "return",
+        "The sum of the true rewards of an episode. An evaluation plays some episodes, and takes their mean.",
+    ),
+    "random": (
+        "random actions",
+        "The return of uniformly random actions. A policy that has learned is clearly above it.",
+    ),
+    "r2": (
+        "R² of returns",
+        "How well the returns of new episodes are predicted by the sums of their proxy rewards, before anything is fitted to them: "
+        "1 is perfect, 0 is no better than their mean.",
+    ),
+    "proxy": (
+        "proxy reward",
+        "The reward of a step that the decoder computes. The policy is trained on it, never on the true one.",
+    ),
+    "error": ("credit error", "The mean of |proxy reward - true reward| over the newest steps."),
+    "correlation": ("correlation", "Pearson's correlation of proxy and true rewards over the newest steps."),
+    "factor": ("factor", "A number of a step that phi computes. The decoder turns the factors into the proxy reward."),
+    "share": (
+        "share",
+        "How much of the variation of the returns a factor explains. Shares add up to the R² of all factors. 0% says that it does "
+        "not matter, or hardly differed between episodes. A factor that offsets others has a negative share.",
+    ),
+    "effect": ("effect", "By how much the reward of a step rises with one standard deviation of the factor."),
+}
+"""The words that a report explains: titles and meanings, by the names of their links."""

@@ -1,6 +1,6 @@
-"""The sections of a report that show several runs together: diagnoses, final values, learning curves."""
+"""The sections of a report that stand first: the verdict on a run, the comparison of several, and learning curves."""
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from html import escape
 from typing import NamedTuple
 
@@ -8,137 +8,320 @@ import numpy as np
 from jaxtyping import Float
 
 from lare_rl.evaluation.reference_returns import REFERENCE_RETURNS
-from lare_rl.report.diagnosis import diagnose
-from lare_rl.report.figures import draw_curves
-from lare_rl.report.html import render_note, render_table
-from lare_rl.report.messages import MESSAGES
-from lare_rl.report.run_summary import ReportedRun, summarise_run
+from lare_rl.report.charts import N_COLOURS, Chart, Curve, Line, draw_legend, format_number, format_spread
+from lare_rl.report.diagnosis import CREDIT_CODES, NEXT_CODES, diagnose
+from lare_rl.report.html import render_fold, render_note, render_table, render_tiles
+from lare_rl.report.messages import MESSAGES, WORDS
+from lare_rl.report.run_summary import ReportedRun, RunSummary, summarise_run
 from lare_rl.runs.metric_names import CREDIT_CORRELATION, CREDIT_ERROR, RETURN, RETURN_R2, RETURN_STD
 from lare_rl.tasks.spec import TaskSpec
-from lare_rl.util.findings import render
-from lare_rl.util.statistics import format_mean_std
+from lare_rl.util.findings import Finding, format_value, render
+from lare_rl.util.statistics import sample_std
 
-__all__ = ["render_diagnoses", "render_final_values", "render_learning_curves"]
+__all__ = [
+    "compare_runs",
+    "render_comparison",
+    "render_final_values",
+    "render_headline",
+    "render_learning_curves",
+    "render_trust",
+    "render_verdict",
+    "render_words",
+    "sort_runs",
+    "summarise_runs",
+]
 
-
-_COLUMNS = {
-    RETURN: ("return", "mean true return at the last evaluation."),
-    CREDIT_ERROR: ("credit error", "mean |proxy reward - true reward| over the newest steps."),
-    CREDIT_CORRELATION: ("correlation", "Pearson's, of proxy and true rewards over the newest steps."),
-    RETURN_R2: (
-        "R² of returns",
-        "how well the last episodes' returns were predicted before anything was fitted to them.",
-    ),
+CLEAR_PROBABILITY = 0.9
+"""A run is the best if a seed of it ends above a seed of the second with this probability."""
+MAX_RANKED = 5
+"""The largest number of runs that the comparing sentence names."""
+_METRICS = {
+    RETURN: "return",
+    RETURN_R2: "R² of returns",
+    CREDIT_CORRELATION: "correlation",
+    CREDIT_ERROR: "credit error",
 }
-"""The columns of the table of final values: titles and meanings."""
+"""The metrics in tables of final values, with their titles."""
 
 
-class _Chart(NamedTuple):
-    """A chart of a metric over the steps."""
+class _Metric(NamedTuple):
+    """A metric that is drawn over the steps."""
 
-    metric: str
+    name: str
     title: str
-    unit: str
-    bottom: float | None = None
-    lowest_bottom: float | None = None
+    limits: tuple[float, float] | None = None
+    """The ends of the axis. The lower one is -1 if a value is negative."""
 
 
-def render_diagnoses(runs: Sequence[ReportedRun], random_returns: Float[np.ndarray, " episodes"]) -> Iterable[str]:
-    """Yield the diagnosis of each run of a task."""
+def summarise_runs(
+    runs: Sequence[ReportedRun], random_returns: Float[np.ndarray, " episodes"]
+) -> list[RunSummary | None]:
+    """Return the summary of each run of a task. Each is compared with a run on the return of the episode alone, if there is one."""
     episodic_returns = {
         reported.name: float(returns.mean())
         for reported in runs
         if reported.run.config.settings.method == "episodic" and len(returns := reported.final_values(RETURN))
     }
-    for reported in runs:
-        episodic_return = next((value for name, value in episodic_returns.items() if name != reported.name), None)
-        if (summary := summarise_run(reported, random_returns, episodic_return)) is not None:
-            sentences = " ".join(render(finding, MESSAGES, "html") for finding in diagnose(summary))
-            yield f'<p class="verdict"><strong>{escape(reported.name)}.</strong> {sentences}</p>'
+    return [
+        summarise_run(
+            reported,
+            random_returns,
+            next((value for name, value in episodic_returns.items() if name != reported.name), None),
+        )
+        for reported in runs
+    ]
+
+
+def render_verdict(reported: ReportedRun, summary: RunSummary | None, film: str = "") -> Iterable[str]:
+    """Yield what a run reached: a film, a verdict and the numbers."""
+    if summary is None:
+        return
+    findings = diagnose(summary)
+    yield f'<div class="hero{" filmed" if film else ""}">{film}<div>'
+    yield f"<h1>{escape(reported.name)} on {escape(reported.run.config.task.name)}</h1>"
+    yield f'<p class="headline">{escape(render_headline(summary))}</p>'
+    for finding in findings:
+        if finding.code not in CREDIT_CODES:
+            class_ = ' class="verdict"' if finding.code in NEXT_CODES else ""
+            yield f"<p{class_}>{render(finding, MESSAGES, 'html')}</p>"
+    yield f"{render_tiles(_tiles(reported, summary))}</div></div>"
+
+
+def _tiles(reported: ReportedRun, summary: RunSummary) -> Iterable[tuple[str, str, str]]:
+    """Yield the numbers of a run: title, number, remark. Those that are unknown are missing."""
+    if len(summary.final_returns):
+        seeds = format_value(len(summary.final_returns), "count seed")
+        spread = f"± {format_number(sample_std(summary.final_returns))} over " if len(summary.final_returns) > 1 else ""
+        yield "Return", format_number(summary.final_return), f"{spread}{seeds}"
+    if len(summary.random_returns):
+        text = f"± {format_number(sample_std(summary.random_returns))} in {format_value(len(summary.random_returns), 'count episode')}"
+        yield "Random actions", format_number(summary.random_mean), text
+    if summary.return_r2 is not None:
+        yield "R² of returns", format_number(summary.return_r2), "of new episodes; 1 is perfect"
+    if (seconds := reported.training_seconds()) is not None:
+        yield "Time trained", _format_seconds(seconds), f"{int(summary.steps[-1]):,} steps for each seed"
+
+
+def render_headline(summary: RunSummary) -> str:
+    """Return the verdict in a few words, as text."""
+    finding = diagnose(summary)[0]
+    return render(Finding(f"headline_{finding.code}", finding.values), MESSAGES)
+
+
+def render_trust(summary: RunSummary | None) -> Iterable[str]:
+    """Yield what is known about the quality of a run's credit."""
+    for finding in [] if summary is None else diagnose(summary):
+        if finding.code in CREDIT_CODES:
+            yield f"<p>{render(finding, MESSAGES, 'html')}</p>"
+
+
+def compare_runs(runs: Sequence[ReportedRun]) -> list[Finding]:
+    """Return the findings that compare the final returns of some runs of a task, which are sorted by them."""
+    finals = {reported.name: values for reported in runs if len(values := reported.final_values(RETURN))}
+    if len(finals) < 2:
+        return []
+    counts = {len(values) for values in finals.values()}
+    n_seeds = Finding("seeds_each", {"n_seeds": counts.pop()}) if len(counts) == 1 else None
+    ranked = tuple(
+        Finding(
+            "ranked",
+            {
+                "name": name,
+                "return_": float(values.mean()),
+                "seeds": None if n_seeds else Finding("seeds", {"n_seeds": len(values)}),
+            },
+        )
+        for name, values in list(finals.items())[:MAX_RANKED]
+    )
+    n_more = len(finals) - len(ranked)
+    (best, best_returns), (second, second_returns), *_ = finals.items()
+    wins = (best_returns[:, None] > second_returns) + 0.5 * (best_returns[:, None] == second_returns)
+    probability, last = float(wins.mean()), float(list(finals.values())[-1].mean())
+    names = {"best": best, "second": second}
+    findings = [
+        Finding("is_best" if probability >= CLEAR_PROBABILITY and wins.size > 1 else "none_is_best", names),
+        Finding(
+            "ranking",
+            {
+                "runs": ranked,
+                "more": Finding("and_more", {"count": n_more, "last": last}) if n_more else None,
+                "seeds": n_seeds,
+            },
+        ),
+        Finding("improvement", names | {"probability": probability, "n_pairs": wins.size}),
+    ]
+    steps = {reported.metrics[-1]["step"] for reported in runs}
+    return findings + (
+        [Finding("different_steps", {"least": min(steps), "most": max(steps)})] if len(steps) > 1 else []
+    )
+
+
+def sort_runs(runs: Iterable[ReportedRun]) -> list[ReportedRun]:
+    """Sort runs by their final returns, the best first."""
+    return sorted(
+        runs,
+        key=lambda reported: (
+            float(reported.final_values(RETURN).mean()) if len(reported.final_values(RETURN)) else -np.inf
+        ),
+        reverse=True,
+    )
+
+
+def render_comparison(task: TaskSpec, runs: Sequence[ReportedRun]) -> Iterable[str]:
+    """Yield the sentences that compare runs of a task."""
+    yield f"<h1>{escape(task.name)}: {len(runs)} runs</h1>"
+    headline, *findings = compare_runs(runs) or [Finding("not_comparable")]
+    yield f'<p class="headline">{render(headline, MESSAGES, "html")}</p>'
+    if findings:
+        yield f'<p class="verdict">{" ".join(render(finding, MESSAGES, "html") for finding in findings)}</p>'
 
 
 def render_final_values(runs: Sequence[ReportedRun]) -> str:
-    """Return a table with a row for each run. It leaves out a metric that no run has."""
-    finals = {metric: [reported.final_values(metric) for reported in runs] for metric in _COLUMNS}
-    finals = {metric: values for metric, values in finals.items() if any(map(len, values))}
+    """Return a table of the last values: a row for each run or, of a single run, for each seed."""
     rows = []
-    for row, reported in enumerate(runs):
-        run, last_step = reported.run, reported.metrics[-1]["step"]
-        cells = [format_mean_std(values[row]) if len(values[row]) else "-" for values in finals.values()]
-        rows.append((run.config.task.name, reported.name, str(len(run.seeds)), f"{last_step:,}", *cells))
-    header = "task", "method", "seeds", "steps", *(_COLUMNS[metric][0] for metric in finals)
-    notes = [f"{title[0].upper()}{title[1:]}: {meaning}" for title, meaning in (_COLUMNS[metric] for metric in finals)]
-    if max(len(reported.run.seeds) for reported in runs) > 1:
-        notes.append("±: standard deviation over seeds.")
-    return render_table(header, rows, numbers=range(2, len(header))) + render_note(" ".join(notes))
+    for reported in runs:
+        task = reported.run.config.task.name
+        values = [reported.final_values(metric) for metric in _METRICS]
+        step, n_seeds = f"{reported.metrics[-1]['step']:,}", len(reported.run.seeds)
+        if len(runs) > 1:
+            rows.append((task, reported.name, str(n_seeds), step, *map(format_spread, values)))
+        else:
+            for i, seed in enumerate(reported.run.seeds):
+                cells = (format_number(numbers[i]) if len(numbers) == n_seeds else "" for numbers in values)
+                rows.append(("", "", str(seed), step, *cells))
+    if len({row[0] for row in rows}) == 1:
+        rows = [("", *row[1:]) for row in rows]
+    header = ("task", "run", "seeds" if len(runs) > 1 else "seed", "steps", *_METRICS.values())
+    return render_table(header, rows, numbers=range(2, len(header)))
 
 
 def render_learning_curves(
     task: TaskSpec, runs: Sequence[ReportedRun], random_returns: Float[np.ndarray, " episodes"]
 ) -> Iterable[str]:
-    """Yield the charts of one task, with all its runs in each."""
-    reference_lines = {"random actions": float(random_returns.mean())} if len(random_returns) else {}
-    if (reference := REFERENCE_RETURNS.get(task.name)) is not None:
-        best = max((float(np.nanmax(returns)) for _, returns in _curves(runs, RETURN).values()), default=-np.inf)
-        if best > (reference.random + reference.trained) / 2:  # the curves of bad runs would look flat below this line
-            reference_lines["true rewards, a million steps"] = reference.trained
+    """Yield the curve of the return of each team, and the curves of the other metrics folded below it."""
+    names = [f"{RETURN}_{role.team}" for role in task.teams] or [RETURN]
+    colours = {reported.name: f"c{i}" if i < N_COLOURS else "grey" for i, reported in enumerate(sort_runs(runs))}
+    references = {"random actions": float(random_returns.mean())} if len(random_returns) else {}
     warmups = {reported.run.config.settings.warmup for reported in runs}
     warmup = warmups.pop() if len(warmups) == 1 else 0
-    yield f"<h2>Learning {escape(task.name)}</h2>"
-    yield '<div class="figures">'
-    for chart in _charts(task):
-        if not (curves := _curves(runs, chart.metric)):
-            continue
-        is_return = chart.metric == RETURN
-        yield f"<figure><figcaption>{escape(chart.title[0].upper() + chart.title[1:])}</figcaption>"
-        yield draw_curves(
-            curves,
-            chart.unit,
-            bottom=chart.bottom,
-            lowest_bottom=chart.lowest_bottom,
-            reference_lines=reference_lines if is_return else None,
-            warmup=warmup,
-            episode_stds=_curves(runs, RETURN_STD) if is_return else None,
-        )
-        yield "</figure>"
-    yield "</div>"
-    yield render_note(" ".join(_explain_charts(task, runs, warmup)))
-
-
-def _curves(runs: Sequence[ReportedRun], metric: str) -> Mapping:
-    curves = {reported.name: reported.curve(metric) for reported in runs}
-    return {name: curve for name, curve in curves.items() if curve is not None}
-
-
-def _charts(task: TaskSpec) -> Iterable[_Chart]:
-    """Yield the charts of a task, one for each team if there are several."""
-    charts = (
-        _Chart(RETURN, "true return", "return"),
-        *(
-            _Chart(f"evaluation/{measure}", words, words)
-            for measure, words in zip(task.measures, (name.replace("_", " ") for name in task.measures), strict=True)
-        ),
-        _Chart(CREDIT_ERROR, "mean |proxy - true reward|", "reward", bottom=0.0),
-        _Chart(CREDIT_CORRELATION, "correlation of proxy and true reward", "correlation"),
-        _Chart(RETURN_R2, "R² of returns, predicted before they were learned from", "R²", lowest_bottom=-1.0),
-    )
-    if not task.teams:
-        yield from charts
-    for chart in charts:
-        for role in task.teams:
-            yield chart._replace(metric=f"{chart.metric}_{role.team}", title=f"{chart.title}, team of {role.team}")
-
-
-def _explain_charts(task: TaskSpec, runs: Sequence[ReportedRun], warmup: int) -> Iterable[str]:
-    """Yield what lines and areas mean."""
-    seed_counts = [len(reported.run.seeds) for reported in runs]
-    if max(seed_counts) > 1:
-        single_seed = "; of a single seed, over the episodes of an evaluation" if min(seed_counts) == 1 else ""
-        yield f"Line: mean over seeds. Band: ± one standard deviation over seeds{single_seed}."
-    else:
-        yield "Band of the return: ± one standard deviation over the episodes of an evaluation."
-    if warmup:
-        yield "Grey area: the first steps, of random actions, before the first update."
+    yield _render_legend(runs, colours, references, warmup)
+    for name, role in zip(names, task.teams or (task,), strict=True):
+        title = f"True return, team of {role.team}" if task.teams else "True return"
+        yield f'<p class="note">{escape(title)}</p>'
+        yield _draw_metric(_Metric(name, title), runs, colours, references, warmup)
+    charts = {metric.title: _draw_metric(metric, runs, colours, {}, warmup) for metric in _other_metrics(task)}
+    figures = [
+        f'<figure><figcaption class="title">{escape(title)}</figcaption>{chart}</figure>'
+        for title, chart in charts.items()
+        if chart
+    ]
     if task.name in REFERENCE_RETURNS:
-        best = REFERENCE_RETURNS[task.name].trained
-        yield f"The highest published return of TD3 on true rewards within a million steps is about {best:,g}."
+        published = format_number(REFERENCE_RETURNS[task.name].trained)
+        yield render_note(
+            f"For comparison: TD3 on true rewards reaches about {published} within a million steps, as published."
+        )
+    yield render_fold("More curves", ['<div class="figures">', *figures, "</div>"] if figures else ())
+
+
+def _other_metrics(task: TaskSpec) -> Iterable[_Metric]:
+    metrics = [_Metric(f"evaluation/{name}", name.replace("_", " ").capitalize()) for name in task.measures]
+    metrics += [
+        _Metric(RETURN_R2, "R² of returns", (0.0, 1.0)),
+        _Metric(CREDIT_CORRELATION, "Correlation of proxy and true rewards", (0.0, 1.0)),
+        _Metric(CREDIT_ERROR, "Credit error: mean |proxy - true reward|"),
+    ]
+    if not task.teams:
+        return metrics
+    return [
+        metric._replace(name=f"{metric.name}_{role.team}", title=f"{metric.title}, team of {role.team}")
+        for metric in metrics
+        for role in task.teams
+    ]
+
+
+def _draw_metric(
+    metric: _Metric, runs: Sequence[ReportedRun], colours: dict[str, str], references: dict[str, float], warmup: int
+) -> str:
+    """Draw a metric of all runs: the mean over seeds and, of few runs, each seed. Return nothing if no run has it."""
+    curves = {reported.name: (reported, curve) for reported in runs if (curve := reported.curve(metric.name))}
+    if not curves:
+        return ""
+    lines, n_coloured = [], sum(colours[name] != "grey" for name in curves)
+    for name, (reported, (steps, values)) in sorted(
+        curves.items(), key=lambda item: colours[item[0]] != "grey", reverse=True
+    ):
+        colour = colours[name]
+        if len(values) > 1 and len(runs) <= N_COLOURS:
+            lines += [Line(steps, row, f"{colour} thin") for row in values]
+        spread = reported.curve(RETURN_STD) if len(values) == 1 and metric.name == RETURN and n_coloured == 1 else None
+        label = name if len(runs) > 1 and (colour != "grey" or len(runs) <= 2 * N_COLOURS) else ""
+        style = "grey other" if colour == "grey" else colour
+        lines.append(Line(steps, _mean(values), style, label, None if spread is None else spread[1][0]))
+    extent = np.array(
+        [min(curve[0][0] for _, curve in curves.values()), max(curve[0][-1] for _, curve in curves.values())]
+    )
+    lines += [Line(extent, np.full(2, value), "grey dashed", name) for name, value in references.items()]
+    has_negative = any((line.y[np.isfinite(line.y)] < 0).any() for line in lines)
+    limits = (-1.0, 1.0) if metric.limits and has_negative else metric.limits
+    final = ", ".join(f"{name} {format_spread(_finite(curve[1][:, -1]))}" for name, (_, curve) in curves.items())
+    return Chart(
+        lines=lines,
+        description=f"{metric.title} over environment steps. Last values: {final}",
+        x_label="environment steps",
+        limits=limits,
+        hovers=_hovers({name: curve for name, (_, curve) in curves.items()}),
+        shaded_until=float(warmup),
+    ).render()
+
+
+def _hovers(curves: dict[str, Curve]) -> dict[float, str]:
+    """Return the values at each step, as texts."""
+    texts: dict[float, list[str]] = {}
+    for name, (steps, values) in curves.items():
+        for step, column in zip(steps, values.T, strict=True):
+            seeds = f" ({', '.join(map(format_number, column))})" if len(curves) == 1 and len(column) > 1 else ""
+            if len(numbers := _finite(column)):
+                texts.setdefault(float(step), [f"step {step:,.0f}"]).append(
+                    f"{name}: {format_number(numbers.mean())}{seeds}"
+                )
+    return {step: "\n".join(lines[: 2 + 2 * N_COLOURS]) for step, lines in sorted(texts.items())}
+
+
+def _render_legend(
+    runs: Sequence[ReportedRun], colours: dict[str, str], references: dict[str, float], warmup: int
+) -> str:
+    """Return the meaning of lines, once for all charts."""
+    seeds = max(len(reported.run.seeds) for reported in runs)
+    entries = [(colour, name) for name, colour in colours.items() if colour != "grey"]
+    n_grey = len(colours) - len(entries)
+    entries += [("grey other", f"{n_grey} with lower returns")] if n_grey else []
+    entries += (
+        [("c0 thin" if len(runs) == 1 else "grey thin", "a seed")] if seeds > 1 and len(runs) <= N_COLOURS else []
+    )
+    entries += [("grey dashed", " / ".join(references))] if references else []
+    return draw_legend(entries + ([("shade", "random steps before the first update")] if warmup else []))
+
+
+def render_words() -> str:
+    """Return the explanations of words, which links lead to."""
+    items = (f'<dt id="{code}">{escape(title)}</dt><dd>{escape(text)}</dd>' for code, (title, text) in WORDS.items())
+    return f'<h2>Words</h2><dl class="words">{"".join(items)}</dl>'
+
+
+def _mean(values: Float[np.ndarray, "seeds evaluations"]) -> Float[np.ndarray, " evaluations"]:
+    """Return the mean over the seeds that have a value, NaN where none has."""
+    return np.array([numbers.mean() if len(numbers := _finite(column)) else np.nan for column in values.T])
+
+
+def _finite(values: np.ndarray) -> np.ndarray:
+    return values[np.isfinite(values)]
+
+
+def _format_seconds(seconds: float) -> str:
+    return (
+        f"{seconds / 3600:.1f} h"
+        if seconds >= 5400
+        else f"{seconds / 60:.0f} min"
+        if seconds >= 90
+        else f"{seconds:.0f} s"
+    )

@@ -2,16 +2,30 @@
 
 from collections import Counter
 from collections.abc import Iterable, Sequence
+from contextlib import suppress
 from html import escape
 from pathlib import Path
 
+from lare_rl.envs.families import load_env_spec
 from lare_rl.errors import LareError
 from lare_rl.evaluation.evaluate import measure_random_returns
-from lare_rl.evaluation.video import record_video
-from lare_rl.report.html import render_note, write_page
-from lare_rl.report.overview import render_diagnoses, render_final_values, render_learning_curves
-from lare_rl.report.run_details import FILM, render_run
+from lare_rl.evaluation.rollout import Rollout, roll_out
+from lare_rl.evaluation.video import encode_film, record_frames
+from lare_rl.report.html import render_film, render_fold, render_note, write_page
+from lare_rl.report.overview import (
+    render_comparison,
+    render_final_values,
+    render_headline,
+    render_learning_curves,
+    render_trust,
+    render_verdict,
+    render_words,
+    sort_runs,
+    summarise_runs,
+)
+from lare_rl.report.run_details import describe_method, render_details, render_settings
 from lare_rl.report.run_summary import ReportedRun
+from lare_rl.runs.checkpoint import STATE_FILE
 from lare_rl.runs.directory import Run, find_run_directories, open_run, open_without_functions
 from lare_rl.tasks.trust import untrusted_module
 from lare_rl.util.provenance import code_version
@@ -20,17 +34,22 @@ __all__ = ["write_report"]
 
 MAX_TITLE_RUNS = 3
 """The largest number of runs that the title names."""
+FILM = "film.webp"
+"""The film in a run's directory."""
+MAX_FILMS, MAX_FRAMES, FILM_BYTES = 4, 160, 280_000
+"""The largest numbers of films and of frames of a film, and the bytes of all films together."""
 
 
 def write_report(
-    runs: Run | str | Path | Iterable[Run | str | Path], out: str | Path | None = None, film: bool = False
+    runs: Run | str | Path | Iterable[Run | str | Path], out: str | Path | None = None, film: bool = True
 ) -> Path:
     """Write the report of one or more runs, and return its path.
 
     Args:
         runs: one run or several, or their directories; finished or not.
         out: the file; the default is report.html in the first run's directory.
-        film: film an episode of each run, as `film.gif` in its directory. The page shows every film that exists.
+        film: show a film of each policy, or of the best of many, where the environment can be drawn. It is kept in the run's
+            directory.
 
     Raises:
         LareError: a directory has no run, a run has no evaluation yet, or the file cannot be written.
@@ -48,17 +67,13 @@ def write_report(
     path = Path(out) if out is not None else reported_runs[0].run.directory / "report.html"
     if not path.parent.is_dir():
         raise LareError(f"the report {path} cannot be written: there is no folder {path.parent}")
-    if film:
-        for reported in reported_runs:
-            record_video(reported.run, reported.run.directory / FILM)
-    title = _title(reported_runs)
-    return write_page(path, title, "\n".join(_render_body(title, reported_runs)))
+    return write_page(path, _title(reported_runs), "\n".join(_render_body(reported_runs, film)))
 
 
 def _open_run(directory: Path) -> Run:
-    """Open a run, without functions if its environment is in an untrusted module: a report imports no such module."""
+    """Open a run, without functions if nothing of it can be loaded. A report imports no untrusted module."""
     run = open_without_functions(directory)
-    return open_run(directory) if untrusted_module(run.config.task) is None else run
+    return open_run(directory) if _can_load(run) else run
 
 
 def _name_runs(runs: Sequence[Run]) -> list[ReportedRun]:
@@ -82,16 +97,83 @@ def _title(reported_runs: Sequence[ReportedRun]) -> str:
     return f"{', '.join(tasks)}: {names}"
 
 
-def _render_body(title: str, reported_runs: Sequence[ReportedRun]) -> list[str]:
-    """Return all sections: diagnoses, final values, learning curves, and the details of each run."""
-    diagnoses, curves, details = [], [], []
-    for task in sorted({reported.run.config.task.name for reported in reported_runs}):
-        runs_of_task = [reported for reported in reported_runs if reported.run.config.task.name == task]
-        spec = runs_of_task[0].run.config.task
-        random_returns = measure_random_returns(spec)
-        diagnoses += render_diagnoses(runs_of_task, random_returns)
-        curves += render_learning_curves(spec, runs_of_task, random_returns)
-    for reported in reported_runs:
-        details += render_run(reported.name, reported.run)
-    heading, version = f"<h1>{escape(title)}</h1>", render_note(f"Drawn by LaRe {code_version()}.")
-    return [heading, *diagnoses, render_final_values(reported_runs), *curves, *details, version]
+def _render_body(reported_runs: Sequence[ReportedRun], film: bool) -> Iterable[str]:
+    """Yield all sections, by task: what was reached, learning curves, and the details of each run."""
+    tasks = sorted({reported.run.config.task.name for reported in reported_runs})
+    for task in tasks:
+        yield from _render_task(
+            sort_runs(reported for reported in reported_runs if reported.run.config.task.name == task), film
+        )
+    yield from render_settings(reported_runs)
+    yield render_words()
+    yield render_note(f"Drawn by LaRe {code_version()}.")
+
+
+def _render_task(runs: Sequence[ReportedRun], film: bool) -> Iterable[str]:
+    """Yield the sections on runs of a task."""
+    task = runs[0].run.config.task
+    random_returns = measure_random_returns(task)
+    summaries = summarise_runs(runs, random_returns)
+    rollouts = [_roll_out(reported.run) for reported in runs]
+    filmed = [i for i, reported in enumerate(runs) if film and _can_load(reported.run)][:MAX_FILMS]
+    films = {i: _load_film(runs[i].run, rollouts[i], FILM_BYTES // len(filmed)) for i in filmed}
+    figures = {i: render_film(data, f"An episode of {runs[i].name}") for i, data in films.items() if data}
+    if len(runs) == 1:
+        yield from render_verdict(runs[0], summaries[0], figures.get(0, ""))
+        yield render_note(describe_method(runs[0].run))
+        yield "<h2>Learning</h2>"
+        yield from render_learning_curves(task, runs, random_returns)
+        yield from render_details(runs[0].run, render_trust(summaries[0]), rollouts[0])
+        yield _note_missing(runs)
+        yield render_fold("Final values of each seed", [render_final_values(runs)])
+        return
+    yield from render_comparison(task, runs)
+    captioned = (
+        f"<figure>{figure}<figcaption>{escape(runs[i].name)}</figcaption></figure>" for i, figure in figures.items()
+    )
+    yield f'<div class="films">{"".join(captioned)}</div>' if figures else ""
+    yield from render_learning_curves(task, runs, random_returns)
+    yield render_final_values(runs)
+    yield "<h2>Each run</h2>"
+    for reported, summary, rollout in zip(runs, summaries, rollouts, strict=True):
+        details = render_details(reported.run, render_trust(summary), rollout)
+        title = f"{reported.name}: {render_headline(summary)}" if summary else reported.name
+        yield render_fold(
+            title, [*render_verdict(reported, summary), render_note(describe_method(reported.run)), *details]
+        )
+    yield _note_missing(runs)
+
+
+def _note_missing(runs: Sequence[ReportedRun]) -> str:
+    """Return a note about runs without a checkpoint."""
+    names = [reported.name for reported in runs if not reported.run.has_checkpoint()]
+    if not names:
+        return ""
+    return render_note(f"Without a checkpoint, there is no film, credit and factors to show: {', '.join(names)}.")
+
+
+def _can_load(run: Run) -> bool:
+    return run.has_checkpoint() and untrusted_module(run.config.task) is None
+
+
+def _roll_out(run: Run) -> Rollout | None:
+    """Play an episode of a run of many agents."""
+    return roll_out(run) if _can_load(run) and load_env_spec(run.config.task).n_agents > 1 else None
+
+
+def _load_film(run: Run, rollout: Rollout | None, max_bytes: int) -> bytes | None:
+    """Return the film in the run's directory, or make one if it is older than the checkpoint. None if nothing can be drawn here."""
+    path = run.directory / FILM
+    if (
+        path.is_file()
+        and path.stat().st_size <= max_bytes
+        and path.stat().st_mtime >= (run.checkpoint / STATE_FILE).stat().st_mtime
+    ):
+        return path.read_bytes()
+    try:
+        film = encode_film(*record_frames(run, max_frames=MAX_FRAMES, rollout=rollout), max_bytes)
+    except LareError:
+        return None
+    with suppress(OSError):
+        path.write_bytes(film)
+    return film

@@ -1,8 +1,9 @@
-"""The sections of a report on one run: credit, factors, functions and settings."""
+"""The sections of a report on one run: what earned the score, credit, factors, functions and settings."""
 
 import json
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping, Sequence
 from html import escape
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float
@@ -10,57 +11,64 @@ from jaxtyping import Float
 from lare_rl.config.effective import effective_settings
 from lare_rl.config.resolve import apply_defaults
 from lare_rl.config.settings import Settings
+from lare_rl.credit import explanation_text
 from lare_rl.credit.methods import find_method
 from lare_rl.envs.families import load_env_spec
-from lare_rl.errors import LareError, install_command
-from lare_rl.evaluation.episode_credit import EpisodeCredit, label_factors, load_episode_credit
-from lare_rl.evaluation.rollout import TeamSample, roll_out, sample_steps
-from lare_rl.evaluation.video import encode_gif, render_rollout
+from lare_rl.errors import install_command
+from lare_rl.evaluation.episode_credit import FactorLabel, label_factors, load_episode_credit
+from lare_rl.evaluation.rollout import Rollout, TeamSample, sample_steps
 from lare_rl.latent.saved import read_source
-from lare_rl.report.figures import draw_credit, draw_credit_map, draw_factors, draw_scatters, visible_steps
-from lare_rl.report.html import (
-    render_factor_table,
-    render_function,
-    render_gif,
-    render_lines,
-    render_note,
-    render_table,
+from lare_rl.report.charts import (
+    Bar,
+    Chart,
+    Line,
+    draw_bars,
+    draw_legend,
+    draw_points,
+    draw_strips,
+    format_number,
+    visible_steps,
 )
+from lare_rl.report.html import render_fold, render_function, render_note, render_table
+from lare_rl.report.run_summary import ReportedRun
 from lare_rl.runs.directory import Run, function_paths
 from lare_rl.tasks.trust import TRUST_VARIABLE, untrusted_module
-from lare_rl.training.explain import explain_run
+from lare_rl.training.explain import explanation_source, find_explanations
+from lare_rl.util.findings import Finding, render
 from lare_rl.util.statistics import column_correlations
 
-__all__ = ["FILM", "render_agents", "render_run"]
+__all__ = ["describe_method", "render_details", "render_settings"]
 
-FILM = "film.gif"
-"""The film in a run's directory."""
-MAX_FILM_BYTES = 64 << 20
-"""The largest film that a page shows."""
 MAX_TSNE_POINTS = 1000
+MIN_BAND = 0.02
+"""A band is visible if it is wider than this fraction of the range of the line."""
+_BAND_NOTE = (
+    " The band is ± two posterior standard deviations: the uncertainty that the returns so far leave, if the true rewards depend "
+    "only on what the decoder sees."
+)
 _OBSERVATIONS = {"before": "before", "after": "after", "both": "before and the observation after"}
 """Texts of the observations that phi reads."""
+_IN_BARS = ("factor", "unknown_factor", "about_factors", "about_states")
+"""Findings that the bars show."""
 
 
-def render_run(name: str, run: Run) -> Iterable[str]:
-    """Yield all sections on one run."""
-    method = find_method(run.config.settings.method)
-    summary = method.summary[0].upper() + method.summary[1:]
-    yield f"<h2>{escape(name)} on {escape(run.config.task.name)}</h2>"
-    yield f"<p>{escape(summary)}. Source: {escape(method.source)}.</p>"
+def render_details(run: Run, trust: Iterable[str] = (), rollout: Rollout | None = None) -> Iterable[str]:
+    """Yield what a run's checkpoint and files show.
+
+    Args:
+        trust: paragraphs on the quality of the credit, which stand below its picture.
+        rollout: an episode, for a run of many agents.
+    """
+    trust = list(trust)
     if module := untrusted_module(run.config.task):
+        yield from trust
         yield from _render_untrusted(run, module)
-    elif run.has_checkpoint():
-        film = run.directory / FILM  # by `lare-rl report --film`
-        shows_film = film.is_file() and film.stat().st_size <= MAX_FILM_BYTES
-        yield render_gif(film.read_bytes(), "one episode of the policy") if shows_film else ""
-        if lines := explain_run(run):
-            yield "<h3>What the returns say</h3>"
-            yield render_lines(lines)
-        yield from render_agents(run) if load_env_spec(run.config.task).n_agents > 1 else _render_single_agent(run)
+    elif not run.has_checkpoint():
+        yield from trust
+    elif rollout is None:
+        yield from _render_single_agent(run, trust)
     else:
-        yield render_note("The run has no checkpoint any more, so credit and factors cannot be drawn.")
-    yield from _render_settings(run)
+        yield from _render_agents(run, rollout, trust)
 
 
 def _render_untrusted(run: Run, module: str) -> Iterable[str]:
@@ -70,123 +78,222 @@ def _render_untrusted(run: Run, module: str) -> Iterable[str]:
         "imported: random play, credit, factors and what the returns say of them then appear here."
     )
     for role, path in function_paths(run.directory, run.config):
-        yield f"<h3>The latent function{f' of {escape(role.team)}' if role.team else ''}</h3>"
-        yield f"<pre>{escape(read_source(path).source)}</pre>"
+        source = f"<pre>{escape(read_source(path).source)}</pre>"
+        yield render_fold(f"The latent function{f' of {role.team}' if role.team else ''}", [source])
 
 
-def _render_single_agent(run: Run) -> Iterable[str]:
-    credit = load_episode_credit(run)
+def _render_single_agent(run: Run, trust: Sequence[str]) -> Iterable[str]:
+    credit, labels = load_episode_credit(run), label_factors(run)
+    correlations = np.full(len(labels), np.nan) if credit is None else credit.correlations
+    yield from _render_earnings(run, [correlations])
     if credit is not None:
-        yield from _render_credit(credit)
+        reward, proxy = credit.reward[:, 0], credit.training_reward[:, 0]
+        rows = {"True reward": reward[:, None]} if credit.has_step_rewards else {}
+        yield '<h2>Credit over one episode<a class="why" href="#proxy" title="What is a proxy reward?">?</a></h2>'
+        yield from trust
+        yield draw_strips(rows | {"Proxy reward": proxy[:, None]}, shared_scale=True)
+        steps = visible_steps(len(reward))
+        x = np.arange(steps.start, steps.stop, dtype=float)
+        lines = [Line(x, reward[steps], "grey", "true reward")] if credit.has_step_rewards else []
+        band = None if credit.uncertainty is None else credit.uncertainty[steps]
+        if band is not None and band.max() < MIN_BAND * np.ptp(proxy[steps]):
+            band = None
+        band_note = "" if band is None else _BAND_NOTE
+        lines.append(Line(x, proxy[steps], "c0", "proxy reward", band))
+        yield draw_legend((line.style, line.label) for line in lines)
+        yield Chart(
+            lines=lines, description="Rewards over the steps of an episode", x_label="step of the episode"
+        ).render()
+        yield render_note(
+            f"The last training episode of the first seed, {len(reward):,} steps, exploration included, judged by the newest "
+            f"decoder. The lines show steps {steps.start} to {steps.stop - 1}. Return {format_number(reward.sum())}, sum of the proxy "
+            f"rewards {format_number(proxy.sum())}.{band_note}"
+        )
+        if labels:
+            yield render_fold("The factors over the same steps", _draw_factors(credit.factors[steps, 0], x, labels))
+    else:
+        yield from trust
     if run.function is not None:
-        yield from _render_factors(run, credit)
-        yield "<h3>The latent function</h3>"
-        yield render_function(run.function)
+        yield render_fold("The latent function phi", [render_function(run.function)])
 
 
-def _render_credit(credit: EpisodeCredit) -> Iterable[str]:
-    """Yield the figure of an episode's proxy rewards, and its explanation."""
-    reward, proxy_reward = credit.reward[:, 0], credit.training_reward[:, 0]
-    steps = visible_steps(len(reward))
-    points = ", the points all steps" if credit.has_step_rewards else ""
-    band = (
-        ""
-        if credit.uncertainty is None
-        else " The band is ± two posterior standard deviations: the uncertainty that the returns so far leave, if the true rewards "
-        "depend only on what the decoder sees."
-    )
-    yield f"<h3>Credit over one episode ({len(reward)} steps)</h3>"
-    yield draw_credit(reward if credit.has_step_rewards else None, proxy_reward, credit.uncertainty)
-    yield render_note(
-        "The last training episode of the first seed, exploration included, judged by the newest decoder: the curve shows steps "
-        f"{steps.start} to {steps.stop - 1}{points}. Return {reward.sum():.1f}, sum of the proxy rewards {proxy_reward.sum():.1f}."
-        f"{band}"
-    )
+def _draw_factors(
+    factors: Float[np.ndarray, "steps factors"], x: Float[np.ndarray, " steps"], labels: Sequence[FactorLabel]
+) -> Iterable[str]:
+    yield '<div class="figures">'
+    for label, factor in zip(labels, factors.T, strict=True):
+        text = f"{label.name} over the steps of an episode"
+        chart = Chart(lines=[Line(x, factor, "c0")], description=text, x_label="step", is_low=True).render()
+        yield f'<figure><figcaption class="title">{escape(label.name)}</figcaption>{chart}</figure>'
+    yield "</div>"
 
 
-def _render_factors(run: Run, credit: EpisodeCredit | None) -> Iterable[str]:
-    labels = label_factors(run)
-    yield "<h3>The factors</h3>"
-    yield render_factor_table(labels, np.full(len(labels), np.nan) if credit is None else credit.correlations)
-    if credit is not None:
-        yield draw_factors(credit.factors[:, 0], [label.name for label in labels])
+def _render_earnings(run: Run, correlations: Sequence[Float[np.ndarray, " factors"]]) -> Iterable[str]:
+    """Yield what earned the score: a bar for each factor, or for the raw features with the largest shares; for each team."""
+    explanations, roles = find_explanations(run), run.config.task.roles
+    sections: list[str] = []
+    for team_index, role in enumerate(roles):
+        findings = explanations[team_index] if team_index < len(explanations) else []
+        labels = label_factors(run, team_index)
+        if len(roles) > 1 and (findings or labels):
+            sections.append(f"<h3>{escape(role.name)}</h3>")
+        meanings = {label.name.removesuffix(" (before)").removesuffix(" (after)"): label.meaning for label in labels}
+        bars = [_make_bar(finding, meanings) for finding in findings if finding.code in ("factor", "unknown_factor")]
+        bars += [bar for finding in findings for bar in _raw_feature_bars(finding)]
+        if bars:
+            sides = (
+                {1: "a step earns more with more of it", -1: "a step earns less"}
+                if any(bar.sign for bar in bars)
+                else {}
+            )
+            keys = {1: "plus", -1: "minus"}
+            legend = (f'<span><i class="{keys[sign]}"></i>{text}</span>' for sign, text in sides.items())
+            sections += [draw_bars(bars), f'<div class="sides">{"".join(legend)}</div>']
+        sections += [render_note(_sentence(finding)) for finding in findings if finding.code not in _IN_BARS]
+        sections.append(
+            render_fold(
+                "The numbers of the factors", _render_factor_table(findings, labels, correlations[team_index], run)
+            )
+        )
+    if any(explanations):
+        yield '<h2>What earned the score<a class="why" href="#share" title="What is a share?">?</a></h2>'
+        yield render_note(f"{source}.") if (source := explanation_source(run)) else ""
+    yield from sections
+
+
+def _sentence(finding: Finding) -> str:
+    return render(finding, explanation_text.MESSAGES).removeprefix("- ")
+
+
+def _make_bar(finding: Finding, meanings: Mapping[str, str]) -> Bar:
+    """Return the bar of a factor: its share, on the side of its effect."""
+    name, effect = finding.values["name"], finding.values["effect"]
+    meaning = meanings.get(name) or name.removeprefix("f_").replace("_", " ")
+    share, slope = float(finding.values.get("share", 0.0)), effect.values.get("slope", 0.0)
+    return Bar(meaning[:1].upper() + meaning[1:], name, abs(share), int(np.sign(slope)), _sentence(finding))
+
+
+def _raw_feature_bars(finding: Finding) -> list[Bar]:
+    largest = finding.values.get("largest") if finding.code == "raw_features_explain" else None
+    features = () if largest is None else largest.values["features"]
+    return [Bar(feature.values["name"], "", feature.values["share"], 0, "") for feature in features]
+
+
+def _render_factor_table(
+    findings: Sequence[Finding], labels: Sequence[FactorLabel], correlations: Float[np.ndarray, " factors"], run: Run
+) -> Iterable[str]:
+    if not labels:
+        return
+    values = {finding.values["name"]: finding.values for finding in findings if finding.code == "factor"}
+    rows = []
+    for label, correlation in zip(labels, correlations, strict=True):
+        described = values.get(label.name.removesuffix(" (before)").removesuffix(" (after)"))
+        numbers = (
+            ("", "")
+            if described is None
+            else (f"{described['share']:z.0%}", render(described["effect"], explanation_text.MESSAGES))
+        )
+        text = "" if np.isnan(correlation) else f"{correlation:.2f}"
+        rows.append((label.name, label.meaning, label.reads, *numbers, text))
+    header = ("factor", "meaning", "entries that it reads", "share", "effect", "correlation with the true reward")
+    yield render_table(header, rows, numbers=(3, 4, 5))
     yield render_note(f"phi scores the observation {_OBSERVATIONS[run.scored_observation]} the step.")
 
 
-def render_agents(run: Run, max_tsne_points: int = MAX_TSNE_POINTS) -> Iterable[str]:
-    """Yield the credit of each agent and step, a film of the episode, and the factors of each team."""
-    rollout = roll_out(run)
-    reward, proxy_reward = rollout.select_episode((rollout.reward, rollout.training_reward))
-    sums = f"Sum of the true rewards {reward.sum():.1f}"
-    if proxy_reward is not None:
-        sums += f", of the proxy rewards {proxy_reward.sum():.1f}"
-    yield "<h3>Who got which credit when</h3>"
-    yield draw_credit_map(reward, proxy_reward)
-    yield render_note(
-        f"One episode of the first seed's policy, every agent a row. {sums}. A film shows the credit beside each agent as "
-        "number and colour: blue for more, red for less."
+def _render_agents(run: Run, rollout: Rollout, trust: Sequence[str]) -> Iterable[str]:
+    """Yield what earned the score of each team, the credit of each agent and step, and the factors."""
+    samples = sample_steps(run) if run.functions else []
+    yield from _render_earnings(
+        run, [sample.correlations for sample in samples] or [np.zeros(0)] * len(run.config.task.roles)
     )
-    try:
-        frames = render_rollout(run, rollout)
-    except LareError as error:  # some packages draw no pictures of their environments
-        frames = None
-        yield render_note(f"There is no film: {error}.")
-    if frames is not None:
-        yield render_gif(encode_gif(frames), "one episode, with the credit of each agent")
-    if run.functions:
-        for team_index, sample in enumerate(sample_steps(run)):
-            yield from _render_team(run, team_index, sample, max_tsne_points)
-
-
-def _render_team(run: Run, team_index: int, sample: TeamSample, max_tsne_points: int) -> Iterable[str]:
-    """Yield a team's factors and its latent function."""
-    name = escape(run.config.task.roles[team_index].name)
-    observation_correlations = column_correlations(sample.next_observation, sample.reward)
-    raw, latent = (np.nanmean(np.abs(values)) for values in (observation_correlations, sample.correlations))
-    yield f"<h3>The factors of {name}</h3>"
-    yield render_factor_table(label_factors(run, team_index), sample.correlations)
+    reward, proxy = rollout.select_episode((rollout.reward, rollout.training_reward))
+    sums = f"Sum of the true rewards {format_number(reward.sum())}"
+    if proxy is not None:
+        sums += f", of the proxy rewards {format_number(proxy.sum())}"
+    yield '<h2>Who got which credit when<a class="why" href="#proxy" title="What is a proxy reward?">?</a></h2>'
+    yield from trust
+    yield draw_strips({"True reward": reward} | ({} if proxy is None else {"Proxy reward": proxy}), shared_scale=False)
     yield render_note(
-        f"Absolute correlation with the true reward, mean over dimensions: {raw:.2f} for the {len(observation_correlations)} "
-        f"numbers of an observation, {latent:.2f} for the {len(sample.correlations)} factors."
+        f"One episode of the first seed's policy, from left to right; every agent is a row. {sums}. A decoder is fitted to sums, so "
+        "each picture has its own scale."
     )
-    yield from _render_tsne(sample, max_tsne_points)
-    yield f"<h3>The latent function of {name}</h3>"
-    yield render_function(run.functions[team_index])
+    for team_index, sample in enumerate(samples):
+        name = run.config.task.roles[team_index].name
+        raw, latent = (
+            np.nanmean(np.abs(values))
+            for values in (column_correlations(sample.next_observation, sample.reward), sample.correlations)
+        )
+        text = (
+            f"Absolute correlation with the true reward, mean over dimensions: {raw:.2f} for the "
+            f"{sample.next_observation.shape[1]} entries of an observation, {latent:.2f} for the {len(sample.correlations)} factors."
+        )
+        yield render_fold(
+            f"The latent function of {name}",
+            [render_note(text), *_render_tsne(sample), render_function(run.functions[team_index])],
+        )
 
 
-def _render_tsne(sample: TeamSample, max_points: int) -> Iterable[str]:
+def _render_tsne(sample: TeamSample) -> Iterable[str]:
     """Yield t-SNE pictures of observations and of factors, coloured by the true reward (the paper's appendix G)."""
     try:
         from sklearn.manifold import TSNE
     except ImportError:
         yield render_note(f"A t-SNE picture of observations and factors is drawn here after {install_command('tsne')}.")
         return
-    points = np.random.default_rng(0).permutation(len(sample.reward))[:max_points]
-
-    def embed(columns: Float[np.ndarray, "rows columns"]) -> Float[np.ndarray, "points 2"]:
-        rows = columns[points]
+    chosen = np.random.default_rng(0).permutation(len(sample.reward))[:MAX_TSNE_POINTS]
+    yield '<div class="figures">'
+    for name, columns in {"observations": sample.next_observation, "factors": sample.factors}.items():
+        rows = columns[chosen]
         rows = (rows - rows.mean(axis=0)) / np.maximum(rows.std(axis=0), 1e-9)
-        return TSNE(init="pca", random_state=0).fit_transform(rows)
-
-    embeddings = {"observations": embed(sample.next_observation), "factors": embed(sample.factors)}
-    yield draw_scatters(embeddings, sample.reward[points])
-    yield render_note("t-SNE of steps of agents: similar steps are close together. Colour: the true reward.")
+        points = TSNE(init="pca", random_state=0).fit_transform(rows)
+        yield draw_points(points, sample.reward[chosen], f"t-SNE of the {name} of agents. Bright: a high true reward.")
+    yield "</div>"
 
 
-def _render_settings(run: Run) -> Iterable[str]:
-    """Yield a table of the settings that differ from the defaults. All settings are folded away below it."""
-    config, settings, default_settings = run.config, run.config.settings, {}
-    if untrusted_module(config.task) is None:
-        defaults = Settings(method=settings.method, algorithm=settings.algorithm)
-        default_settings = effective_settings(apply_defaults(defaults, load_env_spec(config.task)))
-    rows = [
-        (key, value if isinstance(value, str) else json.dumps(value))
-        for key, value in effective_settings(settings).items()
-        if value != default_settings.get(key) or key in ("method", "algorithm")
-    ]
-    versions = ", ".join(f"{library} {version}" for library, version in config.versions.items())
-    rows += [("LaRe", f"{config.lare}; {versions}"), ("machine", config.machine)]
-    yield "<h3>Settings</h3>"
-    yield render_table(("setting", "value"), rows)
-    everything = escape(config.model_dump_json(indent=1))
-    yield f"<details><summary>Everything (config.json)</summary><pre>{everything}</pre></details>"
+def render_settings(runs: Sequence[ReportedRun]) -> Iterable[str]:
+    """Yield the settings: of one run, those that differ from the defaults; of several, those in which they differ."""
+    configs = {reported.name: reported.run.config for reported in runs}
+    columns = {
+        name: {key: _to_text(value) for key, value in effective_settings(config.settings).items()}
+        | {"LaRe": config.lare, **config.versions, "machine": config.machine}
+        for name, config in configs.items()
+    }
+    if len(runs) == 1:
+        (values,) = columns.values()
+        defaults = _default_settings(runs[0].run)
+        rows = [
+            (key, value)
+            for key, value in values.items()
+            if value != defaults.get(key) or key in ("method", "algorithm")
+        ]
+        title, header = "Settings that differ from the defaults", ("setting", "value")
+    else:
+        keys = dict.fromkeys(key for values in columns.values() for key in values)
+        table = {key: [values.get(key, "") for values in columns.values()] for key in keys}
+        rows = [(key, *cells) for key, cells in table.items() if len(set(cells)) > 1]
+        title, header = "Settings that differ between the runs", ("setting", *columns)
+    if rows:
+        yield render_fold(title, [render_table(header, rows)])
+    files = (
+        render_fold(name, [f"<pre>{escape(config.model_dump_json(indent=1))}</pre>"])
+        for name, config in configs.items()
+    )
+    yield render_fold("All settings (config.json)", files)
+
+
+def _default_settings(run: Run) -> dict[str, str]:
+    settings, task = run.config.settings, run.config.task
+    if untrusted_module(task) is not None:
+        return {}
+    defaults = apply_defaults(Settings(method=settings.method, algorithm=settings.algorithm), load_env_spec(task))
+    return {key: _to_text(value) for key, value in effective_settings(defaults).items()}
+
+
+def _to_text(value: Any) -> str:
+    return value if isinstance(value, str) else json.dumps(value)
+
+
+def describe_method(run: Run) -> str:
+    """Return what the run's method does, and its source."""
+    method = find_method(run.config.settings.method)
+    return f"{method.summary[0].upper()}{method.summary[1:]}. Source: {method.source}."

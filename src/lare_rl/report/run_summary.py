@@ -10,10 +10,19 @@ from jaxtyping import Float
 
 from lare_rl.credit.methods import find_method
 from lare_rl.envs.load import shipped_tasks
-from lare_rl.report.figures import Curve
+from lare_rl.report.charts import Curve
 from lare_rl.report.score_use import ScoreUse, summarise_score_use
 from lare_rl.runs.directory import Run
-from lare_rl.runs.metric_names import ACTOR_SATURATION, LIKELIEST_RETURN, RETURN, RETURN_R2, RETURN_STD, SUMMED_RETURN
+from lare_rl.runs.metric_names import (
+    ACTOR_SATURATION,
+    CREDIT_CORRELATION,
+    CREDIT_ERROR,
+    LIKELIEST_RETURN,
+    RETURN,
+    RETURN_R2,
+    RETURN_STD,
+    SUMMED_RETURN,
+)
 from lare_rl.training.advice import describe_untrained
 from lare_rl.util.statistics import grouped_standard_error, sample_std, standard_error
 
@@ -59,6 +68,14 @@ class ReportedRun:
         curve = self.curve(key)
         return np.zeros(0) if curve is None else _finite(curve[1][:, -1])
 
+    def training_seconds(self) -> float | None:
+        """Return how long the run has trained, by its rate between evaluations. None if that is unknown."""
+        rates = {line["step"]: line.get("time/steps_per_second") for line in self.metrics}
+        if not rates or not all(rates.values()):
+            return None
+        steps = sorted(rates)
+        return sum((step - previous) / rates[step] for previous, step in zip([0, *steps], steps, strict=False))
+
 
 @dataclass(frozen=True, kw_only=True)
 class RunSummary:
@@ -81,6 +98,10 @@ class RunSummary:
     """R^2 of the last returns, predicted before anything was fitted to them. None if the method predicts none."""
     median_r2: float | None = None
     """The median of `return_r2` over all evaluations and seeds."""
+    credit_error: float | None = None
+    """The last mean |proxy reward - true reward|, or None if true rewards of steps are unknown."""
+    credit_correlation: float | None = None
+    """The last correlation of proxy and true rewards. None like `credit_error`."""
     score_use: ScoreUse | None = None
     """How the score was taken. None for a method whose rewards do not add up to returns."""
     sees_factors: bool = False
@@ -237,6 +258,8 @@ def summarise_run(
         episodic_return=episodic_return,
         return_r2=None if r2s is None else _last_mean(r2s),
         median_r2=None if r2s is None or not len(_finite(r2s)) else float(np.median(_finite(r2s))),
+        credit_error=_last_value(reported, CREDIT_ERROR),
+        credit_correlation=_last_value(reported, CREDIT_CORRELATION),
         score_use=summarise_score_use(method, settings, task, _score_metrics(reported)),
         sees_factors=method.inputs is not None and method.inputs.has_factors,
         sees_raw_features=method.inputs is None or method.inputs.has_raw_features,
@@ -261,11 +284,16 @@ def _episode_error(reported: ReportedRun) -> float:
 
 def _score_metrics(reported: ReportedRun) -> dict[str, float | None]:
     """Return the last metrics about the score: means over the seeds, and the standard error of the mean gain."""
-    curves = {key: reported.curve(f"credit/{key}") for key in ("average", "log_odds", "gain", "gain_error")}
-    values = {key: None if curve is None else _last_mean(curve[1]) for key, curve in curves.items()}
+    values = {key: _last_value(reported, f"credit/{key}") for key in ("average", "log_odds", "gain", "gain_error")}
     if values["gain_error"] is not None:
         values["gain_error"] /= math.sqrt(len(reported.run.seeds))
     return values
+
+
+def _last_value(reported: ReportedRun, key: str) -> float | None:
+    """Return the mean of the last values of a metric, or None if it was never measured."""
+    curve = reported.curve(key)
+    return None if curve is None else _last_mean(curve[1])
 
 
 def _last_mean(values: Float[np.ndarray, "seeds evaluations"]) -> float | None:

@@ -12,8 +12,13 @@ from lare_rl.credit import returns
 from lare_rl.credit.decomposition import CreditBatch, valid_rows
 from lare_rl.credit.engine import add_to_explanation, explain_returns, init_explanation
 from lare_rl.credit.explanation import Explanation
-from lare_rl.credit.explanation_text import MIN_EXPLAINED_EPISODES, explanation_lines, raw_feature_names
-from lare_rl.credit.methods import METHODS
+from lare_rl.credit.explanation_text import (
+    MESSAGES,
+    MIN_EXPLAINED_EPISODES,
+    explanation_findings,
+    raw_feature_names,
+)
+from lare_rl.credit.methods import METHODS, find_method
 from lare_rl.data.replay import Replay, by_payment
 from lare_rl.nn.normalise import RunningMeanStd, empty_mean_std, update_mean_std
 from lare_rl.runs.directory import Run
@@ -23,9 +28,17 @@ from lare_rl.training.learner import Learner
 from lare_rl.training.saved_state import load_learner
 from lare_rl.training.seed_axis import first_shard, select_seed
 from lare_rl.training.static_config import TrainConfig
+from lare_rl.util.findings import Finding, render
 from lare_rl.util.float64 import float64
 
-__all__ = ["compile_explanation", "describe_returns", "explain_run", "explain_stored_returns"]
+__all__ = [
+    "compile_explanation",
+    "describe_returns",
+    "explain_run",
+    "explain_stored_returns",
+    "explanation_source",
+    "find_explanations",
+]
 
 
 def explain_run(run: Run) -> list[str]:
@@ -34,10 +47,35 @@ def explain_run(run: Run) -> list[str]:
     return describe_returns(run, learner, config)
 
 
+def find_explanations(run: Run) -> list[list[Finding]]:
+    """Return the findings about the returns in a run's last checkpoint, for each team: those of `explanation_findings`."""
+    config, learner, _, _ = load_learner(run)
+    return _find_explanations(run, learner, config)
+
+
+def explanation_source(run: Run) -> str:
+    """Return which seed and which fit an explanation is of. It is empty where that goes without saying."""
+    method = find_method(run.config.settings.method)
+    remarks = [f"of seed {run.seeds[0]} alone"] if len(run.seeds) > 1 else []
+    if method.uses_gradient:
+        remarks.append(f"by a closed-form fit to the stored returns, which is not the decoder of {method.name}")
+    text = ", ".join(remarks)
+    return text[:1].upper() + text[1:]
+
+
 def describe_returns(run: Run, learner: Learner, config: TrainConfig) -> list[str]:
     """Return the explanation of the returns of a run's first seed, in sentences."""
-    lines: list[str] = []
-    roles = run.config.task.roles
+    lines = [
+        f"{f'{team.name}: ' if len(run.config.task.roles) > 1 else ''}{render(finding, MESSAGES)}"
+        for team, findings in zip(config.env.teams, _find_explanations(run, learner, config), strict=False)
+        for finding in findings
+    ]
+    source = explanation_source(run)
+    return [f"{source}:", *lines] if lines and source else lines
+
+
+def _find_explanations(run: Run, learner: Learner, config: TrainConfig) -> list[list[Finding]]:
+    findings, roles = [], run.config.task.roles
     for i, explanation in enumerate(explain_stored_returns(learner, config)):
         role, function = roles[i], run.functions[i] if run.functions else None
         factor_names = [] if function is None else function.factor_columns(run.scored_observation)
@@ -48,15 +86,8 @@ def describe_returns(run: Run, learner: Learner, config: TrainConfig) -> list[st
             else raw_feature_names(role.observation, role.action, n_raw, role.action_size, has_both)
         )
         score_type = returns.estimate_score_type(select_seed(first_shard(learner.decoders[i])))
-        prefix = f"{config.env.teams[i].name}: " if len(roles) > 1 else ""
-        lines += [prefix + line for line in explanation_lines(explanation, score_type, factor_names, raw_names)]
-    remarks = [f"of seed {run.seeds[0]} alone"] if len(run.seeds) > 1 else []
-    if config.method.uses_gradient:
-        remarks.append(f"by a closed-form fit to the stored returns, which is not the decoder of {config.method.name}")
-    if lines and remarks:
-        heading = ", ".join(remarks)
-        lines.insert(0, f"{heading[0].upper()}{heading[1:]}:")
-    return lines
+        findings.append(explanation_findings(explanation, score_type, factor_names, raw_names))
+    return findings
 
 
 def explain_stored_returns(learner: Learner, config: TrainConfig) -> list[Explanation]:

@@ -1,0 +1,301 @@
+"""Charts as HTML, for pages that are read on a phone, in the dark and on paper.
+
+Lines are SVG that is stretched to the width of the page. Texts are HTML beside it, so their size is the same on every screen.
+Colours are classes of report.css.
+"""
+
+import base64
+import io
+import math
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+from html import escape
+from itertools import pairwise
+
+import numpy as np
+from jaxtyping import Float, UInt8
+from PIL import Image, ImageDraw
+
+from lare_rl.util.findings import format_value
+from lare_rl.util.statistics import sample_std
+
+__all__ = [
+    "N_COLOURS",
+    "Bar",
+    "Chart",
+    "Curve",
+    "Line",
+    "draw_bars",
+    "draw_legend",
+    "draw_points",
+    "draw_strips",
+    "format_number",
+    "visible_steps",
+]
+
+N_COLOURS = 4
+"""The number of colours that are told apart; other lines are grey."""
+MAX_VISIBLE_STEPS = 100
+"""The largest number of steps that a reader can distinguish in a line."""
+MAX_STRIP_COLUMNS = 200
+"""The largest number of columns of a strip. Each is the mean of some steps."""
+MAX_HOVERS = 60
+"""The largest number of positions at which a chart shows its numbers."""
+MAX_LABEL = 24
+"""Characters of the text at the end of a line that a chart has room for."""
+_UNITS = 1000
+"""The width and the height of a chart in its own units."""
+_LABEL_GAP = 5.5
+"""Percent of a chart's height between two labels."""
+_VIRIDIS = np.array([(68, 1, 84), (59, 82, 139), (33, 145, 140), (94, 201, 98), (253, 231, 37)], float)
+
+Curve = tuple[Float[np.ndarray, " evaluations"], Float[np.ndarray, "seeds evaluations"]]
+"""Steps, and the values that were measured at them."""
+
+
+@dataclass(frozen=True)
+class Line:
+    """A line of a chart. NaN are gaps."""
+
+    x: Float[np.ndarray, " points"]
+    y: Float[np.ndarray, " points"]
+    style: str
+    """Classes of report.css: a colour, and `thin` or `dashed`."""
+    label: str = ""
+    """The text at its end."""
+    band: Float[np.ndarray, " points"] | None = None
+    """Half the width of a band around it."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Chart:
+    """Lines over a common axis."""
+
+    lines: Sequence[Line]
+    description: str
+    """The text for readers who do not see the chart."""
+    x_label: str
+    limits: tuple[float, float] | None = None
+    """The ends of the y axis, where they are fixed."""
+    hovers: Mapping[float, str] = field(default_factory=dict)
+    """Texts that appear at values of x."""
+    shaded_until: float = 0.0
+    is_low: bool = False
+
+    def render(self) -> str:
+        """Return the chart as HTML."""
+        x = np.concatenate([line.x for line in self.lines])
+        start, end = float(x.min()), float(x.max())
+        bottom, top = self.limits or self._find_limits()
+
+        def to_units(values: np.ndarray, low: float, high: float) -> np.ndarray:
+            return np.clip(
+                np.nan_to_num((values - low) / max(high - low, 1e-12) * _UNITS, posinf=9e9), -_UNITS, 2 * _UNITS
+            )
+
+        def across(values: np.ndarray) -> np.ndarray:
+            return to_units(np.asarray(values, float), start, end)
+
+        def down(values: np.ndarray) -> np.ndarray:
+            return _UNITS - to_units(np.asarray(values, float), bottom, top)
+
+        y_ticks, x_ticks = _choose_ticks(bottom, top, 3 if self.is_low else 5), _choose_ticks(start, end, 5)
+        shapes = [f'<path class="grid" d="{"".join(f"M0 {y:.0f}h{_UNITS}" for y in down(np.array(y_ticks)))}"/>']
+        if self.shaded_until > start:
+            shapes.append(
+                f'<rect class="shade" width="{across(np.array([self.shaded_until]))[0]:.0f}" height="{_UNITS}"/>'
+            )
+        for line in self.lines:
+            if line.band is not None:
+                edges = zip((line.x, line.x[::-1]), (line.y + line.band, (line.y - line.band)[::-1]), strict=True)
+                outline = " ".join(_points(across(x), down(y)) for x, y in edges)
+                shapes.append(f'<polygon class="band {line.style}" points="{outline}"/>')
+        for line in self.lines:
+            is_known = np.isfinite(line.y)
+            points = _points(across(line.x[is_known]), down(line.y[is_known]))
+            shapes.append(f'<polyline class="{line.style}" points="{points}"/>')
+        shapes += self._render_hovers(across)
+        labels = [(float(down(line.y[-1:])[0]) / 10, line) for line in self.lines if line.label]
+        texts = [
+            f'<span class="label {line.style}" style="top:{y:.1f}%">{escape(line.label)}</span>'
+            for (_, line), y in zip(labels, _spread([y for y, _ in labels]), strict=True)
+        ]
+        texts += [
+            f'<span class="y" style="top:{y / 10:.1f}%">{format_number(tick)}</span>'
+            for tick, y in zip(y_ticks, down(np.array(y_ticks)), strict=True)
+        ]
+        texts += [
+            f'<span class="x" style="left:{x / 10:.1f}%">{_format_steps(tick)}</span>'
+            for tick, x in zip(x_ticks, across(np.array(x_ticks)), strict=True)
+        ]
+        n_characters = max(len(format_number(tick)) for tick in y_ticks)
+        classes = f"chart{' low' if self.is_low else ''}{' labelled' if labels else ''}"
+        n_label = min(MAX_LABEL, max([len(line.label) for line in self.lines]))
+        return (
+            f'<div class="{classes}" style="--digits:{n_characters};--label:{n_label}"><div class="plot">'
+            f'<svg viewBox="0 0 {_UNITS} {_UNITS}" preserveAspectRatio="none" role="img" aria-label="{escape(self.description)}">'
+            f'{"".join(shapes)}</svg>{"".join(texts)}<span class="axis">{escape(self.x_label)}</span></div></div>'
+        )
+
+    def _find_limits(self) -> tuple[float, float]:
+        values = np.concatenate([line.y for line in self.lines])
+        if not np.isfinite(values).any():
+            return 0.0, 1.0
+        low, high = float(np.nanmin(values)), float(np.nanmax(values))
+        size = high - low or abs(high) or 1.0
+        for line in self.lines:
+            if line.band is not None:  # a wide band must not flatten the lines
+                low = max(min(low, float(np.nanmin(line.y - line.band))), low - size / 2)
+                high = min(max(high, float(np.nanmax(line.y + line.band))), high + size / 2)
+        return low - 0.05 * size, high + 0.05 * size
+
+    def _render_hovers(self, across: Callable[[np.ndarray], np.ndarray]) -> list[str]:
+        chosen = list(self.hovers.items())[:: math.ceil(len(self.hovers) / MAX_HOVERS) or 1]
+        centres = across(np.array([x for x, _ in chosen]))
+        edges = np.concatenate([[0], (centres[1:] + centres[:-1]) / 2, [_UNITS]]) if chosen else np.zeros(0)
+        return [
+            f'<rect class="hover" x="{x:.0f}" width="{end - x:.0f}" height="{_UNITS}"><title>{escape(text)}</title></rect>'
+            for (_, text), x, end in zip(chosen, edges, edges[1:], strict=False)
+        ]
+
+
+@dataclass(frozen=True)
+class Bar:
+    """A bar with a sign: its length is `amount`, to the right for a sign of 1 and to the left for -1. A sign of 0 has no side."""
+
+    text: str
+    name: str
+    amount: float
+    sign: int
+    hover: str
+
+
+def draw_legend(entries: Iterable[tuple[str, str]]) -> str:
+    """Draw the meaning of the styles of lines, and of the style `shade`."""
+    shade = '<rect class="shade" width="26" height="12"/>'
+    keys = (
+        (shade if style == "shade" else f'<path class="key {style}" d="M0 6h26"/>', text) for style, text in entries
+    )
+    items = (f'<li><svg viewBox="0 0 26 12">{key}</svg>{escape(text)}</li>' for key, text in keys)
+    return f'<ul class="legend">{"".join(items)}</ul>'
+
+
+def draw_bars(bars: Sequence[Bar]) -> str:
+    """Draw bars below each other, with their amounts as percentages."""
+    longest, has_left = max([bar.amount for bar in bars] + [1e-9]), any(bar.sign < 0 and bar.amount for bar in bars)
+    items = []
+    for bar in bars:
+        width = max(0.0, bar.amount) / longest * (50 if has_left else 100)
+        start = (50 - width if bar.sign < 0 else 50) if has_left else 0
+        side = "minus" if bar.sign < 0 else "plus"
+        items.append(
+            f'<li title="{escape(bar.hover)}"><span class="meaning">{escape(bar.text)} <code>{escape(bar.name)}</code></span>'
+            f'<span class="track{" both" if has_left else ""}"><i class="{side}" style="left:{start:.1f}%;width:{width:.1f}%"></i>'
+            f'</span><span class="amount">{bar.amount:.0%}</span></li>'
+        )
+    return f'<ul class="bars">{"".join(items)}</ul>'
+
+
+def draw_strips(rows: Mapping[str, Float[np.ndarray, "steps agents"]], shared_scale: bool) -> str:
+    """Draw values over the steps of an episode as colours, with a strip for each name and, within it, a row for each agent.
+
+    Args:
+        shared_scale: whether a colour means the same in all strips.
+    """
+    pooled = {name: _average_steps(values) for name, values in rows.items()}
+    scales = {name: (float(values.min()), float(values.max())) for name, values in pooled.items()}
+    if shared_scale:
+        scale = min(low for low, _ in scales.values()), max(high for _, high in scales.values())
+        scales = dict.fromkeys(scales, scale)
+    strips = []
+    for name, values in pooled.items():
+        low, high = scales[name]
+        pixels = _colour((values.T - low) / max(high - low, 1e-12))
+        height = 28 if len(pixels) == 1 else 12 * len(pixels)
+        text = f"{name}, from {format_number(low)} (dark) to {format_number(high)} (bright)"
+        strips.append(
+            f'<figure class="strip"><figcaption>{escape(text)}</figcaption><img alt="{escape(text)}" style="height:{height}px" '
+            f'src="{_encode_png(Image.fromarray(pixels))}"></figure>'
+        )
+    return "".join(strips)
+
+
+def draw_points(points: Float[np.ndarray, "points 2"], values: Float[np.ndarray, " points"], text: str) -> str:
+    """Draw points in the colours of their values. The colours leave out the extreme 2% on both sides."""
+    size, radius = 480, 4
+    low, high = np.percentile(values, [2, 98])
+    positions = radius + (points - points.min(axis=0)) / np.ptp(points, axis=0) * (size - 2 * radius)
+    image = Image.new("RGBA", (size, size))
+    draw = ImageDraw.Draw(image)
+    for (x, y), colour in zip(positions, _colour((values - low) / max(high - low, 1e-12)), strict=True):
+        draw.ellipse((x - radius, y - radius, x + radius, y + radius), fill=tuple(map(int, colour)))
+    return (
+        f'<figure><figcaption>{escape(text)}</figcaption><img alt="{escape(text)}" src="{_encode_png(image)}"></figure>'
+    )
+
+
+def visible_steps(length: int) -> slice:
+    """Return the steps of an episode that a line shows: all, or the middle ones of a long episode."""
+    first = max(0, (length - MAX_VISIBLE_STEPS) // 2)
+    return slice(first, min(length, first + MAX_VISIBLE_STEPS))
+
+
+def format_number(value: float | np.number) -> str:
+    """Write a number as all pages do."""
+    return format_value(float(value) + 0.0, "score")
+
+
+def format_spread(values: Float[np.ndarray, " values"]) -> str:
+    """Write the mean of some values ± their standard deviation, which has two digits. A single value stands alone."""
+    if not len(values):
+        return ""
+    mean, std = float(np.mean(values)), sample_std(values)
+    if len(values) == 1 or not std:
+        return format_number(mean)
+    n_places = 0 if abs(mean) >= 100 or std >= 10 else min(6, 1 - math.floor(math.log10(std)))
+    return f"{mean:,.{n_places}f} ± {std:,.{n_places}f}"
+
+
+def _colour(position: Float[np.ndarray, "*shape"]) -> UInt8[np.ndarray, "*shape 3"]:
+    """Return the colours of numbers between 0 and 1."""
+    position = np.clip(position, 0, 1) * (len(_VIRIDIS) - 1)
+    return np.stack([np.interp(position, range(len(_VIRIDIS)), channel) for channel in _VIRIDIS.T], -1).astype(np.uint8)
+
+
+def _encode_png(image: Image.Image) -> str:
+    """Return the address of an image that holds its data."""
+    file = io.BytesIO()
+    image.quantize(64, Image.Quantize.FASTOCTREE).save(file, "PNG", optimize=True)
+    return f"data:image/png;base64,{base64.b64encode(file.getvalue()).decode()}"
+
+
+def _average_steps(values: Float[np.ndarray, "steps agents"]) -> Float[np.ndarray, "columns agents"]:
+    n_columns = min(len(values), MAX_STRIP_COLUMNS)
+    return np.stack([chunk.mean(axis=0) for chunk in np.array_split(values, n_columns)])
+
+
+def _points(x: np.ndarray, y: np.ndarray) -> str:
+    return " ".join(f"{a:.0f},{b:.0f}" for a, b in zip(x, y, strict=True))
+
+
+def _choose_ticks(low: float, high: float, n_ticks: int) -> list[float]:
+    """Return round numbers between two others."""
+    raw = max(high - low, 1e-12) / n_ticks
+    power = 10.0 ** math.floor(math.log10(raw))
+    step = next(factor * power for factor in (1, 2, 2.5, 5, 10) if factor * power >= raw * 0.999)
+    return [float(step * i) for i in range(math.ceil(low / step - 1e-9), math.floor(high / step + 1e-9) + 1)] or [low]
+
+
+def _spread(positions: Sequence[float]) -> list[float]:
+    """Return positions of labels, moved apart where they would overlap."""
+    moved, order = np.array(positions, float), sorted(range(len(positions)), key=lambda i: positions[i])
+    for _ in range(50):
+        for i, j in pairwise(order):
+            overlap = max(0.0, _LABEL_GAP - (moved[j] - moved[i])) / 2
+            moved[[i, j]] += -overlap, overlap
+        moved += max(0.0, -moved.min(initial=0)) - max(0.0, moved.max(initial=0) - 100)
+    return moved.tolist()
+
+
+def _format_steps(x: float) -> str:
+    return f"{x / 1e6:g}M" if x >= 1e6 else f"{x / 1e3:g}k" if x >= 1e3 else f"{x:g}"

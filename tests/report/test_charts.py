@@ -1,0 +1,118 @@
+"""The charts of pages."""
+
+import re
+
+import numpy as np
+import pytest
+
+from helpers.markup import check_markup
+from lare_rl.report.charts import (
+    Bar,
+    Chart,
+    Line,
+    draw_bars,
+    draw_points,
+    draw_strips,
+    format_spread,
+    visible_steps,
+)
+
+X = np.arange(3.0)
+
+
+def chart(*lines, **options):
+    html = Chart(lines=lines, description="a chart", x_label="step", **options).render()
+    check_markup(html)
+    return html
+
+
+def heights(html):
+    """The y of the points of each line, from 0 at the top to 1000."""
+    return [
+        [int(point.split(",")[1]) for point in points.split()]
+        for points in re.findall(r'<polyline[^>]*points="([^"]*)"', html)
+    ]
+
+
+@pytest.mark.parametrize(
+    ("length", "first", "end"), [(1, 0, 1), (30, 0, 30), (100, 0, 100), (101, 0, 100), (1000, 450, 550)]
+)
+def test_visible_steps(length, first, end):
+    assert visible_steps(length) == slice(first, end)
+
+
+def test_lines_fill_the_chart():
+    ((top, middle, bottom),) = heights(chart(Line(X, -X, "c0")))
+    assert 0 < top < middle < bottom < 1000
+    assert heights(chart(Line(X, X / 2, "c0"), limits=(0.0, 1.0))) == [[1000, 500, 0]]
+
+
+def test_gaps_and_equal_values():
+    assert [len(line) for line in heights(chart(Line(X, np.array([np.nan, 1, 2]), "c0")))] == [2]
+    assert [len(line) for line in heights(chart(Line(X, np.zeros(3), "c0"), Line(X, np.full(3, np.nan), "c1")))] == [
+        3,
+        0,
+    ]
+
+
+def test_wide_band_does_not_flatten_a_line():
+    (line,) = heights(chart(Line(X, X, "c0", band=np.full(3, 1000.0))))
+    assert max(line) - min(line) > 300
+
+
+def test_hovers_are_limited():
+    html = chart(
+        Line(np.arange(500.0), np.arange(500.0), "c0"), hovers={float(step): f"<{step}>" for step in range(500)}
+    )
+    assert 30 <= html.count("<title>&lt;") <= 60
+
+
+def test_labels_do_not_overlap():
+    html = chart(*(Line(X, X + i / 100, "c0", f"line {i}") for i in range(6)), Line(X, X - 9, "c0", "low"))
+    tops = [float(top) for top in re.findall(r'class="label[^>]*top:([\d.]+)%', html)]
+    assert min(np.diff(sorted(tops))) > 4
+    assert (min(tops), max(tops)) >= (0, 50)
+    assert max(tops) <= 100
+
+
+def test_bars_have_sides():
+    html = draw_bars([Bar("<speed>", "f", 0.9, 1, "more"), Bar("cost", "g", 0.45, -1, "less")])
+    check_markup(html)
+    bars = re.findall(r'<i class="(\w+)" style="left:([\d.]+)%;width:([\d.]+)%"', html)
+    assert bars == [("plus", "50.0", "50.0"), ("minus", "25.0", "25.0")]
+    assert "90%" in html
+    only_right = draw_bars([Bar("speed", "f", 0.9, 1, "")])
+    assert "left:0.0%;width:100.0%" in only_right
+
+
+def test_strips_share_a_scale_if_they_are_comparable():
+    rows = {"true": np.linspace(0, 1, 1000)[:, None], "proxy": np.linspace(0, 2, 1000)[:, None]}
+    shared, separate = (draw_strips(rows, shared_scale=shared) for shared in (True, False))
+    check_markup(shared)
+    assert (
+        re.findall(r"from (\S+) \(dark\) to (\S+) \(bright\)</fig", shared) == [("0.0025", "1.99")] * 2
+        or "to 2" in shared
+    )
+    images = re.findall(r'src="([^"]+)"', separate)
+    assert images[0] == images[1]
+    assert len(set(re.findall(r'src="([^"]+)"', shared))) == 2
+    assert len(shared) < 5000
+
+
+def test_points():
+    points = np.random.default_rng(0).normal(size=(50, 2))
+    check_markup(draw_points(points, points[:, 0], "points"))
+
+
+@pytest.mark.parametrize(
+    ("values", "text"),
+    [
+        ([], ""),
+        ([0.5], "0.5"),
+        ([1234.5, 1234.5], "1,234"),
+        ([1000.0, 2000.0], "1,500 ± 707"),
+        ([0.9, 0.92], "0.910 ± 0.014"),
+    ],
+)
+def test_format_spread(values, text):
+    assert format_spread(np.array(values)) == text
