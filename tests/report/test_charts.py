@@ -60,6 +60,13 @@ def test_wide_band_does_not_flatten_a_line():
     assert max(line) - min(line) > 300
 
 
+def test_single_point_is_visible():
+    html = chart(Line(X[1:2], X[1:2], "c0"), shaded_until=0.5)
+    assert html.count('<polyline class="c0 dot"') == 1
+    assert len(heights(html)[0]) == 2  # a line without length, with round ends
+    assert 'class="shade" width="476"' in html
+
+
 def test_hovers_are_limited():
     html = chart(
         Line(np.arange(500.0), np.arange(500.0), "c0"), hovers={float(step): f"<{step}>" for step in range(500)}
@@ -81,6 +88,7 @@ def test_bars_have_sides():
     bars = re.findall(r'<i class="(\w+)" style="left:([\d.]+)%;width:([\d.]+)%"', html)
     assert bars == [("plus", "50.0", "50.0"), ("minus", "25.0", "25.0")]
     assert "90%" in html
+    assert "<i" not in draw_bars([Bar("speed", "f", 0.001, 1, "")])
     only_right = draw_bars([Bar("speed", "f", 0.9, 1, "")])
     assert "left:0.0%;width:100.0%" in only_right
 
@@ -112,6 +120,7 @@ def test_points():
         ([1234.5, 1234.5], "1,234"),
         ([1000.0, 2000.0], "1,500 ± 707"),
         ([0.9, 0.92], "0.910 ± 0.014"),
+        ([1.0, 1.0 + 1e-8], "1 ± 7e-09"),
     ],
 )
 def test_format_spread(values, text):

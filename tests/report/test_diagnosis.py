@@ -218,11 +218,12 @@ def test_outcomes_have_headlines(code):
 
 def test_single_steps_are_compared_where_they_are_known():
     assert "single_steps" not in find(RISING_2, return_r2=0.9)
+    assert "steps_agree" in find(RISING_2, credit_error=1e-9, credit_correlation=0.999)
     finding = find(RISING_2, credit_error=0.25, credit_correlation=0.5)["single_steps"]
     assert (finding.values["error"], finding.values["correlation"]) == (0.25, 0.5)
 
 
 def test_message_of_nested_findings():
     text = render(find(RISING_2)["learned"], MESSAGES)
-    for words in ("71 ± 1.41", "8,000 steps", "2 seeds", "0 ± 1 in 3 episodes"):
+    for words in ("71 ± 1.4", "8,000 steps", "2 seeds", "0 ± 1 in 3 episodes"):
         assert words in text

@@ -41,6 +41,8 @@ MAX_STRIP_COLUMNS = 200
 """The largest number of columns of a strip. Each is the mean of some steps."""
 MAX_HOVERS = 60
 """The largest number of positions at which a chart shows its numbers."""
+SMALL_STD = 1e-3
+"""Smaller standard deviations are written with one digit."""
 MAX_LABEL = 24
 """Characters of the text at the end of a line that a chart has room for."""
 _UNITS = 1000
@@ -86,6 +88,8 @@ class Chart:
         """Return the chart as HTML."""
         x = np.concatenate([line.x for line in self.lines])
         start, end = float(x.min()), float(x.max())
+        if start == end:  # a single point stands out inside
+            start, end = 0.0, 1.05 * end or 1.0
         bottom, top = self.limits or self._find_limits()
 
         def to_units(values: np.ndarray, low: float, high: float) -> np.ndarray:
@@ -113,7 +117,8 @@ class Chart:
         for line in self.lines:
             is_known = np.isfinite(line.y)
             points = _points(across(line.x[is_known]), down(line.y[is_known]))
-            shapes.append(f'<polyline class="{line.style}" points="{points}"/>')
+            style = line.style if is_known.sum() > 1 else f"{line.style} dot"
+            shapes.append(f'<polyline class="{style}" points="{points}{f" {points}" if is_known.sum() == 1 else ""}"/>')
         shapes += self._render_hovers(across)
         labels = [(float(down(line.y[-1:])[0]) / 10, line) for line in self.lines if line.label]
         texts = [
@@ -188,10 +193,12 @@ def draw_bars(bars: Sequence[Bar]) -> str:
         width = max(0.0, bar.amount) / longest * (50 if has_left else 100)
         start = (50 - width if bar.sign < 0 else 50) if has_left else 0
         side = "minus" if bar.sign < 0 else "plus"
+        shape = (
+            f'<i class="{side}" style="left:{start:.1f}%;width:{width:.1f}%"></i>' if round(100 * bar.amount) else ""
+        )
         items.append(
             f'<li title="{escape(bar.hover)}"><span class="meaning">{escape(bar.text)} <code>{escape(bar.name)}</code></span>'
-            f'<span class="track{" both" if has_left else ""}"><i class="{side}" style="left:{start:.1f}%;width:{width:.1f}%"></i>'
-            f'</span><span class="amount">{bar.amount:.0%}</span></li>'
+            f'<span class="track{" both" if has_left else ""}">{shape}</span><span class="amount">{bar.amount:.0%}</span></li>'
         )
     return f'<ul class="bars">{"".join(items)}</ul>'
 
@@ -252,7 +259,9 @@ def format_spread(values: Float[np.ndarray, " values"]) -> str:
     mean, std = float(np.mean(values)), sample_std(values)
     if len(values) == 1 or not std:
         return format_number(mean)
-    n_places = 0 if abs(mean) >= 100 or std >= 10 else min(6, 1 - math.floor(math.log10(std)))
+    if std < SMALL_STD:
+        return f"{format_number(mean)} ± {std:.1g}"
+    n_places = 0 if abs(mean) >= 100 or std >= 10 else 1 - math.floor(math.log10(std))
     return f"{mean:,.{n_places}f} ± {std:,.{n_places}f}"
 
 

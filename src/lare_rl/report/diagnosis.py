@@ -15,7 +15,7 @@ from lare_rl.util.statistics import sample_std
 
 __all__ = ["CREDIT_CODES", "NEXT_CODES", "diagnose"]
 
-CREDIT_CODES = ("explained", "decoder_is_outdated", "score_use", "single_steps")
+CREDIT_CODES = ("explained", "decoder_is_outdated", "score_use", "single_steps", "steps_agree")
 """Findings about the quality of the credit."""
 NEXT_CODES = (
     "explains_little", "try_closed_form", "is_rising", "one_seed_was_better", "has_fallen", "is_stuck", "needs_training",
@@ -23,6 +23,8 @@ NEXT_CODES = (
 )  # fmt: skip
 """Findings that recommend what to do next."""
 
+CLOSE_CORRELATION = 0.99
+"""Proxy and true rewards of steps agree if their correlation is higher."""
 HIGH_R2 = 0.8
 """Proxy rewards explain nearly all of the score if R^2 of the returns is higher."""
 EVALUATION_STDS = 3
@@ -126,6 +128,8 @@ def _score_use(run: RunSummary) -> Finding | None:
 def _single_steps(run: RunSummary) -> Finding | None:
     if run.credit_error is None or run.credit_correlation is None:
         return None
+    if run.credit_correlation > CLOSE_CORRELATION:
+        return Finding("steps_agree", {"correlation": run.credit_correlation})
     return Finding("single_steps", {"error": run.credit_error, "correlation": run.credit_correlation})
 
 

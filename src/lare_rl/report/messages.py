@@ -32,9 +32,9 @@ MESSAGES = {
     "not_learned": "{reached}; {baseline}.",
     "reached": "The return is {return_:score}{std} after {steps:,} steps{seeds}{likeliest}",
     "likeliest": ", by sampled actions as in training; the most likely action gets {return_:score}",
-    "std": " ± {std:score}",
+    "std": " ± {std:std}",
     "over_seeds": " (mean over {n_seeds} seeds)",
-    "baseline": "random actions get {return_:score} ± {std:score} in {n_episodes:count episode}{initial}",
+    "baseline": "random actions get {return_:score} ± {std:std} in {n_episodes:count episode}{initial}",
     "initial_policies": ", and before training it got {returns:score}",
     # The comparison with another run
     "above_episodic": "That is more than training on the return of the episode alone gives here ({return_:score}).",
@@ -62,6 +62,7 @@ MESSAGES = {
         "Its proxy rewards, from {inputs}, usually explain {amount} of the score (median R² of returns: {r2:.2f}), but not the last "
         "episodes (R² {last_r2:.2f}): perhaps the policy has changed, and the decoder has not adapted yet."
     ),
+    "steps_agree": "In single steps, proxy and true rewards agree: their correlation is {correlation:r2}.",
     "single_steps": (
         "In single steps, proxy and true rewards correlate with {correlation:.2f} and differ by {error:score} on average. Returns "
         "are sums over episodes: several rewards of single steps may give the same sums."

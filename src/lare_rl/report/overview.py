@@ -16,7 +16,6 @@ from lare_rl.report.run_summary import ReportedRun, RunSummary, summarise_run
 from lare_rl.runs.metric_names import CREDIT_CORRELATION, CREDIT_ERROR, RETURN, RETURN_R2, RETURN_STD
 from lare_rl.tasks.spec import TaskSpec
 from lare_rl.util.findings import Finding, format_value, render
-from lare_rl.util.statistics import sample_std
 
 __all__ = [
     "compare_runs",
@@ -90,14 +89,13 @@ def render_verdict(reported: ReportedRun, summary: RunSummary | None, film: str 
 def _tiles(reported: ReportedRun, summary: RunSummary) -> Iterable[tuple[str, str, str]]:
     """Yield the numbers of a run: title, number, remark. Those that are unknown are missing."""
     if len(summary.final_returns):
-        seeds = format_value(len(summary.final_returns), "count seed")
-        spread = f"± {format_number(sample_std(summary.final_returns))} over " if len(summary.final_returns) > 1 else ""
-        yield "Return", format_number(summary.final_return), f"{spread}{seeds}"
+        number, _, std = format_spread(summary.final_returns).partition(" ± ")
+        yield "Return", number, f"{f'± {std}, ' if std else ''}{format_value(len(summary.final_returns), 'count seed')}"
     if len(summary.random_returns):
-        text = f"± {format_number(sample_std(summary.random_returns))} in {format_value(len(summary.random_returns), 'count episode')}"
-        yield "Random actions", format_number(summary.random_mean), text
+        number, _, std = format_spread(summary.random_returns).partition(" ± ")
+        yield "Random actions", number, f"± {std or 0}, {format_value(len(summary.random_returns), 'count episode')}"
     if summary.return_r2 is not None:
-        yield "R² of returns", format_number(summary.return_r2), "of new episodes; 1 is perfect"
+        yield "R² of returns", format_value(summary.return_r2, "r2"), "of new episodes; 1 is perfect"
     if (seconds := reported.training_seconds()) is not None:
         yield "Time trained", _format_seconds(seconds), f"{int(summary.steps[-1]):,} steps for each seed"
 
@@ -257,9 +255,9 @@ def _draw_metric(
         label = name if len(runs) > 1 and (colour != "grey" or len(runs) <= 2 * N_COLOURS) else ""
         style = "grey other" if colour == "grey" else colour
         lines.append(Line(steps, _mean(values), style, label, None if spread is None else spread[1][0]))
-    extent = np.array(
-        [min(curve[0][0] for _, curve in curves.values()), max(curve[0][-1] for _, curve in curves.values())]
-    )
+    first_step = min(curve[0][0] for _, curve in curves.values())
+    last_step = max(curve[0][-1] for _, curve in curves.values())
+    extent = np.array([first_step if first_step < last_step else 0.0, last_step])
     lines += [Line(extent, np.full(2, value), "grey dashed", name) for name, value in references.items()]
     has_negative = any((line.y[np.isfinite(line.y)] < 0).any() for line in lines)
     limits = (-1.0, 1.0) if metric.limits and has_negative else metric.limits

@@ -40,7 +40,7 @@ from lare_rl.util.statistics import column_correlations
 __all__ = ["describe_method", "render_details", "render_settings"]
 
 MAX_TSNE_POINTS = 1000
-MIN_BAND = 0.02
+MIN_BAND = 0.04
 """A band is visible if it is wider than this fraction of the range of the line."""
 _BAND_NOTE = (
     " The band is ± two posterior standard deviations: the uncertainty that the returns so far leave, if the true rewards depend "
@@ -50,6 +50,10 @@ _OBSERVATIONS = {"before": "before", "after": "after", "both": "before and the o
 """Texts of the observations that phi reads."""
 _IN_BARS = ("factor", "unknown_factor", "about_factors", "about_states")
 """Findings that the bars show."""
+_SUMMARIES = ("factors_explain", "raw_features_explain")
+"""Findings that stand above the bars."""
+_SIDES = ((1, "plus", "the reward of a step rises with the factor"), (-1, "minus", "it falls with the factor"))
+"""Signs of bars: their sides, and what they say."""
 
 
 def render_details(run: Run, trust: Iterable[str] = (), rollout: Rollout | None = None) -> Iterable[str]:
@@ -140,16 +144,14 @@ def _render_earnings(run: Run, correlations: Sequence[Float[np.ndarray, " factor
         meanings = {label.name.removesuffix(" (before)").removesuffix(" (after)"): label.meaning for label in labels}
         bars = [_make_bar(finding, meanings) for finding in findings if finding.code in ("factor", "unknown_factor")]
         bars += [bar for finding in findings for bar in _raw_feature_bars(finding)]
+        sections += [f"<p>{escape(_sentence(finding))}</p>" for finding in findings if finding.code in _SUMMARIES]
         if bars:
-            sides = (
-                {1: "a step earns more with more of it", -1: "a step earns less"}
-                if any(bar.sign for bar in bars)
-                else {}
-            )
-            keys = {1: "plus", -1: "minus"}
-            legend = (f'<span><i class="{keys[sign]}"></i>{text}</span>' for sign, text in sides.items())
-            sections += [draw_bars(bars), f'<div class="sides">{"".join(legend)}</div>']
-        sections += [render_note(_sentence(finding)) for finding in findings if finding.code not in _IN_BARS]
+            signs = {bar.sign for bar in bars}
+            texts = (f'<span><i class="{side}"></i>{text}</span>' for sign, side, text in _SIDES if sign in signs)
+            sections += [draw_bars(bars), f'<div class="sides">{"".join(texts)}</div>']
+        sections += [
+            render_note(_sentence(finding)) for finding in findings if finding.code not in (*_IN_BARS, *_SUMMARIES)
+        ]
         sections.append(
             render_fold(
                 "The numbers of the factors", _render_factor_table(findings, labels, correlations[team_index], run)
@@ -157,7 +159,9 @@ def _render_earnings(run: Run, correlations: Sequence[Float[np.ndarray, " factor
         )
     if any(explanations):
         yield '<h2>What earned the score<a class="why" href="#share" title="What is a share?">?</a></h2>'
-        yield render_note(f"{source}.") if (source := explanation_source(run)) else ""
+        source = explanation_source(run)
+        text = "A bar is the share of the differences between returns that a factor explains."
+        yield render_note(f"{text} {source}." if source else text)
     yield from sections
 
 
@@ -170,7 +174,13 @@ def _make_bar(finding: Finding, meanings: Mapping[str, str]) -> Bar:
     name, effect = finding.values["name"], finding.values["effect"]
     meaning = meanings.get(name) or name.removeprefix("f_").replace("_", " ")
     share, slope = float(finding.values.get("share", 0.0)), effect.values.get("slope", 0.0)
-    return Bar(meaning[:1].upper() + meaning[1:], name, abs(share), int(np.sign(slope)), _sentence(finding))
+    return Bar(
+        meaning[:1].upper() + meaning[1:],
+        name,
+        abs(share),
+        int(np.sign(slope)) if round(100 * share) else 0,
+        _sentence(finding),
+    )
 
 
 def _raw_feature_bars(finding: Finding) -> list[Bar]:

@@ -61,6 +61,7 @@ def format_value(value: Any, spec: str = "") -> str:
     * `score`: a whole number if it is large, otherwise three digits.
     * `count NOUN`: the number with its noun, in the singular or the plural, such as `1 episode` and `1,000 episodes`.
     * `r2`: two decimal places, three near 1.
+    * `std`: two digits, for a standard deviation.
     * `error`: one digit, for a standard error.
     """
     match spec.split(" ", 1):
@@ -70,6 +71,8 @@ def format_value(value: Any, spec: str = "") -> str:
             return f"{value:,} {noun}{'' if value == 1 else 's'}"
         case ["r2"]:
             return f"{value:.3f}" if value > 0.99 else f"{value:.2f}"
+        case ["std"]:
+            return f"{value:,.0f}" if math.isfinite(value) and abs(value) >= 10 else f"{value:.2g}"
         case ["error"]:
             return f"{value:.1g}" if value >= 0.001 else "less than 0.001"
     return format(value, spec)
