@@ -41,9 +41,7 @@ Frame = UInt8[np.ndarray, "height width 3"]
 
 
 def record_video(run: Run, path: str | Path, best: bool = False, deterministic: bool = False) -> None:
-    """Film one episode of the first seed's policy, the last or the best.
-
-    A .gif needs the extra `lare-rl[report]`, an .mp4 the extra `lare-rl[video]`.
+    """Film one episode of the first seed's policy, the last or the best, as a .gif, or as an .mp4 with the extra `lare-rl[video]`.
 
     A film of a particle task shows each agent's credit, as number and colour.
 

@@ -71,13 +71,16 @@ def summarise_runs(
     ]
 
 
-def render_verdict(reported: ReportedRun, summary: RunSummary | None, film: str = "") -> Iterable[str]:
+def render_verdict(
+    reported: ReportedRun, summary: RunSummary | None, film: str = "", has_title: bool = True
+) -> Iterable[str]:
     """Yield what a run reached: a film, a verdict and the numbers."""
     if summary is None:
         return
     findings = diagnose(summary)
     yield f'<div class="hero{" filmed" if film else ""}">{film}<div>'
-    yield f"<h1>{escape(reported.name)} on {escape(reported.run.config.task.name)}</h1>"
+    if has_title:
+        yield f"<h1>{escape(reported.name)} on {escape(reported.run.config.task.name)}</h1>"
     yield f'<p class="headline">{escape(render_headline(summary))}</p>'
     for finding in findings:
         if finding.code not in CREDIT_CODES:
@@ -182,14 +185,14 @@ def render_final_values(runs: Sequence[ReportedRun]) -> str:
         values = [reported.final_values(metric) for metric in _METRICS]
         step, n_seeds = f"{reported.metrics[-1]['step']:,}", len(reported.run.seeds)
         if len(runs) > 1:
-            rows.append((task, reported.name, str(n_seeds), step, *map(format_spread, values)))
+            rows.append((task, reported.name, *map(format_spread, values), str(n_seeds), step))
         else:
             for i, seed in enumerate(reported.run.seeds):
                 cells = (format_number(numbers[i]) if len(numbers) == n_seeds else "" for numbers in values)
-                rows.append(("", "", str(seed), step, *cells))
+                rows.append(("", f"seed {seed}", *cells, "", step))
     if len({row[0] for row in rows}) == 1:
         rows = [("", *row[1:]) for row in rows]
-    header = ("task", "run", "seeds" if len(runs) > 1 else "seed", "steps", *_METRICS.values())
+    header = ("task", "run", *_METRICS.values(), "seeds", "steps")
     return render_table(header, rows, numbers=range(2, len(header)))
 
 

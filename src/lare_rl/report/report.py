@@ -139,7 +139,8 @@ def _render_task(runs: Sequence[ReportedRun], film: bool) -> Iterable[str]:
         details = render_details(reported.run, render_trust(summary), rollout)
         title = f"{reported.name}: {render_headline(summary)}" if summary else reported.name
         yield render_fold(
-            title, [*render_verdict(reported, summary), render_note(describe_method(reported.run)), *details]
+            title,
+            [*render_verdict(reported, summary, has_title=False), render_note(describe_method(reported.run)), *details],
         )
     yield _note_missing(runs)
 

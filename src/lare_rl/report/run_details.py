@@ -280,7 +280,7 @@ def render_settings(runs: Sequence[ReportedRun]) -> Iterable[str]:
     else:
         keys = dict.fromkeys(key for values in columns.values() for key in values)
         table = {key: [values.get(key, "") for values in columns.values()] for key in keys}
-        rows = [(key, *cells) for key, cells in table.items() if len(set(cells)) > 1]
+        rows = [(key, *cells) for key, cells in table.items() if len({*cells} - {""}) > 1]
         title, header = "Settings that differ between the runs", ("setting", *columns)
     if rows:
         yield render_fold(title, [render_table(header, rows)])
@@ -306,4 +306,5 @@ def _to_text(value: Any) -> str:
 def describe_method(run: Run) -> str:
     """Return what the run's method does, and its source."""
     method = find_method(run.config.settings.method)
-    return f"{method.summary[0].upper()}{method.summary[1:]}. Source: {method.source}."
+    source = "" if method.source == "-" else f" Source: {method.source}."
+    return f"{method.summary[0].upper()}{method.summary[1:]}.{source}"
