@@ -11,7 +11,7 @@ from lare_rl.errors import LareError
 
 pydantic_ai = pytest.importorskip("pydantic_ai")
 
-from pydantic_ai.messages import ModelResponse, SystemPromptPart, TextPart, UserPromptPart  # noqa: E402
+from pydantic_ai.messages import ModelMessagesTypeAdapter, ModelResponse, TextPart  # noqa: E402
 from pydantic_ai.models.function import FunctionModel  # noqa: E402
 from pydantic_ai.models.test import TestModel  # noqa: E402
 
@@ -21,12 +21,15 @@ REPLY = json.dumps({"Understand": "", "Analyze": "", "Functions": PHI})
 
 
 def record_requests(*replies):
-    """Return a model of Pydantic AI with these replies, and the list of its requests: kinds of parts, and their texts."""
+    """Return a model of Pydantic AI with these replies, and the list of its requests: kinds of messages, and their texts."""
     replies, requests = list(replies), []
 
     def answer(messages, info):
-        requests.append([(type(part), part.content) for message in messages for part in message.parts])
-        return ModelResponse(parts=[TextPart(content=replies.pop(0))])
+        contents = [
+            content for message in ModelMessagesTypeAdapter.dump_python(messages) for content in message["parts"]
+        ]
+        requests.append([(content["part_kind"], content["content"]) for content in contents])
+        return ModelResponse([TextPart(replies.pop(0))])
 
     return FunctionModel(answer, model_name="m"), requests
 
@@ -37,7 +40,7 @@ def test_messages_are_converted():
     assert (phi.source, phi.model) == (PHI.strip("\n"), "m")
     system, user, reply, correction = requests[1]
     assert requests[0] == [system, user]
-    assert [kind for kind, _ in requests[1]] == [SystemPromptPart, UserPromptPart, TextPart, UserPromptPart]
+    assert [kind for kind, _ in requests[1]] == ["system-prompt", "user-prompt", "text", "user-prompt"]
     assert reply[1] == "no function"
     assert phi.exchanges[1]["messages"][-1]["content"] == correction[1]
 
@@ -55,7 +58,7 @@ def test_model_in_a_running_loop():
         return [adapted.reply([{"role": "user", "content": "Write some."}], number) for number in range(2)]
 
     assert asyncio.run(ask()) == ["first", "second"]
-    assert requests == [[(UserPromptPart, "Write some.")]] * 2
+    assert requests == [[("user-prompt", "Write some.")]] * 2
 
 
 def test_errors():

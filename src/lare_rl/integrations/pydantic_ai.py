@@ -69,8 +69,8 @@ def _model_name(agent: Agent[Any, Any]) -> str:
 def _convert(message: Message) -> ModelMessage:
     match message["role"]:
         case "system":
-            return ModelRequest(parts=[SystemPromptPart(content=message["content"])])
+            return ModelRequest([SystemPromptPart(content=message["content"])])
         case "assistant":
-            return ModelResponse(parts=[TextPart(content=message["content"])])
+            return ModelResponse([TextPart(content=message["content"])])
         case _:
-            return ModelRequest(parts=[UserPromptPart(content=message["content"])])
+            return ModelRequest([UserPromptPart(content=message["content"])])
