@@ -63,3 +63,26 @@ def test_example_of_a_score_at_the_end(name, simulator, arguments):
     compile(path.read_text(encoding="utf-8"), name, "exec")
     pytest.importorskip(simulator)
     assert np.isfinite(runpy.run_path(str(path))["main"](**arguments)).all()
+
+
+@pytest.mark.filterwarnings("ignore:.*v4 is out of date")
+def test_optuna_study(tmp_path):
+    path = EXAMPLES / "optuna_study.py"
+    compile(path.read_text(encoding="utf-8"), path.name, "exec")
+    optuna = pytest.importorskip("optuna")
+    example = runpy.run_path(str(path))
+    small = {"evaluate_every": 50, "evaluation_episodes": 1, "method": "rd-linear"}
+    study = example["main"](n_trials=2, steps=100, warmup=50, out=str(tmp_path), **small)
+    for number, trial in enumerate(study.trials):
+        metrics = lare_rl.open_run(tmp_path / str(number)).metrics()
+        assert trial.intermediate_values == {line["step"]: line["evaluation/return"] for line in metrics}
+        assert lare_rl.open_run(tmp_path / str(number)).config.settings.hyperparameters.tau == trial.params["tau"]
+    study.enqueue_trial({"gamma": 0.95, "tau": 0.01})
+
+    def prune(trial):
+        report = example["Report"](trial)
+        report.on_evaluation([{"step": step, "evaluation/return": -1e9} for step in (50, 100)])
+
+    study.pruner = optuna.pruners.MedianPruner(n_startup_trials=0)
+    study.optimize(prune, 1)
+    assert study.trials[-1].state == optuna.trial.TrialState.PRUNED

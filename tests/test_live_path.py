@@ -11,7 +11,7 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from helpers.chat_servers import Server, refuse, reply_with
+from helpers.chat_servers import Server, refuse, reply_with, request_messages
 from helpers.toy_envs import PHI, toy_spec
 from lare_rl.envs.load import read_task
 from lare_rl.errors import LareError
@@ -27,11 +27,11 @@ KEY = "sk-a-key-that-nobody-may-see"
 
 def recorded_answers(handler) -> None:
     """Give the recorded replies to a request, each once."""
-    messages = handler.server.requests[-1]["messages"]
+    messages = request_messages(handler.server.requests[-1])
     for recording in shipped_recordings("factors", 0):
         for exchange in recording.exchanges:
             if exchange.messages == messages:
-                times = sum(request["messages"] == messages for request in handler.server.requests)
+                times = sum(request_messages(request) == messages for request in handler.server.requests)
                 return reply_with(exchange.replies[times - 1])(handler)
     return refuse(404, "not recorded")(handler)
 
@@ -223,7 +223,7 @@ def test_function_of_another_task_is_corrected(serve):
     other = next(recording for recording in reacher if recording.task == "Reacher-v4").exchanges[-1].replies[0]
     server = serve(reply_with(other), reply_with(to_reply(PHI)))
     assert design(toy_spec(), model=LiveModel("m", server.url), candidates=1).source == PHI.strip("\n")
-    error = server.requests[1]["messages"][-1]["content"]
+    error = request_messages(server.requests[1])[-1]["content"]
     assert re.search(r"^E-RUN line \d+: IndexError: .* beyond the end of an axis", error, re.MULTILINE)
 
 

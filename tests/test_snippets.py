@@ -19,7 +19,7 @@ import numpy as np
 import pytest
 
 import lare_rl
-from helpers.chat_servers import Server, text_completion
+from helpers.chat_servers import Server, reply_with
 from helpers.untrained_runs import write_run
 from lare_rl.sweep import processes
 from lare_rl.sweep.sweep import read_sweep
@@ -104,7 +104,7 @@ class Page:
 
     def serve(self, source):
         """Start a language model that always writes the same function; it answers at all addresses on the page."""
-        server = Server(lambda handler: handler.send(200, json.dumps(text_completion(to_reply(source))).encode()))
+        server = Server(reply_with(to_reply(source)))
         self.patch.setenv("OPENAI_BASE_URL", server.url)
         self.patch.setenv("OPENAI_API_KEY", "key")
         self.url = server.url

@@ -32,6 +32,7 @@ if TYPE_CHECKING:
     from lare_rl.report.report import write_report as write_report
     from lare_rl.runs.directory import Run as Run
     from lare_rl.runs.directory import open_run as open_run
+    from lare_rl.runs.plan import load_config as load_config
     from lare_rl.tasks.payments import PaymentRule as PaymentRule
     from lare_rl.tasks.spec import TaskSpec as TaskSpec
     from lare_rl.training.reflect import reflect as reflect

@@ -23,15 +23,50 @@ def text_completion(text: str | None, usage: dict | None = None, **message: Any)
     }
 
 
+def text_response(text: str | None, usage: dict | None = None, refusal: str | None = None) -> dict[str, Any]:
+    """Return an answer of OpenAI's Responses API, from a model that reasons."""
+    contents = [{"type": "output_text", "text": text, "annotations": []}] if text else []
+    contents += [{"type": "refusal", "refusal": refusal}] if refusal else []
+    return {
+        "id": "1",
+        "object": "response",
+        "created_at": 0,
+        "status": "completed",
+        "error": None,
+        "incomplete_details": None,
+        "model": "m",
+        "output": [
+            {"type": "reasoning", "id": "2", "summary": []},
+            {"type": "message", "id": "3", "role": "assistant", "status": "completed", "content": contents},
+        ],
+        "usage": {"input_tokens": 100, "output_tokens": 10, "total_tokens": 110} if usage is None else usage,
+    }
+
+
+def request_messages(request: dict[str, Any]) -> list[dict[str, str]]:
+    """Return the messages of a request, of either API."""
+    return request["messages"] if "messages" in request else request["input"]
+
+
 class Handler(BaseHTTPRequestHandler):
     server: "Server"
 
     def do_POST(self) -> None:
         self.server.requests.append(json.loads(self.rfile.read(int(self.headers["Content-Length"]))))
         self.server.headers.append(self.headers)
+        self.server.apis.append(self.api)
         answers = self.server.answers
         answer = answers.pop(0) if len(answers) > 1 else answers[0]
         answer(self)
+
+    @property
+    def api(self) -> str:
+        return self.path.rpartition("/")[2]
+
+    def send_text(self, text: str | None, **details: Any) -> None:
+        """Answer a request of either API."""
+        answer = text_response if self.api == "responses" else text_completion
+        self.send(200, json.dumps(answer(text, **details)).encode())
 
     def send(self, status: int, body: bytes, **headers: str) -> None:
         self.begin(status, Content_Length=str(len(body)), **headers)
@@ -66,6 +101,7 @@ class Server(ThreadingHTTPServer):
         self.answers = list(answers)
         self.requests: list[dict] = []
         self.headers: list[Any] = []
+        self.apis: list[str] = []
         self.url = f"http://127.0.0.1:{self.server_port}/v1"
         threading.Thread(target=self.serve_forever, kwargs={"poll_interval": 0.01}, daemon=True).start()
 
@@ -77,8 +113,8 @@ class Server(ThreadingHTTPServer):
         """Ignore a client that hangs up."""
 
 
-def reply_with(text: str | None, **kwargs: Any) -> Answer:
-    return raw_answer(json.dumps(text_completion(text, **kwargs)).encode())
+def reply_with(text: str | None, **details: Any) -> Answer:
+    return lambda handler: handler.send_text(text, **details)
 
 
 def raw_answer(body: bytes, status: int = 200, **headers: str) -> Answer:

@@ -4,6 +4,7 @@ import gzip
 import json
 import threading
 import time
+from functools import partial
 
 import pytest
 
@@ -20,9 +21,12 @@ from helpers.chat_servers import (
     reply_with,
     reset_connection,
     text_completion,
+    text_response,
 )
 from lare_rl.errors import LareError
+from lare_rl.llm import ladder
 from lare_rl.llm.budget import Budget, BudgetExceededError, max_request_tokens
+from lare_rl.llm.ladder import Ladder, store_ladder
 from lare_rl.llm.live import LiveModel, ModelError
 
 KEY = "sk-secret-key-0123456789"
@@ -31,23 +35,40 @@ ATTEMPTS, REPLY_TOKENS = 6, 16_384
 
 
 @pytest.fixture
-def start(monkeypatch):
+def serve(monkeypatch):
     """Start a server with its answers. Return it, a model that asks it, and the list of the model's pauses."""
     monkeypatch.setenv("OPENAI_API_KEY", KEY)
     monkeypatch.delenv("OPENAI_BASE_URL", raising=False)
+    monkeypatch.setattr(ladder, "_VERIFIED", {})
     servers = []
 
-    def start(*answers, **settings):
+    def serve(*answers, first_rung=None, **settings):
         servers.append(Server(*answers))
+        if first_rung is None:
+            pytest.importorskip("openai.resources.responses")  # the client may be older
+        else:
+            store_ladder(f"{servers[-1].url}/", "m", first_rung)
         pauses = []
         return servers[-1], LiveModel("m", servers[-1].url, sleep=pauses.append, **settings), pauses
 
-    yield start
+    yield serve
     for server in servers:
         server.stop()
 
 
-def test_request(start):
+@pytest.fixture
+def start(serve):
+    """Start a server that is asked for chat completions."""
+    return partial(serve, first_rung=Ladder().without_responses())
+
+
+@pytest.fixture(params=["responses", "chat"])
+def start_either(request, serve):
+    """Start a server of either API."""
+    return serve if request.param == "responses" else partial(serve, first_rung=Ladder().without_responses())
+
+
+def test_request_for_a_completion(start):
     server, model, pauses = start(reply_with("hello"), temperature=0.5)
     assert model.reply(REQUEST, 0) == "hello"
     (request,) = server.requests
@@ -61,6 +82,19 @@ def test_request(start):
     assert pauses == []
 
 
+def test_request_for_a_response(serve):
+    server, model, pauses = serve(reply_with("hello"), temperature=0.5)
+    assert model.reply(REQUEST, 0) == "hello"
+    (request,) = server.requests
+    schema = request["text"]["format"]["schema"]
+    assert (request["text"]["format"]["type"], set(schema["properties"])) == ("json_schema", set(schema["required"]))
+    assert request["input"] == REQUEST
+    assert (request["max_output_tokens"], request["temperature"], request["store"]) == (REPLY_TOKENS, 0.5, False)
+    assert server.headers[0]["Authorization"] == f"Bearer {KEY}"
+    assert (model.budget.requests_used, model.budget.tokens_in, model.budget.tokens_out) == (1, 100, 10)
+    assert (server.apis, pauses) == (["responses"], [])
+
+
 @pytest.mark.parametrize(
     ("answer", "text"),
     [
@@ -70,19 +104,29 @@ def test_request(start):
         (reply_with("x" * 100_000), "x" * 100_000),
         (reply_with("a \ud800 b"), "a ? b"),  # a lone surrogate, which no file can store
         (reply_with(f"Your key is {KEY}."), "Your key is [key]."),
-        (raw_answer(gzip.compress(json.dumps(text_completion("hello")).encode()), Content_Encoding="gzip"), "hello"),
     ],
 )
-def test_reply_text(start, answer, text):
-    _, model, _ = start(answer)
+def test_reply_text(start_either, answer, text):
+    _, model, _ = start_either(answer)
     assert model.reply(REQUEST, 0) == text
 
 
-def test_truncated_reply_is_reported(start):
-    answer = text_completion("half of")
-    answer["choices"][0]["finish_reason"] = "length"
+def test_compressed_reply(start):
+    _, model, _ = start(
+        raw_answer(gzip.compress(json.dumps(text_completion("hello")).encode()), Content_Encoding="gzip")
+    )
+    assert model.reply(REQUEST, 0) == "hello"
+
+
+def test_truncated_reply_is_reported(start_either):
+    def cut_off(handler):
+        completion, response = text_completion("half of"), text_response("half of")
+        completion["choices"][0]["finish_reason"] = "length"
+        response |= {"status": "incomplete", "incomplete_details": {"reason": "max_output_tokens"}}
+        handler.send(200, json.dumps(response if handler.api == "responses" else completion).encode())
+
     messages = []
-    _, model, _ = start(raw_answer(json.dumps(answer).encode()), on_message=messages.append)
+    _, model, _ = start_either(cut_off, on_message=messages.append)
     assert model.reply(REQUEST, 0) == "half of"
     assert len(messages) == 2
     assert "cut off" in messages[1]
@@ -97,16 +141,16 @@ def test_temporary_error_is_retried(start):
         assert pauses == [0.5, 1.0, 2.0]
 
 
-def test_retry_after(start):
+def test_retry_after(start_either):
     answers = [refuse(429, Retry_After=value) for value in ("3", "9999", "Wed, 21 Oct 2015 07:28:00 GMT")]
-    _, model, pauses = start(*answers, reply_with("hello"))
+    _, model, pauses = start_either(*answers, reply_with("hello"))
     assert model.reply(REQUEST, 0) == "hello"
     assert pauses == [3.0, 60.0, 2.0]
 
 
 @pytest.mark.parametrize("answer", [hang_up, reset_connection, break_off])
-def test_broken_connection_is_retried_and_counted(start, answer):
-    server, model, pauses = start(answer, reply_with("hello"))
+def test_broken_connection_is_retried_and_counted(start_either, answer):
+    server, model, pauses = start_either(answer, reply_with("hello"))
     assert model.reply(REQUEST, 0) == "hello"
     assert (len(server.requests), pauses) == (2, [0.5])
     assert model.budget.tokens_out == REPLY_TOKENS + 10
@@ -156,20 +200,109 @@ def test_permanent_error_is_not_retried(start, answer, requests, words):
     assert (len(server.requests), pauses) == (requests, [])
 
 
-def test_retries_end(start):
-    server, model, pauses = start(refuse(503))
+def test_retries_end(start_either):
+    server, model, pauses = start_either(refuse(503))
     with pytest.raises(ModelError, match="HTTP 503"):
         model.reply(REQUEST, 0)
     assert len(server.requests) == ATTEMPTS
     assert pauses == [0.5, 1, 2, 4, 8]
 
 
+def refuse_responses(answer, completion=None):
+    """Answer requests of the Responses API in one way, and those for chat completions with a text or in another way."""
+    return lambda handler: (answer if handler.api == "responses" else completion or reply_with("hello"))(handler)
+
+
+@pytest.mark.parametrize(
+    "answer",
+    [
+        *map(refuse, (403, 404, 405, 500, 501)),
+        refuse(400, "text.format is not supported"),
+        refuse(422, "unknown field input"),
+        raw_answer(b'{"error": "Unexpected endpoint or method. (POST /v1/responses)"}'),
+        raw_answer(b"<html>Welcome</html>"),
+        raw_answer(b'{"output": [{"type": "message", "content": [{"text": 1}]}]}'),
+    ],
+)
+def test_server_without_the_responses_api(serve, answer):
+    server, model, pauses = serve(refuse_responses(answer))
+    assert [model.reply(REQUEST, number) for number in range(2)] == ["hello"] * 2
+    assert server.apis == ["responses", "completions", "completions"]
+    assert server.requests[1]["response_format"]["type"] == "json_schema"
+    assert (pauses, model.budget.requests_used) == ([], 3)
+    assert LiveModel("m", server.url).reply(REQUEST, 0) == "hello"  # the process stores what the server supports
+    assert server.apis[3:] == ["completions"]
+    LiveModel("other", server.url).reply(REQUEST, 0)
+    assert server.apis[4:] == ["responses", "completions"]
+
+
+def test_all_rungs(serve):
+    server, model, pauses = serve(*[refuse(400, "this format is not supported")] * 3, reply_with("hello"))
+    assert model.reply(REQUEST, 0) == "hello"
+    formats = [request.get("response_format", {}).get("type") for request in server.requests]
+    assert server.apis == ["responses", *["completions"] * 3]
+    assert (formats, pauses) == ([None, "json_schema", "json_object", None], [])
+
+
+def test_refused_options_of_a_response(serve):
+    refusals = [
+        refuse(400, "Unsupported parameter: 'temperature' is not supported with this model."),
+        refuse(400, "max_output_tokens is too large: at most 8192 tokens"),
+    ]
+    server, model, _ = serve(*refusals, reply_with("hello"), temperature=1.0)
+    assert model.reply(REQUEST, 0) == "hello"
+    assert server.apis == ["responses"] * 3
+    assert ["temperature" in request for request in server.requests] == [True, False, False]
+    assert [request["max_output_tokens"] for request in server.requests] == [
+        REPLY_TOKENS,
+        REPLY_TOKENS,
+        REPLY_TOKENS // 2,
+    ]
+
+
+def test_error_of_a_known_responses_api_is_retried(serve):
+    server, model, pauses = serve(reply_with("hello"), refuse(500), raw_answer(b"{}"), reply_with("again"))
+    assert [model.reply(REQUEST, number) for number in range(2)] == ["hello", "again"]
+    assert (server.apis, pauses) == (["responses"] * 4, [0.5, 1.0])
+
+
+def test_failed_response(serve):
+    failed = {"status": "failed", "error": {"code": "server_error", "message": "The model crashed."}, "output": []}
+    server, model, pauses = serve(raw_answer(json.dumps(failed).encode()))
+    with pytest.raises(ModelError, match="The model crashed"):
+        model.reply(REQUEST, 0)
+    assert (server.apis, len(pauses)) == (["responses"] * ATTEMPTS, ATTEMPTS - 1)
+
+
+@pytest.mark.parametrize("status", [403, 404])
+def test_error_of_both_apis(serve, status):
+    server, model, _ = serve(refuse_responses(refuse(status, "first"), refuse(status, "there is no model m")))
+    with pytest.raises(ModelError, match="there is no model m"):
+        model.reply(REQUEST, 0)
+    assert server.apis == ["responses", "completions"]
+
+
+def test_client_without_the_responses_api(serve, monkeypatch):
+    server, _, _ = serve(reply_with("hello"), first_rung=Ladder())
+    connect = LiveModel._connect
+    monkeypatch.setattr(LiveModel, "_connect", lambda self: OldClient(connect(self)))
+    assert LiveModel("m", server.url).reply(REQUEST, 0) == "hello"
+    assert server.apis == ["completions"]
+
+
+class OldClient:
+    """A client as before version 1.66 of OpenAI's package."""
+
+    def __init__(self, client):
+        self.chat, self.base_url = client.chat, client.base_url
+
+
 def hang(handler):
     threading.Event().wait(30)
 
 
-def test_closed_port(start):
-    server, model, pauses = start(reply_with("hello"))
+def test_closed_port(start_either):
+    server, model, pauses = start_either(reply_with("hello"))
     server.stop()
     with pytest.raises(ModelError, match=r"http://127\.0\.0\.1:\d+/v1/ cannot be reached"):
         model.reply(REQUEST, 0)
@@ -178,9 +311,9 @@ def test_closed_port(start):
 
 
 @pytest.mark.parametrize("answer", [drip_body(200), drip_body(500), drip_headers, hang])
-def test_slow_answer_ends_with_the_time_of_the_design(start, answer):
+def test_slow_answer_ends_with_the_time_of_the_design(start_either, answer):
     messages = []
-    server, model, _ = start(answer, budget=Budget(seconds=0.4), on_message=messages.append)
+    server, model, _ = start_either(answer, budget=Budget(seconds=0.4), on_message=messages.append)
     began = time.monotonic()
     with pytest.raises(BudgetExceededError, match="TimeoutError"):
         model.reply(REQUEST, 0)
@@ -200,8 +333,8 @@ def test_slow_answer_ends_with_the_time_of_the_design(start, answer):
         (compress("gzip, gzip", 2), "gzip, gzip"),
     ],
 )
-def test_large_answer(start, answer, words):
-    server, model, _ = start(answer, budget=Budget(requests=1, tokens=100_000_000))
+def test_large_answer(start_either, answer, words):
+    server, model, _ = start_either(answer, budget=Budget(requests=1, tokens=100_000_000))
     with pytest.raises(LareError, match=words):
         model.reply(REQUEST, 0)
     assert server.headers[0]["Accept-Encoding"] == "identity"
@@ -235,10 +368,11 @@ def test_unsupported_options_are_dropped_for_good(start):
         {"prompt_tokens": float("inf"), "completion_tokens": 1},
         {"prompt_tokens": 10**400, "completion_tokens": 1},
         {"prompt_tokens": 1, "completion_tokens": -1},
+        {"input_tokens": 1},
     ],
 )
-def test_bytes_are_counted_without_usage(start, usage):
-    _, model, _ = start(reply_with("grüße", usage=usage))
+def test_bytes_are_counted_without_usage(start_either, usage):
+    _, model, _ = start_either(reply_with("grüße", usage=usage))
     model.reply(REQUEST, 0)
     assert (model.budget.tokens_in, model.budget.tokens_out) == (max_request_tokens(REQUEST), 7)
     assert "counted as bytes" in model.budget.summary()
@@ -272,9 +406,9 @@ def test_token_budget(start):
     assert [request["max_completion_tokens"] for request in server.requests[:2]] == [REPLY_TOKENS] * 2
 
 
-def test_pauses_count_as_waiting(start):
+def test_pauses_count_as_waiting(start_either):
     messages = []
-    _, model, pauses = start(
+    _, model, pauses = start_either(
         refuse(429, Retry_After="999999999"), budget=Budget(seconds=150.0), on_message=messages.append
     )
     with pytest.raises(BudgetExceededError, match="2 minutes"):
@@ -288,8 +422,8 @@ def test_pauses_count_as_waiting(start):
     ("status", "location"),
     [(301, "https://elsewhere.example/v1"), (302, "http://127.0.0.1:1/v1/chat/completions"), (308, "//127.0.0.2/v1")],
 )
-def test_redirect_to_another_server(start, status, location):
-    server, model, pauses = start(raw_answer(b"", status, Location=location))
+def test_redirect_to_another_server(start_either, status, location):
+    server, model, pauses = start_either(raw_answer(b"", status, Location=location))
     with pytest.raises(ModelError, match="redirects to http"):
         model.reply(REQUEST, 0)
     assert (len(server.requests), pauses) == (1, [])

@@ -136,6 +136,17 @@ def design(
         _print_function(function, find_free_path(Path(f"{spec.name}.py")))
     else:
         _save_function(function, out)
+        print_line(_next_command(task, spec, out.with_suffix(".py"), kind, data))
+
+
+def _next_command(task: str, spec: "TaskSpec", out: Path, kind: Kind, data: str | None) -> str:
+    """Return what to do with a new function."""
+    if spec.team is not None:
+        return f"to train with it: lare-rl train TASK --function {out}, with a --function for each team of TASK"
+    if data is not None:
+        return f"to use it: lare-rl relabel {data} --task {task} --function {out} --out NEW"
+    method = " --method llm-reward" if kind == "reward" else ""
+    return f"to train with it: lare-rl train {task} --function {out}{method}"
 
 
 def load_policy(run: Path | None, spec: "TaskSpec") -> "Policy | None":

@@ -5,7 +5,7 @@ import functools
 import inspect
 import io
 import itertools
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence, Set
 from contextvars import ContextVar
 from types import NoneType
 from typing import Annotated, Any, Literal, get_args, get_origin
@@ -22,6 +22,7 @@ from tyro.constructors import (
 
 from lare_rl.algorithms.registry import ALGORITHMS
 from lare_rl.errors import CheckedModel, LareError, did_you_mean, model_keys, nested_model
+from lare_rl.runs.plan import load_config
 from lare_rl.util.renamed_fields import rename_options
 
 __all__ = ["parse"]
@@ -49,7 +50,8 @@ def parse(
     prog = f"lare-rl {name}"
     with _RULES, _hide(_hidden_algorithms(options)), contextlib.redirect_stderr(io.StringIO()) as stderr:
         try:
-            command, unknown = tyro.cli(_defer(commands[name]), prog=prog, args=options, return_unknown_args=True)
+            deferred_command = _defer(commands[name], options)
+            command, unknown = tyro.cli(deferred_command, prog=prog, args=options, return_unknown_args=True)
         except LareError as error:
             raise LareError(f"{error}; see {prog} --help") from None
         except SystemExit as exit_:
@@ -90,10 +92,11 @@ def _first_paragraph(box: str) -> str:
     return next((" ".join(" ".join(group).split()) for is_text, group in groups if is_text), "")
 
 
-def _defer(command: Callable[..., None]) -> Callable[..., Callable[[], None]]:
+def _defer(command: Callable[..., None], options: Sequence[str] = ()) -> Callable[..., Callable[[], None]]:
     """Return a function with the signature of a command that only stores its arguments.
 
-    So an error inside the command is not taken for an error of the command line.
+    So an error inside the command is not taken for an error of the command line. `options` are the words of the command line.
+    With --config, they change the settings of this file.
     """
     signature = inspect.signature(command)
 
@@ -101,7 +104,10 @@ def _defer(command: Callable[..., None]) -> Callable[..., Callable[[], None]]:
     def store(*args: Any, **kwargs: Any) -> Callable[[], None]:
         for name, parameter in signature.parameters.items():
             if isinstance(parameter.default, CheckedModel):
-                kwargs[name] = type(parameter.default)(**kwargs[name])
+                values = kwargs[name]
+                if kwargs.get("config") is not None:
+                    values = _merge(load_config(kwargs["config"]).values, values, set(_requested_keys(options)))
+                kwargs[name] = type(parameter.default)(**values)
         return functools.partial(command, *args, **kwargs)
 
     del store.__wrapped__  # tyro would read docstring and signature there
@@ -111,6 +117,27 @@ def _defer(command: Callable[..., None]) -> Callable[..., Callable[[], None]]:
         name: _option_type(parameter.annotation, parameter.default) for name, parameter in signature.parameters.items()
     }
     return store
+
+
+def _requested_keys(options: Sequence[str]) -> Iterator[str]:
+    """Yield the keys of settings that the command line names, such as `td3.gamma`; `no_normalise` for `--no-normalise`."""
+    for option in options:
+        if option.startswith("--"):
+            key = option[2:].partition("=")[0].replace("-", "_")
+            yield key
+            table, dot, name = key.rpartition(".")  # a switch that is turned off
+            yield f"{table}{dot}{name.removeprefix('no_')}"
+
+
+def _merge(old: Mapping[str, Any], new: Mapping[str, Any], keys: Set[str], prefix: str = "") -> dict[str, Any]:
+    """Return nested settings with new values for these keys."""
+    merged = dict(old)
+    for name, value in new.items():
+        if isinstance(value, Mapping):
+            merged[name] = _merge(merged.get(name) or {}, value, keys, f"{prefix}{name}.")
+        elif f"{prefix}{name}" in keys:
+            merged[name] = value
+    return {name: value for name, value in merged.items() if value != {}}
 
 
 def _option_names(command: Callable[..., None]) -> Iterator[str]:

@@ -21,6 +21,7 @@ from lare_rl.cli.terminal import (
 from lare_rl.config.effective import unused_settings
 from lare_rl.config.settings import ResolvedSettings, Settings
 from lare_rl.errors import LareError, install_command
+from lare_rl.runs.plan import RunPlan, load_config
 from lare_rl.util.variables import read_variable
 
 if TYPE_CHECKING:
@@ -39,6 +40,7 @@ def train(
     settings: Annotated[Settings, tyro.conf.arg(name="")] = DEFAULTS,
     function: Annotated[tyro.conf.UseAppendAction[tuple[Path, ...]], tyro.conf.arg(metavar="FILE")] = (),
     out: Annotated[Path | None, tyro.conf.arg(metavar="DIR")] = None,
+    config: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None,
     resume: Annotated[Path | None, tyro.conf.arg(metavar="DIR")] = None,
     tensorboard: bool = False,
     wandb: Annotated[str | None, tyro.conf.arg(metavar="PROJECT")] = None,
@@ -54,6 +56,8 @@ def train(
         function: a latent function (.py), or a reply with one (.json), to use instead of a recorded one; verified before it is
             run. Where several teams learn, one --function for each, in the order of the task.
         out: the run directory, which must not exist; the default is runs/TASK-METHOD-ALGORITHM-sSEED.
+        config: a TOML or JSON file with task, function, out and any of the settings, or the directory of a run to repeat. The options of
+            the command line win.
         resume: a run directory to continue, from its last checkpoint and with its own settings. With --steps, a finished run is
             extended.
         tensorboard: write TensorBoard events into the run directory too (needs the extra lare-rl[tensorboard]).
@@ -61,33 +65,40 @@ def train(
         mlflow: send the metrics of each seed to an experiment of MLflow too (needs the extra lare-rl[mlflow]).
         watch: write verdict and curves to watch.html in the run directory after every evaluation, and open it in the browser.
     """
-    if task is not None:
+    plan = RunPlan(None, DEFAULTS, None, None) if config is None else load_config(config)
+    chosen_task = task or plan.task
+    if isinstance(chosen_task, str):
         from lare_rl.envs.load import read_task
 
-        read_task(task)  # a typo is reported before the slow imports
+        read_task(chosen_task)  # a typo is reported before the slow imports
     import lare_rl
     from lare_rl.runs.directory import open_run
 
     if resume is not None:
-        if (task, function, out, settings.model_copy(update={"steps": None})) != (None, (), None, DEFAULTS):
+        options = (task, function, out, config, settings.model_copy(update={"steps": None}))
+        if options != (None, (), None, None, DEFAULTS):
             raise LareError("--resume uses the run's settings: give it no task, and no setting but --steps")
         run_settings = open_run(resume).config.settings
         listeners = [*_listeners(wandb, mlflow, run_settings), *_live_page(resume, watch)]
         run = lare_rl.resume(resume, steps=settings.steps, tensorboard=tensorboard, listeners=listeners)
-    elif task is None:
+    elif chosen_task is None:
         raise LareError(
-            "there is no task: use lare-rl train TASK (lare-rl tasks lists them), or lare-rl train --resume DIR"
+            f"there is no task{'' if config is None else f' in {config}'}: use lare-rl train TASK (lare-rl tasks lists them), "
+            "or lare-rl train --resume DIR"
         )
     else:
         from lare_rl.config.resolve import resolve
+        from lare_rl.envs.load import resolve_task
         from lare_rl.runs.directory import default_directory
 
-        spec = lare_rl.load_task(task)
+        spec = resolve_task(chosen_task)
         resolved = resolve(settings, spec)
-        for warning in unused_settings(settings, resolved, spec).values():
-            raise LareError(f"{warning}: leave the setting out")
-        functions = _load_functions(function, spec, resolved) if function else None
-        out = out or default_directory(spec, resolved)
+        for name, warning in unused_settings(settings, resolved, spec).items():
+            if not (plan.is_run and plan.has(name, settings)):
+                raise LareError(f"{warning}: leave the setting out")
+        planned = plan.function_for(resolved)
+        functions = _load_functions(function or planned, spec, resolved) if function or planned else None
+        out = out or plan.out or default_directory(spec, resolved)
         run = lare_rl.train(
             spec,
             settings,
@@ -99,14 +110,18 @@ def train(
     print_line(f"finished {run.directory}; to see it: lare-rl report {run.directory}")
 
 
-def _load_functions(files: tuple[Path, ...], spec: "TaskSpec", resolved: ResolvedSettings) -> "list[LatentFunction]":
+def _load_functions(
+    files: "Sequence[Path | LatentFunction]", spec: "TaskSpec", resolved: ResolvedSettings
+) -> "list[LatentFunction]":
     """Load and verify the latent functions of a run."""
     from lare_rl.latent.function import CHANGED_SUFFIX, pair_with_roles
     from lare_rl.latent.saved import load_function
     from lare_rl.training.latent_functions import check_draw_unused
 
     check_draw_unused(resolved)
-    functions = [load_function(file, role) for file, role in pair_with_roles(files, spec)]
+    functions = [
+        load_function(file, role) if isinstance(file, Path) else file for file, role in pair_with_roles(files, spec)
+    ]
     for function in functions:
         if function.changed:
             author = function.model.removesuffix(CHANGED_SUFFIX)

@@ -10,7 +10,10 @@ from typing import Any
 from lare_rl.errors import LareError
 from lare_rl.util.renamed_fields import rename_keys
 
-__all__ = ["FORMAT", "migrate"]
+__all__ = ["CONFIG", "FORMAT", "migrate"]
+
+CONFIG = "config.json"
+"""The configuration of a run, in its directory."""
 
 FORMAT = 7
 """The format of config.json. It is increased whenever its contents change."""

@@ -5,11 +5,11 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from lare_rl.envs.load import resolve_task
-from lare_rl.errors import LareError, short_repr
+from lare_rl.errors import LareError
 from lare_rl.latent.function import LatentFunction, function_from_verdict, normalise_source
 from lare_rl.latent.verify import Check, Steps, Verdict, sample_steps, verify
 from lare_rl.llm import prompts
-from lare_rl.llm.model import Model, recorded_model
+from lare_rl.llm.model import Model, ModelFunction, as_model, recorded_model
 from lare_rl.llm.prompts import MAX_CANDIDATES, N_CANDIDATES, Kind, Message, Stage
 from lare_rl.llm.recording import Recorder
 from lare_rl.llm.reply import MalformedReplyError, parse_reply
@@ -172,7 +172,7 @@ def check_recorded(task: TaskSpec, kind: Kind, draw: int, candidates: int) -> No
 def design(
     task: TaskSpec | str | Path,
     kind: Kind = "factors",
-    model: Model | None = None,
+    model: Model | ModelFunction | None = None,
     draw: int = 0,
     candidates: int = N_CANDIDATES,
     pre_verification: bool = True,
@@ -190,7 +190,8 @@ def design(
     Args:
         task: a name, a path, or a spec.
         kind: several factors, or one reward.
-        model: the language model to ask. Without one, the shipped recordings answer.
+        model: the language model to ask: an object with `name` and `reply(messages, sample)`, or a function from messages to a
+            text. Without one, the shipped recordings answer.
         draw: the number of the shipped recording that answers (0 to 4). It is independent of the training seed.
         candidates: n. With 1 (the paper's ablation without self-prompting), the single candidate is the function and
             nothing is combined.
@@ -205,11 +206,9 @@ def design(
         LareError: the model cannot answer, the environment does not run, or each team of the task needs its own function.
     """
     task = require_role(resolve_task(task))
-    if model is not None and not isinstance(model, Model):
-        raise LareError(f"a model must have a name and a method reply(messages, sample): {short_repr(model)} does not")
     if not 1 <= candidates <= MAX_CANDIDATES:
         raise LareError(f"candidates = {candidates}: from 1 to {MAX_CANDIDATES}")
-    model = model or recorded_model(task.name, kind, draw)
+    model = recorded_model(task.name, kind, draw) if model is None else as_model(model)
     sample_steps(task, steps)  # an environment that does not run is found before a model is paid
     recorder = Recorder(task.name, kind, getattr(model, "temperature", None), record)
     conversation = Conversation(task, kind, model, recorder, on_message, steps)

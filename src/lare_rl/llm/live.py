@@ -3,7 +3,7 @@
     limits       of time and size: see `http_limits`; of requests, tokens and waiting: see `budget`
     redirects    to another server are refused, because it would receive the request
     retries      408, 409, 429, 5xx and broken connections, with back-off or after the time that the server names
-    structure    requested as a JSON schema, as a JSON object if the server has no schemas, or else only in words
+    requests     of the strictest kind that the server supports: see `ladder`
     the key      see `key`
 
 `reply` reads every reply, however its structure was requested.
@@ -12,7 +12,7 @@
 import re
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, NamedTuple
 
 from lare_rl.errors import LareError, install_command
@@ -27,6 +27,7 @@ from lare_rl.llm.http_limits import (
     run_in_time,
 )
 from lare_rl.llm.key import KEY_VARIABLE, api_key, redact_key
+from lare_rl.llm.ladder import MIN_REPLY_TOKENS, FailedResponseError, find_ladder, store_ladder
 from lare_rl.llm.prompts import Message
 from lare_rl.util.safe_io import read_json
 from lare_rl.util.sanitize import one_line
@@ -36,8 +37,6 @@ __all__ = ["LiveModel", "ModelError"]
 
 _MAX_ATTEMPTS = 6
 _MAX_PAUSE_S = 60.0
-_MAX_REPLY_TOKENS, _MIN_REPLY_TOKENS = 16_384, 1024
-"""The limit on a reply's tokens. It is halved while the model allows less, down to the second number."""
 _MAX_EXCERPT, _MAX_MESSAGE = 200, 500
 """Characters of an answer that a message quotes, and of the message."""
 
@@ -46,25 +45,6 @@ _RETRIED_STATUSES = {408, 409, 429}
 # Errors of the HTTP library by the beginnings of their names, because the library depends on the client's version.
 _PERMANENT_ERRORS = ("UnsupportedProtocol", "InvalidURL", "LocalProtocolError")
 _NOT_SENT_ERRORS = ("Connect", *_PERMANENT_ERRORS)
-
-_KEYS = ["Understand", "Analyze", "Functions"]
-_SCHEMA = {
-    "type": "object",
-    "properties": {key: {"type": "string"} for key in _KEYS},
-    "required": _KEYS,
-    "additionalProperties": False,
-}
-_RESPONSE_FORMATS: tuple[dict[str, Any], ...] = (
-    {
-        "response_format": {
-            "type": "json_schema",
-            "json_schema": {"name": "evaluation_function", "strict": True, "schema": _SCHEMA},
-        }
-    },
-    {"response_format": {"type": "json_object"}},
-    {},
-)
-"""Options that request a structure, the strictest first."""
 
 
 class ModelError(LareError):
@@ -97,12 +77,6 @@ class LiveModel:
     on_message: Callable[[str], None] = lambda _: None
     """Called with messages about waiting and retries."""
     sleep: Callable[[float], None] = time.sleep
-    # What the server has been found to support. A refused request makes it smaller.
-    _formats: list[dict[str, Any]] = field(default_factory=lambda: list(_RESPONSE_FORMATS), init=False, repr=False)
-    _limit_options: list[str] = field(
-        default_factory=lambda: ["max_completion_tokens", "max_tokens"], init=False, repr=False
-    )  # the name for newer servers, and for older ones
-    _reply_tokens: int = field(default=_MAX_REPLY_TOKENS, init=False, repr=False)
 
     def __post_init__(self) -> None:
         if not self.name.strip() or not self.name.isprintable():
@@ -121,6 +95,9 @@ class LiveModel:
             raise ModelError(f"a live model needs an extra: {install_command('llm')}") from None
         except Exception as error:  # the client raises errors of several kinds for a bad address
             raise ModelError(f"the endpoint {self.base_url!r} cannot be used: {_safe_text(error)}") from None
+        self._ladder = find_ladder(str(self._client.base_url), self.name)
+        if not hasattr(self._client, "responses"):  # in versions of the client before 1.66
+            self._ladder = self._ladder.without_responses()
 
     def _connect(self) -> Any:
         """Return a client that limits the time and the size of answers."""
@@ -163,16 +140,15 @@ class LiveModel:
 
     def _request(self, messages: Sequence[Message]) -> str | _Failure:
         """Send one request. Return the reply, or why there is none."""
-        max_tokens = min(self._reply_tokens, self.budget.max_reply_tokens(messages, _MIN_REPLY_TOKENS))
-        options = {self._limit_options[0]: max_tokens, **self._formats[0]}
-        if self.temperature is not None:
-            options["temperature"] = self.temperature
+        max_tokens = min(self._ladder.reply_tokens, self.budget.max_reply_tokens(messages, MIN_REPLY_TOKENS))
+        request = self._ladder.request(self.name, messages, max_tokens, self.temperature)
         self.budget.requests_used += 1
         timeout_s = min(self.budget.reply_timeout_s, self.budget.seconds_left)
-        create = self._client.chat.completions.with_streaming_response.create
+        api = self._client.responses if self._ladder.api == "responses" else self._client.chat.completions
+        create = api.with_streaming_response.create
 
         def fetch() -> bytes:
-            with create(model=self.name, messages=list(messages), **options) as response:
+            with create(**request) as response:
                 return read_body(response)
 
         try:
@@ -183,22 +159,27 @@ class LiveModel:
         return self._read_answer(body, messages, max_tokens)
 
     def _read_answer(self, body: bytes, messages: Sequence[Message], max_tokens: int) -> str | _Failure:
-        """Return the text of a chat completion. An answer that is none is a failure."""
+        """Return the text of an answer. A body that is no answer is a failure."""
         try:
-            answer = read_json(body)
-            choice = answer["choices"][0]
-            message = choice["message"]
-            text = message.get("content") or message.get("refusal") or ""
-            if not isinstance(text, str):
-                raise TypeError("the content is not a text")
+            answer = self._ladder.read_answer(body)
+        except FailedResponseError as error:
+            self.budget.count_reply(None, messages, body.decode(errors="replace"))
+            return _Failure(_safe_text(f"the model failed: {error}"), retry=True)
         except (ValueError, TypeError, KeyError, IndexError, AttributeError) as error:
             page = body.decode(errors="replace")
             self.budget.count_reply(None, messages, page)
-            reason = f"the answer is not a chat completion ({type(error).__name__}: {error})"
-            return _Failure(_safe_text(f"{reason}: {_excerpt(page)}"), retry=True)
-        text = text.encode(errors="replace").decode()  # replaces lone surrogates
-        self.budget.count_reply(answer.get("usage"), messages, text)
-        if choice.get("finish_reason") == "length":
+            kind = "response" if self._ladder.api == "responses" else "chat completion"
+            reason = f"the answer is not a {kind} ({type(error).__name__}: {error})"
+            is_missing = self._ladder.api == "responses" and not self._ladder.is_verified
+            if is_missing:  # some servers answer any request for an unknown address
+                self._ladder = self._ladder.without_responses()
+            return _Failure(_safe_text(f"{reason}: {_excerpt(page)}"), retry=True, request_changed=is_missing)
+        if not self._ladder.is_verified:
+            self._ladder = replace(self._ladder, is_verified=True)
+        store_ladder(str(self._client.base_url), self.name, self._ladder)
+        text = answer.text.encode(errors="replace").decode()  # replaces lone surrogates
+        self.budget.count_reply(answer.usage, messages, text)
+        if answer.is_cut_off:
             self.on_message(f"{self.name}: a reply was cut off at the {max_tokens:,} tokens that it was allowed")
         return text
 
@@ -225,29 +206,14 @@ class LiveModel:
     def _refusal(self, error: StatusError) -> _Failure:
         """Handle an HTTP error: change the request, wait, or give up."""
         message = _safe_text(f"HTTP {error.status}: {_error_text(error.body)}")
-        if error.status in (400, 422) and self._ask_for_less(error.body.lower()):
+        ladder = self._ladder.after_refusal(error.status, error.body.lower(), self.temperature is not None)
+        if ladder is not None:
+            self._ladder = ladder
             return _Failure(message, retry=True, request_changed=True)
         retry = error.status in _RETRIED_STATUSES or error.status >= 500
         return _Failure(
             message, retry=retry and "insufficient_quota" not in error.body, pause_s=_retry_after_s(error.headers)
         )
-
-    def _ask_for_less(self, reason: str) -> bool:
-        """Change further requests to what the server may support. Return false if there is nothing left to change."""
-        too_long = "token" in reason and re.search("large|at most|maximum|context|exceed", reason)
-        if too_long and self._reply_tokens > _MIN_REPLY_TOKENS:
-            self._reply_tokens //= 2
-        elif "max_completion_tokens" in reason and len(self._limit_options) > 1:
-            self._limit_options.pop(0)
-        elif "temperature" in reason and self.temperature is not None:
-            self.temperature = None
-        elif len(self._formats) > 1:
-            self._formats.pop(0)
-        elif len(self._limit_options) > 1:
-            self._limit_options.pop(0)
-        else:
-            return False
-        return True
 
 
 def _safe_text(text: object) -> str:

@@ -1,15 +1,20 @@
-"""The interface of a language model: a name, and replies. The design loop uses nothing else of a model."""
+"""The interface of a language model: a name, and replies. The design loop uses nothing else of a model.
 
-from collections.abc import Sequence
+A function from messages to a text is a model too.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Protocol, runtime_checkable
+from typing import Any, Protocol, runtime_checkable
 
-from lare_rl.errors import LareError
+from lare_rl.errors import LareError, short_repr
+from lare_rl.llm.key import redact_key
 from lare_rl.llm.prompts import Kind, Message
 from lare_rl.llm.recording import RecordedModel, read_recording, shipped_recordings
 from lare_rl.util.safe_io import read_text
 
-__all__ = ["RECORDED", "Model", "recorded_model"]
+__all__ = ["RECORDED", "FunctionModel", "Model", "ModelFunction", "as_model", "recorded_model"]
 
 
 @runtime_checkable
@@ -21,6 +26,41 @@ class Model(Protocol):
     def reply(self, messages: Sequence[Message], sample: int) -> str:
         """Return the text of reply number `sample` (0, 1, ...) to the same request. Raises `LareError` if there is no reply."""
         ...
+
+
+ModelFunction = Callable[[list[Message]], str]
+"""Takes the messages of a request, each with `role` and `content`, and returns the text of the reply."""
+
+
+@dataclass(frozen=True)
+class FunctionModel:
+    """A model that calls a function."""
+
+    function: ModelFunction
+    name: str
+
+    def reply(self, messages: Sequence[Message], sample: int) -> str:
+        try:
+            text = self.function([dict(message) for message in messages])
+        except LareError:
+            raise
+        except Exception as error:
+            raise LareError(redact_key(f"the model {self.name} failed: {type(error).__name__}: {error}")) from error
+        if not isinstance(text, str):
+            raise LareError(f"the model {self.name} must return a text, and returned {short_repr(text)}")
+        return redact_key(text)
+
+
+def as_model(model: Any) -> Model:
+    """Return a model, or the model that a function is. Raises `LareError` for anything else."""
+    if isinstance(model, Model):
+        return model
+    if callable(model):
+        return FunctionModel(model, getattr(model, "__name__", type(model).__name__))
+    raise LareError(
+        "a model must be a function from messages to a text, or have a name and a method reply(messages, sample), as "
+        f"lare_rl.llm.live.LiveModel('NAME') has: {short_repr(model)} does not"
+    )
 
 
 RECORDED = "recorded"

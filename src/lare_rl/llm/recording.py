@@ -116,9 +116,10 @@ class RecordedModel:
                 self.name = f"{recording.model}, recorded {recording.recorded}, draw {recording.draw}"
                 return replies[sample]
         raise LareError(
-            f"no recorded reply fits this request for task {self.task!r} (reply {sample + 1}); most shipped tasks have "
-            "them, for their exact texts. Ask a model (lare-rl design TASK --model NAME --out phi.py), train with a function of your own "
-            "(--function phi.py; in a sweep file, the table [functions]), or by a method that needs none (--method bayes)"
+            f"no recorded reply fits task {self.task!r} (reply {sample + 1}): most shipped tasks have some, for their exact texts. "
+            "Ask a model (lare_rl.design(task, model=...), or lare-rl design TASK --model NAME --out phi.py), train with a "
+            "function of your own (--function phi.py; in a sweep file, the table [functions]), or with a method that needs none "
+            "(--method bayes)"
         )
 
 

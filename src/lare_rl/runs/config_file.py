@@ -9,7 +9,7 @@ from pathlib import Path
 
 import jax
 
-from lare_rl.config.migrate import FORMAT, migrate
+from lare_rl.config.migrate import CONFIG, FORMAT, migrate
 from lare_rl.config.settings import ResolvedSettings
 from lare_rl.envs.families import load_env_spec
 from lare_rl.errors import CheckedModel, LareError
@@ -20,8 +20,6 @@ from lare_rl.util.provenance import code_version
 from lare_rl.util.safe_io import read_json, read_text
 
 __all__ = ["CONFIG", "Config", "make_config", "read_config", "write_config"]
-
-CONFIG = "config.json"
 
 MAX_CONFIG_BYTES = 8 << 20
 

@@ -17,12 +17,13 @@ from lare_rl.config.settings import Settings
 from lare_rl.credit.methods import find_method
 from lare_rl.envs.load import load_task
 from lare_rl.errors import LareError
+from lare_rl.runs.plan import relative_task
 from lare_rl.sweep.jobs import Job, check_job, make_job
 from lare_rl.sweep.processes import train_in_processes, train_on_ray
 from lare_rl.sweep.resources import Resources
 from lare_rl.training.loop import RunInterruptedError
 from lare_rl.util.renamed_fields import rename_keys
-from lare_rl.util.safe_io import MAX_SETTINGS_BYTES, read_text, read_toml
+from lare_rl.util.safe_io import read_table
 
 __all__ = ["Sweep", "read_sweep", "run_sweep"]
 
@@ -70,9 +71,9 @@ def read_sweep(path: Path) -> tuple[Sweep, list[Job]]:
     Raises:
         LareError: the file cannot be read, a run could not be trained, or a setting affects no run.
     """
-    text = read_text(path, MAX_SETTINGS_BYTES)
+    table = read_table(path)
     try:
-        sweep = Sweep(**read_toml(text))
+        sweep = Sweep(**table)
         _check_functions(sweep)
         jobs = list(_make_jobs(sweep, path))
         directories: set[Path] = set()
@@ -82,7 +83,7 @@ def read_sweep(path: Path) -> tuple[Sweep, list[Job]]:
             directories.add(job.directory)
             check_job(job)
         _check_settings(jobs)
-    except (LareError, ValueError) as error:
+    except LareError as error:
         raise LareError(f"{path}: {error}") from error
     return sweep, jobs
 
@@ -126,7 +127,7 @@ def _check_functions(sweep: Sweep) -> None:
 def _make_jobs(sweep: Sweep, path: Path) -> Iterator[Job]:
     """Plan every run of a sweep, task by task."""
     root = path.parent / (sweep.out or Path("runs") / path.stem)
-    tasks = [load_task(path.parent / name if name.endswith(".toml") else name) for name in sweep.tasks]
+    tasks = [load_task(relative_task(path, name)) for name in sweep.tasks]
     names = [task.name for task in tasks]
     if unknown := sorted(sweep.functions.keys() - set(names)):
         raise LareError(f"functions of {unknown[0]}, which is none of the tasks {', '.join(names)}")

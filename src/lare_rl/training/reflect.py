@@ -19,7 +19,7 @@ from lare_rl.envs.play import Episode, Policy, play_episodes
 from lare_rl.errors import LareError
 from lare_rl.latent.function import LatentFunction
 from lare_rl.latent.improve import Assessment, improve
-from lare_rl.llm.model import Model
+from lare_rl.llm.model import Model, ModelFunction, as_model
 from lare_rl.runs.directory import Run
 from lare_rl.tasks.spec import TaskSpec, require_role, select_states
 from lare_rl.training.stored_episodes import stored_role_episodes
@@ -36,7 +36,7 @@ N_CORRELATED = 3
 def reflect(
     function: LatentFunction,
     task: TaskSpec | str | Path,
-    model: Model,
+    model: Model | ModelFunction,
     rounds: int = 1,
     *,
     episodes: Sequence[Episode] | Run | None = None,
@@ -52,6 +52,7 @@ def reflect(
     Args:
         function: a function from `lare_rl.design`, or written by hand.
         task: the task of the function: a name, a path, or a spec.
+        model: the language model, as for `lare_rl.design`.
         episodes: whole episodes, or a run whose stored episodes are used; by default, 40 are played.
         policy: plays the episodes instead of random actions: a function from one observation of a single agent (and the mask of
             available actions, if the environment has one) to one action.
@@ -60,7 +61,7 @@ def reflect(
     Raises:
         LareError: `rounds` is less than 1, or each team of the task has its own function.
     """
-    role = require_role(resolve_task(task))
+    role, model = require_role(resolve_task(task)), as_model(model)
     if rounds < 1:
         raise LareError(f"rounds = {rounds}: at least one is needed")
 

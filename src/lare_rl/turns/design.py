@@ -7,7 +7,7 @@ from typing import Any
 
 from lare_rl.errors import LareError
 from lare_rl.latent.function import normalise_source
-from lare_rl.llm.model import Model
+from lare_rl.llm.model import Model, ModelFunction, as_model
 from lare_rl.llm.prompts import correct
 from lare_rl.llm.recording import Recorder
 from lare_rl.llm.reply import MalformedReplyError, parse_reply
@@ -44,7 +44,7 @@ def design_turn_phi(
     goal: str,
     tools: Sequence[Mapping[str, Any]],
     turns: Sequence[Turn],
-    model: Model,
+    model: Model | ModelFunction,
     *,
     examples: Sequence[Turn] | None = None,
     record: Path | None = None,
@@ -55,7 +55,7 @@ def design_turn_phi(
         goal: what the agent is to do.
         tools: the descriptions of its tools, in the form of OpenAI's chat completions.
         turns: turns that programs are checked on, such as all of some rollouts (`split_turns`).
-        model: the language model.
+        model: the language model, as for `lare_rl.design`.
         examples: the turns that the model sees. The default is five of `turns`, of different tools.
         record: the file to which every exchange is written.
 
@@ -64,6 +64,7 @@ def design_turn_phi(
     """
     if not turns:
         raise LareError("a phi over turns is checked on turns, and there is none")
+    model = as_model(model)
     request = turn_request(goal, tools, choose_examples(turns) if examples is None else examples)
     recorder = Recorder("turns", "events", getattr(model, "temperature", None), record)
     problems = ""

@@ -18,6 +18,7 @@ __all__ = [
     "check_depth",
     "parse_integer",
     "read_json",
+    "read_table",
     "read_text",
     "read_toml",
 ]
@@ -81,6 +82,23 @@ def read_toml(text: str) -> dict[str, Any]:
         return check_depth(tomllib.loads(text))
     except RecursionError:
         raise ValueError(_TOO_DEEP) from None
+
+
+def read_table(path: Path) -> dict[str, Any]:
+    """Read a file that is written by hand: JSON if its name ends with .json, else TOML.
+
+    Raises:
+        LareError: the file cannot be read, or is no table.
+    """
+    text, is_json = read_text(path, MAX_SETTINGS_BYTES), path.suffix == ".json"
+    try:
+        table = read_json(text) if is_json else read_toml(text)
+    except ValueError as error:
+        hint = "; a text needs quotes" if str(error).startswith("Invalid value") else ""
+        raise LareError(f"{path}: it is not valid {'JSON' if is_json else 'TOML'}: {error}{hint}") from error
+    if not isinstance(table, dict):
+        raise LareError(f"{path}: it is JSON, but not an object")
+    return table
 
 
 def check_depth(value: Any) -> Any:

@@ -1,0 +1,76 @@
+"""Language models of Pydantic AI: Anthropic, Google, Bedrock, Mistral and others.
+
+model = pydantic_ai_model("anthropic:claude-sonnet-4-5")
+phi = lare_rl.design(task, model=model)
+"""
+
+import asyncio
+import threading
+from functools import cache
+from typing import Any
+
+from lare_rl.errors import LareError, missing_extra_error, short_repr
+from lare_rl.llm.model import FunctionModel
+from lare_rl.llm.prompts import Message
+
+try:
+    from pydantic_ai import Agent
+    from pydantic_ai.messages import (
+        ModelMessage,
+        ModelRequest,
+        ModelResponse,
+        SystemPromptPart,
+        TextPart,
+        UserPromptPart,
+    )
+except ImportError:
+    raise missing_extra_error("lare_rl.integrations.pydantic_ai", "pydantic-ai") from None
+
+__all__ = ["pydantic_ai_model"]
+
+
+def pydantic_ai_model(model: Any) -> FunctionModel:
+    """Return a model that asks Pydantic AI, for `lare_rl.design(task, model=...)`.
+
+    Args:
+        model: the name of a model (`anthropic:claude-sonnet-4-5`), a model of Pydantic AI, or an `Agent` that returns texts.
+
+    Raises:
+        LareError: there is no such model, or its key is missing.
+    """
+    try:
+        agent = model if isinstance(model, Agent) else Agent(model)
+    except Exception as error:  # Pydantic AI, and the client of each provider, raise their own
+        raise LareError(f"Pydantic AI cannot use {short_repr(model)}: {error}") from error
+
+    def ask(messages: list[Message]) -> str:
+        history = [_convert(message) for message in messages[:-1]]
+        run = agent.run(messages[-1]["content"], message_history=history)
+        return asyncio.run_coroutine_threadsafe(run, _event_loop()).result().output
+
+    return FunctionModel(ask, _model_name(agent))
+
+
+@cache
+def _event_loop() -> asyncio.AbstractEventLoop:
+    """Return a loop that runs in a thread of its own, because in a notebook a loop runs in the main thread already.
+
+    It is one loop for all requests, because connections belong to a loop.
+    """
+    loop = asyncio.new_event_loop()
+    threading.Thread(target=loop.run_forever, daemon=True).start()
+    return loop
+
+
+def _model_name(agent: Agent[Any, Any]) -> str:
+    return str(getattr(agent.model, "model_name", None) or agent.model or agent.name)
+
+
+def _convert(message: Message) -> ModelMessage:
+    match message["role"]:
+        case "system":
+            return ModelRequest([SystemPromptPart(content=message["content"])])
+        case "assistant":
+            return ModelResponse([TextPart(content=message["content"])])
+        case _:
+            return ModelRequest([UserPromptPart(content=message["content"])])

@@ -1,0 +1,178 @@
+"""What a server supports. The strictest request comes first, and a refused request leads to the next rung.
+
+    responses   OpenAI's Responses API, with a JSON schema
+    chat        chat completions: with a JSON schema, with a JSON object, or with the structure only in words
+
+The rung that a server answered is stored for the process, by endpoint and model.
+"""
+
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any, Literal, NamedTuple
+
+from lare_rl.llm.prompts import Message
+from lare_rl.util.safe_io import read_json
+
+__all__ = [
+    "MAX_REPLY_TOKENS",
+    "MIN_REPLY_TOKENS",
+    "Answer",
+    "FailedResponseError",
+    "Ladder",
+    "find_ladder",
+    "store_ladder",
+]
+
+MAX_REPLY_TOKENS, MIN_REPLY_TOKENS = 16_384, 1024
+"""The limit on a reply's tokens. It is halved while the model allows less, down to the second number."""
+
+_KEYS = ["Understand", "Analyze", "Functions"]
+_SCHEMA = {
+    "name": "evaluation_function",
+    "strict": True,
+    "schema": {
+        "type": "object",
+        "properties": {key: {"type": "string"} for key in _KEYS},
+        "required": _KEYS,
+        "additionalProperties": False,
+    },
+}
+
+
+class _Rung(NamedTuple):
+    api: Literal["responses", "chat"]
+    options: dict[str, Any]
+    """Options that request a structure."""
+
+
+_RUNGS = (
+    _Rung("responses", {"text": {"format": {"type": "json_schema", **_SCHEMA}}}),
+    _Rung("chat", {"response_format": {"type": "json_schema", "json_schema": _SCHEMA}}),
+    _Rung("chat", {"response_format": {"type": "json_object"}}),
+    _Rung("chat", {}),
+)
+_CHAT_LIMITS = ("max_completion_tokens", "max_tokens")
+"""The option that limits the tokens of a chat completion: its name for newer servers, and for older ones."""
+
+_REFUSED_STATUSES = (400, 422)
+_MISSING_API_STATUSES = (403, 404, 405, 500, 501)
+"""What servers without the Responses API, or with a part of it, answer to such a request."""
+
+
+class FailedResponseError(Exception):
+    """An answer says that the model failed."""
+
+
+class Answer(NamedTuple):
+    """The content of an answer."""
+
+    text: str
+    usage: Any
+    is_cut_off: bool
+
+
+@dataclass(frozen=True)
+class Ladder:
+    """The requests that a server may support, the present one first."""
+
+    rungs: tuple[_Rung, ...] = _RUNGS
+    chat_limits: tuple[str, ...] = _CHAT_LIMITS
+    reply_tokens: int = MAX_REPLY_TOKENS
+    has_temperature: bool = True
+    is_verified: bool = False
+    """Whether the server has answered a request on the first of these rungs."""
+
+    @property
+    def api(self) -> str:
+        return self.rungs[0].api
+
+    def request(
+        self, name: str, messages: Sequence[Message], max_tokens: int, temperature: float | None
+    ) -> dict[str, Any]:
+        """Return the arguments of a request."""
+        options = {"model": name, **self.rungs[0].options}
+        if temperature is not None and self.has_temperature:
+            options["temperature"] = temperature
+        if self.api == "responses":
+            # OpenAI stores responses by default, and no chat completions.
+            return {"input": list(messages), "max_output_tokens": max_tokens, "store": False, **options}
+        return {"messages": list(messages), self.chat_limits[0]: max_tokens, **options}
+
+    def without_responses(self) -> "Ladder":
+        """Return the rungs of chat completions."""
+        return replace(self, rungs=tuple(rung for rung in self.rungs if rung.api == "chat"), is_verified=False)
+
+    def after_refusal(self, status: int, reason: str, has_temperature: bool) -> "Ladder | None":
+        """Return the ladder after a refused request, or None if nothing is left to change.
+
+        Args:
+            status: the HTTP status.
+            reason: the body of the answer, in lower case.
+            has_temperature: whether the request had a temperature.
+        """
+        if status in _REFUSED_STATUSES:
+            return self._ask_for_less(reason, has_temperature)
+        may_be_missing = self.api == "responses" and not self.is_verified
+        return self.without_responses() if may_be_missing and status in _MISSING_API_STATUSES else None
+
+    def _ask_for_less(self, reason: str, has_temperature: bool) -> "Ladder | None":
+        too_long = "token" in reason and re.search("large|at most|maximum|context|exceed", reason)
+        is_chat = self.api == "chat"
+        if too_long and self.reply_tokens > MIN_REPLY_TOKENS:
+            return replace(self, reply_tokens=self.reply_tokens // 2)
+        if is_chat and "max_completion_tokens" in reason and len(self.chat_limits) > 1:
+            return replace(self, chat_limits=self.chat_limits[1:])
+        if "temperature" in reason and has_temperature and self.has_temperature:
+            return replace(self, has_temperature=False)
+        if len(self.rungs) > 1:
+            return replace(self, rungs=self.rungs[1:], is_verified=False)
+        if len(self.chat_limits) > 1:
+            return replace(self, chat_limits=self.chat_limits[1:])
+        return None
+
+    def read_answer(self, body: bytes) -> Answer:
+        """Read the body of an answer.
+
+        Raises:
+            FailedResponseError: the model failed.
+            ValueError, TypeError, KeyError, IndexError, AttributeError: the body is no answer of this API.
+        """
+        answer = read_json(body)
+        return _read_response(answer) if self.api == "responses" else _read_completion(answer)
+
+
+def _read_completion(answer: Any) -> Answer:
+    choice = answer["choices"][0]
+    message = choice["message"]
+    text = message.get("content") or message.get("refusal") or ""
+    if not isinstance(text, str):
+        raise TypeError("the content is not a text")
+    return Answer(text, answer.get("usage"), choice.get("finish_reason") == "length")
+
+
+def _read_response(answer: Any) -> Answer:
+    if answer.get("status") == "failed":
+        raise FailedResponseError((answer.get("error") or {}).get("message") or "no reason was named")
+    messages = [item for item in answer["output"] if item["type"] == "message"]
+    contents = [content for message in messages for content in message["content"]]
+    text = "".join(content.get("text") or content.get("refusal") or "" for content in contents)
+    is_cut_off = (answer.get("incomplete_details") or {}).get("reason") == "max_output_tokens"
+    usage = answer.get("usage") or {}
+    # Under the names of chat completions.
+    names = {"prompt_tokens": "input_tokens", "completion_tokens": "output_tokens"}
+    return Answer(text, {name: usage.get(source) for name, source in names.items()}, is_cut_off)
+
+
+_VERIFIED: dict[tuple[str, str], Ladder] = {}
+"""The ladders of servers that have answered, by endpoint and model."""
+
+
+def find_ladder(endpoint: str, name: str) -> Ladder:
+    """Return the ladder that an endpoint and a model have answered in this process, or the whole ladder."""
+    return _VERIFIED.get((endpoint, name), Ladder())
+
+
+def store_ladder(endpoint: str, name: str, ladder: Ladder) -> None:
+    """Store the ladder that an endpoint and a model have answered."""
+    _VERIFIED[endpoint, name] = ladder

@@ -1,0 +1,135 @@
+"""What a file says of a run: its task, its settings, its latent functions and its directory.
+
+The file is TOML or JSON, written by hand. Or it is the configuration of an earlier run, which is then repeated.
+"""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+from pydantic import Field, field_validator
+
+from lare_rl.config.migrate import CONFIG
+from lare_rl.config.settings import ResolvedSettings, Settings
+from lare_rl.credit.methods import find_method
+from lare_rl.errors import LareError
+from lare_rl.llm.prompts import N_CANDIDATES
+from lare_rl.tasks.spec import TaskSpec
+from lare_rl.util.renamed_fields import rename_keys
+from lare_rl.util.safe_io import read_table
+
+if TYPE_CHECKING:
+    from lare_rl.latent.function import LatentFunction
+    from lare_rl.runs.directory import Run
+
+__all__ = ["RunPlan", "load_config", "relative_task"]
+
+
+@dataclass(frozen=True)
+class RunPlan:
+    """What a file says of a run. Whatever it does not say is None."""
+
+    task: str | TaskSpec | None
+    settings: Settings
+    function: "tuple[Path | LatentFunction, ...] | None"
+    out: Path | None
+    is_run: bool = False
+    """Whether it is the configuration of an earlier run. All settings are then decided."""
+
+    @property
+    def values(self) -> dict[str, Any]:
+        """The settings that the file has, in nested tables."""
+        return self.settings.model_dump(exclude_unset=True)
+
+    def has(self, name: str, settings: Settings) -> bool:
+        """Return whether a setting, by its dotted name, has the value that the file says."""
+
+        def get(values: Any) -> Any:
+            for key in name.split("."):
+                values = values.get(key) if isinstance(values, dict) else None
+            return values
+
+        return get(self.values) == get(settings.model_dump())
+
+    def function_for(self, settings: ResolvedSettings) -> "tuple[Path | LatentFunction, ...]":
+        """Return the functions of the file for the settings of a run. There are none if another method needs none."""
+        replaced = settings.method != self.settings.method and not find_method(settings.method).needs_phi
+        return () if replaced else self.function or ()
+
+
+class _PlanFile(Settings):
+    """The keys of a file."""
+
+    task: Annotated[str, Field(min_length=1)] | None = None
+    function: tuple[Path, ...] | None = None
+    out: Path | None = None
+
+    @field_validator("function", mode="before")
+    @classmethod
+    def _read_one_path(cls, value: Any) -> Any:
+        return (value,) if isinstance(value, str) else value
+
+
+def load_config(path: str | Path) -> RunPlan:
+    """Read a file for `lare_rl.train` or `lare-rl train --config`.
+
+        plan = lare_rl.load_config("run.toml")
+        run = lare_rl.train(plan.task, plan.settings, function=plan.function)
+
+    Args:
+        path: a TOML or JSON file with the keys `task`, `function` and `out` and those of `Settings`; paths in it are relative to it.
+            Or a run directory or its config.json: the new run has the same settings and functions.
+
+    Raises:
+        LareError: the file cannot be read, or a key or a value is not valid.
+    """
+    path = Path(path)
+    if path.is_dir():
+        return _plan_repetition(path)
+    values = rename_keys(read_table(path))
+    if "task_sha256" in values:
+        if path.name != CONFIG:
+            raise LareError(f"{path}: it is the {CONFIG} of a run: name the run directory, which has the functions too")
+        return _plan_repetition(path.parent)
+    try:
+        if "settings" in values:
+            raise LareError("write the keys of [settings] outside of this table, which only a sweep has")
+        file = _PlanFile(**values)
+        settings = Settings(**{name: values[name] for name in values.keys() & Settings.model_fields.keys()})
+    except LareError as error:
+        raise LareError(f"{path}: {error}") from error
+    return RunPlan(
+        task=None if file.task is None else relative_task(path, file.task),
+        settings=settings,
+        function=None if file.function is None else tuple(path.parent / name for name in file.function),
+        out=None if file.out is None else path.parent / file.out,
+    )
+
+
+def relative_task(file: Path, task: str) -> str:
+    """Return the shipped name, or the path, of a task that a file names. A path is relative to the file."""
+    return str(file.parent / task) if task.endswith(".toml") else task
+
+
+def _plan_repetition(directory: Path) -> RunPlan:
+    """Return the plan of a run like an earlier one."""
+    from lare_rl.runs.directory import open_run
+
+    run = open_run(directory)
+    return RunPlan(
+        task=run.config.task, settings=_used_settings(run), function=run.functions or None, out=None, is_run=True
+    )
+
+
+def _used_settings(run: "Run") -> Settings:
+    """Return the settings that a run used."""
+    from lare_rl.config.effective import unused_names
+
+    resolved = run.config.settings
+    values = resolved.model_dump()
+    values[resolved.algorithm] = values.pop("hyperparameters")
+    values |= {"draw": 0, "candidates": N_CANDIDATES}  # the functions themselves are used again
+    for name in unused_names(resolved):
+        table, _, key = name.rpartition(".")
+        (values[table] if table else values).pop(key)
+    return Settings(**values)

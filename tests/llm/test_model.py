@@ -1,0 +1,76 @@
+"""What counts as a language model: an object with a name and replies, or a function."""
+
+import json
+
+import pytest
+
+import lare_rl
+from helpers.scripted_model import ScriptedModel
+from helpers.toy_envs import PHI, toy_spec
+from lare_rl.errors import LareError
+from lare_rl.latent.design import DesignModelError
+from lare_rl.llm.live import LiveModel
+from lare_rl.llm.model import as_model
+
+REPLY = json.dumps({"Understand": "", "Analyze": "", "Functions": PHI})
+
+
+def test_function_is_a_model():
+    requests = []
+
+    def my_model(messages):
+        requests.append([message["role"] for message in messages])
+        return REPLY if len(requests) > 1 else "no"
+
+    phi = lare_rl.design(toy_spec(), model=my_model, candidates=1)
+    assert (phi.source, phi.model) == (PHI.strip("\n"), "my_model")
+    assert requests == [["system", "user"], ["system", "user", "assistant", "user"]]
+
+
+def test_reflection_asks_a_function(phi):
+    requests = []
+    lare_rl.reflect(phi, toy_spec(), lambda messages: requests.append(messages) or REPLY)
+    assert requests
+
+
+def test_object_with_a_name_is_used_as_it_is():
+    model = ScriptedModel(PHI)
+    assert as_model(model) is model
+
+
+def test_replies_before_an_error_are_recorded():
+    replies = ["no"]
+    with pytest.raises(DesignModelError, match="the model <lambda> failed: IndexError: pop from empty list") as error:
+        lare_rl.design(toy_spec(), model=lambda messages: replies.pop(), candidates=1)
+    assert error.value.recorder.exchanges[0].replies == ["no"]
+
+
+def test_key_is_removed(monkeypatch):
+    monkeypatch.setenv("OPENAI_API_KEY", "sk-secret-key")
+    assert as_model(lambda messages: "It is sk-secret-key.").reply([], 0) == "It is [key]."
+    with pytest.raises(LareError, match=r"KeyError: '\[key\]'"):
+        as_model(lambda messages: {}["sk-secret-key"]).reply([], 0)
+
+
+@pytest.mark.parametrize("reply", [None, b"text", {"content": "text"}])
+def test_function_must_return_a_text(reply):
+    with pytest.raises(LareError, match="must return a text, and returned"):
+        as_model(lambda messages: reply).reply([], 0)
+
+
+@pytest.mark.parametrize("model", ["gpt-5-mini", 1, object()])
+def test_other_values_are_refused(model):
+    with pytest.raises(LareError, match="a model must be a function from messages to a text"):
+        as_model(model)
+
+
+def test_own_task_without_a_model():
+    with pytest.raises(LareError, match=r"'Chase'.*model=.*--model NAME.*--function phi\.py.*bayes") as error:
+        lare_rl.design(toy_spec())
+    assert "\n" not in str(error.value)
+
+
+def test_live_model_is_a_model(monkeypatch):
+    monkeypatch.setenv("OPENAI_API_KEY", "none")
+    live = LiveModel("m", "http://127.0.0.1:1/v1")
+    assert as_model(live) is live

@@ -1,0 +1,184 @@
+"""Files for `lare-rl train --config`, and earlier runs in their place."""
+
+import json
+from pathlib import Path
+
+import pytest
+
+import lare_rl
+from helpers.toy_envs import PHI, toy_spec
+from lare_rl import cli
+from lare_rl.cli.parse import parse
+from lare_rl.config.resolve import resolve
+from lare_rl.config.settings import Settings
+from lare_rl.credit.methods import METHODS
+from lare_rl.runs.directory import create_run
+from lare_rl.runs.plan import load_config
+
+FILE = """
+task = "chase.toml"
+function = "phi.py"
+out = "runs/chase"
+method = "lare-bayes"
+steps = 250
+scale_rewards = true
+td3 = { gamma = 0.9 }
+
+[credit]
+optimism = 0.5
+"""
+
+
+@pytest.fixture
+def write(tmp_path):
+    """Return a function that writes a file into a directory of its own."""
+    (tmp_path / "plans").mkdir()
+
+    def write(text, name="run.toml") -> Path:
+        (tmp_path / "plans" / name).write_text(text)
+        return Path("plans", name)
+
+    return write
+
+
+def read_keywords(*arguments):
+    """Return the arguments of the command that a command line calls."""
+    return parse(cli.COMMANDS, "", ["train", *map(str, arguments)]).keywords
+
+
+def test_file(write, monkeypatch, tmp_path):
+    monkeypatch.chdir(tmp_path)
+    plan = load_config(write(FILE))
+    assert (plan.task, plan.function, plan.out) == (
+        "plans/chase.toml",
+        (Path("plans/phi.py"),),
+        Path("plans/runs/chase"),
+    )
+    settings = {"method": "lare-bayes", "steps": 250, "scale_rewards": True}
+    assert plan.settings == Settings(**settings, td3={"gamma": 0.9}, credit={"optimism": 0.5})
+    values = {"task": "Reacher-v4", "function": ["a.py", "b.py"], "seeds": 2, "ppo": {"anneal": False}}
+    plan = load_config(write(json.dumps(values), "run.json"))
+    assert (plan.task, plan.function, plan.out) == ("Reacher-v4", (Path("plans/a.py"), Path("plans/b.py")), None)
+    assert plan.settings == Settings(seeds=2, ppo={"anneal": False})
+
+
+def test_options_win_over_the_file(write, monkeypatch, tmp_path):
+    monkeypatch.chdir(tmp_path)
+    path = write(FILE.replace("steps = 250", "steps = 250\nseeds = 3"))
+    assert read_keywords("--config", path)["settings"] == load_config(path).settings
+    options = "--seeds 1 --steps=500 --td3.tau 0.1 --no-scale-rewards --credit.optimism 0.1 --credit.normalise False"
+    settings = read_keywords("--config", path, *options.split())["settings"]
+    assert settings == Settings(
+        method="lare-bayes",
+        seeds=1,  # the default, and not the value of the file
+        steps=500,
+        td3={"gamma": 0.9, "tau": 0.1},
+        credit={"optimism": 0.1, "normalise": False},
+    )
+    assert settings.credit.model_fields_set == {"optimism", "normalise"}  # the algorithm decides the others
+    path = write("[ppo]\nanneal = true\nclip = 0.3")
+    assert (
+        read_keywords("--config", path, "--ppo.no-anneal")["settings"].ppo
+        == Settings(ppo={"anneal": False, "clip": 0.3}).ppo
+    )
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("stepz = 1", "there is no key 'stepz' (did you mean 'steps'?)"),
+        ("tasks = 'x'", "there is no key 'tasks' (did you mean 'task'?)"),
+        ("td3 = { gama = 1 }", "there is no key 'td3.gama' (did you mean 'gamma'?)"),
+        ("[settings]\nsteps = 1", "write the keys of [settings] outside of this table"),
+        ("steps = 'many'", "steps = 'many': input should be a valid integer"),
+        ("steps = 0", "steps = 0: input should be greater than or equal to 1"),
+        ("method = 'lara'", "no method 'lara'; the methods are"),
+        ("function = 1", "function = 1: "),
+        ("task = 1", "task = 1: input should be a valid string"),
+        ("td3 = 1", "td3 = 1: should be a table of settings"),
+        ("task = Reacher-v4", "a text needs quotes"),
+    ],
+)
+def test_mistakes(write, command, text, words):
+    status, out, err = command("train", "--config", write(text))
+    assert (status, out, err.count("\n")) == (2, "", 1)
+    assert err.startswith("lare-rl: plans/run.toml")
+    assert words in err
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "words"),
+    [
+        ("none.toml", None, "plans/none.toml cannot be read: No such file"),
+        ("list.json", "[1]", "plans/list.json: it is JSON, but not an object"),
+        ("bad.json", "{", "plans/bad.json: it is not valid JSON"),
+        ("copy.json", '{"task_sha256": "0"}', "name the run directory"),
+        (".", None, "plans is not a run"),
+        ("no-task.toml", "steps = 100", "there is no task in plans/no-task.toml"),
+        ("no-file.toml", "task = 'chase.toml'", "there is no task file plans/chase.toml"),
+    ],
+)
+def test_files_that_cannot_be_used(write, command, name, text, words):
+    if text is not None:
+        write(text, name)
+    status, out, err = command("train", "--config", Path("plans", name))
+    assert (status, out, err.count("\n")) == (2, "", 1)
+    assert words in err
+
+
+def test_resume_takes_no_file(write, command):
+    status, _, err = command("train", "--resume", "runs/x", "--config", write("steps = 100"))
+    assert status == 2
+    assert "--resume uses the run's settings" in err
+
+
+@pytest.fixture
+def trained(monkeypatch):
+    """Return the arguments of each call of `lare_rl.train`."""
+    calls = []
+
+    def record(task, settings, **options):
+        calls.append((task, settings, options))
+        return type("Run", (), {"directory": options["out"]})
+
+    monkeypatch.setattr(lare_rl, "train", record, raising=False)
+    return calls
+
+
+def test_command_trains_what_the_file_says(write, spec_file, command, trained, tmp_path):
+    write(spec_file().read_text(), "chase.toml")
+    write(PHI, "phi.py")
+    path = write(FILE)
+    assert command("train", "--config", path)[0] == 0
+    assert command("train", "--config", path, "--out", "other", "--method", "bayes")[0] == 0
+    (task, settings, options), (_, other_settings, other_options) = trained
+    assert (task.name, options["out"], other_options["out"]) == ("Chase", Path("plans/runs/chase"), Path("other"))
+    assert (settings.steps, other_settings.method) == (250, "bayes")
+    assert options["function"][0].source == PHI.strip("\n")
+    assert other_options["function"] is None  # another method needs none
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_settings_of_a_run_are_those_of_its_repetition(method, phi, reward, tmp_path):
+    if METHODS[method].multi_agent_only or METHODS[method].needs_whole_episodes:
+        pytest.skip("a method for other tasks")
+    task = toy_spec()
+    settings = Settings(method=method, steps=240, rollout_steps=12, evaluate_every=60, seed=3, td3={"gamma": 0.9})
+    resolved = resolve(settings, task)
+    needs_phi = METHODS[method].needs_phi
+    function = reward if METHODS[method].phi_kind == "reward" else phi
+    create_run(tmp_path / "run", task, resolved, [function] * needs_phi)
+    for path in (tmp_path / "run", tmp_path / "run" / "config.json"):
+        plan = load_config(path)
+        assert resolve(plan.settings, plan.task) == resolved
+        assert plan.task == task
+        assert [used.digest for used in plan.function or ()] == [function.digest] * needs_phi
+
+
+def test_repetition_with_another_algorithm(command, trained, tmp_path):
+    resolved = resolve(Settings(method="bayes", steps=240, rollout_steps=12, td3={"gamma": 0.9}), toy_spec())
+    create_run(tmp_path / "run", toy_spec(), resolved, [])
+    assert command("train", "--config", "run", "--algorithm", "sac")[0] == 0  # td3 makes no difference any more
+    assert (trained[0][1].algorithm, trained[0][1].steps) == ("sac", 240)
+    status, _, err = command("train", "--config", "run", "--ppo.clip", 0.3)
+    assert (status, "ppo.clip makes no difference to td3" in err) == (2, True)
