@@ -12,6 +12,7 @@ import matplotlib
 import numpy as np
 import tyro
 from jaxtyping import Float
+from matplotlib.colors import to_hex
 
 from lare_rl.evaluation.rollout import roll_out
 from lare_rl.runs.directory import open_run
@@ -32,7 +33,7 @@ def draw_panel(
         y = top + agent * CELL
         lines.append(f'<text x="{LEFT - 10}" y="{y + 21}" text-anchor="end">agent {agent + 1}</text>')
         for step in range(reward.shape[0]):
-            colour = matplotlib.colors.to_hex(colours[step, agent])
+            colour = to_hex(colours[step, agent])
             box = f'x="{LEFT + step * CELL}" y="{y}" width="{CELL - GAP}" height="{CELL - GAP}"'
             lines.append(f'<rect {box} fill="{colour}"><title>{reward[step, agent]:.2f}</title></rect>')
     return lines

@@ -5,8 +5,10 @@ half cheetah is made: its model, a file of Gymnasium, uses an attribute that MuJ
 """
 
 import contextlib
+import importlib
 import warnings
 from collections.abc import Iterator
+from typing import Any
 
 import gymnasium
 
@@ -29,7 +31,7 @@ def mujoco_warnings(name: str) -> Iterator[None]:
         yield
         return
     try:
-        import mujoco
+        mujoco: Any = importlib.import_module("mujoco")  # its type stubs lack these functions
     except ImportError as missing:
         raise missing_extra_error(f"environment {name!r}", "mujoco") from missing
     messages: list[str] = []

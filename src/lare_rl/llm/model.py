@@ -6,7 +6,7 @@ A function from messages to a text is a model too.
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Protocol, runtime_checkable
+from typing import Any, Protocol, cast, runtime_checkable
 
 from lare_rl.errors import LareError, short_repr
 from lare_rl.llm.key import redact_key
@@ -21,7 +21,10 @@ __all__ = ["RECORDED", "FunctionModel", "Model", "ModelFunction", "as_model", "r
 class Model(Protocol):
     """A language model."""
 
-    name: str
+    @property
+    def name(self) -> str:
+        """What provenance calls it."""
+        ...
 
     def reply(self, messages: Sequence[Message], sample: int) -> str:
         """Return the text of reply number `sample` (0, 1, ...) to the same request. Raises `LareError` if there is no reply."""
@@ -56,7 +59,7 @@ def as_model(model: Any) -> Model:
     if isinstance(model, Model):
         return model
     if callable(model):
-        return FunctionModel(model, getattr(model, "__name__", type(model).__name__))
+        return FunctionModel(cast(ModelFunction, model), getattr(model, "__name__", type(model).__name__))
     raise LareError(
         "a model must be a function from messages to a text, or have a name and a method reply(messages, sample), as "
         f"lare_rl.llm.live.LiveModel('NAME') has: {short_repr(model)} does not"
