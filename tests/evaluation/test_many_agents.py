@@ -130,7 +130,7 @@ def test_report(runs, monkeypatch):
     for role in run.config.task.roles:
         assert details.count(f"<summary>The latent function of {role.name}</summary>") == 1
     assert details.count('class="strip"') == 2  # true and proxy rewards
-    assert details.count("t-SNE") == 4
+    assert details.count("<figcaption>t-SNE") == 4
     curves = "\n".join(render_learning_curves(run.config.task, [ReportedRun("a", run)], np.zeros(0)))
     titles = re.findall(r"team of (\w+)</", curves)
     assert set(titles) == {"predator", "prey"}
