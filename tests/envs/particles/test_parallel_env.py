@@ -69,4 +69,4 @@ def test_missing_pettingzoo(monkeypatch):
     monkeypatch.delitem(sys.modules, "lare_rl.envs.particles.parallel_env")
     with pytest.raises(LareError) as error:
         import lare_rl.envs.particles.parallel_env  # noqa: F401
-    assert str(error.value) == f"lare_rl.envs.particles.parallel_env needs an extra: {install_command('particles')}"
+    assert str(error.value) == f"lare_rl.envs.particles.parallel_env needs an extra: {install_command('pettingzoo')}"
