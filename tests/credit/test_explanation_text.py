@@ -135,10 +135,8 @@ def test_residual_values():
 
 ANYTHING = {
     **dict.fromkeys(("share", "slope", "std", "correlation"), 0.5),
-    **dict.fromkeys(
-        ("n_episodes", "this", "other", "target", "largest", "features", "name", "names", "raw", "effect"), "x"
-    ),
-    **dict.fromkeys(("n_unused", "n_raw", "count"), 3),
+    **dict.fromkeys(("this", "other", "target", "largest", "features", "name", "names", "raw", "effect"), "x"),
+    **dict.fromkeys(("n_episodes", "n_unused", "n_raw", "count"), 3),
     **dict.fromkeys(("more", "states", "shape", "before", "after", "scored_observation"), None),
 }
 

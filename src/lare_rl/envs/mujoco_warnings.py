@@ -12,7 +12,7 @@ from typing import Any
 
 import gymnasium
 
-from lare_rl.errors import missing_extra_error
+from lare_rl.errors import LareError, missing_extra_error
 
 __all__ = ["mujoco_warnings"]
 
@@ -32,8 +32,12 @@ def mujoco_warnings(name: str) -> Iterator[None]:
         return
     try:
         mujoco: Any = importlib.import_module("mujoco")  # its type stubs lack these functions
-    except ImportError as missing:
-        raise missing_extra_error(f"environment {name!r}", "mujoco") from missing
+    except ModuleNotFoundError as missing:
+        if missing.name == "mujoco":
+            raise missing_extra_error(f"environment {name!r}", "mujoco") from missing
+        raise
+    except ImportError as error:  # parts of it are missing, after an upgrade say, and it says how to repair that
+        raise LareError(" ".join(str(error).split())) from error
     messages: list[str] = []
     previous = mujoco.get_mju_user_warning()
     mujoco.set_mju_user_warning(messages.append)
