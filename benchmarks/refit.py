@@ -17,7 +17,7 @@ import numpy as np
 
 from lare_rl.credit import accuracy, decomposition, descent
 from lare_rl.credit.decoder_settings import RECENT_STEPS
-from lare_rl.credit.decomposition import CreditBatch, Decomposition
+from lare_rl.credit.decomposition import CreditBatch, DecoderState
 from lare_rl.credit.methods import Fit
 from lare_rl.data import replay
 from lare_rl.data.sampling import CreditSample, sample_drawn
@@ -35,9 +35,9 @@ UPDATES, STRETCH = 20_000, 5_000
 
 @partial(jax.jit, static_argnames=("fit", "config"))
 def updates(
-    credit: Decomposition, stored_replay: replay.Replay, key: jax.Array, fit: Fit, config: TrainConfig
-) -> Decomposition:
-    def update(credit: Decomposition, sample: CreditSample) -> tuple[Decomposition, None]:
+    credit: DecoderState, stored_replay: replay.Replay, key: jax.Array, fit: Fit, config: TrainConfig
+) -> DecoderState:
+    def update(credit: DecoderState, sample: CreditSample) -> tuple[DecoderState, None]:
         features = decoder_inputs(replay.read(stored_replay, sample.steps), config, 0)
         chosen = sample.episodes
         episodes = CreditBatch(features, sample.episode, chosen.length, chosen.mean_reward[..., 0], chosen.mask)

@@ -88,13 +88,13 @@ class AssignerConfig:
 
     @property
     def n_levels(self) -> int:
-        """The number of groups that episodes may belong to."""
+        """The number of levels that episodes may belong to."""
         return MAX_LEVELS if self.groups else 0
 
     @property
     def is_exact(self) -> bool:
         """Whether the proxy rewards of an episode are corrected to add up to its return."""
-        return self.settings.exact in ("last", "spread") and "exact" in self.method.settings
+        return self.method.is_exact(self.settings.exact)
 
     def raw_feature_names(self, n_features: int) -> list[str]:
         """Return names of the raw features; none if they are not entries of observations and the action."""

@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int, Key
 
 from lare_rl.credit import closed_form, decomposition, descent, engine, returns
-from lare_rl.credit.decomposition import CreditBatch, Decomposition
+from lare_rl.credit.decomposition import CreditBatch, DecoderState
 from lare_rl.credit.engine import CreditSpec, StepBatch
 from lare_rl.data.layouts import sample_steps as _sample_steps
 from lare_rl.nn.normalise import update_scale
@@ -31,13 +31,13 @@ sample_steps = jax.jit(_sample_steps, static_argnames="steps")
 
 
 @partial(jax.jit, static_argnames="spec")
-def fit_closed_form(state: Decomposition, spec: CreditSpec) -> Decomposition:
+def fit_closed_form(state: DecoderState, spec: CreditSpec) -> DecoderState:
     """Fit the decoder to its sufficient statistics."""
     return returns.fit_closed_form(state, spec.method, spec.score_types)
 
 
 @jax.jit
-def is_due(state: Decomposition) -> Bool[Array, ""]:
+def is_due(state: DecoderState) -> Bool[Array, ""]:
     """Return whether there are enough new episodes for another closed-form fit."""
     assert state.closed_form is not None
     return closed_form.is_due(state.closed_form)
@@ -45,15 +45,13 @@ def is_due(state: Decomposition) -> Bool[Array, ""]:
 
 @partial(jax.jit, static_argnames="spec")
 def fit_by_gradient(
-    state: Decomposition, batches: CreditBatch, keys: Key[Array, " updates"], spec: CreditSpec
-) -> tuple[Decomposition, Float[Array, ""]]:
+    state: DecoderState, batches: CreditBatch, keys: Key[Array, " updates"], spec: CreditSpec
+) -> tuple[DecoderState, Float[Array, ""]]:
     """Update the decoder once for each of some batches. Also return the mean of their losses."""
     fit, settings = spec.method.fit, spec.settings
     assert fit is not None
 
-    def body(
-        state: Decomposition, inputs: tuple[CreditBatch, Key[Array, ""]]
-    ) -> tuple[Decomposition, Float[Array, ""]]:
+    def body(state: DecoderState, inputs: tuple[CreditBatch, Key[Array, ""]]) -> tuple[DecoderState, Float[Array, ""]]:
         state, metrics = descent.update(state, *inputs, fit, settings)
         return state, metrics["credit/loss"]
 

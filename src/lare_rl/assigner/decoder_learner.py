@@ -25,7 +25,7 @@ from lare_rl.assigner.assigner_config import AssignerConfig
 from lare_rl.assigner.compiled_functions import FlatState, on_cpu, pad, padded_size
 from lare_rl.assigner.store import Store, StoredEpisode
 from lare_rl.credit import closed_form, decomposition, prequential, returns
-from lare_rl.credit.decomposition import CreditBatch, Decomposition
+from lare_rl.credit.decomposition import CreditBatch, DecoderState
 from lare_rl.credit.explanation import Explanation
 from lare_rl.credit.history import next_history
 from lare_rl.credit.methods import Fit, Reward
@@ -52,7 +52,7 @@ class DecoderLearner:
     def __init__(self, config: AssignerConfig, store: Store):
         self.config, self.store = config, store
         with on_cpu():
-            self.decoder: Decomposition | None = compiled.init_decoder(jax.random.key(config.seed), spec=config.spec)
+            self.decoder: DecoderState | None = compiled.init_decoder(jax.random.key(config.seed), spec=config.spec)
         """None for a method that has no decoder."""
         self.scale = empty_scale() if self.decoder is None else None
         """The scale of R/T, if there is no decoder. A decoder has its own."""
@@ -77,7 +77,7 @@ class DecoderLearner:
         self._is_fitted = False
         self._flat_cache: tuple[Any, FlatState | None] = None, None
         """A decoder or a scale, and its leaves."""
-        self._residual_cache: tuple[Decomposition | None, dict[int, float]] = None, {}
+        self._residual_cache: tuple[DecoderState | None, dict[int, float]] = None, {}
         """A decoder, and what its proxy rewards lack to the returns of episodes, by their numbers."""
 
     @property
@@ -216,8 +216,8 @@ class DecoderLearner:
         return (closed_form.FIT_GROWTH - 1) * self.n_learned
 
     def _learn(
-        self, decoder: Decomposition, new: Sequence[StoredEpisode], later: Sequence[StoredEpisode]
-    ) -> Decomposition:
+        self, decoder: DecoderState, new: Sequence[StoredEpisode], later: Sequence[StoredEpisode]
+    ) -> DecoderState:
         """Return a decoder that has learned from some new episodes, while later ones still wait."""
         for batch in self._episode_batches(new):
             decoder = compiled.predict_then_update(decoder, batch, settings=self.config.settings)
@@ -375,7 +375,7 @@ class DecoderLearner:
         newest = self.scale if self.decoder is None else self.decoder
         if flat is None or cached is not newest:
             source = newest
-            if isinstance(source, Decomposition):
+            if isinstance(source, DecoderState):
                 source = source._replace(optimizer=(), score_type_predictions=None)
                 if not decomposition.is_optimistic(self.config.method, self.config.settings):
                     source = source._replace(closed_form=None)

@@ -50,7 +50,7 @@ from lare_rl.nn.normalise import (
 
 __all__ = [
     "CreditBatch",
-    "Decomposition",
+    "DecoderState",
     "agent_mean",
     "agent_shares",
     "decode",
@@ -100,7 +100,7 @@ def valid_rows(episodes: CreditBatch) -> Bool[Array, "rows *agents"]:
     return is_step.reshape(-1, *[1] * (len(shape) - 1)) & acted
 
 
-class Decomposition(NamedTuple):
+class DecoderState(NamedTuple):
     """The state of return decomposition."""
 
     network: DecoderNetwork
@@ -137,7 +137,7 @@ def init(
     score_types: tuple[int, ...] = (ScoreType.SUM,),
     window: int = WINDOW,
     inputs: tuple[tuple[str, int], ...] = (),
-) -> Decomposition:
+) -> DecoderState:
     """Return the state with an untrained decoder. All other functions need the same `settings` and `score_types`.
 
     Args:
@@ -163,7 +163,7 @@ def init(
     closed = None
     if several or not method.uses_gradient:
         closed = closed_form.init(basis, score_types, with_spread=is_optimistic(method, settings))
-    return Decomposition(
+    return DecoderState(
         network=network,
         optimizer=init_adam(network, settings.learning_rate) if method.uses_gradient else (),
         statistics=empty_mean_std(basis.n_standardised),
@@ -183,7 +183,7 @@ def is_optimistic(method: Method, settings: CreditSettings) -> bool:
     return settings.optimism > 0 and "optimism" in method.settings
 
 
-def score_type_index(state: Decomposition, n_score_types: int) -> Int[Array, ""] | int:
+def score_type_index(state: DecoderState, n_score_types: int) -> Int[Array, ""] | int:
     """Return the position of the used score type in the list of fitted score types."""
     if n_score_types == 1:
         return 0
@@ -191,8 +191,8 @@ def score_type_index(state: Decomposition, n_score_types: int) -> Int[Array, ""]
 
 
 def observe_steps(
-    state: Decomposition, inputs: Float[Array, "*batch inputs"], mask: Bool[Array, "*batch"] | None = None
-) -> Decomposition:
+    state: DecoderState, inputs: Float[Array, "*batch inputs"], mask: Bool[Array, "*batch"] | None = None
+) -> DecoderState:
     """Add new steps to the statistics that `normalise` uses. Add each step exactly once.
 
     Steps where `mask` is false are ignored.
@@ -205,12 +205,12 @@ def observe_steps(
 
 
 def observe_returns(
-    state: Decomposition,
+    state: DecoderState,
     mean_reward: Float[Array, " batch"],
     length: Int[Array, " batch"],
     finished: Bool[Array, " batch"],
     level: Int[Array, " batch"] | None = None,
-) -> Decomposition:
+) -> DecoderState:
     """Add newly finished episodes, as R/T and T, to the scales and to the means of their levels. Add each episode exactly once.
 
     Episodes where `finished` is false are ignored.
@@ -224,7 +224,7 @@ def observe_returns(
 
 
 def level_returns(
-    state: Decomposition, level: Int[Array, " episodes"] | None, length: Int[Array, " episodes"]
+    state: DecoderState, level: Int[Array, " episodes"] | None, length: Int[Array, " episodes"]
 ) -> Float[Array, " episodes"]:
     """Return the part of each episode's return that its level explains, or that is the same for all, and that no step is paid for."""
     if state.levels is not None and level is not None:
@@ -240,12 +240,12 @@ def level_returns(
     return start_value + state.closed_form.intercept[index][level] * unit
 
 
-def is_normalised(state: Decomposition, settings: CreditSettings) -> bool:
+def is_normalised(state: DecoderState, settings: CreditSettings) -> bool:
     """Return whether the decoder's inputs and outputs are normalised. A decoder in closed form does not need this."""
     return settings.normalise and not isinstance(state.network, LinearDecoder)
 
 
-def reward_unit(state: Decomposition, settings: CreditSettings) -> Float[Array, ""]:
+def reward_unit(state: DecoderState, settings: CreditSettings) -> Float[Array, ""]:
     """Return the unit of the decoder's output: the root mean square of R/T, or of R if the score is a mean."""
     if not is_normalised(state, settings):
         return jnp.ones(())
@@ -253,7 +253,7 @@ def reward_unit(state: Decomposition, settings: CreditSettings) -> Float[Array, 
 
 
 def normalise_inputs(
-    state: Decomposition, inputs: Float[Array, "*batch inputs"], settings: CreditSettings
+    state: DecoderState, inputs: Float[Array, "*batch inputs"], settings: CreditSettings
 ) -> Float[Array, "*batch inputs"]:
     """Return the inputs as the decoder receives them."""
     return standardise(state.statistics, inputs) if is_normalised(state, settings) else inputs
@@ -261,7 +261,7 @@ def normalise_inputs(
 
 def decode(
     network: DecoderNetwork,
-    state: Decomposition,
+    state: DecoderState,
     inputs: Float[Array, "rows *agents inputs"],
     settings: CreditSettings,
     key: PRNGKeyArray | None = None,
@@ -271,7 +271,7 @@ def decode(
 
 
 def decoder_rewards(
-    state: Decomposition,
+    state: DecoderState,
     inputs: Float[Array, "rows *agents inputs"],
     settings: CreditSettings,
     length: Float[Array, " rows"] | Int[Array, " rows"] | None = None,
@@ -285,7 +285,7 @@ def decoder_rewards(
 
 
 def optimistic_rewards(
-    state: Decomposition,
+    state: DecoderState,
     inputs: Float[Array, "rows *agents inputs"],
     settings: CreditSettings,
     length: Float[Array, " rows"] | Int[Array, " rows"] | None = None,
@@ -308,7 +308,7 @@ def optimistic_rewards(
 
 def _per_step(
     output: Float[Array, "rows *agents"],
-    state: Decomposition,
+    state: DecoderState,
     length: Float[Array, " rows"] | Int[Array, " rows"] | None,
 ) -> Float[Array, "rows *agents"]:
     """Return the decoder's output for each step as a part of R: divided by T if the score is a mean."""

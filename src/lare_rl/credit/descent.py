@@ -12,7 +12,7 @@ from lare_rl.credit.decoder_network import DecoderNetwork
 from lare_rl.credit.decoder_settings import CreditSettings
 from lare_rl.credit.decomposition import (
     CreditBatch,
-    Decomposition,
+    DecoderState,
     agent_mean,
     decode,
     level_returns,
@@ -26,7 +26,7 @@ __all__ = ["loss_and_gradient", "update", "update_in_chunks"]
 
 
 def loss_and_gradient(
-    state: Decomposition, episodes: CreditBatch, key: PRNGKeyArray, fit: Fit, settings: CreditSettings
+    state: DecoderState, episodes: CreditBatch, key: PRNGKeyArray, fit: Fit, settings: CreditSettings
 ) -> tuple[Float[Array, ""], DecoderNetwork]:
     """Return the loss of `fit`, and its gradient with respect to the decoder's weights."""
     loss = _decoder_loss if fit is Fit.DECODER_LOSS else partial(_mean_loss, fit=fit)
@@ -34,8 +34,8 @@ def loss_and_gradient(
 
 
 def update(
-    state: Decomposition, episodes: CreditBatch, key: PRNGKeyArray, fit: Fit, settings: CreditSettings
-) -> tuple[Decomposition, dict[str, Float[Array, ""]]]:
+    state: DecoderState, episodes: CreditBatch, key: PRNGKeyArray, fit: Fit, settings: CreditSettings
+) -> tuple[DecoderState, dict[str, Float[Array, ""]]]:
     """Take one step of gradient descent on a batch of episodes. Return the new state, and the metric `credit/loss`.
 
     The loss is in squared units of `scale`, or of the reward if `normalise` is off.
@@ -44,8 +44,8 @@ def update(
 
 
 def update_in_chunks(
-    state: Decomposition, chunks: CreditBatch, key: PRNGKeyArray, fit: Fit, settings: CreditSettings
-) -> tuple[Decomposition, dict[str, Float[Array, ""]]]:
+    state: DecoderState, chunks: CreditBatch, key: PRNGKeyArray, fit: Fit, settings: CreditSettings
+) -> tuple[DecoderState, dict[str, Float[Array, ""]]]:
     """Take one step by the mean of the gradients of several chunks of a batch.
 
     The chunks are along a leading axis. Each has the same number of episodes, and all masks are 1. The gradient equals that of all
@@ -63,8 +63,8 @@ def update_in_chunks(
 
 
 def _step(
-    state: Decomposition, loss: Float[Array, ""], gradient: DecoderNetwork, settings: CreditSettings
-) -> tuple[Decomposition, dict[str, Float[Array, ""]]]:
+    state: DecoderState, loss: Float[Array, ""], gradient: DecoderNetwork, settings: CreditSettings
+) -> tuple[DecoderState, dict[str, Float[Array, ""]]]:
     """Take one step of Adam, with the weight decay added to the gradient."""
     gradient = jax.tree.map(lambda slope, weight: slope + settings.weight_decay * weight, gradient, state.network)
     network, optimizer = adam_step(state.network, gradient, state.optimizer, settings.learning_rate)
@@ -73,7 +73,7 @@ def _step(
 
 def _mean_loss(
     network: DecoderNetwork,
-    state: Decomposition,
+    state: DecoderState,
     episodes: CreditBatch,
     key: PRNGKeyArray,
     fit: Fit,
@@ -106,7 +106,7 @@ def _mean_loss(
 
 
 def _decoder_loss(
-    network: Any, state: Decomposition, episodes: CreditBatch, key: PRNGKeyArray, settings: CreditSettings
+    network: Any, state: DecoderState, episodes: CreditBatch, key: PRNGKeyArray, settings: CreditSettings
 ) -> Float[Array, ""]:
     """Return the decoder's `loss` on whole episodes, which are padded to the same length."""
     target = _targets(state, episodes, settings)
@@ -115,7 +115,7 @@ def _decoder_loss(
     return network.loss(inputs, episodes.length, target, episodes.mask, key)
 
 
-def _targets(state: Decomposition, episodes: CreditBatch, settings: CreditSettings) -> Float[Array, " episodes"]:
+def _targets(state: DecoderState, episodes: CreditBatch, settings: CreditSettings) -> Float[Array, " episodes"]:
     """Return R/T of each episode, or R if the score is a mean, in the decoder's unit, without what its level explains."""
     mean_reward = episodes.mean_reward
     if episodes.level is not None:

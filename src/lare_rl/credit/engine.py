@@ -26,7 +26,7 @@ from lare_rl.credit import closed_form, decomposition
 from lare_rl.credit.basis import Basis
 from lare_rl.credit.closed_form import ClosedForm
 from lare_rl.credit.decoder_settings import CreditSettings
-from lare_rl.credit.decomposition import CreditBatch, Decomposition
+from lare_rl.credit.decomposition import CreditBatch, DecoderState
 from lare_rl.credit.explanation import Explanation, StepStatistics, add_steps, empty_step_statistics, explain
 from lare_rl.credit.input_names import input_size, input_sizes, tracked_size
 from lare_rl.credit.methods import Fit, Method, Reward
@@ -123,7 +123,7 @@ def credit_spec(
     inputs = method.inputs.resolve(scored_observation, single_agent=single_agent) if method.inputs is not None else ()
     score_types = (ScoreType.SUM,)
     if "score" in method.settings:
-        score_types = score_types_to_fit(settings.score, fixed_length, closed_form=not method.uses_gradient)
+        score_types = score_types_to_fit(settings.score, fixed_length, allow_log_odds=not method.uses_gradient)
     return CreditSpec(
         method=method,
         settings=settings,
@@ -138,7 +138,7 @@ def credit_spec(
     )
 
 
-def init_decoder(key: PRNGKeyArray, spec: CreditSpec) -> Decomposition | None:
+def init_decoder(key: PRNGKeyArray, spec: CreditSpec) -> DecoderState | None:
     """Return an untrained decoder. Return None for a method that fits nothing."""
     if spec.method.reward is not Reward.PROXY:
         return None
@@ -174,13 +174,13 @@ class StepBatch(NamedTuple):
     """Which agents acted. None means all. Only for methods that pay shares of the return."""
 
 
-RewardSource = Decomposition | Scale
+RewardSource = DecoderState | Scale
 """A decoder; for a method that fits nothing, the scale of R/T."""
 
 
 def return_scale(source: RewardSource) -> Scale:
     """Return the scale of R/T."""
-    return source.scale if isinstance(source, Decomposition) else source
+    return source.scale if isinstance(source, DecoderState) else source
 
 
 def proxy_rewards(
@@ -197,7 +197,7 @@ def proxy_rewards(
             # The return of a running episode is not known yet.
             share = jnp.where(steps.finished, min_max_scale(return_scale(source), steps.mean_reward), 0.5)
             return jnp.broadcast_to(share[..., None], steps.inputs.shape[:-1])
-    assert isinstance(source, Decomposition)
+    assert isinstance(source, DecoderState)
     rows = steps.inputs.reshape(-1, *steps.inputs.shape[-2:])
     with_optimism = optimistic and decomposition.is_optimistic(spec.method, spec.settings)
     compute = decomposition.optimistic_rewards if with_optimism else decomposition.decoder_rewards

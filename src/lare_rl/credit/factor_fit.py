@@ -66,7 +66,7 @@ def assess_factors(
     """
     length = np.array([len(episode) for episode in inputs])
     lengths_differ = len(set(length)) > 1
-    score_types = score_types_to_fit(score or "auto", fixed_length=not lengths_differ, closed_form=False)
+    score_types = score_types_to_fit(score or "auto", fixed_length=not lengths_differ, allow_log_odds=False)
     with float64():
         features, step_statistics = mean_features(inputs, alive, basis)
         predict = partial(predict_returns, returns=returns, length=length, basis=basis)

@@ -142,6 +142,10 @@ class Method:
         """Whether the rewards of an episode are shares of its return, so that they always add up to it."""
         return DECODERS[self.decoder].pays_shares
 
+    def is_exact(self, exact: str) -> bool:
+        """Return whether the setting `exact` corrects proxy rewards to add up to the return."""
+        return exact in ("last", "spread") and "exact" in self.settings
+
     def choose_exact(self, exact: str) -> str:
         """Return how proxy rewards are made exact, by the setting `exact`."""
         if exact != "auto":

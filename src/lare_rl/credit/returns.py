@@ -22,7 +22,7 @@ from lare_rl.credit.closed_form import ClosedForm, LinearDecoder
 from lare_rl.credit.decoder_settings import CreditSettings
 from lare_rl.credit.decomposition import (
     CreditBatch,
-    Decomposition,
+    DecoderState,
     agent_mean,
     agent_shares,
     decoder_rewards,
@@ -58,7 +58,7 @@ ROUNDING = 1e-6
 """Squared errors below this fraction of the squared returns are treated as equal."""
 
 
-def is_fitted(state: Decomposition) -> Bool[Array, ""]:
+def is_fitted(state: DecoderState) -> Bool[Array, ""]:
     """Return whether the decoder has learned anything yet."""
     if isinstance(state.network, LinearDecoder):
         assert state.closed_form is not None
@@ -66,13 +66,13 @@ def is_fitted(state: Decomposition) -> Bool[Array, ""]:
     return optax.tree_utils.tree_get(state.optimizer, "count") > 0
 
 
-def predict_then_update(state: Decomposition, episodes: CreditBatch, settings: CreditSettings) -> Decomposition:
+def predict_then_update(state: DecoderState, episodes: CreditBatch, settings: CreditSettings) -> DecoderState:
     """Predict the returns of new episodes, and then add the episodes to the sums of a closed-form fit."""
     state = predict(state, episodes, settings)
     return state if state.closed_form is None else add_episodes(state, episodes)
 
 
-def predict(state: Decomposition, episodes: CreditBatch, settings: CreditSettings) -> Decomposition:
+def predict(state: DecoderState, episodes: CreditBatch, settings: CreditSettings) -> DecoderState:
     """Store the returns of episodes, and the decoder's predictions of them before it is fitted to these episodes.
 
     There may be at most as many episodes as the window of `state.predictions` has. Episodes with mask 0 are ignored, and before the
@@ -116,7 +116,7 @@ def _episode_sums(
 
 
 def predicted_returns(
-    state: Decomposition, episodes: CreditBatch, settings: CreditSettings
+    state: DecoderState, episodes: CreditBatch, settings: CreditSettings
 ) -> Float[Array, " episodes"]:
     """Return the sum of each episode's proxy rewards, which are the mean over the agents that are alive."""
     n_episodes = len(episodes.length)
@@ -168,19 +168,19 @@ def _columns(decoder: LinearDecoder, episodes: CreditBatch) -> Float[Array, "epi
     return jnp.concatenate([features, one_hot], axis=1)
 
 
-def is_stale(state: Decomposition) -> Bool[Array, ""]:
+def is_stale(state: DecoderState) -> Bool[Array, ""]:
     """Return whether the features in the sums were standardised by outdated statistics."""
     assert state.closed_form is not None
     return closed_form.is_stale(state.closed_form, state.statistics)
 
 
-def reset_statistics(state: Decomposition) -> Decomposition:
+def reset_statistics(state: DecoderState) -> DecoderState:
     """Set the sums to zero, and standardise features by the newest statistics. All stored episodes must then be added again."""
     assert state.closed_form is not None
     return state._replace(closed_form=closed_form.reset_statistics(state.closed_form, state.statistics))
 
 
-def add_episodes(state: Decomposition, episodes: CreditBatch) -> Decomposition:
+def add_episodes(state: DecoderState, episodes: CreditBatch) -> DecoderState:
     """Add whole episodes to the sums of a closed-form fit, in float64 if that is enabled."""
     assert state.closed_form is not None
     return state._replace(closed_form=add_to_sums(state.closed_form, episodes))
@@ -206,8 +206,8 @@ def add_to_sums(closed: ClosedForm, episodes: CreditBatch) -> ClosedForm:
 
 
 def fit_closed_form(
-    state: Decomposition, method: Method, score_types: tuple[int, ...], *, batched: bool = False
-) -> Decomposition:
+    state: DecoderState, method: Method, score_types: tuple[int, ...], *, batched: bool = False
+) -> DecoderState:
     """Fit in closed form to all episodes that have been added, and determine the type of the score.
 
     `batched` is as in `evidence.fit`.
@@ -231,7 +231,7 @@ def fit_closed_form(
     return state
 
 
-def estimate_score_type(state: Decomposition) -> ScoreTypeEstimate | None:
+def estimate_score_type(state: DecoderState) -> ScoreTypeEstimate | None:
     """Return the score type that the decoder uses, or None if the settings give it or it makes no difference.
 
     A sum and a mean make no difference as long as all episodes have the same length.
@@ -254,7 +254,7 @@ def _score_type_errors(predictions: Predictions) -> Float[Array, " score_types"]
 
 
 def reward_std(
-    state: Decomposition, rows: Float[Array, "rows inputs"], score_types: tuple[int, ...]
+    state: DecoderState, rows: Float[Array, "rows inputs"], score_types: tuple[int, ...]
 ) -> Float[Array, " rows"]:
     """Return the posterior standard deviation of r_hat, or of T r_hat if the score is a mean.
 

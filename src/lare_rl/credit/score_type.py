@@ -28,18 +28,18 @@ class ScoreTypeEstimate(NamedTuple):
     """Whether this type predicts the returns clearly better than the other one."""
 
 
-def score_types_to_fit(score: str, fixed_length: bool, *, closed_form: bool) -> tuple[ScoreType, ...]:
+def score_types_to_fit(score: str, fixed_length: bool, *, allow_log_odds: bool) -> tuple[ScoreType, ...]:
     """Return the types to fit, in the order of their values.
 
     Args:
         score: the setting of this name.
         fixed_length: whether all episodes have the same length. A sum and a mean are then the same.
-        closed_form: whether the decoder is fitted in closed form. Only then can the score be log odds.
+        allow_log_odds: whether a score may be log odds. Decoders that are fitted in closed form allow it.
     """
     if score in ("sum", "average"):
         return (ScoreType.SUM,) if score == "sum" else (ScoreType.MEAN,)
     linear = (ScoreType.SUM,) if fixed_length else (ScoreType.SUM, ScoreType.MEAN)
-    return (*linear, ScoreType.LOG_ODDS) if score == "binary" and closed_form else linear
+    return (*linear, ScoreType.LOG_ODDS) if score == "binary" and allow_log_odds else linear
 
 
 def prediction_window(payments: PaymentRule, score: str) -> int:

@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from lare_rl.credit.decoder_settings import RECENT_STEPS
-from lare_rl.credit.decomposition import Decomposition
+from lare_rl.credit.decomposition import DecoderState
 from lare_rl.credit.methods import Fit
 from lare_rl.credit.returns import reward_std
 from lare_rl.data import replay
@@ -107,7 +107,7 @@ def _read_rewards(
     return steps, rewards(steps, learner.reward_state, config)
 
 
-def _posterior_std(decoder: Decomposition, steps: StoredSteps, config: TrainConfig) -> Float[Array, " steps"]:
+def _posterior_std(decoder: DecoderState, steps: StoredSteps, config: TrainConfig) -> Float[Array, " steps"]:
     """Compute the posterior standard deviation of a single agent's proxy rewards, in float64."""
     return reward_std(decoder, decoder_inputs(steps, config, 0)[:, 0], config.score_types)
 

@@ -16,7 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from lare_rl.credit.decoders import DECODERS
-from lare_rl.credit.decomposition import Decomposition, decoder_rewards
+from lare_rl.credit.decomposition import DecoderState, decoder_rewards
 from lare_rl.credit.input_names import input_arrays
 from lare_rl.credit.methods import Method, Reward
 from lare_rl.envs.interface import alive_mean
@@ -44,7 +44,7 @@ def missing_reward_reason(method: Method) -> str | None:
     return None
 
 
-def reward_graph(credit: Decomposition | None, config: TrainConfig, team_index: int, phi: Graph | None = None) -> Graph:
+def reward_graph(credit: DecoderState | None, config: TrainConfig, team_index: int, phi: Graph | None = None) -> Graph:
     """Return the graph of a team's proxy rewards, without optimism.
 
     Args:
@@ -66,7 +66,7 @@ def reward_graph(credit: Decomposition | None, config: TrainConfig, team_index: 
         return finish(r_hat=compute(partial(_reward, credit=credit, config=config), inputs))
 
 
-def _reward(arrays: dict[str, Any], credit: Decomposition | None, config: TrainConfig) -> Any:
+def _reward(arrays: dict[str, Any], credit: DecoderState | None, config: TrainConfig) -> Any:
     """Return the proxy rewards of one step."""
     inputs, length = arrays["inputs"], arrays.get("length")
     rows = inputs if inputs.ndim > 1 else inputs[None]

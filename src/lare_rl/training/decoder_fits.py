@@ -6,7 +6,7 @@ from jaxtyping import Array, Float, Key, PRNGKeyArray
 
 from lare_rl.credit import descent
 from lare_rl.credit.batch_plan import plan_batch
-from lare_rl.credit.decomposition import CreditBatch, Decomposition
+from lare_rl.credit.decomposition import CreditBatch, DecoderState
 from lare_rl.data import replay
 from lare_rl.data.replay import Replay
 from lare_rl.data.sampling import CreditSample, sample_drawn, sample_packed, sample_padded
@@ -19,8 +19,8 @@ from lare_rl.training.static_config import TrainConfig
 __all__ = ["fit_decoders", "fit_repeatedly", "fit_seeds", "sample_credit"]
 
 CHUNK_ROWS = 2400
-"""About how many rows each chunk of a decoder's gradient is computed from. More rows do not fit into the cache, and
-fewer make the matrix products inefficient. On one core, 256 episodes of six agents at once took 1.5 times as long."""
+"""About how many rows each chunk of a decoder's gradient is computed from. More rows do not fit into the cache of a core,
+and fewer make the matrix products inefficient."""
 
 
 def sample_credit(buffer: Replay, key: PRNGKeyArray, updates: int, config: TrainConfig) -> CreditSample | None:
@@ -40,8 +40,8 @@ def sample_credit(buffer: Replay, key: PRNGKeyArray, updates: int, config: Train
 
 
 def fit_decoders(
-    decoders: tuple[Decomposition, ...], buffer: Replay, sample: CreditSample, key: PRNGKeyArray, config: TrainConfig
-) -> tuple[tuple[Decomposition, ...], dict[str, Float[Array, ""]]]:
+    decoders: tuple[DecoderState, ...], buffer: Replay, sample: CreditSample, key: PRNGKeyArray, config: TrainConfig
+) -> tuple[tuple[DecoderState, ...], dict[str, Float[Array, ""]]]:
     """Update every team's decoder once."""
     steps = replay.read(buffer, sample.steps)
     keys = jax.random.split(key, len(decoders))
@@ -53,8 +53,8 @@ def fit_decoders(
 
 
 def _update_decoder(
-    decoder: Decomposition, batch: CreditBatch, key: PRNGKeyArray, config: TrainConfig
-) -> tuple[Decomposition, dict[str, Float[Array, ""]]]:
+    decoder: DecoderState, batch: CreditBatch, key: PRNGKeyArray, config: TrainConfig
+) -> tuple[DecoderState, dict[str, Float[Array, ""]]]:
     """Take one gradient step. The gradient of a large batch of equally long episodes is computed in chunks."""
     assert config.method.fit is not None
     n_rows, n_episodes = batch.inputs[..., 0].size, len(batch.length)
@@ -75,23 +75,23 @@ def fit_seeds(
     learner: Learner, keys: Key[Array, " seeds"], config: TrainConfig
 ) -> tuple[Learner, dict[str, Float[Array, " seeds"]]]:
     """Update the decoders of every seed `fit_updates` times. Return the mean of each metric."""
-    # On a CPU, a large batch of episodes of one seed fills the caches already.
+    # On a CPU, one seed after the other: a batch of one seed fills the caches already.
     decoders, metrics = map_leading_axis(
-        lambda seed: fit_repeatedly(*seed, config), (learner, keys), batched=config.batched
+        lambda pair: fit_repeatedly(*pair, config), (learner, keys), batched=config.batched
     )
     return learner._replace(decoders=decoders), metrics
 
 
 def fit_repeatedly(
     learner: Learner, key: PRNGKeyArray, config: TrainConfig
-) -> tuple[tuple[Decomposition, ...], dict[str, Float[Array, ""]]]:
+) -> tuple[tuple[DecoderState, ...], dict[str, Float[Array, ""]]]:
     """Update the decoders `fit_updates` times. Return them, and the mean of each metric."""
     sample_key, key = jax.random.split(key)
     samples = sample_credit(learner.replay, sample_key, config.fit_updates, config)
     if samples is None:
         return learner.decoders, {}
 
-    def body(decoders: tuple[Decomposition, ...], update: tuple[CreditSample, PRNGKeyArray]):
+    def body(decoders: tuple[DecoderState, ...], update: tuple[CreditSample, PRNGKeyArray]):
         return fit_decoders(decoders, learner.replay, *update, config)
 
     decoders, metrics = jax.lax.scan(body, learner.decoders, (samples, jax.random.split(key, config.fit_updates)))

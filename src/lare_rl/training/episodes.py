@@ -16,7 +16,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from lare_rl.credit import closed_form, returns
-from lare_rl.credit.decomposition import CreditBatch, Decomposition
+from lare_rl.credit.decomposition import CreditBatch, DecoderState
 from lare_rl.credit.methods import Fit
 from lare_rl.data import replay
 from lare_rl.data.replay import Index, Replay
@@ -30,7 +30,7 @@ __all__ = ["Decoders", "PredictedReturns", "fold_episodes", "learn_returns", "pr
 MAX_ROWS = 8000
 """The most rows of decoder inputs that are read at a time, unless a single episode has more."""
 
-Decoders = tuple[Decomposition, ...]
+Decoders = tuple[DecoderState, ...]
 PredictedReturns = Float[Array, "*seeds envs episodes teams"] | None
 State = TypeVar("State")
 
@@ -59,7 +59,7 @@ def learn_returns(
     return learned, n_now, predicted
 
 
-def _is_refitted(before: Decomposition, after: Decomposition) -> Bool[Array, ""]:
+def _is_refitted(before: DecoderState, after: DecoderState) -> Bool[Array, ""]:
     assert before.closed_form is not None
     assert after.closed_form is not None
     return before.closed_form.n_fitted != after.closed_form.n_fitted
@@ -72,7 +72,7 @@ def predict_returns(
     buffer = replay.by_payment(buffer)
     rows, slots = buffer.row.shape[-1], buffer.first.shape[-1]
 
-    def body(state: tuple[Decomposition, Array], episodes: CreditBatch, first: Index) -> tuple[Decomposition, Array]:
+    def body(state: tuple[DecoderState, Array], episodes: CreditBatch, first: Index) -> tuple[DecoderState, Array]:
         decoder, predicted = state
         # The last step of what is paid is in the episode itself, which the first one need not be.
         last = first.number + episodes.length - 1
@@ -168,12 +168,12 @@ def _rebuild_statistics(decoders: Decoders, buffer: Replay, is_stale: Bool[Array
     return jax.tree.map(lambda new, old: jnp.where(is_stale, new, old), rebuilt, decoders)
 
 
-def _fit_closed_forms(decoder: Decomposition, is_due: Bool[Array, " seeds"], config: TrainConfig) -> Decomposition:
+def _fit_closed_forms(decoder: DecoderState, is_due: Bool[Array, " seeds"], config: TrainConfig) -> DecoderState:
     """Make the closed-form fits of a team's decoder for the seeds that are due."""
     batched = config.batched
     fit = partial(returns.fit_closed_form, method=config.method, score_types=config.score_types, batched=batched)
 
-    def fit_seed(seed: tuple[Decomposition, Bool[Array, ""]]) -> Decomposition:
+    def fit_seed(seed: tuple[DecoderState, Bool[Array, ""]]) -> DecoderState:
         decoder, is_due = seed
         assert decoder.closed_form is not None
         return jax.lax.cond(is_due & closed_form.is_due(decoder.closed_form), fit, lambda unchanged: unchanged, decoder)

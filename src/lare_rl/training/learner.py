@@ -14,7 +14,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
 from lare_rl.credit import decomposition
-from lare_rl.credit.decomposition import Decomposition
+from lare_rl.credit.decomposition import DecoderState
 from lare_rl.credit.engine import RewardSource, init_decoder
 from lare_rl.credit.history import next_history, scan_history
 from lare_rl.data import replay
@@ -44,7 +44,7 @@ class Learner(NamedTuple):
 
     algorithm: Any
     """The state of the algorithm."""
-    decoders: tuple[Decomposition, ...]
+    decoders: tuple[DecoderState, ...]
     """The decoders, one for each team; empty for a method that fits nothing."""
     scale: tuple[Scale, ...]
     """The scale of each team's R/T, for a method that fits nothing. A decoder has its own."""
@@ -58,7 +58,7 @@ class Learner(NamedTuple):
         return self.decoders or self.scale
 
 
-def init_decoders(keys: Sequence[PRNGKeyArray], config: TrainConfig) -> tuple[Decomposition, ...]:
+def init_decoders(keys: Sequence[PRNGKeyArray], config: TrainConfig) -> tuple[DecoderState, ...]:
     """Return untrained decoders, one for each team; none for a method that fits nothing."""
     decoders = (init_decoder(key, spec) for key, spec in zip(keys, config.credit_specs, strict=True))
     return tuple(decoder for decoder in decoders if decoder is not None)
@@ -170,7 +170,7 @@ def _levels(steps: Trajectory, config: TrainConfig) -> Int[Array, "time envs"] |
     return jnp.clip(jnp.asarray(steps.next_timestep.measures[config.group]).astype(jnp.int32), 0, config.n_levels - 1)
 
 
-def _observe(decoder: Decomposition, steps: StoredSteps, config: TrainConfig, team_index: int) -> Decomposition:
+def _observe(decoder: DecoderState, steps: StoredSteps, config: TrainConfig, team_index: int) -> DecoderState:
     """Add new steps, and the episodes that were paid in them, to the statistics of a team's decoder."""
     rows, mask = decoder_inputs(steps, config, team_index), row_mask(steps, config, team_index)
     decoder = decomposition.observe_steps(decoder, rows, mask)
@@ -181,7 +181,7 @@ def _observe(decoder: Decomposition, steps: StoredSteps, config: TrainConfig, te
 
 def with_learned_returns(
     learner: Learner,
-    decoders: tuple[Decomposition, ...],
+    decoders: tuple[DecoderState, ...],
     n_learned: Int[Array, "*seeds envs"],
     predicted: Float[Array, "*seeds envs episodes teams"] | None,
 ) -> Learner:

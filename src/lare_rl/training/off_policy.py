@@ -12,7 +12,7 @@ from jaxtyping import Array, Float, Int, Key, PRNGKeyArray, Scalar
 
 from lare_rl.algorithms.batches import Transitions
 from lare_rl.algorithms.off_policy import OffPolicySettings
-from lare_rl.credit.decomposition import Decomposition
+from lare_rl.credit.decomposition import DecoderState
 from lare_rl.data import replay
 from lare_rl.data.replay import Index, Replay, StoredSteps
 from lare_rl.data.sampling import CreditSample, sample_transitions
@@ -75,7 +75,7 @@ def _train_seed(
     n_updates = config.rollout_steps * config.n_envs
 
     def update(
-        carry: tuple[Any, tuple[Decomposition, ...]], inputs: tuple[Int[Scalar, ""], UpdateSample, PRNGKeyArray]
+        carry: tuple[Any, tuple[DecoderState, ...]], inputs: tuple[Int[Scalar, ""], UpdateSample, PRNGKeyArray]
     ) -> tuple[Any, dict[str, Array]]:
         state, decoders = carry
         update_index, sample, key = inputs

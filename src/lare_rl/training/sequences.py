@@ -15,7 +15,7 @@ from jaxtyping import Array, Bool, Float, Int, Key, PRNGKeyArray, Scalar
 
 from lare_rl.algorithms.batches import Metrics, Sequences
 from lare_rl.algorithms.qmix import QMIXSettings
-from lare_rl.credit.decomposition import Decomposition
+from lare_rl.credit.decomposition import DecoderState
 from lare_rl.data import replay
 from lare_rl.data.layouts import lay_out_padded
 from lare_rl.data.replay import Index, Replay
@@ -32,7 +32,7 @@ from lare_rl.training.static_config import TrainConfig
 
 __all__ = ["SequenceState", "act", "get_actor", "init", "init_memory", "train_step"]
 
-Updated = tuple[Any, tuple[Decomposition, ...]]
+Updated = tuple[Any, tuple[DecoderState, ...]]
 """The state of the algorithm, and the decoders."""
 
 MIN_CUT_LENGTH = 32

@@ -117,7 +117,7 @@ class TrainConfig:
     @property
     def is_exact(self) -> bool:
         """Whether the proxy rewards of an episode are corrected to add up to its return."""
-        return self.credit.exact in ("last", "spread") and "exact" in self.method.settings
+        return self.method.is_exact(self.credit.exact)
 
     @property
     def predicts_ahead(self) -> bool:
