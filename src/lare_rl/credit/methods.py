@@ -232,7 +232,7 @@ for _method in (
     Method(
         "lrr",
         "likelihood of the return under Gaussian rewards, leaving out each step in turn",
-        "Xiao and Jiao, LRR, 2025",
+        "Xiao and Jiao, LRR, 2025 (after the abstract; no code found)",
         inputs=input_names.RAW,
         fit=Fit.LIKELIHOOD,
         decoder="lrr",
@@ -271,7 +271,7 @@ for _method in (
     ),
     Method(
         "rudder",
-        "differences between an LSTM's predictions of the return",
+        "differences between an LSTM's predictions of the return, as a model of single steps learns them",
         "Arjona-Medina et al., RUDDER, NeurIPS 2019",
         inputs=input_names.RAW,
         fit=Fit.DECODER_LOSS,
@@ -288,15 +288,15 @@ for _method in (
     Method(
         "grd",
         "a causal model, in which learned masks choose the causes of the reward",
-        "Zhang et al., GRD, NeurIPS 2023",
+        "Zhang et al., GRD, NeurIPS 2023 (after the code, not the paper)",
         inputs=input_names.TRANSITION,
         fit=Fit.DECODER_LOSS,
         decoder="grd",
     ),
     Method(
         "rbt",
-        "a transformer over all steps that one payment is for",
-        "Tang et al., RBT, TMLR 2025",
+        "a transformer over at most 512 steps, those of one payment, as a model of single steps learns it",
+        "Tang et al., RBT, TMLR 2025 (after the code, not the paper)",
         inputs=input_names.TRANSITION,
         fit=Fit.DECODER_LOSS,
         decoder="rbt",
@@ -320,7 +320,7 @@ for _method in (
     Method(
         "tar2",
         "attention over time and agents; each is paid a share of the return itself",
-        "Kapoor et al., TAR2, 2025",
+        "Kapoor et al., TAR2, 2025 (after the code, not the paper)",
         inputs=input_names.OBSERVATION_ACTION,
         fit=Fit.ALL_STEPS,
         decoder="tar2",
