@@ -32,7 +32,8 @@ from paper.trained import MEANING
 pytestmark = pytest.mark.docs
 
 ROOT = Path(__file__).parents[1]
-PAGES = sorted([*ROOT.glob("*.md"), *ROOT.glob("docs/**/*.md"), *ROOT.glob("benchmarks/*.md")])
+SKILL = ROOT / "skills" / "lare" / "SKILL.md"
+PAGES = sorted([*ROOT.glob("*.md"), *ROOT.glob("docs/**/*.md"), *ROOT.glob("benchmarks/*.md"), SKILL])
 BLOCK = re.compile(r"^```(\w*)\n(.*?)^```", re.DOTALL | re.MULTILINE)
 RUNNABLE = ("sh", "python", "toml")
 
@@ -272,6 +273,7 @@ PREPARE = {
     "docs/how-to/reproduce.md": write_study,
     "docs/how-to/runs.md": train_run,
     "docs/reference/starcraft.md": write_study,
+    "skills/lare/SKILL.md": lambda page: page.write("phi.py", block("skills/lare/SKILL.md", "python", 0)),
     "docs/how-to/sweeps.md": write_study,
 }
 """What the reader of a page already has."""
