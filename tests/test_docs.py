@@ -4,17 +4,23 @@ import ast
 import doctest
 import importlib
 import re
+import shlex
 from pathlib import Path
 
 import pytest
 
 import lare_rl
+from lare_rl.cli import COMMANDS
+from lare_rl.cli.parse import parse
 from lare_rl.envs.families import FAMILIES
 
 ROOT = Path(__file__).parents[1]
-PAGES = sorted([*ROOT.glob("*.md"), *ROOT.glob("docs/**/*.md"), *ROOT.glob("benchmarks/*.md")])
+GUIDES = [ROOT / "AGENTS.md", ROOT / "skills" / "lare" / "SKILL.md"]
+"""Pages for coding agents."""
+PAGES = sorted({*ROOT.glob("*.md"), *ROOT.glob("docs/**/*.md"), *ROOT.glob("benchmarks/*.md"), *GUIDES})
 LINK = re.compile(r"\]\(([^)#]*)(?:#([^)]*))?\)")
 HEADING = re.compile(r"^#+ (.*)$", re.MULTILINE)
+COMMAND = re.compile(r"(?:`|^)lare-rl ([a-z][^`#\n]*)", re.MULTILINE)
 PYTHON = re.compile(r"```python\n(.*?)```", re.DOTALL)
 
 
@@ -38,6 +44,26 @@ def test_python_blocks_parse():
     for page in PAGES:
         for block in PYTHON.findall(page.read_text(encoding="utf-8")):
             ast.parse(block, str(page))
+
+
+@pytest.mark.parametrize("page", GUIDES, ids=lambda page: page.name)
+def test_commands_for_agents_parse(page, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    Path("runs").mkdir()
+    Path("runs", "pendulum").touch()  # which --config reads
+    commands = COMMAND.findall(page.read_text(encoding="utf-8"))
+    assert len(commands) > 1
+    for command in commands:
+        parse(COMMANDS, "", shlex.split(command))
+
+
+def test_skill_has_its_front_matter():
+    path = ROOT / "skills" / "lare" / "SKILL.md"
+    _, front, body = path.read_text(encoding="utf-8").split("---\n", 2)
+    values = dict(line.split(": ", 1) for line in front.splitlines())
+    assert (values["name"], set(values)) == (path.parent.name, {"name", "description"})
+    assert 0 < len(values["description"]) <= 1024  # the limit of the format
+    assert body.strip()
 
 
 def test_api_page_has_every_public_name():

@@ -32,7 +32,8 @@ from paper.trained import MEANING
 pytestmark = pytest.mark.docs
 
 ROOT = Path(__file__).parents[1]
-PAGES = sorted([*ROOT.glob("*.md"), *ROOT.glob("docs/**/*.md"), *ROOT.glob("benchmarks/*.md")])
+SKILL = ROOT / "skills" / "lare" / "SKILL.md"
+PAGES = sorted([*ROOT.glob("*.md"), *ROOT.glob("docs/**/*.md"), *ROOT.glob("benchmarks/*.md"), SKILL])
 BLOCK = re.compile(r"^```(\w*)\n(.*?)^```", re.DOTALL | re.MULTILINE)
 RUNNABLE = ("sh", "python", "toml")
 
@@ -263,6 +264,11 @@ def train_run(page):
     return lare_rl.train("Reacher-v4", settings, out="runs/lare", listeners=[])
 
 
+def prepare_runs(page):
+    train_run(page)
+    page.write("cheetah.toml", shorten(block("docs/how-to/runs.md", "toml", 0)))
+
+
 def prepare_api(page):
     source = train_run(page).functions[0].source
     for name, value in (("WANDB_MODE", "offline"), ("WANDB_SILENT", "true"), ("MLFLOW_ALLOW_FILE_STORE", "true")):
@@ -279,6 +285,15 @@ def export_policy(page):
     exec(EXPORT_NAMES, page.names)
 
 
+def prepare_models(page):
+    page.serve(PENDULUM)
+    page.write("pendulum.toml", block("docs/tutorials/your-own-environment.md", "toml", 0))
+    page.names["my_client"] = SimpleNamespace(ask=lambda messages: to_reply(PENDULUM))
+    name = "lare_rl.integrations.pydantic_ai"  # its library may be missing; tests/integrations has its tests
+    adapter = SimpleNamespace(pydantic_ai_model=lambda name: page.names["my_model"])
+    page.patch.setitem(sys.modules, name, adapter)
+
+
 def prepare_plugin(page):
     """Make the snippets one module, which can be imported by its name."""
     module = ModuleType("my_plugin")
@@ -293,6 +308,7 @@ PREPARE = {
     "docs/how-to/scores.md": write_pendulum,
     "docs/how-to/write-phi.md": write_pendulum,
     "docs/how-to/poor-policies.md": train_pendulum,
+    "docs/how-to/language-models.md": prepare_models,
     "docs/how-to/export.md": export_policy,
     "docs/how-to/extend.md": prepare_plugin,
     "docs/how-to/jax-environments.md": lambda page: page.write(
@@ -301,9 +317,10 @@ PREPARE = {
     "docs/tutorials/your-own-logs.md": write_logs,
     "docs/how-to/libraries/sb3.md": lambda page: lare_rl.design("Reacher-v4").save(page.directory / "phi.py"),
     "docs/how-to/reproduce.md": write_study,
-    "docs/how-to/runs.md": train_run,
+    "docs/how-to/runs.md": prepare_runs,
     "docs/reference/files.md": train_run,
     "docs/reference/starcraft.md": write_study,
+    "skills/lare/SKILL.md": lambda page: page.write("phi.py", block("skills/lare/SKILL.md", "python", 0)),
     "docs/how-to/sweeps.md": write_study,
 }
 """What the reader of a page already has."""
