@@ -34,6 +34,8 @@ PACKAGES = (
     "stable-baselines3",
     "sbx-rl",
     "torch",
+    "textworld",
+    "jericho",
 )
 
 TD3 = {

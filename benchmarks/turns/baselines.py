@@ -4,7 +4,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from lare_rl.credit.precisions import JITTER, NUMPY, Regression, dense_moments, equal_shares, next_posterior
-from turns.finite_task import FiniteTask, Rollouts
+from turns.finite_task import Rollouts, Task
 
 __all__ = ["gigpo", "grpo", "summed_credit"]
 
@@ -12,12 +12,12 @@ Turns = Float[np.ndarray, "rollouts turns"]
 ROUNDS = 40
 
 
-def grpo(task: FiniteTask, rollouts: Rollouts) -> Turns:
+def grpo(task: Task, rollouts: Rollouts) -> Turns:
     """Return the outcome minus the mean of the group, for every turn. (Shao et al., 2024, without division by the deviation.)"""
     return (rollouts.outcome - _means(rollouts.outcome, rollouts.group))[:, None] * rollouts.mask
 
 
-def gigpo(task: FiniteTask, rollouts: Rollouts, discount: float = 0.95) -> Turns:
+def gigpo(task: Task, rollouts: Rollouts, discount: float = 0.95) -> Turns:
     """Return GRPO's advantage plus that among turns of the group with the same state (Feng et al., 2025), without deviations."""
     mask, anchor = rollouts.mask, task.anchor[rollouts.state]
     turns_left = rollouts.length[:, None] - 1 - np.arange(mask.shape[1])
@@ -28,7 +28,7 @@ def gigpo(task: FiniteTask, rollouts: Rollouts, discount: float = 0.95) -> Turns
     return advantage
 
 
-def summed_credit(task: FiniteTask, rollouts: Rollouts) -> Turns:
+def summed_credit(task: Task, rollouts: Rollouts) -> Turns:
     """Return LaRe's proxy rewards as advantages: scores of turns whose sum predicts the outcome. This must not be done.
 
     The scores are linear in the features of a turn, fitted as `credit/evidence.py` says, with one group. Their mean is subtracted.

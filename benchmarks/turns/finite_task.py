@@ -6,12 +6,12 @@ agent stops by the last action, or is cut off and fails. The outcome is 0 or 1. 
 
 from collections.abc import Callable, Hashable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-__all__ = ["FiniteTask", "Rollouts", "TaskRules", "one_hot"]
+__all__ = ["FiniteTask", "Rollouts", "Task", "TaskRules", "Truth", "one_hot"]
 
 GROUP_SIZE = 8
 """Rollouts of the same task in a batch."""
@@ -80,6 +80,28 @@ class Truth(NamedTuple):
     value: Float[np.ndarray, "rollouts turns"]
 
 
+class Task(Protocol):
+    """What is needed to train on a family of tasks."""
+
+    names: tuple[str, ...]
+    """Of the features of a turn: tools, two generic ones, events, tokens."""
+    anchor: Int[np.ndarray, " states"]
+
+    @property
+    def n_tools(self) -> int: ...
+    def success_rate(self, theta: Float[np.ndarray, "inputs actions"]) -> float: ...
+    def play(
+        self, theta: Float[np.ndarray, "inputs actions"], random: np.random.Generator, n_groups: int
+    ) -> Rollouts: ...
+    def truth(self, theta: Float[np.ndarray, "inputs actions"], rollouts: Rollouts) -> Truth: ...
+    def gradient(
+        self,
+        theta: Float[np.ndarray, "inputs actions"],
+        rollouts: Rollouts,
+        advantage: Float[np.ndarray, "rollouts turns"],
+    ) -> Float[np.ndarray, "inputs actions"]: ...
+
+
 class FiniteTask:
     """The tables of a family, and what is computed from them."""
 
@@ -115,6 +137,10 @@ class FiniteTask:
         anchors = {anchor: i for i, anchor in enumerate(dict.fromkeys(map(rules.anchor, rules.states)))}
         self.anchor = np.array([anchors[rules.anchor(state)] for state in rules.states])
         self.tool = np.array(rules.tool_index)
+
+    @property
+    def n_tools(self) -> int:
+        return len(self.rules.tools)
 
     @property
     def policy_shape(self) -> tuple[int, int]:

@@ -18,7 +18,7 @@ import numpy as np
 from lare_rl.turns.credit import TurnCredit
 from lare_rl.turns.features import TurnTable
 from measure import correlation, write
-from turns.learning import TASKS, make_table, make_task
+from turns.learning import FINITE, TASKS, make_table, make_task
 
 SIZES = (64, 128, 256, 512, 1024)
 LARGE_CHANGE = 0.05
@@ -105,7 +105,7 @@ def main() -> None:
     cost = measure_cost(options.repeats)
     rows = [
         measure_data_set(name, size, seed, features)
-        for name in TASKS
+        for name in FINITE
         for features in ("events", "generic")
         for size in SIZES
         for seed in range(options.seeds)
@@ -120,7 +120,7 @@ def main() -> None:
         {name: round(value, 2) for name, value in figures.items()},
     )
     table = []
-    for name in TASKS:
+    for name in FINITE:
         for features in ("events", "generic"):
             for size in SIZES:
                 subset = [
