@@ -32,6 +32,7 @@ print(credit.rewards_at(steps).shape)
     [
         ("lare_rl.integrations.sb3", "stable_baselines3", "lare_rl.integrations.sb3", "sb3"),
         ("lare_rl.integrations.torchrl", "torchrl", "lare_rl.integrations.torchrl", "torchrl"),
+        ("lare_rl.integrations.pydantic_ai", "pydantic_ai", "lare_rl.integrations.pydantic_ai", "pydantic-ai"),
         ("lare_rl.integrations.pettingzoo", "pettingzoo", "lare_rl.integrations.pettingzoo", "pettingzoo"),
         ("lare_rl.envs.particles.parallel_env", "pettingzoo", "lare_rl.envs.particles.parallel_env", "pettingzoo"),
         ("lare_rl.report.charts", "PIL", "a report", "report"),
