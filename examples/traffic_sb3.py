@@ -24,7 +24,7 @@ def main(steps: int = 14_400, episodes: int = 4) -> tuple[float, float]:
     model.learn(steps, callback=CreditCallback(credit))
     print(credit.metrics())
     test = make_task("traffic", "test")
-    policy = play_scores(test, lambda env: lambda obs: model.predict(obs, deterministic=True)[0], episodes)
+    policy = play_scores(test, lambda env: lambda obs: model.predict(obs, deterministic=False)[0], episodes)
     rule = play_scores(test, final_score.traffic.longest_queue, episodes)
     means = [float(np.mean([score for score, _ in scores])) for scores in (policy, rule)]
     env.close()

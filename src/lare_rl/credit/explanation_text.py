@@ -92,7 +92,7 @@ MESSAGES = {
         "computed from them."
     ),
     "unused_raw_features": (
-        "{n_unused} of {n_raw} raw entries are switched off, because the returns do not depend on them: {names}{more}."
+        "{n_unused} of {n_raw} raw entries are switched off, because they explain nothing beside the others: {names}{more}."
     ),
     "more_names": " and {count} more",
     "high_when_large": (
