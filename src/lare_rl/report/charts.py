@@ -181,11 +181,15 @@ class Bar:
 
 
 def draw_legend(entries: Iterable[tuple[str, str]]) -> str:
-    """Draw the meaning of the styles of lines, and of the style `shade`."""
-    shade = '<rect class="shade" width="26" height="12"/>'
-    keys = (
-        (shade if style == "shade" else f'<path class="key {style}" d="M0 6h26"/>', text) for style, text in entries
-    )
+    """Draw the meaning of the styles of lines, and of the styles `shade` and `band ...` of areas."""
+
+    def draw_key(style: str) -> str:
+        is_area = style.startswith(("shade", "band"))
+        return (
+            f'<rect class="{style}" width="26" height="12"/>' if is_area else f'<path class="key {style}" d="M0 6h26"/>'
+        )
+
+    keys = ((draw_key(style), text) for style, text in entries)
     items = (f'<li><svg viewBox="0 0 26 12">{key}</svg>{escape(text)}</li>' for key, text in keys)
     return f'<ul class="legend">{"".join(items)}</ul>'
 

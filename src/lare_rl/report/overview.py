@@ -299,6 +299,8 @@ def _render_legend(
     entries += (
         [("c0 thin" if len(runs) == 1 else "grey thin", "a seed")] if seeds > 1 and len(runs) <= N_COLOURS else []
     )
+    if seeds == 1 and len(entries) == 1:
+        entries += [("band c0", "± deviation over the episodes of an evaluation")]
     entries += [("grey dashed", " / ".join(references))] if references else []
     return draw_legend(entries + ([("shade", "random steps before the first update")] if warmup else []))
 
