@@ -1,4 +1,4 @@
-"""The README's picture: the true rewards of an episode of CN-6 beside those that were recovered from totals.
+"""Draw the README's picture: the true rewards of an episode of CN-6, and the rewards that LaRe recovered from totals.
 
     lare-rl train CN-6 --steps 205000 --out RUN
     python benchmarks/credit_picture.py RUN
@@ -54,8 +54,7 @@ def main(run: tyro.conf.Positional[Path], out: Path = PICTURE) -> None:
     height = n_agents * CELL
     second = TOP + height + 70
     width, bottom = LEFT + n_steps * CELL, second + height
-    note = f"the only number that LaRe saw is their sum, {reward.sum():.1f}"
-    lines = draw_panel("True rewards", f"({note})", reward, TOP, scale)
+    lines = draw_panel("True rewards", f"(their sum is {reward.sum():.1f})", reward, TOP, scale)
     lines += draw_panel("Rewards that LaRe recovered", f"(their sum is {proxy.sum():.1f})", proxy, second, scale)
     lines.append(f'<text x="{LEFT}" y="{bottom + 24}">first step</text>')
     lines.append(f'<text x="{width}" y="{bottom + 24}" text-anchor="end">last step</text>')

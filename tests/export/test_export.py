@@ -334,3 +334,10 @@ def test_invalid_inputs(export):
         exported.reward(np.zeros((4, 2)), np.zeros((3, 1)), np.zeros((4, 2)))
     rows = exported.reward(np.zeros((4, 2)), np.zeros(1), np.zeros((4, 2)))  # one action for all steps
     np.testing.assert_array_equal(rows, exported.reward(np.zeros((4, 2)), np.zeros((4, 1)), np.zeros((4, 2))))
+
+
+def test_trained_example_has_the_exported_programs():
+    root = Path(__file__).parents[2]
+    example, package = root / "examples" / "trained" / "HalfCheetah-v4", root / "src" / "lare_rl"
+    for path in (package / "export" / "exported.py", package / "phi" / "evaluate.py"):
+        assert (example / path.name).read_bytes() == path.read_bytes(), "export the example again"
