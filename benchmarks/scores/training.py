@@ -3,9 +3,9 @@
     PYTHONPATH=benchmarks python -m scores.training KIND --out RUNS
 
 Kinds: `not-a-sum` (the corridor's scores), `binary` (won or lost by chance), `payments` (PP-6 paid every step, every 5 steps, and at
-the end), `exact` (PP-6, rewards that add up exactly), `groups` (CN-6 in levels), `published` (published methods on CN-6 and PP-6). Runs
-that exist in RUNS are not trained again. `late` is the mean return of the evaluations after three quarters of the steps, and `area`
-that of all evaluations, which also says how fast a method learns.
+the end), `exact` (PP-6, rewards that add up exactly), `groups` (CN-6 in levels), `published` (published methods on CN-6 and PP-6).
+Finished runs in RUNS are not trained again, and stopped ones continue. `late` is the mean return of the evaluations after three
+quarters of the steps, and `area` that of all evaluations, which also says how fast a method learns.
 """
 
 from collections.abc import Callable, Iterator
@@ -124,7 +124,9 @@ def main(
     scores: dict[str, dict[str, list[float]]] = {}
     for row in rows:
         directory = out / kind / row.table.replace(" ", "") / row.label.replace(" ", "")
-        if not (directory / "metrics.jsonl").exists():
+        if (directory / "config.json").exists():
+            lare_rl.resume(directory)
+        else:
             lare_rl.train(row.task, lare_rl.Settings(**row.settings, seeds=seeds), out=directory)
         for measure, after in (("late", 0.75), ("area", 0.0)):
             returns = mean_returns(directory, after)
