@@ -17,8 +17,9 @@ def test_recorded_requests():
     for name in names:
         recording = read_recording((SHIPPED_RECORDINGS / name).read_text(encoding="utf-8"), name)
         task = read_task(recording.task)
-        first, second = recording.exchanges
+        first, second, *corrections = recording.exchanges
         assert (first.stage, second.stage) == ("candidate", "combine"), name
+        assert {exchange.stage for exchange in corrections} <= {"correct"}, name
         assert candidate(task, recording.kind) == first.messages, name
         assert combine(task, first.replies, recording.kind) == second.messages, name
         assert name == f"{recording.kind}/{recording.task}.draw{recording.draw}.json"
