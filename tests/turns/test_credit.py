@@ -100,8 +100,9 @@ def test_noise_is_not_trusted():
     [
         (0.2, 0.0, 0.8, "trusted"),
         (0.2, 0.2, 0.95, "surprised"),
-        (0.02, 0.0, 0.95, "small_gain"),
-        (-0.1, 0.0, 1.0, "harmful"),
+        (0.045, 0.0, 0.95, "small_gain"),
+        (0.03, 0.0, 1.0, "unclear_gain"),
+        (-0.1, 0.0, 1.0, "unclear_gain"),
         (np.nan, 0.0, 1.0, "unknown"),
     ],
 )

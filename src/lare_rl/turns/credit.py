@@ -110,7 +110,7 @@ class TurnCredit:
         self,
         lambda_: float | None = None,
         *,
-        window: int = 5,
+        window: int = 20,
         logistic: bool = False,
         phi: Phi | None = None,
     ):

@@ -7,8 +7,8 @@ Both numbers compare outcomes with values that the rollout itself had no part in
 * the surprise at the end: the mean of R - V before the last turns of agents that stopped by themselves. If it is large, then the values
   miss what agents see before they stop, and the last turn gets the credit of the turns before it.
 
-Lambda is 0.8 while both numbers allow it, otherwise 0.95, which needs the values less. If the values seem worse than the mean of the group,
-or if rollouts are too few to tell, lambda is 1 and the advantage is that of GRPO: the outcome minus the mean of the group.
+Lambda is 0.8 while both numbers allow it, and otherwise 0.95, which needs the values less. While it is not clear that the values are better
+than the mean of the group, lambda is 1 and the advantage is that of GRPO: the outcome minus the mean of the group.
 """
 
 import math
@@ -37,12 +37,10 @@ __all__ = [
 TRUSTING, CAREFUL, BROADCAST = 0.8, 0.95, 1.0
 """The values of lambda."""
 MIN_GAIN_Z = 2.0
-"""Lambda 0.8 needs a gain of more than this many standard errors."""
-MAX_SURPRISE, SURPRISE_PER_GAIN = 0.25, 0.05
-"""Lambda 0.8 needs a surprise below the first, in standard deviations of outcomes, and below the second times the standard errors of the
-gain: the less certain the gain, the smaller the surprise must be. These limits were chosen on the two testbeds of `benchmarks/turns`."""
-MAX_LOSS_Z = 2.0
-"""With a negative gain of more than this many standard errors, the values are not used."""
+"""Values are used if their gain is above this many standard errors."""
+MIN_GAIN, MAX_SURPRISE = 0.05, 0.15
+"""Lambda 0.8 needs a larger gain, and a smaller surprise in standard deviations of outcomes. These limits, and the window of `TurnCredit`,
+were chosen on the testbeds (a) and (b) of `benchmarks/turns`, with other seeds than those that are reported."""
 MIN_ROLLOUTS = 16
 """With fewer rollouts, the values are not used."""
 
@@ -110,11 +108,10 @@ def choose_lambda(trust: Trust) -> tuple[float, Finding]:
     values = trust._asdict()
     if math.isnan(trust.gain):
         return BROADCAST, Finding("unknown", values)
-    if trust.gain < -MAX_LOSS_Z * trust.gain_error:
-        return BROADCAST, Finding("harmful", values)
     if trust.gain <= MIN_GAIN_Z * trust.gain_error:
+        return BROADCAST, Finding("unclear_gain", values)
+    if trust.gain < MIN_GAIN:
         return CAREFUL, Finding("small_gain", values)
-    certainty = trust.gain / max(trust.gain_error, 1e-12)
-    if trust.surprise > min(MAX_SURPRISE, SURPRISE_PER_GAIN * certainty) * trust.outcome_std:
+    if trust.surprise > MAX_SURPRISE * trust.outcome_std:
         return CAREFUL, Finding("surprised", values)
     return TRUSTING, Finding("trusted", values)

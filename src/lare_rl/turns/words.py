@@ -9,13 +9,14 @@ MESSAGES = {
         "there are {n_rollouts:count rollout} with a spread of outcomes of {outcome_std:.2g}, from which nothing can be said about the "
         "values; the advantage is the outcome minus the mean of its group, as in GRPO"
     ),
-    "harmful": (
-        "values of prefixes predict outcomes worse than the mean of the group does (gain {gain:.1%} ± {gain_error:.1%}); the advantage is "
-        "the outcome minus that mean, as in GRPO"
+    "unclear_gain": (
+        "it is not clear that values of prefixes predict outcomes better than the mean of the group does (gain {gain:.1%} ± "
+        "{gain_error:.1%}); the advantage is the outcome minus that mean, as in GRPO. More rollouts help, and features of events: what "
+        "happened in a turn"
     ),
     "small_gain": (
-        "values of prefixes remove {gain:.1%} ± {gain_error:.1%} of the squared error of the group's mean, which is too little to trust "
-        "them. More rollouts help, and features of events: what happened in a turn"
+        "values of prefixes remove only {gain:.1%} ± {gain_error:.1%} of the squared error of the group's mean. Features of events help: "
+        "what happened in a turn"
     ),
     "surprised": (
         "values of prefixes remove {gain:.1%} ± {gain_error:.1%} of the squared error of the group's mean, but outcomes are "

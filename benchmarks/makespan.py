@@ -1,0 +1,67 @@
+"""How well do methods predict makespans, which are a maximum and not a sum?
+
+    python benchmarks/makespan.py
+
+Random actions in the job shop of `benchmarks/real`, whose package must be installed. Each method is fitted to episode after episode.
+The figure is R^2 of the last 32 of 96 scores, each predicted before it was fitted.
+"""
+
+from pathlib import Path
+
+import gymnasium
+import numpy as np
+import tyro
+
+import lare_rl
+from measure import write
+
+N_EPISODES = 96
+REAL = Path(__file__).parent / "real"
+TASK, PHI = REAL / "tasks" / "jobshop.toml", REAL / "phi" / "jobshop.py"
+METHODS = "bayes", "bayes-history", "bayes-progress", "lare-bayes", "lare-bayes-history", "lare-bayes-progress"
+
+
+def play(seed: int) -> list[tuple[np.ndarray, np.ndarray, np.ndarray, float]]:
+    """Return episodes of random actions: observations, actions, next observations and the score."""
+    env = gymnasium.make("final_score:JobShop-v0")
+    env.action_space.seed(seed)
+    episodes = []
+    for k in range(N_EPISODES):
+        observation, rows, done, score = env.reset(seed=1000 * seed + k)[0], [], False, 0.0
+        while not done:
+            action = env.action_space.sample()
+            next_observation, reward, terminated, truncated, _ = env.step(action)
+            rows.append((observation, action, next_observation))
+            observation, done, score = next_observation, terminated or truncated, score + float(reward)
+        episodes.append((*map(np.array, zip(*rows, strict=True)), score))
+    return episodes
+
+
+def measure_r2(method: str, episodes: list) -> float:
+    """Return R^2 of the last scores, each predicted before it was fitted."""
+    phi = lare_rl.load_function(PHI, TASK) if method.startswith("lare-") else None
+    credit = lare_rl.CreditAssigner(method, phi, task=TASK)
+    for episode in episodes:
+        credit.add_episode(*episode)
+        credit.fit()
+    return credit.metrics()["credit/return_r2"]
+
+
+def main(seeds: int = 10) -> None:
+    """Measure.
+
+    Args:
+        seeds: numbers of sets of episodes.
+    """
+    r2: dict[str, list[float]] = {method: [] for method in METHODS}
+    for seed in range(seeds):
+        episodes = play(seed)
+        for method in METHODS:
+            r2[method].append(measure_r2(method, episodes))
+        print(seed, {method: round(values[-1], 2) for method, values in r2.items()}, flush=True)
+    rows = {m: {"mean": float(np.mean(v)), "std": float(np.std(v, ddof=1)), "n": len(v)} for m, v in r2.items()}
+    write("makespan", {"command": f"python benchmarks/makespan.py --seeds {seeds}", "rows": rows})
+
+
+if __name__ == "__main__":
+    tyro.cli(main, description=__doc__)
