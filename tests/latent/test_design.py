@@ -89,7 +89,7 @@ def test_draws_and_kinds():
     assert functions[0].digest != functions[1].digest
     reward = design(task, "reward", candidates=1)
     assert (reward.kind, reward.size) == ("reward", 1)
-    with pytest.raises(LareError, match="no recorded reply.*--model.*--function.*--method bayes"):
+    with pytest.raises(LareError, match=r"no recorded reply.*--model.*--function.*--method bayes"):
         design(toy_spec())
 
 
