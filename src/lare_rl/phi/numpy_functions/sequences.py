@@ -7,7 +7,6 @@ from typing import Any
 
 from lare_rl.phi.arrays import Array, as_array, broadcast, concatenate, elementwise, stack
 from lare_rl.phi.builder import current_builder
-from lare_rl.phi.indices import ALL
 from lare_rl.phi.limits import RefusedError
 from lare_rl.phi.numpy_functions.reductions import along, flatten_constant
 from lare_rl.phi.numpy_functions.registry import (
@@ -46,7 +45,7 @@ def accumulate(ufunc: str, array: Array, axis: Any = 0) -> Any:
     size, shift = array.row_shape[at], 1
     while shift < size:
         before = [max(i - shift, 0) for i in range(size)]
-        array = elementwise(ufunc, array, array[(*(ALL,) * at, before)])
+        array = elementwise(ufunc, array, array.select(at, before))
         shift *= 2
     return array
 
@@ -66,7 +65,7 @@ def diff(a: Array, n: int = 1, axis: int = -1, prepend: Any = None, append: Any 
     )
     op = "not_equal" if a.kind == "bool" else "subtract"
     for _ in range(n):
-        a = elementwise(op, a[(*(ALL,) * at, slice(1, None))], a[(*(ALL,) * at, slice(None, -1))])
+        a = elementwise(op, a.select(at, slice(1, None)), a.select(at, slice(None, -1)))
     return a
 
 
@@ -87,7 +86,7 @@ def _gradient_along(f: Array, at: int, spacing: Array, edge_order: int) -> Any:
         raise ValueError(f"np.gradient needs at least {edge_order + 1} numbers along its axis")
 
     def entries(index: Any) -> Any:
-        return f[(*(ALL,) * at, index)]
+        return f.select(at, index)
 
     x = [float(v) for v in require_constant(spacing, "the spacing of np.gradient").ravel()]
     x = [i * x[0] for i in range(size)] if len(x) == 1 else x
@@ -124,7 +123,7 @@ def trapezoid(y: Array, x: Any = None, dx: Any = 1.0, axis: int = -1) -> Any:
         x = as_array(x)
         width = diff(x, 1, 0 if x.ndim == 1 else at)
         width = width[(..., *(None,) * (y.ndim - 1 - at))] if x.ndim == 1 and y.ndim > 1 else width
-    both = elementwise("add", y[(*(ALL,) * at, slice(1, None))], y[(*(ALL,) * at, slice(None, -1))])
+    both = elementwise("add", y.select(at, slice(1, None)), y.select(at, slice(None, -1)))
     return along("sum", elementwise("multiply", width, elementwise("divide", both, 2.0)), at)
 
 
@@ -193,7 +192,7 @@ def quantile(a: Array, q: Any, axis: Any = None, *, method: Any = "linear", keep
 
 def _at_fraction(ordered: Array, at: int, fraction: float, method: str) -> Any:
     position = fraction * (ordered.row_shape[at] - 1)
-    low, high = (ordered[(*(ALL,) * at, i)] for i in (math.floor(position), math.ceil(position)))
+    low, high = (ordered.select(at, i) for i in (math.floor(position), math.ceil(position)))
     weights = {
         "linear": position - math.floor(position), "lower": 0.0, "higher": 1.0, "midpoint": 0.5,
         "nearest": float(round(position) - math.floor(position)),
