@@ -181,6 +181,7 @@ print(*envs.pids, flush=True)
 envs.reset(np.ones(2, bool), np.arange(2))
 while True:
     envs.step(np.zeros((2, 2, 2), np.float32))
+    print(flush=True)
 """
 
 
@@ -199,7 +200,9 @@ def test_workers_end_silently_with_their_parent(how, fault):
     try:
         pids = list(map(int, parent.stdout.readline().split()))
         assert all(map(is_running, pids))
-        time.sleep(0.5)  # the third step has begun
+        parent.stdout.readline()
+        parent.stdout.readline()
+        time.sleep(0.3)  # the third step has begun
         os.killpg(parent.pid, how)  # as a terminal does
         _, error_output = parent.communicate(timeout=30)
     finally:

@@ -54,15 +54,9 @@ def accumulate(ufunc: str, array: Array, axis: Any = 0) -> Any:
 def diff(a: Array, n: int = 1, axis: int = -1, prepend: Any = None, append: Any = None) -> Any:
     (at,) = a.row_axes(axis)
     edge = (*a.row_shape[:at], 1, *a.row_shape[at + 1 :])
-    ends = [
-        x if x is a or x is None or as_array(x).ndim else broadcast(as_array(x), edge, a.batch_axis)
-        for x in (prepend, a, append)
-    ]
-    a = (
-        concatenate([as_array(x) for x in ends if x is not None], at)
-        if prepend is not None or append is not None
-        else a
-    )
+    if prepend is not None or append is not None:
+        arrays = [as_array(x) for x in (prepend, a, append) if x is not None]
+        a = concatenate([x if x.ndim else broadcast(x, edge, a.batch_axis) for x in arrays], at)
     op = "not_equal" if a.kind == "bool" else "subtract"
     for _ in range(n):
         a = elementwise(op, a.select(at, slice(1, None)), a.select(at, slice(None, -1)))
@@ -95,19 +89,16 @@ def _gradient_along(f: Array, at: int, spacing: Array, edge_order: int) -> Any:
     def column(values: list[float]) -> Array:
         return as_array(values).reshaped(shape, None)
 
-    before, behind = [x[i] - x[i - 1] for i in range(1, size - 1)], [x[i + 1] - x[i] for i in range(1, size - 1)]
-    pieces = [entries(slice(0, 1)), *([entries(slice(1, -1))] if size > 2 else []), entries(slice(-1, None))]
-    pieces[0] = (entries(slice(1, 2)) - entries(slice(0, 1))) / (x[1] - x[0])
-    pieces[-1] = (entries(slice(-1, None)) - entries(slice(-2, -1))) / (x[-1] - x[-2])
+    pieces = [(entries(slice(1, 2)) - entries(slice(0, 1))) / (x[1] - x[0])]
     if size > 2:
-        inner = [
-            (-d1 / (d0 * (d0 + d1)), (d1 - d0) / (d0 * d1), d0 / (d1 * (d0 + d1)))
-            for d0, d1 in zip(before, behind, strict=True)
-        ]
-        w_before, w_middle, w_behind = (column([weights[i] for weights in inner]) for i in range(3))
-        pieces[1] = (
+        steps = [(x[i] - x[i - 1], x[i + 1] - x[i]) for i in range(1, size - 1)]
+        w_before = column([-d1 / (d0 * (d0 + d1)) for d0, d1 in steps])
+        w_middle = column([(d1 - d0) / (d0 * d1) for d0, d1 in steps])
+        w_behind = column([d0 / (d1 * (d0 + d1)) for d0, d1 in steps])
+        pieces.append(
             entries(slice(None, -2)) * w_before + entries(slice(1, -1)) * w_middle + entries(slice(2, None)) * w_behind
         )
+    pieces.append((entries(slice(-1, None)) - entries(slice(-2, -1))) / (x[-1] - x[-2]))
     if edge_order == 2:
         h = x[1] - x[0]
         pieces[0] = (-1.5 * entries(slice(0, 1)) + 2.0 * entries(slice(1, 2)) - 0.5 * entries(slice(2, 3))) / h

@@ -134,11 +134,9 @@ def _interval(x: Array, knots: np.ndarray) -> Any:
     if len(knots) < 2:
         raise ValueError("np.interp needs at least two points")
     current_builder().check_size((math.prod(x.row_shape), len(knots)))
-    return (
-        _steps_above(x, as_array(knots[1:-1]), "greater_equal")
-        if len(knots) > 2
-        else elementwise("multiply", 0, elementwise("isnan", x))
-    )
+    if len(knots) == 2:
+        return elementwise("multiply", 0, elementwise("isnan", x))
+    return _steps_above(x, as_array(knots[1:-1]), "greater_equal")
 
 
 @numpy_function()
