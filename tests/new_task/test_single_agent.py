@@ -201,6 +201,7 @@ def test_one_team(tmp_path):
 
 def test_two_teams(tmp_path):
     draft = draft_task("pettingzoo/mpe2.simple_adversary_v3:parallel_env")
+    assert (draft.name, draft.missing_keys) == ("simple_adversary_v3", ())
     assert list(draft.teams) == ["simple_adversary_v3-adversary.toml", "simple_adversary_v3-agent.toml"]
     task = load_with_teams(tmp_path, draft)
     adversary, agent = task.roles
