@@ -38,8 +38,6 @@ print(credit.rewards_at(steps).shape)
         ("lare_rl.report.charts", "PIL", "a report", "report"),
         ("lare_rl.report.figures", "matplotlib", "a figure", "report"),
         ("lare_rl.envs.canvas", "matplotlib", "a picture", "report"),
-        ("lare_rl.envs.particles.drawing", "matplotlib", "a picture", "report"),
-        ("lare_rl.envs.smax.drawing", "matplotlib", "a picture", "report"),
         ("lare_rl.logs.tables", "pyarrow", "a Parquet file", "parquet"),
         ("lare_rl.logs.huggingface", "datasets", "a Hugging Face data set", "datasets"),
         ("lare_rl.logs.minari", "minari", "a Minari data set", "minari"),

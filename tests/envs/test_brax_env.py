@@ -5,13 +5,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from helpers.jax_families import check_arrays, family_task, play, skip_without, step_keys
+from helpers.jax_families import check_arrays, family_task, play, require_family, step_keys
 from lare_rl.envs.brax_env import make
-from lare_rl.envs.families import make_env
-from lare_rl.errors import LareError
-from lare_rl.new_task.single_agent import draft_task
 
-skip_without("brax", "mujoco.mjx")
+require_family("brax")
 
 pytestmark = pytest.mark.filterwarnings("ignore:Accessing .* directly from:DeprecationWarning")
 
@@ -32,24 +29,3 @@ def test_last_observation_is_the_terminal_state():
         state = step(state, jnp.asarray(actions[0, number, 0]))
     np.testing.assert_allclose(timesteps.observation[0, last, 0], state.obs, rtol=1e-3, atol=1e-4)
     assert timesteps.reward[0, : last + 1].sum() == last + 1
-
-
-@pytest.mark.parametrize(
-    ("environment", "changes", "content"),
-    [
-        ("brax/halfcheeta", {}, "did you mean 'halfcheetah'"),
-        ("brax/ant", {"arguments": {"backend": "none"}}, "cannot be made: .*backend"),
-        ("brax/ant", {"agents": ["a"]}, "agents has no effect on brax/ant"),
-    ],
-)
-def test_refusals(environment, changes, content):
-    with pytest.raises(LareError, match=content) as error:
-        make_env(family_task(environment, **changes))
-    assert "\n" not in str(error.value)
-
-
-def test_draft():
-    draft = draft_task(PENDULUM)
-    assert draft.missing_keys == ()
-    assert "observation_size = 4\naction_size = 1\n" in draft.toml
-    assert "1 entry, between -1 and 1." in draft.toml

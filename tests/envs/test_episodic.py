@@ -89,6 +89,7 @@ def test_score_replaces_the_sum():
         ("goals", 1, "no 'goals': it has 'step', 'score'"),
         ("score", "high", "'score'.* 'high', which is not a number"),
         ("score", math.nan, "'score'.* nan, which is not finite"),
+        ("score", 10**400, "'score'.*, which is not a number"),
     ],
 )
 def test_invalid_score(key, value, content):

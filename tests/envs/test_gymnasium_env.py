@@ -6,7 +6,7 @@ from typing import Any
 import gymnasium
 import numpy as np
 import pytest
-from gymnasium.spaces import Box, Dict, Discrete, MultiDiscrete
+from gymnasium.spaces import Box, Discrete
 
 from helpers.toy_envs import Chase, toy_spec
 from lare_rl.envs.env_errors import EnvOutputError
@@ -76,19 +76,11 @@ class Integers(Chase):
     action_space = Box(-3, 3, (1,), np.int8)
 
 
-class Nested(Chase):
-    observation_space = Dict({"grid": Box(0, 9, (2, 2), np.float32), "pick": MultiDiscrete([2, 3])})
-
-    def observe(self) -> Any:
-        super().observe()
-        return {"grid": np.array([[1, 2], [3, 4]], np.float32), "pick": np.array([1, 2])}
-
-
 class Plane(Chase):
     action_space = Box(-1, 1, (2, 2), np.float32)
 
 
-for maker in (Invalid, Reuses, OutOfItsSpace, Precise, Integers, Nested, Plane):
+for maker in (Invalid, Reuses, OutOfItsSpace, Precise, Integers, Plane):
     checks = {"disable_env_checker": maker in (Invalid, Reuses, OutOfItsSpace)}
     gymnasium.register(f"foreign/{maker.__name__}-v0", entry_point=maker, max_episode_steps=20, **checks)
 
@@ -156,10 +148,6 @@ def test_observations_are_copied():
     assert [timestep.observation.tolist() for timestep in timesteps] == [[[first + step] * 2] for step in range(3)]
 
 
-def test_observations_are_flattened():
-    assert make_env("Nested").reset(0).observation.tolist() == [[1, 2, 3, 4, 0, 1, 0, 0, 1]]
-
-
 def test_measures_are_those_of_the_last_step():
     env = GymnasiumEnv(toy_spec(measures=("distance",), max_episode_steps=2))
     assert env.spec.measures == ("distance",)
@@ -206,12 +194,9 @@ def test_invalid_value_or_failure(kwargs, content):
     assert isinstance(error.value, EnvOutputError) == content.startswith(("observation", "reward"))
 
 
-def test_observation_outside_its_space():
+def test_spaces_that_are_refused():
     with pytest.raises(LareError, match="failed in reset: index 7"):
         make_env("OutOfItsSpace").reset(0)
-
-
-def test_action_with_two_axes_is_refused():
     with pytest.raises(LareError, match="one axis"):
         make_env("Plane")
 

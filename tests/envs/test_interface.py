@@ -90,13 +90,6 @@ def test_continuous_action_is_scaled_to_the_bounds_of_each_agent():
     np.testing.assert_allclose(to_env_action(jnp.array(action), spec), env_action, rtol=1e-6)
 
 
-def test_agents_of_teams():
-    teams = Team("cat", 0, 2), Team("mouse", 2, 5)
-    assert EnvSpec(teams, 1, 1, discrete=True, max_steps=1).n_agents == 5
-    assert [team.n_agents for team in teams] == [2, 3]
-    assert list(range(5))[teams[1].agents] == [2, 3, 4]
-
-
 @pytest.mark.parametrize(
     ("make", "is_jax"),
     [(lambda: ParticleJaxEnv("CN-6"), True), (Echo, True), (ToyHostEnv, False), (lambda: JaxOnHost(Echo()), False)],

@@ -5,14 +5,13 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from helpers.jax_families import check_arrays, family_task, play, skip_without, step_keys
+from helpers.jax_families import check_arrays, family_task, play, require_family, step_keys
 from lare_rl.envs.families import make_env
 from lare_rl.envs.interface import Team
 from lare_rl.envs.jaxmarl_env import make
 from lare_rl.errors import LareError
-from lare_rl.new_task.single_agent import draft_task
 
-skip_without("jaxmarl")
+require_family("jaxmarl")
 
 SPREAD = "jaxmarl/MPE_simple_spread_v3"
 TAG = "jaxmarl/MPE_simple_tag_v3"
@@ -68,32 +67,3 @@ def test_masks_states_and_units_that_die():
         assert not timesteps.reward[episode, 1 : last + 1][~acted].any()
         assert not timesteps.available[episode, :last][~acted][:, 1:].any()
     assert not timesteps.alive[:, -1].all()
-
-
-@pytest.mark.parametrize(
-    ("environment", "changes", "content"),
-    [
-        ("jaxmarl/MPE_simple_spread_v2", {}, "did you mean 'MPE_simple_spread_v3'"),
-        ("jaxmarl/hanabi", {}, "no time limit.*max_episode_steps"),
-        ("jaxmarl/coin_game", {}, "its steps hide the last observation"),
-        ("jaxmarl/storm", {"max_episode_steps": 9}, "not a dictionary by agent"),
-        (TAG, {"agents": ["cat_*"]}, "no agent is in"),
-    ],
-)
-def test_refusals(environment, changes, content):
-    with pytest.raises(LareError, match=content) as error:
-        make_env(family_task(environment, **changes))
-    assert "\n" not in str(error.value)
-
-
-def test_draft():
-    assert draft_task(SPREAD).teams == {}
-    draft = draft_task(TAG)
-    assert list(draft.teams) == ["MPE_simple_tag_v3-adversary.toml", "MPE_simple_tag_v3-agent.toml"]
-    assert 'agents = ["agent_[0-9]*"]' in draft.teams["MPE_simple_tag_v3-agent.toml"]
-
-
-def test_pictures():
-    env = make(family_task(SPREAD))
-    state, _ = env.reset(jax.random.key(0))
-    assert len(env.frames(jax.tree.map(lambda leaf: np.stack([leaf]), state))) == 1

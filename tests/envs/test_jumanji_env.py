@@ -1,19 +1,15 @@
 """Environments of Jumanji, compared with its own steps."""
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from helpers.jax_families import check_arrays, family_task, play, skip_without, step_keys
-from lare_rl.envs.families import make_env
+from helpers.jax_families import check_arrays, family_task, play, require_family, step_keys
 from lare_rl.envs.interface import to_package_action
 from lare_rl.envs.jax_spaces import Choices
 from lare_rl.envs.jumanji_env import make
-from lare_rl.errors import LareError
-from lare_rl.new_task.single_agent import draft_task
 
-skip_without("jumanji")
+require_family("jumanji")
 
 KNAPSACK = "jumanji/Knapsack-v1"
 
@@ -71,38 +67,3 @@ def test_masks_of_each_choice():
     masks = jnp.array([[True, False, True], [True, True, False]])
     available = Choices((3, 2), (2,)).mask_combinations(masks)
     np.testing.assert_array_equal(available, [True, True, False, False, True, True])
-
-
-def test_pictures():
-    env = make(family_task("jumanji/Game2048-v1", max_episode_steps=3))
-    state, _ = env.reset(jax.random.key(0))
-    frames = env.frames(jax.tree.map(lambda leaf: np.stack([leaf, leaf]), state))
-    assert len(frames) == 2
-    assert (frames[0].ndim, frames[0].shape[2]) == (3, 3)
-
-
-@pytest.mark.parametrize(
-    ("environment", "changes", "content"),
-    [
-        ("jumanji/Snake-v2", {}, "did you mean 'Snake-v1'"),
-        (KNAPSACK, {}, "no time limit.*max_episode_steps"),
-        ("jumanji/JobShop-v0", {"max_episode_steps": 9}, "10 choices at a time have 16679880978201 combinations"),
-        ("jumanji/LevelBasedForaging-v0", {}, "each of its 2 agents has rewards"),
-        ("jumanji/MultiCVRP-v0", {"max_episode_steps": 9}, "its actions are BoundedArray"),
-        ("jumanji/Maze-v0", {"arguments": {"rows": 3}}, "cannot be made: .*rows"),
-    ],
-)
-def test_refusals(environment, changes, content):
-    with pytest.raises(LareError, match=content) as error:
-        make_env(family_task(environment, **changes))
-    assert "\n" not in str(error.value)
-
-
-def test_draft():
-    draft = draft_task("jumanji/Snake-v1")
-    assert draft.missing_keys == ()
-    assert "0 to 719: grid (shape 12 by 12 by 5, row by row); 720: step_count." in draft.toml
-    assert "action_mask" not in draft.toml
-    assert "An episode ends:\n- if no action can be performed" in draft.toml
-    assert "1.0 if a fruit is eaten" not in draft.toml
-    assert "max_episode_steps = 1000" in draft_task("jumanji/Game2048-v1").toml

@@ -13,9 +13,15 @@ NAMES = ["HalfCheetah-v4", "HalfCheetah-v5", "lare/HalfCheetahTarget-v4"]
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_making_an_environment_writes_no_log(name, tmp_path, monkeypatch, capfd):
+def test_making_an_environment_writes_no_log_and_restores_the_handler(name, tmp_path, monkeypatch, capfd):
     monkeypatch.chdir(tmp_path)
-    make_gymnasium(name).close()
+    handler = [].append
+    mujoco.set_mju_user_warning(handler)
+    try:
+        make_gymnasium(name).close()
+        assert mujoco.get_mju_user_warning() is handler
+    finally:
+        mujoco.set_mju_user_warning(None)
     assert list(tmp_path.iterdir()) == []
     assert capfd.readouterr() == ("", "")
 
@@ -31,17 +37,6 @@ def test_only_deprecations_are_dropped():
     assert [str(warning.message) for warning in warned] == [
         f"MuJoCo, environment {NAMES[0]!r}: the timestep is too large"
     ]
-
-
-@pytest.mark.parametrize("name", NAMES)
-def test_handler_is_restored(name):
-    handler = [].append
-    mujoco.set_mju_user_warning(handler)
-    try:
-        make_gymnasium(name).close()
-        assert mujoco.get_mju_user_warning() is handler
-    finally:
-        mujoco.set_mju_user_warning(None)
 
 
 @pytest.mark.parametrize("name", NAMES)

@@ -15,7 +15,6 @@ from helpers.toy_envs import toy_spec
 from lare_rl.envs.env_errors import EnvOutputError
 from lare_rl.envs.families import make_env
 from lare_rl.envs.interface import Team
-from lare_rl.envs.load import load_task
 from lare_rl.envs.pettingzoo_env import ParallelHost, make
 from lare_rl.envs.play import play_steps
 from lare_rl.errors import LareError
@@ -110,22 +109,15 @@ def test_real_environments(environment, arguments, sizes, n_episodes, monkeypatc
 # Teams
 
 
-def test_teams_follow_the_task_file(tmp_path):
-    for name, agents in (("good", "agent_*"), ("bad", "adversary_*")):
-        keys = f'name = "{name}"\nteam = "{name}"\nagents = ["{agents}"]\nlike = "all.toml"'
-        (tmp_path / f"{name}.toml").write_text(keys)
-    keys = f'environment = "{ADVERSARY}"\nobservation_size = 13\naction_size = 5\n'
-    (tmp_path / "all.toml").write_text(f'name = "all"\n{keys}description = "d"\nobservation = "o"\naction = "a"\n')
-    (tmp_path / "both.toml").write_text('like = "all.toml"\nname = "both"\nteams = ["good.toml", "bad.toml"]')
-    host = make(load_task(tmp_path / "both.toml"))
+def test_teams_of_a_task():
+    patterns = {"good": "agent_*", "bad": "adversary_*"}
+    teams = tuple(make_task(ADVERSARY, 13, 5, team=name, agents=(agents,)) for name, agents in patterns.items())
+    host = make(make_task(ADVERSARY, 13, 5, teams=teams))
     assert host.spec.teams == (Team("good", 0, 2), Team("bad", 2, 3))
     first = host.reset(0)
     np.testing.assert_array_equal(first.observation[:, 10:], np.eye(3))
     assert not first.observation[2, 8:10].any()  # the adversary's padding
     assert first.observation[0, 8:10].any()
-    (tmp_path / "good.toml").write_text((tmp_path / "good.toml").read_text() + "\nobservation_size = 12")
-    with pytest.raises(LareError, match=r"'good': observation_size = 12, but .* size 13"):
-        load_task(tmp_path / "both.toml")
 
 
 # Episodes

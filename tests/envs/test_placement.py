@@ -57,11 +57,15 @@ def test_a_second_simulation_is_tried(name, separate, monkeypatch):
     task = single_spec(name)
     assert needs_process(task) == separate
     assert not simulations
-    with make_vec_env(task, 3) as envs:
-        assert not separate or len(set(envs.pids)) == 3
-        observation, moved = step_all(envs)
-    np.testing.assert_allclose(moved, 0.9 * observation - 0.1, rtol=1e-5)
-    assert measure_step_s(task) > (0.004 if name == "Slow" else 0)
+    if name in ("Shares", "Many"):
+        monkeypatch.setattr(placement, "n_cores", lambda: 2)
+        monkeypatch.setattr(placement, "measure_step_s", lambda task: 1.0)  # so slow that two processes save time
+        with make_vec_env(task, 2) as envs:
+            assert len(set(envs.pids)) == 2
+            observation, moved = step_all(envs)
+        np.testing.assert_allclose(moved, 0.9 * observation - 0.1, rtol=1e-5)
+    if name == "Slow":
+        assert measure_step_s(task) > 0.004
 
 
 def test_familiar_packages_and_scripts_share_a_process(monkeypatch):
@@ -110,22 +114,13 @@ def test_separate_environment_equals_local():
             remote.render()
 
 
-def test_hang_is_an_error_of_one_line(monkeypatch):
-    monkeypatch.setenv("STALL", __file__)
-    task = single_spec("Stalls", processes="separate", timeout=3)
-    with contextlib.closing(make_host_env(task)) as env:
-        env.reset(0)
-        with pytest.raises(LareError, match=r"did not reply for 3 s in step; .*timeout in the task file"):
-            env.step(np.float32([[0, 0, 1]]))
-
-
 def test_hang_ends_soon_after_a_request_to_stop(monkeypatch):
     monkeypatch.setenv("STALL", __file__)
     monkeypatch.setattr(workers, "STOP_TIMEOUT_S", 0.5)
     with make_vec_env(single_spec("Stalls", processes="separate"), 1) as envs:
         envs.reset(np.ones(1, bool), np.zeros(1, int))
         envs.stop_requested = lambda: True
-        with pytest.raises(LareError, match=r"did not reply for 0.5 s in step"):
+        with pytest.raises(LareError, match=r"did not reply for 0.5 s in step; .*timeout in the task file"):
             envs.step(np.float32([[[0, 0, 1]]]))
 
 

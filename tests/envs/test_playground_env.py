@@ -5,13 +5,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from helpers.jax_families import check_arrays, family_task, play, skip_without, step_keys
-from lare_rl.envs.families import make_env
+from helpers.jax_families import check_arrays, family_task, play, require_family, step_keys
 from lare_rl.envs.playground_env import make
-from lare_rl.errors import LareError
-from lare_rl.new_task.single_agent import draft_task
 
-skip_without("mujoco_playground", "mujoco.mjx")
+require_family("playground")
 
 PENDULUM = "playground/PendulumSwingup"
 
@@ -31,22 +28,3 @@ def test_steps_and_time_limit():
         rewards += state.reward
     np.testing.assert_allclose(timesteps.observation[0, -1, 0], state.obs, rtol=1e-3, atol=1e-4)
     assert timesteps.reward[0].sum() == pytest.approx(float(rewards), rel=1e-3)
-
-
-@pytest.mark.parametrize(
-    ("environment", "changes", "content"),
-    [
-        ("playground/CheetaRun", {}, "did you mean 'CheetahRun'"),
-        (PENDULUM, {"arguments": {"gravity": 3}}, "cannot be made: .*gravity"),
-    ],
-)
-def test_refusals(environment, changes, content):
-    with pytest.raises(LareError, match=content) as error:
-        make_env(family_task(environment, **changes))
-    assert "\n" not in str(error.value)
-
-
-def test_draft():
-    draft = draft_task(PENDULUM)
-    assert draft.missing_keys == ("observation", "action")
-    assert "Swingup environment." in draft.toml

@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 
 from helpers.jax_families import check_arrays, family_task, play
-from lare_rl.envs.jax_spaces import make_bounds
 from lare_rl.envs.robot_env import RobotEnv
 from lare_rl.errors import LareError
 
@@ -25,6 +24,8 @@ class ToyState(NamedTuple):
 
 class ToyRobot:
     """Observes and earns its time. It ends at `end`, and its simulator diverges at `nan`."""
+
+    action_size = 1
 
     def __init__(self, end=99, nan=99, keys=("state", "privileged_state")):
         self.end, self.nan, self.keys = end, nan, keys
@@ -43,7 +44,7 @@ class ToyRobot:
 
 def make_toy(action_repeat=1, measures=(), **toy) -> RobotEnv:
     task = family_task("brax/toy", measures=list(measures))
-    return RobotEnv(ToyRobot(**toy), task, make_bounds(-1, 1, (1,), "brax/toy"), 4, lambda states: [], action_repeat)
+    return RobotEnv(ToyRobot(**toy), task, 4, lambda states: [], action_repeat)
 
 
 def play_toy(**toy):

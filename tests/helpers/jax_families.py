@@ -12,9 +12,11 @@ from lare_rl.envs.interface import EnvSpec, JaxEnv, Timestep, to_env_action
 from lare_rl.tasks.spec import TaskSpec
 
 
-def skip_without(*packages: str) -> None:
-    """Skip a module of tests if a package is not installed. Importing it here would turn its warnings into errors."""
-    for package in packages:
+def require_family(environment: str) -> None:
+    """Skip a test, or a module of tests, without the family's package. Importing it here would turn its warnings into errors."""
+    family = environment.partition("/")[0]
+    packages = {"brax": ["brax", "mujoco.mjx"], "playground": ["mujoco_playground", "mujoco.mjx"]}
+    for package in packages.get(family, [family]):
         if importlib.util.find_spec(package) is None:
             pytest.skip(f"{package} is not installed", allow_module_level=True)
 

@@ -1,7 +1,5 @@
 """Factors of batches, and factors that are not finite."""
 
-import math
-
 import numpy as np
 import pytest
 
@@ -27,23 +25,6 @@ def test_compute_factors_in_chunks(rows, monkeypatch):
     np.testing.assert_array_equal(
         factors, np.concatenate([-np.square(action - observation[:, 0:1]), -np.square(action)], axis=1)
     )
-
-
-@pytest.mark.parametrize(
-    "body",
-    [
-        "return [action[:, 0:1] > 0, (observation[:, 0:1] * 9).astype(int), observation[:, 0:1] / 3]",
-        "return [np.linalg.norm(observation, axis=1, keepdims=True), np.median(action, 1, keepdims=True)]",
-        "return [np.where(observation[:, 0] > 0, 1.0, math.pi)[:, None], observation.argmax(1)[:, None]]",
-    ],
-)
-def test_compute_factors_as_python(body):
-    source, steps = f"import math\nimport numpy as np\n{phi_source(body)}", random_steps(5, (17, 6))
-    factors = compute_factors(read(source, 17, 6), *steps)
-    assert factors.dtype == np.float32
-    namespace: dict = {"np": np, "math": math}
-    exec(compile(source, "phi", "exec"), namespace)
-    np.testing.assert_allclose(factors, np.concatenate(namespace["evaluation_func"](*steps), axis=1), rtol=1e-6)
 
 
 @pytest.mark.parametrize(

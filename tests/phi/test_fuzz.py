@@ -95,8 +95,8 @@ def test_grammar_is_refused_or_agrees_with_numpy(source, seed):
         return
     event("accepted")
     factors = evaluate(graph, {"observation": observation, "action": action}, dtype=np.float64)["factors"]
-    # NumPy computes functions of truth values in float16.
-    np.testing.assert_allclose(factors, expected, rtol=1e-2 if "b" in source.split("int)")[1] else 1e-8, atol=1e-8)
+    # NumPy computes functions of truth values in float16. The root of a rounding error is about 1e-8.
+    np.testing.assert_allclose(factors, expected, rtol=1e-2 if "b" in source.split("int)")[1] else 1e-8, atol=1e-7)
 
 
 SOURCES = [

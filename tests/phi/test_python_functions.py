@@ -34,6 +34,7 @@ EXPRESSIONS = """
     len(list(itertools.permutations([1, 2, 3]))) | sum(itertools.accumulate([1, 2, 3])) | sum(itertools.chain([1], [2, 3]))
     sum(b - a for a, b in itertools.pairwise([1, 4, 9])) | sum(itertools.islice([1, 2, 3, 4], 2)) | sum(itertools.repeat(2, 3))
     len(list(itertools.combinations_with_replacement([1, 2, 3], 2))) | sum(itertools.starmap(pow, [(2, 3), (3, 2)]))
+    sorted({1, 2, 3} - {2, 4})[1] | sum({1, 2} & {2, 3}) | sum({1, 2, 3} ^ {3, 4}) | sum({1}.union([2, 3])) | sum({1, 2}.difference([2]))
     functools.reduce(operator.mul, [1, 2, 3, 4]) | operator.itemgetter(1)([5, 6]) | operator.truediv(1, 4) | operator.neg(3)
     collections.OrderedDict([('a', 2)])['a'] | float('%.3f' % 1.23456) | float('{:.1f}'.format(2.25)) | float(f'{1.5:.2f}')
 """

@@ -2,7 +2,7 @@
 
 from typing import Any
 
-from lare_rl.envs.jax_spaces import construct, import_package, make_bounds
+from lare_rl.envs.jax_spaces import construct, import_package
 from lare_rl.envs.robot_env import RobotEnv
 from lare_rl.tasks.spec import TaskSpec
 
@@ -28,5 +28,4 @@ def make(task: TaskSpec, **_: Any) -> RobotEnv:
 
         return image.render_array(env.sys, [state.pipeline_state for state in states])
 
-    bounds = make_bounds(-1.0, 1.0, (env.action_size,), task.environment)
-    return RobotEnv(env, task, bounds, task.max_episode_steps or MAX_STEPS, draw)
+    return RobotEnv(env, task, MAX_STEPS, draw)

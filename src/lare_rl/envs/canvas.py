@@ -1,4 +1,4 @@
-"""A square figure without a window, on which all environments draw."""
+"""A square figure without a window, on which all environments draw, and what they need of Matplotlib for it."""
 
 from collections.abc import Callable
 
@@ -8,13 +8,14 @@ from jaxtyping import UInt8
 from lare_rl.errors import missing_extra_error
 
 try:
+    from matplotlib import colormaps, patches
     from matplotlib.axes import Axes
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 except ImportError as missing:
     raise missing_extra_error("a picture", "report") from missing
 
-__all__ = ["blank_figure", "paint_frames", "to_pixels"]
+__all__ = ["Axes", "Figure", "blank_figure", "colormaps", "paint_frames", "patches", "to_pixels"]
 
 
 def blank_figure() -> tuple[Figure, Axes]:

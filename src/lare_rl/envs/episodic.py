@@ -7,7 +7,8 @@ from typing import Any
 import gymnasium
 from gymnasium.utils import RecordConstructorArgs
 
-from lare_rl.errors import LareError, short_repr
+from lare_rl.envs.env_errors import to_float
+from lare_rl.errors import LareError
 
 __all__ = ["TRUE_REWARD", "EpisodicReward", "read_score"]
 
@@ -63,9 +64,9 @@ def read_score(info: Mapping[str, Any], key: str) -> float:
     if key not in info:
         raise LareError(f"the info of the last step has no {key!r}: it has {', '.join(map(repr, info)) or 'nothing'}")
     try:
-        score = float(info[key])
-    except (TypeError, ValueError):
-        raise LareError(f"info[{key!r}] of the last step is {short_repr(info[key])}, which is not a number") from None
+        score = to_float(info[key])
+    except ValueError as error:
+        raise LareError(f"info[{key!r}] of the last step {error}") from None
     if not math.isfinite(score):
         raise LareError(f"info[{key!r}] of the last step is {score}, which is not finite")
     return score

@@ -5,28 +5,12 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
-import numpy as np
-from jaxtyping import Array, Float, PRNGKeyArray, UInt8
+from jaxtyping import Array, Float, PRNGKeyArray
 
+from lare_rl.envs import jax_spaces
 from lare_rl.envs.env_errors import one_line_errors
 from lare_rl.envs.interface import Timestep
-from lare_rl.envs.jax_spaces import (
-    Bounds,
-    Choices,
-    agent_spec,
-    agent_timestep,
-    cast_like,
-    construct,
-    draw_states,
-    find_measures,
-    flat_size,
-    flatten_tree,
-    import_package,
-    make_bounds,
-    make_choices,
-    raw_key,
-    strong_types,
-)
+from lare_rl.envs.jax_spaces import Bounds, Choices, PackageEnv
 from lare_rl.errors import LareError, short_repr
 from lare_rl.tasks.spec import TaskSpec
 
@@ -44,24 +28,25 @@ def make(task: TaskSpec, **_: Any) -> "GymnaxEnv":
     Raises:
         LareError: gymnax is not installed, or the environment cannot be made.
     """
-    gymnax = import_package("gymnax", task)
+    gymnax = jax_spaces.import_package("gymnax", task)
     names = gymnax.registered_envs
-    _, defaults = construct(task, names, gymnax.make, {})
+    _, defaults = jax_spaces.construct(task, names, gymnax.make, {})
     is_parameter = {key: hasattr(defaults, key) for key in task.arguments}
     arguments = {key: value for key, value in task.arguments.items() if not is_parameter[key]}
-    env, params = construct(task, names, gymnax.make, arguments)
+    env, params = jax_spaces.construct(task, names, gymnax.make, arguments)
     changes = {key: value for key, value in task.arguments.items() if is_parameter[key]}
     if task.max_episode_steps:
         changes[LIMIT] = task.max_episode_steps
     return GymnaxEnv(env, params.replace(**changes), task)
 
 
-class GymnaxEnv:
+class GymnaxEnv(PackageEnv):
     """An environment of gymnax as a `JaxEnv`. An observation that is a number of a state becomes one-hot."""
 
     def __init__(self, env: Any, params: Any, task: TaskSpec):
-        self.env, self.params, self._name = env, params, task.environment
-        spaces = import_package("gymnax.environments.spaces", task)
+        super().__init__(env, task)
+        self.params = params
+        spaces = jax_spaces.import_package("gymnax.environments.spaces", task)
         observation_space = env.observation_space(params)
         self._n_states = int(observation_space.n) if isinstance(observation_space, spaces.Discrete) else 0
         self._action = _read_action(env.action_space(params), spaces, task.environment)
@@ -69,23 +54,23 @@ class GymnaxEnv:
         with one_line_errors(f"environment {self._name!r} cannot be used"):
             observation, state = jax.eval_shape(env.reset_env, key, params)
             info = jax.eval_shape(env.step_env, key, state, action, params)[-1]
-        self.spec = agent_spec(
+        self.spec = jax_spaces.agent_spec(
             self._action,
-            observation_size=self._n_states or flat_size(observation),
+            observation_size=self._n_states or jax_spaces.flat_size(observation),
             max_steps=int(getattr(params, LIMIT)),
-            measures=find_measures(task, info),
+            measures=jax_spaces.find_measures(task, info),
         )
 
     def reset(self, key: PRNGKeyArray) -> tuple[Any, Timestep]:
-        observation, state = self.env.reset_env(raw_key(key), self.params)
-        return strong_types(state), agent_timestep(self.spec, self._flatten(observation))
+        observation, state = self.env.reset_env(jax_spaces.raw_key(key), self.params)
+        return jax_spaces.strong_types(state), jax_spaces.agent_timestep(self.spec, self._flatten(observation))
 
     def step(self, state: Any, action: Float[Array, "1 action"], key: PRNGKeyArray) -> tuple[Any, Timestep]:
         env_action = self._action.decode(action[0])
         observation, next_state, reward, terminated, info = self.env.step_env(
-            raw_key(key), state, env_action, self.params
+            jax_spaces.raw_key(key), state, env_action, self.params
         )
-        timestep = agent_timestep(
+        timestep = jax_spaces.agent_timestep(
             self.spec,
             self._flatten(observation),
             reward=reward,
@@ -93,40 +78,24 @@ class GymnaxEnv:
             truncated=self.env.is_truncated(next_state, self.params),
             measures=info,
         )
-        return cast_like(next_state, state), timestep
+        return jax_spaces.cast_like(next_state, state), timestep
 
-    def frames(
-        self, states: Any, credit: Float[np.ndarray, "steps agents"] | None = None
-    ) -> list[UInt8[np.ndarray, "height width 3"]]:
-        """Return gymnax's pictures of states, which do not show credit. Raise `LareError` if it draws no such environment."""
-        return draw_states(self._name, self._draw, states)
-
-    def _draw(self, states: Sequence[Any]) -> list[np.ndarray]:
+    def _draw(self, states: Sequence[Any]) -> Sequence[Any]:
         from gymnax.visualize import Visualizer
-        from matplotlib import pyplot
 
-        from lare_rl.envs.canvas import to_pixels
-
-        pictures = []
         visualizer = Visualizer(self.env, self.params, states)
-        try:
-            visualizer.init()
-            if not hasattr(visualizer, "im"):
-                raise LareError(f"environment {self._name!r} cannot be drawn: gymnax has no pictures of it")
-            for index in range(len(states)):
-                visualizer.update(index)
-                pictures.append(to_pixels(visualizer.fig))
-        finally:
-            pyplot.close(visualizer.fig)
-        return pictures
+        visualizer.init()
+        if not hasattr(visualizer, "im"):
+            raise LareError(f"environment {self._name!r} cannot be drawn: gymnax has no pictures of it")
+        return jax_spaces.draw_updates(visualizer, len(states))
 
     def _flatten(self, observation: Any) -> Float[Array, " observation"]:
-        return jax.nn.one_hot(observation, self._n_states) if self._n_states else flatten_tree(observation)
+        return jax.nn.one_hot(observation, self._n_states) if self._n_states else jax_spaces.flatten_tree(observation)
 
 
 def _read_action(space: Any, spaces: Any, environment: str) -> Choices | Bounds:
     if isinstance(space, spaces.Discrete):
-        return make_choices((space.n,), (), environment, space.dtype)
+        return jax_spaces.make_choices((space.n,), (), environment, space.dtype)
     if isinstance(space, spaces.Box):
-        return make_bounds(space.low, space.high, tuple(space.shape), environment)
-    raise LareError(f"environment {environment!r} cannot be used: its action space is {short_repr(space)}")
+        return jax_spaces.make_bounds(space.low, space.high, tuple(space.shape), environment)
+    raise jax_spaces.unusable(environment, f"its action space is {short_repr(space)}")

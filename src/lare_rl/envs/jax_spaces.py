@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
+from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray, UInt8
 
 from lare_rl.envs.env_errors import one_line_errors
 from lare_rl.envs.interface import EnvSpec, Team, Timestep
@@ -24,12 +24,12 @@ from lare_rl.tasks.spec import TaskSpec
 __all__ = [
     "Bounds",
     "Choices",
-    "CountedState",
+    "PackageEnv",
     "agent_spec",
     "agent_timestep",
     "cast_like",
     "construct",
-    "draw_states",
+    "draw_updates",
     "find_measures",
     "flat_size",
     "flatten_tree",
@@ -40,17 +40,11 @@ __all__ = [
     "read_measures",
     "strong_types",
     "unstack",
+    "unusable",
 ]
 
 MAX_COMBINATIONS = 1024
 """The largest number of combinations of several choices that become a single choice."""
-
-
-class CountedState(NamedTuple):
-    """A package's state, and the number of steps since the start of the episode."""
-
-    env: Any
-    steps: Int[Array, ""]
 
 
 # Packages
@@ -108,6 +102,10 @@ def construct(
         raise LareError(f"{message}: {task.family} has no {name!r}{hint}")
     with one_line_errors(message), _silence():
         return make(name, **(task.arguments if arguments is None else arguments))
+
+
+def unusable(environment: str, reason: str) -> LareError:
+    return LareError(f"environment {environment!r} cannot be used: {reason}")
 
 
 # Values
@@ -204,10 +202,8 @@ def make_choices(sizes: Sequence[int], shape: tuple[int, ...], environment: str,
     """Make a discrete action. Raise `LareError` if its choices have too many combinations."""
     choices = Choices(tuple(map(int, sizes)), shape, dtype)
     if choices.size > MAX_COMBINATIONS:
-        raise LareError(
-            f"environment {environment!r} cannot be used: its {len(sizes)} choices at a time have {choices.size} combinations, "
-            f"more than {MAX_COMBINATIONS}"
-        )
+        combinations = f"{choices.size} combinations, more than {MAX_COMBINATIONS}"
+        raise unusable(environment, f"its {len(sizes)} choices at a time have {combinations}")
     return choices
 
 
@@ -215,7 +211,7 @@ def make_bounds(low: Any, high: Any, shape: tuple[int, ...], environment: str) -
     """Make a continuous action. Raise `LareError` if it has no bounds."""
     low, high = (np.broadcast_to(np.asarray(bound, np.float32), shape).ravel().copy() for bound in (low, high))
     if not (np.isfinite(low).all() and np.isfinite(high).all()):
-        raise LareError(f"environment {environment!r} cannot be used: its actions have no bounds")
+        raise unusable(environment, "its actions have no bounds")
     return Bounds(low, high, shape)
 
 
@@ -271,17 +267,44 @@ def agent_timestep(
 # Pictures
 
 
+class PackageEnv:
+    """What the adapters share: a package's environment, and pictures of its states."""
+
+    def __init__(self, env: Any, task: TaskSpec):
+        self.env, self._name = env, task.environment
+
+    def frames(
+        self, states: Any, credit: Float[np.ndarray, "steps agents"] | None = None
+    ) -> list[UInt8[np.ndarray, "height width 3"]]:
+        """Return the package's pictures of states, which do not show credit. Raise `LareError` if it cannot draw them here."""
+        with one_line_errors(f"environment {self._name!r} cannot be drawn here", _render_hint), _silence():
+            return [np.asarray(picture)[..., :3].astype(np.uint8) for picture in self._draw(unstack(states))]
+
+    def _draw(self, states: Sequence[Any]) -> Sequence[Any]:
+        """Draw the states of an episode by the package's functions."""
+        raise NotImplementedError
+
+
 def unstack(states: Any) -> list[Any]:
     """Return the states of an episode (leading axis: steps) one by one, on the host."""
-    states = jax.device_get(states)
-    leaves, structure = jax.tree.flatten(states)
+    leaves, structure = jax.tree.flatten(jax.device_get(states))
     return [jax.tree.unflatten(structure, step) for step in zip(*leaves, strict=True)]
 
 
-def draw_states(environment: str, draw: Callable[[list[Any]], Sequence[Any]], states: Any) -> list[np.ndarray]:
-    """Return the pictures that a package draws of the states of an episode. Raise `LareError` if it cannot draw them here."""
-    with one_line_errors(f"environment {environment!r} cannot be drawn here", _render_hint), _silence():
-        return [np.asarray(picture)[..., :3].astype(np.uint8) for picture in draw(unstack(states))]
+def draw_updates(visualizer: Any, n_states: int) -> list[np.ndarray]:
+    """Return the pictures of a visualizer whose `update` draws the state of an index on its figure. The figure is closed."""
+    from matplotlib import pyplot
+
+    from lare_rl.envs.canvas import to_pixels
+
+    pictures = []
+    try:
+        for index in range(n_states):
+            visualizer.update(index)
+            pictures.append(to_pixels(visualizer.fig))
+    finally:
+        pyplot.close(visualizer.fig)
+    return pictures
 
 
 def _render_hint(error: BaseException) -> str:

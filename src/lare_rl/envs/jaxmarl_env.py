@@ -7,23 +7,12 @@ import gymnasium
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray, UInt8
+from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
+from lare_rl.envs import jax_spaces
 from lare_rl.envs.agent_arrays import Agent, AgentArrays, make_agent
 from lare_rl.envs.env_errors import no_time_limit_error, one_line_errors
 from lare_rl.envs.interface import EnvSpec, Timestep
-from lare_rl.envs.jax_spaces import (
-    cast_like,
-    construct,
-    draw_states,
-    find_measures,
-    flat_size,
-    flatten_tree,
-    import_package,
-    raw_key,
-    read_measures,
-    strong_types,
-)
 from lare_rl.envs.pettingzoo_construct import group_by_team
 from lare_rl.errors import LareError, short_repr
 from lare_rl.tasks.spec import TaskSpec
@@ -48,13 +37,11 @@ def make(task: TaskSpec, **_: Any) -> "JaxMARLEnv":
     Raises:
         LareError: JaxMARL is not installed, or the environment cannot be made, or it has no time limit.
     """
-    jaxmarl = import_package("jaxmarl", task)
+    jaxmarl = jax_spaces.import_package("jaxmarl", task)
     names = jaxmarl.registered_envs
     if task.environment_name in RESETS_ITSELF:
-        raise LareError(
-            f"environment {task.environment!r} cannot be used: its steps hide the last observation of a game"
-        )
-    env = construct(task, names, jaxmarl.make)
+        raise jax_spaces.unusable(task.environment, "its steps hide the last observation of a game")
+    env = jax_spaces.construct(task, names, jaxmarl.make)
     limit_name = next((name for name in LIMITS if getattr(env, name, None)), None)
     changes: dict[str, Any] = {}
     if limit_name and task.max_episode_steps:
@@ -62,7 +49,7 @@ def make(task: TaskSpec, **_: Any) -> "JaxMARLEnv":
     if getattr(env, "auto_reset", False):  # multi-agent Brax resets inside its steps, unless it is told not to
         changes["auto_reset"] = False
     if changes:
-        env = construct(task, names, jaxmarl.make, changes | task.arguments)
+        env = jax_spaces.construct(task, names, jaxmarl.make, changes | task.arguments)
     limit = task.max_episode_steps or (getattr(env, limit_name) if limit_name else None)
     if limit is None:
         raise no_time_limit_error(task)
@@ -77,7 +64,7 @@ class JaxMARLState(NamedTuple):
     alive: Bool[Array, " agents"]
 
 
-class JaxMARLEnv:
+class JaxMARLEnv(jax_spaces.PackageEnv):
     """An environment of JaxMARL as a `JaxEnv`.
 
     Agents are in the order of their teams, and their spaces are padded as in `AgentArrays`. JaxMARL does not tell a time limit from
@@ -88,14 +75,15 @@ class JaxMARLEnv:
     spec: EnvSpec
 
     def __init__(self, env: Any, task: TaskSpec, max_steps: int):
-        self.env, self._name = env, task.environment
-        message = f"environment {self._name!r} cannot be used"
+        super().__init__(env, task)
         names, teams = group_by_team(list(env.agents), task)
-        with one_line_errors(message):
+        with one_line_errors(f"environment {self._name!r} cannot be used"):
             observations, state = jax.eval_shape(env.reset, jnp.zeros(2, jnp.uint32))
             if not (isinstance(observations, Mapping) and set(names) <= set(observations)):
-                raise LareError(f"{message}: its observations are not a dictionary by agent")
-            agents = [_make_agent(name, env.action_space(name), flat_size(observations[name])) for name in names]
+                raise jax_spaces.unusable(self._name, "its observations are not a dictionary by agent")
+            agents = [
+                _make_agent(name, env.action_space(name), jax_spaces.flat_size(observations[name])) for name in names
+            ]
             self.layout = AgentArrays(agents)
             self._masks = _find_masks(env, state) if self.layout.discrete else None
             actions = {agent.name: jnp.asarray(agent.action_space.sample()) for agent in agents}
@@ -107,13 +95,13 @@ class JaxMARLEnv:
             state_size=jax.eval_shape(self._read_state, observations, state).shape[0],
             masks_actions=self._masks is not None or not self.layout.available.all(),
             is_jax=True,
-            measures=find_measures(task, infos),
+            measures=jax_spaces.find_measures(task, infos),
         )
 
     def reset(self, key: PRNGKeyArray) -> tuple[JaxMARLState, Timestep]:
-        observations, env_state = self.env.reset(raw_key(key))
+        observations, env_state = self.env.reset(jax_spaces.raw_key(key))
         alive = jnp.ones(self.spec.n_agents, bool)
-        state = JaxMARLState(strong_types(env_state), jnp.zeros((), jnp.int32), alive)
+        state = JaxMARLState(jax_spaces.strong_types(env_state), jnp.zeros((), jnp.int32), alive)
         return state, self._make_timestep(observations, state, jnp.zeros(self.spec.n_agents), jnp.zeros((), bool), {})
 
     def step(
@@ -121,13 +109,13 @@ class JaxMARLEnv:
     ) -> tuple[JaxMARLState, Timestep]:
         agents = self.layout.agents
         actions = {agent.name: _decode(agent, action[index]) for index, agent in enumerate(agents)}
-        observations, env_state, rewards, dones, infos = self.env.step_env(raw_key(key), state.env, actions)
+        observations, env_state, rewards, dones, infos = self.env.step_env(jax_spaces.raw_key(key), state.env, actions)
         reward = jnp.stack([jnp.asarray(rewards[agent.name], jnp.float32).reshape(()) for agent in agents])
         done = jnp.stack([jnp.asarray(dones[agent.name], bool).reshape(()) for agent in agents])
         ended = jnp.asarray(dones[ALL], bool).reshape(())
         alive = state.alive & (ended | ~done)
         ended |= ~alive.any()
-        next_state = JaxMARLState(cast_like(env_state, state.env), state.steps + 1, alive)
+        next_state = JaxMARLState(jax_spaces.cast_like(env_state, state.env), state.steps + 1, alive)
         return next_state, self._make_timestep(observations, next_state, reward * state.alive, ended, infos)
 
     def _make_timestep(
@@ -147,22 +135,22 @@ class JaxMARLEnv:
             reward=reward,
             terminated=ended & ~at_limit,
             truncated=at_limit,
-            measures=read_measures(self.spec, infos),
+            measures=jax_spaces.read_measures(self.spec, infos),
         )
 
     def _pad(self, observations: Mapping[Any, Any]) -> Float[Array, "agents observation"]:
         """Return all observations in one array: padded, and with the agent's index if the agents' spaces differ."""
         layout = self.layout
-        vectors = [flatten_tree(observations[agent.name]) for agent in layout.agents]
+        vectors = [jax_spaces.flatten_tree(observations[agent.name]) for agent in layout.agents]
         padded = jnp.stack([jnp.pad(vector, (0, layout.longest_observation - len(vector))) for vector in vectors])
         return jnp.concatenate([padded, jnp.eye(len(vectors))], axis=1) if layout.adds_index else padded
 
     def _read_state(self, observations: Mapping[Any, Any], state: Any) -> Float[Array, " state"]:
         """Return the global state. Without one, return all observations if credit is assigned from the state."""
         if WORLD_STATE in observations:
-            return flatten_tree(observations[WORLD_STATE])
+            return jax_spaces.flatten_tree(observations[WORLD_STATE])
         if hasattr(self.env, "get_world_state"):
-            return flatten_tree(self.env.get_world_state(state))
+            return jax_spaces.flatten_tree(self.env.get_world_state(state))
         return self._pad(observations).ravel() if self._from_observations else jnp.zeros(0)
 
     def _read_masks(self, state: JaxMARLState) -> Bool[Array, "agents action"]:
@@ -177,28 +165,13 @@ class JaxMARLEnv:
         acts = state.alive & available.any(axis=1)
         return jnp.where(acts[:, None], available, first)
 
-    def frames(
-        self, states: JaxMARLState, credit: Float[np.ndarray, "steps agents"] | None = None
-    ) -> list[UInt8[np.ndarray, "height width 3"]]:
-        """Return JaxMARL's pictures of a particle task, which do not show credit. Raise `LareError` for other environments."""
+    def _draw(self, states: Sequence[Any]) -> Sequence[Any]:
+        """Draw the states of a particle task."""
         if not hasattr(self.env, "num_entities"):
             raise LareError(f"environment {self._name!r} cannot be drawn: only JaxMARL's particle tasks (MPE_...) can")
-        return draw_states(self._name, self._draw, states.env)
-
-    def _draw(self, states: Sequence[Any]) -> list[np.ndarray]:
         from jaxmarl.environments.mpe.mpe_visualizer import MPEVisualizer
-        from matplotlib import pyplot
 
-        from lare_rl.envs.canvas import to_pixels
-
-        visualizer, pictures = MPEVisualizer(self.env, list(states)), []
-        try:
-            for index in range(len(states)):
-                visualizer.update(index)
-                pictures.append(to_pixels(visualizer.fig))
-        finally:
-            pyplot.close(visualizer.fig)
-        return pictures
+        return jax_spaces.draw_updates(MPEVisualizer(self.env, [state.env for state in states]), len(states))
 
 
 def _make_agent(name: Any, space: Any, observation_size: int) -> Agent:

@@ -2,34 +2,18 @@
 
 import inspect
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, PRNGKeyArray, UInt8
+from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
+from lare_rl.envs import jax_spaces
 from lare_rl.envs.env_errors import no_time_limit_error, one_line_errors
 from lare_rl.envs.interface import Timestep
-from lare_rl.envs.jax_spaces import (
-    Bounds,
-    Choices,
-    CountedState,
-    agent_spec,
-    agent_timestep,
-    cast_like,
-    construct,
-    draw_states,
-    find_measures,
-    flat_size,
-    flatten_tree,
-    import_package,
-    make_bounds,
-    make_choices,
-    raw_key,
-    strong_types,
-)
-from lare_rl.errors import LareError, short_repr
+from lare_rl.envs.jax_spaces import Bounds, Choices, PackageEnv
+from lare_rl.errors import short_repr
 from lare_rl.tasks.spec import TaskSpec
 
 __all__ = ["JumanjiEnv", "make", "observed_arrays"]
@@ -48,18 +32,25 @@ def make(task: TaskSpec, **_: Any) -> "JumanjiEnv":
     Raises:
         LareError: Jumanji is not installed, or the environment cannot be made, or it has several agents or no time limit.
     """
-    jumanji = import_package("jumanji", task)
+    jumanji = jax_spaces.import_package("jumanji", task)
     names = sorted(jumanji.registered_environments())
-    env = construct(task, names, jumanji.make)
+    env = jax_spaces.construct(task, names, jumanji.make)
     if task.max_episode_steps and LIMIT in inspect.signature(type(env).__init__).parameters:
-        env = construct(task, names, jumanji.make, {LIMIT: task.max_episode_steps} | task.arguments)
+        env = jax_spaces.construct(task, names, jumanji.make, {LIMIT: task.max_episode_steps} | task.arguments)
     limit = task.max_episode_steps or getattr(env, LIMIT, None)
     if limit is None:
         raise no_time_limit_error(task)
     return JumanjiEnv(env, task, limit)
 
 
-class JumanjiEnv:
+class JumanjiState(NamedTuple):
+    """Jumanji's state, and the number of steps since the start of the episode."""
+
+    env: Any
+    steps: Int[Array, ""]
+
+
+class JumanjiEnv(PackageEnv):
     """An environment of Jumanji as a `JaxEnv`.
 
     The observation is all arrays of Jumanji's observation but the mask, in the order of its fields, each row by row. Several choices
@@ -68,41 +59,39 @@ class JumanjiEnv:
     """
 
     def __init__(self, env: Any, task: TaskSpec, max_steps: int):
-        self.env, self._name = env, task.environment
-        specs = import_package("jumanji.specs", task)
+        super().__init__(env, task)
+        specs = jax_spaces.import_package("jumanji.specs", task)
         self._action = _read_action(env.action_spec, specs, task.environment)
         with one_line_errors(f"environment {self._name!r} cannot be used"):
             _, timestep = jax.eval_shape(env.reset, jnp.zeros(2, jnp.uint32))
         if timestep.reward.shape:
-            raise LareError(
-                f"environment {self._name!r} cannot be used: each of its {len(timestep.reward)} agents has rewards, and LaRe's "
-                "adapter of Jumanji has one agent"
-            )
-        self.spec = agent_spec(
+            agents = f"each of its {len(timestep.reward)} agents has rewards"
+            raise jax_spaces.unusable(self._name, f"{agents}, and LaRe's adapter of Jumanji has one agent")
+        self.spec = jax_spaces.agent_spec(
             self._action,
-            observation_size=flat_size(_observed(timestep.observation)),
+            observation_size=jax_spaces.flat_size(_observed(timestep.observation)),
             max_steps=max_steps,
             masks_actions=_find_mask(timestep.observation) is not None and isinstance(self._action, Choices),
-            measures=find_measures(task, timestep.extras or {}),
+            measures=jax_spaces.find_measures(task, timestep.extras or {}),
         )
 
-    def reset(self, key: PRNGKeyArray) -> tuple[CountedState, Timestep]:
-        state, timestep = self.env.reset(raw_key(key))
-        return CountedState(strong_types(state), jnp.zeros((), jnp.int32)), self._make_timestep(timestep, 0)
+    def reset(self, key: PRNGKeyArray) -> tuple[JumanjiState, Timestep]:
+        state, timestep = self.env.reset(jax_spaces.raw_key(key))
+        return JumanjiState(jax_spaces.strong_types(state), jnp.zeros((), jnp.int32)), self._make_timestep(timestep, 0)
 
     def step(
-        self, state: CountedState, action: Float[Array, "1 action"], key: PRNGKeyArray
-    ) -> tuple[CountedState, Timestep]:
+        self, state: JumanjiState, action: Float[Array, "1 action"], key: PRNGKeyArray
+    ) -> tuple[JumanjiState, Timestep]:
         """Make one step. The key is not used: Jumanji's state has its own."""
         next_state, timestep = self.env.step(state.env, self._action.decode(action[0]))
         steps = state.steps + 1
-        return CountedState(cast_like(next_state, state.env), steps), self._make_timestep(timestep, steps)
+        return JumanjiState(jax_spaces.cast_like(next_state, state.env), steps), self._make_timestep(timestep, steps)
 
     def _make_timestep(self, timestep: Any, steps: Any) -> Timestep:
         is_terminal = timestep.last() & (timestep.discount == 0)
-        return agent_timestep(
+        return jax_spaces.agent_timestep(
             self.spec,
-            flatten_tree(_observed(timestep.observation)),
+            jax_spaces.flatten_tree(_observed(timestep.observation)),
             reward=timestep.reward,
             terminated=is_terminal,
             truncated=(timestep.last() & ~is_terminal) | (steps >= self.spec.max_steps),
@@ -114,17 +103,11 @@ class JumanjiEnv:
         mask = _find_mask(observation)
         return None if mask is None or isinstance(self._action, Bounds) else self._action.mask_combinations(mask)
 
-    def frames(
-        self, states: CountedState, credit: Float[np.ndarray, "steps agents"] | None = None
-    ) -> list[UInt8[np.ndarray, "height width 3"]]:
-        """Return Jumanji's pictures of states, which do not show credit. Raise `LareError` if it draws no such environment."""
-        return draw_states(self._name, self._draw, states.env)
-
-    def _draw(self, states: Sequence[Any]) -> list[np.ndarray]:
+    def _draw(self, states: Sequence[Any]) -> Sequence[Any]:
         viewer = self.env.unwrapped._viewer
         viewer._display = viewer._display_rgb_array  # the viewer was made to open windows
         try:
-            return [np.array(viewer.render(state)) for state in states]
+            return [np.array(viewer.render(state.env)) for state in states]
         finally:
             viewer.close()
 
@@ -152,10 +135,10 @@ def _is_mask(path: tuple[Any, ...]) -> bool:
 
 def _read_action(spec: Any, specs: Any, environment: str) -> Choices | Bounds:
     if isinstance(spec, specs.DiscreteArray):
-        return make_choices((spec.num_values,), (), environment, spec.dtype)
+        return jax_spaces.make_choices((spec.num_values,), (), environment, spec.dtype)
     if isinstance(spec, specs.MultiDiscreteArray):
         sizes = np.asarray(spec.num_values)
-        return make_choices(sizes.ravel().tolist(), sizes.shape, environment, spec.dtype)
+        return jax_spaces.make_choices(sizes.ravel().tolist(), sizes.shape, environment, spec.dtype)
     if isinstance(spec, specs.BoundedArray) and np.issubdtype(spec.dtype, np.floating):
-        return make_bounds(spec.minimum, spec.maximum, tuple(spec.shape), environment)
-    raise LareError(f"environment {environment!r} cannot be used: its actions are {short_repr(spec)}")
+        return jax_spaces.make_bounds(spec.minimum, spec.maximum, tuple(spec.shape), environment)
+    raise jax_spaces.unusable(environment, f"its actions are {short_repr(spec)}")

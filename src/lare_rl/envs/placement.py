@@ -7,6 +7,7 @@ does not know are tried in a worker process.
 
 import contextlib
 import logging
+import math
 from functools import lru_cache
 
 import gymnasium
@@ -16,9 +17,8 @@ from jaxtyping import Float
 from lare_rl.envs.families import FAMILIES, is_gymnasium, load_env_spec, make_host_env, picklable_maker
 from lare_rl.envs.interface import Timestep
 from lare_rl.envs.trials import time_steps
-from lare_rl.envs.vec_env import VecEnv, n_cores
+from lare_rl.envs.vec_env import LocalVecEnv, VecEnv, n_cores
 from lare_rl.envs.workers import SubprocVecEnv
-from lare_rl.envs.workers import make_vec_env as make_local_or_parallel
 from lare_rl.errors import LareError
 from lare_rl.tasks.spec import PETTINGZOO_PREFIX, TaskSpec
 
@@ -38,6 +38,9 @@ SLOW_START_S = 2.0
 """The same, if making it takes longer, so that it is not made twice to try that."""
 SECOND_TIMEOUT_S = 30.0
 """If a second environment hangs for so long beside a first one that started fast, each needs a process of its own."""
+
+MIN_SAVED_S = 3e-4
+"""Workers are used if they make a step of all environments at least this much faster. A call of all workers costs about as much."""
 
 _log = logging.getLogger(__name__)
 
@@ -74,14 +77,19 @@ class SeparateEnv:
 def make_vec_env(task: TaskSpec, n: int, parallel: bool = False) -> VecEnv:
     """Make `n` environments of a task: each in a process of its own if it needs that, else where they step fastest.
 
-    If `parallel`, they are in worker processes in any case.
+    An environment that cannot be made in another process, such as one that the user's script registers, stays in this process.
+    If `parallel`, all are in worker processes in any case.
     """
     if needs_process(task):
         return _make_separate(task, n)
-    maker = picklable_maker(task)
+    makers = [picklable_maker(task)] * n
     if parallel:
-        return SubprocVecEnv([maker] * n)
-    return make_local_or_parallel(maker, n, measure_step_s(task) if n > 1 else 0.0)
+        return SubprocVecEnv(makers)
+    n_saved = n - math.ceil(n / n_cores())
+    if n_saved and n_saved * measure_step_s(task) > MIN_SAVED_S:
+        with contextlib.suppress(LareError):
+            return SubprocVecEnv(makers)
+    return LocalVecEnv(makers)
 
 
 def n_open_envs(task: TaskSpec, n_seeds: int, n_episodes: int) -> int:

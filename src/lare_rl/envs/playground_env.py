@@ -3,7 +3,7 @@
 import math
 from typing import Any
 
-from lare_rl.envs.jax_spaces import construct, import_package, make_bounds
+from lare_rl.envs.jax_spaces import construct, import_package
 from lare_rl.envs.robot_env import RobotEnv
 from lare_rl.tasks.spec import TaskSpec
 
@@ -36,9 +36,7 @@ def make(task: TaskSpec, **_: Any) -> RobotEnv:
     def draw(states: list[Any]) -> Any:
         return env.render(states, **SIZE)
 
-    # Playground's own algorithms act in [-1, 1] as well.
-    bounds = make_bounds(-1.0, 1.0, (env.action_size,), task.environment)
-    return RobotEnv(env, task, bounds, task.max_episode_steps or limit, draw, config.action_repeat)
+    return RobotEnv(env, task, limit, draw, config.action_repeat)
 
 
 def _choose_implementation(task: TaskSpec) -> str:

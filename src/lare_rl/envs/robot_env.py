@@ -5,24 +5,11 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
-import numpy as np
-from jaxtyping import Array, Float, Int, PRNGKeyArray, UInt8
+from jaxtyping import Array, Float, Int, PRNGKeyArray
 
+from lare_rl.envs import jax_spaces
 from lare_rl.envs.env_errors import one_line_errors
 from lare_rl.envs.interface import Timestep
-from lare_rl.envs.jax_spaces import (
-    Bounds,
-    agent_spec,
-    agent_timestep,
-    cast_like,
-    draw_states,
-    find_measures,
-    flat_size,
-    flatten_tree,
-    raw_key,
-    strong_types,
-)
-from lare_rl.errors import LareError
 from lare_rl.tasks.spec import TaskSpec
 
 __all__ = ["RobotEnv", "RobotState"]
@@ -40,7 +27,7 @@ class RobotState(NamedTuple):
     privileged: Float[Array, " state"]
 
 
-class RobotEnv:
+class RobotEnv(jax_spaces.PackageEnv):
     """An environment of Brax or Playground as a `JaxEnv`.
 
     The packages count steps and reset in wrappers, which this adapter does not use. An episode is truncated after `max_steps` steps.
@@ -52,7 +39,6 @@ class RobotEnv:
         self,
         env: Any,
         task: TaskSpec,
-        action: Bounds,
         max_steps: int,
         draw: Callable[[list[Any]], Sequence[Any]],
         action_repeat: int = 1,
@@ -61,32 +47,33 @@ class RobotEnv:
 
         Args:
             env: the package's environment, without wrappers.
-            action: the bounds of actions.
-            max_steps: the time limit, in steps of this environment.
+            max_steps: the time limit of a task without one, in steps of this environment.
             draw: makes pictures of the package's states.
             action_repeat: how often an action is repeated. The rewards of the repetitions are added up.
         """
-        self.env, self._name, self._action, self._draw = env, task.environment, action, draw
-        self._action_repeat = action_repeat
+        super().__init__(env, task)
+        # Playground's own algorithms act in [-1, 1] as well.
+        self._action = jax_spaces.make_bounds(-1.0, 1.0, (env.action_size,), self._name)
+        self._draw_states, self._action_repeat = draw, action_repeat
         with one_line_errors(f"environment {self._name!r} cannot be used"):
             state = jax.eval_shape(env.reset, jnp.zeros(2, jnp.uint32))
         if isinstance(state.obs, Mapping) and OBSERVATION not in state.obs:
             keys = ", ".join(state.obs)
-            raise LareError(f"environment {self._name!r} cannot be used: it observes {keys}, but not {OBSERVATION!r}")
+            raise jax_spaces.unusable(self._name, f"it observes {keys}, but not {OBSERVATION!r}")
         observation, privileged = _split_observation(state.obs)
-        self.spec = agent_spec(
-            action,
-            observation_size=flat_size(observation),
-            max_steps=max_steps,
-            state_size=flat_size(privileged),
-            measures=find_measures(task, state.metrics),
+        self.spec = jax_spaces.agent_spec(
+            self._action,
+            observation_size=jax_spaces.flat_size(observation),
+            max_steps=task.max_episode_steps or max_steps,
+            state_size=jax_spaces.flat_size(privileged),
+            measures=jax_spaces.find_measures(task, state.metrics),
         )
 
     def reset(self, key: PRNGKeyArray) -> tuple[RobotState, Timestep]:
-        env_state = strong_types(self.env.reset(raw_key(key)))
-        observation, privileged = map(flatten_tree, _split_observation(env_state.obs))
+        env_state = jax_spaces.strong_types(self.env.reset(jax_spaces.raw_key(key)))
+        observation, privileged = map(jax_spaces.flatten_tree, _split_observation(env_state.obs))
         state = RobotState(env_state, jnp.zeros((), jnp.int32), observation, privileged)
-        return state, agent_timestep(self.spec, observation, state=privileged)
+        return state, jax_spaces.agent_timestep(self.spec, observation, state=privileged)
 
     def step(
         self, state: RobotState, action: Float[Array, "1 action"], key: PRNGKeyArray
@@ -96,15 +83,15 @@ class RobotEnv:
         for _ in range(self._action_repeat):
             env_state = self.env.step(_copy(env_state), self._action.decode(action[0]))
             reward += env_state.reward
-        observation, privileged = map(flatten_tree, _split_observation(env_state.obs))
+        observation, privileged = map(jax_spaces.flatten_tree, _split_observation(env_state.obs))
         is_finite = jnp.isfinite(observation).all() & jnp.isfinite(privileged).all() & jnp.isfinite(reward)
         next_state = RobotState(
-            env=cast_like(env_state, state.env),
+            env=jax_spaces.cast_like(env_state, state.env),
             steps=state.steps + 1,
             observation=jnp.where(is_finite, observation, state.observation),
             privileged=jnp.where(is_finite, privileged, state.privileged),
         )
-        timestep = agent_timestep(
+        timestep = jax_spaces.agent_timestep(
             self.spec,
             next_state.observation,
             reward=jnp.where(is_finite, reward, 0.0),
@@ -115,11 +102,8 @@ class RobotEnv:
         )
         return next_state, timestep
 
-    def frames(
-        self, states: RobotState, credit: Float[np.ndarray, "steps agents"] | None = None
-    ) -> list[UInt8[np.ndarray, "height width 3"]]:
-        """Return MuJoCo's pictures of states, which do not show credit. Raise `LareError` if nothing can be drawn here."""
-        return draw_states(self._name, self._draw, states.env)
+    def _draw(self, states: Sequence[RobotState]) -> Sequence[Any]:
+        return self._draw_states([state.env for state in states])
 
 
 def _split_observation(observation: Any) -> tuple[Any, Any]:

@@ -5,8 +5,6 @@ which one died.
 """
 
 import atexit
-import contextlib
-import math
 import time
 from collections import defaultdict
 from collections.abc import Sequence
@@ -18,14 +16,11 @@ from jaxtyping import Bool, Shaped
 
 from lare_rl.envs.interface import EnvSpec
 from lare_rl.envs.shared_arrays import MAX_WORKERS, map_arrays, open_shared_memory
-from lare_rl.envs.vec_env import LocalVecEnv, Maker, VecEnv, check_same_sizes, n_cores
+from lare_rl.envs.vec_env import Maker, VecEnv, check_same_sizes, n_cores
 from lare_rl.envs.worker_process import Worker, end_workers, pickle_maker
 from lare_rl.errors import LareError
 
-__all__ = ["SubprocVecEnv", "close_idle_workers", "make_vec_env"]
-
-MIN_SAVED_S = 3e-4
-"""Workers are used if they make a step of all environments at least this much faster. A call of all workers costs about as much."""
+__all__ = ["SubprocVecEnv", "close_idle_workers"]
 
 STOP_TIMEOUT_S = 20.0
 """The time within which an environment must reply once the user has asked the run to stop."""
@@ -34,22 +29,6 @@ POLL_S = 1.0
 
 _idle_workers: defaultdict[str, list[Worker]] = defaultdict(list)
 """Workers that wait for the next batch of environments, by the key of their environment."""
-
-
-def make_vec_env(maker: Maker, n: int, step_s: float) -> VecEnv:
-    """Make `n` environments: in worker processes if their steps take long enough, and in this process otherwise.
-
-    An environment that cannot be made in another process, such as one that the user's script registers, stays in this process.
-
-    Args:
-        maker: the function that makes one of them.
-        step_s: how long a step of one of them takes (s).
-    """
-    n_saved = n - math.ceil(n / n_cores())
-    if n_saved * step_s > MIN_SAVED_S:
-        with contextlib.suppress(LareError):
-            return SubprocVecEnv([maker] * n)
-    return LocalVecEnv([maker] * n)
 
 
 @atexit.register

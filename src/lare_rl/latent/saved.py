@@ -135,9 +135,7 @@ def _add_provenance(function: LatentFunction, record: Path) -> LatentFunction:
         return function
     try:
         saved = read_json(read_text(record))
-        json.dumps(
-            saved, ensure_ascii=False
-        ).encode()  # half of a two-part Unicode character can be read but not written
+        json.dumps(saved, ensure_ascii=False).encode()  # half of a surrogate pair can be read but not written
         model = saved["model"] if saved["source"] == function.source else saved["model"] + CHANGED_SUFFIX
         exchanges = tuple(Exchange(**exchange).model_dump() for exchange in saved["exchanges"])
         if not isinstance(model, str):

@@ -3,6 +3,7 @@
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from typing import Any
 
 import gymnasium
 from gymnasium.spaces import Box, Discrete
@@ -13,13 +14,14 @@ from lare_rl.tasks.spec import FILL_IN
 __all__ = [
     "LIMIT_LINE",
     "MEASURES_LINE",
-    "SCORED_OBSERVATION_LINE",
     "SCORE_LINE",
     "Draft",
     "count_entries",
     "describe_action",
     "describe_flattening",
+    "environment_lines",
     "file_name",
+    "make_draft",
     "text_lines",
     "warning_lines",
 ]
@@ -77,6 +79,29 @@ def warning_lines(
         *([f"# Sections that were not used: {', '.join(unused)}."] if unused else []),
         "# Take out every sentence that still reveals the reward. Describe the goal, not how it is rewarded.",
     ]
+
+
+def environment_lines(environment: str, observation_size: int, action_size: int) -> list[str]:
+    """Return the lines about an environment that the drafts of a task and of its teams share."""
+    return [
+        f'environment = "{environment}"',
+        f"observation_size = {observation_size}",
+        f"action_size = {action_size}",
+        SCORED_OBSERVATION_LINE,
+    ]
+
+
+def make_draft(
+    name: str,
+    lines: Sequence[str],
+    texts: Mapping[str, str],
+    first_lines: Mapping[str, str],
+    removed: tuple[str, ...],
+    **fields: Any,
+) -> Draft:
+    """Return the draft of a task file: its lines, and then its texts. `fields` are further fields of `Draft`."""
+    toml = "\n".join([*lines, *text_lines(texts, first_lines)]) + "\n"
+    return Draft(name, toml, tuple(key for key, text in texts.items() if not text), removed, **fields)
 
 
 def text_lines(texts: Mapping[str, str], first_lines: Mapping[str, str]) -> list[str]:

@@ -8,6 +8,7 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+from gymnasium.spaces import Box, Discrete
 
 from lare_rl.envs.interface import EnvSpec
 from lare_rl.envs.jaxmarl_env import JaxMARLEnv
@@ -16,7 +17,7 @@ from lare_rl.envs.pettingzoo_construct import agent_kind
 from lare_rl.errors import LareError
 from lare_rl.new_task import draft
 from lare_rl.new_task.documentation import first_section, plain_lines, split_sections, write_texts
-from lare_rl.new_task.draft import Draft, count_entries, file_name, text_lines, warning_lines
+from lare_rl.new_task.draft import Draft, count_entries, file_name, warning_lines
 from lare_rl.new_task.many_agents import make_stub, write_team_drafts
 
 __all__ = ["draft_jax_task"]
@@ -32,37 +33,32 @@ def draft_jax_task(environment_id: str) -> Draft:
     family, _, name = environment_id.partition("/")
     make = import_module(f"lare_rl.envs.{family}_env").make
     stub = make_stub(name, environment_id)
-    has_limit = True
+    limit: dict[str, int] = {}
     try:
         env = make(stub)
     except LareError as error:
+        limit = {"max_episode_steps": DEFAULT_LIMIT}
         try:
-            env = make(stub.model_copy(update={"max_episode_steps": DEFAULT_LIMIT}))
+            env = make(stub.model_copy(update=limit))
         except LareError:
             raise error from None
-        has_limit = False
     texts, removed = _read_texts(env)
-    limit_lines = [] if has_limit else [draft.LIMIT_LINE]
+    limit_lines = [draft.LIMIT_LINE] if limit else []
     if isinstance(env, JaxMARLEnv):
         kinds = list(dict.fromkeys(agent_kind(agent.name) for agent in env.layout.agents))
         if len(kinds) > 1:
             stubs = tuple(make_stub(kind, environment_id, team=kind, agents=(kind, f"{kind}_[0-9]*")) for kind in kinds)
-            limit = {} if has_limit else {"max_episode_steps": DEFAULT_LIMIT}
             env = make(make_stub(name, environment_id, teams=stubs, **limit))
         return write_team_drafts(file_name(name), environment_id, env, texts, removed, limit_lines)
     lines = [
         *warning_lines(removed),
         f'name = "{file_name(name)}"',
-        f'environment = "{environment_id}"',
-        f"observation_size = {env.spec.observation_size}",
-        f"action_size = {env.spec.action_size}",
-        draft.SCORED_OBSERVATION_LINE,
+        *draft.environment_lines(environment_id, env.spec.observation_size, env.spec.action_size),
         draft.SCORE_LINE,
         *limit_lines,
-        *text_lines(texts, {"observation": _describe_observation(env), "action": _describe_action(env.spec)}),
     ]
-    missing = tuple(key for key in texts if not texts[key])
-    return Draft(file_name(name), "\n".join(lines) + "\n", missing, removed)
+    first_lines = {"observation": _describe_observation(env), "action": _describe_action(env.spec)}
+    return draft.make_draft(file_name(name), lines, texts, first_lines, removed)
 
 
 def _read_texts(env: Any) -> tuple[dict[str, str], tuple[str, ...]]:
@@ -106,9 +102,5 @@ def _describe_observation(env: Any) -> str:
 
 
 def _describe_action(spec: EnvSpec) -> str:
-    if spec.discrete:
-        return f"{count_entries(spec.action_size)}, all 0 but one: the action that is taken."
-    lows, highs = set(spec.low.ravel().tolist()), set(spec.high.ravel().tolist())
-    quantifier = "each " if spec.action_size > 1 else ""
-    bounds = f", {quantifier}between {lows.pop():g} and {highs.pop():g}" if len(lows) == len(highs) == 1 else ""
-    return f"{count_entries(spec.action_size)}{bounds}."
+    space = Discrete(spec.action_size) if spec.discrete else Box(spec.low[0], spec.high[0])
+    return f"{count_entries(spec.action_size)}{draft.describe_action(space)}."

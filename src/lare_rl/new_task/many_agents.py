@@ -6,6 +6,7 @@ import json
 import re
 import sys
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from fnmatch import fnmatchcase
 from typing import Any, Protocol, runtime_checkable
 
@@ -15,7 +16,7 @@ from lare_rl.envs.pettingzoo_construct import agent_kind, find_time_limit, make_
 from lare_rl.envs.pettingzoo_env import ParallelHost
 from lare_rl.new_task import draft
 from lare_rl.new_task.documentation import first_section, plain_lines, split_sections, write_texts
-from lare_rl.new_task.draft import Draft, count_entries, file_name, text_lines, warning_lines
+from lare_rl.new_task.draft import Draft, count_entries, file_name, warning_lines
 from lare_rl.tasks.spec import PETTINGZOO_PREFIX, TaskSpec
 
 __all__ = ["draft_multi_agent_task", "make_stub", "write_team_drafts"]
@@ -29,6 +30,8 @@ IRRELEVANT = re.compile(
 )
 """Lines of a description that belong to other keys, or to none."""
 
+TEAM_KEYS = ("observation", "action")
+"""The texts that differ from team to team."""
 TEAMS_COMMENT = [
     "# The agents of each kind are a team, which learns on its own. If all agents are one team, remove this line and",
     "# describe observations and actions below, as the files of the teams do.",
@@ -77,38 +80,22 @@ def write_team_drafts(
         removed: the lines that were removed from the texts.
         more_lines: further lines of the task file.
     """
-    several = len(env.spec.teams) > 1
-    environment_lines = [
-        f'environment = "{environment_id}"',
-        f"observation_size = {env.spec.observation_size}",
-        f"action_size = {env.spec.action_size}",
-        draft.SCORED_OBSERVATION_LINE,
-    ]
+    teams = env.spec.teams
+    environment_lines = draft.environment_lines(environment_id, env.spec.observation_size, env.spec.action_size)
+    end = [*environment_lines, draft.SCORE_LINE, *more_lines]
+    head = [*warning_lines(removed), f'name = "{name}"']
+    if len(teams) == 1:
+        return draft.make_draft(name, [*head, *end], texts, _first_lines(env, teams[0]), removed)
     files = {}
-    for team in env.spec.teams if several else ():
-        head, team_texts = _team_lines(env, team), _team_text_lines(env, team, texts)
-        team_lines = [*warning_lines(removed), *head, *environment_lines, *team_texts]
-        files[f"{name}-{team.name}.toml"] = "\n".join(team_lines) + "\n"
-    if several:
-        own_text_lines = text_lines(texts | dict.fromkeys(("observation", "action"), "See the teams."), {})
-    else:
-        own_text_lines = text_lines(texts, _first_lines(env, env.spec.teams[0]))
-    lines = [
-        *warning_lines(removed),
-        f'name = "{name}"',
-        *([*TEAMS_COMMENT, f"teams = {json.dumps(list(files))}"] if several else []),
-        *environment_lines,
-        draft.SCORE_LINE,
-        *more_lines,
-        *own_text_lines,
-    ]
-    return Draft(
-        name=name,
-        toml="\n".join(lines) + "\n",
-        missing_keys=tuple(key for key in texts if not texts[key]),
-        removed=removed,
-        teams=files,
+    for team in teams:
+        lines = [*warning_lines(removed), *_team_lines(env, team), *environment_lines]
+        team_draft = draft.make_draft(name, lines, _team_texts(env, team, texts), _first_lines(env, team), removed)
+        files[f"{name}-{team.name}.toml"] = team_draft.toml
+    lines = [*head, *TEAMS_COMMENT, f"teams = {json.dumps(list(files))}", *end]
+    task_draft = draft.make_draft(
+        name, lines, texts | dict.fromkeys(TEAM_KEYS, "See the teams."), {}, removed, teams=files
     )
+    return replace(task_draft, missing_keys=tuple(key for key in texts if not texts[key]))
 
 
 def make_stub(name: str, environment: str, **keys: Any) -> TaskSpec:
@@ -133,7 +120,7 @@ def _read_texts(env: Any) -> tuple[dict[str, str], tuple[str, ...]]:
     rows = [line for line in summary.splitlines() if not line.strip().startswith("|")]
     about = plain_lines("\n".join(rows))
     lines = {"description": [line for line in about if not IRRELEVANT.search(line)]}
-    for key in ("observation", "action"):
+    for key in TEAM_KEYS:
         section = first_section(sections, f"{key} space", key, f"{key}s")
         lines[key] = section or [line for line in about if re.search(rf"\b{key}s?( space)?: ", line)]
     return write_texts(lines, sections)
@@ -145,16 +132,16 @@ def _team_lines(host: Layouts, team: Team) -> list[str]:
     return [f'name = "{team.name}"', f'team = "{team.name}"', f"agents = {json.dumps(patterns)}"]
 
 
-def _team_text_lines(host: Layouts, team: Team, texts: Mapping[str, str]) -> list[str]:
+def _team_texts(host: Layouts, team: Team, texts: Mapping[str, str]) -> dict[str, str]:
     """Return the texts of a team: the lines that do not begin with the name of another team."""
     other_teams = {other.name for other in host.spec.teams} - {team.name}
     team_texts = dict(texts)
-    for key in ("observation", "action"):
+    for key in TEAM_KEYS:
         lines = texts[key].splitlines()
         team_texts[key] = "\n".join(line for line in lines if line.split(" ")[0].lower() not in other_teams)
     if texts["description"]:
         team_texts["description"] += f"\nYou judge each agent that is called {team.name}, from what it observes itself."
-    return text_lines(team_texts, _first_lines(host, team))
+    return team_texts
 
 
 def _first_lines(host: Layouts, team: Team) -> dict[str, str]:

@@ -9,7 +9,7 @@ from lare_rl.envs.gymnasium_env import make_gymnasium
 from lare_rl.errors import LareError
 from lare_rl.new_task import draft
 from lare_rl.new_task.documentation import first_section, plain_lines, split_sections, write_texts
-from lare_rl.new_task.draft import Draft, count_entries, file_name, text_lines, warning_lines
+from lare_rl.new_task.draft import Draft, count_entries, file_name, warning_lines
 from lare_rl.tasks.spec import PETTINGZOO_PREFIX
 
 __all__ = ["draft_task"]
@@ -69,14 +69,9 @@ def _write_draft(environment_id: str, env: gymnasium.Env) -> Draft:
     lines = [
         *warning_lines(removed, unused=unused),
         f'name = "{file_name(name)}"',
-        f'environment = "{full_id}"',
-        f"observation_size = {observation_size}",
-        f"action_size = {action_size}",
-        draft.SCORED_OBSERVATION_LINE,
+        *draft.environment_lines(full_id, observation_size, action_size),
         draft.SCORE_LINE,
         draft.MEASURES_LINE,
         *([] if env.spec and env.spec.max_episode_steps else [draft.LIMIT_LINE]),
-        *text_lines(texts, first_lines),
     ]
-    missing = tuple(key for key in texts if not texts[key])
-    return Draft(file_name(name), "\n".join(lines) + "\n", missing, removed, unused_sections=unused)
+    return draft.make_draft(file_name(name), lines, texts, first_lines, removed, unused_sections=unused)

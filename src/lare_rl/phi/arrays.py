@@ -180,6 +180,10 @@ class Array(_Value):
             return Array(current_builder().add("first_row", (), shape, self.kind), None)
         return self.rearranged(*fixed_index(self, entries))
 
+    def select(self, axis: int, index: Any) -> Any:
+        """Return x[index] along an axis that is counted from the front."""
+        return self[(*(ALL,) * axis, index)]
+
     def __setitem__(self, index: Any, value: Any) -> None:
         entries = self._entries(index)
         if entries and is_mask(entries[0]):
@@ -326,7 +330,7 @@ def stack(arrays: Sequence[Array], axis: Any) -> Array:
     at = arrays[0].axis(axis, extra=1)
     if len({array.row_shape for array in arrays}) > 1 or len({array.batch_axis for array in arrays}) > 1:
         raise ValueError(f"arrays that are stacked must have the same shape: {_shapes_text(arrays)}")
-    return concatenate([array[(*(ALL,) * at, None)] for array in arrays], at)
+    return concatenate([array.select(at, None) for array in arrays], at)
 
 
 def concatenate(arrays: Sequence[Array], axis: Any) -> Array:

@@ -111,10 +111,11 @@ class Builder:
     def elementwise(self, op: str, *inputs: int) -> int:
         """Add an operation on each number, with NumPy's rules for kinds. Shapes are broadcast."""
         negative = op == "power" and self.is_constant(inputs[1]) and bool((self.nodes[inputs[1]].option < 0).any())
-        typed = elementwise_kinds(op, tuple(self.nodes[i].kind for i in inputs), negative)
-        if typed.op is None:
+        kinds = tuple(self.nodes[i].kind for i in inputs)
+        typed_op, operand_kind, result_kind = elementwise_kinds(op, kinds, negative)
+        if typed_op is None:
             return inputs[0]
-        return self._broadcast(typed.op, [self.cast(i, typed.operands) for i in inputs], typed.result)
+        return self._broadcast(typed_op, [self.cast(i, operand_kind) for i in inputs], result_kind)
 
     def where(self, condition: int, x: int, y: int) -> int:
         kind = widest([self.nodes[x].kind, self.nodes[y].kind])

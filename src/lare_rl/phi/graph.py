@@ -23,7 +23,7 @@ from typing import Any, Literal, NamedTuple, get_args
 
 import numpy as np
 
-__all__ = ["ELEMENTWISE", "Gather", "Graph", "Kind", "Node", "Typed", "elementwise_kinds", "widest"]
+__all__ = ["ELEMENTWISE", "Gather", "Graph", "Kind", "Node", "elementwise_kinds", "widest"]
 
 Kind = Literal["bool", "int", "float"]
 
@@ -193,17 +193,14 @@ _ON_BOOL = {"add": "logical_or", "maximum": "logical_or", "multiply": "logical_a
 """What NumPy makes of arithmetic on bool arrays."""
 
 
-class Typed(NamedTuple):
-    """An operation, the kind that its operands are cast to, and the kind of its result. `op` is None if nothing is to be done."""
-
-    op: str | None
-    operands: Kind
-    result: Kind
-
-
 @lru_cache(1024)
-def elementwise_kinds(op: str, kinds: tuple[Kind, ...], negative_exponent: bool = False) -> Typed:
-    """Return which operation NumPy applies to operands of these kinds."""
+def elementwise_kinds(
+    op: str, kinds: tuple[Kind, ...], negative_exponent: bool = False
+) -> tuple[str | None, Kind, Kind]:
+    """Return which operation NumPy applies to operands of these kinds, the kind that they are cast to, and that of the result.
+
+    The operation is None if nothing is to be done.
+    """
     result, kind = ELEMENTWISE[op], widest(kinds)
     if result == "int":
         if kind == "float":
@@ -216,17 +213,17 @@ def elementwise_kinds(op: str, kinds: tuple[Kind, ...], negative_exponent: bool 
         if op in ("subtract", "negative", "sign"):
             raise TypeError(f"{op} of truth values: use np.logical_xor, ~ or astype(float)")
         if op == "abs":
-            return Typed(None, kind, kind)
+            return None, kind, kind
         if op in _ON_BOOL:
             op, result = _ON_BOOL[op], "logical"
         else:
             kind = "int"
     if op in ("floor", "ceil", "trunc", "rint") and kind == "int":
-        return Typed(None, kind, kind)
+        return None, kind, kind
     if op == "copysign" or (op == "power" and kind == "int" and negative_exponent):
         kind = "float"
     operands: Kind = "float" if result == "float" else "bool" if result == "logical" else kind
-    return Typed(op, operands, "bool" if result in ("bool", "logical") else operands)
+    return op, operands, "bool" if result in ("bool", "logical") else operands
 
 
 def widest(kinds: Sequence[str]) -> Kind:

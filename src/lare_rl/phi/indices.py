@@ -90,10 +90,9 @@ def computed_positions(array: Shaped, entries: Sequence[Any], as_array: Callable
     entry.
     """
     at_arrays = [i for i, entry in enumerate(entries) if not isinstance(entry, slice) and entry is not None]
+    # If slices are between arrays, the axes of the arrays come first in the result.
     apart = at_arrays != list(range(at_arrays[0], at_arrays[-1] + 1))
-    first = (
-        -1 if apart else at_arrays[0]
-    )  # if slices are between arrays, the axes of the arrays come first in the result
+    first = -1 if apart else at_arrays[0]
     computed = as_array(0)
     before: list[np.ndarray] = []
     behind: list[np.ndarray] = []

@@ -27,9 +27,7 @@ MAX_MESSAGES = 8  # about names that are not available, in one refusal
 MAX_MESSAGE_LENGTH = 500
 
 # Single functions of NumPy
-MAX_CONSTANT_SIZE = (
-    1024  # numbers in an argument of a function that NumPy computes on constants, and the largest integer there
-)
+MAX_CONSTANT_SIZE = 1024  # numbers in a constant that NumPy itself computes with, and the largest integer there
 MAX_SYSTEM_SIZE = 64  # the same for functions that solve equations
 MAX_TRANSFORM_LENGTH = 256
 MAX_INVERSE_SIZE = 4  # rows of a matrix that is inverted

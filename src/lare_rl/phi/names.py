@@ -32,11 +32,11 @@ def factor_meanings(source: str, names: Sequence[str]) -> list[str]:
     }
     meanings, comment, numbered = {}, "", ""
     for number, line in enumerate(lines):
-        if _is_comment(line) and not (number and _is_comment(lines[number - 1])):
+        above = number > 0 and _is_comment(lines[number - 1])
+        if _is_comment(line) and not above:
             comment = _leading_comment(lines[number:])
             numbered = comment if NUMBERING.match(comment) else ""
         name = assigned.get(number)
-        above = number and _is_comment(lines[number - 1])
         if name is not None and (above or (name in names and numbered)):
             meanings[name] = NUMBERING.sub("", comment)
         if name in names:
@@ -88,5 +88,4 @@ def _is_comment(line: str) -> bool:
 
 def _leading_comment(lines: list[str]) -> str:
     """Return the comment at the start of the lines."""
-    texts = (line.strip().lstrip("#").strip() for line in itertools.takewhile(_is_comment, lines))
-    return " ".join(texts)
+    return " ".join(line.strip().lstrip("#").strip() for line in itertools.takewhile(_is_comment, lines))

@@ -71,14 +71,8 @@ def combine_values(meter: Meter, name: str, x: Any, y: Any) -> Any:
         return x + y if name == "add" else x | y
     if isinstance(x, Set) and isinstance(y, Set) and name in ("or", "and", "sub", "xor"):
         meter.pay(len(x) + len(y))
-        return Set(
-            {
-                "or": lambda: dict(x | y),
-                "and": lambda: {key: None for key in x if key in y},
-                "sub": lambda: {key: None for key in x if key not in y},
-                "xor": lambda: {key: None for key in x | y if (key in x) != (key in y)},
-            }[name]()
-        )
+        keeps = {"or": operator.or_, "and": operator.and_, "sub": operator.gt, "xor": operator.ne}[name]
+        return Set({key: None for key in x | y if keeps(key in x, key in y)})
     if name == "mod" and isinstance(x, str):
         values = y if isinstance(y, tuple) else (y,)
         texts = sum(len(value) for value in values if isinstance(value, str))
@@ -168,6 +162,5 @@ def _set_method(runtime: Runtime, values: Set, name: str, args: Sequence[Any]) -
     if name in ("issubset", "issuperset"):
         small, large = (values, other) if name == "issubset" else (other, values)
         return all(key in large for key in small)
-    return combine_values(
-        runtime.meter, {"union": "or", "intersection": "and", "difference": "sub"}[name], values, other
-    )
+    operation = {"union": "or", "intersection": "and", "difference": "sub"}[name]
+    return combine_values(runtime.meter, operation, values, other)

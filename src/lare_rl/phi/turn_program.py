@@ -19,11 +19,7 @@ from lare_rl.phi.interpreter import Interpreter
 from lare_rl.phi.limits import MAX_FACTORS, MAX_INT_BITS, MAX_MESSAGE_LENGTH, MAX_TEXT_LENGTH, RefusedError
 from lare_rl.phi.read import describe_failure, parse
 from lare_rl.phi.runtime import Meter
-from lare_rl.phi.values import (
-    Bound,
-    Function,
-    describe,
-)
+from lare_rl.phi.values import Bound, Function, describe
 from lare_rl.util.sanitize import one_line
 
 __all__ = ["TURN_FUNCTION_NAME", "TurnProgram", "read_turn_program", "shorten"]

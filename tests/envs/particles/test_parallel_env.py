@@ -1,6 +1,5 @@
 """The particle tasks as PettingZoo environments."""
 
-import sys
 import warnings
 
 import numpy as np
@@ -8,7 +7,7 @@ import pytest
 
 from lare_rl.envs.particles.parallel_env import ParticleEnv
 from lare_rl.envs.particles.task import MAX_STEPS
-from lare_rl.errors import LareError, install_command
+from lare_rl.errors import LareError
 
 with warnings.catch_warnings():
     # PettingZoo's tests import one of its games in a deprecated way.
@@ -62,11 +61,3 @@ def test_calls_that_are_refused():
             call(ParticleEnv("CN-6"))
     with pytest.raises(LareError, match="no render mode 'human'"):
         ParticleEnv("PP-6", render_mode="human")
-
-
-def test_missing_pettingzoo(monkeypatch):
-    monkeypatch.setitem(sys.modules, "pettingzoo", None)
-    monkeypatch.delitem(sys.modules, "lare_rl.envs.particles.parallel_env")
-    with pytest.raises(LareError) as error:
-        import lare_rl.envs.particles.parallel_env  # noqa: F401
-    assert str(error.value) == f"lare_rl.envs.particles.parallel_env needs an extra: {install_command('pettingzoo')}"

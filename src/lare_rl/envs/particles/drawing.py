@@ -3,17 +3,8 @@
 import numpy as np
 from jaxtyping import Float, UInt8
 
-from lare_rl.envs.canvas import blank_figure, paint_frames
+from lare_rl.envs.canvas import Axes, Figure, blank_figure, colormaps, paint_frames, patches
 from lare_rl.envs.particles.task import ParticleTask
-from lare_rl.errors import missing_extra_error
-
-try:
-    from matplotlib import colormaps
-    from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
-    from matplotlib.patches import Circle, Rectangle
-except ImportError as missing:
-    raise missing_extra_error("a picture", "report") from missing
 
 __all__ = ["draw_frames", "draw_state"]
 
@@ -67,7 +58,7 @@ def _paint(
     axes.set(xlim=(-side, side), ylim=(-side, side), aspect="equal")
     axes.axis("off")
     square = (-task.radius, -task.radius)
-    axes.add_patch(Rectangle(square, 2 * task.radius, 2 * task.radius, fill=False, edgecolor="#dddddd"))
+    axes.add_patch(patches.Rectangle(square, 2 * task.radius, 2 * task.radius, fill=False, edgecolor="#dddddd"))
     colours: list = [
         TEAM_COLOUR if entity < task.teams[0].stop else OTHER_COLOUR for entity in range(task.world.n_moving)
     ]
@@ -81,7 +72,8 @@ def _paint(
     for entity in landmarks_first:
         edge = edges[entity] if entity < task.world.n_moving else "none"
         radius = max(float(task.world.size[entity]), 0.008 * side)
-        axes.add_patch(Circle(tuple(position[entity]), radius, facecolor=colours[entity], edgecolor=edge, linewidth=1))
+        circle = patches.Circle(tuple(position[entity]), radius, facecolor=colours[entity], edgecolor=edge, linewidth=1)
+        axes.add_patch(circle)
     if credit is not None:
         for (x, y), size, value in zip(position, task.world.size, credit, strict=False):
             axes.text(x, y + size + 0.01 * side, f"{value:.2g}", fontsize=8, ha="center", va="bottom")

@@ -7,17 +7,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, UInt8
 
-from lare_rl.envs.canvas import blank_figure, paint_frames
+from lare_rl.envs.canvas import Axes, Figure, blank_figure, paint_frames, patches
 from lare_rl.envs.smax.battle import FIELD, Battle, attack_target
 from lare_rl.envs.smax.scenarios import Scenario
-from lare_rl.errors import missing_extra_error
-
-try:
-    from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
-    from matplotlib.patches import Circle, Rectangle, Wedge
-except ImportError as missing:
-    raise missing_extra_error("a picture", "report") from missing
 
 __all__ = ["draw_frames", "draw_state", "find_hits"]
 
@@ -56,7 +48,7 @@ def draw_frames(
 def _paint(axes: Axes, scenario: Scenario, battle: Battle, previous: Battle | None, credit: float | None) -> None:
     axes.set(xlim=(-0.5, FIELD + 0.5), ylim=(-0.5, FIELD + 0.5), aspect="equal")
     axes.axis("off")
-    axes.add_patch(Rectangle((0, 0), FIELD, FIELD, fill=False, edgecolor="#888888"))
+    axes.add_patch(patches.Rectangle((0, 0), FIELD, FIELD, fill=False, edgecolor="#888888"))
     is_alive = np.asarray(battle.health > 0)
     health = np.asarray(battle.health) / scenario.unit_stats("health")
     names = (*scenario.ally_types, *scenario.enemy_types)
@@ -66,8 +58,8 @@ def _paint(axes: Axes, scenario: Scenario, battle: Battle, previous: Battle | No
             axes.plot(x, y, marker="x", color=DEAD_COLOUR, markersize=5)
             continue
         colour, radius = _side_colour(scenario, unit), float(scenario.unit_stats("radius")[unit])
-        axes.add_patch(Circle((x, y), radius, facecolor="white", edgecolor=colour, linewidth=1.2))
-        axes.add_patch(Wedge((x, y), radius, 90, 90 + 360 * float(health[unit]), facecolor=colour, alpha=0.8))
+        axes.add_patch(patches.Circle((x, y), radius, facecolor="white", edgecolor=colour, linewidth=1.2))
+        axes.add_patch(patches.Wedge((x, y), radius, 90, 90 + 360 * float(health[unit]), facecolor=colour, alpha=0.8))
         axes.text(x, y, names[unit][0], fontsize=7, ha="center", va="center", color="black")
     for shooter, target in find_hits(scenario, battle, previous) if previous else ():
         (x, y), (to_x, to_y) = battle.position[shooter], battle.position[target]

@@ -17,6 +17,7 @@ from lare_rl.phi.numpy_functions.registry import (
     FUNCTIONS,
     array_functions,
     as_float,
+    as_sizes,
     astype,
     dtype_kind,
     numpy_function,
@@ -121,7 +122,7 @@ def meshgrid(*xi: Array, indexing: Any = "xy", sparse: Any = False, copy: Any = 
 
 @numpy_function()
 def fromfunction(function: Callable[..., Any], shape: Any, *, dtype: Any = "float") -> Any:
-    sizes = [operator.index(n) for n in shape]
+    sizes = as_sizes(shape)
     current_builder().check_size([*sizes, len(sizes) or 1])
     return function(*(astype(grid, dtype) for grid in np.indices(sizes)))
 
@@ -180,7 +181,7 @@ INDEXED = {"r_": Concatenator(False), "c_": Concatenator(True), "mgrid": Grid(Fa
 
 @numpy_function()
 def indices(dimensions: Any, dtype: Any = "int") -> Array:
-    sizes = [operator.index(n) for n in dimensions]
+    sizes = as_sizes(dimensions)
     current_builder().check_size([*sizes, len(sizes)])
     return astype(np.indices(sizes), dtype)
 

@@ -10,7 +10,6 @@ import numpy as np
 
 from lare_rl.phi.arrays import Array, as_array, concatenate, elementwise, invert, power
 from lare_rl.phi.graph import ELEMENTWISE
-from lare_rl.phi.indices import ALL
 from lare_rl.phi.limits import RefusedError
 from lare_rl.phi.numpy_functions.registry import UFUNCS, as_numbers, as_operand, call_numpy, numpy_function
 from lare_rl.phi.operand import Operand
@@ -152,7 +151,7 @@ def unwrap(p: Array, discont: Any = None, axis: int = -1, *, period: Any = 2 * m
     correction = elementwise("where", at_half, period / 2, wrapped) - step
     correction = elementwise("where", abs(step) < (period / 2 if discont is None else discont), 0.0, correction)
     shift = call_numpy("cumsum", [correction], {"axis": axis})
-    first = call_numpy("zeros_like", [p[(*(ALL,) * p.axis(axis), slice(0, 1))]], {})
+    first = call_numpy("zeros_like", [p.select(p.axis(axis), slice(0, 1))], {})
     return p + concatenate([first, shift], axis)
 
 

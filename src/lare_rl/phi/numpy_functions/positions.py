@@ -16,6 +16,8 @@ from lare_rl.phi.limits import RefusedError
 from lare_rl.phi.numpy_functions.registry import (
     FUNCTIONS,
     array_functions,
+    as_list,
+    as_sizes,
     numpy_function,
     numpy_functions,
     require_constant,
@@ -39,15 +41,14 @@ def rot90(m: Array, k: int = 1, axes: Any = (0, 1)) -> Array:
 @numpy_function()
 def roll(a: Array, shift: Any, axis: Any = None) -> Array:
     a.row_axes(axis)
-    shifts = [operator.index(s) for s in (shift if isinstance(shift, (tuple, list)) else [shift])]
+    shifts = as_sizes(shift)
     if len(shifts) > 4:
         raise RefusedError("E-COST", "np.roll along more than 4 axes")
     if axis is None:
         return a.rearranged(lambda positions: np.roll(positions, shifts[0]), a.batch_axis)
-    at = [a.axis(i) for i in (axis if isinstance(axis, (tuple, list)) else [axis])]
-    return a.rearranged(
-        lambda positions: np.roll(positions, shifts if len(shifts) > 1 else shifts[0], at), a.batch_axis
-    )
+    at = list(map(a.axis, as_list(axis)))
+    amount = shifts if len(shifts) > 1 else shifts[0]
+    return a.rearranged(lambda positions: np.roll(positions, amount, at), a.batch_axis)
 
 
 @numpy_function()
@@ -113,7 +114,7 @@ def take(a: Array, indices: Any, axis: Any = None, mode: Any = "raise") -> Any:
     if mode in ("clip", "wrap"):
         size = a.row_shape[at]
         index = FUNCTIONS["clip"](as_array(index), 0, size - 1) if mode == "clip" else as_array(index) % size
-    return a[(*(ALL,) * at, index)]
+    return a.select(at, index)
 
 
 def _along_axis(arr: Array, indices: Array, axis: Any) -> tuple[Any, ...]:
@@ -149,10 +150,7 @@ def diagonal(a: Array, offset: int = 0, axis1: int = 0, axis2: int = 1) -> Array
 
 @numpy_function("sliding_window_view", "lib.stride_tricks.sliding_window_view")
 def sliding_window_view(x: Array, window_shape: Any, axis: Any = None) -> Array:
-    axes = x.row_axes(axis)
-    sizes = [
-        operator.index(size) for size in (window_shape if isinstance(window_shape, (tuple, list)) else [window_shape])
-    ]
+    axes, sizes = x.row_axes(axis), as_sizes(window_shape)
     if len(sizes) != len(axes) or any(not 1 <= n <= x.row_shape[i] for n, i in zip(sizes, axes, strict=False)):
         raise ValueError(f"a window of the shape {tuple(sizes)} does not fit into the shape {x.shape}")
     current_builder().check_size([*x.row_shape, *sizes])

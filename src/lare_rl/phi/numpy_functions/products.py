@@ -20,6 +20,7 @@ from lare_rl.phi.numpy_functions.registry import (
     FUNCTIONS,
     array_functions,
     as_arrays,
+    as_list,
     as_numbers,
     numpy_function,
     numpy_functions,
@@ -106,7 +107,7 @@ def inner(a: Array, b: Array) -> Any:
 def tensordot(a: Array, b: Array, axes: Any = 2) -> Any:
     first, second = list(string.ascii_lowercase[: a.ndim]), list(string.ascii_uppercase[: b.ndim])
     pairs = [range(a.ndim - axes, a.ndim), range(axes)] if isinstance(axes, int) else axes
-    axes_a, axes_b = (list(pair) if isinstance(pair, (list, tuple, range)) else [pair] for pair in pairs)
+    axes_a, axes_b = map(as_list, pairs)
     for i, j in zip(axes_a, axes_b, strict=True):
         second[b.axis(j)] = first[a.axis(i)]
     free = [letter for letter in first if letter not in second] + [letter for letter in second if letter not in first]
@@ -124,16 +125,13 @@ def cross(a: Array, b: Array, axisa: int = -1, axisb: int = -1, axisc: int = -1,
     axisa, axisb, axisc = (axisa, axisb, axisc) if axis is None else (axis, axis, axis)
     at_a, at_b = a.row_axes(axisa)[0], b.row_axes(axisb)[0]
 
-    def entry(x: Array, at: int, i: int) -> Any:
-        return x[(*(ALL,) * at, i)]
-
     sizes = a.row_shape[at_a], b.row_shape[at_b]
     if not set(sizes) <= {2, 3}:
         raise ValueError(f"np.cross of vectors of {sizes[0]} and {sizes[1]} numbers")
-    a0, a1, b0, b1 = (entry(x, at, i) for x, at in ((a, at_a), (b, at_b)) for i in (0, 1))
+    a0, a1, b0, b1 = (x.select(at, i) for x, at in ((a, at_a), (b, at_b)) for i in (0, 1))
     if sizes == (2, 2):
         return a0 * b1 - a1 * b0
-    a2, b2 = (entry(x, at, 2) if n == 3 else as_array(0.0) for x, at, n in ((a, at_a, sizes[0]), (b, at_b, sizes[1])))
+    a2, b2 = (x.select(at, 2) if n == 3 else as_array(0.0) for x, at, n in ((a, at_a, sizes[0]), (b, at_b, sizes[1])))
     return stack([a1 * b2 - a2 * b1, a2 * b0 - a0 * b2, a0 * b1 - a1 * b0], axisc)
 
 

@@ -9,7 +9,6 @@ from typing import Any
 from lare_rl.phi.arrays import Array, as_array, broadcast, elementwise
 from lare_rl.phi.builder import current_builder
 from lare_rl.phi.graph import ELEMENTWISE
-from lare_rl.phi.indices import ALL
 from lare_rl.phi.limits import RefusedError
 from lare_rl.phi.numpy_functions.elementwise import UNARY
 from lare_rl.phi.numpy_functions.registry import FUNCTIONS, array_functions, as_numbers, numpy_function, numpy_variants
@@ -157,7 +156,7 @@ def reduce_by(
         more = {"initial": initial, "where": where} if initial is not None or where is not True else {}
         return FUNCTIONS[UFUNC_REDUCTIONS[ufunc]](array, axis, keepdims=keepdims, **more)
     for at in reversed(array.row_axes(axis)):
-        slices = [array[(*(ALL,) * at, slice(i, i + 1) if keepdims else i)] for i in range(array.row_shape[at])]
+        slices = [array.select(at, slice(i, i + 1) if keepdims else i) for i in range(array.row_shape[at])]
         array = functools.reduce(lambda x, y: elementwise(ufunc, x, y), slices)
     return array
 

@@ -143,6 +143,17 @@ def as_arrays(values: Any) -> list[Array]:
     return [as_array(value) for value in values]
 
 
+def as_list(value: Any) -> list[Any]:
+    """Return the entries of a list, tuple, range or array, or a single value as a list."""
+    several = isinstance(value, (list, tuple, range)) or (isinstance(value, Array) and value.ndim)
+    return list(value) if several else [value]
+
+
+def as_sizes(value: Any) -> list[int]:
+    """Return an integer, or several, as a list."""
+    return list(map(operator.index, as_list(value)))
+
+
 def as_float(value: Any) -> float:
     if not isinstance(value, (bool, int, float, Array)):
         raise TypeError(f"a number is needed, not {describe(value)}")

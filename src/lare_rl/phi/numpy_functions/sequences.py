@@ -7,7 +7,6 @@ from typing import Any
 
 from lare_rl.phi.arrays import Array, as_array, broadcast, concatenate, elementwise, stack
 from lare_rl.phi.builder import current_builder
-from lare_rl.phi.indices import ALL
 from lare_rl.phi.limits import RefusedError
 from lare_rl.phi.numpy_functions.reductions import along, flatten_constant
 from lare_rl.phi.numpy_functions.registry import (
@@ -46,7 +45,7 @@ def accumulate(ufunc: str, array: Array, axis: Any = 0) -> Any:
     size, shift = array.row_shape[at], 1
     while shift < size:
         before = [max(i - shift, 0) for i in range(size)]
-        array = elementwise(ufunc, array, array[(*(ALL,) * at, before)])
+        array = elementwise(ufunc, array, array.select(at, before))
         shift *= 2
     return array
 
@@ -55,18 +54,12 @@ def accumulate(ufunc: str, array: Array, axis: Any = 0) -> Any:
 def diff(a: Array, n: int = 1, axis: int = -1, prepend: Any = None, append: Any = None) -> Any:
     (at,) = a.row_axes(axis)
     edge = (*a.row_shape[:at], 1, *a.row_shape[at + 1 :])
-    ends = [
-        x if x is a or x is None or as_array(x).ndim else broadcast(as_array(x), edge, a.batch_axis)
-        for x in (prepend, a, append)
-    ]
-    a = (
-        concatenate([as_array(x) for x in ends if x is not None], at)
-        if prepend is not None or append is not None
-        else a
-    )
+    if prepend is not None or append is not None:
+        arrays = [as_array(x) for x in (prepend, a, append) if x is not None]
+        a = concatenate([x if x.ndim else broadcast(x, edge, a.batch_axis) for x in arrays], at)
     op = "not_equal" if a.kind == "bool" else "subtract"
     for _ in range(n):
-        a = elementwise(op, a[(*(ALL,) * at, slice(1, None))], a[(*(ALL,) * at, slice(None, -1))])
+        a = elementwise(op, a.select(at, slice(1, None)), a.select(at, slice(None, -1)))
     return a
 
 
@@ -87,7 +80,7 @@ def _gradient_along(f: Array, at: int, spacing: Array, edge_order: int) -> Any:
         raise ValueError(f"np.gradient needs at least {edge_order + 1} numbers along its axis")
 
     def entries(index: Any) -> Any:
-        return f[(*(ALL,) * at, index)]
+        return f.select(at, index)
 
     x = [float(v) for v in require_constant(spacing, "the spacing of np.gradient").ravel()]
     x = [i * x[0] for i in range(size)] if len(x) == 1 else x
@@ -96,19 +89,16 @@ def _gradient_along(f: Array, at: int, spacing: Array, edge_order: int) -> Any:
     def column(values: list[float]) -> Array:
         return as_array(values).reshaped(shape, None)
 
-    before, behind = [x[i] - x[i - 1] for i in range(1, size - 1)], [x[i + 1] - x[i] for i in range(1, size - 1)]
-    pieces = [entries(slice(0, 1)), *([entries(slice(1, -1))] if size > 2 else []), entries(slice(-1, None))]
-    pieces[0] = (entries(slice(1, 2)) - entries(slice(0, 1))) / (x[1] - x[0])
-    pieces[-1] = (entries(slice(-1, None)) - entries(slice(-2, -1))) / (x[-1] - x[-2])
+    pieces = [(entries(slice(1, 2)) - entries(slice(0, 1))) / (x[1] - x[0])]
     if size > 2:
-        inner = [
-            (-d1 / (d0 * (d0 + d1)), (d1 - d0) / (d0 * d1), d0 / (d1 * (d0 + d1)))
-            for d0, d1 in zip(before, behind, strict=True)
-        ]
-        w_before, w_middle, w_behind = (column([weights[i] for weights in inner]) for i in range(3))
-        pieces[1] = (
+        steps = [(x[i] - x[i - 1], x[i + 1] - x[i]) for i in range(1, size - 1)]
+        w_before = column([-d1 / (d0 * (d0 + d1)) for d0, d1 in steps])
+        w_middle = column([(d1 - d0) / (d0 * d1) for d0, d1 in steps])
+        w_behind = column([d0 / (d1 * (d0 + d1)) for d0, d1 in steps])
+        pieces.append(
             entries(slice(None, -2)) * w_before + entries(slice(1, -1)) * w_middle + entries(slice(2, None)) * w_behind
         )
+    pieces.append((entries(slice(-1, None)) - entries(slice(-2, -1))) / (x[-1] - x[-2]))
     if edge_order == 2:
         h = x[1] - x[0]
         pieces[0] = (-1.5 * entries(slice(0, 1)) + 2.0 * entries(slice(1, 2)) - 0.5 * entries(slice(2, 3))) / h
@@ -124,7 +114,7 @@ def trapezoid(y: Array, x: Any = None, dx: Any = 1.0, axis: int = -1) -> Any:
         x = as_array(x)
         width = diff(x, 1, 0 if x.ndim == 1 else at)
         width = width[(..., *(None,) * (y.ndim - 1 - at))] if x.ndim == 1 and y.ndim > 1 else width
-    both = elementwise("add", y[(*(ALL,) * at, slice(1, None))], y[(*(ALL,) * at, slice(None, -1))])
+    both = elementwise("add", y.select(at, slice(1, None)), y.select(at, slice(None, -1)))
     return along("sum", elementwise("multiply", width, elementwise("divide", both, 2.0)), at)
 
 
@@ -193,7 +183,7 @@ def quantile(a: Array, q: Any, axis: Any = None, *, method: Any = "linear", keep
 
 def _at_fraction(ordered: Array, at: int, fraction: float, method: str) -> Any:
     position = fraction * (ordered.row_shape[at] - 1)
-    low, high = (ordered[(*(ALL,) * at, i)] for i in (math.floor(position), math.ceil(position)))
+    low, high = (ordered.select(at, i) for i in (math.floor(position), math.ceil(position)))
     weights = {
         "linear": position - math.floor(position), "lower": 0.0, "higher": 1.0, "midpoint": 0.5,
         "nearest": float(round(position) - math.floor(position)),

@@ -18,6 +18,7 @@ from lare_rl.phi.numpy_functions.registry import (
     FUNCTIONS,
     array_functions,
     as_arrays,
+    as_list,
     numpy_function,
     numpy_functions,
     numpy_variants,
@@ -28,7 +29,7 @@ from lare_rl.phi.operand import BATCH, BatchSize, common_batch_axis
 
 def split_shape(shape: Any) -> tuple[tuple[int, ...], int | None]:
     """Return a shape that a program names as the shape in the graph and the batch axis."""
-    sizes = list(shape) if isinstance(shape, (list, tuple)) else [shape]
+    sizes = as_list(shape)
     batch_axes = [axis for axis, size in enumerate(sizes) if isinstance(size, BatchSize)]
     if len(batch_axes) > 1:
         BATCH.refuse()
@@ -45,7 +46,7 @@ def check_order(order: Any) -> None:
 @numpy_function()
 def reshape(a: Array, shape: Any, order: Any = "C") -> Array:
     """Reshape. The batch axis may be merged with axes behind it, or divided again."""
-    sizes = list(shape) if isinstance(shape, (list, tuple)) else [shape]
+    sizes = as_list(shape)
     check_order(order)
     row_shape, batch_axis = split_shape(sizes)
     free = [axis for axis, size in enumerate(row_shape) if size == -1]
@@ -87,10 +88,9 @@ def swapaxes(a: Array, axis1: int, axis2: int) -> Array:
 
 @numpy_function()
 def moveaxis(a: Array, source: Any, destination: Any) -> Array:
-    sources, destinations = ([x] if isinstance(x, int) else list(x) for x in (source, destination))
-    moved = [a.axis(axis) for axis in sources]
+    moved = [a.axis(axis) for axis in as_list(source)]
     order = [axis for axis in range(a.ndim) if axis not in moved]
-    for target, axis in sorted(zip([a.axis(x) for x in destinations], moved, strict=True)):
+    for target, axis in sorted(zip(map(a.axis, as_list(destination)), moved, strict=True)):
         order.insert(target, axis)
     return a.transposed(order)
 
@@ -104,17 +104,16 @@ def rollaxis(a: Array, axis: int, start: int = 0) -> Array:
 
 @numpy_function()
 def expand_dims(a: Array, axis: Any) -> Any:
-    for at in (
-        sorted(a.axis(i, extra=len(axis)) for i in axis) if isinstance(axis, (tuple, list)) else [a.axis(axis, extra=1)]
-    ):
-        a = a[(*(ALL,) * at, None)]
+    axes = as_list(axis)
+    for at in sorted(a.axis(i, extra=len(axes)) for i in axes):
+        a = a.select(at, None)
     return a
 
 
 @numpy_function()
 def squeeze(a: Array, axis: Any = None) -> Any:
     single = [i for i, size in enumerate(a.row_shape) if size == 1 and i != a.batch_axis]
-    removed = single if axis is None else [a.axis(i) for i in ([axis] if isinstance(axis, int) else axis)]
+    removed = single if axis is None else list(map(a.axis, as_list(axis)))
     if not set(removed) <= set(single):
         raise ValueError(f"an axis of {a.shape} whose length is not 1 cannot be removed")
     return a[tuple(0 if i in removed else ALL for i in range(a.ndim))]
@@ -228,7 +227,7 @@ def array_split(ary: Array, indices_or_sections: Any, axis: int = 0) -> list[Any
             raise ValueError(f"{size} numbers cannot be split into {count} parts")
         lengths = [size // count + (i < size % count) for i in range(count)]
         ends = [0, *itertools.accumulate(lengths)]
-    return [ary[(*(ALL,) * at, slice(start, end))] for start, end in itertools.pairwise(ends)]
+    return [ary.select(at, slice(start, end)) for start, end in itertools.pairwise(ends)]
 
 
 @numpy_variants(
@@ -250,7 +249,7 @@ def split(axis_for: Callable[[Array, int], int], ary: Array, indices_or_sections
 @numpy_function()
 def unstack(x: Array, *, axis: int = 0) -> tuple[Any, ...]:
     (at,) = x.row_axes(axis)
-    return tuple(x[(*(ALL,) * at, i)] for i in range(x.row_shape[at]))
+    return tuple(x.select(at, i) for i in range(x.row_shape[at]))
 
 
 numpy_functions(
@@ -270,7 +269,7 @@ def delete(arr: Array, obj: Any, axis: Any = None) -> Any:
         obj if isinstance(obj, (slice, int)) else require_constant(obj, "the index of np.delete")
     ]
     rest = np.setdiff1d(np.arange(arr.row_shape[at]), removed)
-    return arr[(*(ALL,) * at, as_array(rest) if len(rest) else slice(0, 0))]
+    return arr.select(at, as_array(rest) if len(rest) else slice(0, 0))
 
 
 @numpy_function()
@@ -278,5 +277,5 @@ def insert(arr: Array, obj: int, values: Any, axis: Any = None) -> Any:
     at = arr.row_axes(0 if axis is None and arr.ndim == 1 else axis)[0]
     i = range(arr.row_shape[at] + 1)[obj]
     values = broadcast(as_array(values), (*arr.row_shape[:at], 1, *arr.row_shape[at + 1 :]), arr.batch_axis)
-    ends = [arr[(*(ALL,) * at, end)] for end in (slice(None, i), slice(i, None)) if len(range(arr.row_shape[at])[end])]
+    ends = [arr.select(at, end) for end in (slice(None, i), slice(i, None)) if len(range(arr.row_shape[at])[end])]
     return concatenate([*ends[: i > 0], values, *ends[i > 0 :]], at)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import functools
 import math
-import operator
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -18,6 +17,7 @@ from lare_rl.phi.numpy_functions.registry import (
     array_functions,
     as_float,
     as_numbers,
+    as_sizes,
     numpy_function,
     numpy_variants,
     require_constant,
@@ -134,22 +134,20 @@ def _interval(x: Array, knots: np.ndarray) -> Any:
     if len(knots) < 2:
         raise ValueError("np.interp needs at least two points")
     current_builder().check_size((math.prod(x.row_shape), len(knots)))
-    return (
-        _steps_above(x, as_array(knots[1:-1]), "greater_equal")
-        if len(knots) > 2
-        else elementwise("multiply", 0, elementwise("isnan", x))
-    )
+    if len(knots) == 2:
+        return elementwise("multiply", 0, elementwise("isnan", x))
+    return _steps_above(x, as_array(knots[1:-1]), "greater_equal")
 
 
 @numpy_function()
 def unravel_index(indices: Array, shape: Any, order: Any = "C") -> tuple[Any, ...]:
-    sizes = [operator.index(size) for size in (shape if isinstance(shape, (tuple, list)) else [shape])]
+    sizes = as_sizes(shape)
     return tuple((indices // stride) % size for stride, size in zip(_strides(sizes, order), sizes, strict=True))
 
 
 @numpy_function()
 def ravel_multi_index(multi_index: Any, dims: Any, *, order: Any = "C") -> Any:
-    strides = _strides([operator.index(size) for size in dims], order)
+    strides = _strides(as_sizes(dims), order)
     terms = [elementwise("multiply", index, stride) for index, stride in zip(multi_index, strides, strict=True)]
     return functools.reduce(lambda x, y: elementwise("add", x, y), terms)
 

@@ -1,0 +1,117 @@
+"""What the families of other packages' JAX environments share: refusals, missing packages, pictures and drafts."""
+
+import sys
+
+import jax
+import numpy as np
+import pytest
+
+from helpers.jax_families import family_task, require_family
+from lare_rl.envs.families import make_env
+from lare_rl.errors import LareError, install_command
+from lare_rl.new_task.single_agent import draft_task
+
+pytestmark = pytest.mark.filterwarnings("ignore:Accessing .* directly from:DeprecationWarning")
+
+CARTPOLE, TAG, KNAPSACK = "gymnax/CartPole-v1", "jaxmarl/MPE_simple_tag_v3", "jumanji/Knapsack-v1"
+
+
+@pytest.mark.parametrize(
+    ("environment", "changes", "content"),
+    [
+        ("gymnax/CartPole-v0", {}, r"gymnax has no 'CartPole-v0' \(did you mean 'CartPole-v1'\?\)"),
+        (CARTPOLE, {"arguments": {"colour": 3}}, "cannot be made: .*colour"),
+        (CARTPOLE, {"agents": ["a"]}, "agents has no effect on gymnax/CartPole-v1"),
+        (CARTPOLE, {"measures": ["speed"], "observation_size": 4, "action_size": 2}, "no measure 'speed'"),
+        (CARTPOLE, {"observation_size": 4, "action_size": 3}, "action_size = 3, but .* actions of size 2"),
+        ("brax/halfcheeta", {}, "did you mean 'halfcheetah'"),
+        ("brax/ant", {"arguments": {"backend": "none"}}, "cannot be made: .*backend"),
+        ("playground/CheetaRun", {}, "did you mean 'CheetahRun'"),
+        ("playground/PendulumSwingup", {"arguments": {"gravity": 3}}, "cannot be made: .*gravity"),
+        ("jumanji/Snake-v2", {}, "did you mean 'Snake-v1'"),
+        (KNAPSACK, {}, "no time limit.*max_episode_steps"),
+        ("jumanji/JobShop-v0", {"max_episode_steps": 9}, "10 choices at a time have 16679880978201 combinations"),
+        ("jumanji/LevelBasedForaging-v0", {}, "each of its 2 agents has rewards"),
+        ("jumanji/MultiCVRP-v0", {"max_episode_steps": 9}, "its actions are BoundedArray"),
+        ("jumanji/Maze-v0", {"arguments": {"rows": 3}}, "cannot be made: .*rows"),
+        ("jaxmarl/MPE_simple_spread_v2", {}, "did you mean 'MPE_simple_spread_v3'"),
+        ("jaxmarl/hanabi", {}, "no time limit.*max_episode_steps"),
+        ("jaxmarl/coin_game", {}, "its steps hide the last observation"),
+        ("jaxmarl/storm", {"max_episode_steps": 9}, "not a dictionary by agent"),
+        (TAG, {"agents": ["cat_*"]}, "no agent is in"),
+        (TAG, {"agents": ["agent_*"]}, "adversary_0 is in no team"),
+    ],
+)
+def test_refusals(environment, changes, content):
+    require_family(environment)
+    with pytest.raises(LareError, match=content) as error:
+        make_env(family_task(environment, **changes))
+    assert "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize("family", ["gymnax", "brax", "playground", "jumanji", "jaxmarl"])
+def test_missing_package(family, monkeypatch):
+    package = "mujoco_playground" if family == "playground" else family
+    for name in [name for name in sys.modules if name == package or name.startswith(f"{package}.")]:
+        monkeypatch.delitem(sys.modules, name)
+    monkeypatch.setitem(sys.modules, package, None)
+    with pytest.raises(LareError) as error:
+        make_env(family_task(f"{family}/X"))
+    assert str(error.value) == f"environment '{family}/X' needs an extra: {install_command(family)}"
+
+
+@pytest.mark.parametrize(
+    ("environment", "sizes", "refusal"),
+    [
+        ("gymnax/Catch-bsuite", (50, 3), None),
+        ("gymnax/DeepSea-bsuite", (64, 2), "gymnax has no pictures"),
+        ("jumanji/Game2048-v1", (16, 4), None),
+        ("jaxmarl/MPE_simple_spread_v3", (18, 5), None),
+        ("jaxmarl/HeuristicEnemySMAX", (127, 10), "only JaxMARL's particle tasks"),
+    ],
+)
+def test_pictures(environment, sizes, refusal):
+    require_family(environment)
+    env = make_env(family_task(environment, *sizes, max_episode_steps=None if "SMAX" in environment else 3))
+    state, _ = env.reset(jax.random.key(0))
+    states = jax.tree.map(lambda leaf: np.stack([leaf, leaf]), state)
+    if refusal:
+        with pytest.raises(LareError, match=refusal):
+            env.frames(states)
+        return
+    frames = env.frames(states)
+    assert [(frame.ndim, frame.shape[2], frame.dtype) for frame in frames] == [(3, 3, np.uint8)] * 2
+
+
+@pytest.mark.parametrize(
+    ("environment", "missing", "words", "absent"),
+    [
+        (CARTPOLE, ("observation", "action"), [f'"{CARTPOLE}"\nobservation_size = 4\naction_size = 2\n'], []),
+        ("brax/inverted_pendulum", (), ["observation_size = 4\naction_size = 1\n", "1 entry, between -1 and 1."], []),
+        ("playground/PendulumSwingup", ("observation", "action"), ["Swingup environment."], []),
+        (
+            "jumanji/Snake-v1",
+            (),
+            [
+                "0 to 719: grid (shape 12 by 12 by 5, row by row); 720: step_count.",
+                "An episode ends:\n- if no action can be",
+            ],
+            ["action_mask", "1.0 if a fruit is eaten"],
+        ),
+        ("jumanji/Game2048-v1", (), ["max_episode_steps = 1000"], []),
+    ],
+)
+def test_draft(environment, missing, words, absent):
+    require_family(environment)
+    draft = draft_task(environment)
+    assert (draft.name, draft.missing_keys) == (environment.partition("/")[2], missing)
+    assert [text for text in words if text not in draft.toml] == []
+    assert [text for text in absent if text in draft.toml] == []
+
+
+def test_draft_of_teams():
+    require_family(TAG)
+    assert draft_task("jaxmarl/MPE_simple_spread_v3").teams == {}
+    teams = draft_task(TAG).teams
+    assert list(teams) == ["MPE_simple_tag_v3-adversary.toml", "MPE_simple_tag_v3-agent.toml"]
+    assert 'agents = ["agent_[0-9]*"]' in teams["MPE_simple_tag_v3-agent.toml"]
