@@ -16,6 +16,7 @@ from helpers.toy_envs import Chase, toy_spec
 from lare_rl.evaluation.video import encode_film
 from lare_rl.report.html import render_table
 from lare_rl.report.live_page import LivePage
+from lare_rl.report.messages import MESSAGES
 from lare_rl.report.overview import compare_runs, sort_runs, summarise_runs
 from lare_rl.report.run_summary import ReportedRun
 
@@ -155,14 +156,24 @@ def test_training_time(make_run):
 
 
 def test_report_errors(make_run, tmp_path):
-    run, empty = make_run("a", [1.0]), make_run("b", [1.0], steps=())
     for sources, out, words in (
         ([], "report.html", "No runs"),
-        ([run], "none/report.html", "there is no folder"),
-        ([empty], "report.html", "b has no evaluation yet"),
+        ([make_run("a", [1.0])], "no/report.html", "no folder"),
     ):
         with pytest.raises(lare_rl.LareError, match=words):
             lare_rl.write_report(sources, tmp_path / out)
+
+
+def test_run_without_evaluation(make_run, tmp_path):
+    """Its report has what there is: the settings."""
+    empty = make_run("b", [1.0], steps=())
+    page = page_of(empty, tmp_path)
+    assert page.count(MESSAGES["no_evaluation"]) == 1
+    assert "config.json" in page
+    assert 'class="chart' not in page
+    page = page_of([empty, make_run("a", [1.0], method="rd")], tmp_path)
+    assert page.count(MESSAGES["no_evaluation"]) == 1
+    assert 'class="chart' in page
 
 
 def test_unknown_step_rewards(runs, tmp_path):

@@ -75,14 +75,14 @@ def render_verdict(
     reported: ReportedRun, summary: RunSummary | None, film: str = "", has_title: bool = True
 ) -> Iterable[str]:
     """Yield what a run reached: a film, a verdict and the numbers."""
-    if summary is None:
-        return
-    findings = diagnose(summary)
     yield f'<div class="hero{" filmed" if film else ""}">{film}<div>'
     if has_title:
         yield f"<h1>{escape(reported.name)} on {escape(reported.run.config.task.name)}</h1>"
+    if summary is None:
+        yield f'<p class="headline">{MESSAGES["no_evaluation"]}</p></div></div>'
+        return
     yield f'<p class="headline">{escape(render_headline(summary))}</p>'
-    for finding in findings:
+    for finding in diagnose(summary):
         if finding.code not in CREDIT_CODES:
             class_ = ' class="verdict"' if finding.code in NEXT_CODES else ""
             yield f"<p{class_}>{render(finding, MESSAGES, 'html')}</p>"
@@ -151,7 +151,7 @@ def compare_runs(runs: Sequence[ReportedRun]) -> list[Finding]:
         ),
         Finding("improvement", names | {"probability": probability, "n_pairs": wins.size}),
     ]
-    steps = {reported.metrics[-1]["step"] for reported in runs}
+    steps = {reported.last_step for reported in runs if reported.metrics}
     return findings + (
         [Finding("different_steps", {"least": min(steps), "most": max(steps)})] if len(steps) > 1 else []
     )
@@ -183,7 +183,7 @@ def render_final_values(runs: Sequence[ReportedRun]) -> str:
     for reported in runs:
         task = reported.run.config.task.name
         values = [reported.final_values(metric) for metric in _METRICS]
-        step, n_seeds = f"{reported.metrics[-1]['step']:,}", len(reported.run.seeds)
+        step, n_seeds = f"{reported.last_step:,}", len(reported.run.seeds)
         if len(runs) > 1:
             rows.append((task, reported.name, *map(format_spread, values), str(n_seeds), step))
         else:
@@ -208,8 +208,8 @@ def render_learning_curves(
     yield _render_legend(runs, colours, references, warmup)
     for name, role in zip(names, task.teams or (task,), strict=True):
         title = f"True return, team of {role.team}" if task.teams else "True return"
-        yield f'<p class="note">{escape(title)}</p>'
-        yield _draw_metric(_Metric(name, title), runs, colours, references, warmup)
+        if chart := _draw_metric(_Metric(name, title), runs, colours, references, warmup):
+            yield render_note(title) + chart
     charts = {metric.title: _draw_metric(metric, runs, colours, {}, warmup) for metric in _other_metrics(task)}
     figures = [
         f'<figure><figcaption class="title">{escape(title)}</figcaption>{chart}</figure>'

@@ -61,6 +61,11 @@ class ReportedRun:
         """The lines of metrics.jsonl."""
         return self.run.metrics()
 
+    @property
+    def last_step(self) -> int:
+        """The step of the last evaluation; 0 before the first."""
+        return self.metrics[-1]["step"] if self.metrics else 0
+
     def curve(self, key: str) -> Curve | None:
         """Return a metric over the steps, with NaN where it is missing. None if it was never measured."""
         values = {
