@@ -105,7 +105,7 @@ def design(
     from lare_rl.llm.live import LiveModel
     from lare_rl.llm.model import RECORDED, recorded_model
 
-    model = model or RECORDED
+    model = RECORDED if model is None else model
     is_live = model != RECORDED and not model.endswith(".json")
     _check_options(is_live, live, draw, reflect, policy, data)
     _check_files(out, record)
@@ -125,7 +125,7 @@ def design(
         _save_attempts(error, find_free_path(Path(f"{spec.name}.attempts.json")))
         sys.exit(error.status)
     finally:
-        if isinstance(author, LiveModel):
+        if isinstance(author, LiveModel) and author.budget.requests_used:
             print_progress(f"{author.name}: {author.budget.summary(live.price)}")
     if out is None:
         _print_function(function, find_free_path(Path(f"{spec.name}.py")))
