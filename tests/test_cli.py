@@ -21,7 +21,7 @@ from lare_rl.util.provenance import code_version
 
 TINY = (
     "--steps 200 --rollout-steps 50 --evaluate-every 100 --evaluation-episodes 1 "
-    "--method lare-linear --td3.warmup 100 --td3.hidden 8 8"
+    "--method lare-linear --credit.score sum --td3.warmup 100 --td3.hidden 8 8 --td3.batch-size 8"
 ).split()
 
 

@@ -99,8 +99,9 @@ def test_request(start_either):
     ],
 )
 def test_reply_text(start_either, answer, text):
-    _, model, _ = start_either(answer)
+    server, model, _ = start_either(answer)
     assert model.reply(REQUEST, 0) == text
+    assert "temperature" not in server.requests[0]
 
 
 def test_compressed_reply(start):

@@ -13,6 +13,7 @@ import pytest
 import lare_rl
 from helpers.markup import check_markup
 from helpers.toy_envs import Chase, toy_spec
+from helpers.training_runs import QUICK_CREDIT
 from lare_rl.evaluation.video import encode_film
 from lare_rl.report.html import render_table
 from lare_rl.report.live_page import LivePage
@@ -36,7 +37,7 @@ gymnasium.register("toys/EpisodicChase-v0", entry_point=episodic_chase, max_epis
 @pytest.fixture(scope="module")
 def runs(small, phi, tmp_path_factory):
     """Two small runs of a toy, one with rewards at each step, and one with a reward at the last step."""
-    directory, settings = tmp_path_factory.mktemp("runs"), small(method="lare-bayes", steps=240)
+    directory, settings = tmp_path_factory.mktemp("runs"), small(method="lare-bayes", credit=QUICK_CREDIT)
     return [
         lare_rl.train(toy_spec(environment=name), settings, function=phi, out=directory / name[5:-3], listeners=[])
         for name in ("toys/Chase-v0", "toys/EpisodicChase-v0")
