@@ -112,8 +112,8 @@ def test_compiled_environment(run_elsewhere, tmp_path):
     run_elsewhere(
         PROGRAM,
         "design CN-6 --out phi.py",
-        "train CN-6 --function phi.py --steps 50 --environments 2 --evaluate-every 50 --evaluation-episodes 2 --ippo.hidden 8 "
-        "--credit.score sum --out run",
+        "train CN-6 --method dense --steps 50 --environments 2 --evaluate-every 50 --evaluation-episodes 2 --ippo.hidden 8 "
+        "--out run",
         "report run --no-film",
     )
     assert (tmp_path / "run" / "report.html").stat().st_size > 10_000
