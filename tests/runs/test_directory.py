@@ -75,8 +75,8 @@ def test_find_run_directories(make_run, tmp_path):
     both = [first.directory, second.directory]
     assert find_run_directories([tmp_path / "runs"]) == both
     assert find_run_directories([tmp_path / "runs" / "Chase"]) == both
-    found = find_run_directories([second.directory, first.directory / ".." / ".." / "Chase"])
-    assert [path.resolve() for path in found] == both[::-1]
+    directories = find_run_directories([second.directory, first.directory / ".." / ".." / "Chase"])
+    assert [path.resolve() for path in directories] == both[::-1]
 
 
 def test_logs_of_sweep_are_skipped(make_run):
