@@ -1,6 +1,5 @@
 """The command line, in this process: what it prints, and that a mistake is one line and exit status 2."""
 
-import json
 import re
 import shutil
 import subprocess
@@ -10,6 +9,7 @@ from pathlib import Path
 
 import pytest
 
+from helpers.scripted_model import to_reply
 from helpers.toy_envs import PHI
 from lare_rl import cli
 from lare_rl.algorithms.registry import ALGORITHMS
@@ -21,7 +21,7 @@ from lare_rl.util.provenance import code_version
 
 TINY = (
     "--steps 200 --rollout-steps 50 --evaluate-every 100 --evaluation-episodes 1 "
-    "--method lare-linear --td3.warmup 100 --td3.hidden 8 8"
+    "--method lare-linear --credit.score sum --td3.warmup 100 --td3.hidden 8 8 --td3.batch-size 8"
 ).split()
 
 
@@ -59,7 +59,7 @@ def first_column(table):
         ("train Reacher-v4 --resume runs/none", ["--resume", "--steps"]),
         ("train --resume runs/none --seed 1", ["--resume", "--steps"]),
         ("train Reacher-v4 --function none.py", ["none.py does not exist"]),
-        ("train Reacher-v4 --steps 120", ["steps = 120", "rollout_steps = 50"]),
+        ("train Reacher-v4 --steps 120 --evaluate-every 70", ["steps = 120", "100 or 150", "= 70", "50 or 100"]),
         ("train Reacher-v4 --method magic", ["'magic'", *METHODS]),
         ("train CN-6 --algorithm ppo", ["ppo", "CN-6"]),
         ("train CompetitivePP-6-prey", ["CompetitivePP-6-prey is one team"]),
@@ -95,15 +95,12 @@ def test_command_mistake(command, tmp_path, arguments, words):
     assert list(tmp_path.iterdir()) == []
 
 
-@pytest.mark.parametrize("arguments", [["--debug", "evaluate", "none"], ["evaluate", "none", "--debug"]])
-def test_debug(command, arguments):
-    status, out, err = command(*arguments)
-    assert (status, out) == (2, "")
-    assert err.startswith("Traceback (most recent call last):\n")
-    assert err.splitlines()[-1].startswith("lare-rl: none is not a run")
-
-
-def test_version(command):
+def test_debug_and_version(command):
+    for arguments in ("--debug evaluate none", "evaluate none --debug"):
+        status, out, err = command(*arguments.split())
+        assert (status, out) == (2, "")
+        assert err.startswith("Traceback (most recent call last):\n")
+        assert err.splitlines()[-1].startswith("lare-rl: none is not a run")
     assert command("--version") == (0, f"{code_version()}\n", "")
 
 
@@ -116,12 +113,7 @@ def test_help(command):
 
 def test_help_of_options(command):
     _, out, _ = command("train", "--help")
-    options = [
-        "steps INT",
-        "out DIR",
-        "scored-observation {before,after,both}",
-        "credit.hidden [INT [INT ...]]",
-    ]
+    options = ["steps INT", "out DIR", "scored-observation {before,after,both}", "credit.hidden [INT [INT ...]]"]
     assert all(f" --{option} " in out for option in options)
     assert not any(f" --{name}." in out for name in ALGORITHMS)
     for name in ("--algorithm sac", "--algorithm=sac"):
@@ -134,13 +126,20 @@ def test_help_of_options(command):
 
 
 def test_a_typo_in_a_task_file_is_reported_before_slow_imports(spec_file):
-    path = spec_file(observation=None, observatoin="typo")
-    for arguments in (["train", path], ["verify", "phi.py", "--task", path]):
-        program = f"import sys; sys.argv = {['lare-rl', *map(str, arguments)]}; from lare_rl.cli import main\n"
-        program += "try: main()\nfinally: print(sorted({'jax', 'gymnasium', 'numpy'} & set(sys.modules)))"
-        process = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True)
-        assert "there is no key 'observatoin'" in process.stderr
-        assert process.stdout == "[]\n"
+    path = str(spec_file(observation=None, observatoin="typo"))
+    program = f"""
+import sys
+from lare_rl.cli import main
+for arguments in ["train", {path!r}], ["verify", "phi.py", "--task", {path!r}]:
+    sys.argv = ["lare-rl", *arguments]
+    try:
+        main()
+    except SystemExit:
+        print(sorted({{"jax", "gymnasium", "numpy"}} & set(sys.modules)))
+"""
+    process = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True)
+    assert process.stderr.count("there is no key 'observatoin'") == 2
+    assert process.stdout == "[]\n[]\n"
 
 
 def test_progress_of_episodes(monkeypatch, capsys):
@@ -154,8 +153,7 @@ def test_progress_of_episodes(monkeypatch, capsys):
     lines = capsys.readouterr().err.splitlines()
     assert lines[:2] == ["played 1 of 20 episodes, 3 min left", "played 4 of 20 episodes, 3 min left"]
     assert len(lines) == 7
-    quick = EpisodeProgress(20)
-    quick(20)
+    EpisodeProgress(20)(20)
     assert capsys.readouterr().err == ""
 
 
@@ -251,9 +249,7 @@ def test_verify_with_returns(command, phi, spec_file):
     assert "before" in both.partition("Fitted to all 30 episodes")[2]
 
 
-SAVED_REPLY = json.dumps(
-    {"Understand": "", "Analyze": "", "Functions": "def evaluation_func(o, a):\n    return [a[:, 0]]"}
-)
+SAVED_REPLY = to_reply("def evaluation_func(o, a):\n    return [a[:, 0]]")
 BAD_SOURCE = "import os\ndef evaluation_func(o, a):\n    return [np.clamp(a), open('x')]\n"
 DULL_SOURCE = "def evaluation_func(o, a):\n    still = 0 * a\n    return [still, a]\n"
 
@@ -263,13 +259,7 @@ DULL_SOURCE = "def evaluation_func(o, a):\n    still = 0 * a\n    return [still,
     [
         ("phi.py", PHI, "--fit 19", 2, ["at least 20 episodes"]),
         ("phi.py", PHI, "--policy run", 2, ["--policy"]),
-        (
-            "bad.py",
-            BAD_SOURCE,
-            "",
-            1,
-            ["FAILED  read\n        E-IMPORT line 1:", "\n        E-NUMPY line 3:", "np.clip"],
-        ),
+        ("bad.py", BAD_SOURCE, "", 1, ["FAILED  read\n        E-IMPORT line 1:", "        E-NUMPY line 3:", "np.clip"]),
         ("reply.json", SAVED_REPLY, "", 1, ["        E-FORM line 2", "into the same chat"]),
         ("dull.py", DULL_SOURCE, "", 0, ["advice  factor 'still' never varies"]),
     ],
@@ -283,12 +273,10 @@ def test_verify_messages(file, text, options, status, words, command, spec_file,
 
 
 def test_error_of_many_lines(command, spec_file, tmp_path):
-    (tmp_path / "bad.py").write_text("import os\ndef evaluation_func(o, a):\n    return [np.load(a)]\n")
+    (tmp_path / "bad.py").write_text(BAD_SOURCE)
     status, _, err = command("train", spec_file(), "--function", "bad.py")
     assert (status, err.count("\n")) == (2, 1)
-    assert "bad.py: " in err
-    assert "E-IMPORT line 1" in err
-    assert "E-NUMPY line 3" in err
+    assert all(words in err for words in ("bad.py: ", "E-IMPORT line 1", "E-NUMPY line 3"))
 
 
 def test_from_training_to_report(command, spec_file, phi):

@@ -33,13 +33,15 @@ def test_offline_td3_bc(tmp_path):
         assert main(str(tmp_path / "new"), rewards, steps=3) == []
 
 
-@pytest.mark.filterwarnings("ignore")  # of these libraries
+@pytest.mark.filterwarnings("ignore")  # of these libraries and simulators
 @pytest.mark.parametrize(
     ("name", "library", "arguments"),
     [
         ("tianshou_td3.py", "tianshou", {"steps": 20}),
         ("skrl_td3.py", "skrl", {"steps": 1200}),
         ("rllib_ppo.py", "ray.rllib.algorithms.ppo", {"iterations": 1}),
+        ("wheat_sb3.py", "pcse", {"steps": 405, "episodes": 1}),
+        ("traffic_sb3.py", "libsumo", {"steps": 360, "episodes": 1}),
     ],
 )
 def test_example_of_a_library(name, library, arguments):
@@ -50,21 +52,6 @@ def test_example_of_a_library(name, library, arguments):
     assert np.isfinite(runpy.run_path(str(path))["main"](**arguments)).all()
 
 
-@pytest.mark.filterwarnings("ignore")  # of the simulators
-@pytest.mark.parametrize(
-    ("name", "simulator", "arguments"),
-    [
-        ("wheat_sb3.py", "pcse", {"steps": 405, "episodes": 1}),
-        ("traffic_sb3.py", "libsumo", {"steps": 360, "episodes": 1}),
-    ],
-)
-def test_example_of_a_score_at_the_end(name, simulator, arguments):
-    path = EXAMPLES / name
-    compile(path.read_text(encoding="utf-8"), name, "exec")
-    pytest.importorskip(simulator)
-    assert np.isfinite(runpy.run_path(str(path))["main"](**arguments)).all()
-
-
 @pytest.mark.filterwarnings("ignore:.*v4 is out of date")
 def test_optuna_study(tmp_path):
     path = EXAMPLES / "optuna_study.py"
@@ -72,11 +59,10 @@ def test_optuna_study(tmp_path):
     optuna = pytest.importorskip("optuna")
     example = runpy.run_path(str(path))
     small = {"evaluate_every": 50, "evaluation_episodes": 1, "method": "rd-linear"}
-    study = example["main"](n_trials=2, steps=100, warmup=50, out=str(tmp_path), **small)
-    for number, trial in enumerate(study.trials):
-        metrics = lare_rl.open_run(tmp_path / str(number)).metrics()
-        assert trial.intermediate_values == {line["step"]: line["evaluation/return"] for line in metrics}
-        assert lare_rl.open_run(tmp_path / str(number)).config.settings.hyperparameters.tau == trial.params["tau"]
+    study = example["main"](n_trials=1, steps=100, warmup=50, out=str(tmp_path), **small)
+    (trial,), run = study.trials, lare_rl.open_run(tmp_path / "0")
+    assert trial.intermediate_values == {line["step"]: line["evaluation/return"] for line in run.metrics()}
+    assert run.config.settings.hyperparameters.tau == trial.params["tau"]
     study.enqueue_trial({"gamma": 0.95, "tau": 0.01})
 
     def prune(trial):

@@ -61,7 +61,7 @@ def test_imports_run_downwards():
 def test_find_imports():
     assert "lare_rl.errors.LareError" in find_imports("lare_rl.cli")
     assert "lare_rl.llm.prompts.candidate" in find_imports("lare_rl.cli.functions")
-    assert "lare_rl.training.train.train" in find_imports("lare_rl.cli.runs")
+    assert "lare_rl.training.train.train" in find_imports("lare_rl.cli.train")
 
 
 def test_no_module_names_a_device():

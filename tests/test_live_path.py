@@ -2,7 +2,6 @@
 
 import json
 import os
-import re
 import subprocess
 import sys
 from pathlib import Path
@@ -12,14 +11,13 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from helpers.chat_servers import Server, refuse, reply_with, request_messages
+from helpers.scripted_model import to_reply
 from helpers.toy_envs import PHI, toy_spec
 from lare_rl.envs.load import read_task
 from lare_rl.errors import LareError
 from lare_rl.latent.design import design
 from lare_rl.latent.saved import load_function
 from lare_rl.llm import prompts
-from lare_rl.llm.budget import Budget
-from lare_rl.llm.live import LiveModel
 from lare_rl.llm.recording import read_recording, shipped_recordings
 
 KEY = "sk-a-key-that-nobody-may-see"
@@ -48,10 +46,6 @@ def serve(monkeypatch):
     yield start
     for server in servers:
         server.stop()
-
-
-def to_reply(source: str) -> str:
-    return json.dumps({"Understand": "", "Analyze": "", "Functions": source})
 
 
 @pytest.fixture
@@ -101,17 +95,6 @@ def test_live_model_to_trained_policy(serve, command, design_live, tmp_path):
     assert not any(KEY.encode() in path.read_bytes() for path in tmp_path.rglob("*") if path.is_file())
 
 
-def test_failed_attempts_are_saved(serve, design_live, tmp_path):
-    server = serve(reply_with("I would rather talk about something else."))
-    for name in ("Reacher-v4.attempts.json", "Reacher-v4.attempts-2.json"):
-        status, out, err = design_live(server, "--candidates", 1)
-        assert (status, out) == (1, "")
-        assert len([line for line in err.splitlines() if line.startswith("lare-rl: ")]) == 1
-        assert "not one JSON object" in err
-        assert f"every attempt is kept in {name}" in err
-        assert saved_stages(tmp_path / name) == ["candidate", *["correct"] * 4]
-
-
 @pytest.mark.parametrize(
     ("options", "words"),
     [
@@ -128,31 +111,31 @@ def test_budget(serve, design_live, options, words):
     assert len(server.requests) <= 2
 
 
-def test_replies_are_saved_when_the_budget_ends(serve, design_live, tmp_path):
-    status, out, err = design_live(serve(reply_with("\x1b[31mno")), "--candidates", 1, "--requests", 2)
-    assert (status, out) == (2, "")
-    assert err.splitlines()[-2:-1] == ["every attempt is kept in Reacher-v4.attempts.json"]
-    assert "\x1b" not in err
-    assert saved_stages(tmp_path / "Reacher-v4.attempts.json") == ["candidate", "correct"]
-
-
-def test_failed_design_is_one_line(serve, design_live, tmp_path):
-    server = serve(reply_with(to_reply("x = np.load('a')\ny = np.fromfile('b')")))
-    status, _, err = design_live(server, "--candidates", 1, "--record", "talk.json")
+@pytest.mark.parametrize(
+    ("text", "options", "status", "words", "n_replies"),
+    [
+        ("I would rather talk about something else.", [], 1, ["not one JSON object"], 5),
+        ("\x1b[31mno", ["--requests", 2], 2, ["the budget of 2 requests is spent"], 2),
+        (
+            to_reply("x = np.load('a')\ny = np.fromfile('b')"),
+            ["--record", "talk.json"],
+            1,
+            ["'Reacher-v4'", "E-NUMPY line 1", " (and 1 more)"],
+            5,
+        ),
+    ],
+)
+def test_attempts_are_saved(serve, design_live, tmp_path, text, options, status, words, n_replies):
+    """In the file of --record, or in a new one."""
+    (tmp_path / "Reacher-v4.attempts.json").touch()
+    result, out, err = design_live(serve(reply_with(text)), "--candidates", 1, *options)
+    assert (result, out) == (status, "")
     (line,) = [line for line in err.splitlines() if line.startswith("lare-rl: ")]
-    assert status == 1
-    assert "'Reacher-v4'" in line
-    assert "E-NUMPY line 1" in line
-    assert line.endswith(" (and 1 more)")
-    assert "every attempt is kept in talk.json" in err
-    assert saved_stages(tmp_path / "talk.json") == ["candidate", *["correct"] * 4]
-
-
-def test_error_of_a_server_is_sanitized(serve, design_live):
-    status, _, err = design_live(serve(refuse(401, "\x1b[2J\u202eno\U000e0041")))
-    assert status == 2
-    assert "HTTP 401: ?[2J?no?" in err.splitlines()[-1]
-    assert err.isascii()
+    assert all(word in line for word in words)
+    assert "\x1b" not in err
+    name = "talk.json" if "--record" in options else "Reacher-v4.attempts-2.json"
+    assert f"every attempt is kept in {name}" in err
+    assert saved_stages(tmp_path / name) == ["candidate", *["correct"] * (n_replies - 1)]
 
 
 @pytest.mark.parametrize(
@@ -174,10 +157,22 @@ def test_files_are_checked_before_a_model_is_asked(command, tmp_path, arguments,
     assert words in err
 
 
-def run_lare(*arguments, **streams):
-    """Run `lare-rl` in another process."""
-    command = [sys.executable, "-c", "from lare_rl.cli import main; main()", *map(str, arguments)]
-    return subprocess.run(command, stderr=subprocess.PIPE, **streams)
+RUN_LARE = """
+import sys
+from lare_rl.cli import main
+for command in sys.argv[1:]:
+    sys.argv = ["lare-rl", *command.split()]
+    try:
+        main()
+    except SystemExit as exit_:
+        print("status", exit_.code, file=sys.stderr)
+"""
+
+
+def run_lare(*commands, **options):
+    """Run commands of `lare-rl` in another process, and return its standard output and the lines of its standard error."""
+    process = subprocess.run([sys.executable, "-c", RUN_LARE, *commands], stderr=subprocess.PIPE, **options)
+    return process.stdout, process.stderr.decode().splitlines()
 
 
 def test_terminal_without_unicode(tmp_path):
@@ -186,11 +181,10 @@ def test_terminal_without_unicode(tmp_path):
     exchange = {"stage": "candidate", "messages": messages, "replies": [to_reply(source)]}
     recording = shipped_recordings("factors", 0)[0].model_dump() | {"exchanges": [exchange]}
     (tmp_path / "r.json").write_text(json.dumps(recording))
-    arguments = ("design", "Reacher-v4", "--model", "r.json", "--candidates", 1)
     plain = os.environ | {"PYTHONIOENCODING": "cp1252"}
-    done = run_lare(*arguments, cwd=tmp_path, env=plain, stdout=subprocess.PIPE)
-    assert done.returncode == 0, done.stderr
-    assert b"\\u6f22\\u5b57" in done.stdout
+    command = "design Reacher-v4 --model r.json --candidates 1"
+    out, _ = run_lare(command, cwd=tmp_path, env=plain, stdout=subprocess.PIPE)
+    assert b"\\u6f22\\u5b57" in out
 
 
 @pytest.mark.skipif(not Path("/proc/self").exists(), reason="no directory in which nobody can write")
@@ -208,23 +202,12 @@ def test_function_is_printed_if_it_cannot_be_written(command, tmp_path):
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="no disk that is always full")
 def test_function_is_saved_if_it_cannot_be_printed(tmp_path):
     with open("/dev/full", "w") as full:
-        done = run_lare("design", "Reacher-v4", cwd=tmp_path, stdout=full)
-        assert done.returncode == 2
-        assert "kept in Reacher-v4.py" in done.stderr.decode().splitlines()[-1]
-        assert load_function(tmp_path / "Reacher-v4.py", read_task("Reacher-v4")).size > 0
-        done = run_lare("prompt", "Reacher-v4", cwd=tmp_path, stdout=full)
-        assert done.returncode == 2
-        assert "No space left on device" in done.stderr.decode()
-
-
-def test_function_of_another_task_is_corrected(serve):
-    # The chase has observations of size 2; the recorded function of Reacher reads entry 10.
-    reacher = shipped_recordings("factors", 0)
-    other = next(recording for recording in reacher if recording.task == "Reacher-v4").exchanges[-1].replies[0]
-    server = serve(reply_with(other), reply_with(to_reply(PHI)))
-    assert design(toy_spec(), model=LiveModel("m", server.url), candidates=1).source == PHI.strip("\n")
-    error = request_messages(server.requests[1])[-1]["content"]
-    assert re.search(r"^E-RUN line \d+: IndexError: .* beyond the end of an axis", error, re.MULTILINE)
+        _, err = run_lare("design Reacher-v4", "prompt Reacher-v4", cwd=tmp_path, stdout=full)
+    *_, design_error, design_status, prompt_error, prompt_status = err
+    assert "kept in Reacher-v4.py" in design_error
+    assert "No space left on device" in prompt_error
+    assert design_status == prompt_status == "status 2"
+    assert load_function(tmp_path / "Reacher-v4.py", read_task("Reacher-v4")).size > 0
 
 
 REPLIES = st.one_of(
@@ -260,11 +243,3 @@ def test_design_ends_for_all_replies(replies):
     else:
         assert function.size >= 1
         assert model.n_requests <= 5
-
-
-def test_long_replies_end_with_the_budget(serve):
-    server = serve(reply_with("{" * 2_000_000))
-    model = LiveModel("m", server.url, budget=Budget(tokens=100_000), sleep=lambda _: None)
-    with pytest.raises(LareError):
-        design(toy_spec(), model=model, candidates=1)
-    assert len(server.requests) <= 6

@@ -3,6 +3,7 @@
 import ast
 import re
 from collections.abc import Iterator
+from functools import cache
 from pathlib import Path
 
 ROOT = Path(__file__).parents[1]
@@ -35,6 +36,7 @@ WRITTEN_BY_MODELS = ROOT / "benchmarks" / "real" / "phi"
 """Texts of a language model, which are data."""
 
 
+@cache
 def is_banned(name: str) -> bool:
     return name in BANNED or GENITIVE.match(name) is not None
 

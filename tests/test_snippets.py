@@ -4,7 +4,6 @@ Only budgets are changed: `CUTS` makes numbers of steps and episodes small, `sma
 of the table `PREPARE` makes what the reader of a page already has (a log, a server).
 """
 
-import json
 import os
 import re
 import shlex
@@ -20,7 +19,8 @@ import pytest
 
 import lare_rl
 from helpers.chat_servers import Server, reply_with
-from helpers.untrained_runs import write_run
+from helpers.scripted_model import to_reply
+from helpers.untrained_runs import invent_training
 from lare_rl.sweep import processes
 from lare_rl.sweep.sweep import read_sweep
 from lare_rl.tasks import spec
@@ -153,15 +153,6 @@ class Page:
             exec(compile(SELF_HOSTED.sub(self.url, shorten(text)), "snippet", "exec"), self.names)
 
 
-def invent_run(job, cores, running):
-    """Write metrics instead of training a run of a sweep."""
-    metrics = [
-        {"step": job.resolved.steps, "seed": seed, **dict.fromkeys(MEANING, seed + 1.0)}
-        for seed in job.resolved.all_seeds
-    ]
-    write_run(job.directory, job.task, job.resolved, metrics)
-
-
 def block(page, language, number):
     return [text for name, text in blocks(ROOT / page) if name == language][number]
 
@@ -184,16 +175,13 @@ action = np.ones((5, 2), np.float32)
 """
 
 
-def to_reply(source):
-    return json.dumps({"Understand": "", "Analyze": "", "Functions": source})
-
-
 def write_study(page):
     """Write the files that the study names. Its runs are not trained."""
     page.write("study.toml", shorten(STUDY))
     page.write("my-task.toml", PENDULUM_TASK.replace('"Pendulum"', '"MyTask"'))
     page.write("phi.py", PENDULUM)
-    page.patch.setattr(processes, "train_in_process", invent_run)
+    train = invent_training(lambda job, seed: dict.fromkeys(MEANING, seed + 1.0))
+    page.patch.setattr(processes, "train_in_process", train)
 
 
 def write_pendulum(page):

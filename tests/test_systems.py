@@ -27,7 +27,7 @@ PHI = """
 STUDY = """
     tasks = ["pendulum.toml"]
     methods = ["episodic"]
-    settings = { steps = 200, evaluation_episodes = 1, td3 = { warmup = 100 } }
+    settings = { steps = 100, rollout_steps = 50, evaluation_episodes = 1, td3 = { warmup = 50, hidden = [8], batch_size = 8 } }
 """
 LOST = """
 import ctypes, os, signal, sys
@@ -95,9 +95,9 @@ def test_host_environment_in_worker_processes(run_elsewhere, tmp_path):
     output = run_elsewhere(
         PROGRAM,
         "verify phi.py --task pendulum.toml",
-        "train pendulum.toml --function phi.py --steps 400 --environments 2 --evaluate-every 200 --evaluation-episodes 2 "
-        "--td3.warmup 200 --out run",
-        "train --resume run --steps 600",
+        "train pendulum.toml --function phi.py --steps 200 --environments 2 --evaluate-every 100 --evaluation-episodes 1 "
+        "--td3.warmup 100 --td3.hidden 8 --td3.batch-size 8 --credit.score sum --out run",
+        "train --resume run --steps 300",
         "evaluate run --episodes 2",
         "report run",
         "compare run",
@@ -112,10 +112,8 @@ def test_compiled_environment(run_elsewhere, tmp_path):
     run_elsewhere(
         PROGRAM,
         "design CN-6 --out phi.py",
-        "verify phi.py --task CN-6",
-        "train CN-6 --function phi.py --steps 100 --environments 2 --evaluate-every 50 --evaluation-episodes 2 --out run",
-        "train --resume run --steps 150",
-        "evaluate run --episodes 2",
-        "report run",
+        "train CN-6 --method dense --steps 50 --environments 2 --evaluate-every 50 --evaluation-episodes 2 --ippo.hidden 8 "
+        "--out run",
+        "report run --no-film",
     )
     assert (tmp_path / "run" / "report.html").stat().st_size > 10_000

@@ -7,7 +7,6 @@ import pytest
 
 from lare_rl.compare import bootstrap
 from lare_rl.compare.bootstrap import (
-    Estimate,
     estimate,
     interquartile_mean,
     performance_profile,
@@ -131,10 +130,6 @@ def test_intervals_contain_true_mean(monkeypatch):
         mean = estimate(lambda scores: scores.mean(axis=(-2, -1)), random.normal(size=(10, 1)))
         n_inside += mean.low <= 0 <= mean.high
     assert 46 <= n_inside <= 60
-
-
-def test_single_run_has_no_width():
-    assert estimate(interquartile_mean, np.array([[3.0]])) == Estimate(3.0, 3.0, 3.0)
 
 
 def test_mann_whitney_by_hand():

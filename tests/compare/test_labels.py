@@ -66,11 +66,8 @@ def test_functions_split_labels(make_run):
 
 def test_directories_split_labels(make_run):
     """If two runs have a seed in common. Runs of other seeds are more seeds of the same label."""
-    old, new, more = (
-        make_run("old", [1.0]),
-        make_run("new", [2.0], evaluation_episodes=3),
-        make_run("more", [3.0], seed=1),
-    )
+    old, new = make_run("old", [1.0]), make_run("new", [2.0], evaluation_episodes=3)
+    more = make_run("more", [3.0], seed=1)
     assert sizes([old, more]) == {"dense": 2}
     assert list(label_runs([old, new, more])) == ["dense, old", "dense, new", "dense, more"]
     assert sizes([old, make_run("old", [1.0], "Reacher-v4")]) == {"dense": 2}
@@ -79,15 +76,11 @@ def test_directories_split_labels(make_run):
 
 
 def test_settings_without_effect_do_not_split_labels(make_run):
-    runs = [
-        make_run("a", [1.0], method="lare-rd"),
-        make_run("b", [2.0], method="lare-rd", scored_observation=toy_spec().scored_observation, seed=1),
-    ]
+    default = {"scored_observation": toy_spec().scored_observation, "seed": 1}
+    runs = [make_run("a", [1.0], method="lare-rd"), make_run("b", [2.0], method="lare-rd", **default)]
     assert sizes(runs) == {"lare-rd": 2}
-    runs = [
-        make_run("c", [1.0]),
-        make_run("d", [2.0], scored_observation="after", credit={"hidden": (8,)}, draw=3, seed=1),
-    ]
+    unused = {"scored_observation": "after", "credit": {"hidden": (8,)}, "draw": 3, "seed": 1}
+    runs = [make_run("c", [1.0]), make_run("d", [2.0], **unused)]
     assert sizes(runs) == {"dense": 2}
     runs = [make_run("e", [1.0], method="lare-rd", scored_observation="after"), runs[0]]
     assert list(label_runs(runs)) == ["lare-rd", "dense"]

@@ -52,11 +52,7 @@ def test_page_of_tasks_without_common_scale(make_run, tmp_path):
 
 
 def test_command(make_run, command, tmp_path):
-    runs = [
-        make_run("a", [1.0, 3.0]),
-        make_run("b", [2.0, 4.0], method="rd"),
-        make_run("c", [7.0], "Depot", method="rd"),
-    ]
+    runs = make_run("a", [1.0, 3.0]), make_run("b", [2.0, 4.0], method="rd"), make_run("c", [7.0], "Depot", method="rd")
     paths = [run.directory for run in runs]
     status, out, _ = command("compare", *paths)
     assert status == 0

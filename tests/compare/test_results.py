@@ -46,19 +46,17 @@ def test_table_and_run(write_csv, run):
     path = write_csv(method_rows("mine", "other"))
     results, findings = collect_results((run.directory, path))
     assert findings == []
-    assert [(row.label, row.mean) for row in compare(results).rows] == [
-        ("dense", 0.625),
-        ("mine", 0.125),
-        ("other", 1.125),
-    ]
+    means = [(row.label, row.mean) for row in compare(results).rows]
+    assert means == [("dense", 0.625), ("mine", 0.125), ("other", 1.125)]
     assert labels(collect_results((path, run.directory))[0]) == ["mine", "dense", "other"]
     assert labels(collect_results((path,))[0]) == ["mine", "other"]
+    with pytest.raises(LareError, match=r"none\.csv"):
+        collect_results((path.with_name("none.csv"),))
 
 
 def test_baseline_of_command(write_csv, run, command, tmp_path):
-    status, out, error = command(
-        "compare", write_csv(method_rows("mine")), run.directory, "--out", tmp_path / "page.html"
-    )
+    path = write_csv(method_rows("mine"))
+    status, out, error = command("compare", path, run.directory, "--out", tmp_path / "page.html")
     assert (status, error) == (0, "")
     assert "mine (baseline)" in out
     assert "dense (baseline)" not in out
@@ -120,8 +118,3 @@ def test_any_text_is_read_or_refused(text, header, tmp_path_factory):
     except LareError as error:
         message = str(error)
     assert "\n" not in message
-
-
-def test_missing_table(tmp_path):
-    with pytest.raises(LareError, match=r"own\.csv"):
-        collect_results((tmp_path / "own.csv",))

@@ -19,11 +19,6 @@ def test_max_reply_tokens():
         budget.max_reply_tokens(REQUEST * 3)
 
 
-def test_requests_are_limited():
-    with pytest.raises(BudgetExceededError, match="2 requests"):
-        Budget(requests=2, requests_used=2).max_reply_tokens(REQUEST)
-
-
 @pytest.mark.parametrize(("seconds", "timeout_s"), [(60.0, 120.0), (900.0, 120.0), (3600.0, 450.0)])
 def test_reply_timeout(seconds, timeout_s):
     assert Budget(seconds=seconds).reply_timeout_s == timeout_s

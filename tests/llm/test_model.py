@@ -1,18 +1,16 @@
 """What counts as a language model: an object with a name and replies, or a function."""
 
-import json
-
 import pytest
 
 import lare_rl
-from helpers.scripted_model import ScriptedModel
+from helpers.scripted_model import ScriptedModel, to_reply
 from helpers.toy_envs import PHI, toy_spec
 from lare_rl.errors import LareError
 from lare_rl.latent.design import DesignModelError
 from lare_rl.llm.live import LiveModel
 from lare_rl.llm.model import as_model
 
-REPLY = json.dumps({"Understand": "", "Analyze": "", "Functions": PHI})
+REPLY = to_reply(PHI)
 
 
 def test_function_is_a_model():
@@ -31,11 +29,6 @@ def test_reflection_asks_a_function(phi):
     requests = []
     lare_rl.reflect(phi, toy_spec(), lambda messages: requests.append(messages) or REPLY)
     assert requests
-
-
-def test_object_with_a_name_is_used_as_it_is():
-    model = ScriptedModel(PHI)
-    assert as_model(model) is model
 
 
 def test_replies_before_an_error_are_recorded():
@@ -70,7 +63,7 @@ def test_own_task_without_a_model():
     assert "\n" not in str(error.value)
 
 
-def test_live_model_is_a_model(monkeypatch):
+def test_objects_with_a_name_are_used_as_they_are(monkeypatch):
     monkeypatch.setenv("OPENAI_API_KEY", "none")
-    live = LiveModel("m", "http://127.0.0.1:1/v1")
-    assert as_model(live) is live
+    for model in (ScriptedModel(PHI), LiveModel("m", "http://127.0.0.1:1/v1")):
+        assert as_model(model) is model

@@ -2,7 +2,6 @@
 
 import pytest
 
-from helpers.toy_envs import toy_spec
 from lare_rl.envs.load import read_task
 from lare_rl.llm.prompts import candidate, combine, correct
 from lare_rl.llm.recording import SHIPPED_RECORDINGS, read_recording
@@ -27,25 +26,6 @@ def test_recorded_requests():
 
 def test_sparse_task_has_the_same_request():
     assert candidate(read_task("HalfCheetahSparse-v4")) == candidate(read_task("HalfCheetah-v4"))
-
-
-def test_candidate():
-    system, user = candidate(toy_spec())
-    assert system["role"] == "system"
-    assert user == {
-        "role": "user",
-        "content": "# Task\nFollow the first entry.\n\n# Observation\n0: the target. 1: noise.\n\n# Action\n0: the guess.",
-    }
-    reward_system, reward_user = candidate(toy_spec(), "reward")
-    assert reward_system != system
-    assert reward_user == user
-
-
-def test_combine():
-    messages = combine(toy_spec(), ["  first\n", "second"])
-    assert messages[:2] == candidate(toy_spec())
-    assert messages[2] == {"role": "assistant", "content": "Attempt 1:\nfirst\n\nAttempt 2:\nsecond"}
-    assert messages[3]["role"] == "user"
 
 
 @pytest.mark.parametrize("errors", ["form: wrong", "KeyError: {error}", "{0} {} {{'a': 1}}", "100 % \\1"])

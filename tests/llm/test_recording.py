@@ -84,22 +84,23 @@ def test_invalid_recording(text, words):
 
 
 def test_failed_write_loses_no_reply(tmp_path, monkeypatch):
-    def fail(*_):
-        raise OSError(28, "No space left on device")
-
     path = tmp_path / "talk.json"
     recorder = Recorder("Chase", "factors", path=path)
-    with monkeypatch.context() as patch:
-        patch.setattr(os, "replace", fail)
-        with pytest.raises(LareError, match="No space left"):
-            recorder.add("candidate", REQUEST, "one", "A model")
+
+    def fail_to_add(reply):
+        def fail(*_):
+            raise OSError(28, "No space left on device")
+
+        with monkeypatch.context() as patch:
+            patch.setattr(os, "replace", fail)
+            with pytest.raises(LareError, match="No space left"):
+                recorder.add("candidate", REQUEST, reply, "A model")
+
+    fail_to_add("one")
     assert list(tmp_path.iterdir()) == []
     recorder.add("candidate", REQUEST, "two", "A model")
     content = path.read_text()
-    with monkeypatch.context() as patch:
-        patch.setattr(os, "replace", fail)
-        with pytest.raises(LareError, match="No space left"):
-            recorder.add("candidate", REQUEST, "three", "A model")
+    fail_to_add("three")
     assert path.read_text() == content
     assert list(tmp_path.iterdir()) == [path]
     recorder.save(path, "A model", new=False)

@@ -48,11 +48,8 @@ def test_lines_fill_the_chart():
 
 
 def test_gaps_and_equal_values():
-    assert [len(line) for line in heights(chart(Line(X, np.array([np.nan, 1, 2]), "c0")))] == [2]
-    assert [len(line) for line in heights(chart(Line(X, np.zeros(3), "c0"), Line(X, np.full(3, np.nan), "c1")))] == [
-        3,
-        0,
-    ]
+    values = (np.array([np.nan, 1, 2]), np.zeros(3), np.full(3, np.nan))
+    assert [len(line) for line in heights(chart(*(Line(X, y, "c0") for y in values)))] == [2, 3, 0]
 
 
 def test_wide_band_does_not_flatten_a_line():
@@ -97,13 +94,12 @@ def test_strips_share_a_scale_if_they_are_comparable():
     rows = {"true": np.linspace(0, 1, 1000)[:, None], "proxy": np.linspace(0, 2, 1000)[:, None]}
     shared, separate = (draw_strips(rows, shared_scale=shared) for shared in (True, False))
     check_markup(shared)
-    assert (
-        re.findall(r"from (\S+) \(dark\) to (\S+) \(bright\)</fig", shared) == [("0.0025", "1.99")] * 2
-        or "to 2" in shared
-    )
-    images = re.findall(r'src="([^"]+)"', separate)
-    assert images[0] == images[1]
-    assert len(set(re.findall(r'src="([^"]+)"', shared))) == 2
+    scales = re.findall(r"from (\S+) \(dark\) to (\S+) \(bright\)</fig", shared)
+    assert len(scales) == 2
+    assert len(set(scales)) == 1
+    images, other_images = (re.findall(r'src="([^"]+)"', html) for html in (shared, separate))
+    assert images[0] != images[1]
+    assert other_images[0] == other_images[1]
     assert len(shared) < 5000
 
 

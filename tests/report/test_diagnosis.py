@@ -6,6 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from lare_rl.report.conditions import CONDITIONS
 from lare_rl.report.diagnosis import diagnose
 from lare_rl.report.messages import MESSAGES
 from lare_rl.report.run_summary import RunSummary
@@ -90,8 +91,9 @@ def test_outcome_values():
     assert reached["std"].values["std"] == pytest.approx(np.sqrt(2))
     assert reached["seeds"].values["n_seeds"] == 2
     assert reached["likeliest"] is None
-    sampled = find(RISING_2, likeliest_return=80.0)["learned"]
-    assert "the most likely action gets 80" in render(sampled, MESSAGES)
+    text = render(find(RISING_2, likeliest_return=80.0)["learned"], MESSAGES)
+    for words in ("the most likely action gets 80", "71 ± 1.4", "8,000 steps", "2 seeds", "0 ± 1 in 3 episodes"):
+        assert words in text
     assert (baseline["return_"], baseline["std"], baseline["n_episodes"]) == (0, 1, 3)
     assert baseline["initial"].values["returns"] == (3, 4)
 
@@ -205,15 +207,8 @@ def test_messages_render():
         text = render(Finding(code, defaultdict(lambda: 3)), MESSAGES)
         assert text
         assert "{" not in text
-
-
-@pytest.mark.parametrize(
-    "code",
-    """no_return untrained equal_returns outcome_unknown learned some_seeds_learned worse_than_random may_beat_random
-    may_beat_initial_policy not_learned""".split(),
-)
-def test_outcomes_have_headlines(code):
-    assert {code, f"headline_{code}"} <= MESSAGES.keys()
+    for group in ("Findings that stand alone", "The outcome"):
+        assert {f"headline_{code}" for code in CONDITIONS[group]} <= MESSAGES.keys()
 
 
 def test_single_steps_are_compared_where_they_are_known():
@@ -221,9 +216,3 @@ def test_single_steps_are_compared_where_they_are_known():
     assert "steps_agree" in find(RISING_2, credit_error=1e-9, credit_correlation=0.999)
     finding = find(RISING_2, credit_error=0.25, credit_correlation=0.5)["single_steps"]
     assert (finding.values["error"], finding.values["correlation"]) == (0.25, 0.5)
-
-
-def test_message_of_nested_findings():
-    text = render(find(RISING_2)["learned"], MESSAGES)
-    for words in ("71 ± 1.4", "8,000 steps", "2 seeds", "0 ± 1 in 3 episodes"):
-        assert words in text

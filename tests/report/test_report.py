@@ -13,9 +13,11 @@ import pytest
 import lare_rl
 from helpers.markup import check_markup
 from helpers.toy_envs import Chase, toy_spec
+from helpers.training_runs import QUICK_CREDIT
 from lare_rl.evaluation.video import encode_film
 from lare_rl.report.html import render_table
 from lare_rl.report.live_page import LivePage
+from lare_rl.report.messages import MESSAGES
 from lare_rl.report.overview import compare_runs, sort_runs, summarise_runs
 from lare_rl.report.run_summary import ReportedRun
 
@@ -35,7 +37,7 @@ gymnasium.register("toys/EpisodicChase-v0", entry_point=episodic_chase, max_epis
 @pytest.fixture(scope="module")
 def runs(small, phi, tmp_path_factory):
     """Two small runs of a toy, one with rewards at each step, and one with a reward at the last step."""
-    directory, settings = tmp_path_factory.mktemp("runs"), small(method="lare-bayes", steps=240)
+    directory, settings = tmp_path_factory.mktemp("runs"), small(method="lare-bayes", credit=QUICK_CREDIT)
     return [
         lare_rl.train(toy_spec(environment=name), settings, function=phi, out=directory / name[5:-3], listeners=[])
         for name in ("toys/Chase-v0", "toys/EpisodicChase-v0")
@@ -61,15 +63,8 @@ def n_lines(chart, style):
 
 def test_sections_of_report(runs, tmp_path):
     page = page_of(runs[0], tmp_path)
-    sections = (
-        'class="headline"',
-        'class="tiles"',
-        'class="chart',
-        'class="strip"',
-        "The latent function",
-        "config.json",
-    )
-    positions = [page.index(section) for section in sections]
+    classes = [f'class="{name}' for name in ("headline", "tiles", "chart", "strip")]
+    positions = [page.index(section) for section in (*classes, "The latent function", "config.json")]
     assert positions == sorted(positions)
     assert page.count("<dt>") == 4  # the numbers of the header
     assert 'src="data:image/webp' not in page
@@ -137,50 +132,48 @@ def test_names_of_runs(make_run, tmp_path):
     assert "&lt;b&gt;c" in page
 
 
-def test_comparison_with_the_return_of_the_episode_alone(make_run):
-    runs = [
+def test_summary_of_runs(make_run):
+    """A run is compared with one that was trained on the return of the episode alone."""
+    first, second = (
         ReportedRun(method, make_run(method, [value, value + 1], method=method))
         for method, value in [("rd", 9.0), ("episodic", 1.0)]
-    ]
-    first, second = summarise_runs(runs, np.zeros(0))
-    assert (first.episodic_return, second.episodic_return) == (1.5, None)
-
-
-def test_training_time(make_run):
-    reported = ReportedRun("a", make_run("a", [1.0]))
-    assert reported.training_seconds() is None
-    for line in reported.metrics:
+    )
+    summaries = summarise_runs([first, second], np.zeros(0))
+    assert [summary.episodic_return for summary in summaries] == [1.5, None]
+    assert first.training_seconds() is None
+    for line in first.metrics:
         line["time/steps_per_second"] = line["step"] / 10
-    assert reported.training_seconds() == pytest.approx(50 / 5 + 50 / 10)
+    assert first.training_seconds() == pytest.approx(50 / 5 + 50 / 10)
 
 
 def test_report_errors(make_run, tmp_path):
-    run, empty = make_run("a", [1.0]), make_run("b", [1.0], steps=())
     for sources, out, words in (
         ([], "report.html", "No runs"),
-        ([run], "none/report.html", "there is no folder"),
-        ([empty], "report.html", "b has no evaluation yet"),
+        ([make_run("a", [1.0])], "no/report.html", "no folder"),
     ):
         with pytest.raises(lare_rl.LareError, match=words):
             lare_rl.write_report(sources, tmp_path / out)
 
 
+def test_run_without_evaluation(make_run, tmp_path):
+    """Its report has what there is: the settings."""
+    empty = make_run("b", [1.0], steps=())
+    page = page_of(empty, tmp_path)
+    assert page.count(MESSAGES["no_evaluation"]) == 1
+    assert "config.json" in page
+    assert 'class="chart' not in page
+    page = page_of([empty, make_run("a", [1.0], method="rd")], tmp_path)
+    assert page.count(MESSAGES["no_evaluation"]) == 1
+    assert 'class="chart' in page
+
+
 def test_unknown_step_rewards(runs, tmp_path):
     """If only the last step has a reward, there is no error, no correlation, and no picture of true rewards."""
-    about_true_rewards = (
-        "|proxy - true reward|",
-        "Correlation of",
-        ">true reward</li>",
-        "correlation with the true reward",
-    )
-
-    def texts_in_report(run):
-        page = page_of(run, tmp_path)
-        assert "R² of returns" in page
-        assert ">proxy reward</li>" in page
-        return [text for text in about_true_rewards if text in page]
-
-    assert [texts_in_report(run) for run in runs] == [list(about_true_rewards), []]
+    pages = [page_of(run, tmp_path) for run in runs]
+    for text in ("|proxy - true reward|", "Correlation of", ">true reward</li>", "correlation with the true reward"):
+        assert [text in page for page in pages] == [True, False]
+    for text in ("R² of returns", ">proxy reward</li>"):
+        assert all(text in page for page in pages)
 
 
 def test_live_page(make_run, monkeypatch):

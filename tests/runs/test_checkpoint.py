@@ -37,7 +37,7 @@ def save(directory, rows, end):
     checkpoint.save(directory, learner, {"step": int(end.sum())}, {})
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=20, deadline=None)
 @given(moves=st.lists(st.tuples(st.integers(-12, 12), st.integers(-12, 12)), min_size=1, max_size=12))
 def test_rows_come_back(moves, tmp_path_factory):
     """A move forward writes rows in an environment. A move back drops some, which are overwritten later."""
@@ -95,31 +95,12 @@ def test_truncated_file_is_refused(name, n_bytes, tmp_path):
     assert (host is None) if name == "state.npz" else (host == {"step": 3})
 
 
-def test_packed_entry_is_refused(tmp_path):
-    directory = tmp_path / "checkpoint"
-    save(directory, np.zeros(CAPACITY), 3)
-    content = bytearray((directory / "state.npz").read_bytes())
-    content[content.index(b"PK\x01\x02") + 10] ^= 64  # a bit that names another compression
-    (directory / "state.npz").write_bytes(content)
-    with pytest.raises(LareError, match=r"\.replay\.row\.npy is packed"):
-        checkpoint.load(directory, template(1, 1, CAPACITY))
-
-
-def test_other_shape_is_refused(tmp_path):
-    save(tmp_path / "checkpoint", np.zeros(CAPACITY), 3)
-    with pytest.raises(LareError, match=r"\.replay\.row has shape \(1, 1, 16\), not \(1, 2, 16\)"):
-        checkpoint.load(tmp_path / "checkpoint", template(1, 2, CAPACITY))
-
-
-@pytest.mark.parametrize("capacity", [CAPACITY + 4, CAPACITY - 4])
-def test_replay_of_extended_run_may_be_larger(capacity, tmp_path):
+def test_replay_of_extended_run_may_be_larger(tmp_path):
     save(tmp_path / "checkpoint", np.arange(1.0, CAPACITY + 1), 9)
-    if capacity < CAPACITY:
-        with pytest.raises(LareError, match="has shape"):
-            checkpoint.load(tmp_path / "checkpoint", template(1, 1, capacity))
-        return
-    learner, _, _ = checkpoint.load(tmp_path / "checkpoint", template(1, 1, capacity))
-    np.testing.assert_array_equal(learner.replay.columns["reward"][0, 0], [*range(1, 11), *[0] * (capacity - 10)])
+    with pytest.raises(LareError, match=r"\.replay\.row has shape \(1, 1, 16\), not \(1, 1, 12\)"):
+        checkpoint.load(tmp_path / "checkpoint", template(1, 1, CAPACITY - 4))
+    learner, _, _ = checkpoint.load(tmp_path / "checkpoint", template(1, 1, CAPACITY + 4))
+    np.testing.assert_array_equal(learner.replay.columns["reward"][0, 0], [*range(1, 11), *[0] * 10])
     np.testing.assert_array_equal(learner.replay.row[0, 0], [*range(CAPACITY), *[0] * 4])
 
 

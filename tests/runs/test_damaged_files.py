@@ -10,23 +10,19 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from helpers.toy_envs import toy_spec
+from helpers.untrained_runs import LINE, write_changed_run
 from lare_rl.config.migrate import FORMAT
-from lare_rl.config.resolve import resolve
-from lare_rl.config.settings import Settings
 from lare_rl.envs.load import read_task
 from lare_rl.errors import LareError
-from lare_rl.llm.model import recorded_model
 from lare_rl.report.report import write_report
 from lare_rl.runs import checkpoint, metrics_file
-from lare_rl.runs.config_file import MAX_CONFIG_BYTES, make_config, read_config
+from lare_rl.runs.config_file import MAX_CONFIG_BYTES, read_config
 from lare_rl.runs.directory import open_run
 from lare_rl.runs.metrics_file import read_metrics
 from lare_rl.sweep.sweep import read_sweep
 
 DEEP = "[" * 50_000
 TOO_DEEP = "nested more than 64 deep"
-LINE = {"step": 1, "seed": 0, "evaluation/return": 1.5}
 
 
 def refusal(read, *arguments) -> str:
@@ -36,20 +32,6 @@ def refusal(read, *arguments) -> str:
     assert "\n" not in str(error.value)
     assert len(str(error.value)) < 1000
     return str(error.value)
-
-
-@pytest.fixture
-def write_run(tmp_path):
-    """Write the directory of a run that was never trained, with changes of its config.json."""
-
-    def write(**changes) -> Path:
-        config = make_config(toy_spec(), resolve(Settings(method="dense", steps=100), toy_spec()), ())
-        values = json.loads(config.model_dump_json()) | changes
-        (tmp_path / "config.json").write_text(json.dumps(values))
-        (tmp_path / "metrics.jsonl").write_text(json.dumps(LINE) + "\n")
-        return tmp_path
-
-    return write
 
 
 # config.json
@@ -90,16 +72,17 @@ def test_config_content(tmp_path, content, message):
         ({"function_sha256": ["0" * 64, "1" * 64]}, "2 latent functions for 1 roles"),
     ],
 )
-def test_config_values(write_run, changes, message):
-    settings = json.loads((write_run() / "config.json").read_text())["settings"]
+def test_config_values(tmp_path, changes, message):
+    settings = json.loads((write_changed_run(tmp_path) / "config.json").read_text())["settings"]
     changes = {
         name: {**settings, **value} if name == "settings" and value else value for name, value in changes.items()
     }
-    assert message in refusal(open_run, write_run(**changes))
+    assert message in refusal(open_run, write_changed_run(tmp_path, **changes))
 
 
-def test_html_is_escaped(write_run):
-    page = write_report([write_run(machine="<script>alert(1)</script>", lare="<img src=x>")]).read_text("utf-8")
+def test_html_is_escaped(tmp_path):
+    run = write_changed_run(tmp_path, machine="<script>alert(1)</script>", lare="<img src=x>")
+    page = write_report([run]).read_text("utf-8")
     assert "<script" not in page
     assert "<img" not in page
 
@@ -129,8 +112,8 @@ def test_html_is_escaped(write_run):
         ),
     ],
 )
-def test_metrics_line(write_run, line, message):
-    directory = write_run()
+def test_metrics_line(tmp_path, line, message):
+    directory = write_changed_run(tmp_path)
     with (directory / "metrics.jsonl").open("a") as file:
         file.write(line + "\n")
     for text in (refusal(read_metrics, directory), refusal(write_report, [directory])):
@@ -138,18 +121,13 @@ def test_metrics_line(write_run, line, message):
         assert message in text
 
 
-def test_metrics_size(write_run, monkeypatch):
+def test_metrics_size_and_incomplete_line(tmp_path, monkeypatch):
     monkeypatch.setattr(metrics_file, "MAX_METRICS_BYTES", 1 << 20)
-    directory = write_run()
-    (directory / "metrics.jsonl").write_text("x" * (2 << 20))
-    assert "metrics.jsonl is larger than 1 MB" in refusal(read_metrics, directory)
-
-
-def test_metrics_incomplete_line_is_skipped(write_run):
-    directory = write_run()
-    with (directory / "metrics.jsonl").open("a") as file:
-        file.write('{"step": 2')
-    assert read_metrics(directory) == [LINE]
+    path = write_changed_run(tmp_path) / "metrics.jsonl"
+    path.write_text(path.read_text() + '{"step": 2')
+    assert read_metrics(tmp_path) == [LINE]
+    path.write_text("x" * (2 << 20))
+    assert "metrics.jsonl is larger than 1 MB" in refusal(read_metrics, tmp_path)
 
 
 # state.npz
@@ -250,26 +228,7 @@ def test_state_that_is_no_archive(directory, content):
     check_refused(directory)
 
 
-# Recordings, sweeps and task files
-
-
-@pytest.mark.parametrize(
-    ("content", "message"),
-    [
-        ("", "not JSON"),
-        (DEEP, TOO_DEEP),
-        ('{"task": ' + "[" * 988 + "]" * 988 + "}", TOO_DEEP),
-        ("[]", "not an object"),
-        ('{"task": "\\ud800"}', "surrogate"),
-        ('{"task": 3}', "task = 3"),
-    ],
-)
-def test_recording(tmp_path, content, message):
-    path = tmp_path / "talk.json"
-    path.write_text(content)
-    text = refusal(recorded_model, "Chase", "factors", 0, path)
-    assert str(path) in text
-    assert message in text
+# Sweeps and task files
 
 
 @pytest.mark.parametrize("read", [read_task, read_sweep])

@@ -23,14 +23,11 @@ def run(tmp_path):
     return create_run(tmp_path / "run", toy_spec(), settings, [verify_function(PHI, toy_spec())])
 
 
-def test_open_run_equals_created(run):
+def test_open_run_equals_created(run, monkeypatch):
     opened = open_run(run.directory)
     assert opened.config == run.config
     assert opened.function.digest == run.function.digest
     assert as_run(run) is run
-
-
-def test_config_names_versions_of_installed_packages(run, monkeypatch):
     assert {"jax", "python"} < set(run.config.versions)
     monkeypatch.setattr(config_file, "VERSIONED_PACKAGES", ("jax", "no-such-extra"))
     assert set(make_config(run.config.task, run.config.settings, []).versions) == {"jax", "python"}
@@ -72,18 +69,14 @@ def test_lock_refuses_second_process(run):
 # Runs below a directory, as of a sweep
 
 
-def test_runs_below_directory(make_run, tmp_path):
+def test_find_run_directories(make_run, tmp_path):
+    """Each run counts once, and directories of killed processes do not count."""
     first, second, _ = make_run("a", [1.0]), make_run("b", [2.0], method="rd"), make_run(".c.0123.new", [3.0])
     both = [first.directory, second.directory]
     assert find_run_directories([tmp_path / "runs"]) == both
     assert find_run_directories([tmp_path / "runs" / "Chase"]) == both
-    assert find_run_directories([first.directory]) == both[:1]
-
-
-def test_run_counts_once(make_run):
-    first, second = make_run("a", [1.0]), make_run("b", [2.0], method="rd")
-    paths = [second.directory, first.directory.parent]
-    assert find_run_directories(paths) == [second.directory, first.directory]
+    directories = find_run_directories([second.directory, first.directory / ".." / ".." / "Chase"])
+    assert [path.resolve() for path in directories] == both[::-1]
 
 
 def test_logs_of_sweep_are_skipped(make_run):

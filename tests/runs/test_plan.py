@@ -49,11 +49,8 @@ def read_keywords(*arguments):
 def test_file(write, monkeypatch, tmp_path):
     monkeypatch.chdir(tmp_path)
     plan = load_config(write(FILE))
-    assert (plan.task, plan.function, plan.out) == (
-        "plans/chase.toml",
-        (Path("plans/phi.py"),),
-        Path("plans/runs/chase"),
-    )
+    assert (plan.task, plan.function) == ("plans/chase.toml", (Path("plans/phi.py"),))
+    assert (plan.out, plan.source) == (Path("plans/runs/chase"), Path("plans/run.toml"))
     settings = {"method": "lare-bayes", "steps": 250, "scale_rewards": True}
     assert plan.settings == Settings(**settings, td3={"gamma": 0.9}, credit={"optimism": 0.5})
     values = {"task": "Reacher-v4", "function": ["a.py", "b.py"], "seeds": 2, "ppo": {"anneal": False}}
@@ -77,10 +74,8 @@ def test_options_win_over_the_file(write, monkeypatch, tmp_path):
     )
     assert settings.credit.model_fields_set == {"optimism", "normalise"}  # the algorithm decides the others
     path = write("[ppo]\nanneal = true\nclip = 0.3")
-    assert (
-        read_keywords("--config", path, "--ppo.no-anneal")["settings"].ppo
-        == Settings(ppo={"anneal": False, "clip": 0.3}).ppo
-    )
+    settings = read_keywords("--config", path, "--ppo.no-anneal")["settings"]
+    assert settings.ppo == Settings(ppo={"anneal": False, "clip": 0.3}).ppo
 
 
 @pytest.mark.parametrize(
@@ -168,11 +163,10 @@ def test_settings_of_a_run_are_those_of_its_repetition(method, phi, reward, tmp_
     needs_phi = METHODS[method].needs_phi
     function = reward if METHODS[method].phi_kind == "reward" else phi
     create_run(tmp_path / "run", task, resolved, [function] * needs_phi)
-    for path in (tmp_path / "run", tmp_path / "run" / "config.json"):
-        plan = load_config(path)
-        assert resolve(plan.settings, plan.task) == resolved
-        assert plan.task == task
-        assert [used.digest for used in plan.function or ()] == [function.digest] * needs_phi
+    plan = load_config(tmp_path / "run")
+    assert resolve(plan.settings, plan.task) == resolved
+    assert plan.task == task
+    assert [used.digest for used in plan.function or ()] == [function.digest] * needs_phi
 
 
 def test_repetition_with_another_algorithm(command, trained, tmp_path):
@@ -180,5 +174,5 @@ def test_repetition_with_another_algorithm(command, trained, tmp_path):
     create_run(tmp_path / "run", toy_spec(), resolved, [])
     assert command("train", "--config", "run", "--algorithm", "sac")[0] == 0  # td3 makes no difference any more
     assert (trained[0][1].algorithm, trained[0][1].steps) == ("sac", 240)
-    status, _, err = command("train", "--config", "run", "--ppo.clip", 0.3)
+    status, _, err = command("train", "--config", "run/config.json", "--ppo.clip", 0.3)
     assert (status, "ppo.clip makes no difference to td3" in err) == (2, True)

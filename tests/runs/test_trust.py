@@ -1,17 +1,14 @@
 """A run directory may name any Python module: nothing is imported that the user does not trust."""
 
-import json
 import sys
 
 import pytest
 
 from helpers.toy_envs import PHI, toy_spec
-from lare_rl.config.resolve import resolve
-from lare_rl.config.settings import Settings
+from helpers.untrained_runs import write_changed_run
 from lare_rl.errors import LareError
 from lare_rl.latent.saved import read_source
 from lare_rl.report.report import write_report
-from lare_rl.runs.config_file import make_config
 from lare_rl.runs.directory import open_run
 
 
@@ -20,13 +17,7 @@ def write_run(tmp_path):
     """Write the directory of a run of an environment."""
 
     def write(environment, **changes):
-        config = make_config(toy_spec(), resolve(Settings(method="dense", steps=100), toy_spec()), ())
-        task = json.loads(toy_spec(environment=environment).model_dump_json())
-        values = json.loads(config.model_dump_json()) | {"task": task} | changes
-        (tmp_path / "config.json").write_text(json.dumps(values))
-        line = {"step": 1, "seed": 0, "evaluation/return": 1.5}
-        (tmp_path / "metrics.jsonl").write_text(json.dumps(line) + "\n")
-        return tmp_path
+        return write_changed_run(tmp_path, task=toy_spec(environment=environment).model_dump(mode="json"), **changes)
 
     return write
 

@@ -14,9 +14,10 @@ from lare_rl.cli.functions import new_task, prompt, verify
 from lare_rl.cli.lists import algorithms, methods, tasks
 from lare_rl.cli.logs import relabel
 from lare_rl.cli.parse import parse
-from lare_rl.cli.runs import cross_play, evaluate, export, report, train
+from lare_rl.cli.runs import cross_play, evaluate, export, report
 from lare_rl.cli.studies import compare, reproduce, sweep
 from lare_rl.cli.terminal import print_error, print_line
+from lare_rl.cli.train import train
 from lare_rl.cli.turns import turn_credit, turn_phi
 from lare_rl.errors import LareError
 from lare_rl.util import compilation

@@ -2,7 +2,7 @@
 
 import sys
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
 from pydantic import Field
@@ -23,6 +23,7 @@ if TYPE_CHECKING:
     from lare_rl.envs.play import Policy
     from lare_rl.latent.design import DesignError
     from lare_rl.latent.function import LatentFunction
+    from lare_rl.llm.live import LiveModel
     from lare_rl.tasks.spec import TaskSpec
 
 
@@ -46,6 +47,14 @@ class LiveOptions(CheckedModel):
     """of a million tokens in and of a million out; the cost is then reported."""
     temperature: _NonNegative | None = None
     """sampling temperature of the model; the default is the server's."""
+
+    def open(self, name: str) -> "LiveModel":
+        """Return the model of this name."""
+        from lare_rl.llm.budget import Budget
+        from lare_rl.llm.live import LiveModel
+
+        budget = Budget(requests=self.requests, tokens=self.budget, seconds=60 * self.minutes)
+        return LiveModel(name, self.base_url, self.temperature, budget, on_message=print_progress)
 
 
 DEFAULT_LIVE = LiveOptions()
@@ -90,48 +99,34 @@ def design(
             Parquet file, or the id of a local Minari data set.
         out: a .py file to write, with the replies and checks in a .json beside it; it must not exist.
     """
-    from lare_rl.envs.load import load_task, read_task
+    import lare_rl
+    from lare_rl.envs.load import read_task
     from lare_rl.latent.design import DesignError
-    from lare_rl.latent.design import design as design_function
-    from lare_rl.llm.budget import Budget
     from lare_rl.llm.live import LiveModel
     from lare_rl.llm.model import RECORDED, recorded_model
 
-    is_live = model is not None and model != RECORDED and not model.endswith(".json")
+    model = RECORDED if model is None else model
+    is_live = model != RECORDED and not model.endswith(".json")
     _check_options(is_live, live, draw, reflect, policy, data)
     _check_files(out, record)
-    spec = load_task(task) if data is None else read_task(task)
-    play = load_policy(policy, spec)
-    budget = Budget(requests=live.requests, tokens=live.budget, seconds=60 * live.minutes)
-    if is_live:
-        requested_model = LiveModel(str(model), live.base_url, live.temperature, budget, on_message=print_progress)
-    else:
-        recording = None if model in (None, RECORDED) else Path(str(model))
-        requested_model = recorded_model(spec.name, kind, draw, recording)
+    spec = lare_rl.load_task(task) if data is None else read_task(task)
+    play, steps = load_policy(policy, spec), load_steps(data, spec)
+    recording = None if model == RECORDED else Path(model)
+    author = live.open(model) if is_live else recorded_model(spec.name, kind, draw, recording)
+    common: dict[str, Any] = {"record": record, "on_message": print_progress}
     try:
-        function = design_function(
-            spec,
-            kind,
-            requested_model,
-            candidates=candidates,
-            pre_verification=pre_verification,
-            record=record,
-            on_message=print_progress,
-            steps=load_steps(data, spec),
+        function = lare_rl.design(
+            spec, kind, author, candidates=candidates, pre_verification=pre_verification, steps=steps, **common
         )
         if reflect:
-            from lare_rl.training.reflect import reflect as reflect_on
-
-            function = reflect_on(
-                function, spec, requested_model, reflect, policy=play, record=record, on_message=print_progress
-            )
+            function = lare_rl.reflect(function, spec, author, reflect, policy=play, **common)
     except DesignError as error:
         print_error(error)
         _save_attempts(error, find_free_path(Path(f"{spec.name}.attempts.json")))
         sys.exit(error.status)
     finally:
-        if budget.requests_used:
-            print_progress(f"{requested_model.name}: {budget.summary(live.price)}")
+        if isinstance(author, LiveModel) and author.budget.requests_used:
+            print_progress(f"{author.name}: {author.budget.summary(live.price)}")
     if out is None:
         _print_function(function, find_free_path(Path(f"{spec.name}.py")))
     else:

@@ -22,7 +22,6 @@ from tyro.constructors import (
 
 from lare_rl.algorithms.registry import ALGORITHMS
 from lare_rl.errors import CheckedModel, LareError, did_you_mean, model_keys, nested_model
-from lare_rl.runs.plan import load_config
 from lare_rl.util.renamed_fields import rename_options
 
 __all__ = ["parse"]
@@ -105,8 +104,8 @@ def _defer(command: Callable[..., None], options: Sequence[str] = ()) -> Callabl
         for name, parameter in signature.parameters.items():
             if isinstance(parameter.default, CheckedModel):
                 values = kwargs[name]
-                if kwargs.get("config") is not None:
-                    values = _merge(load_config(kwargs["config"]).values, values, set(_requested_keys(options)))
+                if (plan := kwargs.get("config")) is not None:
+                    values = _merge(plan.values, values, set(_requested_keys(options)))
                 kwargs[name] = type(parameter.default)(**values)
         return functools.partial(command, *args, **kwargs)
 

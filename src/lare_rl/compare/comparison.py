@@ -27,7 +27,7 @@ from lare_rl.evaluation.reference_returns import REFERENCE_RETURNS
 from lare_rl.runs.metric_names import RETURN
 from lare_rl.util.statistics import Band, sample_std
 
-__all__ = ["Comparison", "OverallRow", "Row", "compare", "compare_over_tasks", "compare_tasks"]
+__all__ = ["Comparison", "Row", "compare", "compare_over_tasks", "compare_tasks"]
 
 MAX_SPLITS = 20_000
 """The exact test needs all ways to split the runs into two groups: 12,870 for two groups of 8 seeds. Beyond this limit, the interval

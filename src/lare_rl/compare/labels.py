@@ -12,7 +12,7 @@ from lare_rl.credit.methods import find_method
 from lare_rl.runs.config_file import Config
 from lare_rl.runs.directory import Run
 
-__all__ = ["Difference", "find_differences", "find_origin_differences", "label_runs"]
+__all__ = ["find_differences", "find_origin_differences", "label_runs"]
 
 IGNORED_SETTINGS = {"seed", "seeds", "draw", "steps", "evaluate_every", "evaluation_episodes"}
 """Settings that do not distinguish methods."""

@@ -146,6 +146,7 @@ class ResolvedSettings(_RunSettings[Never]):
 
     @model_validator(mode="after")
     def _check_multiples(self) -> "ResolvedSettings":
+        problems = []
         for name in ("steps", "evaluate_every"):
             steps = getattr(self, name)
             if remainder := steps % self.iteration_steps:
@@ -154,7 +155,9 @@ class ResolvedSettings(_RunSettings[Never]):
                 if self.environments > 1:
                     iteration = f"{self.iteration_steps} ({iteration} of environments = {self.environments})"
                 numbers = f"{lower} or {upper}" if lower else f"{upper}"
-                raise ValueError(f"{name} = {steps} is not a multiple of {iteration}: use {numbers}")
+                problems.append(f"{name} = {steps} is not a multiple of {iteration}: use {numbers}")
+        if problems:
+            raise ValueError("; ".join(problems))
         return self
 
     @property

@@ -14,15 +14,7 @@ from typing import Any, Literal, NamedTuple
 from lare_rl.llm.prompts import Message
 from lare_rl.util.safe_io import read_json
 
-__all__ = [
-    "MAX_REPLY_TOKENS",
-    "MIN_REPLY_TOKENS",
-    "Answer",
-    "FailedResponseError",
-    "Ladder",
-    "find_ladder",
-    "store_ladder",
-]
+__all__ = ["MIN_REPLY_TOKENS", "Answer", "FailedResponseError", "Ladder", "find_ladder", "store_ladder"]
 
 MAX_REPLY_TOKENS, MIN_REPLY_TOKENS = 16_384, 1024
 """The limit on a reply's tokens. It is halved while the model allows less, down to the second number."""

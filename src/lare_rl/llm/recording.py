@@ -11,18 +11,10 @@ from typing import Literal
 from lare_rl.errors import CheckedModel, LareError
 from lare_rl.llm.key import redact_key
 from lare_rl.llm.prompts import Message, Stage
-from lare_rl.util.files import replace_file
+from lare_rl.util.files import write_atomically
 from lare_rl.util.safe_io import read_json
 
-__all__ = [
-    "SHIPPED_RECORDINGS",
-    "Exchange",
-    "RecordedModel",
-    "Recorder",
-    "RecordingKind",
-    "read_recording",
-    "shipped_recordings",
-]
+__all__ = ["SHIPPED_RECORDINGS", "Exchange", "RecordedModel", "Recorder", "read_recording", "shipped_recordings"]
 
 RecordingKind = Literal["factors", "reward", "events"]
 """What a recorded function returns: factors or a reward of a step, or the events of a turn (`lare_rl.turns`)."""
@@ -160,10 +152,7 @@ class Recorder:
         """Write the recording to a file. Raises `LareError` if the file cannot be written, or it exists and should be `new`."""
         if new and path.exists():
             raise LareError(f"{path} exists, and is not overwritten; choose another file")
-        try:
-            replace_file(path, lambda file: file.write(self.to_json(model).encode()))
-        except OSError as error:
-            raise LareError(f"{path} cannot be written: {error.strerror}") from error
+        write_atomically(path, lambda file: file.write(self.to_json(model).encode()))
 
     def to_json(self, model: str) -> str:
         """Return the content of the file, without the key."""

@@ -6,19 +6,10 @@ from html import escape
 from importlib.resources import files
 from pathlib import Path
 
-from lare_rl.errors import LareError
 from lare_rl.latent.function import LatentFunction
-from lare_rl.util.files import replace_file
+from lare_rl.util.files import write_atomically
 
-__all__ = [
-    "render_film",
-    "render_fold",
-    "render_function",
-    "render_note",
-    "render_table",
-    "render_tiles",
-    "write_page",
-]
+__all__ = ["render_film", "render_fold", "render_function", "render_note", "render_table", "render_tiles", "write_page"]
 
 _EMPTY = ("", "-")
 """Texts of cells that say nothing."""
@@ -47,10 +38,7 @@ def write_page(path: Path, title: str, body: str, refresh: int | None = None) ->
     reload = "" if refresh is None else f'<meta http-equiv="refresh" content="{refresh}">\n'
     style = (files("lare_rl.report") / "report.css").read_text(encoding="utf-8")
     page = _PAGE.format(title=escape(title), style=style, body=body, refresh=reload).encode()
-    try:
-        replace_file(path, lambda file: file.write(page))
-    except OSError as error:
-        raise LareError(f"the report {path} cannot be written: {error.strerror}") from error
+    write_atomically(path, lambda file: file.write(page))
     return path
 
 

@@ -2,7 +2,6 @@
 
 import webbrowser
 from contextlib import suppress
-from html import escape
 from pathlib import Path
 
 import numpy as np
@@ -60,16 +59,12 @@ class LivePage:
                 self._random_returns = measure_random_returns(task)
             reported = ReportedRun(settings.method, run)
             title = f"{task.name}: {settings.method}"
-            sections = [] if reported.metrics else [f"<h1>{escape(title)}</h1>"]
-            if reported.metrics:
-                (summary,) = summarise_runs([reported], self._random_returns)
-                sections += render_verdict(reported, summary)
-                sections += render_learning_curves(task, [reported], self._random_returns)
-            step = reported.metrics[-1]["step"] if reported.metrics else 0
+            (summary,) = summarise_runs([reported], self._random_returns)
             state = f"reloaded every {REFRESH_S} seconds" if self._is_running else "not running"
-            sections.append(
-                render_note(
-                    f"Step {step:,} of {settings.steps:,}; {state}. lare-rl report draws credit and factors too."
-                )
-            )
+            steps = f"Step {reported.last_step:,} of {settings.steps:,}"
+            sections = [
+                *render_verdict(reported, summary),
+                *render_learning_curves(task, [reported], self._random_returns),
+                render_note(f"{steps}; {state}. lare-rl report draws credit and factors too."),
+            ]
             write_page(self._directory / PAGE, title, "\n".join(sections), REFRESH_S if self._is_running else None)

@@ -4,6 +4,7 @@ __all__ = ["MESSAGES", "WORDS"]
 
 MESSAGES = {
     # Findings that stand alone
+    "no_evaluation": "No evaluation of the return exists yet.",
     "headline_no_return": "Nothing can be said",
     "no_return": "The last evaluation gave no return.",
     "headline_untrained": "Nothing was learned",

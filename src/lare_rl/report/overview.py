@@ -12,9 +12,10 @@ from lare_rl.report.charts import N_COLOURS, Chart, Curve, Line, draw_legend, fo
 from lare_rl.report.diagnosis import CREDIT_CODES, NEXT_CODES, diagnose
 from lare_rl.report.html import render_fold, render_note, render_table, render_tiles
 from lare_rl.report.messages import MESSAGES, WORDS
-from lare_rl.report.run_summary import ReportedRun, RunSummary, summarise_run
+from lare_rl.report.run_summary import ReportedRun, RunSummary, finite, summarise_run
 from lare_rl.runs.metric_names import CREDIT_CORRELATION, CREDIT_ERROR, RETURN, RETURN_R2, RETURN_STD
 from lare_rl.tasks.spec import TaskSpec
+from lare_rl.util.durations import format_seconds
 from lare_rl.util.findings import Finding, format_value, render
 
 __all__ = [
@@ -56,18 +57,10 @@ def summarise_runs(
     runs: Sequence[ReportedRun], random_returns: Float[np.ndarray, " episodes"]
 ) -> list[RunSummary | None]:
     """Return the summary of each run of a task. Each is compared with a run on the return of the episode alone, if there is one."""
-    episodic_returns = {
-        reported.name: float(returns.mean())
-        for reported in runs
-        if reported.run.config.settings.method == "episodic" and len(returns := reported.final_values(RETURN))
-    }
+    episodic = [run for run in runs if run.run.config.settings.method == "episodic" and np.isfinite(run.final_return)]
     return [
-        summarise_run(
-            reported,
-            random_returns,
-            next((value for name, value in episodic_returns.items() if name != reported.name), None),
-        )
-        for reported in runs
+        summarise_run(run, random_returns, next((other.final_return for other in episodic if other is not run), None))
+        for run in runs
     ]
 
 
@@ -75,14 +68,14 @@ def render_verdict(
     reported: ReportedRun, summary: RunSummary | None, film: str = "", has_title: bool = True
 ) -> Iterable[str]:
     """Yield what a run reached: a film, a verdict and the numbers."""
-    if summary is None:
-        return
-    findings = diagnose(summary)
     yield f'<div class="hero{" filmed" if film else ""}">{film}<div>'
     if has_title:
         yield f"<h1>{escape(reported.name)} on {escape(reported.run.config.task.name)}</h1>"
+    if summary is None:
+        yield f'<p class="headline">{MESSAGES["no_evaluation"]}</p></div></div>'
+        return
     yield f'<p class="headline">{escape(render_headline(summary))}</p>'
-    for finding in findings:
+    for finding in diagnose(summary):
         if finding.code not in CREDIT_CODES:
             class_ = ' class="verdict"' if finding.code in NEXT_CODES else ""
             yield f"<p{class_}>{render(finding, MESSAGES, 'html')}</p>"
@@ -100,7 +93,7 @@ def _tiles(reported: ReportedRun, summary: RunSummary) -> Iterable[tuple[str, st
     if summary.return_r2 is not None:
         yield "R² of returns", format_value(summary.return_r2, "r2"), "of new episodes; 1 is perfect"
     if (seconds := reported.training_seconds()) is not None:
-        yield "Time trained", _format_seconds(seconds), f"{int(summary.steps[-1]):,} steps for each seed"
+        yield "Time trained", format_seconds(seconds), f"{int(summary.steps[-1]):,} steps for each seed"
 
 
 def render_headline(summary: RunSummary) -> str:
@@ -151,7 +144,7 @@ def compare_runs(runs: Sequence[ReportedRun]) -> list[Finding]:
         ),
         Finding("improvement", names | {"probability": probability, "n_pairs": wins.size}),
     ]
-    steps = {reported.metrics[-1]["step"] for reported in runs}
+    steps = {reported.last_step for reported in runs if reported.metrics}
     return findings + (
         [Finding("different_steps", {"least": min(steps), "most": max(steps)})] if len(steps) > 1 else []
     )
@@ -159,13 +152,7 @@ def compare_runs(runs: Sequence[ReportedRun]) -> list[Finding]:
 
 def sort_runs(runs: Iterable[ReportedRun]) -> list[ReportedRun]:
     """Sort runs by their final returns, the best first."""
-    return sorted(
-        runs,
-        key=lambda reported: (
-            float(reported.final_values(RETURN).mean()) if len(reported.final_values(RETURN)) else -np.inf
-        ),
-        reverse=True,
-    )
+    return sorted(runs, key=lambda reported: reported.final_return, reverse=True)
 
 
 def render_comparison(task: TaskSpec, runs: Sequence[ReportedRun]) -> Iterable[str]:
@@ -183,7 +170,7 @@ def render_final_values(runs: Sequence[ReportedRun]) -> str:
     for reported in runs:
         task = reported.run.config.task.name
         values = [reported.final_values(metric) for metric in _METRICS]
-        step, n_seeds = f"{reported.metrics[-1]['step']:,}", len(reported.run.seeds)
+        step, n_seeds = f"{reported.last_step:,}", len(reported.run.seeds)
         if len(runs) > 1:
             rows.append((task, reported.name, *map(format_spread, values), str(n_seeds), step))
         else:
@@ -208,8 +195,8 @@ def render_learning_curves(
     yield _render_legend(runs, colours, references, warmup)
     for name, role in zip(names, task.teams or (task,), strict=True):
         title = f"True return, team of {role.team}" if task.teams else "True return"
-        yield f'<p class="note">{escape(title)}</p>'
-        yield _draw_metric(_Metric(name, title), runs, colours, references, warmup)
+        if chart := _draw_metric(_Metric(name, title), runs, colours, references, warmup):
+            yield render_note(title) + chart
     charts = {metric.title: _draw_metric(metric, runs, colours, {}, warmup) for metric in _other_metrics(task)}
     figures = [
         f'<figure><figcaption class="title">{escape(title)}</figcaption>{chart}</figure>'
@@ -264,7 +251,7 @@ def _draw_metric(
     lines += [Line(extent, np.full(2, value), "grey dashed", name) for name, value in references.items()]
     has_negative = any((line.y[np.isfinite(line.y)] < 0).any() for line in lines)
     limits = (-1.0, 1.0) if metric.limits and has_negative else metric.limits
-    final = ", ".join(f"{name} {format_spread(_finite(curve[1][:, -1]))}" for name, (_, curve) in curves.items())
+    final = ", ".join(f"{name} {format_spread(finite(curve[1][:, -1]))}" for name, (_, curve) in curves.items())
     return Chart(
         lines=lines,
         description=f"{metric.title} over environment steps. Last values: {final}",
@@ -281,7 +268,7 @@ def _hovers(curves: dict[str, Curve]) -> dict[float, str]:
     for name, (steps, values) in curves.items():
         for step, column in zip(steps, values.T, strict=True):
             seeds = f" ({', '.join(map(format_number, column))})" if len(curves) == 1 and len(column) > 1 else ""
-            if len(numbers := _finite(column)):
+            if len(numbers := finite(column)):
                 texts.setdefault(float(step), [f"step {step:,.0f}"]).append(
                     f"{name}: {format_number(numbers.mean())}{seeds}"
                 )
@@ -313,18 +300,4 @@ def render_words() -> str:
 
 def _mean(values: Float[np.ndarray, "seeds evaluations"]) -> Float[np.ndarray, " evaluations"]:
     """Return the mean over the seeds that have a value, NaN where none has."""
-    return np.array([numbers.mean() if len(numbers := _finite(column)) else np.nan for column in values.T])
-
-
-def _finite(values: np.ndarray) -> np.ndarray:
-    return values[np.isfinite(values)]
-
-
-def _format_seconds(seconds: float) -> str:
-    return (
-        f"{seconds / 3600:.1f} h"
-        if seconds >= 5400
-        else f"{seconds / 60:.0f} min"
-        if seconds >= 90
-        else f"{seconds:.0f} s"
-    )
+    return np.array([numbers.mean() if len(numbers := finite(column)) else np.nan for column in values.T])

@@ -52,7 +52,7 @@ def write_report(
             directory.
 
     Raises:
-        LareError: a directory has no run, a run has no evaluation yet, or the file cannot be written.
+        LareError: a directory has no run, or the file cannot be written.
     """
     sources = [runs] if isinstance(runs, (Run, str, Path)) else list(runs)
     if not sources:
@@ -61,9 +61,6 @@ def write_report(
     for source in sources:
         opened += [source] if isinstance(source, Run) else map(_open_run, find_run_directories([Path(source)]))
     reported_runs = _name_runs(opened)
-    for reported in reported_runs:
-        if not reported.metrics:
-            raise LareError(f"{reported.run.directory} has no evaluation yet: there is nothing to report")
     path = Path(out) if out is not None else reported_runs[0].run.directory / "report.html"
     if not path.parent.is_dir():
         raise LareError(f"the report {path} cannot be written: there is no folder {path.parent}")

@@ -34,6 +34,7 @@ __all__ = [
     "SEED_STDS",
     "ReportedRun",
     "RunSummary",
+    "finite",
     "summarise_run",
 ]
 
@@ -61,6 +62,11 @@ class ReportedRun:
         """The lines of metrics.jsonl."""
         return self.run.metrics()
 
+    @property
+    def last_step(self) -> int:
+        """The step of the last evaluation; 0 before the first."""
+        return self.metrics[-1]["step"] if self.metrics else 0
+
     def curve(self, key: str) -> Curve | None:
         """Return a metric over the steps, with NaN where it is missing. None if it was never measured."""
         values = {
@@ -75,7 +81,13 @@ class ReportedRun:
     def final_values(self, key: str) -> Float[np.ndarray, " seeds"]:
         """Return the values of a metric at the last evaluation, for the seeds for which it is known."""
         curve = self.curve(key)
-        return np.zeros(0) if curve is None else _finite(curve[1][:, -1])
+        return np.zeros(0) if curve is None else finite(curve[1][:, -1])
+
+    @property
+    def final_return(self) -> float:
+        """The mean return of the seeds at the last evaluation; -inf if it is unknown."""
+        returns = self.final_values(RETURN)
+        return float(returns.mean()) if len(returns) else -math.inf
 
     def training_seconds(self) -> float | None:
         """Return how long the run has trained, by its rate between evaluations. None if that is unknown."""
@@ -266,7 +278,7 @@ def summarise_run(
         episode_error=_episode_error(reported),
         episodic_return=episodic_return,
         return_r2=None if r2s is None else _last_mean(r2s),
-        median_r2=None if r2s is None or not len(_finite(r2s)) else float(np.median(_finite(r2s))),
+        median_r2=None if r2s is None or not len(finite(r2s)) else float(np.median(finite(r2s))),
         credit_error=_last_value(reported, CREDIT_ERROR),
         credit_correlation=_last_value(reported, CREDIT_CORRELATION),
         score_use=summarise_score_use(method, settings, task, _score_metrics(reported)),
@@ -307,8 +319,9 @@ def _last_value(reported: ReportedRun, key: str) -> float | None:
 
 def _last_mean(values: Float[np.ndarray, "seeds evaluations"]) -> float | None:
     """Return the mean over the seeds at the last evaluation that has a finite value."""
-    return next((float(finite.mean()) for column in values.T[::-1] if len(finite := _finite(column))), None)
+    return next((float(numbers.mean()) for column in values.T[::-1] if len(numbers := finite(column))), None)
 
 
-def _finite(values: np.ndarray) -> Float[np.ndarray, " values"]:
+def finite(values: np.ndarray) -> Float[np.ndarray, " values"]:
+    """Return the finite ones of some values."""
     return values[np.isfinite(values)]

@@ -29,7 +29,6 @@ from lare_rl.util.safe_io import read_json
 __all__ = [
     "DAMAGED_FILE_ERRORS",
     "STATE_FILE",
-    "Snapshot",
     "fill_template",
     "load",
     "named_leaves",

@@ -3,7 +3,7 @@
 The file is TOML or JSON, written by hand. Or it is the configuration of an earlier run, which is then repeated.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -29,10 +29,12 @@ __all__ = ["RunPlan", "load_config", "relative_task"]
 class RunPlan:
     """What a file says of a run. Whatever it does not say is None."""
 
-    task: str | TaskSpec | None
-    settings: Settings
-    function: "tuple[Path | LatentFunction, ...] | None"
-    out: Path | None
+    task: str | TaskSpec | None = None
+    settings: Settings = field(default_factory=Settings)
+    function: "tuple[Path | LatentFunction, ...] | None" = None
+    out: Path | None = None
+    source: Path | None = None
+    """The file, or the directory of the run."""
     is_run: bool = False
     """Whether it is the configuration of an earlier run. All settings are then decided."""
 
@@ -103,6 +105,7 @@ def load_config(path: str | Path) -> RunPlan:
         settings=settings,
         function=None if file.function is None else tuple(path.parent / name for name in file.function),
         out=None if file.out is None else path.parent / file.out,
+        source=path,
     )
 
 
@@ -116,9 +119,7 @@ def _plan_repetition(directory: Path) -> RunPlan:
     from lare_rl.runs.directory import open_run
 
     run = open_run(directory)
-    return RunPlan(
-        task=run.config.task, settings=_used_settings(run), function=run.functions or None, out=None, is_run=True
-    )
+    return RunPlan(run.config.task, _used_settings(run), run.functions or None, source=directory, is_run=True)
 
 
 def _used_settings(run: "Run") -> Settings:

@@ -25,7 +25,7 @@ from lare_rl.training.loop import RunInterruptedError
 from lare_rl.util.renamed_fields import rename_keys
 from lare_rl.util.safe_io import read_table
 
-__all__ = ["Sweep", "read_sweep", "run_sweep"]
+__all__ = ["read_sweep", "run_sweep"]
 
 Texts = Annotated[tuple[str, ...], Field(min_length=1)]
 Draws = Annotated[tuple[Annotated[int, Field(ge=0)], ...], Field(min_length=1)]

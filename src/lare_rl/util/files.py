@@ -10,7 +10,7 @@ from uuid import uuid4
 
 from lare_rl.errors import LareError
 
-__all__ = ["replace_file", "write_arrays", "write_atomically"]
+__all__ = ["write_arrays", "write_atomically"]
 
 
 RETRY_S = 0.01, 0.03, 0.1, 0.3, 1.0
@@ -18,26 +18,10 @@ RETRY_S = 0.01, 0.03, 0.1, 0.3, 1.0
 
 
 def write_atomically(path: Path, write: Callable[[Any], object]) -> None:
-    """Replace a file by what `write` writes. Raises `LareError` if the file cannot be written."""
-    try:
-        replace_file(path, write)
-    except OSError as error:
-        reason = error.strerror or error
-        raise LareError(f"{path} cannot be written ({reason}); an existing file is unchanged") from error
-
-
-def write_arrays(path: Path, arrays: Mapping[str, Any]) -> None:
-    """Replace an .npz file. Raises `LareError` if it cannot be written."""
-    import numpy as np  # here, because the command line imports this module before it shows a message
-
-    write_atomically(path, lambda file: np.savez(file, allow_pickle=False, **arrays))
-
-
-def replace_file(path: Path, write: Callable[[Any], object]) -> None:
     """Let `write` fill a new file, and move it to `path` when it is complete on the disk.
 
     Raises:
-        OSError: the file cannot be written.
+        LareError: the file cannot be written.
     """
     new = path.with_name(f"{path.name}.{uuid4().hex}.new")  # unique: another process may write the same file
     try:
@@ -46,9 +30,18 @@ def replace_file(path: Path, write: Callable[[Any], object]) -> None:
             file.flush()
             os.fsync(file.fileno())
         _move(new, path)
-    except BaseException:  # an interruption must not leave the new file either
+    except OSError as error:
+        reason = error.strerror or error
+        raise LareError(f"{path} cannot be written ({reason}); an existing file is unchanged") from error
+    finally:  # an interruption must not leave the new file either
         new.unlink(missing_ok=True)
-        raise
+
+
+def write_arrays(path: Path, arrays: Mapping[str, Any]) -> None:
+    """Replace an .npz file. Raises `LareError` if it cannot be written."""
+    import numpy as np  # here, because the command line imports this module before it shows a message
+
+    write_atomically(path, lambda file: np.savez(file, allow_pickle=False, **arrays))
 
 
 def _move(new: Path, path: Path) -> None:

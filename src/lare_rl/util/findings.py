@@ -17,7 +17,7 @@ from dataclasses import dataclass, field
 from html import escape
 from typing import Any, Literal
 
-__all__ = ["Catalogue", "Finding", "format_value", "render"]
+__all__ = ["Finding", "format_value", "render"]
 
 Catalogue = Mapping[str, str]
 """The templates of a room, by the codes of its findings."""

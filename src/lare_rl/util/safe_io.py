@@ -14,7 +14,6 @@ from lare_rl.errors import LareError
 __all__ = [
     "MAX_DEPTH",
     "MAX_SETTINGS_BYTES",
-    "MAX_TEXT_BYTES",
     "check_depth",
     "parse_integer",
     "read_json",

@@ -8,7 +8,7 @@ import pytest
 
 from helpers.listeners import AtStep
 from helpers.long_tests import long_case
-from helpers.untrained_runs import write_run
+from helpers.untrained_runs import invent_training
 from lare_rl.cli import studies
 from lare_rl.credit.methods import METHODS
 from lare_rl.errors import LareError
@@ -34,18 +34,14 @@ def all_jobs(exhibit, budget, root):
 
 
 def train_with_score(score):
-    """Return a function that writes metrics instead of training: a score of settings and seed, and a tenth of it as the error."""
+    """Invent training whose runs have a score of settings and seed, and a tenth of it as the error."""
 
-    def train(job, cores, running):
-        metrics = []
-        for step in (job.resolved.steps // 2, job.resolved.steps):
-            for seed in job.resolved.all_seeds:
-                value = float(score(job.resolved, seed))
-                scores = dict.fromkeys((RETURN, SUMMED_RETURN, TRAVELLED, WON), value) | {CREDIT_ERROR: 0.1 * value}
-                metrics.append({"step": step, "seed": seed, **scores, "credit/correlation": 0.5})
-        write_run(job.directory, job.task, job.resolved, metrics)
+    def find_metrics(job, seed):
+        value = float(score(job.resolved, seed))
+        scores = dict.fromkeys((RETURN, SUMMED_RETURN, TRAVELLED, WON), value)
+        return scores | {CREDIT_ERROR: 0.1 * value, "credit/correlation": 0.5}
 
-    return train
+    return invent_training(find_metrics)
 
 
 @pytest.fixture

@@ -2,7 +2,7 @@
 
 import pytest
 
-from helpers.untrained_runs import write_run
+from helpers.untrained_runs import invent_training
 from lare_rl.errors import LareError
 from lare_rl.runs.metric_names import RETURN
 from lare_rl.sweep import processes
@@ -20,16 +20,10 @@ def only_jobshop(monkeypatch):
     monkeypatch.setattr(real, "read_study", lambda: study)
 
 
-def invented_training(job, cores, running):
-    value = float(len(job.directory.name))
-    steps = (job.resolved.steps // 2, job.resolved.steps)
-    metrics = [{"step": step, "seed": seed, RETURN: value} for step in steps for seed in job.resolved.all_seeds]
-    write_run(job.directory, job.task, job.resolved, metrics)
-
-
 @pytest.mark.usefixtures("only_jobshop")
 def test_page(monkeypatch, tmp_path):
-    monkeypatch.setattr(processes, "train_in_process", invented_training)
+    train = invent_training(lambda job, seed: {RETURN: float(len(job.directory.name))})
+    monkeypatch.setattr(processes, "train_in_process", train)
     page = reproduce("real", "smoke", Resources(), tmp_path / "runs", tmp_path / "out")
     text = page.read_text()
     assert text.startswith(f"# {real.TITLE}\n\nBy `lare-rl reproduce real --budget smoke`. Seeds: 1. LaRe ")

@@ -30,6 +30,8 @@ def test_same_as_in_this_process(cart):
         assert np.array_equal(observation, plain_observation)
         assert rest == plain_rest
     assert cart.read("gravity") == 9.8
+    cart.close()
+    assert cart._process.poll() == 0
 
 
 def test_errors_name_the_reason(cart):
@@ -38,9 +40,6 @@ def test_errors_name_the_reason(cart):
     assert cart.reset(seed=1)[0].shape == (4,)
     with pytest.raises(RuntimeError, match="ModuleNotFoundError: No module named 'nowhere'"):
         ChildEnv("nowhere:Env", {})
-
-
-def test_dead_process(cart):
     cart._process.kill()
     with pytest.raises(RuntimeError, match="process ended with code -9"):
         cart.reset(seed=1)
@@ -52,8 +51,3 @@ def test_hanging_process(cart, monkeypatch):
     with pytest.raises(TimeoutError, match="no answer"):
         cart.reset(seed=1)
     assert cart._process.poll() is not None
-
-
-def test_close_ends_the_process(cart):
-    cart.close()
-    assert cart._process.poll() == 0

@@ -1,0 +1,151 @@
+"""The command `train`."""
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import tyro
+from tyro.conf import Positional
+from tyro.constructors import PrimitiveConstructorSpec
+
+from lare_rl.cli.terminal import print_line, print_progress
+from lare_rl.config.effective import unused_settings
+from lare_rl.config.settings import ResolvedSettings, Settings
+from lare_rl.errors import LareError
+from lare_rl.runs.plan import RunPlan, load_config
+
+if TYPE_CHECKING:
+    from lare_rl.latent.function import LatentFunction
+    from lare_rl.tasks.spec import TaskSpec
+    from lare_rl.training.progress import Listener
+
+DEFAULTS = Settings()
+
+_READ_PLAN = PrimitiveConstructorSpec(
+    nargs=1,
+    metavar="FILE",
+    instance_from_str=lambda paths: load_config(paths[0]),
+    is_instance=lambda value: value is None or isinstance(value, RunPlan),
+    str_from_instance=lambda plan: [str(plan)],
+)
+"""Reads the file or run of --config once, so that options can change its settings."""
+
+
+def train(
+    task: Annotated[Positional[str | None], tyro.conf.arg(metavar="[TASK]")] = None,
+    settings: Annotated[Settings, tyro.conf.arg(name="")] = DEFAULTS,
+    function: Annotated[tyro.conf.UseAppendAction[tuple[Path, ...]], tyro.conf.arg(metavar="FILE")] = (),
+    out: Annotated[Path | None, tyro.conf.arg(metavar="DIR")] = None,
+    config: Annotated[RunPlan | None, _READ_PLAN] = None,
+    resume: Annotated[Path | None, tyro.conf.arg(metavar="DIR")] = None,
+    tensorboard: bool = False,
+    wandb: Annotated[str | None, tyro.conf.arg(metavar="PROJECT")] = None,
+    mlflow: Annotated[str | None, tyro.conf.arg(metavar="EXPERIMENT")] = None,
+    watch: bool = False,
+) -> None:
+    """Train on a task's episodic rewards. Ctrl-C saves and stops; --resume continues.
+
+    The help lists the hyperparameters of an algorithm if it is named, as in lare-rl train --algorithm ppo --help.
+
+    Args:
+        task: a shipped name (see `lare-rl tasks`), or the path of a task file. Not given with --resume.
+        function: a latent function (.py), or a reply with one (.json), to use instead of a recorded one; verified before it is
+            run. Where several teams learn, one --function for each, in the order of the task.
+        out: the run directory, which must not exist; the default is runs/TASK-METHOD-ALGORITHM-sSEED.
+        config: a TOML or JSON file with task, function, out and any of the settings, or the directory of a run to repeat. The options of
+            the command line win.
+        resume: a run directory to continue, from its last checkpoint and with its own settings. With --steps, a finished run is
+            extended.
+        tensorboard: write TensorBoard events into the run directory too (needs the extra lare-rl[tensorboard]).
+        wandb: send the metrics of each seed to a project of Weights & Biases too (needs the extra lare-rl[wandb]).
+        mlflow: send the metrics of each seed to an experiment of MLflow too (needs the extra lare-rl[mlflow]).
+        watch: write verdict and curves to watch.html in the run directory after every evaluation, and open it in the browser.
+    """
+    plan = config or RunPlan()
+    chosen_task = task or plan.task
+    if isinstance(chosen_task, str):
+        from lare_rl.envs.load import read_task
+
+        read_task(chosen_task)  # a typo is reported before the slow imports
+    import lare_rl
+    from lare_rl.runs.directory import open_run
+
+    if resume is not None:
+        options = (task, function, out, config, settings.model_copy(update={"steps": None}))
+        if options != (None, (), None, None, DEFAULTS):
+            raise LareError("--resume uses the run's settings: give it no task, and no setting but --steps")
+        run_settings = open_run(resume).config.settings
+        listeners = [*_listeners(wandb, mlflow, run_settings), *_live_page(resume, watch)]
+        run = lare_rl.resume(resume, steps=settings.steps, tensorboard=tensorboard, listeners=listeners)
+    elif chosen_task is None:
+        raise LareError(
+            f"there is no task{f' in {plan.source}' if config else ''}: use lare-rl train TASK (lare-rl tasks lists them), "
+            "or lare-rl train --resume DIR"
+        )
+    else:
+        from lare_rl.config.resolve import resolve
+        from lare_rl.envs.load import resolve_task
+        from lare_rl.runs.directory import default_directory
+
+        spec = resolve_task(chosen_task)
+        resolved = resolve(settings, spec)
+        for name, warning in unused_settings(settings, resolved, spec).items():
+            if not (plan.is_run and plan.has(name, settings)):
+                raise LareError(f"{warning}: leave the setting out")
+        planned = plan.function_for(resolved)
+        functions = _load_functions(function or planned, spec, resolved) if function or planned else None
+        out = out or plan.out or default_directory(spec, resolved)
+        run = lare_rl.train(
+            spec,
+            settings,
+            function=functions,
+            out=out,
+            tensorboard=tensorboard,
+            listeners=[*_listeners(wandb, mlflow, resolved), *_live_page(out, watch)],
+        )
+    print_line(f"finished {run.directory}; to see it: lare-rl report {run.directory}")
+
+
+def _load_functions(
+    files: "Sequence[Path | LatentFunction]", spec: "TaskSpec", resolved: ResolvedSettings
+) -> "list[LatentFunction]":
+    """Load and verify the latent functions of a run."""
+    from lare_rl.latent.function import CHANGED_SUFFIX, pair_with_roles
+    from lare_rl.latent.saved import load_function
+    from lare_rl.training.latent_functions import check_draw_unused
+
+    check_draw_unused(resolved)
+    functions = [
+        load_function(file, role) if isinstance(file, Path) else file for file, role in pair_with_roles(files, spec)
+    ]
+    for function in functions:
+        if function.changed:
+            author = function.model.removesuffix(CHANGED_SUFFIX)
+            print_progress(f"the function by {author} was changed after it was saved: its hash differs")
+    return functions
+
+
+def _listeners(wandb: str | None, mlflow: str | None, settings: ResolvedSettings) -> "list[Listener]":
+    """Return the terminal, and the requested tracking services."""
+    from lare_rl.training.progress import Terminal
+    from lare_rl.training.trackers import MLflow, WeightsAndBiases
+
+    listeners: list[Listener] = [Terminal()]
+    config = settings.model_dump(mode="json")
+    if wandb is not None:
+        listeners.append(WeightsAndBiases(project=wandb, config=config))
+    if mlflow is not None:
+        listeners.append(MLflow(mlflow, parameters=config))
+    return listeners
+
+
+def _live_page(directory: Path, watch: bool) -> "list[Listener]":
+    """Return the page that shows the run, if it is requested now, or was requested before the run was stopped."""
+    if not watch and not directory.exists():
+        return []
+    from lare_rl.report.live_page import PAGE, LivePage
+
+    page = directory / PAGE
+    if watch:
+        print_progress(f"to watch it: {page}")
+    return [LivePage(directory, browser=watch)] if watch or page.exists() else []
