@@ -125,7 +125,7 @@ def test_rewards_depend_on_the_seed_and_the_newest_decoder():
 
 
 def test_rewards_can_be_scaled_and_optimistic():
-    optimism = small_assigner().config.settings.model_copy(update={"optimism": 1.0})
+    optimism = SMALL_CREDIT.model_copy(update={"optimism": 1.0})
     episodes = random_episodes([8] * 12)
     assigners = [small_assigner(), small_assigner(scale_rewards=True), small_assigner(settings=optimism)]
     for credit in assigners:
@@ -165,7 +165,7 @@ def test_steps_episodes_and_scores_give_the_same_rewards(method, function):
 )
 def test_score_type_is_found_and_rewards_add_up_to_the_score(setting, score, phi):
     lengths = np.random.default_rng(0).integers(3, 13, size=80)
-    settings = small_assigner().config.settings.model_copy(update={"score": setting})
+    settings = SMALL_CREDIT.model_copy(update={"score": setting})
     credit = small_assigner("lare-linear", phi, settings=settings)
     scores, numbers = [], []
     for episode in random_episodes(lengths):
@@ -284,18 +284,6 @@ def test_several_threads_may_use_an_assigner():
 
 
 # Steps and episodes
-
-
-def test_add_interleaves_environments():
-    credit, episodes = small_assigner(), random_episodes([4, 2, 3, 5])
-    remaining = {env_id: list(zip(*episode, strict=True)) for env_id, episode in zip("abcd", episodes, strict=True)}
-    while remaining:
-        rows = [steps.pop(0) for steps in remaining.values()]
-        ended = [not steps for steps in remaining.values()]
-        credit.add(*map(np.array, zip(*rows, strict=True)), ended, np.zeros(len(rows)), env_ids=list(remaining))
-        remaining = {env_id: steps for env_id, steps in remaining.items() if steps}
-    assert sorted(stored(credit)) == sorted((len(e.reward), sum(e.reward.tolist())) for e in episodes)
-    assert credit.store.dropped == 0
 
 
 def test_add_gives_no_number_to_rows_that_are_not_valid():

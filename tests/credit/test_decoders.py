@@ -1,34 +1,27 @@
 """What all decoders have in common: shapes, causality, where they are random, and that they learn."""
 
-from functools import partial
-
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from helpers.decoder_toys import make_decoder
 from helpers.long_tests import long_case
 from lare_rl.credit import decomposition, descent
-from lare_rl.credit.arel import AREL
 from lare_rl.credit.decoder_settings import CreditSettings
 from lare_rl.credit.decomposition import CreditBatch
-from lare_rl.credit.lrr import LRR
 from lare_rl.credit.methods import METHODS, Fit
-from lare_rl.credit.stas import STAS
-from lare_rl.credit.step_decoders import Bottleneck, StepDecoder
-from lare_rl.credit.tar2 import TAR2
 
 EPISODES, STEPS, AGENTS, FEATURES = 4, 5, 3, 6
 KEY = jax.random.key(1)
 ROWS = np.random.default_rng(0).normal(size=(EPISODES * STEPS, AGENTS, FEATURES)).astype(np.float32)
-DECODERS = {
-    "step": partial(StepDecoder, FEATURES, (8,), 2.0),
-    "bottleneck": partial(Bottleneck, FEATURES, (16,), 2, (8,), 0.1, 2.0),
-    "lrr": partial(LRR, FEATURES, (8,), 2.0),
-    "arel": partial(AREL, FEATURES, STEPS),
-    "stas": partial(STAS, FEATURES, STEPS, AGENTS, 2.0),
-    "tar2": partial(TAR2, 4, 2, STEPS, AGENTS, 2.0),
-}
+DECODERS = ("step", "bottleneck", "lrr", "arel", "stas", "tar2")
+SMALL = {"hidden": (8,), "encoder": (16,), "bottleneck": 2, "divergence": 0.1}
+
+
+def small_decoder(name):
+    sizes = {"observation": 4, "action": 2} if name == "tar2" else FEATURES
+    return make_decoder(name, sizes, STEPS, AGENTS, seed=1, **SMALL)
 
 
 @jax.jit
@@ -42,7 +35,7 @@ def episodes(values):
 
 @pytest.mark.parametrize("name", [long_case(name) if name == "tar2" else name for name in DECODERS])
 def test_outputs(name):
-    decoder = DECODERS[name](key=KEY)
+    decoder = small_decoder(name)
     output = decode(decoder, ROWS)
     first, second = (decode(decoder, ROWS, jax.random.key(seed)) for seed in (1, 2))
     for result in (output, first):
@@ -67,7 +60,7 @@ def test_outputs(name):
 
 
 def test_bottleneck_equations():
-    decoder, noise = DECODERS["bottleneck"](key=KEY), jax.random.normal(KEY, (EPISODES * STEPS, AGENTS, 2))
+    decoder, noise = small_decoder("bottleneck"), jax.random.normal(KEY, (EPISODES * STEPS, AGENTS, 2))
     mean, log_variance = jnp.split(decoder.encoder(jnp.asarray(ROWS)), 2, axis=-1)
     assert float(jnp.abs(log_variance).max()) > 0.1
     for key, z in ((KEY, mean + jnp.sqrt(jnp.exp(log_variance)) * noise), (None, mean)):

@@ -6,9 +6,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from helpers.decoder_toys import check_padding, loss_gradient, make_decoder, train_by_loss
 from helpers.numpy_attention import numpy_linear
-from lare_rl.credit.diaster import Diaster
-from lare_rl.nn.networks import adam_step, init_adam
 
 EPISODES, STEPS, FEATURES = 4, 7, 3
 LENGTH = np.array([7, 4, 2, 1])
@@ -16,7 +15,7 @@ LENGTH = np.array([7, 4, 2, 1])
 
 @pytest.fixture(scope="module")
 def decoder():
-    return Diaster(FEATURES, (5,), key=jax.random.key(0))
+    return make_decoder("diaster", FEATURES, STEPS, hidden=(5,))
 
 
 @pytest.fixture(scope="module")
@@ -66,37 +65,18 @@ def test_loss_against_numpy(decoder, rows):
     assert float(loss) == pytest.approx(want / 3, rel=1e-3)
 
 
-@jax.jit
-def loss_gradient(decoder, rows):
-    args = rows, jnp.asarray(LENGTH), jnp.ones(EPISODES), jnp.ones(EPISODES), jax.random.key(1)
-    return jax.grad(lambda decoder: decoder.loss(*args))(decoder)
-
-
 def test_gradient_ignores_padding_and_the_step_model_does_not_train_the_other(decoder, rows):
-    padded = np.where(np.arange(STEPS)[:, None] < LENGTH[:, None, None], rows, np.float32(99.0))
     larger = eqx.tree_at(lambda d: d.step_model, decoder, jax.tree.map(lambda leaf: 100 * leaf, decoder.step_model))
-    gradient = loss_gradient(decoder, rows)
-    pairs = (gradient, loss_gradient(decoder, padded)), (gradient.gru, loss_gradient(larger, rows).gru)
-    for a, b in zip(*map(jax.tree.leaves, zip(*pairs, strict=True)), strict=True):
+    pair = check_padding(decoder, rows, LENGTH).gru, loss_gradient(larger, rows, LENGTH).gru
+    for a, b in zip(*map(jax.tree.leaves, pair), strict=True):
         np.testing.assert_allclose(a, b, rtol=1e-4, atol=1e-6)
 
 
 def test_must_learn_step_rewards():
     """Step rewards are linear in the features. Only returns are observed."""
     rng, weight = np.random.default_rng(1), np.array([1.0, -2.0, 0.5], np.float32)
-    decoder = Diaster(FEATURES, (32,), key=jax.random.key(0))
-
-    def body(state, inputs):
-        (decoder, optimizer), (x, key) = state, inputs
-        target, length = jnp.mean(x @ weight, axis=1), jnp.full(len(x), STEPS)
-        gradient = jax.grad(lambda d: d.loss(x, length, target, jnp.ones(len(x)), key))(decoder)
-        return adam_step(decoder, gradient, optimizer, 1e-2), None
-
-    @jax.jit
-    def train(decoder, x):
-        state = decoder, init_adam(decoder, 1e-2)
-        return jax.lax.scan(body, state, (x, jax.random.split(jax.random.key(0), len(x))))[0][0]
-
-    decoder = train(decoder, rng.normal(size=(600, 32, STEPS, FEATURES)).astype(np.float32))
+    x = rng.normal(size=(600, 32, STEPS, FEATURES)).astype(np.float32)
+    decoder = make_decoder("diaster", FEATURES, STEPS, hidden=(32,))
+    decoder = train_by_loss(decoder, x, (x @ weight).mean(axis=-1), 1e-2)
     x = rng.normal(size=(500, FEATURES)).astype(np.float32)
     assert np.corrcoef(decoder(jnp.asarray(x), None).r_hat, x @ weight)[0, 1] > 0.9

@@ -11,15 +11,11 @@ from hypothesis import strategies as st
 
 from lare_rl.credit import evidence
 
+pytestmark = pytest.mark.usefixtures("in_float64")
+
 GROUP_INDEX = np.repeat([0, 1, 2], [3, 4, 5])
 MAX_EPISODES = 320
 add_episodes = jax.jit(evidence.add_episodes)
-
-
-@pytest.fixture(autouse=True)
-def in_float64():
-    with jax.enable_x64(True):
-        yield
 
 
 def sample_episodes(count=40, noise=0.1, seed=0):

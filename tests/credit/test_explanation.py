@@ -9,15 +9,11 @@ import pytest
 from lare_rl.credit import evidence, explanation
 from lare_rl.credit.basis import Basis, expand
 
+pytestmark = pytest.mark.usefixtures("in_float64")
+
 PLAIN, EXTENDED = Basis(2, 3, extended=False), Basis(2, 3, extended=True)
 """Two factors and three raw features. Inputs that a test does not need are 0."""
 MAX_STEPS, MAX_EPISODES = 4096, 256
-
-
-@pytest.fixture(autouse=True)
-def in_float64():
-    with jax.enable_x64(True):
-        yield
 
 
 features_of = jax.jit(expand, static_argnums=0)

@@ -5,34 +5,27 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from helpers.decoder_toys import check_padding, make_decoder, train_by_loss
+from helpers.numpy_attention import numpy_mlp
 from lare_rl.credit import grd, input_names
-from lare_rl.credit.basis import Basis
-from lare_rl.credit.decoder_network import DecoderShape
-from lare_rl.credit.decoder_settings import CreditSettings
-from lare_rl.credit.grd import GRD, causes, init_grd, sample_mask
+from lare_rl.credit.grd import causes, sample_mask
 from lare_rl.errors import LareError
-from lare_rl.nn.networks import adam_step, init_adam
 
 EPISODES, STEPS, STATES, ACTIONS = 4, 6, 3, 2
 LENGTH = np.array([6, 4, 2, 1])
 LAMBDAS = (0.1, 0.2, 0.3, 0.4, 0.5)
 KEY = jax.random.key(0)
+SIZES = {"observation": STATES, "action": ACTIONS, "next_observation": STATES}
 
 
 @pytest.fixture(scope="module")
 def decoder():
-    return GRD(STATES, ACTIONS, (5,), LAMBDAS, key=KEY)
+    return make_decoder("grd", SIZES, STEPS, hidden=(5,), sparsity=LAMBDAS)
 
 
 @pytest.fixture(scope="module")
 def rows():
     return np.random.default_rng(0).normal(size=(EPISODES, STEPS, 2 * STATES + ACTIONS)).astype(np.float32)
-
-
-def numpy_mlp(mlp, x):
-    first, second = mlp.layers
-    hidden = np.maximum(x @ np.asarray(first.weight) + np.asarray(first.bias), 0)
-    return hidden @ np.asarray(second.weight) + np.asarray(second.bias)
 
 
 def numpy_log_density(decoder, row, state_mask, action_mask):
@@ -103,14 +96,7 @@ def test_samples_of_masks():
 
 
 def test_gradient_ignores_padding(decoder, rows):
-    @jax.jit
-    def gradient(rows):
-        args = rows, jnp.asarray(LENGTH), jnp.ones(EPISODES), jnp.ones(EPISODES), jax.random.key(1)
-        return jax.grad(lambda decoder: decoder.loss(*args))(decoder)
-
-    padded = np.where(np.arange(STEPS)[:, None] < LENGTH[:, None, None], rows, np.float32(99.0))
-    for a, b in zip(*map(jax.tree.leaves, (gradient(rows), gradient(padded))), strict=True):
-        np.testing.assert_allclose(a, b, rtol=1e-4, atol=1e-6)
+    check_padding(decoder, rows, LENGTH)
 
 
 def test_loss_without_episodes_is_finite(decoder, rows):
@@ -127,22 +113,11 @@ def test_must_learn_causes(monkeypatch):
     monkeypatch.setattr(grd, "DYNAMICS_STEPS", 32)
     monkeypatch.setattr(grd, "REWARD_THRESHOLD", np.inf)  # a network that ignores an entry does not need its mask
     monkeypatch.setattr(grd, "DYNAMICS_THRESHOLD", np.inf)
-    decoder = GRD(STATES, ACTIONS, (16,), (0.03,) * 5, key=KEY)
+    decoder = make_decoder("grd", SIZES, STEPS, hidden=(16,), sparsity=(0.03,) * 5)
     x = np.random.default_rng(1).normal(size=(1000, 16, STEPS, STATES + ACTIONS)).astype(np.float32)
     reward = 2 * x[..., 0] - x[..., STATES]
     rows = np.concatenate([x, np.repeat(x[..., 1:2] + x[..., STATES + 1 : STATES + 2], STATES, axis=-1)], axis=-1)
-    length = jnp.full(16, STEPS)
-
-    def body(state, inputs):
-        (decoder, optimizer), (rows, target, key) = state, inputs
-        gradient = jax.grad(lambda d: d.loss(rows, length, target, jnp.ones(16), key))(decoder)
-        return adam_step(decoder, gradient, optimizer, 1e-2), None
-
-    @jax.jit
-    def train(decoder, *inputs):
-        return jax.lax.scan(body, (decoder, init_adam(decoder, 1e-2)), inputs)[0][0]
-
-    decoder = train(decoder, rows, reward.mean(axis=-1), jax.random.split(KEY, len(rows)))
+    decoder = train_by_loss(decoder, rows, reward.mean(axis=-1), 1e-2)
     assert causes(decoder.state_reward).tolist() == [True, False, False]
     assert causes(decoder.action_reward).tolist() == [True, False]
     r_hat = np.asarray(decoder(jnp.asarray(rows[0]), None).r_hat)
@@ -155,11 +130,8 @@ def test_must_learn_causes(monkeypatch):
 
 
 def test_inputs_of_another_order_are_refused():
-    shape = DecoderShape(
-        Basis(0, 8, extended=False), STEPS, 1, (("action", 2), ("observation", 3), ("next_observation", 3))
-    )
     with pytest.raises(LareError, match=r"reads the inputs observation, action, next_observation, .*'action': 2"):
-        init_grd(KEY, shape, CreditSettings())
+        make_decoder("grd", {"action": 2, "observation": 3, "next_observation": 3}, STEPS)
 
 
 def test_input_sizes():

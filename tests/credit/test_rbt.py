@@ -7,23 +7,23 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from helpers.numpy_attention import numpy_attention, numpy_layer_norm, numpy_linear
+from helpers.decoder_toys import check_padding, make_decoder, train_by_loss
+from helpers.numpy_attention import numpy_attention, numpy_layer_norm, numpy_linear, numpy_mlp
 from lare_rl.config.validity import check_credit
 from lare_rl.credit import rbt
 from lare_rl.credit.decoder_settings import CreditSettings
 from lare_rl.credit.methods import METHODS
-from lare_rl.credit.rbt import RBT
 from lare_rl.errors import LareError
-from lare_rl.nn.networks import adam_step, init_adam
 from lare_rl.tasks.payments import PAID_AT_END, PaymentRule
 
 BAGS, STEPS, STATES, ACTIONS, SIZE = 4, 5, 3, 2, 8
 LENGTH = np.array([5, 4, 2, 1])
+SIZES = {"observation": STATES, "action": ACTIONS, "next_observation": STATES}
 
 
 @pytest.fixture(scope="module")
 def decoder():
-    return RBT(STATES, ACTIONS, (SIZE,), key=jax.random.key(0))
+    return make_decoder("rbt", SIZES, STEPS, hidden=(SIZE,))
 
 
 @pytest.fixture(scope="module")
@@ -33,11 +33,6 @@ def rows():
 
 def numpy_norm(layer, x):
     return numpy_layer_norm(x, 1e-5) * np.asarray(layer.weight) + np.asarray(layer.bias)
-
-
-def numpy_mlp(mlp, x):
-    first, second = mlp.layers
-    return numpy_linear(second, np.maximum(numpy_linear(first, x), 0))
 
 
 def numpy_bag(decoder, bag):
@@ -88,38 +83,19 @@ def test_a_tenth_is_dropped():
 
 def test_gradient_ignores_padding(decoder, rows, monkeypatch):
     monkeypatch.setattr(rbt, "DROPOUT", 0.0)
-
-    @jax.jit
-    def gradient(rows):
-        args = rows, jnp.asarray(LENGTH), jnp.ones(BAGS), jnp.ones(BAGS), jax.random.key(1)
-        return jax.grad(lambda decoder: decoder.loss(*args))(decoder)
-
-    padded = np.where(np.arange(STEPS)[:, None] < LENGTH[:, None, None], rows, np.float32(9.0))
-    for a, b in zip(*map(jax.tree.leaves, (gradient(rows), gradient(padded))), strict=True):
-        np.testing.assert_allclose(a, b, rtol=1e-3, atol=1e-5)
+    check_padding(decoder, rows, LENGTH)
 
 
 def test_must_learn_rewards_and_next_states():
     """Rewards are linear in state and action. The next state is the action."""
     rng, weight = np.random.default_rng(1), np.array([1.0, 0, 0.5, -1.0, 0], np.float32)
-    decoder = RBT(STATES, ACTIONS, (16,), key=jax.random.key(0))
     x = rng.normal(size=(500, 32, STEPS, STATES + ACTIONS)).astype(np.float32)
     rows = np.concatenate([x, x[..., -1:].repeat(STATES, axis=-1)], axis=-1)
-    reward, length = x @ weight, jnp.full(32, STEPS)
-
-    def body(state, inputs):
-        (decoder, optimizer), (rows, target, key) = state, inputs
-        gradient = jax.grad(lambda d: d.loss(rows, length, target, jnp.ones(32), key))(decoder)
-        return adam_step(decoder, gradient, optimizer, 5e-3), None
-
-    @jax.jit
-    def train(decoder, *inputs):
-        decoder = jax.lax.scan(body, (decoder, init_adam(decoder, 5e-3)), inputs)[0][0]
-        last = jnp.asarray(rows[0])
-        return decoder(last, None).r_hat, decoder.bag_rewards(last, jnp.ones(last.shape[:2], bool), None)[1]
-
-    keys = jax.random.split(jax.random.key(0), len(rows))
-    r_hat, next_state = map(np.asarray, train(decoder, rows, reward.mean(axis=-1), keys))
+    reward = x @ weight
+    decoder = train_by_loss(make_decoder("rbt", SIZES, STEPS, hidden=(16,)), rows, reward.mean(axis=-1), 5e-3)
+    last = jnp.asarray(rows[0])
+    r_hat = np.asarray(decoder(last, None).r_hat)
+    next_state = np.asarray(decoder.bag_rewards(last, jnp.ones(last.shape[:2], bool), None)[1])
     assert np.corrcoef(r_hat.ravel(), reward[0].ravel())[0, 1] > 0.6
     assert np.corrcoef(next_state[..., 0].ravel(), x[0, ..., -1].ravel())[0, 1] > 0.9
 

@@ -11,14 +11,10 @@ from hypothesis import strategies as st
 from lare_rl.credit import evidence, relevance
 from lare_rl.credit.basis import Basis
 
+pytestmark = pytest.mark.usefixtures("in_float64")
+
 BASIS = Basis(n_factors=2, n_raw=10, extended=False)
 MAX_EPISODES = 120
-
-
-@pytest.fixture(autouse=True)
-def in_float64():
-    with jax.enable_x64(True):
-        yield
 
 
 def episodes(count, relevant, noise, seed):

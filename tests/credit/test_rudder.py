@@ -5,9 +5,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from helpers.decoder_toys import check_padding, make_decoder, train_by_loss
 from helpers.numpy_attention import numpy_linear
-from lare_rl.credit.rudder import RUDDER
-from lare_rl.nn.networks import adam_step, init_adam
 
 EPISODES, STEPS, FEATURES = 4, 7, 3
 LENGTH = np.array([7, 4, 2, 1])
@@ -15,7 +14,7 @@ LENGTH = np.array([7, 4, 2, 1])
 
 @pytest.fixture(scope="module")
 def decoder():
-    return RUDDER(FEATURES, (5,), key=jax.random.key(0))
+    return make_decoder("rudder", FEATURES, STEPS, hidden=(5,))
 
 
 @pytest.fixture(scope="module")
@@ -56,14 +55,7 @@ def test_loss_against_numpy(decoder, rows):
 
 
 def test_gradient_ignores_padding(decoder, rows):
-    @jax.jit
-    def gradient(rows):
-        args = rows, jnp.asarray(LENGTH), jnp.ones(EPISODES), jnp.ones(EPISODES), jax.random.key(1)
-        return jax.grad(lambda decoder: decoder.loss(*args))(decoder)
-
-    padded = np.where(np.arange(STEPS)[:, None] < LENGTH[:, None, None], rows, np.float32(99.0))
-    for a, b in zip(*map(jax.tree.leaves, (gradient(rows), gradient(padded))), strict=True):
-        np.testing.assert_allclose(a, b, rtol=1e-4, atol=1e-6)
+    check_padding(decoder, rows, LENGTH)
 
 
 def test_must_learn_step_rewards_and_a_cause_in_the_past():
@@ -72,23 +64,9 @@ def test_must_learn_step_rewards_and_a_cause_in_the_past():
     The step model learns the mean over that sign, and the differences of predictions the sign, too.
     """
     rng, weight = np.random.default_rng(1), np.array([1.0, 0, 0.5], np.float32)
-    decoder = RUDDER(FEATURES, (32,), key=jax.random.key(0))
-
-    def rewards(x):
-        return x @ weight + np.sign(x[..., :1, 2]) * x[..., 1]
-
-    def body(state, inputs):
-        (decoder, optimizer), (x, target) = state, inputs
-        length = jnp.full(len(x), STEPS)
-        gradient = jax.grad(lambda d: d.loss(x, length, target, jnp.ones(len(x)), jax.random.key(0)))(decoder)
-        return adam_step(decoder, gradient, optimizer, 1e-2), None
-
-    @jax.jit
-    def train(decoder, *episodes):
-        return jax.lax.scan(body, (decoder, init_adam(decoder, 1e-2)), episodes)[0][0]
-
     x = rng.normal(size=(600, 32, STEPS, FEATURES)).astype(np.float32)
-    decoder = train(decoder, x, rewards(x).mean(axis=-1))
+    rewards = x @ weight + np.sign(x[..., :1, 2]) * x[..., 1]
+    decoder = train_by_loss(make_decoder("rudder", FEATURES, STEPS, hidden=(32,)), x, rewards.mean(axis=-1), 1e-2)
     x = rng.normal(size=(100, STEPS, FEATURES)).astype(np.float32)
     r_hat = np.asarray(decoder(jnp.asarray(x), None).r_hat)
     assert np.corrcoef(r_hat.ravel(), (x @ weight).ravel())[0, 1] > 0.9

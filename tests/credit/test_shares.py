@@ -71,9 +71,8 @@ def test_rewards_add_up_to_the_return():
     rng = np.random.default_rng(0)
     alive = np.ones((2, 2 * STEPS, AGENTS), bool)
     alive[0, 2:STEPS, 1] = alive[1, 1:STEPS, :2] = False
-    returns = np.repeat(rng.normal(size=(2, 2)), STEPS, axis=1).astype(
-        np.float32
-    )  # two environments, two episodes each
+    # Two environments, two episodes each.
+    returns = np.repeat(rng.normal(size=(2, 2)), STEPS, axis=1).astype(np.float32)
     inputs = rng.normal(size=(2, 2 * STEPS, AGENTS, 4)).astype(np.float32)
     steps = StepBatch(inputs, np.full(returns.shape, STEPS), returns / STEPS, np.ones(returns.shape, bool), alive=alive)
     unfinished = steps._replace(finished=~steps.finished)  # the return is not known yet

@@ -1,38 +1,24 @@
-import math
-
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from helpers.numpy_attention import numpy_attention, numpy_layer_norm, numpy_linear
-from lare_rl.credit.stas import STAS, Coalitions, TimeLayer, dropout
+from helpers.decoder_toys import make_decoder
+from helpers.numpy_attention import numpy_coalitions, numpy_time_layer
+from lare_rl.credit.stas import Coalitions, TimeLayer, dropout
 
 STEPS, AGENTS = 5, 3
 KEY = jax.random.key(1)
 
 
-def test_time_layer_against_numpy():
-    """Its input is not added again after the feed-forward layers, and the attention is added twice."""
+def test_layers_against_numpy():
+    rng = np.random.default_rng(0)
+    steps, agents = (rng.normal(size=(n, 128)).astype(np.float32) for n in (STEPS, AGENTS))
     layer = TimeLayer(key=KEY)
-    x = np.random.default_rng(0).normal(size=(STEPS, 128)).astype(np.float32)
-    projected = [numpy_linear(linear, x).reshape(STEPS, 4, 32) for linear in (layer.query, layer.key, layer.value)]
-    a = numpy_linear(layer.merge, numpy_attention(*projected, np.tri(STEPS, dtype=bool)))
-    hidden = numpy_linear(layer.feed_forward.layers[0], numpy_layer_norm(x + a, 1e-12))
-    hidden *= 0.5 * (1 + np.vectorize(math.erf)(hidden / np.sqrt(2)))
-    want = numpy_layer_norm(numpy_linear(layer.feed_forward.layers[1], hidden) + 2 * a, 1e-12)
-    np.testing.assert_allclose(layer(jnp.asarray(x), None), want, rtol=1e-3, atol=1e-4)
-
-
-def test_coalitions_against_numpy():
-    """The output is the mean over coalitions of attention, for which each agent has its own queries."""
-    layer, key = Coalitions(AGENTS, key=KEY), jax.random.key(1)
-    x = np.random.default_rng(0).normal(size=(AGENTS, 128)).astype(np.float32)
-    query = np.stack([x[i] @ layer.query.weight[i] + layer.query.bias[i] for i in range(AGENTS)])
-    projected = query, numpy_linear(layer.key, x), numpy_linear(layer.value, x)
-    projected = [values.reshape(AGENTS, 4, 32) for values in projected]
-    masks = np.asarray(jax.random.bernoulli(key, 0.5, (5, AGENTS, AGENTS))) | np.eye(AGENTS, dtype=bool)
-    want = np.mean([numpy_linear(layer.merge, numpy_attention(*projected, mask)) for mask in masks], axis=0)
-    np.testing.assert_allclose(layer(jnp.asarray(x), key, None), want, rtol=1e-4, atol=1e-5)
+    np.testing.assert_allclose(layer(jnp.asarray(steps), None), numpy_time_layer(layer, steps), rtol=1e-3, atol=1e-4)
+    layer = Coalitions(AGENTS, key=KEY)
+    masks = np.asarray(jax.random.bernoulli(KEY, 0.5, (5, AGENTS, AGENTS))) | np.eye(AGENTS, dtype=bool)
+    want = numpy_coalitions(layer, agents, masks)
+    np.testing.assert_allclose(layer(jnp.asarray(agents), KEY, None), want, rtol=1e-4, atol=1e-5)
 
 
 def test_dropout_is_independent_for_each_entry():
@@ -45,7 +31,7 @@ def test_dropout_is_independent_for_each_entry():
 
 def test_reward_is_a_mean_over_samples():
     """It is nearer to the mean over many samples than a single sample."""
-    decoder = STAS(6, STEPS, AGENTS, 2.0, key=KEY)
+    decoder = make_decoder("stas", 6, STEPS, AGENTS, seed=1)
     rows = np.random.default_rng(0).normal(size=(2 * STEPS, AGENTS, 6)).astype(np.float32)
 
     @jax.jit

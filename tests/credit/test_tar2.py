@@ -1,28 +1,26 @@
 """TAR2 against a slow NumPy twin, and what it must learn."""
 
-import math
-
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from helpers.numpy_attention import numpy_attention, numpy_layer_norm, numpy_linear
+from helpers.decoder_toys import make_decoder
+from helpers.numpy_attention import numpy_coalitions, numpy_gelu, numpy_linear, numpy_mlp, numpy_time_layer
 from lare_rl.config.validity import check_credit
 from lare_rl.credit.decoder_settings import CreditSettings
 from lare_rl.credit.methods import METHODS
 from lare_rl.credit.shares import return_shares
-from lare_rl.credit.tar2 import TAR2
 from lare_rl.errors import LareError
 from lare_rl.nn.networks import adam_step, init_adam
 
-EPISODES, STEPS, AGENTS, OBSERVATIONS, ACTIONS, GAIN = 2, 4, 3, 5, 2, 2.0
+EPISODES, STEPS, AGENTS, OBSERVATIONS, ACTIONS = 2, 4, 3, 5, 2
 KEY = jax.random.key(1)
 
 
 @pytest.fixture(scope="module")
 def decoder():
-    return TAR2(OBSERVATIONS, ACTIONS, STEPS, AGENTS, GAIN, key=jax.random.key(0))
+    return make_decoder("tar2", {"observation": OBSERVATIONS, "action": ACTIONS}, STEPS, AGENTS)
 
 
 @pytest.fixture(scope="module")
@@ -31,30 +29,6 @@ def rows():
     action = np.eye(ACTIONS)[rng.integers(ACTIONS, size=(EPISODES * STEPS, AGENTS))]
     observation = rng.normal(size=(EPISODES * STEPS, AGENTS, OBSERVATIONS))
     return np.concatenate([observation, action], axis=-1).astype(np.float32)
-
-
-def numpy_gelu(x):
-    return x * 0.5 * (1 + np.vectorize(math.erf)(x / np.sqrt(2)))
-
-
-def numpy_mlp(mlp, x):
-    first, second = mlp.layers
-    return numpy_linear(second, numpy_gelu(numpy_linear(first, x)))
-
-
-def numpy_time_layer(layer, x):
-    projected = [numpy_linear(linear, x).reshape(STEPS, 4, 16) for linear in (layer.query, layer.key, layer.value)]
-    a = numpy_linear(layer.merge, numpy_attention(*projected, np.tri(STEPS, dtype=bool)))
-    first, second = layer.feed_forward.layers
-    hidden = numpy_gelu(numpy_linear(first, numpy_layer_norm(x + a, 1e-12)))
-    return numpy_layer_norm(numpy_linear(second, hidden) + 2 * a, 1e-12)
-
-
-def numpy_agent_layer(layer, x, masks):
-    query = np.stack([x[i] @ layer.query.weight[i] + layer.query.bias[i] for i in range(AGENTS)])
-    projected = query, numpy_linear(layer.key, x), numpy_linear(layer.value, x)
-    projected = [values.reshape(AGENTS, 4, 16) for values in projected]
-    return np.mean([numpy_linear(layer.merge, numpy_attention(*projected, mask)) for mask in masks], axis=0)
 
 
 def numpy_output(decoder, episode, key):
@@ -67,14 +41,14 @@ def numpy_output(decoder, episode, key):
         x = np.stack([numpy_time_layer(decoder.time_layers[i], x[:, agent]) for agent in range(AGENTS)], axis=1)
         x = x + np.asarray(decoder.agent_numbers)[i][np.asarray(jax.random.permutation(order_key, AGENTS))]
         masks = np.asarray(jax.random.bernoulli(mask_key, 0.5, (5, AGENTS, AGENTS))) | np.eye(AGENTS, dtype=bool)
-        x = np.stack([numpy_agent_layer(decoder.agent_layers[i], step, masks) for step in x])
+        x = np.stack([numpy_coalitions(decoder.agent_layers[i], step, masks) for step in x])
         outputs.append(x)
     h = np.concatenate(outputs, axis=-1)
     outcome = np.broadcast_to(h[-1].mean(axis=0), h.shape)
-    contributions = numpy_mlp(decoder.contribution_model, np.concatenate([h, outcome], axis=-1))[..., 0]
+    contributions = numpy_mlp(decoder.contribution_model, np.concatenate([h, outcome], axis=-1), numpy_gelu)[..., 0]
     past = np.concatenate([np.zeros_like(h[:1]), h[:-1]])
     mean_state = np.broadcast_to(state.mean(axis=1, keepdims=True), state.shape)
-    logits = numpy_mlp(decoder.action_model, np.concatenate([mean_state, past], axis=-1))
+    logits = numpy_mlp(decoder.action_model, np.concatenate([mean_state, past], axis=-1), numpy_gelu)
     log_p = logits - np.log(np.exp(logits).sum(axis=-1, keepdims=True))
     return contributions, (log_p * action).sum(axis=-1)
 
@@ -83,7 +57,7 @@ def test_output_against_numpy(decoder, rows):
     output = jax.jit(lambda rows: decoder(rows, KEY))(rows)
     want = [numpy_output(decoder, episode, KEY) for episode in rows.reshape(EPISODES, STEPS, AGENTS, -1)]
     contributions, log_p = (np.concatenate(values) for values in zip(*want, strict=True))
-    np.testing.assert_allclose(output.r_hat, GAIN * contributions, rtol=1e-3, atol=1e-4)
+    np.testing.assert_allclose(output.r_hat, np.sqrt(STEPS * AGENTS) * contributions, rtol=1e-3, atol=1e-4)
     np.testing.assert_allclose(output.penalty, -0.05 * log_p, rtol=1e-3, atol=1e-5)
 
 
@@ -100,7 +74,7 @@ def test_contributions_are_a_mean_over_samples(decoder, rows):
 def test_must_learn_contributions_and_actions():
     """The reward of an agent is its first entry. It acts by the sign of the mean second entry. Only returns are observed."""
     steps, agents, updates, n_episodes = 3, 2, 100, 32
-    decoder = TAR2(2, 2, steps, agents, 1.0, key=jax.random.key(0))
+    decoder = make_decoder("tar2", {"observation": 2, "action": 2}, steps, agents)
     observation = np.random.default_rng(0).normal(size=(updates, n_episodes, steps, agents, 2))
     chosen = (observation[..., 1].mean(axis=-1, keepdims=True) > 0).astype(int).repeat(agents, axis=-1)
     episodes = np.concatenate([observation, np.eye(2)[chosen]], axis=-1).astype(np.float32)
@@ -120,7 +94,7 @@ def test_must_learn_contributions_and_actions():
         decoder = jax.lax.scan(body, (decoder, init_adam(decoder, 1e-3)), inputs)[0][0]
         return decoder(inputs[0][0], None).r_hat, decoder(inputs[0][0], KEY).penalty
 
-    target = (4 * reward.mean(axis=(2, 3))).astype(np.float32)
+    target = (4 * np.sqrt(steps * agents) * reward.mean(axis=(2, 3))).astype(np.float32)
     r_hat, penalty = map(np.asarray, train(decoder, rows, target, jax.random.split(KEY, updates)))
     contributions = r_hat.reshape(n_episodes, steps, agents)
     assert np.corrcoef(contributions.ravel(), reward[0].ravel())[0, 1] > 0.7

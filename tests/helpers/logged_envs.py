@@ -6,10 +6,8 @@ import gymnasium
 import numpy as np
 from gymnasium.spaces import Box, flatten
 
+from helpers.assigner_episodes import SMALL_CREDIT
 from lare_rl.assigner.assigner import CreditAssigner
-from lare_rl.credit.decoder_settings import CreditSettings
-
-SMALL_CREDIT = CreditSettings(hidden=(8,), drawn_steps=4, steps=16, episodes=2)
 
 
 class RecordingAssigner(CreditAssigner):
@@ -43,7 +41,8 @@ def recording_assigner(env, method="ircr", **options):
 class RandomEnv(gymnasium.Env):
     """Random observations and rewards, in episodes of 1 to 5 steps. Every other episode is truncated.
 
-    The first observation is always the same. With `rewrites`, all observations are in the same memory.
+    The first observation is always the same. With `rewrites`, all observations are in the same memory, and `LoggedEnv` overwrites
+    actions.
     """
 
     def __init__(self, observation_space=None, action_space=None, seed=0, rewrites=False):
@@ -53,7 +52,7 @@ class RandomEnv(gymnasium.Env):
         self.random = np.random.default_rng(seed)
         self.first = self.observation_space.sample()
         self.memory = self.first.copy() if rewrites and isinstance(self.observation_space, Box) else None
-        self.truncates = True
+        self.truncates, self.rewrites = True, rewrites
 
     def reset(self, *, seed=None, options=None):
         self.steps_left = int(self.random.integers(1, 6))
@@ -92,7 +91,9 @@ class LoggedEnv(gymnasium.Wrapper):
         return observation, info
 
     def step(self, action):
-        action = np.array(action)
+        original, action = action, np.array(action)
+        if getattr(self.unwrapped, "rewrites", False) and isinstance(original, np.ndarray):
+            original[...] = 0
         observation, reward, terminated, truncated, info = self.env.step(action)
         reward = float(np.round(4096 * reward) / 4096)
         before, self.observation = self.observation, deepcopy(observation)

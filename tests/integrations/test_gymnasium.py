@@ -126,6 +126,18 @@ def test_vector_reset_drops_episodes(mode):
     assert credit.store.dropped == n_running > 0
 
 
+def test_reset_after_an_end_begins_with_a_step():
+    """In NEXT_STEP mode, the call after an end resets, unless the loop has done it."""
+    vector, envs = make_vector()
+    credit = recording_assigner(envs[0])
+    wrapped = VectorCredit(vector, credit, pay="environment")
+    wrapped.reset()
+    envs[0].unwrapped.steps_left = 1
+    wrapped.step(wrapped.action_space.sample())
+    play(wrapped, 10)
+    check_episodes(credit, envs)
+
+
 def test_reset_mask_drops_one_episode():
     vector, envs = make_vector(DISABLED)
     credit = recording_assigner(envs[0])

@@ -95,6 +95,15 @@ def test_rewards():
         assert reward == pytest.approx(float(r_hat[NAMES.index(agent)]), rel=1e-5) != 0
 
 
+def test_agent_that_joins_is_paid_when_it_acts():
+    """Before an episode ends, ircr pays 0.5 to each agent that acts."""
+    team = LoggedTeam(NAMES, joins={"a_2": 2})
+    results = play(CreditParallel(team, make_assigner()))
+    for (_, rewards, *_), step in zip(results[:-1], team.log[:-1], strict=True):
+        assert {agent for agent, reward in rewards.items() if reward} == set(step)
+    assert any(len(rewards) > len(step) for (_, rewards, *_), step in zip(results, team.log, strict=True))
+
+
 def test_reset_drops_episode():
     credit = make_assigner()
     wrapped = CreditParallel(LoggedTeam(NAMES), credit)

@@ -1,5 +1,7 @@
 """Credit as pure functions: it recovers rewards from returns, and works under JAX's transformations."""
 
+from functools import partial
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -7,12 +9,15 @@ import pytest
 from jax.sharding import PartitionSpec
 
 import lare_rl
+from lare_rl.credit.decoder_settings import CreditSettings, default_credit
 from lare_rl.errors import LareError
 from lare_rl.integrations.pure_credit import CreditSteps, pure_credit
 
 N_ENVS, N_STEPS, LENGTH = 4, 20, 10
 WEIGHT = np.array([1.0, -2.0, 0.5], np.float32)
 SIZES = {"observation_size": 2, "action_size": 1, "n_envs": N_ENVS, "n_steps": N_STEPS, "max_steps": LENGTH}
+SUM = {**SIZES, "settings": CreditSettings(score="sum")}
+"""Nothing is fitted to find out the type of the score, which takes seconds to compile."""
 
 
 def make_steps(key, agents=()):
@@ -32,12 +37,11 @@ def correlation(x, y):
     return float(np.corrcoef(np.ravel(x), np.ravel(y))[0, 1])
 
 
-def train(credit, key, n_rounds=30, agents=()):
+def train(credit, key, n_rounds=30, make=make_steps):
     """Observe and refit in a compiled loop. Return the state."""
 
     def body(state, key):
-        steps, _ = make_steps(key, agents)
-        return credit.refit(credit.observe(state, steps), key), None
+        return credit.refit(credit.observe(state, make(key)[0]), key), None
 
     init_key, key = jax.random.split(key)
     return jax.lax.scan(body, credit.init(init_key), jax.random.split(key, n_rounds))[0]
@@ -45,7 +49,7 @@ def train(credit, key, n_rounds=30, agents=()):
 
 @pytest.mark.parametrize("method", ["bayes", "rrdu"])
 def test_rewards_are_recovered_from_returns(method):
-    credit = pure_credit(method, **SIZES, fit_updates=100)
+    credit = pure_credit(method, **SUM, fit_updates=100)
     state = jax.jit(lambda key: train(credit, key))(jax.random.key(0))
     steps, true_reward = make_steps(jax.random.key(1))
     r_hat = jax.jit(credit.reward)(state, steps)
@@ -54,26 +58,36 @@ def test_rewards_are_recovered_from_returns(method):
 
 
 def test_rewards_of_many_agents():
-    credit = pure_credit("bayes", **SIZES, agents=3)
-    state = jax.jit(lambda key: train(credit, key, agents=(3,)))(jax.random.key(0))
+    settings = default_credit(3).model_copy(update={"score": "sum"})
+    credit = pure_credit("bayes", **SIZES, settings=settings, agents=3)
+    state = jax.jit(lambda key: train(credit, key, make=partial(make_steps, agents=(3,))))(jax.random.key(0))
     steps, true_reward = make_steps(jax.random.key(1), (3,))
     assert correlation(credit.reward(state, steps), true_reward) > 0.9
 
 
 def test_phi_is_part_of_the_program(phi):
-    credit = pure_credit("lare-bayes", phi, **SIZES | {"observation_size": phi.sizes[0], "action_size": phi.sizes[1]})
+    credit = pure_credit("lare-bayes", phi, **SIZES)
     state = jax.jit(lambda key: train(credit, key))(jax.random.key(0))
     steps, _ = make_steps(jax.random.key(1))
     assert np.isfinite(jax.jit(credit.reward)(state, steps)).all()
     assert "callback" not in str(jax.make_jaxpr(credit.observe)(state, steps))
 
 
+def test_phi_reads_actions_in_the_units_of_the_environment(reward):
+    credit = pure_credit("llm-reward", reward, **SIZES, low=-3.0, high=1.0)
+    steps, _ = make_steps(jax.random.key(1))
+    r_hat = credit.reward(credit.init(jax.random.key(0)), steps)
+    rows = [np.asarray(x).reshape(N_STEPS * N_ENVS, -1) for x in (steps.observation, 2 * steps.action - 1)]
+    after = np.asarray(steps.next_observation).reshape(N_STEPS * N_ENVS, -1)
+    expected = reward.step_factors(*rows, after, "after")
+    np.testing.assert_allclose(np.ravel(r_hat), np.ravel(expected), rtol=1e-5, atol=1e-5)
+
+
 def test_invalid_factors_are_counted_and_not_used(phi):
     """A step is invalid where the observation is NaN. `lare-linear` reads factors alone."""
-    credit = pure_credit("lare-linear", phi, **SIZES)
-    is_invalid = (
-        jnp.zeros((N_STEPS, N_ENVS), bool).at[[3, 9, 14], [0, 1, 2]].set(True)
-    )  # 9: the last step of an episode
+    credit = pure_credit("lare-linear", phi, **SUM)
+    # Step 9 is the last one of an episode.
+    is_invalid = jnp.zeros((N_STEPS, N_ENVS), bool).at[[3, 9, 14], [0, 1, 2]].set(True)
 
     def steps_of(key):
         steps, true_reward = make_steps(key)
@@ -81,13 +95,7 @@ def test_invalid_factors_are_counted_and_not_used(phi):
             next_observation=jnp.where(is_invalid[..., None], jnp.nan, steps.next_observation)
         ), true_reward
 
-    def run(key):
-        def body(state, key):
-            return credit.refit(credit.observe(state, steps_of(key)[0]), key), None
-
-        return jax.lax.scan(body, credit.init(key), jax.random.split(key, 30))[0]
-
-    state = jax.jit(run)(jax.random.key(0))
+    state = jax.jit(lambda key: train(credit, key, make=steps_of))(jax.random.key(0))
     assert int(state.n_invalid) == 90
     steps, _ = steps_of(jax.random.key(1))
     r_hat = np.asarray(credit.reward(state, steps))
@@ -102,7 +110,7 @@ def test_invalid_factors_are_counted_and_not_used(phi):
 
 def test_functions_are_mapped_over_seeds():
     """`vmap` and `shard_map` give what single calls give."""
-    credit = pure_credit("bayes", **SIZES)
+    credit = pure_credit("bayes", **SUM)
     keys = jax.random.split(jax.random.key(0), 2)
 
     def run(key):

@@ -10,6 +10,7 @@ from tensordict import TensorDict
 from torchrl.collectors import Collector
 from torchrl.data import LazyTensorStorage, ReplayBuffer, TensorDictReplayBuffer
 from torchrl.envs import Compose, GymWrapper, RewardScaling, SerialEnv
+from torchrl.envs.utils import step_mdp
 
 from helpers.logged_envs import LoggedEnv, RandomEnv, RecordingAssigner, check_episodes, recording_assigner
 from lare_rl.errors import LareError
@@ -74,10 +75,10 @@ def test_time_is_last_dimension():
     env, start = serial_env(envs), None
     for _ in range(3):
         batch = env.rollout(7, tensordict=start, auto_reset=start is None, break_when_any_done=False)
-        start = env.step_and_maybe_reset(batch[..., -1].clone())[1]
+        start = env.maybe_reset(step_mdp(batch[..., -1]))
         buffer.extend(batch.exclude("collector"))
-    assert credit.store.steps == 63
-    assert credit.store.ended > 3
+    check_episodes(credit, envs)
+    assert (credit.store.steps, credit.store.dropped) == (63, 0)
 
 
 def test_single_steps():
@@ -87,6 +88,13 @@ def test_single_steps():
     for step in roll_out(30, env):
         buffer.add(step)
     check_episodes(credit, [env])
+
+
+def test_done_alone_ends_an_episode():
+    batch = roll_out(30).exclude(("next", "terminated"), ("next", "truncated"))
+    credit = recording_assigner(make_env())
+    make_buffer(credit).extend(batch)
+    assert credit.store.ended == int(batch["next", "done"].sum()) > 0
 
 
 def test_samples():
@@ -130,14 +138,6 @@ def test_threads():
     for thread in threads:
         thread.join()
     assert errors == []
-
-
-def test_small_capacity():
-    buffer = make_buffer(recording_assigner(make_env(), capacity=20))
-    for _ in range(4):
-        buffer.extend(roll_out(10))
-    with pytest.raises(LareError, match=r"step 0 .*20 to 39 .*capacity = 20"):
-        buffer[:]
 
 
 def test_bad_arguments():

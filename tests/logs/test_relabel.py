@@ -7,12 +7,15 @@ import signal
 import sys
 
 import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
 import pytest
 
 import lare_rl
 from helpers.long_tests import long_case
 from helpers.toy_logs import PHI, logged_episodes, read_directory
 from lare_rl import LareError
+from lare_rl.credit.decoder_settings import CreditSettings
 from lare_rl.logs.relabel import MESSAGES, Relabelled, hold_out_flags, predicted_return_statistics
 from lare_rl.util.findings import render
 
@@ -46,7 +49,7 @@ def test_linear_score(folder, tmp_path):
 @pytest.mark.parametrize("parquet", [False, True])
 def test_groups_share_an_intercept(parquet, tmp_path):
     """Returns of the group "hard" are lower, and so is the second entry, which no step is paid for."""
-    pyarrow, episodes = pytest.importorskip("pyarrow"), list(logged_episodes(120))
+    episodes = list(logged_episodes(120))
     names = ["easy" if number % 2 else "hard" for number in range(len(episodes))]
     for name, episode in zip(names, episodes, strict=True):
         steps = len(episode["actions"])
@@ -57,9 +60,9 @@ def test_groups_share_an_intercept(parquet, tmp_path):
     source = episodes
     if parquet:
         rows = [{key: value.tolist() for key, value in episode.items()} for episode in episodes]
-        pyarrow.parquet.write_table(pyarrow.Table.from_pylist(rows), tmp_path / "log.parquet")
+        pq.write_table(pa.Table.from_pylist(rows), tmp_path / "log.parquet")
         source = tmp_path / "log.parquet"
-    result = lare_rl.relabel(source, tmp_path / "new")
+    result = lare_rl.relabel(source, tmp_path / "new", settings=CreditSettings(score="sum"))
     assert result.return_r2 > 0.98
     if not parquet:
         new = read_directory(tmp_path / "new")
@@ -78,7 +81,13 @@ def test_score_of_noise(tmp_path):
 def test_relabel_twice_in_place(folder, tmp_path, method):
     """The second fit is to the original rewards, so that nothing changes."""
     path = folder(logged_episodes(40))
-    options = {"method": method, "updates": 16, "hold_out": 0.25, "overwrite": True}
+    options = {
+        "method": method,
+        "updates": 16,
+        "hold_out": 0.25,
+        "overwrite": True,
+        "settings": CreditSettings(score="sum"),
+    }
     result = lare_rl.relabel(path, path, **options)
     assert math.isfinite(result.return_r2)
     first = read_directory(path)

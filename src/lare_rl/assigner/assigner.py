@@ -12,7 +12,6 @@ samples steps, because stored proxy rewards would be those of an older decoder.
 
 import threading
 from collections.abc import Hashable, Sequence
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -25,23 +24,22 @@ from lare_rl.assigner.assigner_config import (
     Space,
     check_config,
     check_finite,
-    resolve_layouts,
+    resolve_config,
     to_flags,
     to_step_ids,
 )
 from lare_rl.assigner.decoder_learner import DecoderLearner
 from lare_rl.assigner.saving import AssignerState
+from lare_rl.assigner.step_rewards import StepRewards
 from lare_rl.assigner.store import Store
-from lare_rl.credit.decoder_settings import CreditSettings, default_credit
+from lare_rl.credit.decoder_settings import CreditSettings
 from lare_rl.credit.explanation_text import explanation_lines
-from lare_rl.credit.methods import Reward, find_method
+from lare_rl.credit.methods import Reward
 from lare_rl.credit.returns import estimate_score_type
-from lare_rl.envs.families import find_score
-from lare_rl.envs.load import resolve_task
 from lare_rl.errors import LareError
 from lare_rl.latent.function import LatentFunction
 from lare_rl.tasks.payments import PAID_AT_END, PaymentRule
-from lare_rl.tasks.spec import MAX_LEVELS, ScoredObservation, TaskSpec
+from lare_rl.tasks.spec import ScoredObservation, TaskSpec
 
 __all__ = ["CreditAssigner"]
 
@@ -97,30 +95,23 @@ class CreditAssigner:
         Raises:
             LareError: method, function, task and spaces do not go together.
         """
-        task = None if task is None else resolve_task(task, playable=False)
-        settings = settings or default_credit(agents)
-        if settings.score == "auto" and task is not None and (score := find_score(task)) is not None:
-            settings = settings.model_copy(update={"score": score})
-        settings = settings.model_copy(update={"exact": find_method(method).choose_exact(settings.exact)})
-        observation, action = resolve_layouts(task, {"observation": observation_space, "action": action_space})
         self._init(
-            AssignerConfig(
-                method=find_method(method),
-                phi=phi,
-                task=task,
-                observation=observation,
-                action=action,
-                scored_observation=scored_observation or (task.scored_observation if task is not None else "after"),
+            resolve_config(
+                method,
+                phi,
+                task,
+                settings,
+                {"observation": observation_space, "action": action_space},
+                scored_observation=scored_observation,
                 agents=agents,
                 max_steps=max_steps,
                 capacity=capacity,
-                settings=settings,
                 seed=seed,
                 fits_per_step=fits_per_step,
                 scale_rewards=scale_rewards,
                 forget=forget,
-                payments=payments or (PAID_AT_END if task is None else task.payment_rule),
-                groups=(task is not None and task.group is not None) if groups is None else groups,
+                payments=payments,
+                groups=groups,
             )
         )
 
@@ -132,6 +123,7 @@ class CreditAssigner:
         self.group_names: dict[Hashable, int] = {}
         """The number of each group."""
         self.learner = DecoderLearner(config, self.store)
+        self.step_rewards = StepRewards(self.learner)
         self.lock = threading.RLock()
 
     def add(
@@ -191,7 +183,7 @@ class CreditAssigner:
             if len(rows):
                 step_ids[rows] = self.learner.add_steps(*steps, None if alive is None else alive[rows])
                 env_ids = [ids[row] for row in rows.tolist()]
-                level = self._levels(group, n_rows)[rows]
+                level = self.config.to_levels(group, n_rows, self.group_names)[rows]
                 paid_episodes = self.store.extend(env_ids, step_ids[rows], steps, team_reward, ended, level)
                 self.learner.queue_episodes(paid_episodes)
                 self.learner.flush_large_queues()
@@ -228,25 +220,10 @@ class CreditAssigner:
             if is_score:
                 rewards[-1] = score
             rule = PAID_AT_END if is_score else self.config.payments
-            (level,) = self._levels(None if group is None else [group], 1).tolist()
+            (level,) = self.config.to_levels(None if group is None else [group], 1, self.group_names).tolist()
             self.learner.queue_episodes(self.store.add_paid_episode(step_ids, rewards, rule, level))
             self.learner.flush_large_queues()
             return step_ids
-
-    def _levels(self, group: Sequence[Hashable] | None, n_rows: int) -> Int[np.ndarray, " n"]:
-        """Return the number of each row's group. Raises `LareError` if there are too many groups, or if they do not fit."""
-        if (group is not None) != self.config.groups:
-            needs = "needs group" if self.config.groups else "has no groups: leave group out, or set groups=True"
-            raise LareError(f"this assigner {needs}")
-        if group is None:
-            return np.zeros(n_rows, np.int32)
-        if len(group) != n_rows:
-            raise LareError(f"group has {len(group)} entries, but there are {n_rows} steps")
-        new = [name for name in dict.fromkeys(group) if name not in self.group_names]
-        if len(self.group_names) + len(new) > MAX_LEVELS:
-            raise LareError(f"there are more than {MAX_LEVELS} groups, of which {new[-1]!r} is one: merge some of them")
-        self.group_names |= {name: len(self.group_names) + i for i, name in enumerate(new)}
-        return np.array([self.group_names[name] for name in group], np.int32)
 
     def end(self, env_id: Hashable, score: float | None = None) -> None:
         """End the episode of an environment, with `score` as its return, or else the sum of its rewards.
@@ -257,10 +234,7 @@ class CreditAssigner:
             LareError: no episode is running in this environment, or the score is not finite.
         """
         with self.lock:
-            return_ = self.store.find_running(env_id).return_
-            if score is not None and not np.isfinite(score):
-                raise LareError(f"the score of the environment {env_id!r} is {score}: give a finite number")
-            self.learner.queue_episodes([self.store.end(env_id, return_ if score is None else float(score))])
+            self.learner.queue_episodes([self.store.end(env_id, score)])
 
     def drop(self, env_id: Hashable) -> None:
         """Abandon the episode of an environment: it is never learned from. Its steps still have proxy rewards."""
@@ -297,7 +271,7 @@ class CreditAssigner:
             step_ids = to_step_ids(steps)
             reward = np.zeros((*step_ids.shape, *self.config.agent_axis), np.float32)
             is_step = step_ids >= 0
-            reward[is_step] = self.learner.rewards_at(step_ids[is_step])
+            reward[is_step] = self.step_rewards.stored(step_ids[is_step])
             return reward
 
     def rewards(
@@ -325,7 +299,7 @@ class CreditAssigner:
             length = np.full(len(inputs), self.store.mean_length) if length is None else np.asarray(length, np.int32)
             if length.shape != (len(inputs),):
                 raise LareError(f"length has the shape {length.shape}: give one number for each of {len(inputs)} steps")
-            return self.learner.rewards(inputs, length)
+            return self.step_rewards.of(inputs, length)
 
     def metrics(self) -> dict[str, float]:
         """Return metrics of the decoder, which need no true rewards.
@@ -384,9 +358,7 @@ class CreditAssigner:
     def get_state(self, *, episodes: bool) -> AssignerState:
         """Return the state, as plain data. `__setstate__` restores it. Steps and episodes are in it if `episodes` is true."""
         with self.lock:
-            state = saving.get_state(self.config, self.learner, episodes=episodes)
-            names = (name if isinstance(name, str | int | float) else str(name) for name in self.group_names)
-            return replace(state, group_names=tuple(names))
+            return saving.get_state(self.learner, self.group_names, episodes=episodes)
 
     def __getstate__(self) -> AssignerState:
         """Return the state for another process, or for a model's file: decoder and `phi`, without steps and episodes."""

@@ -1,8 +1,9 @@
 """The fixed configuration of a `CreditAssigner`: method, function, spaces and settings; and the decoder's inputs of steps."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Hashable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from pathlib import Path
 from typing import Any
 
 import gymnasium
@@ -11,14 +12,15 @@ from jaxtyping import Bool, Float, Int
 
 from lare_rl.assigner.space_layout import SpaceLayout, make_layout
 from lare_rl.config.validity import check_credit
-from lare_rl.credit.decoder_settings import CreditSettings
+from lare_rl.credit.decoder_settings import CreditSettings, default_credit
 from lare_rl.credit.engine import CreditSpec, credit_spec
 from lare_rl.credit.explanation_text import raw_feature_names
-from lare_rl.credit.history import next_history
+from lare_rl.credit.history import next_history_columns
 from lare_rl.credit.input_names import input_arrays
-from lare_rl.credit.methods import Method
+from lare_rl.credit.methods import Method, find_method
 from lare_rl.credit.score_type import prediction_window
-from lare_rl.envs.families import load_env_spec
+from lare_rl.envs.families import find_score, load_env_spec
+from lare_rl.envs.load import resolve_task
 from lare_rl.errors import LareError, short_repr
 from lare_rl.latent.function import LatentFunction, check_task
 from lare_rl.tasks.payments import PAID_AT_END, PaymentRule
@@ -29,7 +31,7 @@ __all__ = [
     "Space",
     "check_config",
     "check_finite",
-    "resolve_layouts",
+    "resolve_config",
     "to_flags",
     "to_step_ids",
 ]
@@ -122,12 +124,12 @@ class AssignerConfig:
         self, inputs: Float[np.ndarray, "n *agents inputs"], begins: Bool[np.ndarray, " n"]
     ) -> Float[np.ndarray, "n *agents all_inputs"]:
         """Return the inputs of successive steps with their history. `begins` is true for the first step of each episode."""
-        entries = inputs[..., : self.spec.basis.n_tracked]
-        history = np.full((*entries.shape[:-1], 3, entries.shape[-1]), np.nan, np.float32)
+        n_tracked, size = self.spec.basis.n_tracked, inputs.shape[-1]
+        rows = np.concatenate([inputs, np.full((*inputs.shape[:-1], 3 * n_tracked), np.nan, np.float32)], axis=-1)
         for i in np.flatnonzero(~begins):
             if i:
-                history[i] = next_history(history[i - 1], entries[i - 1])
-        return np.concatenate([inputs, history.reshape(*entries.shape[:-1], -1)], axis=-1)
+                rows[i, ..., size:] = next_history_columns(rows[i - 1], n_tracked)
+        return rows
 
     def to_rows(
         self, observation: Any, action: Any, next_observation: Any
@@ -147,6 +149,26 @@ class AssignerConfig:
                 )
         return rows["observation"], rows["action"], rows["next_observation"]
 
+    def to_levels(
+        self, group: Sequence[Hashable] | None, n_rows: int, group_names: dict[Hashable, int]
+    ) -> Int[np.ndarray, " n"]:
+        """Return the number of each row's group, and add new groups to `group_names`.
+
+        Raises `LareError` if there are too many groups, or if they do not fit.
+        """
+        if (group is not None) != self.groups:
+            needs = "needs group" if self.groups else "has no groups: leave group out, or set groups=True"
+            raise LareError(f"this assigner {needs}")
+        if group is None:
+            return np.zeros(n_rows, np.int32)
+        if len(group) != n_rows:
+            raise LareError(f"group has {len(group)} entries, but there are {n_rows} steps")
+        new = [name for name in dict.fromkeys(group) if name not in group_names]
+        if len(group_names) + len(new) > MAX_LEVELS:
+            raise LareError(f"there are more than {MAX_LEVELS} groups, of which {new[-1]!r} is one: merge some of them")
+        group_names |= {name: len(group_names) + i for i, name in enumerate(new)}
+        return np.array([group_names[name] for name in group], np.int32)
+
     def to_team_reward(
         self, reward: Any, alive: Any, n_steps: int
     ) -> tuple[Float[np.ndarray, " n"], Bool[np.ndarray, "n agents"] | None]:
@@ -163,12 +185,46 @@ class AssignerConfig:
         return reward, mask
 
 
-def resolve_layouts(task: TaskSpec | None, spaces: Mapping[str, Space | None]) -> list[SpaceLayout]:
-    """Return the layouts of observations and actions.
+def resolve_config(
+    method: str,
+    phi: LatentFunction | None,
+    task: TaskSpec | str | Path | None,
+    settings: CreditSettings | None,
+    spaces: Mapping[str, Space | None],
+    *,
+    scored_observation: ScoredObservation | None,
+    payments: PaymentRule | None,
+    groups: bool | None,
+    agents: int,
+    **values: Any,
+) -> AssignerConfig:
+    """Return the configuration for arguments of `CreditAssigner`. The task decides what is None.
 
     Raises:
-        LareError: there is neither a space nor a task, or the two differ.
+        LareError: there is no such method or task, or the spaces are not those of the task.
     """
+    task, chosen = None if task is None else resolve_task(task, playable=False), find_method(method)
+    settings = settings or default_credit(agents)
+    if settings.score == "auto" and task is not None and (score := find_score(task)) is not None:
+        settings = settings.model_copy(update={"score": score})
+    observation, action = _resolve_layouts(task, spaces)
+    return AssignerConfig(
+        method=chosen,
+        phi=phi,
+        task=task,
+        observation=observation,
+        action=action,
+        settings=settings.model_copy(update={"exact": chosen.choose_exact(settings.exact)}),
+        scored_observation=scored_observation or ("after" if task is None else task.scored_observation),
+        payments=payments or (PAID_AT_END if task is None else task.payment_rule),
+        groups=(task is not None and task.group is not None) if groups is None else groups,
+        agents=agents,
+        **values,
+    )
+
+
+def _resolve_layouts(task: TaskSpec | None, spaces: Mapping[str, Space | None]) -> list[SpaceLayout]:
+    """Return the layouts of observations and actions. Raises `LareError` if there is no space and no task, or the two differ."""
     layouts = []
     for name, space in spaces.items():
         if space is None and task is None:

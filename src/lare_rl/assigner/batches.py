@@ -7,13 +7,14 @@ import numpy as np
 from jaxtyping import Int
 
 from lare_rl.assigner import compiled_functions as compiled
+from lare_rl.assigner.compiled_functions import MAX_CALL_ROWS, padded_size
 from lare_rl.assigner.store import Store, StoredEpisode
 from lare_rl.credit.batch_plan import plan_batch
 from lare_rl.credit.decomposition import CreditBatch
 from lare_rl.credit.engine import CreditSpec
 from lare_rl.data.layouts import Layout, lay_out_packed, lay_out_padded, lay_out_sampled
 
-__all__ = ["pack_in_order", "sample_batch"]
+__all__ = ["pack_in_order", "sample_batch", "whole_episodes"]
 
 
 def sample_batch(store: Store, spec: CreditSpec, random: np.random.Generator, longest: int) -> CreditBatch:
@@ -34,6 +35,16 @@ def sample_batch(store: Store, spec: CreditSpec, random: np.random.Generator, lo
     key = jax.random.key(int(random.integers(2**31)))
     step = np.asarray(compiled.sample_steps(key, length.astype(np.int32), steps=plan.rows))
     return _gather(store, episodes, lay_out_sampled(length, step), len(episodes))
+
+
+def whole_episodes(store: Store, spec: CreditSpec, episodes: Sequence[StoredEpisode]) -> Iterator[CreditBatch]:
+    """Yield batches of whole episodes, in their order. Rows are padded to one of two sizes, so that few programs are compiled."""
+    lengths = [len(episode.steps) for episode in episodes]
+    longest = max(lengths, default=1)
+    rows = padded_size(longest)
+    if sum(lengths) > rows:
+        rows = padded_size(max(longest, min(MAX_CALL_ROWS // spec.agents, spec.window * longest)))
+    return pack_in_order(store, episodes, spec.window, rows)
 
 
 def pack_in_order(store: Store, episodes: Sequence[StoredEpisode], n_slots: int, rows: int) -> Iterator[CreditBatch]:

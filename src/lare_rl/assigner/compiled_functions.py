@@ -2,18 +2,21 @@
 
 from contextlib import AbstractContextManager
 from functools import partial
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int, Key
+from jaxtyping import Array, Bool, Float, Key
 
 from lare_rl.credit import closed_form, decomposition, descent, engine, returns
 from lare_rl.credit.decomposition import CreditBatch, DecoderState
 from lare_rl.credit.engine import CreditSpec, StepBatch
 from lare_rl.data.layouts import sample_steps as _sample_steps
 from lare_rl.nn.normalise import update_scale
+
+MAX_CALL_ROWS = 8192
+"""Rows that are processed in one call."""
 
 init_decoder = jax.jit(engine.init_decoder, static_argnames="spec")
 observe_steps = jax.jit(decomposition.observe_steps)
@@ -59,38 +62,13 @@ def fit_by_gradient(
     return state, jnp.mean(losses)
 
 
-class FlatState(NamedTuple):
-    """A flattened `RewardSource`. Flattening it anew for every call would take longer than the call."""
-
-    leaves: list[Array]
-    structure: Any
-    """The tree structure, from `jax.tree.flatten`."""
-
-
 @partial(jax.jit, static_argnames=("structure", "spec"))
 def training_rewards(
-    leaves: list[Array],
-    inputs: Float[Array, "rows agents inputs"],
-    length: Int[Array, " rows"],
-    mean_reward: Float[Array, " rows"] | None,
-    finished: Bool[Array, " rows"] | None,
-    alive: Bool[Array, "rows agents"] | None,
-    last: Bool[Array, " rows"] | None,
-    residual: Float[Array, " rows"] | None,
-    structure: Any,
-    spec: CreditSpec,
+    leaves: list[Array], steps: StepBatch, alive: Bool[Array, "rows agents"] | None, structure: Any, spec: CreditSpec
 ) -> Float[Array, "rows agents"]:
-    """Return the rewards of steps by a flat state. `engine.StepBatch` describes the arrays that may be None."""
+    """Return the rewards of steps by a flat `RewardSource`: its leaves and structure, from `jax.tree.flatten`."""
     source = jax.tree.unflatten(structure, leaves)
-    steps = StepBatch(
-        inputs=inputs,
-        length=length,
-        mean_reward=jnp.zeros(len(length)) if mean_reward is None else mean_reward,
-        finished=jnp.ones(len(length), bool) if finished is None else finished,
-        last=last,
-        residual=residual,
-    )
-    alive = jnp.ones(inputs.shape[:-1], bool) if alive is None else alive
+    alive = jnp.ones(steps.inputs.shape[:-1], bool) if alive is None else alive
     return engine.training_rewards(source, steps, spec, alive)
 
 

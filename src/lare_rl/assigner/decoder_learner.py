@@ -1,4 +1,4 @@
-"""The decoder of a `CreditAssigner`: the data that wait for it, when it is fitted, and the rewards that it gives.
+"""The decoder of a `CreditAssigner`: the data that wait for it, and when it is fitted.
 
 Calls of compiled functions cost the same for one row as for hundreds, so data wait until there are enough of them, or until a result
 depends on them:
@@ -8,27 +8,25 @@ depends on them:
                    └─► pending episodes ──────────────────────────────────learn_returns─────► sufficient statistics, decoder
 """
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from itertools import chain
 from math import inf
-from typing import Any
 
 import jax
-import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Int
 
-from lare_rl.assigner import batches
 from lare_rl.assigner import compiled_functions as compiled
 from lare_rl.assigner.assigner_config import AssignerConfig
-from lare_rl.assigner.compiled_functions import FlatState, on_cpu, pad, padded_size
+from lare_rl.assigner.batches import sample_batch, whole_episodes
+from lare_rl.assigner.compiled_functions import MAX_CALL_ROWS, on_cpu, pad, padded_size
 from lare_rl.assigner.store import Store, StoredEpisode
-from lare_rl.credit import closed_form, decomposition, prequential, returns
-from lare_rl.credit.decomposition import CreditBatch, DecoderState
+from lare_rl.credit import closed_form, prequential, returns
+from lare_rl.credit.decomposition import DecoderState
 from lare_rl.credit.explanation import Explanation
-from lare_rl.credit.history import next_history
-from lare_rl.credit.methods import Fit, Reward
+from lare_rl.credit.history import next_history_columns
+from lare_rl.credit.methods import Fit
 from lare_rl.nn.normalise import empty_scale
 from lare_rl.util.float64 import float64
 
@@ -36,8 +34,6 @@ __all__ = ["CHUNK_UPDATES", "DecoderLearner"]
 
 MAX_PENDING_STEPS = 256
 """The most steps that may wait for their inputs, or for the running statistics."""
-MAX_CALL_ROWS = 8192
-"""Rows that are processed in one call."""
 CHUNK_UPDATES = 16
 """Gradient updates of a decoder in one call."""
 MAX_PENDING_UPDATES = 256
@@ -75,10 +71,6 @@ class DecoderLearner:
         """Episodes that the decoder has not learned from yet. Episodes that ended in one call are together."""
         self._pending_updates = 0.0
         self._is_fitted = False
-        self._flat_cache: tuple[Any, FlatState | None] = None, None
-        """A decoder or a scale, and its leaves."""
-        self._residual_cache: tuple[DecoderState | None, dict[int, float]] = None, {}
-        """A decoder, and what its proxy rewards lack to the returns of episodes, by their numbers."""
 
     @property
     def is_fitted(self) -> bool:
@@ -143,15 +135,9 @@ class DecoderLearner:
         """Compute the history of steps, whose other inputs are stored. Earlier steps of their episodes have theirs."""
         store, basis = self.store, self.config.spec.basis
         rows, size = step_ids % store.capacity, basis.n_standardised
-        previous = store.previous[rows]
-        for row, step in zip(rows.tolist(), previous.tolist(), strict=True):
-            history = store.inputs[row, ..., size:]
-            if step < 0:
-                history[...] = np.nan
-                continue
-            before = store.inputs[step % store.capacity]
-            last = before[..., size:].reshape(*before.shape[:-1], 3, basis.n_tracked)
-            history[...] = next_history(last, before[..., : basis.n_tracked]).reshape(history.shape)
+        for row, previous in zip(rows.tolist(), store.previous[rows].tolist(), strict=True):
+            before = store.inputs[previous % store.capacity]
+            store.inputs[row, ..., size:] = np.nan if previous < 0 else next_history_columns(before, basis.n_tracked)
 
     def flush_statistics(self) -> None:
         """Add pending inputs to the running statistics, and pending returns to the scales."""
@@ -219,7 +205,7 @@ class DecoderLearner:
         self, decoder: DecoderState, new: Sequence[StoredEpisode], later: Sequence[StoredEpisode]
     ) -> DecoderState:
         """Return a decoder that has learned from some new episodes, while later ones still wait."""
-        for batch in self._episode_batches(new):
+        for batch in whole_episodes(self.store, self.config.spec, new):
             decoder = compiled.predict_then_update(decoder, batch, settings=self.config.settings)
         if decoder.closed_form is None:
             return decoder
@@ -227,18 +213,10 @@ class DecoderLearner:
         if self.config.method.fit is not Fit.SIGNS and may_rebuild and compiled.is_stale(decoder):
             decoder = compiled.reset_statistics(decoder)
             later_ids = set(map(id, later))
-            for batch in self._episode_batches([e for e in self.store.episodes.values() if id(e) not in later_ids]):
+            earlier = [episode for episode in self.store.episodes.values() if id(episode) not in later_ids]
+            for batch in whole_episodes(self.store, self.config.spec, earlier):
                 decoder = compiled.add_episodes(decoder, batch)
         return compiled.fit_closed_form(decoder, spec=self.config.spec) if compiled.is_due(decoder) else decoder
-
-    def _episode_batches(self, episodes: Sequence[StoredEpisode]) -> Iterator[CreditBatch]:
-        """Yield batches of whole episodes. Rows are padded to one of two sizes, so that few programs are compiled."""
-        lengths = [len(episode.steps) for episode in episodes]
-        longest, window = max(lengths, default=1), self.config.spec.window
-        rows = padded_size(longest)
-        if sum(lengths) > rows:
-            rows = padded_size(max(longest, min(MAX_CALL_ROWS // self.config.agents, window * longest)))
-        return batches.pack_in_order(self.store, episodes, window, rows)
 
     def fit(self, n_updates: int) -> None:
         """Fit now, by this many gradient updates. A closed-form decoder is fitted once, whatever the number is."""
@@ -270,118 +248,12 @@ class DecoderLearner:
         rng = np.random.default_rng([seed, self.n_updates])
         longest = padded_size(max(len(episode.steps) for episode in self.store.episodes.values()))
         with on_cpu():
-            samples = [batches.sample_batch(self.store, spec, rng, longest) for _ in range(n_updates)]
+            samples = [sample_batch(self.store, spec, rng, longest) for _ in range(n_updates)]
             stacked = jax.tree.map(lambda *leaves: np.stack(leaves), *samples)
             keys = jax.random.split(jax.random.fold_in(jax.random.key(seed), self.n_updates), n_updates)
             self.decoder, loss = compiled.fit_by_gradient(self.decoder, stacked, keys, spec=spec)
         self.n_updates += n_updates
         self.loss = float(loss)
-
-    def rewards(
-        self,
-        inputs: Float[np.ndarray, "n *agents inputs"],
-        length: Int[np.ndarray, " n"],
-        alive: Bool[np.ndarray, "n *agents"] | None = None,
-        rows: Int[np.ndarray, " n"] | None = None,
-        last: Bool[np.ndarray, " n"] | None = None,
-        residual: Float[np.ndarray, " n"] | None = None,
-    ) -> Float[np.ndarray, "n *agents"]:
-        """Return the rewards of steps; 0 while nothing has been fitted.
-
-        Args:
-            inputs: the decoder's inputs.
-            length: T of each step's episode.
-            rows: the steps' rows in the store, for a method that pays by the return of a step's episode.
-            last: whether a step is the last one of its episode. Only for `exact`, like the next argument.
-            residual: the return of the step's episode, less the sum of its proxy rewards.
-        """
-        reward = np.zeros(inputs.shape[:-1], np.float32)
-        if self.config.method.reward is Reward.PROXY and not self.is_fitted:
-            return reward
-        inputs = inputs.reshape(len(inputs), self.config.agents, inputs.shape[-1])
-        mean_reward, finished = None, None
-        if self.config.method.reward is Reward.UNIFORM:
-            mean_reward, finished = self.store.mean_reward[rows], self.store.length[rows] > 0
-        for start in range(0, len(inputs), MAX_CALL_ROWS):
-            chunk = slice(start, start + MAX_CALL_ROWS)
-            size = padded_size(len(inputs[chunk]))
-            padded_length = pad(length[chunk].astype(np.int32), size)
-            padded_length[len(inputs[chunk]) :] = 1  # a score that is a mean is divided by T
-            arrays = (
-                None if x is None else pad(x[chunk], size) for x in (mean_reward, finished, alive, last, residual)
-            )
-            with on_cpu():
-                flat = self._flat_state()
-                r_hat = compiled.training_rewards(
-                    flat.leaves,
-                    pad(inputs[chunk], size),
-                    padded_length,
-                    *arrays,
-                    structure=flat.structure,
-                    spec=self.config.spec,
-                )
-            reward[chunk] = np.asarray(r_hat)[: len(inputs[chunk])].reshape(reward[chunk].shape)
-        return reward
-
-    def level_return(self, level: int, length: int) -> float:
-        """Return the part of the return of an episode that its group explains."""
-        if self.decoder is None or not self.config.n_levels or not self.is_fitted:
-            return 0.0
-        with on_cpu():
-            return float(decomposition.level_returns(self.decoder, jnp.array([level]), jnp.array([length]))[0])
-
-    def rewards_at(self, step_ids: Int[np.ndarray, " n"]) -> Float[np.ndarray, "n *agents"]:
-        """Return the rewards of stored steps. Raises `LareError` if a step is not stored."""
-        rows = self.store.rows(step_ids)
-        if len(rows) and step_ids.max() >= self.store.steps - self.n_pending_steps:
-            self.flush_inputs()
-        alive = None if self.store.alive is None else self.store.alive[rows]
-        last, residual = self._residuals(step_ids, rows) if self.config.is_exact and self.is_fitted else (None, None)
-        return self.rewards(self.store.inputs[rows], self.store.lengths(rows), alive, rows, last, residual)
-
-    def _residuals(
-        self, step_ids: Int[np.ndarray, " n"], rows: Int[np.ndarray, " n"]
-    ) -> tuple[Bool[np.ndarray, " n"], Float[np.ndarray, " n"]]:
-        """Return which steps are the last ones of their episodes, and the residuals of these. Those that are not used are 0."""
-        store = self.store
-        number = store.episode[rows]
-        stored = [store.episodes.get(k) for k in number.tolist()]
-        last = np.array([e is not None and e.steps[-1] == k for e, k in zip(stored, step_ids, strict=True)], bool)
-        is_used = last if self.config.settings.exact == "last" else np.array([e is not None for e in stored], bool)
-        numbers = np.unique(number[is_used])
-        residual = np.zeros(len(rows), np.float32)
-        residual[is_used] = self._episode_residuals(numbers.tolist())[np.searchsorted(numbers, number[is_used])]
-        return last, residual
-
-    def _episode_residuals(self, numbers: Sequence[int]) -> Float[np.ndarray, " episodes"]:
-        """Return the returns of episodes, less the sums of their proxy rewards by the newest decoder."""
-        if self._residual_cache[0] is not self.decoder:
-            self._residual_cache = self.decoder, {}
-        residuals = self._residual_cache[1]
-        new = [number for number in numbers if number not in residuals]
-        episodes = [self.store.episodes[number] for number in new]
-        predicted: list[float] = []
-        with on_cpu():
-            for batch in self._episode_batches(episodes):
-                sums = compiled.predicted_returns(self.decoder, batch, settings=self.config.settings)
-                predicted += np.asarray(sums)[np.asarray(batch.mask) > 0].tolist()
-        scores = [episode.score for episode in episodes]
-        residuals.update(zip(new, np.subtract(scores, predicted).tolist(), strict=True))
-        return np.array([residuals[number] for number in numbers], np.float32)
-
-    def _flat_state(self) -> FlatState:
-        """Return what rewards are computed from, in flat form."""
-        cached, flat = self._flat_cache
-        newest = self.scale if self.decoder is None else self.decoder
-        if flat is None or cached is not newest:
-            source = newest
-            if isinstance(source, DecoderState):
-                source = source._replace(optimizer=(), score_type_predictions=None)
-                if not decomposition.is_optimistic(self.config.method, self.config.settings):
-                    source = source._replace(closed_form=None)
-            flat = FlatState(*jax.tree.flatten(source))
-            self._flat_cache = newest, flat
-        return flat
 
     def metrics(self) -> dict[str, float]:
         """Return metrics that need no true rewards. Returns are predicted before they are learned from."""
@@ -411,7 +283,7 @@ class DecoderLearner:
             return None
         with on_cpu(), float64():
             state = compiled.init_explanation(self.decoder.statistics, basis=basis)
-            for batch in self._episode_batches(list(self.store.episodes.values())):
+            for batch in whole_episodes(self.store, self.config.spec, list(self.store.episodes.values())):
                 state = compiled.add_to_explanation(state, batch)
             explanation = compiled.explain_returns(state, self.decoder.is_mean.astype(int))
             return jax.tree.map(np.asarray, explanation)

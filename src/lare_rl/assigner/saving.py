@@ -7,7 +7,7 @@ DIRECTORY/
 """
 
 import json
-from collections.abc import Iterator
+from collections.abc import Hashable, Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -65,7 +65,7 @@ class AssignerState:
     """The groups in the order of their numbers, as texts or numbers."""
 
 
-def get_state(config: AssignerConfig, learner: DecoderLearner, *, episodes: bool) -> AssignerState:
+def get_state(learner: DecoderLearner, group_names: Iterable[Hashable], *, episodes: bool) -> AssignerState:
     """Return the state of an assigner, with stored steps and episodes if `episodes` is true."""
     learner.learn_returns()
     store = learner.store
@@ -76,7 +76,8 @@ def get_state(config: AssignerConfig, learner: DecoderLearner, *, episodes: bool
         arrays[name] = np.concatenate(chunks)
     if episodes:
         arrays |= _store_arrays(store)
-    return AssignerState(config, learner.n_learned, learner.n_updates, arrays)
+    names = (name if isinstance(name, str | int | float) else str(name) for name in group_names)
+    return AssignerState(learner.config, learner.n_learned, learner.n_updates, arrays, tuple(names))
 
 
 def restore(learner: DecoderLearner, state: AssignerState) -> None:

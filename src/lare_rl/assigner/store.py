@@ -132,43 +132,47 @@ class Store:
         observation, _, next_observation = steps
         for i, env_id in enumerate(env_ids):
             episode = self.get_running(env_id, observation[i])
-            self._append(episode, int(step_ids[i]), float(reward[i]))
             episode.level = 0 if level is None else int(level[i])
             episode.last_observation = next_observation[i]
-            step, team_reward = len(episode.steps) - 1, np.reshape(reward[i], (1,))
-            if is_paid(self.payments, step, team_reward, bool(ended[i])):
-                payment = self._pay(episode, episode.return_)
-                if ended[i]:
-                    del self.running[env_id]
+            payment = self._add_step(episode, int(step_ids[i]), float(reward[i]), self.payments, bool(ended[i]))
+            if ended[i]:
+                del self.running[env_id]
+            if payment is not None:
                 yield payment
 
-    def _append(self, episode: RunningEpisode, step_id: int, reward: float) -> None:
+    def _add_step(
+        self, episode: RunningEpisode, step_id: int, reward: float, payments: PaymentRule, ended: bool
+    ) -> StoredEpisode | None:
+        """Add a step to an episode. Return the steps of the payment that comes with it, if there is one."""
         if len(episode.steps) > episode.n_paid:
             self.previous[step_id % self.capacity] = episode.steps[-1]
         episode.steps.append(step_id)
         episode.return_ += reward
+        is_payment = is_paid(payments, len(episode.steps) - 1, np.array([reward]), ended)
+        return self._pay(episode, episode.return_) if is_payment else None
 
-    def find_running(self, env_id: Hashable) -> RunningEpisode:
-        """Return the running episode of an environment. Raises `LareError` if there is none."""
+    def end(self, env_id: Hashable, score: float | None = None) -> StoredEpisode:
+        """End the running episode of an environment, with `score` as its return, or as its last payment.
+
+        Without a score, it is the sum of the rewards since the last payment.
+
+        Raises:
+            LareError: no episode is running, the score is not finite, its first steps are not stored any more, or all of its steps
+                have been paid for.
+        """
         if env_id not in self.running:
             raise LareError(
                 f"no episode is running in the environment {env_id!r}: it has ended, or is older than "
                 f"{self.capacity} steps (capacity)"
             )
-        return self.running[env_id]
-
-    def end(self, env_id: Hashable, score: float) -> StoredEpisode:
-        """End the running episode of an environment, with `score` as its return, or as its last payment.
-
-        Raises:
-            LareError: its first steps are not stored any more, or all of its steps have been paid for.
-        """
+        if score is not None and not np.isfinite(score):
+            raise LareError(f"the score of the environment {env_id!r} is {score}: give a finite number")
         episode = self.running.pop(env_id)
         if len(episode.steps) == episode.n_paid:
             raise LareError(
                 f"the last step of the environment {env_id!r} was paid already: end the episode with this step"
             )
-        return self._pay(episode, score)
+        return self._pay(episode, episode.return_ if score is None else float(score))
 
     def _pay(self, episode: RunningEpisode, payment: float) -> StoredEpisode:
         """Store the steps that a payment is for."""
@@ -208,9 +212,9 @@ class Store:
         """Store an episode that has just ended, by the reward of each of its steps. Yield the steps of each payment."""
         episode = RunningEpisode(level=level)
         for i, step_id in enumerate(steps.tolist()):
-            self._append(episode, step_id, float(reward[i]))
-            if is_paid(payments, i, reward[i : i + 1], i == len(steps) - 1):
-                yield self._pay(episode, episode.return_)
+            payment = self._add_step(episode, step_id, float(reward[i]), payments, i == len(steps) - 1)
+            if payment is not None:
+                yield payment
 
     def restore_episode(self, number: int, episode: StoredEpisode) -> None:
         """Store an episode under its number."""

@@ -25,7 +25,7 @@ from lare_rl.credit.decoder_settings import CreditSettings
 from lare_rl.nn.attention import LayerNorm, attend, causal_mask
 from lare_rl.nn.networks import MLP, Linear
 
-__all__ = ["AREL", "Block", "init_arel"]
+__all__ = ["AREL", "Block"]
 
 MAX_WIDTH = 100
 """The maximum width of a token."""
@@ -72,11 +72,11 @@ class AREL(eqx.Module):
     agent_blocks: tuple[Block, ...]
     read_out: tuple[Linear, Linear, Linear]
 
-    def __init__(self, n_inputs: int, max_steps: int, *, key: PRNGKeyArray):
-        size = min(n_inputs, MAX_WIDTH)
+    def __init__(self, key: PRNGKeyArray, shape: DecoderShape, settings: CreditSettings):
+        size = min(shape.n_inputs, MAX_WIDTH)
         embed_key, position_key, time_key, agents_key, *read_keys = jax.random.split(key, 7)
-        self.embed = Linear(n_inputs, size, key=embed_key)
-        self.position = jax.random.normal(position_key, (max_steps, size))
+        self.embed = Linear(shape.n_inputs, size, key=embed_key)
+        self.position = jax.random.normal(position_key, (shape.max_steps, size))
         self.time_blocks = tuple(Block(size, key=key) for key in jax.random.split(time_key, DEPTH))
         self.agent_blocks = tuple(Block(size, key=key) for key in jax.random.split(agents_key, DEPTH))
         self.read_out = (
@@ -98,8 +98,3 @@ class AREL(eqx.Module):
         penalty = VARIANCE_PENALTY / steps**2 * jnp.var(y, axis=1, ddof=1, keepdims=True)
         outputs = y, jnp.broadcast_to(penalty, y.shape)
         return DecoderOutput(*(jnp.broadcast_to(values.reshape(rows, 1), (rows, agents)) for values in outputs))
-
-
-def init_arel(key: PRNGKeyArray, shape: DecoderShape, settings: CreditSettings) -> AREL:
-    """Return an untrained `AREL`. `settings` is not used."""
-    return AREL(shape.n_inputs, shape.max_steps, key=key)

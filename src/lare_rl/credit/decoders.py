@@ -27,7 +27,7 @@ class Decoder:
 
     name: str
     init: "Callable[[PRNGKeyArray, DecoderShape, CreditSettings], DecoderNetwork] | str"
-    """A function that returns an untrained decoder, or its place as `module:function`, which is imported when it is needed."""
+    """A class or function that returns an untrained decoder, or its place as `module:name`, which is imported when it is needed."""
     settings: frozenset[str] = frozenset()
     """The names of the `CreditSettings` that `init` reads."""
     whole_episodes: bool = False
@@ -60,22 +60,20 @@ def register_decoder(decoder: Decoder) -> None:
 
 
 for _decoder in (
-    Decoder("step", "lare_rl.credit.step_decoders:init_step_decoder", frozenset({"hidden"})),
+    Decoder("step", "lare_rl.credit.step_decoders:StepDecoder", frozenset({"hidden"})),
     Decoder(
         "bottleneck",
-        "lare_rl.credit.step_decoders:init_bottleneck",
+        "lare_rl.credit.step_decoders:Bottleneck",
         frozenset({"hidden", "encoder", "bottleneck", "divergence"}),
     ),
-    Decoder("lrr", "lare_rl.credit.lrr:init_lrr", frozenset({"hidden"})),
-    Decoder("arel", "lare_rl.credit.arel:init_arel", whole_episodes=True),
-    Decoder("stas", "lare_rl.credit.stas:init_stas", whole_episodes=True),
-    Decoder("tar2", "lare_rl.credit.tar2:init_tar2", whole_episodes=True, pays_shares=True, predicts_actions=True),
-    Decoder("diaster", "lare_rl.credit.diaster:init_diaster", frozenset({"hidden"}), single_agent_only=True),
-    Decoder("rudder", "lare_rl.credit.rudder:init_rudder", frozenset({"hidden"}), single_agent_only=True),
-    Decoder("grd", "lare_rl.credit.grd:init_grd", frozenset({"hidden", "sparsity"}), single_agent_only=True),
-    Decoder(
-        "rbt", "lare_rl.credit.rbt:init_rbt", frozenset({"hidden"}), single_agent_only=True, longest_segment=RBT_STEPS
-    ),
+    Decoder("lrr", "lare_rl.credit.lrr:LRR", frozenset({"hidden"})),
+    Decoder("arel", "lare_rl.credit.arel:AREL", whole_episodes=True),
+    Decoder("stas", "lare_rl.credit.stas:STAS", whole_episodes=True),
+    Decoder("tar2", "lare_rl.credit.tar2:TAR2", whole_episodes=True, pays_shares=True, predicts_actions=True),
+    Decoder("diaster", "lare_rl.credit.diaster:Diaster", frozenset({"hidden"}), single_agent_only=True),
+    Decoder("rudder", "lare_rl.credit.rudder:RUDDER", frozenset({"hidden"}), single_agent_only=True),
+    Decoder("grd", "lare_rl.credit.grd:GRD", frozenset({"hidden", "sparsity"}), single_agent_only=True),
+    Decoder("rbt", "lare_rl.credit.rbt:RBT", frozenset({"hidden"}), single_agent_only=True, longest_segment=RBT_STEPS),
     Decoder("linear", "lare_rl.credit.closed_form:init_linear_decoder"),
     Decoder("additive", "lare_rl.credit.closed_form:init_linear_decoder", extended_basis=True),
 ):

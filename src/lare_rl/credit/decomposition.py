@@ -197,9 +197,8 @@ def observe_steps(
 
     Steps where `mask` is false are ignored.
     """
-    rows = inputs.reshape(-1, inputs.shape[-1])[
-        :, : len(state.statistics.mean)
-    ]  # a history has no statistics of its own
+    # A history has no statistics of its own.
+    rows = inputs.reshape(-1, inputs.shape[-1])[:, : len(state.statistics.mean)]
     mask = None if mask is None else mask.ravel()
     return state._replace(statistics=update_mean_std(state.statistics, rows, mask))
 

@@ -102,7 +102,7 @@ def _mean_loss(
         loss = losses.squared_error(mean, target, weight)
     valid = (episodes.episode_index >= 0) & (episodes.episode_index < n_episodes)
     penalty = jnp.sum(jnp.where(valid, penalty, 0)) / jnp.maximum(jnp.sum(valid), 1)
-    return loss + penalty * jnp.sum(weight) / jnp.maximum(jnp.sum(weight > 0), 1)
+    return loss + penalty * losses.batch_mean(weight, weight)
 
 
 def _decoder_loss(

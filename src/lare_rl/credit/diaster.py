@@ -17,10 +17,11 @@ from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
 from lare_rl.credit.decoder_network import DecoderOutput, DecoderShape
 from lare_rl.credit.decoder_settings import CreditSettings
+from lare_rl.credit.losses import batch_mean
 from lare_rl.credit.step_targets import step_loss
 from lare_rl.nn.networks import GRU, MLP, Linear
 
-__all__ = ["Diaster", "init_diaster"]
+__all__ = ["Diaster"]
 
 
 class Diaster(eqx.Module):
@@ -31,7 +32,8 @@ class Diaster(eqx.Module):
     """From the state of the GRU to F."""
     step_model: MLP
 
-    def __init__(self, n_inputs: int, hidden: tuple[int, ...], *, key: PRNGKeyArray):
+    def __init__(self, key: PRNGKeyArray, shape: DecoderShape, settings: CreditSettings):
+        n_inputs, hidden = shape.n_inputs, settings.hidden
         gru_key, readout_key, step_key = jax.random.split(key, 3)
         self.gru = GRU(n_inputs, hidden[0], key=gru_key)
         self.readout = Linear(hidden[0], 1, key=readout_key)
@@ -67,9 +69,10 @@ class Diaster(eqx.Module):
 
         Args:
             inputs: the inputs at the steps. Steps beyond an episode's length are padding.
+            length: T of each episode.
             target: R/T in units of the scale.
             mask: 1 for an episode, 0 for padding.
-            key: the random key of the cuts.
+            key: the random key of the cuts; in other decoders, of all that is drawn.
         """
         max_steps = inputs.shape[1]
         t, last = jnp.arange(max_steps), jnp.maximum(length - 1, 0)[:, None]
@@ -82,9 +85,4 @@ class Diaster(eqx.Module):
         f_prefix = self.piece_rewards(inputs, jnp.zeros_like(inputs[..., 0], bool))
         f_prefix = jnp.where(t == last, total[:, None], f_prefix)
         loss = piece_loss + step_loss(self.step_model, inputs, f_prefix, length)
-        return jnp.sum(mask * loss) / jnp.maximum(jnp.sum(mask > 0), 1)
-
-
-def init_diaster(key: PRNGKeyArray, shape: DecoderShape, settings: CreditSettings) -> Diaster:
-    """Return an untrained `Diaster`."""
-    return Diaster(shape.n_inputs, settings.hidden, key=key)
+        return batch_mean(mask * loss, mask)

@@ -182,10 +182,8 @@ def _fit(
         groups, indices = posterior, (group_index, strength_index)
         start = evidence.init_posterior(len(strength_index), int(strength_index.max()) + 1)
         separate = relevance.fit_strengths(statistics, score_type, *indices, groups, start, MAX_EXPLANATION_ROUNDS)
-        has_own_strengths, posterior = (
-            relevance.is_better(separate, groups),
-            relevance.select(separate, groups, *indices),
-        )
+        has_own_strengths = relevance.is_better(separate, groups)
+        posterior = relevance.select(separate, groups, *indices)
     r2 = 1 - problem.dof / (problem.q * jnp.where(posterior.beta > 0, posterior.beta, 1))
     r2 = jnp.where((problem.dof > 1) & (problem.y_std > 0), jnp.clip(r2, 0, 1), jnp.nan)
     weight = posterior.weight / jnp.where(problem.y_std > 0, problem.y_std, 1)

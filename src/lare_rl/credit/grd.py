@@ -29,10 +29,11 @@ from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
 from lare_rl.credit.decoder_network import DecoderOutput, DecoderShape
 from lare_rl.credit.decoder_settings import CreditSettings
+from lare_rl.credit.losses import batch_mean
 from lare_rl.credit.step_targets import is_step
 from lare_rl.nn.networks import MLP, smooth_clip
 
-__all__ = ["GRD", "causes", "init_grd", "sample_mask"]
+__all__ = ["GRD", "causes", "sample_mask"]
 
 TEMPERATURE = 0.01
 COMPONENTS = 3
@@ -78,17 +79,17 @@ class GRD(eqx.Module):
     sparsity: tuple[float, ...] = eqx.field(static=True)
     """lambda_sr, lambda_ar, lambda_ss, lambda_ii and lambda_as."""
 
-    def __init__(
-        self, n_states: int, n_actions: int, hidden: tuple[int, ...], sparsity: tuple[float, ...], *, key: PRNGKeyArray
-    ):
+    def __init__(self, key: PRNGKeyArray, shape: DecoderShape, settings: CreditSettings):
+        """Make an untrained model. Raises `LareError` if its inputs are not s, a and the next s."""
+        n_states, n_actions, _ = shape.sizes("observation", "action", "next_observation")
         keys = jax.random.split(key, 6)
         self.state_reward = _init_logits(n_states, key=keys[0])
         self.action_reward = _init_logits(n_actions, key=keys[1])
         self.state_state = _init_logits(n_states, n_states, key=keys[2])
         self.action_state = _init_logits(n_actions, n_states, key=keys[3])
-        self.reward_model = MLP(n_states + n_actions, hidden, 1, key=keys[4])
-        self.dynamics = MLP(n_states + n_actions, hidden, 3 * COMPONENTS, key=keys[5])
-        self.sparsity = sparsity
+        self.reward_model = MLP(n_states + n_actions, settings.hidden, 1, key=keys[4])
+        self.dynamics = MLP(n_states + n_actions, settings.hidden, 3 * COMPONENTS, key=keys[5])
+        self.sparsity = settings.sparsity
 
     def _split(self, inputs: Float[Array, "*rows inputs"]) -> list[Float[Array, "*rows entries"]]:
         """Return s, a and the next s."""
@@ -132,20 +133,13 @@ class GRD(eqx.Module):
         mask: Float[Array, " episodes"],
         key: PRNGKeyArray,
     ) -> Float[Array, ""]:
-        """Return the loss of the episodes where `mask` is 1.
-
-        Args:
-            inputs: s, a and the next s at the steps. Steps beyond an episode's length are padding.
-            target: R/T in units of the scale.
-            mask: 1 for an episode, 0 for padding.
-            key: the random key of the masks, and of the steps whose next states are predicted.
-        """
+        """Return the loss. The arguments are those of `Diaster.loss`. `key` is also for the steps whose next states are predicted."""
         keys = jax.random.split(key, 5)
         lambda_sr, lambda_ar, lambda_ss, lambda_ii, lambda_as = self.sparsity
         valid = is_step(length, inputs.shape[1]) & (mask > 0)[:, None]
         r_hat = self._reward(inputs, sample_mask(self.state_reward, keys[0]), sample_mask(self.action_reward, keys[1]))
         error = jnp.sum(valid * r_hat, axis=1) / jnp.maximum(length, 1) - target
-        reward_loss = jnp.sum(mask * error**2) / jnp.maximum(jnp.sum(mask > 0), 1)
+        reward_loss = batch_mean(mask * error**2, mask)
         reward_sparsity = lambda_sr * _mean_sparsity(self.state_reward) + lambda_ar * _mean_sparsity(self.action_reward)
 
         n_valid, rows = jnp.sum(valid), inputs.reshape(-1, inputs.shape[-1])
@@ -167,9 +161,3 @@ def _mean_sparsity(logits: Float[Array, "*edges 2"], selected: Bool[Array, "*edg
     negative_log = jax.nn.softplus(logits[..., 0] - logits[..., 1])
     selected = jnp.ones(negative_log.shape, bool) if selected is None else selected
     return jnp.sum(selected * negative_log) / jnp.maximum(jnp.sum(selected), 1)
-
-
-def init_grd(key: PRNGKeyArray, shape: DecoderShape, settings: CreditSettings) -> GRD:
-    """Return an untrained `GRD`. Raises `LareError` if its inputs are not s, a and the next s."""
-    n_states, n_actions, _ = shape.sizes("observation", "action", "next_observation")
-    return GRD(n_states, n_actions, settings.hidden, settings.sparsity, key=key)

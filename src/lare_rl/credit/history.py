@@ -17,7 +17,7 @@ from jaxtyping import Array, Bool, Float
 
 from lare_rl.envs.interface import AnyArray
 
-__all__ = ["next_history", "scan_history"]
+__all__ = ["next_history", "next_history_columns", "scan_history"]
 
 
 def next_history(
@@ -27,6 +27,14 @@ def next_history(
     xp = jnp if isinstance(entries, jax.Array) else np
     # fmax and fmin ignore NaN.
     return xp.stack([xp.fmax(history[..., 0, :], entries), xp.fmin(history[..., 1, :], entries), entries], axis=-2)
+
+
+def next_history_columns(
+    row: Float[np.ndarray, "*batch inputs"], n_tracked: int
+) -> Float[np.ndarray, "*batch history"]:
+    """Return the history of the next step, from the inputs of a step: first its tracked entries, and last its own history."""
+    history = row[..., -3 * n_tracked :].reshape(*row.shape[:-1], 3, n_tracked)
+    return next_history(history, row[..., :n_tracked]).reshape(*row.shape[:-1], -1)
 
 
 def scan_history(

@@ -11,6 +11,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
 __all__ = [
+    "batch_mean",
     "episode_means",
     "episode_weight",
     "leave_one_out_likelihood",
@@ -18,6 +19,11 @@ __all__ = [
     "subsampling_variance",
     "unbiased_squared_error",
 ]
+
+
+def batch_mean(values: Float[Array, " episodes"], weight: Float[Array, " episodes"]) -> Float[Array, ""]:
+    """Return the sum of values, divided by the number of episodes whose weight is not zero."""
+    return jnp.sum(values) / jnp.maximum(jnp.sum(weight > 0), 1)
 
 
 def episode_means(
@@ -39,7 +45,7 @@ def squared_error(
     With `mean` over all T steps and `target` = R/T, this is the loss of RD (Efroni et al., 2021; LaRe, Eq. 6). With `mean` over K
     sampled steps, it is the loss of RRD (Ren et al., 2022, Eq. 6). `episode_weight` computes `weight`.
     """
-    return jnp.sum(weight * (mean - target) ** 2) / jnp.maximum(jnp.sum(weight > 0), 1)
+    return batch_mean(weight * (mean - target) ** 2, weight)
 
 
 def subsampling_variance(
@@ -62,8 +68,7 @@ def unbiased_squared_error(
     variance: Float[Array, " episodes"],
 ) -> Float[Array, ""]:
     """Return the loss of RRD-unbiased: RRD's loss minus the `subsampling_variance`. Its expectation is RD's loss."""
-    correction = jnp.sum(weight * variance) / jnp.maximum(jnp.sum(weight > 0), 1)
-    return squared_error(mean, target, weight) - correction
+    return squared_error(mean, target, weight) - batch_mean(weight * variance, weight)
 
 
 def leave_one_out_likelihood(
@@ -78,7 +83,7 @@ def leave_one_out_likelihood(
     p_b = mean_t 1/sigma_t^2 and l_b = mean_t log sigma_t, over the steps of episode b. See `lrr.py`.
     """
     loss = weight * (mean - target) ** 2 * precision / 2 + jnp.where(weight > 0, log_std, 0)
-    return jnp.sum(loss) / jnp.maximum(jnp.sum(weight > 0), 1)
+    return batch_mean(loss, weight)
 
 
 def episode_weight(

@@ -23,7 +23,7 @@ from lare_rl.credit.decoder_network import DecoderOutput, DecoderShape
 from lare_rl.credit.decoder_settings import CreditSettings
 from lare_rl.nn.networks import MLP, smooth_clip
 
-__all__ = ["LRR", "MAX_LOG_STD", "init_lrr"]
+__all__ = ["LRR", "MAX_LOG_STD"]
 
 MAX_LOG_STD = 5.0
 """The deviation is between exp(-5) and exp(5), so that no likelihood is infinite."""
@@ -38,16 +38,11 @@ class LRR(eqx.Module):
     mlp: MLP
     gain: float = eqx.field(static=True)
 
-    def __init__(self, n_inputs: int, hidden: tuple[int, ...], gain: float, *, key: PRNGKeyArray):
-        self.gain = gain
-        self.mlp = MLP(n_inputs, hidden, 2, key=key)
+    def __init__(self, key: PRNGKeyArray, shape: DecoderShape, settings: CreditSettings):
+        self.gain = shape.gain
+        self.mlp = MLP(shape.n_inputs, settings.hidden, 2, key=key)
 
     def __call__(self, inputs: Float[Array, "rows *agents inputs"], key: PRNGKeyArray | None) -> DecoderOutput:
         output = self.mlp(inputs)
         log_std = smooth_clip(output[..., 1], MAX_LOG_STD)
         return DecoderOutput(self.gain * output[..., 0], jnp.zeros_like(log_std), log_std)
-
-
-def init_lrr(key: PRNGKeyArray, shape: DecoderShape, settings: CreditSettings) -> LRR:
-    """Return an untrained `LRR`."""
-    return LRR(shape.n_inputs, settings.hidden, shape.gain, key=key)

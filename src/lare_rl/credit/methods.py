@@ -7,170 +7,22 @@ return, which is the reward of the last step. A method works for a single agent 
 `register_method` adds a method, for this package and for plugins alike.
 """
 
-from dataclasses import KW_ONLY, dataclass
-from enum import StrEnum
-from typing import Literal
-
-from lare_rl.credit import input_names
 from lare_rl.credit.decoders import DECODERS
-from lare_rl.credit.input_names import InputNames
+from lare_rl.credit.input_names import (
+    FACTORS,
+    FACTORS_AND_SCORED,
+    FACTORS_SCORED_AND_HISTORY,
+    NEXT_OBSERVATION_ACTION,
+    OBSERVATION_ACTION,
+    RAW,
+    SCORED,
+    SCORED_AND_HISTORY,
+    TRANSITION,
+)
+from lare_rl.credit.method import Fit, Method, Reward
 from lare_rl.util.plugins import Registry
 
 __all__ = ["METHODS", "Fit", "Method", "Reward", "find_method", "register_method"]
-
-
-class Fit(StrEnum):
-    """How the decoder is fitted to returns (equations in `losses.py`)."""
-
-    ALL_STEPS = "all steps"
-    """RD: the proxy rewards of all T steps of an episode against its return."""
-    SAMPLED_STEPS = "sampled steps"
-    """RRD: K sampled steps of each episode."""
-    SAMPLED_STEPS_UNBIASED = "sampled steps, unbiased"
-    """RRD-unbiased: as RRD, minus the variance that the sampling adds."""
-    LIKELIHOOD = "likelihood of sampled steps"
-    """LRR: as RRD, but the likelihood of the return, under rewards whose uncertainty the decoder learns (equations in `lrr.py`)."""
-    DECODER_LOSS = "the decoder's loss"
-    """Diaster, RUDDER, GRD and RBT: the `loss` of the decoder, on whole episodes (equations in the files of these names)."""
-    EVIDENCE = "evidence"
-    """In closed form, on all episodes (equations in `evidence.py`)."""
-    PREFIX_EVIDENCE = "evidence of prefixes"
-    """In closed form, on all prefixes of all episodes: a step is paid the change of the expected return (`returns.py`)."""
-    SIGNS = "best signs"
-    """In closed form: the best signs of a sum of the factors (equation in `closed_form.py`)."""
-
-    @property
-    def closed_form(self) -> bool:
-        """Whether the fit needs no gradient descent."""
-        return self in (Fit.EVIDENCE, Fit.PREFIX_EVIDENCE, Fit.SIGNS)
-
-    @property
-    def samples_steps(self) -> bool:
-        """Whether an update reads K steps of each episode, and not all of them."""
-        return self in (Fit.SAMPLED_STEPS, Fit.SAMPLED_STEPS_UNBIASED, Fit.LIKELIHOOD)
-
-    @property
-    def separate(self) -> bool:
-        """Whether the fit is too expensive for every update of the algorithm, and so runs between chunks of updates."""
-        return self is Fit.DECODER_LOSS
-
-    @property
-    def settings(self) -> frozenset[str]:
-        """The names of the `CreditSettings` that the fit reads."""
-        match self:
-            case Fit.DECODER_LOSS:
-                names = {"episodes", "exact"}
-            case Fit.EVIDENCE:
-                names = {"score", "optimism", "exact"}
-            case Fit.PREFIX_EVIDENCE | Fit.SIGNS:
-                names = {"exact"}
-            case _:
-                names = {"score", "sum_form", "steps", "exact"} | ({"drawn_steps"} if self.samples_steps else set())
-        return frozenset(names if self.closed_form else names | {"learning_rate", "weight_decay", "normalise"})
-
-
-class Reward(StrEnum):
-    """What the algorithm is trained on."""
-
-    TRUE = "true"
-    EPISODIC = "episodic"
-    PROXY = "proxy"
-    """The output of the decoder."""
-    UNIFORM = "uniform"
-    """The mean reward of the episode, scaled to [0, 1] by the lowest and highest so far."""
-    DESIGNED = "designed"
-    """The output of a reward function that the language model wrote."""
-
-
-@dataclass(frozen=True)
-class Method:
-    """A way to assign credit."""
-
-    name: str
-    summary: str
-    source: str
-    _: KW_ONLY
-    inputs: InputNames | None = None
-    """What the decoder reads."""
-    fit: Fit | None = None
-    decoder: str = "step"
-    """The name of a registered decoder."""
-    reward: Reward = Reward.PROXY
-    shared: bool = False
-    """Whether all agents get the mean of their proxy rewards: credit over time, but not among agents."""
-
-    @property
-    def has_proxy_rewards(self) -> bool:
-        """Whether it computes a proxy reward for each step."""
-        return self.reward not in (Reward.TRUE, Reward.EPISODIC)
-
-    @property
-    def calibrated(self) -> bool:
-        """Whether its rewards are in the unit of the true ones, because they are fitted to add up to returns."""
-        return self.reward is Reward.PROXY
-
-    @property
-    def needs_phi(self) -> bool:
-        """Whether it needs a function that a language model wrote."""
-        return self.inputs is not None and self.inputs.has_factors
-
-    @property
-    def phi_kind(self) -> Literal["factors", "reward"]:
-        """The kind of function that a language model is asked for, if the method needs one."""
-        return "reward" if self.reward is Reward.DESIGNED else "factors"
-
-    @property
-    def uses_scored_observation(self) -> bool:
-        """Whether it matters which observations the task's `scored_observation` names."""
-        return self.needs_phi or (self.inputs is not None and self.inputs.depends_on_scored_observation)
-
-    @property
-    def uses_gradient(self) -> bool:
-        """Whether its decoder is fitted by gradient descent."""
-        return self.fit is not None and not self.fit.closed_form
-
-    @property
-    def settings(self) -> frozenset[str]:
-        """The names of the `CreditSettings` that the method reads."""
-        if self.fit is None:
-            return frozenset()
-        names = self.fit.settings | DECODERS[self.decoder].settings
-        return names - {"exact"} if self.pays_shares else names
-
-    @property
-    def pays_shares(self) -> bool:
-        """Whether the rewards of an episode are shares of its return, so that they always add up to it."""
-        return DECODERS[self.decoder].pays_shares
-
-    def is_exact(self, exact: str) -> bool:
-        """Return whether the setting `exact` corrects proxy rewards to add up to the return."""
-        return exact in ("last", "spread") and "exact" in self.settings
-
-    def choose_exact(self, exact: str) -> str:
-        """Return how proxy rewards are made exact, by the setting `exact`."""
-        if exact != "auto":
-            return exact
-        return "last" if self.fit is Fit.PREFIX_EVIDENCE else "no"
-
-    @property
-    def extended_basis(self) -> bool:
-        """Whether its closed-form decoder has shapes and pairs of its inputs as features."""
-        return DECODERS[self.decoder].extended_basis
-
-    @property
-    def needs_whole_episodes(self) -> bool:
-        """Whether its decoder reads whole episodes, all of the same length."""
-        return DECODERS[self.decoder].whole_episodes
-
-    @property
-    def multi_agent_only(self) -> bool:
-        """Whether it needs several agents."""
-        return self.shared or self.needs_whole_episodes
-
-    @property
-    def single_agent_only(self) -> bool:
-        """Whether it works for a single agent only."""
-        return DECODERS[self.decoder].single_agent_only
 
 
 METHODS = Registry[Method]("method")
@@ -213,195 +65,169 @@ for _method in (
         "Gangwani et al., IRCR, NeurIPS 2020",
         reward=Reward.UNIFORM,
     ),
-    Method("rd", "return decomposition on raw features", _RD, inputs=input_names.RAW, fit=Fit.ALL_STEPS),
-    Method("rrd", "randomized return decomposition", _RRD, inputs=input_names.RAW, fit=Fit.SAMPLED_STEPS),
-    Method(
-        "rrdu",
-        "RRD without the bias of drawing steps",
-        _RRD,
-        inputs=input_names.RAW,
-        fit=Fit.SAMPLED_STEPS_UNBIASED,
-    ),
+    Method("rd", "return decomposition on raw features", _RD, RAW, Fit.ALL_STEPS),
+    Method("rrd", "randomized return decomposition", _RRD, RAW, Fit.SAMPLED_STEPS),
+    Method("rrdu", "RRD without the bias of drawing steps", _RRD, RAW, Fit.SAMPLED_STEPS_UNBIASED),
     Method(
         "rrdu-next",
         "rrdu on the next state and the action",
         f"{_RRD}; these inputs: this package",
-        inputs=input_names.NEXT_OBSERVATION_ACTION,
-        fit=Fit.SAMPLED_STEPS_UNBIASED,
+        NEXT_OBSERVATION_ACTION,
+        Fit.SAMPLED_STEPS_UNBIASED,
     ),
     Method(
         "lrr",
         "likelihood of the return under Gaussian rewards, leaving out each step in turn",
         "Xiao and Jiao, LRR, 2025 (after the abstract; no code found)",
-        inputs=input_names.RAW,
-        fit=Fit.LIKELIHOOD,
-        decoder="lrr",
+        RAW,
+        Fit.LIKELIHOOD,
+        "lrr",
     ),
-    Method(
-        "rd-linear",
-        "linear regression on the state and the action",
-        _BAYES,
-        inputs=input_names.SCORED,
-        fit=Fit.EVIDENCE,
-        decoder="linear",
-    ),
+    Method("rd-linear", "linear regression on the state and the action", _BAYES, SCORED, Fit.EVIDENCE, "linear"),
     Method(
         "bayes",
         "regression on functions of the entries of the state and the action",
         _BAYES,
-        inputs=input_names.SCORED,
-        fit=Fit.EVIDENCE,
-        decoder="additive",
+        SCORED,
+        Fit.EVIDENCE,
+        "additive",
     ),
-    Method(
-        "vib-rd",
-        "RD after a learned information bottleneck",
-        _VIB,
-        inputs=input_names.RAW,
-        fit=Fit.ALL_STEPS,
-        decoder="bottleneck",
-    ),
+    Method("vib-rd", "RD after a learned information bottleneck", _VIB, RAW, Fit.ALL_STEPS, "bottleneck"),
     Method(
         "vib-rrdu",
         "RRD-unbiased after a learned information bottleneck",
         _VIB,
-        inputs=input_names.RAW,
-        fit=Fit.SAMPLED_STEPS_UNBIASED,
-        decoder="bottleneck",
+        RAW,
+        Fit.SAMPLED_STEPS_UNBIASED,
+        "bottleneck",
     ),
     Method(
         "rudder",
         "differences between an LSTM's predictions of the return, as a model of single steps learns them",
         "Arjona-Medina et al., RUDDER, NeurIPS 2019",
-        inputs=input_names.RAW,
-        fit=Fit.DECODER_LOSS,
-        decoder="rudder",
+        RAW,
+        Fit.DECODER_LOSS,
+        "rudder",
     ),
     Method(
         "diaster",
         "differences between predicted rewards of pieces of an episode",
         "Lin et al., Diaster, AAAI 2024",
-        inputs=input_names.OBSERVATION_ACTION,
-        fit=Fit.DECODER_LOSS,
-        decoder="diaster",
+        OBSERVATION_ACTION,
+        Fit.DECODER_LOSS,
+        "diaster",
     ),
     Method(
         "grd",
         "a causal model, in which learned masks choose the causes of the reward",
         "Zhang et al., GRD, NeurIPS 2023 (after the code, not the paper)",
-        inputs=input_names.TRANSITION,
-        fit=Fit.DECODER_LOSS,
-        decoder="grd",
+        TRANSITION,
+        Fit.DECODER_LOSS,
+        "grd",
     ),
     Method(
         "rbt",
         "a transformer over at most 512 steps, those of one payment, as a model of single steps learns it",
         "Tang et al., RBT, TMLR 2025 (after the code, not the paper)",
-        inputs=input_names.TRANSITION,
-        fit=Fit.DECODER_LOSS,
-        decoder="rbt",
+        TRANSITION,
+        Fit.DECODER_LOSS,
+        "rbt",
     ),
     Method(
         "arel",
         "attention over time and agents, one reward a step",
         "Xiao et al., AREL, AAMAS 2022",
-        inputs=input_names.RAW,
-        fit=Fit.ALL_STEPS,
-        decoder="arel",
+        RAW,
+        Fit.ALL_STEPS,
+        "arel",
     ),
     Method(
         "stas",
         "attention over time, Shapley values over agents",
         "Chen et al., STAS, AAAI 2024",
-        inputs=input_names.OBSERVATION_ACTION,
-        fit=Fit.ALL_STEPS,
-        decoder="stas",
+        OBSERVATION_ACTION,
+        Fit.ALL_STEPS,
+        "stas",
     ),
     Method(
         "tar2",
         "attention over time and agents; each is paid a share of the return itself",
         "Kapoor et al., TAR2, 2025 (after the code, not the paper)",
-        inputs=input_names.OBSERVATION_ACTION,
-        fit=Fit.ALL_STEPS,
-        decoder="tar2",
+        OBSERVATION_ACTION,
+        Fit.ALL_STEPS,
+        "tar2",
     ),
-    Method("lare-rd", "return decomposition on latent rewards", _LARE, inputs=input_names.FACTORS, fit=Fit.ALL_STEPS),
-    Method(
-        "lare-rrdu",
-        "RRD-unbiased on latent rewards",
-        _LARE,
-        inputs=input_names.FACTORS,
-        fit=Fit.SAMPLED_STEPS_UNBIASED,
-    ),
+    Method("lare-rd", "return decomposition on latent rewards", _LARE, FACTORS, Fit.ALL_STEPS),
+    Method("lare-rrdu", "RRD-unbiased on latent rewards", _LARE, FACTORS, Fit.SAMPLED_STEPS_UNBIASED),
     Method(
         "lare-linear",
         "linear regression on latent rewards",
         f"LaRe, appendix B; the fit: {_BAYES}",
-        inputs=input_names.FACTORS,
-        fit=Fit.EVIDENCE,
-        decoder="linear",
+        FACTORS,
+        Fit.EVIDENCE,
+        "linear",
     ),
     Method(
         "lare-bayes",
         "regression on latent rewards and, if the returns require them, on functions of them and of raw entries",
         _BAYES,
-        inputs=input_names.FACTORS_AND_SCORED,
-        fit=Fit.EVIDENCE,
-        decoder="additive",
+        FACTORS_AND_SCORED,
+        Fit.EVIDENCE,
+        "additive",
     ),
     Method(
         "bayes-history",
         "as bayes, and on the changes of largest, smallest and last values: for scores that are no sum",
         _BAYES,
-        inputs=input_names.SCORED_AND_HISTORY,
-        fit=Fit.EVIDENCE,
-        decoder="additive",
+        SCORED_AND_HISTORY,
+        Fit.EVIDENCE,
+        "additive",
     ),
     Method(
         "lare-bayes-history",
         "as lare-bayes, and on the changes of largest, smallest and last factors: for scores that are no sum",
         _BAYES,
-        inputs=input_names.FACTORS_SCORED_AND_HISTORY,
-        fit=Fit.EVIDENCE,
-        decoder="additive",
+        FACTORS_SCORED_AND_HISTORY,
+        Fit.EVIDENCE,
+        "additive",
     ),
     Method(
         "bayes-progress",
         "changes of the expected return, as the history of an episode predicts it: for scores that are no sum",
         _PROGRESS,
-        inputs=input_names.SCORED_AND_HISTORY,
-        fit=Fit.PREFIX_EVIDENCE,
-        decoder="additive",
+        SCORED_AND_HISTORY,
+        Fit.PREFIX_EVIDENCE,
+        "additive",
     ),
     Method(
         "lare-bayes-progress",
         "as bayes-progress, from latent rewards and raw entries",
         _PROGRESS,
-        inputs=input_names.FACTORS_SCORED_AND_HISTORY,
-        fit=Fit.PREFIX_EVIDENCE,
-        decoder="additive",
+        FACTORS_SCORED_AND_HISTORY,
+        Fit.PREFIX_EVIDENCE,
+        "additive",
     ),
     Method(
         "lare-signs",
         "without a reward model: the sum of the factors, with the best signs",
         _LARE,
-        inputs=input_names.FACTORS,
-        fit=Fit.SIGNS,
-        decoder="linear",
+        FACTORS,
+        Fit.SIGNS,
+        "linear",
     ),
     Method(
         "llm-reward",
         "the reward that the language model wrote; nothing is fitted",
         "LaRe, appendix F.4; Ma et al., Eureka, ICLR 2024",
-        inputs=input_names.FACTORS,
+        FACTORS,
         reward=Reward.DESIGNED,
     ),
     Method(
         "lare-rd-shared",
         "lare-rd without credit among agents: each agent gets the mean of all",
         _LARE,
-        inputs=input_names.FACTORS,
-        fit=Fit.ALL_STEPS,
+        FACTORS,
+        Fit.ALL_STEPS,
         shared=True,
     ),
 ):

@@ -24,12 +24,13 @@ from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 from lare_rl.credit.decoder_network import DecoderOutput, DecoderShape
 from lare_rl.credit.decoder_settings import CreditSettings
 from lare_rl.credit.decoders import RBT_STEPS
+from lare_rl.credit.losses import batch_mean
 from lare_rl.credit.step_targets import is_step, step_loss
 from lare_rl.errors import LareError
 from lare_rl.nn.attention import LayerNorm, attend, causal_mask
 from lare_rl.nn.networks import MLP, Linear
 
-__all__ = ["RBT", "Block", "init_rbt"]
+__all__ = ["RBT", "Block"]
 
 LAYERS = 3
 DROPOUT = 0.1
@@ -88,14 +89,16 @@ class RBT(eqx.Module):
     """B"""
     step_model: MLP
 
-    def __init__(self, n_states: int, n_actions: int, hidden: tuple[int, ...], *, key: PRNGKeyArray):
-        size, keys = hidden[0], jax.random.split(key, 5 + LAYERS)
+    def __init__(self, key: PRNGKeyArray, shape: DecoderShape, settings: CreditSettings):
+        """Make an untrained model. Raises `LareError` if its inputs are not s, a and the next s."""
+        n_states, n_actions, _ = shape.sizes("observation", "action", "next_observation")
+        size, keys = settings.hidden[0], jax.random.split(key, 5 + LAYERS)
         self.embed_state = Linear(n_states, size, key=keys[0])
         self.embed_action = Linear(n_actions, size, key=keys[1])
         self.first_norm, self.last_norm = LayerNorm(size), LayerNorm(size)
         self.bag_attention = Linear(size, 2 * size + 1, key=keys[2])
         self.next_state = Linear(size, n_states, key=keys[3])
-        self.step_model = MLP(n_states + n_actions, hidden, 1, key=keys[4])
+        self.step_model = MLP(n_states + n_actions, settings.hidden, 1, key=keys[4])
         self.blocks = tuple(Block(size, key=block_key) for block_key in keys[5:])
 
     def _split(self, inputs: Float[Array, "*rows inputs"]) -> list[Float[Array, "*rows entries"]]:
@@ -137,14 +140,7 @@ class RBT(eqx.Module):
         mask: Float[Array, " episodes"],
         key: PRNGKeyArray,
     ) -> Float[Array, ""]:
-        """Return the loss of the transformer plus that of the step model, as the mean over the bags where `mask` is 1.
-
-        Args:
-            inputs: s, a and the next s at the steps of each bag. Steps beyond its length are padding.
-            length: T of each bag.
-            target: R/T in units of the scale.
-            mask: 1 for a bag, 0 for padding.
-            key: the random key of what is dropped.
+        """Return the loss of the transformer plus that of the step model. The arguments are those of `Diaster.loss`, for bags.
 
         Raises:
             LareError: a bag has more steps than `RBT_STEPS`.
@@ -162,10 +158,4 @@ class RBT(eqx.Module):
         state_loss = jnp.sum(valid * squared_error, axis=1) / n_steps
         prefix = jnp.cumsum(reward, axis=1) / max_steps
         loss = reward_loss + state_loss + step_loss(self.step_model, self._step_inputs(inputs), prefix, length)
-        return jnp.sum(mask * loss) / jnp.maximum(jnp.sum(mask > 0), 1)
-
-
-def init_rbt(key: PRNGKeyArray, shape: DecoderShape, settings: CreditSettings) -> RBT:
-    """Return an untrained `RBT`. Raises `LareError` if its inputs are not s, a and the next s."""
-    n_states, n_actions, _ = shape.sizes("observation", "action", "next_observation")
-    return RBT(n_states, n_actions, settings.hidden, key=key)
+        return batch_mean(mask * loss, mask)

@@ -26,10 +26,11 @@ from jaxtyping import Array, Float, Int, PRNGKeyArray
 
 from lare_rl.credit.decoder_network import DecoderOutput, DecoderShape
 from lare_rl.credit.decoder_settings import CreditSettings
+from lare_rl.credit.losses import batch_mean
 from lare_rl.credit.step_targets import is_step, step_loss
 from lare_rl.nn.networks import MLP, Linear
 
-__all__ = ["RUDDER", "init_rudder"]
+__all__ = ["RUDDER"]
 
 CONTINUOUS_WEIGHT = 0.5
 """The weight of the continuous prediction."""
@@ -58,7 +59,8 @@ class RUDDER(eqx.Module):
     """From the state h of the LSTM to g."""
     step_model: MLP
 
-    def __init__(self, n_inputs: int, hidden: tuple[int, ...], *, key: PRNGKeyArray):
+    def __init__(self, key: PRNGKeyArray, shape: DecoderShape, settings: CreditSettings):
+        n_inputs, hidden = shape.n_inputs, settings.hidden
         cell_key, gate_key, readout_key, step_key = jax.random.split(key, 4)
         self.cell_input = _init_normal(n_inputs, hidden[0], 0.0, key=cell_key)
         self.input_gate = _init_normal(hidden[0], hidden[0], GATE_BIAS, key=gate_key)
@@ -88,13 +90,7 @@ class RUDDER(eqx.Module):
         mask: Float[Array, " episodes"],
         key: PRNGKeyArray,
     ) -> Float[Array, ""]:
-        """Return the loss of the LSTM plus that of the step model, as the mean over the episodes where `mask` is 1.
-
-        Args:
-            inputs: the inputs at the steps. Steps beyond an episode's length are padding.
-            target: R/T in units of the scale.
-            mask: 1 for an episode, 0 for padding.
-        """
+        """Return the loss of the LSTM plus that of the step model. The arguments are those of `Diaster.loss`."""
         max_steps, n_steps = inputs.shape[1], jnp.maximum(length, 1)
         total = target * length / max_steps  # R in the unit of g
         g = self.predictions(inputs)
@@ -104,9 +100,4 @@ class RUDDER(eqx.Module):
         share = jnp.arange(1, max_steps + 1) / n_steps[:, None]
         prefix = g + share * (total - last)[:, None]
         loss = return_loss + step_loss(self.step_model, inputs, prefix, length)
-        return jnp.sum(mask * loss) / jnp.maximum(jnp.sum(mask > 0), 1)
-
-
-def init_rudder(key: PRNGKeyArray, shape: DecoderShape, settings: CreditSettings) -> RUDDER:
-    """Return an untrained `RUDDER`."""
-    return RUDDER(shape.n_inputs, settings.hidden, key=key)
+        return batch_mean(mask * loss, mask)

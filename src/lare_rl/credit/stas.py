@@ -21,7 +21,7 @@ from lare_rl.credit.decoder_settings import CreditSettings
 from lare_rl.nn.attention import LayerNorm, attend, causal_mask
 from lare_rl.nn.networks import MLP, Linear
 
-__all__ = ["REWARD_SAMPLES", "STAS", "Coalitions", "TimeLayer", "dropout", "gelu", "init_stas"]
+__all__ = ["REWARD_SAMPLES", "STAS", "Coalitions", "TimeLayer", "dropout", "gelu"]
 
 SIZE, HEADS, LAYERS, COALITIONS = 128, 4, 3, 5
 """The width of a token, the number of heads, of layers over time, and of sampled coalitions."""
@@ -120,14 +120,14 @@ class STAS(eqx.Module):
     head: Linear
     gain: float = eqx.field(static=True)
 
-    def __init__(self, n_inputs: int, max_steps: int, n_agents: int, gain: float, *, key: PRNGKeyArray):
-        self.gain = gain
+    def __init__(self, key: PRNGKeyArray, shape: DecoderShape, settings: CreditSettings):
+        self.gain = shape.gain
         embed_key, position_key, number_key, layers_key, coalitions_key, head_key = jax.random.split(key, 6)
-        self.embed = Linear(n_inputs, SIZE, key=embed_key)
-        self.position = jax.random.normal(position_key, (max_steps, SIZE))
-        self.agent_number = jax.random.normal(number_key, (n_agents, SIZE))
+        self.embed = Linear(shape.n_inputs, SIZE, key=embed_key)
+        self.position = jax.random.normal(position_key, (shape.max_steps, SIZE))
+        self.agent_number = jax.random.normal(number_key, (shape.n_agents, SIZE))
         self.layers = tuple(TimeLayer(key=key) for key in jax.random.split(layers_key, LAYERS))
-        self.coalitions = Coalitions(n_agents, key=coalitions_key)
+        self.coalitions = Coalitions(shape.n_agents, key=coalitions_key)
         self.head = Linear(SIZE, 1, key=head_key)
 
     def __call__(self, inputs: Float[Array, "rows agents inputs"], key: PRNGKeyArray | None) -> DecoderOutput:
@@ -152,8 +152,3 @@ class STAS(eqx.Module):
         coalitions_key, order_key = jax.random.split(key)
         order = jax.random.permutation(order_key, len(self.agent_number))
         return self.gain * self.head(self.coalitions(x + self.agent_number[order], coalitions_key, dropout_key))[..., 0]
-
-
-def init_stas(key: PRNGKeyArray, shape: DecoderShape, settings: CreditSettings) -> STAS:
-    """Return an untrained `STAS`. `settings` is not used."""
-    return STAS(shape.n_inputs, shape.max_steps, shape.n_agents, shape.gain, key=key)

@@ -5,11 +5,12 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, PRNGKeyArray
 
+from lare_rl.credit.basis import Basis
 from lare_rl.credit.decoder_network import DecoderOutput, DecoderShape
 from lare_rl.credit.decoder_settings import CreditSettings
 from lare_rl.nn.networks import MLP
 
-__all__ = ["Bottleneck", "StepDecoder", "init_bottleneck", "init_step_decoder"]
+__all__ = ["Bottleneck", "StepDecoder"]
 
 
 class StepDecoder(eqx.Module):
@@ -18,9 +19,9 @@ class StepDecoder(eqx.Module):
     mlp: MLP
     gain: float = eqx.field(static=True)
 
-    def __init__(self, n_inputs: int, hidden: tuple[int, ...], gain: float, *, key: PRNGKeyArray):
-        self.gain = gain
-        self.mlp = MLP(n_inputs, hidden, 1, key=key)
+    def __init__(self, key: PRNGKeyArray, shape: DecoderShape, settings: CreditSettings):
+        self.gain = shape.gain
+        self.mlp = MLP(shape.n_inputs, settings.hidden, 1, key=key)
 
     def __call__(self, inputs: Float[Array, "rows *agents inputs"], key: PRNGKeyArray | None) -> DecoderOutput:
         return DecoderOutput(self.gain * self.mlp(inputs)[..., 0], jnp.zeros(inputs.shape[:-1]))
@@ -38,21 +39,12 @@ class Bottleneck(eqx.Module):
     step_decoder: StepDecoder
     beta: float = eqx.field(static=True)
 
-    def __init__(
-        self,
-        n_inputs: int,
-        encoder: tuple[int, ...],
-        size: int,
-        hidden: tuple[int, ...],
-        beta: float,
-        gain: float,
-        *,
-        key: PRNGKeyArray,
-    ):
-        self.beta = beta
+    def __init__(self, key: PRNGKeyArray, shape: DecoderShape, settings: CreditSettings):
+        self.beta, size = settings.divergence, settings.bottleneck
         encoder_key, decoder_key = jax.random.split(key)
-        self.encoder = MLP(n_inputs, encoder, 2 * size, key=encoder_key)
-        self.step_decoder = StepDecoder(size, hidden, gain, key=decoder_key)
+        self.encoder = MLP(shape.n_inputs, settings.encoder, 2 * size, key=encoder_key)
+        code = shape._replace(basis=Basis(n_factors=0, n_raw=size, extended=False))
+        self.step_decoder = StepDecoder(decoder_key, code, settings)
 
     def __call__(self, inputs: Float[Array, "rows *agents inputs"], key: PRNGKeyArray | None) -> DecoderOutput:
         mean, log_variance = jnp.split(self.encoder(inputs), 2, axis=-1)
@@ -61,21 +53,3 @@ class Bottleneck(eqx.Module):
             z = mean + jnp.exp(0.5 * log_variance) * jax.random.normal(key, mean.shape)
         divergence = 0.5 * jnp.sum(jnp.exp(log_variance) + mean**2 - 1 - log_variance, axis=-1)
         return DecoderOutput(self.step_decoder(z, None).r_hat, self.beta * divergence)
-
-
-def init_step_decoder(key: PRNGKeyArray, shape: DecoderShape, settings: CreditSettings) -> StepDecoder:
-    """Return an untrained `StepDecoder`."""
-    return StepDecoder(shape.n_inputs, settings.hidden, shape.gain, key=key)
-
-
-def init_bottleneck(key: PRNGKeyArray, shape: DecoderShape, settings: CreditSettings) -> Bottleneck:
-    """Return an untrained `Bottleneck`."""
-    return Bottleneck(
-        shape.n_inputs,
-        encoder=settings.encoder,
-        size=settings.bottleneck,
-        hidden=settings.hidden,
-        beta=settings.divergence,
-        gain=shape.gain,
-        key=key,
-    )

@@ -25,7 +25,7 @@ from lare_rl.credit.decoder_settings import CreditSettings
 from lare_rl.credit.stas import REWARD_SAMPLES, Coalitions, TimeLayer, gelu
 from lare_rl.nn.networks import MLP, Linear
 
-__all__ = ["TAR2", "init_tar2"]
+__all__ = ["TAR2"]
 
 SIZE, LAYERS = 64, 3
 """The width of a token, and the number of pairs of layers."""
@@ -47,17 +47,19 @@ class TAR2(eqx.Module):
     action_model: MLP
     gain: float = eqx.field(static=True)
 
-    def __init__(
-        self, n_observations: int, n_actions: int, max_steps: int, n_agents: int, gain: float, *, key: PRNGKeyArray
-    ):
-        self.gain = gain
+    def __init__(self, key: PRNGKeyArray, shape: DecoderShape, settings: CreditSettings):
+        """Make an untrained network. Raises `LareError` if its inputs are not observation and action."""
+        n_observations, n_actions = shape.sizes("observation", "action")
+        self.gain = shape.gain
         keys = jax.random.split(key, 8)
         self.embed_observation = Linear(n_observations, SIZE, key=keys[0])
         self.embed_action = Linear(n_actions, SIZE, key=keys[1])
-        self.position = jax.random.normal(keys[2], (max_steps, SIZE))
-        self.agent_numbers = jax.random.normal(keys[3], (LAYERS, n_agents, SIZE))
+        self.position = jax.random.normal(keys[2], (shape.max_steps, SIZE))
+        self.agent_numbers = jax.random.normal(keys[3], (LAYERS, shape.n_agents, SIZE))
         self.time_layers = tuple(TimeLayer(SIZE, key=key) for key in jax.random.split(keys[4], LAYERS))
-        self.agent_layers = tuple(Coalitions(n_agents, SIZE, key=key) for key in jax.random.split(keys[5], LAYERS))
+        self.agent_layers = tuple(
+            Coalitions(shape.n_agents, SIZE, key=key) for key in jax.random.split(keys[5], LAYERS)
+        )
         self.contribution_model = MLP(2 * LAYERS * SIZE, (SIZE,), 1, key=keys[6], activation=gelu)
         self.action_model = MLP((1 + LAYERS) * SIZE, (SIZE,), n_actions, key=keys[7], activation=gelu)
 
@@ -99,9 +101,3 @@ class TAR2(eqx.Module):
     def _contributions(self, h: Float[Array, "episodes steps agents stacked"]) -> Float[Array, "episodes steps agents"]:
         outcome = jax.lax.stop_gradient(jnp.mean(h[:, -1:], axis=2, keepdims=True))
         return self.contribution_model(jnp.concatenate([h, jnp.broadcast_to(outcome, h.shape)], axis=-1))[..., 0]
-
-
-def init_tar2(key: PRNGKeyArray, shape: DecoderShape, settings: CreditSettings) -> TAR2:
-    """Return an untrained `TAR2`. `settings` is not used. Raises `LareError` if its inputs are not observation and action."""
-    n_observations, n_actions = shape.sizes("observation", "action")
-    return TAR2(n_observations, n_actions, shape.max_steps, shape.n_agents, shape.gain, key=key)

@@ -64,8 +64,7 @@ class Credit(gymnasium.Wrapper, RecordConstructorArgs):
         return observation, info
 
     def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
-        action = deepcopy(action)  # the environment may write into it
-        observation, reward, terminated, truncated, info = self.env.step(action)
+        observation, reward, terminated, truncated, info = self.env.step(deepcopy(action))  # it may write into it
         credit_reward = float(reward)
         if self.score is not None:
             credit_reward = read_score(info, self.score) if terminated or truncated else 0.0
@@ -132,8 +131,7 @@ class VectorCredit(VectorWrapper, RecordConstructorArgs):
     def step(
         self, actions: Any
     ) -> tuple[Any, Any, Bool[np.ndarray, " envs"], Bool[np.ndarray, " envs"], dict[str, Any]]:
-        actions = deepcopy(actions)
-        observation, reward, terminated, truncated, infos = self.env.step(actions)
+        observation, reward, terminated, truncated, infos = self.env.step(deepcopy(actions))
         done = np.asarray(terminated | truncated)
         valid = ~self._done if self.mode == AutoresetMode.NEXT_STEP else np.ones(self.num_envs, bool)
         steps = self._recorder.add(

@@ -235,9 +235,8 @@ def _create_assigner(
         forget=False,
         groups=log.layout.has_groups,
     )
-    bytes_per_step = (
-        4 * create(capacity=1).config.spec.basis.n_inputs + 16
-    )  # inputs, and the store's own data of each step
+    # Inputs, and the store's own data of each step.
+    bytes_per_step = 4 * create(capacity=1).config.spec.basis.n_inputs + 16
     return create(capacity=max(MIN_CAPACITY, int(memory * 2**30 / bytes_per_step)))
 
 
@@ -294,7 +293,7 @@ def _compute_rewards(
             if episode.complete and next(is_held_out):
                 counts.returns.append(float(episode.reward.sum()))
                 level = 0 if episode.group is None else credit.group_names.get(episode.group, UNSEEN)
-                level_return = 0.0 if level == UNSEEN else credit.learner.level_return(level, len(episode))
+                level_return = 0.0 if level == UNSEEN else credit.step_rewards.level_return(level, len(episode))
                 counts.predictions.append(float(reward.sum(dtype=np.float64)) + level_return)
             if episode.complete and credit.config.is_exact:
                 reward = _make_exact(reward, episode.reward, credit.config)

@@ -1,0 +1,122 @@
+"""The rewards of steps, by the newest decoder of a `CreditAssigner`."""
+
+from collections.abc import Sequence
+from functools import partial
+from operator import itemgetter
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int
+
+from lare_rl.assigner import compiled_functions as compiled
+from lare_rl.assigner.batches import whole_episodes
+from lare_rl.assigner.compiled_functions import MAX_CALL_ROWS, on_cpu, pad, padded_size
+from lare_rl.assigner.decoder_learner import DecoderLearner
+from lare_rl.credit import decomposition
+from lare_rl.credit.decomposition import DecoderState
+from lare_rl.credit.engine import StepBatch
+from lare_rl.credit.methods import Reward
+
+__all__ = ["StepRewards"]
+
+
+class StepRewards:
+    """Computes the rewards of steps by the newest decoder of a learner."""
+
+    def __init__(self, learner: DecoderLearner):
+        self.learner, self.config, self.store = learner, learner.config, learner.store
+        self._flat_cache: tuple[Any, list[Array], Any] = None, [], None
+        """A decoder or a scale, its leaves, and its structure. Flattening it anew for every call would take longer than the call."""
+        self._residual_cache: tuple[DecoderState | None, dict[int, float]] = None, {}
+        """A decoder, and what its proxy rewards lack to the returns of episodes, by their numbers."""
+
+    def stored(self, step_ids: Int[np.ndarray, " n"]) -> Float[np.ndarray, "n *agents"]:
+        """Return the rewards of stored steps. Raises `LareError` if a step is not stored."""
+        store = self.store
+        rows = store.rows(step_ids)
+        if len(rows) and step_ids.max() >= store.steps - self.learner.n_pending_steps:
+            self.learner.flush_inputs()
+        is_exact = self.config.is_exact and self.learner.is_fitted
+        last, residual = self._residuals(step_ids, rows) if is_exact else (None, None)
+        finished, alive = store.length[rows] > 0, None if store.alive is None else store.alive[rows]
+        return self._compute(
+            StepBatch(store.inputs[rows], store.lengths(rows), store.mean_reward[rows], finished, last, residual), alive
+        )
+
+    def of(
+        self, inputs: Float[np.ndarray, "n *agents inputs"], length: Int[np.ndarray, " n"]
+    ) -> Float[np.ndarray, "n *agents"]:
+        """Return the rewards of any steps, whose episodes have these lengths. The method must not need their returns."""
+        return self._compute(StepBatch(inputs, length, np.zeros(len(length), np.float32), np.ones(len(length), bool)))
+
+    def _compute(
+        self, steps: StepBatch, alive: Bool[np.ndarray, "n agents"] | None = None
+    ) -> Float[np.ndarray, "n *agents"]:
+        """Return the rewards of steps, in chunks of few sizes, so that few programs are compiled; 0 before the first fit."""
+        reward = np.zeros(steps.inputs.shape[:-1], np.float32)
+        if self.config.method.reward is Reward.PROXY and not self.learner.is_fitted:
+            return reward
+        inputs = steps.inputs.reshape(len(reward), self.config.agents, steps.inputs.shape[-1])
+        arrays = steps._replace(inputs=inputs, length=steps.length.astype(np.int32)), alive
+        for start in range(0, len(reward), MAX_CALL_ROWS):
+            chunk = slice(start, start + MAX_CALL_ROWS)
+            selected = jax.tree.map(itemgetter(chunk), arrays)
+            count = len(selected[0].length)
+            padded = jax.tree.map(partial(pad, size=padded_size(count)), selected)
+            with on_cpu():
+                leaves, structure = self._flat_state()
+                r_hat = compiled.training_rewards(leaves, *padded, structure=structure, spec=self.config.spec)
+            reward[chunk] = np.asarray(r_hat)[:count].reshape(reward[chunk].shape)
+        return reward
+
+    def _flat_state(self) -> tuple[list[Array], Any]:
+        """Return the leaves and the structure of what rewards are computed from."""
+        newest = self.learner.scale if self.learner.decoder is None else self.learner.decoder
+        if self._flat_cache[0] is not newest:
+            source = newest
+            if isinstance(source, DecoderState):
+                source = source._replace(optimizer=(), score_type_predictions=None)
+                if not decomposition.is_optimistic(self.config.method, self.config.settings):
+                    source = source._replace(closed_form=None)
+            self._flat_cache = newest, *jax.tree.flatten(source)
+        return self._flat_cache[1:]
+
+    def _residuals(
+        self, step_ids: Int[np.ndarray, " n"], rows: Int[np.ndarray, " n"]
+    ) -> tuple[Bool[np.ndarray, " n"], Float[np.ndarray, " n"]]:
+        """Return which steps are the last ones of their episodes, and the residuals of these. Those that are not used are 0."""
+        number = self.store.episode[rows]
+        stored = [self.store.episodes.get(k) for k in number.tolist()]
+        last = np.array([e is not None and e.steps[-1] == k for e, k in zip(stored, step_ids, strict=True)], bool)
+        is_used = last if self.config.settings.exact == "last" else np.array([e is not None for e in stored], bool)
+        numbers = np.unique(number[is_used])
+        residual = np.zeros(len(rows), np.float32)
+        residual[is_used] = self._episode_residuals(numbers.tolist())[np.searchsorted(numbers, number[is_used])]
+        return last, residual
+
+    def _episode_residuals(self, numbers: Sequence[int]) -> Float[np.ndarray, " episodes"]:
+        """Return the returns of episodes, less the sums of their proxy rewards by the newest decoder."""
+        decoder = self.learner.decoder
+        if self._residual_cache[0] is not decoder:
+            self._residual_cache = decoder, {}
+        residuals = self._residual_cache[1]
+        new = [number for number in numbers if number not in residuals]
+        episodes = [self.store.episodes[number] for number in new]
+        predicted: list[float] = []
+        with on_cpu():
+            for batch in whole_episodes(self.store, self.config.spec, episodes):
+                sums = compiled.predicted_returns(decoder, batch, settings=self.config.settings)
+                predicted += np.asarray(sums)[np.asarray(batch.mask) > 0].tolist()
+        scores = [episode.score for episode in episodes]
+        residuals.update(zip(new, np.subtract(scores, predicted).tolist(), strict=True))
+        return np.array([residuals[number] for number in numbers], np.float32)
+
+    def level_return(self, level: int, length: int) -> float:
+        """Return the part of the return of an episode that its group explains."""
+        decoder = self.learner.decoder
+        if decoder is None or not self.config.n_levels or not self.learner.is_fitted:
+            return 0.0
+        with on_cpu():
+            return float(decomposition.level_returns(decoder, jnp.array([level]), jnp.array([length]))[0])

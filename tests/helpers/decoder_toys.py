@@ -1,0 +1,49 @@
+"""Decoders for tests, and what their losses have in common (`from helpers.decoder_toys import ...`)."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from lare_rl.credit.basis import Basis
+from lare_rl.credit.decoder_network import DecoderShape
+from lare_rl.credit.decoder_settings import CreditSettings
+from lare_rl.credit.decoders import DECODERS
+from lare_rl.nn.networks import adam_step, init_adam
+
+
+def make_decoder(name, sizes, steps, agents=1, seed=0, **settings):
+    """Return an untrained decoder for inputs of these sizes, which is one number or numbers by names."""
+    sizes = sizes if isinstance(sizes, dict) else {"observation": sizes}
+    shape = DecoderShape(Basis(0, sum(sizes.values()), extended=False), steps, agents, tuple(sizes.items()))
+    return DECODERS[name].init_network(jax.random.key(seed), shape, CreditSettings(**settings))
+
+
+def train_by_loss(decoder, rows, target, learning_rate):
+    """Make an update by the decoder's own loss for each of some batches of episodes of one length."""
+    length, mask = jnp.full(rows.shape[1], rows.shape[2]), jnp.ones(rows.shape[1])
+
+    def body(state, batch):
+        (decoder, optimizer), (x, target, key) = state, batch
+        gradient = jax.grad(lambda decoder: decoder.loss(x, length, target, mask, key))(decoder)
+        return adam_step(decoder, gradient, optimizer, learning_rate), None
+
+    @jax.jit
+    def train(decoder, *batches):
+        return jax.lax.scan(body, (decoder, init_adam(decoder, learning_rate)), batches)[0][0]
+
+    return train(decoder, rows, target, jax.random.split(jax.random.key(0), len(rows)))
+
+
+@jax.jit
+def loss_gradient(decoder, rows, length):
+    args = rows, length, jnp.ones(len(rows)), jnp.ones(len(rows)), jax.random.key(1)
+    return jax.grad(lambda decoder: decoder.loss(*args))(decoder)
+
+
+def check_padding(decoder, rows, length):
+    """Assert that the gradient does not depend on steps beyond the episodes. Return it."""
+    padded = np.where(np.arange(rows.shape[1])[:, None] < length[:, None, None], rows, np.float32(9.0))
+    gradient = loss_gradient(decoder, rows, length)
+    for a, b in zip(*map(jax.tree.leaves, (gradient, loss_gradient(decoder, padded, length))), strict=True):
+        np.testing.assert_allclose(a, b, rtol=1e-3, atol=1e-5)
+    return gradient
