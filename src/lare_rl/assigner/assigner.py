@@ -271,7 +271,7 @@ class CreditAssigner:
             step_ids = to_step_ids(steps)
             reward = np.zeros((*step_ids.shape, *self.config.agent_axis), np.float32)
             is_step = step_ids >= 0
-            reward[is_step] = self.step_rewards.stored(step_ids[is_step])
+            reward[is_step] = self.step_rewards.rewards_at(step_ids[is_step])
             return reward
 
     def rewards(
@@ -299,7 +299,7 @@ class CreditAssigner:
             length = np.full(len(inputs), self.store.mean_length) if length is None else np.asarray(length, np.int32)
             if length.shape != (len(inputs),):
                 raise LareError(f"length has the shape {length.shape}: give one number for each of {len(inputs)} steps")
-            return self.step_rewards.of(inputs, length)
+            return self.step_rewards.rewards(inputs, length)
 
     def metrics(self) -> dict[str, float]:
         """Return metrics of the decoder, which need no true rewards.

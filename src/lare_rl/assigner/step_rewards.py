@@ -32,7 +32,7 @@ class StepRewards:
         self._residual_cache: tuple[DecoderState | None, dict[int, float]] = None, {}
         """A decoder, and what its proxy rewards lack to the returns of episodes, by their numbers."""
 
-    def stored(self, step_ids: Int[np.ndarray, " n"]) -> Float[np.ndarray, "n *agents"]:
+    def rewards_at(self, step_ids: Int[np.ndarray, " n"]) -> Float[np.ndarray, "n *agents"]:
         """Return the rewards of stored steps. Raises `LareError` if a step is not stored."""
         store = self.store
         rows = store.rows(step_ids)
@@ -45,7 +45,7 @@ class StepRewards:
             StepBatch(store.inputs[rows], store.lengths(rows), store.mean_reward[rows], finished, last, residual), alive
         )
 
-    def of(
+    def rewards(
         self, inputs: Float[np.ndarray, "n *agents inputs"], length: Int[np.ndarray, " n"]
     ) -> Float[np.ndarray, "n *agents"]:
         """Return the rewards of any steps, whose episodes have these lengths. The method must not need their returns."""

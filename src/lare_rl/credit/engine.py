@@ -20,6 +20,7 @@ from functools import cached_property
 from typing import NamedTuple
 
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
 from lare_rl.credit import closed_form, decomposition
@@ -158,19 +159,19 @@ def init_decoder(key: PRNGKeyArray, spec: CreditSpec) -> DecoderState | None:
 class StepBatch(NamedTuple):
     """Steps, and facts about their episodes."""
 
-    inputs: Float[Array, "*batch agents inputs"]
+    inputs: Float[Array | np.ndarray, "*batch agents inputs"]
     """The decoder's inputs."""
-    length: Int[Array, "*batch"]
+    length: Int[Array | np.ndarray, "*batch"]
     """T of the step's episode; an estimate while it is running."""
-    mean_reward: Float[Array, "*batch"]
+    mean_reward: Float[Array | np.ndarray, "*batch"]
     """R/T of the step's episode."""
-    finished: Bool[Array, "*batch"]
+    finished: Bool[Array | np.ndarray, "*batch"]
     """Whether the step's episode has ended."""
-    last: Bool[Array, "*batch"] | None = None
+    last: Bool[Array | np.ndarray, "*batch"] | None = None
     """Whether the step is the last one of an episode that has ended. Only for `exact`."""
-    residual: Float[Array, "*batch"] | None = None
+    residual: Float[Array | np.ndarray, "*batch"] | None = None
     """R of the step's episode, less the sum of its proxy rewards; 0 if that is unknown. Only for `exact`."""
-    alive: Bool[Array, "*batch agents"] | None = None
+    alive: Bool[Array | np.ndarray, "*batch agents"] | None = None
     """Which agents acted. None means all. Only for methods that pay shares of the return."""
 
 
