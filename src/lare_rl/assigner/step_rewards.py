@@ -41,20 +41,20 @@ class StepRewards:
         is_exact = self.config.is_exact and self.learner.is_fitted
         last, residual = self._residuals(step_ids, rows) if is_exact else (None, None)
         finished, alive = store.length[rows] > 0, None if store.alive is None else store.alive[rows]
-        return self._compute(
-            StepBatch(store.inputs[rows], store.lengths(rows), store.mean_reward[rows], finished, last, residual), alive
-        )
+        arrays: Any = store.inputs[rows], store.lengths(rows), store.mean_reward[rows], finished, last, residual
+        return self._compute(StepBatch(*arrays), alive)
 
     def rewards(
         self, inputs: Float[np.ndarray, "n *agents inputs"], length: Int[np.ndarray, " n"]
     ) -> Float[np.ndarray, "n *agents"]:
         """Return the rewards of any steps, whose episodes have these lengths. The method must not need their returns."""
-        return self._compute(StepBatch(inputs, length, np.zeros(len(length), np.float32), np.ones(len(length), bool)))
+        arrays: Any = inputs, length, np.zeros(len(length), np.float32), np.ones(len(length), bool)
+        return self._compute(StepBatch(*arrays))
 
     def _compute(
         self, steps: StepBatch, alive: Bool[np.ndarray, "n agents"] | None = None
     ) -> Float[np.ndarray, "n *agents"]:
-        """Return the rewards of steps, in chunks of few sizes, so that few programs are compiled; 0 before the first fit."""
+        """Return the rewards of steps (NumPy arrays), in chunks of few sizes, so that few programs are compiled; 0 before the first fit."""
         reward = np.zeros(steps.inputs.shape[:-1], np.float32)
         if self.config.method.reward is Reward.PROXY and not self.learner.is_fitted:
             return reward

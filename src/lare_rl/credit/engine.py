@@ -20,7 +20,6 @@ from functools import cached_property
 from typing import NamedTuple
 
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
 from lare_rl.credit import closed_form, decomposition
@@ -159,19 +158,19 @@ def init_decoder(key: PRNGKeyArray, spec: CreditSpec) -> DecoderState | None:
 class StepBatch(NamedTuple):
     """Steps, and facts about their episodes."""
 
-    inputs: Float[Array | np.ndarray, "*batch agents inputs"]
+    inputs: Float[Array, "*batch agents inputs"]
     """The decoder's inputs."""
-    length: Int[Array | np.ndarray, "*batch"]
+    length: Int[Array, "*batch"]
     """T of the step's episode; an estimate while it is running."""
-    mean_reward: Float[Array | np.ndarray, "*batch"]
+    mean_reward: Float[Array, "*batch"]
     """R/T of the step's episode."""
-    finished: Bool[Array | np.ndarray, "*batch"]
+    finished: Bool[Array, "*batch"]
     """Whether the step's episode has ended."""
-    last: Bool[Array | np.ndarray, "*batch"] | None = None
+    last: Bool[Array, "*batch"] | None = None
     """Whether the step is the last one of an episode that has ended. Only for `exact`."""
-    residual: Float[Array | np.ndarray, "*batch"] | None = None
+    residual: Float[Array, "*batch"] | None = None
     """R of the step's episode, less the sum of its proxy rewards; 0 if that is unknown. Only for `exact`."""
-    alive: Bool[Array | np.ndarray, "*batch agents"] | None = None
+    alive: Bool[Array, "*batch agents"] | None = None
     """Which agents acted. None means all. Only for methods that pay shares of the return."""
 
 
