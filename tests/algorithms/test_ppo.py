@@ -5,6 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from helpers.numpy_twins import assert_close
 from lare_rl.algorithms.batches import Rollout
 from lare_rl.algorithms.ppo import PPOSettings, ppo
 from lare_rl.nn.normalise import empty_mean_std, running_std, update_mean_std
@@ -31,10 +32,6 @@ def random_rollout():
     done[4, 2] = 1
     arrays = (observation[:-1], action, rng.normal(size=(6, 4)), observation[1:], terminated, done)
     return Rollout(*(jnp.asarray(array, jnp.float32) for array in arrays))
-
-
-def assert_close(a, b, rtol=1e-4, atol=1e-5):
-    jax.tree.map(lambda x, y: np.testing.assert_allclose(x, y, rtol=rtol, atol=atol), a, b)
 
 
 def test_advantages():

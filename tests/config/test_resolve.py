@@ -151,13 +151,9 @@ VALID = {"credit": CreditSettings(), "n_agents": 1, "n_raw_features": 9}
 @pytest.mark.parametrize(
     ("method", "changes", "texts"),
     [
-        ("llm-reward", {"scored_observation": "both"}, ["scored_observation", "'before' or 'after'"]),
-        ("ircr", {"scale_rewards": True}, ["scale_rewards"]),
-        ("diaster", {"n_agents": 3}, ["single agent", "3"]),
         ("arel", {"n_agents": 1, "fixed_length": True}, ["among agents"]),
         ("arel", {"n_agents": 3}, ["whole episodes"]),
         ("stas", {"n_agents": 3, "team_level": True, "fixed_length": True}, ["credit_scope"]),
-        ("rrd", {"credit": CreditSettings(steps=16)}, ["steps = 16", "drawn_steps = 64"]),
         ("bayes", {"n_raw_features": 7057}, ["1024", "7057", "rrdu"]),
         ("rd-linear", {"n_raw_features": 1025}, ["1024", "1025"]),
         ("diaster", {"credit": CreditSettings(hidden=())}, ["hidden"]),

@@ -9,14 +9,20 @@ from hypothesis import strategies as st
 
 from helpers.replays import COLUMNS, extend, filled_replay, read, replay_columns, slow_replay, slow_segments, stream
 from lare_rl.data import replay, sampling
+from lare_rl.data.extend import abandon_running
 from lare_rl.data.replay import Index
-from lare_rl.data.trajectory import Trajectory
-from lare_rl.envs.interface import Timestep
 from lare_rl.tasks.payments import PaymentRule
 
 ENVS, LONGEST, CHUNKS = 3, 6, (1, 3, 7)
 CAPACITY = replay.required_capacity(max(CHUNKS), LONGEST)
 LENGTHS = st.lists(st.integers(1, LONGEST), min_size=1, max_size=8)
+
+
+def read_all(buffer):
+    """Read the stored steps of each environment, [envs rows ...], and others after them."""
+    number = np.asarray(replay.oldest_transition(buffer))[:, None] + np.arange(CAPACITY)
+    steps = read(buffer, Index(np.repeat(np.arange(ENVS)[:, None], CAPACITY, axis=1), number))
+    return jax.tree.map(np.asarray, steps)
 
 
 @given(st.lists(LENGTHS, min_size=ENVS, max_size=ENVS), st.lists(st.sampled_from(CHUNKS), min_size=1, max_size=8))
@@ -25,9 +31,7 @@ def test_replay_matches_slow_twin(lengths_by_env, chunks):
     total = sum(chunks)
     rows = [stream(lengths * (total + 1), env)[:total] for env, lengths in enumerate(lengths_by_env)]
     buffer = filled_replay(rows, chunks, CAPACITY)
-    number = np.asarray(replay.oldest_transition(buffer))[:, None] + np.arange(CAPACITY)
-    index = Index(np.repeat(np.arange(ENVS)[:, None], CAPACITY, axis=1), number)
-    steps = jax.tree.map(np.asarray, read(buffer, index))
+    steps = read_all(buffer)
     # The number of the last step that ended an episode is the number of steps of finished episodes.
     ends = [[i + 1 for i, row in enumerate(env_rows) if row[3]] for env_rows in rows]
     mean_length = sum(env_ends[-1] for env_ends in ends if env_ends) // max(1, sum(map(len, ends)))
@@ -59,10 +63,10 @@ def test_replay_matches_slow_twin(lengths_by_env, chunks):
     assert set(steps.next_columns) == {"observation", "state"}
 
 
+episodes_in_order = jax.jit(sampling.episodes_in_order, static_argnums=(3, 4))
+MAX_STEPS = 8 * max(CHUNKS)
 RULES = (
-    PaymentRule(period=1),
     PaymentRule(period=3),
-    PaymentRule(nonzero=True),
     PaymentRule(period=4, nonzero=True),
     PaymentRule(period=4, window=2),
     PaymentRule(nonzero=True, window=3),
@@ -74,27 +78,24 @@ RULES = (
 @settings(max_examples=15, deadline=None)
 def test_segments_match_slow_twin(rule, data):
     lengths_by_env = data.draw(st.lists(LENGTHS, min_size=ENVS, max_size=ENVS))
-    chunks = data.draw(st.lists(st.sampled_from(CHUNKS), min_size=1, max_size=8))
+    chunks = data.draw(st.lists(st.sampled_from(CHUNKS[1:]), min_size=1, max_size=8))
     total, pays = sum(chunks), np.random.default_rng(data.draw(st.integers(0, 9))).random((ENVS, 200)) < 0.4
     rows = [stream(lengths * (total + 1), env)[:total] for env, lengths in enumerate(lengths_by_env)]
     rows = [[(*row[:2], row[2] * pays[env, i], row[3]) for i, row in enumerate(rows[env])] for env in range(ENVS)]
     buffer = filled_replay(rows, chunks, CAPACITY, rule)
-    by_payment = replay.by_payment(buffer)
-    sample = sampling.episodes_in_order(
-        by_payment, jnp.zeros(ENVS, int), jnp.array(0), ENVS * total, ENVS * total * LONGEST
-    )
-    sample = jax.tree.map(np.asarray, sample)
-    read_rows = read(buffer, sample.steps)
-    observation, expected = np.asarray(read_rows.columns["observation"])[:, 0, 0], []
+    start, limits = jnp.zeros(ENVS, int), (ENVS * MAX_STEPS, ENVS * MAX_STEPS * LONGEST)
+    sample = jax.tree.map(np.asarray, episodes_in_order(replay.by_payment(buffer), start, jnp.array(0), *limits))
+    observation = np.asarray(read(buffer, sample.steps).columns["observation"])[:, 0, 0]
+    all_steps, expected = read_all(buffer), []
     for env in range(ENVS):
         finished, running = slow_replay(rows[env], chunks, CAPACITY)
         segments = slow_segments([*finished, running], rule)
         expected += segments
-        number = int(replay.oldest_transition(buffer)[env]) + np.arange(sum(map(len, [*finished, running])))
-        steps = jax.tree.map(np.asarray, read(buffer, Index(np.full(len(number), env), number)))
+        n_stored = sum(map(len, [*finished, running]))
+        steps = jax.tree.map(lambda rows, env=env, n=n_stored: rows[env, :n], all_steps)
         last = np.concatenate([np.arange(len(unpaid)) == len(unpaid) - 1 for _, unpaid, _ in segments] or [[]])
         np.testing.assert_array_equal(steps.last[: len(last)], last)
-        np.testing.assert_array_equal(steps.finished, np.arange(len(number)) < len(last))
+        np.testing.assert_array_equal(steps.finished, np.arange(n_stored) < len(last))
         payments = [payment for payment, _, _ in segments]
         np.testing.assert_allclose(steps.episodic_reward[steps.last], np.reshape(payments, (-1, 2)), rtol=1e-6)
         assert not steps.episodic_reward[~steps.last].any()
@@ -108,7 +109,7 @@ def test_segments_match_slow_twin(rule, data):
 def test_abandon_running_forgets_its_payments():
     buffer = filled_replay([stream([2, 5])] * ENVS, [6], CAPACITY, PaymentRule(period=2))
     assert replay.by_payment(buffer).episodes.tolist() == [3] * ENVS
-    abandoned = replay.abandon_running(buffer, jnp.array([True, False, True]))
+    abandoned = abandon_running(buffer, jnp.array([True, False, True]))
     assert replay.by_payment(abandoned).episodes.tolist() == [1, 3, 1]
     longer = extend(
         abandoned, *replay_columns([stream([7], env)[:3] for env in (7, 8, 9)]), payments=PaymentRule(period=2)
@@ -117,23 +118,10 @@ def test_abandon_running_forgets_its_payments():
     assert read(longer, replay.newest_steps(longer, 3)).last.tolist()[::2] == [[False, True, False]] * 2
 
 
-def test_extend_in_chunks():
-    rows = [stream([4, 3, 2, 5], env) for env in range(ENVS)]
-    chunked, at_once = (filled_replay(rows, chunks, CAPACITY) for chunks in ([1, 3, 3, 7], [7, 7]))
-    jax.tree.map(np.testing.assert_array_equal, chunked, at_once)
-
-
-def test_newest_steps():
-    rows = [stream([4, 6, 3, 2, 5], env) for env in range(ENVS)]
-    buffer = filled_replay(rows, [7, 7], CAPACITY)
-    observation = read(buffer, replay.newest_steps(buffer, 5)).columns["observation"]
-    np.testing.assert_array_equal(observation[..., 0, 0], [[row[0] for row in env[9:14]] for env in rows])
-
-
 def test_abandon_running():
     buffer = filled_replay([stream([2, 5], 0), stream([4, 3], 1), stream([3, 1, 9], 2)], [7], CAPACITY)
     assert buffer.running.tolist() == [True, True, True]
-    abandoned = replay.abandon_running(buffer, jnp.array([True, False, True]))
+    abandoned = abandon_running(buffer, jnp.array([True, False, True]))
     assert replay.n_transitions(abandoned).tolist() == [2, 7, 4]
     assert abandoned.next_row.tolist() == [3, int(buffer.next_row[1]), 6]
     assert abandoned.running.tolist() == [False, True, False]
@@ -143,7 +131,7 @@ def test_abandon_running():
         steps.columns["observation"][..., 0, 0], [[k, k + 1, k + 2] for k in (700_000, 800_000, 900_000)]
     )
     np.testing.assert_allclose(steps.mean_reward[0], [[0.5, -1]] * 3)
-    unchanged = replay.abandon_running(abandoned, jnp.array([True, False, True]))
+    unchanged = abandon_running(abandoned, jnp.array([True, False, True]))
     assert jax.tree.all(jax.tree.map(np.array_equal, unchanged, abandoned))
 
 
@@ -156,25 +144,3 @@ def test_hide_newest():
     assert finished.sum(axis=1).tolist() == [2, 7, 5]
     restored = hidden._replace(episodes=buffer.episodes, running=buffer.running)
     assert jax.tree.all(jax.tree.map(np.array_equal, restored, buffer))
-
-
-@pytest.mark.parametrize(("steps", "longest"), [(1, 1), (7, 6), (50, 1000)])
-def test_required_capacity(steps, longest):
-    # The worst case: a running episode lacks one step of the longest, and then each step is an episode.
-    worst = stream([longest, *[1] * (steps - 1), 1])
-    rows = longest + 1 + 2 * (steps - 1) if steps > 1 else longest + 1
-    assert len(worst) == longest + steps
-    assert rows <= replay.required_capacity(steps, longest)
-
-
-def test_empty_replay():
-    empty = replay.init_replay(COLUMNS, ENVS, CAPACITY, 2)
-    assert replay.n_transitions(empty).tolist() == replay.n_finished(empty).tolist() == [0, 0, 0]
-
-
-def test_trajectory_ended():
-    """A step is the last of its episode if it is terminated or truncated."""
-    terminated, truncated = np.array([[False, True, False, True]]), np.array([[False, False, True, True]])
-    timestep = Timestep(*[np.zeros((1, 4))] * 5, terminated=terminated, truncated=truncated, measures={})
-    trajectory = Trajectory(timestep, np.zeros((1, 4, 1, 1)), np.zeros((1, 4, 1, 1)), timestep)
-    np.testing.assert_array_equal(trajectory.ended, [[False, True, True, True]])

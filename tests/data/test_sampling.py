@@ -51,12 +51,6 @@ def assert_uniform(sampled, expected, deviations=6):
     np.testing.assert_allclose(counts, mean, atol=deviations * np.sqrt(mean))
 
 
-def test_episodes_differ_by_environment(buffer):
-    assert len(set(replay.n_transitions(buffer).tolist())) > 1
-    assert len(set(replay.n_finished(buffer).tolist())) > 1
-    assert replay.oldest_transition(buffer).min() > 0
-
-
 def test_sample_transitions_is_uniform(buffer):
     assert_uniform(pairs(sample_transitions(buffer, jax.random.key(0), (200, 500))), TRANSITIONS)
 

@@ -30,3 +30,8 @@ def q_values(critics, observation, action):
 
 def equal(a, b):
     return jax.tree.all(jax.tree.map(np.array_equal, a, b))
+
+
+def assert_close(a, b, rtol=1e-4, atol=1e-5):
+    """Assert that two trees of arrays are equal but for rounding."""
+    jax.tree.map(lambda x, y: np.testing.assert_allclose(x, y, rtol=rtol, atol=atol), a, b)

@@ -3,6 +3,7 @@
 import jax
 import numpy as np
 
+from lare_rl.data import extend as writes
 from lare_rl.data import replay
 from lare_rl.tasks.payments import PAID_AT_END
 
@@ -12,7 +13,7 @@ COLUMNS = {
     "action": jax.ShapeDtypeStruct((2, 1), np.float32),
     "terminated": jax.ShapeDtypeStruct((), np.bool_),
 }
-extend, read = jax.jit(replay.extend, static_argnames="payments"), jax.jit(replay.read)
+extend, read = jax.jit(writes.extend, static_argnames="payments"), jax.jit(replay.read)
 
 
 def stream(lengths, env=0):

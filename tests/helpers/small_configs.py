@@ -124,6 +124,23 @@ def random_steps(env=ONE_AGENT, envs=1, seed=0, lengths=LENGTHS):
     return Trajectory(timestep, action, to_env_action(action, env), next_timestep)
 
 
+def with_other_dead_values(steps):
+    """Return the steps with other observations, actions and rewards of agents that have left."""
+    dead = ~steps.timestep.alive
+    # The next observation of an agent's last step still counts.
+    long_dead = dead & np.roll(dead, 1, axis=0) & ~np.roll(steps.ended, 1, axis=0)[..., None]
+    assert 0.1 < dead.mean() < 0.5
+    assert long_dead.any()
+    return steps._replace(
+        timestep=steps.timestep._replace(observation=np.where(long_dead[..., None], 99, steps.timestep.observation)),
+        next_timestep=steps.next_timestep._replace(
+            observation=np.where(dead[..., None], 99, steps.next_timestep.observation),
+            reward=np.where(dead, 99, steps.next_timestep.reward),
+        ),
+        action=np.where(dead[..., None], np.eye(4, dtype=np.float32)[0], steps.action),
+    )
+
+
 def random_factors(config, steps, seed=1):
     """Return random factors of every row."""
     shape = (*steps.ended.shape, config.credit_rows, max(config.n_factors, default=0))

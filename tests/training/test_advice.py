@@ -2,16 +2,11 @@
 
 import json
 
-import gymnasium
 import numpy as np
 import pytest
-from gymnasium.spaces import Box
 
 import lare_rl
-from helpers.listeners import MessageListener
-from helpers.toy_envs import Chase, pick_spec, toy_spec
-from helpers.training_runs import CHASE, train_quietly
-from lare_rl.algorithms.ppo import PPOSettings
+from helpers.toy_envs import pick_spec, toy_spec
 from lare_rl.config.resolve import resolve
 from lare_rl.config.settings import Settings
 from lare_rl.runs.config_file import make_config
@@ -22,47 +17,33 @@ from lare_rl.training.advice import (
     find_large_observations,
     find_saturated_policies,
     find_untrained,
-    saturation,
 )
+from lare_rl.training.compiled import compile_functions
+from lare_rl.training.saturation import greedy_actions, saturation
 from lare_rl.training.saved_state import load_learner
-from lare_rl.training.session import restore_session
 from lare_rl.util.findings import render
 
 
-class Bright(Chase):
-    """The second feature of the observation is a light of up to 900 W/m²."""
-
-    observation_space = Box(-1000, 1000, (2,), np.float32)
-
-    def observe(self):
-        return super().observe() * np.array([1, 900], np.float32)
-
-
-gymnasium.register("toys/Bright-v0", entry_point=Bright, max_episode_steps=20)
-
-BRIGHT = CHASE.model_copy(
-    update={"name": "Bright", "environment": "toys/Bright-v0", "observation": "0: the target\n1: light (W/m²)"}
+@pytest.mark.parametrize(
+    ("settings", "factor", "text"),
+    [
+        ({}, 1, None),
+        ({}, 50, "--algorithm ppo"),
+        ({"algorithm": "ppo"}, 50, None),  # it normalises observations
+        ({"algorithm": "ppo", "ppo": {"normalise_observations": False}}, 50, "--ppo.normalise-observations"),
+    ],
 )
-
-
-@pytest.mark.long
-def test_large_observations_are_reported_once(dense, tmp_path):
-    """Of a run with small observations, `test_train.py` sees that there is no such message."""
-    listener = MessageListener()
-    train_quietly(BRIGHT, dense(steps=60), tmp_path / "run", listeners=[listener])
-    (message,) = (line for line in listener.messages if line.startswith("Observations are large"))
-    assert "light (W/m²)" in message
-    assert "--algorithm ppo" in message
-
-
-@pytest.mark.parametrize(("normalise", "expected"), [(True, []), (False, ["large observations"])])
-def test_large_observations_of_ppo(normalise, expected, dense_run):
+def test_large_observations(settings, factor, text, dense_run):
     config, learner, _, _ = load_learner(dense_run)
-    replay = learner.replay._replace(columns={"observation": 50 * learner.replay.columns["observation"]})
-    settings = Settings(method="rrdu", algorithm="ppo", ppo=PPOSettings(normalise_observations=normalise))
-    run_config = dense_run.config.model_copy(update={"settings": resolve(settings, toy_spec())})
+    observation = learner.replay.columns["observation"] * np.float32([1, factor])
+    resolved = resolve(Settings(method="rrdu", **settings), toy_spec())
+    task = dense_run.config.task.model_copy(update={"observation": "0: the target\n1: light (W/m²)"})
+    run_config = dense_run.config.model_copy(update={"settings": resolved, "task": task})
+    replay = learner.replay._replace(columns={"observation": observation})
     findings = find_large_observations(Run(dense_run.directory, run_config, ()), replay, config)
-    assert [finding.code for finding in findings] == expected
+    messages = [render(finding, MESSAGES) for finding in findings]
+    assert len(messages) == (text is not None)
+    assert all("light (W/m²)" in message and text in message for message in messages)
 
 
 @pytest.mark.parametrize(
@@ -104,11 +85,11 @@ def test_saturated_policies(action, saturations, start):
 
 
 def test_greedy_actions_of_newest_states(dense_run):
-    session, _ = restore_session(dense_run)
-    actions = session.greedy_actions(5)
-    session.close()
+    config, learner, host, _ = load_learner(dense_run)
+    functions, replay = compile_functions(config), learner.replay
+    actor = functions.get_actor(learner, host["step"])
+    actions = greedy_actions(functions.act, actor, replay, config, 5)
     assert actions.shape == (2, 5, 1)
-    replay = session.learner.replay
     rows = (int(replay.next_row[1, 0]) - np.arange(1, 6)) % 64
     observation = np.asarray(replay.columns["observation"][1, 0, rows, 0])
     policy = lare_rl.load_policy(dense_run, seed=dense_run.seeds[1])

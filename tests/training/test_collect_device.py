@@ -13,6 +13,7 @@ from helpers.small_configs import ONE_AGENT, SMALL_SETTINGS, small_config
 from lare_rl.algorithms.qmix import qmix
 from lare_rl.algorithms.td3 import TD3Settings
 from lare_rl.envs.interface import Timestep
+from lare_rl.training import collect_device
 from lare_rl.training.collect_device import DeviceCollector, unroll_on_device
 from lare_rl.training.compiled import compile_functions
 from lare_rl.training.streams import Stream, stream_keys
@@ -99,19 +100,20 @@ def test_collect_resets_memory_with_episode(learner, steps):
     assert n_episodes > 30
 
 
-def test_restore_continues_exactly(learner):
-    collector, restored = DeviceCollector(ENV, CONFIG, SEEDS), DeviceCollector(ENV, CONFIG, SEEDS)
-    collector.collect(learner[1], 0)
-    dropped, messages = restored.restore(collector.state_dict())
-    assert (dropped.shape, dropped.any(), messages) == ((2, ENVS), False, [])
-    a, b = (envs.collect(learner[1], ENVS * TIME) for envs in (collector, restored))
-    assert jax.tree.all(jax.tree.map(jnp.array_equal, a, b))
-
-
 def test_collect_seeds_do_not_depend_on_each_other(steps):
     reverse = DeviceCollector(ENV, CONFIG, SEEDS[::-1]).collect(make_actor(SEEDS[::-1])[1], 0)
     for a, b in zip(jax.tree.leaves(reverse), jax.tree.leaves(steps), strict=True):
         np.testing.assert_allclose(a, b[::-1, :TIME], rtol=1e-4, atol=1e-5)
+
+
+def test_reset_with_each_step_changes_nothing(learner, steps, monkeypatch):
+    """As a card does if a reset is cheap."""
+    assert collect_device.is_reset_cheap(ENV, ENVS)
+    monkeypatch.setattr(collect_device, "MAX_RESET_FLOPS", 0)
+    assert not collect_device.is_reset_cheap(ENV, ENVS)
+    collector = DeviceCollector(ENV, replace(CONFIG, resets_with_steps=True), SEEDS)
+    first = jax.tree.map(lambda rows: rows[:, :TIME], steps)
+    jax.tree.map(np.testing.assert_array_equal, collector.collect(learner[1], 0), first)
 
 
 def test_evaluate_equals_plain_loop(learner):

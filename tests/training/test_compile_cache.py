@@ -3,10 +3,10 @@
 import threading
 from dataclasses import dataclass
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 
+from helpers.compilations import record_compilations
 from helpers.small_configs import small_config
 from helpers.toy_envs import PHI, toy_spec
 from lare_rl.latent.function import verify_function
@@ -68,15 +68,6 @@ def test_learning_is_compiled_while_steps_are_collected():
     thread.start()
     learner = init_seeds(functions, seed_keys(jnp.arange(2), 0))
     thread.join()
-    compiled = []
-
-    def listen(event, seconds, **_):
-        if "backend_compile" in event:
-            compiled.append(event)
-
-    jax.monitoring.register_event_duration_secs_listener(listen)
-    try:
+    with record_compilations() as compiled:
         functions.learn_returns(learner)
-    finally:
-        jax.monitoring.unregister_event_duration_listener(listen)
     assert compiled == []

@@ -89,7 +89,9 @@ def add_all(decoders, buffer, config):
         long_case("rd-linear", "td3", ONE_AGENT, PaymentRule(period=4)),
     ],
 )
-def test_learn_returns_keeps_the_statistics_from_scratch(method, algorithm, env, payments):
+def test_learn_returns_keeps_the_statistics_from_scratch(method, algorithm, env, payments, monkeypatch):
+    """Also if not all episodes are read at a time."""
+    monkeypatch.setattr(episodes, "MAX_ROWS", 24 * env.n_agents)
     config = small_config(method, algorithm, env, capacity=1000, payments=payments)
     steps = with_growing_observations(random_steps(env, lengths=LONG), 100)
     n_steps = set()

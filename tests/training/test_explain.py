@@ -4,6 +4,7 @@ import jax
 import pytest
 
 import lare_rl
+from helpers.compilations import record_compilations
 from helpers.listeners import MessageListener
 from helpers.toy_envs import toy_spec
 from helpers.training_runs import train_quietly
@@ -36,17 +37,8 @@ def test_explanation_is_compiled_from_shapes(learned_training):
     config, learner, _, _ = load_learner(run)
     clear_compile_cache()
     compile_explanation(learner_shape(config, len(run.seeds)), config)
-    compiled = []
-
-    def listen(event, seconds, **_):
-        if "backend_compile" in event:
-            compiled.append(event)
-
-    jax.monitoring.register_event_duration_secs_listener(listen)
-    try:
+    with record_compilations() as compiled:
         assert explain_stored_returns(learner, config)
-    finally:
-        jax.monitoring.unregister_event_duration_listener(listen)
     assert compiled == []
 
 

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from helpers.long_tests import long_case
+from helpers.numpy_twins import assert_close
 from helpers.small_configs import (
     LENGTHS,
     ONE_AGENT,
@@ -28,11 +29,11 @@ from helpers.small_configs import (
     team_rewards,
     untrained_learner,
     with_factor_decoders,
+    with_other_dead_values,
 )
 from lare_rl.credit import closed_form, returns
 from lare_rl.credit.decoder_settings import CreditSettings
 from lare_rl.credit.engine import return_scale
-from lare_rl.credit.methods import METHODS, Fit
 from lare_rl.data import replay
 from lare_rl.data.sampling import sample_drawn
 from lare_rl.envs.interface import EnvSpec, Team
@@ -45,10 +46,6 @@ from lare_rl.training.rewards import assess, rewards, team_proxy_rewards
 ENDS = np.cumsum(LENGTHS)[:-1]
 MANY = partial(small_config, algorithm="ippo", env=ONE_TEAM)
 TEAMS = partial(small_config, algorithm="ippo", env=TWO_TEAMS)
-
-
-def assert_close(a, b, rtol=1e-4, atol=1e-5):
-    jax.tree.map(partial(np.testing.assert_allclose, rtol=rtol, atol=atol), a, b)
 
 
 def proxy_rewards(steps, state, config):
@@ -140,7 +137,7 @@ def test_rewards(method, scale_rewards):
 
 def with_running_episode(config):
     """Return a learner with a running episode of two steps, and the learner without it."""
-    learner, steps = learner_with_episodes(config), jax.tree.map(lambda rows: rows[:2], random_steps())
+    learner, steps = learner_with_episodes(config), jax.tree.map(lambda rows: rows[:2], random_steps(config.env))
     return add_steps(learner, config, steps), learner
 
 
@@ -166,25 +163,12 @@ def check_closed_form(credit, z, reward):
     np.testing.assert_allclose(sums.products, (length * centred.T) @ centred, rtol=1e-3, atol=1e-4)
 
 
-def test_closed_form_sums_finished_episodes():
-    config = small_config("lare-linear")
-    factors, steps = random_factors(config, random_steps()), random_steps()
-    learner, _ = with_running_episode(config)
-    check_closed_form(
-        learner.decoders[0], np.split(factors[:, 0, 0], ENDS), np.split(steps.next_timestep.reward[:, 0, 0], ENDS)
-    )
-
-
 def test_abandon_episodes_does_not_change_the_fit():
     config = small_config("lare-linear")
     longer, learner = with_running_episode(config)
     shorter = abandon_episodes(longer, jnp.array([True]))
     jax.tree.map(np.testing.assert_array_equal, shorter.decoders[0].closed_form, learner.decoders[0].closed_form)
     assert shorter.replay.transitions.tolist() == learner.replay.transitions.tolist()
-
-
-def test_methods_have_all_fits():
-    assert {method.fit for method in METHODS.values()} >= set(Fit)
 
 
 def test_assess_reads_the_newest_steps():
@@ -300,16 +284,14 @@ def test_assess_measures_each_team():
     assert float(results["credit/error_second"]) == pytest.approx(2 * np.abs(true[mask]).mean(), rel=1e-4)
 
 
-@pytest.mark.long
-def test_closed_form_sums_means_over_alive_agents():
+def test_closed_form_sums_means_over_alive_agents_of_finished_episodes():
     config, steps = TEAMS("lare-linear"), random_steps(TWO_TEAMS)
-    factors, learner = random_factors(config, steps), learner_with_episodes(config)
+    factors, (learner, _) = random_factors(config, steps), with_running_episode(config)
     for credit, team, size in zip(learner.decoders, TWO_TEAMS.teams, config.n_factors, strict=True):
-        rows = []
-        for factors_t, alive in zip(
-            factors[:, 0, team.agents, :size], steps.timestep.alive[:, 0, team.agents], strict=True
-        ):
-            rows.append(factors_t[alive].mean(axis=0) if alive.any() else np.full(size, np.nan))
+        all_rows, alive = factors[:, 0, team.agents, :size], steps.timestep.alive[:, 0, team.agents]
+        rows = [
+            z[mask].mean(axis=0) if mask.any() else [np.nan] * size for z, mask in zip(all_rows, alive, strict=True)
+        ]
         check_closed_form(credit, np.split(np.array(rows), ENDS), np.split(team_rewards(steps, team), ENDS))
 
 
@@ -348,18 +330,7 @@ OTHERS = ("rd", "rrdu", "vib-rd", "lare-rrdu", "lare-signs", "lare-rd-shared", "
 def test_values_of_dead_agents_change_nothing(method):
     config, steps = MANY(method), random_steps(ONE_TEAM)
     dead, factors = ~steps.timestep.alive, random_factors(config, steps)
-    assert 0.1 < dead.mean() < 0.5
-    # The next observation of an agent's last step still counts.
-    long_dead = dead & np.roll(dead, 1, axis=0) & ~np.roll(steps.ended, 1, axis=0)[..., None]
-    assert long_dead.any()
-    changed = steps._replace(
-        timestep=steps.timestep._replace(observation=np.where(long_dead[..., None], 99, steps.timestep.observation)),
-        next_timestep=steps.next_timestep._replace(
-            observation=np.where(dead[..., None], 99, steps.next_timestep.observation),
-            reward=np.where(dead, 99, steps.next_timestep.reward),
-        ),
-        action=np.where(dead[..., None], np.eye(4, dtype=np.float32)[0], steps.action),
-    )
+    changed = with_other_dead_values(steps)
     results = []
     for trajectory, z in ((steps, factors), (changed, np.where(dead[..., None], 99, factors).astype(np.float32))):
         learner = add_steps(untrained_learner(config), config, trajectory, z)

@@ -17,7 +17,7 @@ from lare_rl.envs.particles.catalogue import TASKS
 from lare_rl.errors import LareError
 from lare_rl.latent.function import verify_function
 from lare_rl.runs.directory import create_run, open_run
-from lare_rl.training.factors import compute_factors
+from lare_rl.training import factors
 from lare_rl.training.latent_functions import choose_functions
 from lare_rl.training.saved_state import load_learner
 from lare_rl.training.session import restore_session
@@ -68,8 +68,8 @@ def test_stored_factors_follow_scored_observation(echo_run):
     agent left."""
     config, learner, _, _ = load_learner(echo_run)
     assert config.n_factors == (4,)
-    alive, factors = (np.asarray(learner.replay.columns[name])[0, :, :10] for name in ("alive", "factors"))
-    time_before, time_after = 6 * factors[..., 1], 6 * factors[..., 3]
+    alive, z = (np.asarray(learner.replay.columns[name])[0, :, :10] for name in ("alive", "factors"))
+    time_before, time_after = 6 * z[..., 1], 6 * z[..., 3]
     goes_on = alive[:, 1:] & alive[:, :-1] & np.isclose(time_before[:, 1:], 1 + time_before[:, :-1])
     assert goes_on.mean() > 0.3
     np.testing.assert_allclose(time_after[:, :-1][goes_on], time_before[:, 1:][goes_on], atol=1e-5)
@@ -92,8 +92,10 @@ def test_create_run_with_one_function_per_team(tmp_path):
         open_run(run.directory)
 
 
-def test_compute_factors_of_state(echo):
-    """One row in each step: the global state, and all actions concatenated."""
+@pytest.mark.parametrize("max_operations", [factors.MAX_COMPILED_OPERATIONS, 0])
+def test_compute_factors_of_state(max_operations, echo, monkeypatch):
+    """One row in each step: the global state, and all actions concatenated. Large graphs are computed by NumPy."""
+    monkeypatch.setattr(factors, "MAX_COMPILED_OPERATIONS", max_operations)
     task = echo.model_copy(update={"credit_scope": "state", "observation_size": 9, "action_size": 9})
     source = "def evaluation_func(s, a):\n    return [np.sum(s * a, axis=1, keepdims=True), s[:, 0:1]]\n"
     graph, steps = verify_function(source, task).graph, random_steps(Echo.spec)
@@ -101,8 +103,8 @@ def test_compute_factors_of_state(echo):
         config = small_config("lare-rd", "qmix", Echo.spec, credit_scope="state", scored_observation=scored_observation)
         state = (steps.timestep if scored_observation == "before" else steps.next_timestep).state
         expected = np.stack([(state * steps.action.reshape(state.shape)).sum(axis=-1), state[..., 0]], axis=-1)
-        factors = compute_factors([graph], jax.tree.map(jnp.asarray, steps), config)
-        np.testing.assert_allclose(factors[..., 0, :], expected, rtol=1e-5, atol=1e-6)
+        z = factors.compute_factors([graph], jax.tree.map(jnp.asarray, steps), config)
+        np.testing.assert_allclose(z[..., 0, :], expected, rtol=1e-5, atol=1e-6)
 
 
 @pytest.mark.parametrize(

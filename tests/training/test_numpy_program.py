@@ -53,16 +53,11 @@ def test_other_operations_are_refused(function):
         to_numpy(function, draw(4), draw(4))
 
 
-def make_run(tmp_path, algorithm, **changes):
-    task = toy_spec(**changes)
-    settings = resolve(Settings(method="dense", algorithm=algorithm, seeds=2, capacity=4000), task)
-    return make_train_config(create_run(tmp_path / "run", task, settings, ()))
-
-
 @pytest.mark.parametrize("greedy", [True, False])
 @pytest.mark.parametrize("algorithm", ["td3", "sac", "ppo"])
 def test_policy_on_host_equals_compiled_policy(algorithm, greedy, tmp_path, monkeypatch):
-    config = make_run(tmp_path, algorithm)
+    settings = resolve(Settings(method="dense", algorithm=algorithm, seeds=2, capacity=4000), toy_spec())
+    config = make_train_config(create_run(tmp_path / "run", toy_spec(), settings, ()))
     functions = compile_functions(config)
     actor = functions.get_actor(init_seeds(functions, seed_keys(jnp.arange(2), 0)), 0)
     noise = None if greedy else draw(2, 3, 1, config.noise_size)

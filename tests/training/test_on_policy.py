@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from helpers.long_tests import long_case
+from helpers.numpy_twins import assert_close
 from helpers.small_configs import (
     LENGTHS,
     ONE_AGENT,
@@ -25,6 +26,7 @@ from helpers.small_configs import (
     store_seeds,
     stored_steps,
     untrained_learner,
+    with_other_dead_values,
 )
 from lare_rl.algorithms.ppo import ppo
 from lare_rl.nn.normalise import standardise
@@ -176,24 +178,12 @@ def test_rollout_of_many_agents():
 
 def test_train_step_ignores_dead_agents():
     config, steps = ippo_config("dense", env=ONE_TEAM), random_steps(ONE_TEAM)
-    dead = ~steps.timestep.alive
-    # The next observation of an agent's last step still counts.
-    long_dead = dead & np.roll(dead, 1, axis=0) & ~np.roll(steps.ended, 1, axis=0)[..., None]
-    changed = steps._replace(
-        timestep=steps.timestep._replace(observation=np.where(long_dead[..., None], 99, steps.timestep.observation)),
-        next_timestep=steps.next_timestep._replace(
-            observation=np.where(dead[..., None], 99, steps.next_timestep.observation),
-            reward=np.where(dead, 99, steps.next_timestep.reward),
-        ),
-        action=np.where(dead[..., None], np.eye(4, dtype=np.float32)[0], steps.action),
-    )
     train, results = jax.jit(partial(on_policy._train_seed, config=config)), []
-    for trajectory in (steps, changed):
+    for trajectory in (steps, with_other_dead_values(steps)):
         learner, _ = store_and_roll_out(config, trajectory)
         learner, metrics = train(learner, newest(trajectory), jax.random.key(0), jnp.array(0))
         results.append((learner.algorithm, metrics))
-    for a, b in zip(*map(jax.tree.leaves, results), strict=True):
-        np.testing.assert_allclose(a, b, rtol=1e-3, atol=1e-5)
+    assert_close(*results, 1e-3)
 
 
 @pytest.mark.long
@@ -210,5 +200,4 @@ def test_train_step_of_seeds_in_lockstep(algorithm, env):
     alone = add_steps(alone, config, steps, learn=True)
     alone = alone._replace(decoders=jax.jit(partial(fit_repeatedly, config=config))(alone, keys[1])[0])
     alone, _ = jax.jit(partial(on_policy._train_seed, config=config))(alone, steps, keys[1], jnp.array(40))
-    for a, b in zip(jax.tree.leaves(together), jax.tree.leaves(alone), strict=True):
-        np.testing.assert_allclose(np.asarray(a)[1], b, rtol=1e-3, atol=1e-4)
+    assert_close(jax.tree.map(lambda leaf: np.asarray(leaf)[1], together), alone, 1e-3, 1e-4)

@@ -12,8 +12,9 @@ from lare_rl.training.process import SAME_REQUEST_S, catch_stop_signals
 
 
 def test_second_signal_ends_process(monkeypatch, capfd):
-    handler = signal.getsignal(signal.SIGINT)
+    handler, n_threads = signal.getsignal(signal.SIGINT), threading.active_count()
     with catch_stop_signals() as stop:
+        assert threading.active_count() == n_threads + 1
         assert not stop.is_set()
         signal.raise_signal(signal.SIGINT)
         signal.raise_signal(signal.SIGTERM)  # within a moment: the same request
@@ -24,6 +25,10 @@ def test_second_signal_ends_process(monkeypatch, capfd):
         with pytest.raises(KeyboardInterrupt):
             signal.raise_signal(signal.SIGINT)
     assert signal.getsignal(signal.SIGINT) is handler
+    assert signal.set_wakeup_fd(-1) == -1
+    for thread in threading.enumerate()[n_threads:]:
+        thread.join(10)
+    assert threading.active_count() == n_threads
 
 
 PROGRAM = """
@@ -47,13 +52,3 @@ def test_second_signal_ends_process_that_hangs_in_c():
     finally:
         process.kill()
         process.stdout.close()
-
-
-def test_watching_ends_with_the_context():
-    n_threads = threading.active_count()
-    with catch_stop_signals():
-        assert threading.active_count() == n_threads + 1
-    assert signal.set_wakeup_fd(-1) == -1
-    for thread in threading.enumerate()[n_threads:]:
-        thread.join(10)
-    assert threading.active_count() == n_threads

@@ -53,10 +53,6 @@ lare_rl.train(spec, settings, function=function, out="killed", listeners=[kill])
 """
 
 
-def phi_for(method, phi):
-    return phi if METHODS[method].needs_phi else None
-
-
 def test_resume_after_kill_is_exact(small, phi, factor_run, tmp_path):
     """SIGKILL in another process, in the middle of an episode and between two checkpoints."""
     phi.save(tmp_path / "phi")
@@ -138,7 +134,7 @@ def test_resume_is_exact(build, task, changes, stop, phi, request, tmp_path):
 
 
 def test_overlapped_collection_resumes_exactly(small, phi, tmp_path):
-    settings = small(algorithm="sac", method="lare-rrdu", overlap_collection=True)
+    settings = small(scored_observation="both", overlap_collection=True)  # compiled as `factor_run`
     expected = train_quietly(toy_spec(), settings, tmp_path / "complete", phi)
     train_and_stop(toy_spec(), settings, tmp_path / "run", 156, phi)
     assert_equal_runs(resume_quietly(tmp_path / "run"), expected)

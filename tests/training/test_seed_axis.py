@@ -13,7 +13,7 @@ from helpers.jax_toy_envs import echo_spec
 from helpers.listeners import metrics_without_times
 from helpers.long_tests import long_case
 from helpers.toy_envs import toy_spec
-from helpers.training_runs import resume_quietly, train_and_stop, train_quietly
+from helpers.training_runs import QUICK_CREDIT, resume_quietly, train_and_stop, train_quietly
 from lare_rl.runs.directory import open_run
 from lare_rl.training import seed_axis
 
@@ -45,8 +45,9 @@ print(json.dumps({
 @pytest.mark.parametrize(
     ("task", "changes"),
     [
-        ("CN-6", {"algorithm": "ippo", "method": "bayes"}),
-        (toy_spec(), {"algorithm": "td3", "method": "bayes"}),
+        (echo_spec(), {"algorithm": "ippo", "method": "rd-linear"}),
+        (toy_spec(), {"algorithm": "td3", "method": "rrdu"}),
+        long_case("CN-6", {"algorithm": "ippo", "method": "bayes"}),
         long_case(echo_spec(), {"algorithm": "qmix", "method": "rd"}),
         long_case(echo_spec(), {"algorithm": "ippo", "method": "rd", "first_fit": "held-out", "environments": 16}),
         long_case(echo_spec(environment="hosted/three"), {"algorithm": "qmix", "method": "dense", "environments": 1}),
@@ -55,7 +56,7 @@ print(json.dumps({
 )
 def test_devices_train_as_a_single_device(task, changes, small, small_many, tmp_path):
     make_settings = small if changes["algorithm"] in ("td3", "sac") else small_many
-    settings = make_settings(seeds=N_DEVICES, **changes)
+    settings = make_settings(seeds=N_DEVICES, credit=QUICK_CREDIT, **changes)
     task = lare_rl.load_task(task) if isinstance(task, str) else task
     run = train_quietly(task, settings, tmp_path / "run")
     train_and_stop(task, settings, tmp_path / "to-devices", settings.evaluate_every)

@@ -20,7 +20,7 @@ SEPARATE = single_spec("Fails", processes="separate")
 @pytest.fixture
 def settings(small):
     return small(
-        algorithm="ppo", method="bayes", steps=60, rollout_steps=10, evaluate_every=30, evaluation_episodes=3, seeds=2
+        algorithm="ppo", method="dense", steps=60, rollout_steps=10, evaluate_every=30, evaluation_episodes=3, seeds=2
     )
 
 
@@ -31,8 +31,17 @@ def two_cores(monkeypatch):
 
 
 def test_run_equals_one_in_a_single_process(settings, tmp_path, monkeypatch):
-    """Also after a stop. Each simulation is started once: the training environment and one for evaluations, of each seed."""
-    local = train_quietly(single_spec("Many"), settings, tmp_path / "local")
+    """Also after a stop. Each simulation is started once: the training environment and one for evaluations, of each seed.
+
+    Listeners hear of every step, also inside an iteration and during an evaluation.
+    """
+    steps, listener = [], MessageListener()
+    listener.on_step = steps.append
+    with monkeypatch.context() as patch:
+        patch.setattr(loop, "PROGRESS_S", -1.0)
+        local = train_quietly(single_spec("Many"), settings, tmp_path / "local", listeners=[listener])
+    assert [step for step in steps if step <= 10] == [*range(1, 11), 10]
+    assert steps.count(30) == 1 + 1 + N_STEPS  # the last step, the iteration, and each step of the evaluation
     monkeypatch.setenv("STARTS_FILE", str(tmp_path / "starts"))
     run = train_quietly(SEPARATE, settings, tmp_path / "separate")
     pids = (tmp_path / "starts").read_text().split()
@@ -59,21 +68,3 @@ def test_hang_during_training(settings, tmp_path):
     assert [line["step"] for line in open_run(tmp_path / "run").metrics()] == [30, 30]
     resumed = resume_quietly(tmp_path / "run")
     assert [line["step"] for line in resumed.metrics()] == [30, 30, 60, 60]
-
-
-def test_listeners_hear_of_steps_inside_an_iteration(settings, tmp_path, monkeypatch):
-    class Steps(MessageListener):
-        def __init__(self):
-            super().__init__()
-            self.steps = []
-
-        def on_step(self, step):
-            self.steps.append(step)
-
-    monkeypatch.setattr(loop, "PROGRESS_S", -1.0)
-    listener = Steps()
-    train_quietly(single_spec("Many"), settings, tmp_path / "run", listeners=[listener])
-    iterations = [step for step in listener.steps if step <= 10]
-    assert iterations == [*range(1, 11), 10]
-    evaluation = [index for index, step in enumerate(listener.steps) if step == 30]
-    assert len(evaluation) == 1 + 1 + N_STEPS  # the last step, the iteration, and each step of the evaluation

@@ -20,6 +20,7 @@ def test_episodes_of_each_seed(factor_run):
         assert shapes == {"observations": (21, 2), "actions": (20, 1), **scalars}
         expected = -np.square(episode["actions"][:, 0] - episode["observations"][:-1, 0])
         np.testing.assert_allclose(episode["rewards"], expected, rtol=1e-5, atol=1e-6)
+        assert len(np.unique(episode["observations"], axis=0)) == 21
         assert not episode["terminations"].any()
         assert np.flatnonzero(episode["truncations"]).tolist() == [19]
         assert np.abs(episode["actions"]).max() <= 2

@@ -11,7 +11,7 @@ from lare_rl.data.replay import (
     Index,
     Replay,
     end_of_episode,
-    flatten_envs,
+    look_up,
     n_finished,
     n_transitions,
     oldest_transition,
@@ -89,18 +89,16 @@ def sample_distinct_episodes(replay: Replay, key: PRNGKeyArray, count: int) -> E
 
 def get_episodes(replay: Replay, index: Index) -> EpisodeSample:
     """Return finished episodes. `index.number` counts from the oldest episode of each environment."""
-    slots = replay.first.shape[-1]
     episode = replay.oldest[index.env] + index.number
-    slot = episode % slots + index.env * slots
-    first = flatten_envs(replay.first if replay.first_paid is None else replay.first_paid)[slot]
+    first = look_up(replay.first if replay.first_paid is None else replay.first_paid, index.env, episode)
     length = jnp.maximum(end_of_episode(replay, index.env, episode) - first, 1)
     has_episodes = jnp.sum(n_finished(replay)) > 0
     return EpisodeSample(
         first=Index(index.env, first),
         length=length,
-        mean_reward=flatten_envs(replay.episode_return)[slot] / length[..., None],
+        mean_reward=look_up(replay.episode_return, index.env, episode) / length[..., None],
         mask=jnp.broadcast_to(has_episodes.astype(jnp.float32), first.shape),
-        level=None if replay.level is None else flatten_envs(replay.level)[slot],
+        level=None if replay.level is None else look_up(replay.level, index.env, episode),
     )
 
 

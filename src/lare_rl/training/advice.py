@@ -15,21 +15,17 @@ from lare_rl.util.findings import Finding, render
 
 __all__ = [
     "MESSAGES",
-    "N_PROBE_STATES",
     "describe_untrained",
     "find_constant_returns",
     "find_large_observations",
     "find_saturated_policies",
     "find_untrained",
-    "saturation",
 ]
 
 MAX_RMS = 10.0
 """The largest root mean square of an observation's feature that needs no advice."""
 N_PROBE_STATES = 1000
 """The number of stored observations of an environment that are inspected."""
-ACTION_BOUND = 0.99
-"""A component of a normalised action is at a bound if its size is larger."""
 N_EQUAL_EVALUATIONS = 5
 """The number of evaluations with equal returns that is reported."""
 EQUAL_RTOL = 1e-3
@@ -90,21 +86,12 @@ def find_large_observations(run: Run, replay: Replay, config: TrainConfig) -> li
     largest = int(np.argmax(rms))
     if not rms[largest] > MAX_RMS:
         return []
-    alternative = Finding("normalise", {"algorithm": settings.algorithm}) if can_normalise else None
-    if config.algorithm.single_agent and config.env.n_agents == 1:
-        alternative = Finding("use ppo")
+    alternative = Finding("use ppo") if config.env.n_agents == 1 else None
+    if can_normalise:
+        alternative = Finding("normalise", {"algorithm": settings.algorithm})
     names = raw_feature_names(run.config.task.roles[0].observation, "", config.env.observation_size, 0, both=False)
     values = {"feature": names[largest], "rms": float(rms[largest])}
     return [Finding("large observations", values | {"algorithm": settings.algorithm, "alternative": alternative})]
-
-
-def saturation(action: Float[np.ndarray, "seeds steps action"]) -> Float[np.ndarray, " seeds"]:
-    """Return the fraction of an action's components that are at the same bound in all states.
-
-    Each seed's policy has chosen the actions in the same states, without noise, between -1 and 1.
-    """
-    bound = np.where(np.abs(action) > ACTION_BOUND, np.sign(action), 0)
-    return np.mean((bound[:, 0] != 0) & np.all(bound == bound[:, :1], axis=1), axis=-1)
 
 
 def find_saturated_policies(saturations: Sequence[float], seeds: Sequence[int]) -> list[Finding]:

@@ -12,8 +12,10 @@ from jaxtyping import Array, Bool, Float, Int, Key
 
 from lare_rl.algorithms.registry import Noise
 from lare_rl.data.trajectory import Trajectory
+from lare_rl.envs.families import make_env
 from lare_rl.envs.interface import JaxEnv, Timestep, team_mean, to_env_action
 from lare_rl.nn.masks import select
+from lare_rl.tasks.spec import TaskSpec
 from lare_rl.training.compile_cache import cache_by_value
 from lare_rl.training.compiled import init_memory, policy_function
 from lare_rl.training.evaluation import EpisodeBatch, Evaluation
@@ -21,7 +23,7 @@ from lare_rl.training.seed_axis import jit_over_seeds, seed_sharding
 from lare_rl.training.static_config import TrainConfig
 from lare_rl.training.streams import Stream, device_noise, stream_keys
 
-__all__ = ["DeviceCollector", "VecEnvState", "collect", "is_reset_cheap", "reset", "unroll_on_device"]
+__all__ = ["DeviceCollector", "VecEnvState", "collect", "is_reset_cheap", "make_jax_env", "reset", "unroll_on_device"]
 
 Act = Callable[..., tuple[Array, Any]]
 """From actor, memory, observation, available actions, noise and episode starts to the action and the new memory."""
@@ -60,7 +62,7 @@ class DeviceCollector:
     def evaluate(self, actor: Any, n_episodes: int, number: int = 0) -> Evaluation:
         """Evaluate whole episodes. The same number gives the same initial states; the run's own evaluations use 0."""
         keys = stream_keys(self._seeds, Stream.EVALUATION_EPISODES, number)
-        return Evaluation(*jax.device_get(tuple(self._evaluate(actor, keys, n_episodes=n_episodes))))
+        return jax.device_get(self._evaluate(actor, keys, n_episodes=n_episodes))
 
     def state_dict(self) -> dict[str, np.ndarray]:
         """Return the arrays that `restore` needs."""
@@ -201,6 +203,14 @@ def _exploration_policy(env_steps: int | Int[Array, ""], config: TrainConfig) ->
     return act
 
 
+@cache_by_value
+def make_jax_env(task: TaskSpec) -> JaxEnv:
+    """Make an environment of pure functions. The same object serves all runs, so that their collectors compile once."""
+    env = make_env(task)
+    assert isinstance(env, JaxEnv)
+    return env
+
+
 def is_reset_cheap(env: JaxEnv, n_envs: int) -> bool:
     """Whether a card should reset all environments with each step, by XLA's estimate of the operations."""
     keys = jax.eval_shape(lambda: jax.random.split(jax.random.key(0), n_envs))
@@ -210,15 +220,15 @@ def is_reset_cheap(env: JaxEnv, n_envs: int) -> bool:
 
 def _evaluate(
     env: JaxEnv, actor: Any, keys: Key[Array, " seeds"], *, n_episodes: int, config: TrainConfig
-) -> tuple[Any, ...]:
-    """Return the fields of an `Evaluation`."""
+) -> Evaluation:
     steps, mask, _ = unroll_on_device(env, actor, keys, n_episodes, config, config.greedy)
     reward = steps.next_timestep.reward * mask[..., None]
     returns = [team_mean(reward, steps.timestep.alive, team).sum(axis=0) for team in config.env.teams]
     summed_returns = [reward[..., team.agents].sum(axis=(0, -1)) for team in config.env.teams]
     last = mask & steps.ended
     measures = {name: (values * last).sum(axis=0) for name, values in steps.next_timestep.measures.items()}
-    return jnp.stack(returns, axis=-1), jnp.stack(summed_returns, axis=-1), mask.sum(axis=0), measures
+    returns, summed_returns = (jnp.stack(values, axis=-1) for values in (returns, summed_returns))
+    return Evaluation(returns, summed_returns, mask.sum(axis=0), measures)
 
 
 def _map_envs(function: Callable[..., Any]) -> Callable[..., Any]:

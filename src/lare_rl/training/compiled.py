@@ -19,6 +19,7 @@ from lare_rl.phi.graph import Graph
 from lare_rl.training import episodes, off_policy, on_policy, sequences
 from lare_rl.training.compile_cache import cache_by_value
 from lare_rl.training.decoder_fits import fit_seeds
+from lare_rl.training.iteration import Metrics
 from lare_rl.training.learner import Learner, init_learner, store, with_learned_returns
 from lare_rl.training.rewards import assess
 from lare_rl.training.seed_axis import jit_over_seeds, shape_over_seeds
@@ -38,8 +39,6 @@ __all__ = [
     "steps_shape",
     "training_module",
 ]
-
-Metrics = dict[str, Float[Array, " seeds"]]
 
 
 class CompiledFunctions(NamedTuple):

@@ -70,14 +70,14 @@ def predict_returns(
 ) -> Float[Array, "envs episodes teams"]:
     """Return the predicted returns of the replay of one seed, with those of the episodes from `since` on computed anew."""
     buffer = replay.by_payment(buffer)
-    rows, slots = buffer.row.shape[-1], buffer.first.shape[-1]
+    slots = buffer.first.shape[-1]
 
     def body(state: tuple[DecoderState, Array], episodes: CreditBatch, first: Index) -> tuple[DecoderState, Array]:
         decoder, predicted = state
         # The last step of what is paid is in the episode itself, which the first one need not be.
         last = first.number + episodes.length - 1
-        slot = buffer.episode[first.env, last % rows] % slots
-        slot = jnp.where(episodes.mask > 0, slot, slots)  # an index out of range, which is dropped
+        episode = replay.look_up(buffer.episode, first.env, last)
+        slot = jnp.where(episodes.mask > 0, episode % slots, slots)  # an index out of range, which is dropped
         values = returns.predicted_returns(decoder, episodes, config.credit)
         return decoder, predicted.at[first.env, slot].set(values.astype(predicted.dtype), mode="drop")
 

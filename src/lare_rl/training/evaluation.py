@@ -2,7 +2,6 @@
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import jax
@@ -26,17 +25,16 @@ class EpisodeBatch(NamedTuple):
     """The states after each step of an environment of pure functions, [time seeds episodes ...]; None on the host."""
 
 
-@dataclass(frozen=True)
-class Evaluation:
+class Evaluation(NamedTuple):
     """Results of whole episodes of each seed's policy."""
 
-    returns: Float[np.ndarray, "seeds episodes teams"]
+    returns: Float[AnyArray, "seeds episodes teams"]
     """R of each team: the sum over time of the mean over its agents that are alive."""
-    summed_returns: Float[np.ndarray, "seeds episodes teams"]
+    summed_returns: Float[AnyArray, "seeds episodes teams"]
     """The sum over time and over all agents of a team: the usual score of particle tasks."""
-    lengths: Int[np.ndarray, "seeds episodes"]
+    lengths: Int[AnyArray, "seeds episodes"]
     """In steps."""
-    measures: dict[str, Float[np.ndarray, "seeds episodes"]]
+    measures: dict[str, Float[AnyArray, "seeds episodes"]]
     """The task's own measures, from the last step."""
 
     def metrics(self, spec: EnvSpec) -> dict[str, Float[np.ndarray, " seeds"]]:
@@ -59,8 +57,7 @@ class Evaluation:
 
 def concatenate(evaluations: Sequence[Evaluation]) -> Evaluation:
     """Concatenate the episodes of evaluations of the same seeds."""
-    fields = [(result.returns, result.summed_returns, result.lengths, result.measures) for result in evaluations]
-    return Evaluation(*jax.tree.map(lambda *arrays: np.concatenate(arrays, axis=1), *fields))
+    return jax.tree.map(lambda *arrays: np.concatenate(arrays, axis=1), *evaluations)
 
 
 def metrics_lines(seeds: Sequence[int], step: int, metrics: Mapping[str, Any], rate: float) -> list[dict[str, Any]]:

@@ -18,6 +18,7 @@ from lare_rl.credit.decomposition import DecoderState
 from lare_rl.credit.engine import RewardSource, init_decoder
 from lare_rl.credit.history import next_history, scan_history
 from lare_rl.data import replay
+from lare_rl.data.extend import abandon_running, extend, set_newest
 from lare_rl.data.replay import STEP_COLUMNS, Replay, StoredSteps
 from lare_rl.data.trajectory import Trajectory
 from lare_rl.envs.interface import team_mean
@@ -111,7 +112,7 @@ def store_with_factors(
     """
     columns, next_columns = replay_columns(steps, factors, config, scored)
     team_reward, level = _team_rewards(steps, config), _levels(steps, config)
-    buffer = replay.extend(learner.replay, columns, next_columns, team_reward, steps.ended, config.payments, level)
+    buffer = extend(learner.replay, columns, next_columns, team_reward, steps.ended, config.payments, level)
     if config.n_tracked:
         buffer = _with_history(learner.replay, buffer, len(steps.ended), config)
     new_steps = replay.read(buffer, replay.newest_steps(buffer, len(steps.ended)))
@@ -132,7 +133,7 @@ def _with_history(before: Replay, buffer: Replay, n_steps: int, config: TrainCon
     last_history = next_history(last_step.columns["history"][:, 0], tracked_inputs(last_step, config)[:, 0])
     entries = jnp.swapaxes(tracked_inputs(new_steps, config), 0, 1)
     history = scan_history(last_history, entries, jnp.broadcast_to(first.T[..., None], entries.shape[:-1]))
-    return replay.set_newest(buffer, "history", history)
+    return set_newest(buffer, "history", history)
 
 
 def replay_columns(
@@ -186,13 +187,13 @@ def with_learned_returns(
     predicted: Float[Array, "*seeds envs episodes teams"] | None,
 ) -> Learner:
     """Return the learner with the results of `learn_returns`."""
-    buffer = replay.set_predicted_returns(learner.replay, predicted)
+    buffer = replay.replace_payments(learner.replay, predicted_return=predicted)
     return learner._replace(decoders=decoders, n_learned=n_learned, replay=buffer)
 
 
 def abandon_episodes(learner: Learner, abandoned: Bool[Array, " envs"]) -> Learner:
     """Return the learner without the running episodes of some environments."""
-    buffer = replay.abandon_running(learner.replay, abandoned)
+    buffer = abandon_running(learner.replay, abandoned)
     # Payments of these episodes may have been learned from.
     n_learned = jnp.minimum(learner.n_learned, replay.by_payment(buffer).episodes)
     return learner._replace(replay=buffer, n_learned=n_learned)

@@ -77,10 +77,9 @@ def _train_seed(
 def _with_predicted_returns(learner: Learner, config: TrainConfig) -> Replay:
     """Return the replay with the sums of proxy rewards of all episodes that end in the newest steps."""
     buffer = replay.by_payment(learner.replay)
-    first = (buffer.transitions - config.rollout_steps) % replay.capacity(buffer)
-    since = jnp.take_along_axis(buffer.episode, first[:, None], axis=1)[:, 0]
+    since = replay.look_up(buffer.episode, jnp.arange(config.n_envs), buffer.transitions - config.rollout_steps)
     predicted = predict_returns(learner.decoders, buffer, since, config)
-    return replay.set_predicted_returns(learner.replay, predicted)
+    return replay.replace_payments(learner.replay, predicted_return=predicted)
 
 
 def _rollout(learner: Learner, steps: Trajectory, config: TrainConfig) -> Rollout:

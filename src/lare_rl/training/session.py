@@ -4,29 +4,24 @@ import time
 from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
-from functools import partial
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int, Key, Shaped
+from jaxtyping import Array, Float, Key
 
 from lare_rl.algorithms.off_policy import OffPolicySettings
 from lare_rl.config.settings import ResolvedSettings
-from lare_rl.data import replay
 from lare_rl.data.trajectory import Trajectory
-from lare_rl.envs.families import make_env
-from lare_rl.envs.interface import JaxEnv
 from lare_rl.errors import LareError
 from lare_rl.runs import checkpoint
 from lare_rl.runs.best_policy import BEST_FILE, BestPolicy, empty_best, load_best, save_best, update_best
 from lare_rl.runs.directory import Run
 from lare_rl.runs.metric_names import ACTOR_SATURATION, LIKELIEST_RETURN
-from lare_rl.tasks.spec import TaskSpec
-from lare_rl.training import advice, first_fit, iteration
+from lare_rl.training import first_fit, iteration, saturation
 from lare_rl.training.batching import is_batching_faster
-from lare_rl.training.collect_device import DeviceCollector, is_reset_cheap
+from lare_rl.training.collect_device import DeviceCollector, is_reset_cheap, make_jax_env
 from lare_rl.training.collect_host import HostCollector, make_host_collector
 from lare_rl.training.compile_cache import cache_by_value
 from lare_rl.training.compiled import (
@@ -86,6 +81,8 @@ class Session:
     """The checkpoint that is being written."""
     _iteration_s: float = MAX_CALL_S
     """How long an iteration of the last compiled call has taken."""
+    _stop_requested: Callable[[], bool] = field(default=lambda: False)
+    """Whether the user has asked the run to stop."""
 
     @property
     def settings(self) -> ResolvedSettings:
@@ -106,8 +103,9 @@ class Session:
             FirstFitStoppedError: the user has asked the run to stop, during the decoder's first fit. The session cannot
                 continue.
         """
+        self._stop_requested = stop_requested
         if self.loop is None or self._is_before_first_fit:
-            self._iterate(stop_requested)
+            self._iterate()
         else:
             self._iterate_compiled((until - self.step) // self.settings.iteration_steps)
 
@@ -134,7 +132,7 @@ class Session:
         self.latest_metrics |= {name: values for name, values in state.metrics.items() if is_measured[name].any()}
         self.step += n_iterations * self.settings.iteration_steps
 
-    def _iterate(self, stop_requested: Callable[[], bool]) -> None:
+    def _iterate(self) -> None:
         """Collect steps, compute factors, store them, sometimes fit the decoder, update the algorithm.
 
         With `overlap_collection`, the device updates while the host collects, by the policy from before the update.
@@ -143,20 +141,21 @@ class Session:
             actor = jax.tree.map(jnp.copy, self.actor)  # the update reuses the memory of its learner
             # In a thread, because the call of an update returns when the device has nearly finished it.
             stored_only = _empty_steps(self.config, len(self.run.seeds))
-            updating = self._threads.submit(self._update, stored_only, stop_requested)
+            updating = self._threads.submit(self._update, stored_only)
             steps = self.collector.collect(actor, self.step)
             updating.result()
             self._store(steps)
         else:
             steps = self.collector.collect(self.actor, self.step)
             self._store(steps)
-            self._update(steps, stop_requested)
+            self._update(steps)
         self.step += self.settings.iteration_steps
 
     def _store(self, steps: Trajectory) -> None:
         self._check_factors()
-        functions = self._iteration_functions(lambda: False)
-        self.learner, is_finite = iteration.store_steps(self.learner, steps, functions, when_on_host, self.config)
+        self.learner, is_finite = iteration.store_steps(
+            self.learner, steps, self._iteration_functions, when_on_host, self.config
+        )
         self._unchecked = is_finite, steps
 
     def _check_factors(self) -> None:
@@ -171,14 +170,14 @@ class Session:
             compute_host_factors(self.run, self.config, steps)  # raises an error that names the factor
             raise LareError("a factor is not finite in the compiled function; the last checkpoint is whole")
 
-    def _update(self, steps: Trajectory, stop_requested: Callable[[], bool]) -> None:
+    def _update(self, steps: Trajectory) -> None:
         self.learner, self.latest_metrics = iteration.update(
             learner=self.learner,
             measured=self.latest_metrics,
             steps=steps,
             seeds=jnp.asarray(self.run.seeds),
             env_steps=self.step,
-            functions=self._iteration_functions(stop_requested),
+            functions=self._iteration_functions,
             when=when_on_host,
             record=_record,
             config=self.config,
@@ -192,19 +191,17 @@ class Session:
         if self.config.n_devices == 1:
             self._threads.submit(compile_explanation, shape, self.config)
 
-    def _iteration_functions(self, stop_requested: Callable[[], bool]) -> IterationFunctions:
+    @property
+    def _iteration_functions(self) -> IterationFunctions:
         functions = self.functions
-        fit = partial(self._fit, stop_requested=stop_requested)
-        return IterationFunctions(functions.store, functions.learn_returns, fit, functions.train_step)
+        return IterationFunctions(functions.store, functions.learn_returns, self._fit, functions.train_step)
 
-    def _fit(
-        self, learner: Learner, keys: Key[Array, " seeds"], stop_requested: Callable[[], bool]
-    ) -> tuple[Learner, Metrics]:
+    def _fit(self, learner: Learner, keys: Key[Array, " seeds"]) -> tuple[Learner, Metrics]:
         """Fit the decoders. The first fit lasts until it brings no improvement."""
         if not (self._is_before_first_fit and first_fit.has_enough_episodes(learner)):
             return self.functions.fit(learner, keys)
         fit = compile_functions(first_fit.config_of_first_fit(self.config)).fit
-        fitted = first_fit.fit_until_converged(learner, fit, keys, self.config, stop_requested=stop_requested)
+        fitted = first_fit.fit_until_converged(learner, fit, keys, self.config, self._stop_requested)
         self.first_fit_done = True
         return fitted
 
@@ -223,20 +220,10 @@ class Session:
             likeliest = self.collector.evaluate(self.actor, self.settings.evaluation_episodes, deterministic=True)
             metrics[LIKELIEST_RETURN] = likeliest.returns[..., 0].mean(axis=1)
         if self.step > self.config.warmup and isinstance(self.settings.hyperparameters, OffPolicySettings):
-            metrics |= {ACTOR_SATURATION: advice.saturation(self.greedy_actions(advice.N_PROBE_STATES))}
+            metrics[ACTOR_SATURATION] = saturation.measure(
+                self.functions.act, self.actor, self.learner.replay, self.config
+            )
         return metrics_lines(self.run.seeds, self.step, metrics, rate)
-
-    def greedy_actions(self, n_states: int) -> Float[np.ndarray, "seeds states action"]:
-        """Return an off-policy algorithm's actions without noise in the newest states of the first environment.
-
-        If fewer are stored, they are repeated: the shape, and so the compiled program, is always the same.
-        """
-        buffer = self.learner.replay
-        rows = np.asarray(buffer.next_row)[:, :1] - 1 - np.arange(n_states) % int(np.min(buffer.next_row))
-        observation = _read_first_env(buffer.columns["observation"], rows % replay.capacity(buffer))
-        available = np.ones((*rows.shape, 1, self.config.env.action_size), bool)
-        action, _ = self.functions.act(self.actor, (), observation, available, None, np.zeros(rows.shape, bool))
-        return np.asarray(action)[:, :, 0]
 
     def _keep_best(self, score: Float[np.ndarray, " seeds"]) -> None:
         """Save the policies of the seeds whose evaluation is their best so far."""
@@ -317,7 +304,7 @@ def _make_session(run: Run, config: TrainConfig, learner: Learner | None) -> Ses
     """Compile the functions of a session and make its environments. Without a learner, start with an untrained one."""
     task, settings, n_seeds = run.config.task, run.config.settings, len(run.seeds)
     iterates_on_host = not config.env.is_jax or _has_first_fit(run, config)
-    env = _make_jax_env(task) if config.env.is_jax else None
+    env = make_jax_env(task) if config.env.is_jax else None
     if env is not None and config.batched:
         n_envs = config.n_envs * n_seeds // config.n_devices
         config = replace(config, resets_with_steps=is_reset_cheap(env, n_envs))
@@ -343,22 +330,6 @@ def _has_first_fit(run: Run, config: TrainConfig) -> bool:
 def _empty_steps(config: TrainConfig, n_seeds: int) -> Trajectory:
     """Return steps for an update that reads only stored ones."""
     return jax.tree.map(lambda shape: np.zeros(shape.shape, shape.dtype), steps_shape(config, n_seeds))
-
-
-@cache_by_value
-def _make_jax_env(task: TaskSpec) -> JaxEnv:
-    """Make an environment of pure functions. The same object serves all runs, so that their collectors compile once."""
-    env = make_env(task)
-    assert isinstance(env, JaxEnv)
-    return env
-
-
-@jax.jit
-def _read_first_env(
-    column: Shaped[Array, "seeds envs rows *rest"], rows: Int[Array, "seeds steps"]
-) -> Shaped[Array, "seeds steps *rest"]:
-    """Return rows of a column of the replay, of each seed's first environment."""
-    return jax.vmap(lambda seed_column, seed_rows: seed_column[0, seed_rows])(column, rows)
 
 
 _abandon_episodes = jax.jit(jax.vmap(abandon_episodes))

@@ -97,18 +97,7 @@ def evaluate_on_host(envs: VecEnv, policy: Policy, seeds: Sequence[int], n_episo
         where = "" if error.env_index is None else f", in an evaluation of seed {seeds[error.env_index // width]}"
         raise EnvOutputError(f"{error}{where}") from None
     results = Evaluation(returns, summed_returns, lengths, measures)
-    return results if width == n_episodes else _select_episodes(results, n_episodes)
-
-
-def _select_episodes(results: Evaluation, n_episodes: int) -> Evaluation:
-    """Return the first episodes of each seed."""
-    measures = {name: values[:, :n_episodes] for name, values in results.measures.items()}
-    return Evaluation(
-        returns=results.returns[:, :n_episodes],
-        summed_returns=results.summed_returns[:, :n_episodes],
-        lengths=results.lengths[:, :n_episodes],
-        measures=measures,
-    )
+    return jax.tree.map(lambda values: values[:, :n_episodes], results)
 
 
 def add_seed_axis(timestep: Timestep, shape: tuple[int, int]) -> Timestep:
