@@ -47,7 +47,7 @@ def measured(name: str, way: str) -> dict[str, Any]:
             start = time.process_time()
             with mock.patch.object(first_fit, "BATCH_DIVISOR", 1 if way == LARGE else first_fit.BATCH_DIVISOR):
                 keys = stream_keys(run.seeds, Stream.FIT, 0)
-                begun.learner, _ = begun._fit(begun.learner, keys, stop_requested=lambda: False)
+                begun.learner, _ = begun._fit(begun.learner, keys)
                 jax.block_until_ready(begun.learner)
             seconds = time.process_time() - start
             accuracy = begun.functions.assess(begun.learner)

@@ -92,7 +92,7 @@ EVERY_5 = PaymentRule(period=5)
         ("bayes-history", ONE_AGENT, {"payments": EVERY_5}),
         ("bayes-progress", ONE_AGENT, {"exact": "last"}),
         ("bayes", ONE_AGENT, {"score": "binary", "group": "map"}),
-        ("bayes", ONE_AGENT, {"group": "map"}),
+        long_case("bayes", ONE_AGENT, {"group": "map"}),
         long_case("lare-bayes-progress", PHI_ENV, {"payments": EVERY_5}),
         long_case("bayes-progress", ONE_TEAM, {"exact": "spread"}),
         long_case("lare-bayes-history", PHI_ENV, {}),

@@ -42,7 +42,12 @@ def assert_equal_sessions(training, other):
 
 @pytest.mark.parametrize(
     ("algorithm", "method"),
-    [("ippo", "lare-linear"), long_case("ippo", "lare-bayes"), ("qmix", "lare-rd"), long_case("qmix", "lare-bayes")],
+    [
+        ("ippo", "lare-linear"),
+        long_case("ippo", "lare-bayes"),
+        long_case("qmix", "lare-rd"),
+        long_case("qmix", "lare-bayes"),
+    ],
 )
 def test_advance_equals_host_iterations(algorithm, method, begin, monkeypatch):
     monkeypatch.setattr(session, "MAX_CALL_S", 1e6)

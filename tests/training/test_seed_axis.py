@@ -46,7 +46,7 @@ print(json.dumps({
     ("task", "changes"),
     [
         (echo_spec(), {"algorithm": "ippo", "method": "rd-linear"}),
-        (toy_spec(), {"algorithm": "td3", "method": "rrdu"}),
+        long_case(toy_spec(), {"algorithm": "td3", "method": "rrdu"}),
         long_case("CN-6", {"algorithm": "ippo", "method": "bayes"}),
         long_case(echo_spec(), {"algorithm": "qmix", "method": "rd"}),
         long_case(echo_spec(), {"algorithm": "ippo", "method": "rd", "first_fit": "held-out", "environments": 16}),
