@@ -5,12 +5,13 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from lare_rl.envs import jax_spaces
 from lare_rl.envs.env_errors import one_line_errors
 from lare_rl.envs.interface import Timestep
-from lare_rl.envs.jax_spaces import Bounds, Choices, PackageEnv
+from lare_rl.envs.jax_spaces import Bounds, Choices
 from lare_rl.errors import LareError, short_repr
 from lare_rl.tasks.spec import TaskSpec
 
@@ -40,11 +41,11 @@ def make(task: TaskSpec, **_: Any) -> "GymnaxEnv":
     return GymnaxEnv(env, params.replace(**changes), task)
 
 
-class GymnaxEnv(PackageEnv):
+class GymnaxEnv:
     """An environment of gymnax as a `JaxEnv`. An observation that is a number of a state becomes one-hot."""
 
     def __init__(self, env: Any, params: Any, task: TaskSpec):
-        super().__init__(env, task)
+        self.env, self._name = env, task.environment
         self.params = params
         spaces = jax_spaces.import_package("gymnax.environments.spaces", task)
         observation_space = env.observation_space(params)
@@ -79,6 +80,10 @@ class GymnaxEnv(PackageEnv):
             measures=info,
         )
         return jax_spaces.cast_like(next_state, state), timestep
+
+    def frames(self, states: Any, credit: Any = None) -> list[np.ndarray]:
+        """Return the package's pictures of states, which do not show credit. Raise `LareError` if it cannot draw them here."""
+        return jax_spaces.draw_states(self._name, self._draw, states)
 
     def _draw(self, states: Sequence[Any]) -> Sequence[Any]:
         from gymnax.visualize import Visualizer

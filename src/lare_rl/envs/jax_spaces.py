@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray, UInt8
+from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
 from lare_rl.envs.env_errors import one_line_errors
 from lare_rl.envs.interface import EnvSpec, Team, Timestep
@@ -24,11 +24,11 @@ from lare_rl.tasks.spec import TaskSpec
 __all__ = [
     "Bounds",
     "Choices",
-    "PackageEnv",
     "agent_spec",
     "agent_timestep",
     "cast_like",
     "construct",
+    "draw_states",
     "draw_updates",
     "find_measures",
     "flat_size",
@@ -267,22 +267,10 @@ def agent_timestep(
 # Pictures
 
 
-class PackageEnv:
-    """What the adapters share: a package's environment, and pictures of its states."""
-
-    def __init__(self, env: Any, task: TaskSpec):
-        self.env, self._name = env, task.environment
-
-    def frames(
-        self, states: Any, credit: Float[np.ndarray, "steps agents"] | None = None
-    ) -> list[UInt8[np.ndarray, "height width 3"]]:
-        """Return the package's pictures of states, which do not show credit. Raise `LareError` if it cannot draw them here."""
-        with one_line_errors(f"environment {self._name!r} cannot be drawn here", _render_hint), _silence():
-            return [np.asarray(picture)[..., :3].astype(np.uint8) for picture in self._draw(unstack(states))]
-
-    def _draw(self, states: Sequence[Any]) -> Sequence[Any]:
-        """Draw the states of an episode by the package's functions."""
-        raise NotImplementedError
+def draw_states(environment: str, draw: Callable[[list[Any]], Sequence[Any]], states: Any) -> list[np.ndarray]:
+    """Return the pictures that a package draws of an episode's states (leading axis: steps). Raise `LareError` if it cannot draw here."""
+    with one_line_errors(f"environment {environment!r} cannot be drawn here", _render_hint), _silence():
+        return [np.asarray(picture)[..., :3].astype(np.uint8) for picture in draw(unstack(states))]
 
 
 def unstack(states: Any) -> list[Any]:

@@ -64,7 +64,7 @@ class JaxMARLState(NamedTuple):
     alive: Bool[Array, " agents"]
 
 
-class JaxMARLEnv(jax_spaces.PackageEnv):
+class JaxMARLEnv:
     """An environment of JaxMARL as a `JaxEnv`.
 
     Agents are in the order of their teams, and their spaces are padded as in `AgentArrays`. JaxMARL does not tell a time limit from
@@ -75,7 +75,7 @@ class JaxMARLEnv(jax_spaces.PackageEnv):
     spec: EnvSpec
 
     def __init__(self, env: Any, task: TaskSpec, max_steps: int):
-        super().__init__(env, task)
+        self.env, self._name = env, task.environment
         names, teams = group_by_team(list(env.agents), task)
         with one_line_errors(f"environment {self._name!r} cannot be used"):
             observations, state = jax.eval_shape(env.reset, jnp.zeros(2, jnp.uint32))
@@ -164,6 +164,10 @@ class JaxMARLEnv(jax_spaces.PackageEnv):
         first = jnp.arange(available.shape[1]) == 0
         acts = state.alive & available.any(axis=1)
         return jnp.where(acts[:, None], available, first)
+
+    def frames(self, states: Any, credit: Any = None) -> list[np.ndarray]:
+        """Return the package's pictures of states, which do not show credit. Raise `LareError` if it cannot draw them here."""
+        return jax_spaces.draw_states(self._name, self._draw, states)
 
     def _draw(self, states: Sequence[Any]) -> Sequence[Any]:
         """Draw the states of a particle task."""

@@ -12,7 +12,7 @@ from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 from lare_rl.envs import jax_spaces
 from lare_rl.envs.env_errors import no_time_limit_error, one_line_errors
 from lare_rl.envs.interface import Timestep
-from lare_rl.envs.jax_spaces import Bounds, Choices, PackageEnv
+from lare_rl.envs.jax_spaces import Bounds, Choices
 from lare_rl.errors import short_repr
 from lare_rl.tasks.spec import TaskSpec
 
@@ -50,7 +50,7 @@ class JumanjiState(NamedTuple):
     steps: Int[Array, ""]
 
 
-class JumanjiEnv(PackageEnv):
+class JumanjiEnv:
     """An environment of Jumanji as a `JaxEnv`.
 
     The observation is all arrays of Jumanji's observation but the mask, in the order of its fields, each row by row. Several choices
@@ -59,7 +59,7 @@ class JumanjiEnv(PackageEnv):
     """
 
     def __init__(self, env: Any, task: TaskSpec, max_steps: int):
-        super().__init__(env, task)
+        self.env, self._name = env, task.environment
         specs = jax_spaces.import_package("jumanji.specs", task)
         self._action = _read_action(env.action_spec, specs, task.environment)
         with one_line_errors(f"environment {self._name!r} cannot be used"):
@@ -102,6 +102,10 @@ class JumanjiEnv(PackageEnv):
     def _read_mask(self, observation: Any) -> Bool[Array, " action"] | None:
         mask = _find_mask(observation)
         return None if mask is None or isinstance(self._action, Bounds) else self._action.mask_combinations(mask)
+
+    def frames(self, states: Any, credit: Any = None) -> list[np.ndarray]:
+        """Return the package's pictures of states, which do not show credit. Raise `LareError` if it cannot draw them here."""
+        return jax_spaces.draw_states(self._name, self._draw, states)
 
     def _draw(self, states: Sequence[Any]) -> Sequence[Any]:
         viewer = self.env.unwrapped._viewer

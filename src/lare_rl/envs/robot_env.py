@@ -5,6 +5,7 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float, Int, PRNGKeyArray
 
 from lare_rl.envs import jax_spaces
@@ -27,7 +28,7 @@ class RobotState(NamedTuple):
     privileged: Float[Array, " state"]
 
 
-class RobotEnv(jax_spaces.PackageEnv):
+class RobotEnv:
     """An environment of Brax or Playground as a `JaxEnv`.
 
     The packages count steps and reset in wrappers, which this adapter does not use. An episode is truncated after `max_steps` steps.
@@ -51,10 +52,10 @@ class RobotEnv(jax_spaces.PackageEnv):
             draw: makes pictures of the package's states.
             action_repeat: how often an action is repeated. The rewards of the repetitions are added up.
         """
-        super().__init__(env, task)
+        self.env, self._name = env, task.environment
         # Playground's own algorithms act in [-1, 1] as well.
         self._action = jax_spaces.make_bounds(-1.0, 1.0, (env.action_size,), self._name)
-        self._draw_states, self._action_repeat = draw, action_repeat
+        self._draw, self._action_repeat = draw, action_repeat
         with one_line_errors(f"environment {self._name!r} cannot be used"):
             state = jax.eval_shape(env.reset, jnp.zeros(2, jnp.uint32))
         if isinstance(state.obs, Mapping) and OBSERVATION not in state.obs:
@@ -102,8 +103,9 @@ class RobotEnv(jax_spaces.PackageEnv):
         )
         return next_state, timestep
 
-    def _draw(self, states: Sequence[RobotState]) -> Sequence[Any]:
-        return self._draw_states([state.env for state in states])
+    def frames(self, states: Any, credit: Any = None) -> list[np.ndarray]:
+        """Return the package's pictures of states, which do not show credit. Raise `LareError` if it cannot draw them here."""
+        return jax_spaces.draw_states(self._name, self._draw, states.env)
 
 
 def _split_observation(observation: Any) -> tuple[Any, Any]:
