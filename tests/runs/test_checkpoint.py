@@ -1,16 +1,21 @@
 """Checkpoints: rows that come back, files of killed processes, and damaged files."""
 
 import json
+from dataclasses import replace
 from typing import Any, NamedTuple
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from helpers.small_configs import learner_with_episodes, small_config
 from lare_rl.errors import LareError
 from lare_rl.runs import checkpoint
+from lare_rl.tasks.payments import PAID_AT_END, PaymentRule
+from lare_rl.training.compiled import learner_shape
 
 CAPACITY = 16
 
@@ -64,6 +69,17 @@ def test_rows_come_back(moves, tmp_path_factory):
         with np.load(directory / "state.npz") as state:
             in_use = {f"rows-{segment['number']}.npz" for segment in json.loads(str(state["segments"]))}
         assert {path.name for path in directory.iterdir()} == in_use | {"state.npz"}
+
+
+@pytest.mark.parametrize("payments", [PAID_AT_END, PaymentRule(period=4)])
+def test_learner_comes_back(payments, tmp_path):
+    """No field of a learner has the old name of another, so none is renamed when it is read."""
+    config = small_config("bayes", payments=payments)
+    config = replace(config, credit=config.credit.model_copy(update={"exact": "last"}))
+    learner = jax.tree.map(lambda leaf: jnp.asarray(leaf)[None], learner_with_episodes(config))
+    checkpoint.save(tmp_path, learner, {}, {})
+    loaded, _, _ = checkpoint.load(tmp_path, learner_shape(config, 1))
+    jax.tree.map(np.testing.assert_array_equal, loaded, learner)
 
 
 def test_segment_before_dropped_episode_is_kept(tmp_path):

@@ -27,7 +27,7 @@ from lare_rl.runs.checkpoint import DAMAGED_FILE_ERRORS, fill_template, named_le
 from lare_rl.tasks.payments import PaymentRule
 from lare_rl.tasks.spec import TaskSpec
 from lare_rl.util.files import write_arrays, write_atomically
-from lare_rl.util.renamed_fields import rename_fields, rename_keys
+from lare_rl.util.renamed_fields import rename_keys
 from lare_rl.util.safe_io import read_json, read_text
 
 __all__ = ["AssignerState", "get_state", "read_state", "report_damage", "restore", "write_state"]
@@ -86,7 +86,7 @@ def restore(learner: DecoderLearner, state: AssignerState) -> None:
     learner.n_learned, learner.n_updates = state.n_learned, state.n_updates
     if set(PHI_SAMPLE) <= set(arrays):
         learner.phi_sample.append((arrays[PHI_SAMPLE[0]], arrays[PHI_SAMPLE[1]]))
-    learned = {rename_fields(name).removeprefix(LEARNED): array for name, array in arrays.items()}
+    learned = {name.removeprefix(LEARNED): array for name, array in arrays.items()}
     learner.decoder, learner.scale = fill_template((learner.decoder, learner.scale), learned)
     store = learner.store
     store.ended, store.ended_steps, store.dropped = map(int, arrays["counts"])

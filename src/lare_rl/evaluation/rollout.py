@@ -12,16 +12,17 @@ from jaxtyping import Array, Bool, Float
 from lare_rl.data import replay
 from lare_rl.data.trajectory import Trajectory
 from lare_rl.envs.families import make_env
-from lare_rl.envs.interface import JaxEnv, Team
+from lare_rl.envs.interface import JaxEnv, Team, team_mean
 from lare_rl.envs.placement import make_vec_env
 from lare_rl.envs.play import phi_inputs
 from lare_rl.runs.directory import Run
 from lare_rl.training.collect_device import unroll_on_device
 from lare_rl.training.compiled import training_module
+from lare_rl.training.episodes import predict_returns
 from lare_rl.training.evaluation import EpisodeBatch
 from lare_rl.training.factors import compute_host_factors
 from lare_rl.training.host_policy import EvaluationPolicy
-from lare_rl.training.learner import Learner, store_with_factors
+from lare_rl.training.learner import Learner, empty_replay, store_with_factors
 from lare_rl.training.rewards import rewards
 from lare_rl.training.saved_state import load_learner
 from lare_rl.training.seed_axis import select_seed
@@ -133,11 +134,14 @@ def compute_training_rewards(
     """Compute the training rewards of whole episodes by the decoders of a single seed."""
     n_steps, n_episodes = np.shape(steps.next_timestep.terminated)
     # Rewards are computed from stored steps, so a new replay stores these episodes alone.
-    buffer = replay.init_replay(config.columns, n_episodes, 2 * n_steps + 2, len(config.env.teams))
+    buffer = empty_replay(config, n_episodes, 2 * n_steps + 2)
 
     @jax.jit
     def compute(steps: Trajectory, factors: Array) -> Array:
         filled = store_with_factors(learner._replace(replay=buffer), steps, factors, config).replay
+        if config.is_exact:
+            predicted = predict_returns(learner.decoders, filled, replay.by_payment(filled).oldest, config)
+            filled = replay.replace_payments(filled, predicted_return=predicted)
         stored = replay.read(filled, replay.newest_steps(filled, n_steps))
         return jnp.swapaxes(rewards(stored, learner.reward_state, config), 0, 1)
 
@@ -170,7 +174,7 @@ def sample_steps(run: Run, random: bool = False) -> list[TeamSample]:
         mask = np.broadcast_to(rollout.mask[..., None], observation.shape[:-1])
         reward = rollout.reward[..., team.agents]
         if config.team_level:
-            reward = reward.mean(axis=-1, keepdims=True)
+            reward = team_mean(rollout.reward, steps.timestep.alive, team)[..., None]
         else:
             mask = mask & steps.timestep.alive[..., team.agents]
         n_factors = config.n_factors[team_index] if config.n_factors else 0

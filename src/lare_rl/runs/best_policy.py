@@ -16,7 +16,6 @@ from jaxtyping import Float, Int
 from lare_rl.errors import LareError
 from lare_rl.runs.checkpoint import DAMAGED_FILE_ERRORS, fill_template, named_leaves, open_npz
 from lare_rl.util.files import write_arrays
-from lare_rl.util.renamed_fields import rename_fields
 
 __all__ = ["BEST_FILE", "BestPolicy", "empty_best", "load_best", "save_best", "update_best"]
 
@@ -77,7 +76,6 @@ def load_best(directory: Path, actor_shape: Any, n_seeds: int) -> BestPolicy:
         )
     try:
         with open_npz(path) as arrays:
-            renamed = {rename_fields(name): arrays[name] for name in arrays.files}
-            return fill_template(empty_best(n_seeds)._replace(actor=actor_shape), renamed)
+            return fill_template(empty_best(n_seeds)._replace(actor=actor_shape), arrays)
     except DAMAGED_FILE_ERRORS as error:
         raise LareError(f"{path} cannot be read: {error or type(error).__name__}") from error

@@ -173,7 +173,7 @@ def load(directory: Path, template: State) -> tuple[State, dict[str, Any], dict[
         raise LareError(f"there is no checkpoint in {directory}")
     try:
         with open_npz(path) as saved:
-            state = {rename_fields(name): saved[name] for name in saved.files}
+            state = {name: saved[name] for name in saved.files}
         host, segments = _read_host(state.pop("host")), _read_segments(state.pop("segments"))
         learner = _load_rows(fill_template(template, state), directory, segments)
     except DAMAGED_FILE_ERRORS as error:
@@ -213,14 +213,17 @@ def named_leaves(state: Any) -> dict[str, Any]:
 def fill_template(template: Template, arrays: Mapping[str, np.ndarray]) -> Template:
     """Replace the leaves of a template by saved arrays. A leaf that is a NumPy array stays one, and may have 64 bits.
 
+    A name that the template does not have may be of an earlier version.
+
     Raises:
         ValueError: a shape or a type differs.
         KeyError: an array is missing.
     """
     leaves, structure = jax.tree_util.tree_flatten_with_path(template)
+    names = [jax.tree_util.keystr(path) for path, _ in leaves]
+    arrays = {name if name in names else rename_fields(name): array for name, array in arrays.items()}
     filled = []
-    for path, leaf in leaves:
-        name = jax.tree_util.keystr(path)
+    for name, (_, leaf) in zip(names, leaves, strict=True):
         if name.startswith(SAVED_BY_ROW):
             filled.append(leaf)
             continue

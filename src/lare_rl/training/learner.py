@@ -31,6 +31,7 @@ from lare_rl.training.static_config import TrainConfig
 __all__ = [
     "Learner",
     "abandon_episodes",
+    "empty_replay",
     "init_decoders",
     "init_learner",
     "replay_columns",
@@ -74,17 +75,16 @@ def init_learner(key: PRNGKeyArray, config: TrainConfig, init_algorithm: Callabl
         algorithm=init_algorithm(algorithm_key),
         decoders=decoders,
         scale=() if decoders else tuple(empty_scale() for _ in config.env.teams),
-        replay=replay.init_replay(
-            config.columns,
-            config.n_envs,
-            config.capacity,
-            n_teams,
-            config.payments,
-            config.is_exact,
-            config.n_levels > 0,
-        ),
+        replay=empty_replay(config, config.n_envs, config.capacity),
         n_learned=jnp.zeros(config.n_envs, jnp.int32),
     )
+
+
+def empty_replay(config: TrainConfig, n_envs: int, capacity: int) -> Replay:
+    """Return a replay for steps of these environments, with all that the method reads of them."""
+    with_predictions, with_levels = config.is_exact, config.n_levels > 0
+    n_teams = len(config.env.teams)
+    return replay.init_replay(config.columns, n_envs, capacity, n_teams, config.payments, with_predictions, with_levels)
 
 
 def store(

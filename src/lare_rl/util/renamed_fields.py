@@ -37,7 +37,7 @@ _RENAMED_FIELDS = {
 }
 """From old to new names."""
 
-_DECODER = r"(?:\.decoders\[\d+\]|learned\[0\])"
+_DECODER = r"(?:\.decoders\[\d+\]|^\[0\])"
 """A decoder in a checkpoint, or in an assigner."""
 _NETWORK = rf"({_DECODER}\.(?:network|.*\.(?:mu|nu)))"
 """Its network, or one of Adam's moments, which have the same fields."""

@@ -1,0 +1,52 @@
+"""Rollouts of runs whose agents leave, or whose episodes are paid several times."""
+
+import numpy as np
+import pytest
+
+import lare_rl
+from helpers.jax_toy_envs import echo_spec
+from lare_rl.evaluation.rollout import N_SAMPLE_EPISODES, roll_out, sample_steps
+
+TASK = echo_spec(environment="hosted/three", credit_scope="state", observation_size=9, action_size=9, payments=2)
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory):
+    settings = lare_rl.Settings(
+        method="bayes",
+        algorithm="ippo",
+        steps=240,
+        rollout_steps=60,
+        environments=2,
+        evaluate_every=240,
+        evaluation_episodes=2,
+        credit={"exact": "last"},
+        ippo={"hidden": (8,), "minibatch_size": 60, "epochs": 1},
+    )
+    return lare_rl.train(TASK, settings, out=tmp_path_factory.mktemp("runs") / "echo", listeners=[])
+
+
+def test_exact_rewards_add_up_to_payments(run):
+    rollout = roll_out(run, 20)
+    sums, payments = [], []
+    for episode in range(20):
+        alive, true, training = (
+            rollout.select_episode(values, episode)
+            for values in (np.asarray(rollout.steps.timestep.alive), rollout.reward, rollout.training_reward)
+        )
+        for start in range(0, len(true), 2):
+            agents = alive[start : start + 2]
+            sums.append(((training[start : start + 2] * agents).sum(axis=1) / agents.sum(axis=1)).sum())
+            payments.append(((true[start : start + 2] * agents).sum(axis=1) / agents.sum(axis=1)).sum())
+    assert np.std(payments) > 0.1
+    scale = np.dot(sums, payments) / np.dot(payments, payments)  # rewards are divided by their deviation
+    np.testing.assert_allclose(sums, scale * np.array(payments), atol=1e-4)
+
+
+def test_sampled_reward_of_a_team_is_the_mean_over_agents_that_are_alive(run):
+    (sample,) = sample_steps(run, random=True)
+    rollout = roll_out(run, N_SAMPLE_EPISODES, random=True, key=1)
+    alive = np.asarray(rollout.steps.timestep.alive)
+    expected = (rollout.reward * alive).sum(axis=-1) / alive.sum(axis=-1)
+    assert not alive[rollout.mask].all()
+    np.testing.assert_allclose(sample.reward.ravel(), expected[rollout.mask], rtol=1e-6)
