@@ -46,6 +46,8 @@ class Comparison:
     """The candidates for the best decoder of raw features."""
     paper: Directories = ()
     default: Directories = ()
+    without_phi: Directories = ()
+    """The default's fit of raw entries, where it was trained. It is in the table only."""
     metric: str = "evaluation/return"
 
 
@@ -62,7 +64,7 @@ def particles(task: str) -> Comparison:
         {method: [f"{LAPTOP}/{task}/{method}-ippo"] for method in ("rd", "rrd", "arel", "stas")},
         [f"{LAPTOP}/{task}/lare-rd-ippo-draw0"],
         [f"{FULL}/{task}/lare-bayes-ippo-draw0"],
-        "evaluation/summed_return",
+        metric="evaluation/summed_return",
     )
 
 
@@ -95,6 +97,7 @@ COMPARISONS = {
             f"{GPU}/{HALF_CHEETAH}/lare-rrdu",
         ],
         [f"{SWEEP}/{HALF_CHEETAH}/lare-bayes-td3-draw0", f"{GPU}/{HALF_CHEETAH}/lare-bayes"],
+        [f"{GPU}/{HALF_CHEETAH}/bayes"],
     ),
     f"{REACHER}, TD3": Comparison(
         100_000,
@@ -103,6 +106,7 @@ COMPARISONS = {
         {"rrdu": [f"{LEARNING}/{REACHER}/rrdu"], "rd": [f"{SWEEP}/{REACHER}/rd-td3"]},
         [f"{LEARNING}/{REACHER}/lare-rrdu"],
         [f"{SWEEP}/{REACHER}/lare-bayes-td3-draw0", f"{GPU}/{REACHER}/lare-bayes"],
+        [f"{GPU}/{REACHER}/bayes"],
     ),
     f"{WALKER}, TD3": Comparison(
         50_000,
@@ -115,6 +119,7 @@ COMPARISONS = {
         },
         [f"{LEARNING}/{WALKER}/lare-rrdu"],
         [f"{SWEEP}/{WALKER}/lare-bayes-td3-draw0", f"{GPU}/{WALKER}/lare-bayes"],
+        [f"{GPU}/{WALKER}/bayes"],
     ),
     "PP-6, IPPO": particles("PP-6"),
     "SMAX-2s3z, QMIX": Comparison(
@@ -205,19 +210,22 @@ def resample(values: Seeds, random: np.random.Generator) -> Seeds:
     return random.choice(values, len(values))
 
 
-def mean_share(samples: Sequence[Sample]) -> float:
-    """The interquartile mean of the shares of all seeds and tasks."""
+def seed_shares(samples: Sequence[Sample]) -> Seeds:
+    """The shares of all seeds and tasks."""
     shares = [
         (sample.method - np.mean(sample.episodic)) / (np.mean(sample.dense) - np.mean(sample.episodic))
         for sample in samples
     ]
-    return interquartile_mean(np.concatenate(shares))
+    return np.concatenate(shares)
 
 
-def estimate_share(comparisons: Sequence[Comparison], method: str) -> tuple[float, float, float]:
-    """The mean share of a method, and its interval."""
-    random = np.random.default_rng(0)
-    samples = [
+def mean_share(samples: Sequence[Sample]) -> float:
+    """The interquartile mean of the shares of all seeds and tasks."""
+    return interquartile_mean(seed_shares(samples))
+
+
+def read_samples(comparisons: Sequence[Comparison], method: str) -> list[Sample]:
+    return [
         Sample(
             *(
                 seed_means(runs, comparison)
@@ -226,6 +234,11 @@ def estimate_share(comparisons: Sequence[Comparison], method: str) -> tuple[floa
         )
         for comparison in comparisons
     ]
+
+
+def estimate_share(comparisons: Sequence[Comparison], method: str) -> tuple[float, float, float]:
+    """The interquartile mean of a method's shares, and its interval."""
+    random, samples = np.random.default_rng(0), read_samples(comparisons, method)
     repeated = [
         mean_share([Sample(*(resample(values, random) for values in sample)) for sample in samples])
         for _ in range(REPETITIONS)
@@ -273,7 +286,8 @@ def main() -> None:
         cells = [f"{name}, {comparison.steps:,}"]
         runs = method_runs(comparison)
         cells += [cell(comparison.episodic, comparison), f"{cell(runs[RAW], comparison)}, `{best_raw(comparison)}`"]
-        cells += [cell(directories, comparison) for directories in (runs[PAPER], runs[DEFAULT], comparison.dense)]
+        others = comparison.without_phi, runs[PAPER], runs[DEFAULT], comparison.dense
+        cells += [cell(directories, comparison) for directories in others]
         print(f"| {' | '.join(cells)} |")
     rows, complete = {}, []
     for name, comparison in COMPARISONS.items():
@@ -288,6 +302,8 @@ def main() -> None:
     for name, estimates in rows.items():
         texts = [f"{method} {value:.2f} [{low:.2f}, {high:.2f}]" for method, (value, low, high) in estimates.items()]
         print(name.replace("\n", ", "), "; ".join(texts), sep=": ")
+    means = [f"{method} {np.mean(seed_shares(read_samples(complete, method))):.2f}" for method in METHODS]
+    print(f"mean of these tasks: {'; '.join(means)}")
     PICTURE.write_text(draw(rows) + "\n", encoding="utf-8")
 
 

@@ -75,12 +75,12 @@ def methods_page() -> str:
         "[many-agents.md](../explanation/many-agents.md).",
         "Inputs: z, the factors of `phi`; s and s', the observations before and after the step; s\\*, the observation that the task's "
         "`scored_observation` names; a, the action; h, largest, smallest and last values of the entries so far.",
-        "†: no [table of results](../results/README.md) has trained runs of the method.",
+        "(new): no [table of results](../results/README.md) has trained runs of the method yet.",
     ]
     for title, methods in groups.items():
         rows = (
             (
-                code(method.name) + (" †" if method.name in UNMEASURED else ""),
+                code(method.name) + (" (new)" if method.name in UNMEASURED else ""),
                 docstring_text(method.summary),
                 agents_text(method),
                 inputs(method),

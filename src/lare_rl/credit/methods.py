@@ -103,7 +103,7 @@ for _method in (
     ),
     Method(
         "rudder",
-        "differences between an LSTM's predictions of the return, as a model of single steps learns them",
+        "differences between an LSTM's predictions of the return, distilled into a model of single steps",
         "Arjona-Medina et al., RUDDER, NeurIPS 2019",
         RAW,
         Fit.DECODER_LOSS,
@@ -127,7 +127,7 @@ for _method in (
     ),
     Method(
         "rbt",
-        "a transformer over at most 512 steps, those of one payment, as a model of single steps learns it",
+        "a transformer over at most 512 steps, those of one payment, distilled into a model of single steps",
         "Tang et al., RBT, TMLR 2025 (after the code, not the paper)",
         TRANSITION,
         Fit.DECODER_LOSS,
