@@ -286,8 +286,8 @@ def main() -> None:
         cells = [f"{name}, {comparison.steps:,}"]
         runs = method_runs(comparison)
         cells += [cell(comparison.episodic, comparison), f"{cell(runs[RAW], comparison)}, `{best_raw(comparison)}`"]
-        others = comparison.without_phi, runs[PAPER], runs[DEFAULT], comparison.dense
-        cells += [cell(directories, comparison) for directories in others]
+        columns = comparison.without_phi, runs[PAPER], runs[DEFAULT], comparison.dense
+        cells += [cell(directories, comparison) for directories in columns]
         print(f"| {' | '.join(cells)} |")
     rows, complete = {}, []
     for name, comparison in COMPARISONS.items():
