@@ -3,9 +3,9 @@
     PYTHONPATH=benchmarks python -m scores.training KIND --out RUNS
 
 Kinds: `not-a-sum` (the corridor's scores), `binary` (won or lost by chance), `payments` (PP-6 paid every step, every 5 steps, and at
-the end), `exact` (PP-6, rewards that add up exactly), `groups` (CN-6 in levels), `published` (published methods in the corridor, on CN-6 and on PP-6).
-Finished runs in RUNS are not trained again, and stopped ones continue. `late` is the mean return of the evaluations after three
-quarters of the steps, and `area` that of all evaluations, which also says how fast a method learns.
+the end), `exact` (PP-6, rewards that add up exactly), `groups` (CN-6 in levels), `published` (published methods in the corridor, on
+CN-6 and on PP-6). Finished runs in RUNS are not trained again, and stopped ones continue. `late` is the mean return of the evaluations
+after three quarters of the steps, and `area` that of all evaluations, which also says how fast a method learns.
 """
 
 from collections.abc import Callable, Iterator
