@@ -146,6 +146,21 @@ def test_few_or_equal_returns_determine_only_the_mean():
         assert float(posterior.bias) == pytest.approx(bias)
 
 
+@pytest.mark.parametrize("error", [0.0, 1e-18, 1e-9])
+def test_rounding_errors_of_a_constant_have_no_weight(error):
+    """Even if they happen to follow the returns. The time has a constant mean if all episodes are equally long."""
+    means, returns, length, _ = sample_episodes(noise=2.0)
+    means[:, 8] = 0.3 + error * returns / length  # only what follows of this can be stored in the sums
+    statistics = sum_up(means, returns, length)
+    exact = error**2 * statistics.products[-2, -2]
+    row = error * statistics.products[-2, :].at[8].set(error * statistics.products[-2, -2])
+    statistics = statistics._replace(products=statistics.products.at[8].set(row).at[:, 8].set(row).at[8, 8].set(exact))
+    separate = fit(statistics, group_index=np.arange(len(GROUP_INDEX)))
+    without = fit(statistics._replace(products=statistics.products.at[8].set(0).at[:, 8].set(0)))
+    assert separate.weight[8] == 0
+    np.testing.assert_allclose(fit(statistics).weight, without.weight, rtol=1e-9)
+
+
 def test_fit_continues_from_an_earlier_one():
     statistics = sample_statistics()
     posterior = evidence.init_posterior(len(GROUP_INDEX), 3)

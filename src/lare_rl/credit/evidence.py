@@ -48,6 +48,7 @@ from lare_rl.credit.precisions import (
     equal_shares,
     inverse_root,
     next_posterior,
+    varies,
 )
 from lare_rl.nn.leading_axis import map_leading_axis
 
@@ -173,11 +174,12 @@ def regression(
     y_mean = statistics.mean[column]
     y_std = jnp.sqrt(statistics.products[column, column] / n_steps)
     y_std = jnp.where(y_std > 1e-6 * jnp.abs(y_mean), y_std, 0)  # a constant may vary by this much in float32
-    s = statistics.products[:n_features, :n_features]
-    s = s + JITTER * jnp.diag(jnp.diagonal(s))
+    s, p = statistics.products[:n_features, :n_features], statistics.products[:n_features, column]
+    is_used = varies(jnp.diagonal(s) / n_steps, statistics.mean[:n_features] ** 2)
+    s = jnp.where(jnp.outer(is_used, is_used), s + JITTER * jnp.diag(jnp.diagonal(s)), 0)
     return Regression(
         s=s,
-        p=statistics.products[:n_features, column] / jnp.where(y_std > 0, y_std, 1),
+        p=jnp.where(is_used, p, 0) / jnp.where(y_std > 0, y_std, 1),
         q=n_steps,
         dof=statistics.n_episodes - 1,
         y_mean=y_mean,

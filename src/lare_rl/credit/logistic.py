@@ -29,7 +29,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from lare_rl.credit import evidence
 from lare_rl.credit.evidence import JAX, PosteriorSpread
-from lare_rl.credit.precisions import JITTER, PRIOR_RANGE, Posterior, count_determined, inverse_root
+from lare_rl.credit.precisions import JITTER, PRIOR_RANGE, Posterior, count_determined, inverse_root, varies
 
 __all__ = ["WINDOW", "LogOddsFit", "add_episodes", "fit", "init", "predict", "remove_episodes", "spread", "to_returns"]
 
@@ -105,9 +105,10 @@ def fit(state: LogOddsFit, group_index: Int[np.ndarray, " columns"], max_rounds:
     n_episodes, n_groups = jnp.maximum(jnp.sum(valid), 1), int(group_index.max()) + 1
     x = jnp.where(valid[:, None], state.columns, 0).astype(float)
     won = (state.returns > (low + high) / 2).astype(float)
-    trace = JAX.group_sums(
-        jnp.sum(jnp.where(valid[:, None], x - jnp.sum(x, axis=0) / n_episodes, 0) ** 2, axis=0), group_index, n_groups
-    )
+    squares = jnp.sum(jnp.where(valid[:, None], x - jnp.sum(x, axis=0) / n_episodes, 0) ** 2, axis=0)
+    is_used = varies(squares / n_episodes, jnp.sum(x**2) / (n_episodes * x.shape[1]))
+    x = jnp.where(is_used, x, 0)
+    trace = JAX.group_sums(jnp.where(is_used, squares, 0), group_index, n_groups)
     # By this alpha, each group changes the log odds of an episode by about 1.
     equal_alpha = jnp.where(trace > 0, n_groups * trace / n_episodes, 1)
     limits = equal_alpha / PRIOR_RANGE, equal_alpha * PRIOR_RANGE

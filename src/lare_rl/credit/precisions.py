@@ -13,6 +13,7 @@ from jaxtyping import Float, Int
 __all__ = [
     "JITTER",
     "MIN_NOISE",
+    "MIN_VARIATION",
     "NUMPY",
     "PRIOR_RANGE",
     "TOLERANCE",
@@ -27,6 +28,7 @@ __all__ = [
     "expand_groups",
     "inverse_root",
     "next_posterior",
+    "varies",
 ]
 
 PRIOR_RANGE = 1e6
@@ -36,6 +38,9 @@ JITTER = 1e-10
 """This fraction of the diagonal of S is added to S, so that S can be factorised if features are collinear."""
 TOLERANCE = 1e-3
 """The iteration to the fixed point ends when a round changes the log evidence by less than this."""
+MIN_VARIATION = 1e-5
+"""A feature that varies less than this between cases is taken to be constant: what float32 leaves of a constant is less. An episode's mean
+of the time is constant, for example, if all episodes are equally long. A weight for it would be the quotient of two rounding errors."""
 MIN_NOISE = 1e-10
 """The smallest variance of the noise, relative to that of the returns. Float32 features and returns cannot resolve less."""
 
@@ -98,6 +103,11 @@ class Moments(NamedTuple):
     """log det Sigma^-1."""
     residual: Float[Array, ""]
     """q - 2 mu . p + mu . S mu."""
+
+
+def varies(variance: Float[Array, " features"], mean_square: Any) -> Any:
+    """Return which features vary between cases. `mean_square` is what rounding errors are relative to, beside 1."""
+    return variance > MIN_VARIATION**2 * (1 + mean_square)
 
 
 def equal_shares(

@@ -32,6 +32,7 @@ from lare_rl.credit.precisions import (
     equal_shares,
     inverse_root,
     next_posterior,
+    varies,
 )
 
 __all__ = [
@@ -110,6 +111,7 @@ def sum_up(
     total = weight.sum()
     x_mean, y_mean = weight @ x / total, weight @ y / total
     x_centred, y_centred = x - x_mean, y - y_mean
+    x_centred = np.where(varies(weight @ x_centred**2 / total, x_mean**2), x_centred, 0)
     y_std = unit or np.sqrt(weight @ y_centred**2 / total)
     if not y_std > 1e-9 * np.abs(y).max(initial=0):
         y_std, y_centred = 0.0, np.zeros_like(y)
