@@ -5,8 +5,8 @@ Both numbers compare outcomes with values that the rollout itself had no part in
 * the gain: the share of the squared error of R - (mean of the group), over all prefixes, that R - V removes. GRPO's advantage has the
   first error. The gain has a standard error over rollouts.
 * the surprise at the end: the mean of R - V before the last turns of agents that stopped by themselves. If it is large, then the values
-  miss what agents see before they stop, and the last turn gets the credit of the turns before it. If it is negative, the last turn gets less
-  than its due, which has done no harm on the testbeds.
+  miss what agents see before they stop, and the last turn gets the credit of the turns before it. If it is negative, the last turn
+  gets less than its due, which has done no harm on the testbeds.
 
 Lambda is 0.8 while both numbers allow it, and otherwise 0.95, which needs the values less. While it is not clear that the values are better
 than the mean of the group, lambda is 1 and the advantage is that of GRPO: the outcome minus the mean of the group.

@@ -7,8 +7,8 @@ MESSAGES = {
     "grpo": "The advantage is the outcome minus the mean of its group, as in GRPO: {reason}.",
     "chosen": "it was set by the caller. The measurement says: {measured}",
     "unknown": (
-        "there are {n_rollouts:count rollout} whose outcomes have a standard deviation of {outcome_std:.2g}, from which nothing can be said "
-        "about the values"
+        "there are {n_rollouts:count rollout} whose outcomes have a standard deviation of {outcome_std:.2g}, from which nothing can be "
+        "said about the values"
     ),
     "unclear_gain": (
         "it is not clear that values of prefixes predict outcomes better than the mean of the group does (gain {gain:.1%} ± "
