@@ -14,12 +14,17 @@ import lare_rl
 from helpers.markup import check_markup
 from helpers.toy_envs import Chase, toy_spec
 from helpers.training_runs import QUICK_CREDIT
+from helpers.untrained_runs import write_run
+from lare_rl.config.resolve import resolve
+from lare_rl.config.settings import Settings
+from lare_rl.envs.load import load_task
 from lare_rl.evaluation.video import encode_film
 from lare_rl.report.html import render_table
 from lare_rl.report.live_page import LivePage
 from lare_rl.report.messages import MESSAGES
-from lare_rl.report.overview import compare_runs, sort_runs, summarise_runs
+from lare_rl.report.overview import compare_runs, render_learning_curves, sort_runs, summarise_runs
 from lare_rl.report.run_summary import ReportedRun
+from lare_rl.runs.directory import open_without_functions
 
 CHROMIUM = next(
     (path for name in ("chromium", "chromium-browser", "google-chrome") if (path := shutil.which(name))), None
@@ -138,12 +143,25 @@ def test_summary_of_runs(make_run):
         ReportedRun(method, make_run(method, [value, value + 1], method=method))
         for method, value in [("rd", 9.0), ("episodic", 1.0)]
     )
-    summaries = summarise_runs([first, second], np.zeros(0))
+    summaries = summarise_runs([first, second], np.zeros((1, 0)))
     assert [summary.episodic_return for summary in summaries] == [1.5, None]
     assert first.training_seconds() is None
     for line in first.metrics:
         line["time/steps_per_second"] = line["step"] / 10
     assert first.training_seconds() == pytest.approx(50 / 5 + 50 / 10)
+
+
+def test_each_team_is_compared_with_its_own_random_returns(tmp_path):
+    task = load_task("CompetitivePP-6")
+    settings = resolve(Settings(method="dense"), task)
+    metrics = [{"step": 1, "seed": 0, "evaluation/return_predator": 1.0, "evaluation/return_prey": 1.0}]
+    write_run(tmp_path / "run", task, settings, metrics)
+    reported = ReportedRun("a", open_without_functions(tmp_path / "run"))
+    charts = [
+        "".join(render_learning_curves(task, [reported], np.array(returns))).split('class="chart')[1:]
+        for returns in ([[0.0, 0.0], [0.0, 0.0]], [[0.0, 0.0], [-9.0, -9.0]])
+    ]
+    assert [first == second for first, second in zip(*charts, strict=True)] == [True, False]
 
 
 def test_report_errors(make_run, tmp_path):

@@ -54,12 +54,17 @@ class _Metric(NamedTuple):
 
 
 def summarise_runs(
-    runs: Sequence[ReportedRun], random_returns: Float[np.ndarray, " episodes"]
+    runs: Sequence[ReportedRun], random_returns: Float[np.ndarray, "teams episodes"]
 ) -> list[RunSummary | None]:
-    """Return the summary of each run of a task. Each is compared with a run on the return of the episode alone, if there is one."""
+    """Return the summary of each run of a task, with the returns of its first team.
+
+    Each is compared with a run on the return of the episode alone, if there is one.
+    """
     episodic = [run for run in runs if run.run.config.settings.method == "episodic" and np.isfinite(run.final_return)]
     return [
-        summarise_run(run, random_returns, next((other.final_return for other in episodic if other is not run), None))
+        summarise_run(
+            run, random_returns[0], next((other.final_return for other in episodic if other is not run), None)
+        )
         for run in runs
     ]
 
@@ -184,18 +189,18 @@ def render_final_values(runs: Sequence[ReportedRun]) -> str:
 
 
 def render_learning_curves(
-    task: TaskSpec, runs: Sequence[ReportedRun], random_returns: Float[np.ndarray, " episodes"]
+    task: TaskSpec, runs: Sequence[ReportedRun], random_returns: Float[np.ndarray, "teams episodes"]
 ) -> Iterable[str]:
     """Yield the curve of the return of each team, and the curves of the other metrics folded below it."""
     names = [f"{RETURN}_{role.team}" for role in task.teams] or [RETURN]
     colours = {reported.name: f"c{i}" if i < N_COLOURS else "grey" for i, reported in enumerate(sort_runs(runs))}
-    references = {"random actions": float(random_returns.mean())} if len(random_returns) else {}
+    references = [{"random actions": float(returns.mean())} if len(returns) else {} for returns in random_returns]
     warmups = {reported.run.config.settings.warmup for reported in runs}
     warmup = warmups.pop() if len(warmups) == 1 else 0
-    yield _render_legend(runs, colours, references, warmup)
-    for name, role in zip(names, task.teams or (task,), strict=True):
+    yield _render_legend(runs, colours, references[0], warmup)
+    for name, role, reference in zip(names, task.roles, references, strict=True):
         title = f"True return, team of {role.team}" if task.teams else "True return"
-        if chart := _draw_metric(_Metric(name, title), runs, colours, references, warmup):
+        if chart := _draw_metric(_Metric(name, title), runs, colours, reference, warmup):
             yield render_note(title) + chart
     charts = {metric.title: _draw_metric(metric, runs, colours, {}, warmup) for metric in _other_metrics(task)}
     figures = [
