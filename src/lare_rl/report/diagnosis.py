@@ -150,7 +150,9 @@ def _is_rising(run: RunSummary) -> Finding | None:
     quarter = run.mean_returns[-max(2, len(run.mean_returns) // 4) :]
     if last - previous <= max(change, run.final_error) or quarter[-1] - quarter[0] <= change / 2:
         return None
-    return Finding("is_rising", {"directory": run.directory, "steps": 2 * int(run.steps[-1])})
+    is_finished = int(run.steps[-1]) >= run.planned_steps
+    more = Finding("more_steps", {"steps": 2 * int(run.steps[-1])}) if is_finished else None
+    return Finding("is_rising", {"directory": run.directory, "more": more})
 
 
 def _one_seed_was_better(run: RunSummary) -> Finding | None:
@@ -187,7 +189,8 @@ def _is_stuck(run: RunSummary) -> Finding | None:
         seeds = Finding("saturated_seeds", {"n_saturated": run.n_saturated, "n_seeds": run.n_seeds})
         return Finding("is_stuck", {"cause": Finding("saturated", {"seeds": seeds if run.n_seeds > 1 else None})})
     ranges = np.ptp(run.returns[:, -MIN_EVALUATIONS:], axis=1)
-    if len(run.steps) < MIN_EVALUATIONS or np.any(ranges >= STUCK_FRACTION * sample_std(run.random_returns)):
+    # A return that is unknown makes the range NaN, and nothing is said.
+    if len(run.steps) < MIN_EVALUATIONS or not np.all(ranges < STUCK_FRACTION * sample_std(run.random_returns)):
         return None
     return Finding("is_stuck", {"cause": Finding("repeats_behaviour", {"n_evaluations": MIN_EVALUATIONS})})
 

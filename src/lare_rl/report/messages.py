@@ -110,7 +110,8 @@ MESSAGES = {
     "replace_phi": "another phi (`lare-rl design {task} --reflect 2 --model NAME`), or none (`--method bayes`)",
     "bad_raw_features": "the raw entries do not show what the score depends on",
     "write_phi": "a phi (`lare-rl prompt {task}`)",
-    "is_rising": "Next: it was still rising. To continue: `lare-rl train --resume {directory} --steps {steps}`.",
+    "is_rising": "Next: it was still rising. To continue: `lare-rl train --resume {directory}{more}`.",
+    "more_steps": " --steps {steps}",
     "one_seed_was_better": (
         "Next: one seed was better than random actions at step {step:,} ({return_:score}). `lare-rl evaluate {directory} --best` "
         "plays the best policy of each seed. To continue: more `--steps`, or another `--algorithm`."

@@ -134,6 +134,8 @@ class RunSummary:
     """Whether the decoder is trained by gradient descent. It may then not have converged yet."""
     untrained: str | None = None
     """Why the policy was never updated, or None if it was."""
+    planned_steps: int = 0
+    """The number of environment steps of the whole run. It has more than `steps` says if it is unfinished."""
     warmup: int = 0
     """The number of environment steps before the first update."""
     n_saturated: int = 0
@@ -287,6 +289,7 @@ def summarise_run(
         many_agents=SUMMED_RETURN in reported.metrics[-1],
         uses_gradient=method.uses_gradient,
         untrained=describe_untrained(run),
+        planned_steps=settings.steps,
         warmup=settings.warmup,
         n_saturated=int(np.sum(reported.final_values(ACTOR_SATURATION) == 1)),
         directory=str(run.directory),
