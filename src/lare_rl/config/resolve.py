@@ -15,7 +15,7 @@ from lare_rl.envs.placement import SLOW_STEP_S, measure_step_s
 from lare_rl.errors import LareError
 from lare_rl.tasks.spec import TaskSpec
 
-__all__ = ["apply_defaults", "choose_algorithm", "replay_rows", "resolve"]
+__all__ = ["choose_algorithm", "fill_in", "replay_rows", "resolve"]
 
 
 TRAINING_SHARE = 10
@@ -33,7 +33,7 @@ def resolve(settings: Settings, task: TaskSpec) -> ResolvedSettings:
         raise LareError(f"{task.name} is one team of {task.environment}: train the task that has both")
     env = load_env_spec(task)
     _check_algorithm(ALGORITHMS[choose_algorithm(settings.algorithm, env)], task, env)
-    resolved = _normalise(apply_defaults(settings, env), task, env)
+    resolved = fill_in(settings, task, env)
     if settings.evaluation_episodes is None and not env.is_jax and measure_step_s(task) > SLOW_STEP_S:
         n_episodes = resolved.evaluate_every // (TRAINING_SHARE * env.max_steps)
         n_episodes = min(resolved.evaluation_episodes, max(MIN_EVALUATION_EPISODES, n_episodes))
@@ -74,6 +74,11 @@ def resolve(settings: Settings, task: TaskSpec) -> ResolvedSettings:
     return resolved
 
 
+def fill_in(settings: Settings, task: TaskSpec, env: EnvSpec) -> ResolvedSettings:
+    """Fill in the settings that are None. Raises `LareError` if the steps are not a multiple of an iteration's."""
+    return _normalise(_apply_defaults(settings, env), task, env)
+
+
 def choose_algorithm(name: str | None, env: EnvSpec) -> str:
     """Return the requested algorithm, or the default one for an environment."""
     if name is not None:
@@ -83,8 +88,7 @@ def choose_algorithm(name: str | None, env: EnvSpec) -> str:
     return "qmix" if env.state_size and env.masks_actions and len(env.teams) == 1 else "ippo"
 
 
-def apply_defaults(settings: Settings, env: EnvSpec) -> ResolvedSettings:
-    """Fill in the settings that are None. Raises `LareError` if the steps are not a multiple of an iteration's."""
+def _apply_defaults(settings: Settings, env: EnvSpec) -> ResolvedSettings:
     algorithm = choose_algorithm(settings.algorithm, env)
     row = ALGORITHMS[algorithm]
     defaults: dict[str, Any] = {

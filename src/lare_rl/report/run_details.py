@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Float
 
 from lare_rl.config.effective import effective_settings
-from lare_rl.config.resolve import apply_defaults
+from lare_rl.config.resolve import fill_in
 from lare_rl.config.settings import Settings
 from lare_rl.credit import explanation_text
 from lare_rl.credit.methods import find_method
@@ -39,7 +39,7 @@ from lare_rl.util.statistics import column_correlations
 
 __all__ = ["describe_method", "render_details", "render_settings"]
 
-MAX_TSNE_POINTS = 1000
+TSNE_PERPLEXITY, MAX_TSNE_POINTS = 30, 1000
 MIN_BAND = 0.04
 """A band is visible if it is wider than this fraction of the range of the line."""
 _BAND_NOTE = (
@@ -251,11 +251,15 @@ def _render_tsne(sample: TeamSample) -> Iterable[str]:
         yield render_note(f"A t-SNE picture of observations and factors is drawn here after {install_command('tsne')}.")
         return
     chosen = np.random.default_rng(0).permutation(len(sample.reward))[:MAX_TSNE_POINTS]
+    if len(chosen) <= TSNE_PERPLEXITY:
+        return
     yield '<div class="figures">'
     for name, columns in {"observations": sample.next_observation, "factors": sample.factors}.items():
+        if columns.shape[1] < 2:  # a plane needs two columns
+            continue
         rows = columns[chosen]
         rows = (rows - rows.mean(axis=0)) / np.maximum(rows.std(axis=0), 1e-9)
-        points = TSNE(init="pca", random_state=0).fit_transform(rows)
+        points = TSNE(perplexity=TSNE_PERPLEXITY, init="pca", random_state=0).fit_transform(rows)
         yield draw_points(points, sample.reward[chosen], f"t-SNE of the {name} of agents. Bright: a high true reward.")
     yield "</div>"
 
@@ -295,7 +299,7 @@ def _default_settings(run: Run) -> dict[str, str]:
     settings, task = run.config.settings, run.config.task
     if untrusted_module(task) is not None:
         return {}
-    defaults = apply_defaults(Settings(method=settings.method, algorithm=settings.algorithm), load_env_spec(task))
+    defaults = fill_in(Settings(method=settings.method, algorithm=settings.algorithm), task, load_env_spec(task))
     return {key: _to_text(value) for key, value in effective_settings(defaults).items()}
 
 
