@@ -79,10 +79,12 @@ def new_task(
     for key in draft.missing_keys:
         print_line(f"  fill in: {key} ({'the log' if draft.logs_only else 'the environment'} does not document it)")
     data = f" --data {environment}" if draft.logs_only else ""
-    print_line(f"read it, then: lare-rl design {path}{data} --model NAME --out phi.py")
+    roles = [(team_path, f"phi_{team_path.stem}.py") for team_path in paths[1:]] or [(path, "phi.py")]
+    for role_path, function_path in roles:
+        print_line(f"read it, then: lare-rl design {role_path}{data} --model NAME --out {function_path}")
     without_function = "lare-rl relabel without --function" if draft.logs_only else "--method bayes"
     print_line(
-        f"or, without a model: paste the output of lare-rl prompt {path} into a chat, or write phi.py yourself, with a function "
+        f"or, without a model: paste the output of lare-rl prompt {roles[0][0]} into a chat, or write phi.py yourself, with a function "
         f"evaluation_func(observation, action) (docs/how-to/write-phi.md); {without_function} needs no phi.py"
     )
 

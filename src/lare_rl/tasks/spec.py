@@ -221,5 +221,8 @@ def require_role(spec: TaskSpec) -> TaskSpec:
     """Return a task without teams unchanged. Raise `LareError` for a task with teams, which has several latent functions."""
     if spec.teams:
         names = ", ".join(role.name for role in spec.roles)
-        raise LareError(f"{spec.name} has a latent function for each of its teams. Name one of {names} instead.")
+        raise LareError(
+            f"{spec.name} has a latent function for each of its teams ({names}). Name the task of one of them instead: the key "
+            "teams of its file lists their files."
+        )
     return spec
