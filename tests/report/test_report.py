@@ -17,8 +17,11 @@ from helpers.training_runs import QUICK_CREDIT
 from helpers.untrained_runs import write_run
 from lare_rl.config.resolve import resolve
 from lare_rl.config.settings import Settings
+from lare_rl.envs.interface import Team
 from lare_rl.envs.load import load_task
+from lare_rl.evaluation.rollout import TeamSample
 from lare_rl.evaluation.video import encode_film
+from lare_rl.report import run_details
 from lare_rl.report.html import render_table
 from lare_rl.report.live_page import LivePage
 from lare_rl.report.messages import MESSAGES
@@ -164,10 +167,29 @@ def test_each_team_is_compared_with_its_own_random_returns(tmp_path):
     assert [first == second for first, second in zip(*charts, strict=True)] == [True, False]
 
 
+def test_default_settings_are_not_listed(make_run, tmp_path):
+    page = page_of(make_run("a", [1.0], method="bayes"), tmp_path)
+    differing = page[page.index("differ from the defaults") :].partition("</table>")[0]
+    assert "method" in differing
+    assert "credit." not in differing
+
+
+@pytest.mark.parametrize(("n_rows", "n_factors", "n_pictures"), [(40, 2, 2), (40, 1, 1), (30, 2, 0)])
+def test_tsne_needs_two_columns_and_some_rows(n_rows, n_factors, n_pictures):
+    rng = np.random.default_rng(0)
+    sample = TeamSample(
+        team=Team("", 0, 1),
+        next_observation=rng.random((n_rows, 3), np.float32),
+        factors=rng.random((n_rows, n_factors), np.float32),
+        reward=rng.random(n_rows, np.float32),
+    )
+    assert "".join(run_details._render_tsne(sample)).count("<figcaption>t-SNE") == n_pictures
+
+
 def test_report_errors(make_run, tmp_path):
     for sources, out, words in (
         ([], "report.html", "No runs"),
-        ([make_run("a", [1.0])], "no/report.html", "no folder"),
+        ([make_run("a", [1.0])], "no/report.html", "no directory"),
     ):
         with pytest.raises(lare_rl.LareError, match=words):
             lare_rl.write_report(sources, tmp_path / out)

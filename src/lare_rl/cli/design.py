@@ -18,6 +18,7 @@ from lare_rl.cli.terminal import (
     print_progress,
 )
 from lare_rl.errors import CheckedModel, LareError
+from lare_rl.util.files import check_new_path
 
 if TYPE_CHECKING:
     from lare_rl.envs.play import Policy
@@ -176,25 +177,16 @@ def _check_options(
 
 def _check_files(out: Path | None, record: Path | None) -> None:
     """Raise `LareError` if a file could not be written, before a model is asked and paid."""
-    options = [] if record is None else [(record, "--record")]
-    try:
-        if out is not None:
-            if out.is_dir():
-                raise LareError(f"{out} is not the name of a file; choose another --out")
-            options += [(out.with_suffix(suffix), "--out") for suffix in (".py", ".json")]
-        for path, option in options:
-            if path.is_dir():
-                raise LareError(f"{path} is not the name of a file; choose another {option}")
-            if path.exists():
-                raise LareError(f"{path} exists, and is not overwritten; choose another {option}")
-            if not path.parent.is_dir():
-                raise LareError(
-                    f"{path} cannot be written: there is no directory {path.parent}; choose another {option}"
-                )
-        if record is not None and record.resolve() in [path.resolve() for path, option in options if option == "--out"]:
+    files = []
+    if out is not None:
+        check_new_path(out, "--out", overwrite=True)  # a directory has no suffix to replace
+        files = [out.with_suffix(suffix) for suffix in (".py", ".json")]
+    for path in files:
+        check_new_path(path, "--out")
+    if record is not None:
+        check_new_path(record, "--record")
+        if record.resolve() in [path.resolve() for path in files]:
             raise LareError(f"--out writes {record} too: choose another --record")
-    except OSError as error:
-        raise LareError(f"{error.filename} cannot be written: {error.strerror}") from error
 
 
 def _save_attempts(error: "DesignError", other: Path) -> None:

@@ -11,6 +11,7 @@ from tyro.conf import Positional
 
 from lare_rl.errors import LareError
 from lare_rl.util.durations import format_seconds
+from lare_rl.util.files import check_new_path
 from lare_rl.util.sanitize import one_line, sanitize
 
 if TYPE_CHECKING:
@@ -94,10 +95,9 @@ def find_free_path(path: Path) -> Path:
 
 def write_new_file(path: Path, text: str, option: str) -> None:
     """Write a file that must not exist. `option` is the command-line option that names it."""
+    check_new_path(path, option)
     try:
         with path.open("x", encoding="utf-8") as file:
             file.write(text)
-    except FileExistsError:
-        raise LareError(f"{path} exists, and is not overwritten; choose another {option}") from None
     except OSError as error:
         raise LareError(f"{path} cannot be written: {error.strerror}") from error

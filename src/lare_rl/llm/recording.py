@@ -11,7 +11,7 @@ from typing import Literal
 from lare_rl.errors import CheckedModel, LareError
 from lare_rl.llm.key import redact_key
 from lare_rl.llm.prompts import Message, Stage
-from lare_rl.util.files import write_atomically
+from lare_rl.util.files import check_new_path, write_atomically
 from lare_rl.util.safe_io import read_json
 
 __all__ = ["SHIPPED_RECORDINGS", "Exchange", "RecordedModel", "Recorder", "read_recording", "shipped_recordings"]
@@ -119,8 +119,8 @@ class RecordedModel:
 class Recorder:
     """Records every exchange of a design. With a `path`, it saves them to this file after each reply.
 
-    An existing file is never overwritten: the file must not exist when the first reply comes. After that it is replaced as a
-    whole, so that no reply is lost.
+    An existing file is never overwritten: the file must not exist at first. After the first reply it is replaced as a whole, so
+    that no reply is lost.
     """
 
     task: str
@@ -130,6 +130,10 @@ class Recorder:
     exchanges: list[Exchange] = field(default_factory=list)
     file_created: bool = False
     """Whether this recorder has created the file."""
+
+    def __post_init__(self) -> None:
+        if self.path is not None and not self.file_created:
+            check_new_path(self.path)  # before a model is asked and paid
 
     def n_replies(self, stage: Stage, messages: Sequence[Message]) -> int:
         """Return the number of recorded replies to a request."""
@@ -150,8 +154,8 @@ class Recorder:
 
     def save(self, path: Path, model: str, new: bool = True) -> None:
         """Write the recording to a file. Raises `LareError` if the file cannot be written, or it exists and should be `new`."""
-        if new and path.exists():
-            raise LareError(f"{path} exists, and is not overwritten; choose another file")
+        if new:
+            check_new_path(path)
         write_atomically(path, lambda file: file.write(self.to_json(model).encode()))
 
     def to_json(self, model: str) -> str:
