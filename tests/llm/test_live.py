@@ -397,7 +397,7 @@ def test_pauses_count_as_waiting(start_either):
     _, model, pauses = start_either(
         refuse(429, Retry_After="999999999"), budget=Budget(seconds=150.0), on_message=messages.append
     )
-    with pytest.raises(BudgetExceededError, match="2 minutes"):
+    with pytest.raises(BudgetExceededError, match="3 min"):
         model.reply(REQUEST, 0)
     assert pauses == [60.0, 60.0]
     assert "120 s at most" in messages[0]

@@ -8,15 +8,16 @@ import numpy as np
 from jaxtyping import Float
 
 from lare_rl.evaluation.reference_returns import REFERENCE_RETURNS
-from lare_rl.report.charts import N_COLOURS, Chart, Curve, Line, draw_legend, format_number, format_spread
+from lare_rl.report.charts import N_COLOURS, Chart, Line, draw_legend, format_number
 from lare_rl.report.diagnosis import CREDIT_CODES, NEXT_CODES, diagnose
 from lare_rl.report.html import render_fold, render_note, render_table, render_tiles
 from lare_rl.report.messages import MESSAGES, WORDS
-from lare_rl.report.run_summary import ReportedRun, RunSummary, finite, summarise_run
+from lare_rl.report.run_summary import Curve, ReportedRun, RunSummary, finite, summarise_run
 from lare_rl.runs.metric_names import CREDIT_CORRELATION, CREDIT_ERROR, RETURN, RETURN_R2, RETURN_STD
 from lare_rl.tasks.spec import TaskSpec
 from lare_rl.util.durations import format_seconds
 from lare_rl.util.findings import Finding, format_value, render
+from lare_rl.util.statistics import format_mean_std
 
 __all__ = [
     "compare_runs",
@@ -90,10 +91,10 @@ def render_verdict(
 def _tiles(reported: ReportedRun, summary: RunSummary) -> Iterable[tuple[str, str, str]]:
     """Yield the numbers of a run: title, number, remark. Those that are unknown are missing."""
     if len(summary.final_returns):
-        number, _, std = format_spread(summary.final_returns).partition(" ± ")
+        number, _, std = _format_spread(summary.final_returns).partition(" ± ")
         yield "Return", number, f"{f'± {std}, ' if std else ''}{format_value(len(summary.final_returns), 'count seed')}"
     if len(summary.random_returns):
-        number, _, std = format_spread(summary.random_returns).partition(" ± ")
+        number, _, std = _format_spread(summary.random_returns).partition(" ± ")
         yield "Random actions", number, f"± {std or 0}, {format_value(len(summary.random_returns), 'count episode')}"
     if summary.return_r2 is not None:
         yield "R² of returns", format_value(summary.return_r2, "r2"), "of new episodes; 1 is perfect"
@@ -177,7 +178,7 @@ def render_final_values(runs: Sequence[ReportedRun]) -> str:
         values = [reported.final_values(metric) for metric in _METRICS]
         step, n_seeds = f"{reported.last_step:,}", len(reported.run.seeds)
         if len(runs) > 1:
-            rows.append((task, reported.name, *map(format_spread, values), str(n_seeds), step))
+            rows.append((task, reported.name, *map(_format_spread, values), str(n_seeds), step))
         else:
             for i, seed in enumerate(reported.run.seeds):
                 cells = (format_number(numbers[i]) if len(numbers) == n_seeds else "" for numbers in values)
@@ -256,7 +257,7 @@ def _draw_metric(
     lines += [Line(extent, np.full(2, value), "grey dashed", name) for name, value in references.items()]
     has_negative = any((line.y[np.isfinite(line.y)] < 0).any() for line in lines)
     limits = (-1.0, 1.0) if metric.limits and has_negative else metric.limits
-    final = ", ".join(f"{name} {format_spread(finite(curve[1][:, -1]))}" for name, (_, curve) in curves.items())
+    final = ", ".join(f"{name} {_format_spread(finite(curve[1][:, -1]))}" for name, (_, curve) in curves.items())
     return Chart(
         lines=lines,
         description=f"{metric.title} over environment steps. Last values: {final}",
@@ -301,6 +302,11 @@ def render_words() -> str:
     """Return the explanations of words, which links lead to."""
     items = (f'<dt id="{code}">{escape(title)}</dt><dd>{escape(text)}</dd>' for code, (title, text) in WORDS.items())
     return f'<h2>Words</h2><dl class="words">{"".join(items)}</dl>'
+
+
+def _format_spread(values: Float[np.ndarray, " values"]) -> str:
+    """Write the mean of some values ± their standard deviation, or nothing without values."""
+    return format_mean_std(values) if len(values) else ""
 
 
 def _mean(values: Float[np.ndarray, "seeds evaluations"]) -> Float[np.ndarray, " evaluations"]:
