@@ -12,6 +12,7 @@ from dataclasses import dataclass, replace
 from typing import Any, Literal, NamedTuple
 
 from lare_rl.llm.prompts import Message
+from lare_rl.llm.reply import REPLY_KEYS
 from lare_rl.util.safe_io import read_json
 
 __all__ = ["MIN_REPLY_TOKENS", "Answer", "FailedResponseError", "Ladder", "find_ladder", "store_ladder"]
@@ -19,14 +20,13 @@ __all__ = ["MIN_REPLY_TOKENS", "Answer", "FailedResponseError", "Ladder", "find_
 MAX_REPLY_TOKENS, MIN_REPLY_TOKENS = 16_384, 1024
 """The limit on a reply's tokens. It is halved while the model allows less, down to the second number."""
 
-_KEYS = ["Understand", "Analyze", "Functions"]
 _SCHEMA = {
     "name": "evaluation_function",
     "strict": True,
     "schema": {
         "type": "object",
-        "properties": {key: {"type": "string"} for key in _KEYS},
-        "required": _KEYS,
+        "properties": {key: {"type": "string"} for key in REPLY_KEYS},
+        "required": REPLY_KEYS,
         "additionalProperties": False,
     },
 }

@@ -14,10 +14,21 @@ from lare_rl.llm.prompts import Message, Stage
 from lare_rl.util.files import check_new_path, write_atomically
 from lare_rl.util.safe_io import read_json
 
-__all__ = ["SHIPPED_RECORDINGS", "Exchange", "RecordedModel", "Recorder", "read_recording", "shipped_recordings"]
+__all__ = [
+    "RECORDED",
+    "SHIPPED_RECORDINGS",
+    "Exchange",
+    "RecordedModel",
+    "Recorder",
+    "read_recording",
+    "shipped_recordings",
+]
 
 RecordingKind = Literal["factors", "reward", "events"]
 """What a recorded function returns: factors or a reward of a step, or the events of a turn (`lare_rl.turns`)."""
+
+RECORDED = "recorded"
+"""The name of the model that answers from the shipped recordings."""
 
 SHIPPED_RECORDINGS = files("lare_rl.llm") / "recordings"
 
@@ -95,7 +106,7 @@ class RecordedModel:
         """
         self.recordings = recordings
         self.task = task
-        self.name = "recorded"
+        self.name = RECORDED
 
     def reply(self, messages: Sequence[Message], sample: int) -> str:
         """Return the reply number `sample` to a request. See `Model.reply`."""
