@@ -32,6 +32,7 @@ from lare_rl.report.charts import (
 from lare_rl.report.html import render_fold, render_function, render_note, render_table
 from lare_rl.report.run_summary import ReportedRun
 from lare_rl.runs.directory import Run, function_paths
+from lare_rl.tasks.spec import base_name
 from lare_rl.tasks.trust import TRUST_VARIABLE, untrusted_module
 from lare_rl.training.explain import explanation_source, find_explanations
 from lare_rl.util.findings import Finding, render
@@ -141,7 +142,7 @@ def _render_earnings(run: Run, correlations: Sequence[Float[np.ndarray, " factor
         labels = label_factors(run, team_index)
         if len(roles) > 1 and (findings or labels):
             sections.append(f"<h3>{escape(role.name)}</h3>")
-        meanings = {label.name.removesuffix(" (before)").removesuffix(" (after)"): label.meaning for label in labels}
+        meanings = {base_name(label.name): label.meaning for label in labels}
         bars = [_make_bar(finding, meanings) for finding in findings if finding.code in ("factor", "unknown_factor")]
         bars += [bar for finding in findings for bar in _raw_feature_bars(finding)]
         sections += [f"<p>{escape(_sentence(finding))}</p>" for finding in findings if finding.code in _SUMMARIES]
@@ -197,7 +198,7 @@ def _render_factor_table(
     values = {finding.values["name"]: finding.values for finding in findings if finding.code == "factor"}
     rows = []
     for label, correlation in zip(labels, correlations, strict=True):
-        described = values.get(label.name.removesuffix(" (before)").removesuffix(" (after)"))
+        described = values.get(base_name(label.name))
         numbers = (
             ("", "")
             if described is None
