@@ -40,6 +40,7 @@ def resolve(settings: Settings, task: TaskSpec) -> ResolvedSettings:
         resolved = resolved.model_copy(update={"evaluation_episodes": n_episodes})
 
     method, team_level = find_method(resolved.method), task.credit_scope == "state"
+    consumes = ALGORITHMS[resolved.algorithm].consumes
     n_state_features = env.state_size + env.n_agents * env.action_size
     check_credit(
         method,
@@ -53,18 +54,9 @@ def resolve(settings: Settings, task: TaskSpec) -> ResolvedSettings:
         payments=task.payment_rule,
         discrete_actions=env.discrete,
         max_steps=env.max_steps,
+        rollout_steps=resolved.rollout_steps,
+        off_policy=consumes is not Consumes.ROLLOUTS,
     )
-    if method.needs_whole_episodes and resolved.rollout_steps % env.max_steps:
-        raise LareError(
-            f"{method.name} reads whole episodes: rollout_steps = {resolved.rollout_steps} is not a multiple of their length, "
-            f"{env.max_steps}"
-        )
-    consumes = ALGORITHMS[resolved.algorithm].consumes
-    if resolved.credit.exact != "no" and method.uses_gradient and consumes is not Consumes.ROLLOUTS:
-        raise LareError(
-            f"exact needs proxy rewards that stay the same during an iteration, and each update of {resolved.algorithm} changes those "
-            f"of {method.name}: use bayes or lare-bayes, or the algorithms ppo or ippo"
-        )
     if resolved.overlap_collection and (env.is_jax or consumes is not Consumes.TRANSITIONS):
         raise LareError(
             f"overlap_collection needs td3, ddpg or sac and an environment on the host: remove it for {resolved.algorithm} on "
