@@ -12,8 +12,9 @@ from tyro.conf import Positional
 from lare_rl.cli.terminal import (
     Data,
     EpisodeProgress,
-    Kind,
+    FunctionKind,
     Task,
+    load_policy,
     load_steps,
     print_line,
     print_progress,
@@ -32,7 +33,7 @@ if TYPE_CHECKING:
     from lare_rl.tasks.spec import TaskSpec
 
 
-def prompt(task: Task, kind: Kind = "factors") -> None:
+def prompt(task: Task, kind: FunctionKind = "factors") -> None:
     """Print the request that a language model gets for a task.
 
     Args:
@@ -111,7 +112,7 @@ def _draft(source: str) -> "Draft":
 def verify(
     file: Annotated[Positional[Path], tyro.conf.arg(metavar="FILE")],
     task: Annotated[str, tyro.conf.arg(metavar="TASK")],
-    kind: Kind = "factors",
+    kind: FunctionKind = "factors",
     data: Data = None,
     fit: int = 0,
     policy: Annotated[Path | None, tyro.conf.arg(metavar="RUN")] = None,
@@ -137,7 +138,6 @@ def verify(
     from lare_rl.envs.load import load_task, read_task
 
     read_task(task)  # a typo is reported before the slow imports
-    from lare_rl.cli.design import load_policy
     from lare_rl.credit.explanation_text import MIN_EXPLAINED_EPISODES
     from lare_rl.latent.function import function_from_verdict
     from lare_rl.latent.saved import read_source

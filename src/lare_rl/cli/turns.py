@@ -6,8 +6,7 @@ from typing import Annotated
 import tyro
 from tyro.conf import Positional
 
-from lare_rl.cli.design import DEFAULT_LIVE, LiveOptions
-from lare_rl.cli.terminal import print_line, print_progress, write_new_file
+from lare_rl.cli.terminal import DEFAULT_LIVE, LiveOptions, print_line, print_progress, write_new_file
 from lare_rl.util.files import check_new_path
 from lare_rl.util.sanitize import one_line
 
