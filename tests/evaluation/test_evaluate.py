@@ -27,7 +27,7 @@ from lare_rl.evaluation.evaluate import (
 )
 from lare_rl.evaluation.policy import load_policy
 from lare_rl.evaluation.video import check_video_path, record_video, write_video
-from lare_rl.runs.metric_names import LIKELIEST_RETURN
+from lare_rl.runs.metric_names import DETERMINISTIC_RETURN
 from lare_rl.training.compiled import compile_functions
 from lare_rl.training.host_policy import EvaluationPolicy
 from lare_rl.training.saved_state import load_learner
@@ -140,7 +140,7 @@ def test_most_likely_actions_beside_sampled_ones(small, tmp_path, command):
     run = lare_rl.train(
         pick_spec(), small(algorithm="ppo", method="bayes", steps=120), out=tmp_path / "run", listeners=[]
     )
-    has_likeliest = [LIKELIEST_RETURN in line for line in run.metrics()]
+    has_likeliest = [DETERMINISTIC_RETURN in line for line in run.metrics()]
     assert has_likeliest == [False, False, True, True]
     status, out, err = command("evaluate", run.directory, "--episodes", 4)
     lines = out.splitlines()

@@ -91,8 +91,8 @@ def test_outcome_values():
     assert (reached["return_"], reached["steps"]) == (71, 8000)
     assert reached["std"].values["std"] == pytest.approx(np.sqrt(2))
     assert reached["seeds"].values["n_seeds"] == 2
-    assert reached["likeliest"] is None
-    text = render(find(RISING_2, likeliest_return=80.0)["learned"], MESSAGES)
+    assert reached["deterministic"] is None
+    text = render(find(RISING_2, deterministic_return=80.0)["learned"], MESSAGES)
     for words in ("the most likely action gets 80", "71 ± 1.4", "8,000 steps", "2 seeds", "0 ± 1 in 3 episodes"):
         assert words in text
     assert (baseline["return_"], baseline["std"], baseline["n_episodes"]) == (0, 1, 3)
@@ -164,8 +164,8 @@ def test_small_r2_of_a_binary_score_is_no_alarm():
 
 
 def test_next_step_values():
-    more = Finding("more_steps", {"steps": 16_000})
-    assert find(RISING)["is_rising"].values == {"directory": "runs/x", "more": more}
+    command = Finding("resume_longer", {"directory": "runs/x", "steps": 16_000})
+    assert find(RISING)["is_rising"].values == {"command": command}
     unfinished = render(find(RISING, planned_steps=8001)["is_rising"], MESSAGES)
     assert "`lare-rl train --resume runs/x`" in unfinished
     better = find(np.vstack([FLAT - 50, [[0, 0, 38, 0, 1, 0, 1, 0]]]))["one_seed_was_better"]

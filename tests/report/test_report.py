@@ -21,7 +21,7 @@ from lare_rl.envs.interface import Team
 from lare_rl.envs.load import load_task
 from lare_rl.evaluation.rollout import TeamSample
 from lare_rl.evaluation.video import encode_film
-from lare_rl.report import run_details
+from lare_rl.report import live_page, run_details
 from lare_rl.report.html import render_table
 from lare_rl.report.live_page import LivePage
 from lare_rl.report.messages import MESSAGES
@@ -219,6 +219,8 @@ def test_unknown_step_rewards(runs, tmp_path):
 def test_live_page(make_run, monkeypatch):
     opened = []
     monkeypatch.setattr(webbrowser, "open", opened.append)
+    played = []
+    monkeypatch.setattr(live_page, "measure_random_returns", lambda task: played.append(task) or np.zeros((1, 2)))
     run, trained = make_run("a", [1.0], steps=()), make_run("b", [2.0])
     path, page = run.directory / "watch.html", LivePage(run.directory)
     page.on_stop()
@@ -226,10 +228,13 @@ def test_live_page(make_run, monkeypatch):
     page.on_start("a", 0, 100)
     assert opened == [path.resolve().as_uri()]
     assert "Step 0 of 100" in path.read_text()
+    assert played == []  # training begins first
     shutil.copy(trained.directory / "metrics.jsonl", run.directory)
     page.on_evaluation([])
     for text in ('<meta http-equiv="refresh" content="10">', "Step 100 of 100", "<svg", 'class="headline"'):
         assert text in path.read_text()
+    page.on_evaluation([])
+    assert len(played) == 1
     page.on_stop()
     assert "refresh" not in path.read_text()
 

@@ -23,6 +23,7 @@ from lare_rl.evaluation.policy import RunPolicy
 from lare_rl.evaluation.rollout import Rollout, roll_out
 from lare_rl.runs.directory import Run
 from lare_rl.training.streams import Stream, episode_seed
+from lare_rl.util.files import check_new_path
 
 __all__ = ["check_video_path", "encode_film", "record_frames", "record_video", "render_rollout", "write_video"]
 
