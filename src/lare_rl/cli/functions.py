@@ -77,8 +77,11 @@ def new_task(
         print_line(f"    {sentence}")
     if draft.unused_sections:
         print_line(f"  sections of the documentation that were not used: {', '.join(draft.unused_sections)}")
+    where = f" of {', '.join(map(str, paths))}" if draft.teams else ""
     for key in draft.missing_keys:
-        print_line(f"  fill in: {key} ({'the log' if draft.logs_only else 'the environment'} does not document it)")
+        print_line(
+            f"  fill in: {key}{where} ({'the log' if draft.logs_only else 'the environment'} does not document it)"
+        )
     data = f" --data {environment}" if draft.logs_only else ""
     roles = [(team_path, f"phi_{team_path.stem}.py") for team_path in paths[1:]] or [(path, "phi.py")]
     for role_path, function_path in roles:
