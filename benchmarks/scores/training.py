@@ -3,9 +3,9 @@
     PYTHONPATH=benchmarks python -m scores.training KIND --out RUNS
 
 Kinds: `not-a-sum` (the corridor's scores), `binary` (won or lost by chance), `payments` (PP-6 paid every step, every 5 steps, and at
-the end), `exact` (PP-6, rewards that add up exactly), `groups` (CN-6 in levels), `published` (published methods on CN-6 and PP-6).
-Finished runs in RUNS are not trained again, and stopped ones continue. `late` is the mean return of the evaluations after three
-quarters of the steps, and `area` that of all evaluations, which also says how fast a method learns.
+the end), `exact` (PP-6, rewards that add up exactly), `groups` (CN-6 in levels), `published` (published methods in the corridor, on
+CN-6 and on PP-6). Finished runs in RUNS are not trained again, and stopped ones continue. `late` is the mean return of the evaluations
+after three quarters of the steps, and `area` that of all evaluations, which also says how fast a method learns.
 """
 
 from collections.abc import Callable, Iterator
@@ -82,9 +82,11 @@ def groups() -> Iterator[Row]:
 
 
 def published_methods() -> Iterator[Row]:
-    methods = "episodic", "dense", "rd", "rrdu", "lrr", "grd", "tar2", "arel", "stas", "bayes", "lare-rd", "lare-bayes"
+    one_agent = "episodic", "rrdu", "lrr", "grd", "rudder", "rbt", "diaster", "bayes"
+    for score in ("door", "sum"):
+        yield from corridor(score, one_agent, "rrdu")
     for name in ("CN-6", "PP-6"):
-        for method in methods:
+        for method in ("episodic", "rrdu", "lrr", "tar2", "bayes", "lare-bayes"):
             yield particle(name, method, read_task(name), method, method == "rrdu")
 
 

@@ -96,4 +96,6 @@ def test_register_refuses(registered):
         register_method(Method("rd", "mine", "this test"))
     with pytest.raises(LareError, match="no decoder 'nothing'"):
         register_method(Method("new", "mine", "this test", decoder="nothing"))
+    with pytest.raises(LareError, match="whole_episodes"):
+        Decoder("shares", lambda key, shape, settings: None, pays_shares=True)
     register_method(METHODS["rd"])

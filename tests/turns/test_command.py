@@ -54,7 +54,7 @@ def test_command(monkeypatch, capsys, tmp_path, file, rollouts):
     phi.write_text(PHI)
     status, text, _ = run(monkeypatch, capsys, file, "--out", out, "--report", page, "--function", phi)
     assert status == 0
-    assert text.startswith("Lambda ")
+    assert "GRPO: " in text.splitlines()[0]
     credited = [json.loads(line) for line in out.read_text().splitlines()]
     for before, after in zip(rollouts, credited, strict=True):
         credit = after.pop("credit")

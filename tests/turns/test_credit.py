@@ -95,6 +95,18 @@ def test_noise_is_not_trusted():
     assert result.lambda_ > 0.9
 
 
+def test_only_the_guard_turns_to_grpo():
+    table = sample_table(n_groups=3)  # too few
+    guarded, chosen = (lare_rl.TurnCredit(lambda_)(table_rollouts(table)) for lambda_ in (None, 1.0))
+    assert guarded.lambda_ == chosen.lambda_ == 1
+    assert guarded.is_grpo
+    assert "GRPO" in guarded.words[0]
+    assert all(np.ptp(advantage) == 0 for advantage in guarded.advantage)
+    assert not chosen.is_grpo
+    assert "GRPO" not in chosen.words[0]
+    assert max(np.ptp(advantage) for advantage in chosen.advantage) > 0.01
+
+
 @pytest.mark.parametrize(
     ("gain", "surprise", "lambda_", "code"),
     [

@@ -54,6 +54,19 @@ def test_features_of_messages():
     assert third["no tool"] == 1
 
 
+def test_results_without_identifier_follow_the_order_of_calls():
+    calls = [call("read", identifier=1), call("test", identifier=2)]
+    results = [tool("of read", 1), {"role": "tool", "content": "of test"}]
+    (turn,) = split_turns([assistant("", *calls), *results], "it")
+    assert [answered.result for answered in turn.calls] == ["of read", "of test"]
+
+
+@pytest.mark.parametrize("value", [float("nan"), 1e200, "y", None])
+def test_numbers_of_a_phi_are_checked(value):
+    with pytest.raises(LareError, match=r"it, phi: turns\[0\]"):
+        read_rollout({"messages": MESSAGES, "outcome": 1}, "it", lambda turn: {"event": value})
+
+
 def test_turns_of_messages():
     turns = split_turns(MESSAGES, "it")
     assert [len(turn.calls) for turn in turns] == [1, 2, 0]

@@ -10,6 +10,7 @@ from dataclasses import dataclass
 from pkgutil import resolve_name
 from typing import TYPE_CHECKING
 
+from lare_rl.errors import LareError
 from lare_rl.util.plugins import Registry
 
 if TYPE_CHECKING:  # importing JAX takes longer than all else that the command line does before it shows a message
@@ -36,11 +37,17 @@ class Decoder:
     extended_basis: bool = False
     """Whether a closed-form decoder has shapes and pairs of its inputs as features (`basis.py`)."""
     pays_shares: bool = False
-    """Whether its outputs are contributions, and each agent is paid its share of the return at each step (`shares.py`)."""
+    """Whether its outputs are shares of the return, over steps and agents (`shares.py`). It needs `whole_episodes`."""
     predicts_actions: bool = False
     """Whether it learns to predict which action an agent took, which must then be discrete."""
     longest_segment: int | None = None
     """The largest number of steps of a payment that it reads. None means any number."""
+
+    def __post_init__(self) -> None:
+        if self.pays_shares and not self.whole_episodes:
+            raise LareError(
+                f"decoder {self.name}: a decoder that pays shares of an episode's return needs whole_episodes"
+            )
 
     def init_network(self, key: "PRNGKeyArray", shape: "DecoderShape", settings: "CreditSettings") -> "DecoderNetwork":
         """Return an untrained decoder."""

@@ -14,7 +14,7 @@ from lare_rl.turns import trust as trust_rules
 from lare_rl.turns.features import COUNT, HAPPENED, LAST, Prefixes, TurnTable, build_prefixes, tabulate
 from lare_rl.turns.regression import PrefixFit
 from lare_rl.turns.rollouts import Phi, read_rollouts
-from lare_rl.turns.trust import BROADCAST, Errors, Trust
+from lare_rl.turns.trust import UNTRUSTED, Errors, Trust
 from lare_rl.turns.value import advantages, changes, deviations, fit_prefixes, held_out_values, values
 from lare_rl.turns.words import MESSAGES
 from lare_rl.util.findings import Finding, render
@@ -60,13 +60,18 @@ class CreditedTurns:
     value: TurnValues
     """V_t, the expected outcome before the turn."""
     lambda_: float
-    """The lambda that was used: 1 is GRPO's advantage, the outcome minus the mean of the group."""
+    """Lambda of the generalized advantages. If `is_grpo`, it is 1."""
     trust: Trust
     """The gain, its standard error, and the surprise at the end, over the latest calls."""
     effects: tuple[FeatureEffect, ...]
     """Of each feature of a turn."""
     reason: Finding
     """Why this lambda was used."""
+
+    @property
+    def is_grpo(self) -> bool:
+        """Whether the values are not trusted at all, and the advantage is GRPO's: the outcome minus the mean of the group."""
+        return self.reason.code in UNTRUSTED
 
     @property
     def gain(self) -> float:
@@ -89,7 +94,7 @@ class CreditedTurns:
         clear = [effect for effect in self.effects if abs(effect.first) > CLEAR * effect.first_deviation]
         clear.sort(key=lambda effect: -abs(effect.first * effect.frequency))
         return [
-            Finding("lambda", {"lambda_": self.lambda_, "reason": self.reason}),
+            Finding("grpo" if self.is_grpo else "lambda", {"lambda_": self.lambda_, "reason": self.reason}),
             *(Finding("effect", effect._asdict()) for effect in clear[:MAX_SENTENCES]),
         ]
 
@@ -167,7 +172,7 @@ class TurnCredit:
         lambda_, reason = trust_rules.choose_lambda(trust)
         if self.lambda_ is not None:
             lambda_, reason = self.lambda_, Finding("chosen", {"measured": reason})
-        if self.lambda_ is None and lambda_ == BROADCAST:
+        if reason.code in UNTRUSTED:
             advantage = (table.outcome - trust_rules.group_means(table))[table.rollout_index]
         else:
             advantage = advantages(table, progress, lambda_)

@@ -82,8 +82,8 @@ def _read_turn(span: Sequence[tuple[int, Mapping[str, Any]]], where: str) -> Tur
         if answer["role"] == "tool":
             # Without an identifier, results are in the order of the calls.
             key = answer.get("tool_call_id")
-            is_hashable = isinstance(key, str | int)
-            results[key if is_hashable else len(results)] = text, _failed(answer, text)
+            is_identifier = isinstance(key, str | int)
+            results[key if is_identifier else ("position", len(results))] = text, _failed(answer, text)
         else:
             replies.append(text)
     if len(calls) < len(results):

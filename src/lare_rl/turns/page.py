@@ -23,7 +23,7 @@ N_STRIPS = 6
 """The number of rollouts that are drawn."""
 MAX_TURNS = 60
 """The largest number of turns of a strip."""
-MAX_WORDS = 90
+MAX_CHARACTERS = 90
 """Characters of a turn's text, and of its features."""
 SMALL = 0.0005
 """Smaller effects are shown as 0: the evidence has switched the feature off."""
@@ -74,7 +74,7 @@ def write_turn_report(
 
 
 def choose_rollouts(checked: Sequence[Rollout], credit: CreditedTurns) -> list[int]:
-    """Return rollouts to draw: by turns one with the best and one with the worst outcome, those with the clearest turns first."""
+    """Return rollouts to draw: alternately above and below the median outcome, those with the clearest turns first."""
     clarity = [
         float(np.max(np.abs(progress[:-1]) - 2 * deviation[:-1], initial=-np.inf))
         for progress, deviation in zip(credit.progress, credit.deviation, strict=True)
@@ -88,7 +88,7 @@ def choose_rollouts(checked: Sequence[Rollout], credit: CreditedTurns) -> list[i
 
 
 def _render_rollout(k: int, rollout: Mapping[str, Any], checked: Rollout, credit: CreditedTurns) -> list[str]:
-    group = f", group {one_line(checked.group)[:MAX_WORDS]}" if checked.group else ""
+    group = f", group {one_line(checked.group)[:MAX_CHARACTERS]}" if checked.group else ""
     ending = ", cut off" if checked.truncated else ""
     value = credit.value[k]
     rows = []
@@ -123,12 +123,12 @@ def _describe_turn(turn: Turn | None) -> str:
     if turn is None:
         return "-"
     calls = ", ".join(f"{call.tool}({call.arguments})" for call in turn.calls)
-    return one_line(calls or turn.text)[:MAX_WORDS] or "-"
+    return one_line(calls or turn.text)[:MAX_CHARACTERS] or "-"
 
 
 def _describe_features(features: Mapping[str, float]) -> str:
     texts = (name if value == 1 else f"{name} {value:.3g}" for name, value in features.items() if value)
-    return ", ".join(texts)[:MAX_WORDS] or "-"
+    return ", ".join(texts)[:MAX_CHARACTERS] or "-"
 
 
 def _render_effects(credit: CreditedTurns) -> str:

@@ -37,7 +37,7 @@ def turn_request(goal: str, tools: Sequence[Mapping[str, Any]], turns: Sequence[
 
 
 def choose_examples(turns: Sequence[Turn], n_examples: int = N_EXAMPLES) -> list[Turn]:
-    """Return example turns: of each tool in turn the ones with new results, in the order of the attempts."""
+    """Return turns with new results, taking the tools in turn. They keep their order."""
     ranks, counts, results = [], {}, set()
     for index, turn in enumerate(turns):
         tools = tuple(call.tool for call in turn.calls)

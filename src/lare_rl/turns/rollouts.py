@@ -68,7 +68,8 @@ def read_rollout(rollout: Any, where: str, phi: Phi | None = None) -> Rollout:
     truncated = rollout.get("truncated", False)
     if not isinstance(truncated, bool):
         raise LareError(f"{where}: truncated must be true or false, and is {short_repr(truncated)}")
-    numbers = _read_numbers(rollout.get("turns"), where)
+    turn_numbers = rollout.get("turns")
+    numbers = None if turn_numbers is None else _read_numbers(turn_numbers, where)
     messages = rollout.get("messages")
     if messages is None:
         if numbers is None:
@@ -85,7 +86,8 @@ def read_rollout(rollout: Any, where: str, phi: Phi | None = None) -> Rollout:
             )
         features = message_features(turns)
         if phi is not None:
-            features = [{**row, **phi(turn)} for row, turn in zip(features, turns, strict=True)]
+            events = _read_numbers([phi(turn) for turn in turns], f"{where}, phi")
+            features = [{**row, **extra} for row, extra in zip(features, events, strict=True)]
         if numbers is not None:
             features = [{**row, **extra} for row, extra in zip(features, numbers, strict=True)]
     if not features:
@@ -93,9 +95,7 @@ def read_rollout(rollout: Any, where: str, phi: Phi | None = None) -> Rollout:
     return Rollout(tuple(features), outcome, str(group), truncated)
 
 
-def _read_numbers(turns: Any, where: str) -> list[dict[str, float]] | None:
-    if turns is None:
-        return None
+def _read_numbers(turns: Any, where: str) -> list[dict[str, float]]:
     if not isinstance(turns, Sequence) or isinstance(turns, str | bytes):
         raise LareError(f"{where}: turns must be a list with the numbers of each turn, and is {short_repr(turns)}")
     if len(turns) > MAX_TURNS:

@@ -4,15 +4,15 @@ __all__ = ["MESSAGES"]
 
 MESSAGES = {
     "lambda": "Lambda {lambda_:g} was used: {reason}.",
+    "grpo": "The advantage is the outcome minus the mean of its group, as in GRPO: {reason}.",
     "chosen": "it was set by the caller. The measurement says: {measured}",
     "unknown": (
-        "there are {n_rollouts:count rollout} with a spread of outcomes of {outcome_std:.2g}, from which nothing can be said about the "
-        "values; the advantage is the outcome minus the mean of its group, as in GRPO"
+        "there are {n_rollouts:count rollout} whose outcomes have a standard deviation of {outcome_std:.2g}, from which nothing can be said "
+        "about the values"
     ),
     "unclear_gain": (
         "it is not clear that values of prefixes predict outcomes better than the mean of the group does (gain {gain:.1%} ± "
-        "{gain_error:.1%}); the advantage is the outcome minus that mean, as in GRPO. More rollouts help, and features of events: what "
-        "happened in a turn"
+        "{gain_error:.1%}). More rollouts help, and features of events: what happened in a turn"
     ),
     "small_gain": (
         "values of prefixes remove only {gain:.1%} ± {gain_error:.1%} of the squared error of the group's mean. Features of events help: "
