@@ -127,12 +127,10 @@ def test_random_play_is_bounded(monkeypatch):
 
 def test_random_returns_of_each_team():
     """They are those of the same episodes."""
-    task = load_task("CompetitivePP-6")
-    returns = measure_random_returns(task)
-    played = [[episode.return_ for episode in episodes] for episodes in play_random(task)]
-    assert returns.shape == (2, RANDOM_EPISODES)
-    assert returns.tolist() == played
-    assert not np.array_equal(*returns)
+    predators, preys = play_random(load_task("CompetitivePP-6"), 2)
+    for predator, prey in zip(predators, preys, strict=True):
+        assert (predator.reward.shape, prey.reward.shape) == ((25, 6), (25, 2))
+        assert predator.return_ != prey.return_
 
 
 def test_most_likely_actions_beside_sampled_ones(small, tmp_path, command):
