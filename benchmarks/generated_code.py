@@ -24,7 +24,7 @@ import numpy as np
 
 import lare_rl
 from lare_rl.algorithms.td3 import TD3Settings
-from lare_rl.latent.factors import compute_factors
+from lare_rl.latent.factors import compute_batch
 from lare_rl.latent.verify import verify
 from lare_rl.phi.evaluate import evaluate
 from lare_rl.phi.graph import Graph
@@ -221,8 +221,8 @@ def fuzz(budget: int = 3_000) -> None:
             seconds.append(1000 * (time.perf_counter() - start))
             outcomes["accepted" if graph else "refused"] += 1
             if graph is not None:
-                alone = compute_factors(graph, *(array[2:3] for array in steps))[0]
-                same = np.allclose(compute_factors(graph, *steps)[2], alone, rtol=1e-4, atol=1e-4, equal_nan=True)
+                alone = compute_batch(graph, *(array[2:3] for array in steps))[0]
+                same = np.allclose(compute_batch(graph, *steps)[2], alone, rtol=1e-4, atol=1e-4, equal_nan=True)
                 outcomes["accepted, but rows differ"] += not same
         figures[family] = {"programs": len(seconds), **outcomes, "ms to read": quantiles(seconds)}
     figures["audit events while reading"] = dict(events)

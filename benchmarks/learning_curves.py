@@ -21,6 +21,7 @@ import numpy as np
 import lare_rl
 from lare_rl.credit.decoder_settings import CreditSettings
 from lare_rl.report import figures
+from lare_rl.util.statistics import Band
 
 PUBLISHED = {"credit": CreditSettings(normalise=False)}
 
@@ -113,7 +114,7 @@ def mean_and_spread(values: Sequence[Any]) -> list[float]:
     return [float(np.mean(values)), float(np.std(values, ddof=len(values) > 1))]
 
 
-def curve(directory: Path) -> figures.Curve:
+def curve(directory: Path) -> tuple[np.ndarray, np.ndarray]:
     """Steps, and the return of every seed at them."""
     _, lines = read(directory)
     steps, seeds = (sorted({line[key] for line in lines}) for key in ("step", "seed"))
@@ -121,22 +122,27 @@ def curve(directory: Path) -> figures.Curve:
     return np.asarray(steps, float), np.asarray([[returns[seed, step] for step in steps] for seed in seeds], float)
 
 
-def pictured(task: str, label: str) -> figures.Curve | None:
-    """The curves of all kept runs of a method, if there is one."""
+def pictured(task: str, label: str) -> Band | None:
+    """The mean of all kept runs of a method ± the standard deviation over seeds, if there is one."""
     directories = [*(SWEPT / task / f"{label}-td3{ending}" for ending in ("", "-draw0")), RESULTS / task / label]
     entries = [curve(target) for target in directories if target.exists()]
-    return (entries[0][0], np.concatenate([returns for _, returns in entries])) if entries else None
+    if not entries:
+        return None
+    returns = np.concatenate([returns for _, returns in entries])
+    mean, std = returns.mean(axis=0), returns.std(axis=0, ddof=len(returns) > 1)
+    return Band(entries[0][0], mean, mean - std, mean + std)
 
 
 def table() -> None:
     entries = {f"{directory.parent.name}/{directory.name}": row(directory) for directory in sorted(RESULTS.glob("*/*"))}
     (RESULTS.parent / "learning.json").write_text(json.dumps(entries, indent=1) + "\n")
     for task in EXPERIMENTS:
-        curves = {label: curve_pair for label in PICTURED if (curve_pair := pictured(task, label))}
+        curves = {label: band for label in PICTURED if (band := pictured(task, label))}
+        axes = "environment steps", "true return"
         if curves:
             picture = Path(__file__).parents[1] / "docs" / "pictures" / f"{task}.svg"
             picture.parent.mkdir(exist_ok=True)
-            picture.write_text(figures.add_white_background(figures.draw_curves(curves, "true return")) + "\n")
+            picture.write_text(figures.add_white_background(figures.draw_bands(curves, *axes, x_is_steps=True)) + "\n")
     for name, figures_of_run in entries.items():
         cells = [
             f"{key.split('/')[-1]} {value[0]:.3g} ± {value[1]:.2g}"

@@ -203,6 +203,11 @@ def test_new_task_of_two_teams(command, tmp_path):
     assert "rewards" in heading
     assert "reward" in sentence
     assert sorted(path.name for path in tmp_path.iterdir()) == sorted(files)
+    for name in files[1:]:
+        assert f"lare-rl design {name} --model NAME" in out
+    (prompted,) = re.findall(r"lare-rl prompt (\S+)", out)
+    assert command("prompt", prompted)[0] == 0
+    assert "lists their files" in command("prompt", "CompetitivePP-6")[2]
 
 
 def test_new_task_without_documentation(command):

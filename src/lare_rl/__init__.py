@@ -22,8 +22,6 @@ if TYPE_CHECKING:
     from lare_rl.evaluation.evaluate import evaluate_run as evaluate_run
     from lare_rl.evaluation.policy import load_policy as load_policy
     from lare_rl.export.export import export_run as export_run
-    from lare_rl.integrations.pure_credit import CreditSteps as CreditSteps
-    from lare_rl.integrations.pure_credit import pure_credit as pure_credit
     from lare_rl.latent.design import design as design
     from lare_rl.latent.function import LatentFunction as LatentFunction
     from lare_rl.latent.saved import load_function as load_function
@@ -35,6 +33,8 @@ if TYPE_CHECKING:
     from lare_rl.runs.plan import load_config as load_config
     from lare_rl.tasks.payments import PaymentRule as PaymentRule
     from lare_rl.tasks.spec import TaskSpec as TaskSpec
+    from lare_rl.training.pure_credit import CreditSteps as CreditSteps
+    from lare_rl.training.pure_credit import pure_credit as pure_credit
     from lare_rl.training.reflect import reflect as reflect
     from lare_rl.training.stored_episodes import stored_episodes as stored_episodes
     from lare_rl.training.train import resume as resume

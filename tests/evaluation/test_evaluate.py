@@ -12,6 +12,7 @@ from PIL import Image
 import lare_rl
 from helpers.toy_envs import Chase, pick_spec, toy_spec
 from lare_rl.envs.families import make_host_env
+from lare_rl.envs.load import load_task
 from lare_rl.envs.vec_env import LocalVecEnv
 from lare_rl.errors import LareError
 from lare_rl.evaluation import evaluate as module
@@ -26,7 +27,7 @@ from lare_rl.evaluation.evaluate import (
 )
 from lare_rl.evaluation.policy import load_policy
 from lare_rl.evaluation.video import check_video_path, record_video, write_video
-from lare_rl.runs.metric_names import LIKELIEST_RETURN
+from lare_rl.runs.metric_names import DETERMINISTIC_RETURN
 from lare_rl.training.compiled import compile_functions
 from lare_rl.training.host_policy import EvaluationPolicy
 from lare_rl.training.saved_state import load_learner
@@ -112,15 +113,24 @@ def test_gain_over_random():
 
 def test_random_play_is_bounded(monkeypatch):
     """It has a few episodes more than the limit of time allows, unless they take minutes."""
-    assert len(play_random(TASK, limit_s=60.0)) == RANDOM_EPISODES
+    (episodes,) = play_random(TASK, limit_s=60.0)
+    assert len(episodes) == RANDOM_EPISODES
     assert not FilmedChase.open_envs
-    assert len(measure_random_returns(toy_spec(environment="no-such-environment"))) == 0
-    assert len(play_random(TASK, limit_s=-1.0)) == MIN_RANDOM_EPISODES
+    assert measure_random_returns(toy_spec(environment="no-such-environment")).shape == (1, 0)
+    assert len(play_random(TASK, limit_s=-1.0)[0]) == MIN_RANDOM_EPISODES
     numbers = []
     play_random(TASK, 3, on_episode=numbers.append)
     assert numbers == [1, 2, 3]
     monkeypatch.setattr(module, "MAX_RANDOM_PLAY_S", -1.0)
-    assert play_random(TASK) == []
+    assert play_random(TASK) == [[]]
+
+
+def test_random_returns_of_each_team():
+    """They are those of the same episodes."""
+    predators, preys = play_random(load_task("CompetitivePP-6"), 2)
+    for predator, prey in zip(predators, preys, strict=True):
+        assert (predator.reward.shape, prey.reward.shape) == ((25, 6), (25, 2))
+        assert predator.return_ != prey.return_
 
 
 def test_most_likely_actions_beside_sampled_ones(small, tmp_path, command):
@@ -128,7 +138,7 @@ def test_most_likely_actions_beside_sampled_ones(small, tmp_path, command):
     run = lare_rl.train(
         pick_spec(), small(algorithm="ppo", method="bayes", steps=120), out=tmp_path / "run", listeners=[]
     )
-    has_likeliest = [LIKELIEST_RETURN in line for line in run.metrics()]
+    has_likeliest = [DETERMINISTIC_RETURN in line for line in run.metrics()]
     assert has_likeliest == [False, False, True, True]
     status, out, err = command("evaluate", run.directory, "--episodes", 4)
     lines = out.splitlines()
@@ -146,7 +156,7 @@ def test_most_likely_actions_beside_sampled_ones(small, tmp_path, command):
 def test_measures_of_random_play(run, command):
     status, out, err = command("evaluate", run.directory, "--episodes", 4)
     assert (status, err) == (0, "")
-    distances = np.array([episode.measures["distance"] for episode in play_random(TASK)])
+    distances = np.array([episode.measures["distance"] for episode in play_random(TASK)[0]])
     assert f"random actions: distance {format_mean_std(distances)}" in out.splitlines()
     assert distances.std() > 0
 
@@ -226,4 +236,4 @@ def test_policies_and_random_actions_are_evaluated_in_the_evaluation_environment
     evaluations = [line["evaluation/return"] for line in run.metrics()]
     assert max(evaluations) < -500  # a thousand times the training rewards
     assert evaluate_run(run, 2)["Chase"].max() < -500
-    assert max(measure_random_returns(task)) < -500
+    assert measure_random_returns(task).max() < -500

@@ -110,6 +110,9 @@ def test_evaluate_command(runs, command, tmp_path):
     status, out, err = command("evaluate", runs[0].directory, "--episodes", 3, "--video", "film.gif")
     assert (status, err) == (0, "")
     names = [f"CompetitivePP-6-{team}, seed {seed}" for team in ("predator", "prey") for seed in runs[0].seeds]
+    names += [
+        f"CompetitivePP-6-{team}, {line}" for team in ("predator", "prey") for line in ("random actions", "difference")
+    ]
     assert [line.split(": ")[0] for line in out.splitlines()[1:-1]] == names
     assert (tmp_path / "film.gif").read_bytes().startswith(b"GIF8")
 
@@ -131,7 +134,7 @@ def test_report(runs, monkeypatch):
         assert details.count(f"<summary>The latent function of {role.name}</summary>") == 1
     assert details.count('class="strip"') == 2  # true and proxy rewards
     assert details.count("<figcaption>t-SNE") == 4
-    curves = "\n".join(render_learning_curves(run.config.task, [ReportedRun("a", run)], np.zeros(0)))
+    curves = "\n".join(render_learning_curves(run.config.task, [ReportedRun("a", run)], np.zeros((2, 0))))
     titles = re.findall(r"team of (\w+)</", curves)
     assert set(titles) == {"predator", "prey"}
     assert len(titles) == curves.count('class="chart')

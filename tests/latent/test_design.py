@@ -192,7 +192,8 @@ def test_record(chase, tmp_path):
     recording = read_recording(content, "record.json")
     assert tuple(exchange.model_dump() for exchange in recording.exchanges) == function.exchanges
     with pytest.raises(LareError, match="not overwritten"):
-        design(chase, model=ScriptedModel(GOOD), candidates=1, record=path)
+        design(chase, model=CheckingModel(GOOD), candidates=1, record=path)
+    assert len(existed) == 2  # the model was not asked
     assert path.read_text(encoding="utf-8") == content
 
 

@@ -5,7 +5,7 @@ import pytest
 
 from helpers.toy_envs import PHI, phi_source
 from lare_rl.latent import factors as factors_module
-from lare_rl.latent.factors import LatentRewardError, check_finite, compute_factors, find_infinity
+from lare_rl.latent.factors import NonFiniteFactorError, check_finite, compute_batch, find_infinity
 from lare_rl.phi.read import read
 
 
@@ -20,7 +20,7 @@ def test_compute_factors_in_chunks(rows, monkeypatch):
     graph = read(PHI, 2, 1)
     observation, action = random_steps(rows)
     monkeypatch.setattr(factors_module, "_CHUNK_NUMBERS", 10 * graph.size)
-    factors = compute_factors(graph, observation, action)
+    factors = compute_batch(graph, observation, action)
     assert factors.dtype == np.float32
     np.testing.assert_array_equal(
         factors, np.concatenate([-np.square(action - observation[:, 0:1]), -np.square(action)], axis=1)
@@ -34,7 +34,7 @@ def test_compute_factors_in_chunks(rows, monkeypatch):
 def test_check_finite(factors, words):
     observation, action = random_steps(2)
     check_finite(np.ones((2, 2), np.float32), ["a", "b"], observation, action)
-    with pytest.raises(LatentRewardError, match=words) as error:
+    with pytest.raises(NonFiniteFactorError, match=words) as error:
         check_finite(np.array(factors, np.float32), ["a", "b"], observation, action)
     assert error.value.observation is observation
     assert error.value.action is action

@@ -8,7 +8,7 @@ import pytest
 
 from helpers.toy_envs import PHI, phi_source
 from lare_rl.errors import LareError
-from lare_rl.latent.factors import LatentRewardError
+from lare_rl.latent.factors import NonFiniteFactorError
 from lare_rl.latent.function import check_task, features_text, normalise_source, pair_with_roles, verify_function
 from lare_rl.latent.verify import Check
 from lare_rl.phi.limits import RefusedError
@@ -66,7 +66,7 @@ def test_factor_that_is_not_finite_in_use(chase):
     observation, action = np.zeros((5, 2), np.float32), np.ones((5, 1), np.float32)
     observation[4, 0] = -6000
     function = verify_function(phi_source("near = np.sqrt(observation[:, 0:1] + 5000)\nreturn [action, near]"), chase)
-    with pytest.raises(LatentRewardError, match=r"'near' is nan .*-6000") as error:
+    with pytest.raises(NonFiniteFactorError, match=r"'near' is nan .*-6000") as error:
         function(observation, action)
     assert error.value.observation is observation
     assert error.value.action is action

@@ -24,10 +24,10 @@ from helpers.chat_servers import (
     text_response,
 )
 from lare_rl.errors import LareError
-from lare_rl.llm import ladder
+from lare_rl.llm import request_forms
 from lare_rl.llm.budget import Budget, BudgetExceededError, max_request_tokens
-from lare_rl.llm.ladder import Ladder, store_ladder
 from lare_rl.llm.live import LiveModel, ModelError
+from lare_rl.llm.request_forms import RequestForms, store_forms
 
 KEY = "sk-secret-key-0123456789"
 REQUEST = [{"role": "user", "content": "Write some."}]
@@ -39,15 +39,15 @@ def serve(monkeypatch):
     """Start a server with its answers. Return it, a model that asks it, and the list of the model's pauses."""
     monkeypatch.setenv("OPENAI_API_KEY", KEY)
     monkeypatch.delenv("OPENAI_BASE_URL", raising=False)
-    monkeypatch.setattr(ladder, "_VERIFIED", {})
+    monkeypatch.setattr(request_forms, "_VERIFIED", {})
     servers = []
 
-    def serve(*answers, first_rung=None, **settings):
+    def serve(*answers, first_forms=None, **settings):
         servers.append(Server(*answers))
-        if first_rung is None:
+        if first_forms is None:
             pytest.importorskip("openai.resources.responses")  # the client may be older
         else:
-            store_ladder(f"{servers[-1].url}/", "m", first_rung)
+            store_forms(f"{servers[-1].url}/", "m", first_forms)
         pauses = []
         return servers[-1], LiveModel("m", servers[-1].url, sleep=pauses.append, **settings), pauses
 
@@ -59,13 +59,13 @@ def serve(monkeypatch):
 @pytest.fixture
 def start(serve):
     """Start a server that is asked for chat completions."""
-    return partial(serve, first_rung=Ladder().without_responses())
+    return partial(serve, first_forms=RequestForms().without_responses())
 
 
 @pytest.fixture(params=["responses", "chat"])
 def start_either(request, serve):
     """Start a server of either API."""
-    return serve if request.param == "responses" else partial(serve, first_rung=Ladder().without_responses())
+    return serve if request.param == "responses" else partial(serve, first_forms=RequestForms().without_responses())
 
 
 def test_request(start_either):
@@ -232,7 +232,7 @@ def test_server_without_the_responses_api(serve, answer):
     assert server.apis[4:] == ["responses", "completions"]
 
 
-def test_all_rungs(serve):
+def test_all_forms(serve):
     server, model, pauses = serve(*[refuse(400, "this format is not supported")] * 3, reply_with("hello"))
     assert model.reply(REQUEST, 0) == "hello"
     formats = [request.get("response_format", {}).get("type") for request in server.requests]
@@ -276,7 +276,7 @@ def test_error_of_both_apis(serve, status):
 
 
 def test_client_without_the_responses_api(serve, monkeypatch):
-    server, _, _ = serve(reply_with("hello"), first_rung=Ladder())
+    server, _, _ = serve(reply_with("hello"), first_forms=RequestForms())
     connect = LiveModel._connect
     monkeypatch.setattr(LiveModel, "_connect", lambda self: OldClient(connect(self)))
     assert LiveModel("m", server.url).reply(REQUEST, 0) == "hello"
@@ -397,7 +397,7 @@ def test_pauses_count_as_waiting(start_either):
     _, model, pauses = start_either(
         refuse(429, Retry_After="999999999"), budget=Budget(seconds=150.0), on_message=messages.append
     )
-    with pytest.raises(BudgetExceededError, match="2 minutes"):
+    with pytest.raises(BudgetExceededError, match="3 min"):
         model.reply(REQUEST, 0)
     assert pauses == [60.0, 60.0]
     assert "120 s at most" in messages[0]

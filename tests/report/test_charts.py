@@ -13,7 +13,6 @@ from lare_rl.report.charts import (
     draw_bars,
     draw_points,
     draw_strips,
-    format_spread,
     visible_steps,
 )
 
@@ -106,18 +105,3 @@ def test_strips_share_a_scale_if_they_are_comparable():
 def test_points():
     points = np.random.default_rng(0).normal(size=(50, 2))
     check_markup(draw_points(points, points[:, 0], "points"))
-
-
-@pytest.mark.parametrize(
-    ("values", "text"),
-    [
-        ([], ""),
-        ([0.5], "0.5"),
-        ([1234.5, 1234.5], "1,234"),
-        ([1000.0, 2000.0], "1,500 ± 707"),
-        ([0.9, 0.92], "0.910 ± 0.014"),
-        ([1.0, 1.0 + 1e-8], "1 ± 7e-09"),
-    ],
-)
-def test_format_spread(values, text):
-    assert format_spread(np.array(values)) == text

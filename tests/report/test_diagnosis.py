@@ -56,6 +56,7 @@ def find(returns, **facts):
         (FLAT - 1000, {"n_saturated": 1}, "worse_than_random is_stuck single_seed"),
         (FLAT_2, {"return_r2": -0.93, "median_r2": 0.98}, "not_learned decoder_is_outdated needs_training"),
         (np.vstack([FLAT - 50, [[0, 0, 38, 0, 1, 0, 1, 0]]]), {}, "not_learned one_seed_was_better"),
+        (np.array([[0, 0, 0, 0, np.nan, 0, 0, 0], np.zeros(8)]), {}, "not_learned needs_training"),
         (np.full((1, 8), np.nan), {}, "no_return"),
         (RISING, {"untrained": "all steps are random"}, "untrained"),
         (np.zeros((2, 8)), {"random_returns": np.zeros(10)}, "equal_returns"),
@@ -90,8 +91,8 @@ def test_outcome_values():
     assert (reached["return_"], reached["steps"]) == (71, 8000)
     assert reached["std"].values["std"] == pytest.approx(np.sqrt(2))
     assert reached["seeds"].values["n_seeds"] == 2
-    assert reached["likeliest"] is None
-    text = render(find(RISING_2, likeliest_return=80.0)["learned"], MESSAGES)
+    assert reached["deterministic"] is None
+    text = render(find(RISING_2, deterministic_return=80.0)["learned"], MESSAGES)
     for words in ("the most likely action gets 80", "71 ± 1.4", "8,000 steps", "2 seeds", "0 ± 1 in 3 episodes"):
         assert words in text
     assert (baseline["return_"], baseline["std"], baseline["n_episodes"]) == (0, 1, 3)
@@ -163,7 +164,10 @@ def test_small_r2_of_a_binary_score_is_no_alarm():
 
 
 def test_next_step_values():
-    assert find(RISING)["is_rising"].values == {"directory": "runs/x", "steps": 16_000}
+    command = Finding("resume_longer", {"directory": "runs/x", "steps": 16_000})
+    assert find(RISING)["is_rising"].values == {"command": command}
+    unfinished = render(find(RISING, planned_steps=8001)["is_rising"], MESSAGES)
+    assert "`lare-rl train --resume runs/x`" in unfinished
     better = find(np.vstack([FLAT - 50, [[0, 0, 38, 0, 1, 0, 1, 0]]]))["one_seed_was_better"]
     assert better.values == {"step": 3000, "return_": 38, "directory": "runs/x"}
     assert find(FLAT - 1000, n_saturated=1)["is_stuck"].values["cause"].values == {"seeds": None}

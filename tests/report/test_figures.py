@@ -8,7 +8,6 @@ from lare_rl.report.figures import (
     add_white_background,
     draw_band_panels,
     draw_bands,
-    draw_curves,
 )
 from lare_rl.util.statistics import Band
 
@@ -30,7 +29,7 @@ def test_long_legend_makes_figure_higher():
 
 def test_white_background():
     """The rest of the drawing stays the same."""
-    svg = draw_curves({"a": (X, np.zeros((1, 3)))}, "return")
+    svg = draw_bands({"a": Band(X, X, X, X)}, "environment steps", "return", x_is_steps=True)
     root, background, *rest = ElementTree.fromstring(add_white_background(svg)).iter()
     assert (background.tag.rpartition("}")[2], background.attrib["fill"]) == ("rect", "#ffffff")
     elements = [(element.tag, element.attrib) for element in (root, *rest)]

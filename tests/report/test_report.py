@@ -14,12 +14,20 @@ import lare_rl
 from helpers.markup import check_markup
 from helpers.toy_envs import Chase, toy_spec
 from helpers.training_runs import QUICK_CREDIT
+from helpers.untrained_runs import write_run
+from lare_rl.config.resolve import resolve
+from lare_rl.config.settings import Settings
+from lare_rl.envs.interface import Team
+from lare_rl.envs.load import load_task
+from lare_rl.evaluation.rollout import TeamSample
 from lare_rl.evaluation.video import encode_film
+from lare_rl.report import live_page, run_details
 from lare_rl.report.html import render_table
 from lare_rl.report.live_page import LivePage
 from lare_rl.report.messages import MESSAGES
-from lare_rl.report.overview import compare_runs, sort_runs, summarise_runs
+from lare_rl.report.overview import compare_runs, render_learning_curves, sort_runs, summarise_runs
 from lare_rl.report.run_summary import ReportedRun
+from lare_rl.runs.directory import open_without_functions
 
 CHROMIUM = next(
     (path for name in ("chromium", "chromium-browser", "google-chrome") if (path := shutil.which(name))), None
@@ -138,7 +146,7 @@ def test_summary_of_runs(make_run):
         ReportedRun(method, make_run(method, [value, value + 1], method=method))
         for method, value in [("rd", 9.0), ("episodic", 1.0)]
     )
-    summaries = summarise_runs([first, second], np.zeros(0))
+    summaries = summarise_runs([first, second], np.zeros((1, 0)))
     assert [summary.episodic_return for summary in summaries] == [1.5, None]
     assert first.training_seconds() is None
     for line in first.metrics:
@@ -146,10 +154,42 @@ def test_summary_of_runs(make_run):
     assert first.training_seconds() == pytest.approx(50 / 5 + 50 / 10)
 
 
+def test_each_team_is_compared_with_its_own_random_returns(tmp_path):
+    task = load_task("CompetitivePP-6")
+    settings = resolve(Settings(method="dense"), task)
+    metrics = [{"step": 1, "seed": 0, "evaluation/return_predator": 1.0, "evaluation/return_prey": 1.0}]
+    write_run(tmp_path / "run", task, settings, metrics)
+    reported = ReportedRun("a", open_without_functions(tmp_path / "run"))
+    charts = [
+        "".join(render_learning_curves(task, [reported], np.array(returns))).split('class="chart')[1:]
+        for returns in ([[0.0, 0.0], [0.0, 0.0]], [[0.0, 0.0], [-9.0, -9.0]])
+    ]
+    assert [first == second for first, second in zip(*charts, strict=True)] == [True, False]
+
+
+def test_default_settings_are_not_listed(make_run, tmp_path):
+    page = page_of(make_run("a", [1.0], method="bayes"), tmp_path)
+    differing = page[page.index("differ from the defaults") :].partition("</table>")[0]
+    assert "method" in differing
+    assert "credit." not in differing
+
+
+@pytest.mark.parametrize(("n_rows", "n_factors", "n_pictures"), [(40, 2, 2), (40, 1, 1), (30, 2, 0)])
+def test_tsne_needs_two_columns_and_some_rows(n_rows, n_factors, n_pictures):
+    rng = np.random.default_rng(0)
+    sample = TeamSample(
+        team=Team("", 0, 1),
+        next_observation=rng.random((n_rows, 3), np.float32),
+        factors=rng.random((n_rows, n_factors), np.float32),
+        reward=rng.random(n_rows, np.float32),
+    )
+    assert "".join(run_details._render_tsne(sample)).count("<figcaption>t-SNE") == n_pictures
+
+
 def test_report_errors(make_run, tmp_path):
     for sources, out, words in (
         ([], "report.html", "No runs"),
-        ([make_run("a", [1.0])], "no/report.html", "no folder"),
+        ([make_run("a", [1.0])], "no/report.html", "no directory"),
     ):
         with pytest.raises(lare_rl.LareError, match=words):
             lare_rl.write_report(sources, tmp_path / out)
@@ -179,6 +219,8 @@ def test_unknown_step_rewards(runs, tmp_path):
 def test_live_page(make_run, monkeypatch):
     opened = []
     monkeypatch.setattr(webbrowser, "open", opened.append)
+    played = []
+    monkeypatch.setattr(live_page, "measure_random_returns", lambda task: played.append(task) or np.zeros((1, 2)))
     run, trained = make_run("a", [1.0], steps=()), make_run("b", [2.0])
     path, page = run.directory / "watch.html", LivePage(run.directory)
     page.on_stop()
@@ -186,10 +228,13 @@ def test_live_page(make_run, monkeypatch):
     page.on_start("a", 0, 100)
     assert opened == [path.resolve().as_uri()]
     assert "Step 0 of 100" in path.read_text()
+    assert played == []  # training begins first
     shutil.copy(trained.directory / "metrics.jsonl", run.directory)
     page.on_evaluation([])
     for text in ('<meta http-equiv="refresh" content="10">', "Step 100 of 100", "<svg", 'class="headline"'):
         assert text in path.read_text()
+    page.on_evaluation([])
+    assert len(played) == 1
     page.on_stop()
     assert "refresh" not in path.read_text()
 

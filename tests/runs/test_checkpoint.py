@@ -107,7 +107,7 @@ def test_truncated_file_is_refused(name, n_bytes, tmp_path):
     (directory / name).write_bytes((directory / name).read_bytes()[:n_bytes])
     with pytest.raises(LareError, match=r"state\.npz cannot be read"):
         checkpoint.load(directory, template(1, 1, CAPACITY))
-    host = checkpoint.read_host_state(directory)
+    host = checkpoint.read_metadata(directory)
     assert (host is None) if name == "state.npz" else (host == {"step": 3})
 
 

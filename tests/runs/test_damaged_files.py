@@ -175,7 +175,7 @@ def segments(**values) -> np.ndarray:
     ("changes", "message"),
     [
         ({"host": np.array(DEEP)}, TOO_DEEP),
-        ({"host": np.array("[]")}, "host is no object"),
+        ({"host": np.array("[]")}, "metadata is no object"),
         ({"host": np.zeros(3)}, "line 1 column 3"),
         ({"host": host(step="3")}, "'3' is not a count"),
         ({"host": host(step=-1)}, "-1 is not a count"),
@@ -219,7 +219,7 @@ def test_state_zip_bomb(directory):
     with zipfile.ZipFile(directory / "state.npz", "a", zipfile.ZIP_DEFLATED) as archive:
         archive.writestr("latest/more.npy", header((1 << 24,)) + b"\0" * (8 << 24))
     check_refused(directory, "latest/more.npy is packed")
-    assert checkpoint.read_host_state(directory) is None
+    assert checkpoint.read_metadata(directory) is None
 
 
 @pytest.mark.parametrize("content", [b"", b"PK", b"\x93NUMPY\x01\x00" + b"\xff" * 99, header((3,)), b"\x80\x04."])

@@ -29,7 +29,7 @@ from helpers.training_runs import (
 from lare_rl.credit.methods import METHODS
 from lare_rl.errors import LareError
 from lare_rl.latent.function import verify_function
-from lare_rl.runs.checkpoint import read_host_state
+from lare_rl.runs.checkpoint import read_metadata
 from lare_rl.runs.directory import open_run
 from lare_rl.training import loop
 from lare_rl.training.loop import RunInterruptedError
@@ -72,7 +72,7 @@ def test_checkpoint_by_time(dense, dense_run, tmp_path, monkeypatch):
     with pytest.raises(ZeroDivisionError):
         train_quietly(CHASE, dense(), tmp_path / "run", listeners=[AtStep(108, lambda: 1 / 0)])
     assert [line["step"] for line in open_run(tmp_path / "run").metrics()] == [60, 60]
-    assert read_host_state(tmp_path / "run" / "checkpoint")["step"] == 96
+    assert read_metadata(tmp_path / "run" / "checkpoint")["step"] == 96
     assert_equal_runs(resume_quietly(tmp_path / "run"), dense_run)
 
 

@@ -22,7 +22,7 @@ from lare_rl.credit.methods import METHODS
 from lare_rl.envs.env_errors import EnvOutputError
 from lare_rl.errors import LareError
 from lare_rl.latent.function import verify_function
-from lare_rl.runs.checkpoint import read_host_state
+from lare_rl.runs.checkpoint import read_metadata
 from lare_rl.runs.directory import open_run
 from lare_rl.runs.metric_names import ACTOR_SATURATION
 from lare_rl.training import train as training
@@ -184,7 +184,7 @@ def test_diverged_loss_is_not_saved(dense, tmp_path, monkeypatch):
     with pytest.raises(DivergedError, match="critic/loss of seed 1 is not finite at step 84"):
         train_and_stop(CHASE, dense(), tmp_path / "run", 84)
     run = open_run(tmp_path / "run")
-    assert read_host_state(run.checkpoint)["step"] == run.metrics()[-1]["step"] < 84
+    assert read_metadata(run.checkpoint)["step"] == run.metrics()[-1]["step"] < 84
 
 
 @pytest.mark.parametrize("error", [MemoryError(), jax.errors.JaxRuntimeError("RESOURCE_EXHAUSTED: Out of memory")])

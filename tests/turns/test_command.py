@@ -93,7 +93,7 @@ def test_missing_files(monkeypatch, capsys, tmp_path, file):
     status, _, error = run(monkeypatch, capsys, tmp_path / "none.jsonl", "--out", tmp_path / "out.jsonl")
     assert (status, error.count("\n")) == (2, 1)
     status, _, error = run(monkeypatch, capsys, file, "--out", tmp_path / "none" / "out.jsonl")
-    assert (status, "no folder" in error) == (2, True)
+    assert (status, "no directory" in error) == (2, True)
 
 
 def test_turn_phi_prints_the_request(monkeypatch, capsys, tmp_path, file):
@@ -121,6 +121,10 @@ def test_turn_phi_asks_a_model(monkeypatch, capsys, tmp_path, file):
     assert status == 0
     assert out.read_text().endswith(PHI)
     assert json.loads(out.with_suffix(".json").read_text())["kind"] == "events"
+    status, _, error = run(monkeypatch, capsys, file, *options, command="turn-phi")
+    assert (status, "not overwritten" in error) == (2, True)
+    status, _, error = run(monkeypatch, capsys, file, *options[:-1], tmp_path / "none" / "a.py", command="turn-phi")
+    assert (status, "no directory" in error) == (2, True)
     status, _, error = run(monkeypatch, capsys, file, "--out", tmp_path / "c.jsonl", "--function", out)
     assert (status, error) == (0, "")
     status, _, error = run(monkeypatch, capsys, file, *options, command="turn-phi")

@@ -5,64 +5,32 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
-from pydantic import Field
 
 from lare_rl.cli.terminal import (
+    DEFAULT_LIVE,
     Data,
-    Kind,
+    FunctionKind,
+    LiveOptions,
     Task,
     find_free_path,
+    load_policy,
     load_steps,
     print_error,
     print_line,
     print_progress,
 )
-from lare_rl.errors import CheckedModel, LareError
+from lare_rl.errors import LareError
+from lare_rl.util.files import check_new_path
 
 if TYPE_CHECKING:
-    from lare_rl.envs.play import Policy
     from lare_rl.latent.design import DesignError
     from lare_rl.latent.function import LatentFunction
-    from lare_rl.llm.live import LiveModel
     from lare_rl.tasks.spec import TaskSpec
-
-
-_Count = Annotated[int, Field(ge=1)]
-_NonNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
-
-
-class LiveOptions(CheckedModel):
-    """Options that are for a live model only."""
-
-    base_url: str | None = None
-    """the endpoint; the default is OPENAI_BASE_URL, or else OpenAI's. Ollama's is http://localhost:11434/v1."""
-    budget: _Count = 400_000
-    """largest number of tokens, in and out together; a request that might exceed it is not sent."""
-    requests: _Count = 60
-    """largest number of requests."""
-    minutes: Annotated[float, Field(gt=0, allow_inf_nan=False)] = 15.0
-    """longest time to wait for the model, over all requests and retries. One reply may take an eighth of it, and at least 120 s:
-    raise it for a slow model of your own."""
-    price: Annotated[tuple[_NonNegative, _NonNegative] | None, tyro.conf.arg(metavar="IN OUT")] = None
-    """of a million tokens in and of a million out; the cost is then reported."""
-    temperature: _NonNegative | None = None
-    """sampling temperature of the model; the default is the server's."""
-
-    def open(self, name: str) -> "LiveModel":
-        """Return the model of this name."""
-        from lare_rl.llm.budget import Budget
-        from lare_rl.llm.live import LiveModel
-
-        budget = Budget(requests=self.requests, tokens=self.budget, seconds=60 * self.minutes)
-        return LiveModel(name, self.base_url, self.temperature, budget, on_message=print_progress)
-
-
-DEFAULT_LIVE = LiveOptions()
 
 
 def design(
     task: Task,
-    kind: Kind = "factors",
+    kind: FunctionKind = "factors",
     model: str | None = None,
     live: Annotated[LiveOptions, tyro.conf.arg(name="")] = DEFAULT_LIVE,
     draw: int = 0,
@@ -134,7 +102,7 @@ def design(
         print_line(_next_command(task, spec, out.with_suffix(".py"), kind, data))
 
 
-def _next_command(task: str, spec: "TaskSpec", out: Path, kind: Kind, data: str | None) -> str:
+def _next_command(task: str, spec: "TaskSpec", out: Path, kind: FunctionKind, data: str | None) -> str:
     """Return what to do with a new function."""
     if spec.team is not None:
         return f"to train with it: lare-rl train TASK --function {out}, with a --function for each team of TASK"
@@ -142,19 +110,6 @@ def _next_command(task: str, spec: "TaskSpec", out: Path, kind: Kind, data: str 
         return f"to use it: lare-rl relabel {data} --task {task} --function {out} --out NEW"
     method = " --method llm-reward" if kind == "reward" else ""
     return f"to train with it: lare-rl train {task} --function {out}{method}"
-
-
-def load_policy(run: Path | None, spec: "TaskSpec") -> "Policy | None":
-    """Load the policy of a run that is to play a task."""
-    if run is None:
-        return None
-    from lare_rl.evaluation.policy import RunPolicy
-    from lare_rl.runs.directory import open_run
-
-    opened = open_run(run)
-    if opened.config.task.environment != spec.environment:
-        raise LareError(f"{run} is a run of {opened.config.task.name}: its policy cannot play {spec.name}")
-    return RunPolicy(opened, 0, best=False).select_env_action
 
 
 def _check_options(
@@ -176,25 +131,16 @@ def _check_options(
 
 def _check_files(out: Path | None, record: Path | None) -> None:
     """Raise `LareError` if a file could not be written, before a model is asked and paid."""
-    options = [] if record is None else [(record, "--record")]
-    try:
-        if out is not None:
-            if out.is_dir():
-                raise LareError(f"{out} is not the name of a file; choose another --out")
-            options += [(out.with_suffix(suffix), "--out") for suffix in (".py", ".json")]
-        for path, option in options:
-            if path.is_dir():
-                raise LareError(f"{path} is not the name of a file; choose another {option}")
-            if path.exists():
-                raise LareError(f"{path} exists, and is not overwritten; choose another {option}")
-            if not path.parent.is_dir():
-                raise LareError(
-                    f"{path} cannot be written: there is no directory {path.parent}; choose another {option}"
-                )
-        if record is not None and record.resolve() in [path.resolve() for path, option in options if option == "--out"]:
+    files = []
+    if out is not None:
+        check_new_path(out, "--out", overwrite=True)  # a directory has no suffix to replace
+        files = [out.with_suffix(suffix) for suffix in (".py", ".json")]
+    for path in files:
+        check_new_path(path, "--out")
+    if record is not None:
+        check_new_path(record, "--record")
+        if record.resolve() in [path.resolve() for path in files]:
             raise LareError(f"--out writes {record} too: choose another --record")
-    except OSError as error:
-        raise LareError(f"{error.filename} cannot be written: {error.strerror}") from error
 
 
 def _save_attempts(error: "DesignError", other: Path) -> None:

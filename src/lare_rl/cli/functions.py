@@ -12,8 +12,9 @@ from tyro.conf import Positional
 from lare_rl.cli.terminal import (
     Data,
     EpisodeProgress,
-    Kind,
+    FunctionKind,
     Task,
+    load_policy,
     load_steps,
     print_line,
     print_progress,
@@ -32,7 +33,7 @@ if TYPE_CHECKING:
     from lare_rl.tasks.spec import TaskSpec
 
 
-def prompt(task: Task, kind: Kind = "factors") -> None:
+def prompt(task: Task, kind: FunctionKind = "factors") -> None:
     """Print the request that a language model gets for a task.
 
     Args:
@@ -76,13 +77,18 @@ def new_task(
         print_line(f"    {sentence}")
     if draft.unused_sections:
         print_line(f"  sections of the documentation that were not used: {', '.join(draft.unused_sections)}")
+    where = f" of {', '.join(map(str, paths))}" if draft.teams else ""
     for key in draft.missing_keys:
-        print_line(f"  fill in: {key} ({'the log' if draft.logs_only else 'the environment'} does not document it)")
+        print_line(
+            f"  fill in: {key}{where} ({'the log' if draft.logs_only else 'the environment'} does not document it)"
+        )
     data = f" --data {environment}" if draft.logs_only else ""
-    print_line(f"read it, then: lare-rl design {path}{data} --model NAME --out phi.py")
+    roles = [(team_path, f"phi_{team_path.stem}.py") for team_path in paths[1:]] or [(path, "phi.py")]
+    for role_path, function_path in roles:
+        print_line(f"read it, then: lare-rl design {role_path}{data} --model NAME --out {function_path}")
     without_function = "lare-rl relabel without --function" if draft.logs_only else "--method bayes"
     print_line(
-        f"or, without a model: paste the output of lare-rl prompt {path} into a chat, or write phi.py yourself, with a function "
+        f"or, without a model: paste the output of lare-rl prompt {roles[0][0]} into a chat, or write phi.py yourself, with a function "
         f"evaluation_func(observation, action) (docs/how-to/write-phi.md); {without_function} needs no phi.py"
     )
 
@@ -109,7 +115,7 @@ def _draft(source: str) -> "Draft":
 def verify(
     file: Annotated[Positional[Path], tyro.conf.arg(metavar="FILE")],
     task: Annotated[str, tyro.conf.arg(metavar="TASK")],
-    kind: Kind = "factors",
+    kind: FunctionKind = "factors",
     data: Data = None,
     fit: int = 0,
     policy: Annotated[Path | None, tyro.conf.arg(metavar="RUN")] = None,
@@ -135,7 +141,6 @@ def verify(
     from lare_rl.envs.load import load_task, read_task
 
     read_task(task)  # a typo is reported before the slow imports
-    from lare_rl.cli.design import load_policy
     from lare_rl.credit.explanation_text import MIN_EXPLAINED_EPISODES
     from lare_rl.latent.function import function_from_verdict
     from lare_rl.latent.saved import read_source

@@ -66,9 +66,7 @@ def evaluate(
     samples = not (deterministic or ALGORITHMS[settings.algorithm].greedy(env_spec.discrete))
     likeliest = evaluate_policy(opened, episodes, best, True, EpisodeProgress(episodes)) if samples else None
     best_steps = load_actor(opened, best=True)[2].tolist() if best else None
-    random_episodes = []
-    if len(task.roles) == 1:
-        random_episodes = play_random(task, n_random, max(policy_s, RANDOM_PLAY_LIMIT_S), EpisodeProgress(n_random))
+    random_episodes = play_random(task, n_random, max(policy_s, RANDOM_PLAY_LIMIT_S), EpisodeProgress(n_random))
     for line in _describe_evaluation(opened, evaluation, random_episodes, best_steps):
         print_line(line)
     if likeliest is not None:
@@ -106,7 +104,10 @@ def _describe_returns(run: "Run", evaluation: "Evaluation", best_steps: "Sequenc
 
 
 def _describe_evaluation(
-    run: "Run", evaluation: "Evaluation", random_episodes: "Sequence[Episode]", best_steps: "Sequence[int] | None"
+    run: "Run",
+    evaluation: "Evaluation",
+    random_episodes: "Sequence[Sequence[Episode]]",
+    best_steps: "Sequence[int] | None",
 ) -> Iterator[str]:
     """Yield the returns and measures of each seed, and of random actions. `best_steps` are the steps of the best policies."""
     import numpy as np
@@ -116,16 +117,20 @@ def _describe_evaluation(
     from lare_rl.util.statistics import format_mean_std, format_plus_minus
 
     yield from _describe_returns(run, evaluation, best_steps)
-    if random_episodes:
-        returns = np.array([episode.return_ for episode in random_episodes])
-        yield f"random actions: return {format_mean_std(returns)} over {format_value(len(returns), 'count episode')}"
-        if (gain := gain_over_random(evaluation.returns[:, :, 0], returns)) is not None:
-            yield f"difference: {format_plus_minus(*gain)} (± is its standard error)"
+    roles = run.config.task.roles
+    for team_index, (role, episodes) in enumerate(zip(roles, random_episodes, strict=True)):
+        if not episodes:
+            continue
+        team = f"{role.name}, " if len(roles) > 1 else ""
+        returns = np.array([episode.return_ for episode in episodes])
+        yield f"{team}random actions: return {format_mean_std(returns)} over {format_value(len(returns), 'count episode')}"
+        if (gain := gain_over_random(evaluation.returns[:, :, team_index], returns)) is not None:
+            yield f"{team}difference: {format_plus_minus(*gain)} (± is its standard error)"
     for name, seed_values in evaluation.measures.items():
         for seed, values in zip(run.seeds, seed_values, strict=True):
             yield f"seed {seed}: {name} {format_mean_std(values)}"
-        if random_episodes:
-            values = np.array([episode.measures[name] for episode in random_episodes])
+        if random_episodes[0]:
+            values = np.array([episode.measures[name] for episode in random_episodes[0]])
             yield f"random actions: {name} {format_mean_std(values)}"
 
 

@@ -7,14 +7,18 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
+from pydantic import Field
 from tyro.conf import Positional
 
-from lare_rl.errors import LareError
+from lare_rl.errors import CheckedModel, LareError
 from lare_rl.util.durations import format_seconds
+from lare_rl.util.files import check_new_path
 from lare_rl.util.sanitize import one_line, sanitize
 
 if TYPE_CHECKING:
+    from lare_rl.envs.play import Policy
     from lare_rl.latent.verify import Steps
+    from lare_rl.llm.live import LiveModel
     from lare_rl.tasks.spec import TaskSpec
 
 Task = Annotated[Positional[str], tyro.conf.arg(metavar="TASK")]
@@ -22,13 +26,46 @@ RunDirectory = Annotated[Positional[Path], tyro.conf.arg(metavar="RUN")]
 RunDirectories = Annotated[
     Positional[tuple[Path, ...]], tyro.conf.arg(metavar="RUN", help_behavior_hint="(one or more)")
 ]
-Kind = Literal["factors", "reward"]
+FunctionKind = Literal["factors", "reward"]
 Data = Annotated[str | None, tyro.conf.arg(metavar="DATASET")]
 
 FIRST_PROGRESS_S, PROGRESS_S = 5.0, 20.0
 """Seconds before the first line of progress, and between two lines."""
 _TABLE_WIDTH = 200
 """Characters in a line of a table, where the output is not a terminal."""
+
+
+_Count = Annotated[int, Field(ge=1)]
+_NonNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
+
+
+class LiveOptions(CheckedModel):
+    """Options that are for a live model only."""
+
+    base_url: str | None = None
+    """the endpoint; the default is OPENAI_BASE_URL, or else OpenAI's. Ollama's is http://localhost:11434/v1."""
+    budget: _Count = 400_000
+    """largest number of tokens, in and out together; a request that might exceed it is not sent."""
+    requests: _Count = 60
+    """largest number of requests."""
+    minutes: Annotated[float, Field(gt=0, allow_inf_nan=False)] = 15.0
+    """longest time to wait for the model, over all requests and retries. One reply may take an eighth of it, and at least 120 s:
+    raise it for a slow model of your own."""
+    price: Annotated[tuple[_NonNegative, _NonNegative] | None, tyro.conf.arg(metavar="IN OUT")] = None
+    """of a million tokens in and of a million out; the cost is then reported."""
+    temperature: _NonNegative | None = None
+    """sampling temperature of the model; the default is the server's."""
+
+    def open(self, name: str) -> "LiveModel":
+        """Return the model of this name."""
+        from lare_rl.llm.budget import Budget
+        from lare_rl.llm.live import LiveModel
+
+        budget = Budget(requests=self.requests, tokens=self.budget, seconds=60 * self.minutes)
+        return LiveModel(name, self.base_url, self.temperature, budget, on_message=print_progress)
+
+
+DEFAULT_LIVE = LiveOptions()
 
 
 def print_line(text: str) -> None:
@@ -83,6 +120,19 @@ def load_steps(data: str | None, task: "TaskSpec") -> "Steps | None":
     return logged_steps(data, task)
 
 
+def load_policy(run: Path | None, spec: "TaskSpec") -> "Policy | None":
+    """Load the policy of a run that is to play a task."""
+    if run is None:
+        return None
+    from lare_rl.evaluation.policy import RunPolicy
+    from lare_rl.runs.directory import open_run
+
+    opened = open_run(run)
+    if opened.config.task.environment != spec.environment:
+        raise LareError(f"{run} is a run of {opened.config.task.name}: its policy cannot play {spec.name}")
+    return RunPolicy(opened, 0, best=False).select_env_action
+
+
 def find_free_path(path: Path) -> Path:
     """Return the path, or if it exists, the first free one with a number appended."""
     number, free = 1, path
@@ -94,10 +144,9 @@ def find_free_path(path: Path) -> Path:
 
 def write_new_file(path: Path, text: str, option: str) -> None:
     """Write a file that must not exist. `option` is the command-line option that names it."""
+    check_new_path(path, option)
     try:
         with path.open("x", encoding="utf-8") as file:
             file.write(text)
-    except FileExistsError:
-        raise LareError(f"{path} exists, and is not overwritten; choose another {option}") from None
     except OSError as error:
         raise LareError(f"{path} cannot be written: {error.strerror}") from error

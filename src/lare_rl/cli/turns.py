@@ -6,8 +6,8 @@ from typing import Annotated
 import tyro
 from tyro.conf import Positional
 
-from lare_rl.cli.design import DEFAULT_LIVE, LiveOptions
-from lare_rl.cli.terminal import print_line, print_progress, write_new_file
+from lare_rl.cli.terminal import DEFAULT_LIVE, LiveOptions, print_line, print_progress, write_new_file
+from lare_rl.util.files import check_new_path
 from lare_rl.util.sanitize import one_line
 
 
@@ -35,17 +35,14 @@ def turn_credit(
         logistic: model the log odds of outcomes between 0 and 1.
         overwrite: replace --out and --report if they exist.
     """
-    from lare_rl.errors import LareError
     from lare_rl.turns.credit import TurnCredit
     from lare_rl.turns.features import tabulate
     from lare_rl.turns.files import read_rollout_file, write_credit_file
     from lare_rl.turns.rollouts import read_rollouts
 
-    for path in (out, report):
-        if path is not None and path.exists() and not overwrite:
-            raise LareError(f"{path} exists: choose another path, or replace it with --overwrite")
-        if path is not None and not path.parent.is_dir():
-            raise LareError(f"{path} cannot be written: there is no folder {path.parent}")
+    for path, option in ((out, "--out"), (report, "--report")):
+        if path is not None:
+            check_new_path(path, option, overwrite)
     phi = None
     if function is not None:
         from lare_rl.turns.phi import load_turn_phi
@@ -88,8 +85,6 @@ def turn_phi(
         out: a .py file to write, with the model's replies in a .json beside it; they must not exist. The default is to print the function.
     """
     from lare_rl.errors import LareError
-    from lare_rl.llm.budget import Budget
-    from lare_rl.llm.live import LiveModel
     from lare_rl.turns.design import design_turn_phi
     from lare_rl.turns.files import read_rollout_file, read_tool_file
     from lare_rl.turns.messages import split_turns
@@ -106,14 +101,13 @@ def turn_phi(
         return
     record = None if out is None else out.with_suffix(".json")
     for path in (out, record):
-        if path is not None and (path.exists() or not path.parent.is_dir()):
-            raise LareError(f"{path} exists, or its folder does not: choose another --out")
-    budget = Budget(requests=live.requests, tokens=live.budget, seconds=60 * live.minutes)
-    live_model = LiveModel(model, live.base_url, live.temperature, budget, on_message=print_progress)
+        if path is not None:
+            check_new_path(path, "--out")
+    live_model = live.open(model)
     try:
         designed = design_turn_phi(goal, descriptions, turns, live_model, record=record)
     finally:
-        print_progress(f"{live_model.name}: {budget.summary(live.price)}")
+        print_progress(f"{live_model.name}: {live_model.budget.summary(live.price)}")
     if out is None:
         print_line(designed.phi.source)
         return

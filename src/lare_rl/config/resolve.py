@@ -15,7 +15,7 @@ from lare_rl.envs.placement import SLOW_STEP_S, measure_step_s
 from lare_rl.errors import LareError
 from lare_rl.tasks.spec import TaskSpec
 
-__all__ = ["apply_defaults", "choose_algorithm", "replay_rows", "resolve"]
+__all__ = ["choose_algorithm", "fill_in", "replay_rows", "resolve"]
 
 
 TRAINING_SHARE = 10
@@ -33,13 +33,14 @@ def resolve(settings: Settings, task: TaskSpec) -> ResolvedSettings:
         raise LareError(f"{task.name} is one team of {task.environment}: train the task that has both")
     env = load_env_spec(task)
     _check_algorithm(ALGORITHMS[choose_algorithm(settings.algorithm, env)], task, env)
-    resolved = _normalise(apply_defaults(settings, env), task, env)
+    resolved = fill_in(settings, task, env)
     if settings.evaluation_episodes is None and not env.is_jax and measure_step_s(task) > SLOW_STEP_S:
         n_episodes = resolved.evaluate_every // (TRAINING_SHARE * env.max_steps)
         n_episodes = min(resolved.evaluation_episodes, max(MIN_EVALUATION_EPISODES, n_episodes))
         resolved = resolved.model_copy(update={"evaluation_episodes": n_episodes})
 
     method, team_level = find_method(resolved.method), task.credit_scope == "state"
+    consumes = ALGORITHMS[resolved.algorithm].consumes
     n_state_features = env.state_size + env.n_agents * env.action_size
     check_credit(
         method,
@@ -53,18 +54,9 @@ def resolve(settings: Settings, task: TaskSpec) -> ResolvedSettings:
         payments=task.payment_rule,
         discrete_actions=env.discrete,
         max_steps=env.max_steps,
+        rollout_steps=resolved.rollout_steps,
+        off_policy=consumes is not Consumes.ROLLOUTS,
     )
-    if method.needs_whole_episodes and resolved.rollout_steps % env.max_steps:
-        raise LareError(
-            f"{method.name} reads whole episodes: rollout_steps = {resolved.rollout_steps} is not a multiple of their length, "
-            f"{env.max_steps}"
-        )
-    consumes = ALGORITHMS[resolved.algorithm].consumes
-    if resolved.credit.exact != "no" and method.uses_gradient and consumes is not Consumes.ROLLOUTS:
-        raise LareError(
-            f"exact needs proxy rewards that stay the same during an iteration, and each update of {resolved.algorithm} changes those "
-            f"of {method.name}: use bayes or lare-bayes, or the algorithms ppo or ippo"
-        )
     if resolved.overlap_collection and (env.is_jax or consumes is not Consumes.TRANSITIONS):
         raise LareError(
             f"overlap_collection needs td3, ddpg or sac and an environment on the host: remove it for {resolved.algorithm} on "
@@ -72,6 +64,11 @@ def resolve(settings: Settings, task: TaskSpec) -> ResolvedSettings:
         )
     _check_size(resolved, task, env)
     return resolved
+
+
+def fill_in(settings: Settings, task: TaskSpec, env: EnvSpec) -> ResolvedSettings:
+    """Fill in the settings that are None. Raises `LareError` if the steps are not a multiple of an iteration's."""
+    return _normalise(_apply_defaults(settings, env), task, env)
 
 
 def choose_algorithm(name: str | None, env: EnvSpec) -> str:
@@ -83,8 +80,7 @@ def choose_algorithm(name: str | None, env: EnvSpec) -> str:
     return "qmix" if env.state_size and env.masks_actions and len(env.teams) == 1 else "ippo"
 
 
-def apply_defaults(settings: Settings, env: EnvSpec) -> ResolvedSettings:
-    """Fill in the settings that are None. Raises `LareError` if the steps are not a multiple of an iteration's."""
+def _apply_defaults(settings: Settings, env: EnvSpec) -> ResolvedSettings:
     algorithm = choose_algorithm(settings.algorithm, env)
     row = ALGORITHMS[algorithm]
     defaults: dict[str, Any] = {

@@ -1,4 +1,7 @@
-"""Which method and decoder settings go together, and with which task: the rules of `lare_rl.train` and of `CreditAssigner`."""
+"""Which method and decoder settings go together, and with which task.
+
+These are the rules of `lare_rl.train`, of `CreditAssigner` and of `pure_credit`.
+"""
 
 from lare_rl.credit.basis import MAX_RAW_FEATURES
 from lare_rl.credit.decoder_settings import CreditSettings
@@ -24,6 +27,9 @@ def check_credit(
     payments: PaymentRule = PAID_AT_END,
     discrete_actions: bool = True,
     max_steps: int | None = None,
+    rollout_steps: int | None = None,
+    off_policy: bool = False,
+    step_at_a_time: bool = False,
 ) -> None:
     """Raise `LareError` if a method or the settings of its decoder are impossible for a task.
 
@@ -35,8 +41,19 @@ def check_credit(
         scale_rewards: whether rewards are divided by the size of returns.
         discrete_actions: whether the actions are discrete.
         max_steps: the number of steps of the longest episode, if that is known.
+        rollout_steps: the number of steps of an iteration, if there are iterations.
+        off_policy: whether the decoder is fitted between the updates of an iteration.
+        step_at_a_time: whether the reward of a step is computed from this step alone.
     """
     name = method.name
+    if step_at_a_time:
+        reads_history = method.needs_whole_episodes or (method.inputs is not None and "history" in method.inputs.names)
+        if method.reward not in (Reward.PROXY, Reward.DESIGNED) or reads_history:
+            raise LareError(
+                f"{name} does not compute the reward of a step from this step alone: use bayes or lare-bayes"
+            )
+        if credit.exact not in ("auto", "no"):
+            raise LareError("exact needs the other steps of an episode: leave it out")
     if method.reward is Reward.DESIGNED and scored_observation == "both":
         raise LareError(
             f"{name} is one reward for each step: set scored_observation to 'before' or 'after', not to 'both'"
@@ -54,6 +71,15 @@ def check_credit(
     if method.needs_whole_episodes and not payments.only_at_end:
         raise LareError(
             f"{name} reads whole episodes, and the task pays before their end: use a method that reads steps"
+        )
+    if method.needs_whole_episodes and rollout_steps and max_steps and rollout_steps % max_steps:
+        raise LareError(
+            f"{name} reads whole episodes: rollout_steps = {rollout_steps} is not a multiple of their length, {max_steps}"
+        )
+    if off_policy and method.uses_gradient and credit.exact != "no":
+        raise LareError(
+            f"exact needs proxy rewards that stay the same during an iteration, and the updates of an off-policy algorithm change "
+            f"those of {name}: use bayes or lare-bayes, or the algorithms ppo or ippo"
         )
     if DECODERS[method.decoder].predicts_actions and not discrete_actions:
         raise LareError(f"{name} learns which of its actions an agent took, and the task has continuous ones: use stas")

@@ -7,6 +7,7 @@ import numpy as np
 
 from lare_rl.credit.explanation import Explanation
 from lare_rl.credit.score_type import ScoreType, ScoreTypeEstimate
+from lare_rl.tasks.spec import base_name
 from lare_rl.util.findings import Finding, render
 from lare_rl.util.statistics import round_shares
 
@@ -228,7 +229,7 @@ def _factor_findings(explanation: Explanation, names: Sequence[str], total: floa
     """
     indices: dict[str, list[int]] = {}
     for i, name in enumerate(names):
-        indices.setdefault(name.removesuffix(" (before)").removesuffix(" (after)"), []).append(i)
+        indices.setdefault(base_name(name), []).append(i)
     varied = {name: [i for i in numbers if explanation.factor_varies[i]] for name, numbers in indices.items()}
     shares = {name: float(explanation.factor_shares[numbers].sum()) for name, numbers in varied.items() if numbers}
     rounded = dict(zip(shares, round_shares(list(shares.values()), total), strict=True))

@@ -10,7 +10,7 @@ from lare_rl.tasks.spec import NO_ENVIRONMENT, SHARED_KEYS, TaskSpec
 from lare_rl.util.renamed_fields import rename_keys
 from lare_rl.util.safe_io import MAX_SETTINGS_BYTES, read_text, read_toml
 
-__all__ = ["check_environment", "load_task", "read_task", "resolve_task", "shipped_tasks"]
+__all__ = ["check_environment", "load_task", "read_task", "resolve_path", "resolve_task", "shipped_tasks"]
 
 SHIPPED = files("lare_rl.tasks") / "specs"
 
@@ -85,7 +85,7 @@ def _read_values(task: str, ancestors: tuple[str, ...] = ()) -> dict[str, Any]:
     like, teams = values.get("like"), values.get("teams")
 
     def is_valid(name: Any) -> bool:
-        return isinstance(name, str) and _resolve_path(task, name) not in (*ancestors, task)
+        return isinstance(name, str) and resolve_path(task, name) not in (*ancestors, task)
 
     if not (like is None or is_valid(like)):
         raise LareError(f"task {task!r}: like = {like!r} must be another task, without a cycle")
@@ -93,9 +93,9 @@ def _read_values(task: str, ancestors: tuple[str, ...] = ()) -> dict[str, Any]:
         raise LareError(f"task {task!r}: teams = {teams!r} must be a list of other tasks, without a cycle")
     if teams is not None:
         shared = {key: values[key] for key in SHARED_KEYS if key in values}
-        values["teams"] = [shared | _read_values(_resolve_path(task, team), (*ancestors, task)) for team in teams]
+        values["teams"] = [shared | _read_values(resolve_path(task, team), (*ancestors, task)) for team in teams]
     values.pop("like", None)
-    return values if like is None else _read_values(_resolve_path(task, like), (*ancestors, task)) | values
+    return values if like is None else _read_values(resolve_path(task, like), (*ancestors, task)) | values
 
 
 def _read_file(task: str) -> str:
@@ -111,10 +111,10 @@ def _read_file(task: str) -> str:
     raise LareError(f"no task {task!r}{hint}. Name a task file, or a shipped task: {', '.join(shipped_tasks())}.")
 
 
-def _resolve_path(task: str, name: str) -> str:
-    """Return the path or name of a task that a task file names. A path is relative to the folder of this file."""
+def resolve_path(task: str, name: str) -> str:
+    """Return the path or name of a task that a file names. A path is relative to the folder of this file."""
     path = str(Path(task).parent / name)
-    return path if task not in shipped_tasks() and _is_file(path) else name
+    return path if task not in shipped_tasks() and (name.endswith(".toml") or _is_file(path)) else name
 
 
 def _is_file(name: str) -> bool:

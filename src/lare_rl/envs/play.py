@@ -21,6 +21,7 @@ __all__ = [
     "phi_inputs",
     "play_episode",
     "play_episodes",
+    "play_roles",
     "play_steps",
     "sample_action",
 ]
@@ -89,9 +90,17 @@ def play_episodes(
 
 def play_episode(env: HostEnv, role: TaskSpec, policy: Policy | None, rng: np.random.Generator, seed: int) -> Episode:
     """Play one episode. See `play_episodes`."""
+    return play_roles(env, (role,), policy, rng, seed)[0]
+
+
+def play_roles(
+    env: HostEnv, roles: Sequence[TaskSpec], policy: Policy | None, rng: np.random.Generator, seed: int
+) -> list[Episode]:
+    """Play one episode, and return it from the view of each role."""
     timesteps, actions, next_timesteps = zip(*play_steps(env, policy, rng, seed), strict=True)
     measures = {name: float(value) for name, value in next_timesteps[-1].measures.items()}
-    return make_episode(role, env.spec, _stack(timesteps), np.stack(actions), _stack(next_timesteps), measures)
+    steps = _stack(timesteps), np.stack(actions), _stack(next_timesteps)
+    return [make_episode(role, env.spec, *steps, measures) for role in roles]
 
 
 def make_episode(

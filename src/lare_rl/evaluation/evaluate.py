@@ -13,7 +13,7 @@ from lare_rl.envs.families import load_env_spec, make_env, make_host_env
 from lare_rl.envs.interface import JaxEnv
 from lare_rl.envs.load import check_environment
 from lare_rl.envs.placement import make_vec_env, n_open_envs
-from lare_rl.envs.play import Episode, EpisodeListener, play_episode
+from lare_rl.envs.play import Episode, EpisodeListener, play_roles
 from lare_rl.errors import LareError
 from lare_rl.runs.directory import Run, as_run
 from lare_rl.tasks.spec import TaskSpec
@@ -118,9 +118,9 @@ def gain_over_random(
     return float(returns.mean() - random_returns.mean()), math.hypot(standard_error(random_returns), error)
 
 
-def measure_random_returns(task: TaskSpec) -> Float[np.ndarray, " episodes"]:
+def measure_random_returns(task: TaskSpec) -> Float[np.ndarray, "teams episodes"]:
     """Return the returns of `play_random`."""
-    return np.array([episode.return_ for episode in play_random(task)])
+    return np.array([[episode.return_ for episode in episodes] for episodes in play_random(task)])
 
 
 def play_random(
@@ -128,25 +128,27 @@ def play_random(
     n_episodes: int = RANDOM_EPISODES,
     limit_s: float = RANDOM_PLAY_LIMIT_S,
     on_episode: EpisodeListener | None = None,
-) -> list[Episode]:
+) -> list[list[Episode]]:
     """Play `n_episodes` episodes of random actions in the environment of evaluations, or fewer if they take long.
+
+    Returns the same episodes from the view of each role of the task.
 
     After `limit_s` seconds there are `MIN_RANDOM_EPISODES`, because fewer have no useful deviation, and after `MAX_RANDOM_PLAY_S`
     none begins.
 
-    The list is empty if the environment does not run, or if its module must not be imported for a report.
+    The lists are empty if the environment does not run, or if its module must not be imported for a report.
     """
-    task, episodes = task.evaluation_task, list[Episode]()
+    task, episodes = task.evaluation_task, list[list[Episode]]()
     start = time.monotonic()
     if untrusted_module(task) is not None:
-        return episodes
-    with suppress(LareError), closing(make_host_env(task.roles[0])) as env:
+        return [[] for _ in task.roles]
+    with suppress(LareError), closing(make_host_env(task)) as env:
         while len(episodes) < n_episodes:
             seconds = time.monotonic() - start
             if seconds >= (limit_s if len(episodes) >= MIN_RANDOM_EPISODES else MAX_RANDOM_PLAY_S):
                 break
             random = np.random.default_rng(len(episodes))
-            episodes.append(play_episode(env, task.roles[0], None, random, len(episodes)))
+            episodes.append(play_roles(env, task.roles, None, random, len(episodes)))
             if on_episode is not None:
                 on_episode(len(episodes))
-    return episodes
+    return [[views[role_index] for views in episodes] for role_index in range(len(task.roles))]

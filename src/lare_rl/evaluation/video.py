@@ -23,6 +23,7 @@ from lare_rl.evaluation.policy import RunPolicy
 from lare_rl.evaluation.rollout import Rollout, roll_out
 from lare_rl.runs.directory import Run
 from lare_rl.training.streams import Stream, episode_seed
+from lare_rl.util.files import check_new_path
 
 __all__ = ["check_video_path", "encode_film", "record_frames", "record_video", "render_rollout", "write_video"]
 
@@ -135,8 +136,7 @@ def check_video_path(path: Path) -> None:
     """Raise `LareError` if a video could not be written, before the work is done."""
     if path.suffix not in (".gif", ".mp4"):
         raise LareError(f"{path} is no name of a video: it ends in .gif, or in .mp4 with the extra lare-rl[video]")
-    if not path.parent.is_dir():
-        raise LareError(f"the video {path} cannot be written: there is no directory {path.parent}")
+    check_new_path(path, overwrite=True)
 
 
 def write_video(path: Path, frames: Sequence[Frame], frame_seconds: float) -> None:

@@ -11,7 +11,7 @@ import numpy as np
 from lare_rl.errors import LareError
 from lare_rl.phi.arrays import Array, as_array
 from lare_rl.phi.builder import current_builder
-from lare_rl.phi.graph import Graph, Kind
+from lare_rl.phi.graph import Graph, NumberKind
 from lare_rl.phi.numpy_functions import FUNCTIONS, call_numpy
 from lare_rl.training.numpy_program import Operation, UnsupportedOperationError, apply
 
@@ -21,7 +21,7 @@ DTYPES = {"float": np.float32, "int": np.int32, "bool": np.bool_}
 """The types of JAX for kinds of numbers."""
 
 
-def graph_input(name: str, shape: tuple[int, ...], kind: Kind = "float") -> Array:
+def graph_input(name: str, shape: tuple[int, ...], kind: NumberKind = "float") -> Array:
     """Add an input to the graph."""
     return Array(current_builder().input(name, shape, kind), None)
 

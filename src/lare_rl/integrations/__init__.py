@@ -1,1 +1,1 @@
-"""Adapters of `CreditAssigner` for Gymnasium, Stable-Baselines3, PettingZoo and TorchRL."""
+"""Adapters for other libraries: of `CreditAssigner`, and of the language models of Pydantic AI."""

@@ -10,7 +10,7 @@ from lare_rl.latent.function import LatentFunction, function_from_verdict, norma
 from lare_rl.latent.verify import Check, Steps, Verdict, sample_steps, verify
 from lare_rl.llm import prompts
 from lare_rl.llm.model import Model, ModelFunction, as_model, recorded_model
-from lare_rl.llm.prompts import MAX_CANDIDATES, N_CANDIDATES, Kind, Message, Stage
+from lare_rl.llm.prompts import MAX_CANDIDATES, N_CANDIDATES, FunctionKind, Message, Stage
 from lare_rl.llm.recording import Recorder
 from lare_rl.llm.reply import MalformedReplyError, parse_reply
 from lare_rl.tasks.spec import TaskSpec, require_role
@@ -67,7 +67,7 @@ class Attempt:
         return lines[0] + (f" (and {len(lines) - 1} more)" if len(lines) > 1 else "")
 
 
-def examine_reply(reply: str, task: TaskSpec, kind: Kind, steps: Steps | None = None) -> Attempt:
+def examine_reply(reply: str, task: TaskSpec, kind: FunctionKind, steps: Steps | None = None) -> Attempt:
     """Read and verify a reply."""
     try:
         source = normalise_source(parse_reply(reply).functions)
@@ -82,7 +82,7 @@ class Conversation:
     """A model, and the requests to it about a task. Every reply is recorded."""
 
     task: TaskSpec
-    kind: Kind
+    kind: FunctionKind
     model: Model
     recorder: Recorder
     on_message: Callable[[str], None]
@@ -157,7 +157,7 @@ def _quote(reply: str) -> str:
     return reply[:_MAX_QUOTE] if reply.strip() else "(an empty reply)"
 
 
-def check_recorded(task: TaskSpec, kind: Kind, draw: int, candidates: int) -> None:
+def check_recorded(task: TaskSpec, kind: FunctionKind, draw: int, candidates: int) -> None:
     """Check that the shipped recordings have the replies that a design needs when every candidate passes.
 
     Raises:
@@ -171,7 +171,7 @@ def check_recorded(task: TaskSpec, kind: Kind, draw: int, candidates: int) -> No
 
 def design(
     task: TaskSpec | str | Path,
-    kind: Kind = "factors",
+    kind: FunctionKind = "factors",
     model: Model | ModelFunction | None = None,
     draw: int = 0,
     candidates: int = N_CANDIDATES,

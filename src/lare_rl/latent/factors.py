@@ -6,16 +6,16 @@ import numpy as np
 from jaxtyping import Float
 
 from lare_rl.errors import LareError
-from lare_rl.phi.evaluate import compute, evaluate
+from lare_rl.phi.evaluate import compute_nodes, evaluate
 from lare_rl.phi.graph import Graph
 
-__all__ = ["LatentRewardError", "check_finite", "compute_factors", "find_infinity"]
+__all__ = ["NonFiniteFactorError", "check_finite", "compute_batch", "find_infinity"]
 
 _CHUNK_NUMBERS = 1 << 22
 """About how many numbers are computed at a time."""
 
 
-class LatentRewardError(LareError):
+class NonFiniteFactorError(LareError):
     """A factor is not finite. `observation` and `action` are the batch for which it was computed."""
 
     def __init__(self, message: str, observation: np.ndarray, action: np.ndarray):
@@ -23,7 +23,7 @@ class LatentRewardError(LareError):
         self.observation, self.action = observation, action
 
 
-def compute_factors(
+def compute_batch(
     graph: Graph, observation: Float[np.ndarray, "batch observation"], action: Float[np.ndarray, "batch action"]
 ) -> Float[np.ndarray, "batch factors"]:
     """Compute the factors of a batch. They are not checked: they may be infinite or NaN."""
@@ -41,14 +41,14 @@ def check_finite(
     observation: Float[np.ndarray, "batch observation"],
     action: Float[np.ndarray, "batch action"],
 ) -> None:
-    """Check that all factors are finite. Raises `LatentRewardError` if a factor is infinite or NaN."""
+    """Check that all factors are finite. Raises `NonFiniteFactorError` if a factor is infinite or NaN."""
     if not np.isfinite(factors).all():
         row, column = np.argwhere(~np.isfinite(factors))[0]
         text = np.array2string(observation[row], precision=3, threshold=6)
         message = (
             f"the latent function failed: factor {names[column]!r} is {factors[row, column]} for the observation {text}"
         )
-        raise LatentRewardError(message, observation, action)
+        raise NonFiniteFactorError(message, observation, action)
 
 
 def find_infinity(
@@ -58,18 +58,8 @@ def find_infinity(
     action: Float[np.ndarray, "batch action"],
 ) -> tuple[str, int] | None:
     """Return the first operation that makes a factor infinite or NaN on these rows, and its line in the source, or None."""
-    values: list[np.ndarray] = []
-    finite: list[bool] = []
-    inputs = {"observation": observation, "action": action}
-    for node in graph.nodes:
-        if node.op == "input":
-            values.append(inputs[node.option])
-        elif node.op == "constant":
-            values.append(node.option)
-        else:
-            with np.errstate(all="ignore"):
-                values.append(compute(node, [values[i] for i in node.inputs], (len(observation),), dtype=np.float32))
-        finite.append(bool(np.isfinite(values[-1]).all()))
+    values = compute_nodes(graph, {"observation": observation, "action": action}, keep=True)
+    finite = [bool(np.isfinite(value).all()) for value in values]
     needed = graph.needed_for("factors", factor)
     for i, node in enumerate(graph.nodes):
         if i in needed and node.inputs and not finite[i] and all(finite[j] for j in node.inputs):

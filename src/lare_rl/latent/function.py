@@ -13,14 +13,14 @@ import numpy as np
 from jaxtyping import Float
 
 from lare_rl.errors import LareError, short_repr
-from lare_rl.latent.factors import check_finite, compute_factors
+from lare_rl.latent.factors import check_finite, compute_batch
 from lare_rl.latent.verify import Check, Steps, Verdict, verify
 from lare_rl.llm.key import redact_key
-from lare_rl.llm.prompts import Kind
+from lare_rl.llm.prompts import FunctionKind
 from lare_rl.phi.graph import Graph
 from lare_rl.phi.names import factor_meanings, factor_names
 from lare_rl.phi.read import read
-from lare_rl.tasks.spec import ScoredObservation, TaskSpec, require_role, select_states
+from lare_rl.tasks.spec import ScoredObservation, TaskSpec, require_role, select_states, step_names
 
 __all__ = [
     "CHANGED_SUFFIX", "HEADER_PREFIX", "LatentFunction", "check_task", "features_text", "function_from_verdict",
@@ -44,7 +44,7 @@ class LatentFunction:
     """
 
     task: str
-    kind: Kind
+    kind: FunctionKind
     source: str
     size: int
     """d, the number of factors."""
@@ -103,7 +103,7 @@ class LatentFunction:
 
         Raises:
             LareError: the arrays do not have the task's sizes, or the numbers of observations and actions differ.
-            LatentRewardError: a factor is not finite.
+            NonFiniteFactorError: a factor is not finite.
         """
         observations = _as_array("observation", observation, self.sizes[0])
         actions = _as_array("action", action, self.sizes[1])
@@ -111,7 +111,7 @@ class LatentFunction:
         observations, actions = np.atleast_2d(observations), np.atleast_2d(actions)
         if len(observations) != len(actions):
             raise LareError(f"there are {len(observations)} observations and {len(actions)} actions")
-        factors = compute_factors(self.graph, observations, actions)
+        factors = compute_batch(self.graph, observations, actions)
         check_finite(factors, self.names, observations, actions)
         return factors[0] if single else factors
 
@@ -137,9 +137,7 @@ class LatentFunction:
 
     def factor_columns(self, scored_observation: ScoredObservation) -> list[str]:
         """Return the names of the factors of `step_factors`."""
-        if scored_observation != "both":
-            return list(self.names)
-        return [f"{name} ({side})" for side in ("before", "after") for name in self.names]
+        return step_names(scored_observation, self.names)
 
     def __getstate__(self) -> dict[str, Any]:
         """Return the state for another process, without the graph, which is read again there."""
@@ -190,7 +188,7 @@ def _as_array(name: str, values: Any, size: int) -> np.ndarray:
 
 
 def verify_function(
-    source: str, task: TaskSpec, kind: Kind = "factors", steps: Steps | None = None, path: Path | None = None
+    source: str, task: TaskSpec, kind: FunctionKind = "factors", steps: Steps | None = None, path: Path | None = None
 ) -> LatentFunction:
     """Verify a source, and return its function.
 
@@ -210,7 +208,7 @@ def verify_function(
     return function_from_verdict(source, task, kind, verdict)
 
 
-def function_from_verdict(source: str, task: TaskSpec, kind: Kind, verdict: Verdict) -> LatentFunction:
+def function_from_verdict(source: str, task: TaskSpec, kind: FunctionKind, verdict: Verdict) -> LatentFunction:
     """Return the function of a source that could be read, whether or not it has passed every check."""
     role = require_role(task)
     assert verdict.graph is not None

@@ -51,8 +51,9 @@ def improve(
         record: the file to which every exchange is written. If the design had a file, it is this file.
     """
     exchanges = [Exchange(**exchange) for exchange in function.exchanges]
-    recorder = Recorder(task.name, function.kind, getattr(model, "temperature", None), record, exchanges)
-    recorder.file_created = record is not None and bool(exchanges)
+    recorder = Recorder(
+        task.name, function.kind, getattr(model, "temperature", None), record, exchanges, bool(exchanges)
+    )
     conversation = Conversation(task, function.kind, model, recorder, on_message)
     try:
         best, assessment = function, assess(function)

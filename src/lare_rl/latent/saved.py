@@ -18,7 +18,7 @@ from lare_rl.latent.function import (
     verify_function,
 )
 from lare_rl.latent.verify import Steps
-from lare_rl.llm.prompts import Kind
+from lare_rl.llm.prompts import FunctionKind
 from lare_rl.llm.recording import Exchange
 from lare_rl.llm.reply import MalformedReplyError, parse_reply
 from lare_rl.tasks.spec import TaskSpec
@@ -74,7 +74,7 @@ def load_function(path: str | Path, task: TaskSpec | str | Path, steps: Steps | 
             f"{file} was written for the task {saved_task!r}, not for {task.name!r}. If the function is "
             f'right for both tasks, remove the line "{HEADER_PREFIX}task: {saved_task}"'
         )
-    kind: Kind = "reward" if _header_value(header, "kind") == "reward" else "factors"
+    kind: FunctionKind = "reward" if _header_value(header, "kind") == "reward" else "factors"
     function = verify_function(source, task, kind, steps, file)
     if file.suffix == ".json":
         return replace(function, model=_UNNAMED_LLM)

@@ -17,8 +17,8 @@ from jaxtyping import Float
 from lare_rl.envs.families import make_host_env
 from lare_rl.envs.play import find_team, phi_inputs, play_steps
 from lare_rl.errors import LareError
-from lare_rl.latent.factors import compute_factors, find_infinity
-from lare_rl.llm.prompts import Kind
+from lare_rl.latent.factors import compute_batch, find_infinity
+from lare_rl.llm.prompts import FunctionKind
 from lare_rl.phi.graph import Graph
 from lare_rl.phi.limits import MAX_FACTORS, RefusedError
 from lare_rl.phi.names import factor_names
@@ -67,7 +67,7 @@ class Verdict:
         return "\n".join(check.message for check in self.checks if not check.passed)
 
 
-def verify(source: str, task: TaskSpec, kind: Kind = "factors", steps: Steps | None = None) -> Verdict:
+def verify(source: str, task: TaskSpec, kind: FunctionKind = "factors", steps: Steps | None = None) -> Verdict:
     """Verify a source.
 
     Args:
@@ -88,7 +88,7 @@ def verify(source: str, task: TaskSpec, kind: Kind = "factors", steps: Steps | N
     names = factor_names(source, graph.n_factors)
     error = _finite_error(graph, names, observation, action, source)
     checks = Check("read", True), Check("finite", error is None, error or "")
-    advice = () if error else tuple(_advice(graph, names, compute_factors(graph, observation, action)))
+    advice = () if error else tuple(_advice(graph, names, compute_batch(graph, observation, action)))
     return Verdict(checks, graph, advice)
 
 
@@ -99,7 +99,7 @@ def _finite_error(
     # Random numbers that are reproducible for a source, but that its author cannot know.
     rng = np.random.default_rng(list(hashlib.sha256(source.encode(errors="replace")).digest()))
     for batch_name, observations, actions in _test_batches(observation, action, rng):
-        factors = compute_factors(graph, observations, actions)
+        factors = compute_batch(graph, observations, actions)
         bad = ~np.isfinite(factors)
         if bad.any():
             factor = int(bad.any(axis=0).argmax())

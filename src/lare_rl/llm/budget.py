@@ -8,6 +8,7 @@ from typing import Any
 
 from lare_rl.errors import LareError
 from lare_rl.llm.prompts import Message
+from lare_rl.util.durations import format_seconds
 
 __all__ = ["Budget", "BudgetExceededError", "max_request_tokens"]
 
@@ -67,7 +68,7 @@ class Budget:
         if seconds >= self.seconds_left:
             pause = f", and a pause of {seconds:.0f} s comes next" if seconds else ""
             raise BudgetExceededError(
-                f"the {_duration_text(self.seconds)} of waiting for the model are over ({self.seconds_used:.0f} s are used{pause})"
+                f"the {format_seconds(self.seconds)} of waiting for the model are over ({self.seconds_used:.0f} s are used{pause})"
             )
         self.seconds_used += seconds
 
@@ -83,7 +84,7 @@ class Budget:
     def timeout_text(self) -> str:
         """Return the longest time for the next reply in words."""
         timeout_s = min(self.reply_timeout_s, self.seconds_left)
-        return f"{timeout_s:.0f} s at most ({_duration_text(self.seconds_left)} are left for all)"
+        return f"{timeout_s:.0f} s at most ({format_seconds(self.seconds_left)} are left for all)"
 
     def count_reply(self, usage: Any, messages: Sequence[Message], reply: str) -> None:
         """Add the tokens of a request and its reply: those that the server reports as `usage`, or else their bytes."""
@@ -109,7 +110,3 @@ class Budget:
 def max_request_tokens(messages: Sequence[Message]) -> int:
     """Return an upper bound on the tokens of a request: its bytes, and a few around each message."""
     return sum(len(message["content"].encode(errors="replace")) + 16 for message in messages)
-
-
-def _duration_text(seconds: float) -> str:
-    return f"{seconds:.0f} s" if seconds < 120 else f"{seconds / 60:.0f} minutes"

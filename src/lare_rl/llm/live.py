@@ -3,7 +3,7 @@
     limits       of time and size: see `http_limits`; of requests, tokens and waiting: see `budget`
     redirects    to another server are refused, because it would receive the request
     retries      408, 409, 429, 5xx and broken connections, with back-off or after the time that the server names
-    requests     of the strictest kind that the server supports: see `ladder`
+    requests     of the strictest kind that the server supports: see `request_forms`
     the key      see `key`
 
 `reply` reads every reply, however its structure was requested.
@@ -27,8 +27,8 @@ from lare_rl.llm.http_limits import (
     run_in_time,
 )
 from lare_rl.llm.key import KEY_VARIABLE, api_key, redact_key
-from lare_rl.llm.ladder import MIN_REPLY_TOKENS, FailedResponseError, find_ladder, store_ladder
 from lare_rl.llm.prompts import Message
+from lare_rl.llm.request_forms import MIN_REPLY_TOKENS, FailedResponseError, find_forms, store_forms
 from lare_rl.util.safe_io import read_json
 from lare_rl.util.sanitize import one_line
 from lare_rl.util.variables import read_variable
@@ -95,9 +95,9 @@ class LiveModel:
             raise ModelError(f"a live model needs an extra: {install_command('llm')}") from None
         except Exception as error:  # the client raises errors of several kinds for a bad address
             raise ModelError(f"the endpoint {self.base_url!r} cannot be used: {_safe_text(error)}") from None
-        self._ladder = find_ladder(str(self._client.base_url), self.name)
+        self._forms = find_forms(str(self._client.base_url), self.name)
         if not hasattr(self._client, "responses"):  # in versions of the client before 1.66
-            self._ladder = self._ladder.without_responses()
+            self._forms = self._forms.without_responses()
 
     def _connect(self) -> Any:
         """Return a client that limits the time and the size of answers."""
@@ -140,11 +140,11 @@ class LiveModel:
 
     def _request(self, messages: Sequence[Message]) -> str | _Failure:
         """Send one request. Return the reply, or why there is none."""
-        max_tokens = min(self._ladder.reply_tokens, self.budget.max_reply_tokens(messages, MIN_REPLY_TOKENS))
-        request = self._ladder.request(self.name, messages, max_tokens, self.temperature)
+        max_tokens = min(self._forms.reply_tokens, self.budget.max_reply_tokens(messages, MIN_REPLY_TOKENS))
+        request = self._forms.request(self.name, messages, max_tokens, self.temperature)
         self.budget.requests_used += 1
         timeout_s = min(self.budget.reply_timeout_s, self.budget.seconds_left)
-        api = self._client.responses if self._ladder.api == "responses" else self._client.chat.completions
+        api = self._client.responses if self._forms.api == "responses" else self._client.chat.completions
         create = api.with_streaming_response.create
 
         def fetch() -> bytes:
@@ -161,22 +161,22 @@ class LiveModel:
     def _read_answer(self, body: bytes, messages: Sequence[Message], max_tokens: int) -> str | _Failure:
         """Return the text of an answer. A body that is no answer is a failure."""
         try:
-            answer = self._ladder.read_answer(body)
+            answer = self._forms.read_answer(body)
         except FailedResponseError as error:
             self.budget.count_reply(None, messages, body.decode(errors="replace"))
             return _Failure(_safe_text(f"the model failed: {error}"), retry=True)
         except (ValueError, TypeError, KeyError, IndexError, AttributeError) as error:
             page = body.decode(errors="replace")
             self.budget.count_reply(None, messages, page)
-            kind = "response" if self._ladder.api == "responses" else "chat completion"
+            kind = "response" if self._forms.api == "responses" else "chat completion"
             reason = f"the answer is not a {kind} ({type(error).__name__}: {error})"
-            is_missing = self._ladder.api == "responses" and not self._ladder.is_verified
+            is_missing = self._forms.api == "responses" and not self._forms.is_verified
             if is_missing:  # some servers answer any request for an unknown address
-                self._ladder = self._ladder.without_responses()
+                self._forms = self._forms.without_responses()
             return _Failure(_safe_text(f"{reason}: {_excerpt(page)}"), retry=True, request_changed=is_missing)
-        if not self._ladder.is_verified:
-            self._ladder = replace(self._ladder, is_verified=True)
-        store_ladder(str(self._client.base_url), self.name, self._ladder)
+        if not self._forms.is_verified:
+            self._forms = replace(self._forms, is_verified=True)
+        store_forms(str(self._client.base_url), self.name, self._forms)
         text = answer.text.encode(errors="replace").decode()  # replaces lone surrogates
         self.budget.count_reply(answer.usage, messages, text)
         if answer.is_cut_off:
@@ -206,9 +206,9 @@ class LiveModel:
     def _refusal(self, error: StatusError) -> _Failure:
         """Handle an HTTP error: change the request, wait, or give up."""
         message = _safe_text(f"HTTP {error.status}: {_error_text(error.body)}")
-        ladder = self._ladder.after_refusal(error.status, error.body.lower(), self.temperature is not None)
-        if ladder is not None:
-            self._ladder = ladder
+        forms = self._forms.after_refusal(error.status, error.body.lower(), self.temperature is not None)
+        if forms is not None:
+            self._forms = forms
             return _Failure(message, retry=True, request_changed=True)
         retry = error.status in _RETRIED_STATUSES or error.status >= 500
         return _Failure(

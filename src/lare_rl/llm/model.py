@@ -10,8 +10,8 @@ from typing import Any, Protocol, cast, runtime_checkable
 
 from lare_rl.errors import LareError, short_repr
 from lare_rl.llm.key import redact_key
-from lare_rl.llm.prompts import Kind, Message
-from lare_rl.llm.recording import RecordedModel, read_recording, shipped_recordings
+from lare_rl.llm.prompts import FunctionKind, Message
+from lare_rl.llm.recording import RECORDED, RecordedModel, read_recording, shipped_recordings
 from lare_rl.util.safe_io import read_text
 
 __all__ = ["RECORDED", "FunctionModel", "Model", "ModelFunction", "as_model", "recorded_model"]
@@ -66,11 +66,7 @@ def as_model(model: Any) -> Model:
     )
 
 
-RECORDED = "recorded"
-"""The name of the model that answers from the shipped recordings."""
-
-
-def recorded_model(task: str, kind: Kind, draw: int = 0, path: Path | None = None) -> RecordedModel:
+def recorded_model(task: str, kind: FunctionKind, draw: int = 0, path: Path | None = None) -> RecordedModel:
     """Return a model that answers from a file, or from the shipped recordings of that kind and draw.
 
     Raises:

@@ -10,7 +10,17 @@ from typing import Literal
 
 from lare_rl.tasks.spec import TaskSpec
 
-__all__ = ["MAX_CANDIDATES", "N_CANDIDATES", "Kind", "Message", "Stage", "candidate", "combine", "correct", "reflect"]
+__all__ = [
+    "MAX_CANDIDATES",
+    "N_CANDIDATES",
+    "FunctionKind",
+    "Message",
+    "Stage",
+    "candidate",
+    "combine",
+    "correct",
+    "reflect",
+]
 
 N_CANDIDATES = 5
 """The default number of candidates for a function: n in line 2 of the paper's Algorithm 1."""
@@ -18,7 +28,7 @@ N_CANDIDATES = 5
 MAX_CANDIDATES = 100
 """The largest number of candidates for a function."""
 
-Kind = Literal["factors", "reward"]
+FunctionKind = Literal["factors", "reward"]
 """What a function returns: several factors (LaRe), or one reward (LLM reward design)."""
 
 Stage = Literal["candidate", "combine", "correct", "reflect"]
@@ -31,14 +41,14 @@ def _template(name: str) -> str:
     return (files("lare_rl.llm") / "templates" / f"{name}.txt").read_text(encoding="utf-8").strip()
 
 
-def candidate(task: TaskSpec, kind: Kind = "factors") -> list[Message]:
+def candidate(task: TaskSpec, kind: FunctionKind = "factors") -> list[Message]:
     """Return the first request: the role, and the task (the paper's Eq. 2)."""
     sections = (("Task", task.description), ("Observation", task.observation), ("Action", task.action))
     user = "\n\n".join(f"# {title}\n{text.strip()}" for title, text in sections)
     return [{"role": "system", "content": _template(kind)}, {"role": "user", "content": user}]
 
 
-def combine(task: TaskSpec, replies: Sequence[str], kind: Kind = "factors") -> list[Message]:
+def combine(task: TaskSpec, replies: Sequence[str], kind: FunctionKind = "factors") -> list[Message]:
     """Return the request that merges the candidates into one (Eq. 3)."""
     attempts = "\n\n".join(f"Attempt {number}:\n{reply.strip()}" for number, reply in enumerate(replies, start=1))
     return [*candidate(task, kind), *_answer(attempts, _template("combine"))]
@@ -49,7 +59,7 @@ def correct(conversation: Sequence[Message], reply: str, errors: str) -> list[Me
     return [*conversation, *_answer(reply, _template("correct").replace("{error}", errors.strip()))]
 
 
-def reflect(task: TaskSpec, reply: str, evidence: str, kind: Kind = "factors") -> list[Message]:
+def reflect(task: TaskSpec, reply: str, evidence: str, kind: FunctionKind = "factors") -> list[Message]:
     """Return the request that shows how a function's factors relate to the returns of episodes. It is not in the paper."""
     return [*candidate(task, kind), *_answer(reply, _template("reflect").replace("{evidence}", evidence))]
 

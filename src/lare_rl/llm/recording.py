@@ -11,13 +11,24 @@ from typing import Literal
 from lare_rl.errors import CheckedModel, LareError
 from lare_rl.llm.key import redact_key
 from lare_rl.llm.prompts import Message, Stage
-from lare_rl.util.files import write_atomically
+from lare_rl.util.files import check_new_path, write_atomically
 from lare_rl.util.safe_io import read_json
 
-__all__ = ["SHIPPED_RECORDINGS", "Exchange", "RecordedModel", "Recorder", "read_recording", "shipped_recordings"]
+__all__ = [
+    "RECORDED",
+    "SHIPPED_RECORDINGS",
+    "Exchange",
+    "RecordedModel",
+    "Recorder",
+    "read_recording",
+    "shipped_recordings",
+]
 
 RecordingKind = Literal["factors", "reward", "events"]
 """What a recorded function returns: factors or a reward of a step, or the events of a turn (`lare_rl.turns`)."""
+
+RECORDED = "recorded"
+"""The name of the model that answers from the shipped recordings."""
 
 SHIPPED_RECORDINGS = files("lare_rl.llm") / "recordings"
 
@@ -95,7 +106,7 @@ class RecordedModel:
         """
         self.recordings = recordings
         self.task = task
-        self.name = "recorded"
+        self.name = RECORDED
 
     def reply(self, messages: Sequence[Message], sample: int) -> str:
         """Return the reply number `sample` to a request. See `Model.reply`."""
@@ -119,8 +130,8 @@ class RecordedModel:
 class Recorder:
     """Records every exchange of a design. With a `path`, it saves them to this file after each reply.
 
-    An existing file is never overwritten: the file must not exist when the first reply comes. After that it is replaced as a
-    whole, so that no reply is lost.
+    An existing file is never overwritten: the file must not exist at first. After the first reply it is replaced as a whole, so
+    that no reply is lost.
     """
 
     task: str
@@ -130,6 +141,10 @@ class Recorder:
     exchanges: list[Exchange] = field(default_factory=list)
     file_created: bool = False
     """Whether this recorder has created the file."""
+
+    def __post_init__(self) -> None:
+        if self.path is not None and not self.file_created:
+            check_new_path(self.path)  # before a model is asked and paid
 
     def n_replies(self, stage: Stage, messages: Sequence[Message]) -> int:
         """Return the number of recorded replies to a request."""
@@ -150,8 +165,8 @@ class Recorder:
 
     def save(self, path: Path, model: str, new: bool = True) -> None:
         """Write the recording to a file. Raises `LareError` if the file cannot be written, or it exists and should be `new`."""
-        if new and path.exists():
-            raise LareError(f"{path} exists, and is not overwritten; choose another file")
+        if new:
+            check_new_path(path)
         write_atomically(path, lambda file: file.write(self.to_json(model).encode()))
 
     def to_json(self, model: str) -> str:

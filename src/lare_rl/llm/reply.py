@@ -10,7 +10,7 @@ from lare_rl.errors import CheckedModel, LareError
 from lare_rl.llm.key import redact_key
 from lare_rl.util.safe_io import check_depth, parse_integer, read_json
 
-__all__ = ["MalformedReplyError", "Reply", "parse_reply"]
+__all__ = ["REPLY_KEYS", "MalformedReplyError", "Reply", "parse_reply"]
 
 _MAX_CHARACTERS = 200_000
 _MAX_STARTS = 100
@@ -32,11 +32,13 @@ class Reply(CheckedModel):
     """Source of `evaluation_func(observation, action)`."""
 
 
+REPLY_KEYS = [str(field.alias) for field in Reply.model_fields.values()]
+_FUNCTIONS = REPLY_KEYS[-1]
+
 _FENCED_BLOCK = re.compile(r"```[ \t]*+([\w.+-]*+)[ \t]*+\r?\n(.*?)```", re.DOTALL)
 # Some models write their reasoning first, which may contain drafts of the answer.
 _REASONING_END = re.compile(r"</think(?:ing)?>")
 _OBJECT_START = re.compile(r'\{\s*"')
-_KEYS = {"Understand", "Analyze", "Functions"}
 
 
 def parse_reply(text: str) -> Reply:
@@ -90,13 +92,13 @@ def _find_object(text: str) -> dict[str, Any] | None:
             value = check_depth(decoder.raw_decode(text, start)[0])
         except (ValueError, RecursionError):
             continue
-        if value.keys() >= _KEYS:
+        if value.keys() >= set(REPLY_KEYS):
             return value
-        if "Functions" in value:
+        if _FUNCTIONS in value:
             incomplete = value
     if incomplete is not None:
         return incomplete
     for fence in _FENCED_BLOCK.finditer(text):
         if "def " in fence[2]:
-            return {"Understand": text[: fence.start()], "Analyze": "", "Functions": fence[2]}
+            return dict(zip(REPLY_KEYS, (text[: fence.start()], "", fence[2]), strict=True))
     return None

@@ -12,6 +12,7 @@ from lare_rl.envs.spaces import OneHot
 from lare_rl.tasks.spec import FILL_IN
 
 __all__ = [
+    "DEFAULT_LIMIT",
     "LIMIT_LINE",
     "MEASURES_LINE",
     "SCORE_LINE",
@@ -36,8 +37,9 @@ SCORE_LINE = (
 )
 MEASURES_LINE = '# measures = ["distance"] # keys of the last step\'s info to report beside the return'
 
+DEFAULT_LIMIT = 1000
 LIMIT_LINE = (
-    "max_episode_steps = 1000 # the environment has no limit of its own: write the length of its longest episode, or "
+    f"max_episode_steps = {DEFAULT_LIMIT} # the environment has no limit of its own: write the length of its longest episode, or "
     "more (longer episodes are cut)"
 )
 

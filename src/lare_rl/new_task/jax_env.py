@@ -18,14 +18,12 @@ from lare_rl.errors import LareError
 from lare_rl.new_task import draft
 from lare_rl.new_task.documentation import first_section, plain_lines, split_sections, write_texts
 from lare_rl.new_task.draft import Draft, count_entries, file_name, warning_lines
-from lare_rl.new_task.many_agents import make_stub, write_team_drafts
+from lare_rl.new_task.many_agents import make_stub, name_patterns, write_team_drafts
 
 __all__ = ["draft_jax_task"]
 
 FIELD = re.compile(r"^- (observation|action|reward|episode termination|state)s?:", re.MULTILINE)
 """The beginning of a section in Jumanji's documentation."""
-
-DEFAULT_LIMIT = 1000
 
 
 def draft_jax_task(environment_id: str) -> Draft:
@@ -37,7 +35,7 @@ def draft_jax_task(environment_id: str) -> Draft:
     try:
         env = make(stub)
     except LareError as error:
-        limit = {"max_episode_steps": DEFAULT_LIMIT}
+        limit = {"max_episode_steps": draft.DEFAULT_LIMIT}
         try:
             env = make(stub.model_copy(update=limit))
         except LareError:
@@ -47,7 +45,7 @@ def draft_jax_task(environment_id: str) -> Draft:
     if isinstance(env, JaxMARLEnv):
         kinds = list(dict.fromkeys(agent_kind(agent.name) for agent in env.layout.agents))
         if len(kinds) > 1:
-            stubs = tuple(make_stub(kind, environment_id, team=kind, agents=(kind, f"{kind}_[0-9]*")) for kind in kinds)
+            stubs = tuple(make_stub(kind, environment_id, team=kind, agents=name_patterns(kind)) for kind in kinds)
             env = make(make_stub(name, environment_id, teams=stubs, **limit))
         return write_team_drafts(file_name(name), environment_id, env, texts, removed, limit_lines)
     lines = [

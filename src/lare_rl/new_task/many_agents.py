@@ -19,7 +19,7 @@ from lare_rl.new_task.documentation import first_section, plain_lines, split_sec
 from lare_rl.new_task.draft import Draft, count_entries, file_name, warning_lines
 from lare_rl.tasks.spec import PETTINGZOO_PREFIX, TaskSpec
 
-__all__ = ["draft_multi_agent_task", "make_stub", "write_team_drafts"]
+__all__ = ["draft_multi_agent_task", "make_stub", "name_patterns", "write_team_drafts"]
 
 
 GENERIC_MAKERS = ("parallel_env", "env", "raw_env")
@@ -53,11 +53,13 @@ def draft_multi_agent_task(environment_id: str) -> Draft:
     module, _, maker = environment_id.removeprefix(PETTINGZOO_PREFIX).partition(":")
     name = file_name(module.rpartition(".")[2] if maker in GENERIC_MAKERS else maker)
     several = len(kinds) > 1
-    teams = [make_stub(kind, environment_id, team=kind, agents=_patterns(kind)) for kind in kinds] if several else ()
-    task = make_stub(name, environment_id, teams=teams, max_episode_steps=limit or 1000)
+    teams = (
+        [make_stub(kind, environment_id, team=kind, agents=name_patterns(kind)) for kind in kinds] if several else ()
+    )
+    task = make_stub(name, environment_id, teams=teams, max_episode_steps=limit or draft.DEFAULT_LIMIT)
     arguments = _default_arguments(env)
     lines = [
-        *([] if limit else ["max_episode_steps = 1000 # the environment does not state its own limit"]),
+        *([] if limit else [draft.LIMIT_LINE]),
         *([f"# arguments = {{ {arguments} }} # the defaults, unless they are set here"] if arguments else []),
     ]
     with contextlib.closing(ParallelHost(env, task)) as host:
@@ -104,7 +106,7 @@ def make_stub(name: str, environment: str, **keys: Any) -> TaskSpec:
     return TaskSpec(name=file_name(name), environment=environment, observation_size=1, action_size=1, **texts, **keys)
 
 
-def _patterns(kind: str) -> tuple[str, ...]:
+def name_patterns(kind: str) -> tuple[str, ...]:
     """Return patterns that match the agents of a kind. An agent without a number has the name of its kind."""
     return (kind, f"{kind}_[0-9]*", f"{kind}[0-9]*")
 
@@ -128,7 +130,7 @@ def _read_texts(env: Any) -> tuple[dict[str, str], tuple[str, ...]]:
 
 def _team_lines(host: Layouts, team: Team) -> list[str]:
     names = [str(agent.name) for agent in host.layout.agents[team.agents]]
-    patterns = [pattern for pattern in _patterns(team.name) if any(fnmatchcase(name, pattern) for name in names)]
+    patterns = [pattern for pattern in name_patterns(team.name) if any(fnmatchcase(name, pattern) for name in names)]
     return [f'name = "{team.name}"', f'team = "{team.name}"', f"agents = {json.dumps(patterns)}"]
 
 

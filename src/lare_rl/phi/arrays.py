@@ -20,7 +20,7 @@ from typing import Any
 import numpy as np
 
 from lare_rl.phi.builder import current_builder
-from lare_rl.phi.graph import Kind, all_positions, widest
+from lare_rl.phi.graph import NumberKind, all_positions, widest
 from lare_rl.phi.indices import ALL, computed_positions, fixed_index, index_entries, is_mask, masked_index, overwrite
 from lare_rl.phi.limits import RefusedError
 from lare_rl.phi.operand import BATCH, BatchSize, Operand, common_batch_axis
@@ -72,7 +72,7 @@ class Array(_Value):
         return len(self.row_shape)
 
     @property
-    def kind(self) -> Kind:
+    def kind(self) -> NumberKind:
         return current_builder().nodes[self.base._node].kind
 
     @property

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from lare_rl.phi.evaluate import compute
-from lare_rl.phi.graph import Gather, Graph, Kind, Node, all_positions, elementwise_kinds, letter_sizes, widest
+from lare_rl.phi.graph import Gather, Graph, Node, NumberKind, all_positions, elementwise_kinds, letter_sizes, widest
 from lare_rl.phi.limits import DEFAULT_LIMITS, MAX_EINSUM_LETTERS, OPERATION_COST, GraphLimits, RefusedError
 
 __all__ = ["Builder", "building", "current_builder", "inline"]
@@ -23,9 +23,9 @@ ROW_OPS = {
     "first_row": "x[0] of the batch takes one row for all: write x[:, i] for entry i of every row",
 }
 """Values that a program may have, but not compute with: `np.arange(batch)` may be an index, and x[0] has a shape."""
-_KIND_OF_CODE: dict[str, Kind] = {"b": "bool", "i": "int", "u": "int", "f": "float"}
+_KIND_OF_CODE: dict[str, NumberKind] = {"b": "bool", "i": "int", "u": "int", "f": "float"}
 """Kinds by the codes of NumPy's types (`dtype.kind`)."""
-_DTYPES: dict[Kind, type] = {"bool": bool, "int": np.int64, "float": np.float64}
+_DTYPES: dict[NumberKind, type] = {"bool": bool, "int": np.int64, "float": np.float64}
 
 
 class Builder:
@@ -41,7 +41,7 @@ class Builder:
         self._indices: dict[Any, int] = {}
         self._operations = 0
 
-    def add(self, op: str, inputs: Sequence[int], shape: tuple[int, ...], kind: Kind, option: Any = None) -> int:
+    def add(self, op: str, inputs: Sequence[int], shape: tuple[int, ...], kind: NumberKind, option: Any = None) -> int:
         """Add an operation, after its size has been checked.
 
         Raises:
@@ -91,7 +91,7 @@ class Builder:
         if self.work > self.limits.work:
             raise RefusedError("E-COST", "the program computes too much for one row")
 
-    def input(self, name: str, shape: tuple[int, ...], kind: Kind = "float") -> int:
+    def input(self, name: str, shape: tuple[int, ...], kind: NumberKind = "float") -> int:
         """Add an array of the caller."""
         return self.add("input", (), shape, kind, name)
 
@@ -121,7 +121,7 @@ class Builder:
         kind = widest([self.nodes[x].kind, self.nodes[y].kind])
         return self._broadcast("where", [self.cast(condition, "bool"), self.cast(x, kind), self.cast(y, kind)], kind)
 
-    def _broadcast(self, op: str, inputs: Sequence[int], kind: Kind) -> int:
+    def _broadcast(self, op: str, inputs: Sequence[int], kind: NumberKind) -> int:
         """Add an operation. Arrays get axes of length 1 in front, so that batch axes fit in front of all of them."""
         shapes = [self.nodes[i].shape for i in inputs]
         rank = max(map(len, shapes))
@@ -131,7 +131,7 @@ class Builder:
         ]
         return self.add(op, nodes, np.broadcast_shapes(*(self.nodes[i].shape for i in nodes)), kind)
 
-    def cast(self, x: int, kind: Kind) -> int:
+    def cast(self, x: int, kind: NumberKind) -> int:
         return x if self.nodes[x].kind == kind else self.add("cast", [x], self.nodes[x].shape, kind)
 
     # --- along axes -----------------------------------------------------------------------------------------------------
@@ -154,7 +154,7 @@ class Builder:
     def scan(self, op: str, x: int, axis: int) -> int:
         """Add cumsum, cumprod, sort or argsort along an axis."""
         node = self.nodes[x]
-        kind: Kind = "int" if op == "argsort" or (node.kind == "bool" and op != "sort") else node.kind
+        kind: NumberKind = "int" if op == "argsort" or (node.kind == "bool" and op != "sort") else node.kind
         x = x if op == "argsort" else self.cast(x, kind)
         return self.add(op, [x], node.shape, kind, axis - len(node.shape))
 

@@ -23,9 +23,9 @@ from typing import Any, Literal, NamedTuple, get_args
 
 import numpy as np
 
-__all__ = ["ELEMENTWISE", "Gather", "Graph", "Kind", "Node", "elementwise_kinds", "widest"]
+__all__ = ["ELEMENTWISE", "Gather", "Graph", "Node", "NumberKind", "elementwise_kinds", "widest"]
 
-Kind = Literal["bool", "int", "float"]
+NumberKind = Literal["bool", "int", "float"]
 
 
 class Node(NamedTuple):
@@ -35,7 +35,7 @@ class Node(NamedTuple):
     inputs: tuple[int, ...]
     shape: tuple[int, ...]
     """Shape of the result, for one row."""
-    kind: Kind
+    kind: NumberKind
     option: Any = None
     """What else the operation needs: axes, positions, a pattern, the name of an input, the numbers of a constant."""
     line: int = 0
@@ -168,7 +168,7 @@ def all_positions(shape: tuple[int, ...]) -> np.ndarray:
 # --- kinds of numbers ------------------------------------------------------------------------------------------------
 
 
-KINDS: tuple[Kind, ...] = get_args(Kind)
+KINDS: tuple[NumberKind, ...] = get_args(NumberKind)
 """From the narrowest to the widest."""
 
 ELEMENTWISE: dict[str, str] = {
@@ -195,8 +195,8 @@ _ON_BOOL = {"add": "logical_or", "maximum": "logical_or", "multiply": "logical_a
 
 @lru_cache(1024)
 def elementwise_kinds(
-    op: str, kinds: tuple[Kind, ...], negative_exponent: bool = False
-) -> tuple[str | None, Kind, Kind]:
+    op: str, kinds: tuple[NumberKind, ...], negative_exponent: bool = False
+) -> tuple[str | None, NumberKind, NumberKind]:
     """Return which operation NumPy applies to operands of these kinds, the kind that they are cast to, and that of the result.
 
     The operation is None if nothing is to be done.
@@ -222,10 +222,10 @@ def elementwise_kinds(
         return None, kind, kind
     if op == "copysign" or (op == "power" and kind == "int" and negative_exponent):
         kind = "float"
-    operands: Kind = "float" if result == "float" else "bool" if result == "logical" else kind
+    operands: NumberKind = "float" if result == "float" else "bool" if result == "logical" else kind
     return op, operands, "bool" if result in ("bool", "logical") else operands
 
 
-def widest(kinds: Sequence[str]) -> Kind:
+def widest(kinds: Sequence[str]) -> NumberKind:
     """Return the kind that can hold numbers of all these kinds."""
     return max(KINDS, key=lambda kind: kind in kinds and KINDS.index(kind))

@@ -71,3 +71,7 @@ class RefusedError(Exception):
     def __init__(self, code: str, message: str, line: int | None = None):
         super().__init__(message)
         self.code, self.line = code, line
+
+    def located(self, line: int | None) -> str:
+        """Return the message after its rule and a line of the source."""
+        return f"{self.code} line {line}: {self}"

@@ -144,7 +144,7 @@ def _unavailable_names(tree: ast.Module, module: Scope) -> list[str]:
             for name in reversed(names):
                 owner = module_attribute(owner.name, name) if isinstance(owner, Symbol) else None
         except RefusedError as refusal:
-            messages.append(f"{refusal.code} line {node.lineno}: {refusal}")
+            messages.append(refusal.located(node.lineno))
             if len(messages) == MAX_MESSAGES:
                 break
     return messages

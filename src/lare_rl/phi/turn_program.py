@@ -86,8 +86,7 @@ def read_turn_program(source: str) -> TurnProgram:
     try:
         return TurnProgram(source, parse(source))
     except RefusedError as refusal:
-        message = f"{refusal.code} line {refusal.line or 1}: {refusal}"
-        raise RefusedError(refusal.code, message, refusal.line) from None
+        raise RefusedError(refusal.code, refusal.located(refusal.line or 1), refusal.line) from None
 
 
 def shorten(text: str, length: int = MAX_TEXT_LENGTH) -> str:

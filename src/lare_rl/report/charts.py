@@ -17,7 +17,6 @@ from jaxtyping import Float, UInt8
 
 from lare_rl.errors import missing_extra_error
 from lare_rl.util.findings import format_value
-from lare_rl.util.statistics import sample_std
 
 try:
     from PIL import Image, ImageDraw
@@ -28,7 +27,6 @@ __all__ = [
     "N_COLOURS",
     "Bar",
     "Chart",
-    "Curve",
     "Line",
     "draw_bars",
     "draw_legend",
@@ -46,8 +44,6 @@ MAX_STRIP_COLUMNS = 200
 """The largest number of columns of a strip. Each is the mean of some steps."""
 MAX_HOVERS = 60
 """The largest number of positions at which a chart shows its numbers."""
-SMALL_STD = 1e-3
-"""Smaller standard deviations are written with one digit."""
 MAX_LABEL = 24
 """Characters of the text at the end of a line that a chart has room for."""
 _UNITS = 1000
@@ -55,9 +51,6 @@ _UNITS = 1000
 _LABEL_GAP = 5.5
 """Percent of a chart's height between two labels."""
 _VIRIDIS = np.array([(68, 1, 84), (59, 82, 139), (33, 145, 140), (94, 201, 98), (253, 231, 37)], float)
-
-Curve = tuple[Float[np.ndarray, " evaluations"], Float[np.ndarray, "seeds evaluations"]]
-"""Steps, and the values that were measured at them."""
 
 
 @dataclass(frozen=True)
@@ -135,7 +128,7 @@ class Chart:
             for tick, y in zip(y_ticks, down(np.array(y_ticks)), strict=True)
         ]
         texts += [
-            f'<span class="x" style="left:{x / 10:.1f}%">{_format_steps(tick)}</span>'
+            f'<span class="x" style="left:{x / 10:.1f}%">{format_value(tick, "steps")}</span>'
             for tick, x in zip(x_ticks, across(np.array(x_ticks)), strict=True)
         ]
         n_characters = max(len(format_number(tick)) for tick in y_ticks)
@@ -261,19 +254,6 @@ def format_number(value: float | np.number) -> str:
     return format_value(float(value) + 0.0, "score")
 
 
-def format_spread(values: Float[np.ndarray, " values"]) -> str:
-    """Write the mean of some values ± their standard deviation, which has two digits. A single value stands alone."""
-    if not len(values):
-        return ""
-    mean, std = float(np.mean(values)), sample_std(values)
-    if len(values) == 1 or not std:
-        return format_number(mean)
-    if std < SMALL_STD:
-        return f"{format_number(mean)} ± {std:.1g}"
-    n_places = 0 if abs(mean) >= 100 or std >= 10 else 1 - math.floor(math.log10(std))
-    return f"{mean:,.{n_places}f} ± {std:,.{n_places}f}"
-
-
 def _colour(position: Float[np.ndarray, "*shape"]) -> UInt8[np.ndarray, "*shape 3"]:
     """Return the colours of numbers between 0 and 1."""
     position = np.clip(position, 0, 1) * (len(_VIRIDIS) - 1)
@@ -313,7 +293,3 @@ def _spread(positions: Sequence[float]) -> list[float]:
             moved[[i, j]] += -overlap, overlap
         moved += max(0.0, -moved.min(initial=0)) - max(0.0, moved.max(initial=0) - 100)
     return moved.tolist()
-
-
-def _format_steps(x: float) -> str:
-    return f"{x / 1e6:g}M" if x >= 1e6 else f"{x / 1e3:g}k" if x >= 1e3 else f"{x:g}"

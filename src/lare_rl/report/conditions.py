@@ -8,8 +8,8 @@ from lare_rl.report.diagnosis import (
     HIGH_R2,
     STUCK_FRACTION,
 )
-from lare_rl.report.run_summary import CLEAR_ERRORS, LITTLE_R2, MIN_EVALUATIONS, POSSIBLE_ERRORS, SEED_STDS
-from lare_rl.report.score_use import CLEAR_GAIN
+from lare_rl.report.run_summary import LITTLE_R2, MIN_EVALUATIONS, POSSIBLE_ERRORS, SEED_STDS
+from lare_rl.report.score_use import CLEAR_ERRORS, CLEAR_GAIN
 
 __all__ = ["CONDITIONS"]
 

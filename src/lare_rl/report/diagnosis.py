@@ -9,7 +9,8 @@ from collections.abc import Callable, Sequence
 import numpy as np
 
 from lare_rl.credit.basis import MAX_PAIRED_RAW_FEATURES
-from lare_rl.report.run_summary import CLEAR_ERRORS, LITTLE_R2, MIN_EVALUATIONS, RunSummary
+from lare_rl.report.run_summary import LITTLE_R2, MIN_EVALUATIONS, RunSummary
+from lare_rl.report.score_use import CLEAR_ERRORS
 from lare_rl.util.findings import Finding
 from lare_rl.util.statistics import sample_std
 
@@ -72,7 +73,9 @@ def _outcome(run: RunSummary) -> Finding:
         "std": Finding("std", {"std": std}) if std else None,
         "steps": int(run.steps[-1]),
         "seeds": seeds if run.n_seeds > 1 else None,
-        "likeliest": None if run.likeliest_return is None else Finding("likeliest", {"return_": run.likeliest_return}),
+        "deterministic": None
+        if run.deterministic_return is None
+        else Finding("deterministic", {"return_": run.deterministic_return}),
     }
     if not len(run.random_returns):
         return Finding("outcome_unknown", {"reached": Finding("reached", reached)})
@@ -150,7 +153,9 @@ def _is_rising(run: RunSummary) -> Finding | None:
     quarter = run.mean_returns[-max(2, len(run.mean_returns) // 4) :]
     if last - previous <= max(change, run.final_error) or quarter[-1] - quarter[0] <= change / 2:
         return None
-    return Finding("is_rising", {"directory": run.directory, "steps": 2 * int(run.steps[-1])})
+    step, values = int(run.steps[-1]), {"directory": run.directory}
+    longer = Finding("resume_longer", values | {"steps": 2 * step})
+    return Finding("is_rising", {"command": Finding("resume", values) if step < run.planned_steps else longer})
 
 
 def _one_seed_was_better(run: RunSummary) -> Finding | None:
@@ -187,7 +192,8 @@ def _is_stuck(run: RunSummary) -> Finding | None:
         seeds = Finding("saturated_seeds", {"n_saturated": run.n_saturated, "n_seeds": run.n_seeds})
         return Finding("is_stuck", {"cause": Finding("saturated", {"seeds": seeds if run.n_seeds > 1 else None})})
     ranges = np.ptp(run.returns[:, -MIN_EVALUATIONS:], axis=1)
-    if len(run.steps) < MIN_EVALUATIONS or np.any(ranges >= STUCK_FRACTION * sample_std(run.random_returns)):
+    # A return that is unknown makes the range NaN, and nothing is said.
+    if len(run.steps) < MIN_EVALUATIONS or not np.all(ranges < STUCK_FRACTION * sample_std(run.random_returns)):
         return None
     return Finding("is_stuck", {"cause": Finding("repeats_behaviour", {"n_evaluations": MIN_EVALUATIONS})})
 

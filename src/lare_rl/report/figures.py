@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from lare_rl.errors import missing_extra_error
-from lare_rl.report.charts import Curve
+from lare_rl.util.findings import format_value
 from lare_rl.util.statistics import Band
 
 try:
@@ -22,11 +22,9 @@ except ImportError as missing:
 
 __all__ = [
     "COLOURS",
-    "Curve",
     "add_white_background",
     "draw_band_panels",
     "draw_bands",
-    "draw_curves",
     "make_figure",
     "to_svg",
 ]
@@ -73,22 +71,6 @@ def make_figure(rows: int = 1, height: float = 3.4, columns: int = 1) -> tuple[F
         return figure, figure.subplots(rows, columns, sharex=True, sharey=columns > 1, squeeze=False).ravel()
 
 
-def draw_curves(curves: Mapping[str, Curve], y_label: str) -> str:
-    """Draw means over seeds as lines over environment steps, with the standard deviation over seeds as a band."""
-    figure, (axes,) = make_figure(height=3.0)
-    for (line, colour), (name, (steps, values)) in zip(cycle(_LINES), curves.items(), strict=False):
-        mean = values.mean(axis=0)
-        axes.plot(steps, mean, color=colour, linestyle=line, label=name)
-        if len(values) > 1:
-            std = values.std(axis=0, ddof=1)
-            axes.fill_between(steps, mean - std, mean + std, color=colour, alpha=0.22, linewidth=0.7)
-    axes.set(xlabel="environment steps", ylabel=y_label)
-    axes.xaxis.set_major_formatter(_format_steps)
-    if len(curves) > 1:
-        _add_legend(axes)
-    return to_svg(figure)
-
-
 def draw_bands(
     bands: Mapping[str, Band], x_label: str, y_label: str, x_is_steps: bool = False, log_scale: bool = False
 ) -> str:
@@ -131,7 +113,7 @@ def _draw_bands_on(axes: Axes, bands: Mapping[str, Band], x_is_steps: bool) -> N
 
 
 def _format_steps(x: float, _: Any) -> str:
-    return f"{x / 1e6:g}M" if x >= 1e6 else f"{x / 1e3:g}k" if x else "0"
+    return format_value(x, "steps")
 
 
 def _add_legend(axes: Axes) -> None:

@@ -11,6 +11,7 @@ from lare_rl.evaluation.evaluate import measure_random_returns
 from lare_rl.report.html import render_note, write_page
 from lare_rl.report.overview import render_learning_curves, render_verdict, summarise_runs
 from lare_rl.report.run_summary import ReportedRun
+from lare_rl.runs.config_file import read_config
 from lare_rl.runs.directory import open_without_functions
 from lare_rl.training.progress import MetricLines
 
@@ -44,6 +45,8 @@ class LivePage:
     def on_message(self, message: str) -> None: ...
 
     def on_evaluation(self, metrics: MetricLines) -> None:
+        if self._random_returns is None:  # not before the first step, because it may take minutes
+            self._random_returns = measure_random_returns(read_config(self._directory).task)
         self._write()
 
     def on_stop(self) -> None:
@@ -55,16 +58,16 @@ class LivePage:
         with suppress(LareError):
             run = open_without_functions(self._directory)
             task, settings = run.config.task, run.config.settings
-            if self._random_returns is None:
-                self._random_returns = measure_random_returns(task)
+            unknown = np.zeros((len(task.roles), 0))
+            random_returns = unknown if self._random_returns is None else self._random_returns
             reported = ReportedRun(settings.method, run)
             title = f"{task.name}: {settings.method}"
-            (summary,) = summarise_runs([reported], self._random_returns)
+            (summary,) = summarise_runs([reported], random_returns)
             state = f"reloaded every {REFRESH_S} seconds" if self._is_running else "not running"
             steps = f"Step {reported.last_step:,} of {settings.steps:,}"
             sections = [
                 *render_verdict(reported, summary),
-                *render_learning_curves(task, [reported], self._random_returns),
+                *render_learning_curves(task, [reported], random_returns),
                 render_note(f"{steps}; {state}. lare-rl report draws credit and factors too."),
             ]
             write_page(self._directory / PAGE, title, "\n".join(sections), REFRESH_S if self._is_running else None)

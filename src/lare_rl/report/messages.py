@@ -31,8 +31,8 @@ MESSAGES = {
     ),
     "headline_not_learned": "It has not learned yet",
     "not_learned": "{reached}; {baseline}.",
-    "reached": "The return is {return_:score}{std} after {steps:,} steps{seeds}{likeliest}",
-    "likeliest": ", by sampled actions as in training; the most likely action gets {return_:score}",
+    "reached": "The return is {return_:score}{std} after {steps:,} steps{seeds}{deterministic}",
+    "deterministic": ", by sampled actions as in training; the most likely action gets {return_:score}",
     "std": " ± {std:std}",
     "over_seeds": " (mean over {n_seeds} seeds)",
     "baseline": "random actions get {return_:score} ± {std:std} in {n_episodes:count episode}{initial}",
@@ -110,7 +110,9 @@ MESSAGES = {
     "replace_phi": "another phi (`lare-rl design {task} --reflect 2 --model NAME`), or none (`--method bayes`)",
     "bad_raw_features": "the raw entries do not show what the score depends on",
     "write_phi": "a phi (`lare-rl prompt {task}`)",
-    "is_rising": "Next: it was still rising. To continue: `lare-rl train --resume {directory} --steps {steps}`.",
+    "is_rising": "Next: it was still rising. To continue: {command}.",
+    "resume": "`lare-rl train --resume {directory}`",
+    "resume_longer": "`lare-rl train --resume {directory} --steps {steps}`",
     "one_seed_was_better": (
         "Next: one seed was better than random actions at step {step:,} ({return_:score}). `lare-rl evaluate {directory} --best` "
         "plays the best policy of each seed. To continue: more `--steps`, or another `--algorithm`."

@@ -8,15 +8,16 @@ import numpy as np
 from jaxtyping import Float
 
 from lare_rl.evaluation.reference_returns import REFERENCE_RETURNS
-from lare_rl.report.charts import N_COLOURS, Chart, Curve, Line, draw_legend, format_number, format_spread
+from lare_rl.report.charts import N_COLOURS, Chart, Line, draw_legend, format_number
 from lare_rl.report.diagnosis import CREDIT_CODES, NEXT_CODES, diagnose
 from lare_rl.report.html import render_fold, render_note, render_table, render_tiles
 from lare_rl.report.messages import MESSAGES, WORDS
-from lare_rl.report.run_summary import ReportedRun, RunSummary, finite, summarise_run
+from lare_rl.report.run_summary import Curve, ReportedRun, RunSummary, finite, summarise_run
 from lare_rl.runs.metric_names import CREDIT_CORRELATION, CREDIT_ERROR, RETURN, RETURN_R2, RETURN_STD
 from lare_rl.tasks.spec import TaskSpec
 from lare_rl.util.durations import format_seconds
 from lare_rl.util.findings import Finding, format_value, render
+from lare_rl.util.statistics import format_mean_std
 
 __all__ = [
     "compare_runs",
@@ -54,12 +55,17 @@ class _Metric(NamedTuple):
 
 
 def summarise_runs(
-    runs: Sequence[ReportedRun], random_returns: Float[np.ndarray, " episodes"]
+    runs: Sequence[ReportedRun], random_returns: Float[np.ndarray, "teams episodes"]
 ) -> list[RunSummary | None]:
-    """Return the summary of each run of a task. Each is compared with a run on the return of the episode alone, if there is one."""
+    """Return the summary of each run of a task, with the returns of its first team.
+
+    Each is compared with a run on the return of the episode alone, if there is one.
+    """
     episodic = [run for run in runs if run.run.config.settings.method == "episodic" and np.isfinite(run.final_return)]
     return [
-        summarise_run(run, random_returns, next((other.final_return for other in episodic if other is not run), None))
+        summarise_run(
+            run, random_returns[0], next((other.final_return for other in episodic if other is not run), None)
+        )
         for run in runs
     ]
 
@@ -85,10 +91,10 @@ def render_verdict(
 def _tiles(reported: ReportedRun, summary: RunSummary) -> Iterable[tuple[str, str, str]]:
     """Yield the numbers of a run: title, number, remark. Those that are unknown are missing."""
     if len(summary.final_returns):
-        number, _, std = format_spread(summary.final_returns).partition(" ± ")
+        number, _, std = _format_spread(summary.final_returns).partition(" ± ")
         yield "Return", number, f"{f'± {std}, ' if std else ''}{format_value(len(summary.final_returns), 'count seed')}"
     if len(summary.random_returns):
-        number, _, std = format_spread(summary.random_returns).partition(" ± ")
+        number, _, std = _format_spread(summary.random_returns).partition(" ± ")
         yield "Random actions", number, f"± {std or 0}, {format_value(len(summary.random_returns), 'count episode')}"
     if summary.return_r2 is not None:
         yield "R² of returns", format_value(summary.return_r2, "r2"), "of new episodes; 1 is perfect"
@@ -172,7 +178,7 @@ def render_final_values(runs: Sequence[ReportedRun]) -> str:
         values = [reported.final_values(metric) for metric in _METRICS]
         step, n_seeds = f"{reported.last_step:,}", len(reported.run.seeds)
         if len(runs) > 1:
-            rows.append((task, reported.name, *map(format_spread, values), str(n_seeds), step))
+            rows.append((task, reported.name, *map(_format_spread, values), str(n_seeds), step))
         else:
             for i, seed in enumerate(reported.run.seeds):
                 cells = (format_number(numbers[i]) if len(numbers) == n_seeds else "" for numbers in values)
@@ -184,18 +190,18 @@ def render_final_values(runs: Sequence[ReportedRun]) -> str:
 
 
 def render_learning_curves(
-    task: TaskSpec, runs: Sequence[ReportedRun], random_returns: Float[np.ndarray, " episodes"]
+    task: TaskSpec, runs: Sequence[ReportedRun], random_returns: Float[np.ndarray, "teams episodes"]
 ) -> Iterable[str]:
     """Yield the curve of the return of each team, and the curves of the other metrics folded below it."""
     names = [f"{RETURN}_{role.team}" for role in task.teams] or [RETURN]
     colours = {reported.name: f"c{i}" if i < N_COLOURS else "grey" for i, reported in enumerate(sort_runs(runs))}
-    references = {"random actions": float(random_returns.mean())} if len(random_returns) else {}
+    references = [{"random actions": float(returns.mean())} if len(returns) else {} for returns in random_returns]
     warmups = {reported.run.config.settings.warmup for reported in runs}
     warmup = warmups.pop() if len(warmups) == 1 else 0
-    yield _render_legend(runs, colours, references, warmup)
-    for name, role in zip(names, task.teams or (task,), strict=True):
+    yield _render_legend(runs, colours, references[0], warmup)
+    for name, role, reference in zip(names, task.roles, references, strict=True):
         title = f"True return, team of {role.team}" if task.teams else "True return"
-        if chart := _draw_metric(_Metric(name, title), runs, colours, references, warmup):
+        if chart := _draw_metric(_Metric(name, title), runs, colours, reference, warmup):
             yield render_note(title) + chart
     charts = {metric.title: _draw_metric(metric, runs, colours, {}, warmup) for metric in _other_metrics(task)}
     figures = [
@@ -251,7 +257,7 @@ def _draw_metric(
     lines += [Line(extent, np.full(2, value), "grey dashed", name) for name, value in references.items()]
     has_negative = any((line.y[np.isfinite(line.y)] < 0).any() for line in lines)
     limits = (-1.0, 1.0) if metric.limits and has_negative else metric.limits
-    final = ", ".join(f"{name} {format_spread(finite(curve[1][:, -1]))}" for name, (_, curve) in curves.items())
+    final = ", ".join(f"{name} {_format_spread(finite(curve[1][:, -1]))}" for name, (_, curve) in curves.items())
     return Chart(
         lines=lines,
         description=f"{metric.title} over environment steps. Last values: {final}",
@@ -296,6 +302,11 @@ def render_words() -> str:
     """Return the explanations of words, which links lead to."""
     items = (f'<dt id="{code}">{escape(title)}</dt><dd>{escape(text)}</dd>' for code, (title, text) in WORDS.items())
     return f'<h2>Words</h2><dl class="words">{"".join(items)}</dl>'
+
+
+def _format_spread(values: Float[np.ndarray, " values"]) -> str:
+    """Write the mean of some values ± their standard deviation, or nothing without values."""
+    return format_mean_std(values) if len(values) else ""
 
 
 def _mean(values: Float[np.ndarray, "seeds evaluations"]) -> Float[np.ndarray, " evaluations"]:

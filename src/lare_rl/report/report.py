@@ -28,6 +28,7 @@ from lare_rl.report.run_summary import ReportedRun
 from lare_rl.runs.checkpoint import STATE_FILE
 from lare_rl.runs.directory import Run, find_run_directories, open_run, open_without_functions
 from lare_rl.tasks.trust import untrusted_module
+from lare_rl.util.files import check_new_path
 from lare_rl.util.provenance import code_version
 
 __all__ = ["write_report"]
@@ -62,8 +63,7 @@ def write_report(
         opened += [source] if isinstance(source, Run) else map(_open_run, find_run_directories([Path(source)]))
     reported_runs = _name_runs(opened)
     path = Path(out) if out is not None else reported_runs[0].run.directory / "report.html"
-    if not path.parent.is_dir():
-        raise LareError(f"the report {path} cannot be written: there is no folder {path.parent}")
+    check_new_path(path, overwrite=True)
     return write_page(path, _title(reported_runs), "\n".join(_render_body(reported_runs, film)))
 
 

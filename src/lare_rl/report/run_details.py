@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Float
 
 from lare_rl.config.effective import effective_settings
-from lare_rl.config.resolve import apply_defaults
+from lare_rl.config.resolve import fill_in
 from lare_rl.config.settings import Settings
 from lare_rl.credit import explanation_text
 from lare_rl.credit.methods import find_method
@@ -32,6 +32,7 @@ from lare_rl.report.charts import (
 from lare_rl.report.html import render_fold, render_function, render_note, render_table
 from lare_rl.report.run_summary import ReportedRun
 from lare_rl.runs.directory import Run, function_paths
+from lare_rl.tasks.spec import base_name
 from lare_rl.tasks.trust import TRUST_VARIABLE, untrusted_module
 from lare_rl.training.explain import explanation_source, find_explanations
 from lare_rl.util.findings import Finding, render
@@ -39,7 +40,7 @@ from lare_rl.util.statistics import column_correlations
 
 __all__ = ["describe_method", "render_details", "render_settings"]
 
-MAX_TSNE_POINTS = 1000
+TSNE_PERPLEXITY, MAX_TSNE_POINTS = 30, 1000
 MIN_BAND = 0.04
 """A band is visible if it is wider than this fraction of the range of the line."""
 _BAND_NOTE = (
@@ -141,7 +142,7 @@ def _render_earnings(run: Run, correlations: Sequence[Float[np.ndarray, " factor
         labels = label_factors(run, team_index)
         if len(roles) > 1 and (findings or labels):
             sections.append(f"<h3>{escape(role.name)}</h3>")
-        meanings = {label.name.removesuffix(" (before)").removesuffix(" (after)"): label.meaning for label in labels}
+        meanings = {base_name(label.name): label.meaning for label in labels}
         bars = [_make_bar(finding, meanings) for finding in findings if finding.code in ("factor", "unknown_factor")]
         bars += [bar for finding in findings for bar in _raw_feature_bars(finding)]
         sections += [f"<p>{escape(_sentence(finding))}</p>" for finding in findings if finding.code in _SUMMARIES]
@@ -197,7 +198,7 @@ def _render_factor_table(
     values = {finding.values["name"]: finding.values for finding in findings if finding.code == "factor"}
     rows = []
     for label, correlation in zip(labels, correlations, strict=True):
-        described = values.get(label.name.removesuffix(" (before)").removesuffix(" (after)"))
+        described = values.get(base_name(label.name))
         numbers = (
             ("", "")
             if described is None
@@ -251,11 +252,15 @@ def _render_tsne(sample: TeamSample) -> Iterable[str]:
         yield render_note(f"A t-SNE picture of observations and factors is drawn here after {install_command('tsne')}.")
         return
     chosen = np.random.default_rng(0).permutation(len(sample.reward))[:MAX_TSNE_POINTS]
+    if len(chosen) <= TSNE_PERPLEXITY:
+        return
     yield '<div class="figures">'
     for name, columns in {"observations": sample.next_observation, "factors": sample.factors}.items():
+        if columns.shape[1] < 2:  # a plane needs two columns
+            continue
         rows = columns[chosen]
         rows = (rows - rows.mean(axis=0)) / np.maximum(rows.std(axis=0), 1e-9)
-        points = TSNE(init="pca", random_state=0).fit_transform(rows)
+        points = TSNE(perplexity=TSNE_PERPLEXITY, init="pca", random_state=0).fit_transform(rows)
         yield draw_points(points, sample.reward[chosen], f"t-SNE of the {name} of agents. Bright: a high true reward.")
     yield "</div>"
 
@@ -295,7 +300,7 @@ def _default_settings(run: Run) -> dict[str, str]:
     settings, task = run.config.settings, run.config.task
     if untrusted_module(task) is not None:
         return {}
-    defaults = apply_defaults(Settings(method=settings.method, algorithm=settings.algorithm), load_env_spec(task))
+    defaults = fill_in(Settings(method=settings.method, algorithm=settings.algorithm), task, load_env_spec(task))
     return {key: _to_text(value) for key, value in effective_settings(defaults).items()}
 
 

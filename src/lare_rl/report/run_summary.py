@@ -10,14 +10,13 @@ from jaxtyping import Float
 
 from lare_rl.credit.methods import find_method
 from lare_rl.envs.load import shipped_tasks
-from lare_rl.report.charts import Curve
-from lare_rl.report.score_use import ScoreUse, summarise_score_use
+from lare_rl.report.score_use import CLEAR_ERRORS, ScoreUse, summarise_score_use
 from lare_rl.runs.directory import Run
 from lare_rl.runs.metric_names import (
     ACTOR_SATURATION,
     CREDIT_CORRELATION,
     CREDIT_ERROR,
-    LIKELIEST_RETURN,
+    DETERMINISTIC_RETURN,
     RETURN,
     RETURN_R2,
     RETURN_STD,
@@ -27,19 +26,22 @@ from lare_rl.training.advice import describe_untrained
 from lare_rl.util.statistics import grouped_standard_error, sample_std, standard_error
 
 __all__ = [
-    "CLEAR_ERRORS",
     "LITTLE_R2",
     "MIN_EVALUATIONS",
     "POSSIBLE_ERRORS",
     "SEED_STDS",
+    "Curve",
     "ReportedRun",
     "RunSummary",
     "finite",
     "summarise_run",
 ]
 
-CLEAR_ERRORS, POSSIBLE_ERRORS = 2, 1
-"""A difference is clear, or possible, if it exceeds this number of its standard errors."""
+Curve = tuple[Float[np.ndarray, " evaluations"], Float[np.ndarray, "seeds evaluations"]]
+"""Steps, and the values that were measured at them."""
+
+POSSIBLE_ERRORS = 1
+"""A difference is possible if it exceeds this number of its standard errors."""
 SEED_STDS = 2
 """A seed has learned if its final return exceeds the mean of random actions by this number of deviations of their returns."""
 MIN_ERROR = 1e-9
@@ -109,7 +111,7 @@ class RunSummary:
     """True returns of random actions. Empty if they are unknown."""
     initial_returns: Float[np.ndarray, " seeds"] | None = None
     """The returns of the policies before their first update, or None if they were not evaluated."""
-    likeliest_return: float | None = None
+    deterministic_return: float | None = None
     """The final return of the most likely actions, or None if the policy does not sample, or it was not measured."""
     episode_error: float = 0.0
     """The standard error of the mean final return, from episode to episode of the last evaluation."""
@@ -134,6 +136,8 @@ class RunSummary:
     """Whether the decoder is trained by gradient descent. It may then not have converged yet."""
     untrained: str | None = None
     """Why the policy was never updated, or None if it was."""
+    planned_steps: int = 0
+    """The number of environment steps of the whole run. It has more than `steps` says if it is unfinished."""
     warmup: int = 0
     """The number of environment steps before the first update."""
     n_saturated: int = 0
@@ -262,7 +266,7 @@ def summarise_run(
     if (curve := reported.curve(RETURN)) is None:
         return None
     steps, returns = curve
-    likeliest = reported.curve(LIKELIEST_RETURN)
+    deterministic = reported.curve(DETERMINISTIC_RETURN)
     _, r2s = reported.curve(RETURN_R2) or (None, None)
     run, task, settings = reported.run, reported.run.config.task, reported.run.config.settings
     method = find_method(settings.method)
@@ -274,7 +278,7 @@ def summarise_run(
         # One episode has no deviation, so nothing can be compared with it.
         random_returns=random_returns if len(random_returns) > 1 else np.zeros(0),
         initial_returns=initial_returns if np.isfinite(initial_returns).all() else None,
-        likeliest_return=_last_mean(likeliest[1][:, -1:]) if likeliest else None,
+        deterministic_return=_last_mean(deterministic[1][:, -1:]) if deterministic else None,
         episode_error=_episode_error(reported),
         episodic_return=episodic_return,
         return_r2=None if r2s is None else _last_mean(r2s),
@@ -287,6 +291,7 @@ def summarise_run(
         many_agents=SUMMED_RETURN in reported.metrics[-1],
         uses_gradient=method.uses_gradient,
         untrained=describe_untrained(run),
+        planned_steps=settings.steps,
         warmup=settings.warmup,
         n_saturated=int(np.sum(reported.final_values(ACTOR_SATURATION) == 1)),
         directory=str(run.directory),

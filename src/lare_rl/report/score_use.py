@@ -1,4 +1,4 @@
-"""How a run took the score of its task, and whether its credit can be trusted."""
+"""As what a method explains the score of a task, and whether its credit can be trusted."""
 
 import math
 from dataclasses import dataclass
@@ -8,10 +8,10 @@ from lare_rl.credit.methods import Fit, Method
 from lare_rl.tasks.spec import TaskSpec
 from lare_rl.util.findings import Finding
 
-__all__ = ["CLEAR_GAIN", "ScoreUse", "summarise_score_use"]
+__all__ = ["CLEAR_ERRORS", "CLEAR_GAIN", "ScoreUse", "summarise_score_use"]
 
 CLEAR_ERRORS = 2
-"""Predictions are better than the mean return if their gain exceeds this number of its standard errors."""
+"""A difference is clear if it exceeds this number of its standard errors."""
 CLEAR_GAIN = 0.8
 """Predictions leave little of the score if they remove a larger share of the squared error of the mean return."""
 

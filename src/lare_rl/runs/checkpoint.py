@@ -33,7 +33,7 @@ __all__ = [
     "load",
     "named_leaves",
     "open_npz",
-    "read_host_state",
+    "read_metadata",
     "save",
     "take_snapshot",
     "write",
@@ -79,7 +79,7 @@ Template = TypeVar("Template")
 
 
 @dataclass(frozen=True)
-class _Segment:
+class _RowFile:
     """A file of rows."""
 
     number: int
@@ -101,38 +101,38 @@ class Snapshot(NamedTuple):
 
 
 def take_snapshot(
-    directory: Path, learner: WithReplay, host: Mapping[str, Any], arrays: Mapping[str, np.ndarray]
+    directory: Path, learner: WithReplay, metadata: Mapping[str, Any], arrays: Mapping[str, np.ndarray]
 ) -> Snapshot:
     """Copy from the device what the next checkpoint will hold. The last one must have been written.
 
     Args:
-        host: other data to save, as JSON.
+        metadata: other data to save, as JSON.
         arrays: other data to save, as arrays.
     """
     capacity, end = _capacity(learner), np.asarray(learner.replay.next_row)
-    start, segments = np.zeros_like(end), []
+    start, row_files = np.zeros_like(end), []
     if (directory / STATE_FILE).exists():
         with open_npz(directory / STATE_FILE) as saved:
-            start, segments = saved[".replay.next_row"], _read_segments(saved["segments"])
+            start, row_files = saved[".replay.next_row"], _read_row_files(saved["segments"])
     # The last saved row is saved again, because it held only the newest observation then. And if an episode has just
     # been dropped, `end` is smaller than before.
     start = np.minimum(start, end)
     count = end - start + 1
     width = 1 << int(count.max() - 1).bit_length()  # few widths, few compilations
     rows = _read_rows(learner.replay.columns, (start[..., None] + np.arange(width)) % capacity)
-    number = segments[-1].number + 1 if segments else 0
-    segments.append(_Segment(number, start.tolist(), count.tolist()))
-    in_use = [segment for segment in segments if np.any(np.add(segment.start, segment.count) > end - capacity)]
+    number = row_files[-1].number + 1 if row_files else 0
+    row_files.append(_RowFile(number, start.tolist(), count.tolist()))
+    in_use = [row_file for row_file in row_files if np.any(np.add(row_file.start, row_file.count) > end - capacity)]
     state = {name: np.array(leaf) for name, leaf in named_leaves(learner).items()}
     state |= {name: np.array(array) for name, array in arrays.items()}
-    state["host"] = np.array(json.dumps(host))
-    state["segments"] = np.array(json.dumps([asdict(segment) for segment in in_use]))
+    state["host"] = np.array(json.dumps(metadata))
+    state["segments"] = np.array(json.dumps([asdict(row_file) for row_file in in_use]))
     return Snapshot(
         rows_file=_rows_file(number),
         rows={name: np.array(values[:, :, : count.max()]) for name, values in jax.device_get(rows).items()},
         state=state,
-        # Not always the oldest ones: a segment from before a drop may reach further.
-        unused_files=[_rows_file(segment.number) for segment in segments if segment not in in_use],
+        # Not always the oldest ones: a file from before a drop may reach further.
+        unused_files=[_rows_file(row_file.number) for row_file in row_files if row_file not in in_use],
     )
 
 
@@ -147,9 +147,9 @@ def write(directory: Path, snapshot: Snapshot) -> None:
         (directory / name).unlink(missing_ok=True)
 
 
-def save(directory: Path, learner: WithReplay, host: Mapping[str, Any], arrays: Mapping[str, np.ndarray]) -> None:
+def save(directory: Path, learner: WithReplay, metadata: Mapping[str, Any], arrays: Mapping[str, np.ndarray]) -> None:
     """Take a snapshot and write it. The arguments and errors are those of both."""
-    write(directory, take_snapshot(directory, learner, host, arrays))
+    write(directory, take_snapshot(directory, learner, metadata, arrays))
 
 
 def _rows_file(number: int) -> str:
@@ -163,7 +163,7 @@ def load(directory: Path, template: State) -> tuple[State, dict[str, Any], dict[
         template: a training state of the same structure, whose leaves may be shapes.
 
     Returns:
-        The training state, and `host` and `arrays` as saved.
+        The training state, and `metadata` and `arrays` as saved.
 
     Raises:
         LareError: there is no checkpoint, or it has another structure.
@@ -174,18 +174,18 @@ def load(directory: Path, template: State) -> tuple[State, dict[str, Any], dict[
     try:
         with open_npz(path) as saved:
             state = {name: saved[name] for name in saved.files}
-        host, segments = _read_host(state.pop("host")), _read_segments(state.pop("segments"))
-        learner = _load_rows(fill_template(template, state), directory, segments)
+        metadata, row_files = _read_metadata(state.pop("host")), _read_row_files(state.pop("segments"))
+        learner = _load_rows(fill_template(template, state), directory, row_files)
     except DAMAGED_FILE_ERRORS as error:
         raise LareError(f"the checkpoint {path} cannot be read: {error or type(error).__name__}") from error
-    return learner, host, {name: array for name, array in state.items() if not name.startswith(".")}
+    return learner, metadata, {name: array for name, array in state.items() if not name.startswith(".")}
 
 
-def read_host_state(directory: Path) -> dict[str, Any] | None:
-    """Read the `host` of the last checkpoint. Return None if there is no checkpoint that can be read."""
+def read_metadata(directory: Path) -> dict[str, Any] | None:
+    """Read the `metadata` of the last checkpoint. Return None if there is no checkpoint that can be read."""
     try:
         with open_npz(directory / STATE_FILE) as saved:
-            return _read_host(saved["host"])
+            return _read_metadata(saved["host"])
     except DAMAGED_FILE_ERRORS:
         return None
 
@@ -251,17 +251,17 @@ def _pad_rows(array: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
     return np.concatenate([array, padding], axis=2)
 
 
-def _load_rows(learner: State, directory: Path, segments: list[_Segment]) -> State:
+def _load_rows(learner: State, directory: Path, row_files: list[_RowFile]) -> State:
     capacity, columns = _capacity(learner), dict(learner.replay.columns)
     for name, column in columns.items():  # one after the other, so that only one is in memory twice
         buffer = np.zeros(column.shape, column.dtype)
-        for segment in segments:
-            with open_npz(directory / _rows_file(segment.number)) as saved:
+        for row_file in row_files:
+            with open_npz(directory / _rows_file(row_file.number)) as saved:
                 values = saved[name]
-            counts = np.asarray(segment.count)
+            counts = np.asarray(row_file.count)
             for env in np.ndindex(counts.shape):
-                # Of a segment longer than the replay, only the end is in use, as in the replay itself.
-                start, count = int(np.asarray(segment.start)[env]), int(counts[env])
+                # Of a file longer than the replay, only the end is in use, as in the replay itself.
+                start, count = int(np.asarray(row_file.start)[env]), int(counts[env])
                 rows = np.arange(start, start + count)[-capacity:]
                 buffer[(*env, rows % capacity)] = values[env][:count][-capacity:]
         columns[name] = _put_like(column, buffer)
@@ -285,22 +285,22 @@ def _capacity(learner: WithReplay) -> int:
     return next(iter(learner.replay.columns.values())).shape[2]
 
 
-def _read_host(text: Any) -> dict[str, Any]:
+def _read_metadata(text: Any) -> dict[str, Any]:
     """Read the data that are saved as JSON. Raise `ValueError` if they are not valid."""
-    host = read_json(str(text))
-    if not isinstance(host, dict):
-        raise ValueError("host is no object")
-    _check_counts([host[name] for name in ("step", "metrics_length") if name in host])
-    digests = host.get("function_sha256", [])
+    metadata = read_json(str(text))
+    if not isinstance(metadata, dict):
+        raise ValueError("metadata is no object")
+    _check_counts([metadata[name] for name in ("step", "metrics_length") if name in metadata])
+    digests = metadata.get("function_sha256", [])
     if not (isinstance(digests, list) and all(isinstance(digest, str) for digest in digests)):
         raise ValueError("function_sha256 is no list of texts")
-    return host
+    return metadata
 
 
-def _read_segments(text: Any) -> list[_Segment]:
+def _read_row_files(text: Any) -> list[_RowFile]:
     """Read the list of the row files in use. Raise `ValueError` if it is not valid."""
     names = ("number", "start", "count")
-    return [_Segment(**{name: _check_counts(values[name]) for name in names}) for values in read_json(str(text))]
+    return [_RowFile(**{name: _check_counts(values[name]) for name in names}) for values in read_json(str(text))]
 
 
 def _check_counts(value: Any) -> Any:

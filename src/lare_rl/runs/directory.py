@@ -20,7 +20,7 @@ from lare_rl.errors import LareError, short_repr
 from lare_rl.latent.function import LatentFunction, pair_with_roles
 from lare_rl.latent.saved import load_function, read_source
 from lare_rl.phi.graph import Graph
-from lare_rl.runs.checkpoint import STATE_FILE, read_host_state
+from lare_rl.runs.checkpoint import STATE_FILE, read_metadata
 from lare_rl.runs.config_file import CONFIG, Config, make_config, read_config, write_config
 from lare_rl.runs.metrics_file import read_metrics
 from lare_rl.tasks.spec import ScoredObservation, TaskSpec
@@ -195,7 +195,7 @@ def function_paths(directory: Path, config: Config) -> list[tuple[TaskSpec, Path
         return []
     if replacements := sorted(directory.glob("latent_function*-*.py")):
         # Until format 4, a run could replace phi while it trained. Its checkpoint has the hash of the one in use.
-        digests = tuple((read_host_state(directory / CHECKPOINT) or {}).get("function_sha256", digests))
+        digests = tuple((read_metadata(directory / CHECKPOINT) or {}).get("function_sha256", digests))
     if len(digests) != len(roles):
         raise LareError(f"{directory}: there are {len(digests)} latent functions for {len(roles)} roles")
     paths = []

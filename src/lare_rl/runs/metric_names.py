@@ -7,9 +7,9 @@ __all__ = [
     "ACTOR_SATURATION",
     "CREDIT_CORRELATION",
     "CREDIT_ERROR",
-    "LIKELIEST_RETURN",
-    "METRICS",
+    "DETERMINISTIC_RETURN",
     "METRIC_GROUPS",
+    "METRIC_NAMES",
     "RETURN",
     "RETURN_R2",
     "RETURN_STD",
@@ -18,7 +18,7 @@ __all__ = [
 
 RETURN = "evaluation/return"
 RETURN_STD = "evaluation/return_std"
-LIKELIEST_RETURN = "evaluation/likeliest_return"
+DETERMINISTIC_RETURN = "evaluation/deterministic_return"
 SUMMED_RETURN = "evaluation/summed_return"
 CREDIT_ERROR = "credit/error"
 CREDIT_CORRELATION = "credit/correlation"
@@ -35,8 +35,8 @@ METRIC_GROUPS: dict[str, dict[str, str]] = {
         RETURN_STD: "The standard deviation of the true return over these episodes, with n in the denominator.",
         "evaluation/length": "The mean length of these episodes (steps).",
         SUMMED_RETURN: "Many agents: the sum of the true rewards over all steps and all agents of the team.",
-        LIKELIEST_RETURN: "The mean true return of the most likely actions, if the policy samples its actions. Only on the host, at the "
-        "last evaluation.",
+        DETERMINISTIC_RETURN: "The mean true return of the most likely actions, if the policy samples its actions. Only on the host, "
+        "at the last evaluation.",
     },
     "Methods with proxy rewards": {
         RETURN_R2: "R² of the last 32 returns, each predicted before the decoder was fitted to it. Null until 8 returns have been "
@@ -81,5 +81,5 @@ METRIC_GROUPS: dict[str, dict[str, str]] = {
 }
 """What each metric means, by who writes it."""
 
-METRICS = frozenset(name for group in METRIC_GROUPS.values() for name in group)
+METRIC_NAMES = frozenset(name for group in METRIC_GROUPS.values() for name in group)
 """The names of all metrics, without teams and without a task's own measures."""

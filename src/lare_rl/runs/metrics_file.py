@@ -7,11 +7,12 @@ from pathlib import Path
 from typing import Any
 
 from lare_rl.errors import LareError
+from lare_rl.util.renamed_fields import rename_metrics
 from lare_rl.util.safe_io import read_json, read_text
 
 __all__ = ["append_metrics", "read_metrics", "truncate_metrics"]
 
-METRICS = "metrics.jsonl"
+METRICS_FILE = "metrics.jsonl"
 
 MAX_METRICS_BYTES = 512 << 20
 
@@ -30,13 +31,13 @@ def read_metrics(directory: Path) -> list[dict[str, Any]]:
     Raises:
         LareError: the file cannot be read, or a line is not valid.
     """
-    path = (directory / METRICS).absolute()
+    path = (directory / METRICS_FILE).absolute()
     if not path.exists():
         return []
     stat = path.stat()
     state = stat.st_dev, stat.st_ino, stat.st_size, stat.st_mtime_ns
     cached = _parsed.pop(path, None)
-    lines = cached[1] if cached is not None and cached[0] == state else _parse(directory / METRICS)
+    lines = cached[1] if cached is not None and cached[0] == state else _parse(directory / METRICS_FILE)
     _parsed[path] = state, lines
     if len(_parsed) > MAX_PARSED_FILES:
         del _parsed[next(iter(_parsed))]
@@ -45,7 +46,7 @@ def read_metrics(directory: Path) -> list[dict[str, Any]]:
 
 def append_metrics(directory: Path, lines: Sequence[dict[str, Any]]) -> int:
     """Append lines to metrics.jsonl, and return the new size of the file in bytes."""
-    path = directory / METRICS
+    path = directory / METRICS_FILE
     try:
         with path.open("a", encoding="utf-8", newline="\n") as file:
             file.write("".join(json.dumps(line) + "\n" for line in lines))
@@ -62,7 +63,7 @@ def truncate_metrics(directory: Path, n_bytes: int) -> None:
     Raises:
         LareError: lines from before the checkpoint are missing.
     """
-    path = directory / METRICS
+    path = directory / METRICS_FILE
     size = path.stat().st_size if path.exists() else 0
     if size < n_bytes:
         raise LareError(f"{path} has {size} bytes, and the checkpoint needs {n_bytes}: was it copied during training?")
@@ -79,7 +80,7 @@ def _parse(path: Path) -> list[dict[str, Any]]:
             raise LareError(f"{path} is damaged: {error} in line {number}") from error
         if not _is_evaluation(line):
             raise LareError(f"{path} is damaged: line {number} is no evaluation")
-        lines.append(line)
+        lines.append(rename_metrics(line))
     return lines
 
 

@@ -12,6 +12,7 @@ from pydantic import Field, field_validator
 from lare_rl.config.migrate import CONFIG
 from lare_rl.config.settings import ResolvedSettings, Settings
 from lare_rl.credit.methods import find_method
+from lare_rl.envs.load import resolve_path
 from lare_rl.errors import LareError
 from lare_rl.llm.prompts import N_CANDIDATES
 from lare_rl.tasks.spec import TaskSpec
@@ -22,7 +23,7 @@ if TYPE_CHECKING:
     from lare_rl.latent.function import LatentFunction
     from lare_rl.runs.directory import Run
 
-__all__ = ["RunPlan", "load_config", "relative_task"]
+__all__ = ["RunPlan", "load_config"]
 
 
 @dataclass(frozen=True)
@@ -101,17 +102,12 @@ def load_config(path: str | Path) -> RunPlan:
     except LareError as error:
         raise LareError(f"{path}: {error}") from error
     return RunPlan(
-        task=None if file.task is None else relative_task(path, file.task),
+        task=None if file.task is None else resolve_path(str(path), file.task),
         settings=settings,
         function=None if file.function is None else tuple(path.parent / name for name in file.function),
         out=None if file.out is None else path.parent / file.out,
         source=path,
     )
-
-
-def relative_task(file: Path, task: str) -> str:
-    """Return the shipped name, or the path, of a task that a file names. A path is relative to the file."""
-    return str(file.parent / task) if task.endswith(".toml") else task
 
 
 def _plan_repetition(directory: Path) -> RunPlan:

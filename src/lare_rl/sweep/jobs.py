@@ -14,7 +14,7 @@ from lare_rl.envs.families import load_env_spec
 from lare_rl.errors import LareError
 from lare_rl.latent.design import check_recorded
 from lare_rl.llm.prompts import N_CANDIDATES
-from lare_rl.runs.checkpoint import read_host_state
+from lare_rl.runs.checkpoint import read_metadata
 from lare_rl.runs.config_file import CONFIG, read_config
 from lare_rl.runs.directory import CHECKPOINT
 from lare_rl.runs.metrics_file import read_metrics
@@ -48,7 +48,7 @@ class Job:
 
     def step(self) -> int:
         """Return the step of the checkpoint or, without one, of the last evaluation. Raises `LareError` for a damaged run."""
-        if (checkpoint := read_host_state(self.directory / CHECKPOINT)) is not None:
+        if (checkpoint := read_metadata(self.directory / CHECKPOINT)) is not None:
             return checkpoint["step"]
         lines = read_metrics(self.directory)
         return lines[-1]["step"] if lines else 0
@@ -61,7 +61,7 @@ class Job:
             seeds = {line["seed"] for line in read_metrics(self.directory) if line["step"] == last_step}
         except LareError:
             return False
-        checkpoint = read_host_state(self.directory / CHECKPOINT)
+        checkpoint = read_metadata(self.directory / CHECKPOINT)
         return (
             self.started
             and seeds == set(self.resolved.all_seeds)

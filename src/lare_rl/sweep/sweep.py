@@ -15,9 +15,8 @@ from pydantic import Field, model_validator
 from lare_rl.config.effective import unused_settings
 from lare_rl.config.settings import Settings
 from lare_rl.credit.methods import find_method
-from lare_rl.envs.load import load_task
+from lare_rl.envs.load import load_task, resolve_path
 from lare_rl.errors import LareError
-from lare_rl.runs.plan import relative_task
 from lare_rl.sweep.jobs import Job, check_job, make_job
 from lare_rl.sweep.processes import train_in_processes, train_on_ray
 from lare_rl.sweep.resources import Resources
@@ -127,7 +126,7 @@ def _check_functions(sweep: Sweep) -> None:
 def _make_jobs(sweep: Sweep, path: Path) -> Iterator[Job]:
     """Plan every run of a sweep, task by task."""
     root = path.parent / (sweep.out or Path("runs") / path.stem)
-    tasks = [load_task(relative_task(path, name)) for name in sweep.tasks]
+    tasks = [load_task(resolve_path(str(path), name)) for name in sweep.tasks]
     names = [task.name for task in tasks]
     if unknown := sorted(sweep.functions.keys() - set(names)):
         raise LareError(f"functions of {unknown[0]}, which is none of the tasks {', '.join(names)}")

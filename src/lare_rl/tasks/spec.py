@@ -2,6 +2,7 @@
 
 import hashlib
 import json
+from collections.abc import Sequence
 from typing import Annotated, Any, Literal, TypeVar
 
 from pydantic import ConfigDict, Field, field_validator, model_validator
@@ -18,8 +19,10 @@ __all__ = [
     "CreditScope",
     "ScoredObservation",
     "TaskSpec",
+    "base_name",
     "require_role",
     "select_states",
+    "step_names",
 ]
 
 ScoredObservation = Literal["before", "after", "both"]
@@ -32,6 +35,18 @@ State = TypeVar("State")
 def select_states(scored_observation: ScoredObservation, state: State, next_state: State) -> list[State]:
     """Return the states of a step that `phi` reads, in the order in which factors are concatenated."""
     return {"before": [state], "after": [next_state], "both": [state, next_state]}[scored_observation]
+
+
+def step_names(scored_observation: ScoredObservation, names: Sequence[str]) -> list[str]:
+    """Return the names of values that are computed from each of `select_states`."""
+    if scored_observation != "both":
+        return list(names)
+    return [f"{name} ({side})" for side in ("before", "after") for name in names]
+
+
+def base_name(step_name: str) -> str:
+    """Return the name without what `step_names` adds."""
+    return step_name.removesuffix(" (before)").removesuffix(" (after)")
 
 
 CreditScope = Literal["observation", "state"]
@@ -221,5 +236,8 @@ def require_role(spec: TaskSpec) -> TaskSpec:
     """Return a task without teams unchanged. Raise `LareError` for a task with teams, which has several latent functions."""
     if spec.teams:
         names = ", ".join(role.name for role in spec.roles)
-        raise LareError(f"{spec.name} has a latent function for each of its teams. Name one of {names} instead.")
+        raise LareError(
+            f"{spec.name} has a latent function for each of its teams ({names}). Name the task of one of them instead: the key "
+            "teams of its file lists their files."
+        )
     return spec

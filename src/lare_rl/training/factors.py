@@ -11,7 +11,7 @@ from jaxtyping import Array, Float
 from lare_rl.data.trajectory import Trajectory
 from lare_rl.envs.play import phi_inputs
 from lare_rl.errors import LareError
-from lare_rl.latent.factors import LatentRewardError
+from lare_rl.latent.factors import NonFiniteFactorError
 from lare_rl.phi.evaluate import evaluate
 from lare_rl.phi.graph import Graph
 from lare_rl.runs.directory import Run
@@ -75,7 +75,7 @@ def compute_host_factors(run: Run, config: TrainConfig, steps: Trajectory) -> Fl
         after, _ = phi_inputs(config.credit_scope, team, steps.next_timestep, steps.env_action)
         try:
             columns = function.step_factors(before, action, after, run.scored_observation)
-        except LatentRewardError as error:
+        except NonFiniteFactorError as error:
             path, batch = run.directory / FAILED_BATCH, {"observation": error.observation, "action": error.action}
             write_arrays(path, batch)
             raise LareError(f"{error}; it was given the batch in {path}; the last checkpoint is whole") from error

@@ -116,7 +116,7 @@ class Terminal(Listener):
 
 _SUMMARY = {
     "evaluation/return": "return {:.1f}",
-    "evaluation/likeliest_return": "likeliest actions {:.1f}",
+    "evaluation/deterministic_return": "deterministic {:.1f}",
     "evaluation/won": "won {:.2f}",
     "credit/error": "credit error {:.3g}",
     "credit/correlation": "correlation {:.2f}",

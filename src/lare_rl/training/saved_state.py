@@ -28,7 +28,7 @@ class SavedState(NamedTuple):
 
     config: TrainConfig
     learner: Learner
-    host: dict[str, Any]
+    metadata: dict[str, Any]
     """Other values, as JSON."""
     arrays: dict[str, np.ndarray]
     """Other arrays, by name."""
@@ -65,8 +65,8 @@ def load_learner(run: Run, n_devices: int = 1) -> SavedState:
     """
     config = replace(make_train_config(run), n_devices=n_devices)
     try:
-        learner, host, arrays = checkpoint.load(run.checkpoint, learner_shape(config, len(run.seeds)))
-        return SavedState(replace(config, batched=host.get("batched", False)), learner, host, arrays)
+        learner, metadata, arrays = checkpoint.load(run.checkpoint, learner_shape(config, len(run.seeds)))
+        return SavedState(replace(config, batched=metadata.get("batched", False)), learner, metadata, arrays)
     except LareError as error:
         if run.config.lare == code_version():
             raise
@@ -86,8 +86,12 @@ def load_actor(run: Run, best: bool = False) -> tuple[TrainConfig, Any, Int[np.n
         config = make_train_config(run)
         best_policy = load_best(run.checkpoint, actor_shape(config, len(run.seeds)), len(run.seeds))
         return config, jax.device_put(best_policy.actor), best_policy.step
-    config, learner, host, _ = load_learner(run)
-    return config, compile_functions(config).get_actor(learner, host["step"]), np.full(len(run.seeds), host["step"])
+    config, learner, metadata, _ = load_learner(run)
+    return (
+        config,
+        compile_functions(config).get_actor(learner, metadata["step"]),
+        np.full(len(run.seeds), metadata["step"]),
+    )
 
 
 def actor_shape(config: TrainConfig, n_seeds: int) -> Any:

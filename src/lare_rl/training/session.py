@@ -18,7 +18,7 @@ from lare_rl.errors import LareError
 from lare_rl.runs import checkpoint
 from lare_rl.runs.best_policy import BEST_FILE, BestPolicy, empty_best, load_best, save_best, update_best
 from lare_rl.runs.directory import Run
-from lare_rl.runs.metric_names import ACTOR_SATURATION, LIKELIEST_RETURN
+from lare_rl.runs.metric_names import ACTOR_SATURATION, DETERMINISTIC_RETURN
 from lare_rl.training import first_fit, iteration, saturation
 from lare_rl.training.batching import is_batching_faster
 from lare_rl.training.collect_device import DeviceCollector, is_reset_cheap, make_jax_env
@@ -217,8 +217,8 @@ class Session:
             self._keep_best(evaluation.returns[..., 0].mean(axis=1))
         metrics = evaluation.metrics(self.config.env) | self.functions.assess(self.learner) | self.latest_metrics
         if self.step == self.settings.steps and not self.config.greedy and isinstance(self.collector, HostCollector):
-            likeliest = self.collector.evaluate(self.actor, self.settings.evaluation_episodes, deterministic=True)
-            metrics[LIKELIEST_RETURN] = likeliest.returns[..., 0].mean(axis=1)
+            deterministic = self.collector.evaluate(self.actor, self.settings.evaluation_episodes, deterministic=True)
+            metrics[DETERMINISTIC_RETURN] = deterministic.returns[..., 0].mean(axis=1)
         if self.step > self.config.warmup and isinstance(self.settings.hyperparameters, OffPolicySettings):
             metrics[ACTOR_SATURATION] = saturation.measure(
                 self.functions.act, self.actor, self.learner.replay, self.config
@@ -241,11 +241,11 @@ class Session:
         self._check_factors()
         self.finish_saving()
         digests = [function.digest for function in self.run.functions]
-        host = {"step": self.step, "metrics_length": self.metrics_bytes, "fitted": self.first_fit_done}
-        host |= {"function_sha256": digests, "batched": self.config.batched}
+        metadata = {"step": self.step, "metrics_length": self.metrics_bytes, "fitted": self.first_fit_done}
+        metadata |= {"function_sha256": digests, "batched": self.config.batched}
         arrays = {f"latest/{name}": np.asarray(values) for name, values in self.latest_metrics.items()}
         arrays |= {f"collector/{name}": values for name, values in self.collector.state_dict().items()}
-        snapshot = checkpoint.take_snapshot(self.run.checkpoint, self.learner, host, arrays)
+        snapshot = checkpoint.take_snapshot(self.run.checkpoint, self.learner, metadata, arrays)
         self._saving = self._threads.submit(checkpoint.write, self.run.checkpoint, snapshot)
 
     def finish_saving(self) -> None:
@@ -254,10 +254,10 @@ class Session:
             saving, self._saving = self._saving, None
             saving.result()
 
-    def restore(self, host: dict[str, Any], arrays: dict[str, np.ndarray]) -> list[str]:
+    def restore(self, metadata: dict[str, Any], arrays: dict[str, np.ndarray]) -> list[str]:
         """Restore everything but the learner from a checkpoint. Return messages for the user."""
-        self.step, self.metrics_bytes = host["step"], host["metrics_length"]
-        self.first_fit_done = host.get("fitted", False)
+        self.step, self.metrics_bytes = metadata["step"], metadata["metrics_length"]
+        self.first_fit_done = metadata.get("fitted", False)
         self.latest_metrics = jax.device_put(_select_prefix(arrays, "latest/"))
         if (self.run.checkpoint / BEST_FILE).exists():
             n_seeds = len(self.run.seeds)
@@ -289,10 +289,10 @@ def restore_session(run: Run) -> tuple[Session, list[str]]:
     Raises:
         LareError: there is no checkpoint, or it cannot be used.
     """
-    config, learner, host, arrays = load_learner(run, count_seed_devices(len(run.seeds)))
+    config, learner, metadata, arrays = load_learner(run, count_seed_devices(len(run.seeds)))
     session = _make_session(run, config, learner)
     try:
-        return session, session.restore(host, arrays)
+        return session, session.restore(metadata, arrays)
     except checkpoint.DAMAGED_FILE_ERRORS as error:
         session.close()
         raise LareError(

@@ -1,4 +1,4 @@
-"""Files that are replaced as a whole. If the process is killed, or the disk is full, the old file stays."""
+"""Checks of new files; and files that are replaced as a whole. If the process is killed, or the disk is full, the old file stays."""
 
 import contextlib
 import os
@@ -10,11 +10,31 @@ from uuid import uuid4
 
 from lare_rl.errors import LareError
 
-__all__ = ["write_arrays", "write_atomically"]
+__all__ = ["check_new_path", "write_arrays", "write_atomically"]
 
 
 RETRY_S = 0.01, 0.03, 0.1, 0.3, 1.0
 """Windows does not replace a file that another process reads just now. The moments after which it is tried again (s)."""
+
+
+def check_new_path(path: Path, option: str = "file", overwrite: bool | None = None) -> None:
+    """Raise `LareError` if a file could not be written: before the work for it is done.
+
+    Args:
+        path: the file.
+        option: what names it, such as an option of the command line.
+        overwrite: whether it may exist. None if the caller has no such option.
+    """
+    try:
+        if path.is_dir():
+            raise LareError(f"{path} is not the name of a file; choose another {option}")
+        if path.exists() and not overwrite:
+            hint = "" if overwrite is None else ", or replace it with --overwrite"
+            raise LareError(f"{path} exists, and is not overwritten; choose another {option}{hint}")
+        if not path.parent.is_dir():
+            raise LareError(f"{path} cannot be written: there is no directory {path.parent}; choose another {option}")
+    except OSError as error:
+        raise LareError(f"{path} cannot be written: {error.strerror}") from error
 
 
 def write_atomically(path: Path, write: Callable[[Any], object]) -> None:

@@ -63,6 +63,7 @@ def format_value(value: Any, spec: str = "") -> str:
     * `r2`: two decimal places, three near 1.
     * `std`: two digits, for a standard deviation.
     * `error`: one digit, for a standard error.
+    * `steps`: a round number with k or M, such as `250k`.
     """
     match spec.split(" ", 1):
         case ["score"]:
@@ -75,6 +76,8 @@ def format_value(value: Any, spec: str = "") -> str:
             return f"{value:,.0f}" if math.isfinite(value) and abs(value) >= 10 else f"{value:.2g}"
         case ["error"]:
             return f"{value:.1g}" if value >= 0.001 else "less than 0.001"
+        case ["steps"]:
+            return f"{value / 1e6:g}M" if value >= 1e6 else f"{value / 1e3:g}k" if value >= 1e3 else f"{value:g}"
     return format(value, spec)
 
 

@@ -1,13 +1,16 @@
-"""Names in files that an earlier version has written: of arrays in checkpoints and assigners, and of keys of tasks and settings."""
+"""Names in files that an earlier version has written: of arrays in checkpoints and assigners, of keys, and of metrics."""
 
 import re
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-__all__ = ["rename_fields", "rename_keys", "rename_options"]
+__all__ = ["rename_fields", "rename_keys", "rename_metrics", "rename_options"]
 
 _RENAMED_KEYS = {"judged_from": "credit_scope", "judges": "scored_observation"}
 """From old to new keys of tasks, settings and assigners."""
+
+_RENAMED_METRICS = {"likeliest_return": "deterministic_return"}
+"""From old to new metrics, after the slash."""
 
 _RENAMED_OPTIONS = {"--judges": "--scored-observation"}
 """From old to new options of the command line."""
@@ -59,6 +62,12 @@ _RENAMED_PATHS = {
 def rename_keys(values: Mapping[str, Any]) -> dict[str, Any]:
     """Return the values of a table under the present names of its keys. A key beside its old name is not overwritten."""
     return {name if (new := _RENAMED_KEYS.get(name, name)) in values else new: value for name, value in values.items()}
+
+
+def rename_metrics(line: Mapping[str, Any]) -> dict[str, Any]:
+    """Return a line of metrics.jsonl under the present names of metrics."""
+    split = {name: name.rpartition("/") for name in line}
+    return {head + slash + _RENAMED_METRICS.get(tail, tail): line[name] for name, (head, slash, tail) in split.items()}
 
 
 def rename_options(arguments: Sequence[str]) -> list[str]:

@@ -15,7 +15,7 @@ from typing import Any
 
 from lare_rl.phi.arrays import Array, as_array, elementwise
 from lare_rl.phi.builder import current_builder
-from lare_rl.phi.graph import Kind
+from lare_rl.phi.graph import NumberKind
 from lare_rl.phi.limits import RefusedError
 from lare_rl.phi.operand import Operand
 from lare_rl.phi.values import describe
@@ -25,7 +25,7 @@ Function = Callable[..., Any]
 FUNCTIONS: dict[str, Function] = {}
 """All functions, by their names behind `np.`: "sum", "linalg.norm", "add.reduce"."""
 
-KIND_OF_DTYPE: dict[str, Kind] = {
+KIND_OF_DTYPE: dict[str, NumberKind] = {
     **dict.fromkeys("float float16 float32 float64 double single half longdouble f4 f8 f d floating".split(), "float"),
     **dict.fromkeys(
         "int int8 int16 int32 int64 intp int_ uint8 uint16 uint32 uint64 uint i4 i8 i integer byte ubyte short".split(),
@@ -170,7 +170,7 @@ def as_numbers(x: Any) -> Array:
     return astype(x, "float")
 
 
-def dtype_kind(dtype: Any) -> Kind:
+def dtype_kind(dtype: Any) -> NumberKind:
     """Return the kind of a type: "float32", np.float32, float, x.dtype. Raises `RefusedError` for other types."""
     name = dtype_name(dtype)
     if name not in KIND_OF_DTYPE:

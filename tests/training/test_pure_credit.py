@@ -11,7 +11,7 @@ from jax.sharding import PartitionSpec
 import lare_rl
 from lare_rl.credit.decoder_settings import CreditSettings, default_credit
 from lare_rl.errors import LareError
-from lare_rl.integrations.pure_credit import CreditSteps, pure_credit
+from lare_rl.training.pure_credit import CreditSteps, pure_credit
 
 N_ENVS, N_STEPS, LENGTH = 4, 20, 10
 WEIGHT = np.array([1.0, -2.0, 0.5], np.float32)
@@ -131,6 +131,8 @@ def test_functions_are_mapped_over_seeds():
         ({"method": "episodic"}, "bayes"),
         ({"method": "stas"}, "bayes"),
         ({"method": "lare-bayes"}, "phi"),
+        ({"method": "bayes", "settings": CreditSettings(exact="last")}, "exact"),
+        ({"method": "rrd", "settings": CreditSettings(steps=16)}, "drawn_steps"),
         ({"method": "nothing"}, "nothing"),
     ],
 )

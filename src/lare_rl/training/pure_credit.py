@@ -20,8 +20,9 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
 from lare_rl.algorithms.registry import ALGORITHMS
+from lare_rl.config.validity import check_credit
 from lare_rl.credit.decoder_settings import CreditSettings, default_credit
-from lare_rl.credit.methods import Method, Reward, find_method
+from lare_rl.credit.methods import find_method
 from lare_rl.data.replay import StoredSteps, by_payment, mean_length, required_capacity
 from lare_rl.data.trajectory import Trajectory
 from lare_rl.envs.interface import EnvSpec, Team, Timestep, to_env_action
@@ -119,8 +120,25 @@ def pure_credit(
     Raises:
         LareError: the arguments do not go together.
     """
-    chosen = find_method(method)
-    _check_arguments(chosen, phi, settings, (observation_size, action_size))
+    chosen, credit = find_method(method), settings or default_credit(agents)
+    if phi is not None and tuple(phi.sizes) != (observation_size, action_size):
+        raise LareError(
+            f"phi reads observations and actions of the sizes {phi.sizes[0]} and {phi.sizes[1]}, not {observation_size} and "
+            f"{action_size}"
+        )
+    check_credit(
+        chosen,
+        credit,
+        n_agents=agents,
+        n_raw_features=observation_size + action_size,
+        scored_observation=scored_observation,
+        scale_rewards=scale_rewards,
+        discrete_actions=discrete,
+        max_steps=max_steps,
+        step_at_a_time=True,
+    )
+    if chosen.needs_phi and phi is None:
+        raise LareError(f"{method} needs a latent function: phi=...")
     phi = phi if chosen.needs_phi else None
     shape = (agents, action_size)
     env = EnvSpec(
@@ -142,7 +160,7 @@ def pure_credit(
         method=chosen,
         algorithm=algorithm,
         hyperparameters=algorithm.settings,
-        credit=settings or default_credit(agents),
+        credit=credit,
         scale_rewards=scale_rewards,
         n_factors=() if phi is None else (phi.n_factors(scored_observation),),
         n_envs=n_envs,
@@ -152,25 +170,6 @@ def pure_credit(
         fit_updates=fit_updates,
     )
     return _make_functions(config, () if phi is None else (phi.graph,))
-
-
-def _check_arguments(
-    method: Method, phi: LatentFunction | None, settings: CreditSettings | None, sizes: tuple[int, int]
-) -> None:
-    """Raise `LareError` if the arguments do not go together. `sizes` are those of an observation and an action."""
-    if phi is not None and tuple(phi.sizes) != sizes:
-        raise LareError(
-            f"phi reads observations and actions of the sizes {phi.sizes[0]} and {phi.sizes[1]}, not {sizes[0]} and {sizes[1]}"
-        )
-    needs_episode = method.needs_whole_episodes or (method.inputs is not None and "history" in method.inputs.names)
-    if method.reward not in (Reward.PROXY, Reward.DESIGNED) or needs_episode:
-        raise LareError(
-            f"{method.name} does not compute the reward of a step from this step alone: use bayes or lare-bayes"
-        )
-    if settings is not None and settings.exact not in ("auto", "no"):
-        raise LareError("pure_credit computes the reward of a step from this step alone: leave out the setting exact")
-    if method.needs_phi and phi is None:
-        raise LareError(f"{method.name} needs a latent function: phi=...")
 
 
 def _make_functions(config: TrainConfig, phi: tuple[Graph, ...]) -> PureCredit:

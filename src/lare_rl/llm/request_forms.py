@@ -1,9 +1,9 @@
-"""What a server supports. The strictest request comes first, and a refused request leads to the next rung.
+"""The forms of a request, strictest first; after a refusal the next one is tried.
 
     responses   OpenAI's Responses API, with a JSON schema
     chat        chat completions: with a JSON schema, with a JSON object, or with the structure only in words
 
-The rung that a server answered is stored for the process, by endpoint and model.
+The form that a server answered is stored for the process, by endpoint and model.
 """
 
 import re
@@ -12,37 +12,37 @@ from dataclasses import dataclass, replace
 from typing import Any, Literal, NamedTuple
 
 from lare_rl.llm.prompts import Message
+from lare_rl.llm.reply import REPLY_KEYS
 from lare_rl.util.safe_io import read_json
 
-__all__ = ["MIN_REPLY_TOKENS", "Answer", "FailedResponseError", "Ladder", "find_ladder", "store_ladder"]
+__all__ = ["MIN_REPLY_TOKENS", "Answer", "FailedResponseError", "RequestForms", "find_forms", "store_forms"]
 
 MAX_REPLY_TOKENS, MIN_REPLY_TOKENS = 16_384, 1024
 """The limit on a reply's tokens. It is halved while the model allows less, down to the second number."""
 
-_KEYS = ["Understand", "Analyze", "Functions"]
 _SCHEMA = {
     "name": "evaluation_function",
     "strict": True,
     "schema": {
         "type": "object",
-        "properties": {key: {"type": "string"} for key in _KEYS},
-        "required": _KEYS,
+        "properties": {key: {"type": "string"} for key in REPLY_KEYS},
+        "required": REPLY_KEYS,
         "additionalProperties": False,
     },
 }
 
 
-class _Rung(NamedTuple):
+class _RequestForm(NamedTuple):
     api: Literal["responses", "chat"]
     options: dict[str, Any]
     """Options that request a structure."""
 
 
-_RUNGS = (
-    _Rung("responses", {"text": {"format": {"type": "json_schema", **_SCHEMA}}}),
-    _Rung("chat", {"response_format": {"type": "json_schema", "json_schema": _SCHEMA}}),
-    _Rung("chat", {"response_format": {"type": "json_object"}}),
-    _Rung("chat", {}),
+_REQUEST_FORMS = (
+    _RequestForm("responses", {"text": {"format": {"type": "json_schema", **_SCHEMA}}}),
+    _RequestForm("chat", {"response_format": {"type": "json_schema", "json_schema": _SCHEMA}}),
+    _RequestForm("chat", {"response_format": {"type": "json_object"}}),
+    _RequestForm("chat", {}),
 )
 _CHAT_LIMITS = ("max_completion_tokens", "max_tokens")
 """The option that limits the tokens of a chat completion: its name for newer servers, and for older ones."""
@@ -65,25 +65,25 @@ class Answer(NamedTuple):
 
 
 @dataclass(frozen=True)
-class Ladder:
+class RequestForms:
     """The requests that a server may support, the present one first."""
 
-    rungs: tuple[_Rung, ...] = _RUNGS
+    forms: tuple[_RequestForm, ...] = _REQUEST_FORMS
     chat_limits: tuple[str, ...] = _CHAT_LIMITS
     reply_tokens: int = MAX_REPLY_TOKENS
     has_temperature: bool = True
     is_verified: bool = False
-    """Whether the server has answered a request on the first of these rungs."""
+    """Whether the server has answered a request in the first of these forms."""
 
     @property
     def api(self) -> str:
-        return self.rungs[0].api
+        return self.forms[0].api
 
     def request(
         self, name: str, messages: Sequence[Message], max_tokens: int, temperature: float | None
     ) -> dict[str, Any]:
         """Return the arguments of a request."""
-        options = {"model": name, **self.rungs[0].options}
+        options = {"model": name, **self.forms[0].options}
         if temperature is not None and self.has_temperature:
             options["temperature"] = temperature
         if self.api == "responses":
@@ -91,12 +91,12 @@ class Ladder:
             return {"input": list(messages), "max_output_tokens": max_tokens, "store": False, **options}
         return {"messages": list(messages), self.chat_limits[0]: max_tokens, **options}
 
-    def without_responses(self) -> "Ladder":
-        """Return the rungs of chat completions."""
-        return replace(self, rungs=tuple(rung for rung in self.rungs if rung.api == "chat"), is_verified=False)
+    def without_responses(self) -> "RequestForms":
+        """Return the forms of chat completions."""
+        return replace(self, forms=tuple(form for form in self.forms if form.api == "chat"), is_verified=False)
 
-    def after_refusal(self, status: int, reason: str, has_temperature: bool) -> "Ladder | None":
-        """Return the ladder after a refused request, or None if nothing is left to change.
+    def after_refusal(self, status: int, reason: str, has_temperature: bool) -> "RequestForms | None":
+        """Return the forms after a refused request, or None if nothing is left to change.
 
         Args:
             status: the HTTP status.
@@ -108,7 +108,7 @@ class Ladder:
         may_be_missing = self.api == "responses" and not self.is_verified
         return self.without_responses() if may_be_missing and status in _MISSING_API_STATUSES else None
 
-    def _ask_for_less(self, reason: str, has_temperature: bool) -> "Ladder | None":
+    def _ask_for_less(self, reason: str, has_temperature: bool) -> "RequestForms | None":
         too_long = "token" in reason and re.search("large|at most|maximum|context|exceed", reason)
         is_chat = self.api == "chat"
         if too_long and self.reply_tokens > MIN_REPLY_TOKENS:
@@ -117,8 +117,8 @@ class Ladder:
             return replace(self, chat_limits=self.chat_limits[1:])
         if "temperature" in reason and has_temperature and self.has_temperature:
             return replace(self, has_temperature=False)
-        if len(self.rungs) > 1:
-            return replace(self, rungs=self.rungs[1:], is_verified=False)
+        if len(self.forms) > 1:
+            return replace(self, forms=self.forms[1:], is_verified=False)
         if len(self.chat_limits) > 1:
             return replace(self, chat_limits=self.chat_limits[1:])
         return None
@@ -156,15 +156,15 @@ def _read_response(answer: Any) -> Answer:
     return Answer(text, {name: usage.get(source) for name, source in names.items()}, is_cut_off)
 
 
-_VERIFIED: dict[tuple[str, str], Ladder] = {}
-"""The ladders of servers that have answered, by endpoint and model."""
+_VERIFIED: dict[tuple[str, str], RequestForms] = {}
+"""The forms of servers that have answered, by endpoint and model."""
 
 
-def find_ladder(endpoint: str, name: str) -> Ladder:
-    """Return the ladder that an endpoint and a model have answered in this process, or the whole ladder."""
-    return _VERIFIED.get((endpoint, name), Ladder())
+def find_forms(endpoint: str, name: str) -> RequestForms:
+    """Return the forms for an endpoint and a model that have answered in this process, or all forms."""
+    return _VERIFIED.get((endpoint, name), RequestForms())
 
 
-def store_ladder(endpoint: str, name: str, ladder: Ladder) -> None:
-    """Store the ladder that an endpoint and a model have answered."""
-    _VERIFIED[endpoint, name] = ladder
+def store_forms(endpoint: str, name: str, forms: RequestForms) -> None:
+    """Store the forms for an endpoint and a model that have answered."""
+    _VERIFIED[endpoint, name] = forms
