@@ -20,7 +20,7 @@ from lare_rl.envs.trials import time_steps
 from lare_rl.envs.vec_env import LocalVecEnv, VecEnv, n_cores
 from lare_rl.envs.workers import SubprocVecEnv
 from lare_rl.errors import LareError
-from lare_rl.tasks.spec import PETTINGZOO_PREFIX, TaskSpec
+from lare_rl.tasks.spec import PETTINGZOO_PREFIX, TaskSpec, split_environment
 
 __all__ = [
     "SLOW_STEP_S",
@@ -158,14 +158,12 @@ def _select_row(batch: Timestep) -> Timestep:
 
 def _find_package(task: TaskSpec) -> str | None:
     """Return the package of a task's environment, or None if another process could not import it."""
-    module, _, name = task.environment.rpartition(":")
+    module, name = split_environment(task.environment)
     if is_gymnasium(task):
         entry_point = gymnasium.registry[name].entry_point if name in gymnasium.registry else None
         if isinstance(entry_point, str):
             module = module or entry_point.partition(":")[0]
-    elif task.environment.startswith(PETTINGZOO_PREFIX):
-        module = task.environment_name.partition(":")[0]
-    else:
+    elif not task.environment.startswith(PETTINGZOO_PREFIX):
         maker = FAMILIES[task.family].maker
         module = maker if isinstance(maker, str) else maker.__module__
     package = module.partition(":")[0].partition(".")[0]

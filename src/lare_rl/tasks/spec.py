@@ -20,6 +20,7 @@ __all__ = [
     "TaskSpec",
     "require_role",
     "select_states",
+    "split_environment",
 ]
 
 ScoredObservation = Literal["before", "after", "both"]
@@ -211,10 +212,15 @@ class TaskSpec(CheckedModel):
         return hashlib.sha256(self.model_dump_json().encode()).hexdigest()
 
 
+def split_environment(name: str) -> tuple[str, str]:
+    """Return the module that an environment's name imports, or "", and the rest: MODULE:NAME without the prefix of PettingZoo."""
+    module, colon, rest = name.removeprefix(PETTINGZOO_PREFIX).partition(":")
+    return (module, rest) if colon else ("", module)
+
+
 def _module(environment: str) -> tuple[bool, str]:
     """Return whether an environment is PettingZoo's, and the module that its name imports, or ""."""
-    module, colon, _ = environment.removeprefix(PETTINGZOO_PREFIX).partition(":")
-    return environment.startswith(PETTINGZOO_PREFIX), module if colon else ""
+    return environment.startswith(PETTINGZOO_PREFIX), split_environment(environment)[0]
 
 
 def require_role(spec: TaskSpec) -> TaskSpec:
