@@ -56,6 +56,7 @@ BODIES = {
     "return [observation[observation > 0].mean()]": "E-ROWS line 3: np.where",
     "return [np.nonzero(observation)]": "E-NUMPY line 3: same for all rows",
     "return [observation[:, 40]]": "E-RUN line 3: IndexError",
+    "return list(np.insert(observation, -40, 0.0, axis=1).T)": "E-RUN line 3: IndexError",
     "return [observation[:, 40:41]]": "E-RUN line 3: beyond the end",
     "return [observation + action]": "E-RUN line 3: ValueError",
     "return [observation[:, :1] + np.ones((5, 1))]": "E-RUN line 3: for any number of rows",
