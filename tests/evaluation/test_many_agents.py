@@ -1,6 +1,7 @@
 """Rollouts, samples, cross-play, films and reports of runs with many agents."""
 
 import re
+from dataclasses import replace
 from functools import partial
 
 import jax
@@ -97,13 +98,26 @@ def test_combine_policies():
     np.testing.assert_array_equal(actions[0, :, :, 0], np.tile([1.0] * 6 + [4.0] * 2, (3, 1)))
 
 
+def change_run(run, **changes):
+    updates = {key: getattr(run.config, key).model_copy(update=values) for key, values in changes.items()}
+    return replace(run, config=run.config.model_copy(update=updates))
+
+
 def test_bad_cross_play(runs, make_run):
     chase = make_run("a", [1.0])
     with pytest.raises(LareError, match="episodes = 0"):
         cross_play((runs[0], runs[1]), episodes=0)
-    for other, tasks in ((chase, "Chase"), (runs[0], "Chase, CompetitivePP-6")):
-        with pytest.raises(LareError, match=f"two teams.* {tasks}$"):
-            cross_play((chase, other))
+    for pair, message in {
+        (chase, chase): "two teams that learn, and Chase has 1$",
+        (chase, runs[0]): "these are of Chase and CompetitivePP-6$",
+        (runs[0], change_run(runs[0], settings={"algorithm": "other"})): "algorithm, and these are of ippo and other$",
+        (
+            runs[0],
+            change_run(runs[0], task={"description": "Other."}),
+        ): "different tasks with the name CompetitivePP-6$",
+    }.items():
+        with pytest.raises(LareError, match=message):
+            cross_play(pair)
 
 
 def test_evaluate_command(runs, command, tmp_path):

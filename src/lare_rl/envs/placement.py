@@ -9,6 +9,7 @@ import contextlib
 import logging
 import math
 from functools import lru_cache
+from typing import Any
 
 import gymnasium
 import numpy as np
@@ -41,6 +42,8 @@ SECOND_TIMEOUT_S = 30.0
 
 MIN_SAVED_S = 3e-4
 """Workers are used if they make a step of all environments at least this much faster. A call of all workers costs about as much."""
+
+_TIMEOUT_HINT = "; if it needs longer, set timeout in the task file"
 
 _log = logging.getLogger(__name__)
 
@@ -83,12 +86,13 @@ def make_vec_env(task: TaskSpec, n: int, parallel: bool = False) -> VecEnv:
     if needs_process(task):
         return _make_separate(task, n)
     makers = [picklable_maker(task)] * n
+    options: dict[str, Any] = {"timeout": task.timeout, "timeout_hint": _TIMEOUT_HINT}
     if parallel:
-        return SubprocVecEnv(makers)
+        return SubprocVecEnv(makers, **options)
     n_saved = n - math.ceil(n / n_cores())
     if n_saved and n_saved * measure_step_s(task) > MIN_SAVED_S:
         with contextlib.suppress(LareError):
-            return SubprocVecEnv(makers)
+            return SubprocVecEnv(makers, **options)
     return LocalVecEnv(makers)
 
 
@@ -145,9 +149,8 @@ def _measure_task(task_json: str) -> float:
 
 
 def _make_separate(task: TaskSpec, n: int) -> SubprocVecEnv:
-    hint = "; if it needs longer, set timeout in the task file"
     key = task.model_dump_json()
-    return SubprocVecEnv([picklable_maker(task)] * n, n, task.timeout, timeout_hint=hint, reuse_key=key)
+    return SubprocVecEnv([picklable_maker(task)] * n, n, task.timeout, _TIMEOUT_HINT, key)
 
 
 def _select_row(batch: Timestep) -> Timestep:

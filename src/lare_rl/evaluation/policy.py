@@ -50,7 +50,10 @@ class RunPolicy:
     def __init__(self, run: Run, seed_index: int, best: bool, deterministic: bool = False):
         self._env = load_env_spec(run.config.task)
         if self._env.n_agents > 1:
-            raise LareError(f"{run.directory} is a run of {run.config.task.name}: many agents have no single policy")
+            raise LareError(
+                f"{run.directory} is a run of {run.config.task.name}: many agents have no single policy; use lare-rl evaluate, or "
+                "export the run (lare-rl export)"
+            )
         config, actors, _ = load_actor(run, best)
         self._config = replace(config, deterministic=deterministic)
         self._actor = jax.tree.map(lambda leaf: leaf[seed_index : seed_index + 1], actors)

@@ -67,7 +67,7 @@ def record_frames(
 
     Args:
         max_rate: the largest number of frames in a second.
-        max_frames: the largest number of frames. A longer film ends early.
+        max_frames: the largest number of frames. A longer film ends early; that of a single agent in JAX leaves steps out.
         rollout: an episode of many agents that has been played already.
 
     Raises:
@@ -79,9 +79,12 @@ def record_frames(
             raise LareError(
                 "many agents are filmed as they act in training, with their credit: leave best and deterministic out"
             )
+        if not spec.is_jax:
+            raise LareError(
+                f"{run.config.task.name} steps on the host, where only single agents are filmed: leave the video out"
+            )
         frames = render_rollout(run, rollout or roll_out(run))
-        if frames is None:
-            raise LareError(f"{run.config.task.name} steps on the host, where only single agents are filmed")
+        assert frames is not None
         return frames[:max_frames], 1 / FRAMES_PER_SECOND
     policy = RunPolicy(run, 0, best, deterministic)
     if spec.is_jax:

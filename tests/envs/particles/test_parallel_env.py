@@ -26,8 +26,8 @@ def test_episode():
     env.reset(seed=0)
     for step in range(1, MAX_STEPS + 1):
         *_, terminated, truncated, _ = env.step(dict.fromkeys(env.agents, 0))
-        assert set(terminated.values()) == {False}
-        assert set(truncated.values()) == {step == MAX_STEPS}
+        assert set(terminated.values()) == {step == MAX_STEPS}  # as in JAX
+        assert set(truncated.values()) == {False}
     assert env.agents == []
     assert env.step({}) == ({},) * 5
     picture = env.render()

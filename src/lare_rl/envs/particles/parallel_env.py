@@ -38,7 +38,7 @@ def _advance(
 
 
 class ParticleEnv(ParallelEnv[str, Any, Any]):
-    """A particle task as a PettingZoo environment, with individual rewards.
+    """A particle task as a PettingZoo environment, with individual rewards. As in JAX, the time limit terminates the episode.
 
     An agent's name consists of its team and its number within the team: `agent_0`, or `predator_0` and `prey_0`.
 
@@ -98,7 +98,7 @@ class ParticleEnv(ParallelEnv[str, Any, Any]):
             self.agents = []
         observations, rewards = self._by_agent(np.asarray(observation)), self._by_agent(np.asarray(reward).tolist())
         infos = {agent: {} for agent in acted}
-        return observations, rewards, dict.fromkeys(acted, False), dict.fromkeys(acted, ended), infos
+        return observations, rewards, dict.fromkeys(acted, ended), dict.fromkeys(acted, False), infos
 
     def render(self) -> np.ndarray:
         from lare_rl.envs.canvas import to_pixels
