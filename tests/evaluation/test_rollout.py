@@ -44,8 +44,8 @@ def test_exact_rewards_add_up_to_payments(run):
 
 
 def test_sampled_reward_of_a_team_is_the_mean_over_agents_that_are_alive(run):
-    (sample,) = sample_steps(run, random=True)
-    rollout = roll_out(run, N_SAMPLE_EPISODES, random=True, key=1)
+    (sample,) = sample_steps(run)
+    rollout = roll_out(run, N_SAMPLE_EPISODES, key=1)
     alive = np.asarray(rollout.steps.timestep.alive)
     expected = (rollout.reward * alive).sum(axis=-1) / alive.sum(axis=-1)
     assert not alive[rollout.mask].all()

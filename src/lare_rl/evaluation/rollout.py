@@ -75,21 +75,19 @@ class Rollout:
         return jax.tree.map(lambda leaf: leaf[:length, episode], values)
 
 
-def roll_out(run: Run, n_episodes: int = 1, *, random: bool = False, key: int = 0) -> Rollout:
-    """Play episodes with the noise of training, or with random actions.
+def roll_out(run: Run, n_episodes: int = 1, *, actor: Any = None, key: int = 0) -> Rollout:
+    """Play episodes with the noise of training.
 
     Args:
         run: the run, which must have a checkpoint.
-        random: whether to play random actions.
+        actor: an actor of one seed that plays instead of the first seed's.
         key: the random key of an environment of pure functions.
     """
     state = load_learner(run)
     config, learner = state.config, state.learner
-    actor = training_module(config).get_actor(
-        jax.tree.map(lambda leaf: leaf[:1], learner), run.config.settings.steps, config
-    )
-    if random:
-        actor = jax.tree.map(jnp.zeros_like, actor)  # networks of zeros have no preference
+    if actor is None:
+        first = jax.tree.map(lambda leaf: leaf[:1], learner)
+        actor = training_module(config).get_actor(first, run.config.settings.steps, config)
     if config.env.is_jax:
         env = make_env(run.config.task)
         assert isinstance(env, JaxEnv)
@@ -165,9 +163,9 @@ class TeamSample:
         return column_correlations(self.factors, self.reward)
 
 
-def sample_steps(run: Run, random: bool = False) -> list[TeamSample]:
-    """Sample steps of each team, under the first seed's policy or under random actions."""
-    rollout = roll_out(run, N_SAMPLE_EPISODES, random=random, key=1)
+def sample_steps(run: Run, actor: Any = None) -> list[TeamSample]:
+    """Sample steps of each team, under the first seed's policy or another actor of one seed (see `roll_out`)."""
+    rollout = roll_out(run, N_SAMPLE_EPISODES, actor=actor, key=1)
     config, steps, samples = rollout.config, jax.tree.map(np.asarray, rollout.steps), []
     for team_index, team in enumerate(config.env.teams):
         observation, _ = phi_inputs(config.credit_scope, team, steps.next_timestep, steps.env_action)
