@@ -95,7 +95,8 @@ EXPRESSIONS = {
         np.block([x, a]) | np.split(x, 3, axis=1)[1] | np.split(x, [1, 4], axis=1)[1] | np.array_split(x, 4, axis=1)[0]
         np.hsplit(x, 2)[1] | np.unstack(x, axis=1)[2] | np.delete(x, 1, axis=1) | np.delete(x, [0, 2], axis=1)
         np.insert(x, 2, 0.5, axis=1)
-        np.insert(x, -1, 0.5, axis=1) | np.insert(x, 6, 0.5, axis=1) | np.flip(x, axis=1) | np.fliplr(x) | x[:, ::-1] | np.rot90(y, axes=(1, 2))
+        np.insert(x, -1, 0.5, axis=1) | np.insert(x, 6, 0.5, axis=1)
+        np.flip(x, axis=1) | np.fliplr(x) | x[:, ::-1] | np.rot90(y, axes=(1, 2))
         np.roll(x, 2, axis=1) | np.roll(y, (1, 1), axis=(1, 2)) | np.repeat(x, 2, axis=1)
         np.repeat(x, [1, 2, 0, 1, 1, 1], axis=1) | x.repeat(3, axis=1) | np.tile(x, (1, 2)) | np.tile(t, (len(x), 1))
         np.broadcast_to(t, (len(x), 4)) | np.broadcast_arrays(x[:, :1], t)[1] + x[:, :1] | np.pad(x, ((0, 0), (1, 2)))

@@ -54,6 +54,8 @@ BODIES = {
     "return [observation @ observation.T]": "E-ROWS line 3: rows",
     "return [np.einsum('bi,ci->bc', action, action)]": "E-ROWS line 3: rows",
     "return [observation[observation > 0].mean()]": "E-ROWS line 3: np.where",
+    "return [np.unique(observation)]": "E-NUMPY line 3: count with comparisons",
+    "return [np.linalg.svd(observation)[1]]": "E-NUMPY line 3: for 2 x 2 matrices",
     "return [np.nonzero(observation)]": "E-NUMPY line 3: same for all rows",
     "return [observation[:, 40]]": "E-RUN line 3: IndexError",
     "return list(np.insert(observation, -40, 0.0, axis=1).T)": "E-RUN line 3: IndexError",
