@@ -13,7 +13,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from lare_rl.evaluation.rollout import sample_steps
+from lare_rl.evaluation.played_episodes import sample_steps
 from lare_rl.runs.directory import Run, open_run
 from lare_rl.training.saved_state import load_actor
 from lare_rl.util.statistics import column_correlations

@@ -20,7 +20,7 @@ from lare_rl.credit.methods import find_method
 from lare_rl.data.trajectory import Trajectory
 from lare_rl.envs.particles.particle_env import ParticleJaxEnv
 from lare_rl.envs.particles.task import MAX_STEPS
-from lare_rl.evaluation.rollout import compute_training_rewards, unroll_policy
+from lare_rl.evaluation.played_episodes import compute_training_rewards, unroll_policy
 from lare_rl.training import learner as learner_module
 from lare_rl.training.compiled import compile_functions, training_module
 from lare_rl.training.decoder_fits import fit_repeatedly

@@ -153,7 +153,7 @@ def test_measures_of_random_play(run, command):
 
 
 def test_film_of_many_agents_on_the_host_is_refused_before_they_play(run, tmp_path, monkeypatch):
-    monkeypatch.setattr(video, "roll_out", lambda run: pytest.fail("an episode was played"))
+    monkeypatch.setattr(video, "play_run", lambda run: pytest.fail("an episode was played"))
     toy = toy_spec(environment="pettingzoo/helpers.parallel_toy_envs:Toy", observation_size=2, action_size=3)
     with pytest.raises(LareError, match="leave the video out"):
         record_video(replace_task(run, toy), tmp_path / "film.gif")

@@ -15,9 +15,9 @@ from lare_rl.envs.families import make_env
 from lare_rl.envs.interface import Team, team_mean
 from lare_rl.errors import LareError
 from lare_rl.evaluation.cross_play import combine_policies, cross_play
+from lare_rl.evaluation.played_episodes import N_SAMPLE_EPISODES, play_run, sample_steps
 from lare_rl.evaluation.policy import load_policy
-from lare_rl.evaluation.rollout import N_SAMPLE_EPISODES, roll_out, sample_steps
-from lare_rl.evaluation.video import record_video, render_rollout
+from lare_rl.evaluation.video import record_video, render_played
 from lare_rl.report import run_details
 from lare_rl.report.overview import render_learning_curves
 from lare_rl.report.run_summary import ReportedRun
@@ -41,20 +41,20 @@ def runs(tmp_path_factory, small_many):
 
 
 def test_rollout(runs):
-    rollout = roll_out(runs[0])
-    assert rollout.state.world.position.shape == (25, 1, 11, 2)
-    assert rollout.reward.shape == rollout.training_reward.shape == rollout.credit.shape == (25, 1, 8)
-    assert rollout.training_reward.std() > 0
-    assert rollout.select_episode(rollout.reward).shape == (25, 8)
-    assert [frame.shape for frame in render_rollout(runs[0], rollout)] == [(400, 400, 3)] * 25
+    played = play_run(runs[0])
+    assert played.state.world.position.shape == (25, 1, 11, 2)
+    assert played.reward.shape == played.training_reward.shape == played.credit.shape == (25, 1, 8)
+    assert played.training_reward.std() > 0
+    assert played.select_episode(played.reward).shape == (25, 8)
+    assert [frame.shape for frame in render_played(runs[0], played)] == [(400, 400, 3)] * 25
 
 
 @pytest.mark.long
 def test_rollout_without_proxy_rewards(small_many, tmp_path):
     run = lare_rl.train("TriangleArea", small_many(method="dense"), out=tmp_path / "run", listeners=[])
-    rollout = roll_out(run)
-    assert rollout.training_reward is None
-    np.testing.assert_array_equal(rollout.credit, rollout.reward)
+    played = play_run(run)
+    assert played.training_reward is None
+    np.testing.assert_array_equal(played.credit, played.reward)
     page = lare_rl.write_report(run, tmp_path / "report.html").read_text()
     assert page.count('class="strip"') == 1
     assert page.count("data:image/webp") == 1
@@ -142,7 +142,7 @@ def test_single_agent_functions_refuse_many_agents(runs, tmp_path):
 def test_report(runs, monkeypatch):
     monkeypatch.setattr(run_details, "MAX_TSNE_POINTS", 50)
     run = runs[0]
-    details = "\n".join(run_details.render_details(run, rollout=roll_out(run)))
+    details = "\n".join(run_details.render_details(run, played=play_run(run)))
     check_markup(details.replace('href="#', 'href="'))
     assert "nan" not in details
     for role in run.config.task.roles:
