@@ -26,7 +26,7 @@ def resolve_task(task: TaskSpec | str | Path, playable: bool = True) -> TaskSpec
 
     Args:
         task: the spec, the name or the path.
-        playable: whether the environment must exist and match the task.
+        playable: whether the environment of a name or path must exist and match the task. A spec is returned as it is.
 
     Raises:
         LareError: `task` is none of these; and as for `load_task`.

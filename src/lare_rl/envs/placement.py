@@ -36,7 +36,8 @@ __all__ = [
 SLOW_STEP_S = 2e-3
 """An environment of an unknown package gets a process of its own if a step takes longer. A call of a worker takes a tenth of this."""
 SLOW_START_S = 2.0
-"""The same, if making it takes longer, so that it is not made twice to try that."""
+"""An environment that takes longer than this to make gets a process of its own as well. Making a second one to find out would take as
+long again."""
 SECOND_TIMEOUT_S = 30.0
 """If a second environment hangs for so long beside a first one that started fast, each needs a process of its own."""
 

@@ -39,9 +39,9 @@ MAX_OPEN_ENVS = 20
 RANDOM_EPISODES = 10
 """The default number of episodes with random actions."""
 MIN_RANDOM_EPISODES = 5
-"""Fewer episodes with random actions are played only if they take minutes."""
+"""Fewer episodes with random actions are played only if these take longer than `MAX_RANDOM_PLAY_S`."""
 RANDOM_PLAY_LIMIT_S, MAX_RANDOM_PLAY_S = 5.0, 120.0
-"""Seconds after which no other episode of random actions begins: if there are enough, and in any case."""
+"""Seconds after which no other episode of random actions begins: once there are `MIN_RANDOM_EPISODES`, and in any case."""
 
 
 def evaluate_run(
