@@ -48,8 +48,9 @@ def untrusted_module(task: TaskSpec) -> str | None:
 def _makes_environment(name: str) -> bool:
     """Return whether the name is not PettingZoo's, or is of a function that is known to make an environment."""
     module, function = split_environment(name)
-    known = module.partition(".")[0] in _PETTINGZOO_PACKAGES and function == "parallel_env"
-    return known or not name.startswith(PETTINGZOO_PREFIX)
+    if not name.startswith(PETTINGZOO_PREFIX):
+        return True
+    return module.partition(".")[0] in _PETTINGZOO_PACKAGES and function == "parallel_env"
 
 
 def check_trusted(task: TaskSpec, directory: Path) -> None:
