@@ -16,7 +16,7 @@ from jaxtyping import Float
 
 from lare_rl.envs.families import make_env
 from lare_rl.envs.interface import JaxEnv
-from lare_rl.evaluation.rollout import compute_training_rewards, unroll_policy
+from lare_rl.evaluation.played_episodes import compute_training_rewards, unroll_policy
 from lare_rl.runs.directory import Run, open_run
 from lare_rl.training.compiled import training_module
 from lare_rl.training.factors import compute_host_factors

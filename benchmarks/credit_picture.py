@@ -14,7 +14,7 @@ import tyro
 from jaxtyping import Float
 from matplotlib.colors import to_hex
 
-from lare_rl.evaluation.rollout import roll_out
+from lare_rl.evaluation.played_episodes import play_run
 from lare_rl.runs.directory import open_run
 
 PICTURE = Path(__file__).parents[1] / "docs" / "pictures" / "credit.svg"
@@ -46,8 +46,8 @@ def main(run: tyro.conf.Positional[Path], out: Path = PICTURE) -> None:
         run: a finished run of many agents.
         out: the picture.
     """
-    rollout = roll_out(open_run(run))
-    reward, proxy = rollout.select_episode((rollout.reward, rollout.training_reward))
+    played = play_run(open_run(run))
+    reward, proxy = played.select_episode((played.reward, played.training_reward))
     assert proxy is not None
     n_steps, n_agents = reward.shape
     scale = np.percentile(np.stack([reward, proxy]), [2, 98])

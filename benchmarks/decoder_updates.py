@@ -18,9 +18,9 @@ from lare_rl.credit import arel
 from lare_rl.credit.decoder_settings import CreditSettings
 from lare_rl.credit.methods import find_method
 from lare_rl.data.trajectory import Trajectory
-from lare_rl.envs.particles.particle_env import ParticleJaxEnv
+from lare_rl.envs.particles.particle_env import ParticleEnv
 from lare_rl.envs.particles.task import MAX_STEPS
-from lare_rl.evaluation.rollout import compute_training_rewards, unroll_policy
+from lare_rl.evaluation.played_episodes import compute_training_rewards, unroll_policy
 from lare_rl.training import learner as learner_module
 from lare_rl.training.compiled import compile_functions, training_module
 from lare_rl.training.decoder_fits import fit_repeatedly
@@ -29,7 +29,7 @@ from lare_rl.training.seed_axis import select_seed
 from lare_rl.training.static_config import TrainConfig
 from measure import apart, correlation, write
 
-ENV, STORED, TEST_EPISODES, AT_A_TIME = ParticleJaxEnv("CN-6"), 1600, 200, 100
+ENV, STORED, TEST_EPISODES, AT_A_TIME = ParticleEnv("CN-6"), 1600, 200, 100
 CONTENDERS = {"rd": (None, 3200), "arel": (None, 3200), "arel without its penalty": (0.0, 800)}
 """The weight of AREL's penalty (None: the published one), and the number of updates."""
 

@@ -27,7 +27,7 @@ from tensordict import TensorDict
 from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
 
 import lare_rl
-from lare_rl.envs.particles.parallel_env import ParticleEnv
+from lare_rl.envs.particles.parallel_env import ParticleParallelEnv
 from lare_rl.integrations.gymnasium import Credit
 from lare_rl.integrations.pettingzoo import CreditParallel
 from lare_rl.integrations.torchrl import CreditTransform
@@ -55,7 +55,7 @@ def gymnasium_turns(task: lare_rl.TaskSpec) -> Turns:
 
 def pettingzoo_turns() -> Turns:
     """Forty episodes of random actions of six agents."""
-    environment = ParticleEnv("CN-6")
+    environment = ParticleParallelEnv("CN-6")
     spaces: dict[str, Any] = {
         "observation_space": environment.observation_space("agent_0"),
         "action_space": environment.action_space("agent_0"),
@@ -68,7 +68,7 @@ def pettingzoo_turns() -> Turns:
             while environment.agents:
                 environment.step({agent: environment.action_space(agent).sample() for agent in environment.agents})
 
-    return {PLAIN: partial(play, environment), PLUG: partial(play, CreditParallel(ParticleEnv("CN-6"), credit))}
+    return {PLAIN: partial(play, environment), PLUG: partial(play, CreditParallel(ParticleParallelEnv("CN-6"), credit))}
 
 
 def torchrl_turns(task: lare_rl.TaskSpec) -> Turns:

@@ -1,6 +1,7 @@
 """Errors for the user, and checked models: Pydantic models whose errors are one line."""
 
 import difflib
+import operator
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextvars import ContextVar
 from inspect import cleandoc, isclass
@@ -15,6 +16,7 @@ from pydantic_core import core_schema
 __all__ = [
     "CheckedModel",
     "LareError",
+    "check_count",
     "did_you_mean",
     "install_command",
     "missing_extra_error",
@@ -69,6 +71,17 @@ def did_you_mean(name: str, known_names: Iterable[str]) -> str:
     containing = [other for other in names if len(name) > 2 and name.lower() in other.lower()]
     close = suffixed[:1] or difflib.get_close_matches(name, names, n=1) or containing[:1]
     return f" (did you mean {close[0]!r}?)" if close else ""
+
+
+def check_count(name: str, value: Any) -> int:
+    """Return a number that must be whole, and 1 or more. Raise `LareError` for any other value."""
+    try:
+        number = operator.index(value)
+    except TypeError:
+        number = 0
+    if number < 1 or isinstance(value, bool):
+        raise LareError(f"{name} = {short_repr(value)}: give a whole number, 1 or more")
+    return number
 
 
 _is_validating: ContextVar[bool] = ContextVar("is_validating", default=False)

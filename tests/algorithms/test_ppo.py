@@ -37,13 +37,13 @@ def random_rollout():
 def test_advantages():
     """They bootstrap after a truncation, and not after a termination; no advantage reaches back over the end of an episode."""
     rollout = random_rollout()
-    v_tm1, v_t = np.random.default_rng(1).normal(size=(2, 6, 4)).astype(np.float32)
-    got = advantages(rollout, jnp.asarray(v_tm1), jnp.asarray(v_t), SETTINGS)
+    value, next_value = np.random.default_rng(1).normal(size=(2, 6, 4)).astype(np.float32)
+    got = advantages(rollout, jnp.asarray(value), jnp.asarray(next_value), SETTINGS)
     reward, terminated, done = (np.asarray(values) for values in (rollout.reward, rollout.terminated, rollout.done))
     for actor, t in np.ndindex(4, 6):
         expected, weight = 0.0, 1.0
         for k in range(t, 6):
-            delta = reward[k, actor] + 0.99 * (1 - terminated[k, actor]) * v_t[k, actor] - v_tm1[k, actor]
+            delta = reward[k, actor] + 0.99 * (1 - terminated[k, actor]) * next_value[k, actor] - value[k, actor]
             expected += weight * delta
             weight *= 0.99 * 0.95 * (1 - done[k, actor])
         assert float(got[t, actor]) == pytest.approx(expected, rel=1e-4, abs=1e-5)
@@ -52,7 +52,7 @@ def test_advantages():
 def test_prepare_batch():
     """Values are in units of the reward; targets and the critic's outputs in standard deviations of the return."""
     state, rollout = init_state(), random_rollout()
-    state = state._replace(returns=update_mean_std(state.returns, jnp.array([[3.0], [11.0]])))
+    state = state._replace(return_rms=update_mean_std(state.return_rms, jnp.array([[3.0], [11.0]])))
     output = np.asarray(state.params.critic(rollout.observation))[..., 0]
     value = np.asarray(ppo.values(state, rollout.observation))
     np.testing.assert_allclose(value, 7 + 4 * output, rtol=1e-5)
@@ -154,13 +154,13 @@ def test_update_metrics_of_policy_change():
 
 def test_update_ignores_masked_actors():
     settings = TWO_EPOCHS.model_copy(update={"minibatch_size": 99, "normalise_observations": True})
-    rollout, state = random_rollout(), init_state()._replace(observations=empty_mean_std(3))
+    rollout, state = random_rollout(), init_state()._replace(observation_rms=empty_mean_std(3))
     rollout = rollout._replace(available=jnp.ones((6, 4, 2), bool).at[0].set(rollout.action[0] > 0))
     padded = jax.tree.map(lambda rows: jnp.concatenate([rows, jnp.full_like(rows[:, :2], 7)], axis=1), rollout)
     mask = jnp.concatenate([jnp.ones((6, 4)), jnp.zeros((6, 2))], axis=1)
     expected, masked = (update(state, case, KEY, START, settings) for case in (rollout, padded._replace(mask=mask)))
     assert_close(masked, expected, rtol=2e-3)
-    assert float(masked[0].observations.n_rows) == 24
+    assert float(masked[0].observation_rms.n_rows) == 24
 
     # Where there is no choice, there is nothing to train.
     after, metrics = update(state, rollout._replace(available=rollout.action > 0), KEY, START, settings)

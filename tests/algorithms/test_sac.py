@@ -23,10 +23,10 @@ def state():
 
 def numpy_sample(state, observation, key):
     """Return actions and log pi in double precision."""
-    mu, log_sigma = np.split(mlp_forward(state.online.actor, np.asarray(observation)).astype(np.float64), 2, axis=1)
-    sigma = np.exp(log_sigma)
-    u = mu + sigma * np.asarray(jax.random.normal(key, mu.shape))
-    density = np.exp(-0.5 * ((u - mu) / sigma) ** 2) / (sigma * np.sqrt(2 * np.pi))
+    mean, log_std = np.split(mlp_forward(state.online.actor, np.asarray(observation)).astype(np.float64), 2, axis=1)
+    sigma = np.exp(log_std)
+    u = mean + sigma * np.asarray(jax.random.normal(key, mean.shape))
+    density = np.exp(-0.5 * ((u - mean) / sigma) ** 2) / (sigma * np.sqrt(2 * np.pi))
     return np.tanh(u), np.log(density / (1 - np.tanh(u) ** 2)).sum(axis=1)
 
 
@@ -41,11 +41,11 @@ def test_sample(state):
     np.testing.assert_allclose(sac.act(state.online.actor, BATCH.observation), mode, rtol=1e-5, atol=1e-6)
 
 
-@pytest.mark.parametrize(("log_sigma", "clipped"), [(-25.0, -20.0), (5.0, 2.0)])
-def test_sample_is_precise_where_tanh_is_flat(log_sigma, clipped):
+@pytest.mark.parametrize(("log_std", "clipped"), [(-25.0, -20.0), (5.0, 2.0)])
+def test_sample_is_precise_where_tanh_is_flat(log_std, clipped):
     """For u = 20, tanh(u) is 1 in single precision, and its log slope is 2 (log 2 - u). The standard deviation is bounded."""
     network = jax.tree.map(jnp.zeros_like, MLP(1, (), 2, key=KEY))
-    network = eqx.tree_at(lambda network: network.layers[0].bias, network, jnp.array([20.0, log_sigma]))
+    network = eqx.tree_at(lambda network: network.layers[0].bias, network, jnp.array([20.0, log_std]))
     _, log_pi = sample(network, jnp.zeros((1, 1)), KEY)
     noise = float(jax.random.normal(KEY, (1, 1))[0, 0])
     u = 20 + np.exp(clipped) * noise
@@ -86,11 +86,11 @@ def test_update(state):
     jax.tree.map(lambda g, m: np.testing.assert_allclose(m, 0.1 * g, rtol=1e-3, atol=1e-6), gradient, mean)
 
 
-@pytest.mark.parametrize(("log_sigma", "entropy", "falls"), [(-1.9, -1, True), (-5.0, -7.2, False)])
-def test_update_temperature(state, log_sigma, entropy, falls):
+@pytest.mark.parametrize(("log_std", "entropy", "falls"), [(-1.9, -1, True), (-5.0, -7.2, False)])
+def test_update_temperature(state, log_std, entropy, falls):
     """Above the entropy -dim(A) = -2 the temperature falls, below it rises: by Adam's step size at the first step."""
     last = jax.tree.map(jnp.zeros_like, state.online.actor.layers[-1])
-    last = eqx.tree_at(lambda layer: layer.bias, last, jnp.array([0.0, 0, log_sigma, log_sigma]))
+    last = eqx.tree_at(lambda layer: layer.bias, last, jnp.array([0.0, 0, log_std, log_std]))
     actor = eqx.tree_at(lambda actor: actor.layers[-1], state.online.actor, last)
     start = state._replace(online=state.online._replace(actor=actor))
     after, metrics = update(start, BATCH, KEY, jnp.array(0), SETTINGS)

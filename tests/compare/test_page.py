@@ -2,6 +2,7 @@
 
 import json
 import re
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -71,6 +72,8 @@ def test_score_meaning(make_run):
         ({"late": True}, "on Chase averaged over the evaluations after three quarters of 100 steps"),
     ):
         assert text in to_text([find_score_meaning(compare(results, **options))])
+    first = replace(compare(results), step=0)
+    assert "the last" not in to_text([find_score_meaning(first)])
 
 
 def test_comparison_table(make_run):

@@ -76,11 +76,23 @@ class Integers(Chase):
     action_space = Box(-3, 3, (1,), np.int8)
 
 
+class Counts(Chase):
+    action_space = Box(0, 5, (2,), np.int64)
+
+    def step(self, action):
+        assert self.action_space.contains(action)
+        return super().step(action[:1])
+
+
+class Scalar(Chase):
+    action_space = Box(-1, 1, (), np.float32)
+
+
 class Plane(Chase):
     action_space = Box(-1, 1, (2, 2), np.float32)
 
 
-for maker in (Invalid, Reuses, OutOfItsSpace, Precise, Integers, Plane):
+for maker in (Invalid, Reuses, OutOfItsSpace, Precise, Integers, Counts, Scalar, Plane):
     checks = {"disable_env_checker": maker in (Invalid, Reuses, OutOfItsSpace)}
     gymnasium.register(f"foreign/{maker.__name__}-v0", entry_point=maker, max_episode_steps=20, **checks)
 
@@ -197,8 +209,15 @@ def test_invalid_value_or_failure(kwargs, content):
 def test_spaces_that_are_refused():
     with pytest.raises(LareError, match="failed in reset: index 7"):
         make_env("OutOfItsSpace").reset(0)
-    with pytest.raises(LareError, match="one axis"):
-        make_env("Plane")
+    for name in ("Plane", "Scalar"):
+        with pytest.raises(LareError, match="one axis"):
+            make_env(name)
+
+
+def test_integer_actions_are_rounded():
+    env = make_env("Counts")
+    env.reset(0)
+    env.step(np.array([[3.25, 4.75]], np.float32))
 
 
 def test_gymnasium_can_make_it_again():

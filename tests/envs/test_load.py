@@ -75,6 +75,7 @@ def test_like_over_two_generations(spec_file, tmp_path):
         ({"teams": [3]}, r"teams = \[3\] must be"),
         ({"like": "Reacher"}, "did you mean 'Reacher-v5'"),
         ({"environment": "CartPole-v1", "observation_size": 4}, "action_size = 1, but .* actions of size 2"),
+        ({"payments": True}, "payments"),
         ({"environment": "misfits/Endless-v0"}, "no time limit.*max_episode_steps"),
         ({"teams": ["Reacher-v4"]}, "Reacher-v4 is not a team of toys/Chase-v0"),
         ({"environment": "particles/CN-6", "measures": ["info"]}, "no measure 'info'"),

@@ -114,6 +114,12 @@ def test_separate_environment_equals_local():
             remote.render()
 
 
+def test_workers_use_the_timeout_of_the_task():
+    with make_vec_env(toy_spec(environment="helpers.toy_envs:toys/Chase-v0", timeout=7.0), 2, parallel=True) as envs:
+        assert isinstance(envs, workers.SubprocVecEnv)
+        assert envs.timeout == 7.0
+
+
 def test_hang_ends_soon_after_a_request_to_stop(monkeypatch):
     monkeypatch.setenv("STALL", __file__)
     monkeypatch.setattr(workers, "STOP_TIMEOUT_S", 0.5)

@@ -144,6 +144,19 @@ def test_environment_is_closed_when_a_policy_fails():
     assert [env.closed for env in HUNTS] == [True]
 
 
+def test_policy_with_a_memory_forgets_the_episode_before():
+    class Counter:
+        def reset(self):
+            self.count = 0
+
+        def select_env_action(self, observation, available=None):
+            self.count += 1
+            return np.array([self.count / 8], np.float32)
+
+    for episode in play_episodes(toy_spec(max_episode_steps=3), 2, Counter()):
+        assert episode.env_action[:, 0, 0].tolist() == [0.125, 0.25, 0.375]
+
+
 def test_policy_receives_the_observation_before_the_step():
     observations = []
 

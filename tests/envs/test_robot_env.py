@@ -71,7 +71,8 @@ def test_done_terminates():
 
 
 def test_diverged_simulator_terminates():
-    timesteps = play_toy(nan=3)
+    timesteps = play_toy(nan=3, measures=["time"])
+    np.testing.assert_array_equal(timesteps.measures["time"][:3], [1, 2, 0])
     np.testing.assert_array_equal(timesteps.terminated[:3], [False, False, True])
     np.testing.assert_array_equal(timesteps.observation[:3, 0, 0], [1, 2, 2])
     np.testing.assert_array_equal(timesteps.reward[:3, 0], [1, 2, 0])

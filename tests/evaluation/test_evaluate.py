@@ -14,8 +14,9 @@ from helpers.toy_envs import Chase, pick_spec, toy_spec
 from lare_rl.envs.families import make_host_env
 from lare_rl.envs.load import load_task
 from lare_rl.envs.vec_env import LocalVecEnv
-from lare_rl.errors import LareError
+from lare_rl.errors import LareError, check_count
 from lare_rl.evaluation import evaluate as module
+from lare_rl.evaluation import video
 from lare_rl.evaluation.evaluate import (
     MAX_OPEN_ENVS,
     MIN_RANDOM_EPISODES,
@@ -161,12 +162,20 @@ def test_measures_of_random_play(run, command):
     assert distances.std() > 0
 
 
+def test_film_of_many_agents_on_the_host_is_refused_before_they_play(run, tmp_path, monkeypatch):
+    monkeypatch.setattr(video, "play_run", lambda run: pytest.fail("an episode was played"))
+    toy = toy_spec(environment="pettingzoo/helpers.parallel_toy_envs:Toy", observation_size=2, action_size=3)
+    with pytest.raises(LareError, match="leave the video out"):
+        record_video(replace_task(run, toy), tmp_path / "film.gif")
+
+
 def test_evaluate_in_several_batches(run, returns):
     """Every episode begins from a different initial state, and no environment stays open."""
     assert returns.shape == (2, 21)
     assert len(np.unique(returns)) == 42
     assert FilmedChase.max_open == 2 * MAX_OPEN_ENVS
     assert not FilmedChase.open_envs
+    assert check_count("episodes", np.int64(2)) == 2
     with pytest.raises(LareError, match="episodes = 0"):
         evaluate_run(run, 0)
 

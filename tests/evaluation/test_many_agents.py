@@ -1,6 +1,7 @@
 """Rollouts, samples, cross-play, films and reports of runs with many agents."""
 
 import re
+from dataclasses import replace
 from functools import partial
 
 import jax
@@ -14,15 +15,15 @@ from lare_rl.envs.families import make_env
 from lare_rl.envs.interface import Team, team_mean
 from lare_rl.errors import LareError
 from lare_rl.evaluation.cross_play import combine_policies, cross_play
+from lare_rl.evaluation.played_episodes import N_SAMPLE_EPISODES, play_run, sample_steps
 from lare_rl.evaluation.policy import load_policy
-from lare_rl.evaluation.rollout import N_SAMPLE_EPISODES, roll_out, sample_steps
-from lare_rl.evaluation.video import record_video, render_rollout
+from lare_rl.evaluation.video import record_video, render_played
 from lare_rl.report import run_details
 from lare_rl.report.overview import render_learning_curves
 from lare_rl.report.run_summary import ReportedRun
 from lare_rl.training.collect_device import unroll_on_device
 from lare_rl.training.compiled import training_module
-from lare_rl.training.saved_state import load_learner
+from lare_rl.training.saved_state import load_actor, load_learner
 
 pytestmark = pytest.mark.long
 
@@ -40,33 +41,37 @@ def runs(tmp_path_factory, small_many):
 
 
 def test_rollout(runs):
-    rollout = roll_out(runs[0])
-    assert rollout.state.world.position.shape == (25, 1, 11, 2)
-    assert rollout.reward.shape == rollout.training_reward.shape == rollout.credit.shape == (25, 1, 8)
-    assert rollout.training_reward.std() > 0
-    assert rollout.select_episode(rollout.reward).shape == (25, 8)
-    assert [frame.shape for frame in render_rollout(runs[0], rollout)] == [(400, 400, 3)] * 25
+    played = play_run(runs[0])
+    assert played.state.world.position.shape == (25, 1, 11, 2)
+    assert played.reward.shape == played.training_reward.shape == played.credit.shape == (25, 1, 8)
+    assert played.training_reward.std() > 0
+    assert played.select_episode(played.reward).shape == (25, 8)
+    assert [frame.shape for frame in render_played(runs[0], played)] == [(400, 400, 3)] * 25
 
 
 @pytest.mark.long
 def test_rollout_without_proxy_rewards(small_many, tmp_path):
     run = lare_rl.train("TriangleArea", small_many(method="dense"), out=tmp_path / "run", listeners=[])
-    rollout = roll_out(run)
-    assert rollout.training_reward is None
-    np.testing.assert_array_equal(rollout.credit, rollout.reward)
+    played = play_run(run)
+    assert played.training_reward is None
+    np.testing.assert_array_equal(played.credit, played.reward)
     page = lare_rl.write_report(run, tmp_path / "report.html").read_text()
     assert page.count('class="strip"') == 1
     assert page.count("data:image/webp") == 1
 
 
+def first_actor(run):
+    return jax.tree.map(lambda leaf: leaf[:1], load_actor(run)[1])
+
+
 def test_sample_steps(runs):
-    (predators, preys), (random_predators, _) = (sample_steps(runs[0], random=random) for random in (False, True))
+    (predators, preys), (other_predators, _) = (sample_steps(runs[0], actor) for actor in (None, first_actor(runs[1])))
     n_steps = N_SAMPLE_EPISODES * 25
     assert (predators.next_observation.shape, preys.next_observation.shape) == ((6 * n_steps, 24), (2 * n_steps, 24))
     for sample, function in zip((predators, preys), runs[0].functions, strict=True):
         assert sample.factors.shape == (len(sample.reward), function.size)
         assert np.nanmax(np.abs(sample.correlations)) > 0.3
-    assert not np.array_equal(predators.next_observation, random_predators.next_observation)
+    assert not np.array_equal(predators.next_observation, other_predators.next_observation)
 
 
 def test_cross_play(runs, command):
@@ -97,13 +102,26 @@ def test_combine_policies():
     np.testing.assert_array_equal(actions[0, :, :, 0], np.tile([1.0] * 6 + [4.0] * 2, (3, 1)))
 
 
+def change_run(run, **changes):
+    updates = {key: getattr(run.config, key).model_copy(update=values) for key, values in changes.items()}
+    return replace(run, config=run.config.model_copy(update=updates))
+
+
 def test_bad_cross_play(runs, make_run):
     chase = make_run("a", [1.0])
     with pytest.raises(LareError, match="episodes = 0"):
         cross_play((runs[0], runs[1]), episodes=0)
-    for other, tasks in ((chase, "Chase"), (runs[0], "Chase, CompetitivePP-6")):
-        with pytest.raises(LareError, match=f"two teams.* {tasks}$"):
-            cross_play((chase, other))
+    for pair, message in {
+        (chase, chase): "two teams that learn, and Chase has 1$",
+        (chase, runs[0]): "these are of Chase and CompetitivePP-6$",
+        (runs[0], change_run(runs[0], settings={"algorithm": "other"})): "algorithm, and these are of ippo and other$",
+        (
+            runs[0],
+            change_run(runs[0], task={"description": "Other."}),
+        ): "different tasks with the name CompetitivePP-6$",
+    }.items():
+        with pytest.raises(LareError, match=message):
+            cross_play(pair)
 
 
 def test_evaluate_command(runs, command, tmp_path):
@@ -127,7 +145,7 @@ def test_single_agent_functions_refuse_many_agents(runs, tmp_path):
 def test_report(runs, monkeypatch):
     monkeypatch.setattr(run_details, "MAX_TSNE_POINTS", 50)
     run = runs[0]
-    details = "\n".join(run_details.render_details(run, rollout=roll_out(run)))
+    details = "\n".join(run_details.render_details(run, played=play_run(run)))
     check_markup(details.replace('href="#', 'href="'))
     assert "nan" not in details
     for role in run.config.task.roles:

@@ -73,6 +73,6 @@ def test_mask_is_checked(run, mask, words):
 
 
 def test_played_episodes_have_available_actions(run):
-    (episode,) = play_episodes(TASK, 1, load_policy(run).select_env_action)
+    (episode,) = play_episodes(TASK, 1, load_policy(run))
     choices = episode.env_action[:, 0].argmax(axis=-1)
     assert np.isin(choices - np.arange(4), (0, 1)).all()

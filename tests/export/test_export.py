@@ -174,9 +174,9 @@ def test_policy_graph_of_teams(algorithm, env):
     actor = compile_functions(config).get_actor(learner, 0)
     if algorithm == "ippo":
         statistics = jax.tree.map(
-            lambda leaf: leaf + jnp.linspace(1, 2, leaf.size).reshape(leaf.shape), actor.observations
+            lambda leaf: leaf + jnp.linspace(1, 2, leaf.size).reshape(leaf.shape), actor.observation_rms
         )
-        actor = actor._replace(observations=statistics)
+        actor = actor._replace(observation_rms=statistics)
     inputs, expected = policy_case(config, actor)
     outputs = evaluate(policy_graph(jax.tree.map(lambda leaf: leaf[0], actor), config, 0), inputs)
     assert outputs.keys() == expected.keys()

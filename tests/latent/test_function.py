@@ -45,6 +45,8 @@ def test_step_factors(function, scored_observation, columns, expected):
     np.testing.assert_array_equal(factors, expected)
     assert function.factor_columns(scored_observation) == columns
     assert function.n_factors(scored_observation) == len(columns)
+    empty = function.step_factors(np.zeros((0, 2)), np.zeros((0, 1)), np.zeros((0, 2)), scored_observation)
+    assert empty.shape == (0, len(columns))
 
 
 @pytest.mark.parametrize(

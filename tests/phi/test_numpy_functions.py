@@ -73,6 +73,7 @@ EXPRESSIONS = {
         np.logical_or.reduce(b, axis=1) | np.maximum.reduce([x[:, 0], x[:, 1], x[:, 2]]) | np.diff(x, axis=1)
         np.diff(x, n=2) | np.diff(y, axis=1) | np.diff(x, axis=1, prepend=0) | np.diff(x, axis=1, append=x[:, -1:])
         np.gradient(x, axis=1) | np.gradient(x, 0.1, axis=1) | np.gradient(x, np.array([0, 1, 3, 4, 6, 7.0]), axis=1)
+        np.gradient(x, np.array([0, 1, 3, 4, 6, 7.0]), axis=1, edge_order=2)
         np.gradient(x, axis=1, edge_order=2) | np.trapezoid(x, axis=1) | np.trapezoid(x, np.arange(6) ** 2, axis=1)
         np.trapezoid(x, dx=0.1) | np.sort(x, axis=1) | np.argsort(x, axis=1) | np.sort(y, axis=1)
         np.partition(x, 2, axis=1)[:, 2] | np.lexsort((x, i)) | np.median(x, axis=1) | np.median(y, axis=(1, 2))
@@ -93,7 +94,9 @@ EXPRESSIONS = {
         np.column_stack([x[:, 0], a]) | np.dstack([x, x]) | np.append(x, a, axis=1) | np.c_[x[:, 0], x[:, 1:3]]
         np.block([x, a]) | np.split(x, 3, axis=1)[1] | np.split(x, [1, 4], axis=1)[1] | np.array_split(x, 4, axis=1)[0]
         np.hsplit(x, 2)[1] | np.unstack(x, axis=1)[2] | np.delete(x, 1, axis=1) | np.delete(x, [0, 2], axis=1)
-        np.insert(x, 2, 0.5, axis=1) | np.flip(x, axis=1) | np.fliplr(x) | x[:, ::-1] | np.rot90(y, axes=(1, 2))
+        np.insert(x, 2, 0.5, axis=1)
+        np.insert(x, -1, 0.5, axis=1) | np.insert(x, 6, 0.5, axis=1)
+        np.flip(x, axis=1) | np.fliplr(x) | x[:, ::-1] | np.rot90(y, axes=(1, 2))
         np.roll(x, 2, axis=1) | np.roll(y, (1, 1), axis=(1, 2)) | np.repeat(x, 2, axis=1)
         np.repeat(x, [1, 2, 0, 1, 1, 1], axis=1) | x.repeat(3, axis=1) | np.tile(x, (1, 2)) | np.tile(t, (len(x), 1))
         np.broadcast_to(t, (len(x), 4)) | np.broadcast_arrays(x[:, :1], t)[1] + x[:, :1] | np.pad(x, ((0, 0), (1, 2)))

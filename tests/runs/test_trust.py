@@ -1,23 +1,38 @@
 """A run directory may name any Python module: nothing is imported that the user does not trust."""
 
+import subprocess
 import sys
 
 import pytest
 
+from helpers import parallel_toy_envs
 from helpers.toy_envs import PHI, toy_spec
 from helpers.untrained_runs import write_changed_run
+from lare_rl.envs.pettingzoo_construct import make_parallel_env
 from lare_rl.errors import LareError
+from lare_rl.evaluation.evaluate import evaluate_run
 from lare_rl.latent.saved import read_source
 from lare_rl.report.report import write_report
-from lare_rl.runs.directory import open_run
+from lare_rl.runs.config_file import read_config
+from lare_rl.runs.directory import create_run, open_run
+from lare_rl.tasks import trust
+
+
+def touch(path):
+    """Arguments with which `subprocess.call` makes a file."""
+    return {"args": f"touch '{path}'", "shell": True}
 
 
 @pytest.fixture
-def write_run(tmp_path):
+def write_run(tmp_path, monkeypatch):
     """Write the directory of a run of an environment."""
 
-    def write(environment, **changes):
-        return write_changed_run(tmp_path, task=toy_spec(environment=environment).model_dump(mode="json"), **changes)
+    monkeypatch.delenv("LARE_TRUST", raising=False)
+    monkeypatch.setattr(trust, "_own_environments", set())
+
+    def write(environment, spec=None, **changes):
+        task = toy_spec(environment=environment, **spec or {})
+        return write_changed_run(tmp_path, task=task.model_dump(mode="json"), **changes)
 
     return write
 
@@ -29,7 +44,6 @@ def foreign_file(tmp_path, monkeypatch):
     folder.mkdir()
     (folder / "foreign_file.py").write_text("raise SystemExit('it was run')")
     monkeypatch.syspath_prepend(folder)
-    monkeypatch.delenv("LARE_TRUST", raising=False)
     return folder / "foreign_file.py"
 
 
@@ -46,6 +60,42 @@ def test_open_run_refuses_foreign_module(write_run, foreign_file, monkeypatch, e
 @pytest.mark.parametrize("environment", ["helpers.toy_envs:toys/Chase-v0", "json:X", "nowhere_at_all:X"])
 def test_open_run_accepts_installed_or_imported_module(write_run, environment):
     assert open_run(write_run(environment)).functions == ()
+
+
+@pytest.mark.parametrize(
+    ("environment", "evaluation_environment"),
+    [
+        ("pettingzoo/subprocess:call", None),
+        ("pettingzoo/helpers.parallel_toy_envs:call", None),
+        ("pettingzoo/gymnasium:make", None),
+        ("pettingzoo/mpe2.simple_spread_v3:env", None),
+        ("pettingzoo/mpe2.simple_spread_v3:parallel_env", "pettingzoo/mpe2.simple_spread_v3:env"),
+    ],
+)
+def test_run_directory_calls_no_function(write_run, tmp_path, monkeypatch, environment, evaluation_environment):
+    monkeypatch.setattr(parallel_toy_envs, "call", subprocess.call, raising=False)
+    spec = {"arguments": touch(tmp_path / "harm"), "evaluation_environment": evaluation_environment}
+    directory = write_run(environment, spec)
+    write_report([directory])
+    with pytest.raises(LareError, match="LARE_TRUST="):
+        evaluate_run(directory)
+    assert not (tmp_path / "harm").exists()
+
+
+def test_trusted_module_makes_only_its_own_environments(tmp_path, monkeypatch):
+    monkeypatch.setattr(parallel_toy_envs, "call", subprocess.call, raising=False)
+    monkeypatch.setenv("LARE_TRUST", "helpers.parallel_toy_envs")
+    with pytest.raises(LareError, match="call is defined in subprocess"):
+        make_parallel_env("pettingzoo/helpers.parallel_toy_envs:call", touch(tmp_path / "harm"))
+    assert not (tmp_path / "harm").exists()
+
+
+def test_open_run_accepts_environment_of_this_process(write_run):
+    directory = write_run("pettingzoo/helpers.parallel_toy_envs:Toy", {"observation_size": 2, "action_size": 3})
+    with pytest.raises(LareError, match=r"LARE_TRUST=helpers\.parallel_toy_envs"):
+        open_run(directory)
+    create_run(directory / "new", read_config(directory).task, read_config(directory).settings, ())
+    assert open_run(directory).functions == ()
 
 
 @pytest.mark.parametrize(

@@ -138,6 +138,19 @@ def test_evaluate_equals_plain_loop(learner):
         assert evaluation.measures["right"][seed_index, episode] == reward.sum()
 
 
+class Diverging(Echo):
+    """Its measure is not a number after the end of an episode."""
+
+    def timestep(self, cues, reward):
+        measure = jnp.where(cues.step > cues.length, jnp.nan, 1.0)
+        return super().timestep(cues, reward)._replace(measures={"right": measure})
+
+
+def test_evaluate_ignores_measures_after_the_end(learner):
+    evaluation = DeviceCollector(Diverging(), CONFIG, SEEDS).evaluate(learner[1], 5)
+    np.testing.assert_array_equal(evaluation.measures["right"], np.ones((2, 5)))
+
+
 def test_evaluate_initial_states_depend_on_number(learner):
     evaluations = [DeviceCollector(ENV, CONFIG, SEEDS).evaluate(learner[1], 5, number) for number in (0, 0, 1)]
     np.testing.assert_array_equal(evaluations[0].returns, evaluations[1].returns)

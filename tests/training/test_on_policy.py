@@ -101,10 +101,10 @@ def test_train_step_hands_on_the_remaining_progress(monkeypatch):
 def test_act_normalises_by_the_statistics_of_earlier_rollouts():
     config, steps = ppo_config("dense"), random_steps()
     learner, rollout = store_and_roll_out(config, steps)
-    assert float(learner.algorithm.observations.n_rows) == 0
+    assert float(learner.algorithm.observation_rms.n_rows) == 0
     train = jax.jit(partial(on_policy._train_seed, config=config))
     learner, _ = train(learner, newest(steps), jax.random.key(0), jnp.array(0))
-    statistics = learner.algorithm.observations
+    statistics = learner.algorithm.observation_rms
     expected = steps.timestep.observation[-20:, 0, 0].mean(axis=0)
     np.testing.assert_allclose(statistics.mean, expected, rtol=1e-3, atol=1e-5)
     actor, observation = on_policy.get_actor(learner, 0, config), jnp.asarray(steps.timestep.observation[0])

@@ -20,6 +20,8 @@ from lare_rl.util.renamed_fields import rename_fields, rename_keys, rename_optio
         (".decoders[0].optimizer[0].mu.value.bias", ".decoders[0].optimizer[0].mu.readout.bias"),
         (".algorithm.done", ".algorithm.n_due"),
         (".replay.episodes", ".replay.episodes"),
+        (".algorithm.returns.rows", ".algorithm.return_rms.n_rows"),
+        (".observations.mean", ".observation_rms.mean"),
         (".algorithm.qmix.online.agent.decoder.weight", ".algorithm.qmix.online.agent.head.weight"),
         (
             ".algorithm.qmix.online.agent.memory.given.weight",

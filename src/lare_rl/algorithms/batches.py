@@ -44,7 +44,7 @@ class Rollout(NamedTuple):
 
 
 class Sequences(NamedTuple):
-    """Whole episodes, padded to one length: `Consumes.SEQUENCES`. `terminated` and `mask` must be 0 in the padding."""
+    """Whole episodes, padded to one length: `Consumes.SEQUENCES`. `done` and `mask` must be 0 in the padding."""
 
     observation: Float[Array, "episodes steps+1 agents observation"]
     state: Float[Array, "episodes steps+1 state"]
@@ -53,7 +53,7 @@ class Sequences(NamedTuple):
     """One-hot rows."""
     reward: Float[Array, "episodes steps"]
     """The team's reward."""
-    terminated: Float[Array, "episodes steps"]
+    done: Float[Array, "episodes steps"]
     """1 at the last step of an episode, even if a time limit ended it."""
     mask: Float[Array, "episodes steps"]
     """1 on the steps of the episode."""

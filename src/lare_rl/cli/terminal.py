@@ -130,7 +130,7 @@ def load_policy(run: Path | None, spec: "TaskSpec") -> "Policy | None":
     opened = open_run(run)
     if opened.config.task.environment != spec.environment:
         raise LareError(f"{run} is a run of {opened.config.task.name}: its policy cannot play {spec.name}")
-    return RunPolicy(opened, 0, best=False).select_env_action
+    return RunPolicy(opened, 0, best=False)
 
 
 def find_free_path(path: Path) -> Path:

@@ -11,7 +11,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float, Int
 
-from lare_rl.util.statistics import format_rounded
+from lare_rl.util.statistics import format_rounded, wins
 
 __all__ = [
     "REPETITIONS",
@@ -89,7 +89,7 @@ def probability_of_improvement(scores: Scores, baseline: OtherScores) -> Float[n
     P(X > Y) = 1 / M * sum over m of 1 / (N K) * sum over n and k of ([x_nm > y_km] + [x_nm = y_km] / 2)
     """
     x, y = scores[..., :, None, :], baseline[..., None, :, :]
-    return np.mean((x > y) + 0.5 * (x == y), axis=(-3, -2, -1))
+    return np.mean(wins(x, y), axis=(-3, -2, -1))
 
 
 def estimate(function: Callable[..., Float[np.ndarray, "*batch"]], *scores: Float[np.ndarray, "_ _"]) -> Estimate:

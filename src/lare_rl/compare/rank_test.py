@@ -6,12 +6,14 @@ from collections.abc import Sequence
 import numpy as np
 from jaxtyping import Float
 
+from lare_rl.util.statistics import wins
+
 __all__ = ["mann_whitney", "mann_whitney_u"]
 
 
 def mann_whitney_u(a: Float[np.ndarray, " a"], b: Float[np.ndarray, " b"]) -> float:
     """Return the number of pairs in which a is larger than b. A tie counts half."""
-    return float(np.sum(a[:, None] > b) + 0.5 * np.sum(a[:, None] == b))
+    return float(np.sum(wins(a[:, None], b)))
 
 
 def mann_whitney(tasks: Sequence[tuple[Float[np.ndarray, " _"], Float[np.ndarray, " _"]]]) -> tuple[float, float]:

@@ -10,7 +10,7 @@ from gymnasium.spaces import Box, Dict, Discrete
 from jaxtyping import Bool, Float
 
 from lare_rl.envs.interface import EnvSpec, Team
-from lare_rl.envs.spaces import check_spaces, finite_array, flatten_value
+from lare_rl.envs.spaces import check_spaces, decode_box, finite_array, flatten_value
 from lare_rl.errors import LareError, short_repr
 
 __all__ = ["Agent", "AgentArrays", "make_agent"]
@@ -46,8 +46,7 @@ class Agent:
         action, space = action[: self.action_size], self.action_space
         if isinstance(space, Discrete):
             return int(space.start) + int(np.argmax(action))
-        clipped = np.clip(action.reshape(space.shape), space.low, space.high)
-        return (np.rint(clipped) if space.dtype.kind in "iu" else clipped).astype(space.dtype)
+        return decode_box(space, action)
 
     def flatten_observation(self, observation: Any) -> Float[np.ndarray, " observation"]:
         """Return an observation as a new vector, without the mask. Raises `ValueError` like `flatten_value`."""

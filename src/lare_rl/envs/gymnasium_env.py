@@ -5,13 +5,14 @@ from typing import Any
 
 import gymnasium
 import numpy as np
+from gymnasium.spaces import Box
 from jaxtyping import Float
 
 from lare_rl.envs import mujoco_rewards
 from lare_rl.envs.env_errors import EnvOutputError, no_time_limit_error, one_line_errors, read_measures, to_float
 from lare_rl.envs.interface import EnvSpec, Team, Timestep
 from lare_rl.envs.mujoco_warnings import mujoco_warnings
-from lare_rl.envs.spaces import OneHot, check_spaces, finite_array, flatten_spaces
+from lare_rl.envs.spaces import OneHot, check_spaces, decode_box, finite_array, flatten_spaces
 from lare_rl.errors import LareError, short_repr
 from lare_rl.tasks.spec import TaskSpec
 from lare_rl.util.variables import read_variable
@@ -49,7 +50,7 @@ def make_gymnasium(name: str, max_episode_steps: int | None = None, **kwargs: An
             env = gymnasium.make(name, max_episode_steps=max_episode_steps, **kwargs)
         try:
             check_spaces(name, env.observation_space, env.action_space)
-            if len(env.action_space.shape or ()) > 1:
+            if isinstance(env.action_space, Box) and len(env.action_space.shape) != 1:
                 raise LareError(f"the action space of {name} is {env.action_space}, not a Box with one axis")
             return flatten_spaces(env)
         except Exception:
@@ -84,6 +85,7 @@ class GymnasiumEnv:
             measures=task.info_keys,
             first_choice=int(action_space.start) if isinstance(action_space, OneHot) else 0,
         )
+        self._integers = action_space if isinstance(action_space, Box) and action_space.dtype.kind in "iu" else None
         self._state, self._alive = np.zeros(0, np.float32), np.ones(1, bool)
         self._available = np.ones((1, self.spec.action_size), bool)
 
@@ -94,7 +96,8 @@ class GymnasiumEnv:
 
     def step(self, action: Float[np.ndarray, "1 action"]) -> Timestep:
         with one_line_errors(f"environment {self._name!r} failed in step"):
-            observation, reward, terminated, truncated, info = self.environment.step(action[0])
+            vector = decode_box(self._integers, action[0]) if self._integers else action[0]
+            observation, reward, terminated, truncated, info = self.environment.step(vector)
             terminated, truncated = bool(terminated), bool(truncated)  # fails for arrays with several elements
         return self._make_timestep(observation, reward, terminated, truncated, info)
 

@@ -103,4 +103,7 @@ def _read_action(space: Any, spaces: Any, environment: str) -> Choices | Bounds:
         return jax_spaces.make_choices((space.n,), (), environment, space.dtype)
     if isinstance(space, spaces.Box):
         return jax_spaces.make_bounds(space.low, space.high, tuple(space.shape), environment)
-    raise jax_spaces.unusable(environment, f"its action space is {short_repr(space)}")
+    raise jax_spaces.unusable(
+        environment,
+        f"its action space is {short_repr(space)}: LaRe trains discrete actions and bounded continuous ones",
+    )

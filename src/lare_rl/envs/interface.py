@@ -21,6 +21,7 @@ __all__ = [
     "team_mean",
     "to_env_action",
     "to_package_action",
+    "with_available_action",
 ]
 
 AnyArray = Any
@@ -152,6 +153,12 @@ def to_package_action(action: Float[np.ndarray, "*batch action"], spec: EnvSpec)
         return number + spec.first_choice
     numbers = np.stack(np.unravel_index(number, spec.choice_sizes), axis=-1)
     return numbers.reshape(*number.shape, *(spec.package_shape or (-1,)))
+
+
+def with_available_action(mask: Bool[AnyArray, "*batch actions"]) -> Bool[AnyArray, "*batch actions"]:
+    """Return masks in which the first action is available if no other is."""
+    first = np.arange(mask.shape[-1]) == 0
+    return mask | (first & ~mask.any(axis=-1, keepdims=True))
 
 
 def _array_module(array: AnyArray) -> Any:

@@ -17,7 +17,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
 from lare_rl.envs.env_errors import one_line_errors
-from lare_rl.envs.interface import EnvSpec, Team, Timestep
+from lare_rl.envs.interface import EnvSpec, Team, Timestep, with_available_action
 from lare_rl.errors import LareError, did_you_mean, install_command, missing_extra_error
 from lare_rl.tasks.spec import TaskSpec
 
@@ -250,12 +250,10 @@ def agent_timestep(
     """Return a timestep of one agent. By default all actions are available. If a mask has none, the first is."""
     if available is None:
         available = jnp.ones(spec.action_size, bool)
-    available = available.astype(bool)
-    available = available.at[0].set(available[0] | ~available.any())
     return Timestep(
         observation=observation[None],
         state=jnp.zeros(0) if state is None else state,
-        available=available[None],
+        available=with_available_action(available.astype(bool))[None],
         alive=jnp.ones(1, bool),
         reward=jnp.asarray(reward, jnp.float32).reshape(1),
         terminated=jnp.asarray(terminated, bool).reshape(()),

@@ -12,7 +12,7 @@ from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 from lare_rl.envs import jax_spaces
 from lare_rl.envs.agent_arrays import Agent, AgentArrays, make_agent
 from lare_rl.envs.env_errors import no_time_limit_error, one_line_errors
-from lare_rl.envs.interface import EnvSpec, Timestep
+from lare_rl.envs.interface import EnvSpec, Timestep, with_available_action
 from lare_rl.envs.pettingzoo_construct import group_by_team
 from lare_rl.errors import LareError, short_repr
 from lare_rl.tasks.spec import TaskSpec
@@ -161,9 +161,7 @@ class JaxMARLEnv:
             masks = self._masks(state.env)
             rows = [jnp.asarray(masks[agent.name]).astype(bool).ravel() for agent in self.layout.agents]
             available &= jnp.stack([jnp.pad(row, (0, available.shape[1] - len(row))) for row in rows])
-        first = jnp.arange(available.shape[1]) == 0
-        acts = state.alive & available.any(axis=1)
-        return jnp.where(acts[:, None], available, first)
+        return with_available_action(available & state.alive[:, None])
 
     def frames(self, states: Any, credit: Any = None) -> list[np.ndarray]:
         """Return the package's pictures of states, which do not show credit. Raise `LareError` if it cannot draw them here."""
@@ -186,7 +184,9 @@ def _make_agent(name: Any, space: Any, observation_size: int) -> Agent:
     if hasattr(space, "low"):
         low, high = (np.broadcast_to(np.asarray(bound, np.float32), space.shape) for bound in (space.low, space.high))
         return make_agent(name, observation_space, gymnasium.spaces.Box(low, high, dtype=np.float32))
-    raise LareError(f"the actions of {name} are {short_repr(space)}")
+    raise LareError(
+        f"the actions of {name} are {short_repr(space)}: LaRe trains discrete actions and bounded continuous ones"
+    )
 
 
 def _decode(agent: Agent, action: Float[Array, " action"]) -> Array:

@@ -145,4 +145,6 @@ def _read_action(spec: Any, specs: Any, environment: str) -> Choices | Bounds:
         return jax_spaces.make_choices(sizes.ravel().tolist(), sizes.shape, environment, spec.dtype)
     if isinstance(spec, specs.BoundedArray) and np.issubdtype(spec.dtype, np.floating):
         return jax_spaces.make_bounds(spec.minimum, spec.maximum, tuple(spec.shape), environment)
-    raise jax_spaces.unusable(environment, f"its actions are {short_repr(spec)}")
+    raise jax_spaces.unusable(
+        environment, f"its actions are {short_repr(spec)}: LaRe trains discrete actions and bounded continuous ones"
+    )

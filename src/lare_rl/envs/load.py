@@ -7,6 +7,7 @@ from typing import Any
 
 from lare_rl.errors import LareError, did_you_mean, short_repr
 from lare_rl.tasks.spec import NO_ENVIRONMENT, SHARED_KEYS, TaskSpec
+from lare_rl.tasks.trust import trust_environment
 from lare_rl.util.renamed_fields import rename_keys
 from lare_rl.util.safe_io import MAX_SETTINGS_BYTES, read_text, read_toml
 
@@ -25,7 +26,7 @@ def resolve_task(task: TaskSpec | str | Path, playable: bool = True) -> TaskSpec
 
     Args:
         task: the spec, the name or the path.
-        playable: whether the environment must exist and match the task.
+        playable: whether the environment of a name or path must exist and match the task. A spec is returned as it is.
 
     Raises:
         LareError: `task` is none of these; and as for `load_task`.
@@ -58,9 +59,11 @@ def read_task(task: str | Path) -> TaskSpec:
     """Read a task without making its environment. Raises `LareError` like `load_task`."""
     values = _read_values(str(task))
     try:
-        return TaskSpec(**values)
+        spec = TaskSpec(**values)
     except LareError as error:
         raise LareError(f"task {str(task)!r}: {error}") from error
+    trust_environment(spec)
+    return spec
 
 
 def check_environment(spec: TaskSpec) -> None:

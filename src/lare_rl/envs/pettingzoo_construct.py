@@ -12,7 +12,8 @@ import numpy as np
 from lare_rl.envs.env_errors import one_line_errors
 from lare_rl.envs.interface import Team
 from lare_rl.errors import LareError, did_you_mean, install_command, short_repr
-from lare_rl.tasks.spec import PETTINGZOO_PREFIX, TaskSpec
+from lare_rl.tasks.spec import PETTINGZOO_PREFIX, TaskSpec, split_environment
+from lare_rl.tasks.trust import trusted_modules
 
 __all__ = ["agent_kind", "find_time_limit", "group_by_team", "make_parallel_env"]
 
@@ -29,7 +30,7 @@ def make_parallel_env(name: str, arguments: Mapping[str, Any]) -> Any:
     Raises:
         LareError: it cannot be made, or is not a ParallelEnv.
     """
-    module_name, _, maker_name = name.removeprefix(PETTINGZOO_PREFIX).partition(":")
+    module_name, maker_name = split_environment(name)
     if not (module_name and maker_name):
         raise LareError(
             f"environment {name!r} does not say how to make it. Write {PETTINGZOO_PREFIX}MODULE:NAME, "
@@ -41,13 +42,26 @@ def make_parallel_env(name: str, arguments: Mapping[str, Any]) -> Any:
         module = importlib.import_module(module_name)
         if not hasattr(module, maker_name):
             raise LareError(f"{message}: {module_name} has no {maker_name!r}{did_you_mean(maker_name, vars(module))}")
-        env = getattr(module, maker_name)(**arguments)
+        maker = getattr(module, maker_name)
+        _check_maker(maker, name)
+        env = maker(**arguments)
     if hasattr(env, "agent_iter"):
         raise LareError(f"{message}: {maker_name} makes an AECEnv, whose agents take turns. Name its parallel_env.")
     for attribute in REQUIRED:
         if not hasattr(env, attribute):
             raise LareError(f"{message}: {short_repr(env)} is not a ParallelEnv: it has no {attribute}")
     return env
+
+
+def _check_maker(maker: Any, name: str) -> None:
+    """Raise `LareError` for a function that a module has only imported, such as one that runs commands: a file may name it."""
+    module, maker_name = split_environment(name)
+    package = (getattr(maker, "__module__", module) or "").partition(".")[0]
+    trusted = {other.partition(".")[0] for other in (module, "pettingzoo", *trusted_modules())}
+    if package not in trusted:
+        raise LareError(
+            f"environment {name!r}: {maker_name} is defined in {package}. Name it there, or write a function in {module} that calls it."
+        )
 
 
 def _make_hint(error: BaseException) -> str:

@@ -9,6 +9,7 @@ import contextlib
 import logging
 import math
 from functools import lru_cache
+from typing import Any
 
 import gymnasium
 import numpy as np
@@ -20,7 +21,7 @@ from lare_rl.envs.trials import time_steps
 from lare_rl.envs.vec_env import LocalVecEnv, VecEnv, n_cores
 from lare_rl.envs.workers import SubprocVecEnv
 from lare_rl.errors import LareError
-from lare_rl.tasks.spec import PETTINGZOO_PREFIX, TaskSpec
+from lare_rl.tasks.spec import PETTINGZOO_PREFIX, TaskSpec, split_environment
 
 __all__ = [
     "SLOW_STEP_S",
@@ -35,12 +36,15 @@ __all__ = [
 SLOW_STEP_S = 2e-3
 """An environment of an unknown package gets a process of its own if a step takes longer. A call of a worker takes a tenth of this."""
 SLOW_START_S = 2.0
-"""The same, if making it takes longer, so that it is not made twice to try that."""
+"""An environment that takes longer than this to make gets a process of its own as well. Making a second one to find out would take as
+long again."""
 SECOND_TIMEOUT_S = 30.0
 """If a second environment hangs for so long beside a first one that started fast, each needs a process of its own."""
 
 MIN_SAVED_S = 3e-4
 """Workers are used if they make a step of all environments at least this much faster. A call of all workers costs about as much."""
+
+_TIMEOUT_HINT = "; if it needs longer, set timeout in the task file"
 
 _log = logging.getLogger(__name__)
 
@@ -83,12 +87,13 @@ def make_vec_env(task: TaskSpec, n: int, parallel: bool = False) -> VecEnv:
     if needs_process(task):
         return _make_separate(task, n)
     makers = [picklable_maker(task)] * n
+    options: dict[str, Any] = {"timeout": task.timeout, "timeout_hint": _TIMEOUT_HINT}
     if parallel:
-        return SubprocVecEnv(makers)
+        return SubprocVecEnv(makers, **options)
     n_saved = n - math.ceil(n / n_cores())
     if n_saved and n_saved * measure_step_s(task) > MIN_SAVED_S:
         with contextlib.suppress(LareError):
-            return SubprocVecEnv(makers)
+            return SubprocVecEnv(makers, **options)
     return LocalVecEnv(makers)
 
 
@@ -145,9 +150,8 @@ def _measure_task(task_json: str) -> float:
 
 
 def _make_separate(task: TaskSpec, n: int) -> SubprocVecEnv:
-    hint = "; if it needs longer, set timeout in the task file"
     key = task.model_dump_json()
-    return SubprocVecEnv([picklable_maker(task)] * n, n, task.timeout, timeout_hint=hint, reuse_key=key)
+    return SubprocVecEnv([picklable_maker(task)] * n, n, task.timeout, _TIMEOUT_HINT, key)
 
 
 def _select_row(batch: Timestep) -> Timestep:
@@ -158,14 +162,12 @@ def _select_row(batch: Timestep) -> Timestep:
 
 def _find_package(task: TaskSpec) -> str | None:
     """Return the package of a task's environment, or None if another process could not import it."""
-    module, _, name = task.environment.rpartition(":")
+    module, name = split_environment(task.environment)
     if is_gymnasium(task):
         entry_point = gymnasium.registry[name].entry_point if name in gymnasium.registry else None
         if isinstance(entry_point, str):
             module = module or entry_point.partition(":")[0]
-    elif task.environment.startswith(PETTINGZOO_PREFIX):
-        module = task.environment_name.partition(":")[0]
-    else:
+    elif not task.environment.startswith(PETTINGZOO_PREFIX):
         maker = FAMILIES[task.family].maker
         module = maker if isinstance(maker, str) else maker.__module__
     package = module.partition(":")[0].partition(".")[0]

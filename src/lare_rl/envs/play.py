@@ -3,7 +3,7 @@
 import contextlib
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -26,9 +26,23 @@ __all__ = [
     "sample_action",
 ]
 
-Policy = Callable[..., np.ndarray]
-"""A function from the observation of a single agent to its action, in the environment's units. If actions may be unavailable, its
-second argument is the mask of available actions."""
+
+@runtime_checkable
+class StatefulPolicy(Protocol):
+    """A policy that may have a memory (`evaluation.policy.RunPolicy`)."""
+
+    def reset(self) -> None:
+        """Begin a new episode."""
+        ...
+
+    def select_env_action(self, observation: Any, available: Any = None) -> np.ndarray:
+        """Return the action for one observation, in the environment's units."""
+        ...
+
+
+Policy = Callable[..., np.ndarray] | StatefulPolicy
+"""A function from the observation of a single agent to its action, in the environment's units, or an object with one. If actions may
+be unavailable, its second argument is the mask of available actions."""
 
 EpisodeListener = Callable[[int], None]
 """A function that is called with the number of episodes after each of them."""
@@ -131,6 +145,9 @@ def play_steps(
     env: HostEnv, policy: Policy | None, rng: np.random.Generator, seed: int
 ) -> Iterator[tuple[Timestep, np.ndarray, Timestep]]:
     """Play one episode. Yield the timestep before each step, the action, and the timestep after it."""
+    if isinstance(policy, StatefulPolicy):
+        policy.reset()
+        policy = policy.select_env_action
     next_timestep, done = env.reset(seed), False
     while not done:
         timestep = next_timestep
@@ -140,7 +157,7 @@ def play_steps(
         done = bool(next_timestep.terminated or next_timestep.truncated)
 
 
-def _act(policy: Policy, spec: EnvSpec, timestep: Timestep) -> Float[np.ndarray, "1 action"]:
+def _act(policy: Callable[..., np.ndarray], spec: EnvSpec, timestep: Timestep) -> Float[np.ndarray, "1 action"]:
     mask = [timestep.available[0]] if spec.masks_actions else []
     return policy(timestep.observation[0], *mask)[None]
 

@@ -33,7 +33,7 @@ class RobotEnv:
 
     The packages count steps and reset in wrappers, which this adapter does not use. An episode is truncated after `max_steps` steps.
     It terminates where the package says `done`, and where the simulator diverges: the last observation and the reward of a diverged
-    step are the previous observation and 0, because a value that is not finite would spoil all later updates.
+    step are the previous observation and 0, because a value that is not finite would spoil all later updates. So are measures 0.
     """
 
     def __init__(
@@ -99,7 +99,7 @@ class RobotEnv:
             terminated=(env_state.done > 0) | ~is_finite,
             truncated=next_state.steps >= self.spec.max_steps,
             state=next_state.privileged,
-            measures=env_state.metrics,
+            measures=jax.tree.map(lambda value: jnp.where(jnp.isfinite(value), value, 0.0), env_state.metrics),
         )
         return next_state, timestep
 

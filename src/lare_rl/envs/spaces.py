@@ -12,7 +12,7 @@ from jaxtyping import Float
 
 from lare_rl.errors import LareError, short_repr
 
-__all__ = ["OneHot", "OneHotAction", "check_spaces", "finite_array", "flatten_spaces", "flatten_value"]
+__all__ = ["OneHot", "OneHotAction", "check_spaces", "decode_box", "finite_array", "flatten_spaces", "flatten_value"]
 
 
 class OneHot(Box):
@@ -67,6 +67,12 @@ def check_spaces(owner: Any, observation: gymnasium.Space, action: gymnasium.Spa
         )
     if isinstance(action, Box) and not action.is_bounded():
         raise LareError(f"the actions of {owner} have no bounds: {short_repr(action)}")
+
+
+def decode_box(space: Box, vector: Float[np.ndarray, " size"]) -> np.ndarray:
+    """Return the action of a space that a vector stands for. Integers are rounded."""
+    clipped = np.clip(vector.reshape(space.shape), space.low, space.high)
+    return (np.rint(clipped) if space.dtype.kind in "iu" else clipped).astype(space.dtype)
 
 
 def flatten_spaces(env: gymnasium.Env) -> gymnasium.Env:

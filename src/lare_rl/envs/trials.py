@@ -22,7 +22,7 @@ N_COMPARED_STEPS = 3
 
 
 def time_steps(env: HostEnv) -> float:
-    """Return the shortest time of the first steps of an episode (s): other processes may interrupt the others."""
+    """Return the time of the fastest of the first steps (s). The others may have been interrupted."""
     timestep, times = env.reset(0), []
     while len(times) < N_TIMED_STEPS and not (timestep.terminated or timestep.truncated):
         action = fixed_action(env.spec, timestep)

@@ -57,8 +57,8 @@ class SubprocVecEnv(VecEnv):
             processes: the number of processes. Default: the number of cores, but at most one for each environment.
             timeout: the time (s) within which an environment must reply.
             timeout_hint: the end of the message about an environment that does not reply in time.
-            reuse_key: names equal environments with a process each. When the batch is closed, they stay open for the next batch
-                with this key, so that an expensive simulator starts once. Empty: they are closed.
+            reuse_key: keep the processes, one for each environment, open when the batch is closed, for the next batch with this
+                key. Empty: end them.
 
         Raises:
             LareError: an environment cannot be made. Later calls raise it if an environment raises an error, dies or does not

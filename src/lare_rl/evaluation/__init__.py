@@ -1,1 +1,1 @@
-"""Evaluation of trained policies: returns, films, and credit of new episodes."""
+"""Evaluation of trained policies: returns, films, and the credit of episodes."""

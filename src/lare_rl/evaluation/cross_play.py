@@ -11,7 +11,7 @@ from jaxtyping import Array, Float, PRNGKeyArray
 
 from lare_rl.envs.families import make_env
 from lare_rl.envs.interface import JaxEnv, Team, team_mean
-from lare_rl.errors import LareError
+from lare_rl.errors import LareError, check_count
 from lare_rl.runs.directory import Run
 from lare_rl.training.collect_device import unroll_on_device
 from lare_rl.training.compiled import policy_function, training_module
@@ -34,15 +34,22 @@ def cross_play(runs: tuple[Run, Run], episodes: int = 200) -> list[Match]:
     """Let the first team of each run play against the second team of each: four matches, all from the same initial states.
 
     Raises:
-        LareError: the runs are not of one task with two teams, or `episodes` is less than 1.
+        LareError: the runs are not of one task with two teams, or of different algorithms, or `episodes` is less than 1.
     """
-    if episodes < 1:
-        raise LareError(f"episodes = {episodes}: at least one is needed")
-    tasks = {run.config.task.name for run in runs}
-    if len(tasks) > 1 or len(runs[0].config.task.teams) != 2:
+    episodes = check_count("episodes", episodes)
+    (task, other), (algorithm, other_algorithm) = zip(
+        *((run.config.task, run.config.settings.algorithm) for run in runs), strict=True
+    )
+    if task.name != other.name:
+        raise LareError(f"cross-play needs two runs of one task, and these are of {task.name} and {other.name}")
+    if task.digest != other.digest:
         raise LareError(
-            f"cross-play needs two runs of one task in which two teams learn, and these are of {', '.join(sorted(tasks))}"
+            f"cross-play needs two runs of one task, and these have different tasks with the name {task.name}"
         )
+    if len(task.teams) != 2:
+        raise LareError(f"cross-play needs two teams that learn, and {task.name} has {len(task.teams) or 1}")
+    if algorithm != other_algorithm:
+        raise LareError(f"cross-play needs runs of one algorithm, and these are of {algorithm} and {other_algorithm}")
     env = make_env(runs[0].config.task)
     if not isinstance(env, JaxEnv):
         env.close()

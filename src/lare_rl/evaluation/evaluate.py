@@ -14,7 +14,7 @@ from lare_rl.envs.interface import JaxEnv
 from lare_rl.envs.load import check_environment
 from lare_rl.envs.placement import make_vec_env, n_open_envs
 from lare_rl.envs.play import Episode, EpisodeListener, play_roles
-from lare_rl.errors import LareError
+from lare_rl.errors import LareError, check_count
 from lare_rl.runs.directory import Run, as_run
 from lare_rl.tasks.spec import TaskSpec
 from lare_rl.tasks.trust import untrusted_module
@@ -39,9 +39,9 @@ MAX_OPEN_ENVS = 20
 RANDOM_EPISODES = 10
 """The default number of episodes with random actions."""
 MIN_RANDOM_EPISODES = 5
-"""Fewer episodes with random actions are played only if they take minutes."""
+"""Fewer episodes with random actions are played only if these take longer than `MAX_RANDOM_PLAY_S`."""
 RANDOM_PLAY_LIMIT_S, MAX_RANDOM_PLAY_S = 5.0, 120.0
-"""Seconds after which no other episode of random actions begins: if there are enough, and in any case."""
+"""Seconds after which no other episode of random actions begins: once there are `MIN_RANDOM_EPISODES`, and in any case."""
 
 
 def evaluate_run(
@@ -77,8 +77,7 @@ def evaluate_policy(
 
     On the host, `on_episode` is called with the number of episodes of each seed, when some have ended.
     """
-    if not isinstance(episodes, int) or episodes < 1:
-        raise LareError(f"episodes = {episodes}: a whole number, 1 or more")
+    episodes = check_count("episodes", episodes)
     task = run.config.task
     check_environment(task)
     config, actor, _ = load_actor(run, best)

@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from lare_rl.envs.families import load_env_spec
-from lare_rl.envs.interface import to_env_action, to_package_action
+from lare_rl.envs.interface import to_env_action, to_package_action, with_available_action
 from lare_rl.errors import LareError
 from lare_rl.runs.directory import Run, as_run
 from lare_rl.training.host_policy import HostPolicy, draw_noise, init_host_memory, make_policy
@@ -51,8 +51,8 @@ class RunPolicy:
         self._env = load_env_spec(run.config.task)
         if self._env.n_agents > 1:
             raise LareError(
-                f"{run.directory} is a run of {run.config.task.name}: many agents have no single policy; "
-                "export the run (lare-rl export), or use lare-rl evaluate"
+                f"{run.directory} is a run of {run.config.task.name}: many agents have no single policy; use lare-rl evaluate, or "
+                "export the run (lare-rl export)"
             )
         config, actors, _ = load_actor(run, best)
         self._config = replace(config, deterministic=deterministic)
@@ -129,9 +129,7 @@ class RunPolicy:
             raise LareError(
                 f"a mask has {size} booleans for each observation: the shape is {mask.shape}, the type {mask.dtype}"
             )
-        mask = mask.reshape(n_rows, size).astype(bool)
-        mask[:, 0] |= ~mask.any(axis=-1)
-        return mask
+        return with_available_action(mask.reshape(n_rows, size).astype(bool))
 
     def _check_observation(self, observation: Any) -> tuple[Float[np.ndarray, "batch observation"], bool]:
         """Return observations as rows, and whether there is a single one."""

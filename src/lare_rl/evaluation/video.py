@@ -19,13 +19,13 @@ from lare_rl.envs.interface import HostEnv, JaxEnv
 from lare_rl.envs.jax_on_host import JaxOnHost
 from lare_rl.envs.play import play_steps
 from lare_rl.errors import LareError, missing_extra_error
+from lare_rl.evaluation.played_episodes import PlayedEpisodes, play_run
 from lare_rl.evaluation.policy import RunPolicy
-from lare_rl.evaluation.rollout import Rollout, roll_out
 from lare_rl.runs.directory import Run
 from lare_rl.training.streams import Stream, episode_seed
 from lare_rl.util.files import check_new_path
 
-__all__ = ["check_video_path", "encode_film", "record_frames", "record_video", "render_rollout", "write_video"]
+__all__ = ["check_video_path", "encode_film", "record_frames", "record_video", "render_played", "write_video"]
 
 FRAMES_PER_SECOND = 8
 """The frame rate of a film of many agents."""
@@ -62,14 +62,14 @@ def record_frames(
     *,
     max_rate: float = MAX_GIF_FRAMES_PER_SECOND,
     max_frames: int | None = None,
-    rollout: Rollout | None = None,
+    played: PlayedEpisodes | None = None,
 ) -> tuple[list[Frame], float]:
     """Return the frames of one episode, as `record_video` shows it, and the seconds for which each is shown.
 
     Args:
         max_rate: the largest number of frames in a second.
-        max_frames: the largest number of frames. A longer film ends early.
-        rollout: an episode of many agents that has been played already.
+        max_frames: the largest number of frames. A longer film ends early; that of a single agent in JAX leaves steps out.
+        played: an episode of many agents that has been played already.
 
     Raises:
         LareError: the environment cannot be drawn on this machine.
@@ -80,9 +80,12 @@ def record_frames(
             raise LareError(
                 "many agents are filmed as they act in training, with their credit: leave best and deterministic out"
             )
-        frames = render_rollout(run, rollout or roll_out(run))
-        if frames is None:
-            raise LareError(f"{run.config.task.name} steps on the host, where only single agents are filmed")
+        if not spec.is_jax:
+            raise LareError(
+                f"{run.config.task.name} steps on the host, where only single agents are filmed: leave the video out"
+            )
+        frames = render_played(run, played or play_run(run))
+        assert frames is not None
         return frames[:max_frames], 1 / FRAMES_PER_SECOND
     policy = RunPolicy(run, 0, best, deterministic)
     if spec.is_jax:
@@ -95,13 +98,13 @@ def record_frames(
         return _play_and_render(run, env, policy, interval, max_frames), interval / fps
 
 
-def render_rollout(run: Run, rollout: Rollout) -> list[Frame] | None:
+def render_played(run: Run, played: PlayedEpisodes) -> list[Frame] | None:
     """Render the first episode with each agent's credit. Return None for an environment that cannot be drawn."""
     if not load_env_spec(run.config.task).is_jax:
         return None
     env = make_env(run.config.task)
     assert isinstance(env, JaxEnv)
-    return env.frames(rollout.select_episode(rollout.state), rollout.select_episode(rollout.credit))
+    return env.frames(played.select_episode(played.state), played.select_episode(played.credit))
 
 
 def encode_film(frames: Sequence[Frame], frame_seconds: float, max_bytes: int) -> bytes:

@@ -129,7 +129,8 @@ class LatentFunction:
             raise LareError(f"scored_observation = {short_repr(scored_observation)}: it is before, after or both")
         observations = select_states(scored_observation, observation, next_observation)
         lead, actions = np.shape(action)[:-1], _to_rows(action)
-        return np.concatenate([self(_to_rows(array), actions) for array in observations], axis=-1).reshape(*lead, -1)
+        factors = [self(_to_rows(array), actions) for array in observations]
+        return np.concatenate(factors, axis=-1).reshape(*lead, self.n_factors(scored_observation))
 
     def n_factors(self, scored_observation: ScoredObservation) -> int:
         """Return the number of factors of `step_factors`."""

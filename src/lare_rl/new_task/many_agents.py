@@ -17,7 +17,7 @@ from lare_rl.envs.pettingzoo_env import ParallelHost
 from lare_rl.new_task import draft
 from lare_rl.new_task.documentation import first_section, plain_lines, split_sections, write_texts
 from lare_rl.new_task.draft import Draft, count_entries, file_name, warning_lines
-from lare_rl.tasks.spec import PETTINGZOO_PREFIX, TaskSpec
+from lare_rl.tasks.spec import TaskSpec, split_environment
 
 __all__ = ["draft_multi_agent_task", "make_stub", "name_patterns", "write_team_drafts"]
 
@@ -50,7 +50,7 @@ def draft_multi_agent_task(environment_id: str) -> Draft:
     """Draft a task file from a PettingZoo environment's documentation and spaces. Raises `LareError` if it cannot be made."""
     env = make_parallel_env(environment_id, {})
     limit, kinds = find_time_limit(env, {}), list(dict.fromkeys(map(agent_kind, env.possible_agents or ())))
-    module, _, maker = environment_id.removeprefix(PETTINGZOO_PREFIX).partition(":")
+    module, maker = split_environment(environment_id)
     name = file_name(module.rpartition(".")[2] if maker in GENERIC_MAKERS else maker)
     several = len(kinds) > 1
     teams = (

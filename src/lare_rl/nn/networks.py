@@ -15,6 +15,7 @@ __all__ = [
     "Linear",
     "adam_step",
     "clip_gradient",
+    "copy_networks",
     "init_adam",
     "init_orthogonal",
     "polyak_update",
@@ -144,6 +145,11 @@ def clip_gradient(gradient: Parameters, max_norm: float) -> Parameters:
     """Return the gradient, scaled down to the norm `max_norm` if its norm is larger (Pascanu et al., 2013)."""
     factor = max_norm / jnp.maximum(optax.tree.norm(gradient), max_norm)
     return jax.tree.map(lambda leaf: leaf * factor, gradient)
+
+
+def copy_networks(networks: Parameters) -> Parameters:
+    """Return target networks: copies, because one buffer cannot be donated twice to a compiled update."""
+    return jax.tree.map(jnp.copy, networks)
 
 
 def polyak_update(target: Parameters, online: Parameters, tau: float) -> Parameters:

@@ -12,7 +12,7 @@ import numpy as np
 from lare_rl.phi.arrays import Array, Complex, Masked
 from lare_rl.phi.complex_numbers import call_with_complex
 from lare_rl.phi.limits import RefusedError
-from lare_rl.phi.numpy_functions import FUNCTIONS, INDEXED, KIND_OF_DTYPE, Polynomial, call_numpy
+from lare_rl.phi.numpy_functions import FUNCTIONS, INDEXED, KIND_OF_DTYPE, Polynomial, call_numpy, find_hint
 from lare_rl.phi.operand import BatchSize
 from lare_rl.phi.python_functions import BUILTINS
 from lare_rl.phi.runtime import Runtime
@@ -62,23 +62,6 @@ ARRAY_METHODS = frozenset(
     "conjugate choose".split()
 )
 """Methods of arrays that are functions of NumPy with the same name and arguments."""
-
-HINTS = {
-    "np.random": "a factor must not depend on chance",
-    "np.unique": "count with comparisons, such as (x[:, :, None] == values).any(1)",
-    "np.nanmedian": "replace NaN first, then use np.median",
-    "np.nanpercentile": "replace NaN first, then use np.percentile",
-    "np.nanquantile": "replace NaN first, then use np.quantile",
-    "np.histogram": "count with comparisons, such as ((x >= low) & (x < high)).sum(axis=1)",
-    "np.linalg.svd": "for 2 x 2 matrices, use np.linalg.eigvalsh; else sums of squares, np.trace or np.linalg.det",
-    "np.linalg.eig": "for symmetric 2 x 2 matrices, use np.linalg.eigvalsh; else np.trace or np.linalg.det",
-    "np.linalg.eigh": "for symmetric 2 x 2 matrices, use np.linalg.eigvalsh; else np.trace or np.linalg.det",
-    "np.linalg.eigvals": "for symmetric 2 x 2 matrices, use np.linalg.eigvalsh; else np.trace or np.linalg.det",
-    "np.linalg.lstsq": "use np.linalg.solve for at most 4 x 4 numbers",
-    "np.load": "a program has no files", "np.save": "a program has no files", "np.memmap": "a program has no files",
-    "np.fromfile": "a program has no files", "np.loadtxt": "a program has no files", "np.savetxt": "a program has no files",
-}  # fmt: skip
-"""What to write instead of some names that are not available."""
 
 
 def resolve_import(statement: ast.Import | ast.ImportFrom) -> Iterable[tuple[str, Any]]:
@@ -180,8 +163,8 @@ def module_attribute(module: str, name: str) -> Any:
 def _hint(full: str) -> str:
     """Return what to write instead of a name that is not available."""
     full = full[:80]
-    if full in HINTS:
-        return f": {HINTS[full]}"
+    if hint := find_hint(full):
+        return hint
     names = [f"np.{name}" for name in FUNCTIONS] + list(BUILTINS)
     near = difflib.get_close_matches(full, names, 1, 0.8)
     return f": is {near[0]} meant?" if near else ""

@@ -17,7 +17,7 @@ from lare_rl.runs.metric_names import CREDIT_CORRELATION, CREDIT_ERROR, RETURN, 
 from lare_rl.tasks.spec import TaskSpec
 from lare_rl.util.durations import format_seconds
 from lare_rl.util.findings import Finding, format_value, render
-from lare_rl.util.statistics import format_mean_std
+from lare_rl.util.statistics import format_mean_std, wins
 
 __all__ = [
     "compare_runs",
@@ -135,11 +135,11 @@ def compare_runs(runs: Sequence[ReportedRun]) -> list[Finding]:
     )
     n_more = len(finals) - len(ranked)
     (best, best_returns), (second, second_returns), *_ = finals.items()
-    wins = (best_returns[:, None] > second_returns) + 0.5 * (best_returns[:, None] == second_returns)
-    probability, last = float(wins.mean()), float(list(finals.values())[-1].mean())
+    pairs = wins(best_returns[:, None], second_returns)
+    probability, last = float(pairs.mean()), float(list(finals.values())[-1].mean())
     names = {"best": best, "second": second}
     findings = [
-        Finding("is_best" if probability >= CLEAR_PROBABILITY and wins.size > 1 else "none_is_best", names),
+        Finding("is_best" if probability >= CLEAR_PROBABILITY and pairs.size > 1 else "none_is_best", names),
         Finding(
             "ranking",
             {
@@ -148,7 +148,7 @@ def compare_runs(runs: Sequence[ReportedRun]) -> list[Finding]:
                 "seeds": n_seeds,
             },
         ),
-        Finding("improvement", names | {"probability": probability, "n_pairs": wins.size}),
+        Finding("improvement", names | {"probability": probability, "n_pairs": pairs.size}),
     ]
     steps = {reported.last_step for reported in runs if reported.metrics}
     return findings + (

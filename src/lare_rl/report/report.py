@@ -9,7 +9,7 @@ from pathlib import Path
 from lare_rl.envs.families import load_env_spec
 from lare_rl.errors import LareError
 from lare_rl.evaluation.evaluate import measure_random_returns
-from lare_rl.evaluation.rollout import Rollout, roll_out
+from lare_rl.evaluation.played_episodes import PlayedEpisodes, play_run
 from lare_rl.evaluation.video import encode_film, record_frames
 from lare_rl.report.html import render_film, render_fold, render_note, write_page
 from lare_rl.report.overview import (
@@ -111,16 +111,16 @@ def _render_task(runs: Sequence[ReportedRun], film: bool) -> Iterable[str]:
     task = runs[0].run.config.task
     random_returns = measure_random_returns(task)
     summaries = summarise_runs(runs, random_returns)
-    rollouts = [_roll_out(reported.run) for reported in runs]
+    all_played = [_play_run(reported.run) for reported in runs]
     filmed = [i for i, reported in enumerate(runs) if film and _can_load(reported.run)][:MAX_FILMS]
-    films = {i: _load_film(runs[i].run, rollouts[i], FILM_BYTES // len(filmed)) for i in filmed}
+    films = {i: _load_film(runs[i].run, all_played[i], FILM_BYTES // len(filmed)) for i in filmed}
     figures = {i: render_film(data, f"An episode of {runs[i].name}") for i, data in films.items() if data}
     if len(runs) == 1:
         yield from render_verdict(runs[0], summaries[0], figures.get(0, ""))
         yield render_note(describe_method(runs[0].run))
         yield "<h2>Learning</h2>"
         yield from render_learning_curves(task, runs, random_returns)
-        yield from render_details(runs[0].run, render_trust(summaries[0]), rollouts[0])
+        yield from render_details(runs[0].run, render_trust(summaries[0]), all_played[0])
         yield _note_missing(runs)
         yield render_fold("Final values of each seed", [render_final_values(runs)])
         return
@@ -132,8 +132,8 @@ def _render_task(runs: Sequence[ReportedRun], film: bool) -> Iterable[str]:
     yield from render_learning_curves(task, runs, random_returns)
     yield render_final_values(runs)
     yield "<h2>Each run</h2>"
-    for reported, summary, rollout in zip(runs, summaries, rollouts, strict=True):
-        details = render_details(reported.run, render_trust(summary), rollout)
+    for reported, summary, played in zip(runs, summaries, all_played, strict=True):
+        details = render_details(reported.run, render_trust(summary), played)
         title = f"{reported.name}: {render_headline(summary)}" if summary else reported.name
         yield render_fold(
             title,
@@ -154,12 +154,12 @@ def _can_load(run: Run) -> bool:
     return run.has_checkpoint() and untrusted_module(run.config.task) is None
 
 
-def _roll_out(run: Run) -> Rollout | None:
+def _play_run(run: Run) -> PlayedEpisodes | None:
     """Play an episode of a run of many agents."""
-    return roll_out(run) if _can_load(run) and load_env_spec(run.config.task).n_agents > 1 else None
+    return play_run(run) if _can_load(run) and load_env_spec(run.config.task).n_agents > 1 else None
 
 
-def _load_film(run: Run, rollout: Rollout | None, max_bytes: int) -> bytes | None:
+def _load_film(run: Run, played: PlayedEpisodes | None, max_bytes: int) -> bytes | None:
     """Return the film in the run's directory, or make one if it is older than the checkpoint. None if nothing can be drawn here."""
     path = run.directory / FILM
     if (
@@ -169,7 +169,7 @@ def _load_film(run: Run, rollout: Rollout | None, max_bytes: int) -> bytes | Non
     ):
         return path.read_bytes()
     try:
-        film = encode_film(*record_frames(run, max_frames=MAX_FRAMES, rollout=rollout), max_bytes)
+        film = encode_film(*record_frames(run, max_frames=MAX_FRAMES, played=played), max_bytes)
     except LareError:
         return None
     with suppress(OSError):

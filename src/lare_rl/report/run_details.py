@@ -16,7 +16,7 @@ from lare_rl.credit.methods import find_method
 from lare_rl.envs.families import load_env_spec
 from lare_rl.errors import install_command
 from lare_rl.evaluation.episode_credit import FactorLabel, label_factors, load_episode_credit
-from lare_rl.evaluation.rollout import Rollout, TeamSample, sample_steps
+from lare_rl.evaluation.played_episodes import PlayedEpisodes, TeamSample, sample_steps
 from lare_rl.latent.saved import read_source
 from lare_rl.report.charts import (
     Bar,
@@ -57,12 +57,12 @@ _SIDES = ((1, "plus", "the reward of a step rises with the factor"), (-1, "minus
 """Signs of bars: their sides, and what they say."""
 
 
-def render_details(run: Run, trust: Iterable[str] = (), rollout: Rollout | None = None) -> Iterable[str]:
+def render_details(run: Run, trust: Iterable[str] = (), played: PlayedEpisodes | None = None) -> Iterable[str]:
     """Yield what a run's checkpoint and files show.
 
     Args:
         trust: paragraphs on the quality of the credit, which stand below its picture.
-        rollout: an episode, for a run of many agents.
+        played: an episode, for a run of many agents.
     """
     trust = list(trust)
     if module := untrusted_module(run.config.task):
@@ -70,10 +70,10 @@ def render_details(run: Run, trust: Iterable[str] = (), rollout: Rollout | None 
         yield from _render_untrusted(run, module)
     elif not run.has_checkpoint():
         yield from trust
-    elif rollout is None:
+    elif played is None:
         yield from _render_single_agent(run, trust)
     else:
-        yield from _render_agents(run, rollout, trust)
+        yield from _render_agents(run, played, trust)
 
 
 def _render_untrusted(run: Run, module: str) -> Iterable[str]:
@@ -211,13 +211,13 @@ def _render_factor_table(
     yield render_note(f"phi scores the observation {_OBSERVATIONS[run.scored_observation]} the step.")
 
 
-def _render_agents(run: Run, rollout: Rollout, trust: Sequence[str]) -> Iterable[str]:
+def _render_agents(run: Run, played: PlayedEpisodes, trust: Sequence[str]) -> Iterable[str]:
     """Yield what earned the score of each team, the credit of each agent and step, and the factors."""
     samples = sample_steps(run) if run.functions else []
     yield from _render_earnings(
         run, [sample.correlations for sample in samples] or [np.zeros(0)] * len(run.config.task.roles)
     )
-    reward, proxy = rollout.select_episode((rollout.reward, rollout.training_reward))
+    reward, proxy = played.select_episode((played.reward, played.training_reward))
     sums = f"Sum of the true rewards {format_number(reward.sum())}"
     if proxy is not None:
         sums += f", of the proxy rewards {format_number(proxy.sum())}"

@@ -24,7 +24,7 @@ from lare_rl.runs.checkpoint import STATE_FILE, read_metadata
 from lare_rl.runs.config_file import CONFIG, Config, make_config, read_config, write_config
 from lare_rl.runs.metrics_file import read_metrics
 from lare_rl.tasks.spec import ScoredObservation, TaskSpec
-from lare_rl.tasks.trust import check_trusted
+from lare_rl.tasks.trust import check_trusted, trust_environment
 from lare_rl.util.locks import try_lock
 
 __all__ = [
@@ -119,6 +119,7 @@ def create_run(directory: Path, task: TaskSpec, settings: ResolvedSettings, func
         raise LareError(f"the run directory {directory} cannot be made: {error.strerror}") from error
     finally:
         shutil.rmtree(new, ignore_errors=True)
+    trust_environment(task)
     return Run(directory, config, tuple(functions))
 
 

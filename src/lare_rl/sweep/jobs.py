@@ -10,7 +10,6 @@ from lare_rl.config.effective import effective_settings
 from lare_rl.config.resolve import resolve
 from lare_rl.config.settings import ResolvedSettings, Settings
 from lare_rl.credit.methods import find_method
-from lare_rl.envs.families import load_env_spec
 from lare_rl.errors import LareError
 from lare_rl.latent.design import check_recorded
 from lare_rl.llm.prompts import N_CANDIDATES
@@ -19,6 +18,7 @@ from lare_rl.runs.config_file import CONFIG, read_config
 from lare_rl.runs.directory import CHECKPOINT
 from lare_rl.runs.metrics_file import read_metrics
 from lare_rl.tasks.spec import TaskSpec
+from lare_rl.tasks.trust import trust_environment
 from lare_rl.training.latent_functions import choose_functions
 
 __all__ = ["Job", "check_job", "job_to_json", "make_job", "train_job"]
@@ -130,7 +130,7 @@ def train_job(job: dict[str, Any]) -> None:
     """Train the run that `job_to_json` describes, or resume it."""
     directory, task = Path(job["directory"]), TaskSpec(**job["task"])
     if (directory / CONFIG).is_file():
-        load_env_spec(task)  # imports the module of the user's environment, so that `resume` trusts it
+        trust_environment(task)
         lare_rl.resume(directory)
     else:
         lare_rl.train(task, Settings(**job["settings"]), function=job["functions"] or None, out=directory)

@@ -1,1 +1,1 @@
-"""Task files: what a task says, and how it is read."""
+"""Task files: what a task says, when it pays, and which modules it may import."""

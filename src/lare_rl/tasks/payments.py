@@ -11,7 +11,7 @@ class PaymentRule:
     """When an environment pays. At the end of an episode it always pays."""
 
     period: int | None = None
-    """It pays after this number of steps again and again."""
+    """It pays every `period` steps."""
     nonzero: bool = False
     """Every reward that is not 0 is a payment."""
     window: int | None = None

@@ -5,7 +5,7 @@ import json
 from collections.abc import Sequence
 from typing import Annotated, Any, Literal, TypeVar
 
-from pydantic import ConfigDict, Field, field_validator, model_validator
+from pydantic import ConfigDict, Field, StrictInt, field_validator, model_validator
 
 from lare_rl.errors import CheckedModel, LareError
 from lare_rl.tasks.payments import PaymentRule
@@ -22,6 +22,7 @@ __all__ = [
     "base_name",
     "require_role",
     "select_states",
+    "split_environment",
     "step_names",
 ]
 
@@ -75,7 +76,7 @@ values."""
 class PaidSteps(CheckedModel):
     """The value of `paid_for` for payments that are for a fixed number of steps."""
 
-    steps: Annotated[int, Field(ge=1)]
+    steps: Annotated[StrictInt, Field(ge=1)]
     """The number of last steps that a payment is for."""
 
 
@@ -119,7 +120,7 @@ class TaskSpec(CheckedModel):
     score: Literal["sum", "average", "binary"] | None = None
     """Whether the return of an episode is a sum over its steps; an average or grade that does not grow with its length; or binary, won
     or lost. By default, training determines whether a sum or an average predicts returns better."""
-    payments: Literal["end", "nonzero"] | Annotated[int, Field(ge=1)] = "end"
+    payments: Literal["end", "nonzero"] | Annotated[StrictInt, Field(ge=1)] = "end"
     """When the environment pays: once, at the end of an episode; with every reward that is not 0; or every so many steps and at the
     end. Rewards between payments are added up."""
     paid_for: Literal["since_last"] | PaidSteps = "since_last"
@@ -134,7 +135,7 @@ class TaskSpec(CheckedModel):
     does an environment of a package that LaRe does not know, if its steps are slow, or if a second one in its process fails, hangs or
     changes the first."""
     timeout: Annotated[float, Field(gt=0, allow_inf_nan=False)] = 120.0
-    """The time (s) within which an environment in a process of its own must reply. After it, the run stops with a message."""
+    """The time (s) within which an environment in another process must reply. After it, the run stops with a message."""
     arguments: dict[str, Any] = Field(default_factory=dict)
     """Keyword arguments of the environment. Only for families that have them (`pettingzoo/...`, `gymnax/...`, `jumanji/...` and
     others)."""
@@ -226,10 +227,15 @@ class TaskSpec(CheckedModel):
         return hashlib.sha256(self.model_dump_json().encode()).hexdigest()
 
 
+def split_environment(name: str) -> tuple[str, str]:
+    """Return the module that an environment's name imports, or "", and the rest: MODULE:NAME without the prefix of PettingZoo."""
+    module, colon, rest = name.removeprefix(PETTINGZOO_PREFIX).partition(":")
+    return (module, rest) if colon else ("", module)
+
+
 def _module(environment: str) -> tuple[bool, str]:
     """Return whether an environment is PettingZoo's, and the module that its name imports, or ""."""
-    module, colon, _ = environment.removeprefix(PETTINGZOO_PREFIX).partition(":")
-    return environment.startswith(PETTINGZOO_PREFIX), module if colon else ""
+    return environment.startswith(PETTINGZOO_PREFIX), split_environment(environment)[0]
 
 
 def require_role(spec: TaskSpec) -> TaskSpec:

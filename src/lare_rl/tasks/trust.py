@@ -7,38 +7,72 @@ from importlib.util import find_spec
 from pathlib import Path
 
 from lare_rl.errors import LareError
-from lare_rl.tasks.spec import PETTINGZOO_PREFIX, TaskSpec
+from lare_rl.tasks.spec import PETTINGZOO_PREFIX, TaskSpec, split_environment
 from lare_rl.util.variables import read_variable
 
-__all__ = ["TRUST_VARIABLE", "check_trusted", "untrusted_module"]
+__all__ = ["TRUST_VARIABLE", "check_trusted", "trust_environment", "trusted_modules", "untrusted_module"]
 
 TRUST_VARIABLE = "LARE_TRUST"
 """The environment variable with the modules, separated by commas, that run directories and other files may import."""
 
+_PETTINGZOO_PACKAGES = ("mpe2", "pettingzoo")
+"""Packages whose functions `parallel_env` make environments, and do nothing else."""
+
+_own_environments = set[str]()
+"""The names of the environments of this process's own runs."""
+
+
+def trust_environment(task: TaskSpec) -> None:
+    """Trust the environment of a task that the user has given to this process, in all files that it reads later."""
+    _own_environments.update({task.environment, task.evaluation_task.environment})
+
+
+def trusted_modules() -> list[str]:
+    """Return the modules that the user trusts."""
+    return [name.strip() for name in read_variable(TRUST_VARIABLE).split(",")]
+
 
 def untrusted_module(task: TaskSpec) -> str | None:
-    """Return the module that a task's environment would import.
+    """Return the module that a task's environment would import, or whose function it would call.
 
-    Return None without such a module, and for a module that this process has imported or that the user trusts.
+    Return None without such a module, and for one that the user trusts. PettingZoo's environments are made by a function that the
+    task names, so this function must be known too. For Gymnasium, it is enough that this process has imported the module.
     """
-    module, colon, _ = task.environment.removeprefix(PETTINGZOO_PREFIX).partition(":")
-    trusted = [name.strip() for name in read_variable(TRUST_VARIABLE).split(",")]
-    return module if colon and module not in sys.modules and module not in trusted else None
+    module, _ = split_environment(task.environment)
+    names = {task.environment, task.evaluation_task.environment}
+    if not module or module in trusted_modules() or names <= _own_environments:
+        return None
+    return None if module in sys.modules and all(map(_makes_environment, names)) else module
+
+
+def _makes_environment(name: str) -> bool:
+    """Return whether the name is not PettingZoo's, or is of a function that is known to make an environment."""
+    module, function = split_environment(name)
+    if not name.startswith(PETTINGZOO_PREFIX):
+        return True
+    return module.partition(".")[0] in _PETTINGZOO_PACKAGES and function == "parallel_env"
 
 
 def check_trusted(task: TaskSpec, directory: Path) -> None:
-    """Check that a run's environment imports nothing but installed packages and trusted modules.
+    """Check that a run's environment is of an installed package or a trusted module, and calls no function but those that make one.
 
     Raises:
-        LareError: it would import another file.
+        LareError: it would run another file, or call another function.
     """
     module = untrusted_module(task)
-    path = None if module is None else _find_package(module)
+    if module is None:
+        return
+    path = _find_package(module)
     if path is not None and not any(path.is_relative_to(folder) for folder in _package_folders()):
-        raise LareError(
-            f"{directory}: its environment {task.environment!r} would run {path}, which belongs to no installed package. "
-            f"If you trust that file, set {TRUST_VARIABLE}={module}."
-        )
+        reason = f"run {path}, which belongs to no installed package"
+    elif not all(map(_makes_environment, (task.environment, task.evaluation_task.environment))):
+        reason = f"call a function of {module}"
+    else:
+        return
+    raise LareError(
+        f"{directory}: its environment {task.environment!r} would {reason}. If you trust that, set "
+        f"{TRUST_VARIABLE}={module}."
+    )
 
 
 def _find_package(module: str) -> Path | None:
@@ -54,9 +88,9 @@ def _find_package(module: str) -> Path | None:
 
 
 def _package_folders() -> set[Path]:
-    """Return the folders in which packages and Python itself are installed."""
+    """Return the folders in which packages are installed. No module of Python itself makes environments."""
     paths = sysconfig.get_paths()
-    names = ("stdlib", "platstdlib", "purelib", "platlib")
+    names = ("purelib", "platlib")
     return {
         Path(path).resolve()
         for path in (*(paths[name] for name in names), *site.getsitepackages(), site.getusersitepackages())

@@ -226,7 +226,7 @@ def _evaluate(
     returns = [team_mean(reward, steps.timestep.alive, team).sum(axis=0) for team in config.env.teams]
     summed_returns = [reward[..., team.agents].sum(axis=(0, -1)) for team in config.env.teams]
     last = mask & steps.ended
-    measures = {name: (values * last).sum(axis=0) for name, values in steps.next_timestep.measures.items()}
+    measures = {name: jnp.where(last, values, 0.0).sum(axis=0) for name, values in steps.next_timestep.measures.items()}
     returns, summed_returns = (jnp.stack(values, axis=-1) for values in (returns, summed_returns))
     return Evaluation(returns, summed_returns, mask.sum(axis=0), measures)
 

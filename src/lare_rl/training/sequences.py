@@ -211,6 +211,6 @@ def _sequences(
         available=with_last_timestep("available") if config.env.masks_actions else jnp.ones(n_choices, bool),
         action=steps.columns["action"],
         reward=mask * team_mean(reward, alive_agents(steps, config), config.env.teams[0]),
-        terminated=mask * (jnp.arange(n_steps) == episodes.length[:, None] - 1),
+        done=mask * (jnp.arange(n_steps) == episodes.length[:, None] - 1),
         mask=mask,
     )

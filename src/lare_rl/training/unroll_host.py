@@ -23,7 +23,7 @@ __all__ = [
     "unroll_on_host",
 ]
 
-Policy = Callable[[Timestep, Bool[np.ndarray, "seeds envs"]], Float[np.ndarray, "seeds envs agents action"]]
+BatchPolicy = Callable[[Timestep, Bool[np.ndarray, "seeds envs"]], Float[np.ndarray, "seeds envs agents action"]]
 """From a timestep, and which episodes have just begun, to the action."""
 
 
@@ -32,7 +32,7 @@ class DivergedError(LareError):
 
 
 def unroll_on_host(
-    envs: VecEnv, policy: Policy, seeds: Sequence[int], episode_seeds: Sequence[int]
+    envs: VecEnv, policy: BatchPolicy, seeds: Sequence[int], episode_seeds: Sequence[int]
 ) -> Iterator[tuple[Trajectory, Bool[np.ndarray, "seeds episodes"]]]:
     """Play one episode in each environment, all in lockstep.
 
@@ -61,7 +61,9 @@ def unroll_on_host(
         running, episode_start = running & ~steps.ended, np.zeros(shape, bool)
 
 
-def record_on_host(envs: VecEnv, policy: Policy, seeds: Sequence[int], episode_seeds: Sequence[int]) -> EpisodeBatch:
+def record_on_host(
+    envs: VecEnv, policy: BatchPolicy, seeds: Sequence[int], episode_seeds: Sequence[int]
+) -> EpisodeBatch:
     """Play one episode in each environment, and return all steps. The arguments are as in `unroll_on_host`."""
     steps, masks = [], []
     for step, running in unroll_on_host(envs, policy, seeds, episode_seeds):
@@ -70,7 +72,9 @@ def record_on_host(envs: VecEnv, policy: Policy, seeds: Sequence[int], episode_s
     return EpisodeBatch(jax.tree.map(lambda *rows: np.stack(rows), *steps), np.stack(masks), None)
 
 
-def evaluate_on_host(envs: VecEnv, policy: Policy, seeds: Sequence[int], n_episodes: int, first: int = 0) -> Evaluation:
+def evaluate_on_host(
+    envs: VecEnv, policy: BatchPolicy, seeds: Sequence[int], n_episodes: int, first: int = 0
+) -> Evaluation:
     """Evaluate one episode in each of the first `n_episodes` environments of each seed, each from a different initial state.
 
     The initial states depend only on the seed and on the episode's number, which counts from `first`. So every evaluation of a

@@ -55,6 +55,7 @@ _RENAMED_PATHS = {
     rf"{_NETWORK}\.value\.": r"\1.readout.",  # Diaster
     rf"{_NETWORK}\.step\.": r"\1.step_model.",
     r"(?<!\.replay)\.episodes\b": ".n_episodes",
+    r"(^|\.algorithm|\.actor)\.(return|observation)s(?=\.(n_rows|mean|sum_squares)$)": r"\1.\2_rms",  # PPO
 }
 """From patterns of old names to new names, in the order in which they are applied."""
 

@@ -19,6 +19,7 @@ __all__ = [
     "round_shares",
     "sample_std",
     "standard_error",
+    "wins",
 ]
 
 CONSTANT = 1e-10
@@ -32,6 +33,11 @@ class Band(NamedTuple):
     value: Float[np.ndarray, " points"]
     low: Float[np.ndarray, " points"]
     high: Float[np.ndarray, " points"]
+
+
+def wins(x: Float[np.ndarray, "*_"], y: Float[np.ndarray, "*_"]) -> Float[np.ndarray, "*_"]:
+    """Return 1 where x is larger than y, 1/2 where they are equal, and 0 where y is larger."""
+    return (x > y) + 0.5 * (x == y)
 
 
 def sample_std(values: Float[np.ndarray, " values"]) -> float:

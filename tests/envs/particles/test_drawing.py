@@ -6,7 +6,7 @@ from matplotlib.patches import Circle
 from lare_rl.envs.canvas import to_pixels
 from lare_rl.envs.particles.catalogue import TASKS
 from lare_rl.envs.particles.drawing import LANDMARK_COLOUR, OTHER_COLOUR, TEAM_COLOUR, draw_state
-from lare_rl.envs.particles.particle_env import ParticleJaxEnv, ParticleState
+from lare_rl.envs.particles.particle_env import ParticleEnv, ParticleState
 from lare_rl.envs.particles.world import State
 
 
@@ -46,7 +46,7 @@ def test_frames_have_common_scales():
     positions = np.linspace(1, 2, 4)[:, None, None] * start("TriangleArea")
     credit = np.arange(12.0).reshape(4, 3)
     states = ParticleState(State(positions, 0 * positions), np.arange(4))
-    pictures = ParticleJaxEnv("TriangleArea").frames(states, credit)
+    pictures = ParticleEnv("TriangleArea").frames(states, credit)
     assert [picture.shape for picture in pictures] == [(400, 400, 3)] * 4
     assert len({picture.tobytes() for picture in pictures}) == 4
     last = draw_state(TASKS["TriangleArea"], positions[-1], credit[-1], 11.0)

@@ -5,7 +5,7 @@ import warnings
 import numpy as np
 import pytest
 
-from lare_rl.envs.particles.parallel_env import ParticleEnv
+from lare_rl.envs.particles.parallel_env import ParticleParallelEnv
 from lare_rl.envs.particles.task import MAX_STEPS
 from lare_rl.errors import LareError
 
@@ -17,17 +17,17 @@ with warnings.catch_warnings():
 
 @pytest.mark.parametrize("name", ["CompetitivePP-6", "TriangleArea"])
 def test_pettingzoo_checkers(name):
-    parallel_api_test(ParticleEnv(name), num_cycles=60)
-    parallel_seed_test(lambda: ParticleEnv(name), num_cycles=30)
+    parallel_api_test(ParticleParallelEnv(name), num_cycles=60)
+    parallel_seed_test(lambda: ParticleParallelEnv(name), num_cycles=30)
 
 
 def test_episode():
-    env = ParticleEnv("TriangleArea", render_mode="rgb_array")
+    env = ParticleParallelEnv("TriangleArea", render_mode="rgb_array")
     env.reset(seed=0)
     for step in range(1, MAX_STEPS + 1):
         *_, terminated, truncated, _ = env.step(dict.fromkeys(env.agents, 0))
-        assert set(terminated.values()) == {False}
-        assert set(truncated.values()) == {step == MAX_STEPS}
+        assert set(terminated.values()) == {step == MAX_STEPS}  # as in JAX
+        assert set(truncated.values()) == {False}
     assert env.agents == []
     assert env.step({}) == ({},) * 5
     picture = env.render()
@@ -36,12 +36,12 @@ def test_episode():
 
 
 def test_agents_are_named_after_their_teams():
-    names = ParticleEnv("CompetitivePP-6").possible_agents
+    names = ParticleParallelEnv("CompetitivePP-6").possible_agents
     assert names == [*[f"predator_{i}" for i in range(6)], "prey_0", "prey_1"]
 
 
 def test_episodes_without_a_seed_differ():
-    env = ParticleEnv("TriangleArea")
+    env = ParticleParallelEnv("TriangleArea")
     starts = [env.reset(seed=seed)[0]["agent_0"] for seed in (0, None, 0)]
     assert not np.array_equal(starts[0], starts[1])
     np.testing.assert_array_equal(starts[0], starts[2])
@@ -49,15 +49,15 @@ def test_episodes_without_a_seed_differ():
 
 @pytest.mark.parametrize("action", [5, None])
 def test_invalid_action(action):
-    env = ParticleEnv("TriangleArea")
+    env = ParticleParallelEnv("TriangleArea")
     env.reset(seed=0)
     with pytest.raises(LareError, match=f"agent_2 is {action}; it must be 0 to 4"):
         env.step({**dict.fromkeys(env.agents, 0), "agent_2": action})
 
 
 def test_calls_that_are_refused():
-    for call in (lambda env: env.step({}), ParticleEnv.render, ParticleEnv.state):
+    for call in (lambda env: env.step({}), ParticleParallelEnv.render, ParticleParallelEnv.state):
         with pytest.raises(LareError, match="no episode yet"):
-            call(ParticleEnv("CN-6"))
+            call(ParticleParallelEnv("CN-6"))
     with pytest.raises(LareError, match="no render mode 'human'"):
-        ParticleEnv("PP-6", render_mode="human")
+        ParticleParallelEnv("PP-6", render_mode="human")

@@ -47,7 +47,7 @@ def test_catalogue():
 
 def make_state(name: str, *positions: tuple[float, float]) -> State:
     """Return a state at rest: the first entities at these positions, the others far from them and from each other."""
-    entities = len(TASKS[name].world.size)
+    entities = len(TASKS[name].world.radius)
     position = FAR * (1 + np.arange(entities))[:, None] * np.ones(2)
     position[: len(positions)] = positions
     return at_rest(jnp.asarray(position, jnp.float32))

@@ -1,7 +1,7 @@
 """PPO: proximal policy optimisation (Schulman et al., 2017), and IPPO, which is the same update for many agents at once.
 
-    delta_t = r_t + gamma * (1 - terminated_t) * V(s_t) - V(s_{t-1})
-    A_{t-1} = delta_t + gamma * lambda * (1 - done_t) * A_t          (Schulman et al., 2016)
+    delta_t = r_t + gamma * (1 - terminated_t) * V(s_{t+1}) - V(s_t)
+    A_t     = delta_t + gamma * lambda * (1 - done_t) * A_{t+1}      (Schulman et al., 2016)
     rho     = pi(a | s) / pi_old(a | s)
     theta  <- ascend  mean min(rho A, clip(rho, 1 - c, 1 + c) A)  -  v * value loss  +  e * entropy
 
@@ -58,9 +58,9 @@ class PPO(NamedTuple):
 
     params: Networks
     optimizer: optax.OptState
-    returns: RunningMeanStd
+    return_rms: RunningMeanStd
     """Running statistics of the returns that the critic was fitted to."""
-    observations: RunningMeanStd | None
+    observation_rms: RunningMeanStd | None
     """Running statistics that normalise the networks' observations; None if these are not normalised. A rollout is added only
     after the update on it, so that the policy that is updated is the policy that acted."""
 
@@ -69,7 +69,7 @@ class Actor(NamedTuple):
     """What is needed to act."""
 
     policy: StochasticPolicy
-    observations: RunningMeanStd | None
+    observation_rms: RunningMeanStd | None
 
 
 class Batch(NamedTuple):
@@ -99,67 +99,67 @@ def init(key: PRNGKeyArray, observation_size: int, action_size: int, discrete: b
     return PPO(
         params=params,
         optimizer=init_adam(params, settings.learning_rate),
-        returns=empty_mean_std(1),
-        observations=empty_mean_std(observation_size) if settings.normalise_observations else None,
+        return_rms=empty_mean_std(1),
+        observation_rms=empty_mean_std(observation_size) if settings.normalise_observations else None,
     )
 
 
 def get_actor(state: PPO) -> Actor:
     """Return what is needed to act."""
-    return Actor(state.params.actor, state.observations)
+    return Actor(state.params.actor, state.observation_rms)
 
 
-def normalise(observation: Observation, observations: RunningMeanStd | None) -> Observation:
+def normalise(observation: Observation, observation_rms: RunningMeanStd | None) -> Observation:
     """Return observations as the networks receive them: normalised, if there are statistics."""
-    return observation if observations is None else standardise_if_observed(observations, observation)
+    return observation if observation_rms is None else standardise_if_observed(observation_rms, observation)
 
 
 def logits(actor: Actor, observation: Observation, available: Available) -> Action:
     """Return the logit of each choice."""
-    return actor.policy.logits(normalise(observation, actor.observations), available)
+    return actor.policy.logits(normalise(observation, actor.observation_rms), available)
 
 
 def act(actor: Actor, observation: Observation, available: Available) -> Action:
     """Return the likeliest action."""
-    return actor.policy.mode(normalise(observation, actor.observations), available)
+    return actor.policy.mode(normalise(observation, actor.observation_rms), available)
 
 
 def explore(actor: Actor, observation: Observation, available: Available, noise: Action) -> Action:
     """Return an action sampled from the policy with this noise."""
-    return actor.policy.sample(normalise(observation, actor.observations), noise, available)
+    return actor.policy.sample(normalise(observation, actor.observation_rms), noise, available)
 
 
 def values(state: PPO, observation: Observation) -> Value:
     """Return V(s) of normalised observations, in units of the reward."""
-    return (state.returns.mean + _return_std(state.returns) * state.params.critic(observation))[..., 0]
+    return (state.return_rms.mean + _return_std(state.return_rms) * state.params.critic(observation))[..., 0]
 
 
-def _return_std(returns: RunningMeanStd) -> Float[Array, " 1"]:
+def _return_std(return_rms: RunningMeanStd) -> Float[Array, " 1"]:
     """Return the unit of the critic's output: the standard deviation of the returns, or 1 while that is 0."""
-    std = running_std(returns)
+    std = running_std(return_rms)
     return jnp.where(std > 0, std, 1)
 
 
 def advantages(
     rollout: Rollout,
-    v_tm1: Float[Array, "time actors"],
-    v_t: Float[Array, "time actors"],
+    value: Float[Array, "time actors"],
+    next_value: Float[Array, "time actors"],
     settings: PPOSettings,
 ) -> Float[Array, "time actors"]:
     """Return generalised advantage estimates (Schulman et al., 2016, Eq. 16), computed backwards through time.
 
-    A step leads from s_{t-1} to s_t. `v_tm1` is the value of the observation before it, and `v_t` of the one after it.
+    `value` is the value of the observation before each step, and `next_value` of the one after it.
     """
-    discount_t = settings.gamma * (1 - rollout.terminated)
-    delta_t = rollout.reward + discount_t * v_t - v_tm1
-    decay_t = settings.gamma * settings.gae_lambda * (1 - rollout.done)
+    discount = settings.gamma * (1 - rollout.terminated)
+    deltas = rollout.reward + discount * next_value - value
+    decays = settings.gamma * settings.gae_lambda * (1 - rollout.done)
 
     def step(next_advantage: Float[Array, " actors"], inputs: tuple[Float[Array, " actors"], Float[Array, " actors"]]):
         delta, decay = inputs
         advantage = delta + decay * next_advantage
         return advantage, advantage
 
-    return jax.lax.scan(step, jnp.zeros_like(delta_t[0]), (delta_t, decay_t), reverse=True)[1]
+    return jax.lax.scan(step, jnp.zeros_like(deltas[0]), (deltas, decays), reverse=True)[1]
 
 
 def policy_objective(
@@ -193,7 +193,7 @@ def update(
     `progress_remaining` falls from 1 to 0 over the run, for annealing.
     """
     # The batch is computed once, by the policy and the critic before the update.
-    batch, returns, explained_variance = prepare_batch(state, rollout, settings)
+    batch, return_rms, explained_variance = prepare_batch(state, rollout, settings)
     scale = progress_remaining if settings.anneal else 1.0
     rate, clip = settings.learning_rate * scale, settings.clip * scale
 
@@ -225,11 +225,11 @@ def update(
     metrics = jax.tree.map(jnp.mean, metrics) | {"critic/explained_variance": explained_variance}
 
     # From the next rollout on, the networks see observations normalised by this rollout, too.
-    observations = state.observations
-    if observations is not None:
+    observation_rms = state.observation_rms
+    if observation_rms is not None:
         rows = rollout.observation.reshape(-1, rollout.observation.shape[-1])
-        observations = update_mean_std(observations, rows, _bool_mask(rollout.mask))
-    return PPO(params=params, optimizer=optimizer, returns=returns, observations=observations), metrics
+        observation_rms = update_mean_std(observation_rms, rows, _bool_mask(rollout.mask))
+    return PPO(params=params, optimizer=optimizer, return_rms=return_rms, observation_rms=observation_rms), metrics
 
 
 def prepare_batch(
@@ -240,14 +240,14 @@ def prepare_batch(
     The explained variance is the share of the returns' variance that the critic predicted.
     """
     mask = rollout.mask
-    observation = normalise(rollout.observation, state.observations)
+    observation = normalise(rollout.observation, state.observation_rms)
     value = values(state, observation)
-    next_value = values(state, normalise(rollout.next_observation, state.observations))
+    next_value = values(state, normalise(rollout.next_observation, state.observation_rms))
 
     advantage = advantages(rollout, value, next_value, settings)
     explained_variance = 1 - _masked_variance(advantage, mask) / _masked_variance(advantage + value, mask)
     target = (advantage + value).reshape(-1)
-    returns = update_mean_std(state.returns, target[:, None], _bool_mask(mask))
+    return_rms = update_mean_std(state.return_rms, target[:, None], _bool_mask(mask))
     std = jnp.sqrt(_masked_variance(advantage, mask))
     advantage = (advantage - masked_mean(advantage, mask)) / (std + 1e-8)
 
@@ -259,11 +259,11 @@ def prepare_batch(
         log_probability=state.params.actor.log_probability(observation, action, available),
         advantage=advantage.reshape(-1),
         value=state.params.critic(observation)[:, 0],
-        target=(target - returns.mean) / _return_std(returns),
+        target=(target - return_rms.mean) / _return_std(return_rms),
         available=available,
         mask=None if mask is None else mask.ravel(),
     )
-    return batch, returns, explained_variance
+    return batch, return_rms, explained_variance
 
 
 def minibatch_indices(key: PRNGKeyArray, n_steps: int, settings: PPOSettings) -> Int[Array, "updates batch"]:

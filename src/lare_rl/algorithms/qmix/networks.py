@@ -69,9 +69,9 @@ class Mixer(eqx.Module):
     """w_2, before the absolute value is taken."""
     second_bias: MLP
 
-    def __init__(self, agents: int, state_size: int, embed: int, hypernet: int, *, key: PRNGKeyArray):
+    def __init__(self, n_agents: int, state_size: int, embed: int, hypernet: int, *, key: PRNGKeyArray):
         keys = jax.random.split(key, 4)
-        self.first = MLP(state_size, (hypernet,), agents * embed, key=keys[0])
+        self.first = MLP(state_size, (hypernet,), n_agents * embed, key=keys[0])
         self.first_bias = Linear(state_size, embed, key=keys[1])
         self.second = MLP(state_size, (hypernet,), embed, key=keys[2])
         self.second_bias = MLP(state_size, (embed,), 1, key=keys[3])

@@ -2,7 +2,7 @@
 
     a*_t    = the available actions of largest Q_i(h_t, .)                              by the online networks
     V_t     = Q'_tot(s_t, a*_t)                                                         by the target networks
-    G_{t-1} = r_t + gamma * (1 - terminated_t) * ((1 - lambda) V_t + lambda G_t)
+    G_{t-1} = r_t + gamma * (1 - done_t) * ((1 - lambda) V_t + lambda G_t)
     theta  <- descend  sum mask (Q_tot(s_{t-1}, a_{t-1}) - G_{t-1})^2 / 2 / sum mask
     theta' <- theta                                                                     every target_every-th episode
 
@@ -21,7 +21,7 @@ from lare_rl.algorithms.batches import Metrics, Sequences
 from lare_rl.algorithms.qmix import QMIXSettings
 from lare_rl.algorithms.qmix.networks import Mixer, RecurrentNetwork, mix
 from lare_rl.nn.masks import masked_mean
-from lare_rl.nn.networks import adam_step, clip_gradient, init_adam
+from lare_rl.nn.networks import adam_step, clip_gradient, copy_networks, init_adam
 
 __all__ = [
     "QMIX",
@@ -69,18 +69,17 @@ class Memory(NamedTuple):
 
 
 def init(
-    key: PRNGKeyArray, agents: int, observation_size: int, action_size: int, state_size: int, settings: QMIXSettings
+    key: PRNGKeyArray, n_agents: int, observation_size: int, action_size: int, state_size: int, settings: QMIXSettings
 ) -> QMIX:
     """Return untrained networks."""
     agent_key, mixer_key = jax.random.split(key)
-    agent = RecurrentNetwork(observation_size + action_size + agents, settings.hidden, action_size, key=agent_key)
+    agent = RecurrentNetwork(observation_size + action_size + n_agents, settings.hidden, action_size, key=agent_key)
     mixer = None
     if settings.monotonic:
-        mixer = Mixer(agents, state_size, settings.embed, settings.hypernet, key=mixer_key)
+        mixer = Mixer(n_agents, state_size, settings.embed, settings.hypernet, key=mixer_key)
 
     online = Networks(agent, mixer)
-    # The targets are copies, because one buffer cannot be donated twice to the compiled update.
-    return QMIX(online, jax.tree.map(jnp.copy, online), init_adam(online, settings.learning_rate))
+    return QMIX(online, copy_networks(online), init_adam(online, settings.learning_rate))
 
 
 def get_actor(state: QMIX) -> RecurrentNetwork:
@@ -101,8 +100,8 @@ def epsilon(step: Int[Scalar, ""] | int, settings: QMIXSettings) -> Float[Array,
 
 def agent_input(observation: Observations, last_action: Actions) -> Float[Array, "*batch agents in"]:
     """Return the network's input for each agent: its observation, its last action (zeros at first) and its one-hot index."""
-    agents = observation.shape[-2]
-    agent_id = jnp.broadcast_to(jnp.eye(agents), (*observation.shape[:-1], agents))
+    n_agents = observation.shape[-2]
+    agent_id = jnp.broadcast_to(jnp.eye(n_agents), (*observation.shape[:-1], n_agents))
     return jnp.concatenate([observation, last_action, agent_id], axis=-1)
 
 
@@ -140,19 +139,19 @@ def action_values(agent: RecurrentNetwork, batch: Sequences) -> Float[Array, "ep
 
 def lambda_returns(
     reward: Steps,
-    terminated: Steps,
+    done: Steps,
     mask: Steps,
     value: Float[Array, "episodes steps+1"],
     settings: QMIXSettings,
 ) -> Steps:
     """Return G, computed backwards from the end of the padding (PyMARL2's `build_td_lambda_targets`).
 
-    After the last step of an episode G is 0: the rewards are masked there, and `terminated` removes the final value.
+    After the last step of an episode G is 0: the rewards are masked there, and `done` removes the final value.
     """
     gamma, lambda_ = settings.gamma, settings.td_lambda
     r_t, v_t = reward, value[:, 1:]
     # The part of each target that does not depend on later steps. In the padding it is 0.
-    one_step = mask * (r_t + (1 - lambda_) * gamma * (1 - terminated) * v_t)
+    one_step = mask * (r_t + (1 - lambda_) * gamma * (1 - done) * v_t)
     decay = lambda_ * gamma
 
     def step(next_return: Float[Array, " episodes"], one_step: Float[Array, " episodes"]):
@@ -160,7 +159,7 @@ def lambda_returns(
         return return_, return_
 
     # An episode that goes on after its last stored step bootstraps there.
-    final_return = value[:, -1] * (1 - jnp.sum(terminated, axis=1))
+    final_return = value[:, -1] * (1 - jnp.sum(done, axis=1))
     return jax.lax.scan(step, final_return, one_step.T, reverse=True)[1].T
 
 
@@ -173,7 +172,7 @@ def td_targets(
     """Return G: the online networks choose the actions, and the target networks evaluate them (van Hasselt et al., 2016)."""
     action = greedy_action(online_value, batch.available)
     value = mix(target.mixer, jnp.sum(action * action_values(target.agent, batch), axis=-1), batch.state)
-    return lambda_returns(batch.reward, batch.terminated, batch.mask, value, settings)
+    return lambda_returns(batch.reward, batch.done, batch.mask, value, settings)
 
 
 def loss(

@@ -18,18 +18,18 @@ import optax
 from jaxtyping import Array, Float, Int, PRNGKeyArray, Scalar
 
 from lare_rl.algorithms.batches import Action, Metrics, Observation, Transitions
-from lare_rl.algorithms.critics import critic_loss, init_critics, q_values
+from lare_rl.algorithms.critics import fit_critics, init_critics, q_values, td_target
 from lare_rl.algorithms.sac import SACSettings
-from lare_rl.nn.networks import MLP, adam_step, init_adam, polyak_update
+from lare_rl.nn.networks import MLP, adam_step, copy_networks, init_adam, polyak_update
 
 __all__ = ["SAC", "Networks", "act", "explore", "get_actor", "init", "sample", "soft_td_targets", "update"]
 
-MIN_LOG_SIGMA, MAX_LOG_SIGMA = -20.0, 2.0
+MIN_LOG_STD, MAX_LOG_STD = -20.0, 2.0
 
 
 class Networks(NamedTuple):
     actor: MLP
-    """From observations to mu and log sigma of each dimension of the action."""
+    """From observations to mean and log std of each dimension of the action."""
     critics: MLP
     """All critics in one pytree, stacked on a leading axis."""
     log_temperature: Float[Array, ""]
@@ -54,8 +54,7 @@ def init(key: PRNGKeyArray, observation_size: int, action_size: int, settings: S
     online = Networks(actor, critics, jnp.log(jnp.asarray(settings.temperature)))
     return SAC(
         online=online,
-        # The targets are copies, because one buffer cannot be donated twice to the compiled update.
-        target=jax.tree.map(jnp.copy, critics),
+        target=copy_networks(critics),
         actor_optimizer=init_adam(actor, settings.learning_rate),
         critic_optimizer=init_adam(critics, settings.learning_rate),
         temperature_optimizer=init_adam(online.log_temperature, settings.learning_rate),
@@ -68,9 +67,9 @@ def get_actor(state: SAC) -> MLP:
 
 
 def _normal(actor: MLP, observation: Observation) -> tuple[Action, Action]:
-    """Return mu and log sigma of the policy, before the tanh."""
-    mu, log_sigma = jnp.split(actor(observation), 2, axis=-1)
-    return mu, jnp.clip(log_sigma, MIN_LOG_SIGMA, MAX_LOG_SIGMA)
+    """Return mean and log std of the policy, before the tanh."""
+    mean, log_std = jnp.split(actor(observation), 2, axis=-1)
+    return mean, jnp.clip(log_std, MIN_LOG_STD, MAX_LOG_STD)
 
 
 def act(actor: MLP, observation: Observation) -> Action:
@@ -80,18 +79,18 @@ def act(actor: MLP, observation: Observation) -> Action:
 
 def explore(actor: MLP, observation: Observation, noise: Action, settings: SACSettings) -> Action:
     """Return an action sampled from the policy. `noise` is standard normal."""
-    mu, log_sigma = _normal(actor, observation)
-    return jnp.tanh(mu + jnp.exp(log_sigma) * noise)
+    mean, log_std = _normal(actor, observation)
+    return jnp.tanh(mean + jnp.exp(log_std) * noise)
 
 
 def sample(
     actor: MLP, observation: Float[Array, "batch observation"], key: PRNGKeyArray
 ) -> tuple[Float[Array, "batch action"], Float[Array, " batch"]]:
     """Return sampled actions and their log pi: log normal density minus log slope of the tanh (appendix C, Eq. 21)."""
-    mu, log_sigma = _normal(actor, observation)
-    noise = jax.random.normal(key, mu.shape)
-    u = mu + jnp.exp(log_sigma) * noise
-    log_density = -0.5 * noise**2 - log_sigma - 0.5 * jnp.log(2 * jnp.pi)
+    mean, log_std = _normal(actor, observation)
+    noise = jax.random.normal(key, mean.shape)
+    u = mean + jnp.exp(log_std) * noise
+    log_density = -0.5 * noise**2 - log_std - 0.5 * jnp.log(2 * jnp.pi)
     # This form of log(1 - tanh(u)^2) keeps its precision for large u.
     log_slope = 2 * (jnp.log(2.0) - u - jax.nn.softplus(-2 * u))
     return jnp.tanh(u), jnp.sum(log_density - log_slope, axis=-1)
@@ -102,8 +101,7 @@ def soft_td_targets(state: SAC, batch: Transitions, key: PRNGKeyArray, settings:
     next_action, log_pi = sample(state.online.actor, batch.next_observation, key)
     next_q = jnp.min(q_values(state.target, batch.next_observation, next_action), axis=0)
     soft_value = next_q - jnp.exp(state.online.log_temperature) * log_pi
-    discount = settings.gamma * (1 - batch.terminated)
-    return batch.reward + discount * soft_value
+    return td_target(batch, soft_value, settings.gamma)
 
 
 def update(
@@ -118,10 +116,8 @@ def update(
     target_key, actor_key = jax.random.split(key)
     alpha = jnp.exp(state.online.log_temperature)
 
-    # Fit all critics to one target.
     target_q = soft_td_targets(state, batch, target_key, settings)
-    loss, gradient = jax.value_and_grad(critic_loss)(state.online.critics, batch, target_q)
-    critics, critic_optimizer = adam_step(state.online.critics, gradient, state.critic_optimizer, rate)
+    critics, critic_optimizer, loss = fit_critics(state.online.critics, batch, target_q, state.critic_optimizer, rate)
 
     # Improve the policy by the new critics.
     def actor_loss(actor: MLP) -> tuple[Float[Array, ""], Float[Array, ""]]:

@@ -18,9 +18,9 @@ import optax
 from jaxtyping import Array, Float, Int, PRNGKeyArray, Scalar
 
 from lare_rl.algorithms.batches import Action, Metrics, Observation, Transitions
-from lare_rl.algorithms.critics import critic_loss, init_critics, q_value, q_values
+from lare_rl.algorithms.critics import fit_critics, init_critics, q_value, q_values, td_target
 from lare_rl.algorithms.td3 import TD3Settings
-from lare_rl.nn.networks import MLP, adam_step, init_adam, polyak_update
+from lare_rl.nn.networks import MLP, adam_step, copy_networks, init_adam, polyak_update
 
 __all__ = ["TD3", "Networks", "act", "explore", "get_actor", "init", "td_targets", "update"]
 
@@ -48,8 +48,7 @@ def init(key: PRNGKeyArray, observation_size: int, action_size: int, settings: T
     online = Networks(actor, critics)
     return TD3(
         online=online,
-        # The targets are copies, because one buffer cannot be donated twice to the compiled update.
-        target=jax.tree.map(jnp.copy, online),
+        target=copy_networks(online),
         actor_optimizer=init_adam(actor, settings.learning_rate),
         critic_optimizer=init_adam(critics, settings.learning_rate),
     )
@@ -78,8 +77,7 @@ def td_targets(
     noise = jnp.clip(noise, -settings.noise_clip, settings.noise_clip)
     next_action = jnp.clip(act(target.actor, batch.next_observation) + noise, -1, 1)
     next_q = jnp.min(q_values(target.critics, batch.next_observation, next_action), axis=0)
-    discount = settings.gamma * (1 - batch.terminated)
-    return batch.reward + discount * next_q
+    return td_target(batch, next_q, settings.gamma)
 
 
 def update(
@@ -92,10 +90,8 @@ def update(
     """
     rate = settings.learning_rate
 
-    # Fit all critics to one target.
     target_q = td_targets(state.target, batch, key, settings)
-    loss, gradient = jax.value_and_grad(critic_loss)(state.online.critics, batch, target_q)
-    critics, critic_optimizer = adam_step(state.online.critics, gradient, state.critic_optimizer, rate)
+    critics, critic_optimizer, loss = fit_critics(state.online.critics, batch, target_q, state.critic_optimizer, rate)
 
     def actor_loss(actor: MLP) -> Float[Array, ""]:
         critic_1 = jax.tree.map(lambda leaf: leaf[0], critics)

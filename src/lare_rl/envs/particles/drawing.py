@@ -43,8 +43,8 @@ def draw_frames(
 
 
 def _half_side(task: ParticleTask, position: Float[np.ndarray, "*steps entities 2"]) -> float:
-    outermost = np.abs(position) + task.world.size[:, None]
-    return float(MARGIN * max(task.radius, outermost.max()))
+    outermost = np.abs(position) + task.world.radius[:, None]
+    return float(MARGIN * max(task.half_side, outermost.max()))
 
 
 def _paint(
@@ -57,8 +57,8 @@ def _paint(
 ) -> None:
     axes.set(xlim=(-side, side), ylim=(-side, side), aspect="equal")
     axes.axis("off")
-    square = (-task.radius, -task.radius)
-    axes.add_patch(patches.Rectangle(square, 2 * task.radius, 2 * task.radius, fill=False, edgecolor="#dddddd"))
+    square = (-task.half_side, -task.half_side)
+    axes.add_patch(patches.Rectangle(square, 2 * task.half_side, 2 * task.half_side, fill=False, edgecolor="#dddddd"))
     colours: list = [
         TEAM_COLOUR if entity < task.teams[0].stop else OTHER_COLOUR for entity in range(task.world.n_moving)
     ]
@@ -71,9 +71,9 @@ def _paint(
     landmarks_first = [*range(task.world.n_moving, len(position)), *range(task.world.n_moving)]
     for entity in landmarks_first:
         edge = edges[entity] if entity < task.world.n_moving else "none"
-        radius = max(float(task.world.size[entity]), 0.008 * side)
+        radius = max(float(task.world.radius[entity]), 0.008 * side)
         circle = patches.Circle(tuple(position[entity]), radius, facecolor=colours[entity], edgecolor=edge, linewidth=1)
         axes.add_patch(circle)
     if credit is not None:
-        for (x, y), size, value in zip(position, task.world.size, credit, strict=False):
+        for (x, y), size, value in zip(position, task.world.radius, credit, strict=False):
             axes.text(x, y + size + 0.01 * side, f"{value:.2g}", fontsize=8, ha="center", va="bottom")

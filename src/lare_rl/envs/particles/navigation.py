@@ -1,6 +1,6 @@
 """Cooperative navigation: n agents should reach n landmarks without colliding.
 
-    r_i = -min_l |x_i - x_l| - #{j != i: |x_i - x_j| < 2 * AGENT}
+    r_i = -min_l |x_i - x_l| - #{j != i: |x_i - x_j| < 2 * AGENT_RADIUS}
 
 after `simple_spread` of the multi-agent particle environments (Lowe et al., 2017), in the form of STAS and LaRe
 (`simple_spread_n6_noshare` and so on). Landmarks keep a minimum distance, by Poisson disc sampling (Bridson, SIGGRAPH 2007).
@@ -21,11 +21,11 @@ from lare_rl.envs.particles.world import State, World, at_rest
 
 __all__ = ["SIZES", "Size", "make_layouts", "navigation"]
 
-AGENT, LANDMARK = 0.15, 0.05
+AGENT_RADIUS, LANDMARK_RADIUS = 0.15, 0.05
 """The radii of both."""
 SENSITIVITY = 5.0
 """The force of an action."""
-SEPARATION = 4.5 * AGENT
+SEPARATION = 4.5 * AGENT_RADIUS
 """Landmarks are further apart than this."""
 N_VISIBLE_LANDMARKS, N_VISIBLE_AGENTS = 6, 5
 """The numbers of nearest landmarks and nearest agents that an agent sees."""
@@ -41,7 +41,7 @@ class Size:
 
     n_agents: int
     """Also the number of landmarks."""
-    radius: float
+    half_side: float
     """Half the side of the square."""
 
     @property
@@ -67,7 +67,7 @@ def navigation(name: str) -> ParticleTask:
         name=name,
         teams=(Team("agent", 0, size.n_agents),),
         observation_size=4 + 2 * N_VISIBLE_LANDMARKS + 2 * N_VISIBLE_AGENTS,
-        radius=size.radius,
+        half_side=size.half_side,
         world=_world(size),
         reset=partial(_reset, size),
         observe=partial(_observe, size),
@@ -79,20 +79,20 @@ def _world(size: Size) -> World:
     """Make the world. Agents push each other. Landmarks do not collide with anything."""
     n = size.n_agents
     return World(
-        size=np.array([AGENT] * n + [LANDMARK] * n, np.float32),
+        radius=np.array([AGENT_RADIUS] * n + [LANDMARK_RADIUS] * n, np.float32),
         n_moving=n,
         n_colliding=n,
         sensitivity=np.full(n, SENSITIVITY, np.float32),
         max_speed=np.full(n, np.inf, np.float32),
-        contact=np.full((n, n), 2 * AGENT, np.float32),
+        contact=np.full((n, n), 2 * AGENT_RADIUS, np.float32),
     )
 
 
 def _reset(size: Size, key: PRNGKeyArray) -> State:
     """Place agents uniformly in the square, and landmarks at the points of a random layout."""
     agents_key, landmarks_key = jax.random.split(key)
-    agents = jax.random.uniform(agents_key, (size.n_agents, 2), minval=-size.radius, maxval=size.radius)
-    layouts = jnp.asarray(make_layouts(size.n_agents, size.radius, SEPARATION))
+    agents = jax.random.uniform(agents_key, (size.n_agents, 2), minval=-size.half_side, maxval=size.half_side)
+    layouts = jnp.asarray(make_layouts(size.n_agents, size.half_side, SEPARATION))
     landmarks = layouts[jax.random.randint(landmarks_key, (), 0, len(layouts))]
     return at_rest(jnp.concatenate([agents, landmarks]))
 
@@ -112,7 +112,7 @@ def _observe(size: Size, state: State) -> Float[Array, "agents observation"]:
 def _reward(size: Size, state: State) -> Float[Array, " agents"]:
     to_landmarks = views.distances(state.position, size.agents, size.landmarks)
     to_agents = views.distances(state.position, size.agents, size.agents)
-    return -jnp.min(to_landmarks, axis=1) - jnp.sum(to_agents < 2 * AGENT, axis=1)
+    return -jnp.min(to_landmarks, axis=1) - jnp.sum(to_agents < 2 * AGENT_RADIUS, axis=1)
 
 
 @cache

@@ -20,7 +20,7 @@ try:
 except ImportError:
     raise missing_extra_error("lare_rl.envs.particles.parallel_env", "pettingzoo") from None
 
-__all__ = ["ParticleEnv"]
+__all__ = ["ParticleParallelEnv"]
 
 
 @partial(jax.jit, static_argnums=0)
@@ -37,12 +37,12 @@ def _advance(
     return state, task.observe(state), task.reward(state)
 
 
-class ParticleEnv(ParallelEnv[str, Any, Any]):
-    """A particle task as a PettingZoo environment, with individual rewards.
+class ParticleParallelEnv(ParallelEnv[str, Any, Any]):
+    """A particle task as a PettingZoo environment, with individual rewards. As in JAX, the time limit terminates the episode.
 
     An agent's name consists of its team and its number within the team: `agent_0`, or `predator_0` and `prey_0`.
 
-    >>> environment = ParticleEnv("CN-6")
+    >>> environment = ParticleParallelEnv("CN-6")
     >>> observations, _ = environment.reset(seed=0)
     >>> observations["agent_5"].shape
     (26,)
@@ -98,7 +98,7 @@ class ParticleEnv(ParallelEnv[str, Any, Any]):
             self.agents = []
         observations, rewards = self._by_agent(np.asarray(observation)), self._by_agent(np.asarray(reward).tolist())
         infos = {agent: {} for agent in acted}
-        return observations, rewards, dict.fromkeys(acted, False), dict.fromkeys(acted, ended), infos
+        return observations, rewards, dict.fromkeys(acted, ended), dict.fromkeys(acted, False), infos
 
     def render(self) -> np.ndarray:
         from lare_rl.envs.canvas import to_pixels

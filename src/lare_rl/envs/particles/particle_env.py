@@ -12,12 +12,12 @@ from lare_rl.envs.particles.task import MAX_STEPS, N_ACTIONS
 from lare_rl.envs.particles.world import State
 from lare_rl.tasks.spec import TaskSpec
 
-__all__ = ["ParticleJaxEnv", "ParticleState", "make"]
+__all__ = ["ParticleEnv", "ParticleState", "make"]
 
 
-def make(task: TaskSpec, **_: Any) -> "ParticleJaxEnv":
+def make(task: TaskSpec, **_: Any) -> "ParticleEnv":
     """Make the environment of a task with the name `particles/NAME`."""
-    return ParticleJaxEnv(task.environment_name)
+    return ParticleEnv(task.environment_name)
 
 
 class ParticleState(NamedTuple):
@@ -27,7 +27,7 @@ class ParticleState(NamedTuple):
     step: Int[Array, ""]
 
 
-class ParticleJaxEnv:
+class ParticleEnv:
     """A particle task as a `JaxEnv`. The time limit terminates the episode: no rewards are expected after it."""
 
     def __init__(self, name: str):

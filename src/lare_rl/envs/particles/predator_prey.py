@@ -50,7 +50,7 @@ MARGIN = 0.1
 
 @dataclass(frozen=True)
 class View:
-    """The number of nearest entities of each kind that an agent view."""
+    """The number of nearest entities of each kind that an agent sees."""
 
     landmarks: int
     predators: int
@@ -63,12 +63,12 @@ class View:
 
 @dataclass(frozen=True)
 class Size:
-    """Numbers of entities, their radii, the square in which they start (± radius), and what agents see."""
+    """Numbers of entities, their radii, the square in which they start (± half_side), and what agents see."""
 
     n_predators: int
     n_preys: int
     n_landmarks: int
-    radius: float
+    half_side: float
     predator_radius: float
     prey_radius: float
     landmark_radius: float
@@ -103,7 +103,7 @@ def predator_prey(name: str) -> ParticleTask:
         name=name,
         teams=(Team("predator", 0, size.n_predators),),
         observation_size=size.predator_view.observation_size,
-        radius=size.radius,
+        half_side=size.half_side,
         world=make_world(size),
         reset=partial(reset, size),
         observe=partial(observe_predators, size),
@@ -119,7 +119,7 @@ def competitive() -> ParticleTask:
         name="CompetitivePP-6",
         teams=(Team("predator", 0, size.n_predators), Team("prey", size.n_predators, size.preys.stop)),
         observation_size=size.predator_view.observation_size,
-        radius=size.radius,
+        half_side=size.half_side,
         world=make_world(size),
         reset=partial(reset, size),
         observe=lambda state: jnp.concatenate([observe_predators(size, state), observe_preys(size, state)]),
@@ -135,7 +135,7 @@ def make_world(size: Size) -> World:
     moving, entities = size.preys.stop, size.obstacles.stop
     kinds = [size.n_predators, size.n_preys]
     return World(
-        size=np.repeat(
+        radius=np.repeat(
             [size.predator_radius, size.prey_radius, size.landmark_radius], [*kinds, size.n_landmarks]
         ).astype(np.float32),
         n_moving=moving,
@@ -148,7 +148,7 @@ def make_world(size: Size) -> World:
 
 def reset(size: Size, key: PRNGKeyArray) -> State:
     """Place all entities uniformly in their squares. They may overlap."""
-    reach = jnp.array([size.radius] * size.preys.stop + [size.radius - MARGIN] * size.n_landmarks)
+    reach = jnp.array([size.half_side] * size.preys.stop + [size.half_side - MARGIN] * size.n_landmarks)
     return at_rest(reach[:, None] * jax.random.uniform(key, (len(reach), 2), minval=-1, maxval=1))
 
 

@@ -36,8 +36,8 @@ class ParticleTask:
     teams: tuple[Team, ...]
     """All learning agents, in order."""
     observation_size: int
-    radius: float
-    """Agents start within ±radius, but may leave this square."""
+    half_side: float
+    """Agents start within ±half_side, but may leave this square."""
     world: World
     reset: Callable[[PRNGKeyArray], State]
     """The first state of an episode."""

@@ -1,6 +1,6 @@
 """Triangle area: three agents should form a large triangle and avoid three obstacles.
 
-    R = sum_i (0.1 * area - #{l: |x_i - x_l| < AGENT + OBSTACLE})       the same for every agent
+    R = sum_i (0.1 * area - #{l: |x_i - x_l| < AGENT_RADIUS + OBSTACLE_RADIUS})       the same for every agent
 
 after `simple_area` of LaRe. The area is half the cross product of two sides. The published code uses Heron's formula, which may
 take the root of a negative number because of rounding.
@@ -19,7 +19,7 @@ from lare_rl.envs.particles.world import State, World, at_rest
 __all__ = ["triangle_area"]
 
 AGENTS, OBSTACLES = range(3), range(3, 6)
-AGENT, OBSTACLE = 0.15, 0.4
+AGENT_RADIUS, OBSTACLE_RADIUS = 0.15, 0.4
 """The radii of both."""
 SENSITIVITY = 5.0
 """The force of an action."""
@@ -36,7 +36,7 @@ def triangle_area() -> ParticleTask:
         name="TriangleArea",
         teams=(Team("agent", 0, len(AGENTS)),),
         observation_size=4 + 2 * len(OBSTACLES) + 2 * (len(AGENTS) - 1),
-        radius=OBSTACLE_RANGE,
+        half_side=OBSTACLE_RANGE,
         world=_world(),
         reset=_reset,
         observe=_observe,
@@ -46,14 +46,14 @@ def triangle_area() -> ParticleTask:
 
 def _world() -> World:
     """Make the world. Agents and obstacles push each other when they touch."""
-    size = np.array([AGENT] * len(AGENTS) + [OBSTACLE] * len(OBSTACLES), np.float32)
+    radius = np.array([AGENT_RADIUS] * len(AGENTS) + [OBSTACLE_RADIUS] * len(OBSTACLES), np.float32)
     return World(
-        size=size,
+        radius=radius,
         n_moving=len(AGENTS),
-        n_colliding=len(size),
+        n_colliding=len(radius),
         sensitivity=np.full(len(AGENTS), SENSITIVITY, np.float32),
         max_speed=np.full(len(AGENTS), np.inf, np.float32),
-        contact=size[:, None] + size,
+        contact=radius[:, None] + radius,
     )
 
 
@@ -81,5 +81,5 @@ def _observe(state: State) -> Float[Array, "agents observation"]:
 def _reward(state: State) -> Float[Array, " agents"]:
     first, second = state.position[1] - state.position[0], state.position[2] - state.position[0]
     area = jnp.abs(first[0] * second[1] - first[1] * second[0]) / 2
-    overlaps = jnp.sum(views.distances(state.position, AGENTS, OBSTACLES) < AGENT + OBSTACLE)
+    overlaps = jnp.sum(views.distances(state.position, AGENTS, OBSTACLES) < AGENT_RADIUS + OBSTACLE_RADIUS)
     return jnp.full(len(AGENTS), len(AGENTS) * AREA_WEIGHT * area - overlaps)

@@ -36,7 +36,7 @@ DIRECTIONS = np.array([(0, 0), (-1, 0), (1, 0), (0, -1), (0, 1)], np.float32)
 class World:
     """The constants of a world. The first `n_moving` entities are agents and preys. The others are landmarks, which do not move."""
 
-    size: Float[np.ndarray, " entities"]
+    radius: Float[np.ndarray, " entities"]
     """The radii."""
     n_moving: int
     n_colliding: int

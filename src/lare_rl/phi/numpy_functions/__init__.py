@@ -11,10 +11,22 @@ from lare_rl.phi.numpy_functions import (
     tables,
 )
 from lare_rl.phi.numpy_functions.creation import INDEXED
-from lare_rl.phi.numpy_functions.registry import FUNCTIONS, KIND_OF_DTYPE, call_numpy
+from lare_rl.phi.numpy_functions.registry import FUNCTIONS, KIND_OF_DTYPE, call_numpy, find_hint
 from lare_rl.phi.numpy_functions.tables import Polynomial
 
 __all__ = [
-    "FUNCTIONS", "INDEXED", "KIND_OF_DTYPE", "Polynomial", "call_numpy",
-    "creation", "elementwise", "positions", "products", "reductions", "sequences", "shapes", "tables",
+    "FUNCTIONS",
+    "INDEXED",
+    "KIND_OF_DTYPE",
+    "Polynomial",
+    "call_numpy",
+    "creation",
+    "elementwise",
+    "find_hint",
+    "positions",
+    "products",
+    "reductions",
+    "sequences",
+    "shapes",
+    "tables",
 ]  # fmt: skip

@@ -38,6 +38,23 @@ KIND_OF_DTYPE: dict[str, NumberKind] = {
 IGNORED = frozenset("order casting subok copy like device".split())
 """Arguments of NumPy that change no number."""
 
+HINTS = {
+    "np.random": "a factor must not depend on chance",
+    "np.unique": "count with comparisons, such as (x[:, :, None] == values).any(1)",
+    "np.nanmedian": "replace NaN first, then use np.median",
+    "np.nanpercentile": "replace NaN first, then use np.percentile",
+    "np.nanquantile": "replace NaN first, then use np.quantile",
+    "np.histogram": "count with comparisons, such as ((x >= low) & (x < high)).sum(axis=1)",
+    "np.linalg.svd": "for 2 x 2 matrices, use np.linalg.eigvalsh; else sums of squares, np.trace or np.linalg.det",
+    "np.linalg.eig": "for symmetric 2 x 2 matrices, use np.linalg.eigvalsh; else np.trace or np.linalg.det",
+    "np.linalg.eigh": "for symmetric 2 x 2 matrices, use np.linalg.eigvalsh; else np.trace or np.linalg.det",
+    "np.linalg.eigvals": "for symmetric 2 x 2 matrices, use np.linalg.eigvalsh; else np.trace or np.linalg.det",
+    "np.linalg.lstsq": "use np.linalg.solve for at most 4 x 4 numbers",
+    "np.load": "a program has no files", "np.save": "a program has no files", "np.memmap": "a program has no files",
+    "np.fromfile": "a program has no files", "np.loadtxt": "a program has no files", "np.savetxt": "a program has no files",
+}  # fmt: skip
+"""What to write instead of some names that are not available, or only for constants."""
+
 UFUNCS: set[str] = set()
 """Functions on each number that take `where=` together with `out=`."""
 
@@ -184,11 +201,16 @@ def dtype_name(dtype: Any) -> str:
     return name.removeprefix("np.") if isinstance(name, str) else ""
 
 
-def require_constant(x: Any, what: str) -> Any:
+def find_hint(name: str) -> str:
+    """Return what to write instead of a name, as the end of a message. Empty if nothing is known."""
+    return f": {HINTS[name]}" if name in HINTS else ""
+
+
+def require_constant(x: Any, what: str, hint: str = "") -> Any:
     """Return the numbers of a constant. Raises `RefusedError` if they differ from row to row."""
     values = as_array(x).constant
     if values is None:
-        raise RefusedError("E-NUMPY", f"{what} must be the same for all rows")
+        raise RefusedError("E-NUMPY", f"{what} must be the same for all rows{hint}")
     return values
 
 

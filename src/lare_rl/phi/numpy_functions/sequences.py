@@ -100,9 +100,13 @@ def _gradient_along(f: Array, at: int, spacing: Array, edge_order: int) -> Any:
         )
     pieces.append((entries(slice(-1, None)) - entries(slice(-2, -1))) / (x[-1] - x[-2]))
     if edge_order == 2:
-        h = x[1] - x[0]
-        pieces[0] = (-1.5 * entries(slice(0, 1)) + 2.0 * entries(slice(1, 2)) - 0.5 * entries(slice(2, 3))) / h
-        pieces[-1] = (0.5 * entries(slice(-3, -2)) - 2.0 * entries(slice(-2, -1)) + 1.5 * entries(slice(-1, None))) / h
+        for piece, edge, middle, inner in ((0, 0, 1, 2), (-1, size - 1, size - 2, size - 3)):
+            d0, d1 = x[middle] - x[edge], x[inner] - x[middle]
+            pieces[piece] = (
+                entries(slice(edge, edge + 1)) * (-(2 * d0 + d1) / (d0 * (d0 + d1)))
+                + entries(slice(middle, middle + 1)) * ((d0 + d1) / (d0 * d1))
+                - entries(slice(inner, inner + 1)) * (d0 / (d1 * (d0 + d1)))
+            )
     return concatenate(pieces, at)
 
 

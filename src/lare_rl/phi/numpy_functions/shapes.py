@@ -275,7 +275,8 @@ def delete(arr: Array, obj: Any, axis: Any = None) -> Any:
 @numpy_function()
 def insert(arr: Array, obj: int, values: Any, axis: Any = None) -> Any:
     at = arr.row_axes(0 if axis is None and arr.ndim == 1 else axis)[0]
-    i = range(arr.row_shape[at] + 1)[obj]
+    size = arr.row_shape[at]
+    i = range(size)[obj] if obj < 0 else range(size + 1)[obj]
     values = broadcast(as_array(values), (*arr.row_shape[:at], 1, *arr.row_shape[at + 1 :]), arr.batch_axis)
     ends = [arr.select(at, end) for end in (slice(None, i), slice(i, None)) if len(range(arr.row_shape[at])[end])]
     return concatenate([*ends[: i > 0], values, *ends[i > 0 :]], at)

@@ -18,6 +18,7 @@ from lare_rl.phi.numpy_functions.registry import (
     as_float,
     as_numbers,
     as_sizes,
+    find_hint,
     numpy_function,
     numpy_variants,
     require_constant,
@@ -58,7 +59,7 @@ def plain_constant(x: Any, name: str, largest: int) -> Any:
     """Return a small constant as NumPy takes it: a number, or an array of at most two axes."""
     if isinstance(x, (bool, float)) or x is None:
         return x
-    values = require_constant(x, f"the arguments of np.{name}")
+    values = require_constant(x, f"the arguments of np.{name}", find_hint(f"np.{name}"))
     if values.ndim > 2 or values.size > largest or (values.dtype.kind == "i" and np.abs(values).max() > largest):
         raise RefusedError("E-COST", f"np.{name} of more than {largest} numbers, or of larger integers")
     return values.item() if values.ndim == 0 else values

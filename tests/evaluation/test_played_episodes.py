@@ -5,7 +5,7 @@ import pytest
 
 import lare_rl
 from helpers.jax_toy_envs import echo_spec
-from lare_rl.evaluation.rollout import N_SAMPLE_EPISODES, roll_out, sample_steps
+from lare_rl.evaluation.played_episodes import N_SAMPLE_EPISODES, play_run, sample_steps
 
 TASK = echo_spec(environment="hosted/three", credit_scope="state", observation_size=9, action_size=9, payments=2)
 
@@ -27,12 +27,12 @@ def run(tmp_path_factory):
 
 
 def test_exact_rewards_add_up_to_payments(run):
-    rollout = roll_out(run, 20)
+    played = play_run(run, 20)
     sums, payments = [], []
     for episode in range(20):
         alive, true, training = (
-            rollout.select_episode(values, episode)
-            for values in (np.asarray(rollout.steps.timestep.alive), rollout.reward, rollout.training_reward)
+            played.select_episode(values, episode)
+            for values in (np.asarray(played.steps.timestep.alive), played.reward, played.training_reward)
         )
         for start in range(0, len(true), 2):
             agents = alive[start : start + 2]
@@ -44,9 +44,9 @@ def test_exact_rewards_add_up_to_payments(run):
 
 
 def test_sampled_reward_of_a_team_is_the_mean_over_agents_that_are_alive(run):
-    (sample,) = sample_steps(run, random=True)
-    rollout = roll_out(run, N_SAMPLE_EPISODES, random=True, key=1)
-    alive = np.asarray(rollout.steps.timestep.alive)
-    expected = (rollout.reward * alive).sum(axis=-1) / alive.sum(axis=-1)
-    assert not alive[rollout.mask].all()
-    np.testing.assert_allclose(sample.reward.ravel(), expected[rollout.mask], rtol=1e-6)
+    (sample,) = sample_steps(run)
+    played = play_run(run, N_SAMPLE_EPISODES, key=1)
+    alive = np.asarray(played.steps.timestep.alive)
+    expected = (played.reward * alive).sum(axis=-1) / alive.sum(axis=-1)
+    assert not alive[played.mask].all()
+    np.testing.assert_allclose(sample.reward.ravel(), expected[played.mask], rtol=1e-6)

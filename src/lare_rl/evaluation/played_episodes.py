@@ -33,10 +33,10 @@ from lare_rl.util.statistics import column_correlations
 
 __all__ = [
     "N_SAMPLE_EPISODES",
-    "Rollout",
+    "PlayedEpisodes",
     "TeamSample",
     "compute_training_rewards",
-    "roll_out",
+    "play_run",
     "sample_steps",
     "unroll_policy",
 ]
@@ -45,7 +45,7 @@ N_SAMPLE_EPISODES = 40
 
 
 @dataclass(frozen=True, kw_only=True)
-class Rollout:
+class PlayedEpisodes:
     """Whole episodes of the first seed's policy."""
 
     config: TrainConfig
@@ -75,21 +75,19 @@ class Rollout:
         return jax.tree.map(lambda leaf: leaf[:length, episode], values)
 
 
-def roll_out(run: Run, n_episodes: int = 1, *, random: bool = False, key: int = 0) -> Rollout:
-    """Play episodes with the noise of training, or with random actions.
+def play_run(run: Run, n_episodes: int = 1, *, actor: Any = None, key: int = 0) -> PlayedEpisodes:
+    """Play episodes with the noise of training.
 
     Args:
         run: the run, which must have a checkpoint.
-        random: whether to play random actions.
+        actor: an actor of one seed that plays instead of the first seed's.
         key: the random key of an environment of pure functions.
     """
     state = load_learner(run)
     config, learner = state.config, state.learner
-    actor = training_module(config).get_actor(
-        jax.tree.map(lambda leaf: leaf[:1], learner), run.config.settings.steps, config
-    )
-    if random:
-        actor = jax.tree.map(jnp.zeros_like, actor)  # networks of zeros have no preference
+    if actor is None:
+        first = jax.tree.map(lambda leaf: leaf[:1], learner)
+        actor = training_module(config).get_actor(first, run.config.settings.steps, config)
     if config.env.is_jax:
         env = make_env(run.config.task)
         assert isinstance(env, JaxEnv)
@@ -98,7 +96,7 @@ def roll_out(run: Run, n_episodes: int = 1, *, random: bool = False, key: int = 
         batch = _unroll_on_host(run, config, actor, n_episodes)
     factors = compute_host_factors(run, config, batch.steps)
     has_proxy = config.method.has_proxy_rewards
-    return Rollout(
+    return PlayedEpisodes(
         config=config,
         steps=batch.steps,
         mask=batch.mask,
@@ -165,20 +163,20 @@ class TeamSample:
         return column_correlations(self.factors, self.reward)
 
 
-def sample_steps(run: Run, random: bool = False) -> list[TeamSample]:
-    """Sample steps of each team, under the first seed's policy or under random actions."""
-    rollout = roll_out(run, N_SAMPLE_EPISODES, random=random, key=1)
-    config, steps, samples = rollout.config, jax.tree.map(np.asarray, rollout.steps), []
+def sample_steps(run: Run, actor: Any = None) -> list[TeamSample]:
+    """Sample steps of each team, under the first seed's policy or another actor of one seed (see `play_run`)."""
+    played = play_run(run, N_SAMPLE_EPISODES, actor=actor, key=1)
+    config, steps, samples = played.config, jax.tree.map(np.asarray, played.steps), []
     for team_index, team in enumerate(config.env.teams):
         observation, _ = phi_inputs(config.credit_scope, team, steps.next_timestep, steps.env_action)
-        mask = np.broadcast_to(rollout.mask[..., None], observation.shape[:-1])
-        reward = rollout.reward[..., team.agents]
+        mask = np.broadcast_to(played.mask[..., None], observation.shape[:-1])
+        reward = played.reward[..., team.agents]
         if config.team_level:
-            reward = team_mean(rollout.reward, steps.timestep.alive, team)[..., None]
+            reward = team_mean(played.reward, steps.timestep.alive, team)[..., None]
         else:
             mask = mask & steps.timestep.alive[..., team.agents]
         n_factors = config.n_factors[team_index] if config.n_factors else 0
-        factors = rollout.factors[..., config.team_rows(team_index), :n_factors]
+        factors = played.factors[..., config.team_rows(team_index), :n_factors]
         samples.append(
             TeamSample(team=team, next_observation=observation[mask], factors=factors[mask], reward=reward[mask])
         )
