@@ -22,7 +22,7 @@ from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray, UInt8
 from lare_rl.envs.families import register_family
 from lare_rl.envs.interface import EnvSpec, Team, Timestep
 from lare_rl.envs.load import read_task
-from lare_rl.envs.particles.particle_env import ParticleJaxEnv, ParticleState
+from lare_rl.envs.particles.particle_env import ParticleEnv, ParticleState
 from lare_rl.tasks.spec import TaskSpec
 
 __all__ = ["SCORES", "corridor_task", "level_task"]
@@ -126,7 +126,7 @@ class LevelEnv:
     """A particle task in three levels: agents start up to 1, 2 or 3 times as far from the centre."""
 
     def __init__(self, task: TaskSpec, **_: Any):
-        self.inner = ParticleJaxEnv(task.environment_name)
+        self.inner = ParticleEnv(task.environment_name)
         self.spec = EnvSpec(**{**vars(self.inner.spec), "measures": ("level",)})
 
     def reset(self, key: PRNGKeyArray) -> tuple[LevelState, Timestep]:

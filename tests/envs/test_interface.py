@@ -12,7 +12,7 @@ from helpers.host_envs import ToyHostEnv
 from helpers.jax_toy_envs import Echo
 from lare_rl.envs.interface import EnvSpec, HostEnv, JaxEnv, Team, team_mean, to_env_action, to_package_action
 from lare_rl.envs.jax_on_host import JaxOnHost
-from lare_rl.envs.particles.particle_env import ParticleJaxEnv
+from lare_rl.envs.particles.particle_env import ParticleEnv
 from lare_rl.envs.play import play_steps
 from lare_rl.errors import LareError
 
@@ -92,7 +92,7 @@ def test_continuous_action_is_scaled_to_the_bounds_of_each_agent():
 
 @pytest.mark.parametrize(
     ("make", "is_jax"),
-    [(lambda: ParticleJaxEnv("CN-6"), True), (Echo, True), (ToyHostEnv, False), (lambda: JaxOnHost(Echo()), False)],
+    [(lambda: ParticleEnv("CN-6"), True), (Echo, True), (ToyHostEnv, False), (lambda: JaxOnHost(Echo()), False)],
 )
 def test_environment_has_one_kind(make, is_jax):
     """`make_env` closes only a `HostEnv`, and `make_host_env` wraps all others."""

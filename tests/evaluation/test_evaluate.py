@@ -11,7 +11,8 @@ from PIL import Image
 
 import lare_rl
 from helpers.toy_envs import Chase, pick_spec, toy_spec
-from lare_rl.envs.families import make_host_env
+from lare_rl.envs.families import make_host_env, register_family
+from lare_rl.envs.gymnasium_env import GymnasiumEnv
 from lare_rl.envs.load import load_task
 from lare_rl.envs.vec_env import LocalVecEnv
 from lare_rl.errors import LareError, check_count
@@ -51,7 +52,7 @@ class FilmedChase(Chase):
 
     def render(self):
         self.n_frames += 1  # a GIF has no equal frames
-        return np.full((16, 16, 3), 20 * self.n_frames, np.uint8)
+        return np.full((16, 16, 3), 20 * self.n_frames % 256, np.uint8)
 
     def close(self):
         self.open_envs.discard(id(self))
@@ -96,6 +97,25 @@ def test_record_video(run, tmp_path):
     assert not FilmedChase.open_envs
     with pytest.raises(LareError, match=r"toys/Chase-v0.* cannot be made"):
         record_video(replace_task(run, toy_spec()), tmp_path / "film.gif")
+
+
+class Painted:
+    """A host environment of a family of its own."""
+
+    def __init__(self, task, render_mode=None, **_):
+        self._env = GymnasiumEnv(TASK, render_mode=render_mode)
+
+    def __getattr__(self, name):
+        return getattr(self._env, name)
+
+
+register_family("painted", Painted)
+
+
+def test_host_environment_of_a_plugin_is_filmed(run, tmp_path):
+    record_video(replace_task(run, toy_spec(environment="painted/chase")), tmp_path / "film.gif")
+    with Image.open(tmp_path / "film.gif") as film:
+        assert film.n_frames > 5
 
 
 def replace_task(run, task):

@@ -19,7 +19,7 @@ from lare_rl.config.resolve import resolve
 from lare_rl.config.settings import Settings
 from lare_rl.envs.interface import Team
 from lare_rl.envs.load import load_task
-from lare_rl.evaluation.rollout import TeamSample
+from lare_rl.evaluation.played_episodes import TeamSample
 from lare_rl.evaluation.video import encode_film
 from lare_rl.report import live_page, run_details
 from lare_rl.report.html import render_table

@@ -31,6 +31,8 @@ FRAMES_PER_SECOND = 8
 """The frame rate of a film of many agents."""
 MAX_GIF_FRAMES_PER_SECOND = 25.0
 """Browsers play a GIF at 50 frames a second at most, and a frame may take long without a graphics card."""
+DEFAULT_FPS = 30
+"""Frames in a second of an environment that does not say how many it draws."""
 MAX_DRAWINGS = 200
 """The most pictures of a film of a single agent in JAX, whose package may need a second for each."""
 FRAME_SIZE = {"width": 320, "height": 320}
@@ -92,8 +94,8 @@ def record_frames(
         return _play_and_draw(run, policy, min(max_frames or MAX_DRAWINGS, MAX_DRAWINGS)), 1 / MAX_GIF_FRAMES_PER_SECOND
     camera = {"camera_name": "track", **FRAME_SIZE} if _has_tracking_camera(run) else {}
     with closing(make_host_env(run.config.task, render_mode="rgb_array", **camera)) as env:
-        assert isinstance(env, GymnasiumEnv)
-        fps = env.environment.metadata.get("render_fps", 30)
+        metadata = env.environment.metadata if isinstance(env, GymnasiumEnv) else {}
+        fps = metadata.get("render_fps", DEFAULT_FPS)
         interval = max(1, round(fps / max_rate))
         return _play_and_render(run, env, policy, interval, max_frames), interval / fps
 
