@@ -120,9 +120,9 @@ def main(
         kind: the rows.
         out: the directory of the runs.
         seeds: seeds 0 to N - 1.
-        only: labels of rows; all by default.
+        only: labels of rows, or of tables; all by default.
     """
-    rows = [row for row in KINDS[kind]() if not only or row.label in only]
+    rows = [row for row in KINDS[kind]() if not only or {row.label, row.table} & {*only}]
     scores: dict[str, dict[str, list[float]]] = {}
     for row in rows:
         directory = out / kind / row.table.replace(" ", "") / row.label.replace(" ", "")
