@@ -142,6 +142,19 @@ def test_rewards_at_refuses_what_is_no_step_number(steps):
         small_assigner().rewards_at(steps)
 
 
+# Explanations
+
+
+@pytest.mark.parametrize("method", ["bayes-progress", long_case("bayes")])
+def test_explanation_of_noise(method):
+    """A fit to prefixes has a column for the time, which is not the return."""
+    credit, random = small_assigner(method), np.random.default_rng(0)
+    for *steps, _ in random_episodes(random.integers(5, 12, size=100)):
+        credit.add_episode(*steps, random.normal())
+    credit.learner.learn_returns()
+    assert credit.learner.explain().total_r2 < 0.3
+
+
 # Learning
 
 

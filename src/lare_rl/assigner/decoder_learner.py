@@ -278,7 +278,7 @@ class DecoderLearner:
         if self.decoder is None or not self.store.episodes:
             return None
         # Shares are of factors and raw features alone.
-        basis = replace(self.config.spec.basis, extended=True, n_tracked=0, n_levels=0)
+        basis = replace(self.config.spec.basis, extended=True, n_tracked=0, n_levels=0, prefixes=False)
         if not basis.n_features:
             return None
         with on_cpu(), float64():

@@ -168,6 +168,7 @@ def regression(
 ) -> Regression:
     """Return the regression of R/T for a score that is a sum, or of R for a score that is a mean."""
     n_features = len(group_index)
+    assert len(statistics.mean) == n_features + 2
     column = n_features + score_type
     n_steps = jnp.maximum(statistics.n_steps, 1)
     y_mean = statistics.mean[column]
