@@ -70,6 +70,17 @@ def test_groups_share_an_intercept(parquet, tmp_path):
         assert abs(means[0] - means[1]) < 1.5  # without groups: about 10
 
 
+@pytest.mark.parametrize(("method", "is_binary"), [("bayes-progress", False), long_case("bayes", True)])
+def test_predicted_returns_have_the_part_that_no_step_is_paid_for(method, is_binary, tmp_path):
+    episodes = list(logged_episodes(80, max_length=8))
+    for episode in episodes:
+        score = 100 + episode.pop("rewards").sum()
+        episode["score"] = np.array(float(score > 104) if is_binary else score)
+    settings = CreditSettings(score="binary" if is_binary else "auto")
+    result = lare_rl.relabel(episodes, tmp_path / "new", method=method, settings=settings, hold_out=0.2)
+    assert result.return_r2 > 0.3
+
+
 def test_score_of_noise(tmp_path):
     result = lare_rl.relabel(list(logged_episodes(200, noise=True)), tmp_path / "new")
     assert result.return_r2 < 0.1

@@ -40,8 +40,7 @@ UPDATES = 10_000
 """Gradient updates of a decoder."""
 MIN_HELD_OUT = 8
 """The least number of held-out episodes for statistics of their returns."""
-UNSEEN = -1
-"""The number of a group without an episode that was learned from."""
+
 MIN_R2 = 0.1
 """Below this R², the rewards come with a warning."""
 
@@ -292,9 +291,9 @@ def _compute_rewards(
             counts.cut += not episode.complete
             if episode.complete and next(is_held_out):
                 counts.returns.append(float(episode.reward.sum()))
-                level = 0 if episode.group is None else credit.group_names.get(episode.group, UNSEEN)
-                level_return = 0.0 if level == UNSEEN else credit.step_rewards.level_return(level, len(episode))
-                counts.predictions.append(float(reward.sum(dtype=np.float64)) + level_return)
+                level = None if episode.group is None else credit.group_names.get(episode.group)
+                unpaid = credit.step_rewards.unpaid_return(level, len(episode))
+                counts.predictions.append(float(reward.sum(dtype=np.float64)) + unpaid)
             if episode.complete and credit.config.is_exact:
                 reward = _make_exact(reward, episode.reward, credit.config)
             yield RelabelledEpisode(episode, reward)
