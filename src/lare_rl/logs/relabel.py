@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 
 from lare_rl.assigner.assigner import CreditAssigner
 from lare_rl.assigner.assigner_config import AssignerConfig
@@ -278,21 +278,23 @@ def _compute_rewards(
     """
     for batch in _batches(log.episodes()):
         lengths = [len(episode) for episode in batch]
+        begins = [_segment_begins(episode.reward, credit.config) for episode in batch]
+        paid_lengths = [_segment_lengths(first) for first in begins]
         r_hat = credit.rewards(
             np.concatenate([episode.observation for episode in batch]),
             np.concatenate([episode.action for episode in batch]),
             np.concatenate([episode.next_observation for episode in batch]),
-            length=np.repeat(lengths, lengths),
-            begins=np.concatenate([_segment_begins(episode.reward, credit.config) for episode in batch]),
+            length=np.concatenate([np.repeat(paid, paid) for paid in paid_lengths]),
+            begins=np.concatenate(begins),
         )
-        for episode, reward in zip(batch, np.split(r_hat, np.cumsum(lengths)[:-1]), strict=True):
+        for episode, reward, paid in zip(batch, np.split(r_hat, np.cumsum(lengths)[:-1]), paid_lengths, strict=True):
             counts.episodes += 1
             counts.steps += len(episode)
             counts.cut += not episode.complete
             if episode.complete and next(is_held_out):
                 counts.returns.append(float(episode.reward.sum()))
                 level = None if episode.group is None else credit.group_names.get(episode.group)
-                unpaid = credit.step_rewards.unpaid_return(level, len(episode))
+                unpaid = credit.step_rewards.unpaid_return(level, paid)
                 counts.predictions.append(float(reward.sum(dtype=np.float64)) + unpaid)
             if episode.complete and credit.config.is_exact:
                 reward = _make_exact(reward, episode.reward, credit.config)
@@ -307,6 +309,11 @@ def _segment_begins(reward: Float[np.ndarray, " steps"], config: AssignerConfig)
     n_steps = len(reward)
     pays = is_paid(config.payments, np.arange(n_steps), reward[:, None], np.arange(n_steps) == n_steps - 1)
     return np.append(True, pays[:-1])
+
+
+def _segment_lengths(begins: Bool[np.ndarray, " steps"]) -> Int[np.ndarray, " payments"]:
+    """Return the number of steps of each payment of an episode."""
+    return np.diff(np.append(np.flatnonzero(begins), len(begins)))
 
 
 def _make_exact(
