@@ -45,7 +45,9 @@ class Decoder:
 
     def __post_init__(self) -> None:
         if self.pays_shares and not self.whole_episodes:
-            raise LareError(f"decoder {self.name}: a decoder that pays shares of an episode's return needs whole_episodes")
+            raise LareError(
+                f"decoder {self.name}: a decoder that pays shares of an episode's return needs whole_episodes"
+            )
 
     def init_network(self, key: "PRNGKeyArray", shape: "DecoderShape", settings: "CreditSettings") -> "DecoderNetwork":
         """Return an untrained decoder."""
