@@ -322,8 +322,8 @@ class CreditAssigner:
                 return []
             assert self.learner.decoder is not None
             factor_names = [] if config.phi is None else config.phi.factor_columns(config.scored_observation)
-            raw_names = config.raw_feature_names(len(explanation.residual_correlation))
-            return explanation_lines(explanation, estimate_score_type(self.learner.decoder), factor_names, raw_names)
+            score_type = estimate_score_type(self.learner.decoder)
+            return explanation_lines(explanation, score_type, factor_names, config.raw_feature_names)
 
     @property
     def score_type(self) -> str:

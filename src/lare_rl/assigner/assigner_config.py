@@ -14,7 +14,7 @@ from lare_rl.assigner.space_layout import SpaceLayout, make_layout
 from lare_rl.config.validity import check_credit
 from lare_rl.credit.decoder_settings import CreditSettings, default_credit
 from lare_rl.credit.engine import CreditSpec, credit_spec
-from lare_rl.credit.explanation_text import raw_feature_names
+
 from lare_rl.credit.history import next_history_columns
 from lare_rl.credit.input_names import input_arrays
 from lare_rl.credit.methods import Method, find_method
@@ -98,13 +98,11 @@ class AssignerConfig:
         """Whether the proxy rewards of an episode are corrected to add up to its return."""
         return self.method.is_exact(self.settings.exact)
 
-    def raw_feature_names(self, n_features: int) -> list[str]:
-        """Return names of the raw features; none if they are not entries of observations and the action."""
-        inputs = tuple(name for name in self.spec.inputs if name != "factors")
-        if "observation_change" in inputs or inputs[-1:] != ("action",):
-            return []
+    @property
+    def raw_feature_names(self) -> list[str]:
+        """Names of the raw features; none if they are not entries of observations and the action."""
         texts = ("", "") if self.task is None else (self.task.observation, self.task.action)
-        return raw_feature_names(*texts, n_features, self.action.size, both=len(inputs) > 2)
+        return self.spec.raw_feature_names(*texts)
 
     def compute_inputs(
         self, observation: np.ndarray, action: np.ndarray, next_observation: np.ndarray

@@ -28,6 +28,7 @@ from lare_rl.credit.closed_form import ClosedForm
 from lare_rl.credit.decoder_settings import CreditSettings
 from lare_rl.credit.decomposition import CreditBatch, DecoderState
 from lare_rl.credit.explanation import Explanation, StepStatistics, add_steps, empty_step_statistics, explain
+from lare_rl.credit.explanation_text import raw_feature_names
 from lare_rl.credit.input_names import input_size, input_sizes, tracked_size
 from lare_rl.credit.methods import Fit, Method, Reward
 from lare_rl.credit.prequential import WINDOW
@@ -93,6 +94,14 @@ class CreditSpec:
             n_levels=n_levels,
             prefixes=self.method.fit is Fit.PREFIX_EVIDENCE,
         )
+
+    def raw_feature_names(self, observation: str, action: str) -> list[str]:
+        """Return names of the raw features, from a task's texts; none if they are not entries of observations and actions."""
+        if not self.basis.n_raw_used or "observation_change" in self.inputs:
+            return []
+        sizes = dict(input_sizes(self.inputs, dict(self.sizes)))
+        raw = {name: size for name, size in sizes.items() if name not in ("factors", "history")}
+        return raw_feature_names(observation, action, raw)
 
 
 def credit_spec(

@@ -1,7 +1,7 @@
 """What the returns say about the factors: how much they explain, which of them matter, and what may be missing."""
 
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 
@@ -108,15 +108,13 @@ MESSAGES = {
 """The sentences, by the codes of the findings."""
 
 
-def raw_feature_names(observation: str, action: str, n_features: int, action_size: int, both: bool) -> list[str]:
+def raw_feature_names(observation: str, action: str, sizes: Mapping[str, int]) -> list[str]:
     """Return names of the raw features, from a task's texts: the line `7: angle of the foot` names entry 7.
 
     Args:
         observation: the text that describes the observation.
         action: the text that describes the action.
-        n_features: the number of raw features: 0, or at least `action_size`.
-        action_size: the number of entries of the action, which come last.
-        both: whether there are two observations, first the one before the step.
+        sizes: the number of entries of `observation`, `next_observation` and `action`, in their order, as far as they are inputs.
     """
 
     def names(text: str, size: int, kind: str) -> list[str]:
@@ -125,10 +123,12 @@ def raw_feature_names(observation: str, action: str, n_features: int, action_siz
             f"entry {i} of the {kind}" + (f" ({lines[str(i)].strip()})" if str(i) in lines else "") for i in range(size)
         ]
 
-    n_observed = max(0, n_features - action_size)
-    kinds = ["observation before the step", "observation after the step"] if both else ["observation"]
-    observation_names = [name for kind in kinds for name in names(observation, n_observed // len(kinds), kind)]
-    return observation_names + names(action, n_features - n_observed, "action")
+    before, after = "observation", "observation"
+    if {"observation", "next_observation"} <= set(sizes):
+        before, after = "observation before the step", "observation after the step"
+    kinds = {"observation": before, "next_observation": after, "action": "action"}
+    texts = {"observation": observation, "next_observation": observation, "action": action}
+    return [entry for name, size in sizes.items() for entry in names(texts[name], size, kinds[name])]
 
 
 def explanation_lines(
