@@ -24,7 +24,7 @@ from lare_rl.assigner.decoder_learner import MAX_PENDING_UPDATES
 from lare_rl.credit.decoder_settings import CreditSettings
 from lare_rl.credit.methods import METHODS
 from lare_rl.errors import LareError
-from lare_rl.latent.function import LatentFunction
+from lare_rl.latent.function import LatentFunction, verify_function
 
 METHODS_FOR_STEPS = [m for m in METHODS.values() if m.has_proxy_rewards and not m.needs_whole_episodes]
 SINGLE_AGENT_KINDS = {"rd", "rrdu", "diaster", "lare-bayes", "lare-signs", "ircr", "llm-reward"}
@@ -455,6 +455,13 @@ def test_init_refuses(method, kind, changes, message, phi, reward):
     function = {"factors": phi, "reward": reward, None: None}[kind]
     with pytest.raises(LareError, match=message):
         small_assigner(method, **({"phi": function} | changes))
+
+
+def test_signs_of_too_many_factors_are_refused():
+    columns = ", ".join(f"o[:, 0:1] ** {power + 1}" for power in range(17))
+    many = verify_function(f"def evaluation_func(o, a):\n    return [{columns}]\n", TASK)
+    with pytest.raises(LareError, match=r"16 factors.* 17"):
+        small_assigner("lare-signs", many)
 
 
 def test_spaces_of_gymnasium():

@@ -11,10 +11,9 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from lare_rl.assigner.space_layout import SpaceLayout, make_layout
-from lare_rl.config.validity import check_credit
+from lare_rl.config.validity import check_credit, check_factors
 from lare_rl.credit.decoder_settings import CreditSettings, default_credit
 from lare_rl.credit.engine import CreditSpec, credit_spec
-
 from lare_rl.credit.history import next_history_columns
 from lare_rl.credit.input_names import input_arrays
 from lare_rl.credit.methods import Method, find_method
@@ -259,6 +258,7 @@ def check_config(config: AssignerConfig) -> None:
         raise LareError("a phi needs the task that it was designed for: CreditAssigner(..., phi, task=task)")
     if phi is not None and config.task is not None:
         check_task(phi, config.task)
+        check_factors(method, phi.n_factors(config.scored_observation))
     check_credit(
         method,
         config.settings,
