@@ -425,6 +425,20 @@ def test_add_episode_refuses(changes, message):
 
 # Configuration
 
+
+def test_an_episode_that_is_too_long_leaves_the_others():
+    credit = small_assigner(capacity=20)
+    long, *short = random_episodes([12, 3, 3, 3, 3])
+    for t in range(12):
+        rows = [np.stack([a[t], b[t % 3]]) for a, b in zip(long, short[t // 3], strict=True)]
+        flags = [[t == 11, t % 3 == 2], [False] * 2]
+        if t < 11:
+            credit.add(*rows, *flags, env_ids=["long", "short"])
+    with pytest.raises(LareError, match="capacity larger"):
+        credit.add(*rows, *flags, env_ids=["long", "short"])
+    assert (credit.store.ended, credit.store.dropped, credit.store.running) == (4, 1, {})
+
+
 NO_TASK = {"task": None, "observation_space": 2, "action_space": 1}
 
 

@@ -127,18 +127,27 @@ class Store:
     ) -> Iterator[StoredEpisode]:
         """Add new steps to the running episodes of their environments. Yield each episode that is paid.
 
-        `step_ids` are from `add`. `steps` are observations, actions and next observations. Raises `LareError` like `end`.
+        `step_ids` are from `add`. `steps` are observations, actions and next observations. Raises `LareError` like `end`, once all
+        steps are added.
         """
         observation, _, next_observation = steps
+        error = None
         for i, env_id in enumerate(env_ids):
             episode = self.get_running(env_id, observation[i])
             episode.level = 0 if level is None else int(level[i])
             episode.last_observation = next_observation[i]
-            payment = self._add_step(episode, int(step_ids[i]), float(reward[i]), self.payments, bool(ended[i]))
+            payment = None
+            try:
+                payment = self._add_step(episode, int(step_ids[i]), float(reward[i]), self.payments, bool(ended[i]))
+            except LareError as refusal:
+                error = refusal
+                self.dropped += 1
             if ended[i]:
                 del self.running[env_id]
             if payment is not None:
                 yield payment
+        if error is not None:
+            raise error
 
     def _add_step(
         self, episode: RunningEpisode, step_id: int, reward: float, payments: PaymentRule, ended: bool
