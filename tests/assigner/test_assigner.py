@@ -653,6 +653,10 @@ def test_groups_that_do_not_fit_are_refused():
         credit.add_episode(*episode)
     with pytest.raises(LareError, match=r"2 entries.* 5 steps"):
         credit.add(*episode, np.zeros(5, bool), np.zeros(5, bool), group=["a", "b"])
+    assert (credit.store.steps, credit.learner.n_pending_steps) == (0, 0)
+    is_valid = np.arange(5) == 0
+    credit.add(*episode, is_valid, ~is_valid, valid=is_valid, group=["g0", "a", "b", "c", "d"])
+    assert list(credit.group_names) == ["g0"]
     for i in range(64):
         credit.add_episode(*episode, group=f"g{i}")
     with pytest.raises(LareError, match=r"more than 64 groups.*'new'"):

@@ -181,9 +181,9 @@ class CreditAssigner:
             check_finite(rows, steps, team_reward)
             step_ids = np.full(n_rows, -1)
             if len(rows):
+                level = self.config.to_levels(group, n_rows, self.group_names, rows)
                 step_ids[rows] = self.learner.add_steps(*steps, None if alive is None else alive[rows])
                 env_ids = [ids[row] for row in rows.tolist()]
-                level = self.config.to_levels(group, n_rows, self.group_names)[rows]
                 paid_episodes = self.store.extend(env_ids, step_ids[rows], steps, team_reward, ended, level)
                 self.learner.queue_episodes(paid_episodes)
                 self.learner.flush_large_queues()
@@ -216,11 +216,11 @@ class CreditAssigner:
             score = float(reward) if is_score else float(rewards.sum())
             if not np.isfinite(score):
                 raise LareError(f"the score is {score}: give a finite number")
+            (level,) = self.config.to_levels(None if group is None else [group], 1, self.group_names).tolist()
             step_ids = self.learner.add_steps(*steps, alive)
             if is_score:
                 rewards[-1] = score
             rule = PAID_AT_END if is_score else self.config.payments
-            (level,) = self.config.to_levels(None if group is None else [group], 1, self.group_names).tolist()
             self.learner.queue_episodes(self.store.add_paid_episode(step_ids, rewards, rule, level))
             self.learner.flush_large_queues()
             return step_ids

@@ -147,19 +147,28 @@ class AssignerConfig:
         return rows["observation"], rows["action"], rows["next_observation"]
 
     def to_levels(
-        self, group: Sequence[Hashable] | None, n_rows: int, group_names: dict[Hashable, int]
+        self,
+        group: Sequence[Hashable] | None,
+        n_rows: int,
+        group_names: dict[Hashable, int],
+        rows: Int[np.ndarray, " n"] | None = None,
     ) -> Int[np.ndarray, " n"]:
-        """Return the number of each row's group, and add new groups to `group_names`.
+        """Return the number of the group of some rows (by default of all), and add new groups to `group_names`.
 
         Raises `LareError` if there are too many groups, or if they do not fit.
         """
         if (group is not None) != self.groups:
-            needs = "needs group" if self.groups else "has no groups: leave group out, or set groups=True"
-            raise LareError(f"this assigner {needs}")
+            needs, has_none = (
+                "needs group: give group=, one for each row",
+                "has no groups: leave group out, or set groups=True",
+            )
+            raise LareError(f"this assigner {needs if self.groups else has_none}")
+        rows = np.arange(n_rows) if rows is None else rows
         if group is None:
-            return np.zeros(n_rows, np.int32)
+            return np.zeros(len(rows), np.int32)
         if len(group) != n_rows:
             raise LareError(f"group has {len(group)} entries, but there are {n_rows} steps")
+        group = [group[row] for row in rows.tolist()]
         new = [name for name in dict.fromkeys(group) if name not in group_names]
         if len(group_names) + len(new) > MAX_LEVELS:
             raise LareError(f"there are more than {MAX_LEVELS} groups, of which {new[-1]!r} is one: merge some of them")
