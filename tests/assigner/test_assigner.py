@@ -195,6 +195,13 @@ def test_score_type_is_found_and_rewards_add_up_to_the_score(setting, score, phi
         credit.rewards(*steps, length=3)
 
 
+@pytest.mark.parametrize("length", [0, -1, 2.9, np.nan, np.inf])
+def test_rewards_refuse_what_is_no_length(length):
+    *steps, _ = random_episodes([2])[0]
+    with pytest.raises(LareError, match="length of row 1 .* number of steps"):
+        small_assigner().rewards(*steps, length=[2, length])
+
+
 def test_score_type_of_the_task():
     credit = CreditAssigner("ircr", task=TASK.model_copy(update={"score": "average"}))
     assert credit.config.settings.score == "average"

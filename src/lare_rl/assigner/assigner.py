@@ -26,6 +26,7 @@ from lare_rl.assigner.assigner_config import (
     check_finite,
     resolve_config,
     to_flags,
+    to_lengths,
     to_step_ids,
 )
 from lare_rl.assigner.decoder_learner import DecoderLearner
@@ -296,9 +297,7 @@ class CreditAssigner:
                 if begins is None:
                     raise LareError(f"{method.name} reads the history of an episode: give begins, or call rewards_at")
                 inputs = self.config.add_history(inputs, to_flags(begins, "begins", len(inputs)))
-            length = np.full(len(inputs), self.store.mean_length) if length is None else np.asarray(length, np.int32)
-            if length.shape != (len(inputs),):
-                raise LareError(f"length has the shape {length.shape}: give one number for each of {len(inputs)} steps")
+            length = to_lengths([self.store.mean_length] * len(inputs) if length is None else length, len(inputs))
             return self.step_rewards.rewards(inputs, length)
 
     def metrics(self) -> dict[str, float]:

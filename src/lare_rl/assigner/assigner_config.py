@@ -32,6 +32,7 @@ __all__ = [
     "check_finite",
     "resolve_config",
     "to_flags",
+    "to_lengths",
     "to_step_ids",
 ]
 
@@ -288,6 +289,17 @@ def to_flags(values: Any, name: str, n_rows: int) -> Bool[np.ndarray, " steps"]:
     if flags.shape != (n_rows,):
         raise LareError(f"{name} has the shape {flags.shape}: give one flag for each of {n_rows} steps")
     return flags
+
+
+def to_lengths(values: Any, n_rows: int) -> Int[np.ndarray, " steps"]:
+    """Return the length of each row's episode. Raises `LareError` if there are more or fewer, or for one that is no length."""
+    lengths = np.asarray(values, np.float64)
+    if lengths.shape != (n_rows,):
+        raise LareError(f"length has the shape {lengths.shape}: give one number for each of {n_rows} steps")
+    wrong = np.flatnonzero(~(lengths >= 1) | (lengths % 1 != 0))
+    if len(wrong):
+        raise LareError(f"length of row {wrong[0]} is {lengths[wrong[0]]:g}: give the number of steps of its episode")
+    return lengths.astype(np.int32)
 
 
 def to_step_ids(steps: Any) -> Int[np.ndarray, "*shape"]:
