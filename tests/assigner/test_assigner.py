@@ -195,6 +195,13 @@ def test_score_type_is_found_and_rewards_add_up_to_the_score(setting, score, phi
         credit.rewards(*steps, length=3)
 
 
+def test_score_type_is_that_of_all_episodes(phi):
+    credit = small_assigner("lare-linear", phi, settings=SMALL_CREDIT.model_copy(update={"score": "auto"}))
+    for episode in random_episodes(np.random.default_rng(0).integers(3, 13, size=80)):
+        credit.add_episode(*episode[:3], episode.reward.mean())
+    assert credit.score_type == "average"
+
+
 @pytest.mark.parametrize("length", [0, -1, 2.9, np.nan, np.inf])
 def test_rewards_refuse_what_is_no_length(length):
     *steps, _ = random_episodes([2])[0]

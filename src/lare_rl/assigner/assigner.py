@@ -327,10 +327,12 @@ class CreditAssigner:
     @property
     def score_type(self) -> str:
         """How the score is modelled: as the `sum` or the `average` over an episode's steps, or by the `log odds` that they add."""
-        decoder = self.learner.decoder
-        if decoder is None or not (decoder.is_mean | decoder.is_log_odds):
-            return "sum"
-        return "average" if bool(decoder.is_mean) else "log odds"
+        with self.lock:
+            self.learner.learn_if_due()
+            decoder = self.learner.decoder
+            if decoder is None or not (decoder.is_mean | decoder.is_log_odds):
+                return "sum"
+            return "average" if bool(decoder.is_mean) else "log odds"
 
     form = score_type  # the earlier name
 
