@@ -296,7 +296,7 @@ def to_lengths(values: Any, n_rows: int) -> Int[np.ndarray, " steps"]:
     lengths = np.asarray(values, np.float64)
     if lengths.shape != (n_rows,):
         raise LareError(f"length has the shape {lengths.shape}: give one number for each of {n_rows} steps")
-    wrong = np.flatnonzero(~(lengths >= 1) | (lengths % 1 != 0))
+    wrong = np.flatnonzero(~((lengths >= 1) & (lengths < 2**31)) | (lengths != np.floor(lengths)))
     if len(wrong):
         raise LareError(f"length of row {wrong[0]} is {lengths[wrong[0]]:g}: give the number of steps of its episode")
     return lengths.astype(np.int32)
