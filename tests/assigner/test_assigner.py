@@ -205,7 +205,7 @@ def test_score_type_is_that_of_all_episodes(phi):
 @pytest.mark.parametrize("length", [0, -1, 2.9, np.nan, np.inf])
 def test_rewards_refuse_what_is_no_length(length):
     *steps, _ = random_episodes([2])[0]
-    with pytest.raises(LareError, match="length of row 1 .* number of steps"):
+    with pytest.raises(LareError, match=r"length of row 1 .* number of steps"):
         small_assigner().rewards(*steps, length=[2, length])
 
 

@@ -89,10 +89,13 @@ def test_shares_add_up():
 
 
 def test_score_type():
-    for score_type, this, other in ((ScoreType.SUM, "sum", "mean"), (ScoreType.MEAN, "mean", "sum")):
+    types = {ScoreType.SUM: Finding("sum"), ScoreType.MEAN: Finding("mean")}
+    for score_type, rival in ((ScoreType.SUM, ScoreType.MEAN), (ScoreType.MEAN, ScoreType.SUM)):
         for is_certain, code in ((True, "score_type_is_certain"), (False, "score_type_is_uncertain")):
-            finding = find({}, score_type=ScoreTypeEstimate(score_type, is_certain))[0]
-            assert finding == Finding(code, {"this": Finding(this), "other": Finding(other)})
+            finding = find({}, score_type=ScoreTypeEstimate(score_type, is_certain, rival))[0]
+            assert finding == Finding(code, {"this": types[score_type], "other": types[rival]})
+        finding = find({}, score_type=ScoreTypeEstimate(score_type, is_certain=True, rival=ScoreType.LOG_ODDS))[0]
+        assert finding == Finding("score_is_not_log_odds", {"this": types[score_type]})
 
 
 def test_factors_are_in_order_of_shares():

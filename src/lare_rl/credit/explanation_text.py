@@ -57,6 +57,10 @@ MESSAGES = {
         "Steps are paid for what they add to the log odds of the higher score: so far, this predicts returns better than a sum. The "
         "shares and effects below are those of a sum."
     ),
+    "score_is_not_log_odds": (
+        "The score is treated as {this} over the steps of an episode: so far, this predicts returns at least as well as what steps "
+        "add to the log odds of the higher score. This may change."
+    ),
     "sum": "a sum",
     "mean": "an average",
     "returns": "the returns of {n_episodes:,} episodes",
@@ -191,8 +195,10 @@ def _unused_raw_features(explanation: Explanation, names: Sequence[str]) -> list
 def _score_type(estimate: ScoreTypeEstimate) -> Finding:
     if estimate.score_type is ScoreType.LOG_ODDS:
         return Finding("score_is_log_odds")
-    types = Finding("sum"), Finding("mean")
-    this, other = types if estimate.score_type == ScoreType.SUM else types[::-1]
+    this = Finding("sum" if estimate.score_type is ScoreType.SUM else "mean")
+    if estimate.rival is ScoreType.LOG_ODDS:
+        return Finding("score_is_not_log_odds", {"this": this})
+    other = Finding("sum" if estimate.rival is ScoreType.SUM else "mean")
     code = "score_type_is_certain" if estimate.is_certain else "score_type_is_uncertain"
     return Finding(code, {"this": this, "other": other})
 
