@@ -20,6 +20,7 @@ from helpers.assigner_episodes import (
 from helpers.long_tests import long_case
 from helpers.toy_envs import pick_spec
 from lare_rl.assigner.assigner import CreditAssigner
+from lare_rl.assigner.assigner_config import AssignerConfig
 from lare_rl.assigner.decoder_learner import MAX_PENDING_UPDATES
 from lare_rl.credit.decoder_settings import CreditSettings
 from lare_rl.credit.methods import METHODS
@@ -472,6 +473,10 @@ NO_TASK = {"task": None, "observation_space": 2, "action_space": 1}
         ("rd", None, {"task": TASK, "observation_space": 3}, "observation_space .*3 .*observation_size = 2"),
         ("rd", None, {"capacity": 0}, "capacity = 0"),
         ("rd", None, {"capacity": -1}, "capacity = -1"),
+        ("rd", None, {"agents": 0}, "agents = 0"),
+        ("rd", None, {"agents": 2, "max_steps": -3}, "max_steps = -3"),
+        ("rd", None, {"seed": -1}, "seed = -1"),
+        ("rd", None, {"fits_per_step": float("nan")}, "fits_per_step = nan"),
         ("rd", "factors", {}, "no phi"),
         ("lare-rd", "reward", {}, "'factors'.*'reward'"),
         ("lare-rd", "factors", NO_TASK, "task=task"),
@@ -483,6 +488,15 @@ def test_init_refuses(method, kind, changes, message, phi, reward):
     function = {"factors": phi, "reward": reward, None: None}[kind]
     with pytest.raises(LareError, match=message):
         small_assigner(method, **({"phi": function} | changes))
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [("agents", 2.5), ("seed", 1.5), ("fits_per_step", "a"), ("scored_observation", "later"), ("payments", "nonzero")],
+)
+def test_config_refuses_other_types(name, value):
+    with pytest.raises(LareError, match=f"^{name} = "):
+        AssignerConfig(**(dict(small_assigner().config) | {name: value}))
 
 
 def test_signs_of_too_many_factors_are_refused():

@@ -3,7 +3,6 @@
 import json
 import pickle
 import shutil
-from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -112,7 +111,9 @@ def saved(tmp_path_factory, phi):
 
 def test_load_verifies_phi_on_stored_steps_without_an_environment(tmp_path, saved):
     credit = CreditAssigner.load(saved)
-    credit.config = replace(credit.config, task=credit.config.task.model_copy(update={"environment": "none"}))
+    credit.config = credit.config.model_copy(
+        update={"task": credit.config.task.model_copy(update={"environment": "none"})}
+    )
     credit.save(tmp_path)
     assert CreditAssigner.load(tmp_path).config.phi.source == credit.config.phi.source
 

@@ -1,14 +1,14 @@
 """The fixed configuration of a `CreditAssigner`: method, function, spaces and settings; and the decoder's inputs of steps."""
 
 from collections.abc import Hashable, Mapping, Sequence
-from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import gymnasium
 import numpy as np
 from jaxtyping import Bool, Float, Int
+from pydantic import Field, InstanceOf
 
 from lare_rl.assigner.space_layout import SpaceLayout, make_layout
 from lare_rl.config.validity import check_credit, check_factors
@@ -20,7 +20,7 @@ from lare_rl.credit.methods import Method, find_method
 from lare_rl.credit.score_type import prediction_window
 from lare_rl.envs.families import find_score, load_env_spec
 from lare_rl.envs.load import resolve_task
-from lare_rl.errors import LareError, short_repr
+from lare_rl.errors import CheckedModel, LareError, short_repr
 from lare_rl.latent.function import LatentFunction, check_task
 from lare_rl.tasks.payments import PAID_AT_END, PaymentRule
 from lare_rl.tasks.spec import MAX_LEVELS, ScoredObservation, TaskSpec
@@ -40,22 +40,21 @@ Space = gymnasium.Space | SpaceLayout | int
 """A space of Gymnasium, a layout, or the length of a row of numbers."""
 
 
-@dataclass(frozen=True, kw_only=True)
-class AssignerConfig:
+class AssignerConfig(CheckedModel):
     """The configuration of an assigner."""
 
-    method: Method
-    phi: LatentFunction | None
+    method: InstanceOf[Method]
+    phi: InstanceOf[LatentFunction] | None
     task: TaskSpec | None
     observation: SpaceLayout
     action: SpaceLayout
     scored_observation: ScoredObservation
-    agents: int
-    max_steps: int | None
-    capacity: int
+    agents: Annotated[int, Field(ge=1)]
+    max_steps: Annotated[int, Field(ge=1)] | None
+    capacity: Annotated[int, Field(ge=1)]
     settings: CreditSettings
-    seed: int
-    fits_per_step: float
+    seed: Annotated[int, Field(ge=0)]
+    fits_per_step: Annotated[float, Field(ge=0, allow_inf_nan=False)]
     scale_rewards: bool
     forget: bool
     payments: PaymentRule = PAID_AT_END
@@ -211,7 +210,9 @@ def resolve_config(
         LareError: there is no such method or task, or the spaces are not those of the task.
     """
     task, chosen = None if task is None else resolve_task(task, playable=False), find_method(method)
-    settings = settings or default_credit(agents)
+    if phi is not None and not isinstance(phi, LatentFunction):
+        raise LareError(f"phi is {short_repr(phi)}: give a function from lare_rl.design or lare_rl.load_function")
+    settings = default_credit(agents) if settings is None else CreditSettings.model_validate(settings)
     if settings.score == "auto" and task is not None and (score := find_score(task)) is not None:
         settings = settings.model_copy(update={"score": score})
     observation, action = _resolve_layouts(task, spaces)
@@ -252,12 +253,9 @@ def _resolve_layouts(task: TaskSpec | None, spaces: Mapping[str, Space | None]) 
 def check_config(config: AssignerConfig) -> None:
     """Raise `LareError` if method, function and sizes do not go together."""
     method, phi, name = config.method, config.phi, config.method.name
-    if not isinstance(config.capacity, int) or config.capacity < 1:
-        raise LareError(f"capacity = {short_repr(config.capacity)}: give a whole number, 1 or more")
+
     if not method.has_proxy_rewards:
         raise LareError(f"{name} assigns no credit: train on what the environment pays")
-    if phi is not None and not isinstance(phi, LatentFunction):
-        raise LareError(f"phi is {short_repr(phi)}: give a function from lare_rl.design or lare_rl.load_function")
     if method.needs_phi and phi is None:
         raise LareError(f"{name} needs a phi; bayes, rd and rrdu need none")
     if phi is not None and not method.needs_phi:
