@@ -137,7 +137,8 @@ def _fold(
 ) -> tuple[State, ...]:
     """Do as `fold_episodes`, with a `body` that also gets the first step of each episode."""
     buffer, longest, n_episodes = replay.by_payment(buffer), config.longest_segment, config.credit_window
-    rows = max(1, min(expected or n_episodes, n_episodes, MAX_ROWS // (config.credit_rows * longest))) * longest
+    expected = n_episodes if expected is None else max(1, expected)
+    rows = max(1, min(expected, n_episodes, MAX_ROWS // (config.credit_rows * longest))) * longest
     total = jnp.sum(count_episodes_since(buffer, since))
 
     def read_batch(carry: tuple[Int[Array, ""], tuple[State, ...]]) -> tuple[Int[Array, ""], tuple[State, ...]]:
