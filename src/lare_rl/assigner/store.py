@@ -93,6 +93,12 @@ class Store:
         self.dropped = 0
         """Episodes that were abandoned."""
 
+    @property
+    def bytes_per_step(self) -> int:
+        """The memory of a step, without the flags of agents."""
+        arrays = self.inputs, self.length, self.mean_reward, self.episode, self.previous
+        return sum(array.nbytes for array in arrays) // self.capacity
+
     def add(self, n_steps: int, alive: Bool[np.ndarray, "n_steps agents"] | None = None) -> Int[np.ndarray, " n_steps"]:
         """Return numbers for new steps. Episodes whose steps are all too old to be stored are removed.
 

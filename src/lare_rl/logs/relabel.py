@@ -234,9 +234,7 @@ def _create_assigner(
         forget=False,
         groups=log.layout.has_groups,
     )
-    # Inputs, and the store's own data of each step.
-    bytes_per_step = 4 * create(capacity=1).config.spec.basis.n_inputs + 16
-    return create(capacity=max(MIN_CAPACITY, int(memory * 2**30 / bytes_per_step)))
+    return create(capacity=max(MIN_CAPACITY, int(memory * 2**30 / create(capacity=1).store.bytes_per_step)))
 
 
 def _fit(
