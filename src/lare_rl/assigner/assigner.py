@@ -34,6 +34,7 @@ from lare_rl.assigner.saving import AssignerState
 from lare_rl.assigner.step_rewards import StepRewards
 from lare_rl.assigner.store import Store
 from lare_rl.credit.decoder_settings import CreditSettings
+from lare_rl.credit.decoders import DECODERS
 from lare_rl.credit.explanation_text import explanation_lines
 from lare_rl.credit.methods import Reward
 from lare_rl.credit.returns import estimate_score_type
@@ -120,7 +121,10 @@ class CreditAssigner:
         check_config(config)
         self.config = config
         row_shape = (*config.agent_axis, config.spec.basis.n_inputs)
-        self.store = Store(config.capacity, row_shape, config.agents, config.payments, has_levels=config.groups)
+        longest = DECODERS[config.method.decoder].longest_segment
+        self.store = Store(
+            config.capacity, row_shape, config.agents, config.payments, has_levels=config.groups, longest=longest
+        )
         self.group_names: dict[Hashable, int] = {}
         """The number of each group."""
         self.learner = DecoderLearner(config, self.store)

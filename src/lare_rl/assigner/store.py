@@ -63,9 +63,15 @@ class Store:
         payments: PaymentRule = PAID_AT_END,
         *,
         has_levels: bool = False,
+        longest: int | None = None,
     ):
-        """Make an empty store. `row_shape` is the shape of a step's inputs: (inputs,), or (agents, inputs)."""
+        """Make an empty store.
+
+        `row_shape` is the shape of a step's inputs: (inputs,), or (agents, inputs). `longest` is the largest number of steps that the
+        decoder reads of an episode; None if any.
+        """
         self.capacity, self.agents, self.payments, self.has_levels = capacity, agents, payments, has_levels
+        self.longest = longest
         self.inputs = np.zeros((capacity, *row_shape), np.float32)
         """The decoder's inputs for each step: [capacity *agents inputs]."""
         self.alive: Bool[np.ndarray, "capacity agents"] | None = None
@@ -203,6 +209,10 @@ class Store:
         `since_last` are the steps since the last payment, which need not be the steps that this one is for.
         """
         steps = episode.steps
+        if self.longest is not None and len(steps) > self.longest:
+            raise LareError(
+                f"the decoder reads at most {self.longest} steps for one payment, and this one is for {len(steps)}: use rudder, or payments"
+            )
         if self.steps - steps[0] > self.capacity:
             raise LareError(
                 f"an episode of {len(steps)} steps has ended, and its first steps are not stored any more: "
