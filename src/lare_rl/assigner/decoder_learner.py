@@ -176,8 +176,8 @@ class DecoderLearner:
     def learn_returns(self) -> None:
         """Let the decoder learn from pending episodes.
 
-        A late call makes no difference to a decoder in closed form: it is fitted after the same episodes as with prompt calls, so
-        every return is predicted before the decoder is fitted to it.
+        If they are many, a decoder in closed form is fitted several times, so that every return is predicted before the decoder is
+        fitted to it. After a late call, these may be other fits than after prompt ones.
         """
         self.flush_inputs()
         self.flush_statistics()
