@@ -17,7 +17,7 @@ Batches have an axis of agents, of length 1 for a single agent. For credit to wh
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
@@ -45,6 +45,7 @@ __all__ = [
     "RewardSource",
     "StepBatch",
     "add_to_explanation",
+    "correction",
     "credit_spec",
     "explain_returns",
     "init_decoder",
@@ -234,19 +235,18 @@ def training_rewards(
     """Return the rewards that an algorithm is trained on, for each agent of the team. `alive` says which agents acted."""
     r_hat = jnp.broadcast_to(proxy_rewards(source, steps, spec, optimistic=True), alive.shape)
     if steps.residual is not None:
-        r_hat = r_hat + _correction(steps, spec.settings.exact)[..., None]
+        r_hat = r_hat + correction(steps.residual, steps.last, steps.length, spec.settings.exact)[..., None]
     if spec.method.shared:
         r_hat = jnp.broadcast_to(alive_mean(r_hat, alive)[..., None], alive.shape)
     return scale_and_mask(r_hat, return_scale(source), alive, scale_rewards=spec.scale_rewards)
 
 
-def _correction(steps: StepBatch, exact: str) -> Float[Array, "*batch"]:
-    """Return what is added to each step's proxy reward, so that those of an episode add up to its return."""
-    assert steps.residual is not None
-    assert steps.last is not None
-    if exact == "spread":
-        return steps.residual / steps.length
-    return jnp.where(steps.last, steps.residual, 0)
+def correction(residual: Any, last: Any, length: Any, exact: str) -> Any:
+    """Return what is added to each step's proxy reward, so that those of an episode add up to its return.
+
+    The arguments are those of `StepBatch`, as arrays of NumPy or of JAX, and the setting `exact`.
+    """
+    return residual / length if exact == "spread" else residual * last
 
 
 def scale_and_mask(

@@ -28,6 +28,7 @@ from lare_rl.credit.decomposition import (
     decoder_rewards,
     level_returns,
     score_type_index,
+    step_rows,
 )
 from lare_rl.credit.methods import Fit, Method
 from lare_rl.credit.prequential import Predictions, add_predictions, squared_errors
@@ -193,8 +194,7 @@ def add_to_sums(closed: ClosedForm, episodes: CreditBatch) -> ClosedForm:
     returns, mask = episodes.mean_reward * episodes.length, episodes.mask > 0
     if closed.decoder.basis.prefixes:
         index = jnp.minimum(episodes.episode_index, len(mask) - 1)
-        is_step = (episodes.episode_index < len(mask)) & mask[index]
-        columns = _prefix_columns(closed.decoder, episodes)
+        columns, is_step = _prefix_columns(closed.decoder, episodes), step_rows(episodes)
         statistics = evidence.add_prefixes(statistics, columns, returns[index], is_step, jnp.sum(mask))
         return closed._replace(sufficient_statistics=closed_form.split_double(statistics))
     columns = _columns(closed.decoder, episodes)

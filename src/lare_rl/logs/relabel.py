@@ -4,7 +4,7 @@ The log is read twice as a stream. The first pass shows the episodes to a `Credi
 and writes them.
 """
 
-import itertools
+
 import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
@@ -18,6 +18,7 @@ from jaxtyping import Bool, Float, Int
 from lare_rl.assigner.assigner import CreditAssigner
 from lare_rl.assigner.assigner_config import AssignerConfig
 from lare_rl.credit.decoder_settings import CreditSettings
+from lare_rl.credit.engine import correction
 from lare_rl.credit.methods import Reward, find_method
 from lare_rl.envs.load import resolve_task
 from lare_rl.errors import LareError
@@ -318,15 +319,12 @@ def _make_exact(
     r_hat: Float[np.ndarray, " steps"], reward: Float[np.ndarray, " steps"], config: AssignerConfig
 ) -> Float[np.ndarray, " steps"]:
     """Return proxy rewards that add up to each payment."""
-    starts = np.flatnonzero(_segment_begins(reward, config))
-    corrected = r_hat.copy()
-    for start, end in itertools.pairwise([*starts, len(r_hat)]):
-        residual = reward[start:end].sum() - r_hat[start:end].sum(dtype=np.float64)
-        if config.settings.exact == "last":
-            corrected[end - 1] += residual
-        else:
-            corrected[start:end] += residual / (end - start)
-    return corrected
+    begins = _segment_begins(reward, config)
+    lengths = _segment_lengths(begins)
+    residual = np.add.reduceat(reward - r_hat.astype(np.float64), np.flatnonzero(begins))
+    residual, length = (np.repeat(values, lengths) for values in (residual, lengths))
+    change = correction(residual, np.append(begins[1:], True), length, config.settings.exact)
+    return (r_hat + change).astype(r_hat.dtype)
 
 
 def _batches(episodes: Iterator[LoggedEpisode]) -> Iterator[list[LoggedEpisode]]:
