@@ -558,7 +558,8 @@ def test_rewards_of_many_agents(method, function):
     random, numbers, returns = np.random.default_rng(0), [], []
     for _ in range(12):
         episode, alive = team_episode(6, random)
-        numbers.append(credit.add_episode(*episode, alive=alive))
+        reward = np.where(alive, episode.reward, np.nan)
+        numbers.append(credit.add_episode(*episode[:3], reward, alive=alive))
         returns.append(((episode.reward * alive).sum(axis=1) / alive.sum(axis=1)).sum())
     credit.fit(16)
     assert [score for _, score in stored(credit)] == pytest.approx(returns)

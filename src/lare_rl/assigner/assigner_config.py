@@ -19,6 +19,7 @@ from lare_rl.credit.input_names import input_arrays
 from lare_rl.credit.methods import Method, find_method
 from lare_rl.credit.score_type import prediction_window
 from lare_rl.envs.families import find_score, load_env_spec
+from lare_rl.envs.interface import alive_mean
 from lare_rl.envs.load import resolve_task
 from lare_rl.errors import CheckedModel, LareError, short_repr
 from lare_rl.latent.function import LatentFunction, check_task
@@ -184,8 +185,7 @@ class AssignerConfig(CheckedModel):
         if mask is not None and (mask.shape != (n_steps, self.agents) or self.agents == 1):
             raise LareError(f"alive has the shape {mask.shape}: give it ({n_steps}, agents), of more than one agent")
         if self.agents > 1 and reward.shape == (n_steps, self.agents):
-            weight = np.ones_like(reward) if mask is None else mask
-            return (reward * weight).sum(axis=1) / np.maximum(weight.sum(axis=1), 1), mask
+            return alive_mean(reward, np.ones(reward.shape, bool) if mask is None else mask), mask
         if reward.shape != (n_steps,):
             raise LareError(f"reward has the shape {reward.shape}: give one number for each of {n_steps} steps")
         return reward, mask

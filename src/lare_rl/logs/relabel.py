@@ -4,7 +4,6 @@ The log is read twice as a stream. The first pass shows the episodes to a `Credi
 and writes them.
 """
 
-
 import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
