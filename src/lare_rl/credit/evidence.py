@@ -50,6 +50,7 @@ from lare_rl.credit.precisions import (
     next_posterior,
 )
 from lare_rl.nn.leading_axis import map_leading_axis
+from lare_rl.nn.masks import select
 
 __all__ = [
     "JAX",
@@ -244,7 +245,7 @@ def to_return_units(
     With fewer than two episodes, or if all returns are equal, the weights are 0 and the precisions those of `fallback`.
     """
     is_determined = (problem.dof > 0) & (problem.y_std > 0)
-    posterior = jax.tree.map(lambda new, old: jnp.where(is_determined, new, old), posterior, fallback)
+    posterior = select(is_determined, posterior, fallback)
     weight = jnp.where(is_determined, problem.y_std * posterior.weight, 0)
     bias = problem.y_mean - weight @ statistics.mean[: len(problem.group_index)]
     return posterior._replace(weight=weight, bias=bias)

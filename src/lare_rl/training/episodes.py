@@ -22,6 +22,7 @@ from lare_rl.data import replay
 from lare_rl.data.replay import Index, Replay
 from lare_rl.data.sampling import count_episodes_since, episodes_in_order
 from lare_rl.nn.leading_axis import map_leading_axis
+from lare_rl.nn.masks import select
 from lare_rl.training.decoder_inputs import episode_batch
 from lare_rl.training.static_config import TrainConfig
 
@@ -166,7 +167,7 @@ def _rebuild_statistics(decoders: Decoders, buffer: Replay, is_stale: Bool[Array
     empty = tuple(map(returns.reset_statistics, decoders))
     since = jnp.where(is_stale, buffer.oldest, buffer.episodes)
     rebuilt = fold_episodes(empty, buffer, since, returns.add_episodes, config)
-    return jax.tree.map(lambda new, old: jnp.where(is_stale, new, old), rebuilt, decoders)
+    return select(is_stale, rebuilt, decoders)
 
 
 def _fit_closed_forms(decoder: DecoderState, is_due: Bool[Array, " seeds"], config: TrainConfig) -> DecoderState:
