@@ -25,6 +25,7 @@ __all__ = [
     "empty_predictions",
     "gain",
     "r2",
+    "ring_slots",
     "squared_errors",
 ]
 
@@ -60,15 +61,21 @@ def add_predictions(
     level: Int[Array, " episodes"] | None = None,
 ) -> Predictions:
     """Add new episodes, at most as many as the window has. Episodes where `mask` is false are ignored."""
-    window = len(predictions.returns)
-    slot = (predictions.n_episodes.astype(jnp.int32) + jnp.cumsum(mask) - 1) % window
-    slot = jnp.where(mask, slot, window)  # an index out of bounds, which is dropped
+    slot = ring_slots(predictions.n_episodes, mask, len(predictions.returns))
     return Predictions(
         predictions.n_episodes + jnp.sum(mask),
         predictions.returns.at[slot].set(returns.astype(jnp.float32), mode="drop"),
         predictions.predicted.at[slot].set(predicted.astype(jnp.float32), mode="drop"),
         predictions.level if level is None else predictions.level.at[slot].set(level.astype(jnp.int32), mode="drop"),
     )
+
+
+def ring_slots(n_before: Float[Array, ""], mask: Bool[Array, " episodes"], window: int) -> Int[Array, " episodes"]:
+    """Return where new episodes are stored in a window of the last ones.
+
+    Episodes where `mask` is false get an index out of bounds, which `mode="drop"` drops.
+    """
+    return jnp.where(mask, (n_before.astype(jnp.int32) + jnp.cumsum(mask) - 1) % window, window)
 
 
 def squared_errors(predictions: Predictions) -> Float[Array, " decoders"]:
