@@ -98,7 +98,7 @@ def r2(predictions: Predictions) -> Float[Array, " decoders"]:
 def gain(predictions: Predictions) -> tuple[Float[Array, ""], Float[Array, ""]]:
     """Return the gain of the first decoder, and its standard error over episodes. Both are NaN if R^2 is.
 
-    The standard error is that of a ratio of means. An episode that is alone in its level is compared with all other episodes.
+    The standard error is that of a ratio of means, as in `statistics.r_squared`. An episode that is alone in its level is compared with all other episodes.
     """
     valid = jnp.arange(len(predictions.returns)) < predictions.n_episodes
     different = valid[None] & ~jnp.eye(len(valid), dtype=bool)
@@ -110,6 +110,6 @@ def gain(predictions: Predictions) -> tuple[Float[Array, ""], Float[Array, ""]]:
     total = jnp.sum(baseline)
     is_defined = jnp.isfinite(r2(predictions)[0]) & (total > 0)
     ratio = 1 - jnp.sum(error) / jnp.where(is_defined, total, 1)
-    spread = jnp.sum((baseline - error - ratio * baseline) ** 2)
-    std_error = jnp.sqrt(spread) / jnp.where(is_defined, total, 1)
+    n, spread = jnp.sum(valid), jnp.sum((baseline - error - ratio * baseline) ** 2)
+    std_error = jnp.sqrt(n / jnp.maximum(n - 1, 1) * spread) / jnp.where(is_defined, total, 1)
     return jnp.where(is_defined, ratio, jnp.nan), jnp.where(is_defined, std_error, jnp.nan)
