@@ -307,8 +307,9 @@ class CreditAssigner:
     def metrics(self) -> dict[str, float]:
         """Return metrics of the decoder, which need no true rewards.
 
-        `credit/return_r2` is R^2 of the last 32 returns, each predicted before it was learned from: NaN while they are fewer than
-        8, or all the same. `credit/loss` is the mean loss of the last gradient updates.
+        `credit/return_r2` is R^2 of the last 32 returns, or of the last 256 if there are several in an episode or if `score` is
+        `binary`. Each was predicted before it was learned from. It is NaN while they are fewer than 8, or all the same.
+        `credit/loss` is the mean loss of the last gradient updates.
         """
         with self.lock:
             return self.learner.metrics()

@@ -71,11 +71,7 @@ __all__ = [
 
 
 class CreditBatch(NamedTuple):
-    """Steps of some episodes, and the returns of these episodes.
-
-    If K steps are sampled from each episode, rows = episodes * K, in order, with padding where an episode has fewer steps. For
-    `Fit.DECODER_LOSS`, rows = episodes * (steps of the longest possible episode).
-    """
+    """Steps of some episodes, and the returns of these episodes. The rows are laid out as in `data/layouts.py`."""
 
     inputs: Float[Array, "rows *agents inputs"]
     episode_index: Int[Array, " rows"]
@@ -109,7 +105,7 @@ class DecoderState(NamedTuple):
     """The state of return decomposition."""
 
     network: DecoderNetwork
-    """What the decoder consists of: f_psi."""
+    """f_psi."""
     optimizer: optax.OptState
     """Empty for a decoder that is fitted in closed form."""
     statistics: RunningMeanStd

@@ -4,7 +4,8 @@ Episodes may belong to levels, which differ in difficulty. A decoder is then fit
 
     d_g = s_g (mean_g - mean),    s_g = between / (between + within / n_g)
 
-with mean_g the mean of R/T over the n_g episodes of level g, and the variances within and between levels by the method of moments.
+with mean_g the mean of R/T over the n_g episodes of level g, mean = sum_g n_g mean_g / sum_g n_g, and the variances within and
+between levels by the method of moments.
 The factor s_g shrinks the means of levels with few episodes (random effects: Searle, Casella and McCulloch, 1992).
 """
 

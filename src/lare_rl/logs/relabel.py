@@ -135,7 +135,7 @@ def relabel(
     overwrite: bool = False,
     listener: Listener = lambda stage, n_done, n_episodes: None,
 ) -> Relabelled:
-    """Give the steps of logged episodes rewards that add up to the episodes' returns.
+    """Give the steps of logged episodes rewards that are fitted to the episodes' returns. With `exact`, they add up to them.
 
     Args:
         source: a directory of .npz or Parquet files, a Parquet file, a Hugging Face data set on the disk, a Minari id or data set,
