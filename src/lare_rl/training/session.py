@@ -11,6 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Key
 
+from lare_rl.algorithms.batches import Metrics
 from lare_rl.algorithms.off_policy import OffPolicySettings
 from lare_rl.config.settings import ResolvedSettings
 from lare_rl.data.trajectory import Trajectory
@@ -36,7 +37,7 @@ from lare_rl.training.compiled_loop import CompiledLoop, compile_loop, init_loop
 from lare_rl.training.evaluation import metrics_lines
 from lare_rl.training.explain import compile_explanation
 from lare_rl.training.factors import compute_host_factors
-from lare_rl.training.iteration import IterationFunctions, Metrics, when_on_host
+from lare_rl.training.iteration import IterationFunctions, when_on_host
 from lare_rl.training.learner import Learner, abandon_episodes
 from lare_rl.training.saved_state import actor_shape, load_learner, make_train_config
 from lare_rl.training.seed_axis import count_seed_devices
