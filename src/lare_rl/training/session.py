@@ -169,7 +169,10 @@ class Session:
         (is_finite, steps), self._unchecked = self._unchecked, None
         if self.run.functions and not np.all(is_finite):
             compute_host_factors(self.run, self.config, steps)  # raises an error that names the factor
-            raise LareError("a factor is not finite in the compiled function; the last checkpoint is whole")
+            raise LareError(
+                "a factor is finite in NumPy, and not in the compiled function: write phi without numbers that are too large for "
+                "float32; the last checkpoint is whole"
+            )
 
     def _update(self, steps: Trajectory) -> None:
         self.learner, self.latest_metrics = iteration.update(
@@ -297,7 +300,8 @@ def restore_session(run: Run) -> tuple[Session, list[str]]:
     except checkpoint.DAMAGED_FILE_ERRORS as error:
         session.close()
         raise LareError(
-            f"the checkpoint in {run.checkpoint} does not fit its environments: {type(error).__name__}: {error}"
+            f"the checkpoint in {run.checkpoint} does not fit its environments ({type(error).__name__}: {error}): start a new run, or "
+            "install the version that the run names"
         ) from error
 
 
