@@ -574,7 +574,7 @@ def test_rewards_of_many_agents(method, function):
 
 
 def test_team_with_one_reward():
-    credit, random = small_assigner("ircr", agents=3, max_steps=6), np.random.default_rng(0)
+    credit, random = small_assigner("ircr", agents=3), np.random.default_rng(0)
     for _ in range(3):
         episode, _ = team_episode(6, random)
         credit.add_episode(*episode[:3], episode.reward.mean(axis=1))

@@ -82,7 +82,7 @@ class CreditAssigner:
                 "both".
             agents: the number of agents of a team, which shares its return. With several, all arrays have an axis of agents after
                 the axis of steps.
-            max_steps: the length of the longest episode; needed for many agents.
+            max_steps: the length of the longest episode; needed for many agents, if the decoder is fitted by gradient descent.
             capacity: the number of steps that are stored: at least as many as your replay buffer stores.
             settings: the settings of the decoder.
             seed: the random seed of the decoder's weights and of its batches.

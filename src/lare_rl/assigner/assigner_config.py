@@ -277,8 +277,8 @@ def check_config(config: AssignerConfig) -> None:
         payments=config.payments,
         max_steps=config.max_steps,
     )
-    if config.agents > 1 and config.max_steps is None:
-        raise LareError("many agents need max_steps, the number of steps of the longest episode")
+    if config.agents > 1 and config.max_steps is None and method.uses_gradient:
+        raise LareError(f"{name} of many agents needs max_steps, the number of steps of the longest episode")
 
 
 def to_flags(values: Any, name: str, n_rows: int) -> Bool[np.ndarray, " steps"]:

@@ -156,8 +156,10 @@ def relabel(
     """
     if not 0 <= hold_out <= 0.9:
         raise LareError(f"hold_out = {hold_out} must be between 0 and 0.9")
-    if not 0 < memory < math.inf or updates < 1:
-        raise LareError(f"memory = {memory} and updates = {updates} must be positive")
+    if not 0 < memory < math.inf:
+        raise LareError(f"memory = {memory} must be positive and finite")
+    if updates < 1:
+        raise LareError(f"updates = {updates} must be at least 1")
     task = None if task is None else resolve_task(task, playable=False)
     log = open_log(source, task)
     log.check_output(out, overwrite)
