@@ -51,6 +51,7 @@ from lare_rl.credit.precisions import (
 )
 from lare_rl.nn.leading_axis import map_leading_axis
 from lare_rl.nn.masks import select
+from lare_rl.nn.normalise import merge_means
 
 __all__ = [
     "JAX",
@@ -110,10 +111,7 @@ def add_episodes(
     returns: Float[Array, " episodes"],
     length: Int[Array, " episodes"],
 ) -> SufficientStatistics:
-    """Add episodes. Episodes of length 0 are padding.
-
-    Old and new sums are combined as in Chan, Golub and LeVeque (1983), which avoids catastrophic cancellation.
-    """
+    """Add episodes. Episodes of length 0 are padding."""
     weight = length.astype(statistics.mean.dtype)
     v = jnp.concatenate([mean_features, (returns / jnp.maximum(weight, 1))[:, None], returns[:, None]], axis=1)
     return _add_cases(statistics, v, weight, jnp.sum(length > 0))
@@ -146,13 +144,12 @@ def _add_cases(
     n_new = jnp.sum(weight)
     mean = weight @ v / jnp.maximum(n_new, 1)
     centred = jnp.where(weight[:, None] > 0, v - mean, 0)
-    n_steps, difference = statistics.n_steps + n_new, mean - statistics.mean
-    fraction = n_new / jnp.maximum(n_steps, 1)
+    n_steps, merged, difference, fraction = merge_means(statistics.n_steps, statistics.mean, n_new, mean)
     between = jnp.outer(difference, difference) * statistics.n_steps * fraction
     return SufficientStatistics(
         n_episodes=statistics.n_episodes + n_episodes,
         n_steps=n_steps,
-        mean=statistics.mean + fraction * difference,
+        mean=merged,
         products=statistics.products + (weight[:, None] * centred).T @ centred + between,
     )
 
