@@ -495,12 +495,14 @@ def test_init_refuses(method, kind, changes, message, phi, reward):
     [("agents", 2.5), ("seed", 1.5), ("fits_per_step", "a"), ("scored_observation", "later"), ("payments", "nonzero")],
 )
 def test_config_refuses_other_types(name, value):
+    config = small_assigner().config
+    values = {field: getattr(config, field) for field in AssignerConfig.model_fields} | {name: value}
     with pytest.raises(LareError, match=f"^{name} = "):
-        AssignerConfig(**(dict(small_assigner().config) | {name: value}))
+        AssignerConfig(**values)
 
 
 def test_signs_of_too_many_factors_are_refused():
-    columns = ", ".join(f"o[:, 0:1] ** {power + 1}" for power in range(17))
+    columns = ", ".join(f"o[:, 0:1] * {k + 1}" for k in range(17))
     many = verify_function(f"def evaluation_func(o, a):\n    return [{columns}]\n", TASK)
     with pytest.raises(LareError, match=r"16 factors.* 17"):
         small_assigner("lare-signs", many)

@@ -266,7 +266,6 @@ def check_config(config: AssignerConfig) -> None:
         raise LareError("a phi needs the task that it was designed for: CreditAssigner(..., phi, task=task)")
     if phi is not None and config.task is not None:
         check_task(phi, config.task)
-        check_factors(method, phi.n_factors(config.scored_observation))
     check_credit(
         method,
         config.settings,
@@ -277,6 +276,8 @@ def check_config(config: AssignerConfig) -> None:
         payments=config.payments,
         max_steps=config.max_steps,
     )
+    if phi is not None:
+        check_factors(method, phi.n_factors(config.scored_observation))
     if config.agents > 1 and config.max_steps is None and method.uses_gradient:
         raise LareError(f"{name} of many agents needs max_steps, the number of steps of the longest episode")
 
