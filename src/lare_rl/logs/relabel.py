@@ -279,22 +279,23 @@ def _compute_rewards(
     for batch in _batches(log.episodes()):
         lengths = [len(episode) for episode in batch]
         begins = [_segment_begins(episode.reward, credit.config) for episode in batch]
-        paid_lengths = [_segment_lengths(first) for first in begins]
+        payment_lengths = [_segment_lengths(first) for first in begins]
         r_hat = credit.rewards(
             np.concatenate([episode.observation for episode in batch]),
             np.concatenate([episode.action for episode in batch]),
             np.concatenate([episode.next_observation for episode in batch]),
-            length=np.concatenate([np.repeat(paid, paid) for paid in paid_lengths]),
+            length=np.concatenate([np.repeat(payments, payments) for payments in payment_lengths]),
             begins=np.concatenate(begins),
         )
-        for episode, reward, paid in zip(batch, np.split(r_hat, np.cumsum(lengths)[:-1]), paid_lengths, strict=True):
+        rewards = np.split(r_hat, np.cumsum(lengths)[:-1])
+        for episode, reward, payments in zip(batch, rewards, payment_lengths, strict=True):
             counts.episodes += 1
             counts.steps += len(episode)
             counts.cut += not episode.complete
             if episode.complete and next(is_held_out):
                 counts.returns.append(float(episode.reward.sum()))
                 level = None if episode.group is None else credit.group_names.get(episode.group)
-                unpaid = credit.step_rewards.unpaid_return(level, paid)
+                unpaid = credit.step_rewards.unpaid_return(level, payments)
                 counts.predictions.append(float(reward.sum(dtype=np.float64)) + unpaid)
             if episode.complete and credit.config.is_exact:
                 reward = _make_exact(reward, episode.reward, credit.config)
