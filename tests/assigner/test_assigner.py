@@ -20,11 +20,12 @@ from helpers.assigner_episodes import (
 from helpers.long_tests import long_case
 from helpers.toy_envs import pick_spec
 from lare_rl.assigner.assigner import CreditAssigner
+from lare_rl.assigner.assigner_config import AssignerConfig
 from lare_rl.assigner.decoder_learner import MAX_PENDING_UPDATES
 from lare_rl.credit.decoder_settings import CreditSettings
 from lare_rl.credit.methods import METHODS
 from lare_rl.errors import LareError
-from lare_rl.latent.function import LatentFunction
+from lare_rl.latent.function import LatentFunction, verify_function
 
 METHODS_FOR_STEPS = [m for m in METHODS.values() if m.has_proxy_rewards and not m.needs_whole_episodes]
 SINGLE_AGENT_KINDS = {"rd", "rrdu", "diaster", "lare-bayes", "lare-signs", "ircr", "llm-reward"}
@@ -142,6 +143,19 @@ def test_rewards_at_refuses_what_is_no_step_number(steps):
         small_assigner().rewards_at(steps)
 
 
+# Explanations
+
+
+@pytest.mark.parametrize("method", ["bayes-progress", long_case("bayes")])
+def test_explanation_of_noise(method):
+    """A fit to prefixes has a column for the time, which is not the return."""
+    credit, random = small_assigner(method), np.random.default_rng(0)
+    for *steps, _ in random_episodes(random.integers(5, 12, size=100)):
+        credit.add_episode(*steps, random.normal())
+    credit.learner.learn_returns()
+    assert credit.learner.explain().total_r2 < 0.3
+
+
 # Learning
 
 
@@ -180,6 +194,20 @@ def test_score_type_is_found_and_rewards_add_up_to_the_score(setting, score, phi
     np.testing.assert_allclose(short, (2 if credit.score_type == "average" else 1) * long, rtol=1e-5)
     with pytest.raises(LareError, match="length"):
         credit.rewards(*steps, length=3)
+
+
+def test_score_type_is_that_of_all_episodes(phi):
+    credit = small_assigner("lare-linear", phi, settings=SMALL_CREDIT.model_copy(update={"score": "auto"}))
+    for episode in random_episodes(np.random.default_rng(0).integers(3, 13, size=80)):
+        credit.add_episode(*episode[:3], episode.reward.mean())
+    assert credit.score_type == "average"
+
+
+@pytest.mark.parametrize("length", [0, -1, 2.9, np.nan, np.inf])
+def test_rewards_refuse_what_is_no_length(length):
+    *steps, _ = random_episodes([2])[0]
+    with pytest.raises(LareError, match=r"length of row 1 .* number of steps"):
+        small_assigner().rewards(*steps, length=[2, length])
 
 
 def test_score_type_of_the_task():
@@ -412,6 +440,20 @@ def test_add_episode_refuses(changes, message):
 
 # Configuration
 
+
+def test_an_episode_that_is_too_long_leaves_the_others():
+    credit = small_assigner(capacity=20)
+    long, *short = random_episodes([12, 3, 3, 3, 3])
+    for t in range(12):
+        rows = [np.stack([a[t], b[t % 3]]) for a, b in zip(long, short[t // 3], strict=True)]
+        flags = [[t == 11, t % 3 == 2], [False] * 2]
+        if t < 11:
+            credit.add(*rows, *flags, env_ids=["long", "short"])
+    with pytest.raises(LareError, match="capacity larger"):
+        credit.add(*rows, *flags, env_ids=["long", "short"])
+    assert (credit.store.ended, credit.store.dropped, credit.store.running) == (4, 1, {})
+
+
 NO_TASK = {"task": None, "observation_space": 2, "action_space": 1}
 
 
@@ -431,6 +473,10 @@ NO_TASK = {"task": None, "observation_space": 2, "action_space": 1}
         ("rd", None, {"task": TASK, "observation_space": 3}, "observation_space .*3 .*observation_size = 2"),
         ("rd", None, {"capacity": 0}, "capacity = 0"),
         ("rd", None, {"capacity": -1}, "capacity = -1"),
+        ("rd", None, {"agents": 0}, "agents = 0"),
+        ("rd", None, {"agents": 2, "max_steps": -3}, "max_steps = -3"),
+        ("rd", None, {"seed": -1}, "seed = -1"),
+        ("rd", None, {"fits_per_step": float("nan")}, "fits_per_step = nan"),
         ("rd", "factors", {}, "no phi"),
         ("lare-rd", "reward", {}, "'factors'.*'reward'"),
         ("lare-rd", "factors", NO_TASK, "task=task"),
@@ -442,6 +488,24 @@ def test_init_refuses(method, kind, changes, message, phi, reward):
     function = {"factors": phi, "reward": reward, None: None}[kind]
     with pytest.raises(LareError, match=message):
         small_assigner(method, **({"phi": function} | changes))
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [("agents", 2.5), ("seed", 1.5), ("fits_per_step", "a"), ("scored_observation", "later"), ("payments", "nonzero")],
+)
+def test_config_refuses_other_types(name, value):
+    config = small_assigner().config
+    values = {field: getattr(config, field) for field in AssignerConfig.model_fields} | {name: value}
+    with pytest.raises(LareError, match=f"^{name} = "):
+        AssignerConfig(**values)
+
+
+def test_signs_of_too_many_factors_are_refused():
+    columns = ", ".join(f"o[:, 0:1] * {k + 1}" for k in range(17))
+    many = verify_function(f"def evaluation_func(o, a):\n    return [{columns}]\n", TASK)
+    with pytest.raises(LareError, match=r"16 factors.* 17"):
+        small_assigner("lare-signs", many)
 
 
 def test_spaces_of_gymnasium():
@@ -496,7 +560,8 @@ def test_rewards_of_many_agents(method, function):
     random, numbers, returns = np.random.default_rng(0), [], []
     for _ in range(12):
         episode, alive = team_episode(6, random)
-        numbers.append(credit.add_episode(*episode, alive=alive))
+        reward = np.where(alive, episode.reward, np.nan)
+        numbers.append(credit.add_episode(*episode[:3], reward, alive=alive))
         returns.append(((episode.reward * alive).sum(axis=1) / alive.sum(axis=1)).sum())
     credit.fit(16)
     assert [score for _, score in stored(credit)] == pytest.approx(returns)
@@ -511,7 +576,7 @@ def test_rewards_of_many_agents(method, function):
 
 
 def test_team_with_one_reward():
-    credit, random = small_assigner("ircr", agents=3, max_steps=6), np.random.default_rng(0)
+    credit, random = small_assigner("ircr", agents=3), np.random.default_rng(0)
     for _ in range(3):
         episode, _ = team_episode(6, random)
         credit.add_episode(*episode[:3], episode.reward.mean(axis=1))
@@ -619,6 +684,10 @@ def test_groups_that_do_not_fit_are_refused():
         credit.add_episode(*episode)
     with pytest.raises(LareError, match=r"2 entries.* 5 steps"):
         credit.add(*episode, np.zeros(5, bool), np.zeros(5, bool), group=["a", "b"])
+    assert (credit.store.steps, credit.learner.n_pending_steps) == (0, 0)
+    is_valid = np.arange(5) == 0
+    credit.add(*episode, is_valid, ~is_valid, valid=is_valid, group=["g0", "a", "b", "c", "d"])
+    assert list(credit.group_names) == ["g0"]
     for i in range(64):
         credit.add_episode(*episode, group=f"g{i}")
     with pytest.raises(LareError, match=r"more than 64 groups.*'new'"):

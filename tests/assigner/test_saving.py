@@ -3,7 +3,6 @@
 import json
 import pickle
 import shutil
-from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -53,6 +52,22 @@ def test_load_gives_the_same_rewards_and_goes_on(method, capacity, tmp_path, phi
     assert (directory / FUNCTION_FILE).exists() == (function is not None)
 
 
+def test_load_keeps_the_numbers_of_episodes(tmp_path):
+    """A long episode is removed before shorter ones that ended earlier, which leaves a gap."""
+    credit = small_assigner("rd-linear", capacity=40)
+    long, *short = random_episodes([20, 6, 6, 6, 6])
+    for t, steps in enumerate(zip(*long, strict=True)):
+        rows = [np.asarray(array)[None] for array in steps]
+        credit.add(*rows, [t == 19], [False], env_ids=["long"])
+        if t == 10:
+            credit.add_episode(*short[0])
+    for episode in short[1:]:
+        credit.add_episode(*episode)
+    credit.save(tmp_path)
+    assert list(credit.store.episodes) == [0, 2, 3, 4]
+    assert list(CreditAssigner.load(tmp_path).store.episodes) == [0, 2, 3, 4]
+
+
 @pytest.mark.parametrize("is_pickled", [True, False])
 def test_state_without_episodes_gives_the_same_rewards(is_pickled, tmp_path, phi):
     credit, new = trained_assigner("lare-bayes", phi, is_mean=not is_pickled, settings=ANY_SCORE)
@@ -96,7 +111,9 @@ def saved(tmp_path_factory, phi):
 
 def test_load_verifies_phi_on_stored_steps_without_an_environment(tmp_path, saved):
     credit = CreditAssigner.load(saved)
-    credit.config = replace(credit.config, task=credit.config.task.model_copy(update={"environment": "none"}))
+    credit.config = credit.config.model_copy(
+        update={"task": credit.config.task.model_copy(update={"environment": "none"})}
+    )
     credit.save(tmp_path)
     assert CreditAssigner.load(tmp_path).config.phi.source == credit.config.phi.source
 

@@ -64,6 +64,12 @@ def test_rows_and_add_refuse():
     assert store.steps == 8
 
 
+def test_bytes_per_step():
+    store = Store(10, (3,))
+    arrays = [value for value in vars(store).values() if isinstance(value, np.ndarray)]
+    assert store.bytes_per_step == sum(array.nbytes for array in arrays) / 10 == 36
+
+
 def test_lengths_of_a_running_episode_is_the_mean():
     store = Store(20, (1,))
     assert store.mean_length == 1

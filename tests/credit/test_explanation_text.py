@@ -3,8 +3,11 @@
 import numpy as np
 import pytest
 
+from lare_rl.credit.decoder_settings import CreditSettings
+from lare_rl.credit.engine import credit_spec
 from lare_rl.credit.explanation import Explanation
 from lare_rl.credit.explanation_text import MESSAGES, explanation_findings, explanation_lines, raw_feature_names
+from lare_rl.credit.methods import METHODS
 from lare_rl.credit.score_type import ScoreType, ScoreTypeEstimate
 from lare_rl.util.findings import Finding, render
 
@@ -86,10 +89,13 @@ def test_shares_add_up():
 
 
 def test_score_type():
-    for score_type, this, other in ((ScoreType.SUM, "sum", "mean"), (ScoreType.MEAN, "mean", "sum")):
+    types = {ScoreType.SUM: Finding("sum"), ScoreType.MEAN: Finding("mean")}
+    for score_type, rival in ((ScoreType.SUM, ScoreType.MEAN), (ScoreType.MEAN, ScoreType.SUM)):
         for is_certain, code in ((True, "score_type_is_certain"), (False, "score_type_is_uncertain")):
-            finding = find({}, score_type=ScoreTypeEstimate(score_type, is_certain))[0]
-            assert finding == Finding(code, {"this": Finding(this), "other": Finding(other)})
+            finding = find({}, score_type=ScoreTypeEstimate(score_type, is_certain, rival))[0]
+            assert finding == Finding(code, {"this": types[score_type], "other": types[rival]})
+        finding = find({}, score_type=ScoreTypeEstimate(score_type, is_certain=True, rival=ScoreType.LOG_ODDS))[0]
+        assert finding == Finding("score_is_not_log_odds", {"this": types[score_type]})
 
 
 def test_factors_are_in_order_of_shares():
@@ -153,14 +159,39 @@ def test_messages_and_lines():
 
 def test_raw_feature_names():
     observation, action = "- 0: price\n[1] (none)\n2. angle (rad)\n", "0: torque"
-    assert raw_feature_names(observation, action, 4, 1, both=False) == [
+    assert raw_feature_names(observation, action, {"next_observation": 3, "action": 1}) == [
         "entry 0 of the observation (price)",
         "entry 1 of the observation",
         "entry 2 of the observation (angle (rad))",
         "entry 0 of the action (torque)",
     ]
-    assert raw_feature_names("0: price", "", 3, 1, both=True) == [
+    assert raw_feature_names("0: price", "", {"observation": 1, "next_observation": 1, "action": 1}) == [
         "entry 0 of the observation before the step (price)",
         "entry 0 of the observation after the step (price)",
         "entry 0 of the action",
     ]
+
+
+@pytest.mark.parametrize(
+    ("method", "single_agent", "expected"),
+    [
+        ("bayes", True, ["entry 0 of the observation (price)", "entry 0 of the action"]),
+        ("bayes-progress", True, ["entry 0 of the observation (price)", "entry 0 of the action"]),
+        ("rd", False, ["entry 0 of the observation (price)"]),
+        ("rd", True, []),
+    ],
+)
+def test_raw_feature_names_of_methods(method, single_agent, expected):
+    """Neither a history nor a difference of observations has names, and the action need not be an input."""
+    spec = credit_spec(
+        METHODS[method],
+        CreditSettings(),
+        {"factors": 0, "observation": 1, "action": 1},
+        scored_observation="after",
+        single_agent=single_agent,
+        agents=1,
+        max_steps=10,
+        fixed_length=False,
+        scale_rewards=False,
+    )
+    assert spec.raw_feature_names("0: price", "") == expected

@@ -51,7 +51,7 @@ def test_returns_are_predicted_before_a_fit_sees_them():
 def test_score_type(score, other, score_type):
     inputs, alive, returns = sample_episodes(score)
     estimated = assess_factors(inputs, alive, returns, BASIS)
-    assert estimated.score_type == ScoreTypeEstimate(score_type, is_certain=True)
+    assert estimated.score_type == ScoreTypeEstimate(score_type, is_certain=True, rival=ScoreType(1 - score_type))
     assert (estimated.length_r2 is None) == (score == "average")
     fixed = assess_factors(inputs, alive, returns, BASIS, score)
     assert (fixed.score_type, fixed.r2) == (None, estimated.r2)

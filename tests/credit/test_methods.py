@@ -38,6 +38,10 @@ def test_published_rows(name, inputs, fit):
 def test_encoder_with_unknown_names():
     with pytest.raises(LareError, match=r"observation, .*'observations'"):
         input_names.InputNames(("observations",))
+    with pytest.raises(LareError, match="history must be the last"):
+        input_names.InputNames(("history", "action"))
+    with pytest.raises(LareError, match="factors must be"):
+        input_names.InputNames(("observation",), ("factors",))
 
 
 @pytest.mark.parametrize(("name", "words"), [("lare_rrdu", "'lare_rrdu' .*'lare-rrdu'"), ("", "dense, episodic, ")])

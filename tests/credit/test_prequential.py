@@ -56,7 +56,7 @@ def test_gain_against_numpy():
     baseline = np.array([(returns[k] - returns[peers[k]].mean()) ** 2 for k in range(25)])
     error = (returns - predicted) ** 2
     want = 1 - error.sum() / baseline.sum()
-    std_error = np.sqrt(((baseline - error - want * baseline) ** 2).sum()) / baseline.sum()
+    std_error = np.sqrt(25 / 24 * ((baseline - error - want * baseline) ** 2).sum()) / baseline.sum()
     np.testing.assert_allclose(gain(predictions), (want, std_error), rtol=1e-4)
 
 

@@ -9,6 +9,7 @@ import pytest
 
 from helpers.decoder_toys import check_padding, make_decoder, train_by_loss
 from helpers.numpy_attention import numpy_attention, numpy_layer_norm, numpy_linear, numpy_mlp
+from lare_rl.assigner.assigner import CreditAssigner
 from lare_rl.config.validity import check_credit
 from lare_rl.credit import rbt
 from lare_rl.credit.decoder_settings import CreditSettings
@@ -100,9 +101,11 @@ def test_must_learn_rewards_and_next_states():
     assert np.corrcoef(next_state[..., 0].ravel(), x[0, ..., -1].ravel())[0, 1] > 0.9
 
 
-def test_long_payments_are_refused(decoder):
+def test_long_payments_are_refused():
+    credit, rows = CreditAssigner("rbt", observation_space=1, action_space=1), np.zeros((600, 1))
     with pytest.raises(LareError, match=r"at most 512 steps .* 600: use rudder"):
-        decoder.loss(jnp.zeros((1, 600, 8)), jnp.array([600]), jnp.ones(1), jnp.ones(1), jax.random.key(0))
+        credit.add_episode(rows, rows, rows, 1.0)
+    assert not credit.store.episodes
 
 
 @pytest.mark.parametrize(

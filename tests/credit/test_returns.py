@@ -11,6 +11,7 @@ from lare_rl.credit.decoder_settings import CreditSettings
 from lare_rl.credit.decomposition import CreditBatch
 from lare_rl.credit.methods import METHODS
 from lare_rl.credit.prequential import WINDOW, Predictions
+from lare_rl.credit.score_type import ScoreType, ScoreTypeEstimate
 from lare_rl.util.float64 import float64
 
 METHOD, SETTINGS, SCORE_TYPES = METHODS["rd-linear"], CreditSettings(), (0, 1)
@@ -85,3 +86,12 @@ def test_prefixes_are_summed_like_separate_cases():
     assert statistics.n_steps == 7
     np.testing.assert_allclose(statistics.mean, cases.mean(axis=0), rtol=1e-5, atol=1e-6)
     np.testing.assert_allclose(statistics.products, np.cov(cases.T, bias=True) * 7, rtol=1e-4, atol=1e-5)
+
+
+def test_the_rival_of_a_sum_may_be_the_log_odds():
+    won = jnp.arange(WINDOW) % 2 * 1.0
+    predicted = jnp.stack([0.9 * won, 0.1 * won], axis=1)
+    predictions = Predictions(jnp.float32(WINDOW), won, predicted, jnp.zeros(WINDOW, jnp.int32))
+    state = init(jax.random.key(0), 2, METHOD, SETTINGS, 4, 1, (ScoreType.SUM, ScoreType.LOG_ODDS))
+    estimate = returns.estimate_score_type(state._replace(score_type_predictions=predictions))
+    assert estimate == ScoreTypeEstimate(ScoreType.SUM, is_certain=True, rival=ScoreType.LOG_ODDS)

@@ -96,6 +96,8 @@ def test_segments_match_slow_twin(rule, data):
         last = np.concatenate([np.arange(len(unpaid)) == len(unpaid) - 1 for _, unpaid, _ in segments] or [[]])
         np.testing.assert_array_equal(steps.last[: len(last)], last)
         np.testing.assert_array_equal(steps.finished, np.arange(n_stored) < len(last))
+        length = np.concatenate([np.full(len(unpaid), len(paid_for)) for _, unpaid, paid_for in segments] or [[]])
+        np.testing.assert_array_equal(steps.length[: len(last)], length)
         payments = [payment for payment, _, _ in segments]
         np.testing.assert_allclose(steps.episodic_reward[steps.last], np.reshape(payments, (-1, 2)), rtol=1e-6)
         assert not steps.episodic_reward[~steps.last].any()

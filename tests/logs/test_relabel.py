@@ -70,6 +70,30 @@ def test_groups_share_an_intercept(parquet, tmp_path):
         assert abs(means[0] - means[1]) < 1.5  # without groups: about 10
 
 
+@pytest.mark.parametrize(("method", "is_binary"), [("bayes-progress", False), long_case("bayes", True)])
+def test_predicted_returns_have_the_part_that_no_step_is_paid_for(method, is_binary, tmp_path):
+    episodes = list(logged_episodes(80, max_length=8))
+    for episode in episodes:
+        score = 100 + episode.pop("rewards").sum()
+        episode["score"] = np.array(float(score > 104) if is_binary else score)
+    settings = CreditSettings(score="binary" if is_binary else "auto")
+    result = lare_rl.relabel(episodes, tmp_path / "new", method=method, settings=settings, hold_out=0.2)
+    assert result.return_r2 > 0.3
+
+
+def test_mean_scores_that_are_paid_several_times(task, tmp_path):
+    """Each payment is a mean over its own steps."""
+    episodes = list(logged_episodes(60))
+    for episode in episodes:
+        starts = np.arange(0, len(episode["rewards"]), 4)
+        lengths = np.diff(np.append(starts, len(episode["rewards"])))
+        payments = np.add.reduceat(episode["rewards"], starts) / lengths
+        episode["rewards"] = np.zeros_like(episode["rewards"])
+        episode["rewards"][starts + lengths - 1] = payments
+    task = task.model_copy(update={"payments": 4, "score": "average"})
+    assert lare_rl.relabel(episodes, tmp_path / "new", method="rd-linear", task=task, hold_out=0.2).return_r2 > 0.95
+
+
 def test_score_of_noise(tmp_path):
     result = lare_rl.relabel(list(logged_episodes(200, noise=True)), tmp_path / "new")
     assert result.return_r2 < 0.1

@@ -144,6 +144,13 @@ def test_bad_table(tmp_path, rows, message):
     assert list(tmp_path.iterdir()) == [path]
 
 
+@pytest.mark.parametrize("kind", [pa.large_string(), pa.dictionary(pa.int32(), pa.string())])
+def test_groups_are_texts_of_any_type(tmp_path, kind):
+    """polars writes large strings, pandas dictionaries."""
+    pq.write_table(ROWS.append_column("group", pa.array(["easy"] * N_ROWS, kind)), tmp_path / "log.parquet")
+    assert [episode.group for episode in open_log(tmp_path / "log.parquet").episodes()] == ["easy"]
+
+
 def truncate(path):
     path.write_bytes(path.read_bytes()[:-100])
 

@@ -204,3 +204,25 @@ def test_get_actor_has_the_epsilon_of_the_step(step, epsilon, learner):
     config = replace(CONFIG, hyperparameters=SMALL_SETTINGS["qmix"])
     actor = compile_functions(config).get_actor(learner[0], step)
     np.testing.assert_allclose(actor.epsilon, [epsilon] * len(SEEDS), rtol=1e-6)
+
+
+class KeyedEcho(Echo):
+    """Its state holds a random key."""
+
+    def reset(self, key):
+        state, timestep = super().reset(key)
+        return (state, key), timestep
+
+    def step(self, state, action, key):
+        echo, timestep = super().step(state[0], action, key)
+        return (echo, jax.random.split(state[1])[0]), timestep
+
+
+def test_states_with_random_keys_are_restored(learner):
+    collectors = [DeviceCollector(KeyedEcho(), CONFIG, SEEDS) for _ in range(2)]
+    collectors[0].collect(learner[1], 0)
+    collectors[1].restore(collectors[0].state_dict())
+    for name, array in collectors[0].state_dict().items():
+        np.testing.assert_array_equal(collectors[1].state_dict()[name], array)
+    actions = [collector.collect(learner[1], ENVS * TIME).action for collector in collectors]
+    np.testing.assert_array_equal(*actions)

@@ -26,7 +26,7 @@ from helpers.small_configs import (
 )
 from lare_rl.credit import closed_form, decomposition, returns
 from lare_rl.credit.decoder_settings import CreditSettings
-from lare_rl.credit.score_type import ScoreTypeEstimate
+from lare_rl.credit.score_type import ScoreType, ScoreTypeEstimate
 from lare_rl.data import replay
 from lare_rl.tasks.payments import PAID_AT_END, PaymentRule
 from lare_rl.training import episodes
@@ -207,7 +207,8 @@ def test_learn_returns_finds_the_score_type(method, score):
     steps, factors, _, _ = scored_episodes(config, score)
     *_, last = learn_in_chunks(config, steps, factors, 6)
     assert bool(last.decoders[0].is_mean) == (score == "average")
-    assert returns.estimate_score_type(last.decoders[0]) == ScoreTypeEstimate(score == "average", is_certain=True)
+    types = (ScoreType.SUM, ScoreType.MEAN) if score == "sum" else (ScoreType.MEAN, ScoreType.SUM)
+    assert returns.estimate_score_type(last.decoders[0]) == ScoreTypeEstimate(types[0], is_certain=True, rival=types[1])
     fixed = small_config(method, credit=CreditSettings(score=score))
     for untrained in (config, fixed):
         assert returns.estimate_score_type(untrained_learner(untrained).decoders[0]) is None

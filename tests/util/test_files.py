@@ -3,11 +3,12 @@
 from contextlib import nullcontext
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from lare_rl.errors import LareError
 from lare_rl.util import files
-from lare_rl.util.files import write_atomically
+from lare_rl.util.files import write_arrays, write_atomically
 
 
 @pytest.mark.parametrize(
@@ -58,3 +59,12 @@ def test_file_that_another_process_reads(n_refused, tmp_path, monkeypatch):
     assert path.read_bytes() == (b"old" if n_refused == 100 else b"new")
     assert len(calls) == min(n_refused + 1, 4)
     assert list(tmp_path.iterdir()) == [path]
+
+
+def test_arrays_may_have_any_name(tmp_path):
+    arrays = {"file": np.arange(3), "allow_pickle": np.ones(2), ".a[0]": np.zeros((0, 2), np.float32)}
+    write_arrays(tmp_path / "state.npz", arrays)
+    with np.load(tmp_path / "state.npz", allow_pickle=False) as saved:
+        assert saved.files == list(arrays)
+        for name, array in arrays.items():
+            np.testing.assert_array_equal(saved[name], array)

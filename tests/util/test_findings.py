@@ -41,6 +41,9 @@ def test_render_incomplete():
         (0.99, "r2", "0.99"),
         (0.0123, "error", "0.01"),
         (0.0001, "error", "less than 0.001"),
+        (float("nan"), "error", "nan"),
+        (2, "count reply", "2 replies"),
+        (2, "count day", "2 days"),
         (0.5, ".0%", "50%"),
     ],
 )

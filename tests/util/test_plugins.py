@@ -79,3 +79,8 @@ def test_command_with_a_broken_plugin_prints_one_line(tmp_path):
     assert process.returncode == 2
     assert process.stderr.count("\n") == 1
     assert "'no_such_plugin'" in process.stderr
+
+
+def test_plural_of_a_registry():
+    with pytest.raises(LareError, match="the families of environments are"):
+        Registry[int]("family of environments", "families of environments").find("two")

@@ -29,6 +29,7 @@ def test_grouped_standard_error_is_the_larger():
 def test_correlation():
     x = np.arange(4.0)
     assert correlation(x, -3 * x + 1) == pytest.approx(-1)
+    assert np.isnan(correlation(x[:1], x[:1]))
     columns = np.stack([x, np.ones(4), x**2], axis=1)
     np.testing.assert_allclose(column_correlations(columns, x), [1, np.nan, np.corrcoef(x, x**2)[0, 1]])
 
@@ -47,6 +48,7 @@ def test_r_squared():
     ("mean", "std", "text"),
     [
         (4576.2, 349.1, "4576 ± 349"),
+        (71.0, 1.4, "71.00 ± 1.40"),
         (0.4505, 0.115, "0.451 ± 0.115"),
         (0.0002, 0.00021, "0.000200 ± 0.000210"),
         (0.5, 0.0, "0.5000 ± 0.000"),

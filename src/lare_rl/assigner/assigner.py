@@ -26,6 +26,7 @@ from lare_rl.assigner.assigner_config import (
     check_finite,
     resolve_config,
     to_flags,
+    to_lengths,
     to_step_ids,
 )
 from lare_rl.assigner.decoder_learner import DecoderLearner
@@ -33,6 +34,7 @@ from lare_rl.assigner.saving import AssignerState
 from lare_rl.assigner.step_rewards import StepRewards
 from lare_rl.assigner.store import Store
 from lare_rl.credit.decoder_settings import CreditSettings
+from lare_rl.credit.decoders import DECODERS
 from lare_rl.credit.explanation_text import explanation_lines
 from lare_rl.credit.methods import Reward
 from lare_rl.credit.returns import estimate_score_type
@@ -80,7 +82,7 @@ class CreditAssigner:
                 "both".
             agents: the number of agents of a team, which shares its return. With several, all arrays have an axis of agents after
                 the axis of steps.
-            max_steps: the length of the longest episode; needed for many agents.
+            max_steps: the length of the longest episode; needed for many agents, if the decoder is fitted by gradient descent.
             capacity: the number of steps that are stored: at least as many as your replay buffer stores.
             settings: the settings of the decoder.
             seed: the random seed of the decoder's weights and of its batches.
@@ -119,7 +121,10 @@ class CreditAssigner:
         check_config(config)
         self.config = config
         row_shape = (*config.agent_axis, config.spec.basis.n_inputs)
-        self.store = Store(config.capacity, row_shape, config.agents, config.payments, has_levels=config.groups)
+        longest = DECODERS[config.method.decoder].longest_segment
+        self.store = Store(
+            config.capacity, row_shape, config.agents, config.payments, has_levels=config.groups, longest=longest
+        )
         self.group_names: dict[Hashable, int] = {}
         """The number of each group."""
         self.learner = DecoderLearner(config, self.store)
@@ -181,9 +186,9 @@ class CreditAssigner:
             check_finite(rows, steps, team_reward)
             step_ids = np.full(n_rows, -1)
             if len(rows):
+                level = self.config.to_levels(group, n_rows, self.group_names, rows)
                 step_ids[rows] = self.learner.add_steps(*steps, None if alive is None else alive[rows])
                 env_ids = [ids[row] for row in rows.tolist()]
-                level = self.config.to_levels(group, n_rows, self.group_names)[rows]
                 paid_episodes = self.store.extend(env_ids, step_ids[rows], steps, team_reward, ended, level)
                 self.learner.queue_episodes(paid_episodes)
                 self.learner.flush_large_queues()
@@ -216,11 +221,11 @@ class CreditAssigner:
             score = float(reward) if is_score else float(rewards.sum())
             if not np.isfinite(score):
                 raise LareError(f"the score is {score}: give a finite number")
+            (level,) = self.config.to_levels(None if group is None else [group], 1, self.group_names).tolist()
             step_ids = self.learner.add_steps(*steps, alive)
             if is_score:
                 rewards[-1] = score
             rule = PAID_AT_END if is_score else self.config.payments
-            (level,) = self.config.to_levels(None if group is None else [group], 1, self.group_names).tolist()
             self.learner.queue_episodes(self.store.add_paid_episode(step_ids, rewards, rule, level))
             self.learner.flush_large_queues()
             return step_ids
@@ -296,16 +301,15 @@ class CreditAssigner:
                 if begins is None:
                     raise LareError(f"{method.name} reads the history of an episode: give begins, or call rewards_at")
                 inputs = self.config.add_history(inputs, to_flags(begins, "begins", len(inputs)))
-            length = np.full(len(inputs), self.store.mean_length) if length is None else np.asarray(length, np.int32)
-            if length.shape != (len(inputs),):
-                raise LareError(f"length has the shape {length.shape}: give one number for each of {len(inputs)} steps")
+            length = to_lengths([self.store.mean_length] * len(inputs) if length is None else length, len(inputs))
             return self.step_rewards.rewards(inputs, length)
 
     def metrics(self) -> dict[str, float]:
         """Return metrics of the decoder, which need no true rewards.
 
-        `credit/return_r2` is R^2 of the last 32 returns, each predicted before it was learned from: NaN while they are fewer than
-        8, or all the same. `credit/loss` is the mean loss of the last gradient updates.
+        `credit/return_r2` is R^2 of the last 32 returns, or of the last 256 if there are several in an episode or if `score` is
+        `binary`. Each was predicted before it was learned from. It is NaN while they are fewer than 8, or all the same.
+        `credit/loss` is the mean loss of the last gradient updates.
         """
         with self.lock:
             return self.learner.metrics()
@@ -322,16 +326,18 @@ class CreditAssigner:
                 return []
             assert self.learner.decoder is not None
             factor_names = [] if config.phi is None else config.phi.factor_columns(config.scored_observation)
-            raw_names = config.raw_feature_names(len(explanation.residual_correlation))
-            return explanation_lines(explanation, estimate_score_type(self.learner.decoder), factor_names, raw_names)
+            score_type = estimate_score_type(self.learner.decoder)
+            return explanation_lines(explanation, score_type, factor_names, config.raw_feature_names)
 
     @property
     def score_type(self) -> str:
         """How the score is modelled: as the `sum` or the `average` over an episode's steps, or by the `log odds` that they add."""
-        decoder = self.learner.decoder
-        if decoder is None or not (decoder.is_mean | decoder.is_log_odds):
-            return "sum"
-        return "average" if bool(decoder.is_mean) else "log odds"
+        with self.lock:
+            self.learner.learn_if_due()
+            decoder = self.learner.decoder
+            if decoder is None or not (decoder.is_mean | decoder.is_log_odds):
+                return "sum"
+            return "average" if bool(decoder.is_mean) else "log odds"
 
     form = score_type  # the earlier name
 

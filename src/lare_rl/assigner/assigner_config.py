@@ -1,27 +1,27 @@
 """The fixed configuration of a `CreditAssigner`: method, function, spaces and settings; and the decoder's inputs of steps."""
 
 from collections.abc import Hashable, Mapping, Sequence
-from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import gymnasium
 import numpy as np
 from jaxtyping import Bool, Float, Int
+from pydantic import Field, InstanceOf
 
 from lare_rl.assigner.space_layout import SpaceLayout, make_layout
-from lare_rl.config.validity import check_credit
+from lare_rl.config.validity import check_credit, check_factors
 from lare_rl.credit.decoder_settings import CreditSettings, default_credit
 from lare_rl.credit.engine import CreditSpec, credit_spec
-from lare_rl.credit.explanation_text import raw_feature_names
 from lare_rl.credit.history import next_history_columns
 from lare_rl.credit.input_names import input_arrays
 from lare_rl.credit.methods import Method, find_method
 from lare_rl.credit.score_type import prediction_window
 from lare_rl.envs.families import find_score, load_env_spec
+from lare_rl.envs.interface import alive_mean
 from lare_rl.envs.load import resolve_task
-from lare_rl.errors import LareError, short_repr
+from lare_rl.errors import CheckedModel, LareError, short_repr
 from lare_rl.latent.function import LatentFunction, check_task
 from lare_rl.tasks.payments import PAID_AT_END, PaymentRule
 from lare_rl.tasks.spec import MAX_LEVELS, ScoredObservation, TaskSpec
@@ -33,6 +33,7 @@ __all__ = [
     "check_finite",
     "resolve_config",
     "to_flags",
+    "to_lengths",
     "to_step_ids",
 ]
 
@@ -40,22 +41,21 @@ Space = gymnasium.Space | SpaceLayout | int
 """A space of Gymnasium, a layout, or the length of a row of numbers."""
 
 
-@dataclass(frozen=True, kw_only=True)
-class AssignerConfig:
+class AssignerConfig(CheckedModel):
     """The configuration of an assigner."""
 
-    method: Method
-    phi: LatentFunction | None
+    method: InstanceOf[Method]
+    phi: InstanceOf[LatentFunction] | None
     task: TaskSpec | None
     observation: SpaceLayout
     action: SpaceLayout
     scored_observation: ScoredObservation
-    agents: int
-    max_steps: int | None
-    capacity: int
+    agents: Annotated[int, Field(ge=1)]
+    max_steps: Annotated[int, Field(ge=1)] | None
+    capacity: Annotated[int, Field(ge=1)]
     settings: CreditSettings
-    seed: int
-    fits_per_step: float
+    seed: Annotated[int, Field(ge=0)]
+    fits_per_step: Annotated[float, Field(ge=0, allow_inf_nan=False)]
     scale_rewards: bool
     forget: bool
     payments: PaymentRule = PAID_AT_END
@@ -98,13 +98,11 @@ class AssignerConfig:
         """Whether the proxy rewards of an episode are corrected to add up to its return."""
         return self.method.is_exact(self.settings.exact)
 
-    def raw_feature_names(self, n_features: int) -> list[str]:
-        """Return names of the raw features; none if they are not entries of observations and the action."""
-        inputs = tuple(name for name in self.spec.inputs if name != "factors")
-        if "observation_change" in inputs or inputs[-1:] != ("action",):
-            return []
+    @property
+    def raw_feature_names(self) -> list[str]:
+        """Names of the raw features; none if they are not entries of observations and the action."""
         texts = ("", "") if self.task is None else (self.task.observation, self.task.action)
-        return raw_feature_names(*texts, n_features, self.action.size, both=len(inputs) > 2)
+        return self.spec.raw_feature_names(*texts)
 
     def compute_inputs(
         self, observation: np.ndarray, action: np.ndarray, next_observation: np.ndarray
@@ -150,19 +148,28 @@ class AssignerConfig:
         return rows["observation"], rows["action"], rows["next_observation"]
 
     def to_levels(
-        self, group: Sequence[Hashable] | None, n_rows: int, group_names: dict[Hashable, int]
+        self,
+        group: Sequence[Hashable] | None,
+        n_rows: int,
+        group_names: dict[Hashable, int],
+        rows: Int[np.ndarray, " n"] | None = None,
     ) -> Int[np.ndarray, " n"]:
-        """Return the number of each row's group, and add new groups to `group_names`.
+        """Return the number of the group of some rows (by default of all), and add new groups to `group_names`.
 
         Raises `LareError` if there are too many groups, or if they do not fit.
         """
         if (group is not None) != self.groups:
-            needs = "needs group" if self.groups else "has no groups: leave group out, or set groups=True"
-            raise LareError(f"this assigner {needs}")
+            needs, has_none = (
+                "needs group: give group=, one for each row",
+                "has no groups: leave group out, or set groups=True",
+            )
+            raise LareError(f"this assigner {needs if self.groups else has_none}")
+        rows = np.arange(n_rows) if rows is None else rows
         if group is None:
-            return np.zeros(n_rows, np.int32)
+            return np.zeros(len(rows), np.int32)
         if len(group) != n_rows:
             raise LareError(f"group has {len(group)} entries, but there are {n_rows} steps")
+        group = [group[row] for row in rows.tolist()]
         new = [name for name in dict.fromkeys(group) if name not in group_names]
         if len(group_names) + len(new) > MAX_LEVELS:
             raise LareError(f"there are more than {MAX_LEVELS} groups, of which {new[-1]!r} is one: merge some of them")
@@ -178,8 +185,7 @@ class AssignerConfig:
         if mask is not None and (mask.shape != (n_steps, self.agents) or self.agents == 1):
             raise LareError(f"alive has the shape {mask.shape}: give it ({n_steps}, agents), of more than one agent")
         if self.agents > 1 and reward.shape == (n_steps, self.agents):
-            weight = np.ones_like(reward) if mask is None else mask
-            return (reward * weight).sum(axis=1) / np.maximum(weight.sum(axis=1), 1), mask
+            return alive_mean(reward, np.ones(reward.shape, bool) if mask is None else mask), mask
         if reward.shape != (n_steps,):
             raise LareError(f"reward has the shape {reward.shape}: give one number for each of {n_steps} steps")
         return reward, mask
@@ -204,7 +210,9 @@ def resolve_config(
         LareError: there is no such method or task, or the spaces are not those of the task.
     """
     task, chosen = None if task is None else resolve_task(task, playable=False), find_method(method)
-    settings = settings or default_credit(agents)
+    if phi is not None and not isinstance(phi, LatentFunction):
+        raise LareError(f"phi is {short_repr(phi)}: give a function from lare_rl.design or lare_rl.load_function")
+    settings = default_credit(agents) if settings is None else CreditSettings.model_validate(settings)
     if settings.score == "auto" and task is not None and (score := find_score(task)) is not None:
         settings = settings.model_copy(update={"score": score})
     observation, action = _resolve_layouts(task, spaces)
@@ -245,12 +253,9 @@ def _resolve_layouts(task: TaskSpec | None, spaces: Mapping[str, Space | None]) 
 def check_config(config: AssignerConfig) -> None:
     """Raise `LareError` if method, function and sizes do not go together."""
     method, phi, name = config.method, config.phi, config.method.name
-    if not isinstance(config.capacity, int) or config.capacity < 1:
-        raise LareError(f"capacity = {short_repr(config.capacity)}: give a whole number, 1 or more")
+
     if not method.has_proxy_rewards:
         raise LareError(f"{name} assigns no credit: train on what the environment pays")
-    if phi is not None and not isinstance(phi, LatentFunction):
-        raise LareError(f"phi is {short_repr(phi)}: give a function from lare_rl.design or lare_rl.load_function")
     if method.needs_phi and phi is None:
         raise LareError(f"{name} needs a phi; bayes, rd and rrdu need none")
     if phi is not None and not method.needs_phi:
@@ -271,8 +276,10 @@ def check_config(config: AssignerConfig) -> None:
         payments=config.payments,
         max_steps=config.max_steps,
     )
-    if config.agents > 1 and config.max_steps is None:
-        raise LareError("many agents need max_steps, the number of steps of the longest episode")
+    if phi is not None:
+        check_factors(method, phi.n_factors(config.scored_observation))
+    if config.agents > 1 and config.max_steps is None and method.uses_gradient:
+        raise LareError(f"{name} of many agents needs max_steps, the number of steps of the longest episode")
 
 
 def to_flags(values: Any, name: str, n_rows: int) -> Bool[np.ndarray, " steps"]:
@@ -281,6 +288,17 @@ def to_flags(values: Any, name: str, n_rows: int) -> Bool[np.ndarray, " steps"]:
     if flags.shape != (n_rows,):
         raise LareError(f"{name} has the shape {flags.shape}: give one flag for each of {n_rows} steps")
     return flags
+
+
+def to_lengths(values: Any, n_rows: int) -> Int[np.ndarray, " steps"]:
+    """Return the length of each row's episode. Raises `LareError` if there are more or fewer, or for one that is no length."""
+    lengths = np.asarray(values, np.float64)
+    if lengths.shape != (n_rows,):
+        raise LareError(f"length has the shape {lengths.shape}: give one number for each of {n_rows} steps")
+    wrong = np.flatnonzero(~((lengths >= 1) & (lengths < 2**31)) | (lengths != np.floor(lengths)))
+    if len(wrong):
+        raise LareError(f"length of row {wrong[0]} is {lengths[wrong[0]]:g}: give the number of steps of its episode")
+    return lengths.astype(np.int32)
 
 
 def to_step_ids(steps: Any) -> Int[np.ndarray, "*shape"]:

@@ -176,8 +176,8 @@ class DecoderLearner:
     def learn_returns(self) -> None:
         """Let the decoder learn from pending episodes.
 
-        A late call makes no difference to a decoder in closed form: it is fitted after the same episodes as with prompt calls, so
-        every return is predicted before the decoder is fitted to it.
+        If they are many, a decoder in closed form is fitted several times, so that every return is predicted before the decoder is
+        fitted to it. After a late call, these may be other fits than after prompt ones.
         """
         self.flush_inputs()
         self.flush_statistics()
@@ -278,7 +278,7 @@ class DecoderLearner:
         if self.decoder is None or not self.store.episodes:
             return None
         # Shares are of factors and raw features alone.
-        basis = replace(self.config.spec.basis, extended=True, n_tracked=0, n_levels=0)
+        basis = replace(self.config.spec.basis, extended=True, n_tracked=0, n_levels=0, prefixes=False)
         if not basis.n_features:
             return None
         with on_cpu(), float64():

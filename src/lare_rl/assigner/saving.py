@@ -175,6 +175,7 @@ def _store_arrays(store: Store) -> dict[str, np.ndarray]:
         **{name: getattr(store, field)[rows] for name, field in STORE_ARRAYS.items()},
         **({} if store.alive is None else {"alive": store.alive[rows]}),
         "steps": np.array(store.steps),
+        "numbers": np.array(list(store.episodes), np.int64),
         "episodes": np.concatenate([np.zeros(0, np.int64), *(episode.steps for episode in episodes)]),
         "lengths": np.array([len(episode.steps) for episode in episodes], np.int64),
         "scores": np.array([episode.score for episode in episodes], np.float64),
@@ -192,8 +193,11 @@ def _restore_store(store: Store, arrays: dict[str, np.ndarray]) -> None:
         store.alive = np.ones((store.capacity, store.agents), bool)
         store.alive[rows] = arrays["alive"]
     ends = np.cumsum(arrays["lengths"])
-    first = store.ended - len(ends)
+    # Earlier versions saved neither levels nor numbers.
     levels = arrays.get("levels", np.zeros(len(ends), np.int64)).tolist()
-    for i, (end, length, score) in enumerate(zip(ends, arrays["lengths"], arrays["scores"], strict=True)):
+    numbers = arrays.get("numbers", store.ended - len(ends) + np.arange(len(ends))).tolist()
+    for end, length, score, level, number in zip(
+        ends, arrays["lengths"], arrays["scores"], levels, numbers, strict=True
+    ):
         steps = arrays["episodes"][end - length : end]
-        store.restore_episode(first + i, StoredEpisode(steps, float(score), levels[i]))
+        store.restore_episode(number, StoredEpisode(steps, float(score), level))

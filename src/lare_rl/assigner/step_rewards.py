@@ -113,10 +113,16 @@ class StepRewards:
         residuals.update(zip(new, np.subtract(scores, predicted).tolist(), strict=True))
         return np.array([residuals[number] for number in numbers], np.float32)
 
-    def level_return(self, level: int, length: int) -> float:
-        """Return the part of the return of an episode that its group explains."""
+    def unpaid_return(self, level: int | None, length: Int[np.ndarray, " payments"]) -> float:
+        """Return the part of the return of an episode that no step is paid for.
+
+        `level` is None for an unknown group. `length` is the number of steps of each payment.
+        """
         decoder = self.learner.decoder
-        if decoder is None or not self.config.n_levels or not self.learner.is_fitted:
+        if decoder is None or not self.learner.is_fitted:
             return 0.0
+        size = padded_size(len(length))
         with on_cpu():
-            return float(decomposition.level_returns(decoder, jnp.array([level]), jnp.array([length]))[0])
+            levels = None if level is None else jnp.full(size, level)
+            values = decomposition.level_returns(decoder, levels, jnp.asarray(pad(length, size)))
+        return float(np.sum(np.asarray(values)[: len(length)]))

@@ -63,9 +63,15 @@ class Store:
         payments: PaymentRule = PAID_AT_END,
         *,
         has_levels: bool = False,
+        longest: int | None = None,
     ):
-        """Make an empty store. `row_shape` is the shape of a step's inputs: (inputs,), or (agents, inputs)."""
+        """Make an empty store.
+
+        `row_shape` is the shape of a step's inputs: (inputs,), or (agents, inputs). `longest` is the largest number of steps that the
+        decoder reads of an episode; None if any.
+        """
         self.capacity, self.agents, self.payments, self.has_levels = capacity, agents, payments, has_levels
+        self.longest = longest
         self.inputs = np.zeros((capacity, *row_shape), np.float32)
         """The decoder's inputs for each step: [capacity *agents inputs]."""
         self.alive: Bool[np.ndarray, "capacity agents"] | None = None
@@ -92,6 +98,12 @@ class Store:
         """The running episodes by environment. The environment whose last step is the oldest comes first."""
         self.dropped = 0
         """Episodes that were abandoned."""
+
+    @property
+    def bytes_per_step(self) -> int:
+        """The memory of a step, without the flags of agents."""
+        arrays = self.inputs, self.length, self.mean_reward, self.episode, self.previous
+        return sum(array.nbytes for array in arrays) // self.capacity
 
     def add(self, n_steps: int, alive: Bool[np.ndarray, "n_steps agents"] | None = None) -> Int[np.ndarray, " n_steps"]:
         """Return numbers for new steps. Episodes whose steps are all too old to be stored are removed.
@@ -127,18 +139,27 @@ class Store:
     ) -> Iterator[StoredEpisode]:
         """Add new steps to the running episodes of their environments. Yield each episode that is paid.
 
-        `step_ids` are from `add`. `steps` are observations, actions and next observations. Raises `LareError` like `end`.
+        `step_ids` are from `add`. `steps` are observations, actions and next observations. Raises `LareError` like `end`, once all
+        steps are added.
         """
         observation, _, next_observation = steps
+        error = None
         for i, env_id in enumerate(env_ids):
             episode = self.get_running(env_id, observation[i])
             episode.level = 0 if level is None else int(level[i])
             episode.last_observation = next_observation[i]
-            payment = self._add_step(episode, int(step_ids[i]), float(reward[i]), self.payments, bool(ended[i]))
+            payment = None
+            try:
+                payment = self._add_step(episode, int(step_ids[i]), float(reward[i]), self.payments, bool(ended[i]))
+            except LareError as refusal:
+                error = refusal
+                self.dropped += 1
             if ended[i]:
                 del self.running[env_id]
             if payment is not None:
                 yield payment
+        if error is not None:
+            raise error
 
     def _add_step(
         self, episode: RunningEpisode, step_id: int, reward: float, payments: PaymentRule, ended: bool
@@ -188,6 +209,10 @@ class Store:
         `since_last` are the steps since the last payment, which need not be the steps that this one is for.
         """
         steps = episode.steps
+        if self.longest is not None and len(steps) > self.longest:
+            raise LareError(
+                f"the decoder reads at most {self.longest} steps for one payment, and this one is for {len(steps)}: use rudder, or payments"
+            )
         if self.steps - steps[0] > self.capacity:
             raise LareError(
                 f"an episode of {len(steps)} steps has ended, and its first steps are not stored any more: "

@@ -4,6 +4,7 @@ These are the rules of `lare_rl.train`, of `CreditAssigner` and of `pure_credit`
 """
 
 from lare_rl.credit.basis import MAX_RAW_FEATURES
+from lare_rl.credit.closed_form import MAX_SIGNED_FACTORS
 from lare_rl.credit.decoder_settings import CreditSettings
 from lare_rl.credit.decoders import DECODERS
 from lare_rl.credit.methods import Fit, Method, Reward
@@ -11,7 +12,7 @@ from lare_rl.errors import LareError
 from lare_rl.tasks.payments import PAID_AT_END, PaymentRule
 from lare_rl.tasks.spec import ScoredObservation
 
-__all__ = ["check_credit"]
+__all__ = ["check_credit", "check_factors"]
 
 
 def check_credit(
@@ -100,3 +101,16 @@ def check_credit(
         )
     if method.decoder in ("diaster", "rudder", "rbt") and not credit.hidden:
         raise LareError(f"{name} needs a hidden layer: the decoder has hidden = ()")
+
+
+def check_factors(method: Method, n_factors: int) -> None:
+    """Raise `LareError` if a method cannot use a function with this number of factors."""
+    if method.reward is Reward.DESIGNED and n_factors != 1:
+        raise LareError(
+            f"{method.name} needs a function with one array, the reward, and this one has {n_factors}: "
+            "lare-rl design TASK --kind reward writes one"
+        )
+    if method.fit is Fit.SIGNS and n_factors > MAX_SIGNED_FACTORS:
+        raise LareError(
+            f"{method.name} tries all signs of at most {MAX_SIGNED_FACTORS} factors, and there are {n_factors}"
+        )

@@ -87,14 +87,14 @@ class LinearDecoder(eqx.Module):
         size, n_tracked = self.basis.n_standardised, self.basis.n_tracked
         varies = self.std > 0
         std = jnp.where(varies, self.std, 1)
-        features = expand(self.basis, jnp.where(varies, (rows[..., :size] - self.mean) / std, 0))
+        u = jnp.where(varies, (rows[..., :size] - self.mean) / std, 0)
+        features = expand(self.basis, u)
         if not n_tracked:
             return features
-        tracked, varies = slice(n_tracked), varies[:n_tracked]
+        tracked = slice(n_tracked)
         history = rows[..., size:].reshape(*rows.shape[:-1], 3, n_tracked)
-        history = jnp.where(varies, (history - self.mean[tracked]) / std[tracked], 0)
-        u = jnp.where(varies, (rows[..., tracked] - self.mean[tracked]) / std[tracked], 0)
-        return jnp.concatenate([features, expand_history(self.basis, u, history)], axis=-1)
+        history = jnp.where(varies[tracked], (history - self.mean[tracked]) / std[tracked], 0)
+        return jnp.concatenate([features, expand_history(self.basis, u[..., tracked], history)], axis=-1)
 
 
 class ClosedForm(NamedTuple):

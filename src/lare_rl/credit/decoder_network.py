@@ -51,7 +51,10 @@ class DecoderShape(NamedTuple):
     def sizes(self, *names: str) -> list[int]:
         """Return the sizes of the inputs. Raises `LareError` if their names, in order, are not `names`."""
         if tuple(name for name, _ in self.inputs) != names:
-            raise LareError(f"this decoder reads the inputs {', '.join(names)}, and its method has {dict(self.inputs)}")
+            raise LareError(
+                f"this decoder reads the inputs {', '.join(names)}, and its method has {dict(self.inputs)}: register the method with "
+                f"inputs=InputNames({names!r})"
+            )
         return [size for _, size in self.inputs]
 
     @property

@@ -65,16 +65,13 @@ __all__ = [
     "optimistic_rewards",
     "reward_unit",
     "score_type_index",
+    "step_rows",
     "valid_rows",
 ]
 
 
 class CreditBatch(NamedTuple):
-    """Steps of some episodes, and the returns of these episodes.
-
-    If K steps are sampled from each episode, rows = episodes * K, in order, with padding where an episode has fewer steps. For
-    `Fit.DECODER_LOSS`, rows = episodes * (steps of the longest possible episode).
-    """
+    """Steps of some episodes, and the returns of these episodes. The rows are laid out as in `data/layouts.py`."""
 
     inputs: Float[Array, "rows *agents inputs"]
     episode_index: Int[Array, " rows"]
@@ -90,21 +87,25 @@ class CreditBatch(NamedTuple):
     """The level of each episode. None if levels make no difference."""
 
 
+def step_rows(episodes: CreditBatch) -> Bool[Array, " rows"]:
+    """Return which rows are steps of an episode of the batch, and no padding."""
+    n_episodes = len(episodes.length)
+    in_batch = episodes.mask[jnp.minimum(episodes.episode_index, n_episodes - 1)] > 0
+    return (episodes.episode_index < n_episodes) & in_batch
+
+
 def valid_rows(episodes: CreditBatch) -> Bool[Array, "rows *agents"]:
     """Return which rows are steps of an episode of the batch, by agents that acted."""
-    shape, n_episodes = episodes.inputs.shape[:-1], len(episodes.length)
-    is_step = (episodes.episode_index < n_episodes) & (
-        episodes.mask[jnp.minimum(episodes.episode_index, n_episodes - 1)] > 0
-    )
+    shape = episodes.inputs.shape[:-1]
     acted = jnp.ones(shape, bool) if episodes.alive is None else episodes.alive
-    return is_step.reshape(-1, *[1] * (len(shape) - 1)) & acted
+    return step_rows(episodes).reshape(-1, *[1] * (len(shape) - 1)) & acted
 
 
 class DecoderState(NamedTuple):
     """The state of return decomposition."""
 
     network: DecoderNetwork
-    """What the decoder consists of: f_psi."""
+    """f_psi."""
     optimizer: optax.OptState
     """Empty for a decoder that is fitted in closed form."""
     statistics: RunningMeanStd

@@ -18,8 +18,10 @@ from lare_rl.credit.decomposition import (
     level_returns,
     normalise_inputs,
     reward_unit,
+    step_rows,
 )
 from lare_rl.credit.methods import Fit
+from lare_rl.nn.masks import masked_mean
 from lare_rl.nn.networks import adam_step
 
 __all__ = ["loss_and_gradient", "update", "update_in_chunks"]
@@ -100,8 +102,7 @@ def _mean_loss(
         loss = losses.unbiased_squared_error(mean, target, weight, variance)
     else:
         loss = losses.squared_error(mean, target, weight)
-    valid = (episodes.episode_index >= 0) & (episodes.episode_index < n_episodes)
-    penalty = jnp.sum(jnp.where(valid, penalty, 0)) / jnp.maximum(jnp.sum(valid), 1)
+    penalty = masked_mean(penalty, step_rows(episodes))
     return loss + penalty * losses.batch_mean(weight, weight)
 
 

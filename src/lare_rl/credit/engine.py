@@ -17,7 +17,7 @@ Batches have an axis of agents, of length 1 for a single agent. For credit to wh
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
@@ -28,6 +28,7 @@ from lare_rl.credit.closed_form import ClosedForm
 from lare_rl.credit.decoder_settings import CreditSettings
 from lare_rl.credit.decomposition import CreditBatch, DecoderState
 from lare_rl.credit.explanation import Explanation, StepStatistics, add_steps, empty_step_statistics, explain
+from lare_rl.credit.explanation_text import raw_feature_names
 from lare_rl.credit.input_names import input_size, input_sizes, tracked_size
 from lare_rl.credit.methods import Fit, Method, Reward
 from lare_rl.credit.prequential import WINDOW
@@ -44,6 +45,7 @@ __all__ = [
     "RewardSource",
     "StepBatch",
     "add_to_explanation",
+    "correction",
     "credit_spec",
     "explain_returns",
     "init_decoder",
@@ -93,6 +95,14 @@ class CreditSpec:
             n_levels=n_levels,
             prefixes=self.method.fit is Fit.PREFIX_EVIDENCE,
         )
+
+    def raw_feature_names(self, observation: str, action: str) -> list[str]:
+        """Return names of the raw features, from a task's texts; none if they are not entries of observations and actions."""
+        if not self.basis.n_raw_used or "observation_change" in self.inputs:
+            return []
+        sizes = dict(input_sizes(self.inputs, dict(self.sizes)))
+        raw = {name: size for name, size in sizes.items() if name not in ("factors", "history")}
+        return raw_feature_names(observation, action, raw)
 
 
 def credit_spec(
@@ -225,19 +235,18 @@ def training_rewards(
     """Return the rewards that an algorithm is trained on, for each agent of the team. `alive` says which agents acted."""
     r_hat = jnp.broadcast_to(proxy_rewards(source, steps, spec, optimistic=True), alive.shape)
     if steps.residual is not None:
-        r_hat = r_hat + _correction(steps, spec.settings.exact)[..., None]
+        r_hat = r_hat + correction(steps.residual, steps.last, steps.length, spec.settings.exact)[..., None]
     if spec.method.shared:
         r_hat = jnp.broadcast_to(alive_mean(r_hat, alive)[..., None], alive.shape)
     return scale_and_mask(r_hat, return_scale(source), alive, scale_rewards=spec.scale_rewards)
 
 
-def _correction(steps: StepBatch, exact: str) -> Float[Array, "*batch"]:
-    """Return what is added to each step's proxy reward, so that those of an episode add up to its return."""
-    assert steps.residual is not None
-    assert steps.last is not None
-    if exact == "spread":
-        return steps.residual / steps.length
-    return jnp.where(steps.last, steps.residual, 0)
+def correction(residual: Any, last: Any, length: Any, exact: str) -> Any:
+    """Return what is added to each step's proxy reward, so that those of an episode add up to its return.
+
+    The arguments are those of `StepBatch`, as arrays of NumPy or of JAX, and the setting `exact`.
+    """
+    return residual / length if exact == "spread" else residual * last
 
 
 def scale_and_mask(

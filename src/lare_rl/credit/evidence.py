@@ -51,6 +51,8 @@ from lare_rl.credit.precisions import (
     varies,
 )
 from lare_rl.nn.leading_axis import map_leading_axis
+from lare_rl.nn.masks import select
+from lare_rl.nn.normalise import merge_means
 
 __all__ = [
     "JAX",
@@ -110,10 +112,7 @@ def add_episodes(
     returns: Float[Array, " episodes"],
     length: Int[Array, " episodes"],
 ) -> SufficientStatistics:
-    """Add episodes. Episodes of length 0 are padding.
-
-    Old and new sums are combined as in Chan, Golub and LeVeque (1983), which avoids catastrophic cancellation.
-    """
+    """Add episodes. Episodes of length 0 are padding."""
     weight = length.astype(statistics.mean.dtype)
     v = jnp.concatenate([mean_features, (returns / jnp.maximum(weight, 1))[:, None], returns[:, None]], axis=1)
     return _add_cases(statistics, v, weight, jnp.sum(length > 0))
@@ -146,13 +145,12 @@ def _add_cases(
     n_new = jnp.sum(weight)
     mean = weight @ v / jnp.maximum(n_new, 1)
     centred = jnp.where(weight[:, None] > 0, v - mean, 0)
-    n_steps, difference = statistics.n_steps + n_new, mean - statistics.mean
-    fraction = n_new / jnp.maximum(n_steps, 1)
+    n_steps, merged, difference, fraction = merge_means(statistics.n_steps, statistics.mean, n_new, mean)
     between = jnp.outer(difference, difference) * statistics.n_steps * fraction
     return SufficientStatistics(
         n_episodes=statistics.n_episodes + n_episodes,
         n_steps=n_steps,
-        mean=statistics.mean + fraction * difference,
+        mean=merged,
         products=statistics.products + (weight[:, None] * centred).T @ centred + between,
     )
 
@@ -169,6 +167,7 @@ def regression(
 ) -> Regression:
     """Return the regression of R/T for a score that is a sum, or of R for a score that is a mean."""
     n_features = len(group_index)
+    assert len(statistics.mean) == n_features + 2
     column = n_features + score_type
     n_steps = jnp.maximum(statistics.n_steps, 1)
     y_mean = statistics.mean[column]
@@ -245,7 +244,7 @@ def to_return_units(
     With fewer than two episodes, or if all returns are equal, the weights are 0 and the precisions those of `fallback`.
     """
     is_determined = (problem.dof > 0) & (problem.y_std > 0)
-    posterior = jax.tree.map(lambda new, old: jnp.where(is_determined, new, old), posterior, fallback)
+    posterior = select(is_determined, posterior, fallback)
     weight = jnp.where(is_determined, problem.y_std * posterior.weight, 0)
     bias = problem.y_mean - weight @ statistics.mean[: len(problem.group_index)]
     return posterior._replace(weight=weight, bias=bias)

@@ -1,7 +1,7 @@
 """What the returns say about the factors: how much they explain, which of them matter, and what may be missing."""
 
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 
@@ -58,6 +58,10 @@ MESSAGES = {
         "Steps are paid for what they add to the log odds of the higher score: so far, this predicts returns better than a sum. The "
         "shares and effects below are those of a sum."
     ),
+    "score_is_not_log_odds": (
+        "The score is treated as {this} over the steps of an episode: so far, this predicts returns at least as well as what steps "
+        "add to the log odds of the higher score. This may change."
+    ),
     "sum": "a sum",
     "mean": "an average",
     "returns": "the returns of {n_episodes:,} episodes",
@@ -109,15 +113,13 @@ MESSAGES = {
 """The sentences, by the codes of the findings."""
 
 
-def raw_feature_names(observation: str, action: str, n_features: int, action_size: int, both: bool) -> list[str]:
+def raw_feature_names(observation: str, action: str, sizes: Mapping[str, int]) -> list[str]:
     """Return names of the raw features, from a task's texts: the line `7: angle of the foot` names entry 7.
 
     Args:
         observation: the text that describes the observation.
         action: the text that describes the action.
-        n_features: the number of raw features: 0, or at least `action_size`.
-        action_size: the number of entries of the action, which come last.
-        both: whether there are two observations, first the one before the step.
+        sizes: the number of entries of `observation`, `next_observation` and `action`, in their order, as far as they are inputs.
     """
 
     def names(text: str, size: int, kind: str) -> list[str]:
@@ -126,10 +128,12 @@ def raw_feature_names(observation: str, action: str, n_features: int, action_siz
             f"entry {i} of the {kind}" + (f" ({lines[str(i)].strip()})" if str(i) in lines else "") for i in range(size)
         ]
 
-    n_observed = max(0, n_features - action_size)
-    kinds = ["observation before the step", "observation after the step"] if both else ["observation"]
-    observation_names = [name for kind in kinds for name in names(observation, n_observed // len(kinds), kind)]
-    return observation_names + names(action, n_features - n_observed, "action")
+    before, after = "observation", "observation"
+    if {"observation", "next_observation"} <= set(sizes):
+        before, after = "observation before the step", "observation after the step"
+    kinds = {"observation": before, "next_observation": after, "action": "action"}
+    texts = {"observation": observation, "next_observation": observation, "action": action}
+    return [entry for name, size in sizes.items() for entry in names(texts[name], size, kinds[name])]
 
 
 def explanation_lines(
@@ -192,8 +196,10 @@ def _unused_raw_features(explanation: Explanation, names: Sequence[str]) -> list
 def _score_type(estimate: ScoreTypeEstimate) -> Finding:
     if estimate.score_type is ScoreType.LOG_ODDS:
         return Finding("score_is_log_odds")
-    types = Finding("sum"), Finding("mean")
-    this, other = types if estimate.score_type == ScoreType.SUM else types[::-1]
+    this = Finding("sum" if estimate.score_type is ScoreType.SUM else "mean")
+    if estimate.rival is ScoreType.LOG_ODDS:
+        return Finding("score_is_not_log_odds", {"this": this})
+    other = Finding("sum" if estimate.rival is ScoreType.SUM else "mean")
     code = "score_type_is_certain" if estimate.is_certain else "score_type_is_uncertain"
     return Finding(code, {"this": this, "other": other})
 

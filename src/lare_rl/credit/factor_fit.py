@@ -23,8 +23,14 @@ from lare_rl.credit.basis import Basis
 from lare_rl.credit.closed_form import FIT_GROWTH, MAX_EVIDENCE_ROUNDS, LinearDecoder
 from lare_rl.credit.evidence import Posterior, SufficientStatistics
 from lare_rl.credit.explanation import Explanation, StepStatistics, add_steps, empty_step_statistics, explain
-from lare_rl.credit.returns import MAX_ERROR_RATIO
-from lare_rl.credit.score_type import ScoreType, ScoreTypeEstimate, score_types_to_fit
+from lare_rl.credit.score_type import (
+    MAX_ERROR_RATIO,
+    ROUNDING,
+    ScoreType,
+    ScoreTypeEstimate,
+    compare_score_types,
+    score_types_to_fit,
+)
 from lare_rl.util.float64 import float64
 from lare_rl.util.statistics import r_squared
 
@@ -71,7 +77,8 @@ def assess_factors(
         features, step_statistics = mean_features(inputs, alive, basis)
         predict = partial(predict_returns, returns=returns, length=length, basis=basis)
         predicted = {score_type: predict(features, score_type=score_type) for score_type in score_types}
-        errors = {key: float(np.sum((returns[N_FIRST:] - values) ** 2)) for key, values in predicted.items()}
+        margin = ROUNDING * np.sum(returns[N_FIRST:] ** 2)
+        errors = {key: float(np.sum((returns[N_FIRST:] - values) ** 2) + margin) for key, values in predicted.items()}
         is_mean = errors.get(ScoreType.MEAN, np.inf) < MAX_ERROR_RATIO * errors.get(ScoreType.SUM, np.inf)
         score_type = ScoreType(int(is_mean))
         length_r2 = None
@@ -79,9 +86,9 @@ def assess_factors(
             length_r2 = r_squared(returns[N_FIRST:], predict(np.zeros_like(features), score_type=ScoreType.SUM))[0]
         explanation = _explain(features, returns, length, step_statistics, score_type, basis=basis)
         explanation = jax.tree.map(np.asarray, explanation)
-    is_certain = min(errors.values()) < MAX_ERROR_RATIO * max(errors.values())
+
     r2, r2_error = r_squared(returns[N_FIRST:], predicted[score_type])
-    estimate = ScoreTypeEstimate(score_type, is_certain) if len(score_types) > 1 else None
+    estimate = compare_score_types(errors, score_type) if len(score_types) > 1 else None
     return FactorAssessment(r2, r2_error, length_r2=length_r2, score_type=estimate, explanation=explanation)
 
 

@@ -3,7 +3,7 @@
 A score may be no sum: the largest load of a day, the worst delay, whether a level was ever reached, the state at the end. With z_t an
 entry (a factor or a raw entry) and M_t its largest value up to step t,
 
-    g(max_t z_t) = sum_t g(M_t) - g(M_(t-1))
+    g(max_t z_t) = sum_t (g(M_t) - g(M_(t-1)))
 
 for any function g. Likewise for smallest and last values. A step is therefore paid for how far it changes an extreme, or the value
 itself, and the payments of an episode add up to the score. The history of step t holds M_(t-1), the smallest value before, and

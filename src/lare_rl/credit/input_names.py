@@ -44,7 +44,7 @@ _NAMES = (
 
 @dataclass(frozen=True)
 class InputNames:
-    """What a decoder reads of a step. `history` must come last. Raises `LareError` if a name is not one of those above."""
+    """What a decoder reads of a step. Raises `LareError` if a name is not one of those above, or if `history` is not the last one."""
 
     names: tuple[str, ...]
     names_of_many_agents: tuple[str, ...] | None = None
@@ -56,6 +56,10 @@ class InputNames:
                 raise LareError(
                     f"the inputs of a decoder are a tuple of names among {', '.join(_NAMES)}, and was given {names!r}"
                 )
+            if "history" in names[:-1]:
+                raise LareError(f"history must be the last input of a decoder, and the inputs are {names!r}")
+        if self.names_of_many_agents is not None and self.has_factors != ("factors" in self.names_of_many_agents):
+            raise LareError("factors must be an input of a decoder for one agent and for many, or for neither")
 
     def resolve(self, scored_observation: ScoredObservation = "after", *, single_agent: bool = True) -> tuple[str, ...]:
         """Return the names of the inputs, with `scored_observation` replaced by the observations that a task names."""

@@ -4,7 +4,8 @@ Episodes may belong to levels, which differ in difficulty. A decoder is then fit
 
     d_g = s_g (mean_g - mean),    s_g = between / (between + within / n_g)
 
-with mean_g the mean of R/T over the n_g episodes of level g, and the variances within and between levels by the method of moments.
+with mean_g the mean of R/T over the n_g episodes of level g, mean = sum_g n_g mean_g / sum_g n_g, and the variances within and
+between levels by the method of moments.
 The factor s_g shrinks the means of levels with few episodes (random effects: Searle, Casella and McCulloch, 1992).
 """
 
@@ -12,6 +13,8 @@ from typing import NamedTuple
 
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
+
+from lare_rl.nn.normalise import merge_means
 
 __all__ = ["LevelMeans", "add_returns", "empty_level_means", "level_offsets"]
 
@@ -32,7 +35,7 @@ def empty_level_means(n_levels: int) -> LevelMeans:
 def add_returns(
     means: LevelMeans, level: Int[Array, " batch"], mean_reward: Float[Array, " batch"], mask: Bool[Array, " batch"]
 ) -> LevelMeans:
-    """Add the episodes where `mask` is true (Chan, Golub and LeVeque, 1983)."""
+    """Add the episodes where `mask` is true."""
     n_levels = len(means.mean)
     slot = jnp.where(mask, level, n_levels)  # an index out of range, which is dropped
 
@@ -42,13 +45,9 @@ def add_returns(
     n_new = sums(jnp.ones_like(mean_reward))
     mean = sums(mean_reward) / jnp.maximum(n_new, 1)
     squares = sums((mean_reward - mean[jnp.minimum(slot, n_levels - 1)]) ** 2)
-    n_episodes, difference = means.n_episodes + n_new, mean - means.mean
-    fraction = n_new / jnp.maximum(n_episodes, 1)
-    return LevelMeans(
-        n_episodes,
-        means.mean + fraction * difference,
-        means.sum_squares + squares + difference**2 * means.n_episodes * fraction,
-    )
+    n_episodes, merged, difference, fraction = merge_means(means.n_episodes, means.mean, n_new, mean)
+    between = difference**2 * means.n_episodes * fraction
+    return LevelMeans(n_episodes, merged, means.sum_squares + squares + between)
 
 
 def level_offsets(means: LevelMeans) -> Float[Array, " levels"]:

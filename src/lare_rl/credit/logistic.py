@@ -30,6 +30,7 @@ from jaxtyping import Array, Bool, Float, Int
 from lare_rl.credit import evidence
 from lare_rl.credit.evidence import JAX, PosteriorSpread
 from lare_rl.credit.precisions import JITTER, PRIOR_RANGE, Posterior, count_determined, inverse_root, varies
+from lare_rl.credit.prequential import ring_slots
 
 __all__ = ["WINDOW", "LogOddsFit", "add_episodes", "fit", "init", "predict", "remove_episodes", "spread", "to_returns"]
 
@@ -72,8 +73,7 @@ def add_episodes(
     mask: Bool[Array, " episodes"],
 ) -> LogOddsFit:
     """Add new episodes, at most as many as the window has. Episodes where `mask` is false are ignored."""
-    slot = (state.n_episodes.astype(jnp.int32) + jnp.cumsum(mask) - 1) % WINDOW
-    slot = jnp.where(mask, slot, WINDOW)  # an index out of bounds, which is dropped
+    slot = ring_slots(state.n_episodes, mask, WINDOW)
     return state._replace(
         columns=state.columns.at[slot].set(columns.astype(jnp.float32), mode="drop"),
         returns=state.returns.at[slot].set(returns.astype(jnp.float32), mode="drop"),

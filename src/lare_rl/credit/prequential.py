@@ -25,6 +25,7 @@ __all__ = [
     "empty_predictions",
     "gain",
     "r2",
+    "ring_slots",
     "squared_errors",
 ]
 
@@ -60,15 +61,21 @@ def add_predictions(
     level: Int[Array, " episodes"] | None = None,
 ) -> Predictions:
     """Add new episodes, at most as many as the window has. Episodes where `mask` is false are ignored."""
-    window = len(predictions.returns)
-    slot = (predictions.n_episodes.astype(jnp.int32) + jnp.cumsum(mask) - 1) % window
-    slot = jnp.where(mask, slot, window)  # an index out of bounds, which is dropped
+    slot = ring_slots(predictions.n_episodes, mask, len(predictions.returns))
     return Predictions(
         predictions.n_episodes + jnp.sum(mask),
         predictions.returns.at[slot].set(returns.astype(jnp.float32), mode="drop"),
         predictions.predicted.at[slot].set(predicted.astype(jnp.float32), mode="drop"),
         predictions.level if level is None else predictions.level.at[slot].set(level.astype(jnp.int32), mode="drop"),
     )
+
+
+def ring_slots(n_before: Float[Array, ""], mask: Bool[Array, " episodes"], window: int) -> Int[Array, " episodes"]:
+    """Return where new episodes are stored in a window of the last ones.
+
+    Episodes where `mask` is false get an index out of bounds, which `mode="drop"` drops.
+    """
+    return jnp.where(mask, (n_before.astype(jnp.int32) + jnp.cumsum(mask) - 1) % window, window)
 
 
 def squared_errors(predictions: Predictions) -> Float[Array, " decoders"]:
@@ -91,7 +98,8 @@ def r2(predictions: Predictions) -> Float[Array, " decoders"]:
 def gain(predictions: Predictions) -> tuple[Float[Array, ""], Float[Array, ""]]:
     """Return the gain of the first decoder, and its standard error over episodes. Both are NaN if R^2 is.
 
-    The standard error is that of a ratio of means. An episode that is alone in its level is compared with all other episodes.
+    The standard error is that of a ratio of means, as in `statistics.r_squared`. An episode that is alone in its level is compared
+    with all other episodes.
     """
     valid = jnp.arange(len(predictions.returns)) < predictions.n_episodes
     different = valid[None] & ~jnp.eye(len(valid), dtype=bool)
@@ -103,6 +111,6 @@ def gain(predictions: Predictions) -> tuple[Float[Array, ""], Float[Array, ""]]:
     total = jnp.sum(baseline)
     is_defined = jnp.isfinite(r2(predictions)[0]) & (total > 0)
     ratio = 1 - jnp.sum(error) / jnp.where(is_defined, total, 1)
-    spread = jnp.sum((baseline - error - ratio * baseline) ** 2)
-    std_error = jnp.sqrt(spread) / jnp.where(is_defined, total, 1)
+    n, spread = jnp.sum(valid), jnp.sum((baseline - error - ratio * baseline) ** 2)
+    std_error = jnp.sqrt(n / jnp.maximum(n - 1, 1) * spread) / jnp.where(is_defined, total, 1)
     return jnp.where(is_defined, ratio, jnp.nan), jnp.where(is_defined, std_error, jnp.nan)

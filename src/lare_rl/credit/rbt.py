@@ -26,7 +26,6 @@ from lare_rl.credit.decoder_settings import CreditSettings
 from lare_rl.credit.decoders import RBT_STEPS
 from lare_rl.credit.losses import batch_mean
 from lare_rl.credit.step_targets import is_step, step_loss
-from lare_rl.errors import LareError
 from lare_rl.nn.attention import LayerNorm, attend, causal_mask
 from lare_rl.nn.networks import MLP, Linear
 
@@ -140,16 +139,12 @@ class RBT(eqx.Module):
         mask: Float[Array, " episodes"],
         key: PRNGKeyArray,
     ) -> Float[Array, ""]:
-        """Return the loss of the transformer plus that of the step model. The arguments are those of `Diaster.loss`, for bags.
+        """Return the loss of the transformer plus that of the step model.
 
-        Raises:
-            LareError: a bag has more steps than `RBT_STEPS`.
+        The arguments are those of `Diaster.loss`, for bags of at most `RBT_STEPS` steps.
         """
         max_steps, n_steps = inputs.shape[1], jnp.maximum(length, 1)
-        if max_steps > RBT_STEPS:
-            raise LareError(
-                f"rbt reads at most {RBT_STEPS} steps for one payment, and these are {max_steps}: use rudder"
-            )
+        assert max_steps <= RBT_STEPS
         valid = is_step(length, max_steps)
         reward, next_state = self.bag_rewards(inputs, valid, key)
         reward = valid * reward

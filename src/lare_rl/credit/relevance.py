@@ -11,7 +11,6 @@ evidence, so the iteration starts from the precisions of the groups, and its res
 `MIN_GAIN` for each additional precision. Otherwise the fit is that of the groups.
 """
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Int
@@ -19,6 +18,7 @@ from jaxtyping import Array, Bool, Int
 from lare_rl.credit import evidence
 from lare_rl.credit.evidence import Posterior, SufficientStatistics
 from lare_rl.credit.precisions import expand_groups
+from lare_rl.nn import masks
 
 __all__ = ["MIN_GAIN", "fit_strengths", "is_better", "select"]
 
@@ -70,11 +70,5 @@ def select(
     strength_index: Int[np.ndarray, " features"],
 ) -> Posterior:
     """Return the fit that is used, with a precision for each strength. The posteriors may have a leading axis of score types."""
-    is_used = is_better(strengths, groups)
-    return jax.tree.map(
-        lambda separate, shared: jnp.where(
-            is_used.reshape(*is_used.shape, *[1] * (separate.ndim - is_used.ndim)), separate, shared
-        ),
-        strengths,
-        expand_groups(groups, group_index, strength_index),
-    )
+    shared = expand_groups(groups, group_index, strength_index)
+    return masks.select(is_better(strengths, groups), strengths, shared)

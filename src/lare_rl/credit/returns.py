@@ -28,10 +28,17 @@ from lare_rl.credit.decomposition import (
     decoder_rewards,
     level_returns,
     score_type_index,
+    step_rows,
 )
 from lare_rl.credit.methods import Fit, Method
 from lare_rl.credit.prequential import Predictions, add_predictions, squared_errors
-from lare_rl.credit.score_type import ScoreType, ScoreTypeEstimate
+from lare_rl.credit.score_type import (
+    MAX_ERROR_RATIO,
+    ROUNDING,
+    ScoreType,
+    ScoreTypeEstimate,
+    compare_score_types,
+)
 
 __all__ = [
     "MIN_GROWTH",
@@ -48,14 +55,9 @@ __all__ = [
     "reward_std",
 ]
 
-MAX_ERROR_RATIO = 0.95
-"""A score is treated as a mean if its predictions as a mean have a squared error below this fraction of the error as a sum. If all
-episodes are equally long, both errors are equal except for rounding."""
 MIN_GROWTH = 0.02
 """A decoder learns from new episodes when their number exceeds this fraction of the number of old ones. Short episodes thus come in
 batches."""
-ROUNDING = 1e-6
-"""Squared errors below this fraction of the squared returns are treated as equal."""
 
 
 def is_fitted(state: DecoderState) -> Bool[Array, ""]:
@@ -192,8 +194,7 @@ def add_to_sums(closed: ClosedForm, episodes: CreditBatch) -> ClosedForm:
     returns, mask = episodes.mean_reward * episodes.length, episodes.mask > 0
     if closed.decoder.basis.prefixes:
         index = jnp.minimum(episodes.episode_index, len(mask) - 1)
-        is_step = (episodes.episode_index < len(mask)) & mask[index]
-        columns = _prefix_columns(closed.decoder, episodes)
+        columns, is_step = _prefix_columns(closed.decoder, episodes), step_rows(episodes)
         statistics = evidence.add_prefixes(statistics, columns, returns[index], is_step, jnp.sum(mask))
         return closed._replace(sufficient_statistics=closed_form.split_double(statistics))
     columns = _columns(closed.decoder, episodes)
@@ -240,11 +241,12 @@ def estimate_score_type(state: DecoderState) -> ScoreTypeEstimate | None:
         return None
     errors = np.asarray(_score_type_errors(state.score_type_predictions))
     index = int(score_type_index(state, len(errors)))
-    score_type = ScoreType.LOG_ODDS if bool(state.is_log_odds) else ScoreType(index)
-    other_errors = np.delete(errors, index)
-    if np.allclose(errors[index], other_errors, rtol=1e-3):
+    if np.allclose(errors[index], np.delete(errors, index), rtol=1e-3):
         return None
-    return ScoreTypeEstimate(score_type, is_certain=bool(errors[index] < MAX_ERROR_RATIO * other_errors.min()))
+    assert state.closed_form is not None
+    n_binary = int(state.closed_form.log_odds is not None)
+    types = [*ScoreType][: len(errors) - n_binary] + [ScoreType.LOG_ODDS] * n_binary
+    return compare_score_types(dict(zip(types, errors.tolist(), strict=True)), types[index])
 
 
 @jax.jit

@@ -1,12 +1,27 @@
 """How the score of an episode follows from its steps: a sum over them, a mean, or a success whose odds they change."""
 
+from collections.abc import Mapping
 from enum import IntEnum
 from typing import NamedTuple
 
 from lare_rl.credit.prequential import SEGMENT_WINDOW, WINDOW
 from lare_rl.tasks.payments import PaymentRule
 
-__all__ = ["ScoreType", "ScoreTypeEstimate", "prediction_window", "score_types_to_fit"]
+__all__ = [
+    "MAX_ERROR_RATIO",
+    "ROUNDING",
+    "ScoreType",
+    "ScoreTypeEstimate",
+    "compare_score_types",
+    "prediction_window",
+    "score_types_to_fit",
+]
+
+MAX_ERROR_RATIO = 0.95
+"""A score is treated as a mean if its predictions as a mean have a squared error below this fraction of the error as a sum. If all
+episodes are equally long, both errors are equal except for rounding."""
+ROUNDING = 1e-6
+"""Squared errors below this fraction of the squared returns are treated as equal."""
 
 
 class ScoreType(IntEnum):
@@ -25,7 +40,9 @@ class ScoreTypeEstimate(NamedTuple):
 
     score_type: ScoreType
     is_certain: bool
-    """Whether this type predicts the returns clearly better than the other one."""
+    """Whether this type predicts the returns clearly better than its rival."""
+    rival: ScoreType
+    """The other type that predicts them best."""
 
 
 def score_types_to_fit(score: str, fixed_length: bool, *, allow_log_odds: bool) -> tuple[ScoreType, ...]:
@@ -40,6 +57,12 @@ def score_types_to_fit(score: str, fixed_length: bool, *, allow_log_odds: bool) 
         return (ScoreType.SUM,) if score == "sum" else (ScoreType.MEAN,)
     linear = (ScoreType.SUM,) if fixed_length else (ScoreType.SUM, ScoreType.MEAN)
     return (*linear, ScoreType.LOG_ODDS) if score == "binary" and allow_log_odds else linear
+
+
+def compare_score_types(errors: Mapping[ScoreType, float], chosen: ScoreType) -> ScoreTypeEstimate:
+    """Compare the chosen type with the others, by the squared error of each type's predictions of returns."""
+    rival = min((other for other in errors if other != chosen), key=lambda other: errors[other])
+    return ScoreTypeEstimate(chosen, errors[chosen] < MAX_ERROR_RATIO * errors[rival], rival)
 
 
 def prediction_window(payments: PaymentRule, score: str) -> int:

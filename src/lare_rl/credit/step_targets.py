@@ -1,4 +1,4 @@
-"""How a step model learns the differences of a recurrent model, for Diaster and RUDDER.
+"""How a step model learns the differences of a recurrent model, for Diaster, RUDDER and RBT.
 
 A recurrent model reads an episode from its beginning, so that it cannot judge a single stored step. An algorithm that samples
 transitions needs just that. The step model therefore learns the mean of the differences from the step alone:

@@ -221,7 +221,7 @@ def read(replay: Replay, index: Index) -> StoredSteps:
     replay, (env, number) = by_payment(replay), index
     row, episode = look_up(replay.row, env, number), look_up(replay.episode, env, number)
     end, finished = end_of_episode(replay, env, episode), episode < replay.episodes[env]
-    return_, length = look_up(replay.episode_return, env, episode), end - look_up(replay.first, env, episode)
+    return_, length = look_up(replay.episode_return, env, episode), end - segment_start(replay, env, episode)
     last = (number + 1 == end) & finished
     residual = None
     if replay.predicted_return is not None:
@@ -245,6 +245,14 @@ def end_of_episode(replay: Replay, env: Int[Array, "*batch"], episode: Int[Array
     """Return the number of the transition after an episode's last one."""
     newest = replay.episodes + replay.running - 1
     return jnp.where(episode >= newest[env], replay.transitions[env], look_up(replay.first, env, episode + 1))
+
+
+def segment_start(replay: Replay, env: Int[Array, "*batch"], episode: Int[Array, "*batch"]) -> Int[Array, "*batch"]:
+    """Return the number of the first transition that an episode's payment is for; of a running episode, its first transition."""
+    first = look_up(replay.first, env, episode)
+    if replay.first_paid is None:
+        return first
+    return jnp.where(episode < replay.episodes[env], look_up(replay.first_paid, env, episode), first)
 
 
 def newest_steps(replay: Replay, steps: int) -> Index:

@@ -15,6 +15,7 @@ from lare_rl.data.replay import (
     n_finished,
     n_transitions,
     oldest_transition,
+    segment_start,
 )
 
 __all__ = [
@@ -90,7 +91,7 @@ def sample_distinct_episodes(replay: Replay, key: PRNGKeyArray, count: int) -> E
 def get_episodes(replay: Replay, index: Index) -> EpisodeSample:
     """Return finished episodes. `index.number` counts from the oldest episode of each environment."""
     episode = replay.oldest[index.env] + index.number
-    first = look_up(replay.first if replay.first_paid is None else replay.first_paid, index.env, episode)
+    first = segment_start(replay, index.env, episode)
     length = jnp.maximum(end_of_episode(replay, index.env, episode) - first, 1)
     has_episodes = jnp.sum(n_finished(replay)) > 0
     return EpisodeSample(

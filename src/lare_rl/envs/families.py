@@ -47,7 +47,7 @@ class Family(NamedTuple):
     """Whether all environments of the family have one agent."""
 
 
-FAMILIES = Registry[Family]("family of environments")
+FAMILIES = Registry[Family]("family of environments", "families of environments")
 _GYMNASIUM = Family("lare_rl.envs.gymnasium_env:GymnasiumEnv", reads=("max_episode_steps",), single_agent=True)
 _LOGS_ONLY = Family("lare_rl.envs.families:_refuse_to_make", reads=("max_episode_steps",))
 

@@ -125,8 +125,9 @@ def team_mean(
 def alive_mean(
     values: Float[AnyArray, "*batch agents"], alive: Bool[AnyArray, "*batch agents"]
 ) -> Float[AnyArray, "*batch"]:
-    """Return the mean over the agents that are alive, or 0 without such agents."""
-    return (values * alive).sum(axis=-1) / _array_module(values).maximum(alive.sum(axis=-1), 1)
+    """Return the mean over the agents that are alive, or 0 without such agents. Values of other agents may be NaN."""
+    xp = _array_module(values)
+    return xp.where(alive, values, 0).sum(axis=-1) / xp.maximum(alive.sum(axis=-1), 1)
 
 
 def to_env_action(

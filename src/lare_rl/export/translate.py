@@ -42,7 +42,8 @@ def compute(function: Callable[[dict[str, Any]], Any], arrays: dict[str, Array])
         return apply(function, shapes, arrays, _find_function)
     except UnsupportedOperationError as error:
         raise LareError(
-            f"a function of this run cannot be exported: a graph has no operation {str(error)!r}"
+            f"a function of this run cannot be exported, because a graph has no operation {str(error)!r}: load the policy in Python "
+            "with lare_rl.load_policy"
         ) from error
 
 

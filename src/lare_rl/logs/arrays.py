@@ -1,6 +1,5 @@
 """Logs of NumPy arrays: directories with an .npz file for each episode, and logs in memory."""
 
-import zipfile
 from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
@@ -11,6 +10,7 @@ from lare_rl.errors import LareError, short_repr
 from lare_rl.logs.episode import KEYS, RelabelledEpisode
 from lare_rl.logs.log import Log, atomic_output
 from lare_rl.tasks.spec import TaskSpec
+from lare_rl.util.files import save_npz
 
 __all__ = ["FlatLog", "ListLog", "NpzLog", "read_npz"]
 
@@ -26,7 +26,8 @@ class ArrayLog(Log):
             directory.mkdir()
             for number, (episode, r_hat) in enumerate(episodes):
                 arrays = {**episode.contents, "rewards": r_hat, "paid": episode.reward}
-                _save_npz(directory / self.file_name(number, episode.name), arrays)
+                with (directory / self.file_name(number, episode.name)).open("xb") as file:
+                    save_npz(file, arrays)
         return Path(out)
 
     def file_name(self, number: int, name: str) -> str:
@@ -60,14 +61,6 @@ def read_npz(file: Path) -> dict[str, np.ndarray]:
             return {key: archive[key] for key in archive.files}
     except Exception as error:  # NumPy and zipfile may raise anything for an untrusted file
         raise LareError(f"{file} is not an .npz file, or damaged: {short_repr(error)}") from error
-
-
-def _save_npz(file: Path, arrays: Mapping[str, np.ndarray]) -> None:
-    """Write arrays of any name. `numpy.savez` cannot save an array whose name is one of its arguments."""
-    with zipfile.ZipFile(file, "x", allowZip64=True) as archive:
-        for key, array in arrays.items():
-            with archive.open(f"{key}.npy", "w", force_zip64=True) as member:
-                np.lib.format.write_array(member, np.asanyarray(array), allow_pickle=False)
 
 
 class ListLog(ArrayLog):

@@ -3,7 +3,7 @@
 import contextlib
 import shutil
 from abc import ABC, abstractmethod
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Container, Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 from uuid import uuid4
@@ -117,12 +117,19 @@ def _open_path(source: str | Path, role: TaskSpec | None) -> Log:
     return MinariLog(load_dataset(source), role)
 
 
-def check_output(out: Path, overwrite: bool) -> None:
-    """Raise `LareError` if `out` exists and must not be replaced, or if nothing can be written there."""
+def check_output(out: Path, overwrite: bool, folders: Container[str] = ()) -> None:
+    """Raise `LareError` if `out` exists and must not be replaced, or if nothing can be written there.
+
+    `folders` are the names of the directories that a log has. A directory with others is never replaced.
+    """
     if out.exists() and not overwrite:
         raise LareError(f"{out} exists: choose another path, or replace it with --overwrite (overwrite=True)")
     if out.is_dir():
-        foreign = [path.name for path in sorted(out.iterdir()) if path.is_dir() or path.suffix not in LOG_SUFFIXES]
+        foreign = [
+            path.name
+            for path in sorted(out.iterdir())
+            if (path.name not in folders if path.is_dir() else path.suffix not in LOG_SUFFIXES)
+        ]
         if foreign:
             raise LareError(f"{out} cannot be replaced, because {foreign[0]} in it is not a log: choose another path")
     if not out.name or not out.parent.is_dir():
@@ -130,17 +137,17 @@ def check_output(out: Path, overwrite: bool) -> None:
 
 
 @contextlib.contextmanager
-def atomic_output(out: Path, overwrite: bool) -> Iterator[Path]:
+def atomic_output(out: Path, overwrite: bool, folders: Container[str] = ()) -> Iterator[Path]:
     """Yield a temporary path for a file or a directory. At the end it replaces `out`; after an error it is removed.
 
     Raises:
-        LareError: `out` exists, or cannot be written.
+        LareError: `out` exists, or cannot be written: see `check_output`.
     """
-    check_output(out, overwrite)
+    check_output(out, overwrite, folders)
     new, old = (out.with_name(f".{out.name}.{uuid4().hex}.{kind}") for kind in ("new", "old"))
     try:
         yield new
-        check_output(out, overwrite)
+        check_output(out, overwrite, folders)
         if out.exists():
             out.rename(old)
         new.rename(out)

@@ -31,6 +31,10 @@ COPIED_METADATA = (
 )
 
 
+FOLDERS = ("data",)
+"""What the directory of a data set has."""
+
+
 class MinariLog(Log):
     """A data set of one agent, with spaces that can be written as rows of numbers."""
 
@@ -68,7 +72,7 @@ class MinariLog(Log):
         """Raise `LareError` if no data set with the id `out` can be written."""
         path = _dataset_path(out)
         if path.parent.exists():  # otherwise `write` creates the namespace
-            check_output(path, overwrite)
+            check_output(path, overwrite, FOLDERS)
 
     def write(self, out: str | Path, episodes: Iterable[RelabelledEpisode], overwrite: bool, comment: str) -> str:
         """Write a data set with the id `out`, in the same format."""
@@ -77,11 +81,11 @@ class MinariLog(Log):
         if namespace is not None and namespace not in list_local_namespaces():
             create_namespace(namespace)
         metadata = source.metadata
-        with atomic_output(path, overwrite) as directory, warnings.catch_warnings():
+        with atomic_output(path, overwrite, FOLDERS) as directory, warnings.catch_warnings():
             warnings.simplefilter("ignore")  # Minari warns if the spec of an environment cannot be saved
             directory.mkdir()
             storage = MinariStorage.new(
-                directory / "data",
+                directory / FOLDERS[0],
                 source.observation_space,
                 source.action_space,
                 self.dataset.env_spec,

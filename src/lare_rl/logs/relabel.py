@@ -4,7 +4,6 @@ The log is read twice as a stream. The first pass shows the episodes to a `Credi
 and writes them.
 """
 
-import itertools
 import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
@@ -13,11 +12,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 
 from lare_rl.assigner.assigner import CreditAssigner
 from lare_rl.assigner.assigner_config import AssignerConfig
 from lare_rl.credit.decoder_settings import CreditSettings
+from lare_rl.credit.engine import correction
 from lare_rl.credit.methods import Reward, find_method
 from lare_rl.envs.load import resolve_task
 from lare_rl.errors import LareError
@@ -40,8 +40,7 @@ UPDATES = 10_000
 """Gradient updates of a decoder."""
 MIN_HELD_OUT = 8
 """The least number of held-out episodes for statistics of their returns."""
-UNSEEN = -1
-"""The number of a group without an episode that was learned from."""
+
 MIN_R2 = 0.1
 """Below this R², the rewards come with a warning."""
 
@@ -136,7 +135,7 @@ def relabel(
     overwrite: bool = False,
     listener: Listener = lambda stage, n_done, n_episodes: None,
 ) -> Relabelled:
-    """Give the steps of logged episodes rewards that add up to the episodes' returns.
+    """Give the steps of logged episodes rewards that are fitted to the episodes' returns. With `exact`, they add up to them.
 
     Args:
         source: a directory of .npz or Parquet files, a Parquet file, a Hugging Face data set on the disk, a Minari id or data set,
@@ -157,8 +156,10 @@ def relabel(
     """
     if not 0 <= hold_out <= 0.9:
         raise LareError(f"hold_out = {hold_out} must be between 0 and 0.9")
-    if not 0 < memory < math.inf or updates < 1:
-        raise LareError(f"memory = {memory} and updates = {updates} must be positive")
+    if not 0 < memory < math.inf:
+        raise LareError(f"memory = {memory} must be positive and finite")
+    if updates < 1:
+        raise LareError(f"updates = {updates} must be at least 1")
     task = None if task is None else resolve_task(task, playable=False)
     log = open_log(source, task)
     log.check_output(out, overwrite)
@@ -235,9 +236,7 @@ def _create_assigner(
         forget=False,
         groups=log.layout.has_groups,
     )
-    # Inputs, and the store's own data of each step.
-    bytes_per_step = 4 * create(capacity=1).config.spec.basis.n_inputs + 16
-    return create(capacity=max(MIN_CAPACITY, int(memory * 2**30 / bytes_per_step)))
+    return create(capacity=max(MIN_CAPACITY, int(memory * 2**30 / create(capacity=1).store.bytes_per_step)))
 
 
 def _fit(
@@ -279,22 +278,25 @@ def _compute_rewards(
     """
     for batch in _batches(log.episodes()):
         lengths = [len(episode) for episode in batch]
+        begins = [_segment_begins(episode.reward, credit.config) for episode in batch]
+        payment_lengths = [_segment_lengths(first) for first in begins]
         r_hat = credit.rewards(
             np.concatenate([episode.observation for episode in batch]),
             np.concatenate([episode.action for episode in batch]),
             np.concatenate([episode.next_observation for episode in batch]),
-            length=np.repeat(lengths, lengths),
-            begins=np.concatenate([_segment_begins(episode.reward, credit.config) for episode in batch]),
+            length=np.concatenate([np.repeat(payments, payments) for payments in payment_lengths]),
+            begins=np.concatenate(begins),
         )
-        for episode, reward in zip(batch, np.split(r_hat, np.cumsum(lengths)[:-1]), strict=True):
+        rewards = np.split(r_hat, np.cumsum(lengths)[:-1])
+        for episode, reward, payments in zip(batch, rewards, payment_lengths, strict=True):
             counts.episodes += 1
             counts.steps += len(episode)
             counts.cut += not episode.complete
             if episode.complete and next(is_held_out):
                 counts.returns.append(float(episode.reward.sum()))
-                level = 0 if episode.group is None else credit.group_names.get(episode.group, UNSEEN)
-                level_return = 0.0 if level == UNSEEN else credit.step_rewards.level_return(level, len(episode))
-                counts.predictions.append(float(reward.sum(dtype=np.float64)) + level_return)
+                level = None if episode.group is None else credit.group_names.get(episode.group)
+                unpaid = credit.step_rewards.unpaid_return(level, payments)
+                counts.predictions.append(float(reward.sum(dtype=np.float64)) + unpaid)
             if episode.complete and credit.config.is_exact:
                 reward = _make_exact(reward, episode.reward, credit.config)
             yield RelabelledEpisode(episode, reward)
@@ -310,19 +312,21 @@ def _segment_begins(reward: Float[np.ndarray, " steps"], config: AssignerConfig)
     return np.append(True, pays[:-1])
 
 
+def _segment_lengths(begins: Bool[np.ndarray, " steps"]) -> Int[np.ndarray, " payments"]:
+    """Return the number of steps of each payment of an episode."""
+    return np.diff(np.append(np.flatnonzero(begins), len(begins)))
+
+
 def _make_exact(
     r_hat: Float[np.ndarray, " steps"], reward: Float[np.ndarray, " steps"], config: AssignerConfig
 ) -> Float[np.ndarray, " steps"]:
     """Return proxy rewards that add up to each payment."""
-    starts = np.flatnonzero(_segment_begins(reward, config))
-    corrected = r_hat.copy()
-    for start, end in itertools.pairwise([*starts, len(r_hat)]):
-        residual = reward[start:end].sum() - r_hat[start:end].sum(dtype=np.float64)
-        if config.settings.exact == "last":
-            corrected[end - 1] += residual
-        else:
-            corrected[start:end] += residual / (end - start)
-    return corrected
+    begins = _segment_begins(reward, config)
+    lengths = _segment_lengths(begins)
+    residual = np.add.reduceat(reward - r_hat.astype(np.float64), np.flatnonzero(begins))
+    residual, length = (np.repeat(values, lengths) for values in (residual, lengths))
+    change = correction(residual, np.append(begins[1:], True), length, config.settings.exact)
+    return (r_hat + change).astype(r_hat.dtype)
 
 
 def _batches(episodes: Iterator[LoggedEpisode]) -> Iterator[list[LoggedEpisode]]:

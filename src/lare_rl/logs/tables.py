@@ -133,7 +133,7 @@ def _check_columns(path: Path, schema: pa.Schema) -> None:
         if schema.names.count(name) != 1:
             raise LareError(f"{path} needs one column {name}, {meaning}; its columns are {', '.join(schema.names)}")
     kind = schema.field("episode").type
-    if not (pa.types.is_integer(kind) or pa.types.is_string(kind) or pa.types.is_large_string(kind)):
+    if not (pa.types.is_integer(kind) or _is_text(kind)):
         raise LareError(f"{path}: the column episode must be whole numbers or strings, and is {kind}")
 
 
@@ -141,6 +141,10 @@ def _rows_are_episodes(schema: pa.Schema) -> bool:
     """Return whether a row holds an episode: its rewards, or its actions if there is only a score, are a list."""
     key = "rewards" if "rewards" in schema.names else "actions"
     return "episode" not in schema.names and schema.names.count(key) == 1 and _is_list(schema.field(key).type)
+
+
+def _is_text(kind: pa.DataType) -> bool:
+    return pa.types.is_string(kind) or pa.types.is_large_string(kind)
 
 
 def _is_list(kind: pa.DataType) -> bool:
@@ -174,7 +178,9 @@ def _read_column(name: str, key: str, column: pa.ChunkedArray) -> np.ndarray:
             raise LareError(f"{where} must be lists of one length, without gaps")
         shape.append(size)
         values = inner
-    if key == "group" and not shape and pa.types.is_string(values.type):
+    if pa.types.is_dictionary(values.type):
+        values = values.dictionary_decode()
+    if key == "group" and not shape and _is_text(values.type):
         return np.array(values.to_pylist())
     if not (pa.types.is_integer(values.type) or pa.types.is_floating(values.type) or pa.types.is_boolean(values.type)):
         raise LareError(f"{where} must be numbers, and is {column.type}")

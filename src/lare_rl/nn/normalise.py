@@ -1,6 +1,6 @@
 """Running statistics in the training state, by which features and returns of any scale are learned alike."""
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
@@ -11,6 +11,7 @@ __all__ = [
     "Scale",
     "empty_mean_std",
     "empty_scale",
+    "merge_means",
     "min_max_scale",
     "root_mean_square",
     "running_std",
@@ -41,10 +42,7 @@ def empty_mean_std(n_features: int) -> RunningMeanStd:
 def update_mean_std(
     statistics: RunningMeanStd, rows: Float[Array, "batch features"], mask: Bool[Array, " batch"] | None = None
 ) -> RunningMeanStd:
-    """Add a batch of rows. Rows where `mask` is false are ignored.
-
-    This is the parallel update of Chan, Golub and LeVeque (1983), which avoids catastrophic cancellation.
-    """
+    """Add a batch of rows. Rows where `mask` is false are ignored."""
     if mask is None:
         n_new, mean = rows.shape[0], jnp.mean(rows, axis=0)
         batch_squares = jnp.sum((rows - mean) ** 2, axis=0)
@@ -52,13 +50,20 @@ def update_mean_std(
         n_new = jnp.sum(mask)
         mean = jnp.sum(rows, axis=0, where=mask[:, None]) / jnp.maximum(n_new, 1)
         batch_squares = jnp.sum((rows - mean) ** 2, axis=0, where=mask[:, None])
-    n_rows = statistics.n_rows + n_new
-    difference = mean - statistics.mean
-    fraction = n_new / jnp.maximum(n_rows, 1)
+    n_rows, merged, difference, fraction = merge_means(statistics.n_rows, statistics.mean, n_new, mean)
     between = difference**2 * statistics.n_rows * fraction
-    return RunningMeanStd(
-        n_rows, statistics.mean + difference * fraction, statistics.sum_squares + batch_squares + between
-    )
+    return RunningMeanStd(n_rows, merged, statistics.sum_squares + batch_squares + between)
+
+
+def merge_means(n: Any, mean: Any, n_new: Any, new_mean: Any) -> tuple[Any, Any, Any, Any]:
+    """Return number and mean of old and new cases together, the difference d of the two means, and the fraction of new cases.
+
+    The squared deviations of all cases from the new mean are those within the old and the new ones, plus d^2 n fraction. This is the
+    parallel update of Chan, Golub and LeVeque (1983), which avoids catastrophic cancellation.
+    """
+    n_all, difference = n + n_new, new_mean - mean
+    fraction = n_new / jnp.maximum(n_all, 1)
+    return n_all, mean + fraction * difference, difference, fraction
 
 
 def running_std(statistics: RunningMeanStd) -> Float[Array, " features"]:

@@ -89,7 +89,8 @@ def find_large_observations(run: Run, replay: Replay, config: TrainConfig) -> li
     alternative = Finding("use ppo") if config.env.n_agents == 1 else None
     if can_normalise:
         alternative = Finding("normalise", {"algorithm": settings.algorithm})
-    names = raw_feature_names(run.config.task.roles[0].observation, "", config.env.observation_size, 0, both=False)
+    sizes = {"observation": config.env.observation_size}
+    names = raw_feature_names(run.config.task.roles[0].observation, "", sizes)
     values = {"feature": names[largest], "rms": float(rms[largest])}
     return [Finding("large observations", values | {"algorithm": settings.algorithm, "alternative": alternative})]
 

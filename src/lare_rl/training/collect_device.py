@@ -66,12 +66,19 @@ class DeviceCollector:
 
     def state_dict(self) -> dict[str, np.ndarray]:
         """Return the arrays that `restore` needs."""
-        return {str(i): np.asarray(leaf) for i, leaf in enumerate(jax.tree.leaves(self.envs))}
+        leaves = jax.tree.leaves(self.envs)
+        return {
+            str(i): np.asarray(jax.random.key_data(leaf) if _is_key(leaf) else leaf) for i, leaf in enumerate(leaves)
+        }
 
     def restore(self, arrays: dict[str, np.ndarray]) -> tuple[Bool[np.ndarray, "seeds envs"], list[str]]:
         """Restore the environments. Return which episodes were dropped, and messages: never any, as on the host."""
         leaves, structure = jax.tree.flatten(self.envs)
-        envs = jax.tree.unflatten(structure, [arrays[str(i)] for i in range(len(leaves))])
+        saved: list[Any] = [arrays[str(i)] for i in range(len(leaves))]
+        for i, leaf in enumerate(leaves):
+            if _is_key(leaf):
+                saved[i] = jax.random.wrap_key_data(saved[i], impl=jax.random.key_impl(leaf))
+        envs = jax.tree.unflatten(structure, saved)
         self.envs = jax.device_put(envs, seed_sharding(self._n_devices))
         return np.zeros(self.envs.episode_start.shape, bool), []
 
@@ -80,6 +87,11 @@ class DeviceCollector:
 
     def close(self) -> None:
         """Do nothing: there is nothing to close."""
+
+
+def _is_key(leaf: Array) -> bool:
+    """Return whether an array holds random keys, as the state of an environment may."""
+    return jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key)
 
 
 def unroll_on_device(

@@ -11,6 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Key
 
+from lare_rl.algorithms.batches import Metrics
 from lare_rl.algorithms.registry import Consumes
 from lare_rl.data.trajectory import Trajectory
 from lare_rl.envs.interface import Timestep
@@ -19,7 +20,6 @@ from lare_rl.phi.graph import Graph
 from lare_rl.training import episodes, off_policy, on_policy, sequences
 from lare_rl.training.compile_cache import cache_by_value
 from lare_rl.training.decoder_fits import fit_seeds
-from lare_rl.training.iteration import Metrics
 from lare_rl.training.learner import Learner, init_learner, store, with_learned_returns
 from lare_rl.training.rewards import assess
 from lare_rl.training.seed_axis import jit_over_seeds, shape_over_seeds

@@ -11,6 +11,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, Key
 
+from lare_rl.algorithms.batches import Metrics
 from lare_rl.data.trajectory import Trajectory
 from lare_rl.envs.interface import JaxEnv
 from lare_rl.phi.graph import Graph
@@ -19,7 +20,7 @@ from lare_rl.training.collect_device import VecEnvState
 from lare_rl.training.compile_cache import cache_by_value
 from lare_rl.training.compiled import keys_shape, learner_shape, training_module
 from lare_rl.training.decoder_fits import fit_seeds
-from lare_rl.training.iteration import IterationFunctions, Metrics, when_compiled
+from lare_rl.training.iteration import IterationFunctions, when_compiled
 from lare_rl.training.learner import Learner, store, with_learned_returns
 from lare_rl.training.seed_axis import jit_over_seeds, shape_over_seeds
 from lare_rl.training.static_config import TrainConfig

@@ -22,6 +22,7 @@ from lare_rl.data import replay
 from lare_rl.data.replay import Index, Replay
 from lare_rl.data.sampling import count_episodes_since, episodes_in_order
 from lare_rl.nn.leading_axis import map_leading_axis
+from lare_rl.nn.masks import select
 from lare_rl.training.decoder_inputs import episode_batch
 from lare_rl.training.static_config import TrainConfig
 
@@ -137,7 +138,8 @@ def _fold(
 ) -> tuple[State, ...]:
     """Do as `fold_episodes`, with a `body` that also gets the first step of each episode."""
     buffer, longest, n_episodes = replay.by_payment(buffer), config.longest_segment, config.credit_window
-    rows = max(1, min(expected or n_episodes, n_episodes, MAX_ROWS // (config.credit_rows * longest))) * longest
+    expected = n_episodes if expected is None else max(1, expected)
+    rows = max(1, min(expected, n_episodes, MAX_ROWS // (config.credit_rows * longest))) * longest
     total = jnp.sum(count_episodes_since(buffer, since))
 
     def read_batch(carry: tuple[Int[Array, ""], tuple[State, ...]]) -> tuple[Int[Array, ""], tuple[State, ...]]:
@@ -165,7 +167,7 @@ def _rebuild_statistics(decoders: Decoders, buffer: Replay, is_stale: Bool[Array
     empty = tuple(map(returns.reset_statistics, decoders))
     since = jnp.where(is_stale, buffer.oldest, buffer.episodes)
     rebuilt = fold_episodes(empty, buffer, since, returns.add_episodes, config)
-    return jax.tree.map(lambda new, old: jnp.where(is_stale, new, old), rebuilt, decoders)
+    return select(is_stale, rebuilt, decoders)
 
 
 def _fit_closed_forms(decoder: DecoderState, is_due: Bool[Array, " seeds"], config: TrainConfig) -> DecoderState:

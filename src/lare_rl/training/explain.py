@@ -12,12 +12,7 @@ from lare_rl.credit import returns
 from lare_rl.credit.decomposition import CreditBatch, valid_rows
 from lare_rl.credit.engine import add_to_explanation, explain_returns, init_explanation
 from lare_rl.credit.explanation import Explanation
-from lare_rl.credit.explanation_text import (
-    MESSAGES,
-    MIN_EXPLAINED_EPISODES,
-    explanation_findings,
-    raw_feature_names,
-)
+from lare_rl.credit.explanation_text import MESSAGES, MIN_EXPLAINED_EPISODES, explanation_findings
 from lare_rl.credit.methods import METHODS, find_method
 from lare_rl.data.replay import Replay, by_payment
 from lare_rl.nn.normalise import RunningMeanStd, empty_mean_std, update_mean_std
@@ -75,16 +70,11 @@ def describe_returns(run: Run, learner: Learner, config: TrainConfig) -> list[st
 
 
 def _find_explanations(run: Run, learner: Learner, config: TrainConfig) -> list[list[Finding]]:
-    findings, roles = [], run.config.task.roles
+    findings, roles, specs = [], run.config.task.roles, _explanation_config(config).credit_specs
     for i, explanation in enumerate(explain_stored_returns(learner, config)):
         role, function = roles[i], run.functions[i] if run.functions else None
         factor_names = [] if function is None else function.factor_columns(run.scored_observation)
-        n_raw, has_both = len(explanation.residual_correlation), config.scored_observation == "both"
-        raw_names = (
-            []
-            if config.team_level
-            else raw_feature_names(role.observation, role.action, n_raw, role.action_size, has_both)
-        )
+        raw_names = [] if config.team_level else specs[i].raw_feature_names(role.observation, role.action)
         score_type = returns.estimate_score_type(select_seed(first_shard(learner.decoders[i])))
         findings.append(explanation_findings(explanation, score_type, factor_names, raw_names))
     return findings

@@ -10,14 +10,14 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, Key
 
+from lare_rl.algorithms.batches import Metrics
 from lare_rl.data.trajectory import Trajectory
 from lare_rl.training.learner import Learner
 from lare_rl.training.static_config import TrainConfig
 from lare_rl.training.streams import Stream, seed_keys, stream_keys
 
-__all__ = ["IterationFunctions", "Metrics", "store_steps", "update", "when_compiled", "when_on_host"]
+__all__ = ["IterationFunctions", "store_steps", "update", "when_compiled", "when_on_host"]
 
-Metrics = dict[str, Float[Array, " seeds"]]
 Measured = TypeVar("Measured")
 When = Callable[..., tuple[Any, ...]]
 """From a condition, a function and its arguments to the function's results or, if the condition is false, the arguments."""

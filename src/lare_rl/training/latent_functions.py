@@ -5,8 +5,8 @@ from functools import partial
 from pathlib import Path
 
 from lare_rl.config.settings import ResolvedSettings
-from lare_rl.credit.closed_form import MAX_SIGNED_FACTORS
-from lare_rl.credit.methods import Fit, Method, Reward, find_method
+from lare_rl.config.validity import check_factors
+from lare_rl.credit.methods import find_method
 from lare_rl.errors import LareError, short_repr
 from lare_rl.latent.design import design
 from lare_rl.latent.function import LatentFunction, check_task, pair_with_roles
@@ -53,7 +53,7 @@ def choose_functions(
         for function, role in zip(functions, task.roles, strict=True):
             check_task(function, role)
     for function in functions:
-        _check_size(method, function.n_factors(settings.choose_scored_observation(task)))
+        check_factors(method, function.n_factors(settings.choose_scored_observation(task)))
     return tuple(functions)
 
 
@@ -61,15 +61,3 @@ def check_draw_unused(settings: ResolvedSettings) -> None:
     """Raise `LareError` if settings choose a recorded function, for a run whose function the user gives."""
     if (settings.draw, settings.candidates) != (0, N_CANDIDATES):
         raise LareError("draw and candidates choose a recorded function, and a function is given: leave either out")
-
-
-def _check_size(method: Method, n_factors: int) -> None:
-    if method.reward is Reward.DESIGNED and n_factors != 1:
-        raise LareError(
-            f"{method.name} needs a function with one array, the reward, and this one has {n_factors}: "
-            "lare-rl design TASK --kind reward writes one"
-        )
-    if method.fit is Fit.SIGNS and n_factors > MAX_SIGNED_FACTORS:
-        raise LareError(
-            f"{method.name} tries all signs of at most {MAX_SIGNED_FACTORS} factors, and there are {n_factors}"
-        )

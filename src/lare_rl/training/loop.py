@@ -1,5 +1,6 @@
 """The outer loop of Algorithm 1 of the LaRe paper: iterations, evaluations, checkpoints, and messages for the user."""
 
+import shlex
 import threading
 import time
 from collections.abc import Callable, Iterable, Sequence
@@ -98,7 +99,7 @@ def _limit_rate(call: Callable[[int], object]) -> Callable[[int], None]:
 
 def _advance(session: Session, until: int, stop: threading.Event) -> None:
     """Make iterations, none beyond step `until`, unless the user has asked the run to stop."""
-    hint = f"to continue: lare-rl train --resume {session.run.directory}"
+    hint = f"to continue: lare-rl train --resume {shlex.quote(str(session.run.directory))}"
     if stop.is_set():
         _check_losses(session)
         session.save()
@@ -148,5 +149,5 @@ def _check_losses(session: Session) -> None:
             if n_updates and not np.isfinite(loss):
                 raise DivergedError(
                     f"training diverged: {name} of seed {seed} is not finite at step {session.step}; the last checkpoint is "
-                    "whole"
+                    "whole: train again with a smaller learning rate"
                 )

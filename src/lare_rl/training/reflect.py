@@ -111,8 +111,9 @@ def assess_function(function: LatentFunction, role: TaskSpec, episodes: Sequence
     alive, returns = [episode.alive for episode in episodes], np.array([episode.return_ for episode in episodes])
     fit = assess_factors(inputs, alive, returns, basis, role.score)
     names = function.factor_columns(role.scored_observation)
-    both = role.scored_observation == "both"
-    raw_names = raw_feature_names(role.observation, role.action, basis.n_raw_used, role.action_size, both)
+    observed = select_states(role.scored_observation, "observation", "next_observation")
+    sizes = dict.fromkeys(observed, role.observation_size) | {"action": role.action_size}
+    raw_names = raw_feature_names(role.observation, role.action, sizes) if basis.n_raw_used else []
     valid_factors = np.concatenate([z[mask] for z, mask in zip(factors, alive, strict=True)])
     return FunctionAssessment(
         r2=fit.r2,

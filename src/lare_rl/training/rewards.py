@@ -14,15 +14,11 @@ from lare_rl.training.decoder_inputs import alive_agents, step_batch
 from lare_rl.training.learner import Learner
 from lare_rl.training.static_config import TrainConfig
 
-__all__ = ["RewardState", "assess", "rewards", "team_metrics", "team_proxy_rewards"]
+__all__ = ["assess", "rewards", "team_metrics", "team_proxy_rewards"]
 
 
-RewardState = tuple[RewardSource, ...]
-"""Each team's decoder, or scale of R/T: all that is needed to compute rewards."""
-
-
-def rewards(steps: StoredSteps, state: RewardState, config: TrainConfig) -> Float[Array, "*batch agents"]:
-    """Return the rewards that the algorithm is trained on, for each agent. The current decoders compute proxy rewards."""
+def rewards(steps: StoredSteps, state: tuple[RewardSource, ...], config: TrainConfig) -> Float[Array, "*batch agents"]:
+    """Return the rewards that the algorithm is trained on, for each agent, by `Learner.reward_state`."""
     alive = alive_agents(steps, config)
     team_rewards = []
     for i, team in enumerate(config.env.teams):
@@ -40,7 +36,7 @@ def rewards(steps: StoredSteps, state: RewardState, config: TrainConfig) -> Floa
 
 
 def team_proxy_rewards(
-    steps: StoredSteps, state: RewardState, config: TrainConfig, team_index: int
+    steps: StoredSteps, state: tuple[RewardSource, ...], config: TrainConfig, team_index: int
 ) -> Float[Array, "*batch rows"]:
     """Return r_hat of a team, without optimism: one for each of its agents, or one for all if credit goes to whole teams."""
     batch, spec = step_batch(steps, config, team_index), config.credit_specs[team_index]

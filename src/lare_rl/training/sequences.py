@@ -16,6 +16,7 @@ from jaxtyping import Array, Bool, Float, Int, Key, PRNGKeyArray, Scalar
 from lare_rl.algorithms.batches import Metrics, Sequences
 from lare_rl.algorithms.qmix import QMIXSettings
 from lare_rl.credit.decomposition import DecoderState
+from lare_rl.credit.engine import RewardSource
 from lare_rl.data import replay
 from lare_rl.data.layouts import lay_out_padded
 from lare_rl.data.replay import Index, Replay
@@ -27,7 +28,7 @@ from lare_rl.nn.normalise import RunningMeanStd, empty_mean_std, standardise_if_
 from lare_rl.training.decoder_fits import fit_decoders, sample_credit
 from lare_rl.training.decoder_inputs import alive_agents
 from lare_rl.training.learner import Learner
-from lare_rl.training.rewards import RewardState, rewards
+from lare_rl.training.rewards import rewards
 from lare_rl.training.static_config import TrainConfig
 
 __all__ = ["SequenceState", "act", "get_actor", "init", "init_memory", "train_step"]
@@ -188,7 +189,7 @@ def _sequences(
     buffer: Replay,
     episodes: EpisodeSample,
     n_steps: int,
-    reward_state: RewardState,
+    reward_state: tuple[RewardSource, ...],
     states: RunningMeanStd,
     config: TrainConfig,
 ) -> Sequences:

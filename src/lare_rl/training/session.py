@@ -11,6 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Key
 
+from lare_rl.algorithms.batches import Metrics
 from lare_rl.algorithms.off_policy import OffPolicySettings
 from lare_rl.config.settings import ResolvedSettings
 from lare_rl.data.trajectory import Trajectory
@@ -36,7 +37,7 @@ from lare_rl.training.compiled_loop import CompiledLoop, compile_loop, init_loop
 from lare_rl.training.evaluation import metrics_lines
 from lare_rl.training.explain import compile_explanation
 from lare_rl.training.factors import compute_host_factors
-from lare_rl.training.iteration import IterationFunctions, Metrics, when_on_host
+from lare_rl.training.iteration import IterationFunctions, when_on_host
 from lare_rl.training.learner import Learner, abandon_episodes
 from lare_rl.training.saved_state import actor_shape, load_learner, make_train_config
 from lare_rl.training.seed_axis import count_seed_devices
@@ -168,7 +169,10 @@ class Session:
         (is_finite, steps), self._unchecked = self._unchecked, None
         if self.run.functions and not np.all(is_finite):
             compute_host_factors(self.run, self.config, steps)  # raises an error that names the factor
-            raise LareError("a factor is not finite in the compiled function; the last checkpoint is whole")
+            raise LareError(
+                "a factor is finite in NumPy, and not in the compiled function: write phi without numbers that are too large for "
+                "float32; the last checkpoint is whole"
+            )
 
     def _update(self, steps: Trajectory) -> None:
         self.learner, self.latest_metrics = iteration.update(
@@ -296,7 +300,8 @@ def restore_session(run: Run) -> tuple[Session, list[str]]:
     except checkpoint.DAMAGED_FILE_ERRORS as error:
         session.close()
         raise LareError(
-            f"the checkpoint in {run.checkpoint} does not fit its environments: {type(error).__name__}: {error}"
+            f"the checkpoint in {run.checkpoint} does not fit its environments ({type(error).__name__}: {error}): start a new run, or "
+            "install the version that the run names"
         ) from error
 
 

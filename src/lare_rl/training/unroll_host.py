@@ -114,5 +114,6 @@ def check_finite(action: Float[np.ndarray, "seeds *rest"], seeds: Sequence[int])
     for seed, action_of_seed in zip(seeds, action, strict=True):
         if not np.isfinite(action_of_seed).all():
             raise DivergedError(
-                f"training diverged: the policy of seed {seed} is not finite any more; the last checkpoint is whole"
+                f"training diverged: the policy of seed {seed} is not finite any more; the last checkpoint is whole: train again "
+                "with a smaller learning rate"
             )

@@ -11,6 +11,6 @@ def format_seconds(seconds: float) -> str:
     >>> format_seconds(200.0)
     '4 min'
     """
-    if seconds < 60:
+    if round(seconds) < 60:
         return f"{seconds:.0f} s"
     return f"{math.ceil(seconds / 60)} min" if seconds < 5400 else f"{seconds / 3600:.1f} h"

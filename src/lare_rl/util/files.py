@@ -3,14 +3,15 @@
 import contextlib
 import os
 import time
+import zipfile
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
 from uuid import uuid4
 
 from lare_rl.errors import LareError
 
-__all__ = ["check_new_path", "write_arrays", "write_atomically"]
+__all__ = ["check_new_path", "save_npz", "write_arrays", "write_atomically"]
 
 
 RETRY_S = 0.01, 0.03, 0.1, 0.3, 1.0
@@ -59,9 +60,17 @@ def write_atomically(path: Path, write: Callable[[Any], object]) -> None:
 
 def write_arrays(path: Path, arrays: Mapping[str, Any]) -> None:
     """Replace an .npz file. Raises `LareError` if it cannot be written."""
+    write_atomically(path, lambda file: save_npz(file, arrays))
+
+
+def save_npz(file: IO[bytes], arrays: Mapping[str, Any]) -> None:
+    """Write arrays of any name. `numpy.savez` cannot save an array whose name is one of its arguments, which differ by its version."""
     import numpy as np  # here, because the command line imports this module before it shows a message
 
-    write_atomically(path, lambda file: np.savez(file, allow_pickle=False, **arrays))
+    with zipfile.ZipFile(file, "w", allowZip64=True) as archive:
+        for key, array in arrays.items():
+            with archive.open(f"{key}.npy", "w", force_zip64=True) as member:
+                np.lib.format.write_array(member, np.asanyarray(array), allow_pickle=False)
 
 
 def _move(new: Path, path: Path) -> None:

@@ -69,13 +69,14 @@ def format_value(value: Any, spec: str = "") -> str:
         case ["score"]:
             return f"{value:,.0f}" if math.isfinite(value) and abs(value) >= 100 else f"{value:.3g}"
         case ["count", noun]:
-            return f"{value:,} {noun}{'' if value == 1 else 's'}"
+            plural = f"{noun[:-1]}ies" if re.search(r"[^aeiou]y$", noun) else f"{noun}s"
+            return f"{value:,} {noun if value == 1 else plural}"
         case ["r2"]:
             return f"{value:.3f}" if value > 0.99 else f"{value:.2f}"
         case ["std"]:
             return f"{value:,.0f}" if math.isfinite(value) and abs(value) >= 10 else f"{value:.2g}"
         case ["error"]:
-            return f"{value:.1g}" if value >= 0.001 else "less than 0.001"
+            return "less than 0.001" if value < 0.001 else f"{value:.1g}"
         case ["steps"]:
             return f"{value / 1e6:g}M" if value >= 1e6 else f"{value / 1e3:g}k" if value >= 1e3 else f"{value:g}"
     return format(value, spec)

@@ -39,13 +39,14 @@ def load_plugins() -> None:
 class Registry(Mapping[str, T], Generic[T]):
     """Values by name, which plugins can add to: `METHODS = Registry[Method]("method")`."""
 
-    def __init__(self, kind: str):
+    def __init__(self, kind: str, kinds: str | None = None):
         """Create an empty registry.
 
         Args:
             kind: the noun for its values in messages, such as "method".
+            kinds: the plural, if it is not the noun with an s.
         """
-        self._kind = kind
+        self._kind, self._kinds = kind, kinds or f"{kind}s"
         self._values: dict[str, T] = {}
 
     def register(self, name: str, value: T) -> None:
@@ -67,7 +68,7 @@ class Registry(Mapping[str, T], Generic[T]):
             return self._values[name]
         hint = did_you_mean(name, self._values)
         plugin = "" if read_variable("LARE_PLUGINS") else " (of a plugin: name its module in LARE_PLUGINS)"
-        raise LareError(f"no {self._kind} {name!r}{hint}; the {self._kind}s are {', '.join(self._values)}{plugin}")
+        raise LareError(f"no {self._kind} {name!r}{hint}; the {self._kinds} are {', '.join(self._values)}{plugin}")
 
     def __getitem__(self, name: str) -> T:
         if name not in self._values:

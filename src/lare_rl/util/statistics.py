@@ -70,7 +70,9 @@ def round_shares(shares: Sequence[float], total: float = 1.0) -> list[float]:
 
 
 def correlation(x: Float[np.ndarray, " values"], y: Float[np.ndarray, " values"]) -> float:
-    """Return Pearson's correlation, or NaN if one of the two never varies."""
+    """Return Pearson's correlation, or NaN if one of the two never varies or has fewer than two values."""
+    if len(x) < 2:
+        return math.nan
     with np.errstate(invalid="ignore"):
         return float(np.corrcoef(x, y)[0, 1])
 
@@ -114,7 +116,7 @@ def format_rounded(number: float, spread: float) -> str:
 
 
 def format_plus_minus(mean: float, std: float | None) -> str:
-    """Write a mean and its standard deviation, such as `71.0 ± 1.4`. Without a deviation, write the mean alone."""
+    """Write a mean and its standard deviation, such as `71.00 ± 1.40`. Without a deviation, write the mean alone."""
     return format_rounded(mean, 0.0) if std is None else f"{format_rounded(mean, std)} ± {format_rounded(std, std)}"
 
 
