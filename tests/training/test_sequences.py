@@ -66,13 +66,13 @@ def test_sequences_are_the_stored_episodes(method):
     assert np.asarray(episodes.mask).tolist() == [1] * 10 + [0, 0]
     timestep, next_timestep = steps.timestep, steps.next_timestep
     for i in range(10, 12):
-        assert not any(values[i].any() for values in (batch.mask, batch.reward, batch.terminated))
+        assert not any(values[i].any() for values in (batch.mask, batch.reward, batch.done))
     for i in range(10):
         env, first = int(episodes.first.env[i]), int(episodes.first.number[i])
         rows = next(rows for rows in episode_rows(steps, env) if rows[0] == first)
         last, length = rows[-1], len(rows)
         np.testing.assert_array_equal(batch.mask[i], np.arange(12) < length)
-        np.testing.assert_array_equal(batch.terminated[i], np.arange(12) == length - 1)
+        np.testing.assert_array_equal(batch.done[i], np.arange(12) == length - 1)
         for name in ("observation", "state", "available"):
             values = getattr(batch, name)[i]
             np.testing.assert_array_equal(values[:length], getattr(timestep, name)[rows, env])

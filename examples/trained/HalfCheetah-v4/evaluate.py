@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
     from lare_rl.phi.graph import Graph, Node
 
-__all__ = ["compute", "evaluate"]
+__all__ = ["compute", "compute_nodes", "evaluate"]
 
 MAX_INT32_IN_FLOAT32 = 2.0**31 - 128
 """The largest float32 that an int32 can hold."""
@@ -32,6 +32,14 @@ def evaluate(graph: Graph, inputs: Mapping[str, Any], xp: Any = np, dtype: Any =
         xp: `numpy` or `jax.numpy`.
         dtype: the type of floating-point numbers. Integers are int64 for float64, else int32.
     """
+    batch, values = _batch_shape(graph, inputs), compute_nodes(graph, inputs, xp, dtype)
+    return {name: xp.broadcast_to(values[i], (*batch, *graph.nodes[i].shape)) for name, i in graph.outputs.items()}
+
+
+def compute_nodes(
+    graph: Graph, inputs: Mapping[str, Any], xp: Any = np, dtype: Any = np.float32, keep: bool = False
+) -> list[Any]:
+    """Compute the result of every node. Without `keep`, those that are no outputs are None again when nothing reads them any more."""
     batch = _batch_shape(graph, inputs)
     values: list[Any] = []
     with np.errstate(all="ignore"):
@@ -42,9 +50,9 @@ def evaluate(graph: Graph, inputs: Mapping[str, Any], xp: Any = np, dtype: Any =
                 values.append(np.asarray(node.option, _dtypes(dtype)[node.kind]))
             else:
                 values.append(compute(node, [values[i] for i in node.inputs], batch, xp, dtype))
-            for i in unused:
+            for i in () if keep else unused:
                 values[i] = None
-    return {name: xp.broadcast_to(values[i], (*batch, *graph.nodes[i].shape)) for name, i in graph.outputs.items()}
+    return values
 
 
 def compute(node: Node, x: Sequence[Any], batch: tuple[int, ...], xp: Any = np, dtype: Any = np.float64) -> Any:

@@ -116,5 +116,5 @@ def check_depth(value: Any) -> Any:
 def parse_integer(digits: str) -> int:
     """Parse a whole number. Raises `ValueError` if it has too many digits."""
     if len(digits) > _MAX_DIGITS:
-        raise ValueError(f"a number has {len(digits):,} digits, and at most {_MAX_DIGITS:,} are read")
+        raise ValueError(f"a number has {len(digits):,} digits (at most {_MAX_DIGITS:,} are read)")
     return int(digits)
