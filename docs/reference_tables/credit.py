@@ -45,7 +45,6 @@ UNMEASURED = (
     "grd",
     "rbt",
     "tar2",
-    "bayes-history",
     "lare-bayes-history",
     "lare-bayes-progress",
 )
