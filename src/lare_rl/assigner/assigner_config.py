@@ -160,7 +160,7 @@ class AssignerConfig(CheckedModel):
         """
         if (group is not None) != self.groups:
             needs, has_none = (
-                "needs group: give group=, one for each row",
+                "needs group: give group=, one for each row; adapters for libraries have none, so set groups=False there",
                 "has no groups: leave group out, or set groups=True",
             )
             raise LareError(f"this assigner {needs if self.groups else has_none}")
