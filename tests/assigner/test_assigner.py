@@ -688,6 +688,8 @@ def test_groups_that_do_not_fit_are_refused():
     is_valid = np.arange(5) == 0
     credit.add(*episode, is_valid, ~is_valid, valid=is_valid, group=["g0", "a", "b", "c", "d"])
     assert list(credit.group_names) == ["g0"]
+    with pytest.raises(LareError, match="None when it is paid"):
+        credit.add(*episode, is_valid, ~is_valid, valid=is_valid, group=[None, "a", "b", "c", "d"])
     for i in range(64):
         credit.add_episode(*episode, group=f"g{i}")
     with pytest.raises(LareError, match=r"more than 64 groups.*'new'"):

@@ -4,6 +4,7 @@ import importlib
 import sys
 from types import SimpleNamespace
 
+import gymnasium
 import numpy as np
 import pytest
 import sb3_contrib
@@ -125,6 +126,30 @@ def test_callback_steps(kind, env_class, policy):
     credit = make_assigner(env_class=env_class)
     on_policy(env, kind, policy).learn(128, callback=CreditCallback(credit, 5))
     check_shown(credit, envs)
+
+
+class Grouped(gymnasium.Wrapper):
+    """Tells the group of an episode when it ends."""
+
+    n_episodes = 0
+
+    def step(self, action):
+        *results, info = self.env.step(action)
+        if results[2] or results[3]:
+            self.n_episodes += 1
+            info = info | {"level": self.n_episodes % 2}
+        return *results, info
+
+
+@pytest.mark.parametrize("kind", [SAC, PPO])
+def test_groups_are_read_from_info(kind):
+    env, credit = Grouped(TimeLimit(Chase(), EPISODE_STEPS)), CreditAssigner("bayes", task=toy_spec(group="level"))
+    if kind is PPO:
+        on_policy(env, PPO, "MlpPolicy").learn(64, callback=CreditCallback(credit))
+    else:
+        off_policy(env, credit, SAC).learn(60)
+    assert set(credit.group_names) == {0, 1}
+    assert {episode.level for episode in credit.store.episodes.values()} == {0, 1}
 
 
 def test_normalised_buffer():

@@ -162,7 +162,8 @@ class CreditAssigner:
             env_ids: the environment of each row, as any hashable value; 0 to n - 1 by default.
             valid: (n,), false for a row that is not a step, such as the call after an end in which a vector environment resets.
             alive: (n, agents), which agents acted; all by default.
-            group: the group of each row's episode, as a text or a number, if the assigner has groups. At most 64 may differ.
+            group: the group of each row's episode, as a text or a number, if the assigner has groups. At most 64 may differ. It may be
+                None at a step after which nothing is paid.
             lanes: the earlier name of `env_ids`.
 
         Returns:
@@ -187,6 +188,10 @@ class CreditAssigner:
             step_ids = np.full(n_rows, -1)
             if len(rows):
                 level = self.config.to_levels(group, n_rows, self.group_names, rows)
+                if np.any((level < 0) & (ended | (not self.config.payments.only_at_end))):
+                    raise LareError(
+                        "the group of an episode is None when it is paid: give the group of each row that is paid"
+                    )
                 step_ids[rows] = self.learner.add_steps(*steps, None if alive is None else alive[rows])
                 env_ids = [ids[row] for row in rows.tolist()]
                 paid_episodes = self.store.extend(env_ids, step_ids[rows], steps, team_reward, ended, level)

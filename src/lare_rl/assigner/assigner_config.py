@@ -154,13 +154,13 @@ class AssignerConfig(CheckedModel):
         group_names: dict[Hashable, int],
         rows: Int[np.ndarray, " n"] | None = None,
     ) -> Int[np.ndarray, " n"]:
-        """Return the number of the group of some rows (by default of all), and add new groups to `group_names`.
+        """Return the number of the group of some rows (by default of all), and add new groups to `group_names`. It is -1 for None.
 
         Raises `LareError` if there are too many groups, or if they do not fit.
         """
         if (group is not None) != self.groups:
             needs, has_none = (
-                "needs group: give group=, one for each row; adapters for libraries have none, so set groups=False there",
+                "needs group: give group=, one for each row; or set groups=False, if your adapter has none",
                 "has no groups: leave group out, or set groups=True",
             )
             raise LareError(f"this assigner {needs if self.groups else has_none}")
@@ -170,11 +170,11 @@ class AssignerConfig(CheckedModel):
         if len(group) != n_rows:
             raise LareError(f"group has {len(group)} entries, but there are {n_rows} steps")
         group = [group[row] for row in rows.tolist()]
-        new = [name for name in dict.fromkeys(group) if name not in group_names]
+        new = [name for name in dict.fromkeys(group) if name is not None and name not in group_names]
         if len(group_names) + len(new) > MAX_LEVELS:
             raise LareError(f"there are more than {MAX_LEVELS} groups, of which {new[-1]!r} is one: merge some of them")
         group_names |= {name: len(group_names) + i for i, name in enumerate(new)}
-        return np.array([group_names[name] for name in group], np.int32)
+        return np.array([-1 if name is None else group_names[name] for name in group], np.int32)
 
     def to_team_reward(
         self, reward: Any, alive: Any, n_steps: int

@@ -146,7 +146,7 @@ class Store:
         error = None
         for i, env_id in enumerate(env_ids):
             episode = self.get_running(env_id, observation[i])
-            episode.level = 0 if level is None else int(level[i])
+            episode.level = 0 if level is None else max(int(level[i]), 0)
             episode.last_observation = next_observation[i]
             payment = None
             try:

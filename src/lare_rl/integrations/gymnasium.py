@@ -75,6 +75,7 @@ class Credit(gymnasium.Wrapper, RecordConstructorArgs):
             [credit_reward],
             [terminated],
             [truncated],
+            infos=[info],
         )
         self._observation = deepcopy(observation)
         info = {TRUE_REWARD: float(reward), **info, CREDIT_STEP: int(steps[0])}

@@ -1,6 +1,6 @@
 """Shows the steps of another library's environments to a `CreditAssigner`."""
 
-from collections.abc import Hashable, Sequence
+from collections.abc import Hashable, Mapping, Sequence
 from typing import Any, Literal
 
 import gymnasium
@@ -62,17 +62,23 @@ class StepRecorder:
         next_observation: Any,
         *results: Any,
         valid: Bool[np.ndarray, " environments"] | None = None,
+        infos: Sequence[Mapping[str, Any]] | None = None,
     ) -> Int[np.ndarray, " environments"]:
         """Show one step of each environment, and return their numbers.
 
-        `results` are the rewards and the two flags of the steps, as in `CreditAssigner.add`.
+        `results` are the rewards and the two flags of the steps, as in `CreditAssigner.add`. `infos` have the groups of episodes.
         """
+        group, task = None, self.credit.config.task
+        if infos is not None and self.credit.config.groups:
+            group = [None if task is None else info.get(task.group) for info in infos]
         if not self._same_observations:
             observation = self.observation_layout.rows(observation, "observation")
             next_observation = self.observation_layout.rows(next_observation, "next_observation")
         if not self._same_actions:
             action = self.action_layout.rows(action, "action")
-        return self.credit.add(observation, action, next_observation, *results, env_ids=self.env_ids, valid=valid)
+        return self.credit.add(
+            observation, action, next_observation, *results, env_ids=self.env_ids, valid=valid, group=group
+        )
 
     def drop(self, env_index: int) -> None:
         """Give up the running episode of an environment, which was reset."""

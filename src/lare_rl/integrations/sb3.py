@@ -100,7 +100,8 @@ class CreditReplayBuffer(ReplayBuffer):
             low, high = self.action_space.low, self.action_space.high
             env_action = low + (0.5 * (env_action + 1.0) * (high - low))  # as `BasePolicy.unscale_action`
         # `done` includes time limits, and the assigner learns from both kinds of ends in the same way.
-        self.steps[self.pos] = self._recorder.add(obs, env_action, next_obs, reward, done, np.zeros_like(done))
+        cut = np.zeros_like(done)
+        self.steps[self.pos] = self._recorder.add(obs, env_action, next_obs, reward, done, cut, infos=infos)
         super().add(obs, next_obs, action, reward, done, infos)
 
     def sample(self, batch_size: int, env: Any = None) -> Any:
@@ -207,7 +208,8 @@ class CreditCallback(BaseCallback):
                 _set_row(next_observation, env_index, last)
         env_action = values.get("clipped_actions", values["actions"])  # MaskablePPO does not clip actions
         done = values["dones"]
-        steps = self._recorder.add(self._observation, env_action, next_observation, reward, done, np.zeros_like(done))
+        results = reward, done, np.zeros_like(done)
+        steps = self._recorder.add(self._observation, env_action, next_observation, *results, infos=values["infos"])
         self.steps.append(steps)
         self._observation = observation
         # The algorithm itself writes this array into its buffer, and adds gamma V(s') to it at time limits.
