@@ -98,5 +98,5 @@ def _read_measure(infos: Iterable[Mapping[Any, Any]], name: str) -> float:
     if not values:
         keys = ", ".join(sorted({str(key) for info in infos for key in info}))
         content = f"has only {keys}" if keys else "is empty (was the episode cut at max_episode_steps?)"
-        raise LareError(f"the task has the measure {name!r}, but the last step's info {content}")
+        raise LareError(f"the task has the measure or group {name!r}, but the last step's info {content}")
     return float(np.mean(values))

@@ -70,7 +70,8 @@ class StepRecorder:
         """
         group, task = None, self.credit.config.task
         if infos is not None and self.credit.config.groups:
-            group = [None if task is None else info.get(task.group) for info in infos]
+            key = None if task is None else task.group
+            group = [None if key is None else info.get(key) for info in infos]
         if not self._same_observations:
             observation = self.observation_layout.rows(observation, "observation")
             next_observation = self.observation_layout.rows(next_observation, "next_observation")
