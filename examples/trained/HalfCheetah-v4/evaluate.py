@@ -39,7 +39,7 @@ def evaluate(graph: Graph, inputs: Mapping[str, Any], xp: Any = np, dtype: Any =
 def compute_nodes(
     graph: Graph, inputs: Mapping[str, Any], xp: Any = np, dtype: Any = np.float32, keep: bool = False
 ) -> list[Any]:
-    """Compute the result of every node. Without `keep`, those that are no outputs are None again when nothing reads them any more."""
+    """Compute the result of every node. Unless `keep` is true, a result that is not an output becomes None after its last use."""
     batch = _batch_shape(graph, inputs)
     values: list[Any] = []
     with np.errstate(all="ignore"):

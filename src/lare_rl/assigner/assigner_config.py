@@ -253,7 +253,6 @@ def _resolve_layouts(task: TaskSpec | None, spaces: Mapping[str, Space | None]) 
 def check_config(config: AssignerConfig) -> None:
     """Raise `LareError` if method, function and sizes do not go together."""
     method, phi, name = config.method, config.phi, config.method.name
-
     if not method.has_proxy_rewards:
         raise LareError(f"{name} assigns no credit: train on what the environment pays")
     if method.needs_phi and phi is None:

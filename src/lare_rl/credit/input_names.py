@@ -44,7 +44,7 @@ _NAMES = (
 
 @dataclass(frozen=True)
 class InputNames:
-    """What a decoder reads of a step. Raises `LareError` if a name is not one of those above, or if `history` is not the last one."""
+    """What a decoder reads of a step. Raises `LareError` if a name is unknown, or if `history` is not the last name."""
 
     names: tuple[str, ...]
     names_of_many_agents: tuple[str, ...] | None = None

@@ -106,7 +106,7 @@ class Moments(NamedTuple):
 
 
 def varies(variance: Float[Array, " features"], mean_square: Any) -> Any:
-    """Return which features vary between cases. `mean_square` is what rounding errors are relative to, beside 1."""
+    """Return which features vary between cases by more than rounding errors, which grow with `mean_square`."""
     return variance > MIN_VARIATION**2 * (1 + mean_square)
 
 
