@@ -176,6 +176,7 @@ def test_default_settings_are_not_listed(make_run, tmp_path):
 
 @pytest.mark.parametrize(("n_rows", "n_factors", "n_pictures"), [(40, 2, 2), (40, 1, 1), (30, 2, 0)])
 def test_tsne_needs_two_columns_and_some_rows(n_rows, n_factors, n_pictures):
+    pytest.importorskip("sklearn")
     rng = np.random.default_rng(0)
     sample = TeamSample(
         team=Team("", 0, 1),
