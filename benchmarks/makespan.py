@@ -2,8 +2,8 @@
 
     python benchmarks/makespan.py
 
-Random actions in the job shop of `benchmarks/real`, whose package must be installed. The figure is R^2 of the last 32 of 96 scores. Each
-method is fitted to the first 64 episodes, then again after every 8, so each of these scores is predicted before it is fitted.
+Random actions in the job shop of `benchmarks/real`, whose package must be installed. Each method is fitted to 64 episodes. The figure is
+R^2 of the scores of 32 other episodes.
 """
 
 from pathlib import Path
@@ -13,27 +13,28 @@ import numpy as np
 import tyro
 
 import lare_rl
-from measure import write
+from measure import fit_once, write
 
-N_EPISODES, FIRST_FIT, FIT_EVERY = 96, 64, 8
+N_FITTED, N_TEST = 64, 32
 REAL = Path(__file__).parent / "real"
 TASK, PHI = REAL / "tasks" / "jobshop.toml", REAL / "phi" / "jobshop.py"
 METHODS = "bayes", "bayes-history", "bayes-progress", "lare-bayes", "lare-bayes-history", "lare-bayes-progress"
 
 
-def play(seed: int) -> list[tuple[np.ndarray, np.ndarray, np.ndarray, float]]:
-    """Return episodes of random actions: observations, actions, next observations and the score."""
+def play(seed: int) -> list[dict[str, np.ndarray]]:
+    """Return episodes of random actions."""
     env = gymnasium.make("final_score:JobShop-v0")
     env.action_space.seed(seed)
     episodes = []
-    for k in range(N_EPISODES):
-        observation, rows, done, score = env.reset(seed=1000 * seed + k)[0], [], False, 0.0
+    for k in range(N_FITTED + N_TEST):
+        observation, rows, done = env.reset(seed=1000 * seed + k)[0], [], False
         while not done:
             action = env.action_space.sample()
-            next_observation, reward, terminated, truncated, _ = env.step(action)
-            rows.append((observation, action, next_observation))
-            observation, done, score = next_observation, terminated or truncated, score + float(reward)
-        episodes.append((*map(np.array, zip(*rows, strict=True)), score))
+            next_observation, score, terminated, truncated, _ = env.step(action)
+            rows.append((observation, action, next_observation, score))
+            observation, done = next_observation, terminated or truncated
+        names = "observation", "action", "next_observation", "score"
+        episodes.append(dict(zip(names, map(np.array, zip(*rows, strict=True)), strict=True)))
     return episodes
 
 
@@ -41,10 +42,8 @@ def measure_r2(method: str, episodes: list) -> float:
     """Return R^2 of the last scores, each predicted before it was fitted."""
     phi = lare_rl.load_function(PHI, TASK) if method.startswith("lare-") else None
     credit = lare_rl.CreditAssigner(method, phi, task=TASK)
-    for k, episode in enumerate(episodes, start=1):
-        credit.add_episode(*episode)
-        if k >= FIRST_FIT and k % FIT_EVERY == 0:
-            credit.fit()
+    for batch in episodes[:N_FITTED], episodes[N_FITTED:]:
+        fit_once(credit, batch, "score")
     return credit.metrics()["credit/return_r2"]
 
 

@@ -69,6 +69,21 @@ def apart(rewards: Float[np.ndarray, "episodes steps *agents"]) -> Float[np.ndar
     return rewards - rewards.mean(1, keepdims=True)
 
 
+def fit_once(credit: lare_rl.CreditAssigner, episodes: Sequence[Mapping[str, np.ndarray]], score: str) -> None:
+    """Fit to the scores of some episodes, which are sums of the entries named `score`.
+
+    All episodes come in one call. If they came one by one, a decoder in closed form would be fitted after every few of them.
+    """
+    steps = [
+        np.concatenate([e[name] for e in episodes]) for name in ("observation", "action", "next_observation", score)
+    ]
+    lengths = [len(e[score]) for e in episodes]
+    ended = np.zeros(sum(lengths), bool)
+    ended[np.cumsum(lengths) - 1] = True
+    credit.add(*steps, ended, np.zeros_like(ended), env_ids=np.repeat(np.arange(len(lengths)), lengths).tolist())
+    credit.fit()
+
+
 def correlation(x: np.ndarray, y: np.ndarray) -> float:
     """Pearson's correlation over all entries."""
     return float(np.corrcoef(x.ravel(), y.ravel())[0, 1])

@@ -18,7 +18,7 @@ from jaxtyping import Float
 
 import lare_rl
 from lare_rl.envs import mujoco_rewards
-from measure import correlation, write
+from measure import correlation, fit_once, write
 
 TASK, SPEED, N_TEST = "HalfCheetahThreshold-v4", 2.0, 20
 VELOCITY = 8
@@ -63,10 +63,7 @@ def assess(method: str, episodes: list, test: list) -> dict[str, float]:
     """Fit a method to the returns of some episodes, and compare its rewards of other episodes with the true ones."""
     phi = load_terms() if method == "terms" else lare_rl.design(TASK) if method.startswith("lare-") else None
     credit = lare_rl.CreditAssigner("lare-bayes" if method == "terms" else method, phi, task=TASK)
-    for episode in episodes:
-        steps = episode["observation"], episode["action"], episode["next_observation"]
-        credit.add_episode(*steps, float(episode["reward"].sum()))
-    credit.fit()
+    fit_once(credit, episodes, "reward")
     arrays = {k: np.concatenate([episode[k] for episode in test]) for k in test[0]}
     begins = np.concatenate([np.arange(len(episode["reward"])) == 0 for episode in test])
     r_hat = credit.rewards(arrays["observation"], arrays["action"], arrays["next_observation"], begins=begins)
