@@ -52,7 +52,9 @@ def assess(method: str, score: Literal["auto", "binary"], episodes: list, test: 
     """Fit a method to the outcomes of some episodes, and correlate its rewards of other episodes with the metres of their steps."""
     phi = lare_rl.design(TASK) if method.startswith("lare-") else None
     credit = lare_rl.CreditAssigner(method, phi, task=TASK, settings=CreditSettings(score=score))
-    fit_once(credit, episodes, "outcome")
+    half = len(episodes) // 2
+    for batch in episodes[:half], episodes[half:]:  # predictions of the second decide whether odds are fitted
+        fit_once(credit, batch, "outcome")
     arrays = {k: np.concatenate([episode[k] for episode in test]) for k in test[0]}
     begins = np.concatenate([np.arange(len(episode["metres"])) == 0 for episode in test])
     r_hat = credit.rewards(arrays["observation"], arrays["action"], arrays["next_observation"], begins=begins)
