@@ -20,7 +20,7 @@ from lare_rl.credit.decoder_settings import RECENT_STEPS
 from lare_rl.credit.decomposition import CreditBatch, DecoderState
 from lare_rl.credit.methods import Fit
 from lare_rl.data import replay
-from lare_rl.data.sampling import CreditSample, sample_drawn
+from lare_rl.data.sampling import CreditSample, sample_episode_steps
 from lare_rl.nn.normalise import Scale
 from lare_rl.runs.directory import open_run
 from lare_rl.training.decoder_inputs import decoder_inputs
@@ -43,9 +43,9 @@ def updates(
         episodes = CreditBatch(features, sample.episode, chosen.length, chosen.mean_reward[..., 0], chosen.mask)
         return descent.update(credit, episodes, key, fit, config.credit)[0], None
 
-    n_steps = min(config.credit.drawn_steps, config.env.max_steps)
-    n_episodes = max(1, config.credit.steps // config.credit.drawn_steps)
-    samples = sample_drawn(stored_replay, key, STRETCH, n_episodes, n_steps)
+    n_steps = min(config.credit.sampled_steps, config.env.max_steps)
+    n_episodes = max(1, config.credit.steps // config.credit.sampled_steps)
+    samples = sample_episode_steps(stored_replay, key, STRETCH, n_episodes, n_steps)
     return jax.lax.scan(update, credit, samples)[0]
 
 

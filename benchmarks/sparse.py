@@ -24,7 +24,7 @@ from measure import correlation, fit_once, write
 TASK, DISTANCE, N_TEST, MAX_NOISE = "HalfCheetahSparse-v4", 45.0, 20, 1.0
 POLICY = Path(__file__).parent.parent / "examples" / "trained" / "HalfCheetah-v4"
 METHODS = "bayes", "lare-bayes", "bayes-history", "lare-bayes-history", "bayes-progress", "lare-bayes-progress"
-COUNTS = 20, 60, 180
+COUNTS = 20, 60
 
 
 def play(n_episodes: int, seed: int) -> list[dict[str, Float[np.ndarray, "steps *entries"]]]:

@@ -158,7 +158,7 @@ def small():
                 for name in ("td3", "ddpg", "sac")
             },
             "ppo": PPOSettings(hidden=(8,), minibatch_size=16, epochs=2),
-            "credit": {"hidden": (8,), "drawn_steps": 4, "steps": 16},
+            "credit": {"hidden": (8,), "sampled_steps": 4, "steps": 16},
         }
         return Settings(**(values | changes))
 
@@ -185,7 +185,7 @@ def small_many():
             "capacity": 400,
             "ippo": PPOSettings(hidden=(8,), minibatch_size=100, epochs=1),
             **{name: ALGORITHMS[name].settings.model_copy(update=quick) for name in ("qmix", "vdn")},
-            "credit": {"hidden": (8,), "steps": 50, "drawn_steps": 5},
+            "credit": {"hidden": (8,), "steps": 50, "sampled_steps": 5},
         }
         return Settings(**(values | changes))
 

@@ -115,12 +115,12 @@ def single_agent_notes(runs: Mapping[str, Run]) -> Iterator[str]:
     """Differences from the paper's protocol for one agent; `runs` has one run of each task."""
     for task, run in runs.items():
         credit, longest = run.config.settings.credit, load_env_spec(run.config.task).max_steps
-        drawn_steps = credit.drawn_steps
-        if longest < drawn_steps:
+        n_sampled = credit.sampled_steps
+        if longest < n_sampled:
             yield (
-                f"Episodes of fewer than {drawn_steps} steps are taken whole (the paper: {drawn_steps} steps with replacement). So RRD and "
+                f"Episodes of fewer than {n_sampled} steps are taken whole (the paper: {n_sampled} steps with replacement). So RRD and "
                 f"RRD-unbiased have the loss of RD on {task}, whose episodes have {longest} steps; an update reads "
-                f"{credit.steps // drawn_steps} episodes, and {credit.steps // longest} for RD."
+                f"{credit.steps // n_sampled} episodes, and {credit.steps // longest} for RD."
             )
     before = [task for task, run in runs.items() if run.config.task.scored_observation == "before"]
     exception = (

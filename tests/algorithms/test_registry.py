@@ -46,7 +46,7 @@ print(lare_rl.open_run("run").config.settings == run.config.settings)
 
 @pytest.mark.parametrize("discrete", [False, True])
 def test_greedy_samples_distributions_over_choices(discrete):
-    stochastic = {name for name, algorithm in ALGORITHMS.items() if not algorithm.greedy(discrete)}
+    stochastic = {name for name, algorithm in ALGORITHMS.items() if not algorithm.deterministic_evaluation(discrete)}
     assert stochastic == ({"ppo", "ippo"} if discrete else {"ippo"})
 
 

@@ -468,7 +468,7 @@ NO_TASK = {"task": None, "observation_space": 2, "action_space": 1}
         ("rd", None, {"agents": 2}, "max_steps"),
         ("ircr", None, {"scale_rewards": True}, "scale_rewards"),
         ("rd-linear", None, {"observation_space": 10_000}, "1024 .*10001"),
-        ("rrdu", None, {"settings": CreditSettings(drawn_steps=8, steps=4)}, r"steps = 4,.*drawn_steps = 8"),
+        ("rrdu", None, {"settings": CreditSettings(sampled_steps=8, steps=4)}, r"steps = 4,.*sampled_steps = 8"),
         ("rd", None, {"action_space": None}, "action_space"),
         ("rd", None, {"task": TASK, "observation_space": 3}, "observation_space .*3 .*observation_size = 2"),
         ("rd", None, {"capacity": 0}, "capacity = 0"),

@@ -30,7 +30,7 @@ def resolve_named(task, settings):
         ("CN-6", {"method": "diaster"}, ["diaster", "single agent", "6"]),
         ("Reacher-v4", {"method": "llm-reward", "scored_observation": "both"}, ["llm-reward", "scored_observation"]),
         ("Reacher-v4", {"method": "ircr", "scale_rewards": True}, ["scale_rewards", "ircr"]),
-        ("Reacher-v4", {"method": "rrd", "credit": {"steps": 16}}, ["steps = 16", "drawn_steps = 64"]),
+        ("Reacher-v4", {"method": "rrd", "credit": {"steps": 16}}, ["steps = 16", "sampled_steps = 64"]),
         ("CN-6", {"steps": 5000}, ["steps = 5000", "2050", "environments = 82", "4100 or 6150"]),
         ("Reacher-v4", {"steps": 1001}, ["steps = 1001", "rollout_steps = 50", "1000 or 1050"]),
         ("Reacher-v4", {"steps": 1000, "evaluate_every": 40}, ["evaluate_every = 40", "use 50"]),

@@ -21,5 +21,5 @@ from lare_rl.credit.methods import Fit
     ],
 )
 def test_plan_batch(fit, longest, fixed_length, plan):
-    settings = CreditSettings(steps=100, drawn_steps=8, episodes=7)
+    settings = CreditSettings(steps=100, sampled_steps=8, episodes=7)
     assert plan_batch(fit, settings, longest, fixed_length=fixed_length) == plan

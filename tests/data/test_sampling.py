@@ -24,11 +24,11 @@ sample_transitions, sample_episodes, sample_distinct_episodes = (
     jax.jit(function, static_argnums=2)
     for function in (sampling.sample_transitions, sampling.sample_episodes, sampling.sample_distinct_episodes)
 )
-sample_packed, sample_drawn, sample_padded, episodes_in_order = (
+sample_packed, sample_episode_steps, sample_padded, episodes_in_order = (
     jax.jit(function, static_argnums=static)
     for function, static in (
         (sampling.sample_packed, (2, 3, 4)),
-        (sampling.sample_drawn, (2, 3, 4)),
+        (sampling.sample_episode_steps, (2, 3, 4)),
         (sampling.sample_padded, (2, 3, 4)),
         (sampling.episodes_in_order, (3, 4)),
     )
@@ -125,8 +125,8 @@ def test_episodes_in_order(buffer):
     assert_packed(jax.tree.map(np.asarray, sample), expected[:2])
 
 
-def test_sample_drawn_has_steps_of_its_episodes(buffer):
-    sample = jax.tree.map(np.asarray, sample_drawn(buffer, jax.random.key(0), 7, 6, 4))
+def test_sample_episode_steps_has_steps_of_its_episodes(buffer):
+    sample = jax.tree.map(np.asarray, sample_episode_steps(buffer, jax.random.key(0), 7, 6, 4))
     lengths = [FIRST[first][0] for first in pairs(sample.episodes.first)]
     assert 3 in lengths
     rows = pairs(sample.steps)

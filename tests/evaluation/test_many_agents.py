@@ -81,7 +81,7 @@ def test_cross_play(runs, command):
     assert len({match.returns[0, 1] for match in matches}) == 4
     # A policy that plays against itself plays as it does alone.
     state, env = load_learner(runs[0]), make_env(runs[0].config.task)
-    play = jax.jit(partial(unroll_on_device, env, n_episodes=N_EPISODES, config=state.config, greedy=False))
+    play = jax.jit(partial(unroll_on_device, env, n_episodes=N_EPISODES, config=state.config, deterministic=False))
     for seed in range(2):
         learner = jax.tree.map(lambda leaf, seed=seed: leaf[seed : seed + 1], state.learner)
         batch = play(training_module(state.config).get_actor(learner, 200, state.config), jax.random.key(0)[None])

@@ -208,7 +208,7 @@ def policy_case(config, actor):
     action, memory = compile_functions(config).act(actor, memory, observation[None], available[None], None, is_new)
     if memory:
         expected["next_hidden"] = memory.hidden[0]
-    if env.discrete and not config.greedy:
+    if env.discrete and not config.deterministic_evaluation:
         policy_input = on_policy.policy_input(jnp.asarray(observation)[None], config)
 
         expected["logits"] = np.asarray(jax.vmap(ppo.logits)(actor, policy_input, available[None]))[0]

@@ -83,7 +83,7 @@ def test_collect_respects_masks(steps):
 
 
 def test_collect_resets_memory_with_episode(learner, steps):
-    """The greedy choices equal those of the recurrent policy, unrolled over each episode alone."""
+    """The deterministic choices equal those of the recurrent policy, unrolled over each episode alone."""
     n_episodes = 0
     for seed_index, env_index in np.ndindex(2, ENVS):
         agent = jax.tree.map(lambda leaf, i=seed_index: leaf[i], learner[0].algorithm.qmix.online.agent)
@@ -118,7 +118,7 @@ def test_reset_with_each_step_changes_nothing(learner, steps, monkeypatch):
 
 def test_evaluate_equals_plain_loop(learner):
     keys = stream_keys(SEEDS, Stream.EVALUATION_EPISODES, 0)
-    batch = jax.jit(partial(unroll_on_device, ENV, n_episodes=5, config=CONFIG, greedy=True))(learner[1], keys)
+    batch = jax.jit(partial(unroll_on_device, ENV, n_episodes=5, config=CONFIG, deterministic=True))(learner[1], keys)
     steps, mask = jax.tree.map(np.asarray, (batch.steps, batch.mask))
     assert mask.shape == (6, 2, 5)
     np.testing.assert_array_equal(mask, np.cumsum(steps.ended, axis=0) - steps.ended == 0)

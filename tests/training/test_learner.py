@@ -35,7 +35,7 @@ from lare_rl.credit import closed_form, returns
 from lare_rl.credit.decoder_settings import CreditSettings
 from lare_rl.credit.engine import return_scale
 from lare_rl.data import replay
-from lare_rl.data.sampling import sample_drawn
+from lare_rl.data.sampling import sample_episode_steps
 from lare_rl.envs.interface import EnvSpec, Team
 from lare_rl.nn.normalise import root_mean_square
 from lare_rl.training.decoder_fits import fit_decoders, fit_repeatedly, sample_credit
@@ -83,7 +83,7 @@ def test_unbiased_loss_has_the_expectation_of_the_full_loss(n_steps):
         # The rewards of steps shall differ.
         steep = jax.tree.map(lambda weight: 6 * weight, learner.decoders[0].network)
         learner = learner._replace(decoders=(learner.decoders[0]._replace(network=steep),))
-        draws = sample_drawn(learner.replay, jax.random.key(3), 1, 40_000, n_steps)
+        draws = sample_episode_steps(learner.replay, jax.random.key(3), 1, 40_000, n_steps)
         first = jax.tree.map(lambda leaf: leaf[0], draws)
         _, metrics = jitted(fit_decoders, config)(learner.decoders, learner.replay, first, jax.random.key(0))
         losses[name] = float(metrics["credit/loss"])
@@ -305,7 +305,7 @@ def test_must_learn_which_agent_earned_the_reward(method, fixed_length):
         env=env,
         n_envs=8,
         fit_updates=500,
-        credit=CreditSettings(hidden=(16,), learning_rate=1e-2, steps=200, drawn_steps=6),
+        credit=CreditSettings(hidden=(16,), learning_rate=1e-2, steps=200, sampled_steps=6),
         capacity=200,
         rollout_steps=60,
     )

@@ -53,17 +53,17 @@ def test_other_operations_are_refused(function):
         to_numpy(function, draw(4), draw(4))
 
 
-@pytest.mark.parametrize("greedy", [True, False])
+@pytest.mark.parametrize("deterministic", [True, False])
 @pytest.mark.parametrize("algorithm", ["td3", "sac", "ppo"])
-def test_policy_on_host_equals_compiled_policy(algorithm, greedy, tmp_path, monkeypatch):
+def test_policy_on_host_equals_compiled_policy(algorithm, deterministic, tmp_path, monkeypatch):
     settings = resolve(Settings(method="dense", algorithm=algorithm, seeds=2, capacity=4000), toy_spec())
     config = make_train_config(create_run(tmp_path / "run", toy_spec(), settings, ()))
     functions = compile_functions(config)
     actor = functions.get_actor(init_seeds(functions, seed_keys(jnp.arange(2), 0)), 0)
-    noise = None if greedy else draw(2, 3, 1, config.noise_size)
+    noise = None if deterministic else draw(2, 3, 1, config.noise_size)
     inputs = (), draw(2, 3, 1, 2), np.ones((2, 3, 1, config.env.action_size), bool), noise, np.zeros((2, 3), bool)
-    assert host_policy._translate_policy(config, 2, 3, greedy) is not None
-    action, _ = make_policy(config, actor, 3, greedy=greedy)(*inputs)
+    assert host_policy._translate_policy(config, 2, 3, deterministic) is not None
+    action, _ = make_policy(config, actor, 3, deterministic=deterministic)(*inputs)
     monkeypatch.setattr(host_policy, "_translate_policy", lambda *_: None)
-    expected, _ = make_policy(config, actor, 3, greedy=greedy)(*inputs)
+    expected, _ = make_policy(config, actor, 3, deterministic=deterministic)(*inputs)
     np.testing.assert_allclose(action, expected, atol=1e-6)

@@ -132,7 +132,7 @@ def test_functions_are_mapped_over_seeds():
         ({"method": "stas"}, "bayes"),
         ({"method": "lare-bayes"}, "phi"),
         ({"method": "bayes", "settings": CreditSettings(exact="last")}, "exact"),
-        ({"method": "rrd", "settings": CreditSettings(steps=16)}, "drawn_steps"),
+        ({"method": "rrd", "settings": CreditSettings(steps=16)}, "sampled_steps"),
         ({"method": "nothing"}, "nothing"),
     ],
 )

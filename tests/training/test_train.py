@@ -224,7 +224,7 @@ def test_off_policy_learns_toy(algorithm, method, phi, tmp_path):
         evaluate_every=400,
         **{algorithm: ALGORITHMS[algorithm].settings.model_copy(update=small)},
         **({"capacity": 380} if algorithm == "ddpg" else {}),  # with fewer than 20 episodes, no explanation is compiled
-        credit=CreditSettings(hidden=(32,), learning_rate=3e-3, drawn_steps=8, steps=64, score="sum"),
+        credit=CreditSettings(hidden=(32,), learning_rate=3e-3, sampled_steps=8, steps=64, score="sum"),
     )
     run = train_quietly(toy_spec(), settings, tmp_path / "run", phi_for(method, phi))
     assert run.metrics()[-1]["evaluation/return"] > -3
@@ -252,7 +252,7 @@ def test_ppo_learns_toy(task, method, steps, hidden, least, phi, tmp_path):
         ppo=PPOSettings(hidden=hidden, learning_rate=3e-3, gamma=0.5, minibatch_size=50),
         rollout_steps=200,
         fit_updates=50,
-        credit=CreditSettings(hidden=hidden, learning_rate=3e-3, drawn_steps=8, steps=64),
+        credit=CreditSettings(hidden=hidden, learning_rate=3e-3, sampled_steps=8, steps=64),
     )
     run = train_quietly(task, settings, tmp_path / "run", phi_for(method, phi))
     assert run.metrics()[-1]["evaluation/return"] > least

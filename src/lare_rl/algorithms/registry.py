@@ -90,7 +90,7 @@ class Algorithm:
             return Noise.UNIFORM
         return Noise.GUMBEL if discrete else Noise.NORMAL
 
-    def greedy(self, discrete: bool) -> bool:
+    def deterministic_evaluation(self, discrete: bool) -> bool:
         """Return whether a policy acts without noise outside training.
 
         A policy over choices is trained as a distribution. Until it is nearly deterministic, always taking its most likely choice

@@ -63,7 +63,7 @@ def evaluate(
     start = time.monotonic()
     evaluation = evaluate_policy(opened, episodes, best, deterministic, EpisodeProgress(episodes))
     policy_s, n_random = time.monotonic() - start, max(episodes, RANDOM_EPISODES)
-    samples = not (deterministic or ALGORITHMS[settings.algorithm].greedy(env_spec.discrete))
+    samples = not (deterministic or ALGORITHMS[settings.algorithm].deterministic_evaluation(env_spec.discrete))
     likeliest = evaluate_policy(opened, episodes, best, True, EpisodeProgress(episodes)) if samples else None
     best_steps = load_actor(opened, best=True)[2].tolist() if best else None
     random_episodes = play_random(task, n_random, max(policy_s, RANDOM_PLAY_LIMIT_S), EpisodeProgress(n_random))

@@ -90,9 +90,9 @@ def check_credit(
             f"{name} reads at most {longest} steps of one payment, and the task pays for up to "
             f"{payments.longest_segment(max_steps)}: use rudder, or payments"
         )
-    if "drawn_steps" in method.settings and not fixed_length and credit.steps < credit.drawn_steps:
+    if "sampled_steps" in method.settings and not fixed_length and credit.steps < credit.sampled_steps:
         raise LareError(
-            f"the decoder has steps = {credit.steps}, less than drawn_steps = {credit.drawn_steps} of one episode: use more steps"
+            f"the decoder has steps = {credit.steps}, less than sampled_steps = {credit.sampled_steps} of one episode: use more steps"
         )
     if method.fit in (Fit.EVIDENCE, Fit.PREFIX_EVIDENCE) and not method.needs_phi and n_raw_features > MAX_RAW_FEATURES:
         raise LareError(

@@ -32,8 +32,8 @@ def plan_batch(fit: Fit, settings: CreditSettings, longest: int, *, fixed_length
     if fit is Fit.DECODER_LOSS:
         return BatchPlan("padded", settings.episodes, longest)
     if fit.samples_steps:
-        n_episodes = settings.steps // (longest if fixed_length else settings.drawn_steps)
-        return BatchPlan("sampled", max(1, n_episodes), min(settings.drawn_steps, longest))
+        n_episodes = settings.steps // (longest if fixed_length else settings.sampled_steps)
+        return BatchPlan("sampled", max(1, n_episodes), min(settings.sampled_steps, longest))
     if fixed_length:
         return BatchPlan("padded", max(1, settings.steps // longest), longest)
     return BatchPlan("packed", max(1, settings.steps // 2), max(settings.steps, longest))

@@ -2,7 +2,7 @@
 
 from typing import Annotated, Literal
 
-from pydantic import Field
+from pydantic import AliasChoices, Field
 
 from lare_rl.errors import CheckedModel
 
@@ -27,11 +27,11 @@ class CreditSettings(CheckedModel):
     """Normalise features and returns by running statistics. The published form does not."""
     sum_form: bool = False
     """Fit the return R of an episode (Eq. 6 of the paper), not its mean R/T (the published code for one agent)."""
-    drawn_steps: Annotated[int, Field(ge=2)] = 64
-    """K: steps drawn from an episode by RRD and its variants."""
+    sampled_steps: Annotated[int, Field(ge=2, validation_alias=AliasChoices("sampled_steps", "drawn_steps"))] = 64
+    """K: the number of steps that RRD and its variants sample from an episode."""
     steps: Annotated[int, Field(ge=2)] = 256
     """Steps in one update of the decoder: K steps from each of steps / K episodes, or whole episodes with about this many steps in
-    total. On particle tasks, whose episodes all have T = 25 steps: steps / T episodes, even if only K steps of each are drawn."""
+    total. On particle tasks, whose episodes all have T = 25 steps: steps / T episodes, even if only K steps of each are sampled."""
     episodes: Annotated[int, Field(ge=1)] = 8
     """diaster, rudder, grd and rbt (single agents): whole episodes in one update of the decoder."""
     score: Literal["auto", "sum", "average", "binary"] = "auto"
@@ -60,7 +60,7 @@ MULTI_AGENT_CREDIT = CreditSettings(
     hidden=(64, 64, 64, 64),
     learning_rate=5e-4,
     weight_decay=1e-5,
-    drawn_steps=10,
+    sampled_steps=10,
     steps=6400,
     encoder=(256,),
     bottleneck=4,

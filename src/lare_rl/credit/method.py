@@ -56,7 +56,7 @@ class Fit(StrEnum):
             case Fit.PREFIX_EVIDENCE | Fit.SIGNS:
                 names = {"exact"}
             case _:
-                names = {"score", "sum_form", "steps", "exact"} | ({"drawn_steps"} if self.samples_steps else set())
+                names = {"score", "sum_form", "steps", "exact"} | ({"sampled_steps"} if self.samples_steps else set())
         return frozenset(names if self.closed_form else names | {"learning_rate", "weight_decay", "normalise"})
 
 

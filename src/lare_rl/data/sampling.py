@@ -25,7 +25,7 @@ __all__ = [
     "episodes_in_order",
     "get_episodes",
     "sample_distinct_episodes",
-    "sample_drawn",
+    "sample_episode_steps",
     "sample_episodes",
     "sample_packed",
     "sample_padded",
@@ -113,7 +113,7 @@ def _credit_sample(episodes: EpisodeSample, layout: Layout) -> CreditSample:
     )
 
 
-def sample_drawn(replay: Replay, key: PRNGKeyArray, updates: int, count: int, steps: int) -> CreditSample:
+def sample_episode_steps(replay: Replay, key: PRNGKeyArray, updates: int, count: int, steps: int) -> CreditSample:
     """Sample `steps` steps of each of `count` episodes, for RRD."""
     episodes_key, steps_key = jax.random.split(key)
     episodes = sample_episodes(replay, episodes_key, (updates, count))

@@ -79,8 +79,8 @@ def _play_match(
 ) -> Float[Array, ""]:
     """Return the mean over episodes of the first team's return R."""
     team = config.env.teams[0]
-    policy = partial(combine_policies, policy=policy_function(config, greedy=False), team=team)
-    batch = unroll_on_device(env, (first, second), key[None], n_episodes, config, greedy=False, act=policy)
+    policy = partial(combine_policies, policy=policy_function(config, deterministic=False), team=team)
+    batch = unroll_on_device(env, (first, second), key[None], n_episodes, config, deterministic=False, act=policy)
     reward = team_mean(batch.steps.next_timestep.reward, batch.steps.timestep.alive, team)
     return jnp.mean(jnp.sum(reward * batch.mask, axis=0))
 

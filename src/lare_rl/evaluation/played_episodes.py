@@ -110,13 +110,13 @@ def play_run(run: Run, n_episodes: int = 1, *, actor: Any = None, key: int = 0) 
 
 def unroll_policy(env: JaxEnv, config: TrainConfig, actor: Any, n_episodes: int, key: int) -> EpisodeBatch:
     """Play whole episodes of a single seed's actor in one compiled call. The batch has no axis of seeds."""
-    unroll = jax.jit(partial(unroll_on_device, env, n_episodes=n_episodes, config=config, greedy=False))
+    unroll = jax.jit(partial(unroll_on_device, env, n_episodes=n_episodes, config=config, deterministic=False))
     return _drop_seed_axis(unroll(actor, jax.random.key(key)[None]))
 
 
 def _unroll_on_host(run: Run, config: TrainConfig, actor: Any, n_episodes: int) -> EpisodeBatch:
     seeds = run.seeds[:1]
-    policy = EvaluationPolicy(config, actor, seeds, n_episodes, greedy=False)
+    policy = EvaluationPolicy(config, actor, seeds, n_episodes, deterministic=False)
     episode_seeds = [episode_seed(seeds[0], Stream.TRAINING_EPISODES, number) for number in range(n_episodes)]
     with make_vec_env(run.config.task, n_episodes) as envs:
         return _drop_seed_axis(record_on_host(envs, policy, seeds, episode_seeds))

@@ -100,12 +100,12 @@ class RunPolicy:
             raise LareError(
                 f"the policy of {name} has a memory: give it one observation at a time, and call reset() between episodes"
             )
-        greedy = self._config.greedy
+        deterministic = self._config.deterministic_evaluation
         mask = self._check_mask(available, n_rows)
-        noise = None if greedy else draw_noise(self._config, [self._rng], n_rows)
+        noise = None if deterministic else draw_noise(self._config, [self._rng], n_rows)
         n_padded = 1 << (n_rows - 1).bit_length()  # each number of rows needs a program of its own
         if n_padded not in self._policies:
-            self._policies[n_padded] = make_policy(self._config, self._actor, n_padded, greedy=greedy)
+            self._policies[n_padded] = make_policy(self._config, self._actor, n_padded, deterministic=deterministic)
         action, self._memory = self._policies[n_padded](
             self._memory if has_memory else init_host_memory(self._config, 1, n_padded),
             _pad(rows[None, :, None], n_padded),

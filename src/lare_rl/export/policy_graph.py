@@ -64,7 +64,7 @@ def _act(inputs: dict[str, Array], actor: Any, config: TrainConfig, first_choice
         outputs["action"] = to_env_action(action, env)
     else:
         outputs["action"] = jnp.argmax(action, axis=-1) + first_choice
-        if not config.greedy and hasattr(algorithm, "logits"):
+        if not config.deterministic_evaluation and hasattr(algorithm, "logits"):
             choices = available if env.masks_actions else None
             outputs["logits"] = algorithm.logits(actor, policy_input(observation, config), choices)
     return outputs if env.n_agents > 1 else {name: values[0] for name, values in outputs.items()}

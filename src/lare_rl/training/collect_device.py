@@ -100,11 +100,11 @@ def unroll_on_device(
     keys: Key[Array, " seeds"],
     n_episodes: int,
     config: TrainConfig,
-    greedy: bool,
+    deterministic: bool,
     act: Act | None = None,
 ) -> EpisodeBatch:
     """Play whole episodes of a policy, each from a different initial state. `act` replaces the policy of training."""
-    act = act or policy_function(config, greedy)
+    act = act or policy_function(config, deterministic)
     reset_keys, step_keys = jnp.unstack(_split_keys(keys, 2), axis=1)
     envs = reset(env, reset_keys, n_episodes, config)
 
@@ -116,7 +116,7 @@ def unroll_on_device(
         return (envs, running & ~steps.ended), EpisodeBatch(steps, running, envs.state)
 
     keys = jnp.swapaxes(_split_keys(step_keys, config.env.max_steps), 0, 1)
-    randomness = jax.vmap(lambda keys_t: _draw(keys_t, n_episodes, config, greedy))(keys)
+    randomness = jax.vmap(lambda keys_t: _draw(keys_t, n_episodes, config, deterministic))(keys)
     return jax.lax.scan(body, (envs, jnp.ones_like(envs.episode_start)), randomness)[1]
 
 
@@ -145,11 +145,11 @@ class _Randomness(NamedTuple):
     """The keys of the environments."""
 
 
-def _draw(keys: Key[Array, " seeds"], n_envs: int, config: TrainConfig, greedy: bool) -> _Randomness:
+def _draw(keys: Key[Array, " seeds"], n_envs: int, config: TrainConfig, deterministic: bool) -> _Randomness:
     """Draw the random numbers of a step."""
     noise_keys, env_keys = jnp.unstack(_split_keys(keys, 2), axis=1)
     noise, shape = None, (n_envs, config.env.n_agents, config.noise_size)
-    if not greedy:
+    if not deterministic:
         noise = jax.vmap(lambda key: device_noise(key, config.noise, shape))(noise_keys)
     return _Randomness(noise, _split_keys(env_keys, n_envs))
 
@@ -195,14 +195,14 @@ def collect(
 
     keys = jnp.swapaxes(_split_keys(keys, config.rollout_steps), 0, 1)
     step_keys, reset_keys = jnp.unstack(jax.vmap(partial(_split_keys, n_envs=2))(keys), axis=2)
-    randomness = jax.vmap(lambda keys_t: _draw(keys_t, n_envs, config, greedy=False))(step_keys)
+    randomness = jax.vmap(lambda keys_t: _draw(keys_t, n_envs, config, deterministic=False))(step_keys)
     envs, steps = jax.lax.scan(body, envs, (randomness, reset_keys))
     return envs, jax.tree.map(lambda rows: jnp.swapaxes(rows, 0, 1), steps)
 
 
 def _exploration_policy(env_steps: int | Int[Array, ""], config: TrainConfig) -> Act:
     """Return the policy that collects. During the warmup, its actions are random: evenly distributed between the bounds."""
-    policy = policy_function(config, greedy=False)
+    policy = policy_function(config, deterministic=False)
     if not config.warmup:
         return policy
     assert config.noise is Noise.NORMAL
@@ -233,7 +233,7 @@ def is_reset_cheap(env: JaxEnv, n_envs: int) -> bool:
 def _evaluate(
     env: JaxEnv, actor: Any, keys: Key[Array, " seeds"], *, n_episodes: int, config: TrainConfig
 ) -> Evaluation:
-    steps, mask, _ = unroll_on_device(env, actor, keys, n_episodes, config, config.greedy)
+    steps, mask, _ = unroll_on_device(env, actor, keys, n_episodes, config, config.deterministic_evaluation)
     reward = steps.next_timestep.reward * mask[..., None]
     returns = [team_mean(reward, steps.timestep.alive, team).sum(axis=0) for team in config.env.teams]
     summed_returns = [reward[..., team.agents].sum(axis=(0, -1)) for team in config.env.teams]

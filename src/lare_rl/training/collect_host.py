@@ -209,7 +209,7 @@ class HostCollector:
             uniform = [rng.uniform(-1, 1, (*shape, config.env.action_size)) for rng in rngs]
             action = np.stack(uniform, axis=1).astype(np.float32)
             return self._envs.collect(lambda timestep, action_t, episode_start: action_t, action, report)
-        policy = make_policy(config, actor, config.n_envs, greedy=False)
+        policy = make_policy(config, actor, config.n_envs, deterministic=False)
         noise = np.stack([host_noise(rng, config.noise, (*shape, config.noise_size)) for rng in rngs], axis=1)
 
         def explore(timestep: Timestep, noise_t: np.ndarray, episode_start: np.ndarray) -> np.ndarray:

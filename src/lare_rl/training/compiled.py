@@ -83,7 +83,7 @@ def init_memory(config: TrainConfig, *lead: int) -> Any:
     return jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (*lead, *leaf.shape)), memory)
 
 
-def policy_function(config: TrainConfig, greedy: bool) -> Callable[..., tuple[Array, Any]]:
+def policy_function(config: TrainConfig, deterministic: bool) -> Callable[..., tuple[Array, Any]]:
     """Return the policy of all seeds. Its memory is reset where an episode is new."""
     module = training_module(config)
 
@@ -98,7 +98,7 @@ def policy_function(config: TrainConfig, greedy: bool) -> Callable[..., tuple[Ar
         memory = select(is_new, module.init_memory(config), memory)
         return module.act(actor, memory, observation, available, noise, config)
 
-    return jax.vmap(act, in_axes=(0, 0, 0, 0, None if greedy else 0, 0))
+    return jax.vmap(act, in_axes=(0, 0, 0, 0, None if deterministic else 0, 0))
 
 
 @cache_by_value
@@ -138,8 +138,8 @@ def compile_functions(config: TrainConfig, phi: Sequence[Graph] = ()) -> Compile
         train_step=jit(partial(module.train_step, config=config), shared=(3,), donate=(0,)),
         assess=jit(jax.vmap(partial(assess, config=config))),
         get_actor=partial(module.get_actor, config=config),
-        explore=jit(policy_function(config, greedy=False)),
-        act=jit(policy_function(config, greedy=True)),
+        explore=jit(policy_function(config, deterministic=False)),
+        act=jit(policy_function(config, deterministic=True)),
     )
 
 

@@ -9,7 +9,7 @@ from lare_rl.credit.batch_plan import plan_batch
 from lare_rl.credit.decomposition import CreditBatch, DecoderState
 from lare_rl.data import replay
 from lare_rl.data.replay import Replay
-from lare_rl.data.sampling import CreditSample, sample_drawn, sample_packed, sample_padded
+from lare_rl.data.sampling import CreditSample, sample_episode_steps, sample_packed, sample_padded
 from lare_rl.nn.leading_axis import map_leading_axis
 from lare_rl.training.decoder_inputs import episode_batch
 from lare_rl.training.learner import Learner
@@ -32,7 +32,7 @@ def sample_credit(buffer: Replay, key: PRNGKeyArray, updates: int, config: Train
     plan = plan_batch(fit, config.credit, longest, fixed_length=config.has_fixed_segments)
     match plan.layout:
         case "sampled":
-            return sample_drawn(buffer, key, updates, plan.episodes, plan.rows)
+            return sample_episode_steps(buffer, key, updates, plan.episodes, plan.rows)
         case "padded":
             return sample_padded(buffer, key, updates, plan.episodes, plan.rows)
         case "packed":

@@ -25,14 +25,14 @@ HostPolicy = Callable[..., tuple[Float[np.ndarray, "seeds envs agents action"], 
 """From memory, observation, available actions, noise (or None), and which episodes are new, to the action and the new memory."""
 
 
-def make_policy(config: TrainConfig, actor: Any, n_envs: int, *, greedy: bool) -> HostPolicy:
-    """Return the policy of all seeds, each in `n_envs` environments. If `greedy`, it acts without noise."""
+def make_policy(config: TrainConfig, actor: Any, n_envs: int, *, deterministic: bool) -> HostPolicy:
+    """Return the policy of all seeds, each in `n_envs` environments. If `deterministic`, it acts without noise."""
     n_seeds = len(jax.tree.leaves(actor)[0])
-    bind = _translate_policy(config, n_seeds, n_envs, greedy)
+    bind = _translate_policy(config, n_seeds, n_envs, deterministic)
     if bind is not None:
         return bind(jax.tree.map(np.array, jax.device_get(actor)))
     functions = compile_functions(config)
-    act = functions.act if greedy else functions.explore
+    act = functions.act if deterministic else functions.explore
 
     def act_compiled(*inputs: Any) -> tuple[Float[np.ndarray, "seeds envs agents action"], Any]:
         return jax.device_get(act(actor, *inputs))
@@ -42,7 +42,7 @@ def make_policy(config: TrainConfig, actor: Any, n_envs: int, *, greedy: bool) -
 
 @cache_by_value
 def _translate_policy(
-    config: TrainConfig, n_seeds: int, n_envs: int, greedy: bool
+    config: TrainConfig, n_seeds: int, n_envs: int, deterministic: bool
 ) -> Callable[[Any], HostPolicy] | None:
     """Return the policy as a NumPy program, or None if it has an operation that cannot be translated."""
     env, lead = config.env, (n_seeds, n_envs)
@@ -52,10 +52,10 @@ def _translate_policy(
 
     memory = jax.eval_shape(lambda: init_memory(config, *lead))
     observation, available = shape(env.n_agents, env.observation_size), shape(env.n_agents, env.action_size, dtype=bool)
-    noise = None if greedy else shape(env.n_agents, config.noise_size)
+    noise = None if deterministic else shape(env.n_agents, config.noise_size)
     inputs = memory, observation, available, noise, shape(dtype=bool)
     try:
-        return to_numpy(policy_function(config, greedy), actor_shape(config, n_seeds), *inputs)
+        return to_numpy(policy_function(config, deterministic), actor_shape(config, n_seeds), *inputs)
     except UnsupportedOperationError:
         return None
 
@@ -63,8 +63,8 @@ def _translate_policy(
 class EvaluationPolicy:
     """The policy of all seeds for whole episodes, which all begin with its first call. It holds the memory of the actors.
 
-    It acts without noise if `greedy` is true; by default as in evaluations, where only PPO's policy has noise. `noise_rows` says which
-    rows of the noise of how many episodes these episodes get, by default all.
+    It acts without noise if `deterministic` is true; by default as in evaluations, where only PPO's policy has noise. `noise_rows` says
+    which rows of the noise of how many episodes these episodes get, by default all.
     """
 
     def __init__(
@@ -73,13 +73,13 @@ class EvaluationPolicy:
         actor: Any,
         seeds: Sequence[int],
         n_episodes: int,
-        greedy: bool | None = None,
+        deterministic: bool | None = None,
         noise_rows: tuple[int, Int[np.ndarray, " episodes"]] | None = None,
     ):
         self._config = config
         self._n_noise_rows, self._noise_rows = noise_rows or (n_episodes, np.arange(n_episodes))
-        self._greedy = config.greedy if greedy is None else greedy
-        self._policy = make_policy(config, actor, n_episodes, greedy=self._greedy)
+        self._deterministic = config.deterministic_evaluation if deterministic is None else deterministic
+        self._policy = make_policy(config, actor, n_episodes, deterministic=self._deterministic)
         self._memory = init_host_memory(config, len(seeds), n_episodes)
         self._rngs = [numpy_generator(seed, Stream.EVALUATION_NOISE, 0) for seed in seeds]
 
@@ -87,7 +87,7 @@ class EvaluationPolicy:
         self, timestep: Timestep, episode_start: Bool[np.ndarray, "seeds envs"]
     ) -> Float[np.ndarray, "seeds envs agents action"]:
         noise = None
-        if not self._greedy:
+        if not self._deterministic:
             noise = draw_noise(self._config, self._rngs, self._n_noise_rows)[:, self._noise_rows]
         action, self._memory = self._policy(
             self._memory, timestep.observation, timestep.available, noise, episode_start

@@ -220,7 +220,11 @@ class Session:
         if len(self.config.env.teams) == 1:
             self._keep_best(evaluation.returns[..., 0].mean(axis=1))
         metrics = evaluation.metrics(self.config.env) | self.functions.assess(self.learner) | self.latest_metrics
-        if self.step == self.settings.steps and not self.config.greedy and isinstance(self.collector, HostCollector):
+        if (
+            self.step == self.settings.steps
+            and not self.config.deterministic_evaluation
+            and isinstance(self.collector, HostCollector)
+        ):
             deterministic = self.collector.evaluate(self.actor, self.settings.evaluation_episodes, deterministic=True)
             metrics[DETERMINISTIC_RETURN] = deterministic.returns[..., 0].mean(axis=1)
         if self.step > self.config.warmup and isinstance(self.settings.hyperparameters, OffPolicySettings):

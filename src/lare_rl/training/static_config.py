@@ -61,9 +61,9 @@ class TrainConfig:
         return self.algorithm.noise(self.env.discrete)
 
     @property
-    def greedy(self) -> bool:
+    def deterministic_evaluation(self) -> bool:
         """Whether the policy acts without noise outside training."""
-        return self.deterministic or self.algorithm.greedy(self.env.discrete)
+        return self.deterministic or self.algorithm.deterministic_evaluation(self.env.discrete)
 
     @property
     def noise_size(self) -> int:

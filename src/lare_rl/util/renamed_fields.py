@@ -12,7 +12,7 @@ _RENAMED_KEYS = {"judged_from": "credit_scope", "judges": "scored_observation"}
 _RENAMED_METRICS = {"likeliest_return": "deterministic_return"}
 """From old to new metrics, after the slash."""
 
-_RENAMED_OPTIONS = {"--judges": "--scored-observation"}
+_RENAMED_OPTIONS = {"--judges": "--scored-observation", "--credit.drawn-steps": "--credit.sampled-steps"}
 """From old to new options of the command line."""
 
 _RENAMED_FIELDS = {
