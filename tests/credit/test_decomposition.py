@@ -10,7 +10,7 @@ import pytest
 from lare_rl.credit import decomposition, descent
 from lare_rl.credit.decoder_settings import CreditSettings
 from lare_rl.credit.decomposition import CreditBatch
-from lare_rl.credit.evidence import PosteriorSpread
+from lare_rl.credit.evidence import PosteriorCovariance
 from lare_rl.credit.methods import METHODS, Fit
 
 EPISODES, STEPS, FEATURES = 64, 10, 3
@@ -105,8 +105,8 @@ def test_optimism_adds_deviations_of_a_step(score_type):
     state = init(KEY, FEATURES, METHODS["rd-linear"], settings, STEPS, 1, (score_type,))
     assert state.closed_form is not None
     root = np.diag([1.0, 10.0, 100.0]).astype(np.float32)
-    spread = PosteriorSpread(root[None], centre=np.zeros((1, FEATURES)), centre_variance=np.zeros(1))
-    state = state._replace(closed_form=state.closed_form._replace(spread=spread))
+    covariance = PosteriorCovariance(root[None], centre=np.zeros((1, FEATURES)), centre_variance=np.zeros(1))
+    state = state._replace(closed_form=state.closed_form._replace(covariance=covariance))
     optimistic = optimistic_rewards(state, np.eye(FEATURES, dtype=np.float32), settings, length)
     deviation = np.array([1.0, 10.0, 100.0]) / (length if score_type else 1)
     np.testing.assert_allclose(optimistic, 2 * deviation, rtol=1e-5)  # of a decoder whose weights are 0

@@ -190,8 +190,8 @@ def test_posterior_std_is_as_large_as_the_error():
             means, returns, length, weight = sample_episodes(count=count, noise=1.0, seed=seed)
             statistics = sum_up(means, returns, length)
             posterior = fit(statistics)
-            spread = evidence.posterior_spread(statistics, 0, GROUP_INDEX, posterior)
-            std = np.asarray(evidence.posterior_std(spread, jnp.asarray(rows)))
+            covariance = evidence.posterior_covariance(statistics, 0, GROUP_INDEX, posterior)
+            std = np.asarray(evidence.posterior_std(covariance, jnp.asarray(rows)))
             error = np.abs(rows @ (np.asarray(posterior.weight) - weight) + float(posterior.bias) - 0.7)
             assert (error <= 2 * std).mean() > 0.8
             assert error.mean() > 0.2 * std.mean()
@@ -203,11 +203,11 @@ def test_posterior_covariance_is_the_inverse_of_the_precision():
     statistics = sample_statistics()
     posterior = fit(statistics)
     precision = posterior.beta * statistics.products[:-2, :-2] + np.diag(posterior.alpha[GROUP_INDEX])
-    spread = evidence.posterior_spread(statistics, 0, GROUP_INDEX, posterior)
+    covariance = evidence.posterior_covariance(statistics, 0, GROUP_INDEX, posterior)
     want = statistics.products[-2, -2] / statistics.n_steps * np.linalg.inv(precision)
-    np.testing.assert_allclose(spread.root.T @ spread.root, want, rtol=1e-5, atol=1e-12)
+    np.testing.assert_allclose(covariance.root.T @ covariance.root, want, rtol=1e-5, atol=1e-12)
     variance = statistics.products[-2, -2] / statistics.n_steps / (posterior.beta * statistics.n_steps)
-    assert float(evidence.posterior_std(spread, statistics.mean[:-2]) ** 2) == pytest.approx(float(variance))
+    assert float(evidence.posterior_std(covariance, statistics.mean[:-2]) ** 2) == pytest.approx(float(variance))
 
 
 FACTORS = {

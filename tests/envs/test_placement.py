@@ -58,7 +58,7 @@ def test_a_second_simulation_is_tried(name, separate, monkeypatch):
     assert needs_process(task) == separate
     assert not simulations
     if name in ("Shares", "Many"):
-        monkeypatch.setattr(placement, "n_cores", lambda: 2)
+        monkeypatch.setattr(placement, "n_usable_cores", lambda: 2)
         monkeypatch.setattr(placement, "measure_step_s", lambda task: 1.0)  # so slow that two processes save time
         with make_vec_env(task, 2) as envs:
             assert len(set(envs.pids)) == 2
@@ -142,7 +142,7 @@ def test_idle_process_that_died_is_replaced():
 
 
 def test_few_simulations_are_open_at_a_time(monkeypatch):
-    monkeypatch.setattr(placement, "n_cores", lambda: 4)
+    monkeypatch.setattr(placement, "n_usable_cores", lambda: 4)
     separate = single_spec("Many", processes="separate")
     assert [n_open_envs(separate, n_seeds, 10) for n_seeds in (1, 2, 3, 9)] == [4, 2, 1, 1]
     assert n_open_envs(separate, 1, 3) == 3

@@ -27,7 +27,7 @@ def settings(small):
 @pytest.fixture(autouse=True)
 def two_cores(monkeypatch):
     monkeypatch.setattr(placement, "SLOW_STEP_S", 1.0)  # however loaded the machine is
-    monkeypatch.setattr(placement, "n_cores", lambda: 2)
+    monkeypatch.setattr(placement, "n_usable_cores", lambda: 2)
 
 
 def test_run_equals_one_in_a_single_process(settings, tmp_path, monkeypatch):

@@ -36,7 +36,7 @@ from lare_rl.credit import evidence, logistic, relevance
 from lare_rl.credit.basis import Basis, expand, expand_history
 from lare_rl.credit.decoder_network import DecoderOutput, DecoderShape
 from lare_rl.credit.decoder_settings import CreditSettings
-from lare_rl.credit.evidence import Posterior, PosteriorSpread, SufficientStatistics
+from lare_rl.credit.evidence import Posterior, PosteriorCovariance, SufficientStatistics
 from lare_rl.credit.logistic import LogOddsFit
 from lare_rl.credit.score_type import ScoreType
 from lare_rl.nn.leading_axis import map_leading_axis
@@ -118,22 +118,24 @@ class ClosedForm(NamedTuple):
     """The part of R that neither steps nor levels explain, for each score type; 0 if the bias of the decoder includes it."""
     log_odds: LogOddsFit | None
     """The fit of log odds. Only present if the score may be of this type, which is then the last of the decoder's score types."""
-    spread: PosteriorSpread | None
-    """The spread of each score type, along a leading axis. Only present if rewards are optimistic."""
+    covariance: PosteriorCovariance | None
+    """The covariance of each score type, along a leading axis. Only present if rewards are optimistic."""
 
 
-def init(basis: Basis, score_types: tuple[int, ...], *, with_spread: bool = False) -> ClosedForm:
+def init(basis: Basis, score_types: tuple[int, ...], *, with_covariance: bool = False) -> ClosedForm:
     """Return the state before the first episode."""
     is_binary = ScoreType.LOG_ODDS in score_types
     n_score_types = len(score_types)
     n_features, n_columns, zero = basis.n_features, basis.n_columns, jnp.zeros(())
     posterior = evidence.init_posterior(n_columns, int(basis.column_group_index.max(initial=-1)) + 1)
     strengths = evidence.init_posterior(n_columns, int(basis.column_strength_index.max(initial=-1)) + 1)
-    spread = PosteriorSpread(root=jnp.zeros((n_columns, n_columns)), centre=jnp.zeros(n_columns), centre_variance=zero)
+    covariance = PosteriorCovariance(
+        root=jnp.zeros((n_columns, n_columns)), centre=jnp.zeros(n_columns), centre_variance=zero
+    )
     posterior, strengths = jax.tree.map(
         lambda leaf: jnp.tile(leaf, (n_score_types - is_binary, *[1] * leaf.ndim)), (posterior, strengths)
     )
-    spread = jax.tree.map(lambda leaf: jnp.tile(leaf, (n_score_types, *[1] * leaf.ndim)), spread)
+    covariance = jax.tree.map(lambda leaf: jnp.tile(leaf, (n_score_types, *[1] * leaf.ndim)), covariance)
     return ClosedForm(
         decoder=LinearDecoder(
             basis=basis,
@@ -150,7 +152,7 @@ def init(basis: Basis, score_types: tuple[int, ...], *, with_spread: bool = Fals
         intercept=jnp.zeros((n_score_types, basis.n_levels)),
         start_value=jnp.zeros(n_score_types),
         log_odds=logistic.init(n_columns, basis.column_group_index) if is_binary else None,
-        spread=spread if with_spread else None,
+        covariance=covariance if with_covariance else None,
     )
 
 
@@ -232,15 +234,15 @@ def fit(
         intercept=weight[:, basis.n_columns - basis.n_levels :].astype(jnp.float32),
         start_value=start_value.astype(jnp.float32),
     )
-    if state.spread is None:
+    if state.covariance is None:
         return state
-    spreads = [
-        evidence.posterior_spread(statistics, score_type, strength_index, jax.tree.map(itemgetter(i), best))
+    covariances = [
+        evidence.posterior_covariance(statistics, score_type, strength_index, jax.tree.map(itemgetter(i), best))
         for i, score_type in enumerate(linear_types)
     ]
     if state.log_odds is not None:
-        spreads.append(logistic.spread(state.log_odds))
-    return state._replace(spread=jax.tree.map(lambda *leaves: jnp.stack(leaves).astype(jnp.float32), *spreads))
+        covariances.append(logistic.covariance(state.log_odds))
+    return state._replace(covariance=jax.tree.map(lambda *leaves: jnp.stack(leaves).astype(jnp.float32), *covariances))
 
 
 def best_posterior(state: ClosedForm) -> Posterior:

@@ -163,7 +163,7 @@ def init(
     several = len(score_types) > 1
     closed = None
     if several or not method.uses_gradient:
-        closed = closed_form.init(basis, score_types, with_spread=is_optimistic(method, settings))
+        closed = closed_form.init(basis, score_types, with_covariance=is_optimistic(method, settings))
     return DecoderState(
         network=network,
         optimizer=init_adam(network, settings.learning_rate) if method.uses_gradient else (),
@@ -298,11 +298,11 @@ def optimistic_rewards(
     """
     r_hat = decoder_rewards(state, inputs, settings, length)
     assert state.closed_form is not None
-    assert state.closed_form.spread is not None
+    assert state.closed_form.covariance is not None
     assert isinstance(state.network, LinearDecoder)
-    index = score_type_index(state, len(state.closed_form.spread.centre_variance))
-    spread = jax.tree.map(lambda leaf: leaf[index], state.closed_form.spread)
-    std = evidence.posterior_std(spread, state.network.features(inputs))
+    index = score_type_index(state, len(state.closed_form.covariance.centre_variance))
+    covariance = jax.tree.map(lambda leaf: leaf[index], state.closed_form.covariance)
+    std = evidence.posterior_std(covariance, state.network.features(inputs))
     return r_hat + settings.optimism * _per_step(std, state, length)
 
 

@@ -57,7 +57,7 @@ from lare_rl.nn.normalise import merge_means
 __all__ = [
     "JAX",
     "Posterior",
-    "PosteriorSpread",
+    "PosteriorCovariance",
     "Regression",
     "SufficientStatistics",
     "add_episodes",
@@ -67,7 +67,7 @@ __all__ = [
     "fixed_point",
     "init_posterior",
     "most_likely",
-    "posterior_spread",
+    "posterior_covariance",
     "posterior_std",
     "regression",
     "starting_precisions",
@@ -276,7 +276,7 @@ def _round(problem: Regression, alpha: Float[Array, " groups"], beta: Float[Arra
     return next_posterior(JAX, problem, alpha, beta, partial(dense_moments, JAX, problem))
 
 
-class PosteriorSpread(NamedTuple):
+class PosteriorCovariance(NamedTuple):
     """The uncertainty of b + w . f. Its posterior variance is |root (f - centre)|^2 + centre_variance, in squared units of y."""
 
     root: Float[Array, "*score_types features features"]
@@ -287,29 +287,29 @@ class PosteriorSpread(NamedTuple):
     """The variance of y', the mean reward at the centre."""
 
 
-def posterior_spread(
+def posterior_covariance(
     statistics: SufficientStatistics,
     score_type: Int[Array, ""] | int,
     group_index: Int[np.ndarray, " features"],
     posterior: Posterior,
-) -> PosteriorSpread:
-    """Return the spread of a posterior. It is 0 as long as all returns are equal.
+) -> PosteriorCovariance:
+    """Return the covariance of a posterior. It is 0 as long as all returns are equal.
 
     The weight of a feature without data has its prior standard deviation.
     """
     problem = regression(statistics, score_type, group_index)
     alpha, beta = clip_precisions(JAX, problem, posterior.alpha, posterior.beta)
     root, _ = inverse_root(JAX, beta * problem.s + jnp.diag(alpha[group_index]))
-    spread = PosteriorSpread(
+    covariance = PosteriorCovariance(
         root=problem.y_std * root,
         centre=statistics.mean[: len(group_index)],
         centre_variance=problem.y_std**2 / (beta * jnp.maximum(statistics.n_steps, 1)),
     )
-    return jax.tree.map(lambda leaf: jnp.where(problem.y_std > 0, leaf, 0), spread)
+    return jax.tree.map(lambda leaf: jnp.where(problem.y_std > 0, leaf, 0), covariance)
 
 
-def posterior_std(spread: PosteriorSpread, features: Float[Array, "*batch features"]) -> Float[Array, "*batch"]:
+def posterior_std(covariance: PosteriorCovariance, features: Float[Array, "*batch features"]) -> Float[Array, "*batch"]:
     """Return the posterior standard deviation of b + w . f, in the unit of y. Weights beyond those of the features are ignored."""
     n_features = features.shape[-1]
-    distance = (features - spread.centre[..., :n_features]) @ spread.root[..., :n_features].T
-    return jnp.sqrt(jnp.sum(distance**2, axis=-1) + spread.centre_variance)
+    distance = (features - covariance.centre[..., :n_features]) @ covariance.root[..., :n_features].T
+    return jnp.sqrt(jnp.sum(distance**2, axis=-1) + covariance.centre_variance)

@@ -141,7 +141,7 @@ def explain(
     single, pairs = _input_shares(
         factors.feature_shares, basis.n_factors, extended * N_FREQUENCIES, extended * basis.n_factors
     )
-    root = evidence.posterior_spread(factor_statistics, score_type, group_index, factors.posterior).root
+    root = evidence.posterior_covariance(factor_statistics, score_type, group_index, factors.posterior).root
     slope, slope_covariance, linear_share = _slopes(factors.posterior.weight, root.T @ root, step_statistics, basis)
     mean_length = statistics.n_steps / jnp.maximum(statistics.n_episodes, 1)
     divisor = jnp.where(score_type == ScoreType.MEAN, mean_length, 1)  # r_hat of a mean is divided by T

@@ -28,11 +28,21 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from lare_rl.credit import evidence
-from lare_rl.credit.evidence import JAX, PosteriorSpread
+from lare_rl.credit.evidence import JAX, PosteriorCovariance
 from lare_rl.credit.precisions import JITTER, PRIOR_RANGE, Posterior, count_determined, inverse_root, varies
 from lare_rl.credit.prequential import ring_slots
 
-__all__ = ["WINDOW", "LogOddsFit", "add_episodes", "fit", "init", "predict", "remove_episodes", "spread", "to_returns"]
+__all__ = [
+    "WINDOW",
+    "LogOddsFit",
+    "add_episodes",
+    "covariance",
+    "fit",
+    "init",
+    "predict",
+    "remove_episodes",
+    "to_returns",
+]
 
 WINDOW = 512
 """The number of last episodes that are fitted."""
@@ -173,7 +183,7 @@ def to_returns(state: LogOddsFit) -> tuple[Float[Array, ""], Float[Array, ""]]:
     return expected_mean + slope * (state.posterior.bias - mean), slope
 
 
-def spread(state: LogOddsFit) -> PosteriorSpread:
-    """Return the spread of what steps are paid, in the unit of the return."""
+def covariance(state: LogOddsFit) -> PosteriorCovariance:
+    """Return the covariance of what steps are paid, in the unit of the return."""
     _, slope = to_returns(state)
-    return PosteriorSpread(slope * state.root, jnp.zeros(len(state.root)), jnp.zeros(()))
+    return PosteriorCovariance(slope * state.root, jnp.zeros(len(state.root)), jnp.zeros(()))

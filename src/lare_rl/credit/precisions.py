@@ -63,7 +63,7 @@ NUMPY = Backend(np, lambda values, group_index, n_groups: np.bincount(group_inde
 
 
 class Posterior(NamedTuple):
-    """The posterior of the weights, without their covariance, which `evidence.posterior_spread` computes."""
+    """The posterior of the weights, without their covariance, which `evidence.posterior_covariance` computes."""
 
     weight: Float[Array, "*batch features"]
     bias: Float[Array, "*batch"]

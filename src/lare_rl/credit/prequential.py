@@ -111,6 +111,6 @@ def gain(predictions: Predictions) -> tuple[Float[Array, ""], Float[Array, ""]]:
     total = jnp.sum(baseline)
     is_defined = jnp.isfinite(r2(predictions)[0]) & (total > 0)
     ratio = 1 - jnp.sum(error) / jnp.where(is_defined, total, 1)
-    n, spread = jnp.sum(valid), jnp.sum((baseline - error - ratio * baseline) ** 2)
-    std_error = jnp.sqrt(n / jnp.maximum(n - 1, 1) * spread) / jnp.where(is_defined, total, 1)
+    n, squares = jnp.sum(valid), jnp.sum((baseline - error - ratio * baseline) ** 2)
+    std_error = jnp.sqrt(n / jnp.maximum(n - 1, 1) * squares) / jnp.where(is_defined, total, 1)
     return jnp.where(is_defined, ratio, jnp.nan), jnp.where(is_defined, std_error, jnp.nan)

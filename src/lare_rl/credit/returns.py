@@ -266,7 +266,7 @@ def reward_std(
     assert isinstance(state.network, LinearDecoder)
     features, n_linear = state.network.features(rows), len(state.closed_form.posterior.bias)
     index = state.is_mean.astype(int) if n_linear > 1 else 0
-    spread = evidence.posterior_spread(
+    covariance = evidence.posterior_covariance(
         closed_form.to_float64(state.closed_form.sufficient_statistics),
         jnp.asarray(score_types)[index],
         state.network.basis.column_strength_index,
@@ -274,9 +274,9 @@ def reward_std(
     )
     if state.network.basis.prefixes:  # the value before the first step is no part of a reward, and time is
         features = jnp.append(features, jnp.ones((*features.shape[:-1], 1)), axis=-1)
-        spread = spread._replace(centre=jnp.zeros_like(spread.centre), centre_variance=jnp.zeros(()))
-    std = evidence.posterior_std(spread, features)
+        covariance = covariance._replace(centre=jnp.zeros_like(covariance.centre), centre_variance=jnp.zeros(()))
+    std = evidence.posterior_std(covariance, features)
     if state.closed_form.log_odds is None:
         return std
-    log_odds_std = evidence.posterior_std(logistic.spread(state.closed_form.log_odds), features)
+    log_odds_std = evidence.posterior_std(logistic.covariance(state.closed_form.log_odds), features)
     return jnp.where(state.is_log_odds, log_odds_std, std)

@@ -3,7 +3,6 @@
 from collections.abc import Callable
 
 import numpy as np
-from jaxtyping import UInt8
 
 from lare_rl.errors import missing_extra_error
 
@@ -15,6 +14,8 @@ try:
 except ImportError as missing:
     raise missing_extra_error("a picture", "report") from missing
 
+from lare_rl.envs.interface import Frame
+
 __all__ = ["Axes", "Figure", "blank_figure", "colormaps", "paint_frames", "patches", "to_pixels"]
 
 
@@ -25,7 +26,7 @@ def blank_figure() -> tuple[Figure, Axes]:
     return figure, figure.add_axes((0, 0, 1, 1))
 
 
-def paint_frames(n_frames: int, paint: Callable[[Axes, int], None]) -> list[UInt8[np.ndarray, "height width 3"]]:
+def paint_frames(n_frames: int, paint: Callable[[Axes, int], None]) -> list[Frame]:
     """Return pictures. `paint` draws the picture of an index on empty axes."""
     figure, axes = blank_figure()
     frames = []
@@ -36,7 +37,7 @@ def paint_frames(n_frames: int, paint: Callable[[Axes, int], None]) -> list[UInt
     return frames
 
 
-def to_pixels(figure: Figure) -> UInt8[np.ndarray, "height width 3"]:
+def to_pixels(figure: Figure) -> Frame:
     """Return a figure as an array of pixels."""
     canvas = FigureCanvasAgg(figure)
     canvas.draw()

@@ -8,11 +8,12 @@ from dataclasses import dataclass, field
 from typing import Any, NamedTuple, Protocol, TypeVar, runtime_checkable
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, UInt8
 
 __all__ = [
     "AnyArray",
     "EnvSpec",
+    "Frame",
     "HostEnv",
     "JaxEnv",
     "Team",
@@ -26,6 +27,8 @@ __all__ = [
 
 AnyArray = Any
 """A JAX array in compiled code, a NumPy array on the host. The type is `Any`, so that this module need not import JAX."""
+Frame = UInt8[np.ndarray, "height width 3"]
+"""A picture."""
 
 
 @dataclass(frozen=True)
@@ -187,8 +190,8 @@ class JaxEnv(Protocol[State]):
         """Make one step. Continuous actions are in the environment's units, discrete actions are one-hot."""
         ...
 
-    def frames(self, states: State, credit: Float[np.ndarray, "steps agents"] | None = None) -> list[np.ndarray]:
-        """Return an episode's states (leading axis: steps) as pictures (height, width, 3), with each agent's credit."""
+    def frames(self, states: State, credit: Float[np.ndarray, "steps agents"] | None = None) -> list[Frame]:
+        """Return an episode's states (leading axis: steps) as pictures, with each agent's credit."""
         ...
 
 
@@ -206,8 +209,8 @@ class HostEnv(Protocol):
         """Make one step. Continuous actions are in the environment's units, discrete actions are one-hot."""
         ...
 
-    def render(self) -> Any:
-        """Return a picture of the environment (height, width, 3)."""
+    def render(self) -> Frame:
+        """Return a picture of the environment."""
         ...
 
     def close(self) -> None:

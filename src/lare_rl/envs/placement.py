@@ -18,10 +18,11 @@ from jaxtyping import Float
 from lare_rl.envs.families import FAMILIES, is_gymnasium, load_env_spec, make_host_env, picklable_maker
 from lare_rl.envs.interface import Timestep
 from lare_rl.envs.trials import time_steps
-from lare_rl.envs.vec_env import LocalVecEnv, VecEnv, n_cores
+from lare_rl.envs.vec_env import LocalVecEnv, VecEnv
 from lare_rl.envs.workers import SubprocVecEnv
 from lare_rl.errors import LareError
 from lare_rl.tasks.spec import PETTINGZOO_PREFIX, TaskSpec, split_environment
+from lare_rl.util.processes import n_usable_cores
 
 __all__ = [
     "SLOW_STEP_S",
@@ -90,7 +91,7 @@ def make_vec_env(task: TaskSpec, n: int, parallel: bool = False) -> VecEnv:
     options: dict[str, Any] = {"timeout": task.timeout, "timeout_hint": _TIMEOUT_HINT}
     if parallel:
         return SubprocVecEnv(makers, **options)
-    n_saved = n - math.ceil(n / n_cores())
+    n_saved = n - math.ceil(n / n_usable_cores())
     if n_saved and n_saved * measure_step_s(task) > MIN_SAVED_S:
         with contextlib.suppress(LareError):
             return SubprocVecEnv(makers, **options)
@@ -99,7 +100,7 @@ def make_vec_env(task: TaskSpec, n: int, parallel: bool = False) -> VecEnv:
 
 def n_open_envs(task: TaskSpec, n_seeds: int, n_episodes: int) -> int:
     """Return how many environments of each seed play the episodes of an evaluation at the same time."""
-    return min(n_episodes, max(1, n_cores() // n_seeds)) if needs_process(task) else n_episodes
+    return min(n_episodes, max(1, n_usable_cores() // n_seeds)) if needs_process(task) else n_episodes
 
 
 def runs_separately(task: TaskSpec) -> bool:

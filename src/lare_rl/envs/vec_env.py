@@ -1,6 +1,5 @@
 """Many copies of a `HostEnv`, stepped in lockstep. `LocalVecEnv` has them in this process, `workers.SubprocVecEnv` in others."""
 
-import os
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from typing import Any
@@ -12,7 +11,7 @@ from lare_rl.envs.env_errors import EnvOutputError, one_line_errors
 from lare_rl.envs.interface import EnvSpec, HostEnv, Timestep
 from lare_rl.errors import LareError
 
-__all__ = ["LocalVecEnv", "Maker", "VecEnv", "call_env", "check_same_sizes", "empty_batch", "make_env_at", "n_cores"]
+__all__ = ["LocalVecEnv", "Maker", "VecEnv", "call_env", "check_same_sizes", "empty_batch", "make_env_at"]
 
 Maker = Callable[[], HostEnv]
 
@@ -140,8 +139,3 @@ def empty_batch(spec: EnvSpec, n: int) -> Timestep:
         truncated=np.zeros(n, bool),
         measures={name: np.zeros(n, np.float32) for name in spec.measures},
     )
-
-
-def n_cores() -> int:
-    """Return the number of cores that this process may use."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1

@@ -16,9 +16,10 @@ from jaxtyping import Bool, Shaped
 
 from lare_rl.envs.interface import EnvSpec
 from lare_rl.envs.shared_arrays import MAX_WORKERS, map_arrays, open_shared_memory
-from lare_rl.envs.vec_env import Maker, VecEnv, check_same_sizes, n_cores
+from lare_rl.envs.vec_env import Maker, VecEnv, check_same_sizes
 from lare_rl.envs.worker_process import Worker, end_workers, pickle_maker
 from lare_rl.errors import LareError
+from lare_rl.util.processes import n_usable_cores
 
 __all__ = ["SubprocVecEnv", "close_idle_workers"]
 
@@ -68,7 +69,7 @@ class SubprocVecEnv(VecEnv):
         self._timeout_hint, self._reuse_key = timeout_hint, reuse_key
         self.stop_requested = lambda: False
         self._workers: list[Worker] = []
-        n_envs, n_workers = len(makers), min(len(makers), processes or n_cores(), MAX_WORKERS)
+        n_envs, n_workers = len(makers), min(len(makers), processes or n_usable_cores(), MAX_WORKERS)
         if reuse_key and n_workers < n_envs:
             raise LareError(f"{n_envs} environments need a process each, and a batch has at most {MAX_WORKERS}")
         try:

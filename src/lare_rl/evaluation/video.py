@@ -11,11 +11,10 @@ from typing import Any
 
 import jax
 import numpy as np
-from jaxtyping import UInt8
 
 from lare_rl.envs.families import load_env_spec, make_env, make_host_env
 from lare_rl.envs.gymnasium_env import GymnasiumEnv
-from lare_rl.envs.interface import HostEnv, JaxEnv
+from lare_rl.envs.interface import Frame, HostEnv, JaxEnv
 from lare_rl.envs.jax_on_host import JaxOnHost
 from lare_rl.envs.play import play_steps
 from lare_rl.errors import LareError, missing_extra_error
@@ -39,8 +38,6 @@ FRAME_SIZE = {"width": 320, "height": 320}
 """Pixels of a MuJoCo film. The default, 480 by 480, takes twice the time and space."""
 FILM_WIDTH, FILM_QUALITY = 240, 55
 """Pixels and quality of a film in a page."""
-
-Frame = UInt8[np.ndarray, "height width 3"]
 
 
 def record_video(run: Run, path: str | Path, best: bool = False, deterministic: bool = False) -> None:

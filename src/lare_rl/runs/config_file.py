@@ -16,6 +16,7 @@ from lare_rl.errors import CheckedModel, LareError
 from lare_rl.latent.function import LatentFunction
 from lare_rl.tasks.spec import TaskSpec
 from lare_rl.util.files import write_atomically
+from lare_rl.util.processes import n_usable_cores
 from lare_rl.util.provenance import code_version
 from lare_rl.util.safe_io import read_json, read_text
 
@@ -72,7 +73,7 @@ def _find_versions() -> dict[str, str]:
 def _describe_cores() -> str:
     # XLA divides sums among the cores that the process may use, and this decides how they are rounded.
     n_cores = os.cpu_count() or 1
-    n_usable = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else n_cores
+    n_usable = n_usable_cores()
     return f"{n_usable} of {n_cores} cores" if n_usable < n_cores else f"{n_cores} cores"
 
 

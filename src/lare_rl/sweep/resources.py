@@ -9,6 +9,7 @@ from typing import Annotated, NamedTuple
 from pydantic import Field
 
 from lare_rl.errors import CheckedModel, LareError
+from lare_rl.util.processes import usable_cores
 
 __all__ = ["Resources", "Slot", "assign_cards", "assign_cores", "assign_slots"]
 
@@ -56,9 +57,9 @@ def assign_cores(processes: int, cores: int) -> list[list[int]]:
     Raises:
         LareError: there are not enough cores.
     """
-    if not hasattr(os, "sched_getaffinity"):
+    usable = usable_cores()
+    if usable is None:
         return [[] for _ in range(processes)]
-    usable = sorted(os.sched_getaffinity(0))
     if processes * cores > len(usable):
         raise LareError(
             f"{processes} processes with {cores} cores each need {processes * cores} cores, and {len(usable)} are usable here: "

@@ -1,10 +1,11 @@
-"""New processes of this program, on every system."""
+"""The cores and the new processes of this program, on every system."""
 
+import os
 import subprocess
 import sys
 from typing import Any
 
-__all__ = ["own_session"]
+__all__ = ["n_usable_cores", "own_session", "usable_cores"]
 
 
 def own_session() -> dict[str, Any]:
@@ -12,3 +13,13 @@ def own_session() -> dict[str, Any]:
     if sys.platform == "win32":
         return {"creationflags": subprocess.CREATE_NEW_PROCESS_GROUP}
     return {"start_new_session": True}
+
+
+def usable_cores() -> list[int] | None:
+    """Return the cores that this process may use, or None if the system cannot tell."""
+    return sorted(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else None
+
+
+def n_usable_cores() -> int:
+    """Return the number of cores that this process may use, as far as the system can tell."""
+    return len(usable_cores() or range(os.cpu_count() or 1))

@@ -34,6 +34,7 @@ _RENAMED_FIELDS = {
     "over_time": "time_blocks",
     "rivals": "score_type_predictions",
     "rows": "n_rows",
+    "spread": "covariance",
     "squares": "sum_squares",
     "steps": "n_steps",
     "summed": "sufficient_statistics",

@@ -1,9 +1,10 @@
 """Pictures of particle tasks: of a state, and of all steps of an episode."""
 
 import numpy as np
-from jaxtyping import Float, UInt8
+from jaxtyping import Float
 
 from lare_rl.envs.canvas import Axes, Figure, blank_figure, colormaps, paint_frames, patches
+from lare_rl.envs.interface import Frame
 from lare_rl.envs.particles.task import ParticleTask
 
 __all__ = ["draw_frames", "draw_state"]
@@ -31,7 +32,7 @@ def draw_frames(
     task: ParticleTask,
     positions: Float[np.ndarray, "steps entities 2"],
     credit: Float[np.ndarray, "steps agents"] | None = None,
-) -> list[UInt8[np.ndarray, "height width 3"]]:
+) -> list[Frame]:
     """Draw an episode as pictures with common scales of length and of credit."""
     side = _half_side(task, positions)
     scale = None if credit is None else float(np.abs(credit).max())

@@ -4,9 +4,9 @@ from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int, PRNGKeyArray, UInt8
+from jaxtyping import Array, Float, Int, PRNGKeyArray
 
-from lare_rl.envs.interface import EnvSpec, Timestep
+from lare_rl.envs.interface import EnvSpec, Frame, Timestep
 from lare_rl.envs.particles.catalogue import find_particle_task
 from lare_rl.envs.particles.task import MAX_STEPS, N_ACTIONS
 from lare_rl.envs.particles.world import State
@@ -66,9 +66,7 @@ class ParticleEnv:
             measures={},
         )
 
-    def frames(
-        self, states: ParticleState, credit: Float[np.ndarray, "steps agents"] | None = None
-    ) -> list[UInt8[np.ndarray, "height width 3"]]:
+    def frames(self, states: ParticleState, credit: Float[np.ndarray, "steps agents"] | None = None) -> list[Frame]:
         from lare_rl.envs.particles.drawing import draw_frames
 
         return draw_frames(self.task, np.asarray(states.world.position), credit)

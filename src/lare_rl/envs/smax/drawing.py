@@ -5,9 +5,10 @@ from operator import itemgetter
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float, UInt8
+from jaxtyping import Float
 
 from lare_rl.envs.canvas import Axes, Figure, blank_figure, paint_frames, patches
+from lare_rl.envs.interface import Frame
 from lare_rl.envs.smax.battle import FIELD, Battle, attack_target
 from lare_rl.envs.smax.scenarios import Scenario
 
@@ -25,9 +26,7 @@ def draw_state(
     return figure
 
 
-def draw_frames(
-    scenario: Scenario, battles: Battle, credit: Float[np.ndarray, " steps"] | None = None
-) -> list[UInt8[np.ndarray, "height width 3"]]:
+def draw_frames(scenario: Scenario, battles: Battle, credit: Float[np.ndarray, " steps"] | None = None) -> list[Frame]:
     """Draw an episode as pictures.
 
     Args:

@@ -10,9 +10,9 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, PRNGKeyArray, UInt8
+from jaxtyping import Array, Float, PRNGKeyArray
 
-from lare_rl.envs.interface import EnvSpec, Team, Timestep
+from lare_rl.envs.interface import EnvSpec, Frame, Team, Timestep
 from lare_rl.envs.smax import battle as rules
 from lare_rl.envs.smax.battle import ATTACK, Battle, alive, won
 from lare_rl.envs.smax.enemy import Memory, choose_actions, init_memory
@@ -101,9 +101,7 @@ class SMAX:
             measures={"won": won(self.scenario, battle).astype(jnp.float32)},
         )
 
-    def frames(
-        self, states: SmaxState, credit: Float[np.ndarray, "steps agents"] | None = None
-    ) -> list[UInt8[np.ndarray, "height width 3"]]:
+    def frames(self, states: SmaxState, credit: Float[np.ndarray, "steps agents"] | None = None) -> list[Frame]:
         from lare_rl.envs.smax.drawing import draw_frames
 
         if credit is not None:  # all living units have the same credit, dead units none
