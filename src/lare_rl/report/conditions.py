@@ -1,6 +1,7 @@
 """When a diagnosis makes each of its findings. docs/reference/findings.md is made from this table."""
 
 from lare_rl.report.diagnosis import (
+    BAD_R2,
     BETTER_FRACTION,
     CLOSE_CORRELATION,
     EVALUATION_STDS,
@@ -39,6 +40,7 @@ CONDITIONS: dict[str, dict[str, str]] = {
         "explained": f"Always, if returns are predicted. *Nearly all*: R² is above {HIGH_R2}. *Next to nothing*: below {LITTLE_R2}. "
         "*A part*: between.",
         "decoder_is_outdated": f"The last R² is below {LITTLE_R2}, but the median over the run is not.",
+        "worse_than_mean": f"The last R² is below {BAD_R2:g}.",
         "steps_agree": f"True rewards are known, and the correlation of proxy and true rewards is above {CLOSE_CORRELATION}.",
         "single_steps": "True rewards are known, and the correlation is lower.",
         "score_use": "Always, if at least 8 returns were predicted. It ends with a sentence about trust.",
