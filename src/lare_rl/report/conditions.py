@@ -43,7 +43,8 @@ CONDITIONS: dict[str, dict[str, str]] = {
         "worse_than_mean": f"The last R² is below {BAD_R2:g}.",
         "steps_agree": f"True rewards are known, and the correlation of proxy and true rewards is above {CLOSE_CORRELATION}.",
         "single_steps": "True rewards are known, and the correlation is lower.",
-        "score_use": "Always, if at least 8 returns were predicted. It ends with a sentence about trust.",
+        "score_use": "At least 8 returns were predicted. Only its last sentence, about trust, remains if all episodes have the same "
+        "length and there is nothing else to say: a sum and an average are then the same.",
         "trust_nothing": f"`credit/gain` is not larger than {CLEAR_ERRORS} of its standard errors.",
         "trust_part": f"It is larger, but not above {CLEAR_GAIN:.0%}.",
         "trust_sums": f"It is larger, and above {CLEAR_GAIN:.0%}.",

@@ -16,7 +16,9 @@ from lare_rl.util.statistics import sample_std
 
 __all__ = ["CREDIT_CODES", "NEXT_CODES", "diagnose"]
 
-CREDIT_CODES = ("explained", "decoder_is_outdated", "score_use", "single_steps", "steps_agree")
+CREDIT_CODES = (
+    "explained", "decoder_is_outdated", "score_use", "trust_nothing", "trust_part", "trust_sums", "single_steps", "steps_agree",
+)  # fmt: skip
 """Findings about the quality of the credit."""
 NEXT_CODES = (
     "explains_little", "try_closed_form", "is_rising", "one_seed_was_better", "has_fallen", "is_stuck", "needs_training",
