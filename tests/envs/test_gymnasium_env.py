@@ -92,7 +92,15 @@ class Plane(Chase):
     action_space = Box(-1, 1, (2, 2), np.float32)
 
 
-for maker in (Invalid, Reuses, OutOfItsSpace, Precise, Integers, Counts, Scalar, Plane):
+class Undrawable(Chase):
+    metadata = {"render_modes": []}  # noqa: RUF012
+
+    def __init__(self, render_mode=None):
+        super().__init__()
+        self.render_mode = render_mode
+
+
+for maker in (Invalid, Reuses, OutOfItsSpace, Precise, Integers, Counts, Scalar, Plane, Undrawable):
     checks = {"disable_env_checker": maker in (Invalid, Reuses, OutOfItsSpace)}
     gymnasium.register(f"foreign/{maker.__name__}-v0", entry_point=maker, max_episode_steps=20, **checks)
 
@@ -118,6 +126,10 @@ def test_spec_of_real_environments(environment, sizes, low, high):
     assert (spec.low.tolist(), spec.high.tolist()) == ([low], [high])
     assert spec.teams == (Team("agent", 0, 1),)
     assert (spec.state_size, spec.is_jax, spec.fixed_length, spec.agents_leave, spec.masks_actions) == (0, *[False] * 4)
+
+
+def test_environment_that_cannot_be_drawn_is_made_without_a_warning():
+    make_env("Undrawable", render_mode="rgb_array").close()
 
 
 def test_precision_of_bounds():

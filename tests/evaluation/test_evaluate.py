@@ -99,6 +99,12 @@ def test_record_video(run, tmp_path):
         record_video(replace_task(run, toy_spec()), tmp_path / "film.gif")
 
 
+def test_environment_that_renders_nothing_is_not_filmed(run, tmp_path, monkeypatch):
+    monkeypatch.setattr(FilmedChase, "render", lambda env: None)
+    with pytest.raises(LareError, match="returns no picture"):
+        record_video(run, tmp_path / "film.gif")
+
+
 class Painted:
     """A host environment of a family of its own."""
 

@@ -46,6 +46,8 @@ def make_gymnasium(name: str, max_episode_steps: int | None = None, **kwargs: An
         # The user chooses the version: scores of v4 and v5 cannot be compared.
         warnings.filterwarnings("ignore", message=".*is out of date.*", category=DeprecationWarning)
         warnings.filterwarnings("ignore", message=".*Using the latest versioned environment.*")
+        # A report asks for a film, and does without one if it gets none.
+        warnings.filterwarnings("ignore", message=".*that is not in the possible render_modes.*")
         with mujoco_warnings(name):
             env = gymnasium.make(name, max_episode_steps=max_episode_steps, **kwargs)
         try:
