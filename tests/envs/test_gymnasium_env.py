@@ -184,7 +184,7 @@ def test_measures_are_those_of_the_last_step():
 @pytest.mark.parametrize(
     ("kwargs", "content"),
     [
-        ({"observation": np.array([0, np.nan], np.float32)}, "observation contains nan"),
+        ({"observation": np.array([0, np.nan], np.float32)}, r"observation contains nan in entry 1 \(noise\)$"),
         ({"observation": np.zeros(3)}, "observation has the shape"),
         ({"reward": 1e39}, "reward contains inf"),
         ({"reward": None}, "reward is None"),
@@ -211,7 +211,8 @@ def test_invalid_value_or_failure(kwargs, content):
         env.close()
 
     measures = ("won",) if kwargs.get("terminated") is True else ()
-    env = GymnasiumEnv(toy_spec(environment="foreign/Invalid-v0", measures=measures), **kwargs)
+    task = toy_spec(environment="foreign/Invalid-v0", observation="0: the target\n1: noise", measures=measures)
+    env = GymnasiumEnv(task, **kwargs)
     with pytest.raises(LareError, match=content) as error:
         use(env)
     assert "\n" not in str(error.value)

@@ -9,7 +9,14 @@ from gymnasium.spaces import Box
 from jaxtyping import Float
 
 from lare_rl.envs import mujoco_rewards
-from lare_rl.envs.env_errors import EnvOutputError, no_time_limit_error, one_line_errors, read_measures, to_float
+from lare_rl.envs.env_errors import (
+    EnvOutputError,
+    describe_entry,
+    no_time_limit_error,
+    one_line_errors,
+    read_measures,
+    to_float,
+)
 from lare_rl.envs.interface import EnvSpec, Team, Timestep
 from lare_rl.envs.mujoco_warnings import mujoco_warnings
 from lare_rl.envs.spaces import OneHot, check_spaces, decode_box, finite_array, flatten_spaces
@@ -114,7 +121,8 @@ class GymnasiumEnv:
             name = "reward"
             reward = finite_array(to_float(reward))
         except ValueError as error:
-            raise EnvOutputError(f"environment {self._name!r}: the {name} {error}") from None
+            entry = describe_entry(error, self._task.observation) if name == "observation" else ""
+            raise EnvOutputError(f"environment {self._name!r}: the {name} {error}{entry}") from None
         last = terminated or truncated
         return Timestep(
             observation=observation[None],
