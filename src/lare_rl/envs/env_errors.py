@@ -69,7 +69,8 @@ def name_step(number: int) -> Iterator[None]:
 
 def describe_entry(error: ValueError, text: str) -> str:
     """Return what a task's text says of the entry that is not finite, in brackets, or nothing."""
-    meaning = entry_meanings(text).get(error.index) if isinstance(error, NotFiniteError) else None
+    index = error.index if isinstance(error, NotFiniteError) else None
+    meaning = None if index is None else entry_meanings(text).get(index)
     return "" if meaning is None else f" ({meaning})"
 
 
