@@ -213,6 +213,8 @@ def test_new_task_of_two_teams(command, tmp_path):
 def test_new_task_without_documentation(command):
     out = command("new-task", "Hopper-v4", "--out", "hopper.toml")[1]
     assert re.findall(r"fill in: (\w+) ", out) == ["description", "observation", "action"]
+    out = command("new-task", "helpers.toy_envs:toys/Endless-v0", "--out", "endless.toml")[1]
+    assert re.findall(r"fill in: (\w+) ", out)[-1] == "max_episode_steps"
 
 
 def test_design(command, tmp_path):

@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     # The public names. Python imports a name on its first use, so that `lare-rl --help` need not wait for JAX.
     from lare_rl.assigner.assigner import CreditAssigner as CreditAssigner
     from lare_rl.config.settings import Settings as Settings
+    from lare_rl.credit.decoder_settings import CreditSettings as CreditSettings
     from lare_rl.envs.episodic import EpisodicReward as EpisodicReward
     from lare_rl.envs.load import load_task as load_task
     from lare_rl.errors import LareError as LareError

@@ -92,7 +92,15 @@ class Plane(Chase):
     action_space = Box(-1, 1, (2, 2), np.float32)
 
 
-for maker in (Invalid, Reuses, OutOfItsSpace, Precise, Integers, Counts, Scalar, Plane):
+class Undrawable(Chase):
+    metadata = {"render_modes": []}  # noqa: RUF012
+
+    def __init__(self, render_mode=None):
+        super().__init__()
+        self.render_mode = render_mode
+
+
+for maker in (Invalid, Reuses, OutOfItsSpace, Precise, Integers, Counts, Scalar, Plane, Undrawable):
     checks = {"disable_env_checker": maker in (Invalid, Reuses, OutOfItsSpace)}
     gymnasium.register(f"foreign/{maker.__name__}-v0", entry_point=maker, max_episode_steps=20, **checks)
 
@@ -118,6 +126,10 @@ def test_spec_of_real_environments(environment, sizes, low, high):
     assert (spec.low.tolist(), spec.high.tolist()) == ([low], [high])
     assert spec.teams == (Team("agent", 0, 1),)
     assert (spec.state_size, spec.is_jax, spec.fixed_length, spec.agents_leave, spec.masks_actions) == (0, *[False] * 4)
+
+
+def test_environment_that_cannot_be_drawn_is_made_without_a_warning():
+    make_env("Undrawable", render_mode="rgb_array").close()
 
 
 def test_precision_of_bounds():
@@ -172,7 +184,7 @@ def test_measures_are_those_of_the_last_step():
 @pytest.mark.parametrize(
     ("kwargs", "content"),
     [
-        ({"observation": np.array([0, np.nan], np.float32)}, "observation contains nan"),
+        ({"observation": np.array([0, np.nan], np.float32)}, r"observation contains nan in entry 1 \(noise\)$"),
         ({"observation": np.zeros(3)}, "observation has the shape"),
         ({"reward": 1e39}, "reward contains inf"),
         ({"reward": None}, "reward is None"),
@@ -199,7 +211,8 @@ def test_invalid_value_or_failure(kwargs, content):
         env.close()
 
     measures = ("won",) if kwargs.get("terminated") is True else ()
-    env = GymnasiumEnv(toy_spec(environment="foreign/Invalid-v0", measures=measures), **kwargs)
+    task = toy_spec(environment="foreign/Invalid-v0", observation="0: the target\n1: noise", measures=measures)
+    env = GymnasiumEnv(task, **kwargs)
     with pytest.raises(LareError, match=content) as error:
         use(env)
     assert "\n" not in str(error.value)

@@ -411,7 +411,7 @@ INVALID_STEPS = {
     "reward of a_1 contains inf": change(1e39, "rewards"),
     "reward of a_1 is 'much'": change("much", "rewards"),
     "termination of a_1 is array": change(np.zeros(2), "terminations"),
-    "observation of a_1 contains nan": change([0, np.nan], "observations"),
+    "observation of a_1 contains nan in entry 1": change([0, np.nan], "observations"),
     "action mask for a_1, but none at its first": change({"action_mask": [1, 1, 1]}, "infos"),
     "has the agent 'z'": list_agents("a_0", "z"),
     "not 5 dictionaries": lambda *_: (1, 2, 3),

@@ -7,6 +7,7 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as arrays
 
 from helpers.toy_envs import toy_spec
+from lare_rl.envs.env_errors import EnvOutputError
 from lare_rl.envs.families import register_family
 from lare_rl.envs.interface import EnvSpec, Team, Timestep
 from lare_rl.envs.play import Episode, phi_inputs, play_episode, play_episodes, play_steps, sample_action
@@ -60,6 +61,18 @@ class Hunt:
 def make_role(team, **changes) -> TaskSpec:
     values = {"name": team, "team": team, "environment": "hunt/field", "observation_size": 2, "action_size": 2}
     return toy_spec(**values | changes)
+
+
+class SpoiltHunt(Hunt):
+    def step(self, action):
+        if self.time == 1:
+            raise EnvOutputError("the reward contains nan")
+        return super().step(action)
+
+
+def test_error_names_the_step():
+    with pytest.raises(EnvOutputError, match=r"nan, at step 2 of the episode$"):
+        list(play_steps(SpoiltHunt(), None, np.random.default_rng(0), 0))
 
 
 def play_hunt(role: TaskSpec) -> Episode:

@@ -99,6 +99,7 @@ def test_flatten_value_equals_gymnasium(space, seed):
         (Dict(x=PLANE, y=PLANE), {"x": [0, 0]}, "keys x, y"),
         (Dict(x=PLANE), [0, 0], "keys x"),
         (Tuple([PLANE, PLANE]), ([0, 0],), "2 elements"),
+        (Tuple([PLANE, PLANE]), ([0, 0], [0, np.nan]), "nan in entry 3$"),
         (Tuple([PLANE, Discrete(2)]), ([0, 0], 2), r"2, which is not in Discrete\(2\)"),
     ],
 )

@@ -10,7 +10,8 @@ import pytest
 from PIL import Image
 
 import lare_rl
-from helpers.toy_envs import Chase, pick_spec, toy_spec
+from helpers.toy_envs import Chase, levels_spec, pick_spec, toy_spec
+from lare_rl.cli.runs import _describe_evaluation
 from lare_rl.envs.families import make_host_env, register_family
 from lare_rl.envs.gymnasium_env import GymnasiumEnv
 from lare_rl.envs.load import load_task
@@ -22,6 +23,7 @@ from lare_rl.evaluation.evaluate import (
     MAX_OPEN_ENVS,
     MIN_RANDOM_EPISODES,
     RANDOM_EPISODES,
+    evaluate_policy,
     evaluate_run,
     gain_over_random,
     measure_random_returns,
@@ -97,6 +99,12 @@ def test_record_video(run, tmp_path):
     assert not FilmedChase.open_envs
     with pytest.raises(LareError, match=r"toys/Chase-v0.* cannot be made"):
         record_video(replace_task(run, toy_spec()), tmp_path / "film.gif")
+
+
+def test_environment_that_renders_nothing_is_not_filmed(run, tmp_path, monkeypatch):
+    monkeypatch.setattr(FilmedChase, "render", lambda env: None)
+    with pytest.raises(LareError, match="returns no picture"):
+        record_video(run, tmp_path / "film.gif")
 
 
 class Painted:
@@ -180,6 +188,20 @@ def test_measures_of_random_play(run, command):
     distances = np.array([episode.measures["distance"] for episode in play_random(TASK)[0]])
     assert f"random actions: distance {format_mean_std(distances)}" in out.splitlines()
     assert distances.std() > 0
+
+
+def test_random_actions_play_the_same_groups(small, tmp_path, command):
+    """Otherwise a sentence says so. The mean of the numbers of the groups is not reported."""
+    run = lare_rl.train(levels_spec(), small(method="dense", steps=60), out=tmp_path / "run", listeners=[])
+    assert not any("level" in key for line in run.metrics() for key in line)
+    status, out, err = command("evaluate", run.directory, "--episodes", 3)
+    assert (status, err) == (0, "")
+    assert "over 12 episodes" in out
+    assert "level" not in out
+    by_turns = levels_spec(environment="toys/LevelsByTurns-v0")
+    evaluation = evaluate_policy(replace_task(run, by_turns), 3)
+    lines = list(_describe_evaluation(replace_task(run, by_turns), evaluation, play_random(by_turns, 3), None))
+    assert lines[-1].startswith("random actions played other groups (level)")
 
 
 def test_film_of_many_agents_on_the_host_is_refused_before_they_play(run, tmp_path, monkeypatch):

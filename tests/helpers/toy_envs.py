@@ -120,6 +120,37 @@ class Forgetful(Chase):
         return self.observe(), {}
 
 
+class Levels(Chase):
+    """An episode belongs to one of 40 levels: by its seed or, with `by_turns`, by the number of the episode. Entry 1 shows it."""
+
+    count = 0
+
+    def __init__(self, by_turns: bool = False):
+        super().__init__()
+        self.by_turns = by_turns
+
+    def reset(self, *, seed=None, options=None):
+        gymnasium.Env.reset(self, seed=seed)
+        Levels.count += 1
+        self.level = Levels.count % 40 if self.by_turns else int(self.np_random.integers(40))
+        return self.observe(), {}
+
+    def observe(self):
+        super().observe()
+        self.state[1] = self.level / 40
+        return self.state
+
+    def step(self, action):
+        observation, reward, terminated, truncated, _ = super().step(action)
+        return observation, reward, terminated, truncated, {"level": self.level}
+
+
+def levels_spec(**changes) -> TaskSpec:
+    return toy_spec(**{"name": "Levels", "environment": "toys/Levels-v0", "group": "level"} | changes)
+
+
+gymnasium.register("toys/Levels-v0", entry_point=Levels, max_episode_steps=5)
+gymnasium.register("toys/LevelsByTurns-v0", entry_point=Levels, max_episode_steps=5, kwargs={"by_turns": True})
 gymnasium.register("toys/Pick-v0", entry_point=Pick, max_episode_steps=20)
 gymnasium.register("toys/Endless-v0", entry_point=Pick)
 gymnasium.register("toys/Broken-v0", entry_point=Broken, max_episode_steps=20)

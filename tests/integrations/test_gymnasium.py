@@ -13,7 +13,8 @@ from gymnasium.wrappers import NormalizeObservation, TimeLimit
 from gymnasium.wrappers.vector import RecordEpisodeStatistics
 
 from helpers.logged_envs import LoggedEnv, RandomEnv, RecordingAssigner, check_episodes, recording_assigner
-from helpers.toy_envs import toy_spec
+from helpers.toy_envs import Levels, levels_spec, toy_spec
+from lare_rl.assigner.assigner import CreditAssigner
 from lare_rl.envs.episodic import TRUE_REWARD, EpisodicReward
 from lare_rl.errors import LareError
 from lare_rl.integrations.gymnasium import Credit, VectorCredit
@@ -181,6 +182,34 @@ def test_score_in_info(mode):
     check_episodes(credit, [env], use_score=True)
     with pytest.raises(LareError, match="'goals'"):
         play(VectorCredit(make_vector(mode)[0], recording_assigner(env), score="goals"), 40)
+
+
+class Ended(gymnasium.Wrapper):
+    """Notes the levels of the episodes that have ended, in their order."""
+
+    def __init__(self, env, levels):
+        super().__init__(env)
+        self.levels = levels
+
+    def step(self, action):
+        *results, info = self.env.step(action)
+        if results[2] or results[3]:
+            self.levels.append(info["level"])
+        return *results, info
+
+
+@all_modes
+@pytest.mark.parametrize("payments", ["end", 2])
+def test_groups_are_read_from_info(mode, payments):
+    levels, credit = [], CreditAssigner("bayes", task=levels_spec(payments=payments))
+    vector = SyncVectorEnv([lambda n=n: Ended(TimeLimit(Levels(), n), levels) for n in (3, 4)], autoreset_mode=mode)
+    play(VectorCredit(vector, credit, pay="environment"), 20)
+    names, episodes = list(credit.group_names), list(credit.store.episodes.values())
+    assert len(set(levels)) > 1
+    if payments == "end":
+        assert [names[episode.level] for episode in episodes] == levels
+    assert set(levels) <= set(names)
+    assert {type(name) for name in names} == {int}
 
 
 def test_shared_assigner():

@@ -7,6 +7,8 @@ from pettingzoo.test import parallel_api_test
 
 from helpers.logged_envs import RecordingAssigner
 from helpers.parallel_toy_envs import Toy
+from helpers.toy_envs import toy_spec
+from lare_rl.assigner.assigner import CreditAssigner
 from lare_rl.envs.episodic import TRUE_REWARD
 from lare_rl.errors import LareError
 from lare_rl.integrations.pettingzoo import CreditParallel
@@ -20,7 +22,7 @@ class LoggedTeam(Toy):
 
     def __init__(self, *args, **options):
         super().__init__(*args, **options)
-        self.random, self.log = np.random.default_rng(0), []
+        self.random, self.log, self.level = np.random.default_rng(0), [], 0
 
     def observe(self, agent):
         return np.float32([self.possible_agents.index(agent), self.steps])
@@ -32,6 +34,8 @@ class LoggedTeam(Toy):
         self.log.append(
             {agent: (before[agent], actions[agent], observations[agent], rewards[agent]) for agent in before}
         )
+        if not self.agents:
+            infos["a_0"]["level"] = self.level
         return observations, rewards, terminated, truncated, infos
 
 
@@ -118,6 +122,19 @@ def test_team_of_one():
     play(CreditParallel(team, credit))
     (episode,) = credit.store.episodes.values()
     assert episode.score == sum(step["a_0"][3] for step in team.log)
+
+
+def test_groups_are_read_from_info():
+    """Here from that of any agent that has it."""
+    task = toy_spec(observation_size=2, action_size=3, group="level")
+    credit = CreditAssigner("bayes", task=task, observation_space=2, action_space=spaces.Discrete(3), agents=3)
+    team = LoggedTeam(NAMES)
+    wrapped = CreditParallel(team, credit)
+    for level in (5, 7, 5):
+        team.level = level
+        play(wrapped)
+    assert credit.group_names == {5: 0, 7: 1}
+    assert [episode.level for episode in credit.store.episodes.values()] == [0, 1, 0]
 
 
 def test_dict_space():

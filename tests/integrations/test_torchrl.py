@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import torch
 from gymnasium import spaces
+from gymnasium.wrappers import TimeLimit
 from tensordict import TensorDict
 from torchrl.collectors import Collector
 from torchrl.data import LazyTensorStorage, ReplayBuffer, TensorDictReplayBuffer
@@ -13,6 +14,8 @@ from torchrl.envs import Compose, GymWrapper, RewardScaling, SerialEnv
 from torchrl.envs.utils import step_mdp
 
 from helpers.logged_envs import LoggedEnv, RandomEnv, RecordingAssigner, check_episodes, recording_assigner
+from helpers.toy_envs import Levels, levels_spec
+from lare_rl.assigner.assigner import CreditAssigner
 from lare_rl.errors import LareError
 from lare_rl.integrations.torchrl import CREDIT_STEP, REWARD, CreditTransform
 
@@ -65,6 +68,17 @@ def test_collector(env_spaces, categorical, n_envs):
     check_episodes(credit, envs)
     assert (credit.store.dropped, credit.store.steps) == (0, 50 * n_envs)
     collector.shutdown()
+
+
+def test_groups_are_read_from_the_next_state():
+    credit = CreditAssigner("bayes", task=levels_spec())
+    batch = roll_out(20, TimeLimit(Levels(), 5))
+    batch["next", "level"] = 7 + torch.arange(20) // 10
+    make_buffer(credit).extend(batch)
+    assert credit.group_names == {7: 0, 8: 1}
+    assert [episode.level for episode in credit.store.episodes.values()] == [0, 0, 1, 1]
+    with pytest.raises(LareError, match="needs group"):
+        make_buffer(credit).extend(batch.exclude(("next", "level")))
 
 
 def test_time_is_last_dimension():

@@ -132,6 +132,8 @@ def test_undocumented_texts_are_marked(tmp_path):
         load(tmp_path, draft.toml)
     task = load(tmp_path, draft.toml.replace(FILL_IN, "Say"))
     assert (task.observation_size, task.action_size, task.max_episode_steps) == (6, 2, 1000)
+    assert draft.guesses_limit
+    assert "\n# group = " in draft.toml
     assert task.observation.startswith("6 entries, an array of shape (2, 3) row by row.")
 
 

@@ -36,7 +36,13 @@ def find(returns, **facts):
     ("returns", "facts", "codes"),
     [
         (RISING_2, {"return_r2": 0.97, "episodic_return": 12.0}, "learned above_episodic explained is_rising"),
-        (FLAT - 51, {"return_r2": -3.0, **FACTORS}, "not_learned explained explains_little single_seed"),
+        (
+            FLAT - 51,
+            {"return_r2": -3.0, **FACTORS},
+            "not_learned explained worse_than_mean explains_little single_seed",
+        ),
+        (RISING_2, {"return_r2": -3.0, "median_r2": 0.9}, "learned decoder_is_outdated worse_than_mean is_rising"),
+        (FLAT - 51, {"return_r2": -0.9}, "not_learned explained explains_little single_seed"),
         (FLAT - 51, {"return_r2": 0.9}, "not_learned explained needs_training single_seed"),
         (FLAT - 51, {"return_r2": 0.0, "uses_gradient": True}, "not_learned explained try_closed_form single_seed"),
         (FELL, {"episodic_return": 40.0}, "learned below_episodic has_fallen single_seed"),

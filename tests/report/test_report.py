@@ -28,6 +28,7 @@ from lare_rl.report.messages import MESSAGES
 from lare_rl.report.overview import compare_runs, render_learning_curves, sort_runs, summarise_runs
 from lare_rl.report.run_summary import ReportedRun
 from lare_rl.runs.directory import open_without_functions
+from lare_rl.util.findings import Finding
 
 CHROMIUM = next(
     (path for name in ("chromium", "chromium-browser", "google-chrome") if (path := shutil.which(name))), None
@@ -215,6 +216,20 @@ def test_unknown_step_rewards(runs, tmp_path):
         assert [text in page for page in pages] == [True, False]
     for text in ("R² of returns", ">proxy reward</li>"):
         assert all(text in page for page in pages)
+
+
+def test_equal_lengths_are_not_called_a_sum(runs, tmp_path):
+    page = page_of(runs[1], tmp_path)
+    assert "rust the credit" in page
+    assert "The score was taken as" not in page
+
+
+def test_code_in_findings(make_run, monkeypatch):
+    finding = Finding("score_type_is_certain", {"this": Finding("sum"), "other": Finding("mean")})
+    monkeypatch.setattr(run_details, "find_explanations", lambda run: [[finding]])
+    text = "".join(run_details._render_earnings(make_run("a", [1.0]), [np.zeros(0)]))
+    assert "<code>--credit.score</code>" in text
+    assert "`" not in text
 
 
 def test_live_page(make_run, monkeypatch):

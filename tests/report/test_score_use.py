@@ -13,10 +13,10 @@ from lare_rl.util.findings import render
 METRICS = {"average": None, "log_odds": None, "gain": 0.5, "gain_error": 0.05}
 
 
-def describe(method="bayes", metrics=METRICS, task=None, **credit):
+def describe(method="bayes", metrics=METRICS, task=None, equal_lengths=False, **credit):
     task = toy_spec().model_copy(update=task or {})
     settings = resolve(Settings(method=method, credit=credit), task)
-    use = summarise_score_use(METHODS[method], settings, task, metrics)
+    use = summarise_score_use(METHODS[method], settings, task, metrics, equal_lengths=equal_lengths)
     finding = None if use is None else use.finding()
     return use, "" if finding is None else render(finding, MESSAGES)
 
@@ -38,6 +38,12 @@ def describe(method="bayes", metrics=METRICS, task=None, **credit):
 def test_score_use(method, metrics, task, credit, words):
     _, sentence = describe(method, METRICS | metrics, task, **credit)
     assert all(word in sentence for word in words), sentence
+
+
+def test_sum_and_average_of_equal_lengths_are_not_told_apart():
+    assert describe(equal_lengths=True)[1].startswith("Trust the credit in part")
+    assert describe(equal_lengths=True, task={"group": "map"})[1].startswith("The score was taken as")
+    assert describe("bayes-history", equal_lengths=True)[1].startswith("The score was taken as")
 
 
 def test_nothing_is_said_without_predictions():

@@ -11,6 +11,7 @@ from lare_rl.config.resolve import resolve
 from lare_rl.config.settings import Settings
 from lare_rl.runs.config_file import make_config
 from lare_rl.runs.directory import Run
+from lare_rl.runs.metric_names import RETURN, RETURN_STD
 from lare_rl.training.advice import (
     MESSAGES,
     find_constant_returns,
@@ -19,6 +20,7 @@ from lare_rl.training.advice import (
     find_untrained,
 )
 from lare_rl.training.compiled import compile_functions
+from lare_rl.training.loop import _final_findings
 from lare_rl.training.saturation import greedy_actions, saturation
 from lare_rl.training.saved_state import load_learner
 from lare_rl.util.findings import render
@@ -61,6 +63,30 @@ def test_large_observations(settings, factor, text, dense_run):
 def test_constant_returns(returns, is_found):
     findings = find_constant_returns([np.array(per_seed) for per_seed in returns])
     assert [finding.code for finding in findings] == ["constant returns"] * is_found
+
+
+ZERO = (0.0, 0.0)
+
+
+@pytest.mark.parametrize(
+    ("values", "is_found"),
+    [
+        ([ZERO, ZERO, ZERO], True),
+        ([(7.1, 1e-9)] * 3, True),
+        ([ZERO, ZERO, (0.0, 0.1)], False),
+        ([ZERO, ZERO, (1.0, 0.0)], False),
+        ([ZERO, ZERO, (None, None)], False),
+        ([ZERO, ZERO], False),
+    ],
+)
+def test_equal_returns(values, is_found, tmp_path):
+    """Of all evaluations, of which there are enough."""
+    settings = resolve(Settings(method="dense", steps=100, evaluation_episodes=4), toy_spec())
+    run = Run(tmp_path, make_config(toy_spec(), settings, ()), ())
+    lines = [{"step": k, "seed": 0, RETURN: return_, RETURN_STD: std} for k, (return_, std) in enumerate(values)]
+    (tmp_path / "metrics.jsonl").write_text("".join(json.dumps(line) + "\n" for line in lines))
+    codes = [finding.code for finding in _final_findings(run, lines)]
+    assert ("equal returns" in codes) == is_found
 
 
 STUCK = np.full((1, 4, 2), [[1.0, -0.995]])

@@ -349,5 +349,5 @@ def test_evaluate_locates_bad_output(value, text, wrap):
     wrap(BadOutput, value=value, seeds={seed}, reward=isinstance(value, float))
     envs = local_envs(4, WRAPPED)
     evaluate_on_host(envs, proportional(0.0), (0, 1), 2)
-    with pytest.raises(EnvOutputError, match=f"{text}.*, in an evaluation of seed 1$"):
+    with pytest.raises(EnvOutputError, match=f"{text}.*, at step 3 of the episode, in an evaluation of seed 1$"):
         evaluate_on_host(envs, proportional(0.0), (0, 1), 2, first=1)

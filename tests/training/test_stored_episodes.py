@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 import lare_rl
-from helpers.toy_envs import pick_spec, toy_spec
+from helpers.toy_envs import levels_spec, pick_spec, toy_spec
 from helpers.training_runs import QUICK_CREDIT, train_quietly
 from lare_rl.errors import LareError
 from lare_rl.training.stored_episodes import stored_role_episodes
@@ -32,6 +32,16 @@ def test_old_episodes_are_overwritten(dense_run, factor_run):
     assert 0 < len(newest) < len(all_episodes)
     for episode, expected in zip(newest, all_episodes[-len(newest) :], strict=True):
         np.testing.assert_array_equal(episode["observations"], expected["observations"])
+
+
+@pytest.mark.parametrize("payments", ["end", 2])
+def test_groups(small, tmp_path, payments):
+    settings = small(method="bayes", seeds=1, steps=48, credit=QUICK_CREDIT)
+    run = train_quietly(levels_spec(payments=payments), settings, tmp_path / "run")
+    episodes = lare_rl.stored_episodes(run)
+    groups = [int(episode["group"]) for episode in episodes]
+    assert len(set(groups)) > 1
+    assert groups == [round(40 * float(episode["observations"][0, 1])) for episode in episodes]
 
 
 @pytest.mark.long

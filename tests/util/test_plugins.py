@@ -52,12 +52,17 @@ def test_plugin_of_the_environment_variable(plugin, numbers, monkeypatch):
     assert list(numbers) == ["one", "two"]
 
 
-def test_plugin_of_an_installed_package(plugin, numbers):
-    plugin.write_text(PLUGIN)
-    info = plugin.parent / "my_package-1.0.dist-info"
+def install(folder, value="my_plugin"):
+    """Install a package with an entry point of this value."""
+    info = folder / "my_package-1.0.dist-info"
     info.mkdir()
     (info / "METADATA").write_text("Metadata-Version: 2.1\nName: my-package\nVersion: 1.0\n")
-    (info / "entry_points.txt").write_text("[lare_rl.plugins]\nmine = my_plugin\n")
+    (info / "entry_points.txt").write_text(f"[lare_rl.plugins]\nmine = {value}\n")
+
+
+def test_plugin_of_an_installed_package(plugin, numbers):
+    plugin.write_text(PLUGIN)
+    install(plugin.parent)
     assert importlib.metadata.entry_points(group="lare_rl.plugins")
     assert len(numbers) == 2
 
@@ -70,6 +75,15 @@ def test_broken_plugin(source, plugin, numbers, monkeypatch):
     with pytest.raises(LareError, match="'my_plugin'") as error:
         numbers.find("two")
     assert "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize("value", ["my_plugin", "no_such_plugin:register", "not a module"])
+def test_broken_plugin_of_an_installed_package(value, plugin, numbers):
+    plugin.write_text("import no_such_module")
+    install(plugin.parent, value)
+    words = rf"'mine' of the package my-package \(entry point mine = {value}\).*No module named .*uninstall my-package"
+    with pytest.raises(LareError, match=words):
+        numbers.find("two")
 
 
 def test_command_with_a_broken_plugin_prints_one_line(tmp_path):

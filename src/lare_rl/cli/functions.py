@@ -82,6 +82,8 @@ def new_task(
         print_line(
             f"  fill in: {key}{where} ({'the log' if draft.logs_only else 'the environment'} does not document it)"
         )
+    if draft.guesses_limit:
+        print_line("  fill in: max_episode_steps (a guess: the environment has no limit of its own)")
     data = f" --data {environment}" if draft.logs_only else ""
     roles = [(team_path, f"phi_{team_path.stem}.py") for team_path in paths[1:]] or [(path, "phi.py")]
     for role_path, function_path in roles:

@@ -1,8 +1,10 @@
 """The commands for trained runs: `evaluate`, `report`, `export` and `cross-play`."""
 
+import math
 import os
 import sys
 import time
+from collections import Counter
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -33,7 +35,8 @@ def evaluate(
 
     Prints the mean return of the policy with its standard deviation, and the same of as many episodes of random actions, at
     least ten (at least five if they take longer than the policy's), from other initial states, and the difference with its
-    standard error. A policy that samples its actions also plays the most likely ones.
+    standard error. If the task has groups, random actions play from the same initial states as the policy. A policy that samples
+    its actions also plays the most likely ones.
 
     Args:
         run: a run directory.
@@ -44,7 +47,13 @@ def evaluate(
     """
     from lare_rl.algorithms.registry import ALGORITHMS
     from lare_rl.envs.families import load_env_spec
-    from lare_rl.evaluation.evaluate import RANDOM_EPISODES, RANDOM_PLAY_LIMIT_S, evaluate_policy, play_random
+    from lare_rl.evaluation.evaluate import (
+        RANDOM_EPISODES,
+        RANDOM_PLAY_LIMIT_S,
+        evaluate_policy,
+        evaluation_seeds,
+        play_random,
+    )
     from lare_rl.evaluation.video import check_video_path, record_video
     from lare_rl.runs.directory import open_run
     from lare_rl.training.explain import explain_run
@@ -66,7 +75,11 @@ def evaluate(
     samples = not (deterministic or ALGORITHMS[settings.algorithm].deterministic_evaluation(env_spec.discrete))
     likeliest = evaluate_policy(opened, episodes, best, True, EpisodeProgress(episodes)) if samples else None
     best_steps = load_actor(opened, best=True)[2].tolist() if best else None
-    random_episodes = play_random(task, n_random, max(policy_s, RANDOM_PLAY_LIMIT_S), EpisodeProgress(n_random))
+    seeds = [] if task.group is None else evaluation_seeds(opened, episodes)
+    if seeds:  # each equally often, because groups may differ in their returns
+        n_random = len(seeds) * math.ceil(RANDOM_EPISODES / len(seeds))
+    limit_s = max(policy_s, RANDOM_PLAY_LIMIT_S)
+    random_episodes = play_random(task, n_random, limit_s, EpisodeProgress(n_random), seeds)
     for line in _describe_evaluation(opened, evaluation, random_episodes, best_steps):
         print_line(line)
     if likeliest is not None:
@@ -126,7 +139,12 @@ def _describe_evaluation(
         yield f"{team}random actions: return {format_mean_std(returns)} over {format_value(len(returns), 'count episode')}"
         if (gain := gain_over_random(evaluation.returns[:, :, team_index], returns)) is not None:
             yield f"{team}difference: {format_plus_minus(*gain)} (± is its standard error)"
-    for name, seed_values in evaluation.measures.items():
+    if (group := run.config.task.group) is not None and random_episodes[0]:
+        groups = Counter(np.asarray(evaluation.measures[group]).ravel().tolist())
+        random_groups = Counter(episode.measures[group] for episode in random_episodes[0])
+        if any(groups[name] * random_groups.total() != count * groups.total() for name, count in random_groups.items()):
+            yield f"random actions played other groups ({group}), or in other shares, which is a part of the difference"
+    for name, seed_values in evaluation.drop_group(run.config.task).measures.items():
         for seed, values in zip(run.seeds, seed_values, strict=True):
             yield f"seed {seed}: {name} {format_mean_std(values)}"
         if random_episodes[0]:

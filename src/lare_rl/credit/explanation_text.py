@@ -1,13 +1,12 @@
 """What the returns say about the factors: how much they explain, which of them matter, and what may be missing."""
 
-import re
 from collections.abc import Mapping, Sequence
 
 import numpy as np
 
 from lare_rl.credit.explanation import Explanation
 from lare_rl.credit.score_type import ScoreType, ScoreTypeEstimate
-from lare_rl.tasks.spec import base_name
+from lare_rl.tasks.spec import base_name, entry_meanings
 from lare_rl.util.findings import Finding, render
 from lare_rl.util.statistics import round_shares
 
@@ -123,10 +122,8 @@ def raw_feature_names(observation: str, action: str, sizes: Mapping[str, int]) -
     """
 
     def names(text: str, size: int, kind: str) -> list[str]:
-        lines = dict(re.findall(r"^[\s\-*\[]*(\d+)\]?\s*[:.)]\s*(.+)$", text, flags=re.MULTILINE))
-        return [
-            f"entry {i} of the {kind}" + (f" ({lines[str(i)].strip()})" if str(i) in lines else "") for i in range(size)
-        ]
+        meanings = entry_meanings(text)
+        return [f"entry {i} of the {kind}" + (f" ({meanings[i]})" if i in meanings else "") for i in range(size)]
 
     before, after = "observation", "observation"
     if {"observation", "next_observation"} <= set(sizes):

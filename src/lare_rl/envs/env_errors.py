@@ -8,10 +8,20 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
+from lare_rl.envs.spaces import NotFiniteError
 from lare_rl.errors import LareError, short_repr
-from lare_rl.tasks.spec import TaskSpec
+from lare_rl.tasks.spec import TaskSpec, entry_meanings
 
-__all__ = ["EnvOutputError", "as_lare_error", "no_time_limit_error", "one_line_errors", "read_measures", "to_float"]
+__all__ = [
+    "EnvOutputError",
+    "as_lare_error",
+    "describe_entry",
+    "name_step",
+    "no_time_limit_error",
+    "one_line_errors",
+    "read_measures",
+    "to_float",
+]
 
 
 MAX_ERROR = 300
@@ -45,6 +55,23 @@ def one_line_errors(message: str, make_hint: Callable[[BaseException], str] = la
         yield
     except (Exception, SystemExit) as error:
         raise as_lare_error(message, error, make_hint(error)) from error
+
+
+@contextlib.contextmanager
+def name_step(number: int) -> Iterator[None]:
+    """Add the step of the episode to an `EnvOutputError` of a block; 0 is the reset."""
+    try:
+        yield
+    except EnvOutputError as error:
+        error.args = (f"{error}, at step {number} of the episode",)
+        raise
+
+
+def describe_entry(error: ValueError, text: str) -> str:
+    """Return what a task's text says of the entry that is not finite, in brackets, or nothing."""
+    index = error.index if isinstance(error, NotFiniteError) else None
+    meaning = None if index is None else entry_meanings(text).get(index)
+    return "" if meaning is None else f" ({meaning})"
 
 
 def no_time_limit_error(task: TaskSpec) -> LareError:

@@ -9,7 +9,14 @@ from gymnasium.spaces import Box
 from jaxtyping import Float
 
 from lare_rl.envs import mujoco_rewards
-from lare_rl.envs.env_errors import EnvOutputError, no_time_limit_error, one_line_errors, read_measures, to_float
+from lare_rl.envs.env_errors import (
+    EnvOutputError,
+    describe_entry,
+    no_time_limit_error,
+    one_line_errors,
+    read_measures,
+    to_float,
+)
 from lare_rl.envs.interface import EnvSpec, Team, Timestep
 from lare_rl.envs.mujoco_warnings import mujoco_warnings
 from lare_rl.envs.spaces import OneHot, check_spaces, decode_box, finite_array, flatten_spaces
@@ -46,6 +53,8 @@ def make_gymnasium(name: str, max_episode_steps: int | None = None, **kwargs: An
         # The user chooses the version: scores of v4 and v5 cannot be compared.
         warnings.filterwarnings("ignore", message=".*is out of date.*", category=DeprecationWarning)
         warnings.filterwarnings("ignore", message=".*Using the latest versioned environment.*")
+        # A report asks for a film, and does without one if it gets none.
+        warnings.filterwarnings("ignore", message=".*that is not in the possible render_modes.*")
         with mujoco_warnings(name):
             env = gymnasium.make(name, max_episode_steps=max_episode_steps, **kwargs)
         try:
@@ -112,7 +121,8 @@ class GymnasiumEnv:
             name = "reward"
             reward = finite_array(to_float(reward))
         except ValueError as error:
-            raise EnvOutputError(f"environment {self._name!r}: the {name} {error}") from None
+            entry = describe_entry(error, self._task.observation) if name == "observation" else ""
+            raise EnvOutputError(f"environment {self._name!r}: the {name} {error}{entry}") from None
         last = terminated or truncated
         return Timestep(
             observation=observation[None],

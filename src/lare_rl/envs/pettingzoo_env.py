@@ -179,7 +179,9 @@ class ParallelHost:
         try:
             return convert(*values)
         except ValueError as error:
-            raise self._error(f": the {name} of {agent.name} {error}") from None
+            is_named = name == "observation" and not self._task.teams  # each team has texts of its own
+            entry = env_errors.describe_entry(error, self._task.observation) if is_named else ""
+            raise self._error(f": the {name} of {agent.name} {error}{entry}") from None
 
     def _make_timestep(
         self,

@@ -1,6 +1,7 @@
 """Plays episodes of a task from the view of one of its roles, to verify and examine latent functions before training."""
 
 import contextlib
+import itertools
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Protocol, runtime_checkable
@@ -8,6 +9,7 @@ from typing import Any, Protocol, runtime_checkable
 import numpy as np
 from jaxtyping import Bool, Float
 
+from lare_rl.envs.env_errors import name_step
 from lare_rl.envs.families import make_host_env
 from lare_rl.envs.interface import EnvSpec, HostEnv, Team, Timestep, team_mean, to_env_action
 from lare_rl.tasks.spec import CreditScope, TaskSpec
@@ -148,13 +150,16 @@ def play_steps(
     if isinstance(policy, StatefulPolicy):
         policy.reset()
         policy = policy.select_env_action
-    next_timestep, done = env.reset(seed), False
-    while not done:
+    with name_step(0):
+        next_timestep = env.reset(seed)
+    for number in itertools.count(1):
         timestep = next_timestep
         action = sample_action(env.spec, timestep, rng) if policy is None else _act(policy, env.spec, timestep)
-        next_timestep = env.step(action)
+        with name_step(number):
+            next_timestep = env.step(action)
         yield timestep, action, next_timestep
-        done = bool(next_timestep.terminated or next_timestep.truncated)
+        if next_timestep.terminated or next_timestep.truncated:
+            return
 
 
 def _act(policy: Callable[..., np.ndarray], spec: EnvSpec, timestep: Timestep) -> Float[np.ndarray, "1 action"]:

@@ -1,6 +1,6 @@
 """Observations and actions of any Gymnasium space as vectors of finite numbers."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 import gymnasium
@@ -12,7 +12,25 @@ from jaxtyping import Float
 
 from lare_rl.errors import LareError, short_repr
 
-__all__ = ["OneHot", "OneHotAction", "check_spaces", "decode_box", "finite_array", "flatten_spaces", "flatten_value"]
+__all__ = [
+    "NotFiniteError",
+    "OneHot",
+    "OneHotAction",
+    "check_spaces",
+    "decode_box",
+    "finite_array",
+    "flatten_spaces",
+    "flatten_value",
+]
+
+
+class NotFiniteError(ValueError):
+    """An array has a number that is not finite. The message is a predicate."""
+
+    def __init__(self, number: float, index: int | None):
+        """Make the error of the number at this index of the flat array, or None for a single number."""
+        super().__init__(f"contains {number}" + ("" if index is None else f" in entry {index}"))
+        self.number, self.index = number, index
 
 
 class OneHot(Box):
@@ -97,11 +115,11 @@ def flatten_value(space: gymnasium.Space, value: Any) -> Float[np.ndarray, " siz
     if isinstance(space, Dict):
         if not isinstance(value, Mapping) or set(value) != set(space.spaces):
             raise ValueError(f"must have the keys {', '.join(map(str, space.spaces))}, but is {short_repr(value)}")
-        return _concatenate([flatten_value(subspace, value[key]) for key, subspace in space.spaces.items()])
+        return _flatten_all((subspace, value[key]) for key, subspace in space.spaces.items())
     if isinstance(space, Tuple):
         if not isinstance(value, Sequence) or len(value) != len(space.spaces):
             raise ValueError(f"must have {len(space.spaces)} elements, but is {short_repr(value)}")
-        return _concatenate([flatten_value(*pair) for pair in zip(space.spaces, value, strict=True)])
+        return _flatten_all(zip(space.spaces, value, strict=True))
     if not _contains(space, value):
         raise ValueError(f"is {short_repr(value)}, which is not in {short_repr(space)}")
     return np.array(gymnasium.spaces.flatten(space, value), np.float32)
@@ -114,8 +132,15 @@ def _contains(space: gymnasium.Space, value: Any) -> bool:
         return False
 
 
-def _concatenate(vectors: Sequence[Float[np.ndarray, " _"]]) -> Float[np.ndarray, " _"]:
-    return np.concatenate(vectors) if vectors else np.zeros(0, np.float32)
+def _flatten_all(pairs: Iterable[tuple[gymnasium.Space, Any]]) -> Float[np.ndarray, " _"]:
+    """Return the values of some spaces, one behind the other."""
+    vectors = [np.zeros(0, np.float32)]
+    for space, value in pairs:
+        try:
+            vectors.append(flatten_value(space, value))
+        except NotFiniteError as error:
+            raise NotFiniteError(error.number, sum(map(len, vectors)) + (error.index or 0)) from None
+    return np.concatenate(vectors)
 
 
 def finite_array(value: Any, shape: tuple[int, ...] | None = None) -> Float[np.ndarray, "..."]:
@@ -132,5 +157,6 @@ def finite_array(value: Any, shape: tuple[int, ...] | None = None) -> Float[np.n
     if shape is not None and array.shape != shape:
         raise ValueError(f"has the shape {array.shape}, not {shape}")
     if not np.isfinite(array).all():
-        raise ValueError(f"contains {array[~np.isfinite(array)][0]}")
+        index = int(np.argmin(np.isfinite(array)))
+        raise NotFiniteError(float(array.flat[index]), index if array.ndim else None)
     return array

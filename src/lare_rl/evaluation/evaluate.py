@@ -2,6 +2,7 @@
 
 import math
 import time
+from collections.abc import Sequence
 from contextlib import closing, suppress
 from dataclasses import replace
 from pathlib import Path
@@ -22,6 +23,7 @@ from lare_rl.training.collect_device import DeviceCollector
 from lare_rl.training.evaluate_host import evaluate_policy_on_host
 from lare_rl.training.evaluation import Evaluation, concatenate
 from lare_rl.training.saved_state import load_actor
+from lare_rl.training.streams import Stream, episode_seed
 from lare_rl.util.statistics import grouped_standard_error, standard_error
 
 __all__ = [
@@ -29,6 +31,7 @@ __all__ = [
     "RANDOM_EPISODES",
     "evaluate_policy",
     "evaluate_run",
+    "evaluation_seeds",
     "gain_over_random",
     "measure_random_returns",
     "play_random",
@@ -101,6 +104,12 @@ def evaluate_policy(
     return concatenate(evaluations)
 
 
+def evaluation_seeds(run: Run, episodes: int) -> list[int]:
+    """Return the seeds with which an environment on the host is reset for the episodes of `evaluate_policy`, of all seeds of the run."""
+    numbers = range(run.config.settings.evaluation_episodes, run.config.settings.evaluation_episodes + episodes)
+    return [episode_seed(seed, Stream.EVALUATION_EPISODES, number) for number in numbers for seed in run.seeds]
+
+
 def gain_over_random(
     returns: Float[np.ndarray, "seeds episodes"], random_returns: Float[np.ndarray, " random_episodes"]
 ) -> tuple[float, float] | None:
@@ -127,10 +136,12 @@ def play_random(
     n_episodes: int = RANDOM_EPISODES,
     limit_s: float = RANDOM_PLAY_LIMIT_S,
     on_episode: EpisodeListener | None = None,
+    seeds: Sequence[int] = (),
 ) -> list[list[Episode]]:
     """Play `n_episodes` episodes of random actions in the environment of evaluations, or fewer if they take long.
 
-    Returns the same episodes from the view of each role of the task.
+    Returns the same episodes from the view of each role of the task. The environment is reset with `seeds` by turns, by default with
+    the numbers of the episodes.
 
     After `limit_s` seconds there are `MIN_RANDOM_EPISODES`, because fewer have no useful deviation, and after `MAX_RANDOM_PLAY_S`
     none begins.
@@ -146,8 +157,9 @@ def play_random(
             seconds = time.monotonic() - start
             if seconds >= (limit_s if len(episodes) >= MIN_RANDOM_EPISODES else MAX_RANDOM_PLAY_S):
                 break
-            random = np.random.default_rng(len(episodes))
-            episodes.append(play_roles(env, task.roles, None, random, len(episodes)))
+            number = len(episodes)
+            seed = seeds[number % len(seeds)] if seeds else number
+            episodes.append(play_roles(env, task.roles, None, np.random.default_rng(number), seed))
             if on_episode is not None:
                 on_episode(len(episodes))
     return [[views[role_index] for views in episodes] for role_index in range(len(task.roles))]

@@ -194,7 +194,10 @@ def _render(env: HostEnv, run: Run) -> Frame:
         with warnings.catch_warnings():
             # Graphics libraries warn if they find no screen, although another one may not need it.
             warnings.simplefilter("ignore")
-            return np.asarray(env.render())
+            pixels = np.asarray(env.render())
+        if pixels.ndim != 3:
+            raise ValueError("render returns no picture (height, width, 3)")
+        return pixels
     except Exception as error:  # every graphics library has a different error for a missing display
         raise LareError(
             f"{run.config.task.environment} cannot be drawn here: {error}; without a screen, set MUJOCO_GL=egl"

@@ -143,6 +143,9 @@ class VectorCredit(VectorWrapper, RecordConstructorArgs):
             terminated,
             truncated,
             valid=valid,
+            infos=[self._select_info(infos, done, env_index) for env_index in range(self.num_envs)]
+            if self.credit.config.groups
+            else None,
         )
         self._observation, self._done = deepcopy(observation), done.copy()
         infos = {
@@ -173,13 +176,20 @@ class VectorCredit(VectorWrapper, RecordConstructorArgs):
         """Return the scores in `info` of the episodes that have ended, and 0 for the other environments."""
         assert self.score is not None
         scores = np.zeros(self.num_envs)
-        last = infos.get("final_info", infos) if self.mode == AutoresetMode.SAME_STEP else infos
-        # `_name` is the mask of the environments with `name`.
-        values = {name: (value, last.get(f"_{name}", done)) for name, value in last.items() if name[:1] != "_"}
         for env_index in np.flatnonzero(done):
-            info = {name: value[env_index] for name, (value, mask) in values.items() if mask[env_index]}
-            scores[env_index] = read_score(info, self.score)
+            scores[env_index] = read_score(self._select_info(infos, done, env_index), self.score)
         return scores
+
+    def _select_info(self, infos: Mapping[str, Any], done: Bool[np.ndarray, " envs"], env_index: Any) -> dict[str, Any]:
+        """Return the `info` of the last step of one environment."""
+        if self.mode == AutoresetMode.SAME_STEP and done[env_index]:
+            infos = infos.get("final_info", infos)
+
+        def has(name: str) -> bool:
+            mask = infos.get(f"_{name}")  # of the environments with `name`
+            return name[:1] != "_" and (mask is None or bool(mask[env_index]))
+
+        return {name: _select_env(value, env_index) for name, value in infos.items() if has(name)}
 
     def _true_reward(self, infos: Mapping[str, Any], reward: Any) -> Float[np.ndarray, " envs"]:
         """Return the environments' rewards. If an inner wrapper has replaced them, it reports them in `infos`."""

@@ -1,5 +1,6 @@
 """A wrapper of PettingZoo environments that shows every step of a team to a `CreditAssigner`, and returns each agent's r_hat."""
 
+from collections import ChainMap
 from copy import deepcopy
 from typing import Any, Literal
 
@@ -87,6 +88,7 @@ class CreditParallel(BaseParallelWrapper):
             [False],
             env_ids=self._recorder.env_ids,
             alive=alive.reshape(lead) if len(self.team) > 1 else None,
+            group=self._recorder.read_groups([ChainMap(*infos.values())]),
         )
         self._observation = next_observation
         infos = {agent: dict(info) for agent, info in infos.items()}

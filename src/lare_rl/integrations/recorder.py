@@ -68,10 +68,7 @@ class StepRecorder:
 
         `results` are the rewards and the two flags of the steps, as in `CreditAssigner.add`. `infos` have the groups of episodes.
         """
-        group, task = None, self.credit.config.task
-        if infos is not None and self.credit.config.groups:
-            key = None if task is None else task.group
-            group = [None if key is None else info.get(key) for info in infos]
+        group = None if infos is None else self.read_groups(infos)
         if not self._same_observations:
             observation = self.observation_layout.rows(observation, "observation")
             next_observation = self.observation_layout.rows(next_observation, "next_observation")
@@ -80,6 +77,15 @@ class StepRecorder:
         return self.credit.add(
             observation, action, next_observation, *results, env_ids=self.env_ids, valid=valid, group=group
         )
+
+    def read_groups(self, infos: Sequence[Mapping[str, Any]]) -> list[Any] | None:
+        """Return the groups of episodes from the infos of their steps, None where a step has none. None without groups."""
+        config = self.credit.config
+        if not config.groups:
+            return None
+        groups = [None if config.task is None else info.get(str(config.task.group)) for info in infos]
+        # A NumPy number is no longer one after the assigner was saved.
+        return [group.item() if isinstance(group, np.generic | np.ndarray) else group for group in groups]
 
     def drop(self, env_index: int) -> None:
         """Give up the running episode of an environment, which was reset."""

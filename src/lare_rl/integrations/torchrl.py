@@ -35,7 +35,8 @@ class CreditTransform(Transform):
 
     The buffer stores the number of each step ("credit_step") and a reward of 0 instead of the environment's. An episode ends
     where ("next", "done"), "terminated" or "truncated" is true. A collector names the trajectory of each step. Without a collector,
-    the last dimension of the batch is time, and the next batch continues the episodes of this one.
+    the last dimension of the batch is time, and the next batch continues the episodes of this one. If the task has a `group`, each step
+    has it at ("next", GROUP), which an info reader of TorchRL fills.
 
     It may be called from several threads. Before every sample, the pending updates of the decoder are made.
     """
@@ -68,6 +69,8 @@ class CreditTransform(Transform):
                 f"{', '.join(map(str, tensordict.keys()))}"
             )
         next_, config = tensordict.get("next"), self.credit.config
+        key = None if config.task is None else config.task.group
+        has_group = config.groups and key in next_.keys()  # noqa: SIM118
         steps = self.credit.add(
             _read_elements(tensordict, self.observation, config.observation),
             _read_elements(tensordict, self.action, config.action),
@@ -76,6 +79,7 @@ class CreditTransform(Transform):
             _read_flags(next_, "terminated") | _read_flags(next_, "done"),
             _read_flags(next_, "truncated"),
             env_ids=self._trajectories(tensordict),
+            group=_flatten(next_, key).reshape(-1).tolist() if has_group else None,
         )
         reward = tensordict.get(REWARD)
         numbers = torch.as_tensor(steps, device=reward.device).reshape(tensordict.batch_size)

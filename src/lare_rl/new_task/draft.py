@@ -13,6 +13,7 @@ from lare_rl.tasks.spec import FILL_IN
 
 __all__ = [
     "DEFAULT_LIMIT",
+    "GROUP_LINE",
     "LIMIT_LINE",
     "MEASURES_LINE",
     "SCORE_LINE",
@@ -36,6 +37,10 @@ SCORE_LINE = (
     '"average": how good steps were on average'
 )
 MEASURES_LINE = '# measures = ["distance"] # keys of the last step\'s info to report beside the return'
+GROUP_LINE = (
+    '# group = "level" # only if episodes belong to levels, maps or weathers: the key of the last step\'s info with its number, from '
+    "0 to 63"
+)
 
 DEFAULT_LIMIT = 1000
 LIMIT_LINE = (
@@ -67,6 +72,11 @@ class Draft:
     """The titles of sections of the documentation that were not used."""
     logs_only: bool = False
     """Whether the task has logs but no environment."""
+
+    @property
+    def guesses_limit(self) -> bool:
+        """Whether the environment names no time limit, so that the file has a guess."""
+        return LIMIT_LINE in self.toml
 
 
 def warning_lines(

@@ -59,6 +59,7 @@ def draft_multi_agent_task(environment_id: str) -> Draft:
     task = make_stub(name, environment_id, teams=teams, max_episode_steps=limit or draft.DEFAULT_LIMIT)
     arguments = _default_arguments(env)
     lines = [
+        draft.GROUP_LINE,
         *([] if limit else [draft.LIMIT_LINE]),
         *([f"# arguments = {{ {arguments} }} # the defaults, unless they are set here"] if arguments else []),
     ]

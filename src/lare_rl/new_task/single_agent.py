@@ -72,6 +72,7 @@ def _write_draft(environment_id: str, env: gymnasium.Env) -> Draft:
         *draft.environment_lines(full_id, observation_size, action_size),
         draft.SCORE_LINE,
         draft.MEASURES_LINE,
+        draft.GROUP_LINE,
         *([] if env.spec and env.spec.max_episode_steps else [draft.LIMIT_LINE]),
     ]
     return draft.make_draft(file_name(name), lines, texts, first_lines, removed, unused_sections=unused)

@@ -1,6 +1,7 @@
 """When a diagnosis makes each of its findings. docs/reference/findings.md is made from this table."""
 
 from lare_rl.report.diagnosis import (
+    BAD_R2,
     BETTER_FRACTION,
     CLOSE_CORRELATION,
     EVALUATION_STDS,
@@ -39,9 +40,11 @@ CONDITIONS: dict[str, dict[str, str]] = {
         "explained": f"Always, if returns are predicted. *Nearly all*: R² is above {HIGH_R2}. *Next to nothing*: below {LITTLE_R2}. "
         "*A part*: between.",
         "decoder_is_outdated": f"The last R² is below {LITTLE_R2}, but the median over the run is not.",
+        "worse_than_mean": f"The last R² is below {BAD_R2:g}.",
         "steps_agree": f"True rewards are known, and the correlation of proxy and true rewards is above {CLOSE_CORRELATION}.",
         "single_steps": "True rewards are known, and the correlation is lower.",
-        "score_use": "Always, if at least 8 returns were predicted. It ends with a sentence about trust.",
+        "score_use": "At least 8 returns were predicted. Only its last sentence, about trust, remains if all episodes have the same "
+        "length and there is nothing else to say: a sum and an average are then the same.",
         "trust_nothing": f"`credit/gain` is not larger than {CLEAR_ERRORS} of its standard errors.",
         "trust_part": f"It is larger, but not above {CLEAR_GAIN:.0%}.",
         "trust_sums": f"It is larger, and above {CLEAR_GAIN:.0%}.",

@@ -16,7 +16,9 @@ from lare_rl.util.statistics import sample_std
 
 __all__ = ["CREDIT_CODES", "NEXT_CODES", "diagnose"]
 
-CREDIT_CODES = ("explained", "decoder_is_outdated", "score_use", "single_steps", "steps_agree")
+CREDIT_CODES = (
+    "explained", "decoder_is_outdated", "score_use", "trust_nothing", "trust_part", "trust_sums", "single_steps", "steps_agree",
+)  # fmt: skip
 """Findings about the quality of the credit."""
 NEXT_CODES = (
     "explains_little", "try_closed_form", "is_rising", "one_seed_was_better", "has_fallen", "is_stuck", "needs_training",
@@ -26,6 +28,8 @@ NEXT_CODES = (
 
 CLOSE_CORRELATION = 0.99
 """Proxy and true rewards of steps agree if their correlation is higher."""
+BAD_R2 = -1.0
+"""Proxy rewards predict returns much worse than their mean if R^2 of the returns is lower."""
 HIGH_R2 = 0.8
 """Proxy rewards explain nearly all of the score if R^2 of the returns is higher."""
 EVALUATION_STDS = 3
@@ -122,6 +126,11 @@ def _proxy_rewards(run: RunSummary) -> Finding | None:
     if outdated:
         return Finding("decoder_is_outdated", values | {"last_r2": run.return_r2})
     return Finding("explained", values)
+
+
+def _worse_than_mean(run: RunSummary) -> Finding | None:
+    bad = run.return_r2 is not None and run.return_r2 < BAD_R2
+    return Finding("worse_than_mean", {"r2": run.return_r2}) if bad else None
 
 
 def _score_use(run: RunSummary) -> Finding | None:
@@ -234,6 +243,7 @@ _RULES: tuple[tuple[Rule, ...], ...] = (
     (_outcome,),
     (_episodic_comparison,),
     (_proxy_rewards,),
+    (_worse_than_mean,),
     (_score_use,),
     (_single_steps,),
     (_explains_little, _is_rising, _one_seed_was_better, _has_fallen, _is_stuck, _needs_training, _needs_baseline),

@@ -63,6 +63,12 @@ MESSAGES = {
         "Its proxy rewards, from {inputs}, usually explain {amount} of the score (median R² of returns: {r2:.2f}), but not the last "
         "episodes (R² {last_r2:.2f}): perhaps the policy has changed, and the decoder has not adapted yet."
     ),
+    "worse_than_mean": (
+        "Warning: R² of returns is far below 0 ({r2:.2f}): the proxy rewards predict the last returns worse than the mean of these "
+        "returns does. That is no harm if these returns hardly differ, or if the policy has just changed and R² rises again. Otherwise, "
+        "the proxy rewards mislead the policy: check `score` and `group` in the task file (docs/how-to/scores.md), and compare with "
+        "`--method episodic`."
+    ),
     "steps_agree": "In single steps, proxy and true rewards agree: their correlation is {correlation:r2}.",
     "single_steps": (
         "In single steps, proxy and true rewards correlate with {correlation:.2f} and differ by {error:score} on average. Returns "

@@ -3,7 +3,7 @@
 import json
 from collections.abc import Iterable, Mapping, Sequence
 from html import escape
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from jaxtyping import Float
@@ -145,13 +145,15 @@ def _render_earnings(run: Run, correlations: Sequence[Float[np.ndarray, " factor
         meanings = {base_name(label.name): label.meaning for label in labels}
         bars = [_make_bar(finding, meanings) for finding in findings if finding.code in ("factor", "unknown_factor")]
         bars += [bar for finding in findings for bar in _raw_feature_bars(finding)]
-        sections += [f"<p>{escape(_sentence(finding))}</p>" for finding in findings if finding.code in _SUMMARIES]
+        sections += [f"<p>{_sentence(finding, 'html')}</p>" for finding in findings if finding.code in _SUMMARIES]
         if bars:
             signs = {bar.sign for bar in bars}
             texts = (f'<span><i class="{side}"></i>{text}</span>' for sign, side, text in _SIDES if sign in signs)
             sections += [draw_bars(bars), f'<div class="sides">{"".join(texts)}</div>']
         sections += [
-            render_note(_sentence(finding)) for finding in findings if finding.code not in (*_IN_BARS, *_SUMMARIES)
+            f'<p class="note">{_sentence(finding, "html")}</p>'
+            for finding in findings
+            if finding.code not in (*_IN_BARS, *_SUMMARIES)
         ]
         sections.append(
             render_fold(
@@ -166,8 +168,8 @@ def _render_earnings(run: Run, correlations: Sequence[Float[np.ndarray, " factor
     yield from sections
 
 
-def _sentence(finding: Finding) -> str:
-    return render(finding, explanation_text.MESSAGES).removeprefix("- ")
+def _sentence(finding: Finding, style: Literal["text", "html"] = "text") -> str:
+    return render(finding, explanation_text.MESSAGES, style).removeprefix("- ")
 
 
 def _make_bar(finding: Finding, meanings: Mapping[str, str]) -> Bar:

@@ -17,6 +17,7 @@ from lare_rl.runs.metric_names import (
     CREDIT_CORRELATION,
     CREDIT_ERROR,
     DETERMINISTIC_RETURN,
+    LENGTH,
     RETURN,
     RETURN_R2,
     RETURN_STD,
@@ -285,7 +286,9 @@ def summarise_run(
         median_r2=None if r2s is None or not len(finite(r2s)) else float(np.median(finite(r2s))),
         credit_error=_last_value(reported, CREDIT_ERROR),
         credit_correlation=_last_value(reported, CREDIT_CORRELATION),
-        score_use=summarise_score_use(method, settings, task, _score_metrics(reported)),
+        score_use=summarise_score_use(
+            method, settings, task, _score_metrics(reported), equal_lengths=_lengths_are_equal(reported)
+        ),
         sees_factors=method.inputs is not None and method.inputs.has_factors,
         sees_raw_features=method.inputs is None or method.inputs.has_raw_features,
         many_agents=SUMMED_RETURN in reported.metrics[-1],
@@ -306,6 +309,12 @@ def _episode_error(reported: ReportedRun) -> float:
         return 0.0
     n_free = max(1, reported.run.config.settings.evaluation_episodes - 1)  # the deviations have n in the denominator
     return math.sqrt(np.mean(stds**2) / n_free / len(stds))
+
+
+def _lengths_are_equal(reported: ReportedRun) -> bool:
+    """Return whether the mean length is the same in all evaluations of all seeds, of which there are several."""
+    curve = reported.curve(LENGTH)
+    return curve is not None and curve[1].size > 1 and bool(np.ptp(curve[1]) == 0)
 
 
 def _score_metrics(reported: ReportedRun) -> dict[str, float | None]:

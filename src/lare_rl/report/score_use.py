@@ -27,6 +27,8 @@ class ScoreUse:
     """When the environment pays before the end of an episode: the number of steps, or "nonzero"."""
     has_groups: bool = False
     exact: str = "no"
+    equal_lengths: bool = False
+    """Whether all episodes have the same length, so that a sum and an average are the same."""
     gain: float = math.nan
     gain_error: float = math.nan
 
@@ -40,9 +42,13 @@ class ScoreUse:
         if not math.isfinite(self.gain):
             return None
         baseline = Finding("mean_of_payments" if self.period else "mean_of_group" if self.has_groups else "mean_return")
-        trust = "trust_nothing" if not self.is_clear else "trust_sums" if self.gain > CLEAR_GAIN else "trust_part"
-        chance = Finding("chance_remains") if self.is_binary and trust == "trust_part" else None
+        code = "trust_nothing" if not self.is_clear else "trust_sums" if self.gain > CLEAR_GAIN else "trust_part"
+        chance = Finding("chance_remains") if self.is_binary and code == "trust_part" else None
         values = {"gain": self.gain, "error": self.gain_error, "baseline": baseline, "chance": chance}
+        trust = Finding(code, values)
+        is_plain = self.period is None and not self.has_groups and self.exact == "no"
+        if self.equal_lengths and self.form in ("form_sum", "form_mean") and is_plain:
+            return trust
         period_code = "period_nonzero" if self.period == "nonzero" else "period"
         period = None if self.period is None else Finding(period_code, {"period": self.period})
         return Finding(
@@ -52,13 +58,13 @@ class ScoreUse:
                 "period": period,
                 "groups": Finding("with_groups") if self.has_groups else None,
                 "exact": None if self.exact == "no" else Finding(f"exact_{self.exact}"),
-                "trust": Finding(trust, values),
+                "trust": trust,
             },
         )
 
 
 def summarise_score_use(
-    method: Method, settings: ResolvedSettings, task: TaskSpec, values: dict[str, float | None]
+    method: Method, settings: ResolvedSettings, task: TaskSpec, values: dict[str, float | None], *, equal_lengths: bool
 ) -> ScoreUse | None:
     """Return how a run took the score. None for a method whose rewards do not add up to returns.
 
@@ -66,6 +72,7 @@ def summarise_score_use(
         settings: the settings of the run.
         task: the task of the run.
         values: the last metrics `average`, `log_odds`, `gain` and `gain_error`, or None where they are missing.
+        equal_lengths: whether all episodes have the same length.
     """
     if method.fit is None:
         return None
@@ -84,6 +91,7 @@ def summarise_score_use(
         period=None if task.payments == "end" else task.payments,
         has_groups=task.group is not None,
         exact=settings.credit.exact if settings.credit.exact in ("last", "spread") else "no",
+        equal_lengths=equal_lengths,
         gain=math.nan if gain is None else gain,
         gain_error=math.nan if error is None else error,
     )

@@ -8,6 +8,7 @@ __all__ = [
     "CREDIT_CORRELATION",
     "CREDIT_ERROR",
     "DETERMINISTIC_RETURN",
+    "LENGTH",
     "METRIC_GROUPS",
     "METRIC_NAMES",
     "RETURN",
@@ -19,6 +20,7 @@ __all__ = [
 RETURN = "evaluation/return"
 RETURN_STD = "evaluation/return_std"
 DETERMINISTIC_RETURN = "evaluation/deterministic_return"
+LENGTH = "evaluation/length"
 SUMMED_RETURN = "evaluation/summed_return"
 CREDIT_ERROR = "credit/error"
 CREDIT_CORRELATION = "credit/correlation"
@@ -33,7 +35,7 @@ METRIC_GROUPS: dict[str, dict[str, str]] = {
         RETURN: "The mean true return of the episodes. For many agents, the return of a team is the sum over the steps of the mean over "
         "its agents that are alive.",
         RETURN_STD: "The standard deviation of the true return over these episodes, with n in the denominator.",
-        "evaluation/length": "The mean length of these episodes (steps).",
+        LENGTH: "The mean length of these episodes (steps).",
         SUMMED_RETURN: "Many agents: the sum of the true rewards over all steps and all agents of the team.",
         DETERMINISTIC_RETURN: "The mean true return of the most likely actions, if the policy samples its actions. Only on the host, "
         "at the last evaluation.",

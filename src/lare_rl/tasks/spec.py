@@ -2,6 +2,7 @@
 
 import hashlib
 import json
+import re
 from collections.abc import Sequence
 from typing import Annotated, Any, Literal, TypeVar
 
@@ -20,6 +21,7 @@ __all__ = [
     "ScoredObservation",
     "TaskSpec",
     "base_name",
+    "entry_meanings",
     "require_role",
     "select_states",
     "split_environment",
@@ -48,6 +50,12 @@ def step_names(scored_observation: ScoredObservation, names: Sequence[str]) -> l
 def base_name(step_name: str) -> str:
     """Return the name without what `step_names` adds."""
     return step_name.removesuffix(" (before)").removesuffix(" (after)")
+
+
+def entry_meanings(text: str) -> dict[int, str]:
+    """Return the meanings of the entries of an observation or action by its text: the line `7: angle of the foot` is about entry 7."""
+    lines = re.findall(r"^[\s\-*\[]*(\d+)\]?\s*[:.)]\s*(.+)$", text, flags=re.MULTILINE)
+    return {int(number): meaning.strip() for number, meaning in lines}
 
 
 CreditScope = Literal["observation", "state"]

@@ -10,6 +10,7 @@ from lare_rl.config.effective import warmup_warning
 from lare_rl.credit.explanation_text import raw_feature_names
 from lare_rl.data.replay import Replay
 from lare_rl.runs.directory import Run
+from lare_rl.runs.metric_names import RETURN, RETURN_STD
 from lare_rl.training.static_config import TrainConfig
 from lare_rl.util.findings import Finding, render
 
@@ -17,6 +18,7 @@ __all__ = [
     "MESSAGES",
     "describe_untrained",
     "find_constant_returns",
+    "find_equal_returns",
     "find_large_observations",
     "find_saturated_policies",
     "find_untrained",
@@ -28,6 +30,10 @@ N_PROBE_STATES = 1000
 """The number of stored observations of an environment that are inspected."""
 N_EQUAL_EVALUATIONS = 5
 """The number of evaluations with equal returns that is reported."""
+MIN_EQUAL_EPISODES = 10
+"""The number of evaluated episodes of which it is reported that all have the same return."""
+ROUNDING = 1e-6
+"""Returns of all episodes are the same if they differ by less than this fraction of their size."""
 EQUAL_RTOL = 1e-3
 """Returns are equal if they differ by less than this fraction of their size."""
 
@@ -45,6 +51,9 @@ MESSAGES = {
     "than that, the policy is stuck, and more steps seldom help: see docs/how-to/poor-policies.md.",
     "one policy": "The policy",
     "policies of seeds": "The policy of {noun} {seeds}",
+    "equal returns": "Every episode of every evaluation has the return {return_:score}. If training episodes have it too, nothing can be "
+    "learned. Does the environment pay a score, and before its time limit (max_episode_steps)? Do bad episodes differ "
+    "(docs/how-to/scores.md)?",
     "constant returns": "The last {n_evaluations} evaluations of every seed have the same return: the policy does not change what "
     "it does. If this return is not a good one, the policy is stuck: see docs/how-to/poor-policies.md.",
 }
@@ -113,6 +122,17 @@ def find_constant_returns(returns: Sequence[Float[np.ndarray, " seeds"]]) -> lis
     if not _are_equal(returns[-N_EQUAL_EVALUATIONS:]) or _are_equal(returns[-N_EQUAL_EVALUATIONS - 1 : -1]):
         return []
     return [Finding("constant returns", {"n_evaluations": N_EQUAL_EVALUATIONS})]
+
+
+def find_equal_returns(run: Run) -> list[Finding]:
+    """Find out whether all evaluated episodes of a run have the same return, as if the score were never paid."""
+    lines = run.metrics()
+    returns, stds = np.array([(line[RETURN], line[RETURN_STD]) for line in lines], float).reshape(-1, 2).T
+    if len(lines) * run.config.settings.evaluation_episodes < MIN_EQUAL_EPISODES:
+        return []
+    limit = ROUNDING * np.abs(returns).max()
+    is_equal = np.ptp(returns) <= limit and stds.max() <= limit
+    return [Finding("equal returns", {"return_": float(returns[0])})] if is_equal else []
 
 
 def _are_equal(returns: Sequence[Float[np.ndarray, " seeds"]]) -> bool:

@@ -10,6 +10,7 @@ from jaxtyping import Bool, Float, Int
 
 from lare_rl.data.trajectory import Trajectory
 from lare_rl.envs.interface import AnyArray, EnvSpec
+from lare_rl.tasks.spec import TaskSpec
 
 __all__ = ["EpisodeBatch", "Evaluation", "concatenate", "metrics_lines"]
 
@@ -35,7 +36,12 @@ class Evaluation(NamedTuple):
     lengths: Int[AnyArray, "seeds episodes"]
     """In steps."""
     measures: dict[str, Float[AnyArray, "seeds episodes"]]
-    """The task's own measures, from the last step."""
+    """The task's own measures and the group, from the last step."""
+
+    def drop_group(self, task: TaskSpec) -> "Evaluation":
+        """Return the evaluation without the numbers of the groups, whose mean says nothing, unless the task measures them."""
+        names = [name for name in self.measures if name != task.group or name in task.measures]
+        return self._replace(measures={name: self.measures[name] for name in names})
 
     def metrics(self, spec: EnvSpec) -> dict[str, Float[np.ndarray, " seeds"]]:
         """Return the means over the episodes, and the standard deviation of returns, by the keys of metrics.jsonl.

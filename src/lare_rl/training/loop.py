@@ -10,6 +10,7 @@ import numpy as np
 
 from lare_rl.config.effective import warmup_warning
 from lare_rl.errors import LareError
+from lare_rl.runs.directory import Run
 from lare_rl.runs.metric_names import ACTOR_SATURATION, RETURN
 from lare_rl.runs.metrics_file import append_metrics
 from lare_rl.training import advice
@@ -81,7 +82,7 @@ def run_session(session: Session, listeners: Sequence[Listener], stop: threading
             say(sentences)
             explained = bool(sentences)
         if is_last:
-            report(_final_findings(session, lines))
+            report(_final_findings(run, lines))
 
 
 def _limit_rate(call: Callable[[int], object]) -> Callable[[int], None]:
@@ -127,13 +128,14 @@ def _explain(session: Session) -> list[str]:
     return describe_returns(session.run, session.learner, session.config)
 
 
-def _final_findings(session: Session, lines: Sequence[dict[str, Any]]) -> list[Finding]:
+def _final_findings(run: Run, lines: Sequence[dict[str, Any]]) -> list[Finding]:
     findings = []
     if ACTOR_SATURATION in lines[0]:
         saturations = [line[ACTOR_SATURATION] for line in lines]
-        findings += advice.find_saturated_policies(saturations, session.run.seeds)
-    untrained = advice.find_untrained(session.run)
-    if untrained is not None and warmup_warning(session.settings) is None:  # that warning was the first message
+        findings += advice.find_saturated_policies(saturations, run.seeds)
+    findings += advice.find_equal_returns(run)
+    untrained = advice.find_untrained(run)
+    if untrained is not None and warmup_warning(run.config.settings) is None:  # that warning was the first message
         findings.append(untrained)
     return findings
 

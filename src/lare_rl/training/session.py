@@ -219,12 +219,10 @@ class Session:
         evaluation = self.collector.evaluate(self.actor, self.settings.evaluation_episodes)
         if len(self.config.env.teams) == 1:
             self._keep_best(evaluation.returns[..., 0].mean(axis=1))
-        metrics = evaluation.metrics(self.config.env) | self.functions.assess(self.learner) | self.latest_metrics
-        if (
-            self.step == self.settings.steps
-            and not self.config.deterministic_evaluation
-            and isinstance(self.collector, HostCollector)
-        ):
+        metrics = evaluation.drop_group(self.run.config.task).metrics(self.config.env)
+        metrics |= self.functions.assess(self.learner) | self.latest_metrics
+        is_last, is_sampled = self.step == self.settings.steps, not self.config.deterministic_evaluation
+        if is_last and is_sampled and isinstance(self.collector, HostCollector):
             deterministic = self.collector.evaluate(self.actor, self.settings.evaluation_episodes, deterministic=True)
             metrics[DETERMINISTIC_RETURN] = deterministic.returns[..., 0].mean(axis=1)
         if self.step > self.config.warmup and isinstance(self.settings.hyperparameters, OffPolicySettings):

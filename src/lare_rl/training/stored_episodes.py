@@ -1,13 +1,13 @@
 """The episodes that the replay of a run holds: as logs, and for reflection."""
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from pathlib import Path
 
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Int
 
-from lare_rl.data.replay import Replay, end_of_episode
+from lare_rl.data.replay import Replay, by_payment, end_of_episode, look_up
 from lare_rl.envs.interface import EnvSpec, Timestep, to_env_action
 from lare_rl.envs.play import Episode, make_episode
 from lare_rl.errors import LareError
@@ -21,7 +21,7 @@ __all__ = ["stored_episodes", "stored_role_episodes"]
 MAX_ROLE_EPISODES = 200
 """The largest number of episodes for reflection, over all seeds and environments."""
 
-Log = Mapping[str, np.ndarray]
+Log = dict[str, np.ndarray]
 """The arrays of an episode, by name."""
 
 
@@ -35,6 +35,8 @@ def stored_episodes(run: Run | str | Path, seed: int | None = None) -> list[Log]
         rewards         [T]                      the true ones
         terminations    [T]                      TD3, DDPG and SAC: whether the episode ended by itself
         truncations     [T]                      TD3, DDPG and SAC: whether it reached its time limit
+
+        group           a number                 if the task has groups
 
     With many agents, the first three have an axis of agents after the axis of steps. Observations are flattened.
 
@@ -50,9 +52,9 @@ def stored_episodes(run: Run | str | Path, seed: int | None = None) -> list[Log]
     replay = select_seed(learner.replay, seed_index)
     _check_columns(run, replay, "observation", "action", "reward")
     return [
-        _make_log(_env_columns(replay, env_index), rows, config.env)
+        _make_log(_env_columns(replay, env_index), rows, config.env) | group
         for env_index in range(len(replay.row))
-        for rows in _episode_rows(replay, env_index)
+        for rows, group in _finished_episodes(replay, env_index)
     ]
 
 
@@ -74,10 +76,10 @@ def stored_role_episodes(run: Run, role: TaskSpec) -> list[Episode]:
         _check_columns(run, replay, "state" if role.credit_scope == "state" else "observation", "action", "reward")
         for env_index in range(config.n_envs):
             columns = _env_columns(replay, env_index)
-            newest = list(_episode_rows(replay, env_index))[-n_newest:]
+            newest = list(_finished_episodes(replay, env_index))[-n_newest:]
             # The last episodes of each environment were played at about the same time.
             episodes += [
-                (i - len(newest), _make_episode(columns, rows, config.env, role)) for i, rows in enumerate(newest)
+                (i - len(newest), _make_episode(columns, rows, config.env, role)) for i, (rows, _) in enumerate(newest)
             ]
     return [episode for _, episode in sorted(episodes, key=lambda pair: pair[0])]
 
@@ -93,13 +95,23 @@ def _env_columns(replay: Replay, env_index: int) -> dict[str, np.ndarray]:
     return {name: np.asarray(column[env_index]) for name, column in replay.columns.items()}
 
 
-def _episode_rows(replay: Replay, env_index: int) -> Iterator[Int[np.ndarray, " steps"]]:
-    """Yield the rows of the steps of each finished episode. The row after the last one has the final observation."""
+def _finished_episodes(
+    replay: Replay, env_index: int
+) -> Iterator[tuple[Int[np.ndarray, " steps"], dict[str, np.ndarray]]]:
+    """Yield the rows of the steps of each finished episode, and its group, if there are groups.
+
+    The row after the last one has the final observation.
+    """
     row, first = np.asarray(replay.row[env_index]), np.asarray(replay.first[env_index])
     episode = jnp.arange(int(replay.oldest[env_index]), int(replay.episodes[env_index]))
-    ends = np.asarray(end_of_episode(replay, jnp.full_like(episode, env_index), episode))
-    for begin, end in zip(first[episode % len(first)], ends, strict=True):
-        yield row[np.arange(begin, end) % len(row)]
+    env, payments = jnp.full_like(episode, env_index), by_payment(replay)
+    ends = end_of_episode(replay, env, episode)
+    groups: list[dict[str, np.ndarray]] = [{}] * len(episode)
+    if payments.level is not None:
+        levels = look_up(payments.level, env, look_up(payments.episode, env, ends - 1))
+        groups = [{"group": level} for level in np.asarray(levels)]
+    for begin, end, group in zip(first[episode % len(first)], np.asarray(ends), groups, strict=True):
+        yield row[np.arange(begin, end) % len(row)], group
 
 
 def _make_log(columns: Log, rows: Int[np.ndarray, " steps"], env: EnvSpec) -> Log:

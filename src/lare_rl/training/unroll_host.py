@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from lare_rl.data.trajectory import Trajectory
-from lare_rl.envs.env_errors import EnvOutputError
+from lare_rl.envs.env_errors import EnvOutputError, name_step
 from lare_rl.envs.interface import Timestep, team_mean, to_env_action
 from lare_rl.envs.vec_env import VecEnv
 from lare_rl.errors import LareError
@@ -48,14 +48,18 @@ def unroll_on_host(
     n_playing = len(episode_seeds) // len(seeds)
     running[:, :n_playing], env_seeds[:, :n_playing] = True, np.reshape(episode_seeds, (len(seeds), n_playing))
     episode_start = np.ones(shape, bool)
-    envs.reset(running.ravel(), env_seeds.ravel())
+    with name_step(0):
+        envs.reset(running.ravel(), env_seeds.ravel())
     next_timestep = add_seed_axis(envs.batch, shape)
+    number = 0
     while running.any():
         timestep = jax.tree.map(np.copy, next_timestep)
         action = policy(timestep, episode_start)
         check_finite(action, seeds)
         env_action = to_env_action(action, envs.spec)
-        envs.step(env_action.reshape(-1, *env_action.shape[2:]), running.ravel())
+        number += 1
+        with name_step(number):
+            envs.step(env_action.reshape(-1, *env_action.shape[2:]), running.ravel())
         steps = Trajectory(timestep=timestep, action=action, env_action=env_action, next_timestep=next_timestep)
         yield steps, running
         running, episode_start = running & ~steps.ended, np.zeros(shape, bool)

@@ -26,14 +26,19 @@ T = TypeVar("T")
 @cache
 def load_plugins() -> None:
     """Import all plugins. Later calls do nothing. Raises `LareError` if a plugin cannot be imported."""
-    modules = {entry.name: entry.module for entry in entry_points(group="lare_rl.plugins")}
-    names = filter(None, map(str.strip, read_variable("LARE_PLUGINS").split(",")))
-    for plugin, module in (modules | {name: name for name in names}).items():
+    plugins = {}
+    for entry in entry_points(group="lare_rl.plugins"):
+        package = entry.dist.name if entry.dist else "its package"
+        source = f" of the package {package} (entry point {entry.name} = {entry.value})"
+        plugins[entry.name] = entry.value.partition(":")[0].strip(), source, f"Update or uninstall {package}."
+    for name in filter(None, map(str.strip, read_variable("LARE_PLUGINS").split(","))):
+        plugins[name] = name, "", "Correct the variable LARE_PLUGINS, or unset it."
+    for plugin, (module, source, advice) in plugins.items():
         try:
             import_module(module)
         except Exception as error:  # a plugin's code can raise anything
             reason = " ".join(f"{type(error).__name__}: {error}".split())
-            raise LareError(f"the plugin {plugin!r} cannot be imported: {reason}") from error
+            raise LareError(f"the plugin {plugin!r}{source} cannot be imported: {reason}. {advice}") from error
 
 
 class Registry(Mapping[str, T], Generic[T]):
