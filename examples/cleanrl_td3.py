@@ -157,7 +157,7 @@ def main(args: Args) -> list[float]:
         if global_step > args.learning_starts:
             data = rb.sample(args.batch_size)
             if args.method != "dense":  # LaRe
-                credit.fit_owed()  # LaRe
+                credit.fit_pending()  # LaRe
                 data = data._replace(rewards=torch.as_tensor(credit.rewards(*data[:3])))  # LaRe
             with torch.no_grad():
                 noise = torch.randn_like(data.actions) * args.policy_noise

@@ -54,7 +54,7 @@ class CreditMemory(RandomMemory):
         self.credit = credit
 
     def sample_by_index(self, names, *, indexes, mini_batches=1):
-        self.credit.fit_owed()
+        self.credit.fit_pending()
         batches = super().sample_by_index(names, indexes=indexes, mini_batches=mini_batches)
         for batch in batches:
             rows = dict(zip(names, batch, strict=True))  # copies of the stored rows

@@ -64,7 +64,7 @@ class CreditReplayBuffer(VectorReplayBuffer):
         return (rows, *rest)
 
     def sample(self, batch_size):
-        self.credit.fit_owed()
+        self.credit.fit_pending()
         rows = ahead = self.sample_indices(batch_size)
         for _ in range(self.n_step):  # targets read `self.rew` of the sampled row and the n - 1 after it
             self.rew[ahead] = self.credit.rewards_at(self.steps[ahead])
