@@ -1,6 +1,7 @@
 """An environment that uses a given processor time in each step, and does nothing else. `workers.py` measures with it."""
 
 import time
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float
@@ -34,6 +35,6 @@ class Burns:
             pass
         return self.timestep
 
-    def render(self) -> None: ...
+    def render(self) -> Any: ...
 
     def close(self) -> None: ...

@@ -74,13 +74,14 @@ def fit_once(credit: lare_rl.CreditAssigner, episodes: Sequence[Mapping[str, np.
 
     All episodes come in one call. If they came one by one, a decoder in closed form would be fitted after every few of them.
     """
-    steps = [
-        np.concatenate([e[name] for e in episodes]) for name in ("observation", "action", "next_observation", score)
-    ]
+    arrays = {name: np.concatenate([e[name] for e in episodes]) for name in episodes[0]}
+    steps = arrays["observation"], arrays["action"], arrays["next_observation"]
     lengths = [len(e[score]) for e in episodes]
     ended = np.zeros(sum(lengths), bool)
     ended[np.cumsum(lengths) - 1] = True
-    credit.add(*steps, ended, np.zeros_like(ended), env_ids=np.repeat(np.arange(len(lengths)), lengths).tolist())
+    credit.add(
+        *steps, arrays[score], ended, np.zeros_like(ended), env_ids=np.repeat(np.arange(len(lengths)), lengths).tolist()
+    )
     credit.fit()
 
 

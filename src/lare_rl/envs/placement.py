@@ -9,7 +9,7 @@ import contextlib
 import logging
 import math
 from functools import lru_cache
-from typing import Any
+from typing import Any, NoReturn
 
 import gymnasium
 import numpy as np
@@ -72,7 +72,7 @@ class SeparateEnv:
     def step(self, action: Float[np.ndarray, "agents action"]) -> Timestep:
         return _select_row(self.envs.step(action[None]))
 
-    def render(self) -> None:
+    def render(self) -> NoReturn:
         raise LareError("an environment in a process of its own cannot be drawn")
 
     def close(self) -> None:

@@ -17,9 +17,10 @@ Maker = Callable[[], HostEnv]
 
 
 class VecEnv(ABC):
-    """A batch of environments with the same sizes.
+    """n environments with the same sizes. In training, n is the number of seeds times the environments of a seed, seeds first.
 
-    `where` selects environments: the rows of the others do not change. The next call overwrites the returned arrays.
+    `where` selects environments: the rows of the others do not change. The next call overwrites the returned arrays. Environments whose
+    episode has ended are not reset: the caller does it.
     """
 
     def __init__(self, spec: EnvSpec, batch: Timestep):
@@ -29,9 +30,10 @@ class VecEnv(ABC):
         self._length = np.zeros(len(batch.terminated), int)
         """The steps of each environment's running episode."""
         self.stop_requested: Callable[[], bool] = lambda: False
-        """Whether the user wants to stop. Environments in other processes must then reply soon."""
+        """Whether the user wants to stop. Environments in other processes must then reply soon; `LocalVecEnv` ignores it."""
 
     def reset(self, where: Bool[np.ndarray, " n"], seeds: Integer[np.ndarray, " n"]) -> Timestep:
+        """Start an episode in the selected environments."""
         self._call("reset", seeds, where)
         self._length[where] = 0
         self._check_lengths(where)
@@ -40,6 +42,7 @@ class VecEnv(ABC):
     def step(
         self, action: Float[np.ndarray, "n agents action"], where: Bool[np.ndarray, " n"] | None = None
     ) -> Timestep:
+        """Make one step in the selected environments, by default in all. Actions are in the environment's units."""
         where = np.ones(len(action), bool) if where is None else where
         self._call("step", action, where)
         self._length[where] += 1

@@ -26,9 +26,9 @@ class CreditParallel(BaseParallelWrapper):
     """A ParallelEnv whose agents are one team. In the assigner's arrays the agents are in the order of `possible_agents`.
 
     `step` returns r_hat for each agent that acted. The agent's `info` has its reward from the environment ("true_reward") and the
-    number of the step ("credit_step"), for `credit.rewards_at`, which returns the r_hat of all agents. The return of an episode is
-    the sum over the steps of the mean reward of the agents that act. An agent that leaves counts until its last step. The episode
-    ends when all agents have left.
+    number of the step among all steps of the assigner ("credit_step"): `CreditAssigner.rewards_at` returns the r_hat of all agents for
+    it. The return of an episode is the sum over the steps of the mean reward of the agents that act. An agent that leaves counts until
+    its last step. The episode ends when all agents have left. If the assigner has groups, any agent's `info` may have `group`.
 
     `reset` in the middle of an episode gives the episode up: nothing is learned from it.
     """
@@ -39,7 +39,8 @@ class CreditParallel(BaseParallelWrapper):
         Args:
             env: the environment, whose agents all have the same spaces.
             credit: an assigner with `agents=len(env.possible_agents)`, made for the spaces of one agent.
-            pay: the rewards that `step` returns: r_hat, or the environment's.
+            pay: the rewards that `step` returns: "proxy" (r_hat) or "environment" (its own). With "environment", call
+                `CreditAssigner.fit_pending` before `rewards_at`.
 
         Raises:
             LareError: the assigner was made for another number of agents, or for other spaces.
@@ -77,7 +78,7 @@ class CreditParallel(BaseParallelWrapper):
         next_observation = self._replace_rows(self._observation, "observation", observations)
         reward = np.array([float(rewards.get(agent, 0)) for agent in self.team])
         alive = np.array([agent in acting for agent in self.team])
-        # A team of one is a single agent, whose arrays have no axis of agents.
+        # Unlike in training, the arrays of a single agent have no axis of agents.
         lead = (1, len(self.team)) if len(self.team) > 1 else (1,)
         steps = self.credit.add(
             self._observation.reshape(*lead, -1),

@@ -37,7 +37,7 @@ def fit_logistic(
     y: Float[np.ndarray, " prefixes"],
     weight: Float[np.ndarray, " prefixes"],
     group: Int[np.ndarray, " prefixes"],
-    n_cases: int,
+    n_rollouts: int,
 ) -> PrefixFit:
     """Return the posterior of the log odds. The arguments are those of `fit_linear`; y is between 0 and 1."""
     n_groups = int(group.max()) + 1
@@ -47,7 +47,7 @@ def fit_logistic(
     def regress() -> GroupSums:
         p = logistic(eta)
         curvature = np.maximum(p * (1 - p), MIN_CURVATURE)
-        return sum_up(x, eta + (y - p) / curvature, weight * curvature, group, n_groups, n_cases, unit=1.0)
+        return sum_up(x, eta + (y - p) / curvature, weight * curvature, group, n_groups, n_rollouts, unit=1.0)
 
     sums = regress()
     first = np.append(np.diagonal(sums.problem.s) / sums.problem.q * x.shape[1], 1.0) + 1e-12

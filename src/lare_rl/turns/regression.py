@@ -1,18 +1,20 @@
 """The value of a prefix in closed form: a regression of outcomes on features of prefixes, with an intercept for each group.
 
-For every prefix (k, t) of every rollout k, before its turn t, with features x_kt and the outcome R_k of the rollout:
+There is one case for each turn t of each rollout k. Its features x_kt describe what happened before the turn, the prefix, and its outcome
+is that of the whole rollout, R_k. With x' the mean of the features:
 
-    R_k = m + b_group(k) + v . x_kt + e,     b ~ N(0, 1 / alpha_0),     v_i ~ N(0, 1 / alpha_i),     e ~ N(0, 1 / beta)
+    R_k = m + b_group(k) + v . (x_kt - x') + e,     b ~ N(0, 1 / alpha_0),     v_i ~ N(0, 1 / alpha_i),     e ~ N(0, 1 / beta)
 
-Every prefix has the weight w = 1 / (mean length of a rollout), so that a rollout counts for one case on average. (The weight 1 / T_k
+Every case has the weight w = 1 / (mean length of a rollout), so that the weights add up to the number of rollouts. (The weight 1 / T_k
 would be wrong: the length T_k depends on what the agent does later.) m has a flat prior. The precisions maximise the evidence, by the
 rounds of `credit/precisions.py`.
 
-The intercepts are as many as there are groups, but their block of the posterior's precision is diagonal. So they are eliminated:
+There is an intercept for each group, but their block of the posterior's precision is diagonal. So they are eliminated. With the sums
+X = sum w (x - x') and W = sum w in each group, and P the precision of (v, m) if the intercepts were known:
 
-    D = beta n + alpha_0,     B = beta (sums of w x, n) of each group,     H = precision of (v, m) - B^T D^-1 B
+    D = beta W + alpha_0,     B = beta (X, W),     precision of (v, m) = P - B^T D^-1 B
 
-which costs a matrix of the size of v, whatever the number of groups.
+This needs a matrix of the size of v, whatever the number of groups.
 """
 
 from functools import partial
@@ -49,7 +51,7 @@ __all__ = [
 MAX_ROUNDS = 40
 """The maximum number of rounds of the evidence's fixed point, from each of its two starts."""
 NOISE_ONLY = 1e3
-"""The second start: each feature may explain its equal share divided by this."""
+"""The second start: each prior variance is this many times smaller than for equal shares."""
 
 
 class GroupSums(NamedTuple):
@@ -57,35 +59,35 @@ class GroupSums(NamedTuple):
 
     x_mean: Float[np.ndarray, " features"]
     group_x: Float[np.ndarray, "groups features"]
-    """sum w (x - x_mean) in each group."""
+    """X."""
     group_y: Float[np.ndarray, " groups"]
     """sum w (y - y_mean) / y_std in each group."""
     group_weight: Float[np.ndarray, " groups"]
-    """sum w in each group."""
+    """W."""
     problem: Regression
-    """The regression on (v, b). Its matrix S is only that of v; p has both."""
+    """The regression on (v, b). S = sum w (x - x_mean)(x - x_mean)^T is only that of v. p = sum w (x - x_mean) y and then `group_y`."""
 
 
 class PrefixFit(NamedTuple):
-    """The posterior of (v, m, b), about `x_mean`."""
+    """The posterior of (v, m, b)."""
 
     x_mean: Float[np.ndarray, " features"]
     weight: Float[np.ndarray, " features"]
     """v."""
     mean: float
-    """m + v . x_mean."""
+    """m."""
     intercept: Float[np.ndarray, " groups"]
     """b."""
-    root: Float[np.ndarray, "n n"]
-    """root^T root is the covariance of (v, m), n = features + 1."""
-    group_row: Float[np.ndarray, "groups n"]
-    """D^-1 B: b falls by this much if (v, m) grows by 1."""
+    root: Float[np.ndarray, "v_and_m v_and_m"]
+    """root^T root is the covariance of (v, m)."""
+    group_row: Float[np.ndarray, "groups v_and_m"]
+    """D^-1 B: how much the mean of b falls if an entry of (v, m) grows by 1."""
     group_precision: Float[np.ndarray, " groups"]
     """D: the precision of b for some (v, m)."""
     noise: float
-    """1 / beta, the variance of e. 1 if outcomes are probabilities."""
+    """1 / beta, the variance of e. 1 if `is_logistic`."""
     is_logistic: bool
-    """Whether m + b + v . x is the log odds of the outcome (`logistic.py`)."""
+    """Whether m + b + v . (x - x') is the log odds of the outcome (`logistic.py`)."""
 
 
 def sum_up(
@@ -94,7 +96,7 @@ def sum_up(
     weight: Float[np.ndarray, " prefixes"],
     group: Int[np.ndarray, " prefixes"],
     n_groups: int,
-    n_cases: int,
+    n_rollouts: int,
     unit: float | None = None,
 ) -> GroupSums:
     """Return the sums over prefixes. Groups without a prefix are allowed.
@@ -105,8 +107,8 @@ def sum_up(
         weight: of each prefix.
         group: the index of each prefix's group.
         n_groups: the number of groups.
-        n_cases: the number of rollouts.
-        unit: the unit of y; its standard deviation if it is None.
+        n_rollouts: the number of rollouts, which are the degrees of freedom: all prefixes of a rollout have the same outcome.
+        unit: the unit of y. If it is None, the standard deviation of y.
     """
     total = weight.sum()
     x_mean, y_mean = weight @ x / total, weight @ y / total
@@ -125,12 +127,12 @@ def sum_up(
     group_x[group[order][starts]] = np.add.reduceat(weighted[order], starts, axis=0)
     group_y, group_weight = (np.bincount(group, values, n_groups) for values in (scaled, weight))
     strengths = np.concatenate([np.arange(x.shape[1]), np.full(n_groups, x.shape[1])])
-    diagonal = np.concatenate([np.diagonal(s), group_weight - group_weight**2 / total])
+    diagonal = np.concatenate([np.diagonal(s), group_weight - group_weight**2 / total])  # of S for v and b
     problem = Regression(
         s=s,
         p=np.concatenate([scaled @ x_centred, group_y]),
-        q=total,
-        dof=np.asarray(n_cases - 1.0),
+        q=total,  # the sum of w y^2 in a linear fit, where y has the variance 1
+        dof=np.asarray(n_rollouts - 1.0),
         y_mean=y_mean,
         y_std=np.asarray(y_std),
         group_index=strengths,
@@ -140,15 +142,15 @@ def sum_up(
 
 
 class Elimination(NamedTuple):
-    """The posterior of (v, m), and of b given (v, m)."""
+    """The posterior of (v, m), and of b for known (v, m), in units of the standard deviation of y. m is relative to the mean of y."""
 
-    root: Float[np.ndarray, "n n"]
+    root: Float[np.ndarray, "v_and_m v_and_m"]
     log_det: float
     """log det of the precision of (v, b)."""
-    weight: Float[np.ndarray, " n"]
+    weight: Float[np.ndarray, " v_and_m"]
     """(v, m)."""
     intercept: Float[np.ndarray, " groups"]
-    group_row: Float[np.ndarray, "groups n"]
+    group_row: Float[np.ndarray, "groups v_and_m"]
     group_precision: Float[np.ndarray, " groups"]
 
     @property
@@ -159,7 +161,7 @@ class Elimination(NamedTuple):
 
 
 def eliminate_groups(sums: GroupSums, alpha: Float[np.ndarray, " strengths"], beta: float) -> Elimination:
-    """Return the posterior under some precisions."""
+    """Return the posterior of (v, m) under some precisions, with the intercepts eliminated, and then that of b."""
     problem, n = sums.problem, len(sums.x_mean)
     d = beta * sums.group_weight + alpha[-1]
     rows = beta * np.column_stack([sums.group_x, sums.group_weight])
@@ -191,16 +193,16 @@ def fit_linear(
     y: Float[np.ndarray, " prefixes"],
     weight: Float[np.ndarray, " prefixes"],
     group: Int[np.ndarray, " prefixes"],
-    n_cases: int,
+    n_rollouts: int,
 ) -> PrefixFit:
     """Return the posterior under the precisions that maximise the evidence. The arguments are those of `sum_up`.
 
     The evidence may have a maximum where all is noise. So there are two iterations, from equal shares and from much smaller ones. The
     larger evidence wins.
     """
-    sums = sum_up(x, y, weight, group, int(group.max()) + 1, n_cases)
+    sums = sum_up(x, y, weight, group, int(group.max()) + 1, n_rollouts)
     problem = sums.problem
-    beta = 2 * problem.dof / problem.q
+    beta = 2 * problem.dof / problem.q  # the features explain half of the variance
     candidates = [fixed_point(sums, problem.equal_alpha * factor, beta) for factor in (1.0, NOISE_ONLY)]
     best = max(candidates, key=lambda posterior: posterior.log_evidence)
     alpha, beta = clip_precisions(NUMPY, problem, best.alpha, best.beta)

@@ -25,9 +25,9 @@ __all__ = ["advantages", "changes", "deviations", "fit_prefixes", "held_out_valu
 
 def fit_prefixes(table: TurnTable, x: Float[np.ndarray, "turns features"], *, is_logistic: bool = False) -> PrefixFit:
     """Return the fit of the outcomes to the features of all prefixes."""
-    index, n_cases = table.rollout_index, len(table.length)
+    index, n_rollouts = table.rollout_index, len(table.length)
     fit = fit_logistic if is_logistic else fit_linear
-    return fit(x, table.outcome[index], np.full(len(x), n_cases / len(x)), table.group[index], n_cases)
+    return fit(x, table.outcome[index], np.full(len(x), n_rollouts / len(x)), table.group[index], n_rollouts)
 
 
 class _Predictions(NamedTuple):
