@@ -35,7 +35,7 @@ class LoggedTeam(Toy):
             {agent: (before[agent], actions[agent], observations[agent], rewards[agent]) for agent in before}
         )
         if not self.agents:
-            infos["a_0"]["level"] = self.level
+            next(iter(infos.values()))["level"] = self.level
         return observations, rewards, terminated, truncated, infos
 
 
