@@ -1,6 +1,6 @@
 """PPO in one compiled program, in the style of PureJaxRL, on an environment that pays its return at the end of an episode.
 
-    pip install 'lare-rl[gymnax]'
+    pip install '.[gymnax]'
     python examples/purejax_ppo.py
 
 It trains several seeds on gymnax's CartPole-v1 at once, without a language model. Without the lines that end in "# LaRe", PPO trains

@@ -4,6 +4,8 @@ pip install -e 'benchmarks/real[traffic]' -e '.[sb3]'
 python examples/traffic_sb3.py
 """
 
+from pathlib import Path
+
 import gymnasium
 import numpy as np
 from stable_baselines3 import PPO
@@ -13,13 +15,15 @@ import lare_rl
 from final_score.play import make_task, play_scores
 from lare_rl.integrations.sb3 import CreditCallback
 
+REAL = Path(__file__).parent.parent / "benchmarks" / "real"
+
 
 def main(steps: int = 14_400, episodes: int = 4) -> tuple[float, float]:
     """Return the mean score (minus the delay in s) of held-out hours: of the policy, and of a rule of thumb."""
     env = gymnasium.make("Traffic-v0")
-    credit = lare_rl.CreditAssigner(
-        "bayes", observation_space=env.observation_space, action_space=env.action_space, capacity=2 * steps
-    )
+    task = lare_rl.load_task(REAL / "tasks" / "traffic.toml")
+    phi = lare_rl.load_function(REAL / "phi" / "traffic.py", task)  # by a language model
+    credit = lare_rl.CreditAssigner("lare-bayes", phi, task=task, capacity=2 * steps)
     model = PPO("MlpPolicy", env, n_steps=min(720, steps), batch_size=72, seed=0)
     model.learn(steps, callback=CreditCallback(credit))
     print(credit.metrics())

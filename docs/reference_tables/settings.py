@@ -59,7 +59,7 @@ def settings_page() -> str:
         "# Settings",
         "A setting `evaluate_every` is `--evaluate-every` on the command line, `Settings(evaluate_every=...)` in Python and "
         "`evaluate_every` in a sweep file. A setting of an algorithm has its name in front: `--td3.warmup`, "
-        '`Settings(td3={"warmup": 1000})`. A setting of the decoder is under `credit`: `--credit.drawn-steps`.',
+        '`Settings(td3={"warmup": 1000})`. A setting of the decoder is under `credit`: `--credit.sampled-steps`.',
         "If a default is -, the task and the algorithm decide. `config.json` has the values that a run used.",
     ]
     for title, names in RUN_GROUPS.items():

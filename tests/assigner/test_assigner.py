@@ -714,3 +714,4 @@ def test_must_learn_what_wins():
     correlation = np.corrcoef(odds.rewards_at(rows), episode.next_observation[:, 0])[0, 1]
     assert correlation > 0.95
     assert any("log odds" in line for line in odds.explanation())
+    assert [any("won or lost" in line for line in credit.explanation()) for credit in (sums, odds)] == [True, False]

@@ -37,7 +37,7 @@ from lare_rl.credit.decoder_settings import CreditSettings
 from lare_rl.credit.decoders import DECODERS
 from lare_rl.credit.explanation_text import explanation_lines
 from lare_rl.credit.methods import Reward
-from lare_rl.credit.returns import estimate_score_type
+from lare_rl.credit.returns import estimate_score_type, looks_binary
 from lare_rl.errors import LareError
 from lare_rl.latent.function import LatentFunction
 from lare_rl.tasks.payments import PAID_AT_END, PaymentRule
@@ -92,7 +92,8 @@ class CreditAssigner:
                 the policy changes, and False for a log, whose episodes all count the same.
             payments: when the environment pays, if it pays before the end of an episode. The task's by default.
             groups: whether returns of episodes of the same group share an intercept: levels, maps, weather, demand. `add` and
-                `add_episode` then need `group`. The default is whether the task has `group`.
+                `add_episode` then need `group`, which the adapters of libraries read from `info`: under the task's key, or "group". The
+                default is whether the task has `group`.
 
         Raises:
             LareError: method, function, task and spaces do not go together.
@@ -329,10 +330,15 @@ class CreditAssigner:
             explanation, config = self.learner.explain(), self.config
             if explanation is None:
                 return []
-            assert self.learner.decoder is not None
-            factor_names = [] if config.phi is None else config.phi.factor_columns(config.scored_observation)
-            score_type = estimate_score_type(self.learner.decoder)
-            return explanation_lines(explanation, score_type, factor_names, config.raw_feature_names)
+            decoder = self.learner.decoder
+            assert decoder is not None
+            return explanation_lines(
+                explanation,
+                estimate_score_type(decoder),
+                [] if config.phi is None else config.phi.factor_columns(config.scored_observation),
+                config.raw_feature_names,
+                looks_binary=looks_binary(decoder, config.method),
+            )
 
     @property
     def score_type(self) -> str:

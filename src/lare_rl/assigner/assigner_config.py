@@ -94,6 +94,11 @@ class AssignerConfig(CheckedModel):
         return MAX_LEVELS if self.groups else 0
 
     @property
+    def group_key(self) -> str:
+        """The key of an episode's group in `info`."""
+        return "group" if self.task is None or self.task.group is None else self.task.group
+
+    @property
     def is_exact(self) -> bool:
         """Whether the proxy rewards of an episode are corrected to add up to its return."""
         return self.method.is_exact(self.settings.exact)

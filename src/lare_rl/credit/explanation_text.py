@@ -61,6 +61,10 @@ MESSAGES = {
         "The score is treated as {this} over the steps of an episode: so far, this predicts returns at least as well as what steps "
         "add to the log odds of the higher score. This may change."
     ),
+    "looks_binary": (
+        "The last returns have only two values. If the score is won or lost, the odds often predict it better than a sum: set "
+        '`score = "binary"` in the task file, `--credit.score`, or `CreditSettings(score=...)`.'
+    ),
     "sum": "a sum",
     "mean": "an average",
     "returns": "the returns of {n_episodes:,} episodes",
@@ -134,16 +138,25 @@ def raw_feature_names(observation: str, action: str, sizes: Mapping[str, int]) -
 
 
 def explanation_lines(
-    explanation: Explanation, score_type: ScoreTypeEstimate | None, factors: Sequence[str], raw_features: Sequence[str]
+    explanation: Explanation,
+    score_type: ScoreTypeEstimate | None,
+    factors: Sequence[str],
+    raw_features: Sequence[str],
+    *,
+    looks_binary: bool = False,
 ) -> list[str]:
     """Return the sentences of `explanation_findings`."""
-    return [
-        render(finding, MESSAGES) for finding in explanation_findings(explanation, score_type, factors, raw_features)
-    ]
+    findings = explanation_findings(explanation, score_type, factors, raw_features, looks_binary=looks_binary)
+    return [render(finding, MESSAGES) for finding in findings]
 
 
 def explanation_findings(
-    explanation: Explanation, score_type: ScoreTypeEstimate | None, factors: Sequence[str], raw_features: Sequence[str]
+    explanation: Explanation,
+    score_type: ScoreTypeEstimate | None,
+    factors: Sequence[str],
+    raw_features: Sequence[str],
+    *,
+    looks_binary: bool = False,
 ) -> list[Finding]:
     """Return what an explanation says.
 
@@ -152,6 +165,7 @@ def explanation_findings(
         score_type: the estimated type of the score. None if it is set, or makes no difference.
         factors: names of the factors; empty for a method without factors.
         raw_features: names of the raw features; empty if they have none. Then nothing is said of single features.
+        looks_binary: whether the score should be tried as one that is won or lost (`returns.looks_binary`).
     """
     n_episodes, factors_r2 = int(explanation.n_episodes), float(explanation.factors_r2)
     if n_episodes < MIN_EXPLAINED_EPISODES:
@@ -161,6 +175,7 @@ def explanation_findings(
     target = Finding("mean_rewards" if explanation.explains_mean_reward else "returns", {"n_episodes": n_episodes})
     largest = _largest_raw_features(explanation, raw_features)
     findings = [] if score_type is None else [_score_type(score_type)]
+    findings += [Finding("looks_binary")] if looks_binary else []
     if not factors:
         largest_features = Finding("largest", {"features": largest}) if largest else None
         values = {"share": float(explanation.total_r2), "target": target, "largest": largest_features}

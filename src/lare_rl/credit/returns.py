@@ -48,6 +48,7 @@ __all__ = [
     "fit_closed_form",
     "is_fitted",
     "is_stale",
+    "looks_binary",
     "predict",
     "predict_then_update",
     "predicted_returns",
@@ -55,6 +56,8 @@ __all__ = [
     "reward_std",
 ]
 
+MIN_BINARY_RETURNS = 16
+"""With fewer returns, nothing is said about whether they look as if won or lost."""
 MIN_GROWTH = 0.02
 """A decoder learns from new episodes when their number exceeds this fraction of the number of old ones. Short episodes thus come in
 batches."""
@@ -247,6 +250,15 @@ def estimate_score_type(state: DecoderState) -> ScoreTypeEstimate | None:
     n_binary = int(state.closed_form.log_odds is not None)
     types = [*ScoreType][: len(errors) - n_binary] + [ScoreType.LOG_ODDS] * n_binary
     return compare_score_types(dict(zip(types, errors.tolist(), strict=True)), types[index])
+
+
+def looks_binary(state: DecoderState, method: Method) -> bool:
+    """Return whether the last returns have two values, and the method could fit their odds, but does not."""
+    closed = state.closed_form
+    if closed is None or closed.log_odds is not None or "score" not in method.settings:
+        return False
+    n_returns = min(int(state.predictions.n_episodes), len(state.predictions.returns))
+    return n_returns >= MIN_BINARY_RETURNS and len(np.unique(np.asarray(state.predictions.returns)[:n_returns])) == 2
 
 
 @jax.jit

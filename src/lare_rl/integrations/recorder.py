@@ -83,7 +83,7 @@ class StepRecorder:
         config = self.credit.config
         if not config.groups:
             return None
-        groups = [None if config.task is None else info.get(str(config.task.group)) for info in infos]
+        groups = [info.get(config.group_key) for info in infos]
         # A NumPy number is no longer one after the assigner was saved.
         return [group.item() if isinstance(group, np.generic | np.ndarray) else group for group in groups]
 

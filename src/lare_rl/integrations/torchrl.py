@@ -69,8 +69,7 @@ class CreditTransform(Transform):
                 f"{', '.join(map(str, tensordict.keys()))}"
             )
         next_, config = tensordict.get("next"), self.credit.config
-        key = None if config.task is None else config.task.group
-        has_group = config.groups and key in next_.keys()  # noqa: SIM118
+        has_group = config.groups and config.group_key in next_.keys()  # noqa: SIM118
         steps = self.credit.add(
             _read_elements(tensordict, self.observation, config.observation),
             _read_elements(tensordict, self.action, config.action),
@@ -79,7 +78,7 @@ class CreditTransform(Transform):
             _read_flags(next_, "terminated") | _read_flags(next_, "done"),
             _read_flags(next_, "truncated"),
             env_ids=self._trajectories(tensordict),
-            group=_flatten(next_, key).reshape(-1).tolist() if has_group else None,
+            group=_flatten(next_, config.group_key).reshape(-1).tolist() if has_group else None,
         )
         reward = tensordict.get(REWARD)
         numbers = torch.as_tensor(steps, device=reward.device).reshape(tensordict.batch_size)

@@ -75,8 +75,11 @@ def _find_explanations(run: Run, learner: Learner, config: TrainConfig) -> list[
         role, function = roles[i], run.functions[i] if run.functions else None
         factor_names = [] if function is None else function.factor_columns(run.scored_observation)
         raw_names = [] if config.team_level else specs[i].raw_feature_names(role.observation, role.action)
-        score_type = returns.estimate_score_type(select_seed(first_shard(learner.decoders[i])))
-        findings.append(explanation_findings(explanation, score_type, factor_names, raw_names))
+        decoder = select_seed(first_shard(learner.decoders[i]))
+        score_type, looks_binary = returns.estimate_score_type(decoder), returns.looks_binary(decoder, config.method)
+        findings.append(
+            explanation_findings(explanation, score_type, factor_names, raw_names, looks_binary=looks_binary)
+        )
     return findings
 
 
