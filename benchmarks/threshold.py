@@ -74,7 +74,7 @@ def assess(method: str, episodes: list, test: list) -> dict[str, float]:
     }
 
 
-def main(seeds: int = 10, counts: tuple[int, ...] = (10, 30, 60)) -> None:
+def main(seeds: int = 10, counts: tuple[int, ...] = (60,)) -> None:
     """Measure.
 
     Args:
