@@ -83,10 +83,10 @@ def test_same_seed_twice(write_csv, run):
 
 def test_table_and_draw(write_csv, make_run):
     """A table is not a further draw of the runs with its label."""
-    drawn = make_run("a", [0.5, 0.75], draw=1)
+    other = make_run("a", [0.5, 0.75], draw=1)
     path = write_csv(method_rows("dense"))
-    with pytest.raises(LareError, match=rf"{path} and {drawn.directory} both have dense.*rename"):
-        compare(collect_results((drawn.directory, path))[0])
+    with pytest.raises(LareError, match=rf"{path} and {other.directory} both have dense.*rename"):
+        compare(collect_results((other.directory, path))[0])
 
 
 def test_foreign_seed(run):

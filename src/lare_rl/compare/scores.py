@@ -124,10 +124,10 @@ def _check_tasks(results: Sequence[LearningCurves], tasks: Sequence[str], metric
 def _index_curves(results: Sequence[LearningCurves], metric: str) -> dict[_Key, _Curve]:
     curves: dict[_Key, _Curve] = {}
     for result in results:
-        drawn = [other.source for other in results if other.label == result.label and other.draw]
-        if result.config is None and drawn:
+        sources = [other.source for other in results if other.label == result.label and other.draw]
+        if result.config is None and sources:
             raise LareError(
-                f"{result.source} and {drawn[0]} both have {result.label}, and a table has no draws: rename the method in the .csv file"
+                f"{result.source} and {sources[0]} both have {result.label}, and a table has no draws: rename the method in the .csv file"
             )
         for seed, values in result.curves.items():
             key = _Key(result.label, result.task, result.draw, seed)

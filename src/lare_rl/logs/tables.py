@@ -93,7 +93,7 @@ class ParquetLog(TableLog):
                             fields.remove_metadata().to_string().splitlines()
                             for fields in (schema, reader.schema_arrow)
                         )
-                        first = next(other or text for text, other in itertools.zip_longest(*texts) if text != other)
+                        first = next((b or a for a, b in itertools.zip_longest(*texts) if a != b), "a column")
                         raise LareError(f"{file} has other columns or types than {files[0]}, first {first}")
                     yield from reader.iter_batches(batch_rows(schema))
             except (OSError, pa.ArrowException, NotImplementedError) as error:

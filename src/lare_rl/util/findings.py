@@ -49,8 +49,8 @@ def render(finding: Finding, catalogue: Catalogue, style: Literal["text", "html"
         return _CODE.sub(r"<code>\1</code>", escape(text))
     if style == "markdown":
         return "".join(
-            f"`{part}`" if number % 2 else _MARKDOWN_SPECIAL.sub(r"\\\1", part)
-            for number, part in enumerate(_CODE.split(text))
+            f"`{piece}`" if number % 2 else _MARKDOWN_SPECIAL.sub(r"\\\1", piece)
+            for number, piece in enumerate(_CODE.split(text))
         )
     return text
 

@@ -36,13 +36,13 @@ class PPOSettings(AlgorithmSettings):
     """How far the value may move in one update, in standard deviations of the return."""
     value_coef: Annotated[float, Field(ge=0)] = 0.5
     """Coefficient of the value loss."""
-    entropy_coef: Annotated[float, Field(ge=0)] = 0.0
+    entropy_coef: Annotated[float, Field(ge=0)] = 0.01
     """Coefficient of the entropy bonus."""
     huber_delta: Annotated[float, Field(gt=0)] = 10.0
     """Error at which the value loss turns from quadratic to linear, in standard deviations of the return."""
     max_grad_norm: Annotated[float, Field(gt=0)] = 0.5
     """Largest norm of the gradient of actor and critic together; a larger gradient is scaled down to it."""
-    anneal: bool = False
+    anneal: bool = True
     """Let learning rate and clip fall linearly to 0 over the run."""
     normalise_observations: bool = False
     """Normalise the networks' observations by their running mean and standard deviation."""
@@ -85,7 +85,7 @@ register_algorithm(
     Algorithm(
         name="ppo",
         consumes=Consumes.ROLLOUTS,
-        settings=PPOSettings(hidden=(256, 256), entropy_coef=0.01, anneal=True, normalise_observations=True),
+        settings=PPOSettings(hidden=(256, 256), normalise_observations=True),
         module="lare_rl.algorithms.ppo.ppo",
         run_defaults=_ppo_defaults,
         summary="clipped policy steps on the newest rollout; observations are normalised",
@@ -101,9 +101,7 @@ register_algorithm(
             gamma=1.0,
             minibatch_size=128,
             clip=0.5,
-            entropy_coef=0.01,
             max_grad_norm=10.0,
-            anneal=True,
         ),
         module="lare_rl.algorithms.ppo.ppo",
         run_defaults=_ippo_defaults,
