@@ -171,7 +171,9 @@ def test_update_ignores_masked_actors():
 @pytest.mark.parametrize("discrete", [True, False])
 def test_ppo_learns(discrete):
     """The reward is 1 if the choice is the sign of s_0; or it is -(a_0 - s_0)^2."""
-    settings = PPOSettings(hidden=(32,), minibatch_size=64, epochs=4, gamma=0.0, learning_rate=3e-3, entropy_coef=0.0)
+    settings = PPOSettings(
+        hidden=(32,), minibatch_size=64, epochs=4, gamma=0.0, learning_rate=3e-3, entropy_coef=0.0, anneal=False
+    )
 
     def compute_reward(observation, action):
         if discrete:

@@ -133,6 +133,12 @@ def test_bad_runs(runs, metric, message, make_run):
         compare(read([make_run(name, [1.0, 2.0], task, **settings) for name, task, settings in runs], metric), metric)
 
 
+def test_draw_without_a_seed(make_run):
+    runs = [make_run("a", [1.0, 2.0]), make_run("b", [1.0], draw=1)]
+    with pytest.raises(LareError, match=r"dense has no run on Chase with seed 1 and draw 1, .*: train it\Z"):
+        compare(read(runs))
+
+
 def test_two_tasks_with_one_name(make_run):
     first, second = make_run("a", [1.0]), make_run("b", [2.0], method="rd")
     second = Run(second.directory, second.config.model_copy(update={"task": toy_spec(scored_observation="after")}), ())

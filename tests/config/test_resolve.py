@@ -183,7 +183,15 @@ def test_check_credit_accepts():
 
 @pytest.mark.parametrize(
     ("max_steps", "environments", "rollout_steps"),
-    [(360, None, 2160), (20, None, 2000), (500, None, 2000), (5000, None, 2000), (360, 4, 360), (1000, 4, 500)],
+    [
+        (360, None, 2160),
+        (20, None, 2000),
+        (500, None, 2000),
+        (5000, None, 2000),
+        (360, 4, 360),
+        (1000, 4, 500),
+        (1000, 500, 16),
+    ],
 )
 def test_rollouts_of_ppo_are_whole_episodes(max_steps, environments, rollout_steps):
     task = pick_spec(environment="toys/Endless-v0", max_episode_steps=max_steps)

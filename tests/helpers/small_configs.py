@@ -37,8 +37,10 @@ TWO_TEAMS = EnvSpec((Team("first", 0, 3), Team("second", 3, 5)), 3, 4, True, 12,
 
 SMALL_SETTINGS = {
     "td3": TD3Settings(hidden=(8,), batch_size=8, warmup=0),
-    "ppo": PPOSettings(hidden=(8,), minibatch_size=5, epochs=2, normalise_observations=True),
-    "ippo": PPOSettings(hidden=(8,), minibatch_size=50, epochs=1),
+    "ppo": PPOSettings(
+        hidden=(8,), minibatch_size=5, epochs=2, entropy_coef=0.0, anneal=False, normalise_observations=True
+    ),
+    "ippo": PPOSettings(hidden=(8,), minibatch_size=50, epochs=1, entropy_coef=0.0, anneal=False),
     "qmix": QMIXSettings(hidden=4, embed=2, hypernet=3, batch_size=4, update_every=2, target_every=4),
 }
 

@@ -8,6 +8,9 @@ import pytest
 
 from helpers.toy_logs import check_log, logged_episodes, write_rewards_plus_one
 from lare_rl import LareError
+from lare_rl.logs import log as log_module
+from lare_rl.logs import tables as tables_module
+from lare_rl.logs.episode import RelabelledEpisode
 from lare_rl.logs.log import open_log
 
 
@@ -79,7 +82,9 @@ def test_parquet_directory_continues_episodes(tmp_path):
         pq.write_table(rows.slice(start, 50), tmp_path / "log" / f"{number:02d}.parquet")
     check_log(open_log(tmp_path / "log"), logged_episodes(8))
     pq.write_table(rows.drop_columns("comment"), tmp_path / "log" / "99.parquet")
-    with pytest.raises(LareError, match=r"99\.parquet has other columns than .*00\.parquet"):
+    with pytest.raises(
+        LareError, match=r"99\.parquet has other columns or types than .*00\.parquet, first comment: string"
+    ):
         list(open_log(tmp_path / "log").episodes())
 
 
@@ -133,6 +138,9 @@ def with_column(name, values):
         (with_column("actions", pa.array([None] * N_ROWS, pa.float32())), "actions has rows without a value"),
         (with_column("observations", pa.array([[0.0]] + [[0.0, 1.0]] * (N_ROWS - 1))), "lists of one length"),
         (pa.concat_tables([ROWS, with_column("episode", pa.array([1] * N_ROWS)), ROWS]), "episode 0 comes twice"),
+        (with_column("episode", pa.array([0] * (N_ROWS - 2) + [None] * 2)), "episode has rows without a value"),
+        (ROWS.append_column("actions", ROWS["actions"]), "has 2 columns actions"),
+        (ROWS.append_column("episode", ROWS["episode"]), "one column episode"),
         (ROWS.slice(0, 0), "no episode"),
     ],
 )
@@ -149,6 +157,51 @@ def test_groups_are_texts_of_any_type(tmp_path, kind):
     """polars writes large strings, pandas dictionaries."""
     pq.write_table(ROWS.append_column("group", pa.array(["easy"] * N_ROWS, kind)), tmp_path / "log.parquet")
     assert [episode.group for episode in open_log(tmp_path / "log.parquet").episodes()] == ["easy"]
+
+
+def test_episode_ids(tmp_path):
+    """pandas writes categories as dictionaries. A table of episodes may have a column of their ids."""
+    texts = pa.array([f"run {number}" for number in step_rows(logged_episodes(3))["episode"].to_pylist()])
+    rows = step_rows(logged_episodes(3))
+    rows = rows.set_column(0, "episode", texts.dictionary_encode())
+    pq.write_table(rows, tmp_path / "steps.parquet")
+    check_log(open_log(tmp_path / "steps.parquet"), logged_episodes(3))
+    assert [episode.name[-5:] for episode in open_log(tmp_path / "steps.parquet").episodes()] == [
+        "run 0",
+        "run 1",
+        "run 2",
+    ]
+    out = write_rewards_plus_one(tmp_path / "steps.parquet", tmp_path / "new.parquet")
+    assert pq.read_table(out)["episode"].to_pylist() == texts.to_pylist()
+    pq.write_table(
+        episode_rows(logged_episodes(3)).append_column("episode", pa.array([7, 8, 9])), tmp_path / "rows.parquet"
+    )
+    check_log(open_log(tmp_path / "rows.parquet"), logged_episodes(3))
+
+
+@pytest.mark.parametrize("rows", [step_rows, episode_rows])
+def test_few_episodes_are_read_before_the_first_write(tmp_path, monkeypatch, rows):
+    monkeypatch.setattr(log_module, "BATCH_STEPS", 100)
+    pq.write_table(rows(logged_episodes(60)), tmp_path / "log.parquet")
+    read, counts = [], []
+
+    def write(tables, open_writer):
+        for table in tables:
+            counts.append(len(read))
+            assert table.num_rows
+
+    monkeypatch.setattr(tables_module, "write_tables", write)
+    log = open_log(tmp_path / "log.parquet")
+    with pytest.raises(LareError):  # there is no file to rename
+        log.write(
+            tmp_path / "new.parquet",
+            (read.append(item) or RelabelledEpisode(item, item.reward) for item in log.episodes()),
+            False,
+            "",
+        )
+    assert counts[0] < 10
+    assert len(counts) > 6
+    assert counts[-1] == 60
 
 
 def truncate(path):

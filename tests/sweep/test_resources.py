@@ -69,3 +69,5 @@ def test_slots_without_cards(monkeypatch):
 def test_resources_are_checked():
     with pytest.raises(LareError, match="cores = 0"):
         Resources(cores=0)
+    with pytest.raises(LareError, match=r"cards = 1\.5.* whole number, or less than 1"):
+        Resources(cards=1.5)

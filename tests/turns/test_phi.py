@@ -44,6 +44,31 @@ def test_events_of_calls_add_up():
     assert read_turn_phi(SOURCE)(FAILED) == {"passes": 0, "n": 0}
 
 
+OTHER_NAMES = "def turn_events(tool, arguments, result, text):\n    return {'a' if 'a' in arguments else 'b': 1}\n"
+
+
+def test_calls_of_a_turn_have_the_same_events():
+    assert find_problems(OTHER_NAMES, [PASSED, FAILED]).startswith(
+        "E-NAMES call 2: the events are not those of call 1 (a, b)"
+    )
+    rollout = {
+        "messages": [
+            {"role": "assistant", "content": "I look."},
+            {
+                "role": "assistant",
+                "tool_calls": [
+                    {"id": str(k), "function": {"name": "test", "arguments": arguments}}
+                    for k, arguments in enumerate(('{"a": 1}', "{}"))
+                ],
+            },
+            *({"role": "tool", "tool_call_id": str(k), "content": ""} for k in range(2)),
+        ],
+        "outcome": 1,
+    }
+    with pytest.raises(LareError, match="rollout 0, turn 1: the phi over turns failed: E-NAMES call 2"):
+        lare_rl.TurnCredit(phi=read_turn_phi(OTHER_NAMES))([rollout])
+
+
 def test_credit_uses_the_events():
     messages = [
         {"role": "assistant", "tool_calls": [{"id": "1", "function": {"name": "test", "arguments": "{}"}}]},
@@ -81,9 +106,12 @@ def test_files(tmp_path):
     path = tmp_path / "phi.py"
     path.write_text(SOURCE)
     assert load_turn_phi(path).source == SOURCE
-    path.write_text("x = 1")
-    with pytest.raises(LareError, match="turn_events"):
-        load_turn_phi(path)
+    for source in ("x = 1", "# def turn_events\nx = 1", "turn_events = 1"):
+        path.write_text(source)
+        with pytest.raises(LareError, match=f"{path}: not a valid turn function: .*turn_events"):
+            load_turn_phi(path)
+    path.write_text(SOURCE.replace("def turn", "def  turn"))
+    assert load_turn_phi(path)(PASSED) == read_turn_phi(SOURCE)(PASSED)
     with pytest.raises(LareError, match="cannot be read"):
         load_turn_phi(tmp_path / "none.py")
 
@@ -100,8 +128,9 @@ def test_design_corrects_until_a_program_passes():
 def test_design_gives_up():
     with pytest.raises(LareError, match="none of 5 attempts"):
         design_turn_phi("Repair it.", [{"name": "test"}], [PASSED, FAILED], ScriptedModel(*["?"] * 5))
-    with pytest.raises(LareError, match="there is none"):
-        design_turn_phi("Repair it.", [{"name": "test"}], [], ScriptedModel())
+    for turns in ([], [PASSED]):
+        with pytest.raises(LareError, match=f"at least 2 turns, and not on {len(turns)}"):
+            design_turn_phi("Repair it.", [{"name": "test"}], turns, ScriptedModel())
 
 
 def test_request_has_tools_and_turns():

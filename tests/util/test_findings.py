@@ -1,6 +1,6 @@
 import pytest
 
-from lare_rl.util.findings import Finding, format_value, render
+from lare_rl.util.findings import Finding, format_for_reader, render
 
 CATALOGUE = {
     "learned": "Learned in {n_seeds:count seed}: {return_:score}{where}. Next: `lare-rl {command}`.",
@@ -41,14 +41,16 @@ def test_render_incomplete():
         (0.99, "r2", "0.99"),
         (0.0123, "error", "0.01"),
         (0.0001, "error", "less than 0.001"),
+        (25.0, "error", "25"),
+        (9.6, "error", "10"),
+        (9.4, "error", "9"),
         (float("nan"), "error", "nan"),
-        (2, "count reply", "2 replies"),
         (2, "count day", "2 days"),
         (0.5, ".0%", "50%"),
     ],
 )
-def test_format_value(value, spec, text):
-    assert format_value(value, spec) == text
+def test_format_for_reader(value, spec, text):
+    assert format_for_reader(value, spec) == text
 
 
 def test_findings_are_hashable():

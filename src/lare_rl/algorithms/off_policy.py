@@ -6,7 +6,7 @@ from pydantic import Field
 
 from lare_rl.algorithms.registry import AlgorithmSettings
 
-if TYPE_CHECKING:  # importing NumPy takes longer than all else that the command line does before it shows a message
+if TYPE_CHECKING:
     from lare_rl.envs.interface import EnvSpec
 
 __all__ = ["OffPolicySettings", "run_defaults"]

@@ -201,7 +201,7 @@ def _load_episodes(role: "TaskSpec", data: str | None, n_episodes: int, policy: 
 def _print_assessment(function: "LatentFunction", role: "TaskSpec", episodes: "Sequence[Episode]") -> None:
     """Print how well the factors explain the returns of some episodes."""
     from lare_rl.training.reflect import assess_function
-    from lare_rl.util.findings import format_value
+    from lare_rl.util.findings import format_for_reader
 
     assessment = assess_function(function, role, episodes)
     if len({episode.return_ for episode in episodes}) == 1:
@@ -213,7 +213,7 @@ def _print_assessment(function: "LatentFunction", role: "TaskSpec", episodes: "S
             )
         return
     if math.isfinite(assessment.r2):
-        r2, r2_error = format_value(assessment.r2, "r2"), format_value(assessment.r2_error, "error")
+        r2, r2_error = format_for_reader(assessment.r2, "r2"), format_for_reader(assessment.r2_error, "error")
         print_line(
             f"Returns of unseen episodes, predicted by the factors: R² = {r2} (1: exactly; 0: no better than their mean), "
             f"with a standard error of {r2_error}. Each return was predicted from the episodes before it, so R² "
@@ -222,7 +222,7 @@ def _print_assessment(function: "LatentFunction", role: "TaskSpec", episodes: "S
             "or decided by the initial state."
         )
         if assessment.length_r2 is not None:
-            length_r2 = format_value(assessment.length_r2, "r2")
+            length_r2 = format_for_reader(assessment.length_r2, "r2")
             print_line(f"Predicted by the lengths of these episodes alone, without a factor: R² = {length_r2}.")
         print_line(
             f"Fitted to all {len(episodes)} episodes (shares may be high where R² is low, because these returns were seen):"

@@ -97,7 +97,7 @@ def evaluate(
 def _describe_returns(run: "Run", evaluation: "Evaluation", best_steps: "Sequence[int] | None") -> Iterator[str]:
     """Yield the returns of each seed. `best_steps` are the steps of the best policies."""
     from lare_rl.envs.families import load_env_spec
-    from lare_rl.util.findings import format_value
+    from lare_rl.util.findings import format_for_reader
     from lare_rl.util.statistics import format_mean_std
 
     roles, has_many_agents = run.config.task.roles, load_env_spec(run.config.task).n_agents > 1
@@ -105,7 +105,7 @@ def _describe_returns(run: "Run", evaluation: "Evaluation", best_steps: "Sequenc
         for seed_index, seed in enumerate(run.seeds):
             returns = evaluation.returns[seed_index, :, team_index]
             line = f"{role.name}, " if len(roles) > 1 else ""
-            line += f"seed {seed}: return {format_mean_std(returns)} over {format_value(len(returns), 'count episode')}"
+            line += f"seed {seed}: return {format_mean_std(returns)} over {format_for_reader(len(returns), 'count episode')}"
             if best_steps is not None:
                 step = best_steps[seed_index]
                 untrained = ", before its first update" if step <= run.config.settings.warmup else ""
@@ -126,7 +126,7 @@ def _describe_evaluation(
     import numpy as np
 
     from lare_rl.evaluation.evaluate import gain_over_random
-    from lare_rl.util.findings import format_value
+    from lare_rl.util.findings import format_for_reader
     from lare_rl.util.statistics import format_mean_std, format_plus_minus
 
     yield from _describe_returns(run, evaluation, best_steps)
@@ -136,7 +136,7 @@ def _describe_evaluation(
             continue
         team = f"{role.name}, " if len(roles) > 1 else ""
         returns = np.array([episode.return_ for episode in episodes])
-        yield f"{team}random actions: return {format_mean_std(returns)} over {format_value(len(returns), 'count episode')}"
+        yield f"{team}random actions: return {format_mean_std(returns)} over {format_for_reader(len(returns), 'count episode')}"
         if (gain := gain_over_random(evaluation.returns[:, :, team_index], returns)) is not None:
             yield f"{team}difference: {format_plus_minus(*gain)} (± is its standard error)"
     if (group := run.config.task.group) is not None and random_episodes[0]:

@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from lare_rl.compare.labels import find_differences, find_origin_differences, label_runs
-from lare_rl.compare.results import Results, read_results_table, read_run_results
+from lare_rl.compare.results import LearningCurves, read_results_table, read_run_results
 from lare_rl.errors import LareError, did_you_mean
 from lare_rl.runs.directory import Run, find_run_directories, open_without_functions
 from lare_rl.runs.metric_names import RETURN, SUMMED_RETURN
@@ -14,7 +14,7 @@ from lare_rl.util.findings import Finding
 __all__ = ["collect_results", "select_runs"]
 
 
-def collect_results(paths: Sequence[Path], metric: str = RETURN) -> tuple[list[Results], list[Finding]]:
+def collect_results(paths: Sequence[Path], metric: str = RETURN) -> tuple[list[LearningCurves], list[Finding]]:
     """Read the results in run directories and tables (.csv), and find what the user should know about them.
 
     The first label is the baseline. Runs come before tables, unless the first path is a table: its first method is the baseline.
@@ -76,14 +76,16 @@ def select_runs(runs: Sequence[Run], metric: str = RETURN) -> tuple[list[Run], l
     return selected, findings
 
 
-def _find_other_tasks(run_results: Sequence[Results], table_results: Sequence[Results]) -> list[Finding]:
+def _find_other_tasks(run_results: Sequence[LearningCurves], table_results: Sequence[LearningCurves]) -> list[Finding]:
     """Return the tasks of tables that no run has."""
     tasks = tuple(sorted({result.task for result in run_results}))
     unknown = dict.fromkeys((result.source, result.task) for result in table_results if result.task not in tasks)
     return [Finding("other_task", {"source": source, "task": task, "tasks": tasks}) for source, task in unknown]
 
 
-def _find_other_steps(run_results: Sequence[Results], table_results: Sequence[Results], metric: str) -> list[Finding]:
+def _find_other_steps(
+    run_results: Sequence[LearningCurves], table_results: Sequence[LearningCurves], metric: str
+) -> list[Finding]:
     """Return the methods of tables that lack the last step of the runs."""
     last_steps: dict[str, int] = {}  # of the shortest run on each task
     for result in run_results:

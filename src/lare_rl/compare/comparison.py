@@ -21,7 +21,7 @@ from lare_rl.compare.bootstrap import (
     probability_of_improvement,
 )
 from lare_rl.compare.rank_test import mann_whitney
-from lare_rl.compare.results import Results
+from lare_rl.compare.results import LearningCurves
 from lare_rl.compare.scores import Group, group_results
 from lare_rl.evaluation.reference_returns import REFERENCE_RETURNS
 from lare_rl.runs.metric_names import RETURN
@@ -104,7 +104,7 @@ class Comparison:
 
 
 def compare(
-    results: Sequence[Results], metric: str = RETURN, step: int | None = None, late: bool = False
+    results: Sequence[LearningCurves], metric: str = RETURN, step: int | None = None, late: bool = False
 ) -> Comparison:
     """Compare results by their labels. The first label is the baseline.
 
@@ -134,7 +134,7 @@ def compare(
 
 
 def compare_tasks(
-    results: Sequence[Results], metric: str = RETURN, step: int | None = None, late: bool = False
+    results: Sequence[LearningCurves], metric: str = RETURN, step: int | None = None, late: bool = False
 ) -> list[Comparison]:
     """Compare all tasks together, or each task alone if their scores have no common scale."""
     tasks = sorted({result.task for result in results})

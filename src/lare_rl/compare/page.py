@@ -7,7 +7,7 @@ from pathlib import Path
 from lare_rl.compare.bootstrap import REPETITIONS, Estimate
 from lare_rl.compare.comparison import Comparison, compare_over_tasks, compare_tasks
 from lare_rl.compare.messages import MESSAGES, find_min_p, find_score_meaning, find_small_samples, to_text
-from lare_rl.compare.results import Results
+from lare_rl.compare.results import LearningCurves
 from lare_rl.report import figures
 from lare_rl.report.html import render_note, render_table, write_page
 from lare_rl.runs.metric_names import RETURN
@@ -22,7 +22,7 @@ OVERALL_HEADER = ("all tasks", "seeds", "above baseline [95%]", "p")
 
 
 def write_comparisons(
-    results: Sequence[Results],
+    results: Sequence[LearningCurves],
     out: Path,
     metric: str = RETURN,
     findings: Iterable[Finding] = (),
@@ -84,7 +84,7 @@ def _format_cell(value: Estimate | float | None) -> str:
     return str(value) if isinstance(value, Estimate) else f"{value:.2g}"
 
 
-def _find_origin(results: Sequence[Results]) -> Finding | None:
+def _find_origin(results: Sequence[LearningCurves]) -> Finding | None:
     """Return the versions, machine and evaluations that all runs share."""
     configs = [result.config for result in results if result.config is not None]
     values = {

@@ -1,4 +1,4 @@
-"""The values of a metric to compare: of runs, and of tables with the results of other programs.
+"""Read learning curves of one metric from run directories and from CSV tables of other programs.
 
 A table is a CSV file with the columns `method`, `task`, `seed`, `step` and the metric (`evaluation/return` by default). Other
 columns are ignored.
@@ -18,7 +18,7 @@ from lare_rl.runs.config_file import Config
 from lare_rl.runs.directory import Run
 from lare_rl.util.safe_io import read_text
 
-__all__ = ["Results", "group_pairs", "read_results_table", "read_run_results"]
+__all__ = ["LearningCurves", "group_pairs", "read_results_table", "read_run_results"]
 
 _Key = TypeVar("_Key", bound=Hashable)
 _Value = TypeVar("_Value")
@@ -29,7 +29,7 @@ COLUMNS = ("method", "task", "seed", "step")
 
 
 @dataclass(frozen=True)
-class Results:
+class LearningCurves:
     """The values of a metric in one run, or of one method and task in a table."""
 
     label: str
@@ -38,6 +38,7 @@ class Results:
     """The run directory or the table."""
     task: str
     draw: int
+    """The draw of the language model; 0 for a table."""
     curves: Mapping[int, Mapping[int, float]]
     """The values, by seed and step."""
     config: Config | None = None
@@ -52,24 +53,28 @@ def group_pairs(pairs: Iterable[tuple[_Key, _Value]]) -> dict[_Key, list[_Value]
     return groups
 
 
-def read_run_results(runs: Mapping[str, Sequence[Run]], metric: str) -> list[Results]:
-    """Read the values of a metric in runs, which are given by label. Raises `LareError` if a run has no values."""
+def read_run_results(runs: Mapping[str, Sequence[Run]], metric: str) -> list[LearningCurves]:
+    """Read the values of a metric in runs. `runs` maps each label to its runs.
+
+    Raises:
+        LareError: a file is damaged.
+    """
     results = []
     for label, run in ((label, run) for label, group in runs.items() for run in group):
-        lines = [line for line in run.metrics() if line.get(metric) is not None]
-        if not lines:
-            raise LareError(f"{run.directory} has no {metric} yet: leave it out, or compare another metric")
         curves: dict[int, dict[int, float]] = {seed: {} for seed in run.seeds}
-        for line in lines:
-            curves[line["seed"]][line["step"]] = float(line[metric])
+        for line in run.metrics():
+            if (seed := line["seed"]) not in curves:
+                raise LareError(f"the metrics of {run.directory} have the seed {seed}, which the run does not have")
+            if line.get(metric) is not None:
+                curves[seed][line["step"]] = float(line[metric])
         task, draw = run.config.task.name, run.config.settings.draw
         results.append(
-            Results(label=label, source=run.directory, task=task, draw=draw, curves=curves, config=run.config)
+            LearningCurves(label=label, source=run.directory, task=task, draw=draw, curves=curves, config=run.config)
         )
     return results
 
 
-def read_results_table(path: Path, metric: str) -> list[Results]:
+def read_results_table(path: Path, metric: str) -> list[LearningCurves]:
     """Read the curves of each method and task in a table.
 
     Raises:
@@ -83,12 +88,16 @@ def read_results_table(path: Path, metric: str) -> list[Results]:
         raise LareError(f"{path} is not a CSV table: {error}") from error
     if not curves:
         raise LareError(f"{path} has no row with a value of {metric}")
-    return [Results(method, path, task, draw=0, curves=values) for (method, task), values in curves.items()]
+    return [LearningCurves(method, path, task, draw=0, curves=values) for (method, task), values in curves.items()]
 
 
 def _check_columns(path: Path, header: Sequence[str], metric: str) -> None:
     columns = (*COLUMNS, metric)
-    if name := next((name for name in columns if name not in header), None):
+    for name in columns:
+        if (count := list(header).count(name)) == 1:
+            continue
+        if count:
+            raise LareError(f"{path} has {count} columns {name!r}: keep one")
         hint = did_you_mean(name, header)
         raise LareError(f"{path} has no column {name!r}{hint}: a table of results needs {', '.join(columns)}")
 
@@ -103,12 +112,20 @@ def _read_curves(path: Path, rows: csv.DictReader, metric: str) -> dict[tuple[st
         method, task = row["method"], row["task"]
         if not (method and task):
             raise LareError(f"{where} has no method or no task")
-        seed, step = (_parse(f"{where}: {name}", row[name], int, "whole") for name in ("seed", "step"))
+        seed, step = (_parse(f"{where}: {name}", row[name], _whole, "nonnegative whole") for name in ("seed", "step"))
         curve = curves.setdefault((method, task), {}).setdefault(seed, {})
         if step in curve:
             raise LareError(f"{where} is a second row of {method} on {task} with seed {seed} at step {step}")
         curve[step] = _parse(f"{where}: {metric}", row[metric], float, "finite")
     return curves
+
+
+def _whole(text: str) -> int:
+    """Return a whole number of at least 0, which may be written as 1000000.0. Raises `ValueError` for another text."""
+    number = int(text) if text.isdecimal() else float(text)
+    if number < 0 or number != int(number):
+        raise ValueError(text)
+    return int(number)
 
 
 def _parse(where: str, text: str | None, convert: Callable[[str], _Number], kind: str) -> _Number:

@@ -1,7 +1,7 @@
 """The scores of a comparison, as arrays.
 
 A *score* is the value of the metric at an evaluation. If there are several tasks, the metric is the return, and it is scaled: 0 is
-the return of a random policy, and 1 the return of a policy trained by others (`REFERENCE_RETURNS`, for some tasks).
+the return of a random policy, and 1 about the highest published return of TD3 on true rewards (`REFERENCE_RETURNS`, for some tasks).
 """
 
 from collections.abc import Mapping, Sequence
@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from lare_rl.compare.results import Results
+from lare_rl.compare.results import LearningCurves
 from lare_rl.errors import LareError
 from lare_rl.evaluation.reference_returns import REFERENCE_RETURNS
 from lare_rl.runs.metric_names import RETURN
@@ -51,7 +51,7 @@ class _Curve(NamedTuple):
 
 
 def group_results(
-    results: Sequence[Results], metric: str = RETURN, step: int | None = None, late: bool = False
+    results: Sequence[LearningCurves], metric: str = RETURN, step: int | None = None, late: bool = False
 ) -> list[Group]:
     """Group results by label.
 
@@ -77,9 +77,10 @@ def group_results(
         for (i, draw), (j, seed), (k, task) in product(enumerate(draws), enumerate(seeds), enumerate(tasks)):
             key = _Key(label, task, draw, seed)
             if key not in curves:
+                hint = ", or compare each task alone" if len(tasks) > 1 else ""
                 raise LareError(
-                    f"{label} has no run on {task} with seed {seed} and draw {draw}, which it has on another task: train "
-                    "it, or compare each task alone"
+                    f"{label} has no run on {task} with seed {seed} and draw {draw}, and needs the same seeds for every task and "
+                    f"draw: train it{hint}"
                 )
             scores[i, j, k] = [curves[key].values[step] for step in steps]
         if len(tasks) > 1:
@@ -100,11 +101,11 @@ def group_results(
 
 
 def last_quarter(steps: Sequence[int]) -> list[int]:
-    """Return the ascending steps that are after three quarters of the last one."""
+    """Return the steps above 3/4 of the last step. `steps` are ascending."""
     return [step for step in steps if 4 * step > 3 * steps[-1]]
 
 
-def _check_tasks(results: Sequence[Results], tasks: Sequence[str], metric: str) -> None:
+def _check_tasks(results: Sequence[LearningCurves], tasks: Sequence[str], metric: str) -> None:
     """Raise `LareError` if scores of several tasks have no common scale, or two tasks have the same name."""
     if len(tasks) > 1 and metric != RETURN:
         raise LareError(f"{metric} has no common scale over several tasks: compare each task alone")
@@ -120,9 +121,14 @@ def _check_tasks(results: Sequence[Results], tasks: Sequence[str], metric: str) 
                 )
 
 
-def _index_curves(results: Sequence[Results], metric: str) -> dict[_Key, _Curve]:
+def _index_curves(results: Sequence[LearningCurves], metric: str) -> dict[_Key, _Curve]:
     curves: dict[_Key, _Curve] = {}
     for result in results:
+        sources = [other.source for other in results if other.label == result.label and other.draw]
+        if result.config is None and sources:
+            raise LareError(
+                f"{result.source} and {sources[0]} both have {result.label}, and a table has no draws: rename the method in the .csv file"
+            )
         for seed, values in result.curves.items():
             key = _Key(result.label, result.task, result.draw, seed)
             if key in curves:

@@ -51,8 +51,8 @@ class _RunSettings(CheckedModel, Generic[Open]):
     for ippo and 8 for qmix."""
     rollout_steps: Count | Open = OPEN
     """Steps of each copy in an iteration, which collects, stores, fits and updates. By default 50 for algorithms that consume
-    transitions or sequences. For ppo 2000 over all copies, rounded to episodes of the maximum length; for ippo an episode on particle
-    tasks, and on other tasks 2050 over all copies in JAX, 2000 on the host."""
+    transitions or sequences. For ppo 2000 over all copies, and at least 16, rounded to episodes of the maximum length; for ippo an
+    episode on particle tasks, and on other tasks 2050 over all copies in JAX, 2000 on the host, and at least 16."""
     fit_every: Count | Open = OPEN
     """For ppo and ippo, and for every algorithm with diaster, rudder, grd or rbt: iterations between two fits of the decoder. By
     default 10 for ippo, else 1."""

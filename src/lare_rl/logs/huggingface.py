@@ -14,7 +14,7 @@ try:
 except ImportError as missing:
     raise missing_extra_error("a Hugging Face data set", "datasets") from missing
 
-from lare_rl.logs.tables import BATCH_ROWS, TableLog, write_tables
+from lare_rl.logs.tables import TableLog, batch_rows, write_tables
 
 __all__ = ["HuggingFaceLog"]
 
@@ -31,7 +31,7 @@ class HuggingFaceLog(TableLog):
             raise LareError(f"{self.path} has several splits: name one of {names}")
         try:
             dataset: Any = datasets.Dataset.load_from_disk(str(self.path)).with_format("arrow")
-            for table in dataset.iter(BATCH_ROWS):
+            for table in dataset.iter(batch_rows(dataset.features.arrow_schema)):
                 yield from table.to_batches()
         except (OSError, ValueError, KeyError, TypeError, pa.ArrowException) as error:
             raise LareError(f"{self.path} is not a Hugging Face data set, or damaged: {short_repr(error)}") from error

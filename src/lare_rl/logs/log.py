@@ -3,17 +3,21 @@
 import contextlib
 import shutil
 from abc import ABC, abstractmethod
-from collections.abc import Container, Iterable, Iterator, Mapping
+from collections.abc import Callable, Container, Iterable, Iterator, Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 from uuid import uuid4
 
 from lare_rl.errors import LareError, short_repr
 from lare_rl.logs.episode import LoggedEpisode, LogLayout, RelabelledEpisode, infer_layout, parse_episode
 from lare_rl.tasks.spec import TaskSpec, require_role
 
-__all__ = ["Log", "atomic_output", "check_output", "open_log"]
+__all__ = ["Log", "atomic_output", "batch_by_steps", "check_output", "open_log"]
 
+_Item = TypeVar("_Item")
+
+BATCH_STEPS = 8192
+"""The least number of steps whose rewards are computed, or which are written, at a time."""
 LOG_SUFFIXES = frozenset({".npz", ".parquet", ".arrow", ".json"})
 """Files of logs. A directory with other files is never replaced."""
 
@@ -60,6 +64,19 @@ class Log(ABC):
         for name, values, _ in self.read():
             return infer_layout(name, values, role)
         raise LareError(f"{self.name} has no episode")
+
+
+def batch_by_steps(items: Iterable[_Item], count_steps: Callable[[_Item], int]) -> Iterator[list[_Item]]:
+    """Yield lists of successive items with at least `BATCH_STEPS` steps in total, except for the last list."""
+    batch, n_steps = [], 0
+    for item in items:
+        batch.append(item)
+        n_steps += count_steps(item)
+        if n_steps >= BATCH_STEPS:
+            yield batch
+            batch, n_steps = [], 0
+    if batch:
+        yield batch
 
 
 def open_log(source: Any, task: TaskSpec | None = None) -> Log:

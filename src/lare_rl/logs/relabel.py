@@ -22,8 +22,8 @@ from lare_rl.credit.methods import Reward, find_method
 from lare_rl.envs.load import resolve_task
 from lare_rl.errors import LareError
 from lare_rl.latent.function import LatentFunction
-from lare_rl.logs.episode import LoggedEpisode, RelabelledEpisode
-from lare_rl.logs.log import Log, open_log
+from lare_rl.logs.episode import RelabelledEpisode
+from lare_rl.logs.log import Log, batch_by_steps, open_log
 from lare_rl.tasks.payments import is_paid
 from lare_rl.tasks.spec import TaskSpec
 from lare_rl.util.findings import Finding, render
@@ -31,8 +31,6 @@ from lare_rl.util.statistics import correlation, r_squared
 
 __all__ = ["MESSAGES", "Relabelled", "hold_out_flags", "predicted_return_statistics", "relabel"]
 
-BATCH_STEPS = 8192
-"""Steps whose rewards are computed at a time. `phi` takes about as long for many steps as for few."""
 BLOCK_EPISODES = 10
 """The held-out share is the same in every block of episodes, so that it is even in a sorted log."""
 MIN_CAPACITY = 100_000
@@ -276,7 +274,8 @@ def _compute_rewards(
     Raises:
         LareError: the log has another `size` than in the first pass.
     """
-    for batch in _batches(log.episodes()):
+    # `phi` takes about as long for many steps as for few.
+    for batch in batch_by_steps(log.episodes(), len):
         lengths = [len(episode) for episode in batch]
         begins = [_segment_begins(episode.reward, credit.config) for episode in batch]
         payment_lengths = [_segment_lengths(first) for first in begins]
@@ -327,16 +326,3 @@ def _make_exact(
     residual, length = (np.repeat(values, lengths) for values in (residual, lengths))
     change = correction(residual, np.append(begins[1:], True), length, config.settings.exact)
     return (r_hat + change).astype(r_hat.dtype)
-
-
-def _batches(episodes: Iterator[LoggedEpisode]) -> Iterator[list[LoggedEpisode]]:
-    """Yield lists of successive episodes with at least `BATCH_STEPS` steps in total, except for the last list."""
-    batch, n_steps = [], 0
-    for episode in episodes:
-        batch.append(episode)
-        n_steps += len(episode)
-        if n_steps >= BATCH_STEPS:
-            yield batch
-            batch, n_steps = [], 0
-    if batch:
-        yield batch

@@ -15,7 +15,7 @@ import numpy as np
 
 from lare_rl.errors import LareError, missing_extra_error, short_repr
 from lare_rl.logs.episode import KEYS, LoggedEpisode, RelabelledEpisode
-from lare_rl.logs.log import Log, atomic_output
+from lare_rl.logs.log import BATCH_STEPS, Log, atomic_output, batch_by_steps
 from lare_rl.tasks.spec import TaskSpec
 
 try:
@@ -24,10 +24,10 @@ try:
 except ImportError as missing:
     raise missing_extra_error("a Parquet file", "parquet") from missing
 
-__all__ = ["BATCH_ROWS", "ParquetLog", "TableLog", "write_tables"]
+__all__ = ["ParquetLog", "TableLog", "batch_rows", "write_tables"]
 
-BATCH_ROWS = 8192
-"""Rows that are read at a time, and the least number of rows that are written at a time."""
+BATCH_EPISODES = 16
+"""Rows that are read at a time, if a row is an episode."""
 
 
 class TableLog(Log):
@@ -52,25 +52,26 @@ class TableLog(Log):
             return
         _check_columns(self.path, first.schema)
         batches = itertools.chain([first], batches)
-        if "episode" in first.schema.names:
-            tables = self._group_steps(batches)
-        else:
+        if _rows_are_episodes(first.schema):
             rows = (batch.slice(row, 1) for batch in batches for row in range(len(batch)))
             tables = enumerate(pa.Table.from_batches([row]) for row in rows)
+        else:
+            tables = self._group_steps(batches)
         for episode, table in tables:
             name = f"{self.name}, episode {episode}"
             yield name, _read_arrays(name, table), table
 
     def write(self, out: str | Path, episodes: Iterable[RelabelledEpisode], overwrite: bool, comment: str) -> Path:
         with atomic_output(Path(out), overwrite) as path:
-            self.write_file(path, _merge_small(_replace_rewards(*item) for item in episodes))
+            batches = batch_by_steps(episodes, lambda item: len(item.r_hat))
+            self.write_file(path, (pa.concat_tables([_replace_rewards(*item) for item in batch]) for batch in batches))
         return Path(out)
 
     def _group_steps(self, batches: Iterator[pa.RecordBatch]) -> Iterator[tuple[int | str, pa.Table]]:
         """Yield the number and the rows of each episode of a table whose rows are steps."""
         finished: set[int | str] = set()
-        runs = (run for batch in batches for run in _split_episodes(batch))
-        for episode, group in itertools.groupby(runs, key=itemgetter(0)):
+        pieces = (piece for batch in batches for piece in _split_episodes(self.name, batch))
+        for episode, group in itertools.groupby(pieces, key=itemgetter(0)):
             if episode in finished:
                 raise LareError(f"{self.name}, episode {episode} comes twice: sort the rows by episode")
             finished.add(episode)
@@ -88,8 +89,13 @@ class ParquetLog(TableLog):
                 with pq.ParquetFile(file) as reader:
                     schema = schema or reader.schema_arrow
                     if reader.schema_arrow != schema:
-                        raise LareError(f"{file} has other columns than {files[0]}")
-                    yield from reader.iter_batches(BATCH_ROWS)
+                        texts = (
+                            fields.remove_metadata().to_string().splitlines()
+                            for fields in (schema, reader.schema_arrow)
+                        )
+                        first = next((b or a for a, b in itertools.zip_longest(*texts) if a != b), "a column")
+                        raise LareError(f"{file} has other columns or types than {files[0]}, first {first}")
+                    yield from reader.iter_batches(batch_rows(schema))
             except (OSError, pa.ArrowException, NotImplementedError) as error:
                 raise LareError(f"{file} is not a Parquet file, or damaged: {short_repr(error)}") from error
 
@@ -105,50 +111,57 @@ def write_tables(tables: Iterator[pa.Table], open_writer: Callable[[pa.Schema], 
             writer.write_table(table)
 
 
-def _split_episodes(batch: pa.RecordBatch) -> Iterator[tuple[int | str, pa.RecordBatch]]:
+def batch_rows(schema: pa.Schema) -> int:
+    """Return how many rows are read at a time."""
+    return BATCH_EPISODES if _rows_are_episodes(schema) else BATCH_STEPS
+
+
+def _split_episodes(name: str, batch: pa.RecordBatch) -> Iterator[tuple[int | str, pa.RecordBatch]]:
     """Split the rows of a batch where the number of the episode changes."""
-    numbers = np.asarray(batch.column("episode").to_numpy(zero_copy_only=False))
-    starts = [0, *(np.flatnonzero(numbers[1:] != numbers[:-1]) + 1).tolist(), len(numbers)]
+    column = batch.column("episode")
+    if column.null_count:
+        raise LareError(f"{name}: the column episode has rows without a value")
+    if pa.types.is_dictionary(column.type):
+        column = column.dictionary_decode()
+    episode_ids = np.asarray(column.to_numpy(zero_copy_only=False))
+    starts = [0, *(np.flatnonzero(episode_ids[1:] != episode_ids[:-1]) + 1).tolist(), len(episode_ids)]
     for start, end in itertools.pairwise(starts):
-        yield batch.column("episode")[start].as_py(), batch.slice(start, end - start)
-
-
-def _merge_small(tables: Iterable[pa.Table]) -> Iterator[pa.Table]:
-    """Yield the same rows in fewer tables, each with at least `BATCH_ROWS` rows, except for the last one."""
-    pending: list[pa.Table] = []
-    for table in tables:
-        pending.append(table)
-        if sum(map(len, pending)) >= BATCH_ROWS:
-            yield pa.concat_tables(pending)
-            pending = []
-    if pending:
-        yield pa.concat_tables(pending)
+        yield column[start].as_py(), batch.slice(start, end - start)
 
 
 def _check_columns(path: Path, schema: pa.Schema) -> None:
-    """Raise `LareError` if rows are steps, and the columns do not have the episode and the next observation of a step."""
+    """Check that no key has two columns, and that a table of steps has one column `episode` and one `next_observations`."""
+    if key := next((key for key in KEYS if schema.names.count(key) > 1), None):
+        raise LareError(f"{path} has {schema.names.count(key)} columns {key}: keep one")
     if _rows_are_episodes(schema):
         return
     for name, meaning in (("episode", "the episode of a step"), ("next_observations", "the observation after a step")):
         if schema.names.count(name) != 1:
             raise LareError(f"{path} needs one column {name}, {meaning}; its columns are {', '.join(schema.names)}")
-    kind = schema.field("episode").type
-    if not (pa.types.is_integer(kind) or _is_text(kind)):
-        raise LareError(f"{path}: the column episode must be whole numbers or strings, and is {kind}")
+    data_type = schema.field("episode").type
+    ids = data_type.value_type if pa.types.is_dictionary(data_type) else data_type
+    if not (pa.types.is_integer(ids) or _is_text(ids)):
+        raise LareError(f"{path}: the column episode must be whole numbers or strings, and is {data_type}")
 
 
 def _rows_are_episodes(schema: pa.Schema) -> bool:
-    """Return whether a row holds an episode: its rewards, or its actions if there is only a score, are a list."""
-    key = "rewards" if "rewards" in schema.names else "actions"
-    return "episode" not in schema.names and schema.names.count(key) == 1 and _is_list(schema.field(key).type)
+    """Return whether each row is a whole episode: `rewards` (or `actions`, if there are no rewards) is a list column.
+
+    Without rewards, a column `episode` says that rows are steps: the action of a step may be a list, too.
+    """
+    types = dict(zip(schema.names, schema.types, strict=True))
+    if "rewards" in types:
+        return _is_list(types["rewards"])
+    return "episode" not in types and _is_list(types.get("actions", pa.null()))
 
 
-def _is_text(kind: pa.DataType) -> bool:
-    return pa.types.is_string(kind) or pa.types.is_large_string(kind)
+def _is_text(data_type: pa.DataType) -> bool:
+    return pa.types.is_string(data_type) or pa.types.is_large_string(data_type)
 
 
-def _is_list(kind: pa.DataType) -> bool:
-    return pa.types.is_list(kind) or pa.types.is_large_list(kind) or pa.types.is_fixed_size_list(kind)
+def _is_list(data_type: pa.DataType) -> bool:
+    tests = (pa.types.is_list, pa.types.is_large_list, pa.types.is_fixed_size_list)
+    return any(test(data_type) for test in tests)
 
 
 def _read_arrays(name: str, table: pa.Table) -> dict[str, np.ndarray]:
@@ -156,7 +169,7 @@ def _read_arrays(name: str, table: pa.Table) -> dict[str, np.ndarray]:
     arrays = {key: _read_column(name, key, table.column(key)) for key in KEYS if key in table.column_names}
     if _rows_are_episodes(table.schema):
         return {key: array[0] for key, array in arrays.items()}
-    if "score" in arrays and arrays["score"].ndim:
+    if "score" in arrays:
         arrays["score"] = arrays["score"][-1]
     return arrays
 

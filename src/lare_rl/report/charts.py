@@ -16,7 +16,7 @@ import numpy as np
 from jaxtyping import Float, UInt8
 
 from lare_rl.errors import missing_extra_error
-from lare_rl.util.findings import format_value
+from lare_rl.util.findings import format_for_reader
 
 try:
     from PIL import Image, ImageDraw
@@ -128,7 +128,7 @@ class Chart:
             for tick, y in zip(y_ticks, down(np.array(y_ticks)), strict=True)
         ]
         texts += [
-            f'<span class="x" style="left:{x / 10:.1f}%">{format_value(tick, "steps")}</span>'
+            f'<span class="x" style="left:{x / 10:.1f}%">{format_for_reader(tick, "steps")}</span>'
             for tick, x in zip(x_ticks, across(np.array(x_ticks)), strict=True)
         ]
         n_characters = max(len(format_number(tick)) for tick in y_ticks)
@@ -251,7 +251,7 @@ def visible_steps(length: int) -> slice:
 
 def format_number(value: float | np.number) -> str:
     """Write a number as all pages do."""
-    return format_value(float(value) + 0.0, "score")
+    return format_for_reader(float(value) + 0.0, "score")
 
 
 def _colour(position: Float[np.ndarray, "*shape"]) -> UInt8[np.ndarray, "*shape 3"]:

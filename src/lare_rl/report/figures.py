@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from lare_rl.errors import missing_extra_error
-from lare_rl.util.findings import format_value
+from lare_rl.util.findings import format_for_reader
 from lare_rl.util.statistics import Band
 
 try:
@@ -113,7 +113,7 @@ def _draw_bands_on(axes: Axes, bands: Mapping[str, Band], x_is_steps: bool) -> N
 
 
 def _format_steps(x: float, _: Any) -> str:
-    return format_value(x, "steps")
+    return format_for_reader(x, "steps")
 
 
 def _add_legend(axes: Axes) -> None:

@@ -16,7 +16,7 @@ from lare_rl.report.run_summary import Curve, ReportedRun, RunSummary, finite, s
 from lare_rl.runs.metric_names import CREDIT_CORRELATION, CREDIT_ERROR, RETURN, RETURN_R2, RETURN_STD
 from lare_rl.tasks.spec import TaskSpec
 from lare_rl.util.durations import format_seconds
-from lare_rl.util.findings import Finding, format_value, render
+from lare_rl.util.findings import Finding, format_for_reader, render
 from lare_rl.util.statistics import format_mean_std, wins
 
 __all__ = [
@@ -92,12 +92,20 @@ def _tiles(reported: ReportedRun, summary: RunSummary) -> Iterable[tuple[str, st
     """Yield the numbers of a run: title, number, remark. Those that are unknown are missing."""
     if len(summary.final_returns):
         number, _, std = _format_spread(summary.final_returns).partition(" ± ")
-        yield "Return", number, f"{f'± {std}, ' if std else ''}{format_value(len(summary.final_returns), 'count seed')}"
+        yield (
+            "Return",
+            number,
+            f"{f'± {std}, ' if std else ''}{format_for_reader(len(summary.final_returns), 'count seed')}",
+        )
     if len(summary.random_returns):
         number, _, std = _format_spread(summary.random_returns).partition(" ± ")
-        yield "Random actions", number, f"± {std or 0}, {format_value(len(summary.random_returns), 'count episode')}"
+        yield (
+            "Random actions",
+            number,
+            f"± {std or 0}, {format_for_reader(len(summary.random_returns), 'count episode')}",
+        )
     if summary.return_r2 is not None:
-        yield "R² of returns", format_value(summary.return_r2, "r2"), "of new episodes; 1 is perfect"
+        yield "R² of returns", format_for_reader(summary.return_r2, "r2"), "of new episodes; 1 is perfect"
     if (seconds := reported.training_seconds()) is not None:
         yield "Time trained", format_seconds(seconds), f"{int(summary.steps[-1]):,} steps for each seed"
 

@@ -6,7 +6,7 @@ import sys
 from collections.abc import Mapping
 from typing import Annotated, NamedTuple
 
-from pydantic import Field
+from pydantic import AfterValidator, Field
 
 from lare_rl.errors import CheckedModel, LareError
 from lare_rl.util.processes import usable_cores
@@ -21,6 +21,12 @@ PREALLOCATE = "XLA_PYTHON_CLIENT_PREALLOCATE"
 COUNT_CARDS = "import jax; print(0 if jax.default_backend() == 'cpu' else jax.local_device_count())"
 
 
+def _check_cards(cards: float) -> float:
+    if cards > 1 and not cards.is_integer():
+        raise ValueError("must be a whole number, or less than 1")
+    return cards
+
+
 class Resources(CheckedModel):
     """The part of the machine that runs use."""
 
@@ -28,9 +34,9 @@ class Resources(CheckedModel):
     """Runs at a time."""
     cores: Annotated[int, Field(ge=1)] = 1
     """Cores of each run."""
-    cards: Annotated[float, Field(ge=0)] | None = None
-    """Cards (accelerators) of each run; less than 1 if runs share a card. The default is an equal share of those of this machine,
-    and none on a Ray cluster."""
+    cards: Annotated[float, Field(ge=0), AfterValidator(_check_cards)] | None = None
+    """Cards (accelerators) of each run: a whole number, or less than 1 if runs share a card. The default is an equal share of those of
+    this machine, and none on a Ray cluster."""
 
 
 class Slot(NamedTuple):
@@ -69,13 +75,13 @@ def assign_cores(processes: int, cores: int) -> list[list[int]]:
 
 
 def assign_cards(
-    processes: int, cards: float | None, n_cards: int, environment: Mapping[str, str]
+    processes: int, cards: float | None, n_cards: int, variables: Mapping[str, str]
 ) -> list[dict[str, str]]:
     """Return the environment variables that choose the cards of each process.
 
     Args:
         cards: the cards of each process; by default an equal share.
-        environment: the variables of this process, which may choose some of the machine's cards.
+        variables: the environment variables of this process, which may choose some of the machine's cards.
 
     Raises:
         LareError: there are not enough cards.
@@ -90,19 +96,23 @@ def assign_cards(
         )
     if not n_cards:
         return [{} for _ in range(processes)]
-    return [_card_variables(process, share, n_cards, environment) for process in range(processes)]
+    return [_card_variables(process, share, n_cards, variables) for process in range(processes)]
 
 
-def _card_variables(process: int, share: float, n_cards: int, environment: Mapping[str, str]) -> dict[str, str]:
+def _card_variables(process: int, share: float, n_cards: int, variables: Mapping[str, str]) -> dict[str, str]:
     count = int(share)
-    indices = range(process * count, (process + 1) * count) if share >= 1 else [process % n_cards] if share else []
-    variables = {}
+    indices = []
+    if share >= 1:
+        indices = range(process * count, (process + 1) * count)
+    elif share:
+        indices = [process % n_cards]
+    chosen = {}
     for name in VISIBLE_CARDS:
-        visible = environment[name].split(",") if environment.get(name) else list(map(str, range(n_cards)))
-        variables[name] = ",".join(visible[i] for i in indices)
-    if 0 < share < 1 and PREALLOCATE not in environment:
-        variables[PREALLOCATE] = "false"
-    return variables
+        visible = variables[name].split(",") if variables.get(name) else list(map(str, range(n_cards)))
+        chosen[name] = ",".join(visible[i] for i in indices)
+    if 0 < share < 1 and PREALLOCATE not in variables:
+        chosen[PREALLOCATE] = "false"
+    return chosen
 
 
 def _count_cards() -> int:

@@ -62,8 +62,8 @@ def design_turn_phi(
     Raises:
         LareError: the model cannot answer, or no attempt passed.
     """
-    if not turns:
-        raise LareError("a phi over turns is checked on turns, and there is none")
+    if len(turns) < 2:
+        raise LareError(f"a phi over turns is checked on at least 2 turns, and not on {len(turns)}")
     model = as_model(model)
     request = turn_request(goal, tools, choose_examples(turns) if examples is None else examples)
     recorder = Recorder("turns", "events", getattr(model, "temperature", None), record)

@@ -1,11 +1,12 @@
 """A phi over turns: events of a turn that a language model, or a person, has named by a program.
 
-The program is read as data by the interpreter of `lare_rl.phi` (`phi/turn_program.py`), and never executed. It is checked on turns before
-it is used: it must read all of them, always give the same names, and at least one of its events must differ among them.
+The program is read as data by the interpreter of `lare_rl.phi` (`phi/turn_program.py`), and never executed. `design_turn_phi` checks it
+on turns (`find_problems`): it must read all of them, always give the same names, and at least one of its events must differ among them.
+A program from a file is only parsed.
 """
 
-import hashlib
-from collections.abc import Sequence
+import ast
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -28,11 +29,6 @@ class TurnPhi:
     def source(self) -> str:
         return self.program.source
 
-    @property
-    def digest(self) -> str:
-        """The SHA-256 of the source."""
-        return hashlib.sha256(self.source.encode()).hexdigest()
-
     def __call__(self, turn: Turn) -> dict[str, float]:
         """Return the events of a turn.
 
@@ -40,23 +36,25 @@ class TurnPhi:
             LareError: the program fails on this turn.
         """
         try:
-            return self.read_turn(turn)
+            return self.evaluate(turn)
         except RefusedError as refusal:
-            raise LareError(f"the phi over turns failed on a turn: {refusal}") from None
+            raise LareError(f"the phi over turns failed: {refusal}") from None
 
-    def read_turn(self, turn: Turn) -> dict[str, float]:
+    def evaluate(self, turn: Turn) -> dict[str, float]:
         """Return the events of a turn. Raises `RefusedError` with a message for the program's author."""
         if not turn.calls:
             return self.program.events("", {}, turn.reply, turn.text)
-        total: dict[str, float] = {}
-        for call in turn.calls:
-            events = self.program.events(call.tool, _read_arguments(call.arguments), call.result, turn.text)
-            total = {name: total.get(name, 0.0) + value for name, value in events.items()}
-        return total
+        rows = [
+            self.program.events(call.tool, _read_arguments(call.arguments), call.result, turn.text)
+            for call in turn.calls
+        ]
+        for number, row in enumerate(rows, start=1):
+            _check_names(row, rows[0], f"call {number}", "call 1")
+        return {name: sum(row[name] for row in rows) for name in rows[0]}
 
 
 def _read_arguments(text: str) -> dict[str, object]:
-    """Return the arguments of a call as a dictionary. A text that is not a JSON object is its entry `text`."""
+    """Return the arguments of a call as a dictionary. Arguments that are not a JSON object are returned as `{'text': arguments}`."""
     try:
         value = read_json(text, strict=False)
     except ValueError:
@@ -64,12 +62,29 @@ def _read_arguments(text: str) -> dict[str, object]:
     return value if isinstance(value, dict) else {"text": text}
 
 
+def _check_names(row: Mapping[str, float], first: Mapping[str, float], where: str, where_first: str) -> None:
+    """Raise `RefusedError` if a call or a turn has other events than the first one."""
+    if difference := sorted(row.keys() ^ first.keys()):
+        message = (
+            f"E-NAMES {where}: the events are not those of {where_first} ({', '.join(difference)[:200]}): return all events for "
+            "every call, with the value False or 0 if they did not happen"
+        )
+        raise RefusedError("E-NAMES", message)
+
+
 def read_turn_phi(source: str) -> TurnPhi:
     """Read a program. Raises `LareError` if it is not Python, or defines no `turn_events`."""
     try:
-        return TurnPhi(read_turn_program(source))
+        program = read_turn_program(source)
     except RefusedError as refusal:
-        raise LareError(f"this is no phi over turns: {refusal}") from None
+        raise LareError(f"not a valid turn function: {refusal}") from None
+    if not any(
+        isinstance(node, ast.FunctionDef) and node.name == TURN_FUNCTION_NAME for node in ast.walk(program.tree)
+    ):
+        raise LareError(
+            f"not a valid turn function: there is no function {TURN_FUNCTION_NAME}(tool, arguments, result, text)"
+        )
+    return TurnPhi(program)
 
 
 def load_turn_phi(path: str | Path) -> TurnPhi:
@@ -80,8 +95,6 @@ def load_turn_phi(path: str | Path) -> TurnPhi:
     """
     path = Path(path)
     source = read_text(path)
-    if f"def {TURN_FUNCTION_NAME}" not in source:
-        raise LareError(f"{path} has no function {TURN_FUNCTION_NAME}(tool, arguments, result, text)")
     try:
         return read_turn_phi(source)
     except LareError as error:
@@ -92,17 +105,11 @@ def find_problems(source: str, turns: Sequence[Turn]) -> str:
     """Return what is wrong with a program, for its author; an empty text if it passes on these turns."""
     try:
         phi = TurnPhi(read_turn_program(source))
-        rows = [phi.read_turn(turn) for turn in turns]
+        rows = [phi.evaluate(turn) for turn in turns]
+        for number, row in enumerate(rows, start=1):
+            _check_names(row, rows[0], f"turn {number}", "turn 1")
     except RefusedError as refusal:
         return str(refusal)
-    names = [tuple(row) for row in rows]
-    for number, other in enumerate(names):
-        if set(other) != set(names[0]):
-            difference = sorted(set(other) ^ set(names[0]))
-            return (
-                f"E-NAMES turn {number + 1}: the events are not those of turn 1 ({', '.join(difference)[:200]}): return all "
-                "events for every call, with the value False or 0 if they did not happen"
-            )
     if all(row == rows[0] for row in rows):
         return "E-CONSTANT all events have the same values in all turns: name events that happen in some turns only"
     return ""

@@ -86,13 +86,24 @@ def read_rollout(rollout: Any, where: str, phi: Phi | None = None) -> Rollout:
             )
         features = message_features(turns)
         if phi is not None:
-            events = _read_numbers([phi(turn) for turn in turns], f"{where}, phi")
+            events = _read_numbers(_evaluate(phi, turns, where), f"{where}, phi")
             features = [{**row, **extra} for row, extra in zip(features, events, strict=True)]
         if numbers is not None:
             features = [{**row, **extra} for row, extra in zip(features, numbers, strict=True)]
     if not features:
         raise LareError(f"{where} has no turn: the assistant says nothing")
     return Rollout(tuple(features), outcome, str(group), truncated)
+
+
+def _evaluate(phi: Phi, turns: Sequence[Turn], where: str) -> list[Any]:
+    """Return the events of each turn, which are not checked yet. An error names the turn."""
+    events = []
+    for t, turn in enumerate(turns):
+        try:
+            events.append(phi(turn))
+        except LareError as error:
+            raise LareError(f"{where}, turn {t}: {error}") from error
+    return events
 
 
 def _read_numbers(turns: Any, where: str) -> list[dict[str, float]]:

@@ -1,4 +1,4 @@
-"""Findings: results of rules, as a code and values. Their sentences are in one catalogue for each room.
+"""A finding is a message code with its values. Each package has one dictionary of message templates.
 
 A catalogue is a dictionary from code to template. A template is a text of `str.format` with commands in backticks:
 
@@ -17,10 +17,10 @@ from dataclasses import dataclass, field
 from html import escape
 from typing import Any, Literal
 
-__all__ = ["Finding", "format_value", "render"]
+__all__ = ["Finding", "format_for_reader", "render"]
 
 Catalogue = Mapping[str, str]
-"""The templates of a room, by the codes of its findings."""
+"""The message templates of a package, by code."""
 
 _CODE = re.compile(r"`([^`]*)`")
 _MARKDOWN_SPECIAL = re.compile(r"([\\*_|<>\[\]])")
@@ -31,7 +31,7 @@ class Finding:
     """The result of a rule. Findings are hashable if their values are."""
 
     code: str
-    """The key of its sentence in the catalogue of its room."""
+    """The key of its template in the catalogue."""
     values: Mapping[str, Any] = field(default_factory=dict)
 
     def __hash__(self) -> int:
@@ -48,34 +48,35 @@ def render(finding: Finding, catalogue: Catalogue, style: Literal["text", "html"
     if style == "html":
         return _CODE.sub(r"<code>\1</code>", escape(text))
     if style == "markdown":
-        prose_and_code = re.split(r"(`[^`]*`)", text)
         return "".join(
-            text if text.startswith("`") else _MARKDOWN_SPECIAL.sub(r"\\\1", text) for text in prose_and_code
+            f"`{piece}`" if number % 2 else _MARKDOWN_SPECIAL.sub(r"\\\1", piece)
+            for number, piece in enumerate(_CODE.split(text))
         )
     return text
 
 
-def format_value(value: Any, spec: str = "") -> str:
+def format_for_reader(value: Any, spec: str = "") -> str:
     """Format one value by a spec of `str.format`, or by one of these:
 
     * `score`: a whole number if it is large, otherwise three digits.
     * `count NOUN`: the number with its noun, in the singular or the plural, such as `1 episode` and `1,000 episodes`.
-    * `r2`: two decimal places, three near 1.
+    * `r2`: two decimal places, three above 0.99.
     * `std`: two digits, for a standard deviation.
-    * `error`: one digit, for a standard error.
+    * `error`: one digit, or a whole number if it is large, for a standard error.
     * `steps`: a round number with k or M, such as `250k`.
     """
     match spec.split(" ", 1):
         case ["score"]:
             return f"{value:,.0f}" if math.isfinite(value) and abs(value) >= 100 else f"{value:.3g}"
         case ["count", noun]:
-            plural = f"{noun[:-1]}ies" if re.search(r"[^aeiou]y$", noun) else f"{noun}s"
-            return f"{value:,} {noun if value == 1 else plural}"
+            return f"{value:,} {noun}" if value == 1 else f"{value:,} {noun}s"
         case ["r2"]:
             return f"{value:.3f}" if value > 0.99 else f"{value:.2f}"
         case ["std"]:
             return f"{value:,.0f}" if math.isfinite(value) and abs(value) >= 10 else f"{value:.2g}"
         case ["error"]:
+            if value >= 9.5:  # it would be rounded to 1e+01
+                return f"{value:,.0f}"
             return "less than 0.001" if value < 0.001 else f"{value:.1g}"
         case ["steps"]:
             return f"{value / 1e6:g}M" if value >= 1e6 else f"{value / 1e3:g}k" if value >= 1e3 else f"{value:g}"
@@ -93,4 +94,4 @@ class _Formatter(string.Formatter):
             return ""
         if isinstance(value, tuple):
             return ", ".join(self.format_field(element, format_spec) for element in value)
-        return render(value, self.catalogue) if isinstance(value, Finding) else format_value(value, format_spec)
+        return render(value, self.catalogue) if isinstance(value, Finding) else format_for_reader(value, format_spec)

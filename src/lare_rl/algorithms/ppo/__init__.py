@@ -6,10 +6,13 @@ from pydantic import Field
 
 from lare_rl.algorithms.registry import Algorithm, AlgorithmSettings, Consumes, register_algorithm
 
-if TYPE_CHECKING:  # importing NumPy takes longer than all else that the command line does before it shows a message
+if TYPE_CHECKING:
     from lare_rl.envs.interface import EnvSpec
 
 __all__ = ["PPOSettings"]
+
+MIN_ROLLOUT_STEPS = 16
+"""The least number of steps of each environment between two updates, by default: advantages need some steps in a row."""
 
 
 class PPOSettings(AlgorithmSettings):
@@ -26,35 +29,35 @@ class PPOSettings(AlgorithmSettings):
     epochs: Annotated[int, Field(ge=1)] = 10
     """Number of passes over the rollout in one update."""
     minibatch_size: Annotated[int, Field(ge=1)] = 64
-    """Steps in one gradient step; a step of each agent counts by itself."""
+    """Samples per gradient step; each agent's step is one sample."""
     clip: Annotated[float, Field(gt=0)] = 0.2
     """How far the probability ratio may move from 1."""
     value_clip: Annotated[float, Field(gt=0)] = 0.5
     """How far the value may move in one update, in standard deviations of the return."""
     value_coef: Annotated[float, Field(ge=0)] = 0.5
     """Coefficient of the value loss."""
-    entropy_coef: Annotated[float, Field(ge=0)] = 0.0
+    entropy_coef: Annotated[float, Field(ge=0)] = 0.01
     """Coefficient of the entropy bonus."""
     huber_delta: Annotated[float, Field(gt=0)] = 10.0
     """Error at which the value loss turns from quadratic to linear, in standard deviations of the return."""
     max_grad_norm: Annotated[float, Field(gt=0)] = 0.5
     """Largest norm of the gradient of actor and critic together; a larger gradient is scaled down to it."""
-    anneal: bool = False
+    anneal: bool = True
     """Let learning rate and clip fall linearly to 0 over the run."""
     normalise_observations: bool = False
     """Normalise the networks' observations by their running mean and standard deviation."""
 
 
 def _whole_episodes(env: "EnvSpec", n_steps: int) -> int:
-    """Return the multiple of an episode's maximum length that is nearest to a number of steps; this number for long episodes."""
-    return round(n_steps / env.max_steps) * env.max_steps or max(1, n_steps)
+    """Round n_steps to whole episodes of maximum length; keep n_steps if that would give 0."""
+    return round(n_steps / env.max_steps) * env.max_steps or n_steps
 
 
 def _ppo_defaults(env: "EnvSpec", environments: int) -> dict[str, Any]:
     environments = environments or 1
     return {
         "environments": environments,
-        "rollout_steps": _whole_episodes(env, 2000 // environments),
+        "rollout_steps": _whole_episodes(env, max(MIN_ROLLOUT_STEPS, 2000 // environments)),
         "fit_updates": 500,
         "evaluate_iterations": 5,
         "capacity": 1_000_000,
@@ -64,9 +67,10 @@ def _ppo_defaults(env: "EnvSpec", environments: int) -> dict[str, Any]:
 def _ippo_defaults(env: "EnvSpec", environments: int) -> dict[str, Any]:
     # In JAX, as published for particle tasks: 82 episodes of 25 steps between two updates.
     environments = environments or (82 if env.is_jax else 1)
+    n_steps = max(MIN_ROLLOUT_STEPS, (2050 if env.is_jax else 2000) // environments)
     return {
         "environments": environments,
-        "rollout_steps": env.max_steps if env.fixed_length else max(1, (2050 if env.is_jax else 2000) // environments),
+        "rollout_steps": env.max_steps if env.fixed_length else n_steps,
         "fit_every": 10,
         "fit_updates": 50,
         "first_fit": "held-out",
@@ -81,7 +85,7 @@ register_algorithm(
     Algorithm(
         name="ppo",
         consumes=Consumes.ROLLOUTS,
-        settings=PPOSettings(hidden=(256, 256), entropy_coef=0.01, anneal=True, normalise_observations=True),
+        settings=PPOSettings(hidden=(256, 256), normalise_observations=True),
         module="lare_rl.algorithms.ppo.ppo",
         run_defaults=_ppo_defaults,
         summary="clipped policy steps on the newest rollout; observations are normalised",
@@ -97,13 +101,11 @@ register_algorithm(
             gamma=1.0,
             minibatch_size=128,
             clip=0.5,
-            entropy_coef=0.01,
             max_grad_norm=10.0,
-            anneal=True,
         ),
         module="lare_rl.algorithms.ppo.ppo",
         run_defaults=_ippo_defaults,
-        summary="ppo for every agent, with one actor and one critic for all",
+        summary="PPO for every agent, with shared parameters",
         source="de Witt et al., 2020; hyperparameters of LaRe",
         single_agent=False,
         multi_agent=True,
