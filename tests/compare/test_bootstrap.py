@@ -4,6 +4,7 @@ import itertools
 
 import numpy as np
 import pytest
+from scipy.stats import mannwhitneyu
 
 from lare_rl.compare import bootstrap
 from lare_rl.compare.bootstrap import (
@@ -140,3 +141,13 @@ def test_mann_whitney_by_hand():
     assert mann_whitney([(low, high)]) == pytest.approx((1, 1 / 20))
     assert mann_whitney([(high, low), (high, low)])[0] == pytest.approx(1 / 400)
     assert min(mann_whitney([(low, low)])) > 0.5
+
+
+def test_mann_whitney_of_many_seeds():
+    """As SciPy's exact test, which has no ties, and symmetric where all values are equal."""
+    rng = np.random.default_rng(0)
+    a, b = rng.normal(0.5, size=30), rng.normal(size=25)
+    expected = [mannwhitneyu(a, b, alternative=side, method="exact").pvalue for side in ("greater", "less")]
+    assert mann_whitney([(a, b)]) == pytest.approx(expected)
+    assert mann_whitney([(np.zeros(10), np.zeros(10))]) == pytest.approx((1, 1))
+    assert mann_whitney([(np.array([1.0, 1]), np.array([1.0, 0]))])[0] == pytest.approx(1 / 2)

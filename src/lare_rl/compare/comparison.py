@@ -4,7 +4,6 @@ Intervals have 95%, by stratified bootstrap over the seeds (`bootstrap.py`). A m
 language model has a second interval, over the draws. The score of a draw is the mean over its seeds.
 """
 
-import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
@@ -29,10 +28,6 @@ from lare_rl.util.statistics import Band, sample_std
 
 __all__ = ["Comparison", "Row", "compare", "compare_over_tasks", "compare_tasks"]
 
-MAX_SPLITS = 20_000
-"""The exact test needs all ways to split the runs into two groups: 12,870 for two groups of 8 seeds. Beyond this limit, the interval
-says enough."""
-
 
 @dataclass(frozen=True)
 class Row:
@@ -55,7 +50,7 @@ class Row:
     p_value: float | None
     """Probability that chance wins as many pairs of runs or, if fewer than half were won, loses as many (`mann_whitney`).
 
-    None like `difference`, and for more than `MAX_SPLITS` ways to split the runs.
+    None like `difference`.
     """
 
 
@@ -197,6 +192,4 @@ def _improvement(scores: Scores, baseline: OtherScores) -> tuple[Estimate | None
     if min(len(scores), len(baseline)) < 2:
         return None, None
     improvement = estimate(probability_of_improvement, scores, baseline)
-    if math.comb(len(scores) + len(baseline), len(scores)) > MAX_SPLITS:
-        return improvement, None
     return improvement, min(mann_whitney(list(zip(scores.T, baseline.T, strict=True))))

@@ -1,6 +1,6 @@
 """The exact test of Mann and Whitney (1947), over several tasks."""
 
-import itertools
+import math
 from collections.abc import Sequence
 
 import numpy as np
@@ -24,16 +24,25 @@ def mann_whitney(tasks: Sequence[tuple[Float[np.ndarray, " _"], Float[np.ndarray
     `tasks` has the values a and b of each task. If they had the same distribution, all ways to split them into two groups would
     be equally likely.
     """
-    u, probabilities = 0.0, {0.0: 1.0}  # the distribution of U over the tasks so far
+    double_u, probabilities = 0, np.ones(1)
     for a, b in tasks:
-        u += mann_whitney_u(a, b)
-        values = np.concatenate([a, b])
-        splits = [list(split) for split in itertools.combinations(range(len(values)), len(a))]
-        task_us = [mann_whitney_u(values[split], np.delete(values, split)) for split in splits]
-        convolved: dict[float, float] = {}
-        for (total, probability), task_u in itertools.product(probabilities.items(), task_us):
-            convolved[total + task_u] = convolved.get(total + task_u, 0.0) + probability / len(splits)
-        probabilities = convolved
-    at_least = sum(probability for total, probability in probabilities.items() if total >= u)
-    at_most = sum(probability for total, probability in probabilities.items() if total <= u)
-    return min(1.0, at_least), min(1.0, at_most)
+        double_u += round(2 * mann_whitney_u(a, b))
+        probabilities = np.convolve(probabilities, _distribution(np.concatenate([a, b]), len(a)))
+    at_least, at_most = probabilities[double_u:].sum(), probabilities[: double_u + 1].sum()
+    return min(1.0, float(at_least)), min(1.0, float(at_most))
+
+
+def _distribution(values: Float[np.ndarray, " values"], n_a: int) -> Float[np.ndarray, " sums"]:
+    """Return the probabilities of 2 U = 0, 1, 2, ... over all choices of `n_a` of the values as a.
+
+    2 U is the sum of the doubled ranks of a, less n_a (n_a + 1). Ties share their mean rank, so that doubled ranks are whole numbers.
+    """
+    doubled_ranks = 1 + np.sum(2 * (values < values[:, None]) + (values == values[:, None]), axis=1)
+    counts = np.zeros(
+        (n_a + 1, int(doubled_ranks.sum()) + 1)
+    )  # by the number of chosen values, and by the sum of their doubled ranks
+    counts[0, 0] = 1
+    for rank in doubled_ranks:
+        counts[1:, rank:] += counts[:-1, :-rank].copy()
+    first, last = n_a * (n_a + 1), n_a * (n_a + 1) + 2 * n_a * (len(values) - n_a)
+    return counts[n_a, first : last + 1] / math.comb(len(values), n_a)
