@@ -171,7 +171,8 @@ WORDS = {
     ),
     "proxy": (
         "proxy reward",
-        "The reward of a step that the decoder computes. The policy is trained on it, never on the true one.",
+        "The reward of a step that the decoder computes. The policy is trained on it, never on the true one. It is a reward, and not "
+        "the advantage of the step: do not weight the step's gradient by it.",
     ),
     "error": ("credit error", "The mean of |proxy reward - true reward| over the newest steps."),
     "correlation": ("correlation", "Pearson's correlation of proxy and true rewards over the newest steps."),
