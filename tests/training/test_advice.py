@@ -80,7 +80,7 @@ ZERO = (0.0, 0.0)
     ],
 )
 def test_equal_returns(values, is_found, tmp_path):
-    """Of all evaluations, of which there are enough."""
+    """Equal returns are reported if there are enough evaluated episodes, and if all evaluations have them."""
     settings = resolve(Settings(method="dense", steps=100, evaluation_episodes=4), toy_spec())
     run = Run(tmp_path, make_config(toy_spec(), settings, ()), ())
     lines = [{"step": k, "seed": 0, RETURN: return_, RETURN_STD: std} for k, (return_, std) in enumerate(values)]

@@ -38,9 +38,8 @@ def _distribution(values: Float[np.ndarray, " values"], n_a: int) -> Float[np.nd
     2 U is the sum of the doubled ranks of a, less n_a (n_a + 1). Ties share their mean rank, so that doubled ranks are whole numbers.
     """
     doubled_ranks = 1 + np.sum(2 * (values < values[:, None]) + (values == values[:, None]), axis=1)
-    counts = np.zeros(
-        (n_a + 1, int(doubled_ranks.sum()) + 1)
-    )  # by the number of chosen values, and by the sum of their doubled ranks
+    # Choices by the number of values that they have, and by the sum of their doubled ranks.
+    counts = np.zeros((n_a + 1, int(doubled_ranks.sum()) + 1))
     counts[0, 0] = 1
     for rank in doubled_ranks:
         counts[1:, rank:] += counts[:-1, :-rank].copy()

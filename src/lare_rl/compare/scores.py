@@ -123,11 +123,12 @@ def _check_tasks(results: Sequence[LearningCurves], tasks: Sequence[str], metric
 
 def _index_curves(results: Sequence[LearningCurves], metric: str) -> dict[_Key, _Curve]:
     curves: dict[_Key, _Curve] = {}
+    run_sources = {result.label: result.source for result in reversed(results) if result.draw}
     for result in results:
-        sources = [other.source for other in results if other.label == result.label and other.draw]
-        if result.config is None and sources:
+        if result.config is None and result.label in run_sources:
             raise LareError(
-                f"{result.source} and {sources[0]} both have {result.label}, and a table has no draws: rename the method in the .csv file"
+                f"{result.source} and {run_sources[result.label]} both have {result.label}, and a table has no draws: rename the method in "
+                "the .csv file"
             )
         for seed, values in result.curves.items():
             key = _Key(result.label, result.task, result.draw, seed)

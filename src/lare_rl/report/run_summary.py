@@ -312,7 +312,7 @@ def _episode_error(reported: ReportedRun) -> float:
 
 
 def _lengths_are_equal(reported: ReportedRun) -> bool:
-    """Return whether the mean length is the same in all evaluations of all seeds, of which there are several."""
+    """Return whether there are several evaluations, and all have the same mean length of episodes."""
     curve = reported.curve(LENGTH)
     return curve is not None and curve[1].size > 1 and bool(np.ptp(curve[1]) == 0)
 

@@ -35,8 +35,8 @@ class Resources(CheckedModel):
     cores: Annotated[int, Field(ge=1)] = 1
     """Cores of each run."""
     cards: Annotated[float, Field(ge=0), AfterValidator(_check_cards)] | None = None
-    """Cards (accelerators) of each run: a whole number, or less than 1 if runs share a card. The default is an equal share of those of
-    this machine, and none on a Ray cluster."""
+    """Cards (accelerators) of each run: a whole number, or less than 1 if runs share a card. By default, each run gets
+    an equal share of this machine's cards. On a Ray cluster, it gets none by default."""
 
 
 class Slot(NamedTuple):

@@ -31,7 +31,7 @@ N_PROBE_STATES = 1000
 N_EQUAL_EVALUATIONS = 5
 """The number of evaluations with equal returns that is reported."""
 MIN_EQUAL_EPISODES = 10
-"""The number of evaluated episodes of which it is reported that all have the same return."""
+"""A run with fewer evaluated episodes is not reported for equal returns."""
 ROUNDING = 1e-6
 """Returns of all episodes are the same if they differ by less than this fraction of their size."""
 EQUAL_RTOL = 1e-3

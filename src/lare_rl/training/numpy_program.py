@@ -19,7 +19,7 @@ from jax.extend.core import ClosedJaxpr, Jaxpr, JaxprEqn, Literal
 __all__ = ["UnsupportedOperationError", "apply", "to_numpy"]
 
 Operation = Callable[..., Any]
-Library = Callable[[str], Operation]
+ArrayFunctions = Callable[[str], Operation]
 """From a name of NumPy to the function. Raises `UnsupportedOperationError` if there is none."""
 
 
@@ -70,18 +70,18 @@ def to_numpy(function: Callable[..., Any], fixed: Any, *shapes: Any) -> Callable
     return bind
 
 
-def apply(function: Callable[..., Any], shapes: Any, values: Any, library: Library) -> Any:
+def apply(function: Callable[..., Any], shapes: Any, values: Any, array_functions: ArrayFunctions) -> Any:
     """Call a function of JAX with arrays of another kind.
 
     Args:
         function: a function of one pytree of arrays, as for `to_numpy`.
         shapes: the shapes and types of the arrays.
-        library: the functions of these arrays.
+        array_functions: the functions of these arrays.
 
     Raises:
         UnsupportedOperationError: the function has an operation that is not translated.
     """
-    _, registers, calls, results, structure = _trace(function, (shapes,), library)
+    _, registers, calls, results, structure = _trace(function, (shapes,), array_functions)
     leaves = jax.tree.leaves(values)
     registers[: len(leaves)] = leaves
     _run(calls, registers)
@@ -89,14 +89,14 @@ def apply(function: Callable[..., Any], shapes: Any, values: Any, library: Libra
 
 
 def _trace(
-    function: Callable[..., Any], shapes: tuple[Any, ...], library: Library
+    function: Callable[..., Any], shapes: tuple[Any, ...], array_functions: ArrayFunctions
 ) -> tuple[list[int], list[Any], list[_Call], list[int], Any]:
     """Return the registers of the arguments, all registers, the calls, the registers of the results, and their structure."""
     closed, result_shape = jax.make_jaxpr(function, return_shape=True)(*shapes)
     registers: list[Any] = []
     calls: list[_Call] = []
     arguments = [_new_register(registers) for _ in closed.jaxpr.invars]
-    results = _Translator(library, registers, calls).translate(closed, arguments)
+    results = _Translator(array_functions, registers, calls).translate(closed, arguments)
     return arguments, registers, _remove_unused(calls, results), results, jax.tree.structure(result_shape)
 
 
@@ -114,7 +114,7 @@ def _new_register(registers: list[Any], value: Any = None) -> int:
 class _Translator(NamedTuple):
     """Appends the calls of programs."""
 
-    library: Library
+    array_functions: ArrayFunctions
     registers: list[Any]
     calls: list[_Call]
 
@@ -147,7 +147,7 @@ class _Translator(NamedTuple):
                 slices = [(*lead, slice(start, stop)) for start, stop in zip([0, *stops], stops, strict=False)]
                 outputs = [self._append(partial(_take, index=index), *inputs) for index in slices]
             else:
-                outputs = [self._append(_find_operation(equation, self.library), *inputs)]
+                outputs = [self._append(_find_operation(equation, self.array_functions), *inputs)]
             register.update(zip(equation.outvars, outputs, strict=True))
         return [find(atom) for atom in jaxpr.outvars]
 
@@ -159,7 +159,7 @@ class _Translator(NamedTuple):
     def _append_product(self, equation: JaxprEqn, inputs: Sequence[int]) -> int:
         """Append a product over the contracted axes, as a batch of matrix products. Return the register of its result."""
         sums, batches = equation.params["dimension_numbers"]
-        transpose, reshape = self.library("transpose"), self.library("reshape")
+        transpose, reshape = self.array_functions("transpose"), self.array_functions("reshape")
         matrices = []
         for atom, register, contracted, batch, is_left in zip(
             equation.invars, inputs, sums, batches, (True, False), strict=True
@@ -175,7 +175,7 @@ class _Translator(NamedTuple):
                 )
             matrices.append(register)
         shape = _aval(equation.outvars[0]).shape
-        return self._append(lambda x: reshape(x, shape), self._append(self.library("matmul"), *matrices))
+        return self._append(lambda x: reshape(x, shape), self._append(self.array_functions("matmul"), *matrices))
 
 
 def _aval(atom: Any) -> Any:
@@ -204,35 +204,35 @@ def _split_calls(calls: Sequence[_Call], arguments: Sequence[int]) -> tuple[list
     return once, each_time
 
 
-def _find_operation(equation: JaxprEqn, library: Library) -> Operation:
+def _find_operation(equation: JaxprEqn, array_functions: ArrayFunctions) -> Operation:
     """Return the NumPy function of an operation."""
     name, params = equation.primitive.name, equation.params
     inputs, result = [_aval(atom) for atom in equation.invars], _aval(equation.outvars[0])
     if name in ELEMENTWISE and not (name == "div" and np.issubdtype(inputs[0].dtype, np.integer)):
-        return library(ELEMENTWISE[name])
-    reshape, astype = library("reshape"), library("astype")
+        return array_functions(ELEMENTWISE[name])
+    reshape, astype = array_functions("reshape"), array_functions("astype")
     if name in REDUCTIONS:
-        reduction = library(REDUCTIONS[name])
+        reduction = array_functions(REDUCTIONS[name])
         return lambda x: astype(reduction(x, axis=tuple(params["axes"])), result.dtype)
     match name:
         case "broadcast_in_dim" if len(inputs) == 1:
-            shape, expanded, broadcast_to = params["shape"], [1] * len(params["shape"]), library("broadcast_to")
+            shape, expanded, broadcast_to = params["shape"], [1] * len(params["shape"]), array_functions("broadcast_to")
             for size, dimension in zip(inputs[0].shape, params["broadcast_dimensions"], strict=True):
                 expanded[dimension] = size
             return lambda x: broadcast_to(reshape(x, expanded), shape)
         case "clamp":
-            maximum, minimum = library("maximum"), library("minimum")
+            maximum, minimum = array_functions("maximum"), array_functions("minimum")
             return lambda low, x, high: minimum(maximum(x, low), high)
         case "copy" | "stop_gradient":
             return lambda x: x
         case "logistic":
-            exp, negative, add, divide = map(library, ("exp", "negative", "add", "divide"))
+            exp, negative, add, divide = map(array_functions, ("exp", "negative", "add", "divide"))
             return lambda x: divide(1, add(1, exp(negative(x))))
         case "rsqrt":
-            sqrt, divide = library("sqrt"), library("divide")
+            sqrt, divide = array_functions("sqrt"), array_functions("divide")
             return lambda x: divide(1, sqrt(x))
         case "integer_pow":
-            power = library("power")
+            power = array_functions("power")
             return lambda x: power(x, params["y"])
         case "convert_element_type":
             return lambda x: astype(x, params["new_dtype"])
@@ -241,26 +241,26 @@ def _find_operation(equation: JaxprEqn, library: Library) -> Operation:
         case "squeeze":
             return lambda x: reshape(x, result.shape)
         case "transpose":
-            transpose = library("transpose")
+            transpose = array_functions("transpose")
             return lambda x: transpose(x, params["permutation"])
         case "concatenate":
-            concatenate = library("concatenate")
+            concatenate = array_functions("concatenate")
             return lambda *arrays: concatenate(arrays, axis=params["dimension"])
         case "slice":
             strides = params["strides"] or (1,) * len(params["start_indices"])
             bounds = zip(params["start_indices"], params["limit_indices"], strides, strict=True)
             return partial(_take, index=tuple(slice(*bound) for bound in bounds))
         case "gather":
-            return partial(library("gather"), equation)
+            return partial(array_functions("gather"), equation)
         case "iota":
             size, n_trailing = params["shape"][params["dimension"]], len(params["shape"]) - params["dimension"] - 1
             values = np.arange(size, dtype=params["dtype"]).reshape(-1, *[1] * n_trailing)
             return lambda: np.broadcast_to(values, params["shape"])
         case "argmax":
-            argmax = library("argmax")
+            argmax = array_functions("argmax")
             return lambda x: astype(argmax(x, axis=params["axes"][0]), params["index_dtype"])
         case "select_n" if len(inputs) == 3:
-            where = library("where")
+            where = array_functions("where")
             return lambda condition, if_false, if_true: where(condition, if_true, if_false)
     raise UnsupportedOperationError(name)
 
