@@ -29,3 +29,9 @@ def test_last_observation_is_the_terminal_state():
         state = step(state, jnp.asarray(actions[0, number, 0]))
     np.testing.assert_allclose(timesteps.observation[0, last, 0], state.obs, rtol=1e-3, atol=1e-4)
     assert timesteps.reward[0, : last + 1].sum() == last + 1
+
+
+def test_deprecated_attributes_of_a_model_write_no_log(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    make(family_task("brax/halfcheetah"))
+    assert list(tmp_path.iterdir()) == []

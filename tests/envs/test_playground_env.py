@@ -28,3 +28,9 @@ def test_steps_and_time_limit():
         rewards += state.reward
     np.testing.assert_allclose(timesteps.observation[0, -1, 0], state.obs, rtol=1e-3, atol=1e-4)
     assert timesteps.reward[0].sum() == pytest.approx(float(rewards), rel=1e-3)
+
+
+def test_deprecated_attributes_of_a_model_write_no_log(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    make(family_task("playground/CheetahRun"))
+    assert list(tmp_path.iterdir()) == []

@@ -55,9 +55,9 @@ def test_logged_episodes_are_complete(task):
 def test_draft_log_task(folder, tmp_path):
     draft = draft_log_task(folder(logged_episodes(1)))
     assert (draft.name, draft.missing_keys, draft.logs_only) == ("log", ("description", "observation", "action"), True)
-    (tmp_path / "task.toml").write_text(draft.toml.replace("FILL IN", "Filled in"))
+    (tmp_path / "task.toml").write_text(draft.toml)
     task = lare_rl.load_task(tmp_path / "task.toml")
     assert (task.observation_size, task.action_size, task.environment) == (2, 1, "none")
-    (tmp_path / "task.toml").write_text(draft.toml.replace("FILL IN", "Filled in") + 'measures = ["x"]\n')
+    (tmp_path / "task.toml").write_text(draft.toml + 'measures = ["x"]\n')
     with pytest.raises(LareError, match="measures"):
         lare_rl.load_task(tmp_path / "task.toml")

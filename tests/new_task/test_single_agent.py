@@ -128,9 +128,9 @@ def test_undocumented_texts_are_marked(tmp_path):
     draft = draft_task("toys/Silent-v0")
     assert draft.missing_keys == ("description", "observation", "action")
     assert "Left out" not in draft.toml
+    task = load(tmp_path, draft.toml)
     with pytest.raises(LareError, match=f"description still says '{FILL_IN}'"):
-        load(tmp_path, draft.toml)
-    task = load(tmp_path, draft.toml.replace(FILL_IN, "Say"))
+        candidate(task)
     assert (task.observation_size, task.action_size, task.max_episode_steps) == (6, 2, 1000)
     assert draft.guesses_limit
     assert "\n# group = " in draft.toml

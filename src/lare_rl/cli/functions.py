@@ -91,7 +91,7 @@ def new_task(
     without_function = "lare-rl relabel without --function" if draft.logs_only else "--method bayes"
     print_line(
         f"or, without a model: paste the output of lare-rl prompt {roles[0][0]} into a chat, or write phi.py yourself, with a function "
-        f"evaluation_func(observation, action) (docs/how-to/write-phi.md); {without_function} needs no phi.py"
+        f"evaluation_func(observation, action) (docs/how-to/write-phi.md); {without_function} needs no phi.py, and none of the texts"
     )
 
 

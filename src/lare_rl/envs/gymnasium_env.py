@@ -18,7 +18,7 @@ from lare_rl.envs.env_errors import (
     to_float,
 )
 from lare_rl.envs.interface import EnvSpec, Team, Timestep
-from lare_rl.envs.mujoco_warnings import mujoco_warnings
+from lare_rl.envs.mujoco_warnings import import_mujoco, mujoco_warnings
 from lare_rl.envs.spaces import OneHot, check_spaces, decode_box, finite_array, flatten_spaces
 from lare_rl.errors import LareError, short_repr
 from lare_rl.tasks.spec import TaskSpec
@@ -55,6 +55,7 @@ def make_gymnasium(name: str, max_episode_steps: int | None = None, **kwargs: An
         warnings.filterwarnings("ignore", message=".*Using the latest versioned environment.*")
         # A report asks for a film, and does without one if it gets none.
         warnings.filterwarnings("ignore", message=".*that is not in the possible render_modes.*")
+        import_mujoco(name)
         with mujoco_warnings(name):
             env = gymnasium.make(name, max_episode_steps=max_episode_steps, **kwargs)
         try:

@@ -18,6 +18,7 @@ from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
 from lare_rl.envs.env_errors import one_line_errors
 from lare_rl.envs.interface import EnvSpec, Team, Timestep, with_available_action
+from lare_rl.envs.mujoco_warnings import mujoco_warnings
 from lare_rl.errors import LareError, did_you_mean, install_command, missing_extra_error
 from lare_rl.tasks.spec import TaskSpec
 
@@ -100,7 +101,7 @@ def construct(
     if name not in names:
         hint = did_you_mean(name, names) or f"; it has {', '.join(map(str, names))}"
         raise LareError(f"{message}: {task.family} has no {name!r}{hint}")
-    with one_line_errors(message), _silence():
+    with one_line_errors(message), mujoco_warnings(task.environment), _silence():
         return make(name, **(task.arguments if arguments is None else arguments))
 
 

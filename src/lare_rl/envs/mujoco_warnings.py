@@ -1,11 +1,13 @@
-"""MuJoCo's warnings about the models of Gymnasium's environments.
+"""MuJoCo's warnings about the models of environments.
 
 MuJoCo prints a warning, and appends it to a file MUJOCO_LOG.TXT in the working directory. Later versions warn so whenever a
-half cheetah is made: its model, a file of Gymnasium, uses an attribute that MuJoCo will remove. A user cannot change that.
+half cheetah is made: its model, a file of Gymnasium, Brax or Playground, uses an attribute that MuJoCo will remove. A user cannot
+change that.
 """
 
 import contextlib
 import importlib
+import sys
 import warnings
 from collections.abc import Iterator
 from typing import Any
@@ -14,30 +16,38 @@ import gymnasium
 
 from lare_rl.errors import LareError, missing_extra_error
 
-__all__ = ["mujoco_warnings"]
+__all__ = ["import_mujoco", "mujoco_warnings"]
 
 
-@contextlib.contextmanager
-def mujoco_warnings(name: str) -> Iterator[None]:
-    """Make an environment in this block. If it is one of Gymnasium's for MuJoCo, warnings of MuJoCo become warnings of Python.
-
-    Warnings of deprecated attributes are dropped.
+def import_mujoco(name: str) -> None:
+    """Import MuJoCo if the environment is one of Gymnasium's that need it.
 
     Raises:
         LareError: MuJoCo is not installed.
     """
     spec = gymnasium.registry.get(name)
     if spec is None or not str(spec.entry_point).startswith("gymnasium.envs.mujoco"):
-        yield
         return
     try:
-        mujoco: Any = importlib.import_module("mujoco")  # its type stubs lack these functions
+        importlib.import_module("mujoco")
     except ModuleNotFoundError as missing:
         if missing.name == "mujoco":
             raise missing_extra_error(f"environment {name!r}", "mujoco") from missing
         raise
     except ImportError as error:  # parts of it are missing, after an upgrade say, and it says how to repair that
         raise LareError(" ".join(str(error).split())) from error
+
+
+@contextlib.contextmanager
+def mujoco_warnings(name: str) -> Iterator[None]:
+    """Make an environment in this block. If MuJoCo is imported, its warnings become warnings of Python.
+
+    Warnings of deprecated attributes are dropped.
+    """
+    mujoco: Any = sys.modules.get("mujoco")  # its type stubs lack these functions
+    if mujoco is None:
+        yield
+        return
     messages: list[str] = []
     previous = mujoco.get_mju_user_warning()
     mujoco.set_mju_user_warning(messages.append)

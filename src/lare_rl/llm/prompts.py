@@ -8,7 +8,8 @@ from collections.abc import Sequence
 from importlib.resources import files
 from typing import Literal
 
-from lare_rl.tasks.spec import TaskSpec
+from lare_rl.errors import LareError
+from lare_rl.tasks.spec import FILL_IN, TaskSpec
 
 __all__ = [
     "MAX_CANDIDATES",
@@ -42,7 +43,16 @@ def _template(name: str) -> str:
 
 
 def candidate(task: TaskSpec, kind: FunctionKind = "factors") -> list[Message]:
-    """Return the first request: the role, and the task (the paper's Eq. 2)."""
+    """Return the first request: the role, and the task (the paper's Eq. 2).
+
+    Raises:
+        LareError: a text of the task is not filled in.
+    """
+    for key in ("description", "observation", "action"):
+        if FILL_IN in getattr(task, key):
+            raise LareError(
+                f"task {task.name!r}: {key} still says {FILL_IN!r}. Replace it by what a language model must know."
+            )
     sections = (("Task", task.description), ("Observation", task.observation), ("Action", task.action))
     user = "\n\n".join(f"# {title}\n{text.strip()}" for title, text in sections)
     return [{"role": "system", "content": _template(kind)}, {"role": "user", "content": user}]

@@ -95,7 +95,7 @@ NO_ENVIRONMENT = "none"
 """The value of `environment` for a task with logs only, whose environment is not available."""
 
 FILL_IN = "FILL IN"
-"""The placeholder in a draft for texts that must still be written."""
+"""The placeholder in a draft for texts that must be written before a language model reads them."""
 
 
 class TaskSpec(CheckedModel):
@@ -165,13 +165,6 @@ class TaskSpec(CheckedModel):
         except (TypeError, ValueError):
             raise ValueError("a run cannot store dates, inf or nan. Use numbers, strings, lists and tables.") from None
         return arguments
-
-    @model_validator(mode="after")
-    def _check_texts(self) -> "TaskSpec":
-        for key in ("description", "observation", "action"):
-            if FILL_IN in getattr(self, key):
-                raise ValueError(f"{key} still says {FILL_IN!r}. Replace it by what a language model must know.")
-        return self
 
     @model_validator(mode="after")
     def _check_teams(self) -> "TaskSpec":
