@@ -4,8 +4,9 @@
 
 Kinds: `not-a-sum` (the corridor's scores), `binary` (won or lost by chance), `payments` (PP-6 paid every step, every 5 steps, and at
 the end), `exact` (PP-6, rewards that add up exactly), `groups` (CN-6 in levels), `published` (published methods in the corridor, on
-CN-6 and on PP-6). Finished runs in RUNS are not trained again, and stopped ones continue. `late` is the mean return of the evaluations
-after three quarters of the steps, and `area` that of all evaluations, which also says how fast a method learns.
+CN-6 and on PP-6), `cheetah` (HalfCheetah-v4 paid once, every 50 and every 200 steps). Finished runs in RUNS are not trained again, and
+stopped ones continue. `late` is the mean return of the evaluations after three quarters of the steps, and `area` that of all
+evaluations, which also says how fast a method learns.
 """
 
 from collections.abc import Callable, Iterator
@@ -26,7 +27,8 @@ from scores.environments import corridor_task, level_task
 
 PARTICLE_STEPS = 205_000
 CORRIDOR: dict[str, Any] = {"algorithm": "ppo", "steps": 64_000, "environments": 20, "evaluation_episodes": 100}
-Kind = Literal["not-a-sum", "binary", "payments", "exact", "groups", "published"]
+CHEETAH: dict[str, Any] = {"algorithm": "td3", "steps": 30_000, "evaluate_every": 2_500, "evaluation_episodes": 3}
+Kind = Literal["not-a-sum", "binary", "payments", "exact", "groups", "published", "cheetah"]
 
 
 class Row(NamedTuple):
@@ -90,6 +92,23 @@ def published_methods() -> Iterator[Row]:
             yield particle(name, method, read_task(name), method, method == "rrdu")
 
 
+def cheetah() -> Iterator[Row]:
+    task = read_task("HalfCheetah-v4")
+
+    def row(label: str, payments: int | None, method: str, baseline: str, **settings: Any) -> Row:
+        paid = task if payments is None else task.model_copy(update={"payments": payments})
+        table = "HalfCheetah-v4, paid " + ("once" if payments is None else f"every {payments}")
+        return Row(table, label, paid, {"method": method, **CHEETAH, **settings}, label == baseline)
+
+    for method in ("episodic", "bayes", "lare-bayes", "dense", "rrdu", "lare-rrdu", "lrr", "grd", "rudder"):
+        yield row(method, None, method, "bayes")
+    for exact in ("last", "spread"):
+        yield row(f"bayes, exact {exact}", None, "bayes", "bayes", credit={"exact": exact})
+    for period in (50, 200):
+        for method in ("episodic", "bayes", "lare-bayes"):
+            yield row(method, period, method, "episodic")
+
+
 KINDS: dict[str, Callable[[], Iterator[Row]]] = {
     "not-a-sum": not_a_sum,
     "binary": binary,
@@ -97,6 +116,7 @@ KINDS: dict[str, Callable[[], Iterator[Row]]] = {
     "exact": exact,
     "groups": groups,
     "published": published_methods,
+    "cheetah": cheetah,
 }
 
 
