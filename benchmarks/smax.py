@@ -62,11 +62,11 @@ def main(rounds: int = 7, batches: tuple[int, ...] = (1, 32, 256), calls: int = 
             compiling[f"{name}, {worlds}"] = time.process_time() - start
         contenders = {str(worlds): partial(turn, worlds) for worlds in batches}
         seconds = interleave(contenders, rounds)
-        ms_by_battle = {
+        seconds_by_batch = {
             who: [value / (STEPS * int(who) * max(1, calls // int(who))) for value in values]
             for who, values in seconds.items()
         }
-        figures[name] = summary(ms_by_battle, 1, str(batches[0]))
+        figures[name] = summary(seconds_by_batch, 1, str(batches[0]))
         for row in figures[name].values():
             row["steps a second"] = round(1000 / row["median ms"])
         show(f"{name}, a step of a battle", figures[name], str(batches[0]))

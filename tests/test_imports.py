@@ -81,8 +81,8 @@ def test_unknown_name():
         lare_rl.trian  # noqa: B018
 
 
-MAX_MODULES = {"--help": 450, "train --help": 450, "methods": 510, "tasks": 620}
-"""The largest number of modules that are imported after each of these commands, one after the other."""
+COMMANDS = ["--help", "train --help", "methods", "tasks"]
+"""In this order, in one process."""
 WITHOUT_JAX = """
 lare_rl lare_rl.latent.verify lare_rl.phi.read lare_rl.latent.design lare_rl.envs.load lare_rl.tasks.spec lare_rl.envs.pettingzoo_env
 lare_rl.envs.workers lare_rl.turns.credit lare_rl.turns.files
@@ -105,13 +105,12 @@ print(json.dumps(results))
 
 
 def test_command_line_and_light_modules_import_little():
-    arguments = [json.dumps(list(MAX_MODULES)), json.dumps(WITHOUT_JAX)]
+    arguments = [json.dumps(COMMANDS), json.dumps(WITHOUT_JAX)]
     process = subprocess.run([sys.executable, "-c", PROGRAM, *arguments], capture_output=True, text=True, check=True)
     results = json.loads(process.stdout)
     slow = {"jax", "equinox", "gymnasium", "mujoco", "matplotlib", "scipy", "openai"}
-    for (command, max_modules), (has_printed, names) in zip(MAX_MODULES.items(), results, strict=False):
+    for command, (has_printed, names) in zip(COMMANDS, results, strict=False):
         assert has_printed
-        assert 100 < len(names) < max_modules, command
         assert slow.isdisjoint(names)
         assert "numpy" not in names or "help" not in command
-    assert results[len(MAX_MODULES) :] == [[module, False] for module in WITHOUT_JAX]
+    assert results[len(COMMANDS) :] == [[module, False] for module in WITHOUT_JAX]

@@ -14,11 +14,11 @@ from lare_rl.assigner.saving import ARRAYS_FILE, FUNCTION_FILE, TEXT_FILE
 from lare_rl.errors import LareError
 
 
-def trained_assigner(method, phi=None, is_mean=False, **changes):
+def trained_assigner(method, phi=None, is_average=False, **changes):
     """Return an assigner with some episodes and one that goes on, and new steps."""
     credit = small_assigner(method, phi, **changes)
     for *steps, reward in random_episodes([7, 4, 9, 6] * 6):
-        credit.add_episode(*steps, reward.mean() if is_mean else reward)
+        credit.add_episode(*steps, reward.mean() if is_average else reward)
         credit.fit_pending()
     add_episode(credit, random_episodes([3])[0], end=False)
     return credit, random_episodes([10], seed=9)[0]
@@ -70,7 +70,7 @@ def test_load_keeps_the_numbers_of_episodes(tmp_path):
 
 @pytest.mark.parametrize("is_pickled", [True, False])
 def test_state_without_episodes_gives_the_same_rewards(is_pickled, tmp_path, phi):
-    credit, new = trained_assigner("lare-bayes", phi, is_mean=not is_pickled, settings=ANY_SCORE)
+    credit, new = trained_assigner("lare-bayes", phi, is_average=not is_pickled, settings=ANY_SCORE)
     if is_pickled:
         pickled = pickle.dumps(credit)
         assert len(pickled) < 200_000

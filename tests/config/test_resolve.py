@@ -4,7 +4,6 @@ import pytest
 
 from helpers.toy_envs import pick_spec, toy_spec
 from lare_rl.algorithms.qmix import QMIXSettings
-from lare_rl.config import resolve as module
 from lare_rl.config.resolve import replay_rows, resolve
 from lare_rl.config.settings import Settings
 from lare_rl.config.validity import check_credit
@@ -198,13 +197,3 @@ def test_rollouts_of_ppo_are_whole_episodes(max_steps, environments, rollout_ste
     resolved = resolve(Settings(method="bayes", environments=environments), task)
     assert resolved.rollout_steps == rollout_steps
     assert resolved.steps % resolved.iteration_steps == resolved.evaluate_every % resolved.iteration_steps == 0
-
-
-@pytest.mark.parametrize(
-    ("step_s", "max_steps", "n_episodes"), [(1e-4, 360, 10), (0.01, 360, 3), (0.01, 20, 10), (0.01, 200, 5)]
-)
-def test_evaluations_of_a_slow_environment_have_fewer_episodes(step_s, max_steps, n_episodes, monkeypatch):
-    monkeypatch.setattr(module, "measure_step_s", lambda task: step_s)
-    task = pick_spec(environment="toys/Endless-v0", max_episode_steps=max_steps)
-    assert resolve(Settings(method="bayes"), task).evaluation_episodes == n_episodes
-    assert resolve(Settings(method="bayes", evaluation_episodes=7), task).evaluation_episodes == 7

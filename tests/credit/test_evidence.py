@@ -31,12 +31,13 @@ def sample_episodes(count=40, noise=0.1, seed=0):
 
 
 def sum_up(*episodes, n_chunks=1):
-    """Return the statistics of mean features, returns and lengths. Padding lets all calls have the same shapes."""
+    """Return the statistics of mean features, returns and lengths. Padding, which is NaN, lets all calls have the same shapes."""
     statistics = evidence.empty_statistics(episodes[0].shape[1])
     for chunk in np.array_split(np.arange(len(episodes[0])), n_chunks):
         padding = (0, MAX_EPISODES - len(chunk))
-        padded = (np.pad(values[chunk], (padding, (0, 0))[: values.ndim]) for values in episodes)
-        statistics = add_episodes(statistics, *padded)
+        means, episode_returns, length = (np.pad(v[chunk], (padding, (0, 0))[: v.ndim]) for v in episodes)
+        means[len(chunk) :] = episode_returns[len(chunk) :] = np.nan
+        statistics = add_episodes(statistics, means, episode_returns, length)
     return statistics
 
 

@@ -89,8 +89,8 @@ def test_shares_add_up():
 
 
 def test_score_type():
-    types = {ScoreType.SUM: Finding("sum"), ScoreType.MEAN: Finding("mean")}
-    for score_type, rival in ((ScoreType.SUM, ScoreType.MEAN), (ScoreType.MEAN, ScoreType.SUM)):
+    types = {ScoreType.SUM: Finding("sum"), ScoreType.AVERAGE: Finding("mean")}
+    for score_type, rival in ((ScoreType.SUM, ScoreType.AVERAGE), (ScoreType.AVERAGE, ScoreType.SUM)):
         for is_certain, code in ((True, "score_type_is_certain"), (False, "score_type_is_uncertain")):
             finding = find({}, score_type=ScoreTypeEstimate(score_type, is_certain, rival))[0]
             assert finding == Finding(code, {"this": types[score_type], "other": types[rival]})

@@ -46,7 +46,7 @@ def test_returns_are_predicted_before_a_fit_sees_them():
 
 
 @pytest.mark.parametrize(
-    ("score", "other", "score_type"), [("sum", "average", ScoreType.SUM), ("average", "sum", ScoreType.MEAN)]
+    ("score", "other", "score_type"), [("sum", "average", ScoreType.SUM), ("average", "sum", ScoreType.AVERAGE)]
 )
 def test_score_type(score, other, score_type):
     inputs, alive, returns = sample_episodes(score)

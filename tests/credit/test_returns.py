@@ -32,8 +32,8 @@ def untrained():
     return init(jax.random.key(0), 2, METHOD, SETTINGS, 4, 1, SCORE_TYPES)
 
 
-@pytest.mark.parametrize(("ratio", "is_mean"), [(1.03, False), (0.97, False), (0.93, True)])
-def test_a_score_is_a_mean_if_that_predicts_clearly_better(ratio, is_mean):
+@pytest.mark.parametrize(("ratio", "is_average"), [(1.03, False), (0.97, False), (0.93, True)])
+def test_a_score_is_a_mean_if_that_predicts_clearly_better(ratio, is_average):
     """`ratio` is that of the squared errors: as a mean to as a sum."""
     scores = np.random.default_rng(0).normal(size=WINDOW).astype(np.float32)
     predicted = np.stack([scores + 1, scores + np.sqrt(ratio)], axis=1).astype(np.float32)
@@ -41,7 +41,7 @@ def test_a_score_is_a_mean_if_that_predicts_clearly_better(ratio, is_mean):
         jnp.float32(WINDOW), jnp.asarray(scores), jnp.asarray(predicted), jnp.zeros(WINDOW, jnp.int32)
     )
     with jax.enable_x64(True):
-        assert bool(fit(untrained()._replace(score_type_predictions=predictions)).is_mean) == is_mean
+        assert bool(fit(untrained()._replace(score_type_predictions=predictions)).is_average) == is_average
 
 
 def test_returns_are_predicted_from_the_third_episode_on():

@@ -1,5 +1,6 @@
 """Evaluation, policies and films of runs with a single agent."""
 
+import re
 from functools import partial
 
 import gymnasium
@@ -16,7 +17,7 @@ from lare_rl.envs.families import make_host_env, register_family
 from lare_rl.envs.gymnasium_env import GymnasiumEnv
 from lare_rl.envs.load import load_task
 from lare_rl.envs.vec_env import LocalVecEnv
-from lare_rl.errors import LareError, check_count
+from lare_rl.errors import LareError, check_count, install_command
 from lare_rl.evaluation import evaluate as module
 from lare_rl.evaluation import video
 from lare_rl.evaluation.evaluate import (
@@ -88,6 +89,15 @@ def test_write_video(tmp_path):
 @pytest.mark.parametrize(("name", "words"), [("film.xyz", r"\.gif, or in \.mp4"), ("none/film.gif", "no directory")])
 def test_check_video_path(tmp_path, name, words):
     with pytest.raises(LareError, match=words):
+        check_video_path(tmp_path / name)
+
+
+@pytest.mark.parametrize(
+    ("name", "package", "extra"), [("film.gif", "PIL", "report"), ("film.mp4", "imageio", "video")]
+)
+def test_check_video_path_without_the_package(tmp_path, monkeypatch, name, package, extra):
+    monkeypatch.setattr("lare_rl.evaluation.video.find_spec", {package: None}.get)
+    with pytest.raises(LareError, match=re.escape(install_command(extra))):
         check_video_path(tmp_path / name)
 
 

@@ -17,6 +17,7 @@ from lare_rl.training.advice import (
     find_constant_returns,
     find_large_observations,
     find_saturated_policies,
+    find_slow_evaluations,
     find_untrained,
 )
 from lare_rl.training.compiled import compile_functions
@@ -146,3 +147,15 @@ def test_untrained_policy(settings, step, loss, expected, tmp_path):
         assert finding.code == expected[0]
         assert finding.values.items() >= expected[1].items()
         assert f"{step:,} steps" in render(finding, MESSAGES)
+
+
+@pytest.mark.parametrize(
+    ("evaluation_s", "interval_s", "is_found"), [(40.0, 100.0, True), (20.0, 100.0, False), (4.0, 5.0, False)]
+)
+def test_slow_evaluations(evaluation_s, interval_s, is_found):
+    settings = resolve(Settings(method="rrdu", evaluation_episodes=7), toy_spec())
+    messages = [render(finding, MESSAGES) for finding in find_slow_evaluations(settings, evaluation_s, interval_s)]
+    assert len(messages) == is_found
+    assert all(
+        text in message for message in messages for text in ("40%", "--evaluation-episodes (now 7)", "--evaluate-every")
+    )

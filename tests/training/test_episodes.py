@@ -206,8 +206,8 @@ def test_learn_returns_finds_the_score_type(method, score):
     config = small_config(method, capacity=2000)
     steps, factors, _, _ = scored_episodes(config, score)
     *_, last = learn_in_chunks(config, steps, factors, 6)
-    assert bool(last.decoders[0].is_mean) == (score == "average")
-    types = (ScoreType.SUM, ScoreType.MEAN) if score == "sum" else (ScoreType.MEAN, ScoreType.SUM)
+    assert bool(last.decoders[0].is_average) == (score == "average")
+    types = (ScoreType.SUM, ScoreType.AVERAGE) if score == "sum" else (ScoreType.AVERAGE, ScoreType.SUM)
     assert returns.estimate_score_type(last.decoders[0]) == ScoreTypeEstimate(types[0], is_certain=True, rival=types[1])
     fixed = small_config(method, credit=CreditSettings(score=score))
     for untrained in (config, fixed):

@@ -388,7 +388,7 @@ def test_optimism_adds_deviations_to_training_rewards_only(env, score):
     with jax.enable_x64(True):
         rows = features.reshape(-1, features.shape[-1])
         std = np.asarray(returns.reward_std(learner.decoders[0], rows, config.score_types)).reshape(before.shape)
-    divisor = np.where(learner.decoders[0].is_mean, np.asarray(steps.length), 1).reshape(-1, 1)
+    divisor = np.where(learner.decoders[0].is_average, np.asarray(steps.length), 1).reshape(-1, 1)
     np.testing.assert_allclose(after, np.where(alive, before + 2 * std / divisor, 0), rtol=1e-3, atol=1e-5)
     assert (after[alive] > before[alive]).all()
     error = np.abs(before - steps.columns["reward"])[alive].mean()

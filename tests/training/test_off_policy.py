@@ -7,25 +7,20 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from helpers.numpy_twins import assert_close
 from helpers.small_configs import (
     ONE_AGENT,
     SMALL_SETTINGS,
-    SUM_CREDIT,
     add_steps,
     jitted,
     learner_with_episodes,
-    random_factors,
     random_steps,
     read,
     small_config,
-    store_seeds,
     untrained_learner,
 )
 from lare_rl.algorithms.td3 import td3
 from lare_rl.credit.decoder_settings import CreditSettings
 from lare_rl.training import off_policy
-from lare_rl.training.compiled import compile_functions
 from lare_rl.training.rewards import rewards
 
 
@@ -79,18 +74,3 @@ def test_train_step_updates_once_for_each_step(monkeypatch):
         np.testing.assert_array_equal(batch.reward, reward[rows])
         n_terminated += terminated[rows].sum()
     assert n_terminated
-
-
-@pytest.mark.long
-def test_train_step_of_seeds_in_lockstep():
-    config = small_config("lare-rrdu", credit=SUM_CREDIT)
-    functions = compile_functions(config)
-    keys = jax.vmap(jax.random.key)(jnp.arange(3))
-    start, steps = functions.init(keys), random_steps()
-    stacked = jax.tree.map(lambda leaf: np.stack([leaf] * 3), (steps, random_factors(config, steps)))
-    alone = jax.tree.map(lambda leaf: np.asarray(leaf)[1], start)
-    together = functions.learn_returns(store_seeds(config)(start, *stacked))
-    together, _ = functions.train_step(together, stacked[0], keys, 0)
-    alone = add_steps(alone, config, steps, learn=True)
-    alone, _ = jax.jit(partial(off_policy._train_seed, config=config))(alone, keys[1], jnp.array(0))
-    assert_close(jax.tree.map(lambda leaf: np.asarray(leaf)[1], together), alone)

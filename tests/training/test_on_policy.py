@@ -15,15 +15,12 @@ from helpers.small_configs import (
     ONE_AGENT,
     ONE_TEAM,
     SMALL_SETTINGS,
-    SUM_CREDIT,
     TOTAL,
     TWO_TEAMS,
     add_steps,
     jitted,
-    random_factors,
     random_steps,
     small_config,
-    store_seeds,
     stored_steps,
     untrained_learner,
     with_other_dead_values,
@@ -31,8 +28,6 @@ from helpers.small_configs import (
 from lare_rl.algorithms.ppo import ppo
 from lare_rl.nn.normalise import standardise
 from lare_rl.training import on_policy
-from lare_rl.training.compiled import compile_functions
-from lare_rl.training.decoder_fits import fit_repeatedly
 from lare_rl.training.rewards import rewards
 
 ppo_config = partial(small_config, algorithm="ppo", rollout_steps=20)
@@ -184,20 +179,3 @@ def test_train_step_ignores_dead_agents():
         learner, metrics = train(learner, newest(trajectory), jax.random.key(0), jnp.array(0))
         results.append((learner.algorithm, metrics))
     assert_close(*results, 1e-3)
-
-
-@pytest.mark.long
-@pytest.mark.parametrize(("algorithm", "env"), [("ppo", ONE_AGENT), long_case("ippo", TWO_TEAMS)])
-def test_train_step_of_seeds_in_lockstep(algorithm, env):
-    config = small_config("lare-rd", algorithm, env, rollout_steps=TOTAL, n_envs=2, credit=SUM_CREDIT)
-    functions = compile_functions(config)
-    keys = jax.vmap(jax.random.key)(jnp.arange(3))
-    start, steps = functions.init(keys), random_steps(env, 2)
-    stacked = jax.tree.map(lambda leaf: np.stack([leaf] * 3), (steps, random_factors(config, steps)))
-    alone = jax.tree.map(lambda leaf: np.asarray(leaf)[1], start)
-    together, _ = functions.fit(functions.learn_returns(store_seeds(config)(start, *stacked)), keys)
-    together, _ = functions.train_step(together, stacked[0], keys, 40)
-    alone = add_steps(alone, config, steps, learn=True)
-    alone = alone._replace(decoders=jax.jit(partial(fit_repeatedly, config=config))(alone, keys[1])[0])
-    alone, _ = jax.jit(partial(on_policy._train_seed, config=config))(alone, steps, keys[1], jnp.array(40))
-    assert_close(jax.tree.map(lambda leaf: np.asarray(leaf)[1], together), alone, 1e-3, 1e-4)

@@ -75,6 +75,11 @@ def test_candidates_setting_chooses_recording(candidates):
         ({"method": "dense", "capacity": 43}, None, "capacity = 43.*an iteration of Chase takes up to 44"),
         ({"method": "rrdu", "algorithm": "ppo", "capacity": 43}, None, "capacity = 43.*a rollout of Chase"),
         ({"method": "dense", "steps": 9, "rollout_steps": 1, "evaluate_every": 1}, None, "steps = 9 are too few"),
+        (
+            {"method": "dense", "steps": 18, "rollout_steps": 1, "evaluate_every": 2, "environments": 2},
+            None,
+            "environments = 2 needs at least 20",
+        ),
     ],
 )
 def test_bad_arguments_leave_no_directory(changes, function, message, small, tmp_path):

@@ -5,7 +5,6 @@ import json
 import pytest
 
 from helpers.turn_toys import sample_table, table_rollouts
-from lare_rl import cli
 from lare_rl.errors import LareError
 from lare_rl.turns.credit import TurnCredit
 from lare_rl.turns.features import tabulate
@@ -38,21 +37,10 @@ def file(tmp_path, rollouts):
     return path
 
 
-def run(monkeypatch, capsys, *arguments, command="turn-credit"):
-    monkeypatch.setattr("sys.argv", ["lare-rl", command, *map(str, arguments)])
-    status = 0
-    try:
-        cli.main()
-    except SystemExit as exit_:
-        status = exit_.code
-    captured = capsys.readouterr()
-    return status, captured.out, captured.err
-
-
-def test_command(monkeypatch, capsys, tmp_path, file, rollouts):
+def test_command(command, tmp_path, file, rollouts):
     out, page, phi = tmp_path / "credited.jsonl", tmp_path / "page.html", tmp_path / "phi.py"
     phi.write_text(PHI)
-    status, text, _ = run(monkeypatch, capsys, file, "--out", out, "--report", page, "--function", phi)
+    status, text, _ = command("turn-credit", file, "--out", out, "--report", page, "--function", phi)
     assert status == 0
     assert "GRPO: " in text.splitlines()[0]
     credited = [json.loads(line) for line in out.read_text().splitlines()]
@@ -66,7 +54,7 @@ def test_command(monkeypatch, capsys, tmp_path, file, rollouts):
     html = page.read_text()
     assert "works" in html
     assert html.count("<svg") == 6
-    status, _, error = run(monkeypatch, capsys, file, "--out", out)
+    status, _, error = command("turn-credit", file, "--out", out)
     assert (status, "--overwrite" in error) == (2, True)
 
 
@@ -89,45 +77,45 @@ def test_bad_files(tmp_path, content, words):
     assert "\n" not in str(error.value)
 
 
-def test_missing_files(monkeypatch, capsys, tmp_path, file):
-    status, _, error = run(monkeypatch, capsys, tmp_path / "none.jsonl", "--out", tmp_path / "out.jsonl")
+def test_missing_files(command, tmp_path, file):
+    status, _, error = command("turn-credit", tmp_path / "none.jsonl", "--out", tmp_path / "out.jsonl")
     assert (status, error.count("\n")) == (2, 1)
-    status, _, error = run(monkeypatch, capsys, file, "--out", tmp_path / "none" / "out.jsonl")
+    status, _, error = command("turn-credit", file, "--out", tmp_path / "none" / "out.jsonl")
     assert (status, "no directory" in error) == (2, True)
 
 
-def test_turn_phi_prints_the_request(monkeypatch, capsys, tmp_path, file):
+def test_turn_phi_prints_the_request(command, tmp_path, file):
     tools = tmp_path / "tools.json"
     tools.write_text('[{"type": "function", "function": {"name": "try", "description": "Tries."}}]')
     options = ["--tools", tools, "--goal", "Make it work."]
-    status, text, _ = run(monkeypatch, capsys, file, *options, command="turn-phi")
+    status, text, _ = command("turn-phi", file, *options)
     assert status == 0
     assert all(
         words in text for words in ("--- system ---", "find_numbers", "Make it work.", "## try\nTries.", '"nothing"')
     )
     tools.write_text("{}")
-    status, _, error = run(monkeypatch, capsys, file, *options, command="turn-phi")
+    status, _, error = command("turn-phi", file, *options)
     assert (status, "list of tools" in error) == (2, True)
 
 
-def test_turn_phi_asks_a_model(monkeypatch, capsys, tmp_path, file):
+def test_turn_phi_asks_a_model(monkeypatch, command, tmp_path, file):
     reply = json.dumps({"Understand": "", "Analyze": "", "Functions": PHI})
     monkeypatch.setattr("lare_rl.llm.live.LiveModel.reply", lambda self, messages, sample: reply)
     monkeypatch.setattr("lare_rl.llm.live.LiveModel.__post_init__", lambda self: None)
     tools, out = tmp_path / "tools.json", tmp_path / "new.py"
     tools.write_text('[{"name": "try"}]')
     options = ["--tools", tools, "--goal", "Make it work.", "--model", "some", "--out", out]
-    status, _, _ = run(monkeypatch, capsys, file, *options, command="turn-phi")
+    status, _, _ = command("turn-phi", file, *options)
     assert status == 0
     assert out.read_text().endswith(PHI)
     assert json.loads(out.with_suffix(".json").read_text())["kind"] == "events"
-    status, _, error = run(monkeypatch, capsys, file, *options, command="turn-phi")
+    status, _, error = command("turn-phi", file, *options)
     assert (status, "not overwritten" in error) == (2, True)
-    status, _, error = run(monkeypatch, capsys, file, *options[:-1], tmp_path / "none" / "a.py", command="turn-phi")
+    status, _, error = command("turn-phi", file, *options[:-1], tmp_path / "none" / "a.py")
     assert (status, "no directory" in error) == (2, True)
-    status, _, error = run(monkeypatch, capsys, file, "--out", tmp_path / "c.jsonl", "--function", out)
+    status, _, error = command("turn-credit", file, "--out", tmp_path / "c.jsonl", "--function", out)
     assert (status, error) == (0, "")
-    status, _, error = run(monkeypatch, capsys, file, *options, command="turn-phi")
+    status, _, error = command("turn-phi", file, *options)
     assert (status, "exists" in error) == (2, True)
 
 

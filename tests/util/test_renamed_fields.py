@@ -9,7 +9,7 @@ from lare_rl.util.renamed_fields import rename_fields, rename_keys, rename_optio
     ("old", "new"),
     [
         (".credit[0].closed.summed.episodes", ".decoders[0].closed_form.sufficient_statistics.n_episodes"),
-        (".credit[0].average", ".decoders[0].is_mean"),
+        (".credit[0].average", ".decoders[0].is_average"),
         (".credit[0].decoder.step", ".decoders[0].network.position"),
         (".credit[0].decoder.step.layers[0].weight", ".decoders[0].network.step_model.layers[0].weight"),
         ("[0].decoder.value.weight", "[0].network.readout.weight"),

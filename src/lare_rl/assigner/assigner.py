@@ -346,9 +346,9 @@ class CreditAssigner:
         with self.lock:
             self.learner.learn_if_due()
             decoder = self.learner.decoder
-            if decoder is None or not (decoder.is_mean | decoder.is_log_odds):
+            if decoder is None or not (decoder.is_average | decoder.is_log_odds):
                 return "sum"
-            return "average" if bool(decoder.is_mean) else "log odds"
+            return "average" if bool(decoder.is_average) else "log odds"
 
     form = score_type  # the earlier name
 

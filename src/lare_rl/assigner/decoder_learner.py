@@ -285,5 +285,5 @@ class DecoderLearner:
             state = compiled.init_explanation(self.decoder.statistics, basis=basis)
             for batch in whole_episodes(self.store, self.config.spec, list(self.store.episodes.values())):
                 state = compiled.add_to_explanation(state, batch)
-            explanation = compiled.explain_returns(state, self.decoder.is_mean.astype(int))
+            explanation = compiled.explain_returns(state, self.decoder.is_average.astype(int))
             return jax.tree.map(np.asarray, explanation)

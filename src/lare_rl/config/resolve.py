@@ -11,16 +11,10 @@ from lare_rl.credit.methods import find_method
 from lare_rl.data.replay import required_capacity
 from lare_rl.envs.families import find_score, load_env_spec
 from lare_rl.envs.interface import EnvSpec
-from lare_rl.envs.placement import SLOW_STEP_S, measure_step_s
 from lare_rl.errors import LareError
 from lare_rl.tasks.spec import TaskSpec
 
 __all__ = ["choose_algorithm", "fill_in", "replay_rows", "resolve"]
-
-
-TRAINING_SHARE = 10
-"""For each step of evaluations, there are about as many steps of training, if they are slow."""
-MIN_EVALUATION_EPISODES = 3
 
 
 def resolve(settings: Settings, task: TaskSpec) -> ResolvedSettings:
@@ -34,11 +28,6 @@ def resolve(settings: Settings, task: TaskSpec) -> ResolvedSettings:
     env = load_env_spec(task)
     _check_algorithm(ALGORITHMS[choose_algorithm(settings.algorithm, env)], task, env)
     resolved = fill_in(settings, task, env)
-    if settings.evaluation_episodes is None and not env.is_jax and measure_step_s(task) > SLOW_STEP_S:
-        n_episodes = resolved.evaluate_every // (TRAINING_SHARE * env.max_steps)
-        n_episodes = min(resolved.evaluation_episodes, max(MIN_EVALUATION_EPISODES, n_episodes))
-        resolved = resolved.model_copy(update={"evaluation_episodes": n_episodes})
-
     method, team_level = find_method(resolved.method), task.credit_scope == "state"
     consumes = ALGORITHMS[resolved.algorithm].consumes
     n_state_features = env.state_size + env.n_agents * env.action_size
@@ -147,10 +136,11 @@ def _check_algorithm(algorithm: Algorithm, task: TaskSpec, env: EnvSpec) -> None
 
 def _check_size(resolved: ResolvedSettings, task: TaskSpec, env: EnvSpec) -> None:
     """Raise `LareError` if a run is too short, or if the replay could not hold the steps of an iteration."""
-    if 2 * resolved.steps < env.max_steps:
+    required = env.max_steps * resolved.environments // 2
+    if resolved.steps < required:
         raise LareError(
-            f"steps = {resolved.steps} are too few: an episode of {task.name} takes up to {env.max_steps}, and a run at least half "
-            "of that"
+            f"steps = {resolved.steps} are too few: an episode of {task.name} takes up to {env.max_steps} steps, and a run with "
+            f"environments = {resolved.environments} needs at least {required}"
         )
     required = required_capacity(resolved.rollout_steps, env.max_steps) * resolved.environments
     if needs_replay(resolved) and resolved.capacity < required:

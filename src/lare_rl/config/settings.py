@@ -64,11 +64,10 @@ class _RunSettings(CheckedModel, Generic[Open]):
     published: fit_updates, as in every later fit."""
     evaluate_every: Count | Open = OPEN
     """Environment steps between two evaluations; the last step is followed by one, too. A checkpoint is written at each, and after five
-    minutes without one. By default
-    5000 for td3, ddpg and sac, about 10,000 for qmix, 10 iterations for ippo, and 5 iterations for ppo."""
+    minutes without one. By default 5000 for td3, ddpg and sac, about 10,000 for qmix, 10 iterations for ippo, and 5 iterations for
+    ppo."""
     evaluation_episodes: Count | Open = OPEN
-    """Episodes in one evaluation. By default 10; in JAX, 50 for ippo and 32 for qmix. On the host, if a step takes more than 2 ms, as
-    many as take a tenth of the steps between two evaluations, but from 3 to 10."""
+    """Episodes in one evaluation. By default 10; in JAX, 50 for ippo and 32 for qmix."""
     capacity: Annotated[int, Field(ge=4)] | Open = OPEN
     """Rows in the replay of a seed; an episode of T steps takes T + 1. By default 1,000,000; 15,000 of the longest episodes for
     ippo, and 5000 for qmix."""

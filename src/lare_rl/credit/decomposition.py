@@ -114,7 +114,7 @@ class DecoderState(NamedTuple):
     """The scale of R/T."""
     return_scale: Scale
     """The scale of R."""
-    is_mean: Bool[Array, ""]
+    is_average: Bool[Array, ""]
     """Whether the score is treated as a mean over the steps. r_hat is then the output of the decoder, divided by T."""
     is_log_odds: Bool[Array, ""]
     """Whether steps are paid for what they add to the log odds of the higher score."""
@@ -170,7 +170,7 @@ def init(
         statistics=empty_mean_std(basis.n_standardised),
         scale=empty_scale(),
         return_scale=empty_scale(),
-        is_mean=jnp.asarray(score_types == (ScoreType.MEAN,)),
+        is_average=jnp.asarray(score_types == (ScoreType.AVERAGE,)),
         is_log_odds=jnp.asarray(False),
         predictions=empty_predictions(1, window),
         closed_form=closed,
@@ -188,7 +188,7 @@ def score_type_index(state: DecoderState, n_score_types: int) -> Int[Array, ""] 
     """Return the position of the used score type in the list of fitted score types."""
     if n_score_types == 1:
         return 0
-    return jnp.where(state.is_log_odds, n_score_types - 1, state.is_mean.astype(int))
+    return jnp.where(state.is_log_odds, n_score_types - 1, state.is_average.astype(int))
 
 
 def observe_steps(
@@ -235,7 +235,7 @@ def level_returns(
     start_value = jnp.broadcast_to(state.closed_form.start_value[index], length.shape)
     if level is None:
         return start_value
-    per_step = ~(state.is_mean | state.is_log_odds | state.closed_form.decoder.basis.prefixes)
+    per_step = ~(state.is_average | state.is_log_odds | state.closed_form.decoder.basis.prefixes)
     unit = jnp.where(per_step, length, 1)
     return start_value + state.closed_form.intercept[index][level] * unit
 
@@ -249,7 +249,7 @@ def reward_unit(state: DecoderState, settings: CreditSettings) -> Float[Array, "
     """Return the unit of the decoder's output: the root mean square of R/T, or of R if the score is a mean."""
     if not is_normalised(state, settings):
         return jnp.ones(())
-    return jnp.where(state.is_mean, root_mean_square(state.return_scale), root_mean_square(state.scale))
+    return jnp.where(state.is_average, root_mean_square(state.return_scale), root_mean_square(state.scale))
 
 
 def normalise_inputs(
@@ -314,7 +314,7 @@ def _per_step(
     """Return the decoder's output for each step as a part of R: divided by T if the score is a mean."""
     if length is None:
         return output
-    divisor = jnp.where(state.is_mean, length, 1).astype(jnp.float32)
+    divisor = jnp.where(state.is_average, length, 1).astype(jnp.float32)
     return output / divisor.reshape(-1, *[1] * (output.ndim - 1))
 
 

@@ -123,4 +123,4 @@ def _targets(state: DecoderState, episodes: CreditBatch, settings: CreditSetting
         mean_reward = mean_reward - level_returns(state, episodes.level, episodes.length) / jnp.maximum(
             episodes.length, 1
         )
-    return mean_reward * jnp.where(state.is_mean, episodes.length, 1) / reward_unit(state, settings)
+    return mean_reward * jnp.where(state.is_average, episodes.length, 1) / reward_unit(state, settings)

@@ -141,10 +141,11 @@ def _add_cases(
     weight: Float[Array, " cases"],
     n_episodes: Int[Array, ""],
 ) -> SufficientStatistics:
-    """Add cases with their weights. Those of weight 0 are padding."""
-    n_new = jnp.sum(weight)
+    """Add cases with their weights. Those of weight 0 are padding, and may be NaN."""
+    n_new, is_case = jnp.sum(weight), weight[:, None] > 0
+    v = jnp.where(is_case, v, 0)
     mean = weight @ v / jnp.maximum(n_new, 1)
-    centred = jnp.where(weight[:, None] > 0, v - mean, 0)
+    centred = jnp.where(is_case, v - mean, 0)
     n_steps, merged, difference, fraction = merge_means(statistics.n_steps, statistics.mean, n_new, mean)
     between = jnp.outer(difference, difference) * statistics.n_steps * fraction
     return SufficientStatistics(
@@ -202,7 +203,8 @@ def fit(
     While episodes are few, the evidence may have several maxima: one where all variation is noise, and one where none is. An
     iteration that starts near such a maximum stays there, however many episodes follow. So there are three iterations: from
     `start`, from equal shares of the groups with half of the variation as noise, and from the first group with almost no noise. The
-    largest evidence wins. With `MANY_EPISODES_PER_FEATURE`, the second and the third iteration have a single round.
+    largest evidence wins. Once there are `MANY_EPISODES_PER_FEATURE` episodes for each feature, only the first iteration runs to its
+    end; the others stop after one round.
 
     Args:
         group_index: the index of each feature's group.

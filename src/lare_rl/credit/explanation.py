@@ -144,7 +144,7 @@ def explain(
     root = evidence.posterior_covariance(factor_statistics, score_type, group_index, factors.posterior).root
     slope, slope_covariance, linear_share = _slopes(factors.posterior.weight, root.T @ root, step_statistics, basis)
     mean_length = statistics.n_steps / jnp.maximum(statistics.n_episodes, 1)
-    divisor = jnp.where(score_type == ScoreType.MEAN, mean_length, 1)  # r_hat of a mean is divided by T
+    divisor = jnp.where(score_type == ScoreType.AVERAGE, mean_length, 1)  # r_hat of a mean is divided by T
     return explanation._replace(
         total_r2=jnp.maximum(full.r2, factors.r2),
         factors_r2=factors.r2,

@@ -79,8 +79,8 @@ def assess_factors(
         predicted = {score_type: predict(features, score_type=score_type) for score_type in score_types}
         margin = ROUNDING * np.sum(returns[N_FIRST:] ** 2)
         errors = {key: float(np.sum((returns[N_FIRST:] - values) ** 2) + margin) for key, values in predicted.items()}
-        is_mean = errors.get(ScoreType.MEAN, np.inf) < MAX_ERROR_RATIO * errors.get(ScoreType.SUM, np.inf)
-        score_type = ScoreType(int(is_mean))
+        is_average = errors.get(ScoreType.AVERAGE, np.inf) < MAX_ERROR_RATIO * errors.get(ScoreType.SUM, np.inf)
+        score_type = ScoreType(int(is_average))
         length_r2 = None
         if score_type is ScoreType.SUM and lengths_differ:
             length_r2 = r_squared(returns[N_FIRST:], predict(np.zeros_like(features), score_type=ScoreType.SUM))[0]
@@ -146,7 +146,7 @@ def predict_returns(
         block = (np.pad(values, (padding, *[(0, 0)] * (values.ndim - 1))) for values in block)
         statistics, posterior = _add_and_fit(statistics, posterior, *block, score_type=score_type, basis=basis)
         output = features[end:next_end] @ np.asarray(posterior.weight) + float(posterior.bias)
-        predicted.append(output if score_type == ScoreType.MEAN else length[end:next_end] * output)
+        predicted.append(output if score_type == ScoreType.AVERAGE else length[end:next_end] * output)
     return np.concatenate(predicted)
 
 

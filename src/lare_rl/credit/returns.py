@@ -227,8 +227,8 @@ def fit_closed_form(
         is_log_odds = jnp.asarray(False)
         if score_types[-1] == ScoreType.LOG_ODDS:
             is_log_odds, errors = errors[-1] < jnp.min(errors[:-1]), errors[:-1]
-        is_mean = (errors[1] < MAX_ERROR_RATIO * errors[0]) & ~is_log_odds if len(errors) > 1 else state.is_mean
-        state = state._replace(is_mean=is_mean, is_log_odds=is_log_odds)
+        is_average = (errors[1] < MAX_ERROR_RATIO * errors[0]) & ~is_log_odds if len(errors) > 1 else state.is_average
+        state = state._replace(is_average=is_average, is_log_odds=is_log_odds)
     if not method.uses_gradient:
         index = score_type_index(state, len(score_types))
         state = state._replace(network=closed_form.select_score_type(closed.decoder, index))
@@ -277,7 +277,7 @@ def reward_std(
     assert state.closed_form is not None
     assert isinstance(state.network, LinearDecoder)
     features, n_linear = state.network.features(rows), len(state.closed_form.posterior.bias)
-    index = state.is_mean.astype(int) if n_linear > 1 else 0
+    index = state.is_average.astype(int) if n_linear > 1 else 0
     covariance = evidence.posterior_covariance(
         closed_form.to_float64(state.closed_form.sufficient_statistics),
         jnp.asarray(score_types)[index],

@@ -18,7 +18,7 @@ __all__ = [
 ]
 
 MAX_ERROR_RATIO = 0.95
-"""A score is treated as a mean if its predictions as a mean have a squared error below this fraction of the error as a sum. If all
+"""A score is treated as an average if its predictions as an average have a squared error below this fraction of the error as a sum. If all
 episodes are equally long, both errors are equal except for rounding."""
 ROUNDING = 1e-6
 """Squared errors below this fraction of the squared returns are treated as equal."""
@@ -29,8 +29,8 @@ class ScoreType(IntEnum):
 
     SUM = 0
     """The score grows with the number of steps."""
-    MEAN = 1
-    """The score is a mean or a grade, which does not grow with the number of steps."""
+    AVERAGE = 1
+    """The score is an average or a grade, which does not grow with the number of steps."""
     LOG_ODDS = 2
     """The score has two values, and the log odds of the higher one are a sum over the steps (`logistic.py`)."""
 
@@ -50,12 +50,12 @@ def score_types_to_fit(score: str, fixed_length: bool, *, allow_log_odds: bool) 
 
     Args:
         score: the setting of this name.
-        fixed_length: whether all episodes have the same length. A sum and a mean are then the same.
+        fixed_length: whether all episodes have the same length. A sum and an average are then the same.
         allow_log_odds: whether a score may be log odds. Decoders that are fitted in closed form allow it.
     """
     if score in ("sum", "average"):
-        return (ScoreType.SUM,) if score == "sum" else (ScoreType.MEAN,)
-    linear = (ScoreType.SUM,) if fixed_length else (ScoreType.SUM, ScoreType.MEAN)
+        return (ScoreType.SUM,) if score == "sum" else (ScoreType.AVERAGE,)
+    linear = (ScoreType.SUM,) if fixed_length else (ScoreType.SUM, ScoreType.AVERAGE)
     return (*linear, ScoreType.LOG_ODDS) if score == "binary" and allow_log_odds else linear
 
 

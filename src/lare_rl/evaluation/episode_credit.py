@@ -76,7 +76,7 @@ def load_episode_credit(run: Run) -> EpisodeCredit | None:
     if learner.decoders and config.method.fit in (Fit.EVIDENCE, Fit.PREFIX_EVIDENCE) and config.credit_rows == 1:
         with float64():
             std = np.asarray(jax.jit(partial(_posterior_std, config=config))(learner.decoders[0], steps))
-        uncertainty = 2 * std / np.where(learner.decoders[0].is_mean, steps.length, 1)
+        uncertainty = 2 * std / np.where(learner.decoders[0].is_average, steps.length, 1)
     reward = np.asarray(steps.columns["reward"])
     return EpisodeCredit(
         reward=reward,

@@ -4,6 +4,7 @@ import math
 import warnings
 from collections.abc import Iterable, Sequence
 from contextlib import closing
+from importlib.util import find_spec
 from io import BytesIO
 from itertools import count
 from pathlib import Path
@@ -29,7 +30,7 @@ __all__ = ["check_video_path", "encode_film", "record_frames", "record_video", "
 FRAMES_PER_SECOND = 8
 """The frame rate of a film of many agents."""
 MAX_GIF_FRAMES_PER_SECOND = 25.0
-"""Browsers play a GIF at 50 frames a second at most, and a frame may take long without a graphics card."""
+"""Drawing a frame may take long without a graphics card, so a GIF has at most 25 frames a second."""
 DEFAULT_FPS = 30
 """Frames in a second of an environment that does not say how many it draws."""
 MAX_DRAWINGS = 200
@@ -93,7 +94,7 @@ def record_frames(
     with closing(make_host_env(run.config.task, render_mode="rgb_array", **camera)) as env:
         metadata = env.environment.metadata if isinstance(env, GymnasiumEnv) else {}
         fps = metadata.get("render_fps", DEFAULT_FPS)
-        interval = max(1, round(fps / max_rate))
+        interval = max(1, math.ceil(fps / max_rate))
         return _play_and_render(run, env, policy, interval, max_frames), interval / fps
 
 
@@ -138,6 +139,9 @@ def check_video_path(path: Path) -> None:
     """Raise `LareError` if a video could not be written, before the work is done."""
     if path.suffix not in (".gif", ".mp4"):
         raise LareError(f"{path} is no name of a video: it ends in .gif, or in .mp4 with the extra lare-rl[video]")
+    package, extra = ("imageio", "video") if path.suffix == ".mp4" else ("PIL", "report")
+    if find_spec(package) is None:
+        raise missing_extra_error(f"a film in {path.suffix}", extra)
     check_new_path(path, overwrite=True)
 
 

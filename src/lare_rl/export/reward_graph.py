@@ -59,7 +59,7 @@ def reward_graph(credit: DecoderState | None, config: TrainConfig, team_index: i
     with building(Builder(UNLIMITED)):
         arrays = input_arrays(config.credit_specs[team_index].inputs, _StepInputs(config, rows, team_index, phi))
         inputs = {"inputs": concatenate(arrays, -1)}
-        if credit is not None and bool(credit.is_mean):
+        if credit is not None and bool(credit.is_average):
             inputs["length"] = graph_input("length", (1,) if rows else ())
         if config.method.shared and rows and config.env.agents_leave:
             inputs["alive"] = graph_input("alive", rows)

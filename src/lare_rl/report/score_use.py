@@ -77,8 +77,8 @@ def summarise_score_use(
     if method.fit is None:
         return None
     gain, error = values["gain"], values["gain_error"]
-    is_mean = (values["average"] or 0) > 0.5 or settings.credit.score == "average"
-    form = "form_mean" if is_mean else "form_sum"
+    is_average = (values["average"] or 0) > 0.5 or settings.credit.score == "average"
+    form = "form_mean" if is_average else "form_sum"
     if method.fit is Fit.PREFIX_EVIDENCE:
         form = "form_progress"
     elif (values["log_odds"] or 0) > 0.5:

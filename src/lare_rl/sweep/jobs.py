@@ -104,8 +104,6 @@ def check_job(job: Job) -> None:
         raise LareError(f"{job.directory} holds a run of another task: choose another output directory (--out)")
     old = effective_settings(config.settings)
     for name, value in effective_settings(job.resolved).items():
-        if name == "evaluation_episodes" and job.settings.evaluation_episodes is None:
-            continue  # the default depends on the measured time of a step
         if (old_value := old.get(name)) != value:
             raise LareError(
                 f"{job.directory} holds a run with {name} = {old_value}, not {value}: choose another output directory (--out)"

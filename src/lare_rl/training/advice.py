@@ -7,6 +7,7 @@ from jaxtyping import Float
 
 from lare_rl.algorithms.ppo import PPOSettings
 from lare_rl.config.effective import warmup_warning
+from lare_rl.config.settings import ResolvedSettings
 from lare_rl.credit.explanation_text import raw_feature_names
 from lare_rl.data.replay import Replay
 from lare_rl.runs.directory import Run
@@ -21,6 +22,7 @@ __all__ = [
     "find_equal_returns",
     "find_large_observations",
     "find_saturated_policies",
+    "find_slow_evaluations",
     "find_untrained",
 ]
 
@@ -36,6 +38,8 @@ ROUNDING = 1e-6
 """Returns of all episodes are the same if they differ by less than this fraction of their size."""
 EQUAL_RTOL = 1e-3
 """Returns are equal if they differ by less than this fraction of their size."""
+MAX_EVALUATION_SHARE, MIN_EVALUATION_S = 0.3, 5.0
+"""The share of the time, and the time (s), of an evaluation that need no advice."""
 
 MESSAGES = {
     "all steps random": "{reason}",
@@ -54,6 +58,8 @@ MESSAGES = {
     "equal returns": "Every episode of every evaluation has the return {return_:score}. If training episodes have it too, nothing can be "
     "learned. Does the environment pay a score, and before its time limit (max_episode_steps)? Do bad episodes differ "
     "(docs/how-to/scores.md)?",
+    "slow evaluations": "An evaluation takes {seconds:.0f} s, {share:.0%} of the time: --evaluation-episodes (now {n_episodes}) or "
+    "--evaluate-every (now {every:,}) changes that.",
     "constant returns": "The last {n_evaluations} evaluations of every seed have the same return: the policy does not change what "
     "it does. If this return is not a good one, the policy is stuck: see docs/how-to/poor-policies.md.",
 }
@@ -122,6 +128,15 @@ def find_constant_returns(returns: Sequence[Float[np.ndarray, " seeds"]]) -> lis
     if not _are_equal(returns[-N_EQUAL_EVALUATIONS:]) or _are_equal(returns[-N_EQUAL_EVALUATIONS - 1 : -1]):
         return []
     return [Finding("constant returns", {"n_evaluations": N_EQUAL_EVALUATIONS})]
+
+
+def find_slow_evaluations(settings: ResolvedSettings, evaluation_s: float, interval_s: float) -> list[Finding]:
+    """Find out whether an evaluation takes much of the time. `interval_s` is the time from one evaluation to the next, with one of them."""
+    share = evaluation_s / interval_s
+    if share <= MAX_EVALUATION_SHARE or evaluation_s <= MIN_EVALUATION_S:
+        return []
+    values = {"n_episodes": settings.evaluation_episodes, "every": settings.evaluate_every}
+    return [Finding("slow evaluations", {"seconds": evaluation_s, "share": share, **values})]
 
 
 def find_equal_returns(run: Run) -> list[Finding]:

@@ -75,7 +75,7 @@ def predict_returns(
 
     def body(state: tuple[DecoderState, Array], episodes: CreditBatch, first: Index) -> tuple[DecoderState, Array]:
         decoder, predicted = state
-        # The last step of what is paid is in the episode itself, which the first one need not be.
+        # A payment belongs to the episode of its last step; its first step may lie in the episode before.
         last = first.number + episodes.length - 1
         episode = replay.look_up(buffer.episode, first.env, last)
         slot = jnp.where(episodes.mask > 0, episode % slots, slots)  # an index out of range, which is dropped

@@ -94,8 +94,8 @@ def explain_stored_returns(learner: Learner, config: TrainConfig) -> list[Explan
     if not learner.decoders or not has_features or n_stored < MIN_EXPLAINED_EPISODES:
         return []
     with float64():
-        is_mean = tuple(decoder.is_mean for decoder in learner.decoders)
-        explanations = _compile(config)(*first_shard((replay, is_mean)))
+        is_average = tuple(decoder.is_average for decoder in learner.decoders)
+        explanations = _compile(config)(*first_shard((replay, is_average)))
         return jax.tree.map(np.asarray, explanations)
 
 
@@ -104,7 +104,7 @@ def compile_explanation(learner: Learner, config: TrainConfig) -> None:
     config, replay = _explanation_config(config), by_payment(learner.replay)
     if not learner.decoders or not all(spec.basis.n_features for spec in config.credit_specs):
         return
-    inputs = replay, tuple(decoder.is_mean for decoder in learner.decoders)
+    inputs = replay, tuple(decoder.is_average for decoder in learner.decoders)
     shapes = jax.tree.map(lambda leaf: jax.ShapeDtypeStruct(leaf.shape, leaf.dtype), inputs)
     with jax.enable_x64(True):
         _compile(config).lower(*shapes).compile()
@@ -130,16 +130,16 @@ def _compile(config: TrainConfig) -> Any:
 
 
 def _explain_first_seed(
-    replay: Replay, is_mean: tuple[Bool[Array, " seeds"], ...], config: TrainConfig
+    replay: Replay, is_average: tuple[Bool[Array, " seeds"], ...], config: TrainConfig
 ) -> list[Explanation]:
-    buffer, is_mean = select_seed((replay, is_mean))
+    buffer, is_average = select_seed((replay, is_average))
     bases = [replace(spec.basis, n_levels=0) for spec in config.credit_specs]
     empty = tuple(empty_mean_std(basis.n_inputs) for basis in bases)
     # The inputs are standardised first, because the run's decoder may have other inputs, or statistics of earlier steps.
     statistics = fold_episodes(empty, buffer, buffer.oldest, _observe, config)
     states = tuple(init_explanation(team, basis) for team, basis in zip(statistics, bases, strict=True))
     states = fold_episodes(states, buffer, buffer.oldest, add_to_explanation, config)
-    return [explain_returns(state, mean.astype(int)) for state, mean in zip(states, is_mean, strict=True)]
+    return [explain_returns(state, mean.astype(int)) for state, mean in zip(states, is_average, strict=True)]
 
 
 def _observe(statistics: RunningMeanStd, episodes: CreditBatch) -> RunningMeanStd:

@@ -46,6 +46,7 @@ def run_session(session: Session, listeners: Sequence[Listener], stop: threading
     run, settings = session.run, session.settings
     clock, explained, saved_at = Clock(session.step), False, time.monotonic()
     returns: list[np.ndarray] = []
+    evaluated_at: list[float] = []
     session.collector.watch(_limit_rate(lambda step: [listener.on_step(step) for listener in listeners]), stop.is_set)
 
     def say(lines: Iterable[str]) -> None:
@@ -70,13 +71,17 @@ def run_session(session: Session, listeners: Sequence[Listener], stop: threading
                 session.save()
                 saved_at = time.monotonic()
             continue
+        began_at = time.monotonic()
         lines = _evaluate(session, clock.measure_rate(session.step))
         saved_at = time.monotonic()
+        evaluated_at.append(saved_at)
         for listener in listeners:
             listener.on_evaluation(lines)
         if "critic/loss" in lines[0]:
             returns.append(np.array([line[RETURN] for line in lines]))
             report(advice.find_constant_returns(returns))
+        if len(evaluated_at) == 2:  # the first one compiles the policy
+            report(advice.find_slow_evaluations(settings, saved_at - began_at, saved_at - evaluated_at[0]))
         if is_last or not explained:
             sentences = _explain(session)
             say(sentences)

@@ -92,7 +92,7 @@ def _rollout(learner: Learner, steps: Trajectory, config: TrainConfig) -> Rollou
     def for_each_agent(values: Array) -> Float[Array, "time envs agents"]:
         return jnp.broadcast_to(values[..., None], (*values.shape, n_agents)).astype(jnp.float32)
 
-    # Without a discount, the value after a time limit is not finite. The episode's value is then its return up to the limit.
+    # With gamma = 1, a time limit counts as an end: the critic learns the return up to it.
     gamma = getattr(config.hyperparameters, "gamma", 1)
     terminated = for_each_agent(jnp.asarray(steps.next_timestep.terminated if gamma < 1 else steps.ended))
     done = for_each_agent(jnp.asarray(steps.ended))

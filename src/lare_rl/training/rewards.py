@@ -17,7 +17,9 @@ from lare_rl.training.static_config import TrainConfig
 __all__ = ["assess", "rewards", "team_metrics", "team_proxy_rewards"]
 
 
-def rewards(steps: StoredSteps, state: tuple[RewardSource, ...], config: TrainConfig) -> Float[Array, "*batch agents"]:
+def rewards(
+    steps: StoredSteps, sources: tuple[RewardSource, ...], config: TrainConfig
+) -> Float[Array, "*batch agents"]:
     """Return the rewards that the algorithm is trained on, for each agent, by `Learner.reward_state`."""
     alive = alive_agents(steps, config)
     team_rewards = []
@@ -25,22 +27,22 @@ def rewards(steps: StoredSteps, state: tuple[RewardSource, ...], config: TrainCo
         team_alive = alive[..., team.agents]
         if config.method.has_proxy_rewards:
             batch, spec = step_batch(steps, config, i), config.credit_specs[i]
-            team_rewards.append(engine.training_rewards(state[i], batch, spec, team_alive))
+            team_rewards.append(engine.training_rewards(sources[i], batch, spec, team_alive))
             continue
         is_dense = config.method.reward is Reward.TRUE
         reward = steps.columns["reward"][..., team.agents] if is_dense else steps.episodic_reward[..., i, None]
         reward = jnp.broadcast_to(reward, team_alive.shape)
-        scale = engine.return_scale(state[i])
+        scale = engine.return_scale(sources[i])
         team_rewards.append(engine.scale_and_mask(reward, scale, team_alive, scale_rewards=config.scale_rewards))
     return jnp.concatenate(team_rewards, axis=-1)
 
 
 def team_proxy_rewards(
-    steps: StoredSteps, state: tuple[RewardSource, ...], config: TrainConfig, team_index: int
+    steps: StoredSteps, sources: tuple[RewardSource, ...], config: TrainConfig, team_index: int
 ) -> Float[Array, "*batch rows"]:
     """Return r_hat of a team, without optimism: one for each of its agents, or one for all if credit goes to whole teams."""
     batch, spec = step_batch(steps, config, team_index), config.credit_specs[team_index]
-    return engine.proxy_rewards(state[team_index], batch, spec)
+    return engine.proxy_rewards(sources[team_index], batch, spec)
 
 
 def assess(learner: Learner, config: TrainConfig) -> dict[str, Float[Array, ""]]:
@@ -72,7 +74,7 @@ def assess(learner: Learner, config: TrainConfig) -> dict[str, Float[Array, ""]]
             metrics[-1]["credit/return_r2"] = prequential.r2(decoder.predictions)[0]
             metrics[-1]["credit/gain"], metrics[-1]["credit/gain_error"] = prequential.gain(decoder.predictions)
             if decoder.score_type_predictions is not None:
-                metrics[-1]["credit/average"] = decoder.is_mean.astype(jnp.float32)
+                metrics[-1]["credit/average"] = decoder.is_average.astype(jnp.float32)
                 metrics[-1]["credit/log_odds"] = decoder.is_log_odds.astype(jnp.float32)
     return team_metrics(metrics, config)
 

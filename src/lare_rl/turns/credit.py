@@ -2,12 +2,12 @@
 
 from collections.abc import Iterable
 from dataclasses import dataclass
-from functools import cache, partial
+from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Float
-from threadpoolctl import ThreadpoolController
+from threadpoolctl import threadpool_limits
 
 from lare_rl.errors import LareError, short_repr
 from lare_rl.turns import trust as trust_rules
@@ -157,7 +157,7 @@ class TurnCredit:
         if self.logistic and not np.all((table.outcome >= 0) & (table.outcome <= 1)):
             raise LareError("logistic values need outcomes between 0 and 1: use logistic=False, or scale the outcomes")
         # The matrices are small: several threads would mostly wait for each other (`util/float64.py`).
-        with _linear_algebra_libraries().limit(limits=1, user_api="blas"):
+        with threadpool_limits(limits=1, user_api="blas"):
             return self._assign(table)
 
     def _assign(self, table: TurnTable) -> CreditedTurns:
@@ -187,11 +187,6 @@ class TurnCredit:
             effects=_describe_effects(table, prefixes, fit),
             reason=reason,
         )
-
-
-@cache
-def _linear_algebra_libraries() -> ThreadpoolController:
-    return ThreadpoolController()
 
 
 def _describe_effects(table: TurnTable, prefixes: Prefixes, fit: PrefixFit) -> tuple[FeatureEffect, ...]:

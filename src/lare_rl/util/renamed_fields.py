@@ -16,7 +16,8 @@ _RENAMED_OPTIONS = {"--judges": "--scored-observation", "--credit.drawn-steps": 
 """From old to new options of the command line."""
 
 _RENAMED_FIELDS = {
-    "average": "is_mean",
+    "average": "is_average",
+    "is_mean": "is_average",
     "closed": "closed_form",
     "counted": "n_learned",
     "credit": "decoders",
@@ -79,7 +80,7 @@ def rename_options(arguments: Sequence[str]) -> list[str]:
 
 
 def rename_fields(name: str) -> str:
-    """Return the present name of an array: the fields of a state, such as `.decoders[0].is_mean` for `.credit[0].average`."""
+    """Return the present name of an array: the fields of a state, such as `.decoders[0].is_average` for `.credit[0].average`."""
     name = re.sub(r"(?<=\.)\w+", lambda match: _RENAMED_FIELDS.get(match.group(), match.group()), name)
     for pattern, new in _RENAMED_PATHS.items():
         name = re.sub(pattern, new, name)
