@@ -12,7 +12,7 @@ from PIL import Image
 
 import lare_rl
 from helpers.toy_envs import Chase, levels_spec, pick_spec, toy_spec
-from lare_rl.cli.runs import _describe_evaluation
+from lare_rl.cli.runs import _compare_actions, _describe_evaluation
 from lare_rl.envs.families import make_host_env, register_family
 from lare_rl.envs.gymnasium_env import GymnasiumEnv
 from lare_rl.envs.load import load_task
@@ -212,6 +212,26 @@ def test_random_actions_play_the_same_groups(small, tmp_path, command):
     evaluation = evaluate_policy(replace_task(run, by_turns), 3)
     lines = list(_describe_evaluation(replace_task(run, by_turns), evaluation, play_random(by_turns, 3), None))
     assert lines[-1].startswith("random actions played other groups (level)")
+
+
+def test_evaluate_in_another_environment(run, command):
+    status, out, err = command("evaluate", run.directory, "--episodes", 2, "--environment", "toys/Chase-v0")
+    assert (status, err) == (0, "")
+    assert out.splitlines()[0] == "in toys/Chase-v0 (training was in toys/FilmedChase-v0):"
+    assert evaluate_run(run, 2, environment="toys/Chase-v0")["Chase"].shape == (2, 2)
+    for name in ("toys/Missing-v0", "other:Chase-v0"):
+        with pytest.raises(LareError, match=name):
+            evaluate_run(run, environment=name)
+
+
+@pytest.mark.parametrize(("gain", "text"), [(1.0, "better"), (-1.0, "worse"), (0.0, None)])
+def test_the_better_actions_are_named(run, gain, text):
+    sampled = evaluate_policy(run, 3)
+    noise = np.random.default_rng(0).normal(size=sampled.returns.shape)
+    likeliest = sampled._replace(returns=sampled.returns + 100 * gain + noise - noise.mean())
+    lines = list(_compare_actions(run, sampled, likeliest))
+    assert len(lines) == (text is not None)
+    assert all(text in line for line in lines)
 
 
 def test_film_of_many_agents_on_the_host_is_refused_before_they_play(run, tmp_path, monkeypatch):

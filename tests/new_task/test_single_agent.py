@@ -120,6 +120,7 @@ def test_rewards_are_removed(tmp_path):
         "You get a reward of 1 for each catch.",
         '0: guess a \\o/ """; no cost',
     )
+    assert all(f"\n#   {text}\n" in draft.toml for text in draft.removed)
     assert "2 sentences or rows" in draft.toml
     assert draft.unused_sections == ("rewards",)
 

@@ -85,6 +85,7 @@ def test_bars_have_sides():
     assert bars == [("plus", "50.0", "50.0"), ("minus", "25.0", "25.0")]
     assert "90%" in html
     assert "<i" not in draw_bars([Bar("speed", "f", 0.001, 1, "")])
+    assert '<span class="amount">-45%</span>' in draw_bars([Bar("offsets", "f", -0.45, 1, "")])
     only_right = draw_bars([Bar("speed", "f", 0.9, 1, "")])
     assert "left:0.0%;width:100.0%" in only_right
 

@@ -170,14 +170,26 @@ def test_extend_equals_longer_run(dense, dense_run, tmp_path, monkeypatch):
     assert open_run(run.directory).config == longer.config
 
 
-@pytest.mark.parametrize(
-    ("steps", "message"), [(228, "steps = 228.*only be increased"), (242, "steps = 242.*240 or 252")]
-)
-def test_extend_refuses(steps, message, dense_run, tmp_path):
+def test_extend_refuses_fewer_steps(dense_run, tmp_path):
     run = copy_run(dense_run, tmp_path / "run")
-    with pytest.raises(LareError, match=message):
-        resume_quietly(run, steps=steps)
+    with pytest.raises(LareError, match=r"steps = 228.*only be increased"):
+        resume_quietly(run, steps=228)
     assert open_run(run.directory).config == run.config
+
+
+@pytest.mark.parametrize("anneal", [True, False])
+def test_extending_a_run_whose_learning_rate_fell_is_no_long_run(small, tmp_path, anneal):
+    """Steps are rounded up, and a message says so."""
+    ppo = {"hidden": (8,), "minibatch_size": 20, "epochs": 1, "anneal": anneal}
+    settings = small(method="dense", algorithm="ppo", steps=40, rollout_steps=20, evaluate_every=20, ppo=ppo)
+    run = train_quietly(CHASE, settings, tmp_path / "run")
+    listener = AtStep(0, lambda: None)
+    lare_rl.resume(run, steps=70, listeners=[listener])
+    assert open_run(run.directory).config.settings.steps == 80
+    assert sum("steps = 70 is rounded up to 80" in message for message in listener.messages) == 1
+    assert (
+        sum("ppo.anneal" in message and "0%" in message and "50%" in message for message in listener.messages) == anneal
+    )
 
 
 def test_dropped_episodes(dense, tmp_path):

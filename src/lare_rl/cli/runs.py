@@ -29,7 +29,12 @@ if TYPE_CHECKING:
 
 
 def evaluate(
-    run: RunDirectory, episodes: int = 10, best: bool = False, deterministic: bool = False, video: Path | None = None
+    run: RunDirectory,
+    episodes: int = 10,
+    best: bool = False,
+    deterministic: bool = False,
+    environment: str | None = None,
+    video: Path | None = None,
 ) -> None:
     """Evaluate the policy of a run by its true return, from initial states that no evaluation of the run has used.
 
@@ -43,6 +48,8 @@ def evaluate(
         episodes: number of episodes for each seed. Policies act as in training's evaluations.
         best: play the policy of each seed's best evaluation, instead of the last policy.
         deterministic: always take the most likely action, where training's evaluations sample it (ppo with choices, ippo).
+        environment: play in this environment, of the same module and with the same sizes (other maps, years or demand). By default
+            that of the run's evaluations.
         video: a .gif to write of one episode of the first seed (.mp4 with the extra lare-rl[video]).
     """
     from lare_rl.algorithms.registry import ALGORITHMS
@@ -52,6 +59,7 @@ def evaluate(
         RANDOM_PLAY_LIMIT_S,
         evaluate_policy,
         evaluation_seeds,
+        move_evaluations,
         play_random,
     )
     from lare_rl.evaluation.video import check_video_path, record_video
@@ -59,7 +67,7 @@ def evaluate(
     from lare_rl.training.explain import explain_run
     from lare_rl.training.saved_state import load_actor
 
-    opened = open_run(run)
+    opened = move_evaluations(open_run(run), environment)
     task, settings = opened.config.task, opened.config.settings
     env_spec = load_env_spec(task)
     if video is not None:
@@ -87,6 +95,8 @@ def evaluate(
             "The policy samples its actions, as in training. The most likely ones (--deterministic), from the same states:"
         )
         for line in _describe_returns(opened, likeliest, best_steps):
+            print_line(line)
+        for line in _compare_actions(opened, evaluation, likeliest):
             print_line(line)
     if explanation := explain_run(opened):
         print_line(f"Credit, judged on the stored training episodes of seed {opened.seeds[0]}:")
@@ -116,6 +126,21 @@ def _describe_returns(run: "Run", evaluation: "Evaluation", best_steps: "Sequenc
             yield line
 
 
+def _compare_actions(run: "Run", sampled: "Evaluation", likeliest: "Evaluation") -> Iterator[str]:
+    """Say which actions are better, if that is clear. Both evaluations play from the same initial states."""
+    import numpy as np
+
+    from lare_rl.evaluation.evaluate import gain_over_random
+    from lare_rl.report.score_use import CLEAR_ERRORS
+    from lare_rl.util.statistics import format_plus_minus
+
+    for i, role in enumerate(run.config.task.roles):
+        gain = gain_over_random((likeliest.returns - sampled.returns)[:, :, i], np.zeros(2))
+        if gain is not None and abs(gain[0]) > CLEAR_ERRORS * gain[1]:
+            verdict = "better: use deterministic=True in load_policy" if gain[0] > 0 else "worse: let the policy sample"
+            yield f"{role.name}: the most likely actions are {verdict} ({format_plus_minus(*gain)})"
+
+
 def _describe_evaluation(
     run: "Run",
     evaluation: "Evaluation",
@@ -129,8 +154,11 @@ def _describe_evaluation(
     from lare_rl.util.findings import format_for_reader
     from lare_rl.util.statistics import format_mean_std, format_plus_minus
 
+    task = run.config.task
+    if task.evaluation_environment is not None:
+        yield f"in {task.evaluation_environment} (training was in {task.environment}):"
     yield from _describe_returns(run, evaluation, best_steps)
-    roles = run.config.task.roles
+    roles = task.roles
     for team_index, (role, episodes) in enumerate(zip(roles, random_episodes, strict=True)):
         if not episodes:
             continue
@@ -139,12 +167,12 @@ def _describe_evaluation(
         yield f"{team}random actions: return {format_mean_std(returns)} over {format_for_reader(len(returns), 'count episode')}"
         if (gain := gain_over_random(evaluation.returns[:, :, team_index], returns)) is not None:
             yield f"{team}difference: {format_plus_minus(*gain)} (± is its standard error)"
-    if (group := run.config.task.group) is not None and random_episodes[0]:
+    if (group := task.group) is not None and random_episodes[0]:
         groups = Counter(np.asarray(evaluation.measures[group]).ravel().tolist())
         random_groups = Counter(episode.measures[group] for episode in random_episodes[0])
         if any(groups[name] * random_groups.total() != count * groups.total() for name, count in random_groups.items()):
             yield f"random actions played other groups ({group}), or in other shares, which is a part of the difference"
-    for name, seed_values in evaluation.drop_group(run.config.task).measures.items():
+    for name, seed_values in evaluation.drop_group(task).measures.items():
         for seed, values in zip(run.seeds, seed_values, strict=True):
             yield f"seed {seed}: {name} {format_mean_std(values)}"
         if random_episodes[0]:

@@ -4,7 +4,7 @@ from typing import Any
 
 from lare_rl.algorithms.registry import ALGORITHMS, Algorithm, Consumes
 from lare_rl.config.effective import needs_replay, unused_names
-from lare_rl.config.settings import ResolvedSettings, Settings
+from lare_rl.config.settings import ResolvedSettings, Settings, round_up
 from lare_rl.config.validity import check_credit
 from lare_rl.credit.decoder_settings import MULTI_AGENT_CREDIT, RECENT_STEPS, CreditSettings
 from lare_rl.credit.methods import find_method
@@ -16,12 +16,15 @@ from lare_rl.tasks.spec import TaskSpec
 
 __all__ = ["choose_algorithm", "fill_in", "replay_rows", "resolve"]
 
+MIN_EVALUATIONS = 5
+"""Evaluations of a short run of PPO, by default."""
+
 
 def resolve(settings: Settings, task: TaskSpec) -> ResolvedSettings:
     """Fill in the settings that are None, by the task, and check all settings.
 
     Raises:
-        LareError: method, algorithm and task do not go together, or the steps are not a multiple of an iteration's.
+        LareError: method, algorithm and task do not go together.
     """
     if task.team is not None:
         raise LareError(f"{task.name} is one team of {task.environment}: train the task that has both")
@@ -56,7 +59,7 @@ def resolve(settings: Settings, task: TaskSpec) -> ResolvedSettings:
 
 
 def fill_in(settings: Settings, task: TaskSpec, env: EnvSpec) -> ResolvedSettings:
-    """Fill in the settings that are None. Raises `LareError` if the steps are not a multiple of an iteration's."""
+    """Fill in the settings that are None. `steps` and `evaluate_every` are rounded up to whole iterations."""
     return _normalise(_apply_defaults(settings, env), task, env)
 
 
@@ -82,9 +85,12 @@ def _apply_defaults(settings: Settings, env: EnvSpec) -> ResolvedSettings:
         **row.run_defaults(env, settings.environments or 0),
     }
     iteration = (settings.rollout_steps or defaults["rollout_steps"]) * defaults["environments"]
-    for name, iterations in (("steps", "steps_iterations"), ("evaluate_every", "evaluate_iterations")):
-        n_iterations = defaults.pop(iterations, None) or max(1, round(defaults[name] / iteration))
-        defaults[name] = n_iterations * iteration
+    n_iterations = defaults.pop("steps_iterations", None) or max(1, round(defaults["steps"] / iteration))
+    defaults["steps"] = round_up(settings.steps or n_iterations * iteration, iteration)
+    n_iterations = defaults.pop("evaluate_iterations", None) or max(1, round(defaults["evaluate_every"] / iteration))
+    if row.consumes is Consumes.ROLLOUTS:
+        n_iterations = min(n_iterations, max(1, defaults["steps"] // (MIN_EVALUATIONS * iteration)))
+    defaults["evaluate_every"] = round_up(settings.evaluate_every or n_iterations * iteration, iteration)
     method = find_method(settings.method or defaults["method"])
     if method.fit is not None and method.fit.separate:
         defaults["fit_updates"] = max(1, iteration // 50)
@@ -99,7 +105,8 @@ def _apply_defaults(settings: Settings, env: EnvSpec) -> ResolvedSettings:
         "hyperparameters": getattr(settings, algorithm, row.settings),  # one that was registered late has no field
         "credit": credit.model_copy(update=defaults["credit"] | set_credit),
     }
-    return ResolvedSettings(**{**defaults, **set_values, **decided})
+    rounded = {name: defaults[name] for name in ("steps", "evaluate_every")}
+    return ResolvedSettings(**{**defaults, **set_values, **decided, **rounded})
 
 
 def _normalise(resolved: ResolvedSettings, task: TaskSpec, env: EnvSpec) -> ResolvedSettings:

@@ -1,5 +1,6 @@
 """The settings of a run: `Settings`, as a user gives them, and `ResolvedSettings`, in which every value is decided."""
 
+import math
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Annotated, Any, Generic, Literal, Never, TypeVar
 
@@ -12,7 +13,7 @@ from lare_rl.errors import CheckedModel
 from lare_rl.llm.prompts import N_CANDIDATES
 from lare_rl.tasks.spec import ScoredObservation, TaskSpec
 
-__all__ = ["ResolvedSettings", "Settings"]
+__all__ = ["ResolvedSettings", "Settings", "round_up"]
 
 MAX_SEED = 2**31 - 1
 MAX_SEEDS = 1000
@@ -127,6 +128,11 @@ class Settings(create_model("Settings", __base__=_Settings, __module__=__name__,
         def __init__(self, **values: Any) -> None: ...
 
 
+def round_up(steps: int, iteration_steps: int) -> int:
+    """Return the steps of whole iterations."""
+    return math.ceil(steps / iteration_steps) * iteration_steps
+
+
 class ResolvedSettings(_RunSettings[Never]):
     """The settings that a run uses. No value is open, except for `scored_observation`, which the task then decides."""
 
@@ -145,18 +151,11 @@ class ResolvedSettings(_RunSettings[Never]):
 
     @model_validator(mode="after")
     def _check_multiples(self) -> "ResolvedSettings":
-        problems = []
         for name in ("steps", "evaluate_every"):
-            steps = getattr(self, name)
-            if remainder := steps % self.iteration_steps:
-                lower, upper = steps - remainder, steps - remainder + self.iteration_steps
-                iteration = f"rollout_steps = {self.rollout_steps}"
-                if self.environments > 1:
-                    iteration = f"{self.iteration_steps} ({iteration} of environments = {self.environments})"
-                numbers = f"{lower} or {upper}" if lower else f"{upper}"
-                problems.append(f"{name} = {steps} is not a multiple of {iteration}: use {numbers}")
-        if problems:
-            raise ValueError("; ".join(problems))
+            if getattr(self, name) % self.iteration_steps:
+                raise ValueError(
+                    f"{name} = {getattr(self, name)} is not a multiple of an iteration's {self.iteration_steps} steps"
+                )
         return self
 
     @property

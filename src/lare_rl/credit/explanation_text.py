@@ -80,7 +80,8 @@ MESSAGES = {
     ),
     "about_factors": (
         "For each factor: its share of the variation (0%: it does not matter, or its mean hardly differed between episodes; below "
-        "0%: it offsets others), and by how much a step's reward rises with one standard deviation of it:"
+        "0%: it offsets others), and its effect: by how much a step's reward rises with one standard deviation of it. A factor with "
+        "a share of 0% may still tell steps apart:"
     ),
     "unknown_factor": "- {name}: {effect}",
     "factor": "- {name}: {share:z.0%}, {effect}{states}{shape}",

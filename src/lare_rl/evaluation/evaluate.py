@@ -18,7 +18,7 @@ from lare_rl.envs.play import Episode, EpisodeListener, play_roles
 from lare_rl.errors import LareError, check_count
 from lare_rl.runs.directory import Run, as_run
 from lare_rl.tasks.spec import TaskSpec
-from lare_rl.tasks.trust import untrusted_module
+from lare_rl.tasks.trust import trust_environment, untrusted_module
 from lare_rl.training.collect_device import DeviceCollector
 from lare_rl.training.evaluate_host import evaluate_policy_on_host
 from lare_rl.training.evaluation import Evaluation, concatenate
@@ -34,6 +34,7 @@ __all__ = [
     "evaluation_seeds",
     "gain_over_random",
     "measure_random_returns",
+    "move_evaluations",
     "play_random",
 ]
 
@@ -48,7 +49,11 @@ RANDOM_PLAY_LIMIT_S, MAX_RANDOM_PLAY_S = 5.0, 120.0
 
 
 def evaluate_run(
-    run: Run | str | Path, episodes: int = 10, best: bool = False, deterministic: bool = False
+    run: Run | str | Path,
+    episodes: int = 10,
+    best: bool = False,
+    deterministic: bool = False,
+    environment: str | None = None,
 ) -> dict[str, Float[np.ndarray, "seeds episodes"]]:
     """Return true returns by the name of the team. The name of a single team is the name of the task.
 
@@ -60,13 +65,26 @@ def evaluate_run(
         episodes: the number of episodes of each seed.
         best: play the policy of each seed's best evaluation, instead of the last policy.
         deterministic: always take the most likely action, where evaluations sample it.
+        environment: play in this environment, of the same module and with the same sizes. The default is that of the run's evaluations.
 
     Raises:
         LareError: the run has no checkpoint, or the task's environment has changed.
     """
-    run = as_run(run)
+    run = move_evaluations(as_run(run), environment)
     returns = evaluate_policy(run, episodes, best, deterministic).returns
     return {role.name: returns[..., team_index] for team_index, role in enumerate(run.config.task.roles)}
+
+
+def move_evaluations(run: Run, environment: str | None) -> Run:
+    """Return the run with its evaluations in another environment. Raise `LareError` if that cannot be; None changes nothing."""
+    if environment is None:
+        return run
+    task = run.config.task
+    if load_env_spec(task).is_jax:
+        raise LareError(f"{task.name}: only environments on the host can be evaluated in another environment")
+    task = TaskSpec(**task.model_dump() | {"evaluation_environment": environment})
+    trust_environment(task)
+    return replace(run, config=run.config.model_copy(update={"task": task}))
 
 
 def evaluate_policy(

@@ -51,7 +51,8 @@ def candidate(task: TaskSpec, kind: FunctionKind = "factors") -> list[Message]:
     for key in ("description", "observation", "action"):
         if FILL_IN in getattr(task, key):
             raise LareError(
-                f"task {task.name!r}: {key} still says {FILL_IN!r}. Replace it by what a language model must know."
+                f"task {task.name!r}: {key} still says {FILL_IN!r}. Replace it by what a language model must know; a phi of your own "
+                "(--function) and --method bayes need no texts."
             )
     sections = (("Task", task.description), ("Observation", task.observation), ("Action", task.action))
     user = "\n\n".join(f"# {title}\n{text.strip()}" for title, text in sections)

@@ -87,7 +87,8 @@ def warning_lines(
     return [
         f"# A first draft, from {origin}. Read it before you use it: a language model will",
         "# know only these texts.",
-        *([f"# Left out on purpose: {count} with words such as reward, cost or score."] if removed else []),
+        *([f"# Left out on purpose: {count} with words such as reward, cost or score:"] if removed else []),
+        *(f"#   {' '.join(text.split())}" for text in removed),
         *([f"# Sections that were not used: {', '.join(unused)}."] if unused else []),
         "# Take out every sentence that still reveals the reward. Describe the goal, not how it is rewarded.",
     ]

@@ -179,7 +179,11 @@ def _check_factors(factors: object, max_factors: int) -> list[int]:
         raise RefusedError("E-FORM", f"{FUNCTION_NAME} must return {most}, not {len(factors)}")
     for number, factor in enumerate(factors, start=1):
         if not isinstance(factor, Array) or factor.batch_axis != 0 or factor.row_shape != (1, 1):
-            hint = ": write x[:, None]" if isinstance(factor, Array) and factor.row_shape == (1,) else ""
+            hint = (
+                ": write x[:, None], or keepdims=True in a sum"
+                if isinstance(factor, Array) and factor.row_shape == (1,)
+                else ""
+            )
             raise RefusedError(
                 "E-FORM", f"factor {number} must be an array of the shape (batch, 1), not {_describe(factor)}{hint}"
             )

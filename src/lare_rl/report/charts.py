@@ -164,7 +164,7 @@ class Chart:
 
 @dataclass(frozen=True)
 class Bar:
-    """A bar with a sign: its length is `amount`, to the right for a sign of 1 and to the left for -1. A sign of 0 has no side."""
+    """A bar of the length |amount|, to the right for a sign of 1 and to the left for -1. A sign of 0 has no side."""
 
     text: str
     name: str
@@ -189,10 +189,11 @@ def draw_legend(entries: Iterable[tuple[str, str]]) -> str:
 
 def draw_bars(bars: Sequence[Bar]) -> str:
     """Draw bars below each other, with their amounts as percentages."""
-    longest, has_left = max([bar.amount for bar in bars] + [1e-9]), any(bar.sign < 0 and bar.amount for bar in bars)
+    longest = max([abs(bar.amount) for bar in bars] + [1e-9])
+    has_left = any(bar.sign < 0 and bar.amount for bar in bars)
     items = []
     for bar in bars:
-        width = max(0.0, bar.amount) / longest * (50 if has_left else 100)
+        width = abs(bar.amount) / longest * (50 if has_left else 100)
         start = (50 - width if bar.sign < 0 else 50) if has_left else 0
         side = "minus" if bar.sign < 0 else "plus"
         shape = (
@@ -200,7 +201,7 @@ def draw_bars(bars: Sequence[Bar]) -> str:
         )
         items.append(
             f'<li title="{escape(bar.hover)}"><span class="meaning">{escape(bar.text)} <code>{escape(bar.name)}</code></span>'
-            f'<span class="track{" both" if has_left else ""}">{shape}</span><span class="amount">{bar.amount:.0%}</span></li>'
+            f'<span class="track{" both" if has_left else ""}">{shape}</span><span class="amount">{bar.amount:z.0%}</span></li>'
         )
     return f'<ul class="bars">{"".join(items)}</ul>'
 

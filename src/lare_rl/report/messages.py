@@ -136,7 +136,9 @@ MESSAGES = {
     "repeats_behaviour": (
         "it repeats one behaviour: the last {n_evaluations} returns of a seed hardly differ, but the returns of random actions do"
     ),
-    "needs_training": "{limit}Next: {evaluate}more `--steps`, or another `--algorithm` (`lare-rl algorithms`).{phi}",
+    "needs_training": (
+        "{limit}Next: {evaluate}more `--steps` (`lare-rl train --resume`), or another `--algorithm` (`lare-rl algorithms`).{phi}"
+    ),
     "algorithm_is_limit": (
         "The proxy rewards predict returns well, so the algorithm, or the number of steps, may be the limit{agents}{rule}. "
     ),
@@ -147,7 +149,10 @@ MESSAGES = {
         " If state and action have more than {n_features} entries together, a score that depends on products of them, such as price "
         "times power, needs a phi (`lare-rl prompt`)."
     ),
-    "needs_baseline": "Next: better than random actions may be far from good: compare it with a rule of your own.{best}",
+    "needs_baseline": (
+        "Next: better than random actions may be far from good: compare it with a rule of your own "
+        "(docs/how-to/poor-policies.md).{best}"
+    ),
     "best_evaluation": (
         " The best evaluation was {return_:score}, at step {step:,}: `lare-rl evaluate {directory} --best` plays its policy on other "
         "episodes."

@@ -163,7 +163,7 @@ def _render_earnings(run: Run, correlations: Sequence[Float[np.ndarray, " factor
     if any(explanations):
         yield '<h2>What earned the score<a class="why" href="#share" title="What is a share?">?</a></h2>'
         source = explanation_source(run)
-        text = "A bar is the share of the differences between returns that a factor explains."
+        text = "A bar is the share of the differences between returns that a factor explains. A negative share offsets other factors."
         yield render_note(f"{text} {source}." if source else text)
     yield from sections
 
@@ -180,7 +180,7 @@ def _make_bar(finding: Finding, meanings: Mapping[str, str]) -> Bar:
     return Bar(
         meaning[:1].upper() + meaning[1:],
         name,
-        abs(share),
+        share,
         int(np.sign(slope)) if round(100 * share) else 0,
         _sentence(finding),
     )
@@ -311,7 +311,12 @@ def _to_text(value: Any) -> str:
 
 
 def describe_method(run: Run) -> str:
-    """Return what the run's method does, and its source."""
-    method = find_method(run.config.settings.method)
+    """Return what the run's method does, its source, and where policies are evaluated, if it is elsewhere."""
+    method, task = find_method(run.config.settings.method), run.config.task
     source = "" if method.source == "-" else f" Source: {method.source}."
-    return f"{method.summary[0].upper()}{method.summary[1:]}.{source}"
+    place = (
+        f" Trained in {task.environment}, evaluated in {task.evaluation_environment}."
+        if task.evaluation_environment
+        else ""
+    )
+    return f"{method.summary[0].upper()}{method.summary[1:]}.{source}{place}"

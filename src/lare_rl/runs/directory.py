@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any
 from uuid import uuid4
 
-from lare_rl.config.settings import ResolvedSettings
+from lare_rl.config.settings import ResolvedSettings, round_up
 from lare_rl.errors import LareError, short_repr
 from lare_rl.latent.function import LatentFunction, pair_with_roles
 from lare_rl.latent.saved import load_function, read_source
@@ -124,12 +124,13 @@ def create_run(directory: Path, task: TaskSpec, settings: ResolvedSettings, func
 
 
 def extend_run(run: Run, steps: int) -> Run:
-    """Return the run with a larger number of steps, which is written to config.json.
+    """Return the run with a larger number of steps, rounded up to whole iterations. It is written to config.json.
 
     Raises:
-        LareError: the number is smaller than before, or not a multiple of an iteration's steps.
+        LareError: the number is smaller than before.
     """
     settings = run.config.settings
+    steps = round_up(steps, settings.iteration_steps)
     if steps == settings.steps:
         return run
     if steps < settings.steps:

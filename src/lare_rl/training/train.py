@@ -6,7 +6,7 @@ from pathlib import Path
 
 from lare_rl.config.effective import unused_settings, warmup_warning
 from lare_rl.config.resolve import resolve
-from lare_rl.config.settings import Settings
+from lare_rl.config.settings import ResolvedSettings, Settings
 from lare_rl.envs.load import resolve_task
 from lare_rl.envs.workers import close_idle_workers
 from lare_rl.errors import LareError, short_repr
@@ -58,6 +58,7 @@ def train(
     run = create_run(Path(out) if out is not None else default_directory(task, resolved), task, resolved, functions)
     unused = list(unused_settings(settings, resolved, task).values())
     messages = unused[:1] if len(unused) < 2 else [f"{unused[0]} (and {len(unused) - 1} more)"]
+    messages += _describe_rounding(resolved, steps=settings.steps, evaluate_every=settings.evaluate_every)
     with lock_run(run), report_full_memory(run), catch_stop_signals() as stop:
         return _train_from_start(run, tensorboard, listeners, stop, messages)
 
@@ -74,8 +75,8 @@ def resume(
     On the CPU, the metrics are the same, bit for bit, as those of a run that was never stopped (except the times).
 
     Args:
-        steps: a new number of environment steps of each seed, to extend the run. Schedules over the whole run (`ppo.anneal`)
-            then go by the new number.
+        steps: a new number of environment steps of each seed, to extend the run, rounded up to whole iterations. Schedules over the
+            whole run (`ppo.anneal`) then go by the new number.
         tensorboard: also write TensorBoard events. A run that has some always continues them.
         listeners: objects that receive the progress; the default is the terminal.
 
@@ -88,15 +89,40 @@ def resume(
     if tensorboard:
         import_summary_writer()
     with lock_run(run), report_full_memory(run), catch_stop_signals() as stop:
+        earlier_steps = run.config.settings.steps
         run = run if steps is None else extend_run(run, steps)
+        rounding = _describe_rounding(run.config.settings, steps=steps)
         if not run.has_checkpoint():
             if run.metrics():  # metrics are never removed
                 raise LareError(f"{run.directory} has no checkpoint any more: it cannot be resumed")
-            return _train_from_start(run, tensorboard, listeners, stop)
+            return _train_from_start(run, tensorboard, listeners, stop, rounding)
         _prepare(run, listeners)
         session, messages = restore_session(run)
         truncate_metrics(run.directory, session.metrics_bytes)
+        messages = [*rounding, *messages, *_describe_annealing(session, earlier_steps)]
         return _finish(session, tensorboard, listeners, stop, messages)
+
+
+def _describe_rounding(resolved: ResolvedSettings, **requested: int | None) -> list[str]:
+    """Return a message about each number of steps that was rounded up to whole iterations."""
+    iteration = f"an iteration has {resolved.iteration_steps:,} steps (rollout_steps)"
+    return [
+        f"{name} = {steps:,} is rounded up to {rounded:,}: {iteration}"
+        for name, steps in requested.items()
+        if steps is not None and (rounded := getattr(resolved, name)) != steps
+    ]
+
+
+def _describe_annealing(session: Session, earlier_steps: int) -> list[str]:
+    """Return a message if a run is extended whose learning rate fell towards 0."""
+    settings, step = session.settings, session.step
+    if not (step and settings.steps > earlier_steps and getattr(settings.hyperparameters, "anneal", False)):
+        return []
+    return [
+        f"{settings.algorithm}.anneal: the learning rate had fallen to {max(0, 1 - step / earlier_steps):.0%} of its initial value, and "
+        f"falls again from {1 - step / settings.steps:.0%}, so the result is not that of one long run; a run that began with "
+        f"--{settings.algorithm}.no-anneal can be extended"
+    ]
 
 
 def _check_listeners(listeners: Sequence[Listener] | None) -> list[Listener]:
