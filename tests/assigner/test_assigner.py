@@ -1,5 +1,6 @@
 """`CreditAssigner`: it learns from the steps that it gets, and its rewards are those of the newest decoder."""
 
+import re
 import threading
 from dataclasses import fields
 
@@ -666,6 +667,10 @@ def test_must_not_credit_steps_for_the_level(method, tmp_path):
     credited = [abs(np.diff(credit.rewards(states, action, states))[0]) for credit in (grouped, blind)]
     assert credited[1] > 1.0
     assert credited[0] < 0.4 * credited[1]
+    (sentence,) = (line for line in grouped.explanation() if "in group easy" in line)
+    effects = {name: float(re.search(rf"([+-][\d.]+) in group {name}", sentence).group(1)) for name in names}
+    assert effects["easy"] - effects["hard"] == pytest.approx(20, abs=4)
+    assert effects["hard"] - effects["night"] == pytest.approx(20, abs=4)
     if method == "bayes":
         assert grouped.metrics()["credit/return_r2"] > 0.95
         grouped.save(tmp_path / "saved")

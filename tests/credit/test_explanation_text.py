@@ -21,6 +21,7 @@ NO_RESIDUAL = {"residual_correlation": np.zeros(2)}
 def explanation(**changes):
     values = {
         "n_episodes": 40,
+        "mean_length": 10,
         "explains_mean_reward": False,
         "total_r2": 0.97,
         "raw_feature_used": np.array([True, True]),
@@ -39,6 +40,15 @@ def explanation(**changes):
 
 def find(changes, factors=FACTORS, raw_features=(), score_type=None):
     return explanation_findings(explanation(**changes), score_type, factors, raw_features)
+
+
+def test_largest_groups_are_named():
+    effects = {f"map {i}": float(i) for i in range(11)}  # no episode was fitted to the first
+    findings = explanation_findings(explanation(), None, FACTORS, (), groups=effects)
+    (text,) = (render(finding, MESSAGES) for finding in findings if finding.code == "groups_differ")
+    assert all(f"+{i} in group map {i}" in text for i in range(3, 11))
+    assert "and 2 more" in text
+    assert "map 0" not in text
 
 
 ABOUT = "factors_explain about_factors"
@@ -140,8 +150,10 @@ def test_residual_values():
 
 
 ANYTHING = {
-    **dict.fromkeys(("share", "slope", "std", "correlation"), 0.5),
-    **dict.fromkeys(("this", "other", "target", "largest", "features", "name", "names", "raw", "effect"), "x"),
+    **dict.fromkeys(("share", "slope", "std", "correlation", "value"), 0.5),
+    **dict.fromkeys(
+        ("this", "other", "target", "largest", "features", "name", "names", "raw", "effect", "groups"), "x"
+    ),
     **dict.fromkeys(("n_episodes", "n_unused", "n_raw", "count"), 3),
     **dict.fromkeys(("more", "states", "shape", "before", "after", "scored_observation"), None),
 }

@@ -35,6 +35,7 @@ from lare_rl.assigner.step_rewards import StepRewards
 from lare_rl.assigner.store import Store
 from lare_rl.credit.decoder_settings import CreditSettings
 from lare_rl.credit.decoders import DECODERS
+from lare_rl.credit.decomposition import level_effects
 from lare_rl.credit.explanation_text import explanation_lines
 from lare_rl.credit.methods import Reward
 from lare_rl.credit.returns import estimate_score_type, looks_binary
@@ -332,12 +333,14 @@ class CreditAssigner:
                 return []
             decoder = self.learner.decoder
             assert decoder is not None
+            effects = level_effects(decoder, float(explanation.mean_length)).tolist()
             return explanation_lines(
                 explanation,
                 estimate_score_type(decoder),
                 [] if config.phi is None else config.phi.factor_columns(config.scored_observation),
                 config.raw_feature_names,
                 looks_binary=looks_binary(decoder, config.method),
+                groups=dict(zip(self.group_names, effects, strict=False)),
             )
 
     @property

@@ -58,6 +58,7 @@ __all__ = [
     "init",
     "is_normalised",
     "is_optimistic",
+    "level_effects",
     "level_returns",
     "normalise_inputs",
     "observe_returns",
@@ -238,6 +239,17 @@ def level_returns(
     per_step = ~(state.is_average | state.is_log_odds | state.closed_form.decoder.basis.prefixes)
     unit = jnp.where(per_step, length, 1)
     return start_value + state.closed_form.intercept[index][level] * unit
+
+
+def level_effects(state: DecoderState, mean_length: float) -> Float[Array, " levels"]:
+    """Return what an episode of each level and of this length returns beside its steps; empty without levels."""
+    n_levels = 0
+    if state.levels is not None:
+        n_levels = len(state.levels.mean)
+    elif state.closed_form is not None:
+        n_levels = state.closed_form.intercept.shape[-1]
+    length = jnp.full(n_levels, round(mean_length))
+    return level_returns(state, jnp.arange(n_levels), length) - level_returns(state, None, length)
 
 
 def is_normalised(state: DecoderState, settings: CreditSettings) -> bool:

@@ -60,6 +60,7 @@ class Explanation(NamedTuple):
     """The explanation of one team's returns."""
 
     n_episodes: Float[Array, ""]
+    mean_length: Float[Array, ""]
     explains_mean_reward: Bool[Array, ""]
     """Whether R/T is explained, not R: the score is a sum, and episodes differ in length."""
     total_r2: Float[Array, ""]
@@ -119,8 +120,10 @@ def explain(
         extended * basis.n_raw_paired,
     )
     no_factor = jnp.zeros(0)
+    mean_length = statistics.n_steps / jnp.maximum(statistics.n_episodes, 1)
     explanation = Explanation(
         n_episodes=statistics.n_episodes,
+        mean_length=mean_length,
         explains_mean_reward=(score_type == ScoreType.SUM) & _lengths_differ(statistics),
         total_r2=full.r2,
         raw_feature_used=_is_used(full, basis),
@@ -143,7 +146,6 @@ def explain(
     )
     root = evidence.posterior_covariance(factor_statistics, score_type, group_index, factors.posterior).root
     slope, slope_covariance, linear_share = _slopes(factors.posterior.weight, root.T @ root, step_statistics, basis)
-    mean_length = statistics.n_steps / jnp.maximum(statistics.n_episodes, 1)
     divisor = jnp.where(score_type == ScoreType.AVERAGE, mean_length, 1)  # r_hat of a mean is divided by T
     return explanation._replace(
         total_r2=jnp.maximum(full.r2, factors.r2),

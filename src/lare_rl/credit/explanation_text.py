@@ -1,6 +1,7 @@
 """What the returns say about the factors: how much they explain, which of them matter, and what may be missing."""
 
 from collections.abc import Mapping, Sequence
+from typing import Any
 
 import numpy as np
 
@@ -34,6 +35,8 @@ N_LARGEST = 3
 """The number of raw features that are named."""
 N_UNUSED = 12
 """The number of unused raw features that are named."""
+N_GROUPS = 8
+"""The number of groups of episodes that are named."""
 
 _SET_SCORE_TYPE = (
     'This may change. If you know which of them it is, set it: `score = "sum"` or `score = "average"` in the task file, '
@@ -65,6 +68,8 @@ MESSAGES = {
         "The last returns have only two values. If the score is won or lost, the odds often predict it better than a sum: set "
         '`score = "binary"` in the task file, `--credit.score`, or `CreditSettings(score=...)`.'
     ),
+    "groups_differ": "Beside what its steps earn, an episode returns: {groups}{more}. No step is paid for this.",
+    "group_effect": "{value:+.3g} in group {name}",
     "sum": "a sum",
     "mean": "an average",
     "returns": "the returns of {n_episodes:,} episodes",
@@ -145,9 +150,12 @@ def explanation_lines(
     raw_features: Sequence[str],
     *,
     looks_binary: bool = False,
+    groups: Mapping[Any, float] | None = None,
 ) -> list[str]:
     """Return the sentences of `explanation_findings`."""
-    findings = explanation_findings(explanation, score_type, factors, raw_features, looks_binary=looks_binary)
+    findings = explanation_findings(
+        explanation, score_type, factors, raw_features, looks_binary=looks_binary, groups=groups
+    )
     return [render(finding, MESSAGES) for finding in findings]
 
 
@@ -158,6 +166,7 @@ def explanation_findings(
     raw_features: Sequence[str],
     *,
     looks_binary: bool = False,
+    groups: Mapping[Any, float] | None = None,
 ) -> list[Finding]:
     """Return what an explanation says.
 
@@ -167,6 +176,7 @@ def explanation_findings(
         factors: names of the factors; empty for a method without factors.
         raw_features: names of the raw features; empty if they have none. Then nothing is said of single features.
         looks_binary: whether the score should be tried as one that is won or lost (`returns.looks_binary`).
+        groups: what an episode of each group returns beside its steps (`decomposition.level_effects`), by the group's name.
     """
     n_episodes, factors_r2 = int(explanation.n_episodes), float(explanation.factors_r2)
     if n_episodes < MIN_EXPLAINED_EPISODES:
@@ -177,6 +187,7 @@ def explanation_findings(
     largest = _largest_raw_features(explanation, raw_features)
     findings = [] if score_type is None else [_score_type(score_type)]
     findings += [Finding("looks_binary")] if looks_binary else []
+    findings += _groups(groups or {})
     if not factors:
         largest_features = Finding("largest", {"features": largest}) if largest else None
         values = {"share": float(explanation.total_r2), "target": target, "largest": largest_features}
@@ -194,6 +205,17 @@ def explanation_findings(
     if raw_features and factors_r2 < COMPLETE_SHARE:
         findings += _residual_findings(explanation, factors, raw_features)
     return findings + _unused_raw_features(explanation, raw_features)
+
+
+def _groups(effects: Mapping[Any, float]) -> list[Finding]:
+    """Report the groups whose episodes return more or less than their steps are paid for. No episode was fitted to the others."""
+    known = {name: effect for name, effect in effects.items() if effect}
+    largest = sorted(known, key=lambda name: -abs(known[name]))[:N_GROUPS]
+    if not largest:
+        return []
+    named = tuple(Finding("group_effect", {"name": str(name), "value": known[name]}) for name in largest)
+    more = Finding("more_names", {"count": len(known) - N_GROUPS}) if len(known) > N_GROUPS else None
+    return [Finding("groups_differ", {"groups": named, "more": more})]
 
 
 def _unused_raw_features(explanation: Explanation, names: Sequence[str]) -> list[Finding]:

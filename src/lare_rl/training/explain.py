@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Array, Bool
 
 from lare_rl.credit import returns
-from lare_rl.credit.decomposition import CreditBatch, valid_rows
+from lare_rl.credit.decomposition import CreditBatch, level_effects, valid_rows
 from lare_rl.credit.engine import add_to_explanation, explain_returns, init_explanation
 from lare_rl.credit.explanation import Explanation
 from lare_rl.credit.explanation_text import MESSAGES, MIN_EXPLAINED_EPISODES, explanation_findings
@@ -77,8 +77,11 @@ def _find_explanations(run: Run, learner: Learner, config: TrainConfig) -> list[
         raw_names = [] if config.team_level else specs[i].raw_feature_names(role.observation, role.action)
         decoder = select_seed(first_shard(learner.decoders[i]))
         score_type, looks_binary = returns.estimate_score_type(decoder), returns.looks_binary(decoder, config.method)
+        groups = dict(enumerate(level_effects(decoder, float(explanation.mean_length)).tolist()))
         findings.append(
-            explanation_findings(explanation, score_type, factor_names, raw_names, looks_binary=looks_binary)
+            explanation_findings(
+                explanation, score_type, factor_names, raw_names, looks_binary=looks_binary, groups=groups
+            )
         )
     return findings
 
