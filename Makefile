@@ -15,7 +15,7 @@ CREATE := $(PYTHON) -m venv $(VENV)
 INSTALL := $(BIN)/python -m pip install --quiet --no-compile $(PINS)
 endif
 
-.PHONY: demo test test-short test-long check docs site setup constraints clean
+.PHONY: demo test test-short test-families test-long check docs site setup constraints clean
 
 demo: $(VENV)/demo ## Train HalfCheetah on episodic rewards with recorded replies, draw the report, open it
 	@if [ -e $(DEMO) ]; then $(BIN)/lare-rl train --resume $(DEMO); \
@@ -31,6 +31,9 @@ test: check ## Lint, format, types, tests
 test-short: $(VENV)/test ## Some of the tests, with little installed
 	$(BIN)/python -m pytest -n 2 --dist worksteal tests/config tests/data tests/envs/test_gymnasium_env.py tests/envs/test_mujoco_warnings.py \
 		tests/latent tests/report tests/runs tests/test_cli.py tests/training/test_train.py
+
+test-families: $(VENV)/families ## The tests of gymnax and JaxMARL, which need an older Gymnasium: in a VENV of their own, with CONSTRAINTS=
+	$(BIN)/python -m pytest -n 2 --dist worksteal tests/envs/test_gymnax_env.py tests/envs/test_jaxmarl_env.py tests/envs/test_jax_families.py
 
 test-long: setup ## The tests that repeat others with further algorithms, methods and tasks
 	$(BIN)/python -m pytest -n 2 --dist worksteal -m long
@@ -60,6 +63,11 @@ $(VENV)/test: pyproject.toml $(CONSTRAINTS) | $(BIN)/python
 	$(INSTALL) 'pip>=25.1'
 	$(INSTALL) --editable . --group test
 	@touch $(VENV)/demo $@
+
+$(VENV)/families: pyproject.toml | $(BIN)/python
+	$(INSTALL) 'pip>=25.1'
+	$(INSTALL) --editable '.[gymnax,jaxmarl]' --group test
+	@touch $@
 
 $(VENV)/demo: pyproject.toml $(CONSTRAINTS) | $(BIN)/python
 	$(INSTALL) --editable '.[mujoco,report]'

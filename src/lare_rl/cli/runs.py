@@ -90,6 +90,8 @@ def evaluate(
     random_episodes = play_random(task, n_random, limit_s, EpisodeProgress(n_random), seeds)
     for line in _describe_evaluation(opened, evaluation, random_episodes, best_steps):
         print_line(line)
+    if 0 < len(random_episodes[0]) < n_random:
+        print_line(f"random actions ended after {len(random_episodes[0])} of {n_random} episodes, to save time")
     if likeliest is not None:
         print_line(
             "The policy samples its actions, as in training. The most likely ones (--deterministic), from the same states:"
