@@ -35,6 +35,8 @@ def resolve_named(task, settings):
         ("Reacher-v4", {"steps": 1000, "evaluate_every": 40}, ["evaluate_every = 40", "use 50"]),
         ("Reacher-v4", {"rollout_steps": 20, "steps": 20}, ["steps = 20", "50"]),
         ("CN-6", {"capacity": 6149, "method": "rd"}, ["capacity = 6149", "rollout", "6150"]),
+        ("CN-6", {"algorithm": "vdn", "vdn": {"monotonic": True}}, ["vdn.monotonic = True", "use --algorithm qmix"]),
+        ("CN-6", {"algorithm": "qmix", "qmix": {"monotonic": False}}, ["qmix.monotonic", "use --algorithm vdn"]),
         ("CN-6", {"algorithm": "qmix", "method": "rd", "capacity": 999}, ["capacity = 999", "iteration", "1000"]),
     ],
 )

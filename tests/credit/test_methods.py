@@ -102,4 +102,6 @@ def test_register_refuses(registered):
         register_method(Method("new", "mine", "this test", decoder="nothing"))
     with pytest.raises(LareError, match="whole_episodes"):
         Decoder("shares", lambda key, shape, settings: None, pays_shares=True)
+    with pytest.raises(LareError, match=r"decoder mine: settings = .*'temperature'.*: give a set of names of hidden, "):
+        Decoder("mine", "mine:init", settings=frozenset({"hidden", "temperature"}))
     register_method(METHODS["rd"])
