@@ -58,7 +58,9 @@ def test_register_algorithm_refuses_used_name():
 
 @pytest.mark.parametrize(("name", "base"), [("td3", "OffPolicySettings"), ("vdn", "QMIXSettings")])
 def test_settings_must_derive_from_those_of_the_loop(name, base):
-    with pytest.raises(LareError, match=f"algorithm mine: .* consumes {ALGORITHMS[name].consumes} derive from .*:{base}"):
+    with pytest.raises(
+        LareError, match=f"algorithm mine: .* consumes {ALGORITHMS[name].consumes} derive from .*:{base}"
+    ):
         register_algorithm(replace(ALGORITHMS[name], name="mine", settings=ALGORITHMS["ppo"].settings))
 
 

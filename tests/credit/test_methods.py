@@ -109,7 +109,9 @@ def test_output_of_a_decoder_is_checked(call, agents, registered, monkeypatch):
     register_decoder(Decoder("mine", lambda key, shape, settings: Squares(jnp.ones(shape.n_inputs))))
     register_method(Method("mine", "mine", "this test", inputs=input_names.RAW, fit=Fit.ALL_STEPS, decoder="mine"))
     axes = r"\(rows,\)" if agents == 1 else r"\(rows, agents\)"
-    with pytest.raises(LareError, match=rf"'mine' must return DecoderOutput\(r_hat, penalty\), both of the shape {axes}"):
+    with pytest.raises(
+        LareError, match=rf"'mine' must return DecoderOutput\(r_hat, penalty\), both of the shape {axes}"
+    ):
         CreditAssigner("mine", observation_space=2, action_space=1, agents=agents, max_steps=5)
 
 

@@ -45,8 +45,9 @@ class Decoder:
 
     def __post_init__(self) -> None:
         if isinstance(self.settings, str) or not set(self.settings) <= CreditSettings.model_fields.keys():
+            names = ", ".join(CreditSettings.model_fields)
             raise LareError(
-                f"decoder {self.name}: settings = {short_repr(self.settings)}: give a set of names of {', '.join(CreditSettings.model_fields)}"
+                f"decoder {self.name}: settings = {short_repr(self.settings)}: give a set of names of {names}"
             )
         if self.pays_shares and not self.whole_episodes:
             raise LareError(

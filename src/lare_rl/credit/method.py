@@ -94,7 +94,9 @@ class Method:
         examples = {InputNames: 'InputNames(("observation", "action"))', Fit: "Fit.ALL_STEPS", Reward: "Reward.PROXY"}
         for value, (kind, example) in zip((self.inputs, self.fit, self.reward), examples.items(), strict=True):
             if not isinstance(value, kind | None):
-                raise LareError(f"method {self.name}: {short_repr(value)} is no {kind.__name__}: write {example}, for example")
+                raise LareError(
+                    f"method {self.name}: {short_repr(value)} is no {kind.__name__}: write {example}, for example"
+                )
 
     @property
     def has_proxy_rewards(self) -> bool:

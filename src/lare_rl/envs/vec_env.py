@@ -55,7 +55,9 @@ class VecEnv(ABC):
             column = getattr(self.batch, name)
             if not np.isfinite(column).all():  # of all environments at once, which takes less time than one by one
                 index, *entry = np.argwhere(~np.isfinite(column))[0].tolist()
-                raise _output_error(index, f"{name} contains {column[index, *entry]} in entry {', '.join(map(str, entry))}")
+                raise _output_error(
+                    index, f"{name} contains {column[index, *entry]} in entry {', '.join(map(str, entry))}"
+                )
         max_steps, ended = self.spec.max_steps, np.logical_or(self.batch.terminated, self.batch.truncated)
         at_limit = self._length >= max_steps
         invalid = where & ((at_limit != ended) if self.spec.fixed_length else (at_limit & ~ended))
@@ -112,7 +114,9 @@ def call_env(env_index: int, env: HostEnv, command: str, argument: Any, batch: T
         with one_line_errors(f"environment {env_index} failed in {command}"):
             timestep = env.reset(int(argument)) if command == "reset" else env.step(argument)
             if not isinstance(timestep, Timestep):
-                raise EnvOutputError(f"environment {env_index}: {command} must return a Timestep, not {short_repr(timestep)}")
+                raise EnvOutputError(
+                    f"environment {env_index}: {command} must return a Timestep, not {short_repr(timestep)}"
+                )
             for name, column, value in zip(Timestep._fields, columns, timestep, strict=False):
                 if np.shape(value) != column.shape[1:]:
                     shapes = f"{np.shape(value)}, not {column.shape[1:]}"
