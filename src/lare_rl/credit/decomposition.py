@@ -183,16 +183,15 @@ def init(
 
 def _check_output(network: DecoderNetwork, shape: DecoderShape, method: Method) -> None:
     """Raise `LareError` if a plugin's decoder does not return what it should."""
-    agents = () if shape.n_agents == 1 else (shape.n_agents,)
     n_rows = shape.max_steps if method.needs_whole_episodes else 2
-    rows = jax.ShapeDtypeStruct((n_rows, *agents, shape.n_inputs), jnp.float32)
-    output = jax.eval_shape(lambda rows: network(rows, None), rows)
-    if not isinstance(output, DecoderOutput) or not output.r_hat.shape == output.penalty.shape == rows.shape[:-1]:
-        axes = "(rows, agents)" if agents else "(rows,)"
-        raise LareError(
-            f"the decoder {method.decoder!r} must return DecoderOutput(r_hat, penalty), both of the shape {axes}: for inputs of the "
-            f"shape {rows.shape} it returned {short_repr(output)}"
-        )
+    for agents in [(shape.n_agents,), ()] if shape.n_agents == 1 else [(shape.n_agents,)]:  # () in CreditAssigner
+        rows = jax.ShapeDtypeStruct((n_rows, *agents, shape.n_inputs), jnp.float32)
+        output = jax.eval_shape(lambda rows: network(rows, None), rows)
+        if not isinstance(output, DecoderOutput) or not output.r_hat.shape == output.penalty.shape == rows.shape[:-1]:
+            raise LareError(
+                f"the decoder {method.decoder!r} must return DecoderOutput(r_hat, penalty), both of the shape {rows.shape[:-1]} for "
+                f"inputs of the shape {rows.shape}: it returned {short_repr(output)}"
+            )
 
 
 def is_optimistic(method: Method, settings: CreditSettings) -> bool:
