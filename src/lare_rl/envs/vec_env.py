@@ -117,12 +117,13 @@ def call_env(env_index: int, env: HostEnv, command: str, argument: Any, batch: T
                 raise EnvOutputError(
                     f"environment {env_index}: {command} must return a Timestep, not {short_repr(timestep)}"
                 )
-            for name, column, value in zip(Timestep._fields, columns, timestep, strict=False):
+            *values, new_measures = timestep
+            for name, column, value in zip(Timestep._fields, columns, values, strict=False):
                 if np.shape(value) != column.shape[1:]:
                     shapes = f"{np.shape(value)}, not {column.shape[1:]}"
                     raise EnvOutputError(f"environment {env_index}: {name} has the shape {shapes}")
                 column[env_index] = value
-            for name, value in timestep.measures.items():
+            for name, value in new_measures.items():
                 if name not in measures:
                     raise EnvOutputError(f"environment {env_index}: the measure {name!r} is not in EnvSpec.measures")
                 measures[name][env_index] = value
