@@ -13,6 +13,9 @@ SETUP = """
 import json, sys
 import numpy as np
 import lare_rl
+from lare_rl.credit.decoders import Decoder
+from lare_rl.credit.input_names import InputNames
+from lare_rl.credit.methods import Fit, Method
 from lare_rl.errors import LareError
 from lare_rl.latent.function import verify_function
 from helpers.toy_envs import PHI, pick_spec, toy_spec
@@ -49,7 +52,8 @@ CALLS = {
     "lare_rl.stored_episodes(run, 7)": "run has no seed 7",
     "policy([1, 2, 3])": "(3,)",
     "policy('left')": "2 numbers",
-    "policy(np.zeros((0, 2)))": "(0, 2)",
+    "policy(np.zeros((0, 2)))": "the batch is empty",
+    "policy.select_env_action([[0, 0]])": "of shape (2,), and was given an array of shape (1, 2)",
     "lare_rl.export_run('none', 'out')": "none is not a run",
     "lare_rl.write_report([])": "run",
     "lare_rl.load_function('none.py', task)": "none.py does not exist",
@@ -69,11 +73,16 @@ CALLS = {
     "lare_rl.CreditAssigner('lare-bayes', phi, task=pick_spec())": "task='Pick'",
     "lare_rl.relabel('none', 'out', task=7)": "TaskSpec",
     "lare_rl.logged_steps('none', 7)": "TaskSpec",
+    "Method('mine', '', '', inputs=('observation',))": "method mine: ('observation',) is no InputNames: write",
+    "Method('mine', '', '', fit='all steps')": "method mine: 'all steps' is no Fit: write Fit.ALL_STEPS",
+    "InputNames('action')": "a tuple of names",
+    "Decoder('mine', 'mine:init', settings='hidden')": "a set of names",
 }
 """Bad calls, and what the message must contain."""
 
 GOOD_CALLS = {
     "phi([0.5, 0], [0.5]).shape": "(2,)",
+    "InputNames(['action']).names": "('action',)",
     "phi([[0.5, 0]] * 3, [[0.5]] * 3).shape": "(3, 2)",
     "policy([0.5, 0]).shape": "(1,)",
     "policy([[0.5, 0]] * 3).shape": "(3, 1)",

@@ -56,6 +56,14 @@ def test_register_algorithm_refuses_used_name():
         register_algorithm(replace(ALGORITHMS["sac"], name="td3"))
 
 
+@pytest.mark.parametrize(("name", "base"), [("td3", "OffPolicySettings"), ("vdn", "QMIXSettings")])
+def test_settings_must_derive_from_those_of_the_loop(name, base):
+    with pytest.raises(
+        LareError, match=f"algorithm mine: .* consumes {ALGORITHMS[name].consumes} derive from .*:{base}"
+    ):
+        register_algorithm(replace(ALGORITHMS[name], name="mine", settings=ALGORITHMS["ppo"].settings))
+
+
 def test_plugin_algorithm(tmp_path, monkeypatch):
     (tmp_path / "quiet_td3.py").write_text(PLUGIN)
     monkeypatch.setenv("LARE_PLUGINS", "quiet_td3")

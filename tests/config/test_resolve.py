@@ -32,6 +32,8 @@ def resolve_named(task, settings):
         ("Reacher-v4", {"method": "rrd", "credit": {"steps": 16}}, ["steps = 16", "sampled_steps = 64"]),
         ("Reacher-v4", {"rollout_steps": 20, "steps": 20}, ["steps = 20", "50"]),
         ("CN-6", {"capacity": 6149, "method": "rd"}, ["capacity = 6149", "rollout", "6150"]),
+        ("CN-6", {"algorithm": "vdn", "vdn": {"monotonic": True}}, ["vdn.monotonic = True", "use --algorithm qmix"]),
+        ("CN-6", {"algorithm": "qmix", "qmix": {"monotonic": False}}, ["qmix.monotonic", "use --algorithm vdn"]),
         ("CN-6", {"algorithm": "qmix", "method": "rd", "capacity": 999}, ["capacity = 999", "iteration", "1000"]),
     ],
 )

@@ -106,6 +106,8 @@ def test_resolved_settings_round_trip(task, algorithm):
         ("Reacher-v4", {"method": "ircr", "algorithm": "ppo", "fit_updates": 3}, ["fit_updates"]),
         ("Reacher-v4", {"algorithm": "ddpg", "ddpg": {"noise_clip": 0.2}}, ["ddpg.noise_clip"]),
         ("Reacher-v4", {"algorithm": "ddpg", "ddpg": {"noise_clip": 0.2, "policy_noise": 0.1}}, []),
+        ("CN-6", {"algorithm": "vdn", "vdn": {"embed": 8, "hypernet": 8, "hidden": 8}}, ["vdn.embed", "vdn.hypernet"]),
+        ("CN-6", {"algorithm": "qmix", "qmix": {"embed": 8, "hypernet": 8}}, []),
         ("Reacher-v4", {"method": "dense", "algorithm": "ppo", "capacity": 10_000}, ["capacity"]),
         ("Reacher-v4", {"method": "dense", "algorithm": "ppo", "scale_rewards": True}, ["scale_rewards"]),
         ("Reacher-v4", {"method": "rrdu", "algorithm": "ppo", "capacity": 10_000}, []),

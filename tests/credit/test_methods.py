@@ -95,6 +95,24 @@ def test_decoder_with_functions_is_refused_in_one_line(registered):
         CreditAssigner("mlp", observation_space=2, action_space=1)
 
 
+@pytest.mark.parametrize("agents", [1, 2])
+@pytest.mark.parametrize(
+    "call",
+    [
+        lambda self, inputs, key: inputs @ self.weight,
+        lambda self, inputs, key: DecoderOutput(inputs @ self.weight, 0.0),
+        lambda self, inputs, key: DecoderOutput(inputs, inputs),
+        lambda self, inputs, key: DecoderOutput((inputs @ self.weight).ravel(), (inputs @ self.weight).ravel()),
+    ],
+)
+def test_output_of_a_decoder_is_checked(call, agents, registered, monkeypatch):
+    monkeypatch.setattr(Squares, "__call__", call)
+    register_decoder(Decoder("mine", lambda key, shape, settings: Squares(jnp.ones(shape.n_inputs))))
+    register_method(Method("mine", "mine", "this test", inputs=input_names.RAW, fit=Fit.ALL_STEPS, decoder="mine"))
+    with pytest.raises(LareError, match=rf"'mine' must return DecoderOutput.* both of the shape \(2, {agents}\) for "):
+        CreditAssigner("mine", observation_space=2, action_space=1, agents=agents, max_steps=5)
+
+
 def test_register_refuses(registered):
     with pytest.raises(LareError, match="another method 'rd'"):
         register_method(Method("rd", "mine", "this test"))
@@ -102,4 +120,6 @@ def test_register_refuses(registered):
         register_method(Method("new", "mine", "this test", decoder="nothing"))
     with pytest.raises(LareError, match="whole_episodes"):
         Decoder("shares", lambda key, shape, settings: None, pays_shares=True)
+    with pytest.raises(LareError, match=r"decoder mine: settings = .*'temperature'.*: give a set of names of hidden, "):
+        Decoder("mine", "mine:init", settings=frozenset({"hidden", "temperature"}))
     register_method(METHODS["rd"])

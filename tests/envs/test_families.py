@@ -89,6 +89,12 @@ def test_keys_without_effect_are_refused(environment, key):
         make_env(toy_spec(environment=environment, **{key: KEYS[key]}))
 
 
+def test_family_of_a_plugin_may_read_a_key():
+    register_family("reader", ToyHostEnv)
+    with pytest.raises(LareError, match=r"arguments has no effect .*reads=\('arguments',\) to register_family"):
+        make_env(toy_spec(environment="reader/two", arguments={"N": 3}))
+
+
 def test_keys_of_teams_without_effect_are_refused():
     task = read_task("CompetitivePP-6")
     predator, prey = task.teams

@@ -96,6 +96,27 @@ def test_length_of_an_episode_is_checked(changes, words):
         walk(envs, steps=5)
 
 
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"observation": np.zeros(2)}, "observation has the shape (2,), not (2, 2)"),
+        ({"observation": np.float32([[0, 0], [0, np.nan]])}, "observation contains nan in entry 1, 1"),
+        ({"reward": np.full(2, np.inf)}, "reward contains inf in entry 0"),
+        ({"measures": {"goal": np.array(1)}}, "the measure 'goal' is not in EnvSpec.measures"),
+        ({"state": "left"}, "state has the shape (), not (1,)"),
+        (None, "reset must return a Timestep, not None"),
+    ],
+)
+def test_timestep_is_checked(changes, message):
+    class Broken(ToyHostEnv):
+        def timestep(self, reward):
+            return None if changes is None else super().timestep(reward)._replace(**changes)
+
+    with LocalVecEnv([ToyHostEnv, Broken]) as envs, pytest.raises(LareError) as error:
+        walk(envs)
+    assert (str(error.value), error.value.env_index) == (f"environment 1: {message}", 1)
+
+
 @pytest.mark.parametrize("make_vec_env", [LocalVecEnv, partial(SubprocVecEnv, processes=1)])
 @pytest.mark.parametrize(
     ("fault", "message"),

@@ -65,11 +65,24 @@ def test_actions_are_available_and_those_of_the_package(run):
 
 
 @pytest.mark.parametrize(
-    ("mask", "words"), [((), "pass the mask too"), ((np.ones(5, bool),), "6 booleans"), ((np.ones(6),), "float64")]
+    ("rows", "mask", "words"),
+    [
+        (1, (), "pass the mask too"),
+        (1, (np.ones(5, bool),), "6 booleans"),
+        (1, (np.ones(6),), "float64"),
+        (2, (np.ones((6, 2), bool),), r"the shape \(2, 6\), not \(6, 2\)"),
+        (2, (np.ones(12, bool),), r"not \(12,\)"),
+    ],
 )
-def test_mask_is_checked(run, mask, words):
+def test_mask_is_checked(run, rows, mask, words):
     with pytest.raises(LareError, match=words):
-        load_policy(run)(np.ones(2), *mask)
+        load_policy(run)(np.ones((rows, 2)), *mask)
+
+
+def test_mask_may_have_an_axis_for_each_choice(run):
+    mask = (np.arange(6) == 3).reshape(2, 3)
+    assert load_policy(run)(np.ones(2), mask).tolist() == [1, 0]
+    assert load_policy(run)(np.ones((2, 2)), np.stack([mask] * 2)).tolist() == [[1, 0]] * 2
 
 
 def test_played_episodes_have_available_actions(run):

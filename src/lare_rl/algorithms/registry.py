@@ -15,9 +15,10 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from enum import StrEnum
 from importlib import import_module
+from pkgutil import resolve_name
 from typing import TYPE_CHECKING, Any
 
-from lare_rl.errors import CheckedModel
+from lare_rl.errors import CheckedModel, LareError
 from lare_rl.util.plugins import Registry
 
 if TYPE_CHECKING:  # importing NumPy takes longer than all else that the command line does before it shows a message
@@ -101,11 +102,24 @@ class Algorithm:
 
 ALGORITHMS = Registry[Algorithm]("algorithm")
 
+_SETTINGS = {
+    Consumes.TRANSITIONS: "lare_rl.algorithms.off_policy:OffPolicySettings",
+    Consumes.ROLLOUTS: "lare_rl.algorithms.registry:AlgorithmSettings",
+    Consumes.SEQUENCES: "lare_rl.algorithms.qmix:QMIXSettings",
+}
+"""The classes that the settings of algorithms derive from. Their modules import this one."""
+
 
 def register_algorithm(algorithm: Algorithm) -> None:
     """Add an algorithm. Its name then works in `Settings(algorithm=...)` and on the command line.
 
     Raises:
-        LareError: another algorithm has this name.
+        LareError: another algorithm has this name, or the settings lack those that the training loop reads.
     """
+    base = _SETTINGS[algorithm.consumes]
+    if not isinstance(algorithm.settings, resolve_name(base)):
+        raise LareError(
+            f"algorithm {algorithm.name}: the settings of an algorithm that consumes {algorithm.consumes} derive from {base}: pass "
+            "an instance of such a class"
+        )
     ALGORITHMS.register(algorithm.name, algorithm)

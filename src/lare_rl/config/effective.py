@@ -45,6 +45,7 @@ def unused_names(settings: ResolvedSettings) -> list[str]:
     method, algorithm = find_method(settings.method), ALGORITHMS[settings.algorithm]
     on_policy = algorithm.consumes is Consumes.ROLLOUTS
     separate_fit = method.fit is not None and method.fit.separate
+    has_mixer = getattr(settings.hyperparameters, "monotonic", True)
     is_used = {
         "fit_every": method.uses_gradient and (on_policy or separate_fit),
         "fit_updates": method.uses_gradient and (on_policy or separate_fit),
@@ -55,6 +56,8 @@ def unused_names(settings: ResolvedSettings) -> list[str]:
         "capacity": needs_replay(settings),
         "scale_rewards": not on_policy,
         f"{settings.algorithm}.noise_clip": getattr(settings.hyperparameters, "policy_noise", None) != 0,
+        f"{settings.algorithm}.embed": has_mixer,
+        f"{settings.algorithm}.hypernet": has_mixer,
     }
     is_used |= {f"credit.{name}": name in method.settings for name in CreditSettings.model_fields}
     return [name for name, used in is_used.items() if not used]

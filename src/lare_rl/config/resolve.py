@@ -49,6 +49,11 @@ def resolve(settings: Settings, task: TaskSpec) -> ResolvedSettings:
         rollout_steps=resolved.rollout_steps,
         off_policy=consumes is not Consumes.ROLLOUTS,
     )
+    monotonic = getattr(resolved.hyperparameters, "monotonic", None)
+    if monotonic != getattr(ALGORITHMS[resolved.algorithm].settings, "monotonic", None):
+        raise LareError(
+            f"{resolved.algorithm}.monotonic = {monotonic}: use --algorithm {'qmix' if monotonic else 'vdn'}"
+        )
     if resolved.overlap_collection and (env.is_jax or consumes is not Consumes.TRANSITIONS):
         raise LareError(
             f"overlap_collection needs td3, ddpg or sac and an environment on the host: remove it for {resolved.algorithm} on "

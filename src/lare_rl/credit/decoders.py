@@ -10,14 +10,14 @@ from dataclasses import dataclass
 from pkgutil import resolve_name
 from typing import TYPE_CHECKING
 
-from lare_rl.errors import LareError
+from lare_rl.credit.decoder_settings import CreditSettings
+from lare_rl.errors import LareError, short_repr
 from lare_rl.util.plugins import Registry
 
 if TYPE_CHECKING:  # importing JAX takes longer than all else that the command line does before it shows a message
     from jaxtyping import PRNGKeyArray
 
     from lare_rl.credit.decoder_network import DecoderNetwork, DecoderShape
-    from lare_rl.credit.decoder_settings import CreditSettings
 
 __all__ = ["DECODERS", "RBT_STEPS", "Decoder", "register_decoder"]
 
@@ -44,6 +44,11 @@ class Decoder:
     """The largest number of steps of a payment that it reads. None means any number."""
 
     def __post_init__(self) -> None:
+        if isinstance(self.settings, str) or not set(self.settings) <= CreditSettings.model_fields.keys():
+            names = ", ".join(CreditSettings.model_fields)
+            raise LareError(
+                f"decoder {self.name}: settings = {short_repr(self.settings)}: give a set of names of {names}"
+            )
         if self.pays_shares and not self.whole_episodes:
             raise LareError(
                 f"decoder {self.name}: a decoder that pays shares of an episode's return needs whole_episodes"

@@ -161,6 +161,8 @@ def init(
                 f"the decoder {method.decoder!r} holds {short_repr(leaf)}, which cannot be trained: it may have arrays and static "
                 "fields; instead of eqx.nn.MLP, which holds functions, use lare_rl.nn.networks.MLP"
             )
+    if not type(network).__module__.startswith("lare_rl."):
+        _check_output(network, shape, method)
     several = len(score_types) > 1
     closed = None
     if several or not method.uses_gradient:
@@ -178,6 +180,19 @@ def init(
         levels=empty_level_means(basis.n_levels) if basis.n_levels and method.uses_gradient else None,
         score_type_predictions=empty_predictions(len(score_types), window) if several else None,
     )
+
+
+def _check_output(network: DecoderNetwork, shape: DecoderShape, method: Method) -> None:
+    """Raise `LareError` if a plugin's decoder does not return what it should."""
+    n_rows = shape.max_steps if method.needs_whole_episodes else 2
+    for agents in [(shape.n_agents,), ()] if shape.n_agents == 1 else [(shape.n_agents,)]:  # () in CreditAssigner
+        rows = jax.ShapeDtypeStruct((n_rows, *agents, shape.n_inputs), jnp.float32)
+        output = jax.eval_shape(lambda rows: network(rows, None), rows)
+        if not isinstance(output, DecoderOutput) or not output.r_hat.shape == output.penalty.shape == rows.shape[:-1]:
+            raise LareError(
+                f"the decoder {method.decoder!r} must return DecoderOutput(r_hat, penalty), both of the shape {rows.shape[:-1]} for "
+                f"inputs of the shape {rows.shape}: it returned {short_repr(output)}"
+            )
 
 
 def is_optimistic(method: Method, settings: CreditSettings) -> bool:

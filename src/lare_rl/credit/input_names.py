@@ -51,13 +51,16 @@ class InputNames:
     """Another tuple for tasks with several agents. None means the same one."""
 
     def __post_init__(self) -> None:
-        for names in (self.names, self.names_of_many_agents or ()):
-            if not set(names) <= set(_NAMES):
+        for field in ("names", "names_of_many_agents"):
+            names = getattr(self, field) or ()
+            if isinstance(names, str) or not set(names) <= set(_NAMES):
                 raise LareError(
                     f"the inputs of a decoder are a tuple of names among {', '.join(_NAMES)}, and was given {names!r}"
                 )
             if "history" in names[:-1]:
                 raise LareError(f"history must be the last input of a decoder, and the inputs are {names!r}")
+            if isinstance(names, list):  # compiled functions need a tuple
+                object.__setattr__(self, field, tuple(names))
         if self.names_of_many_agents is not None and self.has_factors != ("factors" in self.names_of_many_agents):
             raise LareError("factors must be an input of a decoder for one agent and for many, or for neither")
 

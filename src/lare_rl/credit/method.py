@@ -6,6 +6,7 @@ from typing import Literal
 
 from lare_rl.credit.decoders import DECODERS
 from lare_rl.credit.input_names import InputNames
+from lare_rl.errors import LareError, short_repr
 
 __all__ = ["Fit", "Method", "Reward"]
 
@@ -88,6 +89,14 @@ class Method:
     reward: Reward = Reward.PROXY
     shared: bool = False
     """Whether all agents get the mean of their proxy rewards: credit over time, but not among agents."""
+
+    def __post_init__(self) -> None:
+        examples = {InputNames: 'InputNames(("observation", "action"))', Fit: "Fit.ALL_STEPS", Reward: "Reward.PROXY"}
+        for value, (kind, example) in zip((self.inputs, self.fit, self.reward), examples.items(), strict=True):
+            if not isinstance(value, kind | None):
+                raise LareError(
+                    f"method {self.name}: {short_repr(value)} is no {kind.__name__}: write {example}, for example"
+                )
 
     @property
     def has_proxy_rewards(self) -> bool:

@@ -213,6 +213,8 @@ def _check_keys(task: TaskSpec, family: Family) -> None:
                 advice = "Remove it."
                 if family is _GYMNASIUM and key == "arguments":
                     advice = "Remove it, and pass kwargs to gymnasium.register."
+                elif not str(family.maker).startswith("lare_rl."):
+                    advice = f"Remove it, or pass reads=({key!r},) to register_family, if its maker reads it."
                 raise LareError(f"task {role.name!r}: {key} has no effect on {task.environment}. {advice}")
     if not task.teams:
         return

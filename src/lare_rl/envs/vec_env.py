@@ -9,7 +9,7 @@ from jaxtyping import Bool, Float, Integer, Shaped
 
 from lare_rl.envs.env_errors import EnvOutputError, one_line_errors
 from lare_rl.envs.interface import EnvSpec, HostEnv, Timestep
-from lare_rl.errors import LareError
+from lare_rl.errors import LareError, short_repr
 
 __all__ = ["LocalVecEnv", "Maker", "VecEnv", "call_env", "check_same_sizes", "empty_batch", "make_env_at"]
 
@@ -36,7 +36,7 @@ class VecEnv(ABC):
         """Start an episode in the selected environments."""
         self._call("reset", seeds, where)
         self._length[where] = 0
-        self._check_lengths(where)
+        self._check(where)
         return self.batch
 
     def step(
@@ -46,11 +46,18 @@ class VecEnv(ABC):
         where = np.ones(len(action), bool) if where is None else where
         self._call("step", action, where)
         self._length[where] += 1
-        self._check_lengths(where)
+        self._check(where)
         return self.batch
 
-    def _check_lengths(self, where: Bool[np.ndarray, " n"]) -> None:
-        """Raise `EnvOutputError` if an episode is longer or shorter than the specification says."""
+    def _check(self, where: Bool[np.ndarray, " n"]) -> None:
+        """Raise `EnvOutputError` if a number is not finite, or an episode is longer or shorter than the specification says."""
+        for name in ("observation", "state", "reward"):
+            column = getattr(self.batch, name)
+            if not np.isfinite(column).all():  # of all environments at once, which takes less time than one by one
+                index, *entry = np.argwhere(~np.isfinite(column))[0].tolist()
+                raise _output_error(
+                    index, f"{name} contains {column[index, *entry]} in entry {', '.join(map(str, entry))}"
+                )
         max_steps, ended = self.spec.max_steps, np.logical_or(self.batch.terminated, self.batch.truncated)
         at_limit = self._length >= max_steps
         invalid = where & ((at_limit != ended) if self.spec.fixed_length else (at_limit & ~ended))
@@ -60,9 +67,7 @@ class VecEnv(ABC):
             problem = f"the episode has {length} steps and has not ended, but max_steps is {max_steps}"
             if ended[index]:
                 problem = f"the episode ended after {length} steps, but fixed_length says that all have {max_steps}"
-            error = EnvOutputError(f"environment {index}: {problem}")
-            error.env_index = index
-            raise error
+            raise _output_error(index, problem)
 
     @abstractmethod
     def _call(self, command: str, arguments: Shaped[np.ndarray, "n *rest"], where: Bool[np.ndarray, " n"]) -> None:
@@ -104,18 +109,33 @@ def make_env_at(env_index: int, maker: Maker) -> HostEnv:
 
 def call_env(env_index: int, env: HostEnv, command: str, argument: Any, batch: Timestep) -> None:
     """Call "reset" or "step" of an environment, and write its timestep into a row of the batch."""
+    *columns, measures = batch
     try:
         with one_line_errors(f"environment {env_index} failed in {command}"):
             timestep = env.reset(int(argument)) if command == "reset" else env.step(argument)
+            if not isinstance(timestep, Timestep):
+                raise EnvOutputError(
+                    f"environment {env_index}: {command} must return a Timestep, not {short_repr(timestep)}"
+                )
+            *values, new_measures = timestep
+            for name, column, value in zip(Timestep._fields, columns, values, strict=False):
+                if np.shape(value) != column.shape[1:]:
+                    shapes = f"{np.shape(value)}, not {column.shape[1:]}"
+                    raise EnvOutputError(f"environment {env_index}: {name} has the shape {shapes}")
+                column[env_index] = value
+            for name, value in new_measures.items():
+                if name not in measures:
+                    raise EnvOutputError(f"environment {env_index}: the measure {name!r} is not in EnvSpec.measures")
+                measures[name][env_index] = value
     except EnvOutputError as error:
         error.env_index = env_index
         raise
-    *columns, measures = batch
-    *values, new_measures = timestep
-    for column, value in zip(columns, values, strict=True):
-        column[env_index] = value
-    for name, value in new_measures.items():
-        measures[name][env_index] = value
+
+
+def _output_error(env_index: int, problem: str) -> EnvOutputError:
+    error = EnvOutputError(f"environment {env_index}: {problem}")
+    error.env_index = env_index
+    return error
 
 
 def check_same_sizes(specs: Sequence[EnvSpec]) -> None:

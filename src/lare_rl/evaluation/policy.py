@@ -88,7 +88,10 @@ class RunPolicy:
         """
         rows, is_single = self._check_observation(observation)
         if not is_single:
-            raise LareError(f"select_env_action needs one observation, and was given {len(rows)}")
+            shape = (self._env.observation_size,)
+            raise LareError(
+                f"select_env_action needs one observation of shape {shape}, and was given an array of shape {rows.shape}"
+            )
         return self._select_actions(rows, available)[0]
 
     def _select_actions(
@@ -125,9 +128,11 @@ class RunPolicy:
                 )
             return np.ones((n_rows, size), bool)
         mask = np.asarray(available)
-        if mask.size != n_rows * size or mask.dtype.kind not in "biu":
+        shapes = [(size,), self._env.choice_sizes or (size,)]  # flat, or with an axis for each choice
+        shapes = shapes * (n_rows == 1) + [(n_rows, *shape) for shape in shapes]
+        if mask.shape not in shapes or mask.dtype.kind not in "biu":
             raise LareError(
-                f"a mask has {size} booleans for each observation: the shape is {mask.shape}, the type {mask.dtype}"
+                f"a mask has {size} booleans for each observation: pass the shape {shapes[0]}, not {mask.shape} of type {mask.dtype}"
             )
         return with_available_action(mask.reshape(n_rows, size).astype(bool))
 
@@ -139,7 +144,9 @@ class RunPolicy:
         except (TypeError, ValueError):
             kind = type(observation).__name__
             raise LareError(f"an observation is {size} numbers: no array can be made of {kind}") from None
-        if rows.ndim not in (1, 2) or rows.shape[-1] != size or not rows.size:
+        if rows.ndim == 2 and not len(rows):
+            raise LareError(f"the batch is empty: its shape is {rows.shape}")
+        if rows.ndim not in (1, 2) or rows.shape[-1] != size:
             raise LareError(
                 f"an observation is {size} numbers, and a batch has rows of them: the shape is {rows.shape}"
             )

@@ -61,7 +61,10 @@ class Registry(Mapping[str, T], Generic[T]):
             LareError: another value has this name. Names cannot be reused, because compiled programs are cached by name.
         """
         if self._values.setdefault(name, value) != value:
-            raise LareError(f"there is another {self._kind} {name!r}: choose another name")
+            raise LareError(
+                f"there is another {self._kind} {name!r}: choose another name; if you ran the same file or cell twice, restart Python, "
+                "and start training from another file than the plugin"
+            )
 
     def find(self, name: str) -> T:
         """Return the value of this name.
