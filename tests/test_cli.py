@@ -59,7 +59,6 @@ def first_column(table):
         ("train Reacher-v4 --resume runs/none", ["--resume", "--steps"]),
         ("train --resume runs/none --seed 1", ["--resume", "--steps"]),
         ("train Reacher-v4 --function none.py", ["none.py does not exist"]),
-        ("train Reacher-v4 --steps 120 --evaluate-every 70", ["steps = 120", "100 or 150", "= 70", "50 or 100"]),
         ("train Reacher-v4 --method magic", ["'magic'", *METHODS]),
         ("train CN-6 --algorithm ppo", ["ppo", "CN-6"]),
         ("train CompetitivePP-6-prey", ["CompetitivePP-6-prey is one team"]),

@@ -183,7 +183,7 @@ def test_most_likely_actions_beside_sampled_ones(small, tmp_path, command):
     lines = out.splitlines()
     assert (status, err) == (0, "")
     likeliest = evaluate_run(run, 4, deterministic=True)["Pick"]
-    (index,) = (i for i, line in enumerate(lines) if "most likely" in line)
+    (index,) = (i for i, line in enumerate(lines) if "The most likely ones" in line)
     assert [format_mean_std(row) in line for row, line in zip(likeliest, lines[index + 1 :], strict=False)] == [
         True
     ] * 2

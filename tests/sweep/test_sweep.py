@@ -274,7 +274,6 @@ def test_no_process_after_stop(file):
         (("seeds = 2", "seeds = 2\nprocesses = 2"), "processes .*above"),
         (('["Reacher-v4"]', "[]"), r"tasks = \[\]"),
         (("seeds = 2", "seed = -1"), "seed = -1"),
-        (("steps = 200", "steps = 201"), "on Reacher-v4, steps = 201"),
         (('["Reacher-v4"]', '["Reacher-v5"]'), "no recorded reply .* 'Reacher-v5'"),
         (("rollout_steps = 50", 'method = "rd"'), "method .*methods = "),
         (("[settings]", '[functions]\nReacher = ["phi.py"]\n[settings]'), "functions of Reacher,"),
