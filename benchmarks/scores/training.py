@@ -96,9 +96,9 @@ def cheetah() -> Iterator[Row]:
     task = read_task("HalfCheetah-v4")
 
     def row(label: str, payments: int | None, method: str, baseline: str, **settings: Any) -> Row:
-        paid = task if payments is None else task.model_copy(update={"payments": payments})
+        variant = task if payments is None else task.model_copy(update={"payments": payments})
         table = "HalfCheetah-v4, paid " + ("once" if payments is None else f"every {payments}")
-        return Row(table, label, paid, {"method": method, **CHEETAH, **settings}, label == baseline)
+        return Row(table, label, variant, {"method": method, **CHEETAH, **settings}, label == baseline)
 
     for method in ("episodic", "bayes", "lare-bayes", "dense", "rrdu", "lare-rrdu", "lrr", "grd", "rudder"):
         yield row(method, None, method, "bayes")
