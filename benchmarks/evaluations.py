@@ -1,6 +1,8 @@
 """Evaluations of models of Stable-Baselines3 and SBX while they learn."""
 
+import json
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 import gymnasium
@@ -22,6 +24,14 @@ def evaluate(model: Any, environment: gymnasium.Env, seed: int, episodes: int) -
             returns[episode] += float(reward)
             ended = terminated or truncated
     return float(returns.mean())
+
+
+def append_evaluation(out: Path, model: Any, environment: gymnasium.Env, seed: int, episodes: int, step: int) -> None:
+    """Evaluate a model, append a line of JSON to `out`, and print it."""
+    line = {"step": step, "seed": seed, "evaluation/return": evaluate(model, environment, seed, episodes)}
+    with out.open("a") as file:
+        print(json.dumps(line), file=file)
+    print(f"seed {seed}  step {step:>7d}  return {line['evaluation/return']:10.1f}", flush=True)
 
 
 class Evaluations(BaseCallback):

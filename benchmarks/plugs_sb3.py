@@ -27,7 +27,7 @@ from stable_baselines3.common.noise import NormalActionNoise
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
 import lare_rl
-from evaluations import Evaluations, evaluate
+from evaluations import Evaluations, append_evaluation
 from lare_rl.integrations.sb3 import CreditCallback, CreditReplayBuffer
 from measure import PPO as PPO_COMMON
 from measure import TD3 as TD3_SETTINGS
@@ -152,13 +152,7 @@ def learn(
             model, callbacks = ppo(spec, rewards, seed)
         else:
             model = {"td3": td3, "sbx-sac": sbx_sac}[algorithm](spec, rewards, seed, warmup)
-
-        def report(step: int, model: Any = model, seed: int = seed) -> None:
-            line = {"step": step, "seed": seed, "evaluation/return": evaluate(model, true, seed, episodes)}
-            with out.open("a") as file:
-                print(json.dumps(line), file=file)
-            print(f"seed {seed}  step {step:>7d}  return {line['evaluation/return']:10.1f}", flush=True)
-
+        report = partial(append_evaluation, out, model, true, seed, episodes)
         model.learn(steps, log_interval=1_000_000, callback=[*callbacks, Evaluations(evaluate_every, report)])
 
 

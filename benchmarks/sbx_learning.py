@@ -9,6 +9,7 @@ and rewards; ours normalises observations and the critic's targets. Seeds are tr
 """
 
 import json
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -21,7 +22,7 @@ import tyro
 from stable_baselines3.common.noise import NormalActionNoise
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
-from evaluations import Evaluations, evaluate
+from evaluations import Evaluations, append_evaluation
 from measure import PPO as PPO_COMMON
 from measure import TD3, provenance
 
@@ -86,13 +87,7 @@ def main(
     environment = gymnasium.make(task)
     for seed in range(seeds):
         model = make_model(algorithm, gymnasium.make(task), warmup, seed)
-
-        def report(step: int, model: Any = model, seed: int = seed) -> None:
-            line = {"step": step, "seed": seed, "evaluation/return": evaluate(model, environment, seed, episodes)}
-            with (out / "metrics.jsonl").open("a") as file:
-                file.write(json.dumps(line) + "\n")
-            print(f"seed {seed}  step {step:>7d}  return {line['evaluation/return']:10.1f}", flush=True)
-
+        report = partial(append_evaluation, out / "metrics.jsonl", model, environment, seed, episodes)
         model.learn(steps, log_interval=1_000_000, callback=Evaluations(interval, report))
 
 

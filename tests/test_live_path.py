@@ -19,6 +19,7 @@ from lare_rl.latent.design import design
 from lare_rl.latent.saved import load_function
 from lare_rl.llm import prompts
 from lare_rl.llm.recording import read_recording, shipped_recordings
+from lare_rl.util import files
 
 KEY = "sk-a-key-that-nobody-may-see"
 
@@ -188,7 +189,8 @@ def test_terminal_without_unicode(tmp_path):
 
 
 @pytest.mark.skipif(not Path("/proc/self").exists(), reason="no directory in which nobody can write")
-def test_function_is_printed_if_it_cannot_be_written(command, tmp_path):
+def test_function_is_printed_if_it_cannot_be_written(command, tmp_path, monkeypatch):
+    monkeypatch.setattr(files, "_check_writable", lambda directory: None)  # as if the error came after the check
     status, out, err = command("design", "Reacher-v4", "--out", "/proc/phi.py")
     assert status == 2
     assert "/proc/phi.py cannot be written" in err.splitlines()[-1]

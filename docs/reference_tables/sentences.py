@@ -11,13 +11,13 @@ from lare_rl.logs.relabel import MESSAGES as LOGS
 from lare_rl.phi import numpy_functions
 from lare_rl.phi.numpy_functions import FUNCTIONS
 from lare_rl.phi.python_functions import BUILTINS
-from lare_rl.report.conditions import CONDITIONS
 from lare_rl.report.messages import MESSAGES as REPORT
 from lare_rl.runs.metric_names import METRIC_GROUPS
 from lare_rl.training.advice import MESSAGES as TRAINING
 from lare_rl.turns.words import MESSAGES as TURNS
 from lare_rl.util.variables import VARIABLE_GROUPS
 from reference_tables.cells import code, codes, table
+from reference_tables.conditions import CONDITIONS
 
 __all__ = ["findings_page", "functions_table", "metrics_page", "variables_page"]
 

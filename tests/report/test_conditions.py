@@ -3,8 +3,9 @@
 import ast
 import inspect
 
+from reference_tables.conditions import CONDITIONS
+
 from lare_rl.report import diagnosis
-from lare_rl.report.conditions import CONDITIONS
 from lare_rl.report.messages import MESSAGES
 
 CODES = [code for group in CONDITIONS.values() for code in group]

@@ -5,8 +5,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from reference_tables.conditions import CONDITIONS
 
-from lare_rl.report.conditions import CONDITIONS
 from lare_rl.report.diagnosis import diagnose
 from lare_rl.report.messages import MESSAGES
 from lare_rl.report.run_summary import RunSummary

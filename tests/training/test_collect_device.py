@@ -86,7 +86,7 @@ def test_collect_resets_memory_with_episode(learner, steps):
     """The deterministic choices equal those of the recurrent policy, unrolled over each episode alone."""
     n_episodes = 0
     for seed_index, env_index in np.ndindex(2, ENVS):
-        agent = jax.tree.map(lambda leaf, i=seed_index: leaf[i], learner[0].algorithm.qmix.online.agent)
+        agent = jax.tree.map(lambda leaf, i=seed_index: leaf[i], learner[0].algorithm.networks.online.agent)
         for episode in split_episodes(steps.ended[seed_index, :, env_index]):
             memory = qmix.init_memory((3,), 3, GREEDY)
             for t in episode:

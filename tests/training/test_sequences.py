@@ -45,8 +45,8 @@ def add_seed_axis(leaves):
 
 def compute_sequences(learner, episodes, n_steps, config):
     def compute(learner, episodes):
-        states = learner.algorithm.states
-        return sequences._sequences(learner.replay, episodes, n_steps, learner.reward_state, states, config)
+        statistics = learner.algorithm.mixer_statistics
+        return sequences._sequences(learner.replay, episodes, n_steps, learner.reward_state, statistics, config)
 
     return jax.jit(compute)(learner, episodes)
 
@@ -93,16 +93,18 @@ def test_sequences_are_the_stored_episodes(method):
 def test_mixer_input_is_the_standardised_state_or_all_observations():
     config, steps = qmix_config("dense"), random_steps(ONE_TEAM, 2)
     learner = learner_with_episodes(config)
-    states = sequences._observe_states(learner.algorithm.states, jax.tree.map(jnp.asarray, steps), config)
-    np.testing.assert_allclose(states.mean, steps.next_timestep.state.reshape(-1, 5).mean(axis=0), rtol=1e-3, atol=1e-5)
+    new_steps = jax.tree.map(jnp.asarray, steps)
+    statistics = sequences._observe_states(learner.algorithm.mixer_statistics, new_steps, config)
+    mean = steps.next_timestep.state.reshape(-1, 5).mean(axis=0)
+    np.testing.assert_allclose(statistics.mean, mean, rtol=1e-3, atol=1e-5)
     episodes = get_episodes(learner.replay, replay.Index(jnp.zeros(1, int), jnp.zeros(1, int)))
-    learner = learner._replace(algorithm=learner.algorithm._replace(states=states))
+    learner = learner._replace(algorithm=learner.algorithm._replace(mixer_statistics=statistics))
     batch = compute_sequences(learner, episodes, 5, config)
-    expected = standardise(states, jnp.asarray(steps.timestep.state[:5, 0]))
+    expected = standardise(statistics, jnp.asarray(steps.timestep.state[:5, 0]))
     np.testing.assert_allclose(batch.state[0, :5], expected, rtol=1e-4, atol=1e-5)
 
     stateless = qmix_config("dense", env=replace(ONE_TEAM, state_size=0))
-    assert untrained_learner(stateless).algorithm.states.mean.shape == (9,)
+    assert untrained_learner(stateless).algorithm.mixer_statistics.mean.shape == (9,)
     observation = jnp.arange(18.0).reshape(2, 3, 3)
     mixer_input = sequences._mixer_input(observation, jnp.zeros((2, 0)), stateless)
     np.testing.assert_array_equal(mixer_input, observation.reshape(2, 9))
@@ -135,7 +137,7 @@ def test_train_step_updates_once_for_enough_episodes(method):
     assert all(np.isfinite(values).all() for values in metrics.values())
     unchanged, metrics = train_step(config, select_seed(updated), steps)
     assert metrics["algorithm/updates"].tolist() == [0]
-    assert equal(unchanged.algorithm.qmix, updated.algorithm.qmix)
+    assert equal(unchanged.algorithm.networks, updated.algorithm.networks)
 
 
 @pytest.mark.long

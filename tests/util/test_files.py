@@ -8,7 +8,18 @@ import pytest
 
 from lare_rl.errors import LareError
 from lare_rl.util import files
-from lare_rl.util.files import write_arrays, write_atomically
+from lare_rl.util.files import check_new_path, replace_npz, write_atomically
+
+
+def test_check_new_path(tmp_path):
+    check_new_path(tmp_path / "page.html")
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.skipif(not Path("/proc/self").exists(), reason="no directory in which nobody can write")
+def test_check_new_path_in_a_directory_in_which_nobody_can_write():
+    with pytest.raises(LareError, match="cannot be written"):
+        check_new_path(Path("/proc/x.html"))
 
 
 @pytest.mark.parametrize(
@@ -63,7 +74,7 @@ def test_file_that_another_process_reads(n_refused, tmp_path, monkeypatch):
 
 def test_arrays_may_have_any_name(tmp_path):
     arrays = {"file": np.arange(3), "allow_pickle": np.ones(2), ".a[0]": np.zeros((0, 2), np.float32)}
-    write_arrays(tmp_path / "state.npz", arrays)
+    replace_npz(tmp_path / "state.npz", arrays)
     with np.load(tmp_path / "state.npz", allow_pickle=False) as saved:
         assert saved.files == list(arrays)
         for name, array in arrays.items():

@@ -77,11 +77,6 @@ def on_cpu() -> AbstractContextManager:
     return jax.default_device("cpu")
 
 
-def padded_size(n: int) -> int:
-    """Return the smallest power of two that is at least `n`, so that few shapes are compiled."""
-    return 1 << max(0, n - 1).bit_length()
-
-
 def pad(rows: np.ndarray, size: int) -> np.ndarray:
     """Pad rows with zeros. `numpy.pad` takes ten times as long for a few rows."""
     padded = np.zeros((size, *rows.shape[1:]), rows.dtype)

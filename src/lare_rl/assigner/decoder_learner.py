@@ -20,7 +20,7 @@ from jaxtyping import Int
 from lare_rl.assigner import compiled_functions as compiled
 from lare_rl.assigner.assigner_config import AssignerConfig
 from lare_rl.assigner.batches import sample_batch, whole_episodes
-from lare_rl.assigner.compiled_functions import MAX_CALL_ROWS, on_cpu, pad, padded_size
+from lare_rl.assigner.compiled_functions import MAX_CALL_ROWS, on_cpu, pad
 from lare_rl.assigner.store import Store, StoredEpisode
 from lare_rl.credit import closed_form, prequential, returns
 from lare_rl.credit.decomposition import DecoderState
@@ -29,6 +29,7 @@ from lare_rl.credit.history import next_history_columns
 from lare_rl.credit.methods import Fit
 from lare_rl.nn.normalise import empty_scale
 from lare_rl.util.float64 import float64
+from lare_rl.util.shapes import padded_size
 
 __all__ = ["CHUNK_UPDATES", "DecoderLearner"]
 

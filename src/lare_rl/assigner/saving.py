@@ -26,7 +26,7 @@ from lare_rl.latent.saved import load_function
 from lare_rl.runs.checkpoint import DAMAGED_FILE_ERRORS, fill_template, named_leaves, open_npz
 from lare_rl.tasks.payments import PaymentRule
 from lare_rl.tasks.spec import TaskSpec
-from lare_rl.util.files import write_arrays, write_atomically
+from lare_rl.util.files import replace_npz, write_atomically
 from lare_rl.util.renamed_fields import rename_keys
 from lare_rl.util.safe_io import read_json, read_text
 
@@ -102,7 +102,7 @@ def write_state(state: AssignerState, directory: Path) -> None:
         raise LareError(f"{directory} cannot be written: {error.strerror}") from error
     if state.config.phi is not None:
         state.config.phi.save(directory / FUNCTION_FILE)
-    write_arrays(directory / ARRAYS_FILE, state.arrays)
+    replace_npz(directory / ARRAYS_FILE, state.arrays)
     text = json.dumps(_config_values(state), indent=1).encode()
     write_atomically(directory / TEXT_FILE, lambda file: file.write(text))
 

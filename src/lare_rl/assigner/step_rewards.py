@@ -12,12 +12,13 @@ from jaxtyping import Array, Bool, Float, Int
 
 from lare_rl.assigner import compiled_functions as compiled
 from lare_rl.assigner.batches import whole_episodes
-from lare_rl.assigner.compiled_functions import MAX_CALL_ROWS, on_cpu, pad, padded_size
+from lare_rl.assigner.compiled_functions import MAX_CALL_ROWS, on_cpu, pad
 from lare_rl.assigner.decoder_learner import DecoderLearner
 from lare_rl.credit import decomposition
 from lare_rl.credit.decomposition import DecoderState
 from lare_rl.credit.engine import StepBatch
 from lare_rl.credit.methods import Reward
+from lare_rl.util.shapes import padded_size
 
 __all__ = ["StepRewards"]
 

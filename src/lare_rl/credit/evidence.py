@@ -78,7 +78,7 @@ FIRST_GROUP_GAIN, OTHER_GROUPS_LOSS, LOW_NOISE = 100, 1e4, 1e-6
 """The third start of a fit: the first group may explain `FIRST_GROUP_GAIN` times its equal share, each other group its equal share
 divided by `OTHER_GROUPS_LOSS`, and the noise `LOW_NOISE` times the variance of the returns."""
 MANY_EPISODES_PER_FEATURE = 2
-"""With more episodes than this for each feature, a fit only continues from the earlier one."""
+"""With more episodes than this for each feature, and an earlier fit, the second and third iterations have one round each."""
 
 
 def _add_groups(
@@ -91,10 +91,11 @@ JAX = Backend(jnp, _add_groups, partial(solve_triangular, lower=True))
 
 
 class SufficientStatistics(NamedTuple):
-    """Sums over episodes of v_k = (m_k, R_k / T_k, R_k), weighted by their steps."""
+    """Weighted mean and products of cases: episodes, v_k = (m_k, R_k / T_k, R_k) with weight T_k, or prefixes (`add_prefixes`)."""
 
     n_episodes: Float[Array, ""]
     n_steps: Float[Array, ""]
+    """The sum of the weights. An episode has as many prefixes as steps, each of weight 1."""
     mean: Float[Array, " features_and_targets"]
     products: Float[Array, "features_and_targets features_and_targets"]
     """sum_k T_k (v_k - mean)(v_k - mean)^T"""
@@ -128,7 +129,7 @@ def add_prefixes(
     """Add the prefixes of some episodes, each with the return of its whole episode. Rows where `mask` is false are ignored.
 
     Every prefix counts the same. Only the number of episodes counts as the number of cases, because the prefixes of an episode have
-    the same noise. Treat the score as a mean, so that the regression is of R, not of R/T.
+    the same noise. R takes the place of R/T too, so that it is regressed for every score type.
     """
     weight = mask.astype(statistics.mean.dtype)
     v = jnp.concatenate([features, returns[:, None], returns[:, None]], axis=1)
@@ -203,8 +204,8 @@ def fit(
     While episodes are few, the evidence may have several maxima: one where all variation is noise, and one where none is. An
     iteration that starts near such a maximum stays there, however many episodes follow. So there are three iterations: from
     `start`, from equal shares of the groups with half of the variation as noise, and from the first group with almost no noise. The
-    largest evidence wins. Once there are `MANY_EPISODES_PER_FEATURE` episodes for each feature, only the first iteration runs to its
-    end; the others stop after one round.
+    largest evidence wins. Without an earlier fit, the second is the same as the first, and has one round. With an earlier fit and
+    more than `MANY_EPISODES_PER_FEATURE` episodes for each feature, the second and third have one round each.
 
     Args:
         group_index: the index of each feature's group.
@@ -279,7 +280,7 @@ def _round(problem: Regression, alpha: Float[Array, " groups"], beta: Float[Arra
 
 
 class PosteriorCovariance(NamedTuple):
-    """The uncertainty of b + w . f. Its posterior variance is |root (f - centre)|^2 + centre_variance, in squared units of y."""
+    """The posterior variance of b + w . f is |root (f - centre)|^2 + centre_variance, in squared units of y."""
 
     root: Float[Array, "*score_types features features"]
     """root^T root = Sigma."""
@@ -311,7 +312,10 @@ def posterior_covariance(
 
 
 def posterior_std(covariance: PosteriorCovariance, features: Float[Array, "*batch features"]) -> Float[Array, "*batch"]:
-    """Return the posterior standard deviation of b + w . f, in the unit of y. Weights beyond those of the features are ignored."""
+    """Return the posterior standard deviation of b + w . f, in the unit of y.
+
+    `features` may lack the last columns, such as the intercepts of levels. Their uncertainty is left out.
+    """
     n_features = features.shape[-1]
     distance = (features - covariance.centre[..., :n_features]) @ covariance.root[..., :n_features].T
     return jnp.sqrt(jnp.sum(distance**2, axis=-1) + covariance.centre_variance)

@@ -42,8 +42,8 @@ def fit_strengths(
         group_index: the index of each feature's group.
         strength_index: the index of each feature's strength.
         groups: the fit by groups, from whose precisions the iteration starts.
-        earlier: an earlier result, or `evidence.init_posterior`. With `evidence.MANY_EPISODES_PER_FEATURE`, the iteration continues
-            from it instead.
+        earlier: an earlier result, or `evidence.init_posterior`. With more than `evidence.MANY_EPISODES_PER_FEATURE` episodes for
+            each feature, the iteration continues from it instead.
     """
     start = expand_groups(groups, group_index, strength_index)
     problem = evidence.regression(statistics, score_type, strength_index)

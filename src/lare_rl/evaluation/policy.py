@@ -15,6 +15,7 @@ from lare_rl.runs.directory import Run, as_run
 from lare_rl.training.host_policy import HostPolicy, draw_noise, init_host_memory, make_policy
 from lare_rl.training.saved_state import load_actor
 from lare_rl.training.streams import Stream, numpy_generator
+from lare_rl.util.shapes import padded_size
 
 __all__ = ["RunPolicy", "load_policy"]
 
@@ -97,8 +98,8 @@ class RunPolicy:
     def _select_actions(
         self, rows: Float[np.ndarray, "batch observation"], available: Any
     ) -> Float[np.ndarray, "batch action"]:
-        n_rows, has_memory = len(rows), bool(jax.tree.leaves(self._memory))
-        if has_memory and n_rows > 1:
+        n_rows = len(rows)
+        if n_rows > 1 and jax.tree.leaves(self._memory):
             name = self._config.algorithm.name
             raise LareError(
                 f"the policy of {name} has a memory: give it one observation at a time, and call reset() between episodes"
@@ -106,11 +107,11 @@ class RunPolicy:
         deterministic = self._config.deterministic_evaluation
         mask = self._check_mask(available, n_rows)
         noise = None if deterministic else draw_noise(self._config, [self._rng], n_rows)
-        n_padded = 1 << (n_rows - 1).bit_length()  # each number of rows needs a program of its own
+        n_padded = padded_size(n_rows)
         if n_padded not in self._policies:
             self._policies[n_padded] = make_policy(self._config, self._actor, n_padded, deterministic=deterministic)
         action, self._memory = self._policies[n_padded](
-            self._memory if has_memory else init_host_memory(self._config, 1, n_padded),
+            self._memory,
             _pad(rows[None, :, None], n_padded),
             _pad(mask[None, :, None], n_padded),
             None if noise is None else _pad(noise, n_padded),

@@ -25,7 +25,7 @@ from lare_rl.runs.directory import Run, as_run, function_filename
 from lare_rl.training.compiled import compile_functions
 from lare_rl.training.saved_state import load_actor, load_learner
 from lare_rl.training.seed_axis import select_seed
-from lare_rl.util.files import write_arrays, write_atomically
+from lare_rl.util.files import replace_npz, write_atomically
 from lare_rl.util.provenance import code_version
 
 __all__ = ["ExportResult", "export_run"]
@@ -134,7 +134,7 @@ def _write_arrays(path: Path, graph: Graph) -> None:
             arrays[str(i)] = node.option.astype(np.float32) if node.kind == "float" else node.option
         elif node.op == "gather" and node.option.slices is None:
             arrays[str(i)] = node.option.positions
-    write_arrays(path, arrays)
+    replace_npz(path, arrays)
 
 
 def _write_bytes(path: Path, content: bytes) -> None:

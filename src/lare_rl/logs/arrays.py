@@ -10,7 +10,7 @@ from lare_rl.errors import LareError, short_repr
 from lare_rl.logs.episode import KEYS, RelabelledEpisode
 from lare_rl.logs.log import Log, atomic_output
 from lare_rl.tasks.spec import TaskSpec
-from lare_rl.util.files import save_npz
+from lare_rl.util.files import write_npz
 
 __all__ = ["FlatLog", "ListLog", "NpzLog", "read_npz"]
 
@@ -27,7 +27,7 @@ class ArrayLog(Log):
             for number, (episode, r_hat) in enumerate(episodes):
                 arrays = {**episode.contents, "rewards": r_hat, "paid": episode.reward}
                 with (directory / self.file_name(number, episode.name)).open("xb") as file:
-                    save_npz(file, arrays)
+                    write_npz(file, arrays)
         return Path(out)
 
     def file_name(self, number: int, name: str) -> str:

@@ -15,7 +15,7 @@ from jaxtyping import Float, Int
 
 from lare_rl.errors import LareError
 from lare_rl.runs.checkpoint import DAMAGED_FILE_ERRORS, fill_template, named_leaves, open_npz
-from lare_rl.util.files import write_arrays
+from lare_rl.util.files import replace_npz
 
 __all__ = ["BEST_FILE", "BestPolicy", "empty_best", "load_best", "save_best", "update_best"]
 
@@ -57,7 +57,7 @@ def save_best(directory: Path, best: BestPolicy) -> None:
     """Write the best policies into a checkpoint's directory. Raises `LareError` if they cannot be written."""
     arrays = {name: np.asarray(leaf) for name, leaf in named_leaves(best).items()}
     directory.mkdir(exist_ok=True)
-    write_arrays(directory / BEST_FILE, arrays)
+    replace_npz(directory / BEST_FILE, arrays)
 
 
 def load_best(directory: Path, actor_shape: Any, n_seeds: int) -> BestPolicy:

@@ -22,9 +22,10 @@ import jax
 import numpy as np
 
 from lare_rl.errors import LareError, short_repr
-from lare_rl.util.files import write_arrays
+from lare_rl.util.files import replace_npz
 from lare_rl.util.renamed_fields import rename_fields
 from lare_rl.util.safe_io import read_json
+from lare_rl.util.shapes import padded_size
 
 __all__ = [
     "DAMAGED_FILE_ERRORS",
@@ -118,7 +119,7 @@ def take_snapshot(
     # been dropped, `end` is smaller than before.
     start = np.minimum(start, end)
     count = end - start + 1
-    width = 1 << int(count.max() - 1).bit_length()  # few widths, few compilations
+    width = padded_size(int(count.max()))
     rows = _read_rows(learner.replay.columns, (start[..., None] + np.arange(width)) % capacity)
     number = row_files[-1].number + 1 if row_files else 0
     row_files.append(_RowFile(number, start.tolist(), count.tolist()))
@@ -141,8 +142,8 @@ def write(directory: Path, snapshot: Snapshot) -> None:
     directory.mkdir(exist_ok=True)
     for partial_file in directory.glob("*.new"):  # of a process that was killed while it wrote
         partial_file.unlink(missing_ok=True)
-    write_arrays(directory / snapshot.rows_file, snapshot.rows)
-    write_arrays(directory / STATE_FILE, snapshot.state)
+    replace_npz(directory / snapshot.rows_file, snapshot.rows)
+    replace_npz(directory / STATE_FILE, snapshot.state)
     for name in snapshot.unused_files:
         (directory / name).unlink(missing_ok=True)
 

@@ -17,7 +17,7 @@ from lare_rl.phi.graph import Graph
 from lare_rl.runs.directory import Run
 from lare_rl.tasks.spec import select_states
 from lare_rl.training.static_config import TrainConfig
-from lare_rl.util.files import write_arrays
+from lare_rl.util.files import replace_npz
 
 __all__ = ["compute_factors", "compute_host_factors", "is_compilable"]
 
@@ -77,7 +77,7 @@ def compute_host_factors(run: Run, config: TrainConfig, steps: Trajectory) -> Fl
             columns = function.step_factors(before, action, after, run.scored_observation)
         except NonFiniteFactorError as error:
             path, batch = run.directory / FAILED_BATCH, {"observation": error.observation, "action": error.action}
-            write_arrays(path, batch)
+            replace_npz(path, batch)
             raise LareError(f"{error}; it was given the batch in {path}; the last checkpoint is whole") from error
         factors[..., config.team_rows(i), : columns.shape[-1]] = columns
     return factors

@@ -44,8 +44,9 @@ separately, and short episodes save little."""
 class SequenceState(NamedTuple):
     """The state of the algorithm, and of its training."""
 
-    qmix: Any
-    states: RunningMeanStd
+    networks: Any
+    """What the algorithm learns."""
+    mixer_statistics: RunningMeanStd
     """Running statistics of the mixer's input."""
     n_due: Int[Array, ""]
     """The number of updates that were due so far, made or not: one for every `update_every` episodes."""
@@ -83,7 +84,7 @@ def get_actor(learner: Learner, env_steps: int | Int[Array, ""], config: TrainCo
     """Return the parts of the learner that are needed to act, for all seeds."""
     state, algorithm = learner.algorithm, config.algorithm.load()
     epsilon = algorithm.epsilon(env_steps, _settings(config))
-    return Actor(algorithm.get_actor(state.qmix), jnp.full(state.n_due.shape, epsilon))
+    return Actor(algorithm.get_actor(state.networks), jnp.full(state.n_due.shape, epsilon))
 
 
 def init_memory(config: TrainConfig) -> Any:
@@ -116,33 +117,34 @@ def train_step(
     n_due = jnp.sum(learner.replay.episodes, axis=1) // settings.update_every
     has_batch = jnp.sum(jax.vmap(replay.n_finished)(learner.replay), axis=1) >= settings.batch_size
     n_updates = jnp.where(has_batch, n_due - n_before, 0)
-    states = jax.vmap(partial(_observe_states, config=config))(learner.algorithm.states, steps)
-    learner = learner._replace(algorithm=learner.algorithm._replace(states=states, n_due=n_due))
+    statistics = jax.vmap(partial(_observe_states, config=config))(learner.algorithm.mixer_statistics, steps)
+    learner = learner._replace(algorithm=learner.algorithm._replace(mixer_statistics=statistics, n_due=n_due))
     lengths = jnp.asarray(_cut_lengths(config))
     branches = [jax.vmap(partial(_update_seed, config=config, n_steps=length)) for length in _cut_lengths(config)]
 
-    def update(number: Int[Scalar, ""], carry: tuple[Updated, Metrics]) -> tuple[Updated, Metrics]:
-        (algorithm, decoders), sums = carry
-        current = learner._replace(algorithm=learner.algorithm._replace(qmix=algorithm), decoders=decoders)
-        number_keys = jax.vmap(lambda key: jax.random.split(jax.random.fold_in(key, number)))(keys)
-        sample_keys, update_keys = jnp.unstack(number_keys, axis=1)
+    def make_update(
+        number: Int[Scalar, ""], networks: Any, decoders: tuple[DecoderState, ...]
+    ) -> tuple[Updated, Metrics]:
+        current = learner._replace(algorithm=learner.algorithm._replace(networks=networks), decoders=decoders)
+        pairs = jax.vmap(lambda key: jax.random.split(jax.random.fold_in(key, number)))(keys)
+        sample_keys, update_keys = jnp.unstack(pairs, axis=1)
         sample = partial(sample_distinct_episodes, count=settings.batch_size)
         episodes = jax.vmap(sample)(current.replay, sample_keys)
         longest = jnp.max(episodes.length * (episodes.mask > 0))
         branch = jnp.searchsorted(lengths, longest)
-        updated, metrics = jax.lax.switch(branch, branches, current, episodes, update_keys, n_before + number + 1)
+        return jax.lax.switch(branch, branches, current, episodes, update_keys, n_before + number + 1)
+
+    def update(number: Int[Scalar, ""], carry: tuple[Updated, Metrics]) -> tuple[Updated, Metrics]:
+        before, sums = carry
+        updated, metrics = make_update(number, *before)
         is_due = number < n_updates
         sums = {name: sums[name] + jnp.where(is_due, values, 0) for name, values in metrics.items()}
-        return select(is_due, updated, (algorithm, decoders)), sums
+        return select(is_due, updated, before), sums
 
-    def first_update(learner: Learner) -> tuple[Updated, Metrics]:
-        episodes = jax.vmap(partial(sample_distinct_episodes, count=settings.batch_size))(learner.replay, keys)
-        return branches[-1](learner, episodes, keys, n_before)
-
-    zeros = jax.tree.map(jnp.zeros_like, jax.eval_shape(first_update, learner)[1])
-    start = ((learner.algorithm.qmix, learner.decoders), zeros)
-    (algorithm, decoders), sums = jax.lax.fori_loop(0, jnp.max(n_updates), update, start)
-    learner = learner._replace(algorithm=learner.algorithm._replace(qmix=algorithm), decoders=decoders)
+    start = learner.algorithm.networks, learner.decoders
+    zeros = jax.tree.map(jnp.zeros_like, jax.eval_shape(make_update, jnp.int32(0), *start)[1])
+    (networks, decoders), sums = jax.lax.fori_loop(0, jnp.max(n_updates), update, (start, zeros))
+    learner = learner._replace(algorithm=learner.algorithm._replace(networks=networks), decoders=decoders)
     metrics = {name: total / n_updates for name, total in sums.items()}  # NaN where there was no update
     return learner, metrics | {"algorithm/updates": n_updates.astype(jnp.float32)}
 
@@ -155,11 +157,11 @@ def _cut_lengths(config: TrainConfig) -> list[int]:
     return sorted({-(-longest // 4), -(-longest // 2), longest})
 
 
-def _observe_states(states: RunningMeanStd, steps: Trajectory, config: TrainConfig) -> RunningMeanStd:
-    """Add the mixer's inputs of new steps to the statistics."""
+def _observe_states(statistics: RunningMeanStd, steps: Trajectory, config: TrainConfig) -> RunningMeanStd:
+    """Add the mixer's inputs of new steps to their statistics."""
     timestep = steps.next_timestep
     rows = jnp.asarray(_mixer_input(timestep.observation, timestep.state, config))
-    return update_mean_std(states, rows.reshape(-1, rows.shape[-1]))
+    return update_mean_std(statistics, rows.reshape(-1, rows.shape[-1]))
 
 
 def _update_seed(
@@ -178,11 +180,11 @@ def _update_seed(
         sample = jax.tree.map(lambda leaf: leaf[0], samples)
         decoders, metrics = fit_decoders(decoders, learner.replay, sample, fit_key, config)
     state, settings = learner.algorithm, _settings(config)
-    batch = _sequences(learner.replay, episodes, n_steps, decoders or learner.scale, state.states, config)
+    batch = _sequences(learner.replay, episodes, n_steps, decoders or learner.scale, state.mixer_statistics, config)
     n_episodes = number * settings.update_every
     copy_target = n_episodes // settings.target_every > (n_episodes - settings.update_every) // settings.target_every
-    algorithm, algorithm_metrics = config.algorithm.load().update(state.qmix, batch, copy_target, settings)
-    return (algorithm, decoders), metrics | algorithm_metrics
+    networks, algorithm_metrics = config.algorithm.load().update(state.networks, batch, copy_target, settings)
+    return (networks, decoders), metrics | algorithm_metrics
 
 
 def _sequences(
@@ -190,7 +192,7 @@ def _sequences(
     episodes: EpisodeSample,
     n_steps: int,
     reward_state: tuple[RewardSource, ...],
-    states: RunningMeanStd,
+    mixer_statistics: RunningMeanStd,
     config: TrainConfig,
 ) -> Sequences:
     """Return episodes with the method's rewards, each padded with its last step to `n_steps` steps."""
@@ -208,10 +210,10 @@ def _sequences(
     n_choices = (*observation.shape[:-1], config.env.action_size)
     return Sequences(
         observation=observation,
-        state=standardise_if_observed(states, _mixer_input(observation, state, config)),
+        state=standardise_if_observed(mixer_statistics, _mixer_input(observation, state, config)),
         available=with_last_timestep("available") if config.env.masks_actions else jnp.ones(n_choices, bool),
         action=steps.columns["action"],
         reward=mask * team_mean(reward, alive_agents(steps, config), config.env.teams[0]),
-        done=mask * (jnp.arange(n_steps) == episodes.length[:, None] - 1),
+        done=episodes.mask[:, None] * (jnp.arange(n_steps) == episodes.length[:, None] - 1),
         mask=mask,
     )

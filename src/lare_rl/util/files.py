@@ -1,7 +1,8 @@
-"""Checks of new files; and files that are replaced as a whole. If the process is killed, or the disk is full, the old file stays."""
+"""Check paths of new files, and replace files as a whole. If the process is killed, or the disk is full, the old file stays."""
 
 import contextlib
 import os
+import tempfile
 import time
 import zipfile
 from collections.abc import Callable, Mapping
@@ -11,15 +12,15 @@ from uuid import uuid4
 
 from lare_rl.errors import LareError
 
-__all__ = ["check_new_path", "save_npz", "write_arrays", "write_atomically"]
+__all__ = ["check_new_path", "replace_npz", "write_atomically", "write_npz"]
 
 
 RETRY_S = 0.01, 0.03, 0.1, 0.3, 1.0
-"""Windows does not replace a file that another process reads just now. The moments after which it is tried again (s)."""
+"""Windows does not replace a file that another process reads just now. Pauses between the attempts (s)."""
 
 
 def check_new_path(path: Path, option: str = "file", overwrite: bool | None = None) -> None:
-    """Raise `LareError` if a file could not be written: before the work for it is done.
+    """Raise `LareError` if `path` is unusable. Call this before the work whose result goes there.
 
     Args:
         path: the file.
@@ -34,8 +35,13 @@ def check_new_path(path: Path, option: str = "file", overwrite: bool | None = No
             raise LareError(f"{path} exists, and is not overwritten; choose another {option}{hint}")
         if not path.parent.is_dir():
             raise LareError(f"{path} cannot be written: there is no directory {path.parent}; choose another {option}")
+        _check_writable(path.parent)
     except OSError as error:
         raise LareError(f"{path} cannot be written: {error.strerror}") from error
+
+
+def _check_writable(directory: Path) -> None:
+    tempfile.TemporaryFile(dir=directory).close()  # os.access says nothing to root about /proc
 
 
 def write_atomically(path: Path, write: Callable[[Any], object]) -> None:
@@ -58,13 +64,16 @@ def write_atomically(path: Path, write: Callable[[Any], object]) -> None:
         new.unlink(missing_ok=True)
 
 
-def write_arrays(path: Path, arrays: Mapping[str, Any]) -> None:
+def replace_npz(path: Path, arrays: Mapping[str, Any]) -> None:
     """Replace an .npz file. Raises `LareError` if it cannot be written."""
-    write_atomically(path, lambda file: save_npz(file, arrays))
+    write_atomically(path, lambda file: write_npz(file, arrays))
 
 
-def save_npz(file: IO[bytes], arrays: Mapping[str, Any]) -> None:
-    """Write arrays of any name. `numpy.savez` cannot save an array whose name is one of its arguments, which differ by its version."""
+def write_npz(file: IO[bytes], arrays: Mapping[str, Any]) -> None:
+    """Write arrays of any name.
+
+    `numpy.savez` refuses names that are also its own arguments, such as `file`. Which names these are depends on its version.
+    """
     import numpy as np  # here, because the command line imports this module before it shows a message
 
     with zipfile.ZipFile(file, "w", allowZip64=True) as archive:

@@ -48,6 +48,8 @@ _NETWORK = rf"({_DECODER}\.(?:network|.*\.(?:mu|nu)))"
 """Its network, or one of Adam's moments, which have the same fields."""
 _RENAMED_PATHS = {
     r"\.agent\.decoder\b": ".agent.head",
+    r"^\.algorithm\.qmix\b": ".algorithm.networks",
+    r"^\.algorithm\.states\b": ".algorithm.mixer_statistics",
     rf"({_DECODER})\.decoder\b": r"\1.network",
     rf"{_NETWORK}\.network\b": r"\1.mlp",
     rf"{_NETWORK}\.decoder\.network\b": r"\1.step_decoder.mlp",

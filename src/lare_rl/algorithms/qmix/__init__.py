@@ -36,13 +36,13 @@ class QMIXSettings(AlgorithmSettings):
     update_every: Annotated[int, Field(ge=1)] = 8
     """Number of new episodes for each update."""
     target_every: Annotated[int, Field(ge=1)] = 200
-    """Number of episodes between two copies of the online networks to the target networks."""
+    """Episodes between two copies of the online networks to the target networks. A copy waits for the next update."""
     epsilon_start: Annotated[float, Field(ge=0, le=1)] = 1.0
     """Probability that an agent explores, at the start."""
     epsilon_end: Annotated[float, Field(ge=0, le=1)] = 0.05
     """Probability that an agent explores, at the end."""
     epsilon_steps: Annotated[int, Field(ge=1)] = 100_000
-    """Environment steps over which this probability falls linearly."""
+    """Environment steps over which `epsilon_start` falls linearly to `epsilon_end`."""
 
 
 def _run_defaults(env: "EnvSpec", environments: int) -> dict[str, Any]:
