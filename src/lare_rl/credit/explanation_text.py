@@ -209,12 +209,12 @@ def explanation_findings(
 
 def _groups(effects: Mapping[Any, float]) -> list[Finding]:
     """Report the groups whose episodes return more or less than their steps are paid for. No episode was fitted to the others."""
-    known = {name: effect for name, effect in effects.items() if effect}
-    largest = sorted(known, key=lambda name: -abs(known[name]))[:N_GROUPS]
+    observed = {name: effect for name, effect in effects.items() if effect}
+    largest = sorted(observed, key=lambda name: -abs(observed[name]))[:N_GROUPS]
     if not largest:
         return []
-    named = tuple(Finding("group_effect", {"name": str(name), "value": known[name]}) for name in largest)
-    more = Finding("more_names", {"count": len(known) - N_GROUPS}) if len(known) > N_GROUPS else None
+    named = tuple(Finding("group_effect", {"name": str(name), "value": observed[name]}) for name in largest)
+    more = Finding("more_names", {"count": len(observed) - N_GROUPS}) if len(observed) > N_GROUPS else None
     return [Finding("groups_differ", {"groups": named, "more": more})]
 
 

@@ -319,4 +319,4 @@ def describe_method(run: Run) -> str:
         if task.evaluation_environment
         else ""
     )
-    return f"{method.summary[0].upper()}{method.summary[1:]}.{source}{place}"
+    return f"{method.summary[0].upper()}{method.summary[1:]}.{source}{environments}"
