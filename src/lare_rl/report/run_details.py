@@ -314,7 +314,7 @@ def describe_method(run: Run) -> str:
     """Return what the run's method does, its source, and where policies are evaluated, if it is elsewhere."""
     method, task = find_method(run.config.settings.method), run.config.task
     source = "" if method.source == "-" else f" Source: {method.source}."
-    place = (
+    environments = (
         f" Trained in {task.environment}, evaluated in {task.evaluation_environment}."
         if task.evaluation_environment
         else ""
