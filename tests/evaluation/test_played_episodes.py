@@ -5,6 +5,8 @@ import pytest
 
 import lare_rl
 from helpers.jax_toy_envs import echo_spec
+from helpers.numpy_twins import assert_close
+from lare_rl.evaluation import played_episodes as module
 from lare_rl.evaluation.played_episodes import N_SAMPLE_EPISODES, play_run, sample_steps
 
 TASK = echo_spec(environment="hosted/three", credit_scope="state", observation_size=9, action_size=9, payments=2)
@@ -27,9 +29,9 @@ def run(tmp_path_factory):
 
 
 def test_exact_rewards_add_up_to_payments(run):
-    played = play_run(run, 20)
+    played = play_run(run, N_SAMPLE_EPISODES, key=1)  # the shapes of the other test: they are compiled once
     sums, payments = [], []
-    for episode in range(20):
+    for episode in range(N_SAMPLE_EPISODES):
         alive, true, training = (
             played.select_episode(values, episode)
             for values in (np.asarray(played.steps.timestep.alive), played.reward, played.training_reward)
@@ -50,3 +52,15 @@ def test_sampled_reward_of_a_team_is_the_mean_over_agents_that_are_alive(run):
     expected = (played.reward * alive).sum(axis=-1) / alive.sum(axis=-1)
     assert not alive[played.mask].all()
     np.testing.assert_allclose(sample.reward.ravel(), expected[played.mask], rtol=1e-6)
+
+
+def test_an_episode_does_not_depend_on_the_number_of_environments(run, monkeypatch):
+    """Environments in processes of their own are few, and play some episodes after others."""
+    batches = []
+    for width in (7, 3):
+        monkeypatch.setattr(module, "n_open_envs", lambda task, n_seeds, n_episodes, width=width: width)
+        batches.append(play_run(run, 7))
+    assert len({int(mask.sum()) for mask in batches[0].mask.T}) > 1
+    for episode in range(7):
+        together, few = (played.select_episode((played.steps, played.training_reward), episode) for played in batches)
+        assert_close(together, few)

@@ -123,7 +123,7 @@ def test_draft_of_task(command, tmp_path):
     assert "--data walks/log-v0" in out
     text = (tmp_path / "task.toml").read_text()
     assert "A walker of two legs.\nIt must not fall." in text
-    assert "speed" not in text
     (tmp_path / "task.toml").write_text(text)
     task = lare_rl.load_task("task.toml")
+    assert "speed" not in task.description
     assert (task.name, task.environment, task.observation_size, task.action_size) == ("log-v0", "none", 2, 1)

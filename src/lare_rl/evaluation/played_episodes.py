@@ -1,7 +1,9 @@
 """New episodes of a run's policy, with the credit of each agent, and samples of their steps."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
+from operator import itemgetter
 from typing import Any
 
 import jax
@@ -13,7 +15,7 @@ from lare_rl.data import replay
 from lare_rl.data.trajectory import Trajectory
 from lare_rl.envs.families import make_env
 from lare_rl.envs.interface import JaxEnv, Team, team_mean
-from lare_rl.envs.placement import make_vec_env
+from lare_rl.envs.placement import make_vec_env, n_open_envs
 from lare_rl.envs.play import phi_inputs
 from lare_rl.runs.directory import Run
 from lare_rl.training.collect_device import unroll_on_device
@@ -115,11 +117,30 @@ def unroll_policy(env: JaxEnv, config: TrainConfig, actor: Any, n_episodes: int,
 
 
 def _unroll_on_host(run: Run, config: TrainConfig, actor: Any, n_episodes: int) -> EpisodeBatch:
-    seeds = run.seeds[:1]
-    policy = EvaluationPolicy(config, actor, seeds, n_episodes, deterministic=False)
-    episode_seeds = [episode_seed(seeds[0], Stream.TRAINING_EPISODES, number) for number in range(n_episodes)]
-    with make_vec_env(run.config.task, n_episodes) as envs:
-        return _drop_seed_axis(record_on_host(envs, policy, seeds, episode_seeds))
+    """Play as many episodes at a time as environments may be open. An episode does not depend on how many these are."""
+    seeds, task, batches = run.seeds[:1], run.config.task, []
+    width = n_open_envs(task, 1, n_episodes)
+    with make_vec_env(task, width) as envs:
+        for first in range(0, n_episodes, width):
+            numbers = np.arange(first, min(first + width, n_episodes))
+            noise_rows = n_episodes, np.minimum(np.arange(first, first + width), n_episodes - 1)
+            policy = EvaluationPolicy(config, actor, seeds, width, deterministic=False, noise_rows=noise_rows)
+            episode_seeds = [episode_seed(seeds[0], Stream.TRAINING_EPISODES, number) for number in numbers.tolist()]
+            batch = _drop_seed_axis(record_on_host(envs, policy, seeds, episode_seeds))
+            batches.append(jax.tree.map(itemgetter(np.s_[:, : len(numbers)]), batch))
+    return _join_episodes(batches)
+
+
+def _join_episodes(batches: Sequence[EpisodeBatch]) -> EpisodeBatch:
+    """Join episodes along their axis. The last step of a shorter batch is repeated, as for an episode that has ended."""
+    n_steps = max(len(batch.mask) for batch in batches)
+
+    def lengthen(batch: EpisodeBatch) -> EpisodeBatch:
+        steps = np.minimum(np.arange(n_steps), len(batch.mask) - 1)
+        batch = jax.tree.map(lambda leaf: leaf[steps], batch)
+        return batch._replace(mask=batch.mask & (np.arange(n_steps) == steps)[:, None])
+
+    return jax.tree.map(lambda *leaves: np.concatenate(leaves, axis=1), *map(lengthen, batches))
 
 
 def _drop_seed_axis(batch: EpisodeBatch) -> EpisodeBatch:
