@@ -62,7 +62,7 @@ def test_rewards_of_many_agents():
     credit = pure_credit("bayes", **SIZES, settings=settings, agents=3)
     state = jax.jit(lambda key: train(credit, key, make=partial(make_steps, agents=(3,))))(jax.random.key(0))
     steps, true_reward = make_steps(jax.random.key(1), (3,))
-    assert correlation(credit.reward(state, steps), true_reward) > 0.9
+    assert correlation(jax.jit(credit.reward)(state, steps), true_reward) > 0.9
 
 
 def test_phi_is_part_of_the_program(phi):
@@ -76,7 +76,7 @@ def test_phi_is_part_of_the_program(phi):
 def test_phi_reads_actions_in_the_units_of_the_environment(reward):
     credit = pure_credit("llm-reward", reward, **SIZES, low=-3.0, high=1.0)
     steps, _ = make_steps(jax.random.key(1))
-    r_hat = credit.reward(credit.init(jax.random.key(0)), steps)
+    r_hat = jax.jit(lambda key: credit.reward(credit.init(key), steps))(jax.random.key(0))
     rows = [np.asarray(x).reshape(N_STEPS * N_ENVS, -1) for x in (steps.observation, 2 * steps.action - 1)]
     after = np.asarray(steps.next_observation).reshape(N_STEPS * N_ENVS, -1)
     expected = reward.step_factors(*rows, after, "after")
@@ -98,10 +98,11 @@ def test_invalid_factors_are_counted_and_not_used(phi):
     state = jax.jit(lambda key: train(credit, key, make=steps_of))(jax.random.key(0))
     assert int(state.n_invalid) == 90
     steps, _ = steps_of(jax.random.key(1))
-    r_hat = np.asarray(credit.reward(state, steps))
+    reward = jax.jit(credit.reward)
+    r_hat = np.asarray(reward(state, steps))
     assert (r_hat[is_invalid] == 0).all()
     valid, _ = make_steps(jax.random.key(1))
-    expected = np.asarray(credit.reward(state, valid))
+    expected = np.asarray(reward(state, valid))
     np.testing.assert_array_equal(r_hat[~is_invalid], expected[~is_invalid])
     assert np.isfinite(expected).all()
     returns = float(state.learner.replay.episode_return.max())
@@ -109,7 +110,7 @@ def test_invalid_factors_are_counted_and_not_used(phi):
 
 
 def test_functions_are_mapped_over_seeds():
-    """`vmap` and `shard_map` give what single calls give."""
+    """`vmap` within `shard_map` gives what single calls give."""
     credit = pure_credit("bayes", **SUM)
     keys = jax.random.split(jax.random.key(0), 2)
 
@@ -117,7 +118,6 @@ def test_functions_are_mapped_over_seeds():
         return credit.reward(train(credit, key, n_rounds=5), make_steps(jax.random.key(1))[0])
 
     expected = jnp.stack([jax.jit(run)(key) for key in keys])
-    np.testing.assert_allclose(jax.jit(jax.vmap(run))(keys), expected, rtol=1e-3, atol=1e-4)
     mesh = jax.sharding.Mesh(jax.devices()[:1], ("seeds",))
     sharded = jax.shard_map(
         jax.vmap(run), mesh=mesh, in_specs=PartitionSpec("seeds"), out_specs=PartitionSpec("seeds"), check_vma=False
