@@ -82,7 +82,7 @@ def move_evaluations(run: Run, environment: str | None) -> Run:
     task = run.config.task
     if load_env_spec(task).is_jax:
         raise LareError(f"{task.name}: only environments on the host can be evaluated in another environment")
-    task = TaskSpec(**task.model_dump() | {"evaluation_environment": environment})
+    task = TaskSpec.model_validate(task.model_dump() | {"evaluation_environment": environment})
     trust_environment(task)
     return replace(run, config=run.config.model_copy(update={"task": task}))
 
