@@ -114,7 +114,7 @@ def register_algorithm(algorithm: Algorithm) -> None:
     """Add an algorithm. Its name then works in `Settings(algorithm=...)` and on the command line.
 
     Raises:
-        LareError: another algorithm has this name, or the settings lack those that the training loop reads.
+        LareError: another algorithm has this name, or its settings are of the wrong class.
     """
     base = _SETTINGS[algorithm.consumes]
     if not isinstance(algorithm.settings, resolve_name(base)):

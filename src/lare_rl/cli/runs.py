@@ -130,14 +130,12 @@ def _describe_returns(run: "Run", evaluation: "Evaluation", best_steps: "Sequenc
 
 def _compare_actions(run: "Run", sampled: "Evaluation", likeliest: "Evaluation") -> Iterator[str]:
     """Say which actions are better, if that is clear. Both evaluations play from the same initial states."""
-    import numpy as np
-
-    from lare_rl.evaluation.evaluate import gain_over_random
+    from lare_rl.evaluation.evaluate import mean_with_error
     from lare_rl.report.score_use import CLEAR_ERRORS
     from lare_rl.util.statistics import format_plus_minus
 
     for i, role in enumerate(run.config.task.roles):
-        gain = gain_over_random((likeliest.returns - sampled.returns)[:, :, i], np.zeros(2))
+        gain = mean_with_error((likeliest.returns - sampled.returns)[:, :, i])
         if gain is not None and abs(gain[0]) > CLEAR_ERRORS * gain[1]:
             verdict = "better: use deterministic=True in load_policy" if gain[0] > 0 else "worse: let the policy sample"
             yield f"{role.name}: the most likely actions are {verdict} ({format_plus_minus(*gain)})"

@@ -33,6 +33,7 @@ __all__ = [
     "evaluate_run",
     "evaluation_seeds",
     "gain_over_random",
+    "mean_with_error",
     "measure_random_returns",
     "move_evaluations",
     "play_random",
@@ -137,11 +138,19 @@ def gain_over_random(
 
     Returns None for a single episode, which has no error.
     """
-    if min(returns.shape[1], len(random_returns)) < 2:
+    estimate = mean_with_error(returns)
+    if estimate is None or len(random_returns) < 2:
         return None
-    episode_error = math.sqrt(np.mean(returns.var(axis=1, ddof=1)) / returns.size)
-    error = grouped_standard_error(returns.mean(axis=1), episode_error)
-    return float(returns.mean() - random_returns.mean()), math.hypot(standard_error(random_returns), error)
+    mean, error = estimate
+    return float(mean - random_returns.mean()), math.hypot(standard_error(random_returns), error)
+
+
+def mean_with_error(values: Float[np.ndarray, "seeds episodes"]) -> tuple[float, float] | None:
+    """Return the mean and its standard error, from seed to seed or from episode to episode. Return None for a single episode."""
+    if values.shape[1] < 2:
+        return None
+    episode_error = math.sqrt(np.mean(values.var(axis=1, ddof=1)) / values.size)
+    return float(values.mean()), grouped_standard_error(values.mean(axis=1), episode_error)
 
 
 def measure_random_returns(task: TaskSpec) -> Float[np.ndarray, "teams episodes"]:

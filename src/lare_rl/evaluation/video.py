@@ -69,7 +69,7 @@ def record_frames(
     Args:
         max_rate: the largest number of frames in a second.
         max_frames: the largest number of frames. A longer film ends early; that of a single agent in JAX leaves steps out.
-        played: the episodes to show, for a run of many agents. By default, the policy plays new episodes.
+        played: episodes of a run with many agents; the film shows the first. By default, the policy plays new episodes.
 
     Raises:
         LareError: the environment cannot be drawn on this machine.
