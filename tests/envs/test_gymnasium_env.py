@@ -9,7 +9,7 @@ import pytest
 from gymnasium.spaces import Box, Discrete
 
 from helpers.toy_envs import Chase, toy_spec
-from lare_rl.envs.env_errors import EnvOutputError
+from lare_rl.envs.env_errors import EnvOutputError, check_finite
 from lare_rl.envs.gymnasium_env import GymnasiumEnv, make_gymnasium
 from lare_rl.envs.interface import Team
 from lare_rl.errors import LareError
@@ -204,9 +204,8 @@ def test_measures_are_those_of_the_last_step():
 )
 def test_invalid_value_or_failure(kwargs, content):
     def use(env):
-        env.reset(0)
-        env.step(STILL)
-        env.step(STILL)
+        for timestep in (env.reset(0), env.step(STILL), env.step(STILL)):
+            check_finite(timestep, env.spec, "the environment")
         env.render()
         env.close()
 

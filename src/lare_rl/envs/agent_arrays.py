@@ -10,7 +10,7 @@ from gymnasium.spaces import Box, Dict, Discrete
 from jaxtyping import Bool, Float
 
 from lare_rl.envs.interface import EnvSpec, Team
-from lare_rl.envs.spaces import check_spaces, decode_box, finite_array, flatten_value
+from lare_rl.envs.spaces import check_spaces, decode_box, float_array, flatten_value
 from lare_rl.errors import LareError, short_repr
 
 __all__ = ["Agent", "AgentArrays", "make_agent"]
@@ -67,7 +67,7 @@ class Agent:
             return None
         if not self.discrete:
             raise ValueError(f"belongs to {short_repr(self.action_space)}, which is not discrete")
-        mask = finite_array(mask, (self.action_size,))
+        mask = float_array(mask, (self.action_size,))
         if not np.isin(mask, (0, 1)).all():
             raise ValueError(f"contains {mask[~np.isin(mask, (0, 1))][0]:g} instead of 0 or 1")
         if not mask.any():

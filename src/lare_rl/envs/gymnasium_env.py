@@ -11,7 +11,6 @@ from jaxtyping import Float
 from lare_rl.envs import mujoco_rewards
 from lare_rl.envs.env_errors import (
     EnvOutputError,
-    describe_entry,
     no_time_limit_error,
     one_line_errors,
     read_measures,
@@ -19,9 +18,9 @@ from lare_rl.envs.env_errors import (
 )
 from lare_rl.envs.interface import EnvSpec, Team, Timestep
 from lare_rl.envs.mujoco_warnings import import_mujoco, mujoco_warnings
-from lare_rl.envs.spaces import OneHot, check_spaces, decode_box, finite_array, flatten_spaces
+from lare_rl.envs.spaces import OneHot, check_spaces, decode_box, flatten_spaces, float_array
 from lare_rl.errors import LareError, short_repr
-from lare_rl.tasks.spec import TaskSpec
+from lare_rl.tasks.spec import TaskSpec, entry_meanings
 from lare_rl.util.variables import read_variable
 
 __all__ = ["GymnasiumEnv", "make_gymnasium"]
@@ -69,7 +68,7 @@ def make_gymnasium(name: str, max_episode_steps: int | None = None, **kwargs: An
 
 
 class GymnasiumEnv:
-    """A Gymnasium environment as a `HostEnv`. All values that the environment returns are checked."""
+    """A Gymnasium environment as a `HostEnv`. All values that it returns are checked, but not that they are finite."""
 
     def __init__(self, task: TaskSpec, **kwargs: Any):
         """Make the environment of a task. See `gymnasium.make` for the keyword arguments.
@@ -94,6 +93,7 @@ class GymnasiumEnv:
             high=action_space.high[None].astype(dtype),  # type: ignore[attr-defined]
             measures=task.info_keys,
             first_choice=int(action_space.start) if isinstance(action_space, OneHot) else 0,
+            entry_meanings=entry_meanings(task.observation),
         )
         self._integers = action_space if isinstance(action_space, Box) and action_space.dtype.kind in "iu" else None
         self._state, self._alive = np.zeros(0, np.float32), np.ones(1, bool)
@@ -118,12 +118,11 @@ class GymnasiumEnv:
             )
         name = "observation"
         try:
-            observation = finite_array(observation, (self.spec.observation_size,))
+            observation = float_array(observation, (self.spec.observation_size,))
             name = "reward"
-            reward = finite_array(to_float(reward))
+            reward = float_array(to_float(reward))
         except ValueError as error:
-            entry = describe_entry(error, self._task.observation) if name == "observation" else ""
-            raise EnvOutputError(f"environment {self._name!r}: the {name} {error}{entry}") from None
+            raise EnvOutputError(f"environment {self._name!r}: the {name} {error}") from None
         last = terminated or truncated
         return Timestep(
             observation=observation[None],
