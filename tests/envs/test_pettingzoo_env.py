@@ -450,7 +450,9 @@ def test_invalid_reset(spoil, content):
         host.reset(7)
 
 
-@pytest.mark.parametrize(("state", "content"), [([0, np.inf], "contains inf in entry 1"), ([0, 1, 2], "shape"), ("x", "'x'")])
+@pytest.mark.parametrize(
+    ("state", "content"), [([0, np.inf], "contains inf in entry 1"), ([0, 1, 2], "shape"), ("x", "'x'")]
+)
 def test_invalid_state(state, content):
     class States(Toy):
         def state(self):

@@ -17,9 +17,9 @@ __all__ = [
     "OneHotAction",
     "check_spaces",
     "decode_box",
-    "float_array",
     "flatten_spaces",
     "flatten_value",
+    "float_array",
 ]
 
 

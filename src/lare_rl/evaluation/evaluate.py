@@ -21,7 +21,7 @@ from lare_rl.tasks.spec import TaskSpec
 from lare_rl.tasks.trust import trust_environment, untrusted_module
 from lare_rl.training.collect_device import DeviceCollector
 from lare_rl.training.evaluate_host import evaluate_policy_on_host
-from lare_rl.training.evaluation import Evaluation, concatenate
+from lare_rl.training.evaluation import Evaluation
 from lare_rl.training.saved_state import load_actor
 from lare_rl.training.streams import Stream, episode_seed
 from lare_rl.util.statistics import grouped_standard_error, standard_error
@@ -108,19 +108,10 @@ def evaluate_policy(
         env = make_env(task)
         assert isinstance(env, JaxEnv)
         return DeviceCollector(env, config, run.seeds).evaluate(actor, episodes, number=1)
-    task, evaluations = task.evaluation_task, []
-    for n_done in range(0, episodes, MAX_OPEN_ENVS):
-        n_episodes = min(MAX_OPEN_ENVS, episodes - n_done)
-        with make_vec_env(task, n_open_envs(task, len(run.seeds), n_episodes) * len(run.seeds)) as envs:
-            first = run.config.settings.evaluation_episodes + n_done
-
-            def report(n_done: int, n_before: int = n_done) -> None:
-                on_episode(n_before + n_done)
-
-            evaluations.append(
-                evaluate_policy_on_host(envs, config, actor, run.seeds, n_episodes, first, on_episode=report)
-            )
-    return concatenate(evaluations)
+    task, first = task.evaluation_task, run.config.settings.evaluation_episodes
+    width = n_open_envs(task, len(run.seeds), min(episodes, MAX_OPEN_ENVS))
+    with make_vec_env(task, width * len(run.seeds)) as envs:
+        return evaluate_policy_on_host(envs, config, actor, run.seeds, episodes, first, on_episode=on_episode)
 
 
 def evaluation_seeds(run: Run, episodes: int) -> list[int]:

@@ -21,9 +21,9 @@ from lare_rl.runs.directory import Run
 from lare_rl.training.collect_device import unroll_on_device
 from lare_rl.training.compiled import training_module
 from lare_rl.training.episodes import predict_returns
+from lare_rl.training.evaluate_host import policy_turns
 from lare_rl.training.evaluation import EpisodeBatch
 from lare_rl.training.factors import compute_host_factors
-from lare_rl.training.host_policy import EvaluationPolicy
 from lare_rl.training.learner import Learner, empty_replay, store_with_factors
 from lare_rl.training.rewards import rewards
 from lare_rl.training.saved_state import load_learner
@@ -119,13 +119,9 @@ def unroll_policy(env: JaxEnv, config: TrainConfig, actor: Any, n_episodes: int,
 def _unroll_on_host(run: Run, config: TrainConfig, actor: Any, n_episodes: int) -> EpisodeBatch:
     """Play as many episodes at a time as environments may be open. An episode does not depend on how many these are."""
     seeds, task, batches = run.seeds[:1], run.config.task, []
-    width = n_open_envs(task, 1, n_episodes)
-    with make_vec_env(task, width) as envs:
-        for first in range(0, n_episodes, width):
-            numbers = np.arange(first, min(first + width, n_episodes))
-            noise_rows = n_episodes, np.minimum(np.arange(first, first + width), n_episodes - 1)
-            policy = EvaluationPolicy(config, actor, seeds, width, deterministic=False, noise_rows=noise_rows)
-            episode_seeds = [episode_seed(seeds[0], Stream.TRAINING_EPISODES, number) for number in numbers.tolist()]
+    with make_vec_env(task, n_open_envs(task, 1, n_episodes)) as envs:
+        for numbers, policy in policy_turns(envs, config, actor, seeds, n_episodes, deterministic=False):
+            episode_seeds = [episode_seed(seeds[0], Stream.TRAINING_EPISODES, number) for number in numbers]
             batch = _drop_seed_axis(record_on_host(envs, policy, seeds, episode_seeds))
             batches.append(jax.tree.map(itemgetter(np.s_[:, : len(numbers)]), batch))
     return _join_episodes(batches)
