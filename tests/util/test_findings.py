@@ -3,7 +3,7 @@ import pytest
 from lare_rl.util.findings import Finding, format_for_reader, render
 
 CATALOGUE = {
-    "learned": "Learned in {n_seeds:count seed}: {return_:score}{where}. Next: `lare-rl {command}`.",
+    "learned": "Learned in {n_seeds:count seed}: {return_:number}{where}. Next: `lare-rl {command}`.",
     "where": " at {steps:,}, in <{names}>",
 }
 LEARNED = Finding("learned", {"n_seeds": 1, "return_": 2.5, "where": None, "command": "<x_y>"})

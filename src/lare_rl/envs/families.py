@@ -18,7 +18,7 @@ __all__ = [
     "FAMILIES",
     "Family",
     "check_logs",
-    "find_score",
+    "find_score_type",
     "has_single_agent",
     "is_gymnasium",
     "load_env_spec",
@@ -87,7 +87,7 @@ for _name in ("gymnax", "brax", "playground", "jumanji"):
 register_family("jaxmarl", "lare_rl.envs.jaxmarl_env:make", reads=OPTIONAL_KEYS)
 
 
-def find_score(task: TaskSpec) -> str | None:
+def find_score_type(task: TaskSpec) -> str | None:
     """Return "sum" or "average" (over the steps of an episode) if the task or its family says so."""
     return task.score or _find_family(task).score
 

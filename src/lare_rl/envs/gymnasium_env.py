@@ -49,7 +49,7 @@ def make_gymnasium(name: str, max_episode_steps: int | None = None, **kwargs: An
         return ""
 
     with warnings.catch_warnings(), one_line_errors(f"environment {name!r} cannot be made", make_hint):
-        # The user chooses the version: scores of v4 and v5 cannot be compared.
+        # The user chooses the version: returns of v4 and v5 cannot be compared.
         warnings.filterwarnings("ignore", message=".*is out of date.*", category=DeprecationWarning)
         warnings.filterwarnings("ignore", message=".*Using the latest versioned environment.*")
         # A report asks for a film, and does without one if it gets none.

@@ -55,7 +55,7 @@ MESSAGES = {
     "than that, the policy is stuck, and more steps seldom help: see docs/how-to/poor-policies.md.",
     "one policy": "The policy",
     "policies of seeds": "The policy of {noun} {seeds}",
-    "equal returns": "Every episode of every evaluation has the return {return_:score}. If training episodes have it too, nothing can be "
+    "equal returns": "Every episode of every evaluation has the return {return_:number}. If training episodes have it too, nothing can be "
     "learned. Does the environment pay a score, and before its time limit (max_episode_steps)? Do bad episodes differ "
     "(docs/how-to/scores.md)?",
     "slow evaluations": "An evaluation takes {seconds:.0f} s, {share:.0%} of the time: --evaluation-episodes (now {n_episodes}) or "
