@@ -1,7 +1,8 @@
 """Agents with different spaces in common arrays: observations, actions and bounds are padded with zeros."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import gymnasium
@@ -30,12 +31,14 @@ class Agent:
     action_space: Discrete | Box
     observes_mask: bool
     """Whether the observation is a dictionary with the mask."""
-    observation_size: int = field(init=False)
-    action_size: int = field(init=False)
 
-    def __post_init__(self):
-        object.__setattr__(self, "observation_size", gymnasium.spaces.flatdim(self.observation_space))
-        object.__setattr__(self, "action_size", int(gymnasium.spaces.flatdim(self.action_space)))
+    @cached_property
+    def observation_size(self) -> int:
+        return gymnasium.spaces.flatdim(self.observation_space)
+
+    @cached_property
+    def action_size(self) -> int:
+        return int(gymnasium.spaces.flatdim(self.action_space))
 
     @property
     def discrete(self) -> bool:

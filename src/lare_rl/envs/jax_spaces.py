@@ -51,24 +51,23 @@ MAX_COMBINATIONS = 1024
 # Packages
 
 
-def import_package(name: str, task: TaskSpec, extra: str | None = None) -> ModuleType:
+def import_package(name: str, task: TaskSpec) -> ModuleType:
     """Import a package of an environment, without what it prints.
 
     Raises:
         LareError: it is not installed (the message names the extra), or cannot be imported.
     """
-    extra = extra or task.family
     try:
         with _silence():
             return importlib.import_module(name)
     except ModuleNotFoundError as error:
         if error.name in (name, name.partition(".")[0]):
-            raise missing_extra_error(f"environment {task.environment!r}", extra) from error
+            raise missing_extra_error(f"environment {task.environment!r}", task.family) from error
         reason = error
     except Exception as error:  # an old package may raise anything if a newer JAX has removed a name
         reason = error
     summary = " ".join(str(reason).split())
-    raise LareError(f"{name} cannot be imported: {summary} (try {install_command(extra)})") from reason
+    raise LareError(f"{name} cannot be imported: {summary} (try {install_command(task.family)})") from reason
 
 
 @contextlib.contextmanager

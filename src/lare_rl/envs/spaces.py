@@ -38,10 +38,6 @@ class OneHot(Box):
         """Return the one-hot vector of the action that a vector stands for."""
         return np.eye(len(vector), dtype=np.float32)[int(np.argmax(vector))]
 
-    def to_discrete(self, vector: Float[np.ndarray, " n"]) -> int:
-        """Return the environment's number of the action that a vector stands for."""
-        return self.start + int(np.argmax(vector))
-
 
 class OneHotAction(gymnasium.ActionWrapper, RecordConstructorArgs):
     """Makes an environment with discrete actions accept one-hot vectors."""
@@ -50,11 +46,11 @@ class OneHotAction(gymnasium.ActionWrapper, RecordConstructorArgs):
         RecordConstructorArgs.__init__(self)  # required by Gymnasium to make the same environment again
         super().__init__(env)
         assert isinstance(env.action_space, Discrete)
-        self.one_hot = OneHot(int(env.action_space.n), int(env.action_space.start))
-        self.action_space = self.one_hot
+        self.start = int(env.action_space.start)
+        self.action_space = OneHot(int(env.action_space.n), self.start)
 
     def action(self, action: Float[np.ndarray, " n"]) -> int:
-        return self.one_hot.to_discrete(action)
+        return self.start + int(np.argmax(action))
 
 
 def check_spaces(owner: Any, observation: gymnasium.Space, action: gymnasium.Space) -> None:

@@ -13,12 +13,11 @@ from jaxtyping import Array, Bool, Float
 
 from lare_rl.data import replay
 from lare_rl.data.trajectory import Trajectory
-from lare_rl.envs.families import make_env
 from lare_rl.envs.interface import JaxEnv, Team, team_mean
 from lare_rl.envs.placement import make_vec_env, n_open_envs
 from lare_rl.envs.play import phi_inputs
 from lare_rl.runs.directory import Run
-from lare_rl.training.collect_device import unroll_on_device
+from lare_rl.training.collect_device import make_jax_env, unroll_on_device
 from lare_rl.training.compiled import training_module
 from lare_rl.training.episodes import predict_returns
 from lare_rl.training.evaluate_host import policy_turns
@@ -91,21 +90,18 @@ def play_run(run: Run, n_episodes: int = 1, *, actor: Any = None, key: int = 0) 
         first = jax.tree.map(lambda leaf: leaf[:1], learner)
         actor = training_module(config).get_actor(first, run.config.settings.steps, config)
     if config.env.is_jax:
-        env = make_env(run.config.task)
-        assert isinstance(env, JaxEnv)
-        batch = unroll_policy(env, config, actor, n_episodes, key)
+        batch = unroll_policy(make_jax_env(run.config.task), config, actor, n_episodes, key)
     else:
         batch = _unroll_on_host(run, config, actor, n_episodes)
-    factors = compute_host_factors(run, config, batch.steps)
-    has_proxy = config.method.has_proxy_rewards
+    factors, training_reward = compute_host_factors(run, config, batch.steps), None
+    if config.method.has_proxy_rewards:
+        training_reward = compute_training_rewards(select_seed(learner), batch.steps, factors, config)
     return PlayedEpisodes(
         config=config,
         steps=batch.steps,
         mask=batch.mask,
         factors=factors,
-        training_reward=compute_training_rewards(select_seed(learner), batch.steps, factors, config)
-        if has_proxy
-        else None,
+        training_reward=training_reward,
         state=batch.state,
     )
 

@@ -81,6 +81,9 @@ def read_toml(text: str) -> dict[str, Any]:
         return check_depth(tomllib.loads(text))
     except RecursionError:
         raise ValueError(_TOO_DEEP) from None
+    except tomllib.TOMLDecodeError as error:
+        hint = "; a text needs quotes" if str(error).startswith("Invalid value") else ""
+        raise ValueError(f"{error}{hint}") from error
 
 
 def read_table(path: Path) -> dict[str, Any]:
@@ -93,8 +96,7 @@ def read_table(path: Path) -> dict[str, Any]:
     try:
         table = read_json(text) if is_json else read_toml(text)
     except ValueError as error:
-        hint = "; a text needs quotes" if str(error).startswith("Invalid value") else ""
-        raise LareError(f"{path}: it is not valid {'JSON' if is_json else 'TOML'}: {error}{hint}") from error
+        raise LareError(f"{path}: it is not valid {'JSON' if is_json else 'TOML'}: {error}") from error
     if not isinstance(table, dict):
         raise LareError(f"{path}: it is JSON, but not an object")
     return table
