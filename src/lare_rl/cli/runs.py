@@ -7,14 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
-from lare_rl.cli.terminal import (
-    EpisodeProgress,
-    RunDirectories,
-    RunDirectory,
-    print_line,
-    print_progress,
-    print_table,
-)
+from lare_rl.cli.terminal import EpisodeProgress, RunDirectories, RunDirectory, print_line, print_progress, print_table
 from lare_rl.errors import LareError, install_command
 from lare_rl.util.variables import read_variable
 
@@ -116,10 +109,7 @@ def report(runs: RunDirectories, out: Path | None = None, film: bool = True) -> 
 
 
 def export(
-    run: RunDirectory,
-    out: Annotated[Path, tyro.conf.arg(metavar="DIR")],
-    seed: int | None = None,
-    best: bool = False,
+    run: RunDirectory, out: Annotated[Path, tyro.conf.arg(metavar="DIR")], seed: int | None = None, best: bool = False
 ) -> None:
     """Write policy and rewards for programs that have neither LaRe nor JAX.
 
@@ -142,11 +132,7 @@ def export(
         print_progress(f"without the package onnx, no .onnx files were written: {install_command('onnx')}")
 
 
-def cross_play(
-    first: RunDirectory,
-    second: RunDirectory,
-    episodes: int = 200,
-) -> None:
+def cross_play(first: RunDirectory, second: RunDirectory, episodes: int = 200) -> None:
     """Let the first team of each of two runs play against the second team of each, every seed against every seed.
 
     Prints the first team's return, mean and standard deviation over the pairs of seeds.

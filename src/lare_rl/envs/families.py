@@ -53,12 +53,7 @@ _LOGS_ONLY = Family("lare_rl.envs.families:_refuse_to_make", reads=("max_episode
 
 
 def register_family(
-    name: str,
-    maker: Maker | str,
-    *,
-    reads: tuple[str, ...] = (),
-    score: str | None = None,
-    single_agent: bool = False,
+    name: str, maker: Maker | str, *, reads: tuple[str, ...] = (), score: str | None = None, single_agent: bool = False
 ) -> None:
     """Add a family of environments: a task with `environment = "NAME/..."` then uses its maker.
 

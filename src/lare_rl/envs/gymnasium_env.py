@@ -9,13 +9,7 @@ from gymnasium.spaces import Box
 from jaxtyping import Float
 
 from lare_rl.envs import mujoco_rewards
-from lare_rl.envs.env_errors import (
-    EnvOutputError,
-    no_time_limit_error,
-    one_line_errors,
-    read_measures,
-    to_float,
-)
+from lare_rl.envs.env_errors import EnvOutputError, no_time_limit_error, one_line_errors, read_measures, to_float
 from lare_rl.envs.interface import EnvSpec, Team, Timestep
 from lare_rl.envs.mujoco_warnings import import_mujoco, mujoco_warnings
 from lare_rl.envs.spaces import OneHot, check_spaces, decode_box, flatten_spaces, float_array

@@ -74,11 +74,7 @@ def import_package(name: str, task: TaskSpec) -> ModuleType:
 def _silence() -> Iterator[None]:
     """Hide what packages print and warn of. JaxMARL prints to `sys.__stdout__`."""
     originals, silence = (sys.__stdout__, sys.__stderr__), io.StringIO()
-    with (
-        contextlib.redirect_stdout(silence),
-        contextlib.redirect_stderr(silence),
-        warnings.catch_warnings(),
-    ):
+    with contextlib.redirect_stdout(silence), contextlib.redirect_stderr(silence), warnings.catch_warnings():
         warnings.simplefilter("ignore")
         sys.__stdout__ = sys.__stderr__ = silence  # type: ignore[assignment]
         try:

@@ -12,15 +12,7 @@ from jaxtyping import Float
 
 from lare_rl.errors import LareError, short_repr
 
-__all__ = [
-    "OneHot",
-    "OneHotAction",
-    "check_spaces",
-    "decode_box",
-    "flatten_spaces",
-    "flatten_value",
-    "float_array",
-]
+__all__ = ["OneHot", "OneHotAction", "check_spaces", "decode_box", "flatten_spaces", "flatten_value", "float_array"]
 
 
 class OneHot(Box):
