@@ -6,43 +6,11 @@ from typing import Any
 import gymnasium
 import numpy as np
 from gymnasium.spaces import Box, Dict, Discrete, Tuple
-from gymnasium.utils import RecordConstructorArgs
-from gymnasium.wrappers import FlattenObservation
 from jaxtyping import Float
 
 from lare_rl.errors import LareError, short_repr
 
-__all__ = ["OneHot", "OneHotAction", "check_spaces", "decode_box", "flatten_spaces", "flatten_value", "float_array"]
-
-
-class OneHot(Box):
-    """One of n discrete actions, encoded one-hot. Any other vector stands for the action of its largest entry."""
-
-    def __init__(self, n: int, start: int = 0, seed: int | np.random.Generator | None = None):
-        super().__init__(0, 1, (n,), np.float32, seed)
-        self.start = start
-        """The number of the first action."""
-
-    def sample(self, *args: Any, **kwargs: Any) -> Float[np.ndarray, " n"]:
-        return self.project(super().sample(*args, **kwargs))
-
-    def project(self, vector: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
-        """Return the one-hot vector of the action that a vector stands for."""
-        return np.eye(len(vector), dtype=np.float32)[int(np.argmax(vector))]
-
-
-class OneHotAction(gymnasium.ActionWrapper, RecordConstructorArgs):
-    """Makes an environment with discrete actions accept one-hot vectors."""
-
-    def __init__(self, env: gymnasium.Env):
-        RecordConstructorArgs.__init__(self)  # required by Gymnasium to make the same environment again
-        super().__init__(env)
-        assert isinstance(env.action_space, Discrete)
-        self.start = int(env.action_space.start)
-        self.action_space = OneHot(int(env.action_space.n), self.start)
-
-    def action(self, action: Float[np.ndarray, " n"]) -> int:
-        return self.start + int(np.argmax(action))
+__all__ = ["check_spaces", "decode_box", "flatten_value", "float_array"]
 
 
 def check_spaces(owner: Any, observation: gymnasium.Space, action: gymnasium.Space) -> None:
@@ -69,15 +37,6 @@ def decode_box(space: Box, vector: Float[np.ndarray, " size"]) -> np.ndarray:
     """Return the action of a space that a vector stands for. Integers are rounded."""
     clipped = np.clip(vector.reshape(space.shape), space.low, space.high)
     return (np.rint(clipped) if space.dtype.kind in "iu" else clipped).astype(space.dtype)
-
-
-def flatten_spaces(env: gymnasium.Env) -> gymnasium.Env:
-    """Return the environment with flat observations and one-hot actions."""
-    if isinstance(env.action_space, Discrete):
-        env = OneHotAction(env)
-    if not (isinstance(env.observation_space, Box) and len(env.observation_space.shape) == 1):
-        env = FlattenObservation(env)
-    return env
 
 
 def flatten_value(space: gymnasium.Space, value: Any) -> Float[np.ndarray, " size"]:

@@ -3,6 +3,7 @@
 import contextlib
 
 import gymnasium
+from gymnasium.spaces import flatdim
 
 from lare_rl.envs.families import FAMILIES
 from lare_rl.envs.gymnasium_env import make_gymnasium
@@ -56,8 +57,8 @@ def _write_draft(environment_id: str, env: gymnasium.Env) -> Draft:
         },
         sections,
     )
-    observation_size, action_size = env.observation_space.shape[0], env.action_space.shape[0]  # type: ignore[index]
-    flattening = draft.describe_flattening(env.unwrapped.observation_space)
+    observation_size, action_size = (int(flatdim(space)) for space in (env.observation_space, env.action_space))
+    flattening = draft.describe_flattening(env.observation_space)
     first_lines = {
         "observation": f"{count_entries(observation_size)}{flattening}.",
         "action": f"{count_entries(action_size)}{draft.describe_action(env.action_space)}.",
