@@ -18,6 +18,7 @@ from lare_rl.cli.terminal import (
     load_policy,
     load_steps,
     print_line,
+    print_messages,
     print_progress,
     write_new_file,
 )
@@ -43,8 +44,7 @@ def prompt(task: Task, kind: FunctionKind = "factors") -> None:
     from lare_rl.llm.prompts import candidate
     from lare_rl.tasks.spec import require_role
 
-    for message in candidate(require_role(load_task(task)), kind):
-        print_line(f"--- {message['role']} ---\n{message['content']}\n")
+    print_messages(candidate(require_role(load_task(task)), kind))
 
 
 def new_task(

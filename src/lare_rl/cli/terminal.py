@@ -2,7 +2,7 @@
 
 import sys
 import time
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
@@ -71,6 +71,12 @@ DEFAULT_LIVE = LiveOptions()
 def print_line(text: str) -> None:
     """Print a text to standard output, without characters that control the terminal."""
     print(sanitize(text), flush=True)  # noqa: T201 - the one place that writes to standard output
+
+
+def print_messages(messages: Iterable[Mapping[str, str]]) -> None:
+    """Print the messages of a request to a language model."""
+    for message in messages:
+        print_line(f"--- {message['role']} ---\n{message['content']}\n")
 
 
 def print_table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> None:

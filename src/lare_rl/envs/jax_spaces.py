@@ -19,7 +19,7 @@ from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 from lare_rl.envs.env_errors import one_line_errors
 from lare_rl.envs.interface import EnvSpec, Team, Timestep, with_available_action
 from lare_rl.envs.mujoco_warnings import mujoco_warnings
-from lare_rl.errors import LareError, did_you_mean, install_command, missing_extra_error
+from lare_rl.errors import LareError, did_you_mean, install_command, missing_extra_error, short_repr
 from lare_rl.tasks.spec import TaskSpec
 
 __all__ = [
@@ -42,6 +42,7 @@ __all__ = [
     "strong_types",
     "unstack",
     "unusable",
+    "unusable_actions",
 ]
 
 MAX_COMBINATIONS = 1024
@@ -102,6 +103,11 @@ def construct(
 
 def unusable(environment: str, reason: str) -> LareError:
     return LareError(f"environment {environment!r} cannot be used: {reason}")
+
+
+def unusable_actions(environment: str, space: Any) -> LareError:
+    actions = f"its actions are {short_repr(space)}"
+    return unusable(environment, f"{actions}: LaRe trains discrete actions and bounded continuous ones")
 
 
 # Values

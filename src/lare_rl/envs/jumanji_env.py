@@ -13,7 +13,6 @@ from lare_rl.envs import jax_spaces
 from lare_rl.envs.env_errors import no_time_limit_error, one_line_errors
 from lare_rl.envs.interface import Timestep
 from lare_rl.envs.jax_spaces import Bounds, Choices
-from lare_rl.errors import short_repr
 from lare_rl.tasks.spec import TaskSpec
 
 __all__ = ["JumanjiEnv", "make", "observed_arrays"]
@@ -145,6 +144,4 @@ def _read_action(spec: Any, specs: Any, environment: str) -> Choices | Bounds:
         return jax_spaces.make_choices(sizes.ravel().tolist(), sizes.shape, environment, spec.dtype)
     if isinstance(spec, specs.BoundedArray) and np.issubdtype(spec.dtype, np.floating):
         return jax_spaces.make_bounds(spec.minimum, spec.maximum, tuple(spec.shape), environment)
-    raise jax_spaces.unusable(
-        environment, f"its actions are {short_repr(spec)}: LaRe trains discrete actions and bounded continuous ones"
-    )
+    raise jax_spaces.unusable_actions(environment, spec)

@@ -13,9 +13,9 @@ from jaxtyping import Array, Bool, Float
 
 from lare_rl.data import replay
 from lare_rl.data.trajectory import Trajectory
-from lare_rl.envs.interface import JaxEnv, Team, team_mean
+from lare_rl.envs.interface import JaxEnv
 from lare_rl.envs.placement import make_vec_env, n_open_envs
-from lare_rl.envs.play import phi_inputs
+from lare_rl.envs.play import make_episode
 from lare_rl.runs.directory import Run
 from lare_rl.training.collect_device import make_jax_env, unroll_on_device
 from lare_rl.training.compiled import training_module
@@ -163,7 +163,6 @@ def compute_training_rewards(
 class TeamSample:
     """Steps of one team, over some episodes of the first seed's policy. A row is a step of an agent or, for a state, of the team."""
 
-    team: Team
     next_observation: Float[np.ndarray, "rows observation"]
     """Each agent's observation after the step, or the state."""
     factors: Float[np.ndarray, "rows factors"]
@@ -179,18 +178,12 @@ class TeamSample:
 def sample_steps(run: Run, actor: Any = None) -> list[TeamSample]:
     """Sample steps of each team, under the first seed's policy or another actor of one seed (see `play_run`)."""
     played = play_run(run, N_SAMPLE_EPISODES, actor=actor, key=1)
-    config, steps, samples = played.config, jax.tree.map(np.asarray, played.steps), []
-    for team_index, team in enumerate(config.env.teams):
-        observation, _ = phi_inputs(config.credit_scope, team, steps.next_timestep, steps.env_action)
-        mask = np.broadcast_to(played.mask[..., None], observation.shape[:-1])
-        reward = played.reward[..., team.agents]
-        if config.team_level:
-            reward = team_mean(played.reward, steps.timestep.alive, team)[..., None]
-        else:
-            mask = mask & steps.timestep.alive[..., team.agents]
+    config, samples = played.config, []
+    steps = jax.tree.map(lambda leaf: np.asarray(leaf)[played.mask], played.steps)  # [steps ...]
+    for team_index, role in enumerate(run.config.task.roles):
+        rows = make_episode(role, config.env, steps.timestep, steps.env_action, steps.next_timestep)
         n_factors = config.n_factors[team_index] if config.n_factors else 0
-        factors = played.factors[..., config.team_rows(team_index), :n_factors]
-        samples.append(
-            TeamSample(team=team, next_observation=observation[mask], factors=factors[mask], reward=reward[mask])
-        )
+        factors = played.factors[played.mask][:, config.team_rows(team_index), :n_factors]
+        next_observation, factors, reward = (x[rows.alive] for x in (rows.next_observation, factors, rows.reward))
+        samples.append(TeamSample(next_observation=next_observation, factors=factors, reward=reward))
     return samples

@@ -9,7 +9,7 @@ from lare_rl.envs.families import FAMILIES
 from lare_rl.envs.gymnasium_env import make_gymnasium
 from lare_rl.errors import LareError
 from lare_rl.new_task import draft
-from lare_rl.new_task.documentation import first_section, plain_lines, split_sections, write_texts
+from lare_rl.new_task.documentation import single_agent_lines, split_sections, write_texts
 from lare_rl.new_task.draft import Draft, count_entries, file_name, warning_lines
 from lare_rl.tasks.spec import PETTINGZOO_PREFIX
 
@@ -49,14 +49,7 @@ def draft_task(environment_id: str) -> Draft:
 def _write_draft(environment_id: str, env: gymnasium.Env) -> Draft:
     # Not inspect.getdoc: it would return the docstring of a base class, which does not describe this environment.
     sections = split_sections(type(env.unwrapped).__doc__ or "")
-    texts, removed = write_texts(
-        {
-            "description": plain_lines(sections[""]) + first_section(sections, "description"),
-            "observation": first_section(sections, "observation space", "observation"),
-            "action": first_section(sections, "action space", "action"),
-        },
-        sections,
-    )
+    texts, removed = write_texts(single_agent_lines(sections), sections)
     observation_size, action_size = (int(flatdim(space)) for space in (env.observation_space, env.action_space))
     flattening = draft.describe_flattening(env.observation_space)
     first_lines = {
