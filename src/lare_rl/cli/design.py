@@ -63,8 +63,7 @@ def design(
         reflect: number of further rounds, in which the model sees how well its factors explain the returns of whole episodes,
             and may improve them.
         policy: a run whose policy plays the episodes for --reflect; without it, actions are random.
-        pre_verification: verify and correct the function; without (the paper's ablation), the first reply is kept as it is, if
-            it can be read.
+        pre_verification: verify and correct the function; without (the paper's ablation), the first reply that can be read is kept.
         record: a file to record every exchange in, for --model FILE; it must not exist, and not be the .json of --out.
         data: logged episodes; functions are checked on their steps instead of random steps of the environment. A directory, a
             Parquet file, or the id of a local Minari data set.
