@@ -76,9 +76,7 @@ register_family("smax", "lare_rl.envs.smax.smax_env:make", score="sum")
 register_family("smac", "lare_rl.envs.starcraft:make", score="sum")
 register_family("pettingzoo", "lare_rl.envs.pettingzoo_env:make", reads=OPTIONAL_KEYS)
 for _name in ("gymnax", "brax", "playground", "jumanji"):
-    register_family(
-        _name, f"lare_rl.envs.{_name}_env:make", reads=("max_episode_steps", "arguments"), single_agent=True
-    )
+    register_family(_name, f"lare_rl.envs.{_name}_env:make", reads=OPTIONAL_KEYS[:2], single_agent=True)
 register_family("jaxmarl", "lare_rl.envs.jaxmarl_env:make", reads=OPTIONAL_KEYS)
 
 
@@ -231,9 +229,7 @@ def _check_spec(task: TaskSpec, spec: EnvSpec) -> None:
     if task.teams and [role.team for role in task.teams] != names:
         raise LareError(f"the teams of {env} must be {', '.join(names)}, in this order")
     if len(names) > 1 and not task.teams and task.team is None:
-        raise LareError(
-            f"{env} has the teams {', '.join(names)}. Write a task file for each of them, and list them as teams."
-        )
+        raise LareError(f"{env} has the teams {', '.join(names)}. Write a task file for each, and list them as teams.")
     for role in task.teams:
         for key in SHARED_KEYS:  # training reads only the task's keys, verification only the team's
             team_value, task_value = getattr(role, key), getattr(task, key)

@@ -112,9 +112,7 @@ class GymnasiumEnv:
 
     def _make_timestep(self, observation: Any, reward: Any, terminated: bool, truncated: bool, info: Any) -> Timestep:
         if not isinstance(info, dict):
-            raise LareError(
-                f"environment {self._name!r} returned the info {short_repr(info)}, which is not a dictionary"
-            )
+            raise LareError(f"environment {self._name!r} returned info {short_repr(info)}, which is not a dictionary")
         name = "observation"
         try:
             observation = self._agent.flatten_observation(observation)

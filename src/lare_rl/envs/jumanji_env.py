@@ -118,9 +118,7 @@ class JumanjiEnv:
 def observed_arrays(observation: Any) -> list[tuple[str, Any]]:
     """Return the names and arrays of an observation, without the mask, in the order in which they are flattened."""
     leaves = jax.tree_util.tree_leaves_with_path(observation)
-    return [
-        (jax.tree_util.keystr(path, simple=True, separator="."), leaf) for path, leaf in leaves if not _is_mask(path)
-    ]
+    return [(jax.tree_util.keystr(path, simple=True, separator="."), x) for path, x in leaves if not _is_mask(path)]
 
 
 def _observed(observation: Any) -> list[Any]:

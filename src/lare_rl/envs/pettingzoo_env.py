@@ -53,9 +53,7 @@ class ParallelHost:
         self.environment, self._task, self._name = environment, task, task.environment
         names = list(environment.possible_agents or ())
         if not names or len(set(names)) != len(names):
-            raise LareError(
-                f"environment {self._name!r} has the possible agents {short_repr(names)}. Each needs a name."
-            )
+            raise LareError(f"environment {self._name!r} has possible agents {short_repr(names)}. Each needs a name.")
         names, teams = group_by_team(names, task)
         try:
             with one_line_errors("its spaces cannot be read"):

@@ -42,9 +42,7 @@ def cross_play(runs: tuple[Run, Run], episodes: int = 200) -> list[Match]:
     if task.name != other_task.name:
         raise LareError(f"cross-play needs two runs of one task, and these are of {task.name} and {other_task.name}")
     if task.digest != other_task.digest:
-        raise LareError(
-            f"cross-play needs two runs of one task, and these have different tasks with the name {task.name}"
-        )
+        raise LareError(f"cross-play needs two runs of one task, and these have different tasks named {task.name}")
     if len(task.teams) != 2:
         raise LareError(f"cross-play needs two teams that learn, and {task.name} has {len(task.teams) or 1}")
     if algorithm != other_algorithm:

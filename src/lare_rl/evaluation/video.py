@@ -103,9 +103,7 @@ def render_played(run: Run, played: PlayedEpisodes) -> list[Frame] | None:
     """Render the first episode with each agent's credit. Return None for an environment that cannot be drawn."""
     if not load_env_spec(run.config.task).is_jax:
         return None
-    return make_jax_env(run.config.task).frames(
-        played.select_episode(played.state), played.select_episode(played.credit)
-    )
+    return make_jax_env(run.config.task).frames(*played.select_episode((played.state, played.credit)))
 
 
 def encode_film(frames: Sequence[Frame], frame_seconds: float, max_bytes: int) -> bytes:

@@ -64,10 +64,8 @@ def _read_texts(env: Any) -> tuple[dict[str, str], tuple[str, ...]]:
     sections = split_sections(FIELD.sub(_heading, documentation))
     lines = single_agent_lines(sections)
     # The mask of available actions is no entry of the observation.
-    entries = [
-        line for line in lines["observation"] if "action_mask" not in line and not line.startswith("Observation")
-    ]
-    return write_texts(lines | {"observation": entries}, sections)
+    rows = [line for line in lines["observation"] if "action_mask" not in line and not line.startswith("Observation")]
+    return write_texts(lines | {"observation": rows}, sections)
 
 
 def _heading(match: re.Match[str]) -> str:

@@ -159,9 +159,8 @@ def compare_runs(runs: Sequence[ReportedRun]) -> list[Finding]:
         Finding("improvement", names | {"probability": probability, "n_pairs": pairs.size}),
     ]
     steps = {reported.last_step for reported in runs if reported.metrics}
-    return findings + (
-        [Finding("different_steps", {"least": min(steps), "most": max(steps)})] if len(steps) > 1 else []
-    )
+    findings += [Finding("different_steps", {"least": min(steps), "most": max(steps)})] if len(steps) > 1 else []
+    return findings
 
 
 def sort_runs(runs: Iterable[ReportedRun]) -> list[ReportedRun]:

@@ -131,9 +131,7 @@ def _make_jobs(sweep: Sweep, path: Path) -> Iterator[Job]:
     if unknown := sorted(sweep.functions.keys() - set(names)):
         raise LareError(f"functions of {unknown[0]}, which is none of the tasks {', '.join(names)}")
     if sweep.draws != (0,) and sweep.functions.keys() >= set(names):
-        raise LareError(
-            "draws choose recorded functions, and all tasks have functions in [functions]: leave out either"
-        )
+        raise LareError("draws choose recorded functions, but all tasks have some in [functions]: leave out either")
     for task, method, algorithm in product(tasks, sweep.methods, sweep.algorithms or (None,)):
         functions = [path.parent / function for function in sweep.functions.get(task.name, ())]
         for draw in sweep.draws if find_method(method).needs_phi and not functions else (0,):

@@ -58,9 +58,7 @@ def read_rollouts(rollouts: Any, phi: Phi | None = None) -> list[Rollout]:
 def read_rollout(rollout: Any, where: str, phi: Phi | None = None) -> Rollout:
     """Check one rollout and return it. `where` names it in messages."""
     if not isinstance(rollout, Mapping):
-        raise LareError(
-            f"{where} must be a mapping with an outcome and messages or turns, and is {short_repr(rollout)}"
-        )
+        raise LareError(f"{where} must be a mapping with outcome and messages or turns, and is {short_repr(rollout)}")
     outcome = _read_number(rollout.get("outcome"), f"{where}: outcome")
     group = rollout.get("group", "")
     if not isinstance(group, str | int) or isinstance(group, bool):

@@ -106,9 +106,7 @@ def check_depth(value: Any) -> Any:
     """Return a value that is not nested too deep for recursive functions. Raises `ValueError` if it is nested too deep."""
     level = [value]
     for _ in range(MAX_DEPTH):
-        containers = [
-            item.values() if isinstance(item, dict) else item for item in level if isinstance(item, dict | list)
-        ]
+        containers = [x.values() if isinstance(x, dict) else x for x in level if isinstance(x, dict | list)]
         level = [item for container in containers for item in container]
         if not level:
             return value
