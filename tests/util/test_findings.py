@@ -32,9 +32,9 @@ def test_render_incomplete():
 @pytest.mark.parametrize(
     ("value", "spec", "text"),
     [
-        (12345.6, "score", "12,346"),
-        (-12.345, "score", "-12.3"),
-        (float("nan"), "score", "nan"),
+        (12345.6, "number", "12,346"),
+        (-12.345, "number", "-12.3"),
+        (float("nan"), "number", "nan"),
         (1, "count episode", "1 episode"),
         (1000, "count episode", "1,000 episodes"),
         (0.991, "r2", "0.991"),
