@@ -90,20 +90,13 @@ def render_verdict(
 
 def _tiles(reported: ReportedRun, summary: RunSummary) -> Iterable[tuple[str, str, str]]:
     """Yield the numbers of a run: title, number, remark. Those that are unknown are missing."""
-    if len(summary.final_returns):
-        number, _, std = _format_spread(summary.final_returns).partition(" ± ")
-        yield (
-            "Return",
-            number,
-            f"{f'± {std}, ' if std else ''}{format_for_reader(len(summary.final_returns), 'count seed')}",
-        )
-    if len(summary.random_returns):
-        number, _, std = _format_spread(summary.random_returns).partition(" ± ")
-        yield (
-            "Random actions",
-            number,
-            f"± {std or 0}, {format_for_reader(len(summary.random_returns), 'count episode')}",
-        )
+    for title, values, noun in (
+        ("Return", summary.final_returns, "seed"),
+        ("Random actions", summary.random_returns, "episode"),
+    ):
+        number, _, std = _format_spread(values).partition(" ± ")
+        if number:
+            yield title, number, f"{std and f'± {std}, '}{format_for_reader(len(values), f'count {noun}')}"
     if summary.return_r2 is not None:
         yield "R² of returns", format_for_reader(summary.return_r2, "r2"), "of new episodes; 1 is perfect"
     if (seconds := reported.training_seconds()) is not None:

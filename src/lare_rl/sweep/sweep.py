@@ -135,9 +135,8 @@ def _make_jobs(sweep: Sweep, path: Path) -> Iterator[Job]:
     for task, method, algorithm in product(tasks, sweep.methods, sweep.algorithms or (None,)):
         functions = [path.parent / function for function in sweep.functions.get(task.name, ())]
         for draw in sweep.draws if find_method(method).needs_phi and not functions else (0,):
-            settings = Settings(
-                **{**rename_keys(sweep.settings), "method": method, "algorithm": algorithm, "draw": draw}
-            )
+            chosen = {"method": method, "algorithm": algorithm, "draw": draw}
+            settings = Settings(**rename_keys(sweep.settings) | chosen)
             try:
                 yield make_job(root, task, settings, functions)
             except LareError as error:
