@@ -85,9 +85,9 @@ class EnvSpec:
     """The sizes of several choices at a time, if their combinations are the discrete actions."""
     package_shape: tuple[int, ...] | None = None
     """The shape of an action for the environment's package. By default, discrete actions are numbers, others rows of numbers."""
-    agent_names: tuple[str, ...] = ()
+    agent_names: tuple[str, ...] = field(default=(), compare=False)
     """The environment's names of the agents, for messages."""
-    entry_meanings: Mapping[int, str] = field(default_factory=dict)
+    entry_meanings: Mapping[int, str] = field(default_factory=dict, compare=False)
     """What entries of an observation mean, for messages."""
 
     @property
