@@ -49,10 +49,10 @@ def cross_play(runs: tuple[Run, Run], episodes: int = 200) -> list[Match]:
         raise LareError(f"cross-play needs runs of one algorithm, and these are of {algorithm} and {other_algorithm}")
     if not load_env_spec(task).is_jax:
         raise LareError(f"cross-play is for environments in JAX, and {task.name} steps on the host")
-    configs, actors = zip(*map(_load_actors, runs), strict=True)
-    play_match = jax.jit(partial(_play_match, make_jax_env(task), n_episodes=episodes, config=configs[0]))
+    players = [(run, *_load_actors(run)) for run in runs]
+    play_match = jax.jit(partial(_play_match, make_jax_env(task), n_episodes=episodes, config=players[0][1]))
     matches = []
-    for (run, first_actors), (other, second_actors) in product(zip(runs, actors, strict=True), repeat=2):
+    for (run, _, first_actors), (other, _, second_actors) in product(players, repeat=2):
         returns = [[float(play_match(a, b, jax.random.key(0))) for b in second_actors] for a in first_actors]
         matches.append(Match(first=run, second=other, returns=np.array(returns)))
     return matches
