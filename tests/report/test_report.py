@@ -17,7 +17,6 @@ from helpers.training_runs import QUICK_CREDIT
 from helpers.untrained_runs import write_run
 from lare_rl.config.resolve import resolve
 from lare_rl.config.settings import Settings
-from lare_rl.envs.interface import Team
 from lare_rl.envs.load import load_task
 from lare_rl.evaluation.played_episodes import TeamSample
 from lare_rl.evaluation.video import encode_film
@@ -180,7 +179,6 @@ def test_tsne_needs_two_columns_and_some_rows(n_rows, n_factors, n_pictures):
     pytest.importorskip("sklearn")
     rng = np.random.default_rng(0)
     sample = TeamSample(
-        team=Team("", 0, 1),
         next_observation=rng.random((n_rows, 3), np.float32),
         factors=rng.random((n_rows, n_factors), np.float32),
         reward=rng.random(n_rows, np.float32),
