@@ -5,8 +5,8 @@
 Kinds: `not-a-sum` (the corridor's scores), `binary` (won or lost by chance), `payments` (PP-6 paid every step, every 5 steps, and at
 the end), `exact` (PP-6, rewards that add up exactly), `groups` (CN-6 in levels), `published` (published methods in the corridor, on
 CN-6 and on PP-6), `cheetah` (HalfCheetah-v4 paid once, every 50 and every 200 steps). Finished runs in RUNS are not trained again, and
-stopped ones continue. `late` is the mean return of the evaluations after three quarters of the steps, and `area` that of all
-evaluations, which also says how fast a method learns.
+stopped ones continue. Kept runs are in `results/scores`: copy them to RUNS first. `late` is the mean return of the evaluations after
+three quarters of the steps, and `area` that of all evaluations, which also says how fast a method learns.
 """
 
 from collections.abc import Callable, Iterator
@@ -20,7 +20,7 @@ import lare_rl
 from lare_rl.compare.bootstrap import estimate, interquartile_mean, probability_of_improvement
 from lare_rl.compare.rank_test import mann_whitney
 from lare_rl.envs.load import read_task
-from lare_rl.runs.directory import open_run
+from lare_rl.runs.directory import open_without_functions
 from lare_rl.tasks.spec import TaskSpec
 from measure import write
 from scores.environments import corridor_task, level_task
@@ -120,9 +120,15 @@ KINDS: dict[str, Callable[[], Iterator[Row]]] = {
 }
 
 
+def is_finished(directory: Path) -> bool:
+    """Return whether the run has reached its last step. Kept runs have no weights to continue from."""
+    run = open_without_functions(directory)
+    return run.metrics()[-1]["step"] == run.config.settings.steps
+
+
 def mean_returns(directory: Path, after: float) -> list[float]:
     """Return the mean return of each seed's evaluations after this share of the steps."""
-    run = open_run(directory)
+    run = open_without_functions(directory)
     lines = run.metrics()
     first = after * max(line["step"] for line in lines)
     return [
@@ -146,10 +152,10 @@ def main(
     scores: dict[str, dict[str, list[float]]] = {}
     for row in rows:
         directory = out / kind / row.table.replace(" ", "") / row.label.replace(" ", "")
-        if (directory / "config.json").exists():
-            lare_rl.resume(directory)
-        else:
+        if not (directory / "config.json").exists():
             lare_rl.train(row.task, lare_rl.Settings(**row.settings, seeds=seeds), out=directory)
+        elif not is_finished(directory):
+            lare_rl.resume(directory)
         for measure, after in (("late", 0.75), ("area", 0.0)):
             returns = mean_returns(directory, after)
             scores.setdefault(f"{row.table}, {measure}", {})[row.label] = returns
