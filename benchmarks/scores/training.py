@@ -2,11 +2,20 @@
 
     PYTHONPATH=benchmarks python -m scores.training KIND --out RUNS
 
-Kinds: `not-a-sum` (the corridor's scores), `binary` (won or lost by chance), `payments` (PP-6 paid every step, every 5 steps, and at
-the end), `exact` (PP-6, rewards that add up exactly), `groups` (CN-6 in levels), `published` (published methods in the corridor, on
-CN-6 and on PP-6), `cheetah` (HalfCheetah-v4 paid once, every 50 and every 200 steps). Finished runs in RUNS are not trained again, and
-stopped ones continue. Kept runs are in `results/scores`: copy them to RUNS first. `late` is the mean return of the evaluations after
-three quarters of the steps, and `area` that of all evaluations, which also says how fast a method learns.
+Kinds:
+
+* `not-a-sum`: the corridor's scores.
+* `binary`: the corridor, won or lost by chance.
+* `payments`: PP-6 paid every step, every 5 steps, and at the end.
+* `exact`: PP-6, rewards that add up exactly.
+* `groups`: CN-6 in levels.
+* `published`: published methods in the corridor, on CN-6 and on PP-6.
+* `cheetah`: HalfCheetah-v4 paid once, every 50 and every 200 steps.
+* `threshold`: HalfCheetah, paid for steps faster than 2 m/s.
+
+Finished runs in RUNS are not trained again, and stopped ones continue. Kept runs are in `results/scores`: copy them to RUNS first. `late`
+is the mean return of the evaluations after three quarters of the steps, and `area` that of all evaluations, which also says how fast a
+method learns.
 """
 
 from collections.abc import Callable, Iterator
@@ -28,7 +37,7 @@ from scores.environments import corridor_task, level_task
 PARTICLE_STEPS = 205_000
 CORRIDOR: dict[str, Any] = {"algorithm": "ppo", "steps": 64_000, "environments": 20, "evaluation_episodes": 100}
 CHEETAH: dict[str, Any] = {"algorithm": "td3", "steps": 30_000, "evaluate_every": 2_500, "evaluation_episodes": 3}
-Kind = Literal["not-a-sum", "binary", "payments", "exact", "groups", "published", "cheetah"]
+Kind = Literal["not-a-sum", "binary", "payments", "exact", "groups", "published", "cheetah", "threshold"]
 
 
 class Row(NamedTuple):
@@ -109,6 +118,13 @@ def cheetah() -> Iterator[Row]:
             yield row(method, period, method, "episodic")
 
 
+def threshold() -> Iterator[Row]:
+    for method in ("lare-bayes", "lare-bayes-history", "dense", "rrdu"):
+        settings = {"method": method, **CHEETAH, "steps": 60_000, "evaluate_every": 5_000}
+        task = read_task("HalfCheetahThreshold-v4")
+        yield Row(task.name, method, task, settings, is_baseline=method == "lare-bayes")
+
+
 KINDS: dict[str, Callable[[], Iterator[Row]]] = {
     "not-a-sum": not_a_sum,
     "binary": binary,
@@ -117,6 +133,7 @@ KINDS: dict[str, Callable[[], Iterator[Row]]] = {
     "groups": groups,
     "published": published_methods,
     "cheetah": cheetah,
+    "threshold": threshold,
 }
 
 
