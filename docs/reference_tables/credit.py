@@ -69,9 +69,8 @@ def methods_page() -> str:
             groups[f"{fit} {'with' if method.needs_phi else 'without'} phi"].append(method)
     lines = [
         "# Methods",
-        "A method is a decoder's inputs, a fit and a decoder. `--method NAME` chooses it. The equations are in "
-        "[credit.md](../explanation/credit.md), [closed-form.md](../explanation/closed-form.md) and "
-        "[many-agents.md](../explanation/many-agents.md).",
+        "A method is a decoder's inputs, a fit and a decoder. `--method NAME` chooses it. [credit.md](../explanation/credit.md) explains "
+        "how they work. The equations are in [closed-form.md](../explanation/closed-form.md) and [losses.md](losses.md).",
         "Inputs: z, the factors of `phi`; s and s', the observations before and after the step; s\\*, the observation that the task's "
         "`scored_observation` names; a, the action; h, largest, smallest and last values of the entries so far.",
         "(new): no [table of results](../results/README.md) has trained runs of the method yet.",

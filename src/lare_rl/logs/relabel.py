@@ -137,7 +137,7 @@ def relabel(
 
     Args:
         source: a directory of .npz or Parquet files, a Parquet file, a Hugging Face data set on the disk, a Minari id or data set,
-            flat arrays by name, or a list of mappings of arrays (docs/tutorials/your-own-logs.md).
+            flat arrays by name, or a list of mappings of arrays (docs/reference/logs.md).
         out: the path to write, or the id of the new Minari data set. It is written completely or not at all.
         method: how credit is assigned; the default is `lare-bayes` with a `phi`, and `bayes` without.
         phi: the latent function; it needs its `task`.
