@@ -4,6 +4,7 @@ import ast
 import inspect
 import itertools
 import re
+from collections import defaultdict
 from enum import StrEnum
 from textwrap import dedent
 
@@ -15,7 +16,7 @@ from lare_rl.envs.particles.catalogue import find_particle_task
 from lare_rl.envs.smax.scenarios import find_scenario
 from lare_rl.llm.recording import SHIPPED_RECORDINGS
 from lare_rl.tasks.spec import TaskSpec
-from reference_tables.cells import NONE, code, docstring_text, table
+from reference_tables.cells import NONE, code, codes, docstring_text, table
 
 __all__ = ["algorithms_table", "built_in_tasks_page", "methods_page"]
 
@@ -69,38 +70,45 @@ def methods_page() -> str:
             groups[f"{fit} {'with' if method.needs_phi else 'without'} phi"].append(method)
     lines = [
         "# Methods",
-        "A method is a decoder's inputs, a fit and a decoder. `--method NAME` chooses it. The equations are in "
-        "[credit.md](../explanation/credit.md), [closed-form.md](../explanation/closed-form.md) and "
-        "[many-agents.md](../explanation/many-agents.md).",
-        "Inputs: z, the factors of `phi`; s and s', the observations before and after the step; s\\*, the observation that the task's "
-        "`scored_observation` names; a, the action; h, largest, smallest and last values of the entries so far.",
-        "(new): no [table of results](../results/README.md) has trained runs of the method yet.",
+        "`--method NAME` chooses a method: inputs of a decoder, a fit and a decoder ([equations](../explanation/credit.md), "
+        "[closed forms](../explanation/closed-form.md), [many agents](../explanation/many-agents.md)). Methods without a note are "
+        "for any number of agents. *New*: no [result](../results/README.md) has trained runs of it yet.",
+        "Inputs: z, factors of `phi`; s and s', the observations before and after the step; s\\*, the task's "
+        "`scored_observation`; a, the action; h, largest, smallest and last values of the entries so far.",
     ]
     for title, methods in groups.items():
         rows = (
             (
-                code(method.name) + (" (new)" if method.name in UNMEASURED else ""),
-                docstring_text(method.summary),
-                agents_text(method),
+                code(method.name),
+                f"{method.summary}{notes(method)}",
                 inputs(method),
                 fit_text(method),
-                link(method.source),
             )
             for method in methods
         )
-        header = ("method", "what it is", "agents", "inputs", "fitted to", "source")
+        header = ("method", "what it is", "inputs", "fitted to")
         if title == "No decoder":
-            header, rows = (
-                ("method", "what the algorithm is trained on", "source"),
-                ((code(m.name), m.summary, link(m.source)) for m in methods),
-            )
+            header, rows = ("method", "rewards"), ((code(m.name), m.summary) for m in methods)
         lines += [f"## {title}", table(header, rows)]
     lines += ["## Fits", table(("fitted to", "meaning"), enum_rows(Fit))]
+    lines += ["## Sources", table(("source", "methods"), source_rows())]
     return "\n\n".join(lines)
 
 
-def agents_text(method: Method) -> str:
-    return "many" if method.multi_agent_only else "one" if method.single_agent_only else "any"
+def notes(method: Method) -> str:
+    agents = ["many agents"] if method.multi_agent_only else ["one agent"] if method.single_agent_only else []
+    notes = [*agents, *(["*new*"] if method.name in UNMEASURED else [])]
+    return f" ({', '.join(notes)})" if notes else ""
+
+
+def source_rows() -> list[tuple[str, str]]:
+    """Return each source with its methods."""
+    methods = defaultdict(list)
+    for method in METHODS.values():
+        for source in method.source.split("; "):
+            if source != NONE:
+                methods[source].append(method.name)
+    return [(link(source), codes(names)) for source, names in methods.items()]
 
 
 def inputs(method: Method) -> str:
@@ -125,8 +133,8 @@ def fit_text(method: Method) -> str:
 def link(source: str) -> str:
     """Return a source with a link to the page that it names."""
     return source.replace(
-        "this package, docs/explanation/closed-form.md", "[LaRe](../explanation/closed-form.md)"
-    ).replace("this package", "LaRe")
+        "this package, docs/explanation/closed-form.md", "[this package](../explanation/closed-form.md)"
+    )
 
 
 def enum_rows(enum: type[StrEnum]) -> list[tuple[str, str]]:
@@ -160,24 +168,22 @@ def built_in_tasks_page() -> str:
     specs = [read_task(name) for name in sorted(shipped_tasks(), key=natural_order)]
     lines = [
         "# Built-in tasks",
-        "`lare-rl tasks` lists these names. Sizes are those that `phi` reads: of one agent or, if credit is assigned by the global "
-        "state, of the state and of all actions together. A recorded task needs no language model: `phi` is computed from saved "
-        "replies, and `--draw` chooses among them.",
+        "`lare-rl tasks` lists these names. Sizes are those that `phi` reads: of one agent or, if credit goes to the team, of the "
+        "global state and all actions. Tasks with recorded replies need no language model; `--draw` chooses a reply.",
+        "`scored_observation` is `after`, "
+        + " and ".join(
+            f"`{value}` for {codes(spec.name for spec in specs if spec.scored_observation == value)}"
+            for value in ("before", "both")
+        )
+        + ".",
     ]
     for family, title in FAMILIES.items():
-        rows = (
-            (
-                code(spec.name),
-                agents(spec),
-                observation(spec),
-                action(spec),
-                spec.scored_observation,
-                recordings(spec, specs),
-            )
-            for spec in specs
-            if spec.family == family
-        )
-        header = ("task", "agents", "observation", "action", "scored observation", "recorded replies")
+        names = defaultdict(list)
+        for spec in specs:
+            if spec.family == family:
+                names[agents(spec), observation(spec), action(spec), recordings(spec, specs)].append(spec.name)
+        rows = ((codes(tasks), *cells) for cells, tasks in names.items())
+        header = ("task", "agents", "observation", "action", "recorded replies")
         lines += [f"## {title}", table(header, rows)]
     return "\n\n".join(lines)
 

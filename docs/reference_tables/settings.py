@@ -1,12 +1,14 @@
 """The tables of task keys and of settings."""
 
-from collections.abc import Iterable
+from collections import defaultdict
+from collections.abc import Iterable, Mapping
 from types import SimpleNamespace
 
 from lare_rl.algorithms.registry import ALGORITHMS
 from lare_rl.config.settings import Settings
 from lare_rl.credit.decoder_settings import MULTI_AGENT_CREDIT, CreditSettings
 from lare_rl.credit.methods import METHODS
+from lare_rl.errors import CheckedModel
 from lare_rl.tasks.spec import TaskSpec
 from reference_tables.cells import code, codes, default, docstring_text, kind, table
 
@@ -32,14 +34,20 @@ RUN_GROUPS = {
 ALGORITHM_GROUPS = {"TD3, DDPG and SAC": "td3 ddpg sac", "PPO and IPPO": "ppo ippo", "QMIX and VDN": "qmix vdn"}
 
 
+FORMS = (
+    ("command line", "`--evaluate-every 1000`", "`--td3.warmup 1000`", "`--credit.steps 512`"),
+    ("Python: `Settings(...)`", "`evaluate_every=1000`", '`td3={"warmup": 1000}`', '`credit={"steps": 512}`'),
+)
+"""How settings are given."""
+
+
 def tasks_page() -> str:
     """Return the page about the keys of a task file."""
     check_complete(TASK_GROUPS.values(), TaskSpec.model_fields)
     lines = [
         "# Keys of a task file",
-        "A task file is TOML. In Python, the keys are the fields of `lare_rl.TaskSpec`. [Your own "
-        "environment](../tutorials/your-own-environment.md) writes such a file step by step.",
-        'One more key, `like = "NAME"`, takes all keys that a file leaves out from a built-in task or from another file.',
+        "A task file is TOML ([tutorial](../tutorials/your-own-environment.md)). In Python, the keys are the fields of "
+        '`lare_rl.TaskSpec`. `like = "NAME"` takes the keys that a file leaves out from a built-in task or another file.',
     ]
     for title, names in TASK_GROUPS.items():
         rows = []
@@ -57,9 +65,7 @@ def settings_page() -> str:
     check_complete(ALGORITHM_GROUPS.values(), ALGORITHMS)
     lines = [
         "# Settings",
-        "A setting `evaluate_every` is `--evaluate-every` on the command line, `Settings(evaluate_every=...)` in Python and "
-        "`evaluate_every` in a sweep file. A setting of an algorithm has its name in front: `--td3.warmup`, "
-        '`Settings(td3={"warmup": 1000})`. A setting of the decoder is under `credit`: `--credit.sampled-steps`.',
+        table(("where", "setting of a run", "of an algorithm", "of the decoder"), FORMS),
         "If a default is -, the task and the algorithm decide. `config.json` has the values that a run used.",
     ]
     for title, names in RUN_GROUPS.items():
@@ -75,34 +81,38 @@ def settings_page() -> str:
 
 
 def algorithm_table(names: list[str]) -> str:
-    """Return the settings of several algorithms, with a column of defaults for each."""
-    settings = [ALGORITHMS[name].settings for name in names]
-    fields = {field: info for values in settings for field, info in type(values).model_fields.items()}
-    rows = (
-        (
-            code(name),
-            *(default(getattr(values, name, None)) for values in settings),
-            docstring_text(field.description),
-        )
-        for name, field in fields.items()
-    )
-    return table(("setting", *map(code, names), "meaning"), rows)
+    """Return the settings of several algorithms."""
+    settings = {code(name): ALGORITHMS[name].settings for name in names}
+    fields = {field: info for values in settings.values() for field, info in type(values).model_fields.items()}
+    rows = ((code(name), defaults(name, settings), docstring_text(field.description)) for name, field in fields.items())
+    return table(("setting", "default", "meaning"), rows)
+
+
+def defaults(setting: str, variants: Mapping[str, CheckedModel]) -> str:
+    """Return the default of a setting. If variants differ, or lack it, their names are before their defaults."""
+    names = defaultdict(list)
+    for name, values in variants.items():
+        if hasattr(values, setting):
+            names[default(getattr(values, setting))].append(name)
+    first, *others = (f"{', '.join(group)}: {cell}" for cell, group in names.items())
+    complete = all(hasattr(values, setting) for values in variants.values())
+    return "; ".join([next(iter(names)) if complete else first, *others])
 
 
 def credit_table() -> str:
     """Return the settings of the decoder."""
     changes = ALGORITHMS["qmix"].run_defaults(SimpleNamespace(is_jax=True, max_steps=1), 0)["credit"]
-    columns = (CreditSettings(), MULTI_AGENT_CREDIT, MULTI_AGENT_CREDIT.model_copy(update=changes))
+    variants = {"one agent": CreditSettings(), "many agents": MULTI_AGENT_CREDIT}
     rows = (
         (
             code(name),
-            *(default(getattr(values, name)) for values in columns),
+            defaults(name, variants) + (f"; `qmix`, `vdn`: {default(changes[name])}" if name in changes else ""),
             readers(name),
             docstring_text(field.description),
         )
         for name, field in CreditSettings.model_fields.items()
     )
-    return table(("setting", "one agent", "many agents", "`qmix`, `vdn`", "read by", "meaning"), rows)
+    return table(("setting", "default", "read by", "meaning"), rows)
 
 
 def readers(name: str) -> str:

@@ -18,25 +18,25 @@ class QMIXSettings(AlgorithmSettings):
     hidden: Annotated[int, Field(ge=1)] = 64
     """Width of the agents' network and of its memory."""
     monotonic: bool = True
-    """Mix the agents' values by a monotonic network; otherwise add them up, which is VDN."""
+    """Mix the agents' values by a monotonic network; otherwise add them up (VDN)."""
     embed: Annotated[int, Field(ge=1)] = 32
     """Width of the mixer."""
     hypernet: Annotated[int, Field(ge=1)] = 64
     """Width of the hidden layers of the hypernetworks, which compute the mixer's weights."""
     learning_rate: Annotated[float, Field(gt=0)] = 1e-3
-    """Learning rate of Adam, for all networks."""
+    """Learning rate of Adam."""
     gamma: Annotated[float, Field(ge=0, le=1)] = 0.99
     """Discount factor."""
     td_lambda: Annotated[float, Field(ge=0, le=1)] = 0.6
     """Lambda of the TD(lambda) targets: 0 relies on the target networks, 1 on the rewards."""
     max_grad_norm: Annotated[float, Field(gt=0)] = 10.0
-    """Largest norm of the gradient of agents and mixer together; a larger gradient is scaled down to it."""
+    """Largest norm of the joint gradient of agents and mixer; a larger one is scaled down."""
     batch_size: Annotated[int, Field(ge=1)] = 128
     """Episodes in one update."""
     update_every: Annotated[int, Field(ge=1)] = 8
-    """Number of new episodes for each update."""
+    """New episodes for each update."""
     target_every: Annotated[int, Field(ge=1)] = 200
-    """Episodes between two copies of the online networks to the target networks. A copy waits for the next update."""
+    """Episodes between two updates of the target networks, at the next update."""
     epsilon_start: Annotated[float, Field(ge=0, le=1)] = 1.0
     """Probability that an agent explores, at the start."""
     epsilon_end: Annotated[float, Field(ge=0, le=1)] = 0.05
