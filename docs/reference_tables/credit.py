@@ -9,7 +9,7 @@ from enum import StrEnum
 from textwrap import dedent
 
 from lare_rl.algorithms.registry import ALGORITHMS, Algorithm
-from lare_rl.credit.input_names import InputNames
+from lare_rl.credit.input_names import RAW, InputNames
 from lare_rl.credit.methods import METHODS, Fit, Method
 from lare_rl.envs.load import read_task, shipped_tasks
 from lare_rl.envs.particles.catalogue import find_particle_task
@@ -32,12 +32,12 @@ SYMBOLS = {
 
 FAMILIES = {
     "": "MuJoCo",
-    "lare": "MuJoCo with other rewards",
-    "particles": "Particles",
+    "lare": "MuJoCo, other rewards",
+    "playground": "Playground",
+    "jumanji": "Jumanji",
+    "particles": "particles",
     "smax": "SMAX",
     "smac": "SMAC",
-    "playground": "MuJoCo Playground",
-    "jumanji": "Jumanji",
 }
 
 UNMEASURED = (
@@ -59,22 +59,20 @@ def methods_page() -> str:
     """Return the page about the methods."""
     groups: dict[str, list[Method]] = {
         "No decoder": [method for method in METHODS.values() if method.fit is None],
-        "Closed forms with phi": [],
-        "Closed forms without phi": [],
-        "Gradient descent with phi": [],
-        "Gradient descent without phi": [],
+        "Closed forms": [],
+        "Gradient descent": [],
     }
     for method in METHODS.values():
         if method.fit is not None:
-            fit = "Gradient descent" if method.uses_gradient else "Closed forms"
-            groups[f"{fit} {'with' if method.needs_phi else 'without'} phi"].append(method)
+            groups["Gradient descent" if method.uses_gradient else "Closed forms"].append(method)
     lines = [
         "# Methods",
         "`--method NAME` chooses a method: inputs of a decoder, a fit and a decoder ([equations](../explanation/credit.md), "
         "[closed forms](../explanation/closed-form.md), [many agents](../explanation/many-agents.md)). Methods without a note are "
         "for any number of agents. *New*: no [result](../results/README.md) has trained runs of it yet.",
         "Inputs: z, factors of `phi`; s and s', the observations before and after the step; s\\*, the task's "
-        "`scored_observation`; a, the action; h, largest, smallest and last values of the entries so far.",
+        "`scored_observation`; a, the action; x = (s, a, s - s'), for many agents s'; h, largest, smallest and last values of the "
+        "entries so far.",
     ]
     for title, methods in groups.items():
         rows = (
@@ -91,7 +89,7 @@ def methods_page() -> str:
             header, rows = ("method", "rewards"), ((code(m.name), m.summary) for m in methods)
         lines += [f"## {title}", table(header, rows)]
     lines += ["## Fits", table(("fitted to", "meaning"), enum_rows(Fit))]
-    lines += ["## Sources", table(("source", "methods"), source_rows())]
+    lines += ["## Sources", table(("methods", "source"), source_rows())]
     return "\n\n".join(lines)
 
 
@@ -102,19 +100,20 @@ def notes(method: Method) -> str:
 
 
 def source_rows() -> list[tuple[str, str]]:
-    """Return each source with its methods."""
+    """Return the methods of each source."""
     methods = defaultdict(list)
     for method in METHODS.values():
-        for source in method.source.split("; "):
-            if source != NONE:
-                methods[source].append(method.name)
-    return [(link(source), codes(names)) for source, names in methods.items()]
+        if method.source != NONE:
+            methods[method.source].append(method.name)
+    return [(codes(names), link(source)) for source, names in methods.items()]
 
 
 def inputs(method: Method) -> str:
     """Return the inputs for one agent and, if they differ, for many."""
     if method.inputs is None:
         return NONE
+    if method.inputs == RAW and not method.multi_agent_only:
+        return "s, a, s - s'" if method.single_agent_only else "x"
     single, many = symbols(method.inputs, True), symbols(method.inputs, False)
     if single == many or method.single_agent_only:
         return single
@@ -151,10 +150,10 @@ def enum_rows(enum: type[StrEnum]) -> list[tuple[str, str]]:
 def algorithms_table() -> str:
     """Return the table of algorithms."""
     rows = (
-        (code(name), str(algorithm.consumes), *abilities(algorithm), algorithm.summary, algorithm.source)
+        (code(name), str(algorithm.consumes), *abilities(algorithm), algorithm.summary)
         for name, algorithm in ALGORITHMS.items()
     )
-    return table(("algorithm", "consumes", "agents", "actions", "what it is", "source"), rows)
+    return table(("algorithm", "consumes", "agents", "actions", "what it is"), rows)
 
 
 def abilities(algorithm: Algorithm) -> tuple[str, str]:
@@ -169,22 +168,20 @@ def built_in_tasks_page() -> str:
     lines = [
         "# Built-in tasks",
         "`lare-rl tasks` lists these names. Sizes are those that `phi` reads: of one agent or, if credit goes to the team, of the "
-        "global state and all actions. Tasks with recorded replies need no language model; `--draw` chooses a reply.",
-        "`scored_observation` is `after`, "
-        + " and ".join(
-            f"`{value}` for {codes(spec.name for spec in specs if spec.scored_observation == value)}"
+        "state and the joint action. Tasks with recorded replies need no language model; `--draw` chooses a reply.",
+        "`scored_observation` is `after`"
+        + "".join(
+            f", `{value}` for {codes(spec.name for spec in specs if spec.scored_observation == value)}"
             for value in ("before", "both")
         )
         + ".",
     ]
-    for family, title in FAMILIES.items():
-        names = defaultdict(list)
-        for spec in specs:
-            if spec.family == family:
-                names[agents(spec), observation(spec), action(spec), recordings(spec, specs)].append(spec.name)
-        rows = ((codes(tasks), *cells) for cells, tasks in names.items())
-        header = ("task", "agents", "observation", "action", "recorded replies")
-        lines += [f"## {title}", table(header, rows)]
+    names = defaultdict(list)
+    for spec in sorted(specs, key=lambda spec: list(FAMILIES).index(spec.family)):
+        cells = (FAMILIES[spec.family], agents(spec), observation(spec), action(spec), recordings(spec, specs))
+        names[cells].append(spec.name)
+    header = ("task", "family", "agents", "observation", "action", "recorded replies")
+    lines += [table(header, ((codes(tasks), *cells) for cells, tasks in names.items()))]
     return "\n\n".join(lines)
 
 
@@ -200,25 +197,23 @@ def agents(spec: TaskSpec) -> str:
 
 
 def observation(spec: TaskSpec) -> str:
-    return f"{spec.observation_size}, of the state" if spec.credit_scope == "state" else str(spec.observation_size)
+    return f"state {spec.observation_size}" if spec.credit_scope == "state" else str(spec.observation_size)
 
 
 def action(spec: TaskSpec) -> str:
     if spec.credit_scope == "state":
-        return f"{spec.action_size}, of all agents"
+        return f"joint {spec.action_size}"
     noun = "choice" if spec.family in DISCRETE else "number"
     return f"{spec.action_size} {noun}{'' if spec.action_size == 1 else 's'}"
 
 
 def recordings(spec: TaskSpec, specs: list[TaskSpec]) -> str:
-    """Return what recorded replies there are, for the task or for another with the same texts."""
+    """Return the number of recorded replies for the task, or for another with the same texts."""
     if spec.teams:
         return "those of its teams"
     sources = [spec, *(other for other in specs if other is not spec and texts(other) == texts(spec))]
-    counts = {source.name: count_draws(source.name) for source in sources}
-    name = next((name for name, draws in counts.items() if any(draws.values())), spec.name)
-    cell = ", ".join(f"{count} {kind}" for kind, count in counts[name].items() if count)
-    return (cell if name == spec.name else f"{cell} (`{name}`)") or NONE
+    counts = next(filter(lambda draws: any(draws.values()), (count_draws(source.name) for source in sources)), {})
+    return ", ".join(f"{count} {kind}" for kind, count in counts.items() if count) or NONE
 
 
 def texts(spec: TaskSpec) -> tuple[str, ...]:

@@ -29,8 +29,11 @@ CATALOGUES = {
     "Turns of agents that talk": TURNS,
 }
 
-LEGENDS = ("columns", "intervals", "curves", "over_tasks")
-"""Sentences that explain tables and figures, and are no findings."""
+WITH_CODES = ("Logs", "Turns of agents that talk")
+"""The catalogues whose codes Python returns."""
+
+LEGENDS = ("columns", "intervals", "curves", "over_tasks", "origin", "scores", "scaled_scores", "differ", "largest")
+"""Sentences that describe tables and figures, and are no findings."""
 
 COUNTS = ("count", "needed", "repetitions")
 """Placeholders of numbers, beside those that begin with `n_`."""
@@ -45,20 +48,19 @@ def metrics_page() -> str:
     """Return the page about the metrics."""
     lines = [
         "# Metrics",
-        "`metrics.jsonl` has one line for each seed and evaluation. A value that is not known yet is left out, or null. Keys are "
-        "stable. If several teams learn, a key belongs to the first team, and `KEY_TEAM` to each team. A task's own `measures` are "
+        "`metrics.jsonl` has one line for each seed and evaluation. Values that are not known yet are missing or null. Keys are "
+        "stable. With several teams, a key belongs to the first team, and `KEY_TEAM` to each. A task's `measures` are "
         "`evaluation/NAME`. `CreditAssigner.metrics()` returns those about credit.",
-        "All evaluations of a seed play the same initial states, which differ from those of training episodes. Off-policy algorithms "
-        "and continuous PPO are evaluated without noise. Discrete PPO and IPPO sample their actions, as in training.",
+        "All evaluations of a seed play the same initial states, which no training episode has. Off-policy algorithms and continuous "
+        "PPO are evaluated without noise; discrete PPO and IPPO sample their actions, as in training.",
     ]
     for title, metrics in METRIC_GROUPS.items():
         lines += [f"## {title}", table(("key", "meaning"), ((code(name), text) for name, text in metrics.items()))]
     lines += [
         "## Which credit metric to trust",
-        "`credit/correlation` and `credit/error` look at steps of episodes that the decoder was fitted to. `credit/return_r2` "
-        "does not. It tests the sum of the proxy rewards of an episode, and neither single steps nor the division among agents. If "
-        "episodes differ in length and returns depend on it, R² is near 1 whatever the features are. True rewards are used for these "
-        "metrics only.",
+        "`credit/return_r2` is out of sample, but tests sums over episodes: neither single steps nor the division among agents. If "
+        "returns depend on the length of episodes, it is near 1 whatever the features are. `credit/correlation` and `credit/error` "
+        "are in sample. True rewards are used for these two only.",
     ]
     return "\n\n".join(lines)
 
@@ -67,23 +69,39 @@ def findings_page() -> str:
     """Return the page about the sentences of reports and of commands."""
     lines = [
         "# Findings",
-        "Reports and commands say what they found in whole sentences. Each sentence has a code. In this page N is a number, a word in "
-        "italics a name, and … another sentence of the table.",
+        "What reports and commands say. Here N is a number, a word in italics a name, and … further words or sentences. "
+        "`Relabelled.findings` and `CreditedTurns.findings` have the codes.",
         "## The diagnosis of a run",
-        "`lare-rl report` begins with these sentences, at most one of each group. The final return is the mean over the seeds at the "
-        "last evaluation. Its standard error is the larger of two: that over the seeds, and that over the episodes of the last "
-        "evaluation. The usual change is the median difference between evaluations that follow each other, in the last half of the "
-        "run.",
+        "`lare-rl report` begins with at most one sentence of each group. *Final return*: the mean over seeds at the last "
+        "evaluation; its standard error is that over seeds or over episodes, whichever is larger. *Usual change*: the median "
+        "difference between successive evaluations in the last half of the run.",
     ]
     for title, conditions in CONDITIONS.items():
-        rows = ((code(name), sentence(REPORT[name], REPORT), text) for name, text in conditions.items())
-        lines += [f"### {title}", table(("code", "sentence", "when"), rows)]
+        rows = ((diagnosis(name), text) for name, text in conditions.items())
+        lines += [f"### {title}", table(("sentence", "when"), rows)]
     for title, catalogue in CATALOGUES.items():
-        rows = (
-            (code(name), sentence(text, catalogue)) for name, text in catalogue.items() if is_finding(name, text, title)
-        )
-        lines += [f"## {title}", table(("code", "sentence"), rows)]
+        sentences = {
+            name: first_sentence(text, catalogue) for name, text in catalogue.items() if is_finding(name, text, title)
+        }
+        if title in WITH_CODES:
+            lines += [
+                f"## {title}",
+                table(("code", "sentence"), ((code(name), text) for name, text in sentences.items())),
+            ]
+        else:
+            lines += [f"## {title}", "\n".join(f"* {text}" for text in sentences.values())]
     return "\n\n".join(lines)
+
+
+def diagnosis(name: str) -> str:
+    """Return the headline of a finding, if it has one, and its first sentence."""
+    texts = [first_sentence(REPORT[key], REPORT) for key in (f"headline_{name}", name) if key in REPORT]
+    return ". ".join(text for text in texts if text != "…")
+
+
+def first_sentence(template: str, catalogue: Mapping[str, str]) -> str:
+    first, stop, rest = sentence(template, catalogue).partition(". ")
+    return f"{first}. …" if stop and rest else first.replace("….", "…")
 
 
 def is_finding(name: str, template: str, title: str) -> bool:
@@ -129,7 +147,7 @@ def variables_page() -> str:
     """Return the page about environment variables."""
     lines = [
         "# Environment variables",
-        "LaRe reads these variables. JAX, Weights & Biases, MLflow and Hugging Face also read variables of their own.",
+        "JAX, Weights & Biases, MLflow and Hugging Face read further variables.",
     ]
     for title, variables in VARIABLE_GROUPS.items():
         lines += [
@@ -142,10 +160,15 @@ def variables_page() -> str:
 def functions_table() -> str:
     """Return the table of functions that a phi may call."""
     modules = {name: getattr(numpy_functions, name) for name in numpy_functions.__all__}
+    first_names = {id(function): key for key, function in reversed(FUNCTIONS.items())}
     rows = []
     for name, module in modules.items():
         if inspect.ismodule(module):
-            functions = (key for key, function in FUNCTIONS.items() if defining_module(function) == module.__name__)
+            functions = (
+                key
+                for key, function in FUNCTIONS.items()
+                if defining_module(function) == module.__name__ and first_names[id(function)] == key
+            )
             rows.append((name, codes(sorted(name for name in functions if not VARIANT.search(name)))))
     names = plain_names(BUILTINS)
     rows.append(("Python", codes(name for name in names if "." not in name)))

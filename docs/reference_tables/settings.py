@@ -4,13 +4,15 @@ from collections import defaultdict
 from collections.abc import Iterable, Mapping
 from types import SimpleNamespace
 
+from pydantic.fields import FieldInfo
+
 from lare_rl.algorithms.registry import ALGORITHMS
 from lare_rl.config.settings import Settings
 from lare_rl.credit.decoder_settings import MULTI_AGENT_CREDIT, CreditSettings
 from lare_rl.credit.methods import METHODS
 from lare_rl.errors import CheckedModel
 from lare_rl.tasks.spec import TaskSpec
-from reference_tables.cells import code, codes, default, docstring_text, kind, table
+from reference_tables.cells import NONE, code, codes, default, docstring_text, kind, table
 
 __all__ = ["settings_page", "tasks_page"]
 
@@ -24,17 +26,17 @@ TASK_GROUPS = {
 }
 
 RUN_GROUPS = {
-    "What is trained": "method algorithm steps seeds seed",
-    "The latent function": "scored_observation draw candidates",
-    "Collection": "environments rollout_steps capacity overlap_collection scale_rewards",
+    "The run": "method algorithm steps seeds seed scored_observation draw candidates",
+    "Collection and evaluation": "environments rollout_steps capacity overlap_collection scale_rewards evaluate_every "
+    "evaluation_episodes",
     "Fits of the decoder": "fit_every fit_updates first_fit",
-    "Evaluation": "evaluate_every evaluation_episodes",
 }
 
 ALGORITHM_GROUPS = {"TD3, DDPG and SAC": "td3 ddpg sac", "PPO and IPPO": "ppo ippo", "QMIX and VDN": "qmix vdn"}
 
 
 FORMS = (
+    ("TOML", "`evaluate_every = 1000`", "`td3 = { warmup = 1000 }`", "`credit = { steps = 512 }`"),
     ("command line", "`--evaluate-every 1000`", "`--td3.warmup 1000`", "`--credit.steps 512`"),
     ("Python: `Settings(...)`", "`evaluate_every=1000`", '`td3={"warmup": 1000}`', '`credit={"steps": 512}`'),
 )
@@ -53,10 +55,15 @@ def tasks_page() -> str:
         rows = []
         for name in names.split():
             field = TaskSpec.model_fields[name]
-            value = "required" if field.is_required() else default(field.get_default(call_default_factory=True))
-            rows.append((code(name), kind(field), value, docstring_text(field.description)))
-        lines += [f"## {title}", table(("key", "value", "default", "meaning"), rows)]
+            rows.append((code(name), value_and_default(field), docstring_text(field.description)))
+        lines += [f"## {title}", table(("key", "value (default)", "meaning"), rows)]
     return "\n\n".join(lines)
+
+
+def value_and_default(field: FieldInfo) -> str:
+    """Return the kind of a key's values, and the default in parentheses."""
+    value = "required" if field.is_required() else default(field.get_default(call_default_factory=True))
+    return kind(field) if value == NONE else f"{kind(field)} ({value})"
 
 
 def settings_page() -> str:
@@ -65,7 +72,7 @@ def settings_page() -> str:
     check_complete(ALGORITHM_GROUPS.values(), ALGORITHMS)
     lines = [
         "# Settings",
-        table(("where", "setting of a run", "of an algorithm", "of the decoder"), FORMS),
+        table(("where", "a run's setting", "an algorithm's", "the decoder's"), FORMS),
         "If a default is -, the task and the algorithm decide. `config.json` has the values that a run used.",
     ]
     for title, names in RUN_GROUPS.items():

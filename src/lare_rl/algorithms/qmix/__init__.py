@@ -65,7 +65,7 @@ register_algorithm(
         settings=QMIXSettings(),
         module="lare_rl.algorithms.qmix.qmix",
         run_defaults=_run_defaults,
-        summary="a team's value as a monotonic mixture of its agents' values, each with a memory of its episode",
+        summary="a team's value as a monotonic mixture of its agents' values; recurrent agents",
         source="Rashid et al., ICML 2018; hyperparameters of PyMARL2 (Hu et al., 2021)",
         continuous=False,
         multi_agent=True,
