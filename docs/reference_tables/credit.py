@@ -16,7 +16,7 @@ from lare_rl.envs.particles.catalogue import find_particle_task
 from lare_rl.envs.smax.scenarios import find_scenario
 from lare_rl.llm.recording import SHIPPED_RECORDINGS
 from lare_rl.tasks.spec import TaskSpec
-from reference_tables.cells import NONE, code, codes, docstring_text, table
+from reference_tables.cells import NONE, code, codes, docstring_text, parameters, table
 
 __all__ = ["algorithms_table", "built_in_tasks_page", "methods_page"]
 
@@ -88,8 +88,8 @@ def methods_page() -> str:
         if title == "No decoder":
             header, rows = ("method", "rewards"), ((code(m.name), m.summary) for m in methods)
         lines += [f"## {title}", table(header, rows)]
-    lines += ["## Fits", table(("fitted to", "meaning"), enum_rows(Fit))]
-    lines += ["## Sources", table(("methods", "source"), source_rows())]
+    lines += ["## Fits", parameters((name, "", text) for name, text in enum_rows(Fit))]
+    lines += ["## Sources", parameters((names, "", source) for names, source in source_rows())]
     return "\n\n".join(lines)
 
 

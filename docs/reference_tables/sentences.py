@@ -1,45 +1,23 @@
-"""The tables of metrics, of findings, of environment variables, and of the functions that phi may call."""
+"""The pages about metrics, findings and environment variables."""
 
-import functools
-import inspect
 import re
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 
-from lare_rl.compare.messages import MESSAGES as COMPARISON
-from lare_rl.credit.explanation_text import MESSAGES as EXPLANATION
 from lare_rl.logs.relabel import MESSAGES as LOGS
-from lare_rl.phi import numpy_functions
-from lare_rl.phi.numpy_functions import FUNCTIONS
-from lare_rl.phi.python_functions import BUILTINS
 from lare_rl.report.messages import MESSAGES as REPORT
 from lare_rl.runs.metric_names import METRIC_GROUPS
-from lare_rl.training.advice import MESSAGES as TRAINING
 from lare_rl.turns.words import MESSAGES as TURNS
 from lare_rl.util.variables import VARIABLE_GROUPS
-from reference_tables.cells import code, codes, table
+from reference_tables.cells import code, parameters, table
 from reference_tables.conditions import CONDITIONS
 
-__all__ = ["findings_page", "functions_table", "metrics_page", "variables_page"]
+__all__ = ["findings_page", "metrics_page", "variables_page"]
 
-CATALOGUES = {
-    "While a run trains": TRAINING,
-    "What the returns say": EXPLANATION,
-    "Comparisons": COMPARISON,
-    "Logs": LOGS,
-    "Turns of agents that talk": TURNS,
-}
-
-WITH_CODES = ("Logs", "Turns of agents that talk")
+CATALOGUES = {"`Relabelled.findings`": LOGS, "`CreditedTurns.findings`": TURNS}
 """The catalogues whose codes Python returns."""
 
-LEGENDS = ("columns", "intervals", "curves", "over_tasks", "origin", "scores", "scaled_scores", "differ", "largest")
-"""Sentences that describe tables and figures, and are no findings."""
-
-COUNTS = ("count", "needed", "repetitions")
+COUNTS = ("count", "needed")
 """Placeholders of numbers, beside those that begin with `n_`."""
-
-VARIANT = re.compile(r"^(?!linalg).*\.(outer|reduce|accumulate)$")
-"""The names of variants of elementwise functions, such as `add.reduce`."""
 
 PLACEHOLDER = re.compile(r"(?P<before>.?)\{(?P<name>\w+)(?P<format>:[^}]*)?\}(?=(?P<after>.?))")
 
@@ -55,7 +33,7 @@ def metrics_page() -> str:
         "PPO are evaluated without noise; discrete PPO and IPPO sample their actions, as in training.",
     ]
     for title, metrics in METRIC_GROUPS.items():
-        lines += [f"## {title}", table(("key", "meaning"), ((code(name), text) for name, text in metrics.items()))]
+        lines += [f"## {title}", parameters((code(name), "", text) for name, text in metrics.items())]
     lines += [
         "## Which credit metric to trust",
         "`credit/return_r2` is out of sample, but tests sums over episodes: neither single steps nor the division among agents. If "
@@ -69,8 +47,8 @@ def findings_page() -> str:
     """Return the page about the sentences of reports and of commands."""
     lines = [
         "# Findings",
-        "What reports and commands say. Here N is a number, a word in italics a name, and … further words or sentences. "
-        "`Relabelled.findings` and `CreditedTurns.findings` have the codes.",
+        "When reports say what, and the codes of findings in Python. N is a number, a word in italics a name, and … further words. "
+        "Other sentences of reports and commands say themselves what is meant and what to do.",
         "## The diagnosis of a run",
         "`lare-rl report` begins with at most one sentence of each group. *Final return*: the mean over seeds at the last "
         "evaluation; its standard error is that over seeds or over episodes, whichever is larger. *Usual change*: the median "
@@ -80,16 +58,8 @@ def findings_page() -> str:
         rows = ((diagnosis(name), text) for name, text in conditions.items())
         lines += [f"### {title}", table(("sentence", "when"), rows)]
     for title, catalogue in CATALOGUES.items():
-        sentences = {
-            name: first_sentence(text, catalogue) for name, text in catalogue.items() if is_finding(name, text, title)
-        }
-        if title in WITH_CODES:
-            lines += [
-                f"## {title}",
-                table(("code", "sentence"), ((code(name), text) for name, text in sentences.items())),
-            ]
-        else:
-            lines += [f"## {title}", "\n".join(f"* {text}" for text in sentences.values())]
+        rows = ((code(name), "", sentence(text, catalogue)) for name, text in catalogue.items())
+        lines += [f"## {title}", parameters(rows)]
     return "\n\n".join(lines)
 
 
@@ -102,17 +72,6 @@ def diagnosis(name: str) -> str:
 def first_sentence(template: str, catalogue: Mapping[str, str]) -> str:
     first, stop, rest = sentence(template, catalogue).partition(". ")
     return f"{first}. …" if stop and rest else first.replace("….", "…")
-
-
-def is_finding(name: str, template: str, title: str) -> bool:
-    """Whether a template is a whole sentence, or a reason in one. Others are parts of sentences."""
-    if title == "Turns of agents that talk":
-        return True
-    return name not in LEGENDS and is_sentence(template)
-
-
-def is_sentence(template: str) -> bool:
-    return template.rstrip("}").endswith((".", ":")) or re.search(r"[.:]\{\w+\}$", template) is not None
 
 
 def sentence(template: str, catalogue: Mapping[str, str]) -> str:
@@ -152,39 +111,6 @@ def variables_page() -> str:
     for title, variables in VARIABLE_GROUPS.items():
         lines += [
             f"## {title}",
-            table(("variable", "meaning"), ((code(name), text) for name, text in variables.items())),
+            parameters((code(name), "", text) for name, text in variables.items()),
         ]
     return "\n\n".join(lines)
-
-
-def functions_table() -> str:
-    """Return the table of functions that a phi may call."""
-    modules = {name: getattr(numpy_functions, name) for name in numpy_functions.__all__}
-    first_names = {id(function): key for key, function in reversed(FUNCTIONS.items())}
-    rows = []
-    for name, module in modules.items():
-        if inspect.ismodule(module):
-            functions = (
-                key
-                for key, function in FUNCTIONS.items()
-                if defining_module(function) == module.__name__ and first_names[id(function)] == key
-            )
-            rows.append((name, codes(sorted(name for name in functions if not VARIANT.search(name)))))
-    names = plain_names(BUILTINS)
-    rows.append(("Python", codes(name for name in names if "." not in name)))
-    packages = dict.fromkeys(name.partition(".")[0] for name in names if "." in name)
-    rows += [
-        (package, codes(name.partition(".")[2] for name in names if name.startswith(f"{package}.")))
-        for package in packages
-    ]
-    return table(("group", "functions"), [row for row in rows if row[1]])
-
-
-def defining_module(function: object) -> str:
-    while isinstance(function, functools.partial):
-        function = function.func
-    return getattr(function, "__module__", "")
-
-
-def plain_names(names: Iterable[str]) -> list[str]:
-    return sorted(name for name in names if not re.match(r"[A-Z]|np\.", name))

@@ -12,7 +12,7 @@ from lare_rl.credit.decoder_settings import MULTI_AGENT_CREDIT, CreditSettings
 from lare_rl.credit.methods import METHODS
 from lare_rl.errors import CheckedModel
 from lare_rl.tasks.spec import TaskSpec
-from reference_tables.cells import NONE, code, codes, default, docstring_text, kind, table
+from reference_tables.cells import NONE, code, codes, default, docstring_text, kind, parameters, table
 
 __all__ = ["settings_page", "tasks_page"]
 
@@ -56,14 +56,16 @@ def tasks_page() -> str:
         for name in names.split():
             field = TaskSpec.model_fields[name]
             rows.append((code(name), value_and_default(field), docstring_text(field.description)))
-        lines += [f"## {title}", table(("key", "value (default)", "meaning"), rows)]
+        lines += [f"## {title}", parameters(rows)]
     return "\n\n".join(lines)
 
 
 def value_and_default(field: FieldInfo) -> str:
-    """Return the kind of a key's values, and the default in parentheses."""
-    value = "required" if field.is_required() else default(field.get_default(call_default_factory=True))
-    return kind(field) if value == NONE else f"{kind(field)} ({value})"
+    """Return the kind of a key's values, and the default."""
+    if field.is_required():
+        return f"{kind(field)}, required"
+    value = default(field.get_default(call_default_factory=True))
+    return kind(field) if value == NONE else f"{kind(field)}; default {value}"
 
 
 def settings_page() -> str:
@@ -73,26 +75,27 @@ def settings_page() -> str:
     lines = [
         "# Settings",
         table(("where", "a run's setting", "an algorithm's", "the decoder's"), FORMS),
-        "If a default is -, the task and the algorithm decide. `config.json` has the values that a run used.",
+        "Defaults are in parentheses. Without one, the task and the algorithm decide. `config.json` has the values that a run used.",
     ]
     for title, names in RUN_GROUPS.items():
         fields = {name: Settings.model_fields[name] for name in names.split()}
         rows = (
-            (code(name), default(field.default), docstring_text(field.description)) for name, field in fields.items()
+            (code(name), default(field.default).removeprefix(NONE), docstring_text(field.description))
+            for name, field in fields.items()
         )
-        lines += [f"## {title}", table(("setting", "default", "meaning"), rows)]
+        lines += [f"## {title}", parameters(rows)]
     for title, names in ALGORITHM_GROUPS.items():
-        lines += [f"## {title}", algorithm_table(names.split())]
-    lines += ["## The decoder (`credit`)", credit_table()]
+        lines += [f"## {title}", algorithm_settings(names.split())]
+    lines += ["## The decoder (`credit`)", decoder_settings()]
     return "\n\n".join(lines)
 
 
-def algorithm_table(names: list[str]) -> str:
+def algorithm_settings(names: list[str]) -> str:
     """Return the settings of several algorithms."""
     settings = {code(name): ALGORITHMS[name].settings for name in names}
     fields = {field: info for values in settings.values() for field, info in type(values).model_fields.items()}
     rows = ((code(name), defaults(name, settings), docstring_text(field.description)) for name, field in fields.items())
-    return table(("setting", "default", "meaning"), rows)
+    return parameters(rows)
 
 
 def defaults(setting: str, variants: Mapping[str, CheckedModel]) -> str:
@@ -106,7 +109,7 @@ def defaults(setting: str, variants: Mapping[str, CheckedModel]) -> str:
     return "; ".join([next(iter(names)) if complete else first, *others])
 
 
-def credit_table() -> str:
+def decoder_settings() -> str:
     """Return the settings of the decoder."""
     changes = ALGORITHMS["qmix"].run_defaults(SimpleNamespace(is_jax=True, max_steps=1), 0)["credit"]
     variants = {"one agent": CreditSettings(), "many agents": MULTI_AGENT_CREDIT}
@@ -114,12 +117,11 @@ def credit_table() -> str:
         (
             code(name),
             defaults(name, variants) + (f"; `qmix`, `vdn`: {default(changes[name])}" if name in changes else ""),
-            readers(name),
-            docstring_text(field.description),
+            f"{docstring_text(field.description)} Read by {readers(name)}.",
         )
         for name, field in CreditSettings.model_fields.items()
     )
-    return table(("setting", "default", "read by", "meaning"), rows)
+    return parameters(rows)
 
 
 def readers(name: str) -> str:
