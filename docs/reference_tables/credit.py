@@ -32,10 +32,10 @@ SYMBOLS = {
 
 FAMILIES = {
     "": "MuJoCo",
-    "lare": "MuJoCo, other rewards",
-    "playground": "Playground",
+    "lare": "MuJoCo with other rewards",
+    "playground": "MuJoCo Playground",
     "jumanji": "Jumanji",
-    "particles": "particles",
+    "particles": "Particles",
     "smax": "SMAX",
     "smac": "SMAC",
 }
@@ -68,35 +68,25 @@ def methods_page() -> str:
     lines = [
         "# Methods",
         "`--method NAME` chooses a method: inputs of a decoder, a fit and a decoder ([equations](../explanation/credit.md), "
-        "[closed forms](../explanation/closed-form.md), [many agents](../explanation/many-agents.md)). Methods without a note are "
-        "for any number of agents. *New*: no [result](../results/README.md) has trained runs of it yet.",
+        "[closed forms](../explanation/closed-form.md), [many agents](../explanation/many-agents.md)). In parentheses: inputs; what "
+        "the decoder is [fitted to](#fits); the number of agents, if limited. *New*: no [result](../results/README.md) has trained "
+        "runs of it yet.",
         "Inputs: z, factors of `phi`; s and s', the observations before and after the step; s\\*, the task's "
         "`scored_observation`; a, the action; x = (s, a, s - s'), for many agents s'; h, largest, smallest and last values of the "
         "entries so far.",
     ]
     for title, methods in groups.items():
-        rows = (
-            (
-                code(method.name),
-                f"{method.summary}{notes(method)}",
-                inputs(method),
-                fit_text(method),
-            )
-            for method in methods
-        )
-        header = ("method", "what it is", "inputs", "fitted to")
-        if title == "No decoder":
-            header, rows = ("method", "rewards"), ((code(m.name), m.summary) for m in methods)
-        lines += [f"## {title}", table(header, rows)]
+        lines += [f"## {title}", parameters((code(m.name), notes(m), docstring_text(m.summary)) for m in methods)]
     lines += ["## Fits", parameters((name, "", text) for name, text in enum_rows(Fit))]
     lines += ["## Sources", parameters((names, "", source) for names, source in source_rows())]
     return "\n\n".join(lines)
 
 
 def notes(method: Method) -> str:
-    agents = ["many agents"] if method.multi_agent_only else ["one agent"] if method.single_agent_only else []
-    notes = [*agents, *(["*new*"] if method.name in UNMEASURED else [])]
-    return f" ({', '.join(notes)})" if notes else ""
+    """Return the inputs, the fit and the number of agents of a method, as far as it has them."""
+    agents = "many agents" if method.multi_agent_only else "one agent" if method.single_agent_only else ""
+    fit = "" if method.fit is None else f"{inputs(method)}; {method.fit.value}"
+    return "; ".join(filter(None, (fit, agents, "*new*" if method.name in UNMEASURED else "")))
 
 
 def source_rows() -> list[tuple[str, str]]:
@@ -125,10 +115,6 @@ def symbols(names: InputNames, single_agent: bool) -> str:
     return ", ".join(SYMBOLS[name] for name in chosen)
 
 
-def fit_text(method: Method) -> str:
-    return NONE if method.fit is None else method.fit.value
-
-
 def link(source: str) -> str:
     """Return a source with a link to the page that it names."""
     return source.replace(
@@ -149,11 +135,8 @@ def enum_rows(enum: type[StrEnum]) -> list[tuple[str, str]]:
 
 def algorithms_table() -> str:
     """Return the table of algorithms."""
-    rows = (
-        (code(name), str(algorithm.consumes), *abilities(algorithm), algorithm.summary)
-        for name, algorithm in ALGORITHMS.items()
-    )
-    return table(("algorithm", "consumes", "agents", "actions", "what it is"), rows)
+    rows = ((code(name), str(algorithm.consumes), *abilities(algorithm)) for name, algorithm in ALGORITHMS.items())
+    return table(("algorithm", "consumes", "agents", "actions"), rows)
 
 
 def abilities(algorithm: Algorithm) -> tuple[str, str]:
@@ -167,8 +150,9 @@ def built_in_tasks_page() -> str:
     specs = [read_task(name) for name in sorted(shipped_tasks(), key=natural_order)]
     lines = [
         "# Built-in tasks",
-        "`lare-rl tasks` lists these names. Sizes are those that `phi` reads: of one agent or, if credit goes to the team, of the "
-        "state and the joint action. Tasks with recorded replies need no language model; `--draw` chooses a reply.",
+        "`lare-rl tasks` lists these names. In parentheses: agents, if there are several; entries of the observation and the action "
+        "that `phi` reads, or of the state and the joint action, if credit goes to the team. Then: recorded replies, with which a "
+        "task needs no language model; `--draw` chooses one.",
         "`scored_observation` is `after`"
         + "".join(
             f", `{value}` for {codes(spec.name for spec in specs if spec.scored_observation == value)}"
@@ -176,24 +160,25 @@ def built_in_tasks_page() -> str:
         )
         + ".",
     ]
-    names = defaultdict(list)
-    for spec in sorted(specs, key=lambda spec: list(FAMILIES).index(spec.family)):
-        cells = (FAMILIES[spec.family], agents(spec), observation(spec), action(spec), recordings(spec, specs))
-        names[cells].append(spec.name)
-    header = ("task", "family", "agents", "observation", "action", "recorded replies")
-    lines += [table(header, ((codes(tasks), *cells) for cells, tasks in names.items()))]
+    for family, title in FAMILIES.items():
+        names = defaultdict(list)
+        for spec in specs:
+            if spec.family == family:
+                sizes = ", ".join(filter(None, (agents(spec), observation(spec), action(spec))))
+                names[sizes, recordings(spec, specs)].append(spec.name)
+        lines += [f"## {title}", parameters((codes(tasks), *cells) for cells, tasks in names.items())]
     return "\n\n".join(lines)
 
 
 def agents(spec: TaskSpec) -> str:
-    """Return the number of agents that learn."""
+    """Return the number of agents that learn, or an empty text for one agent."""
     match spec.family:
         case "particles":
             teams = {team.name: team.n_agents for team in find_particle_task(spec.environment_name).teams}
-            return str(teams[spec.team]) if spec.team else " + ".join(map(str, teams.values()))
+            return f"{teams[spec.team] if spec.team else ' + '.join(map(str, teams.values()))} agents"
         case "smax" | "smac":
-            return str(find_scenario(spec.environment_name).n_allies)
-    return "1"
+            return f"{find_scenario(spec.environment_name).n_allies} agents"
+    return ""
 
 
 def observation(spec: TaskSpec) -> str:
@@ -213,7 +198,7 @@ def recordings(spec: TaskSpec, specs: list[TaskSpec]) -> str:
         return "those of its teams"
     sources = [spec, *(other for other in specs if other is not spec and texts(other) == texts(spec))]
     counts = next(filter(lambda draws: any(draws.values()), (count_draws(source.name) for source in sources)), {})
-    return ", ".join(f"{count} {kind}" for kind, count in counts.items() if count) or NONE
+    return ", ".join(f"{count} {kind}" for kind, count in counts.items() if count) or "none"
 
 
 def texts(spec: TaskSpec) -> tuple[str, ...]:

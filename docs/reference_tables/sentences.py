@@ -70,8 +70,10 @@ def diagnosis(name: str) -> str:
 
 
 def first_sentence(template: str, catalogue: Mapping[str, str]) -> str:
-    first, stop, rest = sentence(template, catalogue).partition(". ")
-    return f"{first}. …" if stop and rest else first.replace("….", "…")
+    """Return the text up to the first full stop or, after a few words, colon."""
+    text = sentence(template, catalogue)
+    start = re.match(r"([^(]{40,}?:|.*?[\w)*]\.) ", text)
+    return f"{start[1]} …" if start else text.replace("….", "…")
 
 
 def sentence(template: str, catalogue: Mapping[str, str]) -> str:

@@ -113,14 +113,10 @@ def decoder_settings() -> str:
     """Return the settings of the decoder."""
     changes = ALGORITHMS["qmix"].run_defaults(SimpleNamespace(is_jax=True, max_steps=1), 0)["credit"]
     variants = {"one agent": CreditSettings(), "many agents": MULTI_AGENT_CREDIT}
-    rows = (
-        (
-            code(name),
-            defaults(name, variants) + (f"; `qmix`, `vdn`: {default(changes[name])}" if name in changes else ""),
-            f"{docstring_text(field.description)} Read by {readers(name)}.",
-        )
-        for name, field in CreditSettings.model_fields.items()
-    )
+    rows = []
+    for name, field in CreditSettings.model_fields.items():
+        note = defaults(name, variants) + (f"; `qmix`, `vdn`: {default(changes[name])}" if name in changes else "")
+        rows.append((code(name), note, f"{docstring_text(field.description)} For {readers(name)}."))
     return parameters(rows)
 
 
