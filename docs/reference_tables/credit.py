@@ -9,7 +9,7 @@ from enum import StrEnum
 from textwrap import dedent
 
 from lare_rl.algorithms.registry import ALGORITHMS, Algorithm
-from lare_rl.credit.input_names import RAW, InputNames
+from lare_rl.credit.input_names import RAW
 from lare_rl.credit.methods import METHODS, Fit, Method
 from lare_rl.envs.load import read_task, shipped_tasks
 from lare_rl.envs.particles.catalogue import find_particle_task
@@ -77,7 +77,7 @@ def methods_page() -> str:
     ]
     for title, methods in groups.items():
         lines += [f"## {title}", parameters((code(m.name), notes(m), docstring_text(m.summary)) for m in methods)]
-    lines += ["## Fits", parameters((name, "", text) for name, text in enum_rows(Fit))]
+    lines += ["## Fits", parameters((f"*{name}*", "", text) for name, text in enum_rows(Fit))]
     lines += ["## Sources", parameters((names, "", source) for names, source in source_rows())]
     return "\n\n".join(lines)
 
@@ -99,20 +99,11 @@ def source_rows() -> list[tuple[str, str]]:
 
 
 def inputs(method: Method) -> str:
-    """Return the inputs for one agent and, if they differ, for many."""
-    if method.inputs is None:
-        return NONE
-    if method.inputs == RAW and not method.multi_agent_only:
-        return "s, a, s - s'" if method.single_agent_only else "x"
-    single, many = symbols(method.inputs, True), symbols(method.inputs, False)
-    if single == many or method.single_agent_only:
-        return single
-    return many if method.multi_agent_only else f"{single}; many agents: {many}"
-
-
-def symbols(names: InputNames, single_agent: bool) -> str:
-    chosen = names.names if single_agent or names.names_of_many_agents is None else names.names_of_many_agents
-    return ", ".join(SYMBOLS[name] for name in chosen)
+    """Return the symbols of the inputs."""
+    if method.inputs == RAW and not (method.single_agent_only or method.multi_agent_only):
+        return "x"
+    many_agents = method.inputs.names_of_many_agents if method.multi_agent_only else None
+    return ", ".join(SYMBOLS[name] for name in many_agents or method.inputs.names)
 
 
 def link(source: str) -> str:
