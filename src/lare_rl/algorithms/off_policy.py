@@ -26,7 +26,7 @@ class OffPolicySettings(AlgorithmSettings):
     gamma: Annotated[float, Field(ge=0, le=1)] = 0.99
     """Discount factor."""
     tau: Annotated[float, Field(gt=0, le=1)] = 0.005
-    """Fraction by which the target networks move towards the online networks at a time."""
+    """Fraction by which target networks move towards online ones at a time."""
     warmup: Annotated[int, Field(ge=0)] = 10_000
     """Environment steps with uniformly random actions before the first update."""
 

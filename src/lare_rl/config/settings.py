@@ -31,33 +31,32 @@ class _RunSettings(CheckedModel, Generic[Open]):
     method: str | Open = OPEN
     """How credit is assigned (`lare-rl methods`). By default lare-bayes; with qmix and vdn lare-rd."""
     algorithm: str | Open = OPEN
-    """What trains the policy (`lare-rl algorithms`). By default, for one agent, ppo if actions are discrete, else td3; for
-    many, qmix if there are a global state and action masks, else ippo."""
+    """What trains the policy (`lare-rl algorithms`). By default, for one agent, ppo with discrete actions, else td3; for many,
+    qmix with a global state and action masks, else ippo."""
     steps: Count | Open = OPEN
-    """Environment steps of each seed; in one step, all agents act. By default 1,000,000 for one agent, about 2,000,000 for
+    """Environment steps of each seed; all agents act in one step. By default 1,000,000 for one agent, about 2,000,000 for
     many."""
     seeds: Count = 1
-    """Number of seeds, trained in lockstep in one process."""
+    """Number of seeds, trained in lockstep."""
     seed: Annotated[int, Field(ge=0, le=MAX_SEED)] = 0
-    """The first seed; the others are the numbers after it."""
+    """The first seed; the others follow it."""
     scored_observation: ScoredObservation | None = None
     """Observations of a step that factors and raw features are computed from: before the action, after it, or both. By default,
     the task decides."""
     draw: Annotated[int, Field(ge=0)] = 0
-    """Which recorded reply of the language model phi comes from (0 to 4); independent of the seed."""
+    """The recorded reply that phi comes from (0 to 4); independent of the seed."""
     candidates: Count = N_CANDIDATES
-    """Number of candidates that phi is combined from; with 1, there is no self-prompting. The shipped recordings have 1 and
-    5."""
+    """Candidates that phi is combined from; with 1, no self-prompting. The shipped recordings have 1 and 5."""
     environments: Count | Open = OPEN
-    """Copies of the environment for each seed. Several copies on the host run in worker processes. By default 1 on the host; in
-    JAX 82 for ippo and 8 for qmix."""
+    """Copies of the environment for each seed; several on the host run in worker processes. By default 1 on the host; in JAX 82
+    for ippo and 8 for qmix."""
     rollout_steps: Count | Open = OPEN
-    """Steps of each copy in an iteration, which collects, stores, fits and updates. By default 50; ppo: 2000 over all copies,
-    rounded to episodes of the maximum length; ippo: an episode on particle tasks, else over all copies 2050 in JAX and 2000 on
-    the host. For ppo and ippo at least 16."""
+    """Steps of each copy in an iteration (collect, store, fit, update). By default 50; ppo: 2000 over all copies, rounded to
+    episodes of the maximum length; ippo: an episode on particle tasks, else over all copies 2050 in JAX and 2000 on the host.
+    For ppo and ippo at least 16."""
     fit_every: Count | Open = OPEN
-    """For ppo and ippo, and for diaster, rudder, grd and rbt with every algorithm: iterations between two fits of the decoder.
-    By default 10 for ippo, else 1."""
+    """For ppo and ippo, and for diaster, rudder, grd and rbt: iterations between two fits of the decoder. By default 10 for
+    ippo, else 1."""
     fit_updates: Count | Open = OPEN
     """For the same: gradient steps in each fit. By default 500 for ppo and 50 for ippo; for diaster, rudder, grd and rbt, one
     for every 50 environment steps."""
@@ -65,19 +64,18 @@ class _RunSettings(CheckedModel, Generic[Open]):
     """For ippo: the first fit lasts until the error on held-out episodes stops falling (held-out, the default), or for
     fit_updates (published)."""
     evaluate_every: Count | Open = OPEN
-    """Environment steps between two evaluations; one also follows the last step. A checkpoint is written at each, and after
-    five minutes without one. By default 5000 for td3, ddpg and sac, about 10,000 for qmix, 10 iterations for ippo, and 5 for
-    ppo."""
+    """Environment steps between two evaluations; one also follows the last step. Each writes a checkpoint, as do five minutes
+    without one. By default 5000 for td3, ddpg and sac, about 10,000 for qmix, 10 iterations for ippo, and 5 for ppo."""
     evaluation_episodes: Count | Open = OPEN
     """Episodes in one evaluation. By default 10; in JAX 50 for ippo and 32 for qmix."""
     capacity: Annotated[int, Field(ge=4)] | Open = OPEN
     """Rows in the replay of a seed; an episode of T steps takes T + 1. By default 1,000,000; 15,000 of the longest episodes for
     ippo, and 5000 for qmix."""
     scale_rewards: bool = False
-    """Divide rewards by the running root mean square of R/T. It changes nothing for ppo and ippo."""
+    """Divide rewards by the running root mean square of R/T. No effect with ppo and ippo."""
     overlap_collection: bool = False
-    """Collect the next steps on the host while the device updates: faster on a card, but the policy that collects is one update
-    older. For algorithms that consume transitions, in an environment on the host."""
+    """Collect the next steps on the host while the device updates: faster on a card, with a policy one update older. For
+    algorithms that consume transitions, in an environment on the host."""
     credit: CreditSettings | Open = OPEN
     """How the decoder is fitted. The algorithm decides each of these settings that is not given."""
 

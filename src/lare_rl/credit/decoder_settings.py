@@ -24,9 +24,9 @@ class CreditSettings(CheckedModel):
     weight_decay: Annotated[float, Field(ge=0)] = 0.0
     """The weights times this are added to their gradient."""
     normalise: bool = True
-    """Normalise features and returns by running statistics. The published form does not."""
+    """Normalise features and returns by running statistics (not in the published form)."""
     sum_form: bool = False
-    """Fit the return R of an episode (Eq. 6 of the paper), not R/T (the published code for one agent)."""
+    """Fit an episode's return R (Eq. 6 of the paper), not R/T (the published code for one agent)."""
     sampled_steps: Annotated[int, Field(ge=2, validation_alias=AliasChoices("sampled_steps", "drawn_steps"))] = 64
     """K: steps that RRD and its variants sample from an episode."""
     steps: Annotated[int, Field(ge=2)] = 256
@@ -35,15 +35,13 @@ class CreditSettings(CheckedModel):
     episodes: Annotated[int, Field(ge=1)] = 8
     """diaster, rudder, grd and rbt: whole episodes in one update."""
     score: Literal["auto", "sum", "average", "binary"] = "auto"
-    """Whether the score of an episode is a sum over its steps; an average or grade, which does not grow with their number; or
-    binary: won or lost. `auto`: the task's `score` or, without one, whichever of sum and average has predicted returns
-    better."""
+    """The score of an episode: a sum over its steps; an average or grade, which does not grow with their number; or binary (won
+    or lost). `auto`: the task's `score` or, without one, whichever of sum and average has predicted returns better."""
     exact: Literal["auto", "no", "last", "spread"] = "auto"
-    """Correct the proxy rewards of an episode so that they add up to its return: at its last step, or spread over its steps.
-    `auto`: `last` for bayes-progress and lare-bayes-progress, else `no`."""
+    """Make the proxy rewards of an episode add up to its return, by a correction of its last step or of all steps. `auto`:
+    `last` for bayes-progress and lare-bayes-progress, else `no`."""
     optimism: Annotated[float, Field(ge=0)] = 0.0
-    """Closed forms: add the proxy reward's posterior standard deviation times this factor, so that uncertain steps look
-    better."""
+    """Closed forms: add this many posterior standard deviations to the proxy reward, so that uncertain steps look better."""
     encoder: tuple[Annotated[int, Field(ge=1)], ...] = (256, 256)
     """Widths of the hidden layers of VIB's encoder."""
     bottleneck: Annotated[int, Field(ge=1)] = 8
@@ -51,8 +49,8 @@ class CreditSettings(CheckedModel):
     divergence: Annotated[float, Field(ge=0)] = 5e-3
     """VIB: weight of the code's divergence relative to the squared error of the mean (with `sum_form`: T^2 times as much)."""
     sparsity: tuple[_Weight, _Weight, _Weight, _Weight, _Weight] = (1e-5, 1e-5, 1e-5, 1e-6, 1e-5)
-    """grd: sparsity weights of five groups of causes: of the reward in the state and in the action; of an entry of the next
-    state in the state's other entries, in the entry itself, and in the action."""
+    """grd: sparsity weights of the causes of the reward in the state and in the action, and of those of an entry of the next
+    state in the other entries, in itself, and in the action."""
 
 
 MULTI_AGENT_CREDIT = CreditSettings(

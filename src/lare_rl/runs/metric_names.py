@@ -31,8 +31,8 @@ METRIC_GROUPS: dict[str, dict[str, str]] = {
     "All runs": {
         "step": "Environment steps of the seed.",
         "seed": "The seed.",
-        "time/steps_per_second": "Environment steps of a seed per second since the last evaluation, including that evaluation.",
-        RETURN: "Mean true return of the episodes. A team's return is the sum over steps of the mean over its agents that are alive.",
+        "time/steps_per_second": "Environment steps of a seed per second since the last evaluation, which is included.",
+        RETURN: "Mean true return of the episodes. A team's return is the sum over steps of the mean over its living agents.",
         RETURN_STD: "Standard deviation of the true return over these episodes (n in the denominator).",
         LENGTH: "Mean length of these episodes (steps).",
         SUMMED_RETURN: "Many agents: the true rewards, summed over steps and agents of the team.",
@@ -52,24 +52,23 @@ METRIC_GROUPS: dict[str, dict[str, str]] = {
         "credit/log_odds": "1 if steps are now paid for the log odds of the higher score, else 0. Only for binary scores.",
     },
     "TD3, DDPG and SAC": {
-        "critic/loss": "The sum of the critics' mean squared errors: the mean over the updates of the last iteration.",
-        "critic/value": "The mean target of the critics, over the same updates.",
+        "critic/loss": "Sum of the critics' mean squared errors, mean over the updates of the last iteration.",
+        "critic/value": "Mean target of the critics over these updates.",
         ACTOR_SATURATION: "Share of an action's entries at the same bound in all of the newest 1,000 states. 1: always the same action.",
-        "actor/entropy": "SAC: minus the mean log probability of the policy's actions (nats).",
+        "actor/entropy": "SAC: minus the mean log probability of actions (nats).",
         "actor/temperature": "SAC: alpha, the weight of the entropy.",
     },
     "PPO and IPPO": {
-        "critic/loss": "The loss of the value, in squared standard deviations of the return: the mean over the gradient steps of the last "
-        "update.",
+        "critic/loss": "Loss of the value, in squared standard deviations of the return: mean over the gradient steps of the last update.",
         "critic/explained_variance": "Share of the variance of the rollout's returns that the critic explained before the update.",
-        "actor/objective": "The clipped objective: the mean over the same gradient steps.",
-        "actor/entropy": "The entropy of the policy (nats), over the same gradient steps.",
+        "actor/objective": "The clipped objective, over these gradient steps.",
+        "actor/entropy": "Entropy of the policy (nats), over these gradient steps.",
         "actor/approx_kl": "Divergence from the policy that collected the rollout.",
         "actor/clip_fraction": "Share of steps whose probability ratio is outside the clip range.",
     },
     "QMIX and VDN": {
-        "critic/loss": "Half the mean squared error of the team's value, over the steps of the last update's episodes.",
-        "critic/value": "The mean target of the team's value, over the same steps.",
+        "critic/loss": "Half the mean squared error of the team's value, over the steps of the last update.",
+        "critic/value": "Mean target of the team's value, over these steps.",
     },
     "CreditAssigner only": {
         "credit/episodes": "Number of episodes that have ended.",

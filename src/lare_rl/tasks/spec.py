@@ -104,14 +104,13 @@ class TaskSpec(CheckedModel):
     model_config = ConfigDict(str_strip_whitespace=True)
 
     name: Annotated[str, Field(min_length=1, pattern=r"^[\w.\-]+$")]
-    """Name of the task, in commands and in the names of runs."""
+    """Name in commands and of runs."""
     environment: Annotated[str, Field(min_length=1)]
-    """A Gymnasium id (`module:id` first imports the module that registers it), the name of another family's environment, such
-    as `particles/CN-6`, or `none` if there are only logs. With `none`, functions are designed and logs relabelled, but nothing
-    is trained."""
+    """A Gymnasium id (`module:id` first imports the module that registers it), another family's name, such as `particles/CN-6`,
+    or `none` for logs only: functions are designed and logs relabelled, but nothing is trained."""
     evaluation_environment: str | None = None
-    """The environment of evaluations, such as held-out maps, years or demand. It has the same module and sizes. By default,
-    `environment`. Only on the host."""
+    """The environment of evaluations, such as held-out maps, years or demand, with the same module and sizes. Only on the host.
+    By default, `environment`."""
     observation_size: Annotated[int, Field(ge=1)]
     """Number of entries of an observation."""
     action_size: Annotated[int, Field(ge=1)]
@@ -128,33 +127,33 @@ class TaskSpec(CheckedModel):
     """Time limit (steps) of an environment without its own, or of the episodes of logs."""
     score: Literal["sum", "average", "binary"] | None = None
     """Whether the return of an episode is a sum over its steps; an average or grade that does not grow with its length; or
-    binary, won or lost. By default, training determines whether a sum or an average predicts returns better."""
+    binary, won or lost. By default, training finds which of sum and average predicts returns better."""
     payments: Literal["end", "nonzero"] | Annotated[StrictInt, Field(ge=1)] = "end"
     """When the environment pays: once, at the end of an episode; with every reward that is not 0; or every so many steps and at
     the end. Rewards between payments are added up."""
     paid_for: Literal["since_last"] | PaidSteps = "since_last"
     """Steps that a payment is for: all since the last payment, or `{ steps = 20 }`, the last 20."""
     group: str | None = None
-    """Key of `info` with the group of an episode, a whole number from 0 to 63: its level, map, weather or demand. Returns of a
-    group share an intercept, so that an easy level does not credit what happens on it."""
+    """Key of `info` with the group of an episode, a whole number from 0 to 63: its level, map, weather or demand. Groups have
+    intercepts, so that an easy level does not credit what happens on it."""
     measures: tuple[str, ...] = ()
     """Keys of the last step's `info` whose values are averaged and reported beside the return."""
     processes: Literal["auto", "separate"] = "auto"
     """`separate`: every environment runs in a process of its own, because its simulator allows one simulation in a process.
-    `auto`: so does an environment of a package that LaRe does not know, if its steps are slow, or if a second one in its
-    process fails, hangs or changes the first."""
+    `auto`: also an environment of an unknown package, if its steps are slow, or if a second one in its process fails, hangs or
+    changes the first."""
     timeout: Annotated[float, Field(gt=0, allow_inf_nan=False)] = 120.0
-    """Time (s) within which an environment in another process must reply. After it, the run stops with a message."""
+    """Time (s) within which an environment in another process must reply; else the run stops with a message."""
     arguments: dict[str, Any] = Field(default_factory=dict)
     """Keyword arguments of the environment, for families that have them (`pettingzoo/...`, `gymnax/...`, `jumanji/...` and
     others)."""
     agents: tuple[str, ...] = ()
-    """Names of the agents that this file describes, or patterns such as `prey_*`. By default all. Only for environments whose
-    agents have names (`pettingzoo/...`, `jaxmarl/...`)."""
+    """Names of the agents that this file describes, or patterns such as `prey_*`. By default all. For environments whose agents
+    have names (`pettingzoo/...`, `jaxmarl/...`)."""
     credit_scope: CreditScope = "observation"
     """Whether `phi` reads each agent's observation and action, or the global state and all actions of the team."""
     teams: tuple["TaskSpec", ...] = ()
-    """One task for each team, with its own texts, if several teams learn separately. In TOML, the names of their files."""
+    """One task for each team that learns separately, with its own texts. In TOML, the names of their files."""
     team: str | None = None
     """The team that this file describes, if its environment has several."""
 

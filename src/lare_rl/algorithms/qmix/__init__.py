@@ -18,11 +18,11 @@ class QMIXSettings(AlgorithmSettings):
     hidden: Annotated[int, Field(ge=1)] = 64
     """Width of the agents' network and of its memory."""
     monotonic: bool = True
-    """Mix the agents' values by a monotonic network; otherwise add them up (VDN)."""
+    """Mix the agents' values by a monotonic network; else add them up (VDN)."""
     embed: Annotated[int, Field(ge=1)] = 32
     """Width of the mixer."""
     hypernet: Annotated[int, Field(ge=1)] = 64
-    """Width of the hidden layers of the hypernetworks, which compute the mixer's weights."""
+    """Width of the hidden layers of the hypernetworks, which give the mixer's weights."""
     learning_rate: Annotated[float, Field(gt=0)] = 1e-3
     """Learning rate of Adam."""
     gamma: Annotated[float, Field(ge=0, le=1)] = 0.99
