@@ -42,8 +42,8 @@ CONDITIONS: dict[str, dict[str, str]] = {
         "worse_than_mean": f"The last R² is below {BAD_R2:g}.",
         "steps_agree": f"True rewards are known, and the correlation is above {CLOSE_CORRELATION}.",
         "single_steps": "True rewards are known, and the correlation is lower.",
-        "score_use": "At least 8 returns were predicted. The sentence about trust stands alone if episodes have equal lengths, so that a "
-        "sum and an average are the same, and there is nothing else to say.",
+        "score_use": "At least 8 returns were predicted. The sentence about trust stands alone if all lengths are equal and there is "
+        "nothing else to say.",
         "trust_nothing": f"`credit/gain` is at most {CLEAR_ERRORS} of its standard errors.",
         "trust_part": f"It is larger, but at most {CLEAR_GAIN:.0%}.",
         "trust_sums": f"It is larger, and above {CLEAR_GAIN:.0%}.",

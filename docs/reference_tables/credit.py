@@ -67,10 +67,9 @@ def methods_page() -> str:
             groups["Gradient descent" if method.uses_gradient else "Closed forms"].append(method)
     lines = [
         "# Methods",
-        "`--method NAME` chooses a method: inputs of a decoder, a fit and a decoder ([equations](../explanation/credit.md), "
-        "[closed forms](../explanation/closed-form.md), [many agents](../explanation/many-agents.md)). In parentheses: inputs; what "
-        "the decoder is [fitted to](#fits); the number of agents, if limited. *New*: no [result](../results/README.md) has trained "
-        "runs of it yet.",
+        "`--method NAME` chooses a method ([equations](../explanation/credit.md), [closed forms](../explanation/closed-form.md), "
+        "[many agents](../explanation/many-agents.md)). In parentheses: inputs of the decoder; what it is [fitted to](#fits); agents, "
+        "if limited. *New*: no [result](../results/README.md) has trained runs of it yet.",
         "Inputs: z, factors of `phi`; s and s', the observations before and after the step; s\\*, the task's "
         "`scored_observation`; a, the action; x = (s, a, s - s'), for many agents s'; h, largest, smallest and last values of the "
         "entries so far.",
@@ -142,8 +141,8 @@ def built_in_tasks_page() -> str:
     lines = [
         "# Built-in tasks",
         "`lare-rl tasks` lists these names. In parentheses: agents, if there are several; entries of the observation and the action "
-        "that `phi` reads, or of the state and the joint action, if credit goes to the team. Then: recorded replies, with which a "
-        "task needs no language model; `--draw` chooses one.",
+        "that `phi` reads, or of the state and the joint action, if credit goes to the team. Then: recorded replies, which replace a "
+        "language model; `--draw` chooses one.",
         "`scored_observation` is `after`"
         + "".join(
             f", `{value}` for {codes(spec.name for spec in specs if spec.scored_observation == value)}"

@@ -8,7 +8,7 @@ from lare_rl.report.messages import MESSAGES as REPORT
 from lare_rl.runs.metric_names import METRIC_GROUPS
 from lare_rl.turns.words import MESSAGES as TURNS
 from lare_rl.util.variables import VARIABLE_GROUPS
-from reference_tables.cells import code, parameters, table
+from reference_tables.cells import code, parameters
 from reference_tables.conditions import CONDITIONS
 
 __all__ = ["findings_page", "metrics_page", "variables_page"]
@@ -36,9 +36,9 @@ def metrics_page() -> str:
         lines += [f"## {title}", parameters((code(name), "", text) for name, text in metrics.items())]
     lines += [
         "## Which credit metric to trust",
-        "`credit/return_r2` is out of sample, but tests sums over episodes: neither single steps nor the division among agents. If "
-        "returns depend on the length of episodes, it is near 1 whatever the features are. `credit/correlation` and `credit/error` "
-        "are in sample. True rewards are used for these two only.",
+        "`credit/return_r2` is out of sample, but tests sums over episodes: neither single steps nor the division among agents. It is "
+        "near 1 whatever the features are if returns depend on the length of episodes. `credit/correlation` and `credit/error`, the "
+        "only use of true rewards, are in sample.",
     ]
     return "\n\n".join(lines)
 
@@ -47,16 +47,15 @@ def findings_page() -> str:
     """Return the page about the sentences of reports and of commands."""
     lines = [
         "# Findings",
-        "When reports say what, and the codes of findings in Python. N is a number, a word in italics a name, and … further words. "
-        "Other sentences of reports and commands say themselves what is meant and what to do.",
+        "When a report says what, and the codes of findings in Python. N is a number, a word in italics a name, and … further words. "
+        "Other sentences explain themselves.",
         "## The diagnosis of a run",
         "`lare-rl report` begins with at most one sentence of each group. *Final return*: the mean over seeds at the last "
         "evaluation; its standard error is that over seeds or over episodes, whichever is larger. *Usual change*: the median "
         "difference between successive evaluations in the last half of the run.",
     ]
     for title, conditions in CONDITIONS.items():
-        rows = ((diagnosis(name), text) for name, text in conditions.items())
-        lines += [f"### {title}", table(("sentence", "when"), rows)]
+        lines += [f"### {title}", parameters((f"“{diagnosis(name)}”", "", text) for name, text in conditions.items())]
     for title, catalogue in CATALOGUES.items():
         rows = ((code(name), "", sentence(text, catalogue)) for name, text in catalogue.items())
         lines += [f"## {title}", parameters(rows)]
@@ -64,16 +63,10 @@ def findings_page() -> str:
 
 
 def diagnosis(name: str) -> str:
-    """Return the headline of a finding, if it has one, and its first sentence."""
-    texts = [first_sentence(REPORT[key], REPORT) for key in (f"headline_{name}", name) if key in REPORT]
-    return ". ".join(text for text in texts if text != "…")
-
-
-def first_sentence(template: str, catalogue: Mapping[str, str]) -> str:
-    """Return the text up to the first full stop or, after a few words, colon."""
-    text = sentence(template, catalogue)
-    start = re.match(r"([^(]{40,}?:|.*?[\w)*]\.) ", text)
-    return f"{start[1]} …" if start else text.replace("….", "…")
+    """Return the headline of a finding or, if it has none, the first words of its sentence."""
+    text = sentence(REPORT.get(f"headline_{name}", REPORT[name]), REPORT)
+    start = " ".join(re.findall(r"(?:`[^`]*`|\S)+", re.sub(r"(?<=\. ).*", "…", text))[:9])
+    return start if start == text or start.endswith("…") else f"{start} …"
 
 
 def sentence(template: str, catalogue: Mapping[str, str]) -> str:

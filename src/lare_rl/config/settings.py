@@ -41,8 +41,8 @@ class _RunSettings(CheckedModel, Generic[Open]):
     seed: Annotated[int, Field(ge=0, le=MAX_SEED)] = 0
     """The first seed; the others follow it."""
     scored_observation: ScoredObservation | None = None
-    """Observations of a step that factors and raw features are computed from: before the action, after it, or both. By default,
-    the task decides."""
+    """Overrides the task's key: factors and raw features are computed from the observation before the action, after it, or
+    both."""
     draw: Annotated[int, Field(ge=0)] = 0
     """The recorded reply that phi comes from (0 to 4); independent of the seed."""
     candidates: Count = N_CANDIDATES
@@ -61,15 +61,15 @@ class _RunSettings(CheckedModel, Generic[Open]):
     """For the same: gradient steps in each fit. By default 500 for ppo and 50 for ippo; for diaster, rudder, grd and rbt, one
     for every 50 environment steps."""
     first_fit: Literal["held-out", "published"] | None = None
-    """For ippo: the first fit lasts until the error on held-out episodes stops falling (held-out, the default), or for
-    fit_updates (published)."""
+    """For ippo: the first fit lasts until the held-out error stops falling (held-out, the default), or for fit_updates
+    (published)."""
     evaluate_every: Count | Open = OPEN
     """Environment steps between two evaluations; one also follows the last step. Each writes a checkpoint, as do five minutes
     without one. By default 5000 for td3, ddpg and sac, about 10,000 for qmix, 10 iterations for ippo, and 5 for ppo."""
     evaluation_episodes: Count | Open = OPEN
     """Episodes in one evaluation. By default 10; in JAX 50 for ippo and 32 for qmix."""
     capacity: Annotated[int, Field(ge=4)] | Open = OPEN
-    """Rows in the replay of a seed; an episode of T steps takes T + 1. By default 1,000,000; 15,000 of the longest episodes for
+    """Rows in a seed's replay; an episode of T steps takes T + 1. By default 1,000,000; 15,000 of the longest episodes for
     ippo, and 5000 for qmix."""
     scale_rewards: bool = False
     """Divide rewards by the running root mean square of R/T. No effect with ppo and ippo."""

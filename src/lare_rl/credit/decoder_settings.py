@@ -30,13 +30,13 @@ class CreditSettings(CheckedModel):
     sampled_steps: Annotated[int, Field(ge=2, validation_alias=AliasChoices("sampled_steps", "drawn_steps"))] = 64
     """K: steps that RRD and its variants sample from an episode."""
     steps: Annotated[int, Field(ge=2)] = 256
-    """Steps in one update: K steps of each of steps / K episodes, or whole episodes with about this many steps in total. On
-    particle tasks (T = 25): steps / T episodes, even if only K steps of each are sampled."""
+    """Steps in one update: K of each of steps / K episodes, or whole episodes with about this many. On particle tasks (T = 25):
+    steps / T episodes, even if only K steps of each are sampled."""
     episodes: Annotated[int, Field(ge=1)] = 8
     """diaster, rudder, grd and rbt: whole episodes in one update."""
     score: Literal["auto", "sum", "average", "binary"] = "auto"
-    """The score of an episode: a sum over its steps; an average or grade, which does not grow with their number; or binary (won
-    or lost). `auto`: the task's `score` or, without one, whichever of sum and average has predicted returns better."""
+    """The score of an episode: a sum over its steps, an average, or binary (won or lost). `auto`: the task's `score` or,
+    without one, whichever of sum and average has predicted returns better."""
     exact: Literal["auto", "no", "last", "spread"] = "auto"
     """Make the proxy rewards of an episode add up to its return, by a correction of its last step or of all steps. `auto`:
     `last` for bayes-progress and lare-bayes-progress, else `no`."""
@@ -47,7 +47,7 @@ class CreditSettings(CheckedModel):
     bottleneck: Annotated[int, Field(ge=1)] = 8
     """Size of VIB's code."""
     divergence: Annotated[float, Field(ge=0)] = 5e-3
-    """VIB: weight of the code's divergence relative to the squared error of the mean (with `sum_form`: T^2 times as much)."""
+    """VIB: weight of the code's divergence against the squared error of the mean (with `sum_form`: T^2 times as much)."""
     sparsity: tuple[_Weight, _Weight, _Weight, _Weight, _Weight] = (1e-5, 1e-5, 1e-5, 1e-6, 1e-5)
     """grd: sparsity weights of the causes of the reward in the state and in the action, and of those of an entry of the next
     state in the other entries, in itself, and in the action."""

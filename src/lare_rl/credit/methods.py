@@ -51,9 +51,7 @@ _LARE = "Qu et al., LaRe, AAAI 2025"
 _RD = "Efroni et al., AAAI 2021; Arjona-Medina et al., RUDDER, 2019"
 _RRD = "Ren et al., RRD, ICLR 2022"
 _BAYES = "this package, docs/explanation/closed-form.md; Efroni et al., AAAI 2021; MacKay, 1992"
-_PROGRESS = (
-    "this package, docs/explanation/closed-form.md; Ng et al., ICML 1999 (rewards that are differences of values)"
-)
+_PROGRESS = "this package, docs/explanation/closed-form.md; Ng et al., ICML 1999"
 _VIB = "Alemi et al., ICLR 2017; LaRe, appendix F.2"
 
 for _method in (
@@ -185,7 +183,7 @@ for _method in (
     ),
     Method(
         "lare-bayes-history",
-        "as lare-bayes, and on changes of largest, smallest and last factors: for scores that are no sum",
+        "as lare-bayes, and on changes of largest, smallest and last factors",
         _BAYES,
         FACTORS_SCORED_AND_HISTORY,
         Fit.EVIDENCE,

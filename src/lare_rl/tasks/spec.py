@@ -140,8 +140,8 @@ class TaskSpec(CheckedModel):
     """Keys of the last step's `info` whose values are averaged and reported beside the return."""
     processes: Literal["auto", "separate"] = "auto"
     """`separate`: every environment runs in a process of its own, because its simulator allows one simulation in a process.
-    `auto`: also an environment of an unknown package, if its steps are slow, or if a second one in its process fails, hangs or
-    changes the first."""
+    `auto`: also if an unknown package's steps are slow, or a second environment in its process fails, hangs or changes the
+    first."""
     timeout: Annotated[float, Field(gt=0, allow_inf_nan=False)] = 120.0
     """Time (s) within which an environment in another process must reply; else the run stops with a message."""
     arguments: dict[str, Any] = Field(default_factory=dict)

@@ -25,7 +25,7 @@ class PPOSettings(AlgorithmSettings):
     gamma: Annotated[float, Field(ge=0, le=1)] = 0.99
     """Discount factor."""
     gae_lambda: Annotated[float, Field(ge=0, le=1)] = 0.95
-    """Lambda of the generalised advantage estimates: 0 relies on the critic, 1 on the rewards."""
+    """Lambda of the advantage estimates (GAE): 0 relies on the critic, 1 on the rewards."""
     epochs: Annotated[int, Field(ge=1)] = 10
     """Passes over the rollout in one update."""
     minibatch_size: Annotated[int, Field(ge=1)] = 64
@@ -41,7 +41,7 @@ class PPOSettings(AlgorithmSettings):
     huber_delta: Annotated[float, Field(gt=0)] = 10.0
     """Error at which the value loss becomes linear, in standard deviations of the return."""
     max_grad_norm: Annotated[float, Field(gt=0)] = 0.5
-    """Largest norm of the joint gradient of actor and critic; a larger one is scaled down."""
+    """Largest norm of the joint gradient of actor and critic."""
     anneal: bool = True
     """Let learning rate and clip fall linearly to 0 over the run."""
     normalise_observations: bool = False

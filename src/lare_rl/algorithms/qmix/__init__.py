@@ -30,7 +30,7 @@ class QMIXSettings(AlgorithmSettings):
     td_lambda: Annotated[float, Field(ge=0, le=1)] = 0.6
     """Lambda of the TD(lambda) targets: 0 relies on the target networks, 1 on the rewards."""
     max_grad_norm: Annotated[float, Field(gt=0)] = 10.0
-    """Largest norm of the joint gradient of agents and mixer; a larger one is scaled down."""
+    """Largest norm of the joint gradient of agents and mixer."""
     batch_size: Annotated[int, Field(ge=1)] = 128
     """Episodes in one update."""
     update_every: Annotated[int, Field(ge=1)] = 8
@@ -42,7 +42,7 @@ class QMIXSettings(AlgorithmSettings):
     epsilon_end: Annotated[float, Field(ge=0, le=1)] = 0.05
     """Probability that an agent explores, at the end."""
     epsilon_steps: Annotated[int, Field(ge=1)] = 100_000
-    """Environment steps over which `epsilon_start` falls linearly to `epsilon_end`."""
+    """Environment steps of the linear fall from `epsilon_start` to `epsilon_end`."""
 
 
 def _run_defaults(env: "EnvSpec", environments: int) -> dict[str, Any]:
