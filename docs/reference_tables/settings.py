@@ -104,9 +104,9 @@ def defaults(setting: str, variants: Mapping[str, CheckedModel]) -> str:
     for name, values in variants.items():
         if hasattr(values, setting):
             names[default(getattr(values, setting))].append(name)
-    first, *others = (f"{', '.join(group)}: {cell}" for cell, group in names.items())
+    first, *rest = (f"{', '.join(group)}: {cell}" for cell, group in names.items())
     complete = all(hasattr(values, setting) for values in variants.values())
-    return "; ".join([next(iter(names)) if complete else first, *others])
+    return "; ".join([next(iter(names)) if complete else first, *rest])
 
 
 def decoder_settings() -> str:

@@ -24,9 +24,9 @@ class CreditSettings(CheckedModel):
     weight_decay: Annotated[float, Field(ge=0)] = 0.0
     """The weights times this are added to their gradient."""
     normalise: bool = True
-    """Normalise features and returns by running statistics (not in the published form)."""
+    """Normalise features and returns by running statistics."""
     sum_form: bool = False
-    """Fit an episode's return R (Eq. 6 of the paper), not R/T (the published code for one agent)."""
+    """Fit an episode's return R (Eq. 6 of the paper), not R/T."""
     sampled_steps: Annotated[int, Field(ge=2, validation_alias=AliasChoices("sampled_steps", "drawn_steps"))] = 64
     """K: steps that RRD and its variants sample from an episode."""
     steps: Annotated[int, Field(ge=2)] = 256

@@ -29,7 +29,7 @@ class Fit(StrEnum):
     PREFIX_EVIDENCE = "evidence of prefixes"
     """In closed form, on all prefixes: a step is paid the change of the expected return (`returns.py`)."""
     SIGNS = "best signs"
-    """In closed form: the best signs of a sum of the factors (`closed_form.py`)."""
+    """The best signs of a sum of the factors (`closed_form.py`)."""
 
     @property
     def closed_form(self) -> bool:

@@ -36,7 +36,7 @@ class QMIXSettings(AlgorithmSettings):
     update_every: Annotated[int, Field(ge=1)] = 8
     """New episodes for each update."""
     target_every: Annotated[int, Field(ge=1)] = 200
-    """Episodes between two updates of the target networks, at the next update."""
+    """Episodes between two copies to the target networks, each after an update."""
     epsilon_start: Annotated[float, Field(ge=0, le=1)] = 1.0
     """Probability that an agent explores, at the start."""
     epsilon_end: Annotated[float, Field(ge=0, le=1)] = 0.05
