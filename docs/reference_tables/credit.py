@@ -9,7 +9,7 @@ from enum import StrEnum
 from textwrap import dedent
 
 from lare_rl.algorithms.registry import ALGORITHMS, Algorithm
-from lare_rl.credit.input_names import RAW
+from lare_rl.credit.input_names import RAW, InputNames
 from lare_rl.credit.methods import METHODS, Fit, Method
 from lare_rl.envs.load import read_task, shipped_tasks
 from lare_rl.envs.particles.catalogue import find_particle_task
@@ -84,7 +84,7 @@ def methods_page() -> str:
 def notes(method: Method) -> str:
     """Return the inputs, the fit and the number of agents of a method, as far as it has them."""
     agents = "many agents" if method.multi_agent_only else "one agent" if method.single_agent_only else ""
-    fit = "" if method.fit is None else f"{inputs(method)}; {method.fit.value}"
+    fit = "" if method.fit is None or method.inputs is None else f"{symbols(method, method.inputs)}; {method.fit.value}"
     return "; ".join(filter(None, (fit, agents, "*new*" if method.name in UNMEASURED else "")))
 
 
@@ -97,12 +97,12 @@ def source_rows() -> list[tuple[str, str]]:
     return [(codes(names), link(source)) for source, names in methods.items()]
 
 
-def inputs(method: Method) -> str:
-    """Return the symbols of the inputs."""
-    if method.inputs == RAW and not (method.single_agent_only or method.multi_agent_only):
+def symbols(method: Method, inputs: InputNames) -> str:
+    """Return the symbols of the inputs of a method."""
+    if inputs == RAW and not (method.single_agent_only or method.multi_agent_only):
         return "x"
-    many_agents = method.inputs.names_of_many_agents if method.multi_agent_only else None
-    return ", ".join(SYMBOLS[name] for name in many_agents or method.inputs.names)
+    many_agents = inputs.names_of_many_agents if method.multi_agent_only else None
+    return ", ".join(SYMBOLS[name] for name in many_agents or inputs.names)
 
 
 def link(source: str) -> str:
