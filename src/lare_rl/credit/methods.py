@@ -51,9 +51,7 @@ _LARE = "Qu et al., LaRe, AAAI 2025"
 _RD = "Efroni et al., AAAI 2021; Arjona-Medina et al., RUDDER, 2019"
 _RRD = "Ren et al., RRD, ICLR 2022"
 _BAYES = "this package, docs/explanation/closed-form.md; Efroni et al., AAAI 2021; MacKay, 1992"
-_PROGRESS = (
-    "this package, docs/explanation/closed-form.md; Ng et al., ICML 1999 (rewards that are differences of values)"
-)
+_PROGRESS = "this package, docs/explanation/closed-form.md; Ng et al., ICML 1999"
 _VIB = "Alemi et al., ICLR 2017; LaRe, appendix F.2"
 
 for _method in (
@@ -71,7 +69,7 @@ for _method in (
     Method(
         "rrdu-next",
         "rrdu on the next state and the action",
-        f"{_RRD}; these inputs: this package",
+        f"{_RRD}; inputs: this package",
         NEXT_OBSERVATION_ACTION,
         Fit.SAMPLED_STEPS_UNBIASED,
     ),
@@ -119,7 +117,7 @@ for _method in (
     ),
     Method(
         "grd",
-        "a causal model, in which learned masks choose the causes of the reward",
+        "a causal model: learned masks choose the causes of the reward",
         "Zhang et al., GRD, NeurIPS 2023 (after the code, not the paper)",
         TRANSITION,
         Fit.DECODER_LOSS,
@@ -127,7 +125,7 @@ for _method in (
     ),
     Method(
         "rbt",
-        "a transformer over at most 512 steps, those of one payment, distilled into a model of single steps",
+        "a transformer over the steps of a payment (at most 512), distilled into a model of single steps",
         "Tang et al., RBT, TMLR 2025 (after the code, not the paper)",
         TRANSITION,
         Fit.DECODER_LOSS,
@@ -151,7 +149,7 @@ for _method in (
     ),
     Method(
         "tar2",
-        "attention over time and agents; each is paid a share of the return itself",
+        "attention over time and agents; each agent is paid a share of the return",
         "Kapoor et al., TAR2, 2025 (after the code, not the paper)",
         OBSERVATION_ACTION,
         Fit.ALL_STEPS,
@@ -162,14 +160,14 @@ for _method in (
     Method(
         "lare-linear",
         "linear regression on latent rewards",
-        f"LaRe, appendix B; the fit: {_BAYES}",
+        f"LaRe, appendix B; {_BAYES}",
         FACTORS,
         Fit.EVIDENCE,
         "linear",
     ),
     Method(
         "lare-bayes",
-        "regression on latent rewards and, if the returns require them, on functions of them and of raw entries",
+        "regression on latent rewards and, where returns require it, functions of them and of raw entries",
         _BAYES,
         FACTORS_AND_SCORED,
         Fit.EVIDENCE,
@@ -177,7 +175,7 @@ for _method in (
     ),
     Method(
         "bayes-history",
-        "as bayes, and on the changes of largest, smallest and last values: for scores that are no sum",
+        "as bayes, and on changes of largest, smallest and last values: for scores that are no sum",
         _BAYES,
         SCORED_AND_HISTORY,
         Fit.EVIDENCE,
@@ -185,7 +183,7 @@ for _method in (
     ),
     Method(
         "lare-bayes-history",
-        "as lare-bayes, and on the changes of largest, smallest and last factors: for scores that are no sum",
+        "as lare-bayes, and on changes of largest, smallest and last factors",
         _BAYES,
         FACTORS_SCORED_AND_HISTORY,
         Fit.EVIDENCE,
@@ -193,7 +191,7 @@ for _method in (
     ),
     Method(
         "bayes-progress",
-        "changes of the expected return, as the history of an episode predicts it: for scores that are no sum",
+        "changes of the return that the history predicts: for scores that are no sum",
         _PROGRESS,
         SCORED_AND_HISTORY,
         Fit.PREFIX_EVIDENCE,
@@ -209,7 +207,7 @@ for _method in (
     ),
     Method(
         "lare-signs",
-        "without a reward model: the sum of the factors, with the best signs",
+        "the sum of the factors, with the best signs",
         _LARE,
         FACTORS,
         Fit.SIGNS,
@@ -224,7 +222,7 @@ for _method in (
     ),
     Method(
         "lare-rd-shared",
-        "lare-rd without credit among agents: each agent gets the mean of all",
+        "lare-rd, with the mean over agents for each",
         _LARE,
         FACTORS,
         Fit.ALL_STEPS,
