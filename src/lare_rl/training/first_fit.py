@@ -1,7 +1,7 @@
 """The first fit of gradient-trained decoders for many agents: it lasts until the error on held-out episodes stops falling.
 
 As published, a decoder is fitted in 50 updates to the first episodes and, after every tenth iteration, in 50 more. With
-15 agents that is too few: the policy has settled before the decoder is accurate (docs/results/agents.md).
+15 agents that is too few: the policy has settled before the decoder is accurate (benchmarks/results/agents.md).
 """
 
 from collections.abc import Callable
