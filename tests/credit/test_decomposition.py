@@ -1,4 +1,4 @@
-"""Step rewards are learned from returns alone, at any scale; their units, optimism, and the rows of a batch."""
+"""Step rewards are learned from returns alone, at any scale; their units, and the rows of a batch."""
 
 from functools import partial
 
@@ -10,7 +10,6 @@ import pytest
 from lare_rl.credit import decomposition, descent
 from lare_rl.credit.decoder_settings import CreditSettings
 from lare_rl.credit.decomposition import CreditBatch
-from lare_rl.credit.evidence import PosteriorCovariance
 from lare_rl.credit.methods import METHODS, Fit
 
 EPISODES, STEPS, FEATURES = 64, 10, 3
@@ -18,7 +17,6 @@ KEY = jax.random.key(3)
 init = jax.jit(decomposition.init, static_argnums=range(1, 7))
 update = jax.jit(descent.update, static_argnames=("fit", "settings"))
 proxy_rewards = jax.jit(decomposition.decoder_rewards, static_argnames="settings")
-optimistic_rewards = jax.jit(decomposition.optimistic_rewards, static_argnames="settings")
 
 
 @partial(jax.jit, static_argnames=("fit", "settings"))
@@ -97,19 +95,6 @@ def test_unit_of_proxy_rewards(score_type):
     output = decomposition.decode(state.network, state, jnp.asarray(rows), settings).r_hat
     unit = np.sqrt(np.mean((mean_reward * (length if score_type else 1)) ** 2)) / (length if score_type else 1)
     np.testing.assert_allclose(proxy_rewards(state, rows, settings, length), unit * output, rtol=1e-5)
-
-
-@pytest.mark.parametrize("score_type", [0, 1])
-def test_optimism_adds_deviations_of_a_step(score_type):
-    settings, length = CreditSettings(optimism=2.0), np.array([2, 4, 8])
-    state = init(KEY, FEATURES, METHODS["rd-linear"], settings, STEPS, 1, (score_type,))
-    assert state.closed_form is not None
-    root = np.diag([1.0, 10.0, 100.0]).astype(np.float32)
-    covariance = PosteriorCovariance(root[None], centre=np.zeros((1, FEATURES)), centre_variance=np.zeros(1))
-    state = state._replace(closed_form=state.closed_form._replace(covariance=covariance))
-    optimistic = optimistic_rewards(state, np.eye(FEATURES, dtype=np.float32), settings, length)
-    deviation = np.array([1.0, 10.0, 100.0]) / (length if score_type else 1)
-    np.testing.assert_allclose(optimistic, 2 * deviation, rtol=1e-5)  # of a decoder whose weights are 0
 
 
 @pytest.mark.parametrize("agents", [None, 2])

@@ -15,7 +15,7 @@ __all__ = ["CONFIG", "FORMAT", "migrate"]
 CONFIG = "config.json"
 """The configuration of a run, in its directory."""
 
-FORMAT = 7
+FORMAT = 8
 """The format of config.json. It is increased whenever its contents change."""
 
 
@@ -69,6 +69,15 @@ def _from_6(values: dict[str, Any]) -> dict[str, Any]:
     return values | {"settings": settings | {"credit": {"exact": "no"} | settings["credit"]}}
 
 
+def _from_7(values: dict[str, Any]) -> dict[str, Any]:
+    # `optimism` was removed: it did not help.
+    settings = values.get("settings")
+    if not isinstance(settings, dict) or not isinstance(settings.get("credit"), dict):
+        return values
+    credit = {name: value for name, value in settings["credit"].items() if name != "optimism"}
+    return values | {"settings": settings | {"credit": credit}}
+
+
 def _rename_task_keys(task: dict[str, Any]) -> dict[str, Any]:
     task = rename_keys(task)
     teams = task.get("teams")
@@ -83,5 +92,6 @@ _MIGRATIONS: Mapping[int, Callable[[dict[str, Any]], dict[str, Any]]] = {
     4: _from_4,
     5: _from_5,
     6: _from_6,
+    7: _from_7,
 }
 """Functions that convert a format to the next one."""

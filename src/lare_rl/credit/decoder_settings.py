@@ -42,9 +42,6 @@ class CreditSettings(CheckedModel):
     """Whether the proxy rewards of an episode are corrected, so that they add up to its return: by adding the difference to the
     reward of its last step, or by spreading it over its steps. `auto`: `last` for bayes-progress and lare-bayes-progress, else
     `no`."""
-    optimism: Annotated[float, Field(ge=0)] = 0.0
-    """lare-bayes and other methods in closed form: the algorithm's reward is the proxy reward plus its posterior standard
-    deviation times this factor. Uncertain steps thus look better."""
     encoder: tuple[Annotated[int, Field(ge=1)], ...] = (256, 256)
     """Widths of the hidden layers of VIB's encoder."""
     bottleneck: Annotated[int, Field(ge=1)] = 8

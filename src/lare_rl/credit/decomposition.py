@@ -25,7 +25,7 @@ import jax.numpy as jnp
 import optax
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
-from lare_rl.credit import closed_form, evidence
+from lare_rl.credit import closed_form
 from lare_rl.credit.basis import Basis
 from lare_rl.credit.closed_form import ClosedForm, LinearDecoder
 from lare_rl.credit.decoder_network import DecoderNetwork, DecoderOutput, DecoderShape
@@ -57,13 +57,11 @@ __all__ = [
     "decoder_rewards",
     "init",
     "is_normalised",
-    "is_optimistic",
     "level_effects",
     "level_returns",
     "normalise_inputs",
     "observe_returns",
     "observe_steps",
-    "optimistic_rewards",
     "reward_unit",
     "score_type_index",
     "step_rows",
@@ -166,7 +164,7 @@ def init(
     several = len(score_types) > 1
     closed = None
     if several or not method.uses_gradient:
-        closed = closed_form.init(basis, score_types, with_covariance=is_optimistic(method, settings))
+        closed = closed_form.init(basis, score_types)
     return DecoderState(
         network=network,
         optimizer=init_adam(network, settings.learning_rate) if method.uses_gradient else (),
@@ -193,11 +191,6 @@ def _check_output(network: DecoderNetwork, shape: DecoderShape, method: Method) 
                 f"the decoder {method.decoder!r} must return DecoderOutput(r_hat, penalty), both of the shape {rows.shape[:-1]} for "
                 f"inputs of the shape {rows.shape}: it returned {short_repr(output)}"
             )
-
-
-def is_optimistic(method: Method, settings: CreditSettings) -> bool:
-    """Return whether uncertain steps get higher rewards."""
-    return settings.optimism > 0 and "optimism" in method.settings
 
 
 def score_type_index(state: DecoderState, n_score_types: int) -> Int[Array, ""] | int:
@@ -308,37 +301,7 @@ def decoder_rewards(
     `length` is T, the number of steps of each row's episode. Without it, the score is treated as a sum.
     """
     output = decode(state.network, state, inputs, settings).r_hat
-    return _per_step(reward_unit(state, settings) * output, state, length)
-
-
-def optimistic_rewards(
-    state: DecoderState,
-    inputs: Float[Array, "rows *agents inputs"],
-    settings: CreditSettings,
-    length: Float[Array, " rows"] | Int[Array, " rows"] | None = None,
-) -> Float[Array, "rows *agents"]:
-    """Return r_hat + c sigma: optimism in the face of uncertainty (OFUL: Abbasi-Yadkori, Pal and Szepesvari, NeurIPS 2011).
-
-    sigma is the posterior standard deviation of r_hat, and c is `settings.optimism`. These rewards no longer add up to the return:
-    they are too high for uncertain steps, on purpose. The decoder must be in closed form, and `init` must have had the same
-    optimism.
-    """
-    r_hat = decoder_rewards(state, inputs, settings, length)
-    assert state.closed_form is not None
-    assert state.closed_form.covariance is not None
-    assert isinstance(state.network, LinearDecoder)
-    index = score_type_index(state, len(state.closed_form.covariance.centre_variance))
-    covariance = jax.tree.map(lambda leaf: leaf[index], state.closed_form.covariance)
-    std = evidence.posterior_std(covariance, state.network.features(inputs))
-    return r_hat + settings.optimism * _per_step(std, state, length)
-
-
-def _per_step(
-    output: Float[Array, "rows *agents"],
-    state: DecoderState,
-    length: Float[Array, " rows"] | Int[Array, " rows"] | None,
-) -> Float[Array, "rows *agents"]:
-    """Return the decoder's output for each step as a part of R: divided by T if the score is a mean."""
+    output = reward_unit(state, settings) * output
     if length is None:
         return output
     divisor = jnp.where(state.is_average, length, 1).astype(jnp.float32)

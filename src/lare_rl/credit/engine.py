@@ -4,8 +4,8 @@ A `CreditSpec` says what is fitted to what. With a decoder (`decomposition.py`) 
 into the rewards that an algorithm is trained on:
 
     proxy reward       r_hat of each agent, by the method
-    training reward    + optimism,  averaged over the agents if the method shares credit,  0 for agents that are not alive,
-                       divided by the scale of R/T if that is asked for
+    training reward    averaged over the agents if the method shares credit,  0 for agents that are not alive,  divided by the
+                       scale of R/T if that is asked for
 
 With `exact`, what the proxy rewards of an episode lack to its return, R - sum_t r_hat_t, is added to them: to that of the last step
 (RUDDER: Arjona-Medina et al., 2019), or divided among all steps. They then add up to the return whatever the decoder's error is.
@@ -193,13 +193,8 @@ def return_scale(source: RewardSource) -> Scale:
     return source.scale if isinstance(source, DecoderState) else source
 
 
-def proxy_rewards(
-    source: RewardSource, steps: StepBatch, spec: CreditSpec, *, optimistic: bool = False
-) -> Float[Array, "*batch agents"]:
-    """Return r_hat of each agent, in the unit of the true rewards if the method's rewards have one.
-
-    If `optimistic`, the optimism that the settings ask for is added.
-    """
+def proxy_rewards(source: RewardSource, steps: StepBatch, spec: CreditSpec) -> Float[Array, "*batch agents"]:
+    """Return r_hat of each agent, in the unit of the true rewards if the method's rewards have one."""
     match spec.method.reward:
         case Reward.DESIGNED:
             return steps.inputs[..., 0]
@@ -209,9 +204,7 @@ def proxy_rewards(
             return jnp.broadcast_to(share[..., None], steps.inputs.shape[:-1])
     assert isinstance(source, DecoderState)
     rows = steps.inputs.reshape(-1, *steps.inputs.shape[-2:])
-    with_optimism = optimistic and decomposition.is_optimistic(spec.method, spec.settings)
-    compute = decomposition.optimistic_rewards if with_optimism else decomposition.decoder_rewards
-    r_hat = compute(source, rows, spec.settings, steps.length.ravel())
+    r_hat = decomposition.decoder_rewards(source, rows, spec.settings, steps.length.ravel())
     r_hat = r_hat.reshape(steps.inputs.shape[:-1])
     return _pay_shares(r_hat, steps, spec.max_steps) if spec.method.pays_shares else r_hat
 
@@ -233,7 +226,7 @@ def training_rewards(
     source: RewardSource, steps: StepBatch, spec: CreditSpec, alive: Bool[Array, "*batch team"]
 ) -> Float[Array, "*batch team"]:
     """Return the rewards that an algorithm is trained on, for each agent of the team. `alive` says which agents acted."""
-    r_hat = jnp.broadcast_to(proxy_rewards(source, steps, spec, optimistic=True), alive.shape)
+    r_hat = jnp.broadcast_to(proxy_rewards(source, steps, spec), alive.shape)
     if steps.residual is not None:
         r_hat = r_hat + correction(steps.residual, steps.last, steps.length, spec.settings.exact)[..., None]
     if spec.method.shared:

@@ -53,7 +53,7 @@ class Fit(StrEnum):
             case Fit.DECODER_LOSS:
                 names = {"episodes", "exact"}
             case Fit.EVIDENCE:
-                names = {"score", "optimism", "exact"}
+                names = {"score", "exact"}
             case Fit.PREFIX_EVIDENCE | Fit.SIGNS:
                 names = {"exact"}
             case _:

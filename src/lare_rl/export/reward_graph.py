@@ -45,7 +45,7 @@ def missing_reward_reason(method: Method) -> str | None:
 
 
 def reward_graph(credit: DecoderState | None, config: TrainConfig, team_index: int, phi: Graph | None = None) -> Graph:
-    """Return the graph of a team's proxy rewards, without optimism.
+    """Return the graph of a team's proxy rewards.
 
     Args:
         credit: the decoder of one seed, or None if phi itself is the reward.

@@ -40,7 +40,7 @@ def rewards(
 def team_proxy_rewards(
     steps: StoredSteps, sources: tuple[RewardSource, ...], config: TrainConfig, team_index: int
 ) -> Float[Array, "*batch rows"]:
-    """Return r_hat of a team, without optimism: one for each of its agents, or one for all if credit goes to whole teams."""
+    """Return r_hat of a team: one for each of its agents, or one for all if credit goes to whole teams."""
     batch, spec = step_batch(steps, config, team_index), config.credit_specs[team_index]
     return engine.proxy_rewards(sources[team_index], batch, spec)
 
