@@ -88,6 +88,16 @@ def test_registered_method_is_trained(fit, registered):
     assert np.isfinite(credit.metrics()["credit/loss"])
 
 
+def test_loss_of_a_decoder_is_for_a_single_agent(registered):
+    """Steps of several agents would be mixed with each other: `loss` has an axis of steps, and none of agents."""
+    register_decoder(Decoder("squares", lambda key, shape, settings: Squares(jnp.ones(shape.n_inputs))))
+    register_method(
+        Method("mine", "squares", "this test", inputs=input_names.RAW, fit=Fit.DECODER_LOSS, decoder="squares")
+    )
+    with pytest.raises(LareError, match="mine assigns credit to a single agent, and the task has 2 agents"):
+        CreditAssigner("mine", observation_space=2, action_space=1, agents=2, max_steps=5)
+
+
 def test_decoder_with_functions_is_refused_in_one_line(registered):
     register_decoder(Decoder("mlp", lambda key, shape, settings: eqx.nn.MLP(shape.n_inputs, 1, 4, 1, key=key)))
     register_method(Method("mlp", "mlp", "this test", inputs=input_names.RAW, fit=Fit.ALL_STEPS, decoder="mlp"))

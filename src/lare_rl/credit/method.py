@@ -168,5 +168,5 @@ class Method:
 
     @property
     def single_agent_only(self) -> bool:
-        """Whether it works for a single agent only."""
-        return DECODERS[self.decoder].single_agent_only
+        """Whether it works for a single agent only: `Fit.DECODER_LOSS` has no axis of agents."""
+        return self.fit is Fit.DECODER_LOSS or DECODERS[self.decoder].single_agent_only
