@@ -180,12 +180,7 @@ def next_posterior(
     noise_dof = xp.maximum(problem.dof - xp.sum(n_determined), 0.5)
     alpha, beta = clip_precisions(backend, problem, n_determined / xp.maximum(squares, 1e-30), noise_dof / residual)
     return Posterior(
-        weight=weight,
-        bias=xp.zeros(()),
-        alpha=alpha,
-        beta=beta,
-        n_determined=n_determined,
-        log_evidence=log_evidence,
+        weight=weight, bias=xp.zeros(()), alpha=alpha, beta=beta, n_determined=n_determined, log_evidence=log_evidence
     )
 
 

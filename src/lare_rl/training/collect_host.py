@@ -84,11 +84,7 @@ class HostVecEnv:
         return steps
 
     def _collect_step(
-        self,
-        policy: Callable[..., Any],
-        noise: Float[np.ndarray, "seeds envs agents noise"],
-        steps: Trajectory,
-        t: int,
+        self, policy: Callable[..., Any], noise: Float[np.ndarray, "seeds envs agents noise"], steps: Trajectory, t: int
     ) -> None:
         """Make a step, and write it into row `t` of the steps."""
         action = policy(self._timestep, noise, self._episode_start)
@@ -175,13 +171,7 @@ class HostVecEnv:
 class HostCollector:
     """The training environments, the policy that acts in them, and environments to evaluate it in."""
 
-    def __init__(
-        self,
-        envs: VecEnv,
-        evaluation_envs: VecEnv,
-        config: TrainConfig,
-        seeds: Sequence[int],
-    ):
+    def __init__(self, envs: VecEnv, evaluation_envs: VecEnv, config: TrainConfig, seeds: Sequence[int]):
         self._config, self._seeds = config, list(seeds)
         self._envs, self._evaluation_envs = HostVecEnv(envs, seeds, config.n_envs), evaluation_envs
         self._memory = init_host_memory(config, *self._envs.shape)

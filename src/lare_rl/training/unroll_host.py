@@ -14,14 +14,7 @@ from lare_rl.errors import LareError
 from lare_rl.training.evaluation import EpisodeBatch, Evaluation
 from lare_rl.training.streams import Stream, episode_seed
 
-__all__ = [
-    "DivergedError",
-    "add_seed_axis",
-    "check_finite",
-    "evaluate_on_host",
-    "record_on_host",
-    "unroll_on_host",
-]
+__all__ = ["DivergedError", "add_seed_axis", "check_finite", "evaluate_on_host", "record_on_host", "unroll_on_host"]
 
 BatchPolicy = Callable[[Timestep, Bool[np.ndarray, "seeds envs"]], Float[np.ndarray, "seeds envs agents action"]]
 """From a timestep, and which episodes have just begun, to the action."""

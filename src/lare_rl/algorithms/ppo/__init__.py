@@ -96,13 +96,7 @@ register_algorithm(
     Algorithm(
         name="ippo",
         consumes=Consumes.ROLLOUTS,
-        settings=PPOSettings(
-            learning_rate=1e-4,
-            gamma=1.0,
-            minibatch_size=128,
-            clip=0.5,
-            max_grad_norm=10.0,
-        ),
+        settings=PPOSettings(learning_rate=1e-4, gamma=1.0, minibatch_size=128, clip=0.5, max_grad_norm=10.0),
         module="lare_rl.algorithms.ppo.ppo",
         run_defaults=_ippo_defaults,
         summary="PPO for every agent, with shared parameters",
