@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from helpers.assigner_episodes import (
+    ANY_SCORE,
     SMALL_CREDIT,
     TASK,
     Episode,
@@ -124,6 +125,19 @@ def test_rewards_depend_on_the_seed_and_the_newest_decoder():
     assert not np.array_equal(assigners[0].rewards_at(np.arange(40)), first)
     leaves = jax.tree.leaves(credit.learner.decoder)
     assert {device.platform for leaf in leaves for device in leaf.devices()} == {"cpu"}
+
+
+def test_many_raw_entries_and_different_lengths():
+    """A closed form that compares sum and average has no features of so many entries: the score is then a sum."""
+    credit, rng = (
+        CreditAssigner("rrdu", observation_space=600, action_space=1, settings=ANY_SCORE),
+        np.random.default_rng(0),
+    )
+    for length in (3, 5):
+        s, a = rng.normal(size=(length, 600)), rng.normal(size=(length, 1))
+        credit.add_episode(s, a, s, rng.normal(size=length))
+    credit.fit(1)
+    assert (credit.score_type, np.isfinite(credit.rewards_at([0])).all()) == ("sum", True)
 
 
 def test_rewards_can_be_scaled():

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from lare_rl.credit.decoder_settings import CreditSettings
-from lare_rl.credit.engine import credit_spec
+from lare_rl.credit.engine import CreditSpec
 from lare_rl.credit.explanation import Explanation
 from lare_rl.credit.explanation_text import MESSAGES, explanation_findings, explanation_lines, raw_feature_names
 from lare_rl.credit.methods import METHODS
@@ -195,15 +195,13 @@ def test_raw_feature_names():
 )
 def test_raw_feature_names_of_methods(method, single_agent, expected):
     """Neither a history nor a difference of observations has names, and the action need not be an input."""
-    spec = credit_spec(
-        METHODS[method],
-        CreditSettings(),
-        {"factors": 0, "observation": 1, "action": 1},
-        scored_observation="after",
+    spec = CreditSpec(
+        method=METHODS[method],
+        settings=CreditSettings(),
+        observation_size=1,
+        action_size=1,
         single_agent=single_agent,
         agents=1,
         max_steps=10,
-        fixed_length=False,
-        scale_rewards=False,
     )
     assert spec.raw_feature_names("0: price", "") == expected

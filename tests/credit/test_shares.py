@@ -57,16 +57,15 @@ def test_shares_add_up(contributions, alive):
 
 def test_rewards_add_up_to_the_return():
     """The mean over the agents that are alive, summed over the steps, is the return, whatever the decoder gives."""
-    spec = engine.credit_spec(
-        METHODS["tar2"],
-        CreditSettings(),
-        {"observation": 2, "action": 2},
-        scored_observation="after",
+    spec = engine.CreditSpec(
+        method=METHODS["tar2"],
+        settings=CreditSettings(),
+        observation_size=2,
+        action_size=2,
         single_agent=False,
         agents=AGENTS,
         max_steps=STEPS,
         fixed_length=True,
-        scale_rewards=False,
     )
     rng = np.random.default_rng(0)
     alive = np.ones((2, 2 * STEPS, AGENTS), bool)

@@ -63,9 +63,7 @@ def test_options_win_over_the_file(write, monkeypatch, tmp_path):
     monkeypatch.chdir(tmp_path)
     path = write(FILE.replace("steps = 250", "steps = 250\nseeds = 3"))
     assert read_keywords("--config", path)["settings"] == load_config(path).settings
-    options = (
-        "--seeds 1 --steps=500 --td3.tau 0.1 --no-scale-rewards --credit.exact last --credit.normalise False"
-    )
+    options = "--seeds 1 --steps=500 --td3.tau 0.1 --no-scale-rewards --credit.exact last --credit.normalise False"
     settings = read_keywords("--config", path, *options.split())["settings"]
     assert settings == Settings(
         method="lare-bayes",

@@ -13,7 +13,7 @@ from pydantic import Field, InstanceOf
 from lare_rl.assigner.space_layout import SpaceLayout, make_layout
 from lare_rl.config.validity import check_credit, check_factors
 from lare_rl.credit.decoder_settings import CreditSettings, default_credit
-from lare_rl.credit.engine import CreditSpec, credit_spec
+from lare_rl.credit.engine import CreditSpec
 from lare_rl.credit.history import next_history_columns
 from lare_rl.credit.input_names import input_arrays
 from lare_rl.credit.methods import Method, find_method
@@ -69,22 +69,18 @@ class AssignerConfig(CheckedModel):
     @cached_property
     def spec(self) -> CreditSpec:
         """What is fitted to the returns."""
-        sizes = {
-            "factors": self.phi.n_factors(self.scored_observation) if self.phi is not None else 0,
-            "observation": self.observation.size,
-            "action": self.action.size,
-        }
-        return credit_spec(
-            self.method,
-            self.settings,
-            sizes,
+        return CreditSpec(
+            method=self.method,
+            settings=self.settings,
+            n_factors=0 if self.phi is None else self.phi.n_factors(self.scored_observation),
+            observation_size=self.observation.size,
+            action_size=self.action.size,
             scored_observation=self.scored_observation,
             single_agent=self.agents == 1,
             agents=self.agents,
             max_steps=self.max_steps or 1,
             window=prediction_window(self.payments, self.settings.score),
             n_levels=self.n_levels,
-            fixed_length=False,
             scale_rewards=self.scale_rewards,
         )
 

@@ -14,7 +14,6 @@ TAR2 pays shares of the return instead (`shares.py`), which add up to it, too.
 Batches have an axis of agents, of length 1 for a single agent. For credit to whole teams it has length 1 too.
 """
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, NamedTuple
@@ -46,7 +45,6 @@ __all__ = [
     "StepBatch",
     "add_to_explanation",
     "correction",
-    "credit_spec",
     "explain_returns",
     "init_decoder",
     "init_explanation",
@@ -57,21 +55,26 @@ __all__ = [
 ]
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class CreditSpec:
     """What is fitted to what: the static part of credit assignment for one team."""
 
     method: Method
     settings: CreditSettings
-    inputs: tuple[str, ...]
-    """The names of the decoder's inputs (`input_names.py`)."""
-    sizes: tuple[tuple[str, int], ...]
-    """The sizes of `factors`, `observation` and `action`."""
-    score_types: tuple[int, ...]
-    """The score types that are fitted."""
-    max_steps: int
+    n_factors: int = 0
+    observation_size: int
+    """The size of an observation or, for credit to whole teams, of the global state."""
+    action_size: int
+    scored_observation: ScoredObservation = "after"
+    """Which observations the task names."""
+    single_agent: bool
+    """Whether the task has a single agent."""
     agents: int
     """The number of proxy rewards of a step."""
+    max_steps: int
+    """The number of steps of the longest episode."""
+    fixed_length: bool = False
+    """Whether all episodes have the same length. A sum and a mean are then the same."""
     window: int = WINDOW
     """The number of last returns over which predictions of them are assessed."""
     n_levels: int = 0
@@ -80,72 +83,47 @@ class CreditSpec:
     """Whether training rewards are divided by the running root mean square of R/T."""
 
     @cached_property
+    def inputs(self) -> tuple[str, ...]:
+        """The names of the decoder's inputs (`input_names.py`)."""
+        names = self.method.inputs
+        return () if names is None else names.resolve(self.scored_observation, single_agent=self.single_agent)
+
+    @property
+    def _sizes(self) -> dict[str, int]:
+        return {"factors": self.n_factors, "observation": self.observation_size, "action": self.action_size}
+
+    @property
+    def input_sizes(self) -> tuple[tuple[str, int], ...]:
+        """The name and the size of each input."""
+        return input_sizes(self.inputs, self._sizes)
+
+    @cached_property
     def basis(self) -> Basis:
         """The features that a closed-form decoder computes from a row of inputs."""
-        sizes = dict(self.sizes)
-        n_factors = sizes["factors"] if "factors" in self.inputs else 0
-        n_raw = input_size(tuple(name for name in self.inputs if name not in ("factors", "history")), sizes)
-        n_tracked = tracked_size(self.inputs, sizes)
-        n_levels = 0 if self.method.fit is Fit.SIGNS else self.n_levels
+        raw = tuple(name for name in self.inputs if name not in ("factors", "history"))
         return Basis(
-            n_factors,
-            n_raw,
+            n_factors=self.n_factors if "factors" in self.inputs else 0,
+            n_raw=input_size(raw, self._sizes),
             extended=self.method.extended_basis,
-            n_tracked=n_tracked,
-            n_levels=n_levels,
+            n_tracked=tracked_size(self.inputs, self._sizes),
+            n_levels=0 if self.method.fit is Fit.SIGNS else self.n_levels,
             prefixes=self.method.fit is Fit.PREFIX_EVIDENCE,
         )
+
+    @cached_property
+    def score_types(self) -> tuple[ScoreType, ...]:
+        """The score types that are fitted. Without features, no fit in closed form can compare them."""
+        if "score" not in self.method.settings or not self.basis.n_features:
+            return (ScoreType.SUM,)
+        allow_log_odds = not self.method.uses_gradient
+        return score_types_to_fit(self.settings.score, self.fixed_length, allow_log_odds=allow_log_odds)
 
     def raw_feature_names(self, observation: str, action: str) -> list[str]:
         """Return names of the raw features, from a task's texts; none if they are not entries of observations and actions."""
         if not self.basis.n_raw_used or "observation_change" in self.inputs:
             return []
-        sizes = dict(input_sizes(self.inputs, dict(self.sizes)))
-        raw = {name: size for name, size in sizes.items() if name not in ("factors", "history")}
+        raw = {name: size for name, size in self.input_sizes if name not in ("factors", "history")}
         return raw_feature_names(observation, action, raw)
-
-
-def credit_spec(
-    method: Method,
-    settings: CreditSettings,
-    sizes: Mapping[str, int],
-    *,
-    scored_observation: ScoredObservation,
-    single_agent: bool,
-    agents: int,
-    max_steps: int,
-    fixed_length: bool,
-    scale_rewards: bool,
-    window: int = WINDOW,
-    n_levels: int = 0,
-) -> CreditSpec:
-    """Return the spec of a method for one team. The arguments that a spec has too are described there.
-
-    Args:
-        sizes: the sizes of `factors`, `observation` (the state, for credit to whole teams) and `action`.
-        scored_observation: which observations the task names.
-        single_agent: whether the task has a single agent.
-        agents: the number of proxy rewards of a step.
-        max_steps: the number of steps of the longest episode.
-        fixed_length: whether all episodes have the same length. A sum and a mean are then the same.
-        scale_rewards: whether training rewards are divided by the scale of R/T.
-    """
-    inputs = method.inputs.resolve(scored_observation, single_agent=single_agent) if method.inputs is not None else ()
-    score_types = (ScoreType.SUM,)
-    if "score" in method.settings:
-        score_types = score_types_to_fit(settings.score, fixed_length, allow_log_odds=not method.uses_gradient)
-    return CreditSpec(
-        method=method,
-        settings=settings,
-        inputs=inputs,
-        sizes=tuple(sizes.items()),
-        score_types=score_types,
-        max_steps=max_steps,
-        agents=agents,
-        window=window,
-        n_levels=n_levels,
-        scale_rewards=scale_rewards,
-    )
 
 
 def init_decoder(key: PRNGKeyArray, spec: CreditSpec) -> DecoderState | None:
@@ -161,7 +139,7 @@ def init_decoder(key: PRNGKeyArray, spec: CreditSpec) -> DecoderState | None:
         n_agents=spec.agents,
         score_types=spec.score_types,
         window=spec.window,
-        inputs=input_sizes(spec.inputs, dict(spec.sizes)),
+        inputs=spec.input_sizes,
     )
 
 

@@ -102,7 +102,7 @@ class _StepInputs(dict[str, Any]):
                 n_agents = self.config.env.n_agents if self.config.team_level else 1
                 self[name] = graph_input("action", (*self.rows, n_agents * self.config.env.action_size))
             case _:
-                self[name] = graph_input(name, (*self.rows, self.config.observed_size))
+                self[name] = graph_input(name, (*self.rows, self.config.credit_specs[0].observation_size))
         return self[name]
 
     def _action(self) -> Any:
