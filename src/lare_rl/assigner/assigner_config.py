@@ -11,7 +11,7 @@ from jaxtyping import Bool, Float, Int
 from pydantic import Field, InstanceOf
 
 from lare_rl.assigner.space_layout import SpaceLayout, make_layout
-from lare_rl.config.validity import check_credit, check_factors
+from lare_rl.config.validity import CreditContext, check_credit, check_factors
 from lare_rl.credit.decoder_settings import CreditSettings, default_credit
 from lare_rl.credit.engine import CreditSpec
 from lare_rl.credit.history import next_history_columns
@@ -266,9 +266,7 @@ def check_config(config: AssignerConfig) -> None:
         raise LareError("a phi needs the task that it was designed for: CreditAssigner(..., phi, task=task)")
     if phi is not None and config.task is not None:
         check_task(phi, config.task)
-    check_credit(
-        method,
-        config.settings,
+    context = CreditContext(
         n_agents=config.agents,
         n_raw_features=config.spec.basis.n_raw,
         scored_observation=config.scored_observation,
@@ -276,6 +274,7 @@ def check_config(config: AssignerConfig) -> None:
         payments=config.payments,
         max_steps=config.max_steps,
     )
+    check_credit(method, config.settings, context)
     if phi is not None:
         check_factors(method, phi.n_factors(config.scored_observation))
     if config.agents > 1 and config.max_steps is None and method.uses_gradient:
