@@ -21,12 +21,11 @@ from lare_rl.envs.placement import make_vec_env, n_open_envs
 from lare_rl.envs.vec_env import VecEnv
 from lare_rl.errors import LareError
 from lare_rl.tasks.spec import TaskSpec
-from lare_rl.training.evaluate_host import evaluate_policy_on_host
 from lare_rl.training.evaluation import Evaluation
 from lare_rl.training.host_policy import init_host_memory, make_policy
 from lare_rl.training.static_config import TrainConfig
 from lare_rl.training.streams import Stream, episode_seed, host_noise, numpy_generator
-from lare_rl.training.unroll_host import add_seed_axis, check_finite
+from lare_rl.training.unroll_host import add_seed_axis, check_finite, evaluate_policy_on_host
 
 __all__ = ["HostCollector", "HostVecEnv", "make_host_collector"]
 

@@ -13,6 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int, Key
 
+from lare_rl.config.settings import ResolvedSettings
 from lare_rl.credit import returns
 from lare_rl.credit.prequential import empty_predictions, squared_errors
 from lare_rl.data.replay import Replay, by_payment, hide_newest, n_finished
@@ -23,7 +24,7 @@ from lare_rl.training.learner import Learner
 from lare_rl.training.seed_axis import jit_over_seeds
 from lare_rl.training.static_config import TrainConfig
 
-__all__ = ["FirstFitStoppedError", "config_of_first_fit", "fit_until_converged", "has_enough_episodes"]
+__all__ = ["FirstFitStoppedError", "config_of_first_fit", "fit_until_converged", "has_enough_episodes", "has_first_fit"]
 
 MIN_FIRST_EPISODES = 10
 """With fewer finished episodes of a seed, none are held out."""
@@ -40,6 +41,11 @@ FitFunction = Callable[[Learner, Key[Array, " seeds"]], tuple[Learner, dict[str,
 
 class FirstFitStoppedError(Exception):
     """The user asked the run to stop during the first fit. Nothing of this iteration is kept."""
+
+
+def has_first_fit(settings: ResolvedSettings, config: TrainConfig) -> bool:
+    """Return whether the decoders have a first fit, which lasts until it brings no improvement."""
+    return config.fits_separately and settings.first_fit == "held-out"
 
 
 def has_enough_episodes(learner: Learner) -> bool:
