@@ -15,8 +15,9 @@ from jaxtyping import Array, Float, Int, Key
 
 from lare_rl.config.settings import ResolvedSettings
 from lare_rl.credit import returns
+from lare_rl.credit.decomposition import CreditBatch, DecoderState
 from lare_rl.credit.prequential import empty_predictions, squared_errors
-from lare_rl.data.replay import Replay, by_payment, hide_newest, n_finished
+from lare_rl.data.replay import Index, Replay, by_payment, hide_newest, n_finished
 from lare_rl.nn.masks import select
 from lare_rl.nn.normalise import root_mean_square
 from lare_rl.training.episodes import Decoders, fold_episodes
@@ -117,7 +118,10 @@ def _held_out_error(
     """Return the squared error of the returns of held-out episodes, summed over the teams, each in units of its returns."""
     empty = empty_predictions(1, config.credit_window)
     decoders, replay = tuple(decoder._replace(predictions=empty) for decoder in decoders), by_payment(replay)
-    predict = partial(returns.predict, settings=config.credit)
+
+    def predict(decoder: DecoderState, episodes: CreditBatch, first: Index) -> DecoderState:
+        return returns.predict(decoder, episodes, config.credit)
+
     decoders = fold_episodes(decoders, replay, replay.episodes - n_hidden, predict, config)
     errors = [
         squared_errors(decoder.predictions)[0] / root_mean_square(decoder.return_scale) ** 2 for decoder in decoders

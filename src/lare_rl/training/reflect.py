@@ -102,10 +102,10 @@ def assess_function(function: LatentFunction, role: TaskSpec, episodes: Sequence
     if len(episodes) < MIN_EXPLAINED_EPISODES:
         raise LareError(f"{len(episodes)} episodes say too little of a function: {MIN_EXPLAINED_EPISODES} are needed")
     factors = [_compute_factors(function, role, episode) for episode in episodes]
-    inputs = [
-        np.concatenate([z, *_scored_observations(role, episode), episode.env_action], axis=-1)
-        for z, episode in zip(factors, episodes, strict=True)
-    ]
+    inputs = []
+    for z, episode in zip(factors, episodes, strict=True):
+        observed = select_states(role.scored_observation, episode.observation, episode.next_observation)
+        inputs.append(np.concatenate([z, *observed, episode.env_action], axis=-1))
     n_factors = factors[0].shape[-1]
     basis = Basis(n_factors, inputs[0].shape[-1] - n_factors, extended=True)
     alive, returns = [episode.alive for episode in episodes], np.array([episode.return_ for episode in episodes])
@@ -122,10 +122,6 @@ def assess_function(function: LatentFunction, role: TaskSpec, episodes: Sequence
         sentences=explanation_lines(fit.explanation, fit.score_type, names, raw_names),
         ranges=_describe_ranges(names, valid_factors),
     )
-
-
-def _scored_observations(role: TaskSpec, episode: Episode) -> list[np.ndarray]:
-    return select_states(role.scored_observation, episode.observation, episode.next_observation)
 
 
 def _compute_factors(
