@@ -34,6 +34,7 @@ from jaxtyping import Array, Bool, Float, Int
 from lare_rl.credit import evidence, relevance
 from lare_rl.credit.basis import N_FREQUENCIES, Basis
 from lare_rl.credit.evidence import Posterior, Regression, SufficientStatistics
+from lare_rl.credit.precisions import FeatureIndex
 from lare_rl.credit.score_type import ScoreType
 
 __all__ = ["Explanation", "StepStatistics", "add_steps", "empty_step_statistics", "explain"]
@@ -173,8 +174,8 @@ class _Fit(NamedTuple):
 def _fit(
     statistics: SufficientStatistics,
     score_type: Int[Array, ""] | int,
-    group_index: Int[np.ndarray, " features"],
-    strength_index: Int[np.ndarray, " features"],
+    group_index: FeatureIndex,
+    strength_index: FeatureIndex,
 ) -> _Fit:
     problem = evidence.regression(statistics, score_type, group_index)
     start = evidence.init_posterior(len(group_index), int(group_index.max()) + 1)

@@ -25,12 +25,12 @@ choose the entries that the policy sees, which is not done here.
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
+from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
 from lare_rl.credit.decoder_network import DecoderOutput, DecoderShape
 from lare_rl.credit.decoder_settings import CreditSettings
-from lare_rl.credit.losses import batch_mean
-from lare_rl.credit.step_targets import is_step
+from lare_rl.credit.losses import PerEpisode, batch_mean
+from lare_rl.credit.step_targets import EpisodeInputs, EpisodeLengths, is_step
 from lare_rl.nn.networks import MLP, smooth_clip
 
 __all__ = ["GRD", "causes", "sample_mask"]
@@ -126,12 +126,7 @@ class GRD(eqx.Module):
         return jax.nn.logsumexp(jax.nn.log_softmax(log_weight) + log_density, axis=-1)
 
     def loss(
-        self,
-        inputs: Float[Array, "episodes steps inputs"],
-        length: Int[Array, " episodes"],
-        target: Float[Array, " episodes"],
-        mask: Float[Array, " episodes"],
-        key: PRNGKeyArray,
+        self, inputs: EpisodeInputs, length: EpisodeLengths, target: PerEpisode, mask: PerEpisode, key: PRNGKeyArray
     ) -> Float[Array, ""]:
         """Return the loss. The arguments are those of `Diaster.loss`. `key` is also for the steps whose next states are predicted."""
         keys = jax.random.split(key, 5)
