@@ -23,7 +23,8 @@ from basis import SPEED, scores
 from lare_rl.credit import evidence
 from lare_rl.credit.basis import Basis, expand
 from lare_rl.credit.closed_form import MAX_EVIDENCE_ROUNDS
-from lare_rl.credit.evidence import Posterior, SufficientStatistics
+from lare_rl.credit.evidence import SufficientStatistics
+from lare_rl.credit.precisions import Posterior
 from lare_rl.credit.score_type import ScoreType
 from lare_rl.util.statistics import r_squared
 from measure import write

@@ -4,11 +4,11 @@ import numpy as np
 import pytest
 
 from lare_rl.credit.decoder_settings import CreditSettings
-from lare_rl.credit.engine import CreditSpec
 from lare_rl.credit.explanation import Explanation
 from lare_rl.credit.explanation_text import MESSAGES, explanation_findings, explanation_lines, raw_feature_names
 from lare_rl.credit.methods import METHODS
 from lare_rl.credit.score_type import ScoreType, ScoreTypeEstimate
+from lare_rl.credit.spec import CreditSpec
 from lare_rl.util.findings import Finding, render
 
 FACTORS, RAW_FEATURES = ["speed", "cost"], ["entry 0", "entry 1 (the foot)"]

@@ -13,11 +13,11 @@ from pydantic import Field, InstanceOf
 from lare_rl.assigner.space_layout import SpaceLayout, make_layout
 from lare_rl.config.validity import CreditContext, check_credit, check_factors
 from lare_rl.credit.decoder_settings import CreditSettings, default_credit
-from lare_rl.credit.engine import CreditSpec
 from lare_rl.credit.history import next_history_columns
 from lare_rl.credit.input_names import input_arrays
 from lare_rl.credit.methods import Method, find_method
 from lare_rl.credit.score_type import prediction_window
+from lare_rl.credit.spec import CreditSpec
 from lare_rl.envs.families import find_score, load_env_spec
 from lare_rl.envs.load import resolve_task
 from lare_rl.errors import CheckedModel, LareError, short_repr

@@ -257,15 +257,14 @@ class DecoderLearner:
     def metrics(self) -> dict[str, float]:
         """Return metrics that need no true rewards. Returns are predicted before they are learned from."""
         self.learn_returns()
-        r2 = gain = gain_error = float("nan")
+        predicted = dict.fromkeys(("credit/return_r2", "credit/gain", "credit/gain_error"), float("nan"))
         if self.decoder is not None:
             with on_cpu():
-                predictions = self.decoder.predictions
-                r2, gain, gain_error = map(float, (prequential.r2(predictions)[0], *prequential.gain(predictions)))
+                predicted = {
+                    name: float(value) for name, value in prequential.metrics(self.decoder.predictions).items()
+                }
         return {
-            "credit/return_r2": r2,
-            "credit/gain": gain,
-            "credit/gain_error": gain_error,
+            **predicted,
             "credit/episodes": float(self.store.ended),
             "credit/dropped": float(self.store.dropped),
             "credit/fits": float(self.n_updates),

@@ -35,8 +35,9 @@ from lare_rl.credit import evidence, logistic, relevance
 from lare_rl.credit.basis import Basis, expand, expand_history
 from lare_rl.credit.decoder_network import DecoderOutput, DecoderShape
 from lare_rl.credit.decoder_settings import CreditSettings
-from lare_rl.credit.evidence import Posterior, SufficientStatistics
+from lare_rl.credit.evidence import SufficientStatistics
 from lare_rl.credit.logistic import LogOddsFit
+from lare_rl.credit.precisions import Posterior
 from lare_rl.credit.score_type import ScoreType
 from lare_rl.nn.leading_axis import map_leading_axis
 from lare_rl.nn.normalise import RunningMeanStd, running_std

@@ -56,9 +56,7 @@ from lare_rl.nn.normalise import merge_means
 
 __all__ = [
     "JAX",
-    "Posterior",
     "PosteriorCovariance",
-    "Regression",
     "SufficientStatistics",
     "add_episodes",
     "add_prefixes",

@@ -33,8 +33,8 @@ from jaxtyping import Array, Bool, Float, Int
 
 from lare_rl.credit import evidence, relevance
 from lare_rl.credit.basis import N_FREQUENCIES, Basis
-from lare_rl.credit.evidence import Posterior, Regression, SufficientStatistics
-from lare_rl.credit.precisions import FeatureIndex
+from lare_rl.credit.evidence import SufficientStatistics
+from lare_rl.credit.precisions import FeatureIndex, Posterior, Regression
 from lare_rl.credit.score_type import ScoreType
 
 __all__ = ["Explanation", "StepStatistics", "add_steps", "empty_step_statistics", "explain"]

@@ -21,8 +21,9 @@ from jaxtyping import Array, Bool, Float, Int
 from lare_rl.credit import evidence
 from lare_rl.credit.basis import Basis
 from lare_rl.credit.closed_form import FIT_GROWTH, MAX_EVIDENCE_ROUNDS, LinearDecoder
-from lare_rl.credit.evidence import Posterior, SufficientStatistics
+from lare_rl.credit.evidence import SufficientStatistics
 from lare_rl.credit.explanation import Explanation, StepStatistics, add_steps, empty_step_statistics, explain
+from lare_rl.credit.precisions import Posterior
 from lare_rl.credit.score_type import (
     MAX_ERROR_RATIO,
     ROUNDING,

@@ -15,8 +15,8 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Int
 
 from lare_rl.credit import evidence
-from lare_rl.credit.evidence import Posterior, SufficientStatistics
-from lare_rl.credit.precisions import FeatureIndex, expand_groups
+from lare_rl.credit.evidence import SufficientStatistics
+from lare_rl.credit.precisions import FeatureIndex, Posterior, expand_groups
 from lare_rl.nn import masks
 
 __all__ = ["MIN_GAIN", "fit_strengths", "is_better", "select"]

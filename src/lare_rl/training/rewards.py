@@ -71,8 +71,7 @@ def assess(learner: Learner, config: TrainConfig) -> dict[str, Float[Array, ""]]
         )
         if learner.decoders:
             decoder = learner.decoders[i]
-            metrics[-1]["credit/return_r2"] = prequential.r2(decoder.predictions)[0]
-            metrics[-1]["credit/gain"], metrics[-1]["credit/gain_error"] = prequential.gain(decoder.predictions)
+            metrics[-1] |= prequential.metrics(decoder.predictions)
             if decoder.score_type_predictions is not None:
                 metrics[-1]["credit/average"] = decoder.is_average.astype(jnp.float32)
                 metrics[-1]["credit/log_odds"] = decoder.is_log_odds.astype(jnp.float32)

@@ -8,9 +8,9 @@ import numpy as np
 
 from lare_rl.algorithms.registry import Algorithm, AlgorithmSettings, Consumes, Noise
 from lare_rl.credit.decoder_settings import CreditSettings
-from lare_rl.credit.engine import CreditSpec
 from lare_rl.credit.methods import Method
 from lare_rl.credit.score_type import prediction_window
+from lare_rl.credit.spec import CreditSpec
 from lare_rl.envs.interface import EnvSpec
 from lare_rl.tasks.payments import PAID_AT_END, PaymentRule
 from lare_rl.tasks.spec import MAX_LEVELS, CreditScope, ScoredObservation
