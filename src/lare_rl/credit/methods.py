@@ -8,17 +8,7 @@ return, which is the reward of the last step. A method works for a single agent 
 """
 
 from lare_rl.credit.decoders import DECODERS
-from lare_rl.credit.input_names import (
-    FACTORS,
-    FACTORS_AND_SCORED,
-    FACTORS_SCORED_AND_HISTORY,
-    NEXT_OBSERVATION_ACTION,
-    OBSERVATION_ACTION,
-    RAW,
-    SCORED,
-    SCORED_AND_HISTORY,
-    TRANSITION,
-)
+from lare_rl.credit.input_names import InputNames
 from lare_rl.credit.method import Fit, Method, Reward
 from lare_rl.util.plugins import Registry
 
@@ -46,6 +36,17 @@ def find_method(name: str) -> Method:
     """
     return METHODS.find(name)
 
+
+RAW = InputNames(("observation", "action", "observation_change"), ("next_observation",))
+"""As published for RD and RRD."""
+OBSERVATION_ACTION = InputNames(("observation", "action"))
+TRANSITION = InputNames(("observation", "action", "next_observation"))
+NEXT_OBSERVATION_ACTION = InputNames(("next_observation", "action"))
+SCORED = InputNames(("scored_observation", "action"))
+FACTORS = InputNames(("factors",))
+FACTORS_AND_SCORED = InputNames(("factors", "scored_observation", "action"))
+SCORED_AND_HISTORY = InputNames(("scored_observation", "action", "history"))
+FACTORS_SCORED_AND_HISTORY = InputNames(("factors", "scored_observation", "action", "history"))
 
 _LARE = "Qu et al., LaRe, AAAI 2025"
 _RD = "Efroni et al., AAAI 2021; Arjona-Medina et al., RUDDER, 2019"
