@@ -5,7 +5,7 @@ import pytest
 
 from lare_rl.credit.decoder_settings import CreditSettings
 from lare_rl.credit.explanation import Explanation
-from lare_rl.credit.explanation_text import MESSAGES, explanation_findings, explanation_lines, raw_feature_names
+from lare_rl.credit.explanation_text import MESSAGES, explanation_findings, raw_feature_names
 from lare_rl.credit.methods import METHODS
 from lare_rl.credit.score_type import ScoreType, ScoreTypeEstimate
 from lare_rl.credit.spec import CreditSpec
@@ -164,7 +164,7 @@ def test_messages_and_lines():
         text = render(Finding(code, ANYTHING), MESSAGES)
         assert text
         assert "{" not in text
-    lines = explanation_lines(explanation(), None, FACTORS, RAW_FEATURES)
+    lines = [render(finding, MESSAGES) for finding in explanation_findings(explanation(), None, FACTORS, RAW_FEATURES)]
     assert "90%" in lines[0]
     assert lines[2:4] == ["- cost: 65%, +2 ± 0.1", "- speed: 25%, +1 ± 0.1"]
 

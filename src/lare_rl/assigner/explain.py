@@ -12,8 +12,9 @@ from lare_rl.assigner.compiled_functions import on_cpu
 from lare_rl.assigner.decoder_learner import DecoderLearner
 from lare_rl.credit.decomposition import level_effects
 from lare_rl.credit.explanation import Explanation
-from lare_rl.credit.explanation_text import explanation_lines
+from lare_rl.credit.explanation_text import MESSAGES, explanation_findings
 from lare_rl.credit.returns import estimate_score_type, looks_binary
+from lare_rl.util.findings import render
 from lare_rl.util.float64 import float64
 
 __all__ = ["describe_returns", "explain"]
@@ -26,7 +27,7 @@ def describe_returns(learner: DecoderLearner, group_names: Iterable[Hashable]) -
     if explanation is None or decoder is None:
         return []
     effects = level_effects(decoder, float(explanation.mean_length)).tolist()
-    return explanation_lines(
+    findings = explanation_findings(
         explanation,
         estimate_score_type(decoder),
         [] if config.phi is None else config.phi.factor_columns(config.scored_observation),
@@ -34,6 +35,7 @@ def describe_returns(learner: DecoderLearner, group_names: Iterable[Hashable]) -
         looks_binary=looks_binary(decoder, config.method),
         groups=dict(zip(group_names, effects, strict=False)),
     )
+    return [render(finding, MESSAGES) for finding in findings]
 
 
 def explain(learner: DecoderLearner) -> Explanation | None:

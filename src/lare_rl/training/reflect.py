@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Float
 
 from lare_rl.credit.basis import Basis
-from lare_rl.credit.explanation_text import MIN_EXPLAINED_EPISODES, explanation_lines, raw_feature_names
+from lare_rl.credit.explanation_text import MESSAGES, MIN_EXPLAINED_EPISODES, explanation_findings, raw_feature_names
 from lare_rl.credit.factor_fit import assess_factors
 from lare_rl.envs.load import resolve_task
 from lare_rl.envs.play import Episode, Policy, play_episodes
@@ -23,6 +23,7 @@ from lare_rl.llm.model import Model, ModelFunction, as_model
 from lare_rl.runs.directory import Run
 from lare_rl.tasks.spec import TaskSpec, require_role, select_states
 from lare_rl.training.stored_episodes import stored_role_episodes
+from lare_rl.util.findings import render
 
 __all__ = ["FunctionAssessment", "assess_function", "reflect"]
 
@@ -115,11 +116,12 @@ def assess_function(function: LatentFunction, role: TaskSpec, episodes: Sequence
     sizes = dict.fromkeys(observed, role.observation_size) | {"action": role.action_size}
     raw_names = raw_feature_names(role.observation, role.action, sizes) if basis.n_raw_used else []
     valid_factors = np.concatenate([z[mask] for z, mask in zip(factors, alive, strict=True)])
+    findings = explanation_findings(fit.explanation, fit.score_type, names, raw_names)
     return FunctionAssessment(
         r2=fit.r2,
         r2_error=fit.r2_error,
         length_r2=fit.length_r2,
-        sentences=explanation_lines(fit.explanation, fit.score_type, names, raw_names),
+        sentences=[render(finding, MESSAGES) for finding in findings],
         ranges=_describe_ranges(names, valid_factors),
     )
 
