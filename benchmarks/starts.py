@@ -64,7 +64,7 @@ def predicted(means: np.ndarray, returns: np.ndarray, length: np.ndarray, way: s
     """Of each episode: its prediction, and the log evidence of the fit that follows it."""
     state = (
         evidence.empty_statistics(basis.n_features),
-        evidence.init_posterior(basis.n_features, len(basis.group_sizes)),
+        evidence.init_posterior(basis.group_index),
     )
     sums, posterior = jax.tree.map(lambda leaf: leaf.astype(float), state)
     predictions = []

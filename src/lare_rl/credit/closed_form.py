@@ -125,8 +125,8 @@ def init(basis: Basis, score_types: tuple[int, ...]) -> ClosedForm:
     is_binary = ScoreType.LOG_ODDS in score_types
     n_score_types = len(score_types)
     n_features, n_columns, zero = basis.n_features, basis.n_columns, jnp.zeros(())
-    posterior = evidence.init_posterior(n_columns, int(basis.column_group_index.max(initial=-1)) + 1)
-    strengths = evidence.init_posterior(n_columns, int(basis.column_strength_index.max(initial=-1)) + 1)
+    posterior = evidence.init_posterior(basis.column_group_index)
+    strengths = evidence.init_posterior(basis.column_strength_index)
     posterior, strengths = jax.tree.map(
         lambda leaf: jnp.tile(leaf, (n_score_types - is_binary, *[1] * leaf.ndim)), (posterior, strengths)
     )
@@ -145,7 +145,7 @@ def init(basis: Basis, score_types: tuple[int, ...]) -> ClosedForm:
         strengths=strengths,
         intercept=jnp.zeros((n_score_types, basis.n_levels)),
         start_value=jnp.zeros(n_score_types),
-        log_odds=logistic.init(n_columns, basis.column_group_index) if is_binary else None,
+        log_odds=logistic.init(basis.column_group_index) if is_binary else None,
     )
 
 

@@ -153,11 +153,13 @@ def _add_cases(
     )
 
 
-def init_posterior(n_features: int, n_groups: int) -> Posterior:
+def init_posterior(group_index: FeatureIndex) -> Posterior:
     """Return the posterior before the first episode. Its precisions are 0, which means that they have no value yet."""
     zero = jnp.zeros(())
-    groups = jnp.zeros(n_groups)
-    return Posterior(jnp.zeros(n_features), bias=zero, alpha=groups, beta=zero, n_determined=groups, log_evidence=zero)
+    groups = jnp.zeros(int(group_index.max(initial=-1)) + 1)
+    return Posterior(
+        jnp.zeros(len(group_index)), bias=zero, alpha=groups, beta=zero, n_determined=groups, log_evidence=zero
+    )
 
 
 def regression(

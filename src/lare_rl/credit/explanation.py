@@ -178,12 +178,12 @@ def _fit(
     strength_index: FeatureIndex,
 ) -> _Fit:
     problem = evidence.regression(statistics, score_type, group_index)
-    start = evidence.init_posterior(len(group_index), int(group_index.max()) + 1)
+    start = evidence.init_posterior(group_index)
     posterior = evidence.fit(statistics, score_type, group_index, start, MAX_EXPLANATION_ROUNDS)
     has_own_strengths = jnp.array(False)
     if not np.array_equal(group_index, strength_index):
         groups, indices = posterior, (group_index, strength_index)
-        start = evidence.init_posterior(len(strength_index), int(strength_index.max()) + 1)
+        start = evidence.init_posterior(strength_index)
         separate = relevance.fit_strengths(statistics, score_type, *indices, groups, start, MAX_EXPLANATION_ROUNDS)
         has_own_strengths = relevance.is_better(separate, groups)
         posterior = relevance.select(separate, groups, *indices)

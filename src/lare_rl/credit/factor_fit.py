@@ -135,8 +135,7 @@ def predict_returns(
     `features` are the means of each episode. Only functions of factors are used.
     """
     features, group_index = features[:, basis.is_factor_feature], basis.group_index[basis.is_factor_feature]
-    n_features, n_groups = len(group_index), int(group_index.max()) + 1
-    state = evidence.empty_statistics(n_features), evidence.init_posterior(n_features, n_groups)
+    state = evidence.empty_statistics(len(group_index)), evidence.init_posterior(group_index)
     statistics, posterior = jax.tree.map(lambda leaf: leaf.astype(float), state)
     blocks = list(_growing_blocks(len(returns)))
     max_size = max((end - start for start, end in blocks), default=1)

@@ -31,15 +31,13 @@ from lare_rl.credit.decoder_network import DecoderOutput, DecoderShape
 from lare_rl.credit.decoder_settings import CreditSettings
 from lare_rl.credit.losses import PerEpisode, batch_mean
 from lare_rl.credit.step_targets import EpisodeInputs, EpisodeLengths, is_step
-from lare_rl.nn.networks import MLP, smooth_clip
+from lare_rl.nn.networks import MLP, bound_log_std
 
 __all__ = ["GRD", "causes", "sample_mask"]
 
 TEMPERATURE = 0.01
 COMPONENTS = 3
 """The number of Gaussians in the mixture of a next state's entry."""
-MAX_LOG_STD = 5.0
-"""The deviation of a Gaussian is between exp(-5) and exp(5), so that no likelihood is infinite."""
 DYNAMICS_STEPS = 256
 """The number of steps, drawn from an update's episodes, whose next states are predicted."""
 REWARD_THRESHOLD, DYNAMICS_THRESHOLD = 1e-4, 0.5
@@ -120,7 +118,7 @@ class GRD(eqx.Module):
         state, action, next_state = self._split(inputs)
         masked = [mask.T[:, None] * x for mask, x in ((state_mask, state), (action_mask, action))]
         log_weight, mean, log_std = jnp.split(self.dynamics(jnp.concatenate(masked, axis=-1)), 3, axis=-1)
-        log_std = smooth_clip(log_std, MAX_LOG_STD)
+        log_std = bound_log_std(log_std)
         error = (next_state.T[..., None] - mean) * jnp.exp(-log_std)
         log_density = -0.5 * error**2 - log_std - 0.5 * jnp.log(2 * jnp.pi)
         return jax.nn.logsumexp(jax.nn.log_softmax(log_weight) + log_density, axis=-1)
