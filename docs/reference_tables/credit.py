@@ -9,8 +9,8 @@ from enum import StrEnum
 from textwrap import dedent
 
 from lare_rl.algorithms.registry import ALGORITHMS, Algorithm
-from lare_rl.credit.input_names import RAW, InputNames
-from lare_rl.credit.methods import METHODS, Fit, Method
+from lare_rl.credit.input_names import InputNames
+from lare_rl.credit.methods import METHODS, RAW, Fit, Method
 from lare_rl.envs.load import read_task, shipped_tasks
 from lare_rl.envs.particles.catalogue import find_particle_task
 from lare_rl.envs.smax.scenarios import find_scenario

@@ -9,8 +9,6 @@ from lare_rl.algorithms.registry import AlgorithmSettings
 if TYPE_CHECKING:
     from lare_rl.envs.interface import EnvSpec
 
-__all__ = ["OffPolicySettings", "run_defaults"]
-
 
 class OffPolicySettings(AlgorithmSettings):
     """The hyperparameters that these algorithms share; none of them depends on the task."""

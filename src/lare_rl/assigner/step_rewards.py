@@ -20,8 +20,6 @@ from lare_rl.credit.engine import StepBatch
 from lare_rl.credit.methods import Reward
 from lare_rl.util.shapes import padded_size
 
-__all__ = ["StepRewards"]
-
 
 class StepRewards:
     """Computes the rewards of steps by the newest decoder of a learner."""
@@ -78,9 +76,7 @@ class StepRewards:
         if self._flat_cache[0] is not newest:
             source = newest
             if isinstance(source, DecoderState):
-                source = source._replace(optimizer=(), score_type_predictions=None)
-                if not decomposition.is_optimistic(self.config.method, self.config.settings):
-                    source = source._replace(closed_form=None)
+                source = source._replace(optimizer=(), score_type_predictions=None, closed_form=None)
             self._flat_cache = newest, *jax.tree.flatten(source)
         return self._flat_cache[1:]
 

@@ -6,8 +6,6 @@ from pydantic import AliasChoices, Field
 
 from lare_rl.errors import CheckedModel
 
-__all__ = ["MULTI_AGENT_CREDIT", "RECENT_STEPS", "CreditSettings", "default_credit"]
-
 RECENT_STEPS = 5000
 """Proxy rewards are compared with the true rewards over this number of newest steps of each agent."""
 
@@ -40,8 +38,6 @@ class CreditSettings(CheckedModel):
     exact: Literal["auto", "no", "last", "spread"] = "auto"
     """Make the proxy rewards of an episode add up to its return, by a correction of its last step or of all steps. `auto`:
     `last` for bayes-progress and lare-bayes-progress, else `no`."""
-    optimism: Annotated[float, Field(ge=0)] = 0.0
-    """Closed forms: add this many posterior standard deviations to the proxy reward, so that uncertain steps look better."""
     encoder: tuple[Annotated[int, Field(ge=1)], ...] = (256, 256)
     """Widths of the hidden layers of VIB's encoder."""
     bottleneck: Annotated[int, Field(ge=1)] = 8

@@ -8,10 +8,8 @@ import numpy as np
 from lare_rl.credit.explanation import Explanation
 from lare_rl.credit.score_type import ScoreType, ScoreTypeEstimate
 from lare_rl.tasks.spec import base_name, entry_meanings
-from lare_rl.util.findings import Finding, render
+from lare_rl.util.findings import Finding
 from lare_rl.util.statistics import round_shares
-
-__all__ = ["MESSAGES", "MIN_EXPLAINED_EPISODES", "explanation_findings", "explanation_lines", "raw_feature_names"]
 
 MIN_EXPLAINED_EPISODES = 20
 """With fewer episodes, nothing is said."""
@@ -139,22 +137,6 @@ def raw_feature_names(observation: str, action: str, sizes: Mapping[str, int]) -
     kinds = {"observation": before, "next_observation": after, "action": "action"}
     texts = {"observation": observation, "next_observation": observation, "action": action}
     return [entry for name, size in sizes.items() for entry in names(texts[name], size, kinds[name])]
-
-
-def explanation_lines(
-    explanation: Explanation,
-    score_type: ScoreTypeEstimate | None,
-    factors: Sequence[str],
-    raw_features: Sequence[str],
-    *,
-    looks_binary: bool = False,
-    groups: Mapping[Any, float] | None = None,
-) -> list[str]:
-    """Return the sentences of `explanation_findings`."""
-    findings = explanation_findings(
-        explanation, score_type, factors, raw_features, looks_binary=looks_binary, groups=groups
-    )
-    return [render(finding, MESSAGES) for finding in findings]
 
 
 def explanation_findings(

@@ -32,18 +32,6 @@ from lare_rl.credit.evidence import JAX, PosteriorCovariance
 from lare_rl.credit.precisions import JITTER, PRIOR_RANGE, Posterior, count_determined, inverse_root, varies
 from lare_rl.credit.prequential import ring_slots
 
-__all__ = [
-    "WINDOW",
-    "LogOddsFit",
-    "add_episodes",
-    "covariance",
-    "fit",
-    "init",
-    "predict",
-    "remove_episodes",
-    "to_returns",
-]
-
 WINDOW = 512
 """The number of last episodes that are fitted."""
 TOLERANCE = 1e-3
@@ -64,11 +52,11 @@ class LogOddsFit(NamedTuple):
     """root^T root = Sigma, the covariance of the weights."""
 
 
-def init(n_columns: int, group_index: Int[np.ndarray, " columns"]) -> LogOddsFit:
+def init(group_index: Int[np.ndarray, " columns"]) -> LogOddsFit:
     """Return the state without episodes."""
-    posterior = evidence.init_posterior(n_columns, int(group_index.max()) + 1)
+    n_columns = len(group_index)
     empty = jnp.zeros((WINDOW, n_columns)), jnp.zeros(WINDOW), jnp.zeros(())
-    return LogOddsFit(*empty, posterior, root=jnp.zeros((n_columns, n_columns)))
+    return LogOddsFit(*empty, evidence.init_posterior(group_index), root=jnp.zeros((n_columns, n_columns)))
 
 
 def remove_episodes(state: LogOddsFit) -> LogOddsFit:

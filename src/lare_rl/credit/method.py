@@ -8,8 +8,6 @@ from lare_rl.credit.decoders import DECODERS
 from lare_rl.credit.input_names import InputNames
 from lare_rl.errors import LareError, short_repr
 
-__all__ = ["Fit", "Method", "Reward"]
-
 
 class Fit(StrEnum):
     """How the decoder is fitted to returns (equations in `losses.py`)."""
@@ -53,7 +51,7 @@ class Fit(StrEnum):
             case Fit.DECODER_LOSS:
                 names = {"episodes", "exact"}
             case Fit.EVIDENCE:
-                names = {"score", "optimism", "exact"}
+                names = {"score", "exact"}
             case Fit.PREFIX_EVIDENCE | Fit.SIGNS:
                 names = {"exact"}
             case _:
@@ -168,5 +166,5 @@ class Method:
 
     @property
     def single_agent_only(self) -> bool:
-        """Whether it works for a single agent only."""
-        return DECODERS[self.decoder].single_agent_only
+        """Whether it works for a single agent only: `Fit.DECODER_LOSS` has no axis of agents."""
+        return self.fit is Fit.DECODER_LOSS or DECODERS[self.decoder].single_agent_only

@@ -20,10 +20,10 @@ from lare_rl.runs.directory import Run, as_run
 from lare_rl.tasks.spec import TaskSpec
 from lare_rl.tasks.trust import trust_environment, untrusted_module
 from lare_rl.training.collect_device import DeviceCollector
-from lare_rl.training.evaluate_host import evaluate_policy_on_host
 from lare_rl.training.evaluation import Evaluation, concatenate
 from lare_rl.training.saved_state import load_actor
 from lare_rl.training.streams import Stream, episode_seed
+from lare_rl.training.unroll_host import evaluate_policy_on_host
 from lare_rl.util.statistics import grouped_standard_error, standard_error
 
 __all__ = [

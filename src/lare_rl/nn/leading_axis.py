@@ -5,8 +5,6 @@ from typing import TypeVar
 
 import jax
 
-__all__ = ["map_leading_axis"]
-
 Rows = TypeVar("Rows")
 Result = TypeVar("Result")
 

@@ -27,19 +27,6 @@ from lare_rl.training.static_config import TrainConfig
 from lare_rl.training.streams import seed_keys
 from lare_rl.util.float64 import float64
 
-__all__ = [
-    "CompiledFunctions",
-    "compile_ahead",
-    "compile_functions",
-    "init_memory",
-    "init_seeds",
-    "keys_shape",
-    "learner_shape",
-    "policy_function",
-    "steps_shape",
-    "training_module",
-]
-
 
 class CompiledFunctions(NamedTuple):
     """The functions of a run. `store`, `fit` and `train_step` consume their learner: its buffers are reused for the new one."""
@@ -70,11 +57,8 @@ class CompiledFunctions(NamedTuple):
 
 def training_module(config: TrainConfig) -> ModuleType:
     """Return the module for the data that the run's algorithm consumes."""
-    return {
-        Consumes.TRANSITIONS: off_policy,
-        Consumes.ROLLOUTS: on_policy,
-        Consumes.SEQUENCES: sequences,
-    }[config.algorithm.consumes]
+    modules = {Consumes.TRANSITIONS: off_policy, Consumes.ROLLOUTS: on_policy, Consumes.SEQUENCES: sequences}
+    return modules[config.algorithm.consumes]
 
 
 def init_memory(config: TrainConfig, *lead: int) -> Any:
@@ -88,12 +72,7 @@ def policy_function(config: TrainConfig, deterministic: bool) -> Callable[..., t
     module = training_module(config)
 
     def act(
-        actor: Any,
-        memory: Any,
-        observation: Array,
-        available: Array,
-        noise: Array | None,
-        is_new: Bool[Array, " envs"],
+        actor: Any, memory: Any, observation: Array, available: Array, noise: Array | None, is_new: Bool[Array, " envs"]
     ) -> tuple[Array, Any]:
         memory = select(is_new, module.init_memory(config), memory)
         return module.act(actor, memory, observation, available, noise, config)

@@ -16,8 +16,6 @@ import jax
 import numpy as np
 from jax.extend.core import ClosedJaxpr, Jaxpr, JaxprEqn, Literal
 
-__all__ = ["UnsupportedOperationError", "apply", "to_numpy"]
-
 Operation = Callable[..., Any]
 ArrayFunctions = Callable[[str], Operation]
 """From a name of NumPy to the function. Raises `UnsupportedOperationError` if there is none."""
@@ -306,10 +304,4 @@ ELEMENTWISE = {
     "sub": "subtract",
 }
 """From operations on each number to functions of NumPy."""
-REDUCTIONS = {
-    "reduce_and": "all",
-    "reduce_max": "max",
-    "reduce_min": "min",
-    "reduce_or": "any",
-    "reduce_sum": "sum",
-}
+REDUCTIONS = {"reduce_and": "all", "reduce_max": "max", "reduce_min": "min", "reduce_or": "any", "reduce_sum": "sum"}

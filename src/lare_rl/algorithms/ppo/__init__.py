@@ -9,8 +9,6 @@ from lare_rl.algorithms.registry import Algorithm, AlgorithmSettings, Consumes, 
 if TYPE_CHECKING:
     from lare_rl.envs.interface import EnvSpec
 
-__all__ = ["PPOSettings"]
-
 MIN_ROLLOUT_STEPS = 16
 """The least number of steps of each environment between two updates, by default: advantages need some steps in a row."""
 
@@ -96,13 +94,7 @@ register_algorithm(
     Algorithm(
         name="ippo",
         consumes=Consumes.ROLLOUTS,
-        settings=PPOSettings(
-            learning_rate=1e-4,
-            gamma=1.0,
-            minibatch_size=128,
-            clip=0.5,
-            max_grad_norm=10.0,
-        ),
+        settings=PPOSettings(learning_rate=1e-4, gamma=1.0, minibatch_size=128, clip=0.5, max_grad_norm=10.0),
         module="lare_rl.algorithms.ppo.ppo",
         run_defaults=_ippo_defaults,
         summary="PPO for every agent, with shared parameters",

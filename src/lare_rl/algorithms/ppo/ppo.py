@@ -27,26 +27,6 @@ from lare_rl.nn.masks import masked_mean
 from lare_rl.nn.networks import MLP, adam_step, clip_gradient, init_adam, init_orthogonal
 from lare_rl.nn.normalise import RunningMeanStd, empty_mean_std, running_std, standardise_if_observed, update_mean_std
 
-__all__ = [
-    "PPO",
-    "Actor",
-    "Batch",
-    "Networks",
-    "act",
-    "advantages",
-    "explore",
-    "get_actor",
-    "init",
-    "logits",
-    "minibatch_indices",
-    "normalise",
-    "policy_objective",
-    "prepare_batch",
-    "update",
-    "value_loss",
-    "values",
-]
-
 
 class Networks(NamedTuple):
     actor: StochasticPolicy
@@ -141,10 +121,7 @@ def _return_std(return_rms: RunningMeanStd) -> Float[Array, " 1"]:
 
 
 def advantages(
-    rollout: Rollout,
-    value: Float[Array, "time actors"],
-    next_value: Float[Array, "time actors"],
-    settings: PPOSettings,
+    rollout: Rollout, value: Float[Array, "time actors"], next_value: Float[Array, "time actors"], settings: PPOSettings
 ) -> Float[Array, "time actors"]:
     """Return generalised advantage estimates (Schulman et al., 2016, Eq. 16), computed backwards through time.
 

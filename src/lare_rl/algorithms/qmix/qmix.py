@@ -23,24 +23,6 @@ from lare_rl.algorithms.qmix.networks import Mixer, RecurrentNetwork, mix
 from lare_rl.nn.masks import masked_mean
 from lare_rl.nn.networks import adam_step, clip_gradient, copy_networks, init_adam
 
-__all__ = [
-    "QMIX",
-    "Memory",
-    "Networks",
-    "act",
-    "action_values",
-    "agent_input",
-    "epsilon",
-    "get_actor",
-    "greedy_action",
-    "init",
-    "init_memory",
-    "lambda_returns",
-    "loss",
-    "td_targets",
-    "update",
-]
-
 Observations = Float[Array, "*batch agents observation"]
 Actions = Float[Array, "*batch agents action"]
 AvailableActions = Bool[Array, "*batch agents action"]
@@ -138,11 +120,7 @@ def action_values(agent: RecurrentNetwork, batch: Sequences) -> Float[Array, "ep
 
 
 def lambda_returns(
-    reward: Steps,
-    done: Steps,
-    mask: Steps,
-    value: Float[Array, "episodes steps+1"],
-    settings: QMIXSettings,
+    reward: Steps, done: Steps, mask: Steps, value: Float[Array, "episodes steps+1"], settings: QMIXSettings
 ) -> Steps:
     """Return G, computed backwards from the end of the padding (PyMARL2's `build_td_lambda_targets`).
 
