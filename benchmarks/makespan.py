@@ -13,7 +13,7 @@ import numpy as np
 import tyro
 
 import lare_rl
-from measure import fit_once, write
+from measure import fit_once, record_episodes, write
 
 N_FITTED, N_TEST = 64, 32
 REAL = Path(__file__).parent / "real"
@@ -25,17 +25,8 @@ def play(seed: int) -> list[dict[str, np.ndarray]]:
     """Return episodes of random actions."""
     env = gymnasium.make("final_score:JobShop-v0")
     env.action_space.seed(seed)
-    episodes = []
-    for k in range(N_FITTED + N_TEST):
-        observation, rows, done = env.reset(seed=1000 * seed + k)[0], [], False
-        while not done:
-            action = env.action_space.sample()
-            next_observation, score, terminated, truncated, _ = env.step(action)
-            rows.append((observation, action, next_observation, score))
-            observation, done = next_observation, terminated or truncated
-        names = "observation", "action", "next_observation", "score"
-        episodes.append(dict(zip(names, map(np.array, zip(*rows, strict=True)), strict=True)))
-    return episodes
+    seeds = range(1000 * seed, 1000 * seed + N_FITTED + N_TEST)
+    return record_episodes(env, seeds, lambda: lambda observation: env.action_space.sample())
 
 
 def measure_r2(method: str, episodes: list) -> float:
@@ -43,7 +34,7 @@ def measure_r2(method: str, episodes: list) -> float:
     phi = lare_rl.load_function(PHI, TASK) if method.startswith("lare-") else None
     credit = lare_rl.CreditAssigner(method, phi, task=TASK)
     for batch in episodes[:N_FITTED], episodes[N_FITTED:]:
-        fit_once(credit, batch, "score")
+        fit_once(credit, batch)
     return credit.metrics()["credit/return_r2"]
 
 

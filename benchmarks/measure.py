@@ -1,16 +1,17 @@
-"""Shared by the benchmarks: interleaved rounds, sessions to time, and results with their provenance."""
+"""Shared by the benchmarks: episodes, interleaved rounds, sessions to time, and results with their provenance."""
 
 import json
 import os
 import platform
 import sys
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from statistics import median
 from typing import Any
 
+import gymnasium
 import jax
 import numpy as np
 from jaxtyping import Float
@@ -70,18 +71,42 @@ def apart(rewards: Float[np.ndarray, "episodes steps *agents"]) -> Float[np.ndar
     return rewards - rewards.mean(1, keepdims=True)
 
 
-def fit_once(credit: lare_rl.CreditAssigner, episodes: Sequence[Mapping[str, np.ndarray]], score: str) -> None:
-    """Fit to the scores of some episodes, which are sums of the entries named `score`.
+def record_episodes(
+    env: gymnasium.Env,
+    seeds: Iterable[int],
+    make_policy: Callable[[], Callable[[Any], Any]],
+    info_names: tuple[str, ...] = (),
+) -> list[dict[str, np.ndarray]]:
+    """Play an episode from each seed by a new policy. Return its steps as arrays, with these values of `info`."""
+    names = "observation", "action", "next_observation", "reward", *info_names
+    episodes = []
+    for seed in seeds:
+        policy, (observation, _), rows, done = make_policy(), env.reset(seed=seed), [], False
+        while not done:
+            action = policy(observation)
+            next_observation, reward, terminated, truncated, info = env.step(action)
+            rows.append((observation, action, next_observation, reward, *(info[name] for name in info_names)))
+            observation, done = next_observation, terminated or truncated
+        episodes.append(dict(zip(names, map(np.array, zip(*rows, strict=True)), strict=True)))
+    return episodes
+
+
+def fit_once(credit: lare_rl.CreditAssigner, episodes: Sequence[Mapping[str, np.ndarray]]) -> None:
+    """Fit to the returns of some episodes.
 
     All episodes come in one call. If they came one by one, a decoder in closed form would be fitted after every few of them.
     """
     arrays = {name: np.concatenate([e[name] for e in episodes]) for name in episodes[0]}
     steps = arrays["observation"], arrays["action"], arrays["next_observation"]
-    lengths = [len(e[score]) for e in episodes]
+    lengths = [len(e["reward"]) for e in episodes]
     ended = np.zeros(sum(lengths), bool)
     ended[np.cumsum(lengths) - 1] = True
     credit.add(
-        *steps, arrays[score], ended, np.zeros_like(ended), env_ids=np.repeat(np.arange(len(lengths)), lengths).tolist()
+        *steps,
+        arrays["reward"],
+        ended,
+        np.zeros_like(ended),
+        env_ids=np.repeat(np.arange(len(lengths)), lengths).tolist(),
     )
     credit.fit()
 

@@ -8,6 +8,7 @@ N episodes. The figure is the correlation of its proxy rewards with the metres o
 """
 
 import sys
+from collections.abc import Callable
 from pathlib import Path
 from typing import Literal
 
@@ -19,7 +20,7 @@ from jaxtyping import Float
 import lare_rl
 from lare_rl.credit.decoder_settings import CreditSettings
 from lare_rl.envs.mujoco_rewards import SparseDistanceReward
-from measure import correlation, fit_once, write
+from measure import correlation, fit_once, record_episodes, write
 
 TASK, DISTANCE, N_TEST, MAX_NOISE = "HalfCheetahSparse-v4", 45.0, 20, 1.0
 POLICY = Path(__file__).parent.parent / "examples" / "trained" / "HalfCheetah-v4"
@@ -34,18 +35,14 @@ def play(n_episodes: int, seed: int) -> list[dict[str, Float[np.ndarray, "steps 
 
     policy, rng = exported.load("policy"), np.random.default_rng(seed)
     env = SparseDistanceReward(gymnasium.make("HalfCheetah-v4"), DISTANCE)
-    episodes = []
-    for k in range(n_episodes):
-        noise, (observation, _) = rng.uniform(0, MAX_NOISE), env.reset(seed=1000 * seed + k)
-        position, rows, done = 0.0, [], False
-        while not done:
-            action = np.clip(policy(observation=observation)["action"] + noise * rng.normal(size=6), -1, 1)
-            next_observation, outcome, terminated, truncated, info = env.step(action)
-            rows.append((observation, action, next_observation, outcome, info["x_position"] - position))
-            observation, position, done = next_observation, info["x_position"], terminated or truncated
-        names = "observation", "action", "next_observation", "outcome", "metres"
-        episodes.append({n: np.array(v, np.float32) for n, v in zip(names, zip(*rows, strict=True), strict=True)})
-    return episodes
+
+    def add_noise() -> Callable[[np.ndarray], np.ndarray]:
+        noise = rng.uniform(0, MAX_NOISE)
+        return lambda obs: np.clip(policy(observation=obs)["action"] + noise * rng.normal(size=6), -1, 1)
+
+    episodes = record_episodes(env, range(1000 * seed, 1000 * seed + n_episodes), add_noise, ("x_position",))
+    episodes = [{**e, "metres": np.diff(e["x_position"], prepend=0.0)} for e in episodes]
+    return [{name: values.astype(np.float32) for name, values in e.items()} for e in episodes]
 
 
 def assess(method: str, score: Literal["auto", "binary"], episodes: list, test: list) -> float:
@@ -54,7 +51,7 @@ def assess(method: str, score: Literal["auto", "binary"], episodes: list, test: 
     credit = lare_rl.CreditAssigner(method, phi, task=TASK, settings=CreditSettings(score=score))
     half = len(episodes) // 2
     for batch in episodes[:half], episodes[half:]:  # predictions of the second decide whether odds are fitted
-        fit_once(credit, batch, "outcome")
+        fit_once(credit, batch)
     arrays = {k: np.concatenate([episode[k] for episode in test]) for k in test[0]}
     begins = np.concatenate([np.arange(len(episode["metres"])) == 0 for episode in test])
     r_hat = credit.rewards(arrays["observation"], arrays["action"], arrays["next_observation"], begins=begins)
@@ -71,7 +68,7 @@ def main(seeds: int = 10) -> None:
     won: list[float] = []
     for seed in range(seeds):
         episodes = play(max(COUNTS) + N_TEST, seed)
-        won += [float(episode["outcome"].sum()) for episode in episodes]
+        won += [float(episode["reward"].sum()) for episode in episodes]
         for method in METHODS:
             for score in ("auto",) if method.endswith("progress") else ("auto", "binary"):
                 for count in COUNTS:

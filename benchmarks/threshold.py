@@ -18,7 +18,7 @@ from jaxtyping import Float
 
 import lare_rl
 from lare_rl.envs import mujoco_rewards
-from measure import correlation, fit_once, write
+from measure import correlation, fit_once, record_episodes, write
 
 TASK, SPEED, N_TEST = "HalfCheetahThreshold-v4", 2.0, 20
 VELOCITY = 8
@@ -38,17 +38,9 @@ def play(n_episodes: int, seed: int) -> list[dict[str, Float[np.ndarray, "steps 
     mujoco_rewards.register()
     env = gymnasium.make(f"lare/{TASK}")
     env.action_space.seed(seed)
-    episodes = []
-    for k in range(n_episodes):
-        observation, rows, done = env.reset(seed=1000 * seed + k)[0], [], False
-        while not done:
-            action = env.action_space.sample()
-            after, reward, terminated, truncated, _ = env.step(action)
-            rows.append((observation, action, after, reward))
-            observation, done = after, terminated or truncated
-        names = "observation", "action", "next_observation", "reward"
-        episodes.append({n: np.array(v, np.float32) for n, v in zip(names, zip(*rows, strict=True), strict=True)})
-    return episodes
+    seeds = range(1000 * seed, 1000 * seed + n_episodes)
+    episodes = record_episodes(env, seeds, lambda: lambda observation: env.action_space.sample())
+    return [{name: values.astype(np.float32) for name, values in episode.items()} for episode in episodes]
 
 
 def load_terms() -> lare_rl.LatentFunction:
@@ -63,7 +55,7 @@ def assess(method: str, episodes: list, test: list) -> dict[str, float]:
     """Fit a method to the returns of some episodes, and compare its rewards of other episodes with the true ones."""
     phi = load_terms() if method == "terms" else lare_rl.design(TASK) if method.startswith("lare-") else None
     credit = lare_rl.CreditAssigner("lare-bayes" if method == "terms" else method, phi, task=TASK)
-    fit_once(credit, episodes, "reward")
+    fit_once(credit, episodes)
     arrays = {k: np.concatenate([episode[k] for episode in test]) for k in test[0]}
     begins = np.concatenate([np.arange(len(episode["reward"])) == 0 for episode in test])
     r_hat = credit.rewards(arrays["observation"], arrays["action"], arrays["next_observation"], begins=begins)

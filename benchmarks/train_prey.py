@@ -22,11 +22,10 @@ import optax
 import tyro
 from jaxtyping import Array, Float, Int, PRNGKeyArray
 
-from lare_rl.envs.particles import prey
+from lare_rl.envs.particles import prey, views
 from lare_rl.envs.particles.predator_prey import (
     SIZES,
     Size,
-    chase,
     flee,
     make_world,
     observe_preys,
@@ -50,6 +49,16 @@ RATE, CLIP, ENTROPY, DISCOUNT, TRACE = 3e-4, 0.2, 0.01, 0.95, 0.95
 REWARD_SCALE = 0.1
 LATEST = 5
 """The predators' rewards are averaged over so many iterations, and then compared with TARGET."""
+
+
+def chase(size: Size, state: State) -> Int[Array, " predators"]:
+    """Return the actions of greedy predators, which are used to evaluate preys.
+
+    They move along the axis on which the nearest prey is further away.
+    """
+    nearest = views.nearest_entities(state.position, size.predators, size.preys, 1)
+    x, y = jnp.moveaxis(views.relative_positions(state.position, size.predators, nearest)[:, 0], -1, 0)
+    return jnp.where(jnp.abs(x) > jnp.abs(y), jnp.where(x > 0, 2, 1), jnp.where(y > 0, 4, 3))
 
 
 class Networks(NamedTuple):

@@ -8,7 +8,7 @@ import pytest
 from helpers.host_envs import ToyHostEnv
 from helpers.jax_toy_envs import Echo
 from helpers.toy_envs import toy_spec
-from lare_rl.envs.families import find_score, load_env_spec, make_env, make_host_env, register_family
+from lare_rl.envs.families import find_score_type, load_env_spec, make_env, make_host_env, register_family
 from lare_rl.envs.interface import EnvSpec, Team
 from lare_rl.envs.jax_on_host import JaxOnHost
 from lare_rl.envs.load import read_task
@@ -120,7 +120,7 @@ def test_unregistered_names_belong_to_gymnasium():
 
 def test_score_of_a_task_comes_before_its_family():
     tasks = read_task("SMAX-2s3z"), toy_spec(environment="smax/2s3z", score="average"), toy_spec()
-    assert list(map(find_score, tasks)) == ["sum", "average", None]
+    assert list(map(find_score_type, tasks)) == ["sum", "average", None]
 
 
 # Agreement of a task and its environment

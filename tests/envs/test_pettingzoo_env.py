@@ -424,7 +424,7 @@ INVALID_STEPS = {
 def test_invalid_step(content):
     with pytest.raises(LareError, match=content) as error:
         play(make_host(Toy(spoil=INVALID_STEPS[content])))
-    assert str(error.value).startswith(f"environment '{TOY}'")
+    assert str(error.value).startswith((f"environment '{TOY}'", "the environment: "))
     assert "\n" not in str(error.value)
 
 
@@ -450,7 +450,9 @@ def test_invalid_reset(spoil, content):
         host.reset(7)
 
 
-@pytest.mark.parametrize(("state", "content"), [([0, np.inf], "inf"), ([0, 1, 2], "shape"), ("x", "'x'")])
+@pytest.mark.parametrize(
+    ("state", "content"), [([0, np.inf], "contains inf in entry 1"), ([0, 1, 2], "shape"), ("x", "'x'")]
+)
 def test_invalid_state(state, content):
     class States(Toy):
         def state(self):

@@ -12,7 +12,6 @@ from PIL import Image
 
 import lare_rl
 from helpers.toy_envs import Chase, levels_spec, pick_spec, toy_spec
-from lare_rl.cli.runs import _compare_actions, _describe_evaluation
 from lare_rl.envs.families import make_host_env, register_family
 from lare_rl.envs.gymnasium_env import GymnasiumEnv
 from lare_rl.envs.load import load_task
@@ -32,6 +31,7 @@ from lare_rl.evaluation.evaluate import (
 )
 from lare_rl.evaluation.policy import load_policy
 from lare_rl.evaluation.video import check_video_path, record_video, write_video
+from lare_rl.report.evaluation_lines import compare_actions, describe_evaluation
 from lare_rl.runs.metric_names import DETERMINISTIC_RETURN
 from lare_rl.training.compiled import compile_functions
 from lare_rl.training.host_policy import EvaluationPolicy
@@ -210,7 +210,7 @@ def test_random_actions_play_the_same_groups(small, tmp_path, command):
     assert "level" not in out
     by_turns = levels_spec(environment="toys/LevelsByTurns-v0")
     evaluation = evaluate_policy(replace_task(run, by_turns), 3)
-    lines = list(_describe_evaluation(replace_task(run, by_turns), evaluation, play_random(by_turns, 3), None))
+    lines = list(describe_evaluation(replace_task(run, by_turns), evaluation, play_random(by_turns, 3), None))
     assert lines[-1].startswith("random actions played other groups (level)")
 
 
@@ -229,7 +229,7 @@ def test_the_better_actions_are_named(run, gain, text):
     sampled = evaluate_policy(run, 3)
     noise = np.random.default_rng(0).normal(size=sampled.returns.shape)
     likeliest = sampled._replace(returns=sampled.returns + 100 * gain + noise - noise.mean())
-    lines = list(_compare_actions(run, sampled, likeliest))
+    lines = list(compare_actions(run, sampled, likeliest))
     assert len(lines) == (text is not None)
     assert all(text in line for line in lines)
 

@@ -118,7 +118,7 @@ def test_bad_cross_play(runs, make_run):
         (
             runs[0],
             change_run(runs[0], task={"description": "Other."}),
-        ): "different tasks with the name CompetitivePP-6$",
+        ): "different tasks named CompetitivePP-6$",
     }.items():
         with pytest.raises(LareError, match=message):
             cross_play(pair)

@@ -39,7 +39,7 @@ def save(directory, rows, end):
     rows, end = np.atleast_2d(rows), np.atleast_1d(end)
     row = jnp.broadcast_to(jnp.arange(rows.shape[1]), (1, *rows.shape))
     learner = Learner(Replay({"reward": jnp.asarray(rows[None], jnp.float32)}, row, jnp.asarray(end[None])))
-    checkpoint.save(directory, learner, {"step": int(end.sum())}, {})
+    checkpoint.write(directory, checkpoint.take_snapshot(directory, learner, {"step": int(end.sum())}, {}))
 
 
 @settings(max_examples=20, deadline=None)
@@ -77,7 +77,7 @@ def test_learner_comes_back(payments, tmp_path):
     config = small_config("bayes", payments=payments)
     config = replace(config, credit=config.credit.model_copy(update={"exact": "last"}))
     learner = jax.tree.map(lambda leaf: jnp.asarray(leaf)[None], learner_with_episodes(config))
-    checkpoint.save(tmp_path, learner, {}, {})
+    checkpoint.write(tmp_path, checkpoint.take_snapshot(tmp_path, learner, {}, {}))
     loaded, _, _ = checkpoint.load(tmp_path, learner_shape(config, 1))
     jax.tree.map(np.testing.assert_array_equal, loaded, learner)
 

@@ -159,7 +159,8 @@ def check_refused(directory: Path, message: str = "") -> None:
 @pytest.fixture
 def directory(tmp_path) -> Path:
     """A checkpoint."""
-    checkpoint.save(tmp_path / "checkpoint", make_learner(3), {"step": 3}, {})
+    directory = tmp_path / "checkpoint"
+    checkpoint.write(directory, checkpoint.take_snapshot(directory, make_learner(3), {"step": 3}, {}))
     return tmp_path / "checkpoint"
 
 

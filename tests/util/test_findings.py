@@ -3,7 +3,7 @@ import pytest
 from lare_rl.util.findings import Finding, format_for_reader, render
 
 CATALOGUE = {
-    "learned": "Learned in {n_seeds:count seed}: {return_:score}{where}. Next: `lare-rl {command}`.",
+    "learned": "Learned in {n_seeds:count seed}: {return_:number}{where}. Next: `lare-rl {command}`.",
     "where": " at {steps:,}, in <{names}>",
 }
 LEARNED = Finding("learned", {"n_seeds": 1, "return_": 2.5, "where": None, "command": "<x_y>"})
@@ -32,9 +32,9 @@ def test_render_incomplete():
 @pytest.mark.parametrize(
     ("value", "spec", "text"),
     [
-        (12345.6, "score", "12,346"),
-        (-12.345, "score", "-12.3"),
-        (float("nan"), "score", "nan"),
+        (12345.6, "number", "12,346"),
+        (-12.345, "number", "-12.3"),
+        (float("nan"), "number", "nan"),
         (1, "count episode", "1 episode"),
         (1000, "count episode", "1,000 episodes"),
         (0.991, "r2", "0.991"),

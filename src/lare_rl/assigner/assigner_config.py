@@ -18,7 +18,7 @@ from lare_rl.credit.input_names import input_arrays
 from lare_rl.credit.methods import Method, find_method
 from lare_rl.credit.score_type import prediction_window
 from lare_rl.credit.spec import CreditSpec
-from lare_rl.envs.families import find_score, load_env_spec
+from lare_rl.envs.families import find_score_type, load_env_spec
 from lare_rl.envs.load import resolve_task
 from lare_rl.errors import CheckedModel, LareError, short_repr
 from lare_rl.latent.function import LatentFunction, check_task
@@ -141,7 +141,7 @@ def resolve_config(
     if phi is not None and not isinstance(phi, LatentFunction):
         raise LareError(f"phi is {short_repr(phi)}: give a function from lare_rl.design or lare_rl.load_function")
     settings = default_credit(agents) if settings is None else CreditSettings.model_validate(settings)
-    if settings.score == "auto" and task is not None and (score := find_score(task)) is not None:
+    if settings.score == "auto" and task is not None and (score := find_score_type(task)) is not None:
         settings = settings.model_copy(update={"score": score})
     observation, action = _resolve_layouts(task, spaces)
     return AssignerConfig(

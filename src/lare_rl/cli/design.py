@@ -1,6 +1,8 @@
 """The command `design`: a latent function from recorded replies or from a live model."""
 
 import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -25,6 +27,7 @@ from lare_rl.util.files import check_new_path
 if TYPE_CHECKING:
     from lare_rl.latent.design import DesignError
     from lare_rl.latent.function import LatentFunction
+    from lare_rl.llm.model import Model
     from lare_rl.tasks.spec import TaskSpec
 
 
@@ -60,8 +63,7 @@ def design(
         reflect: number of further rounds, in which the model sees how well its factors explain the returns of whole episodes,
             and may improve them.
         policy: a run whose policy plays the episodes for --reflect; without it, actions are random.
-        pre_verification: verify and correct the function; without (the paper's ablation), the first reply is kept as it is, if
-            it can be read.
+        pre_verification: verify and correct the function; without (the paper's ablation), the first reply that can be read is kept.
         record: a file to record every exchange in, for --model FILE; it must not exist, and not be the .json of --out.
         data: logged episodes; functions are checked on their steps instead of random steps of the environment. A directory, a
             Parquet file, or the id of a local Minari data set.
@@ -69,8 +71,6 @@ def design(
     """
     import lare_rl
     from lare_rl.envs.load import read_task
-    from lare_rl.latent.design import DesignError
-    from lare_rl.llm.live import LiveModel
     from lare_rl.llm.model import RECORDED, recorded_model
 
     model = RECORDED if model is None else model
@@ -79,15 +79,28 @@ def design(
     _check_files(out, record)
     spec = lare_rl.load_task(task) if data is None else read_task(task)
     play, steps = load_policy(policy, spec), load_steps(data, spec)
-    recording = None if model == RECORDED else Path(model)
-    author = live.open(model) if is_live else recorded_model(spec.name, kind, draw, recording)
+    path = None if model == RECORDED else Path(model)
+    author = live.open(model) if is_live else recorded_model(spec.name, kind, draw, path)
     common: dict[str, Any] = {"record": record, "on_message": print_progress}
-    try:
-        function = lare_rl.design(
-            spec, kind, author, candidates=candidates, pre_verification=pre_verification, steps=steps, **common
-        )
+    options: dict[str, Any] = {"candidates": candidates, "pre_verification": pre_verification, "steps": steps, **common}
+    with _after_requests(spec, author, live):
+        function = lare_rl.design(spec, kind, author, **options)
         if reflect:
             function = lare_rl.reflect(function, spec, author, reflect, policy=play, **common)
+    if out is None:
+        _print_function(function, find_free_path(Path(f"{spec.name}.py")))
+    else:
+        _save_function(function, out, _next_command(task, spec, out.with_suffix(".py"), kind, data))
+
+
+@contextmanager
+def _after_requests(spec: "TaskSpec", author: "Model", live: LiveOptions) -> Iterator[None]:
+    """Keep the replies of a design that fails, because they were paid for. Print what a live model has cost."""
+    from lare_rl.latent.design import DesignError
+    from lare_rl.llm.live import LiveModel
+
+    try:
+        yield
     except DesignError as error:
         print_error(error)
         _save_attempts(error, find_free_path(Path(f"{spec.name}.attempts.json")))
@@ -95,11 +108,6 @@ def design(
     finally:
         if isinstance(author, LiveModel) and author.budget.requests_used:
             print_progress(f"{author.name}: {author.budget.summary(live.price)}")
-    if out is None:
-        _print_function(function, find_free_path(Path(f"{spec.name}.py")))
-    else:
-        _save_function(function, out)
-        print_line(_next_command(task, spec, out.with_suffix(".py"), kind, data))
 
 
 def _next_command(task: str, spec: "TaskSpec", out: Path, kind: FunctionKind, data: str | None) -> str:
@@ -169,11 +177,12 @@ def _print_function(function: "LatentFunction", other: Path) -> None:
         raise LareError(f"nothing can be printed ({error.strerror}); the function is kept in {other}") from error
 
 
-def _save_function(function: "LatentFunction", out: Path) -> None:
-    """Save a function. If that fails, print it, because the model's replies were paid for."""
+def _save_function(function: "LatentFunction", out: Path, next_command: str) -> None:
+    """Save a function, and print what to do next. If that fails, print it, because the model's replies were paid for."""
     try:
         function.save(out)
     except LareError:
         print_line(function.source)
         raise
     print_line(f"wrote {out.with_suffix('.py')}: {function.size} factors ({', '.join(function.names)})")
+    print_line(next_command)

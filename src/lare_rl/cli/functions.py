@@ -2,6 +2,7 @@
 
 import math
 import sys
+from collections.abc import Sequence
 from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -17,6 +18,7 @@ from lare_rl.cli.terminal import (
     load_policy,
     load_steps,
     print_line,
+    print_messages,
     print_progress,
     write_new_file,
 )
@@ -24,8 +26,6 @@ from lare_rl.errors import LareError
 from lare_rl.tasks.spec import NO_ENVIRONMENT, ScoredObservation
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
-
     from lare_rl.envs.play import Episode, Policy
     from lare_rl.latent.function import LatentFunction
     from lare_rl.latent.verify import Verdict
@@ -44,8 +44,7 @@ def prompt(task: Task, kind: FunctionKind = "factors") -> None:
     from lare_rl.llm.prompts import candidate
     from lare_rl.tasks.spec import require_role
 
-    for message in candidate(require_role(load_task(task)), kind):
-        print_line(f"--- {message['role']} ---\n{message['content']}\n")
+    print_messages(candidate(require_role(load_task(task)), kind))
 
 
 def new_task(
@@ -141,13 +140,13 @@ def verify(
         scored_observation: the observation of a step that the function reads, instead of the task's.
     """
     from lare_rl.envs.load import load_task, read_task
+    from lare_rl.tasks.spec import require_role
 
     read_task(task)  # a typo is reported before the slow imports
     from lare_rl.credit.explanation_text import MIN_EXPLAINED_EPISODES
     from lare_rl.latent.function import function_from_verdict
     from lare_rl.latent.saved import read_source
     from lare_rl.latent.verify import verify as verify_source
-    from lare_rl.tasks.spec import require_role
 
     source, changed, saved_task = read_source(file)
     if fit and fit < MIN_EXPLAINED_EPISODES:
@@ -157,10 +156,9 @@ def verify(
     spec = load_task(task) if data is None else read_task(task)
     if scored_observation is not None:
         spec = spec.model_copy(update={"scored_observation": scored_observation})
-    play = load_policy(policy, spec)
+    play, role = load_policy(policy, spec), require_role(spec)
     if changed:
         print_line("note    the source was changed after it was saved: its hash differs")
-    role = require_role(spec)
     if saved_task not in (None, role.name):
         print_line(f"note    it was written for the task {saved_task!r}")
     verdict = verify_source(source, spec, kind, load_steps(data, spec))
@@ -186,7 +184,7 @@ def _print_verdict(verdict: "Verdict") -> None:
         print_line(f"advice  {line}")
 
 
-def _load_episodes(role: "TaskSpec", data: str | None, n_episodes: int, policy: "Policy | None") -> "Sequence[Episode]":
+def _load_episodes(role: "TaskSpec", data: str | None, n_episodes: int, policy: "Policy | None") -> Sequence["Episode"]:
     """Return episodes of a log, or of the environment."""
     if data is not None:
         from lare_rl.logs.steps import logged_episodes
@@ -198,7 +196,7 @@ def _load_episodes(role: "TaskSpec", data: str | None, n_episodes: int, policy: 
     return play_episodes(role, n_episodes, policy, on_episode=EpisodeProgress(n_episodes))
 
 
-def _print_assessment(function: "LatentFunction", role: "TaskSpec", episodes: "Sequence[Episode]") -> None:
+def _print_assessment(function: "LatentFunction", role: "TaskSpec", episodes: Sequence["Episode"]) -> None:
     """Print how well the factors explain the returns of some episodes."""
     from lare_rl.training.reflect import assess_function
     from lare_rl.util.findings import format_for_reader

@@ -1,31 +1,18 @@
 """The commands for trained runs: `evaluate`, `report`, `export` and `cross-play`."""
 
-import math
 import os
 import sys
-import time
-from collections import Counter
-from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
-from lare_rl.cli.terminal import (
-    EpisodeProgress,
-    RunDirectories,
-    RunDirectory,
-    print_line,
-    print_progress,
-    print_table,
-)
+from lare_rl.cli.terminal import EpisodeProgress, RunDirectories, RunDirectory, print_line, print_progress, print_table
 from lare_rl.errors import LareError, install_command
 from lare_rl.util.variables import read_variable
 
 if TYPE_CHECKING:
-    from lare_rl.envs.play import Episode
     from lare_rl.runs.directory import Run
-    from lare_rl.training.evaluation import Evaluation
 
 
 def evaluate(
@@ -52,132 +39,33 @@ def evaluate(
             that of the run's evaluations.
         video: a .gif to write of one episode of the first seed (.mp4 with the extra lare-rl[video]).
     """
-    from lare_rl.algorithms.registry import ALGORITHMS
-    from lare_rl.envs.families import load_env_spec
-    from lare_rl.evaluation.evaluate import (
-        RANDOM_EPISODES,
-        RANDOM_PLAY_LIMIT_S,
-        evaluate_policy,
-        evaluation_seeds,
-        move_evaluations,
-        play_random,
-    )
-    from lare_rl.evaluation.video import check_video_path, record_video
+    from lare_rl.evaluation.evaluate import move_evaluations
+    from lare_rl.evaluation.video import check_video_path
+    from lare_rl.report.evaluation_lines import evaluation_lines
     from lare_rl.runs.directory import open_run
     from lare_rl.training.explain import explain_run
-    from lare_rl.training.saved_state import load_actor
 
     opened = move_evaluations(open_run(run), environment)
-    task, settings = opened.config.task, opened.config.settings
-    env_spec = load_env_spec(task)
     if video is not None:
         check_video_path(video)
-        if env_spec.n_agents == 1:
-            _render_without_screen()
-            print_progress("filming an episode; without a graphics card that may take minutes")
-        record_video(opened, video, best, deterministic)
-        print_line(f"wrote {video}")
-    start = time.monotonic()
-    evaluation = evaluate_policy(opened, episodes, best, deterministic, EpisodeProgress(episodes))
-    policy_s, n_random = time.monotonic() - start, max(episodes, RANDOM_EPISODES)
-    samples = not (deterministic or ALGORITHMS[settings.algorithm].deterministic_evaluation(env_spec.discrete))
-    likeliest = evaluate_policy(opened, episodes, best, True, EpisodeProgress(episodes)) if samples else None
-    best_steps = load_actor(opened, best=True)[2].tolist() if best else None
-    seeds = [] if task.group is None else evaluation_seeds(opened, episodes)
-    if seeds:  # each equally often, because groups may differ in their returns
-        n_random = len(seeds) * math.ceil(RANDOM_EPISODES / len(seeds))
-    limit_s = max(policy_s, RANDOM_PLAY_LIMIT_S)
-    random_episodes = play_random(task, n_random, limit_s, EpisodeProgress(n_random), seeds)
-    for line in _describe_evaluation(opened, evaluation, random_episodes, best_steps):
+        _film(opened, video, best, deterministic)
+    for line in evaluation_lines(opened, episodes, best, deterministic, EpisodeProgress):
         print_line(line)
-    if 0 < len(random_episodes[0]) < n_random:
-        print_line(f"random actions ended after {len(random_episodes[0])} of {n_random} episodes, to save time")
-    if likeliest is not None:
-        print_line(
-            "The policy samples its actions, as in training. The most likely ones (--deterministic), from the same states:"
-        )
-        for line in _describe_returns(opened, likeliest, best_steps):
-            print_line(line)
-        for line in _compare_actions(opened, evaluation, likeliest):
-            print_line(line)
     if explanation := explain_run(opened):
         print_line(f"Credit, judged on the stored training episodes of seed {opened.seeds[0]}:")
     for line in explanation:
         print_line(line)
 
 
-def _describe_returns(run: "Run", evaluation: "Evaluation", best_steps: "Sequence[int] | None") -> Iterator[str]:
-    """Yield the returns of each seed. `best_steps` are the steps of the best policies."""
+def _film(run: "Run", video: Path, best: bool, deterministic: bool) -> None:
     from lare_rl.envs.families import load_env_spec
-    from lare_rl.util.findings import format_for_reader
-    from lare_rl.util.statistics import format_mean_std
+    from lare_rl.evaluation.video import record_video
 
-    roles, has_many_agents = run.config.task.roles, load_env_spec(run.config.task).n_agents > 1
-    for team_index, role in enumerate(roles):
-        for seed_index, seed in enumerate(run.seeds):
-            returns = evaluation.returns[seed_index, :, team_index]
-            line = f"{role.name}, " if len(roles) > 1 else ""
-            line += f"seed {seed}: return {format_mean_std(returns)} over {format_for_reader(len(returns), 'count episode')}"
-            if best_steps is not None:
-                step = best_steps[seed_index]
-                untrained = ", before its first update" if step <= run.config.settings.warmup else ""
-                line += f" (the policy of step {step:,}{untrained})"
-            if has_many_agents:
-                sums = evaluation.summed_returns[seed_index, :, team_index]
-                line += f"; summed over the agents {format_mean_std(sums)}"
-            yield line
-
-
-def _compare_actions(run: "Run", sampled: "Evaluation", likeliest: "Evaluation") -> Iterator[str]:
-    """Say which actions are better, if that is clear. Both evaluations play from the same initial states."""
-    from lare_rl.evaluation.evaluate import mean_with_error
-    from lare_rl.report.score_use import CLEAR_ERRORS
-    from lare_rl.util.statistics import format_plus_minus
-
-    for i, role in enumerate(run.config.task.roles):
-        gain = mean_with_error((likeliest.returns - sampled.returns)[:, :, i])
-        if gain is not None and abs(gain[0]) > CLEAR_ERRORS * gain[1]:
-            verdict = "better: use deterministic=True in load_policy" if gain[0] > 0 else "worse: let the policy sample"
-            yield f"{role.name}: the most likely actions are {verdict} ({format_plus_minus(*gain)})"
-
-
-def _describe_evaluation(
-    run: "Run",
-    evaluation: "Evaluation",
-    random_episodes: "Sequence[Sequence[Episode]]",
-    best_steps: "Sequence[int] | None",
-) -> Iterator[str]:
-    """Yield the returns and measures of each seed, and of random actions. `best_steps` are the steps of the best policies."""
-    import numpy as np
-
-    from lare_rl.evaluation.evaluate import gain_over_random
-    from lare_rl.util.findings import format_for_reader
-    from lare_rl.util.statistics import format_mean_std, format_plus_minus
-
-    task = run.config.task
-    if task.evaluation_environment is not None:
-        yield f"in {task.evaluation_environment} (training was in {task.environment}):"
-    yield from _describe_returns(run, evaluation, best_steps)
-    roles = task.roles
-    for team_index, (role, episodes) in enumerate(zip(roles, random_episodes, strict=True)):
-        if not episodes:
-            continue
-        team = f"{role.name}, " if len(roles) > 1 else ""
-        returns = np.array([episode.return_ for episode in episodes])
-        yield f"{team}random actions: return {format_mean_std(returns)} over {format_for_reader(len(returns), 'count episode')}"
-        if (gain := gain_over_random(evaluation.returns[:, :, team_index], returns)) is not None:
-            yield f"{team}difference: {format_plus_minus(*gain)} (± is its standard error)"
-    if (group := task.group) is not None and random_episodes[0]:
-        groups = Counter(np.asarray(evaluation.measures[group]).ravel().tolist())
-        random_groups = Counter(episode.measures[group] for episode in random_episodes[0])
-        if any(groups[name] * random_groups.total() != count * groups.total() for name, count in random_groups.items()):
-            yield f"random actions played other groups ({group}), or in other shares, which is a part of the difference"
-    for name, seed_values in evaluation.drop_group(task).measures.items():
-        for seed, values in zip(run.seeds, seed_values, strict=True):
-            yield f"seed {seed}: {name} {format_mean_std(values)}"
-        if random_episodes[0]:
-            values = np.array([episode.measures[name] for episode in random_episodes[0]])
-            yield f"random actions: {name} {format_mean_std(values)}"
+    if load_env_spec(run.config.task).n_agents == 1:
+        _render_without_screen()
+        print_progress("filming an episode; without a graphics card that may take minutes")
+    record_video(run, video, best, deterministic)
+    print_line(f"wrote {video}")
 
 
 def _render_without_screen() -> None:
@@ -221,10 +109,7 @@ def report(runs: RunDirectories, out: Path | None = None, film: bool = True) -> 
 
 
 def export(
-    run: RunDirectory,
-    out: Annotated[Path, tyro.conf.arg(metavar="DIR")],
-    seed: int | None = None,
-    best: bool = False,
+    run: RunDirectory, out: Annotated[Path, tyro.conf.arg(metavar="DIR")], seed: int | None = None, best: bool = False
 ) -> None:
     """Write policy and rewards for programs that have neither LaRe nor JAX.
 
@@ -247,11 +132,7 @@ def export(
         print_progress(f"without the package onnx, no .onnx files were written: {install_command('onnx')}")
 
 
-def cross_play(
-    first: RunDirectory,
-    second: RunDirectory,
-    episodes: int = 200,
-) -> None:
+def cross_play(first: RunDirectory, second: RunDirectory, episodes: int = 200) -> None:
     """Let the first team of each of two runs play against the second team of each, every seed against every seed.
 
     Prints the first team's return, mean and standard deviation over the pairs of seeds.

@@ -20,9 +20,7 @@ Ray = Annotated[str | None, tyro.conf.arg(metavar="ADDRESS")]
 
 
 def sweep(
-    file: Annotated[Positional[Path], tyro.conf.arg(metavar="FILE")],
-    ray: Ray = None,
-    check: bool = False,
+    file: Annotated[Positional[Path], tyro.conf.arg(metavar="FILE")], ray: Ray = None, check: bool = False
 ) -> None:
     """Train the runs that a TOML file lists and that are not finished yet. All metrics go to results.csv and .parquet.
 

@@ -2,7 +2,7 @@
 
 import sys
 import time
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
@@ -11,6 +11,7 @@ from pydantic import Field
 from tyro.conf import Positional
 
 from lare_rl.errors import CheckedModel, LareError
+from lare_rl.llm.budget import Budget
 from lare_rl.util.durations import format_seconds
 from lare_rl.util.files import check_new_path
 from lare_rl.util.sanitize import one_line, sanitize
@@ -44,11 +45,11 @@ class LiveOptions(CheckedModel):
 
     base_url: str | None = None
     """the endpoint; the default is OPENAI_BASE_URL, or else OpenAI's. Ollama's is http://localhost:11434/v1."""
-    budget: _Count = 400_000
+    budget: _Count = Budget.tokens
     """largest number of tokens, in and out together; a request that might exceed it is not sent."""
-    requests: _Count = 60
+    requests: _Count = Budget.requests
     """largest number of requests."""
-    minutes: Annotated[float, Field(gt=0, allow_inf_nan=False)] = 15.0
+    minutes: Annotated[float, Field(gt=0, allow_inf_nan=False)] = Budget.seconds / 60
     """longest time to wait for the model, over all requests and retries. One reply may take an eighth of it, and at least 120 s:
     raise it for a slow model of your own."""
     price: Annotated[tuple[_NonNegative, _NonNegative] | None, tyro.conf.arg(metavar="IN OUT")] = None
@@ -58,7 +59,6 @@ class LiveOptions(CheckedModel):
 
     def open(self, name: str) -> "LiveModel":
         """Return the model of this name."""
-        from lare_rl.llm.budget import Budget
         from lare_rl.llm.live import LiveModel
 
         budget = Budget(requests=self.requests, tokens=self.budget, seconds=60 * self.minutes)
@@ -71,6 +71,12 @@ DEFAULT_LIVE = LiveOptions()
 def print_line(text: str) -> None:
     """Print a text to standard output, without characters that control the terminal."""
     print(sanitize(text), flush=True)  # noqa: T201 - the one place that writes to standard output
+
+
+def print_messages(messages: Iterable[Mapping[str, str]]) -> None:
+    """Print the messages of a request to a language model."""
+    for message in messages:
+        print_line(f"--- {message['role']} ---\n{message['content']}\n")
 
 
 def print_table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> None:

@@ -1,6 +1,7 @@
 """The command `train`."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -16,6 +17,7 @@ from lare_rl.runs.plan import RunPlan, load_config
 
 if TYPE_CHECKING:
     from lare_rl.latent.function import LatentFunction
+    from lare_rl.runs.directory import Run
     from lare_rl.tasks.spec import TaskSpec
     from lare_rl.training.progress import Listener
 
@@ -67,43 +69,45 @@ def train(
         from lare_rl.envs.load import read_task
 
         read_task(chosen_task)  # a typo is reported before the slow imports
-    import lare_rl
-    from lare_rl.runs.directory import open_run
-
     if resume is not None:
+        import lare_rl
+        from lare_rl.runs.directory import open_run
+
         options = (task, function, out, config, settings.model_copy(update={"steps": None}))
         if options != (None, (), None, None, DEFAULTS):
             raise LareError("--resume uses the run's settings: give it no task, and no setting but --steps")
-        run_settings = open_run(resume).config.settings
-        listeners = [*_listeners(wandb, mlflow, run_settings), *_live_page(resume, watch)]
-        run = lare_rl.resume(resume, steps=settings.steps, tensorboard=tensorboard, listeners=listeners)
+        directory, run_settings = resume, open_run(resume).config.settings
+        start = partial(lare_rl.resume, resume, steps=settings.steps)
     elif chosen_task is None:
         raise LareError(
             f"there is no task{f' in {plan.source}' if config else ''}: use lare-rl train TASK (lare-rl tasks lists them), "
             "or lare-rl train --resume DIR"
         )
     else:
-        from lare_rl.config.resolve import resolve
-        from lare_rl.envs.load import resolve_task
-        from lare_rl.runs.directory import default_directory
-
-        spec = resolve_task(chosen_task)
-        resolved = resolve(settings, spec)
-        for name, warning in unused_settings(settings, resolved, spec).items():
-            if not (plan.is_run and plan.has(name, settings)):
-                raise LareError(f"{warning}: leave the setting out")
-        planned = plan.function_for(resolved)
-        functions = _load_functions(function or planned, spec, resolved) if function or planned else None
-        out = out or plan.out or default_directory(spec, resolved)
-        run = lare_rl.train(
-            spec,
-            settings,
-            function=functions,
-            out=out,
-            tensorboard=tensorboard,
-            listeners=[*_listeners(wandb, mlflow, resolved), *_live_page(out, watch)],
-        )
+        start, directory, run_settings = _prepare(chosen_task, settings, function, out or plan.out, plan)
+    listeners = [*_listeners(wandb, mlflow, run_settings), *_live_page(directory, watch)]
+    run = start(tensorboard=tensorboard, listeners=listeners)
     print_line(f"finished {run.directory}; to see it: lare-rl report {run.directory}")
+
+
+def _prepare(
+    task: "str | TaskSpec", settings: Settings, function: Sequence[Path], out: Path | None, plan: RunPlan
+) -> "tuple[Callable[..., Run], Path, ResolvedSettings]":
+    """Return the function that starts a new run, its directory, and its settings."""
+    import lare_rl
+    from lare_rl.config.resolve import resolve
+    from lare_rl.envs.load import resolve_task
+    from lare_rl.runs.directory import default_directory
+
+    spec = resolve_task(task)
+    resolved = resolve(settings, spec)
+    for name, warning in unused_settings(settings, resolved, spec).items():
+        if not (plan.is_run and plan.has(name, settings)):
+            raise LareError(f"{warning}: leave the setting out")
+    files = function or plan.function_for(resolved)
+    functions = _load_functions(files, spec, resolved) if files else None
+    out = out or default_directory(spec, resolved)
+    return partial(lare_rl.train, spec, settings, function=functions, out=out), out, resolved
 
 
 def _load_functions(

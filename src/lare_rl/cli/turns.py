@@ -6,7 +6,7 @@ from typing import Annotated
 import tyro
 from tyro.conf import Positional
 
-from lare_rl.cli.terminal import DEFAULT_LIVE, LiveOptions, print_line, print_progress, write_new_file
+from lare_rl.cli.terminal import DEFAULT_LIVE, LiveOptions, print_line, print_messages, print_progress, write_new_file
 from lare_rl.util.files import check_new_path
 from lare_rl.util.sanitize import one_line
 
@@ -96,8 +96,7 @@ def turn_phi(
     if not turns:
         raise LareError(f"{rollouts} has no message of an assistant")
     if model is None:
-        for message in turn_request(goal, descriptions, choose_examples(turns)):
-            print_line(f"--- {message['role']} ---\n{message['content']}\n")
+        print_messages(turn_request(goal, descriptions, choose_examples(turns)))
         return
     record = None if out is None else out.with_suffix(".json")
     for path in (out, record):

@@ -56,9 +56,7 @@ def label_runs(runs: Sequence[Run]) -> dict[str, list[Run]]:
     def label(values: Mapping[str, Any]) -> str:
         method, algorithm = values["method"], values["algorithm"]
         names = [name for name in values if (name, method, algorithm) in distinguishing]
-        return ", ".join(
-            [method, *([algorithm] if several_algorithms else []), *(f"{name} {values[name]}" for name in names)]
-        )
+        return ", ".join([method, *[algorithm] * several_algorithms, *(f"{name} {values[name]}" for name in names)])
 
     groups = group_pairs((label(values), run) for run, values in zip(runs, settings, strict=True))
     for split in (_split_by_function, _split_by_directory):

@@ -157,7 +157,5 @@ def _shared_steps(curves: Mapping[_Key, _Curve], metric: str, step: int | None) 
     if step not in steps:
         texts = [f"{shared:,}" for shared in steps]
         texts = texts if len(texts) <= 6 else [*texts[:3], "...", texts[-1]]
-        raise LareError(
-            f"not all runs have a value of {metric} at step {step:,}; all of them have one at {', '.join(texts)}"
-        )
+        raise LareError(f"not all runs have a value of {metric} at step {step:,}; all have one at {', '.join(texts)}")
     return [shared for shared in steps if shared <= step]

@@ -9,7 +9,7 @@ from lare_rl.config.validity import CreditContext, check_credit
 from lare_rl.credit.decoder_settings import MULTI_AGENT_CREDIT, RECENT_STEPS, CreditSettings
 from lare_rl.credit.methods import find_method
 from lare_rl.data.replay import required_capacity
-from lare_rl.envs.families import find_score, load_env_spec
+from lare_rl.envs.families import find_score_type, load_env_spec
 from lare_rl.envs.interface import EnvSpec
 from lare_rl.errors import LareError
 from lare_rl.tasks.spec import TaskSpec
@@ -120,7 +120,7 @@ def _normalise(resolved: ResolvedSettings, task: TaskSpec, env: EnvSpec) -> Reso
         changes["first_fit"] = None
     score, method = resolved.credit.score, find_method(resolved.method)
     if score == "auto":
-        score = find_score(task) or score
+        score = find_score_type(task) or score
     if score != "binary" and env.fixed_length and task.payment_rule.is_regular(env.max_steps):
         score = "auto"  # sum and mean have the same decoder
     credit = {"score": score, "exact": method.choose_exact(resolved.credit.exact)}

@@ -1,7 +1,8 @@
 """Agents with different spaces in common arrays: observations, actions and bounds are padded with zeros."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import gymnasium
@@ -10,7 +11,7 @@ from gymnasium.spaces import Box, Dict, Discrete
 from jaxtyping import Bool, Float
 
 from lare_rl.envs.interface import EnvSpec, Team
-from lare_rl.envs.spaces import check_spaces, decode_box, finite_array, flatten_value
+from lare_rl.envs.spaces import check_spaces, decode_box, flatten_value, float_array
 from lare_rl.errors import LareError, short_repr
 
 __all__ = ["Agent", "AgentArrays", "make_agent"]
@@ -30,12 +31,14 @@ class Agent:
     action_space: Discrete | Box
     observes_mask: bool
     """Whether the observation is a dictionary with the mask."""
-    observation_size: int = field(init=False)
-    action_size: int = field(init=False)
 
-    def __post_init__(self):
-        object.__setattr__(self, "observation_size", gymnasium.spaces.flatdim(self.observation_space))
-        object.__setattr__(self, "action_size", int(gymnasium.spaces.flatdim(self.action_space)))
+    @cached_property
+    def observation_size(self) -> int:
+        return gymnasium.spaces.flatdim(self.observation_space)
+
+    @cached_property
+    def action_size(self) -> int:
+        return int(gymnasium.spaces.flatdim(self.action_space))
 
     @property
     def discrete(self) -> bool:
@@ -67,7 +70,7 @@ class Agent:
             return None
         if not self.discrete:
             raise ValueError(f"belongs to {short_repr(self.action_space)}, which is not discrete")
-        mask = finite_array(mask, (self.action_size,))
+        mask = float_array(mask, (self.action_size,))
         if not np.isin(mask, (0, 1)).all():
             raise ValueError(f"contains {mask[~np.isin(mask, (0, 1))][0]:g} instead of 0 or 1")
         if not mask.any():

@@ -8,14 +8,14 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from lare_rl.envs.spaces import NotFiniteError
+from lare_rl.envs.interface import EnvSpec, Timestep
 from lare_rl.errors import LareError, short_repr
-from lare_rl.tasks.spec import TaskSpec, entry_meanings
+from lare_rl.tasks.spec import TaskSpec
 
 __all__ = [
     "EnvOutputError",
     "as_lare_error",
-    "describe_entry",
+    "check_finite",
     "name_step",
     "no_time_limit_error",
     "one_line_errors",
@@ -67,11 +67,16 @@ def name_step(number: int) -> Iterator[None]:
         raise
 
 
-def describe_entry(error: ValueError, text: str) -> str:
-    """Return what a task's text says of the entry that is not finite, in brackets, or nothing."""
-    index = error.index if isinstance(error, NotFiniteError) else None
-    meaning = None if index is None else entry_meanings(text).get(index)
-    return "" if meaning is None else f" ({meaning})"
+def check_finite(timestep: Timestep, spec: EnvSpec, owner: str) -> None:
+    """Raise `EnvOutputError` for the first number of a timestep that is not finite. `owner` is the subject of the message."""
+    for name in ("observation", "state", "reward"):
+        values = np.asarray(getattr(timestep, name))
+        if not np.isfinite(values).all():
+            index = tuple(np.argwhere(~np.isfinite(values))[0].tolist())
+            agent = "" if name == "state" or spec.n_agents == 1 else f" of {spec.agent_label(index[0])}"
+            meaning = spec.entry_meanings.get(index[-1], "") if name == "observation" else ""
+            entry = "" if name == "reward" else f" in entry {index[-1]}{meaning and f' ({meaning})'}"
+            raise EnvOutputError(f"{owner}: the {name}{agent} contains {values[index]}{entry}")
 
 
 def no_time_limit_error(task: TaskSpec) -> LareError:

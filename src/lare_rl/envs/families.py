@@ -18,7 +18,7 @@ __all__ = [
     "FAMILIES",
     "Family",
     "check_logs",
-    "find_score",
+    "find_score_type",
     "has_single_agent",
     "is_gymnasium",
     "load_env_spec",
@@ -53,12 +53,7 @@ _LOGS_ONLY = Family("lare_rl.envs.families:_refuse_to_make", reads=("max_episode
 
 
 def register_family(
-    name: str,
-    maker: Maker | str,
-    *,
-    reads: tuple[str, ...] = (),
-    score: str | None = None,
-    single_agent: bool = False,
+    name: str, maker: Maker | str, *, reads: tuple[str, ...] = (), score: str | None = None, single_agent: bool = False
 ) -> None:
     """Add a family of environments: a task with `environment = "NAME/..."` then uses its maker.
 
@@ -81,13 +76,11 @@ register_family("smax", "lare_rl.envs.smax.smax_env:make", score="sum")
 register_family("smac", "lare_rl.envs.starcraft:make", score="sum")
 register_family("pettingzoo", "lare_rl.envs.pettingzoo_env:make", reads=OPTIONAL_KEYS)
 for _name in ("gymnax", "brax", "playground", "jumanji"):
-    register_family(
-        _name, f"lare_rl.envs.{_name}_env:make", reads=("max_episode_steps", "arguments"), single_agent=True
-    )
+    register_family(_name, f"lare_rl.envs.{_name}_env:make", reads=OPTIONAL_KEYS[:2], single_agent=True)
 register_family("jaxmarl", "lare_rl.envs.jaxmarl_env:make", reads=OPTIONAL_KEYS)
 
 
-def find_score(task: TaskSpec) -> str | None:
+def find_score_type(task: TaskSpec) -> str | None:
     """Return "sum" or "average" (over the steps of an episode) if the task or its family says so."""
     return task.score or _find_family(task).score
 
@@ -236,9 +229,7 @@ def _check_spec(task: TaskSpec, spec: EnvSpec) -> None:
     if task.teams and [role.team for role in task.teams] != names:
         raise LareError(f"the teams of {env} must be {', '.join(names)}, in this order")
     if len(names) > 1 and not task.teams and task.team is None:
-        raise LareError(
-            f"{env} has the teams {', '.join(names)}. Write a task file for each of them, and list them as teams."
-        )
+        raise LareError(f"{env} has the teams {', '.join(names)}. Write a task file for each, and list them as teams.")
     for role in task.teams:
         for key in SHARED_KEYS:  # training reads only the task's keys, verification only the team's
             team_value, task_value = getattr(role, key), getattr(task, key)

@@ -5,23 +5,17 @@ from typing import Any
 
 import gymnasium
 import numpy as np
-from gymnasium.spaces import Box
+from gymnasium.spaces import Box, Discrete
 from jaxtyping import Float
 
 from lare_rl.envs import mujoco_rewards
-from lare_rl.envs.env_errors import (
-    EnvOutputError,
-    describe_entry,
-    no_time_limit_error,
-    one_line_errors,
-    read_measures,
-    to_float,
-)
+from lare_rl.envs.agent_arrays import Agent
+from lare_rl.envs.env_errors import EnvOutputError, no_time_limit_error, one_line_errors, read_measures, to_float
 from lare_rl.envs.interface import EnvSpec, Team, Timestep
 from lare_rl.envs.mujoco_warnings import import_mujoco, mujoco_warnings
-from lare_rl.envs.spaces import OneHot, check_spaces, decode_box, finite_array, flatten_spaces
+from lare_rl.envs.spaces import check_spaces, float_array
 from lare_rl.errors import LareError, short_repr
-from lare_rl.tasks.spec import TaskSpec
+from lare_rl.tasks.spec import TaskSpec, entry_meanings
 from lare_rl.util.variables import read_variable
 
 __all__ = ["GymnasiumEnv", "make_gymnasium"]
@@ -30,7 +24,7 @@ mujoco_rewards.register()
 
 
 def make_gymnasium(name: str, max_episode_steps: int | None = None, **kwargs: Any) -> gymnasium.Env:
-    """Make an environment with flat observations and actions. See `gymnasium.make` for the arguments.
+    """Make an environment whose spaces can be flattened. See `gymnasium.make` for the arguments.
 
     Raises:
         LareError: the environment cannot be made, or its spaces cannot be flattened.
@@ -50,7 +44,7 @@ def make_gymnasium(name: str, max_episode_steps: int | None = None, **kwargs: An
         return ""
 
     with warnings.catch_warnings(), one_line_errors(f"environment {name!r} cannot be made", make_hint):
-        # The user chooses the version: scores of v4 and v5 cannot be compared.
+        # The user chooses the version: returns of v4 and v5 cannot be compared.
         warnings.filterwarnings("ignore", message=".*is out of date.*", category=DeprecationWarning)
         warnings.filterwarnings("ignore", message=".*Using the latest versioned environment.*")
         # A report asks for a film, and does without one if it gets none.
@@ -62,14 +56,14 @@ def make_gymnasium(name: str, max_episode_steps: int | None = None, **kwargs: An
             check_spaces(name, env.observation_space, env.action_space)
             if isinstance(env.action_space, Box) and len(env.action_space.shape) != 1:
                 raise LareError(f"the action space of {name} is {env.action_space}, not a Box with one axis")
-            return flatten_spaces(env)
+            return env
         except Exception:
             env.close()
             raise
 
 
 class GymnasiumEnv:
-    """A Gymnasium environment as a `HostEnv`. All values that the environment returns are checked."""
+    """A Gymnasium environment as a `HostEnv`. All values that it returns are checked, but not that they are finite."""
 
     def __init__(self, task: TaskSpec, **kwargs: Any):
         """Make the environment of a task. See `gymnasium.make` for the keyword arguments.
@@ -82,20 +76,26 @@ class GymnasiumEnv:
         if not (self.environment.spec and self.environment.spec.max_episode_steps):
             self.close()
             raise no_time_limit_error(task)
-        observation_space, action_space = self.environment.observation_space, self.environment.action_space
-        dtype = np.result_type(action_space.dtype or np.float32, np.float32)  # bounds stay as precise as they are
+        action_space = self.environment.action_space
+        assert isinstance(action_space, Discrete | Box)
+        self._agent = Agent("agent", self.environment.observation_space, action_space, observes_mask=False)
+        fields: dict[str, Any]
+        if isinstance(action_space, Box):
+            dtype = np.result_type(action_space.dtype, np.float32)  # bounds stay as precise as they are
+            fields = {"low": action_space.low[None].astype(dtype), "high": action_space.high[None].astype(dtype)}
+        else:
+            fields = {"first_choice": int(action_space.start)}
         self.spec = EnvSpec(
             teams=(Team("agent", 0, 1),),
-            observation_size=observation_space.shape[0],  # type: ignore[index]
-            action_size=action_space.shape[0],  # type: ignore[index]
-            discrete=isinstance(action_space, OneHot),
+            observation_size=self._agent.observation_size,
+            action_size=self._agent.action_size,
+            discrete=self._agent.discrete,
             max_steps=self.environment.spec.max_episode_steps,
-            low=action_space.low[None].astype(dtype),  # type: ignore[attr-defined]
-            high=action_space.high[None].astype(dtype),  # type: ignore[attr-defined]
             measures=task.info_keys,
-            first_choice=int(action_space.start) if isinstance(action_space, OneHot) else 0,
+            entry_meanings=entry_meanings(task.observation),
+            **fields,
         )
-        self._integers = action_space if isinstance(action_space, Box) and action_space.dtype.kind in "iu" else None
+        self._decodes = action_space.dtype.kind in "iu"  # other actions are passed on as they are
         self._state, self._alive = np.zeros(0, np.float32), np.ones(1, bool)
         self._available = np.ones((1, self.spec.action_size), bool)
 
@@ -106,24 +106,21 @@ class GymnasiumEnv:
 
     def step(self, action: Float[np.ndarray, "1 action"]) -> Timestep:
         with one_line_errors(f"environment {self._name!r} failed in step"):
-            vector = decode_box(self._integers, action[0]) if self._integers else action[0]
-            observation, reward, terminated, truncated, info = self.environment.step(vector)
+            env_action = self._agent.decode_action(action[0]) if self._decodes else action[0]
+            observation, reward, terminated, truncated, info = self.environment.step(env_action)
             terminated, truncated = bool(terminated), bool(truncated)  # fails for arrays with several elements
         return self._make_timestep(observation, reward, terminated, truncated, info)
 
     def _make_timestep(self, observation: Any, reward: Any, terminated: bool, truncated: bool, info: Any) -> Timestep:
         if not isinstance(info, dict):
-            raise LareError(
-                f"environment {self._name!r} returned the info {short_repr(info)}, which is not a dictionary"
-            )
+            raise LareError(f"environment {self._name!r} returned info {short_repr(info)}, which is not a dictionary")
         name = "observation"
         try:
-            observation = finite_array(observation, (self.spec.observation_size,))
+            observation = self._agent.flatten_observation(observation)
             name = "reward"
-            reward = finite_array(to_float(reward))
+            reward = float_array(to_float(reward))
         except ValueError as error:
-            entry = describe_entry(error, self._task.observation) if name == "observation" else ""
-            raise EnvOutputError(f"environment {self._name!r}: the {name} {error}{entry}") from None
+            raise EnvOutputError(f"environment {self._name!r}: the {name} {error}") from None
         last = terminated or truncated
         return Timestep(
             observation=observation[None],

@@ -12,7 +12,7 @@ from lare_rl.envs import jax_spaces
 from lare_rl.envs.env_errors import one_line_errors
 from lare_rl.envs.interface import Timestep
 from lare_rl.envs.jax_spaces import Bounds, Choices
-from lare_rl.errors import LareError, short_repr
+from lare_rl.errors import LareError
 from lare_rl.tasks.spec import TaskSpec
 
 __all__ = ["GymnaxEnv", "make"]
@@ -103,7 +103,4 @@ def _read_action(space: Any, spaces: Any, environment: str) -> Choices | Bounds:
         return jax_spaces.make_choices((space.n,), (), environment, space.dtype)
     if isinstance(space, spaces.Box):
         return jax_spaces.make_bounds(space.low, space.high, tuple(space.shape), environment)
-    raise jax_spaces.unusable(
-        environment,
-        f"its action space is {short_repr(space)}: LaRe trains discrete actions and bounded continuous ones",
-    )
+    raise jax_spaces.unusable_actions(environment, space)

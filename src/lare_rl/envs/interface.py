@@ -4,6 +4,7 @@ A Gymnasium environment has one team of one agent. Arrays always have an axis of
 a `JaxEnv` or a `HostEnv`; `families.py` maps the name of a task's environment to it.
 """
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple, Protocol, TypeVar, runtime_checkable
 
@@ -84,6 +85,10 @@ class EnvSpec:
     """The sizes of several choices at a time, if their combinations are the discrete actions."""
     package_shape: tuple[int, ...] | None = None
     """The shape of an action for the environment's package. By default, discrete actions are numbers, others rows of numbers."""
+    agent_names: tuple[str, ...] = field(default=(), compare=False)
+    """The environment's names of the agents, for messages."""
+    entry_meanings: Mapping[int, str] = field(default_factory=dict, compare=False)
+    """What entries of an observation mean, for messages."""
 
     @property
     def n_agents(self) -> int:
@@ -93,6 +98,10 @@ class EnvSpec:
     def action_dtype(self) -> np.dtype:
         """The type of actions in the environment's units."""
         return np.dtype(np.float32) if self.discrete else self.low.dtype
+
+    def agent_label(self, index: int) -> str:
+        """Return the name of an agent, for messages."""
+        return self.agent_names[index] if self.agent_names else f"agent {index}"
 
 
 class Timestep(NamedTuple):

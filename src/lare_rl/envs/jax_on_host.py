@@ -31,8 +31,6 @@ class JaxOnHost:
 
     def render(self) -> Any:
         """Refuse: `JaxEnv.frames` draws such environments."""
-        raise LareError(
-            "an environment in JAX cannot be rendered step by step. Call its frames() on the states of an episode."
-        )
+        raise LareError("an environment in JAX cannot be rendered step by step: call frames() on an episode's states")
 
     def close(self) -> None: ...

@@ -19,7 +19,7 @@ from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 from lare_rl.envs.env_errors import one_line_errors
 from lare_rl.envs.interface import EnvSpec, Team, Timestep, with_available_action
 from lare_rl.envs.mujoco_warnings import mujoco_warnings
-from lare_rl.errors import LareError, did_you_mean, install_command, missing_extra_error
+from lare_rl.errors import LareError, did_you_mean, install_command, missing_extra_error, short_repr
 from lare_rl.tasks.spec import TaskSpec
 
 __all__ = [
@@ -42,6 +42,7 @@ __all__ = [
     "strong_types",
     "unstack",
     "unusable",
+    "unusable_actions",
 ]
 
 MAX_COMBINATIONS = 1024
@@ -51,35 +52,30 @@ MAX_COMBINATIONS = 1024
 # Packages
 
 
-def import_package(name: str, task: TaskSpec, extra: str | None = None) -> ModuleType:
+def import_package(name: str, task: TaskSpec) -> ModuleType:
     """Import a package of an environment, without what it prints.
 
     Raises:
         LareError: it is not installed (the message names the extra), or cannot be imported.
     """
-    extra = extra or task.family
     try:
         with _silence():
             return importlib.import_module(name)
     except ModuleNotFoundError as error:
         if error.name in (name, name.partition(".")[0]):
-            raise missing_extra_error(f"environment {task.environment!r}", extra) from error
+            raise missing_extra_error(f"environment {task.environment!r}", task.family) from error
         reason = error
     except Exception as error:  # an old package may raise anything if a newer JAX has removed a name
         reason = error
     summary = " ".join(str(reason).split())
-    raise LareError(f"{name} cannot be imported: {summary} (try {install_command(extra)})") from reason
+    raise LareError(f"{name} cannot be imported: {summary} (try {install_command(task.family)})") from reason
 
 
 @contextlib.contextmanager
 def _silence() -> Iterator[None]:
     """Hide what packages print and warn of. JaxMARL prints to `sys.__stdout__`."""
     originals, silence = (sys.__stdout__, sys.__stderr__), io.StringIO()
-    with (
-        contextlib.redirect_stdout(silence),
-        contextlib.redirect_stderr(silence),
-        warnings.catch_warnings(),
-    ):
+    with contextlib.redirect_stdout(silence), contextlib.redirect_stderr(silence), warnings.catch_warnings():
         warnings.simplefilter("ignore")
         sys.__stdout__ = sys.__stderr__ = silence  # type: ignore[assignment]
         try:
@@ -107,6 +103,11 @@ def construct(
 
 def unusable(environment: str, reason: str) -> LareError:
     return LareError(f"environment {environment!r} cannot be used: {reason}")
+
+
+def unusable_actions(environment: str, space: Any) -> LareError:
+    actions = f"its actions are {short_repr(space)}"
+    return unusable(environment, f"{actions}: LaRe trains discrete actions and bounded continuous ones")
 
 
 # Values

@@ -81,9 +81,7 @@ class JaxMARLEnv:
             observations, state = jax.eval_shape(env.reset, jnp.zeros(2, jnp.uint32))
             if not (isinstance(observations, Mapping) and set(names) <= set(observations)):
                 raise jax_spaces.unusable(self._name, "its observations are not a dictionary by agent")
-            agents = [
-                _make_agent(name, env.action_space(name), jax_spaces.flat_size(observations[name])) for name in names
-            ]
+            agents = [_make_agent(x, env.action_space(x), jax_spaces.flat_size(observations[x])) for x in names]
             self.layout = AgentArrays(agents)
             self._masks = _find_masks(env, state) if self.layout.discrete else None
             actions = {agent.name: jnp.asarray(agent.action_space.sample()) for agent in agents}

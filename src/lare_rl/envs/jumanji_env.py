@@ -13,7 +13,6 @@ from lare_rl.envs import jax_spaces
 from lare_rl.envs.env_errors import no_time_limit_error, one_line_errors
 from lare_rl.envs.interface import Timestep
 from lare_rl.envs.jax_spaces import Bounds, Choices
-from lare_rl.errors import short_repr
 from lare_rl.tasks.spec import TaskSpec
 
 __all__ = ["JumanjiEnv", "make", "observed_arrays"]
@@ -119,9 +118,7 @@ class JumanjiEnv:
 def observed_arrays(observation: Any) -> list[tuple[str, Any]]:
     """Return the names and arrays of an observation, without the mask, in the order in which they are flattened."""
     leaves = jax.tree_util.tree_leaves_with_path(observation)
-    return [
-        (jax.tree_util.keystr(path, simple=True, separator="."), leaf) for path, leaf in leaves if not _is_mask(path)
-    ]
+    return [(jax.tree_util.keystr(path, simple=True, separator="."), x) for path, x in leaves if not _is_mask(path)]
 
 
 def _observed(observation: Any) -> list[Any]:
@@ -145,6 +142,4 @@ def _read_action(spec: Any, specs: Any, environment: str) -> Choices | Bounds:
         return jax_spaces.make_choices(sizes.ravel().tolist(), sizes.shape, environment, spec.dtype)
     if isinstance(spec, specs.BoundedArray) and np.issubdtype(spec.dtype, np.floating):
         return jax_spaces.make_bounds(spec.minimum, spec.maximum, tuple(spec.shape), environment)
-    raise jax_spaces.unusable(
-        environment, f"its actions are {short_repr(spec)}: LaRe trains discrete actions and bounded continuous ones"
-    )
+    raise jax_spaces.unusable_actions(environment, spec)

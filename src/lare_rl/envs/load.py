@@ -83,8 +83,7 @@ def _read_values(task: str, ancestors: tuple[str, ...] = ()) -> dict[str, Any]:
     try:
         values = rename_keys(read_toml(_read_file(task)))
     except ValueError as error:  # TOMLDecodeError, or a number with too many digits
-        hint = "; a text needs quotes" if str(error).startswith("Invalid value") else ""
-        raise LareError(f"task {task!r} is not valid TOML: {error}{hint}") from error
+        raise LareError(f"task {task!r} is not valid TOML: {error}") from error
     like, teams = values.get("like"), values.get("teams")
 
     def is_valid(name: Any) -> bool:

@@ -1,6 +1,6 @@
 """A PettingZoo environment as a `HostEnv`: `pettingzoo/MODULE:NAME`, where NAME makes a ParallelEnv.
 
-Agents and spaces are checked once. The values of each step are checked, so that a run never learns from invalid ones.
+Agents and spaces are checked once. The values of each step are checked, but not that they are finite (`check_finite`).
 """
 
 import contextlib
@@ -16,9 +16,9 @@ from lare_rl.envs.agent_arrays import Agent, AgentArrays, make_agent
 from lare_rl.envs.env_errors import EnvOutputError, one_line_errors, read_measures, to_float
 from lare_rl.envs.interface import EnvSpec, Timestep
 from lare_rl.envs.pettingzoo_construct import find_time_limit, group_by_team, make_parallel_env
-from lare_rl.envs.spaces import finite_array
+from lare_rl.envs.spaces import float_array
 from lare_rl.errors import LareError, short_repr
-from lare_rl.tasks.spec import TaskSpec
+from lare_rl.tasks.spec import TaskSpec, entry_meanings
 
 __all__ = ["ParallelHost", "make"]
 
@@ -53,9 +53,7 @@ class ParallelHost:
         self.environment, self._task, self._name = environment, task, task.environment
         names = list(environment.possible_agents or ())
         if not names or len(set(names)) != len(names):
-            raise LareError(
-                f"environment {self._name!r} has the possible agents {short_repr(names)}. Each needs a name."
-            )
+            raise LareError(f"environment {self._name!r} has possible agents {short_repr(names)}. Each needs a name.")
         names, teams = group_by_team(names, task)
         try:
             with one_line_errors("its spaces cannot be read"):
@@ -82,6 +80,8 @@ class ParallelHost:
             state_size=first.state.shape[-1],
             masks_actions=self._masks_actions,
             measures=task.info_keys,
+            agent_names=tuple(map(str, names)),
+            entry_meanings={} if task.teams else entry_meanings(task.observation),  # each team has texts of its own
         )
 
     def reset(self, seed: int) -> Timestep:
@@ -113,7 +113,7 @@ class ParallelHost:
         for index, agent in enumerate(agents):
             required = bool(acted[index] and self._present[index])  # values of an agent that has left may be missing
             if acted[index]:
-                reward[index] = self._read("reward", rewards, agent, _to_reward, required)
+                reward[index] = self._read("reward", rewards, agent, to_float, required)
             terminated[index] = self._read("termination", terminations, agent, to_float, required)
             truncated[index] = self._read("truncation", truncations, agent, to_float, required)
         self._left |= self._present & (terminated | truncated)  # some environments still list such agents
@@ -179,9 +179,7 @@ class ParallelHost:
         try:
             return convert(*values)
         except ValueError as error:
-            is_named = name == "observation" and not self._task.teams  # each team has texts of its own
-            entry = env_errors.describe_entry(error, self._task.observation) if is_named else ""
-            raise self._error(f": the {name} of {agent.name} {error}{entry}") from None
+            raise self._error(f": the {name} of {agent.name} {error}") from None
 
     def _make_timestep(
         self,
@@ -214,7 +212,7 @@ class ParallelHost:
             state=self._read_state(observation),
             available=available,
             alive=observes.copy(),
-            reward=reward.astype(np.float32),
+            reward=float_array(reward),
             terminated=np.array(terminated),
             truncated=np.array(truncated),
             measures=read_measures(reports, self._task, last=last),
@@ -256,10 +254,6 @@ class ParallelHost:
             self._state_failed = True
             return
         try:
-            self._state = finite_array(value, None if self._state is None else self._state.shape)
+            self._state = float_array(value, None if self._state is None else self._state.shape)
         except ValueError as error:
             raise self._error(f": the state {error}") from None
-
-
-def _to_reward(value: Any) -> float:
-    return float(finite_array(to_float(value)))

@@ -9,7 +9,7 @@ from typing import Any, Protocol, runtime_checkable
 import numpy as np
 from jaxtyping import Bool, Float
 
-from lare_rl.envs.env_errors import name_step
+from lare_rl.envs.env_errors import check_finite, name_step
 from lare_rl.envs.families import make_host_env
 from lare_rl.envs.interface import EnvSpec, HostEnv, Team, Timestep, team_mean, to_env_action
 from lare_rl.tasks.spec import CreditScope, TaskSpec
@@ -152,11 +152,13 @@ def play_steps(
         policy = policy.select_env_action
     with name_step(0):
         next_timestep = env.reset(seed)
+        check_finite(next_timestep, env.spec, "the environment")
     for number in itertools.count(1):
         timestep = next_timestep
         action = sample_action(env.spec, timestep, rng) if policy is None else _act(policy, env.spec, timestep)
         with name_step(number):
             next_timestep = env.step(action)
+            check_finite(next_timestep, env.spec, "the environment")
         yield timestep, action, next_timestep
         if next_timestep.terminated or next_timestep.truncated:
             return

@@ -1,4 +1,4 @@
-"""Observations and actions of any Gymnasium space as vectors of finite numbers."""
+"""Observations and actions of any Gymnasium space as vectors of numbers."""
 
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
@@ -6,65 +6,11 @@ from typing import Any
 import gymnasium
 import numpy as np
 from gymnasium.spaces import Box, Dict, Discrete, Tuple
-from gymnasium.utils import RecordConstructorArgs
-from gymnasium.wrappers import FlattenObservation
 from jaxtyping import Float
 
 from lare_rl.errors import LareError, short_repr
 
-__all__ = [
-    "NotFiniteError",
-    "OneHot",
-    "OneHotAction",
-    "check_spaces",
-    "decode_box",
-    "finite_array",
-    "flatten_spaces",
-    "flatten_value",
-]
-
-
-class NotFiniteError(ValueError):
-    """An array has a number that is not finite. The message is a predicate."""
-
-    def __init__(self, number: float, index: int | None):
-        """Make the error of the number at this index of the flat array, or None for a single number."""
-        super().__init__(f"contains {number}" + ("" if index is None else f" in entry {index}"))
-        self.number, self.index = number, index
-
-
-class OneHot(Box):
-    """One of n discrete actions, encoded one-hot. Any other vector stands for the action of its largest entry."""
-
-    def __init__(self, n: int, start: int = 0, seed: int | np.random.Generator | None = None):
-        super().__init__(0, 1, (n,), np.float32, seed)
-        self.start = start
-        """The number of the first action."""
-
-    def sample(self, *args: Any, **kwargs: Any) -> Float[np.ndarray, " n"]:
-        return self.project(super().sample(*args, **kwargs))
-
-    def project(self, vector: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
-        """Return the one-hot vector of the action that a vector stands for."""
-        return np.eye(len(vector), dtype=np.float32)[int(np.argmax(vector))]
-
-    def to_discrete(self, vector: Float[np.ndarray, " n"]) -> int:
-        """Return the environment's number of the action that a vector stands for."""
-        return self.start + int(np.argmax(vector))
-
-
-class OneHotAction(gymnasium.ActionWrapper, RecordConstructorArgs):
-    """Makes an environment with discrete actions accept one-hot vectors."""
-
-    def __init__(self, env: gymnasium.Env):
-        RecordConstructorArgs.__init__(self)  # required by Gymnasium to make the same environment again
-        super().__init__(env)
-        assert isinstance(env.action_space, Discrete)
-        self.one_hot = OneHot(int(env.action_space.n), int(env.action_space.start))
-        self.action_space = self.one_hot
-
-    def action(self, action: Float[np.ndarray, " n"]) -> int:
-        return self.one_hot.to_discrete(action)
+__all__ = ["check_spaces", "decode_box", "flatten_value", "float_array"]
 
 
 def check_spaces(owner: Any, observation: gymnasium.Space, action: gymnasium.Space) -> None:
@@ -93,25 +39,16 @@ def decode_box(space: Box, vector: Float[np.ndarray, " size"]) -> np.ndarray:
     return (np.rint(clipped) if space.dtype.kind in "iu" else clipped).astype(space.dtype)
 
 
-def flatten_spaces(env: gymnasium.Env) -> gymnasium.Env:
-    """Return the environment with flat observations and one-hot actions."""
-    if isinstance(env.action_space, Discrete):
-        env = OneHotAction(env)
-    if not (isinstance(env.observation_space, Box) and len(env.observation_space.shape) == 1):
-        env = FlattenObservation(env)
-    return env
-
-
 def flatten_value(space: gymnasium.Space, value: Any) -> Float[np.ndarray, " size"]:
     """Return a value of a space as a new vector, in the order of `gymnasium.spaces.flatten`.
 
     Unlike Gymnasium's function, this one checks the value.
 
     Raises:
-        ValueError: the value is not in the space. The message is the predicate of a sentence, such as "contains nan".
+        ValueError: the value is not in the space. The message is the predicate of a sentence, such as "has the shape (3,), not (2,)".
     """
     if isinstance(space, Box):
-        return finite_array(value, space.shape).ravel()
+        return float_array(value, space.shape).ravel()
     if isinstance(space, Dict):
         if not isinstance(value, Mapping) or set(value) != set(space.spaces):
             raise ValueError(f"must have the keys {', '.join(map(str, space.spaces))}, but is {short_repr(value)}")
@@ -134,29 +71,20 @@ def _contains(space: gymnasium.Space, value: Any) -> bool:
 
 def _flatten_all(pairs: Iterable[tuple[gymnasium.Space, Any]]) -> Float[np.ndarray, " _"]:
     """Return the values of some spaces, one behind the other."""
-    vectors = [np.zeros(0, np.float32)]
-    for space, value in pairs:
-        try:
-            vectors.append(flatten_value(space, value))
-        except NotFiniteError as error:
-            raise NotFiniteError(error.number, sum(map(len, vectors)) + (error.index or 0)) from None
-    return np.concatenate(vectors)
+    return np.concatenate([np.zeros(0, np.float32), *(flatten_value(space, value) for space, value in pairs)])
 
 
-def finite_array(value: Any, shape: tuple[int, ...] | None = None) -> Float[np.ndarray, "..."]:
+def float_array(value: Any, shape: tuple[int, ...] | None = None) -> Float[np.ndarray, "..."]:
     """Return a value as a new float32 array.
 
     Raises:
-        ValueError: the value is not an array of finite numbers, or has another shape. The message is a predicate.
+        ValueError: the value is not an array of numbers, or has another shape. The message is a predicate.
     """
     try:
-        with np.errstate(over="ignore"):  # numbers beyond float32 become infinite, which is refused below
+        with np.errstate(over="ignore"):  # numbers beyond float32 become infinite, which `check_finite` refuses
             array = np.array(value, np.float32)  # a copy: the environment may write the next value into the same memory
     except (TypeError, ValueError, OverflowError):
         raise ValueError(f"is {short_repr(value)}, which is not an array of numbers") from None
     if shape is not None and array.shape != shape:
         raise ValueError(f"has the shape {array.shape}, not {shape}")
-    if not np.isfinite(array).all():
-        index = int(np.argmin(np.isfinite(array)))
-        raise NotFiniteError(float(array.flat[index]), index if array.ndim else None)
     return array

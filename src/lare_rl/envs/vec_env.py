@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float, Integer, Shaped
 
-from lare_rl.envs.env_errors import EnvOutputError, one_line_errors
+from lare_rl.envs.env_errors import EnvOutputError, check_finite, one_line_errors
 from lare_rl.envs.interface import EnvSpec, HostEnv, Timestep
 from lare_rl.errors import LareError, short_repr
 
@@ -50,14 +50,7 @@ class VecEnv(ABC):
         return self.batch
 
     def _check(self, where: Bool[np.ndarray, " n"]) -> None:
-        """Raise `EnvOutputError` if a number is not finite, or an episode is longer or shorter than the specification says."""
-        for name in ("observation", "state", "reward"):
-            column = getattr(self.batch, name)
-            if not np.isfinite(column).all():  # of all environments at once, which takes less time than one by one
-                index, *entry = np.argwhere(~np.isfinite(column))[0].tolist()
-                raise _output_error(
-                    index, f"{name} contains {column[index, *entry]} in entry {', '.join(map(str, entry))}"
-                )
+        """Raise `EnvOutputError` if an episode is longer or shorter than the specification says."""
         max_steps, ended = self.spec.max_steps, np.logical_or(self.batch.terminated, self.batch.truncated)
         at_limit = self._length >= max_steps
         invalid = where & ((at_limit != ended) if self.spec.fixed_length else (at_limit & ~ended))
@@ -67,7 +60,9 @@ class VecEnv(ABC):
             problem = f"the episode has {length} steps and has not ended, but max_steps is {max_steps}"
             if ended[index]:
                 problem = f"the episode ended after {length} steps, but fixed_length says that all have {max_steps}"
-            raise _output_error(index, problem)
+            error = EnvOutputError(f"environment {index}: {problem}")
+            error.env_index = index
+            raise error
 
     @abstractmethod
     def _call(self, command: str, arguments: Shaped[np.ndarray, "n *rest"], where: Bool[np.ndarray, " n"]) -> None:
@@ -108,7 +103,7 @@ def make_env_at(env_index: int, maker: Maker) -> HostEnv:
 
 
 def call_env(env_index: int, env: HostEnv, command: str, argument: Any, batch: Timestep) -> None:
-    """Call "reset" or "step" of an environment, and write its timestep into a row of the batch."""
+    """Call "reset" or "step" of an environment, check its timestep, and write it into a row of the batch."""
     *columns, measures = batch
     try:
         with one_line_errors(f"environment {env_index} failed in {command}"):
@@ -123,6 +118,8 @@ def call_env(env_index: int, env: HostEnv, command: str, argument: Any, batch: T
                     shapes = f"{np.shape(value)}, not {column.shape[1:]}"
                     raise EnvOutputError(f"environment {env_index}: {name} has the shape {shapes}")
                 column[env_index] = value
+            row = Timestep(*(column[env_index] for column in columns), measures={})  # as float32, which may be infinite
+            check_finite(row, env.spec, f"environment {env_index}")
             for name, value in new_measures.items():
                 if name not in measures:
                     raise EnvOutputError(f"environment {env_index}: the measure {name!r} is not in EnvSpec.measures")
@@ -130,12 +127,6 @@ def call_env(env_index: int, env: HostEnv, command: str, argument: Any, batch: T
     except EnvOutputError as error:
         error.env_index = env_index
         raise
-
-
-def _output_error(env_index: int, problem: str) -> EnvOutputError:
-    error = EnvOutputError(f"environment {env_index}: {problem}")
-    error.env_index = env_index
-    return error
 
 
 def check_same_sizes(specs: Sequence[EnvSpec]) -> None:

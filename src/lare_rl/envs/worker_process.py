@@ -73,10 +73,7 @@ class Worker:
         paths = os.pathsep.join(path or os.getcwd() for path in sys.path)
         variables = {"OMP_NUM_THREADS": "1"} | os.environ | {"PYTHONPATH": paths}
         self.process = subprocess.Popen(
-            [sys.executable, "-P", "-c", PROGRAM, self._address],
-            stdin=subprocess.PIPE,
-            env=variables,
-            **own_session(),
+            [sys.executable, "-P", "-c", PROGRAM, self._address], stdin=subprocess.PIPE, env=variables, **own_session()
         )
 
     def attach(self, env_indices: Sequence[int], memory: str, worker_index: int) -> None:

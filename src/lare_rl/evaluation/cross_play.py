@@ -9,11 +9,11 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 
-from lare_rl.envs.families import make_env
+from lare_rl.envs.families import load_env_spec
 from lare_rl.envs.interface import JaxEnv, Team, team_mean
 from lare_rl.errors import LareError, check_count
 from lare_rl.runs.directory import Run
-from lare_rl.training.collect_device import unroll_on_device
+from lare_rl.training.collect_device import make_jax_env, unroll_on_device
 from lare_rl.training.compiled import policy_function, training_module
 from lare_rl.training.saved_state import load_learner
 from lare_rl.training.static_config import TrainConfig
@@ -37,33 +37,24 @@ def cross_play(runs: tuple[Run, Run], episodes: int = 200) -> list[Match]:
         LareError: the runs are not of one task with two teams, or of different algorithms, or `episodes` is less than 1.
     """
     episodes = check_count("episodes", episodes)
-    (task, other), (algorithm, other_algorithm) = zip(
-        *((run.config.task, run.config.settings.algorithm) for run in runs), strict=True
-    )
-    if task.name != other.name:
-        raise LareError(f"cross-play needs two runs of one task, and these are of {task.name} and {other.name}")
-    if task.digest != other.digest:
-        raise LareError(
-            f"cross-play needs two runs of one task, and these have different tasks with the name {task.name}"
-        )
+    task, other_task = (run.config.task for run in runs)
+    algorithm, other_algorithm = (run.config.settings.algorithm for run in runs)
+    if task.name != other_task.name:
+        raise LareError(f"cross-play needs two runs of one task, and these are of {task.name} and {other_task.name}")
+    if task.digest != other_task.digest:
+        raise LareError(f"cross-play needs two runs of one task, and these have different tasks named {task.name}")
     if len(task.teams) != 2:
         raise LareError(f"cross-play needs two teams that learn, and {task.name} has {len(task.teams) or 1}")
     if algorithm != other_algorithm:
         raise LareError(f"cross-play needs runs of one algorithm, and these are of {algorithm} and {other_algorithm}")
-    env = make_env(runs[0].config.task)
-    if not isinstance(env, JaxEnv):
-        env.close()
-        raise LareError(f"cross-play is for environments in JAX, and {runs[0].config.task.name} steps on the host")
-    configs_and_actors = [_load_actors(run) for run in runs]
-    config = configs_and_actors[0][0]
-    play_match = jax.jit(partial(_play_match, env, n_episodes=episodes, config=config))
+    if not load_env_spec(task).is_jax:
+        raise LareError(f"cross-play is for environments in JAX, and {task.name} steps on the host")
+    players = [(run, *_load_actors(run)) for run in runs]
+    play_match = jax.jit(partial(_play_match, make_jax_env(task), n_episodes=episodes, config=players[0][1]))
     matches = []
-    players = [(run, actors) for run, (_, actors) in zip(runs, configs_and_actors, strict=True)]
-    for (first_run, first_actors), (second_run, second_actors) in product(players, repeat=2):
-        returns = [
-            [float(play_match(first, second, jax.random.key(0))) for second in second_actors] for first in first_actors
-        ]
-        matches.append(Match(first=first_run, second=second_run, returns=np.array(returns)))
+    for (run, _, first_actors), (other, _, second_actors) in product(players, repeat=2):
+        returns = [[float(play_match(a, b, jax.random.key(0))) for b in second_actors] for a in first_actors]
+        matches.append(Match(first=run, second=other, returns=np.array(returns)))
     return matches
 
 

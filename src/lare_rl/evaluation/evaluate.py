@@ -10,8 +10,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
-from lare_rl.envs.families import load_env_spec, make_env, make_host_env
-from lare_rl.envs.interface import JaxEnv
+from lare_rl.envs.families import load_env_spec, make_host_env
 from lare_rl.envs.load import check_environment
 from lare_rl.envs.placement import make_vec_env, n_open_envs
 from lare_rl.envs.play import Episode, EpisodeListener, play_roles
@@ -19,8 +18,8 @@ from lare_rl.errors import LareError, check_count
 from lare_rl.runs.directory import Run, as_run
 from lare_rl.tasks.spec import TaskSpec
 from lare_rl.tasks.trust import trust_environment, untrusted_module
-from lare_rl.training.collect_device import DeviceCollector
-from lare_rl.training.evaluation import Evaluation, concatenate
+from lare_rl.training.collect_device import DeviceCollector, make_jax_env
+from lare_rl.training.evaluation import Evaluation
 from lare_rl.training.saved_state import load_actor
 from lare_rl.training.streams import Stream, episode_seed
 from lare_rl.training.unroll_host import evaluate_policy_on_host
@@ -105,22 +104,11 @@ def evaluate_policy(
     config, actor, _ = load_actor(run, best)
     config = replace(config, deterministic=deterministic)
     if load_env_spec(task).is_jax:
-        env = make_env(task)
-        assert isinstance(env, JaxEnv)
-        return DeviceCollector(env, config, run.seeds).evaluate(actor, episodes, number=1)
-    task, evaluations = task.evaluation_task, []
-    for n_done in range(0, episodes, MAX_OPEN_ENVS):
-        n_episodes = min(MAX_OPEN_ENVS, episodes - n_done)
-        with make_vec_env(task, n_open_envs(task, len(run.seeds), n_episodes) * len(run.seeds)) as envs:
-            first = run.config.settings.evaluation_episodes + n_done
-
-            def report(n_done: int, n_before: int = n_done) -> None:
-                on_episode(n_before + n_done)
-
-            evaluations.append(
-                evaluate_policy_on_host(envs, config, actor, run.seeds, n_episodes, first, on_episode=report)
-            )
-    return concatenate(evaluations)
+        return DeviceCollector(make_jax_env(task), config, run.seeds).evaluate(actor, episodes, number=1)
+    task, first = task.evaluation_task, run.config.settings.evaluation_episodes
+    width = n_open_envs(task, len(run.seeds), min(episodes, MAX_OPEN_ENVS))
+    with make_vec_env(task, width * len(run.seeds)) as envs:
+        return evaluate_policy_on_host(envs, config, actor, run.seeds, episodes, first, on_episode=on_episode)
 
 
 def evaluation_seeds(run: Run, episodes: int) -> list[int]:

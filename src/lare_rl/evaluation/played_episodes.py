@@ -13,24 +13,22 @@ from jaxtyping import Array, Bool, Float
 
 from lare_rl.data import replay
 from lare_rl.data.trajectory import Trajectory
-from lare_rl.envs.families import make_env
-from lare_rl.envs.interface import JaxEnv, Team, team_mean
+from lare_rl.envs.interface import JaxEnv
 from lare_rl.envs.placement import make_vec_env, n_open_envs
-from lare_rl.envs.play import phi_inputs
+from lare_rl.envs.play import make_episode
 from lare_rl.runs.directory import Run
-from lare_rl.training.collect_device import unroll_on_device
+from lare_rl.training.collect_device import make_jax_env, unroll_on_device
 from lare_rl.training.compiled import training_module
 from lare_rl.training.episodes import predict_returns
 from lare_rl.training.evaluation import EpisodeBatch
 from lare_rl.training.factors import compute_host_factors
-from lare_rl.training.host_policy import EvaluationPolicy
 from lare_rl.training.learner import Learner, empty_replay, store_with_factors
 from lare_rl.training.rewards import rewards
 from lare_rl.training.saved_state import load_learner
 from lare_rl.training.seed_axis import select_seed
 from lare_rl.training.static_config import TrainConfig
 from lare_rl.training.streams import Stream, episode_seed
-from lare_rl.training.unroll_host import record_on_host
+from lare_rl.training.unroll_host import policy_turns, record_on_host
 from lare_rl.util.statistics import column_correlations
 
 __all__ = [
@@ -91,21 +89,18 @@ def play_run(run: Run, n_episodes: int = 1, *, actor: Any = None, key: int = 0) 
         first = jax.tree.map(lambda leaf: leaf[:1], learner)
         actor = training_module(config).get_actor(first, run.config.settings.steps, config)
     if config.env.is_jax:
-        env = make_env(run.config.task)
-        assert isinstance(env, JaxEnv)
-        batch = unroll_policy(env, config, actor, n_episodes, key)
+        batch = unroll_policy(make_jax_env(run.config.task), config, actor, n_episodes, key)
     else:
         batch = _unroll_on_host(run, config, actor, n_episodes)
-    factors = compute_host_factors(run, config, batch.steps)
-    has_proxy = config.method.has_proxy_rewards
+    factors, training_reward = compute_host_factors(run, config, batch.steps), None
+    if config.method.has_proxy_rewards:
+        training_reward = compute_training_rewards(select_seed(learner), batch.steps, factors, config)
     return PlayedEpisodes(
         config=config,
         steps=batch.steps,
         mask=batch.mask,
         factors=factors,
-        training_reward=compute_training_rewards(select_seed(learner), batch.steps, factors, config)
-        if has_proxy
-        else None,
+        training_reward=training_reward,
         state=batch.state,
     )
 
@@ -119,13 +114,9 @@ def unroll_policy(env: JaxEnv, config: TrainConfig, actor: Any, n_episodes: int,
 def _unroll_on_host(run: Run, config: TrainConfig, actor: Any, n_episodes: int) -> EpisodeBatch:
     """Play as many episodes at a time as environments may be open. An episode does not depend on how many these are."""
     seeds, task, batches = run.seeds[:1], run.config.task, []
-    width = n_open_envs(task, 1, n_episodes)
-    with make_vec_env(task, width) as envs:
-        for first in range(0, n_episodes, width):
-            numbers = np.arange(first, min(first + width, n_episodes))
-            noise_rows = n_episodes, np.minimum(np.arange(first, first + width), n_episodes - 1)
-            policy = EvaluationPolicy(config, actor, seeds, width, deterministic=False, noise_rows=noise_rows)
-            episode_seeds = [episode_seed(seeds[0], Stream.TRAINING_EPISODES, number) for number in numbers.tolist()]
+    with make_vec_env(task, n_open_envs(task, 1, n_episodes)) as envs:
+        for numbers, policy in policy_turns(envs, config, actor, seeds, n_episodes, deterministic=False):
+            episode_seeds = [episode_seed(seeds[0], Stream.TRAINING_EPISODES, number) for number in numbers]
             batch = _drop_seed_axis(record_on_host(envs, policy, seeds, episode_seeds))
             batches.append(jax.tree.map(itemgetter(np.s_[:, : len(numbers)]), batch))
     return _join_episodes(batches)
@@ -171,7 +162,6 @@ def compute_training_rewards(
 class TeamSample:
     """Steps of one team, over some episodes of the first seed's policy. A row is a step of an agent or, for a state, of the team."""
 
-    team: Team
     next_observation: Float[np.ndarray, "rows observation"]
     """Each agent's observation after the step, or the state."""
     factors: Float[np.ndarray, "rows factors"]
@@ -187,18 +177,12 @@ class TeamSample:
 def sample_steps(run: Run, actor: Any = None) -> list[TeamSample]:
     """Sample steps of each team, under the first seed's policy or another actor of one seed (see `play_run`)."""
     played = play_run(run, N_SAMPLE_EPISODES, actor=actor, key=1)
-    config, steps, samples = played.config, jax.tree.map(np.asarray, played.steps), []
-    for team_index, team in enumerate(config.env.teams):
-        observation, _ = phi_inputs(config.credit_scope, team, steps.next_timestep, steps.env_action)
-        mask = np.broadcast_to(played.mask[..., None], observation.shape[:-1])
-        reward = played.reward[..., team.agents]
-        if config.team_level:
-            reward = team_mean(played.reward, steps.timestep.alive, team)[..., None]
-        else:
-            mask = mask & steps.timestep.alive[..., team.agents]
+    config, samples = played.config, []
+    steps = jax.tree.map(lambda leaf: np.asarray(leaf)[played.mask], played.steps)  # [steps ...]
+    for team_index, role in enumerate(run.config.task.roles):
+        rows = make_episode(role, config.env, steps.timestep, steps.env_action, steps.next_timestep)
         n_factors = config.n_factors[team_index] if config.n_factors else 0
-        factors = played.factors[..., config.team_rows(team_index), :n_factors]
-        samples.append(
-            TeamSample(team=team, next_observation=observation[mask], factors=factors[mask], reward=reward[mask])
-        )
+        factors = played.factors[played.mask][:, config.team_rows(team_index), :n_factors]
+        next_observation, factors, reward = (x[rows.alive] for x in (rows.next_observation, factors, rows.reward))
+        samples.append(TeamSample(next_observation=next_observation, factors=factors, reward=reward))
     return samples

@@ -148,9 +148,7 @@ class RunPolicy:
         if rows.ndim == 2 and not len(rows):
             raise LareError(f"the batch is empty: its shape is {rows.shape}")
         if rows.ndim not in (1, 2) or rows.shape[-1] != size:
-            raise LareError(
-                f"an observation is {size} numbers, and a batch has rows of them: the shape is {rows.shape}"
-            )
+            raise LareError(f"an observation is {size} numbers, a batch has rows of them: the shape is {rows.shape}")
         if not np.isfinite(rows).all():
             raise LareError("an observation holds a number that is not finite")
         return np.atleast_2d(rows), rows.ndim == 1

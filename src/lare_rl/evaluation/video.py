@@ -13,15 +13,16 @@ from typing import Any
 import jax
 import numpy as np
 
-from lare_rl.envs.families import load_env_spec, make_env, make_host_env
+from lare_rl.envs.families import load_env_spec, make_host_env
 from lare_rl.envs.gymnasium_env import GymnasiumEnv
-from lare_rl.envs.interface import Frame, HostEnv, JaxEnv
+from lare_rl.envs.interface import Frame, HostEnv
 from lare_rl.envs.jax_on_host import JaxOnHost
 from lare_rl.envs.play import play_steps
 from lare_rl.errors import LareError, missing_extra_error
 from lare_rl.evaluation.played_episodes import PlayedEpisodes, play_run
 from lare_rl.evaluation.policy import RunPolicy
 from lare_rl.runs.directory import Run
+from lare_rl.training.collect_device import make_jax_env
 from lare_rl.training.streams import Stream, episode_seed
 from lare_rl.util.files import check_new_path
 
@@ -102,9 +103,7 @@ def render_played(run: Run, played: PlayedEpisodes) -> list[Frame] | None:
     """Render the first episode with each agent's credit. Return None for an environment that cannot be drawn."""
     if not load_env_spec(run.config.task).is_jax:
         return None
-    env = make_env(run.config.task)
-    assert isinstance(env, JaxEnv)
-    return env.frames(played.select_episode(played.state), played.select_episode(played.credit))
+    return make_jax_env(run.config.task).frames(*played.select_episode((played.state, played.credit)))
 
 
 def encode_film(frames: Sequence[Frame], frame_seconds: float, max_bytes: int) -> bytes:

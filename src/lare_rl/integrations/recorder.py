@@ -106,9 +106,7 @@ def check_capacity(credit: CreditAssigner, n_steps: int) -> None:
     """Raise `LareError` if an assigner keeps fewer steps than a buffer."""
     capacity = credit.store.capacity
     if capacity < n_steps:
-        raise LareError(
-            f"the assigner keeps {capacity} steps, and the buffer {n_steps}: create it with capacity={n_steps}"
-        )
+        raise LareError(f"the assigner keeps {capacity} steps, the buffer {n_steps}: create it with capacity={n_steps}")
 
 
 def check_pay(pay: str) -> None:

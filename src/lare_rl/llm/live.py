@@ -210,10 +210,9 @@ class LiveModel:
         if forms is not None:
             self._forms = forms
             return _Failure(message, retry=True, request_changed=True)
-        retry = error.status in _RETRIED_STATUSES or error.status >= 500
-        return _Failure(
-            message, retry=retry and "insufficient_quota" not in error.body, pause_s=_retry_after_s(error.headers)
-        )
+        may_recover = error.status in _RETRIED_STATUSES or error.status >= 500
+        retry = may_recover and "insufficient_quota" not in error.body
+        return _Failure(message, retry, pause_s=_retry_after_s(error.headers))
 
 
 def _safe_text(text: object) -> str:

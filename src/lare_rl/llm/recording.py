@@ -112,9 +112,7 @@ class RecordedModel:
         """Return the reply number `sample` to a request. See `Model.reply`."""
         request = list(messages)
         for recording in self.recordings:
-            replies = [
-                reply for exchange in recording.exchanges if exchange.messages == request for reply in exchange.replies
-            ]
+            replies = [reply for x in recording.exchanges if x.messages == request for reply in x.replies]
             if sample < len(replies):
                 self.name = f"{recording.model}, recorded {recording.recorded}, draw {recording.draw}"
                 return replies[sample]
@@ -149,9 +147,7 @@ class Recorder:
     def n_replies(self, stage: Stage, messages: Sequence[Message]) -> int:
         """Return the number of recorded replies to a request."""
         request = stage, list(messages)
-        return sum(
-            len(exchange.replies) for exchange in self.exchanges if (exchange.stage, exchange.messages) == request
-        )
+        return sum(len(x.replies) for x in self.exchanges if (x.stage, x.messages) == request)
 
     def add(self, stage: Stage, messages: Sequence[Message], reply: str, model: str) -> None:
         """Add a reply to a request. If the last request was the same, the reply is added to its replies."""

@@ -100,9 +100,7 @@ class FlatLog(ListLog):
         flat = {key: value for key, value in flat.items() if key in KEYS or np.shape(value)[:1] == (n_steps,)}
         for key, value in flat.items():
             if np.shape(value)[:1] != (n_steps,):
-                raise LareError(
-                    f"{key} must have {n_steps} rows, as many as actions, and its shape is {np.shape(value)}"
-                )
+                raise LareError(f"{key} must have {n_steps} rows, as many as actions: its shape is {np.shape(value)}")
         is_end = np.any([array.astype(bool).reshape(n_steps, -1).any(axis=1) for array in flags], axis=0)
         is_end[-1:] = True
         super().__init__(_FlatEpisodes(flat, np.flatnonzero(is_end) + 1), role)

@@ -6,7 +6,7 @@ from typing import Any
 from lare_rl.assigner.space_layout import SpaceLayout
 from lare_rl.logs.log import Log, open_log
 from lare_rl.new_task.documentation import plain_lines, remove_rewards
-from lare_rl.new_task.draft import SCORE_LINE, Draft, count_entries, text_lines, warning_lines
+from lare_rl.new_task.draft import SCORE_LINE, Draft, count_entries, make_draft, warning_lines
 from lare_rl.tasks.spec import NO_ENVIRONMENT
 
 __all__ = ["draft_log_task"]
@@ -31,15 +31,9 @@ def draft_log_task(source: Any) -> Draft:
         'scored_observation = "after"',
         SCORE_LINE,
         f"max_episode_steps = {limit}" if limit else LIMIT_LINE,
-        *text_lines(texts, {key: _first_line(layout, key) for key, layout in layouts.items()}),
     ]
-    return Draft(
-        name=name,
-        toml="\n".join(lines) + "\n",
-        missing_keys=tuple(key for key, text in texts.items() if not text),
-        removed=removed,
-        logs_only=True,
-    )
+    first_lines = {key: _first_line(layout, key) for key, layout in layouts.items()}
+    return make_draft(name, lines, texts, first_lines, removed, logs_only=True)
 
 
 def _description(log: Log) -> str:

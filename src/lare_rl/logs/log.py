@@ -102,9 +102,7 @@ def open_log(source: Any, task: TaskSpec | None = None) -> Log:
         from lare_rl.logs.arrays import FlatLog, ListLog
 
         return FlatLog(source, role) if isinstance(source, Mapping) else ListLog(source, role)
-    raise LareError(
-        f"{short_repr(source)} is not a log: give a path, a Minari id, arrays by name, or a list of episodes"
-    )
+    raise LareError(f"{short_repr(source)} is not a log: a path, a Minari id, arrays by name, or a list of episodes")
 
 
 def _open_path(source: str | Path, role: TaskSpec | None) -> Log:

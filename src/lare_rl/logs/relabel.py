@@ -154,12 +154,7 @@ def relabel(
     Raises:
         LareError: the log is damaged or empty, `out` cannot be written or exists, or method, function and task do not fit together.
     """
-    if not 0 <= hold_out <= 0.9:
-        raise LareError(f"hold_out = {hold_out} must be between 0 and 0.9")
-    if not 0 < memory < math.inf:
-        raise LareError(f"memory = {memory} must be positive and finite")
-    if updates < 1:
-        raise LareError(f"updates = {updates} must be at least 1")
+    _check_numbers(hold_out, memory, updates)
     task = None if task is None else resolve_task(task, playable=False)
     log = open_log(source, task)
     log.check_output(out, overwrite)
@@ -171,7 +166,8 @@ def relabel(
     comment = f"Rewards by lare-rl relabel, {name}; the old rewards are in infos['paid'], after an entry for the reset."
     path = log.write(out, episodes, overwrite, comment)
     r2, r2_error, return_correlation = predicted_return_statistics(counts.returns, counts.predictions)
-    is_calibrated = credit.config.method.calibrated
+    if not credit.config.method.calibrated:
+        r2 = r2_error = math.nan
     return Relabelled(
         out=path,
         method=name,
@@ -179,11 +175,20 @@ def relabel(
         steps=counts.steps,
         cut=counts.cut,
         held_out=len(counts.returns),
-        return_r2=r2 if is_calibrated else math.nan,
-        return_r2_error=r2_error if is_calibrated else math.nan,
+        return_r2=r2,
+        return_r2_error=r2_error,
         return_correlation=return_correlation,
         explanation=explanation,
     )
+
+
+def _check_numbers(hold_out: float, memory: float, updates: int) -> None:
+    if not 0 <= hold_out <= 0.9:
+        raise LareError(f"hold_out = {hold_out} must be between 0 and 0.9")
+    if not 0 < memory < math.inf:
+        raise LareError(f"memory = {memory} must be positive and finite")
+    if updates < 1:
+        raise LareError(f"updates = {updates} must be at least 1")
 
 
 def hold_out_flags(share: float, seed: int) -> Iterator[bool]:

@@ -4,7 +4,7 @@ import inspect
 import re
 from collections.abc import Mapping, Sequence
 
-__all__ = ["first_section", "plain_lines", "remove_rewards", "split_sections", "write_texts"]
+__all__ = ["first_section", "plain_lines", "remove_rewards", "single_agent_lines", "split_sections", "write_texts"]
 
 HEADING = re.compile(r"^[ \t]*#+\s*(.+?)\s*$", re.MULTILINE)
 
@@ -44,6 +44,15 @@ def split_sections(documentation: str) -> dict[str, str]:
 def first_section(sections: Mapping[str, str], *titles: str) -> list[str]:
     """Return the lines of the first section with one of these titles that is not empty."""
     return plain_lines(next((sections[title] for title in titles if sections.get(title, "").strip()), ""))
+
+
+def single_agent_lines(sections: Mapping[str, str]) -> dict[str, list[str]]:
+    """Return the lines of each text of a task of one agent, by its key."""
+    return {
+        "description": plain_lines(sections[""]) + first_section(sections, "description"),
+        "observation": first_section(sections, "observation space", "observation"),
+        "action": first_section(sections, "action space", "action"),
+    }
 
 
 def write_texts(

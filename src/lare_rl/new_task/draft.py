@@ -8,7 +8,6 @@ from typing import Any
 import gymnasium
 from gymnasium.spaces import Box, Discrete
 
-from lare_rl.envs.spaces import OneHot
 from lare_rl.tasks.spec import FILL_IN
 
 __all__ = [
@@ -158,7 +157,7 @@ def describe_flattening(space: gymnasium.Space) -> str:
 
 def describe_action(space: gymnasium.Space) -> str:
     """Return the encoding or the common bounds of an action, as the end of a sentence about its entries."""
-    if isinstance(space, OneHot | Discrete):
+    if isinstance(space, Discrete):
         return ", all 0 but one: the action that is taken"
     assert isinstance(space, Box)
     lows, highs = set(map(float, space.low.ravel())), set(map(float, space.high.ravel()))

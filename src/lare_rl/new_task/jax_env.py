@@ -2,7 +2,6 @@
 
 import inspect
 import re
-from collections.abc import Iterable
 from importlib import import_module
 from typing import Any
 
@@ -16,7 +15,7 @@ from lare_rl.envs.jumanji_env import JumanjiEnv, observed_arrays
 from lare_rl.envs.pettingzoo_construct import agent_kind
 from lare_rl.errors import LareError
 from lare_rl.new_task import draft
-from lare_rl.new_task.documentation import first_section, plain_lines, split_sections, write_texts
+from lare_rl.new_task.documentation import single_agent_lines, split_sections, write_texts
 from lare_rl.new_task.draft import Draft, count_entries, file_name, warning_lines
 from lare_rl.new_task.many_agents import make_stub, name_patterns, write_team_drafts
 
@@ -63,25 +62,16 @@ def _read_texts(env: Any) -> tuple[dict[str, str], tuple[str, ...]]:
     """Return the texts by their keys, and the removed lines, from the docstring of the package's class."""
     documentation = inspect.cleandoc(vars(type(env.env)).get("__doc__") or "")
     sections = split_sections(FIELD.sub(_heading, documentation))
-    return write_texts(
-        {
-            "description": plain_lines(sections[""]) + first_section(sections, "description"),
-            "observation": list(_without_masks(first_section(sections, "observation space", "observation"))),
-            "action": first_section(sections, "action space", "action"),
-        },
-        sections,
-    )
+    lines = single_agent_lines(sections)
+    # The mask of available actions is no entry of the observation.
+    rows = [line for line in lines["observation"] if "action_mask" not in line and not line.startswith("Observation")]
+    return write_texts(lines | {"observation": rows}, sections)
 
 
 def _heading(match: re.Match[str]) -> str:
     """Return a heading in place of the beginning of a section."""
     lead = "An episode ends:\n" if match[1] == "episode termination" else ""
     return f"## {match[1]}\n{lead}"
-
-
-def _without_masks(lines: Iterable[str]) -> Iterable[str]:
-    """Yield the lines that are not about the mask of available actions, which is no entry of the observation."""
-    return (line for line in lines if "action_mask" not in line and not line.startswith("Observation"))
 
 
 def _describe_observation(env: Any) -> str:

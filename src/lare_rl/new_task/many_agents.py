@@ -53,9 +53,7 @@ def draft_multi_agent_task(environment_id: str) -> Draft:
     module, maker = split_environment(environment_id)
     name = file_name(module.rpartition(".")[2] if maker in GENERIC_MAKERS else maker)
     several = len(kinds) > 1
-    teams = (
-        [make_stub(kind, environment_id, team=kind, agents=name_patterns(kind)) for kind in kinds] if several else ()
-    )
+    teams = [make_stub(kind, environment_id, team=kind, agents=name_patterns(kind)) for kind in kinds if several]
     task = make_stub(name, environment_id, teams=teams, max_episode_steps=limit or draft.DEFAULT_LIMIT)
     arguments = _default_arguments(env)
     lines = [
@@ -95,9 +93,8 @@ def write_team_drafts(
         team_draft = draft.make_draft(name, lines, _team_texts(env, team, texts), _first_lines(env, team), removed)
         files[f"{name}-{team.name}.toml"] = team_draft.toml
     lines = [*head, *TEAMS_COMMENT, f"teams = {json.dumps(list(files))}", *end]
-    task_draft = draft.make_draft(
-        name, lines, texts | dict.fromkeys(TEAM_KEYS, "See the teams."), {}, removed, teams=files
-    )
+    task_texts = texts | dict.fromkeys(TEAM_KEYS, "See the teams.")
+    task_draft = draft.make_draft(name, lines, task_texts, {}, removed, teams=files)
     return replace(task_draft, missing_keys=tuple(key for key in texts if not texts[key]))
 
 

@@ -3,12 +3,13 @@
 import contextlib
 
 import gymnasium
+from gymnasium.spaces import flatdim
 
 from lare_rl.envs.families import FAMILIES
 from lare_rl.envs.gymnasium_env import make_gymnasium
 from lare_rl.errors import LareError
 from lare_rl.new_task import draft
-from lare_rl.new_task.documentation import first_section, plain_lines, split_sections, write_texts
+from lare_rl.new_task.documentation import single_agent_lines, split_sections, write_texts
 from lare_rl.new_task.draft import Draft, count_entries, file_name, warning_lines
 from lare_rl.tasks.spec import PETTINGZOO_PREFIX
 
@@ -38,9 +39,7 @@ def draft_task(environment_id: str) -> Draft:
 
         return draft_jax_task(environment_id)
     if (family := environment_id.partition("/")[0]) in FAMILIES:
-        raise LareError(
-            f"new-task cannot draft a task of {family}: write the task file by hand (docs/reference/tasks.md)"
-        )
+        raise LareError(f"new-task cannot draft a task of {family}: write its file by hand (docs/reference/tasks.md)")
     with contextlib.closing(make_gymnasium(environment_id)) as env:
         return _write_draft(environment_id, env)
 
@@ -48,16 +47,9 @@ def draft_task(environment_id: str) -> Draft:
 def _write_draft(environment_id: str, env: gymnasium.Env) -> Draft:
     # Not inspect.getdoc: it would return the docstring of a base class, which does not describe this environment.
     sections = split_sections(type(env.unwrapped).__doc__ or "")
-    texts, removed = write_texts(
-        {
-            "description": plain_lines(sections[""]) + first_section(sections, "description"),
-            "observation": first_section(sections, "observation space", "observation"),
-            "action": first_section(sections, "action space", "action"),
-        },
-        sections,
-    )
-    observation_size, action_size = env.observation_space.shape[0], env.action_space.shape[0]  # type: ignore[index]
-    flattening = draft.describe_flattening(env.unwrapped.observation_space)
+    texts, removed = write_texts(single_agent_lines(sections), sections)
+    observation_size, action_size = (int(flatdim(space)) for space in (env.observation_space, env.action_space))
+    flattening = draft.describe_flattening(env.observation_space)
     first_lines = {
         "observation": f"{count_entries(observation_size)}{flattening}.",
         "action": f"{count_entries(action_size)}{draft.describe_action(env.action_space)}.",

@@ -15,12 +15,13 @@ import itertools
 import math
 import operator
 from collections.abc import Callable, Iterator, Sequence
+from functools import partial
 from typing import Any
 
 import numpy as np
 
 from lare_rl.phi.builder import current_builder
-from lare_rl.phi.graph import NumberKind, all_positions, widest
+from lare_rl.phi.graph import NumberKind, all_positions
 from lare_rl.phi.indices import ALL, computed_positions, fixed_index, index_entries, is_mask, masked_index, overwrite
 from lare_rl.phi.limits import RefusedError
 from lare_rl.phi.operand import BATCH, BatchSize, Operand, common_batch_axis
@@ -33,8 +34,7 @@ __all__ = [
 
 class _Value(Operand):
     def apply(self, op: str, *operands: Any) -> Any:
-        special = {"power": power, "invert": invert}.get(op)
-        return elementwise(op, *operands) if special is None else special(*operands)
+        return {"power": power, "invert": invert}.get(op, partial(elementwise, op))(*operands)
 
 
 class Array(_Value):
@@ -134,7 +134,7 @@ class Array(_Value):
             RefusedError: the batch axis is among them.
         """
         numbers = range(self.ndim) if axis is None else axis if isinstance(axis, (tuple, list, range)) else [axis]
-        axes = tuple(sorted({self.axis(number) for number in numbers}))
+        axes = tuple(sorted(set(map(self.axis, numbers))))
         if self.batch_axis in axes:
             how = "without axis=" if axis is None else f"along axis {self.batch_axis}"
             raise RefusedError(
@@ -208,8 +208,7 @@ class Array(_Value):
 
     def _entries(self, index: Any) -> list[Any]:
         items = index if isinstance(index, tuple) else (index,)
-        items = [as_array(item) if isinstance(item, (list, tuple, range)) else item for item in items]
-        return index_entries(self, items)
+        return index_entries(self, [as_array(x) if isinstance(x, (list, tuple, range)) else x for x in items])
 
     def _write(self, value: Any, positions: np.ndarray, batch_axis: int | None) -> None:
         """Write into these positions of the base."""
@@ -217,7 +216,7 @@ class Array(_Value):
         if base.read_only:
             raise ValueError("the inputs cannot be written into: copy them first, x = observation.copy()")
         node = builder.cast(broadcast(as_array(value), positions.shape, batch_axis).node, base.kind)
-        sources = all_positions(base.row_shape).copy()
+        sources = all_positions(base.row_shape)
         sources.reshape(-1)[positions.reshape(-1)] = sources.size + np.arange(positions.size)
         base._node = builder.gather(builder.concat([base._node, node]), sources)
 
@@ -284,8 +283,7 @@ def elementwise(op: str, *operands: Any) -> Any:
         return Masked(result, *masks.values())
     arrays = [as_array(operand) for operand in operands]
     batch_axis = common_batch_axis(arrays)
-    nodes = [array.node for array in arrays]
-    builder = current_builder()
+    builder, nodes = current_builder(), [array.node for array in arrays]
     return Array(builder.where(*nodes) if op == "where" else builder.elementwise(op, *nodes), batch_axis)
 
 
@@ -335,18 +333,16 @@ def stack(arrays: Sequence[Array], axis: Any) -> Array:
 
 def concatenate(arrays: Sequence[Array], axis: Any) -> Array:
     """Join arrays along an axis."""
-    first = arrays[0]
-    (at,) = first.row_axes(axis)
+    (at,) = arrays[0].row_axes(axis)
     if len({(array.batch_axis, array.row_shape[:at], array.row_shape[at + 1 :]) for array in arrays}) > 1:
         raise ValueError(f"the shapes {_shapes_text(arrays)} cannot be joined along axis {at}")
     builder = current_builder()
-    kind = widest([array.kind for array in arrays])
     sizes = [math.prod(array.row_shape) for array in arrays]
     builder.check_size((sum(sizes),))
     starts = itertools.accumulate(sizes, initial=0)
     positions = [all_positions(array.row_shape) + start for array, start in zip(arrays, starts, strict=False)]
-    node = builder.concat([builder.cast(array.node, kind) for array in arrays])
-    return Array(builder.gather(node, np.concatenate(positions, at)), first.batch_axis)
+    node = builder.concat([array.node for array in arrays])
+    return Array(builder.gather(node, np.concatenate(positions, at)), arrays[0].batch_axis)
 
 
 def _shapes_text(arrays: Sequence[Array]) -> str:

@@ -54,9 +54,8 @@ class Builder:
                 raise RefusedError("E-ROWS", ROW_OPS[node.op])
         if nodes and all(node.op == "constant" for node in nodes):
             with np.errstate(all="ignore"):
-                return self.constant(
-                    compute(Node(op, tuple(inputs), shape, kind, option), [node.option for node in nodes], ())
-                )
+                node = Node(op, tuple(inputs), shape, kind, option)
+                return self.constant(compute(node, [constant.option for constant in nodes], ()))
         key = op, tuple(inputs), shape, kind, option.tobytes() if isinstance(option, np.ndarray) else option
         if key not in self._indices:
             chain = 1 + max((self._chains[i] for i in inputs), default=-1)
@@ -324,9 +323,7 @@ def _add_for_rows(builder: Builder, node: Node, x: list[int], inputs: Sequence[N
         case "einsum":
             terms, result = node.option.replace("...", "").split("->")
             letter = next(c for c in string.ascii_letters if c not in terms)
-            terms = [
-                ("" if builder.is_constant(i) else letter) + term for term, i in zip(terms.split(","), x, strict=True)
-            ]
+            terms = [("" if builder.is_constant(i) else letter) + t for t, i in zip(terms.split(","), x, strict=True)]
             return builder.einsum(terms, letter + result, x)
     return builder.add(node.op, x, (rows, *node.shape), node.kind, node.option)
 

@@ -182,9 +182,7 @@ def make_class(runtime: Runtime, statement: ast.ClassDef, scope: Scope) -> Class
     """Carry out the definition of a class."""
     bases = [runtime.evaluate(base, scope) for base in statement.bases]
     program_bases = [base for base in bases if isinstance(base, Class)]
-    names = {
-        base.name if isinstance(base, Symbol) else "that is no class" for base in bases if not isinstance(base, Class)
-    }
+    names = {x.name if isinstance(x, Symbol) else "that is no class" for x in bases if not isinstance(x, Class)}
     if not names <= BASES:
         raise RefusedError("E-PYTHON", f"a class cannot have the base {min(names - BASES)[:60]}")
     body = Scope(scope.closure, "class")

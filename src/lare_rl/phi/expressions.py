@@ -133,9 +133,7 @@ def list_items(runtime: Runtime, value: Any) -> Sequence[Any]:
             items = runtime.items(runtime.call(runtime.attribute(value, "__iter__"), [], {}))
         case Class():  # the members of an Enum
             members = value.attributes.items()
-            items = [
-                member for name, member in members if not name.startswith("_") and not isinstance(member, Function)
-            ]
+            items = [x for name, x in members if not name.startswith("_") and not isinstance(x, Function)]
         case _:
             raise TypeError(f"{describe(value)} cannot be gone through")
     runtime.meter.pay(len(items))

@@ -101,11 +101,9 @@ class _Writer:
         from onnx import numpy_helper
 
         array = np.asarray(value)
-        kinds = {"f": np.float32, "i": np.int64, "b": np.bool_}
-        self.constants.append(
-            numpy_helper.from_array(array.astype(kinds[array.dtype.kind]), f"constant_{len(self.constants)}")
-        )
-        return self.constants[-1].name
+        kinds, name = {"f": np.float32, "i": np.int64, "b": np.bool_}, f"constant_{len(self.constants)}"
+        self.constants.append(numpy_helper.from_array(array.astype(kinds[array.dtype.kind]), name))
+        return name
 
     def repeat_for_rows(self, constant: str, shape: tuple[int, ...]) -> str:
         rows = self.op("Shape", next(iter(self.graph.inputs)), start=0, end=1)

@@ -252,7 +252,7 @@ def visible_steps(length: int) -> slice:
 
 def format_number(value: float | np.number) -> str:
     """Write a number as all pages do."""
-    return format_for_reader(float(value) + 0.0, "score")
+    return format_for_reader(float(value) + 0.0, "number")
 
 
 def _colour(position: Float[np.ndarray, "*shape"]) -> UInt8[np.ndarray, "*shape 3"]:

@@ -20,14 +20,7 @@ try:
 except ImportError as missing:
     raise missing_extra_error("a figure", "report") from missing
 
-__all__ = [
-    "COLOURS",
-    "add_white_background",
-    "draw_band_panels",
-    "draw_bands",
-    "make_figure",
-    "to_svg",
-]
+__all__ = ["COLOURS", "add_white_background", "draw_band_panels", "draw_bands", "make_figure", "to_svg"]
 
 COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#000000", "#8c6d31")
 """Okabe and Ito's colours, which colour-blind readers can distinguish."""

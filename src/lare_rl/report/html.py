@@ -60,11 +60,10 @@ def render_note(text: str) -> str:
     return f'<p class="note">{escape(text)}</p>'
 
 
-def render_fold(title: str, sections: Iterable[str], is_open: bool = False) -> str:
+def render_fold(title: str, sections: Iterable[str]) -> str:
     """Return sections under a title that opens them; nothing if they are empty."""
     content = "\n".join(filter(None, sections))
-    opened = " open" if is_open else ""
-    return f"<details{opened}><summary>{escape(title)}</summary>\n{content}\n</details>" if content else ""
+    return f"<details><summary>{escape(title)}</summary>\n{content}\n</details>" if content else ""
 
 
 def render_tiles(tiles: Iterable[tuple[str, str, str]]) -> str:

@@ -11,7 +11,7 @@ MESSAGES = {
     "untrained": "The reason: {reason}.",
     "headline_equal_returns": "Nothing can be learned",
     "equal_returns": (
-        "All episodes, of the policy and of random actions, have the return {return_:score}. Next: does the environment give "
+        "All episodes, of the policy and of random actions, have the return {return_:number}. Next: does the environment give "
         "rewards, and before its time limit (`max_episode_steps`)?"
     ),
     # The outcome
@@ -31,25 +31,25 @@ MESSAGES = {
     ),
     "headline_not_learned": "It has not learned yet",
     "not_learned": "{reached}; {baseline}.",
-    "reached": "The return is {return_:score}{std} after {steps:,} steps{seeds}{deterministic}",
-    "deterministic": ", by sampled actions as in training; the most likely action gets {return_:score}",
+    "reached": "The return is {return_:number}{std} after {steps:,} steps{seeds}{deterministic}",
+    "deterministic": ", by sampled actions as in training; the most likely action gets {return_:number}",
     "std": " ± {std:std}",
     "over_seeds": " (mean over {n_seeds} seeds)",
-    "baseline": "random actions get {return_:score} ± {std:std} in {n_episodes:count episode}{initial}",
-    "initial_policies": ", and before training it got {returns:score}",
+    "baseline": "random actions get {return_:number} ± {std:std} in {n_episodes:count episode}{initial}",
+    "initial_policies": ", and before training it got {returns:number}",
     # The comparison with another run
-    "above_episodic": "That is more than training on the return of the episode alone gives here ({return_:score}).",
-    "like_episodic": "That is about as much as training on the return of the episode alone gives here ({return_:score}).",
-    "below_episodic": "That is less than training on the return of the episode alone gives here ({return_:score}).",
+    "above_episodic": "That is more than training on the return of the episode alone gives here ({return_:number}).",
+    "like_episodic": "That is about as much as training on the return of the episode alone gives here ({return_:number}).",
+    "below_episodic": "That is less than training on the return of the episode alone gives here ({return_:number}).",
     # Several runs
     "is_best": "{best} ends highest",
     "none_is_best": "No run is clearly the best",
     "not_comparable": "There is no return to compare",
     "ranking": "Final returns: {runs}{more}{seeds}.",
-    "ranked": "{name} {return_:score}{seeds}",
+    "ranked": "{name} {return_:number}{seeds}",
     "seeds": " ({n_seeds:count seed})",
     "seeds_each": " (means over {n_seeds:count seed} each)",
-    "and_more": ", and {count} more down to {last:score}",
+    "and_more": ", and {count} more down to {last:number}",
     "improvement": (
         "A seed of {best} ends above a seed of {second} with probability {probability:.2f} (from {n_pairs:count pair} of seeds)."
     ),
@@ -71,7 +71,7 @@ MESSAGES = {
     ),
     "steps_agree": "In single steps, proxy and true rewards agree: their correlation is {correlation:r2}.",
     "single_steps": (
-        "In single steps, proxy and true rewards correlate with {correlation:.2f} and differ by {error:score} on average. Returns "
+        "In single steps, proxy and true rewards correlate with {correlation:.2f} and differ by {error:number} on average. Returns "
         "are sums over episodes: several rewards of single steps may give the same sums."
     ),
     "score_use": "The score was taken as {form}{period}{groups}{exact}. {trust}",
@@ -120,11 +120,11 @@ MESSAGES = {
     "resume": "`lare-rl train --resume {directory}`",
     "resume_longer": "`lare-rl train --resume {directory} --steps {steps}`",
     "one_seed_was_better": (
-        "Next: one seed was better than random actions at step {step:,} ({return_:score}). `lare-rl evaluate {directory} "
+        "Next: one seed was better than random actions at step {step:,} ({return_:number}). `lare-rl evaluate {directory} "
         "--best` plays the best policy of each seed. Then more `--steps`, or another `--algorithm`."
     ),
     "has_fallen": (
-        "Next: it was better before, {return_:score} at step {step:,}. `lare-rl evaluate {directory} --best` plays the best policy "
+        "Next: it was better before, {return_:number} at step {step:,}. `lare-rl evaluate {directory} --best` plays the best policy "
         "of each seed."
     ),
     "is_stuck": (
@@ -154,7 +154,7 @@ MESSAGES = {
         "(docs/how-to/poor-policies.md).{best}"
     ),
     "best_evaluation": (
-        " The best evaluation was {return_:score}, at step {step:,}: `lare-rl evaluate {directory} --best` plays its policy on other "
+        " The best evaluation was {return_:number}, at step {step:,}: `lare-rl evaluate {directory} --best` plays its policy on other "
         "episodes."
     ),
     "single_seed": "One seed says little: another one may reach a different return (`--seeds 3`).",

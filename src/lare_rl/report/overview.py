@@ -90,20 +90,13 @@ def render_verdict(
 
 def _tiles(reported: ReportedRun, summary: RunSummary) -> Iterable[tuple[str, str, str]]:
     """Yield the numbers of a run: title, number, remark. Those that are unknown are missing."""
-    if len(summary.final_returns):
-        number, _, std = _format_spread(summary.final_returns).partition(" ± ")
-        yield (
-            "Return",
-            number,
-            f"{f'± {std}, ' if std else ''}{format_for_reader(len(summary.final_returns), 'count seed')}",
-        )
-    if len(summary.random_returns):
-        number, _, std = _format_spread(summary.random_returns).partition(" ± ")
-        yield (
-            "Random actions",
-            number,
-            f"± {std or 0}, {format_for_reader(len(summary.random_returns), 'count episode')}",
-        )
+    for title, values, noun in (
+        ("Return", summary.final_returns, "seed"),
+        ("Random actions", summary.random_returns, "episode"),
+    ):
+        number, _, std = _format_spread(values).partition(" ± ")
+        if number:
+            yield title, number, f"{std and f'± {std}, '}{format_for_reader(len(values), f'count {noun}')}"
     if summary.return_r2 is not None:
         yield "R² of returns", format_for_reader(summary.return_r2, "r2"), "of new episodes; 1 is perfect"
     if (seconds := reported.training_seconds()) is not None:
@@ -159,9 +152,8 @@ def compare_runs(runs: Sequence[ReportedRun]) -> list[Finding]:
         Finding("improvement", names | {"probability": probability, "n_pairs": pairs.size}),
     ]
     steps = {reported.last_step for reported in runs if reported.metrics}
-    return findings + (
-        [Finding("different_steps", {"least": min(steps), "most": max(steps)})] if len(steps) > 1 else []
-    )
+    findings += [Finding("different_steps", {"least": min(steps), "most": max(steps)})] if len(steps) > 1 else []
+    return findings
 
 
 def sort_runs(runs: Iterable[ReportedRun]) -> list[ReportedRun]:

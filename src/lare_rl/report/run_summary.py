@@ -72,9 +72,7 @@ class ReportedRun:
 
     def curve(self, key: str) -> Curve | None:
         """Return a metric over the steps, with NaN where it is missing. None if it was never measured."""
-        values = {
-            (line["step"], line["seed"]): line.get(key) for line in self.metrics if line["seed"] in self.run.seeds
-        }
+        values = {(x["step"], x["seed"]): x.get(key) for x in self.metrics if x["seed"] in self.run.seeds}
         if all(value is None for value in values.values()):
             return None
         steps = sorted({step for step, _ in values})

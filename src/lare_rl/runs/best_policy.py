@@ -1,6 +1,6 @@
 """The policy of each seed's best evaluation, saved next to the last checkpoint.
 
-    checkpoint/best.npz     the arrays that are needed to act; score and step of each seed
+    checkpoint/best.npz     the arrays that are needed to act; return and step of each seed
 
 The best of many evaluations overestimates its policy. So `lare-rl evaluate --best` plays it from initial states that
 none of them has used.
@@ -25,7 +25,7 @@ BEST_FILE = "best.npz"
 class BestPolicy(NamedTuple):
     """The policy of each seed's best evaluation."""
 
-    score: Float[np.ndarray, " seeds"]
+    return_: Float[np.ndarray, " seeds"]
     """The mean return of the best evaluation; -inf before the first."""
     step: Int[np.ndarray, " seeds"]
     """The environment step of that evaluation."""
@@ -38,16 +38,16 @@ def empty_best(n_seeds: int) -> BestPolicy:
     return BestPolicy(np.full(n_seeds, -np.inf), np.zeros(n_seeds, np.int64), None)
 
 
-def update_best(best: BestPolicy, score: Float[np.ndarray, " seeds"], step: int, actor: Any) -> BestPolicy:
+def update_best(best: BestPolicy, return_: Float[np.ndarray, " seeds"], step: int, actor: Any) -> BestPolicy:
     """Replace the policy of each seed whose evaluation is better than all earlier ones. NaN is never better."""
-    is_better = np.asarray(score) > best.score
+    is_better = np.asarray(return_) > best.return_
 
     def choose(old: Any, new: Any) -> np.ndarray:
         return np.where(is_better.reshape(-1, *[1] * (old.ndim - 1)), np.asarray(new), np.asarray(old))
 
     old_actor = actor if best.actor is None else best.actor
     return BestPolicy(
-        score=np.where(is_better, score, best.score),
+        return_=np.where(is_better, return_, best.return_),
         step=np.where(is_better, step, best.step),
         actor=jax.tree.map(choose, old_actor, actor),
     )

@@ -35,7 +35,6 @@ __all__ = [
     "named_leaves",
     "open_npz",
     "read_metadata",
-    "save",
     "take_snapshot",
     "write",
 ]
@@ -146,11 +145,6 @@ def write(directory: Path, snapshot: Snapshot) -> None:
     replace_npz(directory / STATE_FILE, snapshot.state)
     for name in snapshot.unused_files:
         (directory / name).unlink(missing_ok=True)
-
-
-def save(directory: Path, learner: WithReplay, metadata: Mapping[str, Any], arrays: Mapping[str, np.ndarray]) -> None:
-    """Take a snapshot and write it. The arguments and errors are those of both."""
-    write(directory, take_snapshot(directory, learner, metadata, arrays))
 
 
 def _rows_file(number: int) -> str:

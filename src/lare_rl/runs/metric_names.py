@@ -10,7 +10,6 @@ __all__ = [
     "DETERMINISTIC_RETURN",
     "LENGTH",
     "METRIC_GROUPS",
-    "METRIC_NAMES",
     "RETURN",
     "RETURN_R2",
     "RETURN_STD",
@@ -76,7 +75,4 @@ METRIC_GROUPS: dict[str, dict[str, str]] = {
         "credit/fits": "Number of fits or updates of the decoder.",
     },
 }
-"""What each metric means, by who writes it."""
-
-METRIC_NAMES = frozenset(name for group in METRIC_GROUPS.values() for name in group)
-"""The names of all metrics, without teams and without a task's own measures."""
+"""What each metric means, by who writes it. Names have no teams; a task's own measures are not listed."""

@@ -24,6 +24,9 @@ from lare_rl.training.latent_functions import choose_functions
 __all__ = ["Job", "check_job", "job_to_json", "make_job", "train_job"]
 
 
+ANOTHER_OUT = "choose another output directory (--out)"
+
+
 @dataclass(frozen=True)
 class Job:
     """A planned run."""
@@ -95,23 +98,19 @@ def check_job(job: Job) -> None:
     functions = choose_functions(job.task, job.resolved, job.functions) if job.functions else ()
     if not job.started:
         if job.directory.exists():
-            raise LareError(f"{job.directory} exists, and is not a run: choose another output directory (--out)")
+            raise LareError(f"{job.directory} exists, and is not a run: {ANOTHER_OUT}")
         for role in job.task.roles if method.needs_phi and not functions else ():
             check_recorded(role, method.phi_kind, job.resolved.draw, job.resolved.candidates)
         return
     config = read_config(job.directory)
     if config.task.digest != job.task.digest:
-        raise LareError(f"{job.directory} holds a run of another task: choose another output directory (--out)")
+        raise LareError(f"{job.directory} holds a run of another task: {ANOTHER_OUT}")
     old = effective_settings(config.settings)
     for name, value in effective_settings(job.resolved).items():
         if (old_value := old.get(name)) != value:
-            raise LareError(
-                f"{job.directory} holds a run with {name} = {old_value}, not {value}: choose another output directory (--out)"
-            )
+            raise LareError(f"{job.directory} holds a run with {name} = {old_value}, not {value}: {ANOTHER_OUT}")
     if functions and config.function_sha256 != tuple(function.digest for function in functions):
-        raise LareError(
-            f"{job.directory} holds a run with another latent function: choose another output directory (--out)"
-        )
+        raise LareError(f"{job.directory} holds a run with another latent function: {ANOTHER_OUT}")
 
 
 def job_to_json(job: Job) -> dict[str, Any]:

@@ -101,11 +101,7 @@ def assign_cards(
 
 def _card_variables(process: int, share: float, n_cards: int, variables: Mapping[str, str]) -> dict[str, str]:
     count = int(share)
-    indices = []
-    if share >= 1:
-        indices = range(process * count, (process + 1) * count)
-    elif share:
-        indices = [process % n_cards]
+    indices = range(process * count, (process + 1) * count) if share >= 1 else [process % n_cards] if share else []
     chosen = {}
     for name in VISIBLE_CARDS:
         visible = variables[name].split(",") if variables.get(name) else list(map(str, range(n_cards)))

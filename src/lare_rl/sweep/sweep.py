@@ -131,15 +131,12 @@ def _make_jobs(sweep: Sweep, path: Path) -> Iterator[Job]:
     if unknown := sorted(sweep.functions.keys() - set(names)):
         raise LareError(f"functions of {unknown[0]}, which is none of the tasks {', '.join(names)}")
     if sweep.draws != (0,) and sweep.functions.keys() >= set(names):
-        raise LareError(
-            "draws choose recorded functions, and all tasks have functions in [functions]: leave out either"
-        )
+        raise LareError("draws choose recorded functions, but all tasks have some in [functions]: leave out either")
     for task, method, algorithm in product(tasks, sweep.methods, sweep.algorithms or (None,)):
         functions = [path.parent / function for function in sweep.functions.get(task.name, ())]
         for draw in sweep.draws if find_method(method).needs_phi and not functions else (0,):
-            settings = Settings(
-                **{**rename_keys(sweep.settings), "method": method, "algorithm": algorithm, "draw": draw}
-            )
+            chosen = {"method": method, "algorithm": algorithm, "draw": draw}
+            settings = Settings(**rename_keys(sweep.settings) | chosen)
             try:
                 yield make_job(root, task, settings, functions)
             except LareError as error:

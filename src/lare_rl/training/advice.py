@@ -48,7 +48,7 @@ MESSAGES = {
     ),
     "one policy": "The policy",
     "policies of seeds": "The policy of {noun} {seeds}",
-    "equal returns": "Every episode of every evaluation has the return {return_:score}. If training episodes have it too, nothing can be "
+    "equal returns": "Every episode of every evaluation has the return {return_:number}. If training episodes have it too, nothing can be "
     "learned. Does the environment pay a score, and before its time limit (max_episode_steps)? Do bad episodes differ "
     "(docs/how-to/scores.md)?",
     "slow evaluations": "An evaluation takes {seconds:.0f} s, {share:.0%} of the time: --evaluation-episodes (now {n_episodes}) or "

@@ -60,6 +60,6 @@ def _static_key(value: Any) -> Any:
         case tuple() | list():
             return type(value), tuple(map(_static_key, value))
         case _ if dataclasses.is_dataclass(value) and not isinstance(value, type):
-            fields = dataclasses.fields(value)
-            return type(value), tuple(_static_key(getattr(value, field.name)) for field in fields)
+            names = [field.name for field in dataclasses.fields(value) if field.compare]
+            return type(value), tuple(_static_key(getattr(value, name)) for name in names)
     return type(value), value  # 1, 1.0 and True are equal, but compile differently

@@ -228,7 +228,7 @@ class Session:
         """Save the policies of the seeds whose evaluation is their best so far."""
         old = self.best or empty_best(len(self.run.seeds))
         self.best = update_best(old, score, self.step, self.actor)
-        if np.any(self.best.score > old.score):
+        if np.any(self.best.return_ > old.return_):
             save_best(self.run.checkpoint, self.best)
 
     def save(self) -> None:

@@ -103,6 +103,25 @@ def evaluate_on_host(
     return jax.tree.map(lambda values: values[:, :n_episodes], results)
 
 
+def policy_turns(
+    envs: VecEnv,
+    config: TrainConfig,
+    actor: Any,
+    seeds: Sequence[int],
+    n_episodes: int,
+    deterministic: bool | None = None,
+) -> Iterator[tuple[range, EvaluationPolicy]]:
+    """Yield the numbers of the episodes that begin together, and their policy, until each seed has `n_episodes`.
+
+    If there are fewer environments, some episodes begin after others. The noise of an episode does not depend on that.
+    """
+    width = len(envs.batch.terminated) // len(seeds)
+    for start in range(0, n_episodes, width):
+        rows = np.minimum(np.arange(start, start + width), n_episodes - 1)
+        policy = EvaluationPolicy(config, actor, seeds, width, deterministic, noise_rows=(n_episodes, rows))
+        yield range(start, min(start + width, n_episodes)), policy
+
+
 def evaluate_policy_on_host(
     envs: VecEnv,
     config: TrainConfig,
@@ -113,9 +132,7 @@ def evaluate_policy_on_host(
     on_step: Callable[[], None] = lambda: None,
     on_episode: EpisodeListener = lambda n_done: None,
 ) -> Evaluation:
-    """Evaluate `n_episodes` of each seed's policy. If there are fewer environments, some episodes begin after others.
-
-    An episode does not depend on the number of environments: neither its initial state nor the noise of its actions.
+    """Evaluate `n_episodes` of each seed's policy. An episode does not depend on the number of environments.
 
     Args:
         envs: as many environments for each seed.
@@ -127,18 +144,15 @@ def evaluate_policy_on_host(
         on_step: called before each step of the environments.
         on_episode: called with the number of episodes of each seed, when some have ended.
     """
-    width, evaluations = len(envs.batch.terminated) // len(seeds), []
-    for start in range(0, n_episodes, width):
-        episodes = np.minimum(np.arange(start, start + width), n_episodes - 1)
-        policy = EvaluationPolicy(config, actor, seeds, width, noise_rows=(n_episodes, episodes))
+    evaluations = []
+    for numbers, policy in policy_turns(envs, config, actor, seeds, n_episodes):
 
         def act(*inputs: Any, policy: EvaluationPolicy = policy) -> np.ndarray:
             on_step()
             return policy(*inputs)
 
-        n_playing = min(width, n_episodes - start)
-        evaluations.append(evaluate_on_host(envs, act, seeds, n_playing, first + start))
-        on_episode(start + n_playing)
+        evaluations.append(evaluate_on_host(envs, act, seeds, len(numbers), first + numbers.start))
+        on_episode(numbers.stop)
     return concatenate(evaluations)
 
 

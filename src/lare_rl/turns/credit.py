@@ -112,12 +112,7 @@ class TurnCredit:
     """
 
     def __init__(
-        self,
-        lambda_: float | None = None,
-        *,
-        window: int = 20,
-        logistic: bool = False,
-        phi: Phi | None = None,
+        self, lambda_: float | None = None, *, window: int = 20, logistic: bool = False, phi: Phi | None = None
     ):
         """Make an object that has seen no rollouts.
 

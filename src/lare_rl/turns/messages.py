@@ -20,7 +20,7 @@ from lare_rl.errors import LareError, short_repr
 from lare_rl.util.safe_io import read_json
 from lare_rl.util.sanitize import one_line
 
-__all__ = ["Call", "Turn", "looks_like_error", "message_features", "split_turns"]
+__all__ = ["Call", "Turn", "check_list", "looks_like_error", "message_features", "split_turns"]
 
 MAX_MESSAGES = 20_000
 MAX_CALLS = 64
@@ -51,16 +51,21 @@ class Turn:
     """The texts of the answers that are not results of calls, such as those of a game that speaks as the user."""
 
 
+def check_list(values: Any, name: str, limit: int, where: str) -> None:
+    """Raise `LareError` if a value of a rollout is no list, or has more than `limit` entries."""
+    if not isinstance(values, Sequence) or isinstance(values, str | bytes):
+        raise LareError(f"{where}: {name} must be a list, and is {short_repr(values)}")
+    if len(values) > limit:
+        raise LareError(f"{where} has {len(values)} {name}: at most {limit} are accepted")
+
+
 def split_turns(messages: Any, where: str) -> list[Turn]:
     """Return the turns of a conversation. What comes before the assistant's first message is ignored.
 
     Raises:
         LareError: a message is malformed.
     """
-    if not isinstance(messages, Sequence) or isinstance(messages, str | bytes):
-        raise LareError(f"{where}: messages must be a list, and is {short_repr(messages)}")
-    if len(messages) > MAX_MESSAGES:
-        raise LareError(f"{where} has {len(messages)} messages: at most {MAX_MESSAGES} are accepted")
+    check_list(messages, "messages", MAX_MESSAGES, where)
     spans: list[list[tuple[int, Mapping[str, Any]]]] = []
     for i, message in enumerate(messages):
         if not isinstance(message, Mapping) or not isinstance(message.get("role"), str):
@@ -110,10 +115,7 @@ def _read_calls(message: Mapping[str, Any], where: str) -> list[tuple[str, str, 
     calls = message.get("tool_calls")
     if calls is None:
         return []
-    if not isinstance(calls, Sequence) or isinstance(calls, str | bytes):
-        raise LareError(f"{where}: tool_calls must be a list, and is {short_repr(calls)}")
-    if len(calls) > MAX_CALLS:
-        raise LareError(f"{where} has {len(calls)} calls: at most {MAX_CALLS} are accepted")
+    check_list(calls, "tool_calls", MAX_CALLS, where)
     result = []
     for k, call in enumerate(calls):
         function = call.get("function", call) if isinstance(call, Mapping) else None

@@ -134,9 +134,7 @@ def _describe_features(features: Mapping[str, float]) -> str:
 def _render_effects(credit: CreditedTurns) -> str:
     rows = []
     for effect in sorted(credit.effects, key=lambda effect: -abs(effect.first * effect.frequency)):
-        pairs = (
-            (getattr(effect, name), getattr(effect, f"{name}_deviation")) for name in ("first", "lasting", "further")
-        )
+        pairs = ((getattr(effect, x), getattr(effect, f"{x}_deviation")) for x in ("first", "lasting", "further"))
         numbers = (
             "0" if max(abs(number), deviation) < SMALL else f"{number:+.3f} ± {deviation:.3f}"
             for number, deviation in pairs

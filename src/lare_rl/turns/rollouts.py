@@ -17,7 +17,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from lare_rl.errors import LareError, short_repr
-from lare_rl.turns.messages import Turn, message_features, split_turns
+from lare_rl.turns.messages import Turn, check_list, message_features, split_turns
 from lare_rl.util.sanitize import one_line
 
 __all__ = ["MAX_NUMBER", "Phi", "Rollout", "read_rollout", "read_rollouts"]
@@ -58,9 +58,7 @@ def read_rollouts(rollouts: Any, phi: Phi | None = None) -> list[Rollout]:
 def read_rollout(rollout: Any, where: str, phi: Phi | None = None) -> Rollout:
     """Check one rollout and return it. `where` names it in messages."""
     if not isinstance(rollout, Mapping):
-        raise LareError(
-            f"{where} must be a mapping with an outcome and messages or turns, and is {short_repr(rollout)}"
-        )
+        raise LareError(f"{where} must be a mapping with outcome and messages or turns, and is {short_repr(rollout)}")
     outcome = _read_number(rollout.get("outcome"), f"{where}: outcome")
     group = rollout.get("group", "")
     if not isinstance(group, str | int) or isinstance(group, bool):
@@ -107,10 +105,7 @@ def _evaluate(phi: Phi, turns: Sequence[Turn], where: str) -> list[Any]:
 
 
 def _read_numbers(turns: Any, where: str) -> list[dict[str, float]]:
-    if not isinstance(turns, Sequence) or isinstance(turns, str | bytes):
-        raise LareError(f"{where}: turns must be a list with the numbers of each turn, and is {short_repr(turns)}")
-    if len(turns) > MAX_TURNS:
-        raise LareError(f"{where} has {len(turns)} turns: at most {MAX_TURNS} are accepted")
+    check_list(turns, "turns", MAX_TURNS, where)
     rows = []
     for t, turn in enumerate(turns):
         if not isinstance(turn, Mapping):

@@ -37,7 +37,7 @@ class _Predictions(NamedTuple):
     value: Float[np.ndarray, " turns"]
     slope: Float[np.ndarray, " turns"]
     """Of the value with respect to eta."""
-    score: Float[np.ndarray, " turns"]
+    gradient: Float[np.ndarray, " turns"]
     curvature: Float[np.ndarray, " turns"]
 
 
@@ -54,8 +54,8 @@ def _predict(table: TurnTable, x: Float[np.ndarray, "turns features"], fit: Pref
 def values(table: TurnTable, x: Float[np.ndarray, "turns features"], fit: PrefixFit) -> Float[np.ndarray, " turns"]:
     """Return V of the prefix before each turn. The intercept of a rollout's group leaves out the rollout itself."""
     predictions, index = _predict(table, x, fit), table.rollout_index
-    score, curvature = (np.bincount(index, values) for values in (predictions.score, predictions.curvature))
-    change = score / np.maximum(fit.group_precision[table.group] - curvature, 1e-12)
+    gradient, curvature = (np.bincount(index, values) for values in (predictions.gradient, predictions.curvature))
+    change = gradient / np.maximum(fit.group_precision[table.group] - curvature, 1e-12)
     eta = predictions.eta - change[index]
     return logistic(eta) if fit.is_logistic else eta
 
@@ -112,6 +112,6 @@ def held_out_values(
         covariance = block @ block.swapaxes(1, 2) + 1 / fit.group_precision[table.group[rollouts]][:, None, None]
         # The only rollout of all determines m alone: without this, the system would be singular.
         system = (1 + 1e-9) * np.eye(size) - covariance * predictions.curvature[index][:, None, :]
-        change = np.linalg.solve(system, covariance @ predictions.score[index][..., None])
+        change = np.linalg.solve(system, covariance @ predictions.gradient[index][..., None])
         eta[index] = predictions.eta[index] - change[..., 0]
     return logistic(eta) if fit.is_logistic else eta

@@ -2,7 +2,7 @@
 
 A catalogue is a dictionary from code to template. A template is a text of `str.format` with commands in backticks:
 
-    MESSAGES = {"rising": "The return was still rising at step {step:,} ({return_:score}). Continue with `{command}`."}
+    MESSAGES = {"rising": "The return was still rising at step {step:,} ({return_:number}). Continue with `{command}`."}
     render(Finding("rising", {"step": 5000, "return_": 12.3, "command": "lare-rl train"}), MESSAGES)
 
 A value may also be a finding, whose template is of the same catalogue, or None, which is rendered as an empty text. The elements
@@ -58,7 +58,7 @@ def render(finding: Finding, catalogue: Catalogue, style: Literal["text", "html"
 def format_for_reader(value: Any, spec: str = "") -> str:
     """Format one value by a spec of `str.format`, or by one of these:
 
-    * `score`: a whole number if it is large, otherwise three digits.
+    * `number`: a whole number if it is large, otherwise three digits.
     * `count NOUN`: the number with its noun, in the singular or the plural, such as `1 episode` and `1,000 episodes`.
     * `r2`: two decimal places, three above 0.99.
     * `std`: two digits, for a standard deviation.
@@ -66,7 +66,7 @@ def format_for_reader(value: Any, spec: str = "") -> str:
     * `steps`: a round number with k or M, such as `250k`.
     """
     match spec.split(" ", 1):
-        case ["score"]:
+        case ["number"]:
             return f"{value:,.0f}" if math.isfinite(value) and abs(value) >= 100 else f"{value:.3g}"
         case ["count", noun]:
             return f"{value:,} {noun}" if value == 1 else f"{value:,} {noun}s"

@@ -35,6 +35,7 @@ _RENAMED_FIELDS = {
     "over_time": "time_blocks",
     "rivals": "score_type_predictions",
     "rows": "n_rows",
+    "score": "return_",
     "spread": "covariance",
     "squares": "sum_squares",
     "steps": "n_steps",

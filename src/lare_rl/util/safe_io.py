@@ -81,6 +81,9 @@ def read_toml(text: str) -> dict[str, Any]:
         return check_depth(tomllib.loads(text))
     except RecursionError:
         raise ValueError(_TOO_DEEP) from None
+    except tomllib.TOMLDecodeError as error:
+        hint = "; a text needs quotes" if str(error).startswith("Invalid value") else ""
+        raise ValueError(f"{error}{hint}") from error
 
 
 def read_table(path: Path) -> dict[str, Any]:
@@ -93,8 +96,7 @@ def read_table(path: Path) -> dict[str, Any]:
     try:
         table = read_json(text) if is_json else read_toml(text)
     except ValueError as error:
-        hint = "; a text needs quotes" if str(error).startswith("Invalid value") else ""
-        raise LareError(f"{path}: it is not valid {'JSON' if is_json else 'TOML'}: {error}{hint}") from error
+        raise LareError(f"{path}: it is not valid {'JSON' if is_json else 'TOML'}: {error}") from error
     if not isinstance(table, dict):
         raise LareError(f"{path}: it is JSON, but not an object")
     return table
@@ -104,9 +106,7 @@ def check_depth(value: Any) -> Any:
     """Return a value that is not nested too deep for recursive functions. Raises `ValueError` if it is nested too deep."""
     level = [value]
     for _ in range(MAX_DEPTH):
-        containers = [
-            item.values() if isinstance(item, dict) else item for item in level if isinstance(item, dict | list)
-        ]
+        containers = [x.values() if isinstance(x, dict) else x for x in level if isinstance(x, dict | list)]
         level = [item for container in containers for item in container]
         if not level:
             return value

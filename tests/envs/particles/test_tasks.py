@@ -10,11 +10,12 @@ import pytest
 from envs.particles import twin as slow
 from lare_rl.envs.particles.catalogue import TASKS, find_particle_task
 from lare_rl.envs.particles.navigation import N_LAYOUTS, make_layouts
-from lare_rl.envs.particles.predator_prey import SIZES, chase, observe_preys
+from lare_rl.envs.particles.predator_prey import SIZES, observe_preys
 from lare_rl.envs.particles.prey import logits, sample_actions, shipped_prey
 from lare_rl.envs.particles.task import MAX_STEPS
 from lare_rl.envs.particles.world import State, at_rest, contact_force, move, push
 from lare_rl.errors import LareError
+from train_prey import chase
 
 # The number of agents, the size of an observation, and half the sides of the squares in which moving entities and
 # landmarks start, as the texts of the tasks say.

@@ -5,11 +5,18 @@ import pytest
 from matplotlib.patches import Circle
 
 from helpers.fake_smac import compiled_smax
+from lare_rl.envs.canvas import blank_figure
 from lare_rl.envs.smax.battle import ATTACK, STOP, Battle
-from lare_rl.envs.smax.drawing import ALLY_COLOUR, ENEMY_COLOUR, draw_state, find_hits
+from lare_rl.envs.smax.drawing import ALLY_COLOUR, ENEMY_COLOUR, find_hits, paint_state
 from lare_rl.envs.smax.scenarios import SCENARIOS
 
 SCENARIO = SCENARIOS["2s3z"]
+
+
+def paint(battle, previous=None, credit=None):
+    _, axes = blank_figure()
+    paint_state(axes, SCENARIO, battle, previous, credit)
+    return axes
 
 
 @pytest.fixture(scope="module")
@@ -27,7 +34,7 @@ def battles() -> list[Battle]:
 
 
 def test_living_units_have_the_colours_of_their_sides(battles):
-    circles = [patch for patch in draw_state(SCENARIO, battles[0]).axes[0].patches if isinstance(patch, Circle)]
+    circles = [patch for patch in paint(battles[0]).patches if isinstance(patch, Circle)]
     ally, enemy = (Circle((0, 0), edgecolor=colour).get_edgecolor() for colour in (ALLY_COLOUR, ENEMY_COLOUR))
     assert [circle.get_edgecolor() for circle in circles] == [ally] * 5 + [enemy] * 3
     assert circles[0].radius == 0.625
@@ -37,10 +44,10 @@ def test_hits_are_drawn_in_their_step(battles):
     assert (0, 5) in find_hits(SCENARIO, battles[1], battles[0])
     # The action is still an attack, but the cooldown has not passed.
     assert (0, 5) not in find_hits(SCENARIO, battles[2], battles[1])
-    n_lines = [len(draw_state(SCENARIO, battles[1], previous).axes[0].lines) for previous in (None, battles[0])]
+    n_lines = [len(paint(battles[1], previous).lines) for previous in (None, battles[0])]
     assert n_lines[0] < n_lines[1]
 
 
 def test_credit_is_written_beside_the_step(battles):
-    labels = [draw_state(SCENARIO, battles[2], credit=credit).axes[0].texts[-1].get_text() for credit in (0.25, None)]
+    labels = [paint(battles[2], credit=credit).texts[-1].get_text() for credit in (0.25, None)]
     assert labels == ["step 2   credit 0.25", "step 2"]

@@ -53,11 +53,7 @@ class Size:
         return range(self.n_agents, 2 * self.n_agents)
 
 
-SIZES = {
-    "CN-6": Size(6, 1.5),
-    "CN-15": Size(15, 2.2),
-    "CN-30": Size(30, 3.0),
-}
+SIZES = {"CN-6": Size(6, 1.5), "CN-15": Size(15, 2.2), "CN-30": Size(30, 3.0)}
 
 
 def navigation(name: str) -> ParticleTask:

@@ -26,7 +26,6 @@ __all__ = [
     "SIZES",
     "Size",
     "View",
-    "chase",
     "competitive",
     "flee",
     "make_world",
@@ -196,13 +195,3 @@ def reward_preys(size: Size, state: State) -> Float[Array, " preys"]:
 
 def flee(size: Size, layers: Layers, state: State, key: PRNGKeyArray) -> Int[Array, " preys"]:
     return sample_actions(layers, observe_preys(size, state), key)
-
-
-def chase(size: Size, state: State) -> Int[Array, " predators"]:
-    """Return the actions of greedy predators, which are used to evaluate preys.
-
-    They move along the axis on which the nearest prey is further away.
-    """
-    prey = views.nearest_entities(state.position, size.predators, size.preys, 1)
-    x, y = jnp.moveaxis(views.relative_positions(state.position, size.predators, prey)[:, 0], -1, 0)
-    return jnp.where(jnp.abs(x) > jnp.abs(y), jnp.where(x > 0, 2, 1), jnp.where(y > 0, 4, 3))

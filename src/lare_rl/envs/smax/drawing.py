@@ -1,4 +1,4 @@
-"""Pictures of battles: of a state, and of all steps of an episode."""
+"""Pictures of battles."""
 
 from operator import itemgetter
 
@@ -7,27 +7,18 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from lare_rl.envs.canvas import Axes, Figure, blank_figure, paint_frames, patches
+from lare_rl.envs.canvas import Axes, paint_frames, patches
 from lare_rl.envs.interface import Frame
 from lare_rl.envs.smax.battle import FIELD, Battle, attack_target
 from lare_rl.envs.smax.scenarios import Scenario
 
-__all__ = ["draw_frames", "draw_state", "find_hits"]
+__all__ = ["draw_frames", "find_hits", "paint_state"]
 
 ALLY_COLOUR, ENEMY_COLOUR, DEAD_COLOUR = "#0072b2", "#d55e00", "#bbbbbb"
 
 
-def draw_state(
-    scenario: Scenario, battle: Battle, previous: Battle | None = None, credit: float | None = None
-) -> Figure:
-    """Draw a state. Each unit is a disc, filled in proportion to its health. Lines show the hits since the previous state."""
-    figure, axes = blank_figure()
-    _paint(axes, scenario, battle, previous, credit)
-    return figure
-
-
 def draw_frames(scenario: Scenario, battles: Battle, credit: Float[np.ndarray, " steps"] | None = None) -> list[Frame]:
-    """Draw an episode as pictures.
+    """Draw an episode as pictures. Each unit is a disc, filled in proportion to its health. Lines show the hits of a step.
 
     Args:
         scenario: the units.
@@ -39,12 +30,12 @@ def draw_frames(scenario: Scenario, battles: Battle, credit: Float[np.ndarray, "
 
     def paint(axes: Axes, step: int) -> None:
         previous = states[step - 1] if step else None
-        _paint(axes, scenario, states[step], previous, None if credit is None else float(credit[step]))
+        paint_state(axes, scenario, states[step], previous, None if credit is None else float(credit[step]))
 
     return paint_frames(len(states), paint)
 
 
-def _paint(axes: Axes, scenario: Scenario, battle: Battle, previous: Battle | None, credit: float | None) -> None:
+def paint_state(axes: Axes, scenario: Scenario, battle: Battle, previous: Battle | None, credit: float | None) -> None:
     axes.set(xlim=(-0.5, FIELD + 0.5), ylim=(-0.5, FIELD + 0.5), aspect="equal")
     axes.axis("off")
     axes.add_patch(patches.Rectangle((0, 0), FIELD, FIELD, fill=False, edgecolor="#888888"))

@@ -107,6 +107,4 @@ def find_scenario(name: str) -> Scenario:
     """
     if name in SCENARIOS:
         return SCENARIOS[name]
-    raise LareError(
-        f"no battle {name!r}{did_you_mean(name, SCENARIOS)}. The battles of SMAX are {', '.join(SCENARIO_NAMES)}."
-    )
+    raise LareError(f"no battle {name!r}{did_you_mean(name, SCENARIOS)}. SMAX has {', '.join(SCENARIO_NAMES)}.")

@@ -119,9 +119,8 @@ def round_(a: Operand, decimals: int = 0) -> Any:
 def isclose(a: Operand, b: Operand, rtol: Any = 1e-5, atol: Any = 1e-8, equal_nan: Any = False) -> Any:
     near = abs(a - b) <= atol + rtol * abs(b)
     both_nan = elementwise("logical_and", elementwise("isnan", a), elementwise("isnan", b))
-    close = elementwise(
-        "logical_or", elementwise("logical_and", near, elementwise("isfinite", b)), elementwise("equal", a, b)
-    )
+    near = elementwise("logical_and", near, elementwise("isfinite", b))
+    close = elementwise("logical_or", near, elementwise("equal", a, b))
     return elementwise("logical_or", close, both_nan) if equal_nan else close
 
 

@@ -91,9 +91,7 @@ def pad(array: Array, pad_width: Any, mode: Any = "constant", *, constant_values
     widths = np.broadcast_to(require_constant(pad_width, "the widths of np.pad"), (array.ndim, 2)).tolist()
     if array.batch_axis is not None and widths[array.batch_axis] != [0, 0]:
         raise RefusedError("E-ROWS", "np.pad cannot add rows to the batch: write ((0, 0), (before, after))")
-    current_builder().check_size(
-        [size + sum(map(abs, pair)) for size, pair in zip(array.row_shape, widths, strict=True)]
-    )
+    current_builder().check_size([n + sum(map(abs, pair)) for n, pair in zip(array.row_shape, widths, strict=True)])
     if mode in ("edge", "reflect", "symmetric", "wrap"):
         return array.rearranged(lambda positions: np.pad(positions, widths, mode), array.batch_axis)
     if mode != "constant":

@@ -68,9 +68,7 @@ def gradient(f: Array, *varargs: Any, axis: Any = None, edge_order: int = 1) -> 
     """Central differences inside, and one-sided differences at the ends."""
     axes = f.row_axes(axis)
     spacings = [as_array(x) for x in (varargs if len(varargs) == len(axes) else (varargs or (1.0,)) * len(axes))]
-    slopes = [
-        _gradient_along(as_numbers(f), at, spacing, edge_order) for at, spacing in zip(axes, spacings, strict=True)
-    ]
+    slopes = [_gradient_along(as_numbers(f), at, gap, edge_order) for at, gap in zip(axes, spacings, strict=True)]
     return slopes[0] if isinstance(axis, int) or len(slopes) == 1 else slopes
 
 

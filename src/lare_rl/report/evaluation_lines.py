@@ -1,0 +1,114 @@
+"""The lines of `lare-rl evaluate`: the returns of a run's policy, and those of random and of the most likely actions."""
+
+import math
+import time
+from collections import Counter
+from collections.abc import Callable, Iterator, Sequence
+
+import numpy as np
+
+from lare_rl.algorithms.registry import ALGORITHMS
+from lare_rl.envs.families import load_env_spec
+from lare_rl.envs.play import Episode, EpisodeListener
+from lare_rl.evaluation.evaluate import (
+    RANDOM_EPISODES,
+    RANDOM_PLAY_LIMIT_S,
+    evaluate_policy,
+    evaluation_seeds,
+    gain_over_random,
+    mean_with_error,
+    play_random,
+)
+from lare_rl.report.score_use import CLEAR_ERRORS
+from lare_rl.runs.directory import Run
+from lare_rl.training.evaluation import Evaluation
+from lare_rl.training.saved_state import load_actor
+from lare_rl.util.findings import format_for_reader
+from lare_rl.util.statistics import format_mean_std, format_plus_minus
+
+__all__ = ["compare_actions", "describe_evaluation", "evaluation_lines"]
+
+
+def evaluation_lines(
+    run: Run, episodes: int, best: bool, deterministic: bool, make_listener: Callable[[int], EpisodeListener]
+) -> Iterator[str]:
+    """Play episodes by the policy, by random actions and, for a policy that samples, by the most likely actions. Yield the results.
+
+    The arguments are those of `evaluate_policy`. `make_listener` makes a listener of a number of episodes.
+    """
+    task, settings = run.config.task, run.config.settings
+    start = time.monotonic()
+    evaluation = evaluate_policy(run, episodes, best, deterministic, make_listener(episodes))
+    policy_s, n_random = time.monotonic() - start, max(episodes, RANDOM_EPISODES)
+    is_discrete = load_env_spec(task).discrete
+    samples = not (deterministic or ALGORITHMS[settings.algorithm].deterministic_evaluation(is_discrete))
+    likeliest = evaluate_policy(run, episodes, best, True, make_listener(episodes)) if samples else None
+    best_steps = load_actor(run, best=True)[2].tolist() if best else None
+    seeds = [] if task.group is None else evaluation_seeds(run, episodes)
+    if seeds:  # each equally often, because groups may differ in their returns
+        n_random = len(seeds) * math.ceil(RANDOM_EPISODES / len(seeds))
+    random_episodes = play_random(task, n_random, max(policy_s, RANDOM_PLAY_LIMIT_S), make_listener(n_random), seeds)
+    yield from describe_evaluation(run, evaluation, random_episodes, best_steps)
+    if 0 < len(random_episodes[0]) < n_random:
+        yield f"random actions ended after {len(random_episodes[0])} of {n_random} episodes, to save time"
+    if likeliest is not None:
+        yield "The policy samples its actions, as in training. The most likely ones (--deterministic), from the same states:"
+        yield from _describe_returns(run, likeliest, best_steps)
+        yield from compare_actions(run, evaluation, likeliest)
+
+
+def _describe_returns(run: Run, evaluation: Evaluation, best_steps: Sequence[int] | None) -> Iterator[str]:
+    """Yield the returns of each seed. `best_steps` are the steps of the best policies."""
+    roles, has_many_agents = run.config.task.roles, load_env_spec(run.config.task).n_agents > 1
+    for team_index, role in enumerate(roles):
+        for seed_index, seed in enumerate(run.seeds):
+            returns = evaluation.returns[seed_index, :, team_index]
+            line = f"{role.name}, " if len(roles) > 1 else ""
+            line += f"seed {seed}: return {format_mean_std(returns)} over {format_for_reader(len(returns), 'count episode')}"
+            if best_steps is not None:
+                step = best_steps[seed_index]
+                untrained = ", before its first update" if step <= run.config.settings.warmup else ""
+                line += f" (the policy of step {step:,}{untrained})"
+            if has_many_agents:
+                sums = evaluation.summed_returns[seed_index, :, team_index]
+                line += f"; summed over the agents {format_mean_std(sums)}"
+            yield line
+
+
+def compare_actions(run: Run, sampled: Evaluation, likeliest: Evaluation) -> Iterator[str]:
+    """Say which actions are better, if that is clear. Both evaluations play from the same initial states."""
+    for i, role in enumerate(run.config.task.roles):
+        gain = mean_with_error((likeliest.returns - sampled.returns)[:, :, i])
+        if gain is not None and abs(gain[0]) > CLEAR_ERRORS * gain[1]:
+            verdict = "better: use deterministic=True in load_policy" if gain[0] > 0 else "worse: let the policy sample"
+            yield f"{role.name}: the most likely actions are {verdict} ({format_plus_minus(*gain)})"
+
+
+def describe_evaluation(
+    run: Run, evaluation: Evaluation, random_episodes: Sequence[Sequence[Episode]], best_steps: Sequence[int] | None
+) -> Iterator[str]:
+    """Yield the returns and measures of each seed, and of random actions. `best_steps` are the steps of the best policies."""
+    task = run.config.task
+    if task.evaluation_environment is not None:
+        yield f"in {task.evaluation_environment} (training was in {task.environment}):"
+    yield from _describe_returns(run, evaluation, best_steps)
+    roles = task.roles
+    for team_index, (role, episodes) in enumerate(zip(roles, random_episodes, strict=True)):
+        if not episodes:
+            continue
+        team = f"{role.name}, " if len(roles) > 1 else ""
+        returns = np.array([episode.return_ for episode in episodes])
+        yield f"{team}random actions: return {format_mean_std(returns)} over {format_for_reader(len(returns), 'count episode')}"
+        if (gain := gain_over_random(evaluation.returns[:, :, team_index], returns)) is not None:
+            yield f"{team}difference: {format_plus_minus(*gain)} (± is its standard error)"
+    if (group := task.group) is not None and random_episodes[0]:
+        groups = Counter(np.asarray(evaluation.measures[group]).ravel().tolist())
+        random_groups = Counter(episode.measures[group] for episode in random_episodes[0])
+        if any(groups[name] * random_groups.total() != count * groups.total() for name, count in random_groups.items()):
+            yield f"random actions played other groups ({group}), or in other shares, which is a part of the difference"
+    for name, seed_values in evaluation.drop_group(task).measures.items():
+        for seed, values in zip(run.seeds, seed_values, strict=True):
+            yield f"seed {seed}: {name} {format_mean_std(values)}"
+        if random_episodes[0]:
+            values = np.array([episode.measures[name] for episode in random_episodes[0]])
+            yield f"random actions: {name} {format_mean_std(values)}"
