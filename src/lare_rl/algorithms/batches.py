@@ -4,6 +4,8 @@ from typing import NamedTuple
 
 from jaxtyping import Array, Bool, Float
 
+__all__ = ["Action", "Available", "Metrics", "Observation", "Rollout", "Sequences", "Transitions", "Value"]
+
 Observation = Float[Array, "*batch observation"]
 Action = Float[Array, "*batch action"]
 """In [-1, 1], or a one-hot row."""

@@ -9,6 +9,8 @@ from lare_rl.algorithms.registry import AlgorithmSettings
 if TYPE_CHECKING:
     from lare_rl.envs.interface import EnvSpec
 
+__all__ = ["OffPolicySettings", "run_defaults"]
+
 
 class OffPolicySettings(AlgorithmSettings):
     """The hyperparameters that these algorithms share; none of them depends on the task."""

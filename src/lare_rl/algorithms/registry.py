@@ -24,6 +24,8 @@ from lare_rl.util.plugins import Registry
 if TYPE_CHECKING:  # importing NumPy takes longer than all else that the command line does before it shows a message
     from lare_rl.envs.interface import EnvSpec
 
+__all__ = ["ALGORITHMS", "Algorithm", "AlgorithmSettings", "Consumes", "Noise", "register_algorithm"]
+
 
 class AlgorithmSettings(CheckedModel):
     """The base class of an algorithm's hyperparameters."""

@@ -12,6 +12,8 @@ from lare_rl.errors import LareError, short_repr
 from lare_rl.tasks.payments import PAID_AT_END, PaymentRule
 from lare_rl.tasks.spec import MAX_LEVELS
 
+__all__ = ["NewSteps", "read_episode", "read_steps", "to_flags", "to_lengths", "to_levels", "to_rows", "to_step_ids"]
+
 
 class NewSteps(NamedTuple):
     """The valid rows of a call of `CreditAssigner.add`, or the steps of an episode."""

@@ -33,6 +33,8 @@ from lare_rl.latent.function import LatentFunction
 from lare_rl.tasks.payments import PaymentRule
 from lare_rl.tasks.spec import ScoredObservation, TaskSpec
 
+__all__ = ["CreditAssigner"]
+
 
 class CreditAssigner:
     """Proxy rewards for steps, by any method that assigns credit to steps (`lare-rl methods`). Several threads may use it."""

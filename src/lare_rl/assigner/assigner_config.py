@@ -25,6 +25,8 @@ from lare_rl.latent.function import LatentFunction, check_task
 from lare_rl.tasks.payments import PAID_AT_END, PaymentRule
 from lare_rl.tasks.spec import MAX_LEVELS, ScoredObservation, TaskSpec
 
+__all__ = ["AssignerConfig", "Space", "check_config", "resolve_config"]
+
 Space = gymnasium.Space | SpaceLayout | int
 """A space of Gymnasium, a layout, or the length of a row of numbers."""
 

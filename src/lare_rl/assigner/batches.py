@@ -15,6 +15,8 @@ from lare_rl.credit.spec import CreditSpec
 from lare_rl.data.layouts import Layout, lay_out_packed, lay_out_padded, lay_out_sampled
 from lare_rl.util.shapes import padded_size
 
+__all__ = ["pack_in_order", "sample_batch", "whole_episodes"]
+
 
 def sample_batch(store: Store, spec: CreditSpec, random: np.random.Generator, longest: int) -> CreditBatch:
     """Sample the steps of one gradient update, from episodes that are sampled uniformly with replacement.

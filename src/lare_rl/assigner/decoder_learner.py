@@ -29,6 +29,8 @@ from lare_rl.nn.normalise import empty_scale
 from lare_rl.util.float64 import float64
 from lare_rl.util.shapes import padded_size
 
+__all__ = ["CHUNK_UPDATES", "DecoderLearner"]
+
 MAX_PENDING_STEPS = 256
 """The most steps that may wait for their inputs, or for the running statistics."""
 CHUNK_UPDATES = 16

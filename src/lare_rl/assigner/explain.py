@@ -17,6 +17,8 @@ from lare_rl.credit.returns import estimate_score_type, looks_binary
 from lare_rl.util.findings import render
 from lare_rl.util.float64 import float64
 
+__all__ = ["describe_returns", "explain"]
+
 
 def describe_returns(learner: DecoderLearner, group_names: Iterable[Hashable]) -> list[str]:
     """Return the explanation in sentences. The list is empty for too few episodes, and for a method without a decoder."""

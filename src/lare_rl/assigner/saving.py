@@ -30,6 +30,8 @@ from lare_rl.util.files import replace_npz, write_atomically
 from lare_rl.util.renamed_fields import rename_keys
 from lare_rl.util.safe_io import read_json, read_text
 
+__all__ = ["AssignerState", "get_state", "read_state", "report_damage", "restore", "write_state"]
+
 FORMAT = 1
 TEXT_FILE, ARRAYS_FILE, FUNCTION_FILE = "assigner.json", "state.npz", "phi.py"
 PLAIN_FIELDS = (

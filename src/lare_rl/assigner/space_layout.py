@@ -10,6 +10,8 @@ from pydantic import AliasChoices, Field
 
 from lare_rl.errors import CheckedModel, LareError, short_repr
 
+__all__ = ["SpaceLayout", "make_layout"]
+
 Kind = Literal["numbers", "choices", "named", "in a row"]
 
 

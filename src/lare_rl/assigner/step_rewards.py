@@ -20,6 +20,8 @@ from lare_rl.credit.engine import StepBatch
 from lare_rl.credit.methods import Reward
 from lare_rl.util.shapes import padded_size
 
+__all__ = ["StepRewards"]
+
 
 class StepRewards:
     """Computes the rewards of steps by the newest decoder of a learner."""

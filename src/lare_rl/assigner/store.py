@@ -18,6 +18,8 @@ from jaxtyping import Bool, Float, Int
 from lare_rl.errors import LareError
 from lare_rl.tasks.payments import PAID_AT_END, PaymentRule, is_paid
 
+__all__ = ["RunningEpisode", "Store", "StoredEpisode"]
+
 
 class StoredEpisode(NamedTuple):
     """An episode that has ended, or the steps that a payment is for."""

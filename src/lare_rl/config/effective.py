@@ -9,6 +9,8 @@ from lare_rl.credit.decoder_settings import CreditSettings
 from lare_rl.credit.methods import find_method
 from lare_rl.tasks.spec import TaskSpec
 
+__all__ = ["effective_settings", "needs_replay", "unused_names", "unused_settings", "warmup_warning"]
+
 
 def effective_settings(settings: ResolvedSettings) -> dict[str, Any]:
     """Return the settings that a run uses, by dotted names as on the command line."""

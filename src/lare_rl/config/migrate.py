@@ -10,6 +10,8 @@ from typing import Any
 from lare_rl.errors import LareError
 from lare_rl.util.renamed_fields import rename_keys
 
+__all__ = ["CONFIG", "FORMAT", "migrate"]
+
 CONFIG = "config.json"
 """The configuration of a run, in its directory."""
 

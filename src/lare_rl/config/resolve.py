@@ -14,6 +14,8 @@ from lare_rl.envs.interface import EnvSpec
 from lare_rl.errors import LareError
 from lare_rl.tasks.spec import TaskSpec
 
+__all__ = ["choose_algorithm", "fill_in", "replay_rows", "resolve"]
+
 MIN_EVALUATIONS = 5
 """Evaluations of a short run of PPO, by default."""
 

@@ -13,6 +13,8 @@ from lare_rl.errors import CheckedModel
 from lare_rl.llm.prompts import N_CANDIDATES
 from lare_rl.tasks.spec import ScoredObservation, TaskSpec
 
+__all__ = ["ResolvedSettings", "Settings", "round_up"]
+
 MAX_SEED = 2**31 - 1
 MAX_SEEDS = 1000
 """In one process."""

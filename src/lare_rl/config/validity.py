@@ -15,6 +15,8 @@ from lare_rl.errors import LareError
 from lare_rl.tasks.payments import PAID_AT_END, PaymentRule
 from lare_rl.tasks.spec import ScoredObservation
 
+__all__ = ["CreditContext", "check_credit", "check_factors"]
+
 
 @dataclass(frozen=True, kw_only=True)
 class CreditContext:

@@ -5,6 +5,8 @@ from jaxtyping import Array, Bool, Float
 
 from lare_rl.nn.masks import masked_mean
 
+__all__ = ["masked_correlation", "mean_absolute_error", "metrics"]
+
 
 def metrics(
     r_hat: Float[Array, " steps"],

@@ -25,6 +25,8 @@ from lare_rl.credit.decoder_settings import CreditSettings
 from lare_rl.nn.attention import LayerNorm, attend, causal_mask
 from lare_rl.nn.networks import MLP, Linear
 
+__all__ = ["AREL", "Block"]
+
 MAX_WIDTH = 100
 """The maximum width of a token."""
 DEPTH = 3

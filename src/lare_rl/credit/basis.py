@@ -30,6 +30,17 @@ from jaxtyping import Array, Bool, Float, Int
 
 from lare_rl.credit.history import next_history
 
+__all__ = [
+    "HALF_PERIOD",
+    "MAX_RAW_FEATURES",
+    "N_FREQUENCIES",
+    "Basis",
+    "expand",
+    "expand_history",
+    "fourier_terms",
+    "pair_products",
+]
+
 N_FREQUENCIES = 3
 """The number of frequencies of a shape."""
 HALF_PERIOD = 4.0

@@ -5,6 +5,8 @@ from typing import Literal, NamedTuple
 from lare_rl.credit.decoder_settings import CreditSettings
 from lare_rl.credit.methods import Fit
 
+__all__ = ["BatchPlan", "plan_batch"]
+
 
 class BatchPlan(NamedTuple):
     """The size of a batch. `data/layouts.py` describes the layouts."""

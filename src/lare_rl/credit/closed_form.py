@@ -42,6 +42,22 @@ from lare_rl.credit.score_type import ScoreType
 from lare_rl.nn.leading_axis import map_leading_axis
 from lare_rl.nn.normalise import RunningMeanStd, running_std
 
+__all__ = [
+    "ClosedForm",
+    "LinearDecoder",
+    "best_posterior",
+    "fit",
+    "fit_signs",
+    "init",
+    "init_linear_decoder",
+    "is_due",
+    "is_stale",
+    "reset_statistics",
+    "select_score_type",
+    "split_double",
+    "to_float64",
+]
+
 MAX_SIGNED_FACTORS = 16
 """The maximum number of factors for which all 2^d combinations of signs are tried."""
 STATISTICS_GROWTH = 1.5

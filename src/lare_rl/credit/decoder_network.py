@@ -8,6 +8,8 @@ from jaxtyping import Array, Float, PRNGKeyArray
 from lare_rl.credit.basis import Basis
 from lare_rl.errors import LareError
 
+__all__ = ["DecoderNetwork", "DecoderOutput", "DecoderShape"]
+
 
 class DecoderOutput(NamedTuple):
     """A decoder's output for some steps."""

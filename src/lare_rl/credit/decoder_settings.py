@@ -6,6 +6,8 @@ from pydantic import AliasChoices, Field
 
 from lare_rl.errors import CheckedModel
 
+__all__ = ["MULTI_AGENT_CREDIT", "RECENT_STEPS", "CreditSettings", "default_credit"]
+
 RECENT_STEPS = 5000
 """Proxy rewards are compared with the true rewards over this number of newest steps of each agent."""
 

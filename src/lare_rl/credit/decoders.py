@@ -19,6 +19,8 @@ if TYPE_CHECKING:  # importing JAX takes longer than all else that the command l
 
     from lare_rl.credit.decoder_network import DecoderNetwork, DecoderShape
 
+__all__ = ["DECODERS", "RBT_STEPS", "Decoder", "register_decoder"]
+
 
 @dataclass(frozen=True)
 class Decoder:

@@ -48,6 +48,26 @@ from lare_rl.nn.normalise import (
     update_scale,
 )
 
+__all__ = [
+    "CreditBatch",
+    "DecoderState",
+    "agent_mean",
+    "agent_shares",
+    "decode",
+    "decoder_rewards",
+    "init",
+    "is_normalised",
+    "level_effects",
+    "level_returns",
+    "normalise_inputs",
+    "observe_returns",
+    "observe_steps",
+    "reward_unit",
+    "score_type_index",
+    "step_rows",
+    "valid_rows",
+]
+
 
 class CreditBatch(NamedTuple):
     """Steps of some episodes, and the returns of these episodes. The rows are laid out as in `data/layouts.py`."""

@@ -24,6 +24,8 @@ from lare_rl.credit.methods import Fit
 from lare_rl.nn.masks import masked_mean
 from lare_rl.nn.networks import adam_step
 
+__all__ = ["loss_and_gradient", "update", "update_in_chunks"]
+
 
 def loss_and_gradient(
     state: DecoderState, episodes: CreditBatch, key: PRNGKeyArray, fit: Fit, settings: CreditSettings

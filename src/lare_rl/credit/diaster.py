@@ -21,6 +21,8 @@ from lare_rl.credit.losses import PerEpisode, batch_mean
 from lare_rl.credit.step_targets import EpisodeInputs, EpisodeLengths, step_loss
 from lare_rl.nn.networks import GRU, MLP, Linear
 
+__all__ = ["Diaster"]
+
 
 class Diaster(eqx.Module):
     """The sub-trajectory model and the step model."""

@@ -32,6 +32,21 @@ from lare_rl.credit.spec import CreditSpec
 from lare_rl.envs.interface import alive_mean
 from lare_rl.nn.normalise import RunningMeanStd, Scale, min_max_scale, root_mean_square
 
+__all__ = [
+    "ExplanationState",
+    "RewardSource",
+    "StepBatch",
+    "add_to_explanation",
+    "correction",
+    "explain_returns",
+    "init_decoder",
+    "init_explanation",
+    "proxy_rewards",
+    "return_scale",
+    "scale_and_mask",
+    "training_rewards",
+]
+
 
 def init_decoder(key: PRNGKeyArray, spec: CreditSpec) -> DecoderState | None:
     """Return an untrained decoder. Return None for a method that fits nothing."""

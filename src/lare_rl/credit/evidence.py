@@ -54,6 +54,24 @@ from lare_rl.nn.leading_axis import map_leading_axis
 from lare_rl.nn.masks import select
 from lare_rl.nn.normalise import merge_means
 
+__all__ = [
+    "JAX",
+    "PosteriorCovariance",
+    "SufficientStatistics",
+    "add_episodes",
+    "add_prefixes",
+    "empty_statistics",
+    "fit",
+    "fixed_point",
+    "init_posterior",
+    "most_likely",
+    "posterior_covariance",
+    "posterior_std",
+    "regression",
+    "starting_precisions",
+    "to_return_units",
+]
+
 FIRST_GROUP_GAIN, OTHER_GROUPS_LOSS, LOW_NOISE = 100, 1e4, 1e-6
 """The third start of a fit: the first group may explain `FIRST_GROUP_GAIN` times its equal share, each other group its equal share
 divided by `OTHER_GROUPS_LOSS`, and the noise `LOW_NOISE` times the variance of the returns."""

@@ -37,6 +37,8 @@ from lare_rl.credit.evidence import SufficientStatistics
 from lare_rl.credit.precisions import FeatureIndex, Posterior, Regression
 from lare_rl.credit.score_type import ScoreType
 
+__all__ = ["Explanation", "StepStatistics", "add_steps", "empty_step_statistics", "explain"]
+
 MAX_EXPLANATION_ROUNDS = 100
 """The maximum number of rounds of the evidence's fixed point. It is large because there is no earlier fit to start from."""
 MIN_MEAN_STD = 1e-5

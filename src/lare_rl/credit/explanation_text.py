@@ -11,6 +11,8 @@ from lare_rl.tasks.spec import base_name, entry_meanings
 from lare_rl.util.findings import Finding
 from lare_rl.util.statistics import round_shares
 
+__all__ = ["MESSAGES", "MIN_EXPLAINED_EPISODES", "explanation_findings", "raw_feature_names"]
+
 MIN_EXPLAINED_EPISODES = 20
 """With fewer episodes, nothing is said."""
 LITTLE_SHARE = 0.1

@@ -35,6 +35,8 @@ from lare_rl.credit.score_type import (
 from lare_rl.util.float64 import float64
 from lare_rl.util.statistics import r_squared
 
+__all__ = ["FactorAssessment", "assess_factors", "mean_features", "predict_returns"]
+
 N_FIRST = 10
 """The number of episodes before the first prediction."""
 

@@ -33,6 +33,8 @@ from lare_rl.credit.losses import PerEpisode, batch_mean
 from lare_rl.credit.step_targets import EpisodeInputs, EpisodeLengths, is_step
 from lare_rl.nn.networks import MLP, bound_log_std
 
+__all__ = ["GRD", "causes", "sample_mask"]
+
 TEMPERATURE = 0.01
 COMPONENTS = 3
 """The number of Gaussians in the mixture of a next state's entry."""

@@ -17,6 +17,8 @@ from jaxtyping import Array, Bool, Float
 
 from lare_rl.envs.interface import AnyArray
 
+__all__ = ["next_history", "next_history_columns", "scan_history"]
+
 
 def next_history(
     history: Float[AnyArray, "*batch 3 entries"], entries: Float[AnyArray, "*batch entries"]

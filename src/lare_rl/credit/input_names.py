@@ -19,6 +19,8 @@ from typing import Any
 from lare_rl.errors import LareError
 from lare_rl.tasks.spec import ScoredObservation, select_states
 
+__all__ = ["InputNames", "input_arrays", "input_size", "input_sizes", "tracked_size"]
+
 _NAMES = "factors", "observation", "action", "next_observation", "observation_change", "scored_observation", "history"
 
 

@@ -16,6 +16,8 @@ from jaxtyping import Array, Bool, Float, Int
 
 from lare_rl.nn.normalise import merge_means
 
+__all__ = ["LevelMeans", "add_returns", "empty_level_means", "level_offsets"]
+
 
 class LevelMeans(NamedTuple):
     """The number, the mean and the sum of squared deviations of R/T in each level."""

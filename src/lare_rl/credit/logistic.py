@@ -32,6 +32,18 @@ from lare_rl.credit.evidence import JAX, PosteriorCovariance
 from lare_rl.credit.precisions import JITTER, PRIOR_RANGE, Posterior, count_determined, inverse_root, varies
 from lare_rl.credit.prequential import ring_slots
 
+__all__ = [
+    "WINDOW",
+    "LogOddsFit",
+    "add_episodes",
+    "covariance",
+    "fit",
+    "init",
+    "predict",
+    "remove_episodes",
+    "to_returns",
+]
+
 WINDOW = 512
 """The number of last episodes that are fitted."""
 TOLERANCE = 1e-3

@@ -10,6 +10,17 @@ and has the same minimiser if all episodes have the same length. `sum_form` fits
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
+__all__ = [
+    "PerEpisode",
+    "batch_mean",
+    "episode_means",
+    "episode_weight",
+    "leave_one_out_likelihood",
+    "squared_error",
+    "subsampling_variance",
+    "unbiased_squared_error",
+]
+
 PerEpisode = Float[Array, " episodes"]
 
 

@@ -23,6 +23,8 @@ from lare_rl.credit.decoder_network import DecoderOutput, DecoderShape
 from lare_rl.credit.decoder_settings import CreditSettings
 from lare_rl.nn.networks import MLP, bound_log_std
 
+__all__ = ["LRR"]
+
 
 class LRR(eqx.Module):
     """An MLP with two outputs: mu times a gain, and log sigma.

@@ -8,6 +8,8 @@ from lare_rl.credit.decoders import DECODERS
 from lare_rl.credit.input_names import InputNames
 from lare_rl.errors import LareError, short_repr
 
+__all__ = ["Fit", "Method", "Reward"]
+
 
 class Fit(StrEnum):
     """How the decoder is fitted to returns (equations in `losses.py`)."""

@@ -10,6 +10,30 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Float, Int
 
+__all__ = [
+    "JITTER",
+    "MIN_NOISE",
+    "MIN_VARIATION",
+    "NUMPY",
+    "PRIOR_RANGE",
+    "TOLERANCE",
+    "Backend",
+    "FeatureIndex",
+    "Features",
+    "Groups",
+    "Moments",
+    "Posterior",
+    "Regression",
+    "clip_precisions",
+    "count_determined",
+    "dense_moments",
+    "equal_shares",
+    "expand_groups",
+    "inverse_root",
+    "next_posterior",
+    "varies",
+]
+
 PRIOR_RANGE = 1e6
 """A group may explain at most this many times more, or less, of the returns than its equal share. Without a limit, a group that was
 switched off could not be switched on again."""

@@ -17,6 +17,19 @@ from typing import NamedTuple
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
+__all__ = [
+    "SEGMENT_WINDOW",
+    "WINDOW",
+    "Predictions",
+    "add_predictions",
+    "empty_predictions",
+    "gain",
+    "metrics",
+    "r2",
+    "ring_slots",
+    "squared_errors",
+]
+
 WINDOW = 32
 """R^2 is computed over this number of last episodes."""
 SEGMENT_WINDOW = 256

@@ -29,6 +29,8 @@ from lare_rl.credit.step_targets import EpisodeInputs, EpisodeLengths, is_step, 
 from lare_rl.nn.attention import LayerNorm, attend, causal_mask
 from lare_rl.nn.networks import MLP, Linear
 
+__all__ = ["RBT", "Block"]
+
 LAYERS = 3
 DROPOUT = 0.1
 """The probability that an activation is dropped in an update."""

@@ -19,6 +19,8 @@ from lare_rl.credit.evidence import SufficientStatistics
 from lare_rl.credit.precisions import FeatureIndex, Posterior, expand_groups
 from lare_rl.nn import masks
 
+__all__ = ["MIN_GAIN", "fit_strengths", "is_better", "select"]
+
 MIN_GAIN = 0.5
 """The least gain in log evidence for each additional precision. Of 0.1, 0.25, 0.5 and 1, the middle two predicted the rewards of
 later episodes best on eight scores (`benchmarks/relevance.py`)."""

@@ -34,6 +34,22 @@ from lare_rl.credit.methods import Fit, Method
 from lare_rl.credit.prequential import Predictions, add_predictions, squared_errors
 from lare_rl.credit.score_type import MAX_ERROR_RATIO, ROUNDING, ScoreType, ScoreTypeEstimate, compare_score_types
 
+__all__ = [
+    "MIN_GROWTH",
+    "add_episodes",
+    "add_to_sums",
+    "estimate_score_type",
+    "fit_closed_form",
+    "is_fitted",
+    "is_stale",
+    "looks_binary",
+    "predict",
+    "predict_then_update",
+    "predicted_returns",
+    "reset_statistics",
+    "reward_std",
+]
+
 MIN_BINARY_RETURNS = 16
 """With fewer returns, nothing is said about whether they look as if won or lost."""
 MIN_GROWTH = 0.02

@@ -30,6 +30,8 @@ from lare_rl.credit.losses import PerEpisode, batch_mean
 from lare_rl.credit.step_targets import EpisodeInputs, EpisodeLengths, is_step, step_loss
 from lare_rl.nn.networks import MLP, Linear
 
+__all__ = ["RUDDER"]
+
 CONTINUOUS_WEIGHT = 0.5
 """The weight of the continuous prediction."""
 INITIAL_STD = 0.1

@@ -7,6 +7,16 @@ from typing import NamedTuple
 from lare_rl.credit.prequential import SEGMENT_WINDOW, WINDOW
 from lare_rl.tasks.payments import PaymentRule
 
+__all__ = [
+    "MAX_ERROR_RATIO",
+    "ROUNDING",
+    "ScoreType",
+    "ScoreTypeEstimate",
+    "compare_score_types",
+    "prediction_window",
+    "score_types_to_fit",
+]
+
 MAX_ERROR_RATIO = 0.95
 """A score is treated as an average if its predictions as an average have a squared error below this fraction of the error as a sum. If all
 episodes are equally long, both errors are equal except for rounding."""

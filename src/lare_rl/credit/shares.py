@@ -13,6 +13,8 @@ then, and adds 1e-5 to each denominator.
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
+__all__ = ["return_shares"]
+
 
 def return_shares(
     contributions: Float[Array, "episodes steps agents"], alive: Bool[Array, "episodes steps agents"]

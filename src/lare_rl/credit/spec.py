@@ -12,6 +12,8 @@ from lare_rl.credit.prequential import WINDOW
 from lare_rl.credit.score_type import ScoreType, score_types_to_fit
 from lare_rl.tasks.spec import ScoredObservation
 
+__all__ = ["CreditSpec"]
+
 
 @dataclass(frozen=True, kw_only=True)
 class CreditSpec:

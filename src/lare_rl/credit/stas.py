@@ -21,6 +21,8 @@ from lare_rl.credit.decoder_settings import CreditSettings
 from lare_rl.nn.attention import LayerNorm, attend, causal_mask
 from lare_rl.nn.networks import MLP, Linear
 
+__all__ = ["REWARD_SAMPLES", "STAS", "Coalitions", "TimeLayer", "dropout", "gelu"]
+
 SIZE, HEADS, LAYERS, COALITIONS = 128, 4, 3, 5
 """The width of a token, the number of heads, of layers over time, and of sampled coalitions."""
 REWARD_SAMPLES = 8

@@ -10,6 +10,8 @@ from lare_rl.credit.decoder_network import DecoderOutput, DecoderShape
 from lare_rl.credit.decoder_settings import CreditSettings
 from lare_rl.nn.networks import MLP
 
+__all__ = ["Bottleneck", "StepDecoder"]
+
 
 class StepDecoder(eqx.Module):
     """f_psi: an MLP, times a gain."""

@@ -15,6 +15,8 @@ from jaxtyping import Array, Bool, Float, Int
 
 from lare_rl.nn.networks import MLP
 
+__all__ = ["EpisodeInputs", "EpisodeLengths", "is_step", "step_loss"]
+
 EpisodeInputs = Float[Array, "episodes steps inputs"]
 EpisodeLengths = Int[Array, " episodes"]
 

@@ -25,6 +25,8 @@ from lare_rl.credit.decoder_settings import CreditSettings
 from lare_rl.credit.stas import REWARD_SAMPLES, Coalitions, TimeLayer, gelu
 from lare_rl.nn.networks import MLP, Linear
 
+__all__ = ["TAR2"]
+
 SIZE, LAYERS = 64, 3
 """The width of a token, and the number of pairs of layers."""
 ACTION_WEIGHT = 0.05

@@ -12,6 +12,8 @@ from jaxtyping import Array, Bool, Float, Int
 from lare_rl.data.replay import Replay, Segments, capacity, first_transition, look_up, newest_steps
 from lare_rl.tasks.payments import PAID_AT_END, PaymentRule, is_paid
 
+__all__ = ["abandon_running", "extend", "set_newest"]
+
 Columns = Mapping[str, Array]
 """Arrays with rows first, by name."""
 

@@ -16,6 +16,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int, PRNGKeyArray, Scalar
 
+__all__ = ["Layout", "lay_out_packed", "lay_out_padded", "lay_out_sampled", "sample_steps"]
+
 
 class Layout(NamedTuple):
     """The step of each row. Both arrays are of NumPy or both of JAX."""

@@ -18,6 +18,20 @@ from lare_rl.data.replay import (
     segment_start,
 )
 
+__all__ = [
+    "CreditSample",
+    "EpisodeSample",
+    "count_episodes_since",
+    "episodes_in_order",
+    "get_episodes",
+    "sample_distinct_episodes",
+    "sample_episode_steps",
+    "sample_episodes",
+    "sample_packed",
+    "sample_padded",
+    "sample_transitions",
+]
+
 
 class EpisodeSample(NamedTuple):
     """Some finished episodes."""

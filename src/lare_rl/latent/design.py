@@ -15,6 +15,11 @@ from lare_rl.llm.recording import Recorder
 from lare_rl.llm.reply import MalformedReplyError, parse_reply
 from lare_rl.tasks.spec import TaskSpec, require_role
 
+__all__ = [
+    "Conversation", "DesignError", "DesignInterruptedError", "DesignModelError", "check_recorded", "design",
+    "examine_reply",
+]  # fmt: skip
+
 _MAX_ATTEMPTS = 5
 """Attempts at a function that passes verification, the first included."""
 

@@ -9,6 +9,8 @@ from lare_rl.errors import LareError
 from lare_rl.phi.evaluate import compute_nodes, evaluate
 from lare_rl.phi.graph import Graph
 
+__all__ = ["NonFiniteFactorError", "check_finite", "compute_batch", "find_infinity"]
+
 _CHUNK_NUMBERS = 1 << 22
 """About how many numbers are computed at a time."""
 

@@ -22,6 +22,11 @@ from lare_rl.phi.names import factor_meanings, factor_names
 from lare_rl.phi.read import read
 from lare_rl.tasks.spec import ScoredObservation, TaskSpec, require_role, select_states, step_names
 
+__all__ = [
+    "CHANGED_SUFFIX", "HEADER_PREFIX", "LatentFunction", "check_task", "features_text", "function_from_verdict",
+    "normalise_source", "pair_with_roles", "source_hash", "verify_function",
+]  # fmt: skip
+
 CHANGED_SUFFIX = "; changed by hand since"
 """It is appended to the model's name if a source is not the saved one."""
 

@@ -17,6 +17,8 @@ from lare_rl.llm.recording import Exchange, Recorder
 from lare_rl.llm.reply import MalformedReplyError, parse_reply
 from lare_rl.tasks.spec import TaskSpec
 
+__all__ = ["Assessment", "improve"]
+
 
 @dataclass(frozen=True)
 class Assessment:

@@ -24,6 +24,8 @@ from lare_rl.llm.reply import MalformedReplyError, parse_reply
 from lare_rl.tasks.spec import TaskSpec
 from lare_rl.util.safe_io import read_json, read_text
 
+__all__ = ["SavedSource", "load_function", "read_source"]
+
 _MAX_FILE_BYTES = 1 << 20
 _UNNAMED_LLM = "a model that is not named"
 """The language model of a function that was read from a reply."""

@@ -25,6 +25,8 @@ from lare_rl.phi.names import factor_names
 from lare_rl.phi.read import read
 from lare_rl.tasks.spec import TaskSpec, require_role, select_states
 
+__all__ = ["N_SAMPLE_STEPS", "Check", "Steps", "Verdict", "random_steps", "sample_steps", "verify"]
+
 N_SAMPLE_STEPS = 256
 """The number of steps that a function is tried on."""
 

@@ -7,6 +7,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
+__all__ = ["LayerNorm", "attend", "causal_mask"]
+
 
 class LayerNorm(eqx.Module):
     """(x - mean) / std of each row, then scaled and shifted (Ba, Kiros and Hinton, 2016)."""

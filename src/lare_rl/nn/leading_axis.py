@@ -5,6 +5,8 @@ from typing import TypeVar
 
 import jax
 
+__all__ = ["map_leading_axis"]
+
 Rows = TypeVar("Rows")
 Result = TypeVar("Result")
 

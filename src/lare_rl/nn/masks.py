@@ -6,6 +6,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Num
 
+__all__ = ["masked_mean", "select"]
+
 Tree = TypeVar("Tree")
 
 

@@ -9,6 +9,19 @@ import jax.numpy as jnp
 import optax
 from jaxtyping import Array, Float, PRNGKeyArray
 
+__all__ = [
+    "GRU",
+    "MLP",
+    "Linear",
+    "adam_step",
+    "bound_log_std",
+    "clip_gradient",
+    "copy_networks",
+    "init_adam",
+    "init_orthogonal",
+    "polyak_update",
+]
+
 MAX_LOG_STD = 5.0
 
 

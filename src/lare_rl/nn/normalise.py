@@ -5,6 +5,22 @@ from typing import Any, NamedTuple
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
+__all__ = [
+    "CLIP",
+    "RunningMeanStd",
+    "Scale",
+    "empty_mean_std",
+    "empty_scale",
+    "merge_means",
+    "min_max_scale",
+    "root_mean_square",
+    "running_std",
+    "standardise",
+    "standardise_if_observed",
+    "update_mean_std",
+    "update_scale",
+]
+
 CLIP = 10.0
 """Standardised features are clipped to this many standard deviations."""
 

@@ -15,6 +15,17 @@ from lare_rl.runs.metric_names import RETURN, RETURN_STD
 from lare_rl.training.static_config import TrainConfig
 from lare_rl.util.findings import Finding, render
 
+__all__ = [
+    "MESSAGES",
+    "describe_untrained",
+    "find_constant_returns",
+    "find_equal_returns",
+    "find_large_observations",
+    "find_saturated_policies",
+    "find_slow_evaluations",
+    "find_untrained",
+]
+
 MAX_RMS = 10.0
 """The largest root mean square of an observation's feature that needs no advice."""
 N_PROBE_STATES = 1000

@@ -13,6 +13,8 @@ from lare_rl.nn.leading_axis import map_leading_axis
 from lare_rl.training.static_config import TrainConfig
 from lare_rl.util.float64 import float64
 
+__all__ = ["is_batching_faster"]
+
 MIN_SPEED_UP = 2.0
 """Less may be noise, and then a run would not always choose the same."""
 N_REPETITIONS, N_STARTS = 5, 3

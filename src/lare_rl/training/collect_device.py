@@ -23,6 +23,8 @@ from lare_rl.training.seed_axis import jit_over_seeds, seed_sharding
 from lare_rl.training.static_config import TrainConfig
 from lare_rl.training.streams import Stream, device_noise, stream_keys
 
+__all__ = ["DeviceCollector", "VecEnvState", "collect", "is_reset_cheap", "make_jax_env", "reset", "unroll_on_device"]
+
 Act = Callable[..., tuple[Array, Any]]
 """From actor, memory, observation, available actions, noise and episode starts to the action and the new memory."""
 

@@ -27,6 +27,8 @@ from lare_rl.training.static_config import TrainConfig
 from lare_rl.training.streams import Stream, episode_seed, host_noise, numpy_generator
 from lare_rl.training.unroll_host import add_seed_axis, check_finite, evaluate_policy_on_host
 
+__all__ = ["HostCollector", "HostVecEnv", "make_host_collector"]
+
 
 class HostVecEnv:
     """The training environments of a run, and the running episode of each.

@@ -14,6 +14,8 @@ from typing import Any, ParamSpec, TypeVar
 import numpy as np
 from pydantic import BaseModel
 
+__all__ = ["cache_by_value", "clear_compile_cache"]
+
 MAX_ENTRIES = 64
 """A run needs about eight. The entries that were unused for the longest time are forgotten."""
 

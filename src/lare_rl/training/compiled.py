@@ -27,6 +27,19 @@ from lare_rl.training.static_config import TrainConfig
 from lare_rl.training.streams import seed_keys
 from lare_rl.util.float64 import float64
 
+__all__ = [
+    "CompiledFunctions",
+    "compile_ahead",
+    "compile_functions",
+    "init_memory",
+    "init_seeds",
+    "keys_shape",
+    "learner_shape",
+    "policy_function",
+    "steps_shape",
+    "training_module",
+]
+
 
 class CompiledFunctions(NamedTuple):
     """The functions of a run. `store`, `fit` and `train_step` consume their learner: its buffers are reused for the new one."""

@@ -27,6 +27,8 @@ from lare_rl.training.static_config import TrainConfig
 from lare_rl.training.streams import Stream, stream_keys
 from lare_rl.util.float64 import float64
 
+__all__ = ["CompiledLoop", "LoopState", "compile_loop", "init_loop"]
+
 Measured = tuple[Metrics, dict[str, Bool[Array, " seeds"]]]
 """Metrics, and which of them have been measured."""
 

@@ -16,6 +16,8 @@ from lare_rl.training.learner import Learner
 from lare_rl.training.rewards import team_metrics
 from lare_rl.training.static_config import TrainConfig
 
+__all__ = ["fit_decoders", "fit_repeatedly", "fit_seeds", "sample_credit"]
+
 CHUNK_ROWS = 2400
 """About how many rows each chunk of a decoder's gradient is computed from. More rows do not fit into the cache of a core,
 and fewer make the matrix products inefficient."""

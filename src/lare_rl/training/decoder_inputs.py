@@ -14,6 +14,8 @@ from lare_rl.data.replay import StoredSteps
 from lare_rl.data.sampling import CreditSample
 from lare_rl.training.static_config import TrainConfig
 
+__all__ = ["alive_agents", "decoder_inputs", "episode_batch", "row_mask", "step_batch", "tracked_inputs"]
+
 
 def decoder_inputs(steps: StoredSteps, config: TrainConfig, team_index: int) -> Float[Array, "*batch rows inputs"]:
     """Return the inputs of a team's decoder for some steps."""

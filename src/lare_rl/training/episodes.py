@@ -26,6 +26,8 @@ from lare_rl.nn.masks import select
 from lare_rl.training.decoder_inputs import episode_batch
 from lare_rl.training.static_config import TrainConfig
 
+__all__ = ["Decoders", "PredictedReturns", "fold_episodes", "learn_returns", "predict_returns"]
+
 MAX_ROWS = 8000
 """The most rows of decoder inputs that are read at a time, unless a single episode has more."""
 

@@ -12,6 +12,8 @@ from lare_rl.data.trajectory import Trajectory
 from lare_rl.envs.interface import AnyArray, EnvSpec
 from lare_rl.tasks.spec import TaskSpec
 
+__all__ = ["EpisodeBatch", "Evaluation", "concatenate", "metrics_lines"]
+
 
 class EpisodeBatch(NamedTuple):
     """Whole episodes, each from a different initial state."""

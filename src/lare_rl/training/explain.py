@@ -26,6 +26,15 @@ from lare_rl.training.static_config import TrainConfig
 from lare_rl.util.findings import Finding, render
 from lare_rl.util.float64 import float64
 
+__all__ = [
+    "compile_explanation",
+    "describe_returns",
+    "explain_run",
+    "explain_stored_returns",
+    "explanation_source",
+    "find_explanations",
+]
+
 
 def explain_run(run: Run) -> list[str]:
     """Return the explanation of the returns in a run's last checkpoint, in sentences."""

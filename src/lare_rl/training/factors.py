@@ -19,6 +19,8 @@ from lare_rl.tasks.spec import select_states
 from lare_rl.training.static_config import TrainConfig
 from lare_rl.util.files import replace_npz
 
+__all__ = ["compute_factors", "compute_host_factors", "is_compilable"]
+
 MAX_COMPILED_OPERATIONS, MAX_COMPILED_DEPTH = 400, 200
 """Graphs with more operations, or with a longer chain of them, are computed by NumPy: XLA would compile for too long."""
 

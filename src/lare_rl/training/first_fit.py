@@ -25,6 +25,8 @@ from lare_rl.training.learner import Learner
 from lare_rl.training.seed_axis import jit_over_seeds
 from lare_rl.training.static_config import TrainConfig
 
+__all__ = ["FirstFitStoppedError", "config_of_first_fit", "fit_until_converged", "has_enough_episodes", "has_first_fit"]
+
 MIN_FIRST_EPISODES = 10
 """With fewer finished episodes of a seed, none are held out."""
 PATIENCE = 2

@@ -19,6 +19,8 @@ from lare_rl.training.saved_state import actor_shape
 from lare_rl.training.static_config import TrainConfig
 from lare_rl.training.streams import Stream, host_noise, numpy_generator
 
+__all__ = ["EvaluationPolicy", "HostPolicy", "draw_noise", "init_host_memory", "make_policy"]
+
 HostPolicy = Callable[..., tuple[Float[np.ndarray, "seeds envs agents action"], Any]]
 """From memory, observation, available actions, noise (or None), and which episodes are new, to the action and the new memory."""
 

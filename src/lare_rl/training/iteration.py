@@ -16,6 +16,8 @@ from lare_rl.training.learner import Learner
 from lare_rl.training.static_config import TrainConfig
 from lare_rl.training.streams import Stream, seed_keys, stream_keys
 
+__all__ = ["IterationFunctions", "store_steps", "update", "when_compiled", "when_on_host"]
+
 Measured = TypeVar("Measured")
 When = Callable[..., tuple[Any, ...]]
 """From a condition, a function and its arguments to the function's results or, if the condition is false, the arguments."""

@@ -14,6 +14,8 @@ from lare_rl.latent.saved import load_function
 from lare_rl.llm.prompts import N_CANDIDATES
 from lare_rl.tasks.spec import TaskSpec
 
+__all__ = ["FunctionOrPath", "check_draw_unused", "choose_functions"]
+
 FunctionOrPath = LatentFunction | str | Path
 """A latent function, or the path of its file."""
 

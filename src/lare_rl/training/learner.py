@@ -28,6 +28,18 @@ from lare_rl.training.decoder_inputs import decoder_inputs, row_mask, tracked_in
 from lare_rl.training.factors import compute_factors
 from lare_rl.training.static_config import TrainConfig
 
+__all__ = [
+    "Learner",
+    "abandon_episodes",
+    "empty_replay",
+    "init_decoders",
+    "init_learner",
+    "replay_columns",
+    "store",
+    "store_with_factors",
+    "with_learned_returns",
+]
+
 
 class Learner(NamedTuple):
     """The whole training state of one seed."""

@@ -22,6 +22,8 @@ from lare_rl.training.session import Session
 from lare_rl.training.unroll_host import DivergedError
 from lare_rl.util.findings import Finding, render
 
+__all__ = ["RunInterruptedError", "run_session"]
+
 CHECKPOINT_S = 300.0
 """Seconds after which a checkpoint is written between two evaluations: what a crash may cost."""
 PROGRESS_S = 1.0

@@ -16,6 +16,8 @@ import jax
 import numpy as np
 from jax.extend.core import ClosedJaxpr, Jaxpr, JaxprEqn, Literal
 
+__all__ = ["UnsupportedOperationError", "apply", "to_numpy"]
+
 Operation = Callable[..., Any]
 ArrayFunctions = Callable[[str], Operation]
 """From a name of NumPy to the function. Raises `UnsupportedOperationError` if there is none."""

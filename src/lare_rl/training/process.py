@@ -14,6 +14,8 @@ from lare_rl.config.resolve import replay_rows
 from lare_rl.errors import LareError
 from lare_rl.runs.directory import Run
 
+__all__ = ["catch_stop_signals", "report_full_memory"]
+
 STOP_SIGNALS = signal.SIGINT, signal.SIGTERM
 
 SAME_REQUEST_S = 1.0

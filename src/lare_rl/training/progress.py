@@ -12,6 +12,8 @@ from lare_rl.errors import missing_extra_error
 from lare_rl.util.durations import format_seconds
 from lare_rl.util.sanitize import sanitize
 
+__all__ = ["Clock", "Listener", "MetricLines", "TensorBoard", "Terminal", "import_summary_writer", "known_numbers"]
+
 LINE_S = 60.0
 """Where there is no terminal, a line is printed at least this often (s) while environments step."""
 

@@ -38,6 +38,8 @@ from lare_rl.training.rewards import rewards
 from lare_rl.training.static_config import TrainConfig
 from lare_rl.util.float64 import float64
 
+__all__ = ["CreditSteps", "PureCredit", "PureCreditState", "pure_credit"]
+
 
 class CreditSteps(NamedTuple):
     """Consecutive steps of several environments. With several agents, the arrays marked `*agents` have an axis of agents."""

@@ -25,6 +25,8 @@ from lare_rl.tasks.spec import TaskSpec, require_role, select_states
 from lare_rl.training.stored_episodes import stored_role_episodes
 from lare_rl.util.findings import render
 
+__all__ = ["FunctionAssessment", "assess_function", "reflect"]
+
 N_EPISODES = 40
 """The default number of episodes to play."""
 

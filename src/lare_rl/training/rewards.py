@@ -14,6 +14,8 @@ from lare_rl.training.decoder_inputs import alive_agents, step_batch
 from lare_rl.training.learner import Learner
 from lare_rl.training.static_config import TrainConfig
 
+__all__ = ["assess", "rewards", "team_metrics", "team_proxy_rewards"]
+
 
 def rewards(
     steps: StoredSteps, sources: tuple[RewardSource, ...], config: TrainConfig

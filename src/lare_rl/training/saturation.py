@@ -10,6 +10,8 @@ from jaxtyping import Array, Float, Int, Shaped
 from lare_rl.data.replay import Replay, capacity
 from lare_rl.training.static_config import TrainConfig
 
+__all__ = ["greedy_actions", "measure", "saturation"]
+
 N_STATES = 1000
 """The number of stored observations of an environment in which a policy acts."""
 ACTION_BOUND = 0.99

@@ -20,6 +20,8 @@ from lare_rl.training.learner import Learner
 from lare_rl.training.static_config import TrainConfig
 from lare_rl.util.provenance import code_version
 
+__all__ = ["SavedState", "actor_shape", "load_actor", "load_learner", "make_train_config"]
+
 
 class SavedState(NamedTuple):
     """The training state of a checkpoint."""

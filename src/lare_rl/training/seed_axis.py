@@ -11,6 +11,8 @@ import jax
 from jax.sharding import AxisType, Mesh, NamedSharding, PartitionSpec
 from jaxtyping import Array, Int
 
+__all__ = ["count_seed_devices", "first_shard", "jit_over_seeds", "seed_sharding", "select_seed", "shape_over_seeds"]
+
 AXIS = "seeds"
 
 State = TypeVar("State")

@@ -31,6 +31,8 @@ from lare_rl.training.learner import Learner
 from lare_rl.training.rewards import rewards
 from lare_rl.training.static_config import TrainConfig
 
+__all__ = ["SequenceState", "act", "get_actor", "init", "init_memory", "train_step"]
+
 Updated = tuple[Any, tuple[DecoderState, ...]]
 """The state of the algorithm, and the decoders."""
 

@@ -40,6 +40,8 @@ from lare_rl.training.saved_state import actor_shape
 from lare_rl.training.static_config import TrainConfig
 from lare_rl.util.float64 import one_blas_thread
 
+__all__ = ["Session"]
+
 MAX_CALL_S = 5.0
 """About how long one compiled call may take. Until it returns, the user cannot stop the run."""
 

@@ -20,6 +20,8 @@ from lare_rl.training.session import Session
 from lare_rl.training.static_config import TrainConfig
 from lare_rl.training.streams import seed_keys
 
+__all__ = ["restore_session", "start_session"]
+
 
 def start_session(run: Run) -> Session:
     """Return a session before its first step."""

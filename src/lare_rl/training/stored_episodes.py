@@ -16,6 +16,8 @@ from lare_rl.tasks.spec import TaskSpec
 from lare_rl.training.saved_state import load_learner
 from lare_rl.training.seed_axis import select_seed
 
+__all__ = ["stored_episodes", "stored_role_episodes"]
+
 MAX_ROLE_EPISODES = 200
 """The largest number of episodes for reflection, over all seeds and environments."""
 

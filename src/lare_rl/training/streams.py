@@ -10,6 +10,8 @@ from jaxtyping import Array, Float, Int, Key
 
 from lare_rl.algorithms.registry import Noise
 
+__all__ = ["Stream", "device_noise", "episode_seed", "host_noise", "numpy_generator", "seed_keys", "stream_keys"]
+
 
 class Stream(IntEnum):
     """The purposes of random numbers. The numbers of each purpose are independent of the others."""

@@ -13,6 +13,8 @@ from typing import Any
 from lare_rl.errors import LareError, missing_extra_error
 from lare_rl.training.progress import Listener, MetricLines, known_numbers
 
+__all__ = ["MLflow", "WeightsAndBiases"]
+
 
 class WeightsAndBiases(Listener):
     """Sends every number to Weights & Biases, with the extra `lare-rl[wandb]`."""

@@ -21,6 +21,8 @@ from lare_rl.training.session import Session
 from lare_rl.training.start_session import restore_session, start_session
 from lare_rl.util import compilation
 
+__all__ = ["resume", "train"]
+
 EVENTS_DIRECTORY = "tensorboard"
 """Within the run directory."""
 

@@ -18,6 +18,16 @@ from lare_rl.training.host_policy import EvaluationPolicy
 from lare_rl.training.static_config import TrainConfig
 from lare_rl.training.streams import Stream, episode_seed
 
+__all__ = [
+    "DivergedError",
+    "add_seed_axis",
+    "check_finite",
+    "evaluate_on_host",
+    "evaluate_policy_on_host",
+    "record_on_host",
+    "unroll_on_host",
+]
+
 BatchPolicy = Callable[[Timestep, Bool[np.ndarray, "seeds envs"]], Float[np.ndarray, "seeds envs agents action"]]
 """From a timestep, and which episodes have just begun, to the action."""
 

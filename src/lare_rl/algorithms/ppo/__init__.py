@@ -9,6 +9,8 @@ from lare_rl.algorithms.registry import Algorithm, AlgorithmSettings, Consumes, 
 if TYPE_CHECKING:
     from lare_rl.envs.interface import EnvSpec
 
+__all__ = ["PPOSettings"]
+
 MIN_ROLLOUT_STEPS = 16
 """The least number of steps of each environment between two updates, by default: advantages need some steps in a row."""
 

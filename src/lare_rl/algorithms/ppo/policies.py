@@ -8,6 +8,8 @@ from jaxtyping import Array, Float
 from lare_rl.algorithms.batches import Action, Available, Observation, Value
 from lare_rl.nn.networks import MLP
 
+__all__ = ["UNAVAILABLE_LOGIT", "StochasticPolicy"]
+
 UNAVAILABLE_LOGIT = -1e9
 
 

@@ -9,6 +9,8 @@ from lare_rl.algorithms.registry import Algorithm, AlgorithmSettings, Consumes, 
 if TYPE_CHECKING:
     from lare_rl.envs.interface import EnvSpec
 
+__all__ = ["QMIXSettings"]
+
 
 class QMIXSettings(AlgorithmSettings):
     """Hyperparameters, as PyMARL2 sets them for most maps of the StarCraft challenge."""

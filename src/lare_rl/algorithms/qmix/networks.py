@@ -19,6 +19,8 @@ from jaxtyping import Array, Float, PRNGKeyArray
 
 from lare_rl.nn.networks import GRU, MLP, Linear
 
+__all__ = ["Mixer", "RecurrentNetwork", "mix"]
+
 
 class RecurrentNetwork(eqx.Module):
     """Linear, ReLU, GRU, Linear.

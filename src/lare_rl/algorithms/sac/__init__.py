@@ -7,6 +7,8 @@ from pydantic import Field
 from lare_rl.algorithms.off_policy import OffPolicySettings, run_defaults
 from lare_rl.algorithms.registry import Algorithm, Consumes, register_algorithm
 
+__all__ = ["SACSettings"]
+
 
 class SACSettings(OffPolicySettings):
     """Hyperparameters, as the LaRe paper sets them."""

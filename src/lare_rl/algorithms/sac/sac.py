@@ -22,6 +22,8 @@ from lare_rl.algorithms.critics import fit_critics, init_critics, q_values, td_t
 from lare_rl.algorithms.sac import SACSettings
 from lare_rl.nn.networks import MLP, adam_step, copy_networks, init_adam, polyak_update
 
+__all__ = ["SAC", "Networks", "act", "explore", "get_actor", "init", "sample", "soft_td_targets", "update"]
+
 MIN_LOG_STD, MAX_LOG_STD = -20.0, 2.0
 
 

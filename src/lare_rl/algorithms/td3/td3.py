@@ -22,6 +22,8 @@ from lare_rl.algorithms.critics import fit_critics, init_critics, q_value, q_val
 from lare_rl.algorithms.td3 import TD3Settings
 from lare_rl.nn.networks import MLP, adam_step, copy_networks, init_adam, polyak_update
 
+__all__ = ["TD3", "Networks", "act", "explore", "get_actor", "init", "td_targets", "update"]
+
 
 class Networks(NamedTuple):
     actor: MLP
