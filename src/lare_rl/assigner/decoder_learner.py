@@ -257,7 +257,9 @@ class DecoderLearner:
     def metrics(self) -> dict[str, float]:
         """Return metrics that need no true rewards. Returns are predicted before they are learned from."""
         self.learn_returns()
-        predicted = dict.fromkeys(("credit/return_r2", "credit/gain", "credit/gain_error"), float("nan"))
+        predicted: dict[str, float] = dict.fromkeys(
+            ("credit/return_r2", "credit/gain", "credit/gain_error"), float("nan")
+        )
         if self.decoder is not None:
             with on_cpu():
                 predicted = {
