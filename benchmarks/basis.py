@@ -111,7 +111,7 @@ def bases(z: Array, x: Array) -> Iterator[tuple[str, list[Array]]]:
 def fitted(means: Array, returns: Array, length: Array, group: tuple[int, ...]) -> tuple[Array, Array]:
     numbers = np.array(group)
     sums = evidence.add_episodes(evidence.empty_statistics(len(numbers)), means, returns, length)
-    n_train = evidence.init_posterior(len(numbers), int(numbers.max()) + 1)
+    n_train = evidence.init_posterior(numbers)
     errors = evidence.fit(sums, 0, numbers, n_train, ROUNDS)
     return errors.weight, errors.bias
 

@@ -18,7 +18,8 @@ import numpy as np
 import lare_rl
 from lare_rl.config.resolve import resolve
 from lare_rl.runs.directory import create_run
-from lare_rl.training import first_fit, session
+from lare_rl.training import first_fit
+from lare_rl.training.start_session import start_session
 from lare_rl.training.streams import Stream, stream_keys
 from measure import write
 
@@ -39,7 +40,7 @@ def measured(name: str, way: str) -> dict[str, Any]:
     settings = lare_rl.Settings(method="lare-rd", seeds=3, first_fit="published" if way == "published" else "held-out")
     with tempfile.TemporaryDirectory() as folder:
         run = create_run(Path(folder) / "run", task, resolve(settings, task), [lare_rl.design(task)])
-        begun = session.start_session(run)
+        begun = start_session(run)
         try:
             steps = begun.collector.collect(begun.actor, 0)
             begun.learner, _ = begun.functions.store(begun.learner, steps)

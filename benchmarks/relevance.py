@@ -34,7 +34,7 @@ def fit(means, returns, length, group, strength):
     """Return weights, bias and log evidence of the fit by groups, and of the fit by strengths."""
     group_index, strength_index = np.array(group), np.array(strength)
     sums = evidence.add_episodes(evidence.empty_statistics(len(group)), means, returns, length)
-    starts = [evidence.init_posterior(len(group), int(index.max()) + 1) for index in (group_index, strength_index)]
+    starts = [evidence.init_posterior(index) for index in (group_index, strength_index)]
     groups = evidence.fit(sums, 0, group_index, starts[0], 3 * ROUNDS)
     separate = relevance.fit_strengths(sums, 0, group_index, strength_index, groups, starts[1], ROUNDS)
     return [(fit.weight, fit.bias, fit.log_evidence) for fit in (groups, separate)]

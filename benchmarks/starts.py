@@ -23,7 +23,8 @@ from basis import SPEED, scores
 from lare_rl.credit import evidence
 from lare_rl.credit.basis import Basis, expand
 from lare_rl.credit.closed_form import MAX_EVIDENCE_ROUNDS
-from lare_rl.credit.evidence import Posterior, SufficientStatistics
+from lare_rl.credit.evidence import SufficientStatistics
+from lare_rl.credit.precisions import Posterior
 from lare_rl.credit.score_type import ScoreType
 from lare_rl.util.statistics import r_squared
 from measure import write
@@ -63,7 +64,7 @@ def predicted(means: np.ndarray, returns: np.ndarray, length: np.ndarray, way: s
     """Of each episode: its prediction, and the log evidence of the fit that follows it."""
     state = (
         evidence.empty_statistics(basis.n_features),
-        evidence.init_posterior(basis.n_features, len(basis.group_sizes)),
+        evidence.init_posterior(basis.group_index),
     )
     sums, posterior = jax.tree.map(lambda leaf: leaf.astype(float), state)
     predictions = []

@@ -70,17 +70,18 @@ def move_links(text: str) -> str:
 
 
 def python_reference(sources: dict[str, tuple[str, str]]) -> str:
-    """Return every public name by its docstring, and of a class its settings and the members that the how-to page names."""
+    """Return every public name by its docstring, and of a class its settings and the members that two pages name."""
     import lare_rl
 
-    how_to = (ROOT / "docs/how-to/python.md").read_text(encoding="utf-8")
+    pages = ("how-to/python.md", "reference/credit-assigner.md")
+    text = "\n".join((ROOT / "docs" / page).read_text(encoding="utf-8") for page in pages)
     lines = ["# Python", ""]
     for name, (module, source_name) in sorted(sources.items(), key=lambda item: item[0].lower()):
         public = getattr(lare_rl, name)
         members = [
             member
             for member in vars(public)
-            if not member.startswith("_") and re.search(rf"[`.]{re.escape(member)}\b", how_to)
+            if not member.startswith("_") and re.search(rf"[`.]{re.escape(member)}\b", text)
         ]
         lines += [
             f"::: {module}.{source_name}",

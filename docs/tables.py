@@ -10,7 +10,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 from reference_tables.credit import algorithms_table, built_in_tasks_page, methods_page
-from reference_tables.sentences import findings_page, functions_table, metrics_page, variables_page
+from reference_tables.sentences import findings_page, metrics_page, variables_page
 from reference_tables.settings import settings_page, tasks_page
 
 REFERENCE = Path(__file__).parent / "reference"
@@ -27,7 +27,6 @@ PAGES: dict[str, Callable[[], str]] = {
 
 TABLES: dict[str, dict[str, Callable[[], str]]] = {
     "algorithms.md": {"algorithms": algorithms_table},
-    "phi.md": {"functions": functions_table},
 }
 
 NOTE = "<!-- Made from the code by `python docs/tables.py`. -->"

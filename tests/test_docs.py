@@ -17,7 +17,8 @@ from lare_rl.envs.families import FAMILIES
 ROOT = Path(__file__).parents[1]
 GUIDES = [ROOT / "AGENTS.md", ROOT / "skills" / "lare" / "SKILL.md"]
 """Pages for coding agents."""
-PAGES = sorted({*ROOT.glob("*.md"), *ROOT.glob("docs/**/*.md"), *ROOT.glob("benchmarks/*.md"), *GUIDES})
+FOLDERS = ".", "docs/**", "benchmarks", "benchmarks/results"
+PAGES = sorted({*GUIDES, *(page for folder in FOLDERS for page in ROOT.glob(f"{folder}/*.md"))})
 LINK = re.compile(r"\]\(([^)#]*)(?:#([^)]*))?\)")
 HEADING = re.compile(r"^#+ (.*)$", re.MULTILINE)
 COMMAND = re.compile(r"(?:`|^)lare-rl ([a-z][^`#\n]*)", re.MULTILINE)

@@ -98,8 +98,8 @@ def read_study() -> Study:
     return Study(**read(FOLDER / "study.toml"))
 
 
-def plan_jobs(budget: str, root: Path) -> Jobs:
-    """Return every run of the study.
+def plan_jobs(budget: str, root: Path, tasks: Sequence[str]) -> Jobs:
+    """Return every run of these tasks.
 
     Raises:
         LareError: the package of the tasks or a simulator is not installed.
@@ -110,7 +110,7 @@ def plan_jobs(budget: str, root: Path) -> Jobs:
         )
     return {
         name: {label: list(_plan_runs(name, method, budget, root)) for label, method in read_study().methods.items()}
-        for name in read_study().tasks
+        for name in tasks
     }
 
 
@@ -138,7 +138,7 @@ def merge_settings(settings: Mapping[str, Any], changes: Mapping[str, Any]) -> d
     return merged
 
 
-def make_page(budget_name: str, jobs: Jobs, command: str) -> Page:
+def make_page(page_name: str, budget_name: str, jobs: Jobs, command: str) -> Page:
     """Return the page of the finished runs."""
     study = read_study()
     budget = study.budgets[budget_name]
@@ -161,14 +161,14 @@ def make_page(budget_name: str, jobs: Jobs, command: str) -> Page:
             f"bootstraps; sd: over the seeds. Rules and random actions: sd over {n_episodes} episodes. "
             f"{to_text(find_small_samples(comparison))}".rstrip(),
         ]
-    return Page("real", "\n\n".join(sections), pictures)
+    return Page(page_name, "\n\n".join(sections), pictures)
 
 
 _MEANING = (
     "Scores are of held-out years, maps, demand or instances, of which no method has seen one. A *dense proxy* is a reward of each step "
     "that a practitioner would use. It adds up to the score on wheat and jobshop, and differs from it on traffic, trains and grid, so it "
     "is no upper bound there. A method that is below the row of a rule has learned less than a person writes down in five lines. "
-    "`phi` was written by hand, by people who know the score: LaRe's rows show what factors can do, not what a language model does. "
+    "`phi` was written by a language model from the texts of the task alone. "
     "The tasks: `benchmarks/real`."
 )
 

@@ -21,7 +21,7 @@ UNTRAINED: dict[str, tuple[str, str, Callable[[Budget, str], Page]]] = {
 """Exhibits that need no training: place in the paper, title, and the page."""
 
 REAL = "real"
-"""The name of the study of five tasks of real simulators, which is no exhibit of the paper."""
+"""The name of the study of five tasks of real simulators, which is no exhibit of the paper. `real-TASK` is one task of it."""
 
 Watching = Callable[[Sequence[Job]], AbstractContextManager[Callable[[str], None]]]
 """Shows the progress of jobs; yields the function that prints messages."""
@@ -32,6 +32,7 @@ def listed() -> Iterator[tuple[str, str, str]]:
     yield from ((name, exhibit.source, exhibit.title) for name, exhibit in exhibits().items())
     yield from ((name, source, title) for name, (source, title, _) in UNTRAINED.items())
     yield REAL, real.SOURCE, real.TITLE
+    yield from ((f"{REAL}-{task}", real.SOURCE, f"{real.TITLE}: {task}") for task in real.read_study().tasks)
 
 
 def quiet(jobs: Sequence[Job]) -> AbstractContextManager[Callable[[str], None]]:
@@ -68,8 +69,13 @@ def reproduce(
     if name in UNTRAINED:
         make_page = UNTRAINED[name][-1]
         return write_page(make_page(shared_budget, command), folder)
-    is_real, directory = name == REAL, root / budget
-    jobs = real.plan_jobs(budget, directory / REAL) if is_real else exhibit_jobs(exhibits()[name], budget, directory)
+    directory = root / budget
+    study, _, task = name.partition("-")
+    is_real = study == REAL
+    if is_real:
+        jobs = real.plan_jobs(budget, directory / REAL, [task] if task else list(real.read_study().tasks))
+    else:
+        jobs = exhibit_jobs(exhibits()[name], budget, directory)
     all_jobs = [job for task_jobs in jobs.values() for contender_jobs in task_jobs.values() for job in contender_jobs]
     for job in all_jobs:
         check_job(job)
@@ -80,7 +86,7 @@ def reproduce(
         raise LareError(f"{len(failed)} of {len(all_jobs)} runs failed, so there is no page: {failed_names}")
     write_table(read_metric_rows(job.directory for job in all_jobs), folder / name)
     if is_real:
-        return write_page(real.make_page(budget, jobs, command), folder)
+        return write_page(real.make_page(name, budget, jobs, command), folder)
     page = trained.make_page(name, exhibits()[name], shared_budget, jobs, command)
     return write_page(page, folder)
 

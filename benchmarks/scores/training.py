@@ -2,11 +2,20 @@
 
     PYTHONPATH=benchmarks python -m scores.training KIND --out RUNS
 
-Kinds: `not-a-sum` (the corridor's scores), `binary` (won or lost by chance), `payments` (PP-6 paid every step, every 5 steps, and at
-the end), `exact` (PP-6, rewards that add up exactly), `groups` (CN-6 in levels), `published` (published methods in the corridor, on
-CN-6 and on PP-6), `cheetah` (HalfCheetah-v4 paid once, every 50 and every 200 steps). Finished runs in RUNS are not trained again, and
-stopped ones continue. `late` is the mean return of the evaluations after three quarters of the steps, and `area` that of all
-evaluations, which also says how fast a method learns.
+Kinds:
+
+* `not-a-sum`: the corridor's scores.
+* `binary`: the corridor, won or lost by chance.
+* `payments`: PP-6 paid every step, every 5 steps, and at the end.
+* `exact`: PP-6, rewards that add up exactly.
+* `groups`: CN-6 in levels.
+* `published`: published methods in the corridor, on CN-6 and on PP-6.
+* `cheetah`: HalfCheetah-v4 paid once, every 50 and every 200 steps.
+* `threshold`: HalfCheetah, paid for steps faster than 2 m/s.
+
+Finished runs in RUNS are not trained again, and stopped ones continue. Kept runs are in `results/scores`: copy them to RUNS first. `late`
+is the mean return of the evaluations after three quarters of the steps, and `area` that of all evaluations, which also says how fast a
+method learns.
 """
 
 from collections.abc import Callable, Iterator
@@ -20,7 +29,7 @@ import lare_rl
 from lare_rl.compare.bootstrap import estimate, interquartile_mean, probability_of_improvement
 from lare_rl.compare.rank_test import mann_whitney
 from lare_rl.envs.load import read_task
-from lare_rl.runs.directory import open_run
+from lare_rl.runs.directory import open_without_functions
 from lare_rl.tasks.spec import TaskSpec
 from measure import write
 from scores.environments import corridor_task, level_task
@@ -28,7 +37,7 @@ from scores.environments import corridor_task, level_task
 PARTICLE_STEPS = 205_000
 CORRIDOR: dict[str, Any] = {"algorithm": "ppo", "steps": 64_000, "environments": 20, "evaluation_episodes": 100}
 CHEETAH: dict[str, Any] = {"algorithm": "td3", "steps": 30_000, "evaluate_every": 2_500, "evaluation_episodes": 3}
-Kind = Literal["not-a-sum", "binary", "payments", "exact", "groups", "published", "cheetah"]
+Kind = Literal["not-a-sum", "binary", "payments", "exact", "groups", "published", "cheetah", "threshold"]
 
 
 class Row(NamedTuple):
@@ -109,6 +118,13 @@ def cheetah() -> Iterator[Row]:
             yield row(method, period, method, "episodic")
 
 
+def threshold() -> Iterator[Row]:
+    for method in ("lare-bayes", "lare-bayes-history", "dense", "rrdu"):
+        settings = {"method": method, **CHEETAH, "steps": 60_000, "evaluate_every": 5_000}
+        task = read_task("HalfCheetahThreshold-v4")
+        yield Row(task.name, method, task, settings, is_baseline=method == "lare-bayes")
+
+
 KINDS: dict[str, Callable[[], Iterator[Row]]] = {
     "not-a-sum": not_a_sum,
     "binary": binary,
@@ -117,12 +133,19 @@ KINDS: dict[str, Callable[[], Iterator[Row]]] = {
     "groups": groups,
     "published": published_methods,
     "cheetah": cheetah,
+    "threshold": threshold,
 }
+
+
+def is_finished(directory: Path) -> bool:
+    """Return whether the run has reached its last step. Kept runs have no weights to continue from."""
+    run = open_without_functions(directory)
+    return run.metrics()[-1]["step"] == run.config.settings.steps
 
 
 def mean_returns(directory: Path, after: float) -> list[float]:
     """Return the mean return of each seed's evaluations after this share of the steps."""
-    run = open_run(directory)
+    run = open_without_functions(directory)
     lines = run.metrics()
     first = after * max(line["step"] for line in lines)
     return [
@@ -146,10 +169,10 @@ def main(
     scores: dict[str, dict[str, list[float]]] = {}
     for row in rows:
         directory = out / kind / row.table.replace(" ", "") / row.label.replace(" ", "")
-        if (directory / "config.json").exists():
-            lare_rl.resume(directory)
-        else:
+        if not (directory / "config.json").exists():
             lare_rl.train(row.task, lare_rl.Settings(**row.settings, seeds=seeds), out=directory)
+        elif not is_finished(directory):
+            lare_rl.resume(directory)
         for measure, after in (("late", 0.75), ("area", 0.0)):
             returns = mean_returns(directory, after)
             scores.setdefault(f"{row.table}, {measure}", {})[row.label] = returns

@@ -7,7 +7,7 @@ from pydantic.fields import FieldInfo
 
 from lare_rl.errors import CheckedModel
 
-__all__ = ["code", "codes", "default", "docstring_text", "kind", "table"]
+__all__ = ["code", "codes", "default", "docstring_text", "kind", "parameters", "table"]
 
 NONE = "-"
 """The cell of a value that does not exist."""
@@ -17,6 +17,11 @@ def table(header: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
     """Return a table."""
     lines = [header, ["---"] * len(header), *rows]
     return "\n".join("| " + " | ".join(cell.replace("|", "\\|") for cell in line) + " |" for line in lines)
+
+
+def parameters(rows: Iterable[tuple[str, str, str]]) -> str:
+    """Return a list of names, with notes in parentheses, and meanings."""
+    return "\n".join(f"* {name} ({note}): {text}" if note else f"* {name}: {text}" for name, note, text in rows)
 
 
 def code(text: str) -> str:

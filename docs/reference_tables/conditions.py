@@ -21,43 +21,42 @@ CONDITIONS: dict[str, dict[str, str]] = {
         "equal_returns": "All episodes have the same return.",
     },
     "The outcome": {
-        "learned": f"The final return is above random actions by {CLEAR_ERRORS} standard errors, and above the policy before training by "
-        f"{CLEAR_ERRORS} standard errors.",
-        "some_seeds_learned": "The mean over the seeds is not that high, but at least one seed is above random actions by "
-        f"{SEED_STDS} standard deviations of their returns, and above its own policy before training.",
-        "may_beat_random": f"The final return is above random actions by {POSSIBLE_ERRORS} standard error, and not by {CLEAR_ERRORS}.",
+        "learned": f"The final return is {CLEAR_ERRORS} standard errors above random actions and above the policy before training.",
+        "some_seeds_learned": f"Otherwise, if one seed is {SEED_STDS} standard deviations of their returns above random actions, and above "
+        "its policy before training.",
+        "may_beat_random": f"The final return is {POSSIBLE_ERRORS} standard error above random actions, but not {CLEAR_ERRORS}.",
         "may_beat_initial_policy": "The same for the policy before training.",
-        "worse_than_random": f"The final return is below random actions by {CLEAR_ERRORS} standard errors.",
+        "worse_than_random": f"The final return is {CLEAR_ERRORS} standard errors below random actions.",
         "not_learned": "None of these.",
-        "outcome_unknown": "There are no returns of random actions to compare with.",
+        "outcome_unknown": "Returns of random actions are missing.",
     },
     "The comparison with a run of `episodic`": {
-        "above_episodic": f"The difference is larger than {CLEAR_ERRORS} of its standard errors.",
-        "like_episodic": "The difference is smaller.",
-        "below_episodic": "The difference is larger, and negative.",
+        "above_episodic": f"The difference is more than {CLEAR_ERRORS} of its standard errors.",
+        "like_episodic": "It is smaller.",
+        "below_episodic": "It is larger, and negative.",
     },
     "The proxy rewards": {
-        "explained": f"Always, if returns are predicted. *Nearly all*: R² is above {HIGH_R2}. *Next to nothing*: below {LITTLE_R2}. "
-        "*A part*: between.",
-        "decoder_is_outdated": f"The last R² is below {LITTLE_R2}, but the median over the run is not.",
+        "explained": f"Returns are predicted. *Nearly all*: R² is above {HIGH_R2}; *next to nothing*: below {LITTLE_R2}; *a part*: "
+        "between.",
+        "decoder_is_outdated": f"The last R² is below {LITTLE_R2}, the median over the run is not.",
         "worse_than_mean": f"The last R² is below {BAD_R2:g}.",
-        "steps_agree": f"True rewards are known, and the correlation of proxy and true rewards is above {CLOSE_CORRELATION}.",
+        "steps_agree": f"True rewards are known, and the correlation is above {CLOSE_CORRELATION}.",
         "single_steps": "True rewards are known, and the correlation is lower.",
-        "score_use": "At least 8 returns were predicted. Only its last sentence, about trust, remains if all episodes have the same "
-        "length and there is nothing else to say: a sum and an average are then the same.",
-        "trust_nothing": f"`credit/gain` is not larger than {CLEAR_ERRORS} of its standard errors.",
-        "trust_part": f"It is larger, but not above {CLEAR_GAIN:.0%}.",
+        "score_use": "At least 8 returns were predicted. The sentence about trust stands alone if all lengths are equal and there is "
+        "nothing else to say.",
+        "trust_nothing": f"`credit/gain` is at most {CLEAR_ERRORS} of its standard errors.",
+        "trust_part": f"It is larger, but at most {CLEAR_GAIN:.0%}.",
         "trust_sums": f"It is larger, and above {CLEAR_GAIN:.0%}.",
     },
     "The next step": {
-        "explains_little": f"R² is below {LITTLE_R2} at the end and in most evaluations. The decoder is a closed form.",
-        "try_closed_form": "The same, with a decoder that is fitted by gradient descent.",
-        "is_rising": "The mean of the last quarter of the evaluations is above that of the quarter before by more than the usual change, "
-        "and by more than a standard error. Within the last quarter, the return rose by more than half of the usual change.",
-        "one_seed_was_better": "The final return does not beat random actions, but an evaluation of one seed did by "
+        "explains_little": f"Closed forms: R² is below {LITTLE_R2} at the end and in most evaluations.",
+        "try_closed_form": "The same for gradient descent.",
+        "is_rising": "The last quarter of the evaluations is above the quarter before by more than the usual change and a standard error, "
+        "and rose by more than half of the usual change.",
+        "one_seed_was_better": "The final return does not beat random actions, but an evaluation of one seed did, by "
         f"{EVALUATION_STDS} standard deviations of their returns.",
-        "has_fallen": f"The best evaluation is above the last quarter by {CLEAR_ERRORS} standard errors, by {FALL_FRACTION:.0%} of what "
-        "was learned, and by twice the usual change.",
+        "has_fallen": f"The best evaluation is above the last quarter by {CLEAR_ERRORS} standard errors, {FALL_FRACTION:.0%} of what was "
+        "learned, and twice the usual change.",
         "is_stuck": "The final return does not beat random actions. The last `actor/saturation` is 1, or the last "
         f"{MIN_EVALUATIONS} returns of every seed differ by less than {STUCK_FRACTION:.0%} of the standard deviation of random actions' "
         "returns.",

@@ -4,18 +4,19 @@ import ast
 import inspect
 import itertools
 import re
+from collections import defaultdict
 from enum import StrEnum
 from textwrap import dedent
 
 from lare_rl.algorithms.registry import ALGORITHMS, Algorithm
 from lare_rl.credit.input_names import InputNames
-from lare_rl.credit.methods import METHODS, Fit, Method
+from lare_rl.credit.methods import METHODS, RAW, Fit, Method
 from lare_rl.envs.load import read_task, shipped_tasks
 from lare_rl.envs.particles.catalogue import find_particle_task
 from lare_rl.envs.smax.scenarios import find_scenario
 from lare_rl.llm.recording import SHIPPED_RECORDINGS
 from lare_rl.tasks.spec import TaskSpec
-from reference_tables.cells import NONE, code, docstring_text, table
+from reference_tables.cells import NONE, code, codes, docstring_text, parameters, table
 
 __all__ = ["algorithms_table", "built_in_tasks_page", "methods_page"]
 
@@ -32,11 +33,11 @@ SYMBOLS = {
 FAMILIES = {
     "": "MuJoCo",
     "lare": "MuJoCo with other rewards",
+    "playground": "MuJoCo Playground",
+    "jumanji": "Jumanji",
     "particles": "Particles",
     "smax": "SMAX",
     "smac": "SMAC",
-    "playground": "MuJoCo Playground",
-    "jumanji": "Jumanji",
 }
 
 UNMEASURED = (
@@ -58,75 +59,57 @@ def methods_page() -> str:
     """Return the page about the methods."""
     groups: dict[str, list[Method]] = {
         "No decoder": [method for method in METHODS.values() if method.fit is None],
-        "Closed forms with phi": [],
-        "Closed forms without phi": [],
-        "Gradient descent with phi": [],
-        "Gradient descent without phi": [],
+        "Closed forms": [],
+        "Gradient descent": [],
     }
     for method in METHODS.values():
         if method.fit is not None:
-            fit = "Gradient descent" if method.uses_gradient else "Closed forms"
-            groups[f"{fit} {'with' if method.needs_phi else 'without'} phi"].append(method)
+            groups["Gradient descent" if method.uses_gradient else "Closed forms"].append(method)
     lines = [
         "# Methods",
-        "A method is a decoder's inputs, a fit and a decoder. `--method NAME` chooses it. The equations are in "
-        "[credit.md](../explanation/credit.md), [closed-form.md](../explanation/closed-form.md) and "
-        "[many-agents.md](../explanation/many-agents.md).",
-        "Inputs: z, the factors of `phi`; s and s', the observations before and after the step; s\\*, the observation that the task's "
-        "`scored_observation` names; a, the action; h, largest, smallest and last values of the entries so far.",
-        "(new): no [table of results](../results/README.md) has trained runs of the method yet.",
+        "`--method NAME` chooses a method (equations: [credit](../explanation/credit.md), "
+        "[closed forms](../explanation/closed-form.md), [losses](losses.md)). In parentheses: inputs of the decoder; what it is "
+        "[fitted to](#fits); agents, if limited. *New*: no [result](../results/README.md) has trained runs of it yet.",
+        "Inputs: z, factors of `phi`; s and s', the observations before and after the step; s\\*, the task's "
+        "`scored_observation`; a, the action; x = (s, a, s - s'), for many agents s'; h, largest, smallest and last values of the "
+        "entries so far.",
     ]
     for title, methods in groups.items():
-        rows = (
-            (
-                code(method.name) + (" (new)" if method.name in UNMEASURED else ""),
-                docstring_text(method.summary),
-                agents_text(method),
-                inputs(method),
-                fit_text(method),
-                link(method.source),
-            )
-            for method in methods
-        )
-        header = ("method", "what it is", "agents", "inputs", "fitted to", "source")
-        if title == "No decoder":
-            header, rows = (
-                ("method", "what the algorithm is trained on", "source"),
-                ((code(m.name), m.summary, link(m.source)) for m in methods),
-            )
-        lines += [f"## {title}", table(header, rows)]
-    lines += ["## Fits", table(("fitted to", "meaning"), enum_rows(Fit))]
+        lines += [f"## {title}", parameters((code(m.name), notes(m), docstring_text(m.summary)) for m in methods)]
+    lines += ["## Fits", parameters((f"*{name}*", "", text) for name, text in enum_rows(Fit))]
+    lines += ["## Sources", parameters((names, "", source) for names, source in source_rows())]
     return "\n\n".join(lines)
 
 
-def agents_text(method: Method) -> str:
-    return "many" if method.multi_agent_only else "one" if method.single_agent_only else "any"
+def notes(method: Method) -> str:
+    """Return the inputs, the fit and the number of agents of a method, as far as it has them."""
+    agents = "many agents" if method.multi_agent_only else "one agent" if method.single_agent_only else ""
+    fit = "" if method.fit is None or method.inputs is None else f"{symbols(method, method.inputs)}; {method.fit.value}"
+    return "; ".join(filter(None, (fit, agents, "*new*" if method.name in UNMEASURED else "")))
 
 
-def inputs(method: Method) -> str:
-    """Return the inputs for one agent and, if they differ, for many."""
-    if method.inputs is None:
-        return NONE
-    single, many = symbols(method.inputs, True), symbols(method.inputs, False)
-    if single == many or method.single_agent_only:
-        return single
-    return many if method.multi_agent_only else f"{single}; many agents: {many}"
+def source_rows() -> list[tuple[str, str]]:
+    """Return the methods of each source."""
+    methods = defaultdict(list)
+    for method in METHODS.values():
+        if method.source != NONE:
+            methods[method.source].append(method.name)
+    return [(codes(names), link(source)) for source, names in methods.items()]
 
 
-def symbols(names: InputNames, single_agent: bool) -> str:
-    chosen = names.names if single_agent or names.names_of_many_agents is None else names.names_of_many_agents
-    return ", ".join(SYMBOLS[name] for name in chosen)
-
-
-def fit_text(method: Method) -> str:
-    return NONE if method.fit is None else method.fit.value
+def symbols(method: Method, inputs: InputNames) -> str:
+    """Return the symbols of the inputs of a method."""
+    if inputs == RAW and not (method.single_agent_only or method.multi_agent_only):
+        return "x"
+    many_agents = inputs.names_of_many_agents if method.multi_agent_only else None
+    return ", ".join(SYMBOLS[name] for name in many_agents or inputs.names)
 
 
 def link(source: str) -> str:
     """Return a source with a link to the page that it names."""
     return source.replace(
-        "this package, docs/explanation/closed-form.md", "[LaRe](../explanation/closed-form.md)"
-    ).replace("this package", "LaRe")
+        "this package, docs/explanation/closed-form.md", "[this package](../explanation/closed-form.md)"
+    )
 
 
 def enum_rows(enum: type[StrEnum]) -> list[tuple[str, str]]:
@@ -142,11 +125,8 @@ def enum_rows(enum: type[StrEnum]) -> list[tuple[str, str]]:
 
 def algorithms_table() -> str:
     """Return the table of algorithms."""
-    rows = (
-        (code(name), str(algorithm.consumes), *abilities(algorithm), algorithm.summary, algorithm.source)
-        for name, algorithm in ALGORITHMS.items()
-    )
-    return table(("algorithm", "consumes", "agents", "actions", "what it is", "source"), rows)
+    rows = ((code(name), str(algorithm.consumes), *abilities(algorithm)) for name, algorithm in ALGORITHMS.items())
+    return table(("algorithm", "consumes", "agents", "actions"), rows)
 
 
 def abilities(algorithm: Algorithm) -> tuple[str, str]:
@@ -160,59 +140,55 @@ def built_in_tasks_page() -> str:
     specs = [read_task(name) for name in sorted(shipped_tasks(), key=natural_order)]
     lines = [
         "# Built-in tasks",
-        "`lare-rl tasks` lists these names. Sizes are those that `phi` reads: of one agent or, if credit is assigned by the global "
-        "state, of the state and of all actions together. A recorded task needs no language model: `phi` is computed from saved "
-        "replies, and `--draw` chooses among them.",
+        "`lare-rl tasks` lists these names. In parentheses: agents, if there are several; entries of the observation and the action "
+        "that `phi` reads, or of the state and the joint action, if credit goes to the team. Then: recorded replies, which replace a "
+        "language model; `--draw` chooses one.",
+        "`scored_observation` is `after`"
+        + "".join(
+            f", `{value}` for {codes(spec.name for spec in specs if spec.scored_observation == value)}"
+            for value in ("before", "both")
+        )
+        + ".",
     ]
     for family, title in FAMILIES.items():
-        rows = (
-            (
-                code(spec.name),
-                agents(spec),
-                observation(spec),
-                action(spec),
-                spec.scored_observation,
-                recordings(spec, specs),
-            )
-            for spec in specs
-            if spec.family == family
-        )
-        header = ("task", "agents", "observation", "action", "scored observation", "recorded replies")
-        lines += [f"## {title}", table(header, rows)]
+        names = defaultdict(list)
+        for spec in specs:
+            if spec.family == family:
+                sizes = ", ".join(filter(None, (agents(spec), observation(spec), action(spec))))
+                names[sizes, recordings(spec, specs)].append(spec.name)
+        lines += [f"## {title}", parameters((codes(tasks), *cells) for cells, tasks in names.items())]
     return "\n\n".join(lines)
 
 
 def agents(spec: TaskSpec) -> str:
-    """Return the number of agents that learn."""
+    """Return the number of agents that learn, or an empty text for one agent."""
     match spec.family:
         case "particles":
             teams = {team.name: team.n_agents for team in find_particle_task(spec.environment_name).teams}
-            return str(teams[spec.team]) if spec.team else " + ".join(map(str, teams.values()))
+            return f"{teams[spec.team] if spec.team else ' + '.join(map(str, teams.values()))} agents"
         case "smax" | "smac":
-            return str(find_scenario(spec.environment_name).n_allies)
-    return "1"
+            return f"{find_scenario(spec.environment_name).n_allies} agents"
+    return ""
 
 
 def observation(spec: TaskSpec) -> str:
-    return f"{spec.observation_size}, of the state" if spec.credit_scope == "state" else str(spec.observation_size)
+    return f"state {spec.observation_size}" if spec.credit_scope == "state" else str(spec.observation_size)
 
 
 def action(spec: TaskSpec) -> str:
     if spec.credit_scope == "state":
-        return f"{spec.action_size}, of all agents"
+        return f"joint {spec.action_size}"
     noun = "choice" if spec.family in DISCRETE else "number"
     return f"{spec.action_size} {noun}{'' if spec.action_size == 1 else 's'}"
 
 
 def recordings(spec: TaskSpec, specs: list[TaskSpec]) -> str:
-    """Return what recorded replies there are, for the task or for another with the same texts."""
+    """Return the number of recorded replies for the task, or for another with the same texts."""
     if spec.teams:
         return "those of its teams"
     sources = [spec, *(other for other in specs if other is not spec and texts(other) == texts(spec))]
-    counts = {source.name: count_draws(source.name) for source in sources}
-    name = next((name for name, draws in counts.items() if any(draws.values())), spec.name)
-    cell = ", ".join(f"{count} {kind}" for kind, count in counts[name].items() if count)
-    return (cell if name == spec.name else f"{cell} (`{name}`)") or NONE
+    counts = next(filter(lambda draws: any(draws.values()), (count_draws(source.name) for source in sources)), {})
+    return ", ".join(f"{count} {kind}" for kind, count in counts.items() if count) or "none"
 
 
 def texts(spec: TaskSpec) -> tuple[str, ...]:

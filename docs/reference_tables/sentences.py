@@ -1,42 +1,23 @@
-"""The tables of metrics, of findings, of environment variables, and of the functions that phi may call."""
+"""The pages about metrics, findings and environment variables."""
 
-import functools
-import inspect
 import re
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 
-from lare_rl.compare.messages import MESSAGES as COMPARISON
-from lare_rl.credit.explanation_text import MESSAGES as EXPLANATION
 from lare_rl.logs.relabel import MESSAGES as LOGS
-from lare_rl.phi import numpy_functions
-from lare_rl.phi.numpy_functions import FUNCTIONS
-from lare_rl.phi.python_functions import BUILTINS
 from lare_rl.report.messages import MESSAGES as REPORT
 from lare_rl.runs.metric_names import METRIC_GROUPS
-from lare_rl.training.advice import MESSAGES as TRAINING
 from lare_rl.turns.words import MESSAGES as TURNS
 from lare_rl.util.variables import VARIABLE_GROUPS
-from reference_tables.cells import code, codes, table
+from reference_tables.cells import code, parameters
 from reference_tables.conditions import CONDITIONS
 
-__all__ = ["findings_page", "functions_table", "metrics_page", "variables_page"]
+__all__ = ["findings_page", "metrics_page", "variables_page"]
 
-CATALOGUES = {
-    "While a run trains": TRAINING,
-    "What the returns say": EXPLANATION,
-    "Comparisons": COMPARISON,
-    "Logs": LOGS,
-    "Turns of agents that talk": TURNS,
-}
+CATALOGUES = {"`Relabelled.findings`": LOGS, "`CreditedTurns.findings`": TURNS}
+"""The catalogues whose codes Python returns."""
 
-LEGENDS = ("columns", "intervals", "curves", "over_tasks")
-"""Sentences that explain tables and figures, and are no findings."""
-
-COUNTS = ("count", "needed", "repetitions")
+COUNTS = ("count", "needed")
 """Placeholders of numbers, beside those that begin with `n_`."""
-
-VARIANT = re.compile(r"^(?!linalg).*\.(outer|reduce|accumulate)$")
-"""The names of variants of elementwise functions, such as `add.reduce`."""
 
 PLACEHOLDER = re.compile(r"(?P<before>.?)\{(?P<name>\w+)(?P<format>:[^}]*)?\}(?=(?P<after>.?))")
 
@@ -45,20 +26,19 @@ def metrics_page() -> str:
     """Return the page about the metrics."""
     lines = [
         "# Metrics",
-        "`metrics.jsonl` has one line for each seed and evaluation. A value that is not known yet is left out, or null. Keys are "
-        "stable. If several teams learn, a key belongs to the first team, and `KEY_TEAM` to each team. A task's own `measures` are "
+        "`metrics.jsonl` has one line for each seed and evaluation. Values that are not known yet are missing or null. Keys are "
+        "stable. With several teams, a key belongs to the first team, and `KEY_TEAM` to each. A task's `measures` are "
         "`evaluation/NAME`. `CreditAssigner.metrics()` returns those about credit.",
-        "All evaluations of a seed play the same initial states, which differ from those of training episodes. Off-policy algorithms "
-        "and continuous PPO are evaluated without noise. Discrete PPO and IPPO sample their actions, as in training.",
+        "All evaluations of a seed play the same initial states, which no training episode has. Off-policy algorithms and continuous "
+        "PPO are evaluated without noise; discrete PPO and IPPO sample their actions, as in training.",
     ]
     for title, metrics in METRIC_GROUPS.items():
-        lines += [f"## {title}", table(("key", "meaning"), ((code(name), text) for name, text in metrics.items()))]
+        lines += [f"## {title}", parameters((code(name), "", text) for name, text in metrics.items())]
     lines += [
         "## Which credit metric to trust",
-        "`credit/correlation` and `credit/error` look at steps of episodes that the decoder was fitted to. `credit/return_r2` "
-        "does not. It tests the sum of the proxy rewards of an episode, and neither single steps nor the division among agents. If "
-        "episodes differ in length and returns depend on it, R² is near 1 whatever the features are. True rewards are used for these "
-        "metrics only.",
+        "`credit/return_r2` is out of sample, but tests sums over episodes: neither single steps nor the division among agents. It is "
+        "near 1 whatever the features are if returns depend on the length of episodes. `credit/correlation` and `credit/error`, the "
+        "only use of true rewards, are in sample.",
     ]
     return "\n\n".join(lines)
 
@@ -67,34 +47,26 @@ def findings_page() -> str:
     """Return the page about the sentences of reports and of commands."""
     lines = [
         "# Findings",
-        "Reports and commands say what they found in whole sentences. Each sentence has a code. In this page N is a number, a word in "
-        "italics a name, and … another sentence of the table.",
+        "When a report says what, and the codes of findings in Python. N is a number, a word in italics a name, and … further words. "
+        "Other sentences explain themselves.",
         "## The diagnosis of a run",
-        "`lare-rl report` begins with these sentences, at most one of each group. The final return is the mean over the seeds at the "
-        "last evaluation. Its standard error is the larger of two: that over the seeds, and that over the episodes of the last "
-        "evaluation. The usual change is the median difference between evaluations that follow each other, in the last half of the "
-        "run.",
+        "`lare-rl report` begins with at most one sentence of each group. *Final return*: the mean over seeds at the last "
+        "evaluation; its standard error is that over seeds or over episodes, whichever is larger. *Usual change*: the median "
+        "difference between successive evaluations in the last half of the run.",
     ]
     for title, conditions in CONDITIONS.items():
-        rows = ((code(name), sentence(REPORT[name], REPORT), text) for name, text in conditions.items())
-        lines += [f"### {title}", table(("code", "sentence", "when"), rows)]
+        lines += [f"### {title}", parameters((f"“{diagnosis(name)}”", "", text) for name, text in conditions.items())]
     for title, catalogue in CATALOGUES.items():
-        rows = (
-            (code(name), sentence(text, catalogue)) for name, text in catalogue.items() if is_finding(name, text, title)
-        )
-        lines += [f"## {title}", table(("code", "sentence"), rows)]
+        rows = ((code(name), "", sentence(text, catalogue)) for name, text in catalogue.items())
+        lines += [f"## {title}", parameters(rows)]
     return "\n\n".join(lines)
 
 
-def is_finding(name: str, template: str, title: str) -> bool:
-    """Whether a template is a whole sentence, or a reason in one. Others are parts of sentences."""
-    if title == "Turns of agents that talk":
-        return True
-    return name not in LEGENDS and is_sentence(template)
-
-
-def is_sentence(template: str) -> bool:
-    return template.rstrip("}").endswith((".", ":")) or re.search(r"[.:]\{\w+\}$", template) is not None
+def diagnosis(name: str) -> str:
+    """Return the headline of a finding or, if it has none, the first words of its sentence."""
+    text = sentence(REPORT.get(f"headline_{name}", REPORT[name]), REPORT)
+    start = " ".join(re.findall(r"(?:`[^`]*`|\S)+", re.sub(r"(?<=\. ).*", "…", text))[:9])
+    return start if start == text or start.endswith("…") else f"{start} …"
 
 
 def sentence(template: str, catalogue: Mapping[str, str]) -> str:
@@ -129,39 +101,11 @@ def variables_page() -> str:
     """Return the page about environment variables."""
     lines = [
         "# Environment variables",
-        "LaRe reads these variables. JAX, Weights & Biases, MLflow and Hugging Face also read variables of their own.",
+        "JAX, Weights & Biases, MLflow and Hugging Face read further variables.",
     ]
     for title, variables in VARIABLE_GROUPS.items():
         lines += [
             f"## {title}",
-            table(("variable", "meaning"), ((code(name), text) for name, text in variables.items())),
+            parameters((code(name), "", text) for name, text in variables.items()),
         ]
     return "\n\n".join(lines)
-
-
-def functions_table() -> str:
-    """Return the table of functions that a phi may call."""
-    modules = {name: getattr(numpy_functions, name) for name in numpy_functions.__all__}
-    rows = []
-    for name, module in modules.items():
-        if inspect.ismodule(module):
-            functions = (key for key, function in FUNCTIONS.items() if defining_module(function) == module.__name__)
-            rows.append((name, codes(sorted(name for name in functions if not VARIANT.search(name)))))
-    names = plain_names(BUILTINS)
-    rows.append(("Python", codes(name for name in names if "." not in name)))
-    packages = dict.fromkeys(name.partition(".")[0] for name in names if "." in name)
-    rows += [
-        (package, codes(name.partition(".")[2] for name in names if name.startswith(f"{package}.")))
-        for package in packages
-    ]
-    return table(("group", "functions"), [row for row in rows if row[1]])
-
-
-def defining_module(function: object) -> str:
-    while isinstance(function, functools.partial):
-        function = function.func
-    return getattr(function, "__module__", "")
-
-
-def plain_names(names: Iterable[str]) -> list[str]:
-    return sorted(name for name in names if not re.match(r"[A-Z]|np\.", name))

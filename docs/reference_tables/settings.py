@@ -1,14 +1,18 @@
 """The tables of task keys and of settings."""
 
-from collections.abc import Iterable
+from collections import defaultdict
+from collections.abc import Iterable, Mapping
 from types import SimpleNamespace
+
+from pydantic.fields import FieldInfo
 
 from lare_rl.algorithms.registry import ALGORITHMS
 from lare_rl.config.settings import Settings
 from lare_rl.credit.decoder_settings import MULTI_AGENT_CREDIT, CreditSettings
 from lare_rl.credit.methods import METHODS
+from lare_rl.errors import CheckedModel
 from lare_rl.tasks.spec import TaskSpec
-from reference_tables.cells import code, codes, default, docstring_text, kind, table
+from reference_tables.cells import NONE, code, codes, default, docstring_text, kind, parameters, table
 
 __all__ = ["settings_page", "tasks_page"]
 
@@ -22,14 +26,21 @@ TASK_GROUPS = {
 }
 
 RUN_GROUPS = {
-    "What is trained": "method algorithm steps seeds seed",
-    "The latent function": "scored_observation draw candidates",
-    "Collection": "environments rollout_steps capacity overlap_collection scale_rewards",
+    "The run": "method algorithm steps seeds seed scored_observation draw candidates",
+    "Collection and evaluation": "environments rollout_steps capacity overlap_collection scale_rewards evaluate_every "
+    "evaluation_episodes",
     "Fits of the decoder": "fit_every fit_updates first_fit",
-    "Evaluation": "evaluate_every evaluation_episodes",
 }
 
 ALGORITHM_GROUPS = {"TD3, DDPG and SAC": "td3 ddpg sac", "PPO and IPPO": "ppo ippo", "QMIX and VDN": "qmix vdn"}
+
+
+FORMS = (
+    ("TOML", "`evaluate_every = 1000`", "`td3 = { warmup = 1000 }`", "`credit = { steps = 512 }`"),
+    ("command line", "`--evaluate-every 1000`", "`--td3.warmup 1000`", "`--credit.steps 512`"),
+    ("Python: `Settings(...)`", "`evaluate_every=1000`", '`td3={"warmup": 1000}`', '`credit={"steps": 512}`'),
+)
+"""How settings are given."""
 
 
 def tasks_page() -> str:
@@ -37,18 +48,24 @@ def tasks_page() -> str:
     check_complete(TASK_GROUPS.values(), TaskSpec.model_fields)
     lines = [
         "# Keys of a task file",
-        "A task file is TOML. In Python, the keys are the fields of `lare_rl.TaskSpec`. [Your own "
-        "environment](../tutorials/your-own-environment.md) writes such a file step by step.",
-        'One more key, `like = "NAME"`, takes all keys that a file leaves out from a built-in task or from another file.',
+        "A task file is TOML ([tutorial](../tutorials/your-own-environment.md)). In Python, the keys are the fields of "
+        '`lare_rl.TaskSpec`. `like = "NAME"` takes the keys that a file leaves out from a built-in task or another file.',
     ]
     for title, names in TASK_GROUPS.items():
         rows = []
         for name in names.split():
             field = TaskSpec.model_fields[name]
-            value = "required" if field.is_required() else default(field.get_default(call_default_factory=True))
-            rows.append((code(name), kind(field), value, docstring_text(field.description)))
-        lines += [f"## {title}", table(("key", "value", "default", "meaning"), rows)]
+            rows.append((code(name), value_and_default(field), docstring_text(field.description)))
+        lines += [f"## {title}", parameters(rows)]
     return "\n\n".join(lines)
+
+
+def value_and_default(field: FieldInfo) -> str:
+    """Return the kind of a key's values, and the default."""
+    if field.is_required():
+        return f"{kind(field)}, required"
+    value = default(field.get_default(call_default_factory=True))
+    return kind(field) if value == NONE else f"{kind(field)}; default {value}"
 
 
 def settings_page() -> str:
@@ -57,52 +74,50 @@ def settings_page() -> str:
     check_complete(ALGORITHM_GROUPS.values(), ALGORITHMS)
     lines = [
         "# Settings",
-        "A setting `evaluate_every` is `--evaluate-every` on the command line, `Settings(evaluate_every=...)` in Python and "
-        "`evaluate_every` in a sweep file. A setting of an algorithm has its name in front: `--td3.warmup`, "
-        '`Settings(td3={"warmup": 1000})`. A setting of the decoder is under `credit`: `--credit.sampled-steps`.',
-        "If a default is -, the task and the algorithm decide. `config.json` has the values that a run used.",
+        table(("where", "a run's setting", "an algorithm's", "the decoder's"), FORMS),
+        "Defaults are in parentheses. Without one, the task and the algorithm decide. `config.json` has the values that a run used.",
     ]
     for title, names in RUN_GROUPS.items():
         fields = {name: Settings.model_fields[name] for name in names.split()}
         rows = (
-            (code(name), default(field.default), docstring_text(field.description)) for name, field in fields.items()
+            (code(name), default(field.default).removeprefix(NONE), docstring_text(field.description))
+            for name, field in fields.items()
         )
-        lines += [f"## {title}", table(("setting", "default", "meaning"), rows)]
+        lines += [f"## {title}", parameters(rows)]
     for title, names in ALGORITHM_GROUPS.items():
-        lines += [f"## {title}", algorithm_table(names.split())]
-    lines += ["## The decoder (`credit`)", credit_table()]
+        lines += [f"## {title}", algorithm_settings(names.split())]
+    lines += ["## The decoder (`credit`)", decoder_settings()]
     return "\n\n".join(lines)
 
 
-def algorithm_table(names: list[str]) -> str:
-    """Return the settings of several algorithms, with a column of defaults for each."""
-    settings = [ALGORITHMS[name].settings for name in names]
-    fields = {field: info for values in settings for field, info in type(values).model_fields.items()}
-    rows = (
-        (
-            code(name),
-            *(default(getattr(values, name, None)) for values in settings),
-            docstring_text(field.description),
-        )
-        for name, field in fields.items()
-    )
-    return table(("setting", *map(code, names), "meaning"), rows)
+def algorithm_settings(names: list[str]) -> str:
+    """Return the settings of several algorithms."""
+    settings = {code(name): ALGORITHMS[name].settings for name in names}
+    fields = {field: info for values in settings.values() for field, info in type(values).model_fields.items()}
+    rows = ((code(name), defaults(name, settings), docstring_text(field.description)) for name, field in fields.items())
+    return parameters(rows)
 
 
-def credit_table() -> str:
+def defaults(setting: str, variants: Mapping[str, CheckedModel]) -> str:
+    """Return the default of a setting. If variants differ, or lack it, their names are before their defaults."""
+    names = defaultdict(list)
+    for name, values in variants.items():
+        if hasattr(values, setting):
+            names[default(getattr(values, setting))].append(name)
+    first, *rest = (f"{', '.join(group)}: {cell}" for cell, group in names.items())
+    complete = all(hasattr(values, setting) for values in variants.values())
+    return "; ".join([next(iter(names)) if complete else first, *rest])
+
+
+def decoder_settings() -> str:
     """Return the settings of the decoder."""
     changes = ALGORITHMS["qmix"].run_defaults(SimpleNamespace(is_jax=True, max_steps=1), 0)["credit"]
-    columns = (CreditSettings(), MULTI_AGENT_CREDIT, MULTI_AGENT_CREDIT.model_copy(update=changes))
-    rows = (
-        (
-            code(name),
-            *(default(getattr(values, name)) for values in columns),
-            readers(name),
-            docstring_text(field.description),
-        )
-        for name, field in CreditSettings.model_fields.items()
-    )
-    return table(("setting", "one agent", "many agents", "`qmix`, `vdn`", "read by", "meaning"), rows)
+    variants = {"one agent": CreditSettings(), "many agents": MULTI_AGENT_CREDIT}
+    rows = []
+    for name, field in CreditSettings.model_fields.items():
+        note = defaults(name, variants) + (f"; `qmix`, `vdn`: {default(changes[name])}" if name in changes else "")
+        rows.append((code(name), note, f"{docstring_text(field.description)} For {readers(name)}."))
+    return parameters(rows)
 
 
 def readers(name: str) -> str:

@@ -40,3 +40,8 @@ def test_migrate_renamed_keys():
         "task": {"credit_scope": "state", "teams": [{"scored_observation": "both"}]},
     }
     assert migrate({"format": 5, **old}) == {"format": FORMAT, **new}
+
+
+def test_migrate_removed_settings():
+    old = {"settings": {"credit": {"exact": "no", "optimism": 0.0}}}
+    assert migrate({"format": 7, **old}) == {"format": FORMAT, "settings": {"credit": {"exact": "no"}}}

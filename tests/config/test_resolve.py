@@ -6,7 +6,7 @@ from helpers.toy_envs import pick_spec, toy_spec
 from lare_rl.algorithms.qmix import QMIXSettings
 from lare_rl.config.resolve import replay_rows, resolve
 from lare_rl.config.settings import Settings
-from lare_rl.config.validity import check_credit
+from lare_rl.config.validity import CreditContext, check_credit
 from lare_rl.credit.decoder_settings import MULTI_AGENT_CREDIT, RECENT_STEPS, CreditSettings
 from lare_rl.credit.methods import find_method
 from lare_rl.envs.load import read_task
@@ -158,7 +158,12 @@ def test_replay_rows():
         assert replay_rows(resolve_named(task, settings), max_steps) == rows
 
 
-VALID = {"credit": CreditSettings(), "n_agents": 1, "n_raw_features": 9}
+def check(method, changes):
+    credit, context = (
+        changes.get("credit", CreditSettings()),
+        {name: v for name, v in changes.items() if name != "credit"},
+    )
+    check_credit(find_method(method), credit, CreditContext(**{"n_agents": 1, "n_raw_features": 9} | context))
 
 
 @pytest.mark.parametrize(
@@ -174,7 +179,7 @@ VALID = {"credit": CreditSettings(), "n_agents": 1, "n_raw_features": 9}
 )
 def test_check_credit_refuses(method, changes, texts):
     with pytest.raises(LareError) as error:
-        check_credit(find_method(method), **VALID | changes)
+        check(method, changes)
     assert all(text in str(error.value) for text in texts)
 
 
@@ -191,7 +196,7 @@ def test_check_credit_accepts():
         ("rd", {"credit": CreditSettings(steps=16)}),
     ]
     for method, changes in cases:
-        check_credit(find_method(method), **VALID | changes)
+        check(method, changes)
 
 
 @pytest.mark.parametrize(

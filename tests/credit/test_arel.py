@@ -3,6 +3,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from helpers.credit_specs import observation_spec
 from helpers.numpy_attention import numpy_attention, numpy_layer_norm, numpy_linear
 from lare_rl.credit import decomposition, descent
 from lare_rl.credit.arel import Block
@@ -36,7 +37,7 @@ def test_loss_is_the_published_one_in_other_units():
 
     @jax.jit
     def compute():
-        state = decomposition.init(KEY, FEATURES, method, settings, STEPS, AGENTS)
+        state = decomposition.init(KEY, observation_spec(FEATURES, method, settings, STEPS, AGENTS))
         state = decomposition.observe_steps(state, jnp.asarray(ROWS))
         state = decomposition.observe_returns(state, mean_reward, length, jnp.ones(EPISODES, bool))
         episode_index = jnp.repeat(jnp.arange(EPISODES), STEPS)

@@ -1,15 +1,19 @@
 """What all decoders have in common: shapes, causality, where they are random, and that they learn."""
 
+from dataclasses import replace
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from helpers.credit_specs import observation_spec
 from helpers.decoder_toys import make_decoder
 from helpers.long_tests import long_case
 from lare_rl.credit import decomposition, descent
 from lare_rl.credit.decoder_settings import CreditSettings
 from lare_rl.credit.decomposition import CreditBatch
+from lare_rl.credit.input_names import InputNames
 from lare_rl.credit.methods import METHODS, Fit
 
 EPISODES, STEPS, AGENTS, FEATURES = 4, 5, 3, 6
@@ -99,8 +103,9 @@ def test_must_learn_credit_among_agents_from_the_mean_return(name):
 
     @jax.jit
     def train():
-        inputs = ("observation", 1), ("action", 1)
-        state = decomposition.init(KEY, 2, method, settings, STEPS, AGENTS, inputs=inputs)
+        spec = observation_spec(1, method, settings, STEPS, AGENTS)
+        two_inputs = replace(method, inputs=InputNames(("observation", "action")))
+        state = decomposition.init(KEY, replace(spec, method=two_inputs, action_size=1))
         state = decomposition.observe_steps(state, jnp.asarray(rows))
         state = decomposition.observe_returns(state, jnp.asarray(mean_reward), length, jnp.ones(n_episodes, bool))
         state, losses = jax.lax.scan(body, state, jax.random.split(jax.random.key(0), n_updates))

@@ -1,4 +1,4 @@
-"""Step rewards are learned from returns alone, at any scale; their units, optimism, and the rows of a batch."""
+"""Step rewards are learned from returns alone, at any scale; their units, and the rows of a batch."""
 
 from functools import partial
 
@@ -7,18 +7,17 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from helpers.credit_specs import observation_spec
 from lare_rl.credit import decomposition, descent
 from lare_rl.credit.decoder_settings import CreditSettings
 from lare_rl.credit.decomposition import CreditBatch
-from lare_rl.credit.evidence import PosteriorCovariance
 from lare_rl.credit.methods import METHODS, Fit
 
 EPISODES, STEPS, FEATURES = 64, 10, 3
 KEY = jax.random.key(3)
-init = jax.jit(decomposition.init, static_argnums=range(1, 7))
+init = jax.jit(decomposition.init, static_argnames="spec")
 update = jax.jit(descent.update, static_argnames=("fit", "settings"))
 proxy_rewards = jax.jit(decomposition.decoder_rewards, static_argnames="settings")
-optimistic_rewards = jax.jit(decomposition.optimistic_rewards, static_argnames="settings")
 
 
 @partial(jax.jit, static_argnames=("fit", "settings"))
@@ -45,7 +44,7 @@ def train(fit, settings, reward_scale=1.0, feature_scale=1.0, updates=400):
     reward = (reward_scale * (features @ np.array([1.0, -2.0, 0.5], np.float32) + 1)).astype(np.float32)
     features *= feature_scale
     mean_reward, rows = reward.mean(axis=1), features.reshape(-1, FEATURES)
-    state = init(jax.random.key(0), FEATURES, METHODS["rd"], settings, STEPS, 1)
+    state = init(jax.random.key(0), observation_spec(FEATURES, METHODS["rd"], settings, STEPS))
     state = observe(state, rows, mean_reward, np.full(EPISODES, STEPS))
     k = STEPS if fit is Fit.ALL_STEPS else 5
     episodes = rng.permuted(np.tile(np.arange(EPISODES), (updates, 1)), axis=1)[:, :16]
@@ -90,26 +89,14 @@ def test_scales_of_rewards_and_features_do_not_matter():
 @pytest.mark.parametrize("score_type", [0, 1])
 def test_unit_of_proxy_rewards(score_type):
     """A decoder's output is in units of R/T. If the score is a mean, it is in units of R, and a step gets a T-th of it."""
-    settings, length = CreditSettings(hidden=(8,)), np.array([2, 4, 8])
+    settings = CreditSettings(hidden=(8,), score="average" if score_type else "sum")
+    length = np.array([2, 4, 8])
     mean_reward, rows = np.array([3.0, -1.0, 0.5], np.float32), np.eye(FEATURES, dtype=np.float32)
-    state = init(KEY, FEATURES, METHODS["rd"], settings, STEPS, 1, (score_type,))
+    state = init(KEY, observation_spec(FEATURES, METHODS["rd"], settings, STEPS))
     state = observe(state, rows, mean_reward, length)
     output = decomposition.decode(state.network, state, jnp.asarray(rows), settings).r_hat
     unit = np.sqrt(np.mean((mean_reward * (length if score_type else 1)) ** 2)) / (length if score_type else 1)
     np.testing.assert_allclose(proxy_rewards(state, rows, settings, length), unit * output, rtol=1e-5)
-
-
-@pytest.mark.parametrize("score_type", [0, 1])
-def test_optimism_adds_deviations_of_a_step(score_type):
-    settings, length = CreditSettings(optimism=2.0), np.array([2, 4, 8])
-    state = init(KEY, FEATURES, METHODS["rd-linear"], settings, STEPS, 1, (score_type,))
-    assert state.closed_form is not None
-    root = np.diag([1.0, 10.0, 100.0]).astype(np.float32)
-    covariance = PosteriorCovariance(root[None], centre=np.zeros((1, FEATURES)), centre_variance=np.zeros(1))
-    state = state._replace(closed_form=state.closed_form._replace(covariance=covariance))
-    optimistic = optimistic_rewards(state, np.eye(FEATURES, dtype=np.float32), settings, length)
-    deviation = np.array([1.0, 10.0, 100.0]) / (length if score_type else 1)
-    np.testing.assert_allclose(optimistic, 2 * deviation, rtol=1e-5)  # of a decoder whose weights are 0
 
 
 @pytest.mark.parametrize("agents", [None, 2])
@@ -137,7 +124,7 @@ def test_decoder_of_many_agents_soon_reaches_the_size_of_rare_rewards():
     rewarded = rng.uniform(size=(32, steps, agents)) < 0.005
     rows = np.stack([rewarded, rng.normal(size=rewarded.shape)], axis=-1).reshape(-1, agents, 2).astype(np.float32)
     mean_reward, length = (10 * rewarded.mean(axis=(1, 2))).astype(np.float32), np.full(32, steps)
-    state = init(KEY, 2, METHODS["lare-rd"], settings, steps, agents)
+    state = init(KEY, observation_spec(2, METHODS["lare-rd"], settings, steps, agents))
     batch = CreditBatch(rows, np.repeat(np.arange(32), steps), length, mean_reward, mask=np.ones(32, np.float32))
     batches = jax.tree.map(lambda leaf: np.broadcast_to(leaf, (100, *leaf.shape)), batch)
     state, _ = fit_batches(observe(state, rows, mean_reward, length), batches, fit=Fit.ALL_STEPS, settings=settings)
@@ -150,7 +137,7 @@ def test_loss_of_packed_episodes_against_numpy():
     rng, settings = np.random.default_rng(0), CreditSettings(hidden=(8,), normalise=False, weight_decay=0.1)
     length, returns = np.array([3, 1, 5]), np.array([6.0, -2.0, 1.0], np.float32)
     rows = jnp.asarray(rng.normal(size=(12, FEATURES)), jnp.float32)
-    state = init(KEY, FEATURES, METHODS["rd"], settings, STEPS, 1)
+    state = init(KEY, observation_spec(FEATURES, METHODS["rd"], settings, STEPS))
     r_hat = np.asarray(proxy_rewards(state, rows, settings=settings))
     means = [values.mean() for values in np.split(r_hat[:9], [3, 4])]
     batch = CreditBatch(
@@ -177,7 +164,7 @@ def test_gradient_in_chunks_is_that_of_the_batch(name, sum_form):
     rng = np.random.default_rng(0)
     features, target = rng.normal(size=(n_episodes * k, agents, FEATURES)), rng.normal(size=n_episodes)
     length = np.full(n_episodes, STEPS)
-    state = init(KEY, FEATURES, METHODS[name], settings, STEPS, agents)
+    state = init(KEY, observation_spec(FEATURES, METHODS[name], settings, STEPS, agents))
     state = observe(state, features, target, length)
 
     def batch(n_chunks):

@@ -51,7 +51,7 @@ def fit_from(start, statistics, score_type=0, group_index=tuple(GROUP_INDEX), ma
 
 
 def fit(statistics, score_type=0, group_index=GROUP_INDEX, max_rounds=100):
-    start = evidence.init_posterior(len(group_index), int(group_index.max()) + 1)
+    start = evidence.init_posterior(group_index)
     return fit_from(start, statistics, score_type, tuple(group_index), max_rounds)
 
 
@@ -164,7 +164,7 @@ def test_rounding_errors_of_a_constant_have_no_weight(error):
 
 def test_fit_continues_from_an_earlier_one():
     statistics = sample_statistics()
-    posterior = evidence.init_posterior(len(GROUP_INDEX), 3)
+    posterior = evidence.init_posterior(GROUP_INDEX)
     for _ in range(5):
         posterior = fit_from(posterior, statistics, max_rounds=20)
     for a, b in zip(posterior, fit(statistics), strict=True):

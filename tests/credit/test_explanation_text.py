@@ -4,11 +4,11 @@ import numpy as np
 import pytest
 
 from lare_rl.credit.decoder_settings import CreditSettings
-from lare_rl.credit.engine import credit_spec
 from lare_rl.credit.explanation import Explanation
-from lare_rl.credit.explanation_text import MESSAGES, explanation_findings, explanation_lines, raw_feature_names
+from lare_rl.credit.explanation_text import MESSAGES, explanation_findings, raw_feature_names
 from lare_rl.credit.methods import METHODS
 from lare_rl.credit.score_type import ScoreType, ScoreTypeEstimate
+from lare_rl.credit.spec import CreditSpec
 from lare_rl.util.findings import Finding, render
 
 FACTORS, RAW_FEATURES = ["speed", "cost"], ["entry 0", "entry 1 (the foot)"]
@@ -164,7 +164,7 @@ def test_messages_and_lines():
         text = render(Finding(code, ANYTHING), MESSAGES)
         assert text
         assert "{" not in text
-    lines = explanation_lines(explanation(), None, FACTORS, RAW_FEATURES)
+    lines = [render(finding, MESSAGES) for finding in explanation_findings(explanation(), None, FACTORS, RAW_FEATURES)]
     assert "90%" in lines[0]
     assert lines[2:4] == ["- cost: 65%, +2 ± 0.1", "- speed: 25%, +1 ± 0.1"]
 
@@ -195,15 +195,13 @@ def test_raw_feature_names():
 )
 def test_raw_feature_names_of_methods(method, single_agent, expected):
     """Neither a history nor a difference of observations has names, and the action need not be an input."""
-    spec = credit_spec(
-        METHODS[method],
-        CreditSettings(),
-        {"factors": 0, "observation": 1, "action": 1},
-        scored_observation="after",
+    spec = CreditSpec(
+        method=METHODS[method],
+        settings=CreditSettings(),
+        observation_size=1,
+        action_size=1,
         single_agent=single_agent,
         agents=1,
         max_steps=10,
-        fixed_length=False,
-        scale_rewards=False,
     )
     assert spec.raw_feature_names("0: price", "") == expected

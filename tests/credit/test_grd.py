@@ -7,7 +7,7 @@ import pytest
 
 from helpers.decoder_toys import check_padding, make_decoder, train_by_loss
 from helpers.numpy_attention import numpy_mlp
-from lare_rl.credit import grd, input_names
+from lare_rl.credit import grd, input_names, methods
 from lare_rl.credit.grd import causes, sample_mask
 from lare_rl.errors import LareError
 
@@ -136,6 +136,6 @@ def test_inputs_of_another_order_are_refused():
 
 def test_input_sizes():
     sizes = {"observation": 3, "action": 2, "factors": 4}
-    names = input_names.TRANSITION.resolve()
+    names = methods.TRANSITION.resolve()
     assert input_names.input_sizes(names, sizes) == (("observation", 3), ("action", 2), ("next_observation", 3))
     assert input_names.input_sizes(("factors", "history"), sizes) == (("factors", 4), ("history", 12))

@@ -21,7 +21,7 @@ def make_episodes(n_episodes, seed=0, scale=1.0):
 
 
 def fit(x, returns, rounds=ROUNDS):
-    state = logistic.init(x.shape[1], GROUP_INDEX)
+    state = logistic.init(GROUP_INDEX)
     with float64():
         state = logistic.add_episodes(state, jnp.asarray(x), jnp.asarray(returns), jnp.ones(len(x), bool))
         return logistic.fit(state, GROUP_INDEX, rounds)
@@ -103,7 +103,7 @@ def test_fit_changes_nothing_while_all_returns_are_equal():
 
 def test_window_holds_the_last_episodes():
     x, _, returns = make_episodes(logistic.WINDOW + 10)
-    state = logistic.init(x.shape[1], GROUP_INDEX)
+    state = logistic.init(GROUP_INDEX)
     with float64():
         for start in range(0, len(x), 18):
             chunk = jnp.asarray(np.arange(18) + start < len(x))

@@ -6,6 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from helpers.credit_specs import observation_spec
 from lare_rl.credit import decomposition, descent
 from lare_rl.credit.decoder_settings import CreditSettings
 from lare_rl.credit.decomposition import CreditBatch
@@ -18,7 +19,9 @@ SETTINGS = CreditSettings(hidden=(16,), learning_rate=3e-3)
 
 @pytest.fixture(scope="module")
 def state():
-    return decomposition.init(KEY, FEATURES, METHODS["lrr"], CreditSettings(hidden=(8,), normalise=False), LENGTH, 1)
+    return decomposition.init(
+        KEY, observation_spec(FEATURES, METHODS["lrr"], CreditSettings(hidden=(8,), normalise=False), LENGTH)
+    )
 
 
 @pytest.fixture(scope="module")
@@ -86,7 +89,7 @@ def test_must_learn_rewards_and_where_they_are_uncertain():
 
     @jax.jit
     def train():
-        state = decomposition.init(KEY, FEATURES, METHODS["lrr"], SETTINGS, steps, 1)
+        state = decomposition.init(KEY, observation_spec(FEATURES, METHODS["lrr"], SETTINGS, steps))
         state = decomposition.observe_steps(state, jnp.asarray(rows[0]))
         state = decomposition.observe_returns(state, mean_reward[0], length, jnp.ones(n_episodes, bool))
         return jax.lax.scan(body, state, (jnp.asarray(rows), mean_reward))[0]

@@ -6,7 +6,7 @@ from jaxtyping import Array, Float
 
 from lare_rl import CreditAssigner
 from lare_rl.config.settings import Settings
-from lare_rl.credit import input_names
+from lare_rl.credit import input_names, methods
 from lare_rl.credit.decoder_network import DecoderOutput
 from lare_rl.credit.decoders import DECODERS, Decoder, register_decoder
 from lare_rl.credit.methods import METHODS, Fit, Method, Reward, find_method, register_method
@@ -24,11 +24,11 @@ def test_rows_are_consistent(method):
 @pytest.mark.parametrize(
     ("name", "inputs", "fit"),
     [
-        ("rd", input_names.RAW, Fit.ALL_STEPS),
-        ("rrd", input_names.RAW, Fit.SAMPLED_STEPS),
-        ("rrdu", input_names.RAW, Fit.SAMPLED_STEPS_UNBIASED),
-        ("lare-rd", input_names.FACTORS, Fit.ALL_STEPS),
-        ("lare-rrdu", input_names.FACTORS, Fit.SAMPLED_STEPS_UNBIASED),
+        ("rd", methods.RAW, Fit.ALL_STEPS),
+        ("rrd", methods.RAW, Fit.SAMPLED_STEPS),
+        ("rrdu", methods.RAW, Fit.SAMPLED_STEPS_UNBIASED),
+        ("lare-rd", methods.FACTORS, Fit.ALL_STEPS),
+        ("lare-rrdu", methods.FACTORS, Fit.SAMPLED_STEPS_UNBIASED),
     ],
 )
 def test_published_rows(name, inputs, fit):
@@ -75,9 +75,7 @@ def registered(monkeypatch):
 @pytest.mark.parametrize("fit", [Fit.ALL_STEPS, Fit.SAMPLED_STEPS_UNBIASED, Fit.DECODER_LOSS])
 def test_registered_method_is_trained(fit, registered):
     register_decoder(Decoder("squares", lambda key, shape, settings: Squares(shape.gain * jnp.ones(shape.n_inputs))))
-    register_method(
-        Method(f"squares {fit}", "squares", "this test", inputs=input_names.RAW, fit=fit, decoder="squares")
-    )
+    register_method(Method(f"squares {fit}", "squares", "this test", inputs=methods.RAW, fit=fit, decoder="squares"))
     assert Settings(method=f"squares {fit}").method == f"squares {fit}"
     credit = CreditAssigner(f"squares {fit}", observation_space=2, action_space=1)
     random = np.random.default_rng(0)
@@ -88,9 +86,17 @@ def test_registered_method_is_trained(fit, registered):
     assert np.isfinite(credit.metrics()["credit/loss"])
 
 
+def test_loss_of_a_decoder_is_for_a_single_agent(registered):
+    """Steps of several agents would be mixed with each other: `loss` has an axis of steps, and none of agents."""
+    register_decoder(Decoder("squares", lambda key, shape, settings: Squares(jnp.ones(shape.n_inputs))))
+    register_method(Method("mine", "squares", "this test", inputs=methods.RAW, fit=Fit.DECODER_LOSS, decoder="squares"))
+    with pytest.raises(LareError, match="mine assigns credit to a single agent, and the task has 2 agents"):
+        CreditAssigner("mine", observation_space=2, action_space=1, agents=2, max_steps=5)
+
+
 def test_decoder_with_functions_is_refused_in_one_line(registered):
     register_decoder(Decoder("mlp", lambda key, shape, settings: eqx.nn.MLP(shape.n_inputs, 1, 4, 1, key=key)))
-    register_method(Method("mlp", "mlp", "this test", inputs=input_names.RAW, fit=Fit.ALL_STEPS, decoder="mlp"))
+    register_method(Method("mlp", "mlp", "this test", inputs=methods.RAW, fit=Fit.ALL_STEPS, decoder="mlp"))
     with pytest.raises(LareError, match=r"'mlp' holds .* instead of eqx.nn.MLP.*, use lare_rl.nn.networks.MLP"):
         CreditAssigner("mlp", observation_space=2, action_space=1)
 
@@ -108,7 +114,7 @@ def test_decoder_with_functions_is_refused_in_one_line(registered):
 def test_output_of_a_decoder_is_checked(call, agents, registered, monkeypatch):
     monkeypatch.setattr(Squares, "__call__", call)
     register_decoder(Decoder("mine", lambda key, shape, settings: Squares(jnp.ones(shape.n_inputs))))
-    register_method(Method("mine", "mine", "this test", inputs=input_names.RAW, fit=Fit.ALL_STEPS, decoder="mine"))
+    register_method(Method("mine", "mine", "this test", inputs=methods.RAW, fit=Fit.ALL_STEPS, decoder="mine"))
     with pytest.raises(LareError, match=rf"'mine' must return DecoderOutput.* both of the shape \(2, {agents}\) for "):
         CreditAssigner("mine", observation_space=2, action_space=1, agents=agents, max_steps=5)
 

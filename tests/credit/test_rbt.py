@@ -10,7 +10,7 @@ import pytest
 from helpers.decoder_toys import check_padding, make_decoder, train_by_loss
 from helpers.numpy_attention import numpy_attention, numpy_layer_norm, numpy_linear, numpy_mlp
 from lare_rl.assigner.assigner import CreditAssigner
-from lare_rl.config.validity import check_credit
+from lare_rl.config.validity import CreditContext, check_credit
 from lare_rl.credit import rbt
 from lare_rl.credit.decoder_settings import CreditSettings
 from lare_rl.credit.methods import METHODS
@@ -120,4 +120,4 @@ def test_long_payments_are_refused():
 def test_length_of_payments(payments, max_steps, words):
     sizes = {"n_agents": 1, "n_raw_features": 5, "max_steps": max_steps}
     with nullcontext() if words is None else pytest.raises(LareError, match=words):
-        check_credit(METHODS["rbt"], CreditSettings(), payments=payments, **sizes)
+        check_credit(METHODS["rbt"], CreditSettings(), CreditContext(payments=payments, **sizes))

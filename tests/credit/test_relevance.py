@@ -29,9 +29,9 @@ def episodes(count, relevant, noise, seed):
 @partial(jax.jit, static_argnames="basis")
 def fits(means, mean_reward, length, basis=BASIS):
     statistics = evidence.add_episodes(evidence.empty_statistics(basis.n_features), means, mean_reward * length, length)
-    start = evidence.init_posterior(basis.n_features, len(basis.group_sizes))
+    start = evidence.init_posterior(basis.group_index)
     groups = evidence.fit(statistics, 0, basis.group_index, start, 60)
-    earlier = evidence.init_posterior(basis.n_features, int(basis.strength_index.max()) + 1)
+    earlier = evidence.init_posterior(basis.strength_index)
     indices = basis.group_index, basis.strength_index
     separate = relevance.fit_strengths(statistics, 0, *indices, groups, earlier, 60)
     again = relevance.fit_strengths(statistics, 0, *indices, groups, separate, 60)

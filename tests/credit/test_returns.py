@@ -1,21 +1,23 @@
 """When a score is treated as a mean, and from which episode on returns are predicted."""
 
+from dataclasses import replace
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from helpers.credit_specs import observation_spec
 from lare_rl.credit import closed_form, decomposition, returns
-from lare_rl.credit.basis import Basis
 from lare_rl.credit.decoder_settings import CreditSettings
 from lare_rl.credit.decomposition import CreditBatch
-from lare_rl.credit.methods import METHODS
+from lare_rl.credit.methods import METHODS, Fit
 from lare_rl.credit.prequential import WINDOW, Predictions
 from lare_rl.credit.score_type import ScoreType, ScoreTypeEstimate
 from lare_rl.util.float64 import float64
 
 METHOD, SETTINGS, SCORE_TYPES = METHODS["rd-linear"], CreditSettings(), (0, 1)
-init = jax.jit(decomposition.init, static_argnums=range(1, 7))
+init = jax.jit(decomposition.init, static_argnames="spec")
 
 
 @jax.jit
@@ -29,7 +31,7 @@ def learn(state, episode):
 
 
 def untrained():
-    return init(jax.random.key(0), 2, METHOD, SETTINGS, 4, 1, SCORE_TYPES)
+    return init(jax.random.key(0), observation_spec(2, METHOD, SETTINGS, 4, fixed_length=False))
 
 
 @pytest.mark.parametrize(("ratio", "is_average"), [(1.03, False), (0.97, False), (0.93, True)])
@@ -60,9 +62,8 @@ def test_returns_are_predicted_from_the_third_episode_on():
 def test_prefixes_are_summed_like_separate_cases():
     """The sums over prefixes equal those of every prefix as a case of its own, whatever the packing of the rows is."""
     rng, lengths = np.random.default_rng(0), [3, 1, 4]
-    decoder = init(
-        jax.random.key(0), Basis(2, 1, extended=False, n_levels=2, prefixes=True), METHODS["rd-linear"], SETTINGS, 4, 1
-    )
+    method = replace(METHOD, fit=Fit.PREFIX_EVIDENCE)
+    decoder = init(jax.random.key(0), observation_spec(3, method, SETTINGS, 4, n_levels=2))
     rows = rng.normal(size=(10, 3)).astype(np.float32)
     scores, level = np.float32([2, -1, 5]), np.int32([1, 0, 1])
     batch = CreditBatch(
@@ -92,6 +93,6 @@ def test_the_rival_of_a_sum_may_be_the_log_odds():
     won = jnp.arange(WINDOW) % 2 * 1.0
     predicted = jnp.stack([0.9 * won, 0.1 * won], axis=1)
     predictions = Predictions(jnp.float32(WINDOW), won, predicted, jnp.zeros(WINDOW, jnp.int32))
-    state = init(jax.random.key(0), 2, METHOD, SETTINGS, 4, 1, (ScoreType.SUM, ScoreType.LOG_ODDS))
+    state = init(jax.random.key(0), observation_spec(2, METHOD, CreditSettings(score="binary"), 4))
     estimate = returns.estimate_score_type(state._replace(score_type_predictions=predictions))
     assert estimate == ScoreTypeEstimate(ScoreType.SUM, is_certain=True, rival=ScoreType.LOG_ODDS)

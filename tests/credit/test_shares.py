@@ -7,11 +7,13 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from helpers.credit_specs import observation_spec
 from lare_rl.credit import decomposition, engine
 from lare_rl.credit.decoder_settings import CreditSettings
 from lare_rl.credit.engine import StepBatch
 from lare_rl.credit.methods import METHODS
 from lare_rl.credit.shares import return_shares
+from lare_rl.credit.spec import CreditSpec
 
 EPISODES, STEPS, AGENTS = 3, 4, 3
 shares_of = jax.jit(return_shares)
@@ -57,16 +59,15 @@ def test_shares_add_up(contributions, alive):
 
 def test_rewards_add_up_to_the_return():
     """The mean over the agents that are alive, summed over the steps, is the return, whatever the decoder gives."""
-    spec = engine.credit_spec(
-        METHODS["tar2"],
-        CreditSettings(),
-        {"observation": 2, "action": 2},
-        scored_observation="after",
+    spec = CreditSpec(
+        method=METHODS["tar2"],
+        settings=CreditSettings(),
+        observation_size=2,
+        action_size=2,
         single_agent=False,
         agents=AGENTS,
         max_steps=STEPS,
         fixed_length=True,
-        scale_rewards=False,
     )
     rng = np.random.default_rng(0)
     alive = np.ones((2, 2 * STEPS, AGENTS), bool)
@@ -79,7 +80,9 @@ def test_rewards_add_up_to_the_return():
 
     @jax.jit
     def compute(steps):
-        decoder = decomposition.init(jax.random.key(0), 4, METHODS["rd"], CreditSettings(hidden=(4,)), STEPS, AGENTS)
+        decoder = decomposition.init(
+            jax.random.key(0), observation_spec(4, METHODS["rd"], CreditSettings(hidden=(4,)), STEPS, AGENTS)
+        )
         return engine.training_rewards(decoder, steps, spec, steps.alive)
 
     rewards, contributions = np.asarray(compute(jax.tree.map(lambda *pair: jnp.stack(pair), steps, unfinished)))

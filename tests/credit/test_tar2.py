@@ -7,7 +7,7 @@ import pytest
 
 from helpers.decoder_toys import make_decoder
 from helpers.numpy_attention import numpy_coalitions, numpy_gelu, numpy_linear, numpy_mlp, numpy_time_layer
-from lare_rl.config.validity import check_credit
+from lare_rl.config.validity import CreditContext, check_credit
 from lare_rl.credit.decoder_settings import CreditSettings
 from lare_rl.credit.methods import METHODS
 from lare_rl.credit.shares import return_shares
@@ -114,7 +114,7 @@ def test_must_learn_contributions_and_actions():
 def test_refusals(changes, words):
     args = {"n_agents": 3, "n_raw_features": 7, "fixed_length": True} | changes
     with pytest.raises(LareError, match=words):
-        check_credit(METHODS["tar2"], CreditSettings(), **args)
+        check_credit(METHODS["tar2"], CreditSettings(), CreditContext(**args))
 
 
 def test_exact_is_no_setting():

@@ -7,6 +7,7 @@ import numpy as np
 from gymnasium.spaces import Box, flatten
 
 from helpers.assigner_episodes import SMALL_CREDIT
+from lare_rl.assigner.arguments import to_rows
 from lare_rl.assigner.assigner import CreditAssigner
 
 
@@ -22,7 +23,7 @@ class RecordingAssigner(CreditAssigner):
         self.recorded, self.n_fits = {}, 0
 
     def add(self, observation, action, next_observation, *args, **options):
-        rows = np.concatenate(self.config.to_rows(observation, action, next_observation), axis=-1)
+        rows = np.concatenate(to_rows(self.config, observation, action, next_observation), axis=-1)
         numbers = super().add(observation, action, next_observation, *args, **options)
         self.recorded |= zip(numbers.tolist(), rows, strict=True)
         return numbers

@@ -2,7 +2,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from lare_rl.nn.networks import MLP, smooth_clip
+from lare_rl.nn.networks import MLP, bound_log_std
 
 
 def test_mlp_against_numpy():
@@ -15,7 +15,7 @@ def test_mlp_against_numpy():
     np.testing.assert_allclose(network(jnp.asarray(x[0])), want[0], rtol=1e-5, atol=1e-6)
 
 
-def test_smooth_clip():
+def test_bound_log_std():
     x = jnp.array([-100.0, 0.1, 100.0])
-    np.testing.assert_allclose(smooth_clip(x, 5.0), [-5, 0.1, 5], rtol=1e-3)
-    assert float(jax.grad(lambda x: smooth_clip(x, 5.0))(8.0)) > 0.05
+    np.testing.assert_allclose(bound_log_std(x), [-5, 0.1, 5], rtol=1e-3)
+    assert float(jax.grad(bound_log_std)(8.0)) > 0.05

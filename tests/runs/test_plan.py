@@ -25,7 +25,7 @@ scale_rewards = true
 td3 = { gamma = 0.9 }
 
 [credit]
-optimism = 0.5
+exact = "spread"
 """
 
 
@@ -52,7 +52,7 @@ def test_file(write, monkeypatch, tmp_path):
     assert (plan.task, plan.function) == ("plans/chase.toml", (Path("plans/phi.py"),))
     assert (plan.out, plan.source) == (Path("plans/runs/chase"), Path("plans/run.toml"))
     settings = {"method": "lare-bayes", "steps": 250, "scale_rewards": True}
-    assert plan.settings == Settings(**settings, td3={"gamma": 0.9}, credit={"optimism": 0.5})
+    assert plan.settings == Settings(**settings, td3={"gamma": 0.9}, credit={"exact": "spread"})
     values = {"task": "Reacher-v4", "function": ["a.py", "b.py"], "seeds": 2, "ppo": {"anneal": False}}
     plan = load_config(write(json.dumps(values), "run.json"))
     assert (plan.task, plan.function, plan.out) == ("Reacher-v4", (Path("plans/a.py"), Path("plans/b.py")), None)
@@ -63,16 +63,16 @@ def test_options_win_over_the_file(write, monkeypatch, tmp_path):
     monkeypatch.chdir(tmp_path)
     path = write(FILE.replace("steps = 250", "steps = 250\nseeds = 3"))
     assert read_keywords("--config", path)["settings"] == load_config(path).settings
-    options = "--seeds 1 --steps=500 --td3.tau 0.1 --no-scale-rewards --credit.optimism 0.1 --credit.normalise False"
+    options = "--seeds 1 --steps=500 --td3.tau 0.1 --no-scale-rewards --credit.exact last --credit.normalise False"
     settings = read_keywords("--config", path, *options.split())["settings"]
     assert settings == Settings(
         method="lare-bayes",
         seeds=1,  # the default, and not the value of the file
         steps=500,
         td3={"gamma": 0.9, "tau": 0.1},
-        credit={"optimism": 0.1, "normalise": False},
+        credit={"exact": "last", "normalise": False},
     )
-    assert settings.credit.model_fields_set == {"optimism", "normalise"}  # the algorithm decides the others
+    assert settings.credit.model_fields_set == {"exact", "normalise"}  # the algorithm decides the others
     path = write("[ppo]\nanneal = true\nclip = 0.3")
     settings = read_keywords("--config", path, "--ppo.no-anneal")["settings"]
     assert settings.ppo == Settings(ppo={"anneal": False, "clip": 0.3}).ppo

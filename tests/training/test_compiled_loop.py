@@ -12,6 +12,7 @@ from lare_rl.errors import LareError
 from lare_rl.latent.function import verify_function
 from lare_rl.runs.directory import create_run
 from lare_rl.training import session
+from lare_rl.training.start_session import start_session
 
 
 @pytest.fixture(scope="module")
@@ -27,7 +28,7 @@ def begin(small_many, tmp_path_factory):
         changes |= {"credit": QUICK_CREDIT, "scored_observation": "before"}
         settings = small_many(algorithm=algorithm, method=method, **changes)
         directory = tmp_path_factory.mktemp("loop") / "run"
-        return session.start_session(create_run(directory, echo_spec(), resolve(settings, echo_spec()), [function]))
+        return start_session(create_run(directory, echo_spec(), resolve(settings, echo_spec()), [function]))
 
     return begin
 

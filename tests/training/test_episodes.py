@@ -78,7 +78,10 @@ def statistics_from_scratch(learner, config):
 
 
 def add_all(decoders, buffer, config):
-    return episodes.fold_episodes(decoders, buffer, jnp.zeros_like(buffer.oldest), returns.add_episodes, config)
+    def body(decoder, batch, first):
+        return returns.add_episodes(decoder, batch)
+
+    return episodes.fold_episodes(decoders, buffer, jnp.zeros_like(buffer.oldest), body, config)
 
 
 @pytest.mark.parametrize(

@@ -11,8 +11,8 @@ from helpers.toy_envs import pick_spec
 from lare_rl.envs.families import load_env_spec, picklable_maker
 from lare_rl.envs.vec_env import LocalVecEnv
 from lare_rl.training.compiled import compile_functions, init_seeds
-from lare_rl.training.evaluate_host import evaluate_policy_on_host
 from lare_rl.training.streams import seed_keys
+from lare_rl.training.unroll_host import evaluate_policy_on_host
 
 SEEDS = (0, 3)
 

@@ -12,7 +12,6 @@ from helpers.long_tests import long_case
 from helpers.numpy_twins import assert_close
 from helpers.small_configs import (
     LENGTHS,
-    ONE_AGENT,
     ONE_TEAM,
     SUM_CREDIT,
     TOTAL,
@@ -24,14 +23,13 @@ from helpers.small_configs import (
     random_steps,
     read,
     small_config,
-    steps_as_stored,
     stored_steps,
     team_rewards,
     untrained_learner,
     with_factor_decoders,
     with_other_dead_values,
 )
-from lare_rl.credit import closed_form, returns
+from lare_rl.credit import closed_form
 from lare_rl.credit.decoder_settings import CreditSettings
 from lare_rl.credit.engine import return_scale
 from lare_rl.data import replay
@@ -39,7 +37,6 @@ from lare_rl.data.sampling import sample_episode_steps
 from lare_rl.envs.interface import EnvSpec, Team
 from lare_rl.nn.normalise import root_mean_square
 from lare_rl.training.decoder_fits import fit_decoders, fit_repeatedly, sample_credit
-from lare_rl.training.decoder_inputs import alive_agents, decoder_inputs
 from lare_rl.training.learner import abandon_episodes
 from lare_rl.training.rewards import assess, rewards, team_proxy_rewards
 
@@ -372,31 +369,3 @@ def test_team_level_closed_form_and_assess():
     results = jitted(assess, config)(with_factor_decoders(learner, [1.0]))
     assert float(results["credit/error"]) == pytest.approx(0.5, rel=1e-4)
     assert float(results["credit/correlation"]) == pytest.approx(1, rel=1e-4)
-
-
-@pytest.mark.long
-@pytest.mark.parametrize(("env", "score"), [(ONE_AGENT, "sum"), long_case(ONE_TEAM, "average")])
-def test_optimism_adds_deviations_to_training_rewards_only(env, score):
-    algorithm = "td3" if env is ONE_AGENT else "ippo"
-    config = small_config("lare-bayes", algorithm, env, credit=CreditSettings(score=score, optimism=2.0))
-    learner = learner_with_episodes(config)
-    steps, state = stored_steps(learner), learner.reward_state
-    alive = np.asarray(alive_agents(steps, config))
-    before = np.where(alive, jitted(proxy_rewards, config)(steps, state), 0)
-    after = np.asarray(jitted(rewards, config)(steps, state))
-    features = decoder_inputs(steps, config, 0)
-    with jax.enable_x64(True):
-        rows = features.reshape(-1, features.shape[-1])
-        std = np.asarray(returns.reward_std(learner.decoders[0], rows, config.score_types)).reshape(before.shape)
-    divisor = np.where(learner.decoders[0].is_average, np.asarray(steps.length), 1).reshape(-1, 1)
-    np.testing.assert_allclose(after, np.where(alive, before + 2 * std / divisor, 0), rtol=1e-3, atol=1e-5)
-    assert (after[alive] > before[alive]).all()
-    error = np.abs(before - steps.columns["reward"])[alive].mean()
-    assert float(jitted(assess, config)(learner)["credit/error"]) == pytest.approx(error, rel=1e-4)
-
-
-def test_optimism_before_two_returns():
-    config = small_config("bayes", credit=CreditSettings(optimism=2.0))
-    learner = untrained_learner(config)
-    reward = jitted(rewards, config)(steps_as_stored(config), learner.reward_state)
-    np.testing.assert_array_equal(reward, 0)

@@ -20,7 +20,7 @@ from lare_rl.runs.directory import create_run, open_run
 from lare_rl.training import factors
 from lare_rl.training.latent_functions import choose_functions
 from lare_rl.training.saved_state import load_learner
-from lare_rl.training.session import restore_session
+from lare_rl.training.start_session import restore_session
 
 
 def test_advance_fits_decoders_before_the_update(echo_run):

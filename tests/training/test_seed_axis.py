@@ -25,12 +25,12 @@ import lare_rl
 from helpers.training_runs import train_and_stop
 from lare_rl.runs.directory import open_run
 from lare_rl.tasks.spec import TaskSpec
-from lare_rl.training import session
+from lare_rl.training.start_session import restore_session
 
 task, settings = TaskSpec(**json.loads(sys.argv[1])), lare_rl.Settings(**json.loads(sys.argv[2]))
 train_and_stop(task, settings, "from-devices", settings.evaluate_every)
 lare_rl.resume("to-devices", listeners=[])
-opened, _ = session.restore_session(open_run("from-devices"))
+opened, _ = restore_session(open_run("from-devices"))
 functions = opened.functions
 compiled = [functions.store, functions.train_step] if opened.loop is None else [opened.loop.run]
 collective = re.compile("all-gather|all-reduce|all-to-all|collective-permute|reduce-scatter")

@@ -18,15 +18,15 @@ class OffPolicySettings(AlgorithmSettings):
     hidden: tuple[Annotated[int, Field(ge=1)], ...] = (256, 256)
     """Widths of the hidden layers of actor and critics."""
     critics: Annotated[int, Field(ge=1)] = 2
-    """Number of critics. The target uses the smallest of their values."""
+    """Number of critics. The target uses their smallest value."""
     learning_rate: Annotated[float, Field(gt=0)] = 3e-4
-    """Learning rate of Adam, for all networks."""
+    """Learning rate of Adam."""
     batch_size: Annotated[int, Field(ge=1)] = 256
     """Transitions in one update."""
     gamma: Annotated[float, Field(ge=0, le=1)] = 0.99
     """Discount factor."""
     tau: Annotated[float, Field(gt=0, le=1)] = 0.005
-    """Fraction of the way that the target networks move towards the online networks at a time."""
+    """Fraction by which target networks move towards online ones at a time."""
     warmup: Annotated[int, Field(ge=0)] = 10_000
     """Environment steps with uniformly random actions before the first update."""
 

@@ -18,30 +18,19 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float, Int
 
-from lare_rl.assigner import saving
-from lare_rl.assigner.assigner_config import (
-    AssignerConfig,
-    Space,
-    check_config,
-    check_finite,
-    resolve_config,
-    to_flags,
-    to_lengths,
-    to_step_ids,
-)
+from lare_rl.assigner import arguments, saving
+from lare_rl.assigner.assigner_config import AssignerConfig, Space, check_config, resolve_config
 from lare_rl.assigner.decoder_learner import DecoderLearner
+from lare_rl.assigner.explain import describe_returns
 from lare_rl.assigner.saving import AssignerState
 from lare_rl.assigner.step_rewards import StepRewards
 from lare_rl.assigner.store import Store
 from lare_rl.credit.decoder_settings import CreditSettings
 from lare_rl.credit.decoders import DECODERS
-from lare_rl.credit.decomposition import level_effects
-from lare_rl.credit.explanation_text import explanation_lines
 from lare_rl.credit.methods import Reward
-from lare_rl.credit.returns import estimate_score_type, looks_binary
 from lare_rl.errors import LareError
 from lare_rl.latent.function import LatentFunction
-from lare_rl.tasks.payments import PAID_AT_END, PaymentRule
+from lare_rl.tasks.payments import PaymentRule
 from lare_rl.tasks.spec import ScoredObservation, TaskSpec
 
 __all__ = ["CreditAssigner"]
@@ -175,29 +164,15 @@ class CreditAssigner:
             LareError: shapes do not fit, a number is not finite, or the steps or an episode are more than `capacity`.
         """
         with self.lock:
-            steps = self.config.to_rows(observation, action, next_observation)
-            n_rows = len(steps[0])
-            team_reward, alive = self.config.to_team_reward(reward, alive, n_rows)
-            ended = to_flags(terminated, "terminated", n_rows) | to_flags(truncated, "truncated", n_rows)
-            rows = np.flatnonzero(np.ones(n_rows, bool) if valid is None else to_flags(valid, "valid", n_rows))
-            ids = next(ids for ids in (env_ids, lanes, range(n_rows)) if ids is not None)
-            if len(ids) != n_rows:
-                raise LareError(f"env_ids has {len(ids)} entries, but there are {n_rows} steps")
-            # Copies, because an environment may write its next step into the same memory.
-            observation, action, next_observation = (array[rows] for array in steps)
-            steps, team_reward, ended = (observation, action, next_observation), team_reward[rows], ended[rows]
-            check_finite(rows, steps, team_reward)
-            step_ids = np.full(n_rows, -1)
-            if len(rows):
-                level = self.config.to_levels(group, n_rows, self.group_names, rows)
-                if np.any((level < 0) & (ended | (not self.config.payments.only_at_end))):
-                    raise LareError(
-                        "the group of an episode is None when it is paid: give the group of each row that is paid"
-                    )
-                step_ids[rows] = self.learner.add_steps(*steps, None if alive is None else alive[rows])
-                env_ids = [ids[row] for row in rows.tolist()]
-                paid_episodes = self.store.extend(env_ids, step_ids[rows], steps, team_reward, ended, level)
-                self.learner.queue_episodes(paid_episodes)
+            steps = observation, action, next_observation
+            ids = lanes if env_ids is None else env_ids  # `lanes` is the earlier name
+            new = arguments.read_steps(self.config, steps, reward, terminated, truncated, ids, valid, alive)
+            step_ids = np.full(new.n_rows, -1)
+            if len(new.rows):
+                level = arguments.to_levels(self.config, group, new, self.group_names)
+                step_ids[new.rows] = self.learner.add_steps(*new.steps, new.alive)
+                episodes = self.store.extend(new.env_ids, step_ids[new.rows], new.steps, new.reward, new.ended, level)
+                self.learner.queue_episodes(episodes)
                 self.learner.flush_large_queues()
             return step_ids
 
@@ -217,23 +192,12 @@ class CreditAssigner:
             LareError: as in `add`, or the episode has no step.
         """
         with self.lock:
-            rows = self.config.to_rows(observation, action, next_observation)
-            steps = rows[0].copy(), rows[1].copy(), rows[2].copy()
-            n_steps = len(steps[0])
-            if not n_steps:
-                raise LareError("the episode has no step")
-            is_score = np.ndim(reward) == 0
-            rewards, alive = self.config.to_team_reward(np.zeros(n_steps) if is_score else reward, alive, n_steps)
-            check_finite(np.arange(n_steps), steps, rewards)
-            score = float(reward) if is_score else float(rewards.sum())
-            if not np.isfinite(score):
-                raise LareError(f"the score is {score}: give a finite number")
-            (level,) = self.config.to_levels(None if group is None else [group], 1, self.group_names).tolist()
-            step_ids = self.learner.add_steps(*steps, alive)
-            if is_score:
-                rewards[-1] = score
-            rule = PAID_AT_END if is_score else self.config.payments
-            self.learner.queue_episodes(self.store.add_paid_episode(step_ids, rewards, rule, level))
+            steps = observation, action, next_observation
+            new, rule = arguments.read_episode(self.config, steps, reward, alive)
+            groups = None if group is None else [group] * new.n_rows
+            level = int(arguments.to_levels(self.config, groups, new, self.group_names)[-1])
+            step_ids = self.learner.add_steps(*new.steps, new.alive)
+            self.learner.queue_episodes(self.store.add_paid_episode(step_ids, new.reward, rule, level))
             self.learner.flush_large_queues()
             return step_ids
 
@@ -280,7 +244,7 @@ class CreditAssigner:
         """
         with self.lock:
             self.learner.learn_if_due()
-            step_ids = to_step_ids(steps)
+            step_ids = arguments.to_step_ids(steps)
             reward = np.zeros((*step_ids.shape, *self.config.agent_axis), np.float32)
             is_step = step_ids >= 0
             reward[is_step] = self.step_rewards.rewards_at(step_ids[is_step])
@@ -303,12 +267,14 @@ class CreditAssigner:
             raise LareError(f"{method.name} pays by the return of a step's episode: call rewards_at, with step numbers")
         with self.lock:
             self.learner.learn_if_due()
-            inputs = self.config.compute_inputs(*self.config.to_rows(observation, action, next_observation))
+            inputs = self.config.compute_inputs(*arguments.to_rows(self.config, observation, action, next_observation))
             if self.config.spec.basis.n_tracked:
                 if begins is None:
                     raise LareError(f"{method.name} reads the history of an episode: give begins, or call rewards_at")
-                inputs = self.config.add_history(inputs, to_flags(begins, "begins", len(inputs)))
-            length = to_lengths([self.store.mean_length] * len(inputs) if length is None else length, len(inputs))
+                inputs = self.config.add_history(inputs, arguments.to_flags(begins, "begins", len(inputs)))
+            length = arguments.to_lengths(
+                [self.store.mean_length] * len(inputs) if length is None else length, len(inputs)
+            )
             return self.step_rewards.rewards(inputs, length)
 
     def metrics(self) -> dict[str, float]:
@@ -327,21 +293,7 @@ class CreditAssigner:
         The list is empty for fewer than 20 episodes, and for a method without a decoder.
         """
         with self.lock:
-            self.learner.learn_returns()
-            explanation, config = self.learner.explain(), self.config
-            if explanation is None:
-                return []
-            decoder = self.learner.decoder
-            assert decoder is not None
-            effects = level_effects(decoder, float(explanation.mean_length)).tolist()
-            return explanation_lines(
-                explanation,
-                estimate_score_type(decoder),
-                [] if config.phi is None else config.phi.factor_columns(config.scored_observation),
-                config.raw_feature_names,
-                looks_binary=looks_binary(decoder, config.method),
-                groups=dict(zip(self.group_names, effects, strict=False)),
-            )
+            return describe_returns(self.learner, self.group_names)
 
     @property
     def score_type(self) -> str:

@@ -1,41 +1,31 @@
 """The fixed configuration of a `CreditAssigner`: method, function, spaces and settings; and the decoder's inputs of steps."""
 
-from collections.abc import Hashable, Mapping, Sequence
+from collections.abc import Mapping
 from functools import cached_property
 from pathlib import Path
 from typing import Annotated, Any
 
 import gymnasium
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float
 from pydantic import Field, InstanceOf
 
 from lare_rl.assigner.space_layout import SpaceLayout, make_layout
-from lare_rl.config.validity import check_credit, check_factors
+from lare_rl.config.validity import CreditContext, check_credit, check_factors
 from lare_rl.credit.decoder_settings import CreditSettings, default_credit
-from lare_rl.credit.engine import CreditSpec, credit_spec
 from lare_rl.credit.history import next_history_columns
 from lare_rl.credit.input_names import input_arrays
 from lare_rl.credit.methods import Method, find_method
 from lare_rl.credit.score_type import prediction_window
+from lare_rl.credit.spec import CreditSpec
 from lare_rl.envs.families import find_score_type, load_env_spec
-from lare_rl.envs.interface import alive_mean
 from lare_rl.envs.load import resolve_task
 from lare_rl.errors import CheckedModel, LareError, short_repr
 from lare_rl.latent.function import LatentFunction, check_task
 from lare_rl.tasks.payments import PAID_AT_END, PaymentRule
 from lare_rl.tasks.spec import MAX_LEVELS, ScoredObservation, TaskSpec
 
-__all__ = [
-    "AssignerConfig",
-    "Space",
-    "check_config",
-    "check_finite",
-    "resolve_config",
-    "to_flags",
-    "to_lengths",
-    "to_step_ids",
-]
+__all__ = ["AssignerConfig", "Space", "check_config", "resolve_config"]
 
 Space = gymnasium.Space | SpaceLayout | int
 """A space of Gymnasium, a layout, or the length of a row of numbers."""
@@ -69,22 +59,18 @@ class AssignerConfig(CheckedModel):
     @cached_property
     def spec(self) -> CreditSpec:
         """What is fitted to the returns."""
-        sizes = {
-            "factors": self.phi.n_factors(self.scored_observation) if self.phi is not None else 0,
-            "observation": self.observation.size,
-            "action": self.action.size,
-        }
-        return credit_spec(
-            self.method,
-            self.settings,
-            sizes,
+        return CreditSpec(
+            method=self.method,
+            settings=self.settings,
+            n_factors=0 if self.phi is None else self.phi.n_factors(self.scored_observation),
+            observation_size=self.observation.size,
+            action_size=self.action.size,
             scored_observation=self.scored_observation,
             single_agent=self.agents == 1,
             agents=self.agents,
             max_steps=self.max_steps or 1,
             window=prediction_window(self.payments, self.settings.score),
             n_levels=self.n_levels,
-            fixed_length=False,
             scale_rewards=self.scale_rewards,
         )
 
@@ -133,67 +119,6 @@ class AssignerConfig(CheckedModel):
             if i:
                 rows[i, ..., size:] = next_history_columns(rows[i - 1], n_tracked)
         return rows
-
-    def to_rows(
-        self, observation: Any, action: Any, next_observation: Any
-    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return steps as rows of numbers. Raises `LareError` if their shapes do not fit together."""
-        rows = {
-            "observation": self.observation.rows(observation, "observation"),
-            "action": self.action.rows(action, "action"),
-            "next_observation": self.observation.rows(next_observation, "next_observation"),
-        }
-        n_steps = len(rows["observation"]) if rows["observation"].ndim > 1 else 0
-        for name, values in rows.items():
-            if values.shape[:-1] != (n_steps, *self.agent_axis):
-                shape = ", ".join(["steps", *map(str, self.agent_axis), str(values.shape[-1])])
-                raise LareError(
-                    f"{name} has the shape {values.shape}: give it rows ({shape}), as many as the observations"
-                )
-        return rows["observation"], rows["action"], rows["next_observation"]
-
-    def to_levels(
-        self,
-        group: Sequence[Hashable] | None,
-        n_rows: int,
-        group_names: dict[Hashable, int],
-        rows: Int[np.ndarray, " n"] | None = None,
-    ) -> Int[np.ndarray, " n"]:
-        """Return the number of the group of some rows (by default of all), and add new groups to `group_names`. It is -1 for None.
-
-        Raises `LareError` if there are too many groups, or if they do not fit.
-        """
-        if (group is not None) != self.groups:
-            needs, has_none = (
-                "needs group: give group=, one for each row; or set groups=False, if your adapter has none",
-                "has no groups: leave group out, or set groups=True",
-            )
-            raise LareError(f"this assigner {needs if self.groups else has_none}")
-        rows = np.arange(n_rows) if rows is None else rows
-        if group is None:
-            return np.zeros(len(rows), np.int32)
-        if len(group) != n_rows:
-            raise LareError(f"group has {len(group)} entries, but there are {n_rows} steps")
-        group = [group[row] for row in rows.tolist()]
-        new = [name for name in dict.fromkeys(group) if name is not None and name not in group_names]
-        if len(group_names) + len(new) > MAX_LEVELS:
-            raise LareError(f"there are more than {MAX_LEVELS} groups, of which {new[-1]!r} is one: merge some of them")
-        group_names |= {name: len(group_names) + i for i, name in enumerate(new)}
-        return np.array([-1 if name is None else group_names[name] for name in group], np.int32)
-
-    def to_team_reward(
-        self, reward: Any, alive: Any, n_steps: int
-    ) -> tuple[Float[np.ndarray, " n"], Bool[np.ndarray, "n agents"] | None]:
-        """Return the team's reward of each step, and which agents were alive, if that is given."""
-        reward = np.asarray(reward, np.float64)
-        mask = None if alive is None else np.asarray(alive, bool)
-        if mask is not None and (mask.shape != (n_steps, self.agents) or self.agents == 1):
-            raise LareError(f"alive has the shape {mask.shape}: give it ({n_steps}, agents), of more than one agent")
-        if self.agents > 1 and reward.shape == (n_steps, self.agents):
-            return alive_mean(reward, np.ones(reward.shape, bool) if mask is None else mask), mask
-        if reward.shape != (n_steps,):
-            raise LareError(f"reward has the shape {reward.shape}: give one number for each of {n_steps} steps")
-        return reward, mask
 
 
 def resolve_config(
@@ -270,9 +195,7 @@ def check_config(config: AssignerConfig) -> None:
         raise LareError("a phi needs the task that it was designed for: CreditAssigner(..., phi, task=task)")
     if phi is not None and config.task is not None:
         check_task(phi, config.task)
-    check_credit(
-        method,
-        config.settings,
+    context = CreditContext(
         n_agents=config.agents,
         n_raw_features=config.spec.basis.n_raw,
         scored_observation=config.scored_observation,
@@ -280,46 +203,8 @@ def check_config(config: AssignerConfig) -> None:
         payments=config.payments,
         max_steps=config.max_steps,
     )
+    check_credit(method, config.settings, context)
     if phi is not None:
         check_factors(method, phi.n_factors(config.scored_observation))
     if config.agents > 1 and config.max_steps is None and method.uses_gradient:
         raise LareError(f"{name} of many agents needs max_steps, the number of steps of the longest episode")
-
-
-def to_flags(values: Any, name: str, n_rows: int) -> Bool[np.ndarray, " steps"]:
-    """Return one flag for each row. Raises `LareError` if there are more or fewer."""
-    flags = np.asarray(values, bool)
-    if flags.shape != (n_rows,):
-        raise LareError(f"{name} has the shape {flags.shape}: give one flag for each of {n_rows} steps")
-    return flags
-
-
-def to_lengths(values: Any, n_rows: int) -> Int[np.ndarray, " steps"]:
-    """Return the length of each row's episode. Raises `LareError` if there are more or fewer, or for one that is no length."""
-    lengths = np.asarray(values, np.float64)
-    if lengths.shape != (n_rows,):
-        raise LareError(f"length has the shape {lengths.shape}: give one number for each of {n_rows} steps")
-    wrong = np.flatnonzero(~((lengths >= 1) & (lengths < 2**31)) | (lengths != np.floor(lengths)))
-    if len(wrong):
-        raise LareError(f"length of row {wrong[0]} is {lengths[wrong[0]]:g}: give the number of steps of its episode")
-    return lengths.astype(np.int32)
-
-
-def to_step_ids(steps: Any) -> Int[np.ndarray, "*shape"]:
-    """Return numbers of steps as an array. Raises `LareError` for anything else."""
-    try:
-        step_ids = np.asarray(steps)
-    except ValueError:  # lists of different lengths
-        step_ids = np.array("")
-    if step_ids.size and (step_ids.dtype.kind not in "iu" or step_ids.min() < -1):
-        raise LareError(f"steps are {short_repr(steps)}: give numbers that `add` has returned, or -1")
-    return step_ids.astype(np.int64)
-
-
-def check_finite(rows: np.ndarray, steps: Sequence[np.ndarray], reward: np.ndarray) -> None:
-    """Raise `LareError` for the first number that is not finite. `rows` are the indices of the rows in the user's arrays."""
-    names = ("observation", "action", "next_observation", "reward")
-    for name, values in zip(names, (*steps, reward), strict=True):
-        if not np.isfinite(values).all():
-            index = np.argwhere(~np.isfinite(values))[0]
-            raise LareError(f"{name} of row {rows[index[0]]} has {values[tuple(index)]}: give finite numbers")

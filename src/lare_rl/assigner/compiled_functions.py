@@ -11,7 +11,8 @@ from jaxtyping import Array, Bool, Float, Key
 
 from lare_rl.credit import closed_form, decomposition, descent, engine, returns
 from lare_rl.credit.decomposition import CreditBatch, DecoderState
-from lare_rl.credit.engine import CreditSpec, StepBatch
+from lare_rl.credit.engine import StepBatch
+from lare_rl.credit.spec import CreditSpec
 from lare_rl.data.layouts import sample_steps as _sample_steps
 from lare_rl.nn.normalise import update_scale
 

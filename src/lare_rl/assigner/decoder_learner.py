@@ -9,7 +9,6 @@ depends on them:
 """
 
 from collections.abc import Iterable, Sequence
-from dataclasses import replace
 from itertools import chain
 from math import inf
 
@@ -24,7 +23,6 @@ from lare_rl.assigner.compiled_functions import MAX_CALL_ROWS, on_cpu, pad
 from lare_rl.assigner.store import Store, StoredEpisode
 from lare_rl.credit import closed_form, prequential, returns
 from lare_rl.credit.decomposition import DecoderState
-from lare_rl.credit.explanation import Explanation
 from lare_rl.credit.history import next_history_columns
 from lare_rl.credit.methods import Fit
 from lare_rl.nn.normalise import empty_scale
@@ -259,32 +257,18 @@ class DecoderLearner:
     def metrics(self) -> dict[str, float]:
         """Return metrics that need no true rewards. Returns are predicted before they are learned from."""
         self.learn_returns()
-        r2 = gain = gain_error = float("nan")
+        predicted: dict[str, float] = dict.fromkeys(
+            ("credit/return_r2", "credit/gain", "credit/gain_error"), float("nan")
+        )
         if self.decoder is not None:
             with on_cpu():
-                predictions = self.decoder.predictions
-                r2, gain, gain_error = map(float, (prequential.r2(predictions)[0], *prequential.gain(predictions)))
+                predicted = {
+                    name: float(value) for name, value in prequential.metrics(self.decoder.predictions).items()
+                }
         return {
-            "credit/return_r2": r2,
-            "credit/gain": gain,
-            "credit/gain_error": gain_error,
+            **predicted,
             "credit/episodes": float(self.store.ended),
             "credit/dropped": float(self.store.dropped),
             "credit/fits": float(self.n_updates),
             "credit/loss": self.loss,
         }
-
-    def explain(self) -> Explanation | None:
-        """Explain the stored returns by the inputs. Return None for a method without a decoder, and without episodes."""
-        if self.decoder is None or not self.store.episodes:
-            return None
-        # Shares are of factors and raw features alone.
-        basis = replace(self.config.spec.basis, extended=True, n_tracked=0, n_levels=0, prefixes=False)
-        if not basis.n_features:
-            return None
-        with on_cpu(), float64():
-            state = compiled.init_explanation(self.decoder.statistics, basis=basis)
-            for batch in whole_episodes(self.store, self.config.spec, list(self.store.episodes.values())):
-                state = compiled.add_to_explanation(state, batch)
-            explanation = compiled.explain_returns(state, self.decoder.is_average.astype(int))
-            return jax.tree.map(np.asarray, explanation)

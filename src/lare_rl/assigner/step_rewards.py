@@ -78,9 +78,7 @@ class StepRewards:
         if self._flat_cache[0] is not newest:
             source = newest
             if isinstance(source, DecoderState):
-                source = source._replace(optimizer=(), score_type_predictions=None)
-                if not decomposition.is_optimistic(self.config.method, self.config.settings):
-                    source = source._replace(closed_form=None)
+                source = source._replace(optimizer=(), score_type_predictions=None, closed_form=None)
             self._flat_cache = newest, *jax.tree.flatten(source)
         return self._flat_cache[1:]
 

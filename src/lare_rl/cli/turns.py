@@ -24,7 +24,7 @@ def turn_credit(
 
     Each line of ROLLOUTS is a JSON object: "messages" in the form of OpenAI's chat completions, or "turns" with numbers, or both; an
     "outcome"; and optionally a "group" (the task) and "truncated". CREDITED has the same lines with a key "credit"
-    (docs/tutorials/agents-that-talk.md).
+    (docs/reference/logs.md).
 
     Args:
         rollouts: a JSONL file.

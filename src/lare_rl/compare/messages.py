@@ -15,12 +15,12 @@ MIN_CERTAIN_P = 0.025
 
 MESSAGES = {
     # Runs and tables (`collect.py`).
-    "no_evaluation": "{run} has no evaluation yet, and is left out.",
-    "no_metric": "{run} has no {metric}, and is left out.",
+    "no_evaluation": "{run} is left out: it has no evaluation yet.",
+    "no_metric": "{run} is left out: it has no {metric}.",
     "unfinished": "{run} has only reached step {step:,} of {steps:,}: no run is compared at a later step.",
     "untrained": "{run}: {reason}",
     "mean_over_agents": "Returns are means over the agents. --metric {metric} compares their sums.",
-    "other_task": "{source} has the task {task}, which is left out, because the runs have {tasks}.",
+    "other_task": "{source} is left out: its task is {task}, and that of the runs {tasks}.",
     "other_steps": "{source} has no {metric} of {label} at step {step:,} for every seed: no run is compared there.",
     "differ": "The runs differ in {differences}.",
     "origin": "Runs: {facts}.",
@@ -37,10 +37,8 @@ MESSAGES = {
     "at_last_step": "at step {step:,}, the last at which all runs were evaluated",
     "late": "averaged over the evaluations after three quarters of {step:,} steps",
     # Few runs.
-    "few_seeds": "The bootstrap's interval of {count} seeds can only be their range, which contains the true median in "
-    "{coverage:.0%} of cases, not in 95%.",
-    "few_draws": "The bootstrap's interval of {count} draws can only be their range, which contains the true median in "
-    "{coverage:.0%} of cases, not in 95%.",
+    "few_seeds": "The interval of {count} seeds is their range, which contains the true median in {coverage:.0%} of cases, not in 95%.",
+    "few_draws": "The interval of {count} draws is their range, which contains the true median in {coverage:.0%} of cases, not in 95%.",
     "few_over_tasks": "Intervals of two or three seeds, or draws, are too narrow: they contain the true median in less than 95% of "
     "cases.",
     "min_p": "With these few runs, p is at least {p:.2g}.",
@@ -56,8 +54,7 @@ MESSAGES = {
     "of the language model.",
     "curves": "Lines: IQM over the seeds. Bands: its 95% intervals.",
     "over_tasks": "All tasks: each run is compared with the runs on the same task.",
-    "no_overall_table": "There is no table over all tasks: it needs the same baseline, and another method, on every task with equally "
-    "many seeds.",
+    "no_overall_table": "There is no table over all tasks: every task needs the same baseline and another method, with equally many seeds.",
 }
 
 

@@ -15,7 +15,7 @@ __all__ = ["CONFIG", "FORMAT", "migrate"]
 CONFIG = "config.json"
 """The configuration of a run, in its directory."""
 
-FORMAT = 7
+FORMAT = 8
 """The format of config.json. It is increased whenever its contents change."""
 
 
@@ -32,44 +32,46 @@ def migrate(values: dict[str, Any]) -> dict[str, Any]:
     return values
 
 
-def _from_2(values: dict[str, Any]) -> dict[str, Any]:
-    # Only the checkpoint changed.
-    return values
+Values = dict[str, Any]
 
 
-def _from_3(values: dict[str, Any]) -> dict[str, Any]:
-    # `isolation` said how the process that executed phi was isolated.
-    return {name: value for name, value in values.items() if name != "isolation"}
-
-
-def _from_4(values: dict[str, Any]) -> dict[str, Any]:
+def _from_4(values: Values) -> Values:
     # `reflect_every` replaced phi during a run. The oldest runs have no `first_fit`.
-    settings = values.get("settings")
-    if not isinstance(settings, dict):
-        return values
-    settings = {name: value for name, value in settings.items() if name != "reflect_every"}
-    return values | {"settings": {"first_fit": "published"} | settings}
+    return _change(
+        values, "settings", lambda settings: {"first_fit": "published"} | _without(settings, "reflect_every")
+    )
 
 
-def _from_5(values: dict[str, Any]) -> dict[str, Any]:
+def _from_5(values: Values) -> Values:
     # Keys of settings and tasks got other names.
-    settings, task = values.get("settings"), values.get("task")
-    if isinstance(settings, dict):
-        values = values | {"settings": rename_keys(settings)}
-    if isinstance(task, dict):
-        values = values | {"task": _rename_task_keys(task)}
-    return values
+    return _change(_change(values, "settings", rename_keys), "task", _rename_task_keys)
 
 
-def _from_6(values: dict[str, Any]) -> dict[str, Any]:
+def _from_6(values: Values) -> Values:
     # No proxy rewards were exact.
-    settings = values.get("settings")
-    if not isinstance(settings, dict) or not isinstance(settings.get("credit"), dict):
-        return values
-    return values | {"settings": settings | {"credit": {"exact": "no"} | settings["credit"]}}
+    return _change(
+        values, "settings", lambda settings: _change(settings, "credit", lambda credit: {"exact": "no"} | credit)
+    )
 
 
-def _rename_task_keys(task: dict[str, Any]) -> dict[str, Any]:
+def _from_7(values: Values) -> Values:
+    # `optimism` was removed: it did not help.
+    return _change(
+        values, "settings", lambda settings: _change(settings, "credit", lambda credit: _without(credit, "optimism"))
+    )
+
+
+def _change(values: Values, name: str, change: Callable[[Values], Values]) -> Values:
+    """Change a group of values. What is no group, in a damaged file, stays."""
+    group = values.get(name)
+    return values | {name: change(group)} if isinstance(group, dict) else values
+
+
+def _without(values: Values, name: str) -> Values:
+    return {key: value for key, value in values.items() if key != name}
+
+
+def _rename_task_keys(task: Values) -> Values:
     task = rename_keys(task)
     teams = task.get("teams")
     if isinstance(teams, list):
@@ -77,11 +79,12 @@ def _rename_task_keys(task: dict[str, Any]) -> dict[str, Any]:
     return task
 
 
-_MIGRATIONS: Mapping[int, Callable[[dict[str, Any]], dict[str, Any]]] = {
-    2: _from_2,
-    3: _from_3,
+_MIGRATIONS: Mapping[int, Callable[[Values], Values]] = {
+    2: lambda values: values,  # only the checkpoint changed
+    3: lambda values: _without(values, "isolation"),  # it said how the process that executed phi was isolated
     4: _from_4,
     5: _from_5,
     6: _from_6,
+    7: _from_7,
 }
 """Functions that convert a format to the next one."""

@@ -5,7 +5,7 @@ from typing import Any
 from lare_rl.algorithms.registry import ALGORITHMS, Algorithm, Consumes
 from lare_rl.config.effective import needs_replay, unused_names
 from lare_rl.config.settings import ResolvedSettings, Settings, round_up
-from lare_rl.config.validity import check_credit
+from lare_rl.config.validity import CreditContext, check_credit
 from lare_rl.credit.decoder_settings import MULTI_AGENT_CREDIT, RECENT_STEPS, CreditSettings
 from lare_rl.credit.methods import find_method
 from lare_rl.data.replay import required_capacity
@@ -31,12 +31,10 @@ def resolve(settings: Settings, task: TaskSpec) -> ResolvedSettings:
     env = load_env_spec(task)
     _check_algorithm(ALGORITHMS[choose_algorithm(settings.algorithm, env)], task, env)
     resolved = fill_in(settings, task, env)
-    method, team_level = find_method(resolved.method), task.credit_scope == "state"
+    team_level = task.credit_scope == "state"
     consumes = ALGORITHMS[resolved.algorithm].consumes
     n_state_features = env.state_size + env.n_agents * env.action_size
-    check_credit(
-        method,
-        resolved.credit,
+    context = CreditContext(
         n_agents=env.n_agents,
         n_raw_features=n_state_features if team_level else env.observation_size + env.action_size,
         scored_observation=resolved.choose_scored_observation(task),
@@ -49,6 +47,7 @@ def resolve(settings: Settings, task: TaskSpec) -> ResolvedSettings:
         rollout_steps=resolved.rollout_steps,
         off_policy=consumes is not Consumes.ROLLOUTS,
     )
+    check_credit(find_method(resolved.method), resolved.credit, context)
     monotonic = getattr(resolved.hyperparameters, "monotonic", None)
     if monotonic != getattr(ALGORITHMS[resolved.algorithm].settings, "monotonic", None):
         raise LareError(

@@ -29,54 +29,53 @@ OPEN: Any = None
 
 class _RunSettings(CheckedModel, Generic[Open]):
     method: str | Open = OPEN
-    """How credit is assigned (see `lare-rl methods`). By default lare-bayes, and lare-rd with qmix and vdn."""
+    """How credit is assigned (`lare-rl methods`). By default lare-bayes; with qmix and vdn lare-rd."""
     algorithm: str | Open = OPEN
-    """The reinforcement learning algorithm (see `lare-rl algorithms`). By default, for a single agent: ppo if actions are discrete,
-    else td3. For many agents: qmix if there are a global state and action masks, else ippo."""
+    """What trains the policy (`lare-rl algorithms`). By default, for one agent, ppo with discrete actions, else td3; for many,
+    qmix with a global state and action masks, else ippo."""
     steps: Count | Open = OPEN
-    """Environment steps of each seed (in one step, all agents act). By default 1,000,000 for a single agent, and about 2,000,000
-    for many."""
+    """Environment steps of each seed; all agents act in one step. By default 1,000,000 for one agent, about 2,000,000 for
+    many."""
     seeds: Count = 1
-    """How many seeds to train, in lockstep in one process."""
+    """Number of seeds, trained in lockstep."""
     seed: Annotated[int, Field(ge=0, le=MAX_SEED)] = 0
-    """The first seed; the others are the numbers after it."""
+    """The first seed; the others follow it."""
     scored_observation: ScoredObservation | None = None
-    """The observations of a step that factors and raw features are computed from: before it, after it, or both. By default, the
-    task decides."""
+    """Overrides the task's key: factors and raw features are computed from the observation before the action, after it, or
+    both."""
     draw: Annotated[int, Field(ge=0)] = 0
-    """Which recorded reply of the language model to take phi from (0 to 4); independent of the seed."""
+    """The recorded reply that phi comes from (0 to 4); independent of the seed."""
     candidates: Count = N_CANDIDATES
-    """How many candidates phi is combined from; with 1, there is no self-prompting. The shipped recordings have 1 and 5."""
+    """Candidates that phi is combined from; with 1, no self-prompting. The shipped recordings have 1 and 5."""
     environments: Count | Open = OPEN
-    """Copies of the environment for each seed. By default 1 on the host, where several copies run in worker processes; in JAX, 82
+    """Copies of the environment for each seed; several on the host run in worker processes. By default 1 on the host; in JAX 82
     for ippo and 8 for qmix."""
     rollout_steps: Count | Open = OPEN
-    """Steps of each copy in an iteration, which collects, stores, fits and updates. By default 50 for algorithms that consume
-    transitions or sequences. For ppo 2000 over all copies, and at least 16, rounded to episodes of the maximum length; for ippo an
-    episode on particle tasks, and on other tasks 2050 over all copies in JAX, 2000 on the host, and at least 16."""
+    """Steps of each copy in an iteration (collect, store, fit, update). By default 50; ppo: 2000 over all copies, rounded to
+    episodes of the maximum length; ippo: an episode on particle tasks, else over all copies 2050 in JAX and 2000 on the host.
+    For ppo and ippo at least 16."""
     fit_every: Count | Open = OPEN
-    """For ppo and ippo, and for every algorithm with diaster, rudder, grd or rbt: iterations between two fits of the decoder. By
-    default 10 for ippo, else 1."""
+    """For ppo and ippo, and for diaster, rudder, grd and rbt: iterations between two fits of the decoder. By default 10 for
+    ippo, else 1."""
     fit_updates: Count | Open = OPEN
-    """For the same algorithms: gradient steps of the decoder in each fit. By default 500 for ppo and 50 for ippo; with diaster, rudder,
-    grd and rbt, one for every 50 environment steps."""
+    """For the same: gradient steps in each fit. By default 500 for ppo and 50 for ippo; for diaster, rudder, grd and rbt, one
+    for every 50 environment steps."""
     first_fit: Literal["held-out", "published"] | None = None
-    """For ippo: how long the decoder's first fit lasts. held-out (the default): until the error on held-out episodes stops falling.
-    published: fit_updates, as in every later fit."""
+    """For ippo: the first fit lasts until the held-out error stops falling (held-out, the default), or for fit_updates
+    (published)."""
     evaluate_every: Count | Open = OPEN
-    """Environment steps between two evaluations; the last step is followed by one, too. A checkpoint is written at each, and after five
-    minutes without one. By default 5000 for td3, ddpg and sac, about 10,000 for qmix, 10 iterations for ippo, and 5 iterations for
-    ppo."""
+    """Environment steps between two evaluations; one also follows the last step. Each writes a checkpoint, as do five minutes
+    without one. By default 5000 for td3, ddpg and sac, about 10,000 for qmix, 10 iterations for ippo, and 5 for ppo."""
     evaluation_episodes: Count | Open = OPEN
-    """Episodes in one evaluation. By default 10; in JAX, 50 for ippo and 32 for qmix."""
+    """Episodes in one evaluation. By default 10; in JAX 50 for ippo and 32 for qmix."""
     capacity: Annotated[int, Field(ge=4)] | Open = OPEN
-    """Rows in the replay of a seed; an episode of T steps takes T + 1. By default 1,000,000; 15,000 of the longest episodes for
+    """Rows in a seed's replay; an episode of T steps takes T + 1. By default 1,000,000; 15,000 of the longest episodes for
     ippo, and 5000 for qmix."""
     scale_rewards: bool = False
-    """Divide the rewards that the algorithm sees by the running root mean square of R/T. It changes nothing for ppo and ippo."""
+    """Divide rewards by the running root mean square of R/T. No effect with ppo and ippo."""
     overlap_collection: bool = False
-    """Collect the next steps on the host while the device updates. It is faster on a card; the policy that collects is then one
-    update older. For algorithms that consume transitions, in an environment on the host."""
+    """Collect the next steps on the host while the device updates: faster on a card, with a policy one update older. For
+    algorithms that consume transitions, in an environment on the host."""
     credit: CreditSettings | Open = OPEN
     """How the decoder is fitted. The algorithm decides each of these settings that is not given."""
 

@@ -23,7 +23,6 @@ sum of two float32 numbers. Call functions that take or return `SufficientStatis
 """
 
 import itertools
-from operator import itemgetter
 from typing import NamedTuple
 
 import equinox as eqx
@@ -36,8 +35,9 @@ from lare_rl.credit import evidence, logistic, relevance
 from lare_rl.credit.basis import Basis, expand, expand_history
 from lare_rl.credit.decoder_network import DecoderOutput, DecoderShape
 from lare_rl.credit.decoder_settings import CreditSettings
-from lare_rl.credit.evidence import Posterior, PosteriorCovariance, SufficientStatistics
+from lare_rl.credit.evidence import SufficientStatistics
 from lare_rl.credit.logistic import LogOddsFit
+from lare_rl.credit.precisions import Posterior
 from lare_rl.credit.score_type import ScoreType
 from lare_rl.nn.leading_axis import map_leading_axis
 from lare_rl.nn.normalise import RunningMeanStd, running_std
@@ -118,24 +118,18 @@ class ClosedForm(NamedTuple):
     """The part of R that neither steps nor levels explain, for each score type; 0 if the bias of the decoder includes it."""
     log_odds: LogOddsFit | None
     """The fit of log odds. Only present if the score may be of this type, which is then the last of the decoder's score types."""
-    covariance: PosteriorCovariance | None
-    """The covariance of each score type, along a leading axis. Only present if rewards are optimistic."""
 
 
-def init(basis: Basis, score_types: tuple[int, ...], *, with_covariance: bool = False) -> ClosedForm:
+def init(basis: Basis, score_types: tuple[int, ...]) -> ClosedForm:
     """Return the state before the first episode."""
     is_binary = ScoreType.LOG_ODDS in score_types
     n_score_types = len(score_types)
     n_features, n_columns, zero = basis.n_features, basis.n_columns, jnp.zeros(())
-    posterior = evidence.init_posterior(n_columns, int(basis.column_group_index.max(initial=-1)) + 1)
-    strengths = evidence.init_posterior(n_columns, int(basis.column_strength_index.max(initial=-1)) + 1)
-    covariance = PosteriorCovariance(
-        root=jnp.zeros((n_columns, n_columns)), centre=jnp.zeros(n_columns), centre_variance=zero
-    )
+    posterior = evidence.init_posterior(basis.column_group_index)
+    strengths = evidence.init_posterior(basis.column_strength_index)
     posterior, strengths = jax.tree.map(
         lambda leaf: jnp.tile(leaf, (n_score_types - is_binary, *[1] * leaf.ndim)), (posterior, strengths)
     )
-    covariance = jax.tree.map(lambda leaf: jnp.tile(leaf, (n_score_types, *[1] * leaf.ndim)), covariance)
     return ClosedForm(
         decoder=LinearDecoder(
             basis=basis,
@@ -151,8 +145,7 @@ def init(basis: Basis, score_types: tuple[int, ...], *, with_covariance: bool = 
         strengths=strengths,
         intercept=jnp.zeros((n_score_types, basis.n_levels)),
         start_value=jnp.zeros(n_score_types),
-        log_odds=logistic.init(n_columns, basis.column_group_index) if is_binary else None,
-        covariance=covariance if with_covariance else None,
+        log_odds=logistic.init(basis.column_group_index) if is_binary else None,
     )
 
 
@@ -230,19 +223,10 @@ def fit(
         level, slope = logistic.to_returns(log_odds)
         weight = jnp.concatenate([weight, slope * log_odds.posterior.weight[None]])
         bias, start_value = jnp.append(bias, 0), jnp.append(start_value, level)
-    state = _set_weights(state, weight[:, :n_features], bias)._replace(
+    return _set_weights(state, weight[:, :n_features], bias)._replace(
         intercept=weight[:, basis.n_columns - basis.n_levels :].astype(jnp.float32),
         start_value=start_value.astype(jnp.float32),
     )
-    if state.covariance is None:
-        return state
-    covariances = [
-        evidence.posterior_covariance(statistics, score_type, strength_index, jax.tree.map(itemgetter(i), best))
-        for i, score_type in enumerate(linear_types)
-    ]
-    if state.log_odds is not None:
-        covariances.append(logistic.covariance(state.log_odds))
-    return state._replace(covariance=jax.tree.map(lambda *leaves: jnp.stack(leaves).astype(jnp.float32), *covariances))
 
 
 def best_posterior(state: ClosedForm) -> Posterior:

@@ -22,38 +22,33 @@ class CreditSettings(CheckedModel):
     learning_rate: Annotated[float, Field(gt=0)] = 3e-4
     """Adam's step size."""
     weight_decay: Annotated[float, Field(ge=0)] = 0.0
-    """The factor by which the weights are added to their gradient."""
+    """The weights times this are added to their gradient."""
     normalise: bool = True
-    """Normalise features and returns by running statistics. The published form does not."""
+    """Normalise features and returns by running statistics."""
     sum_form: bool = False
-    """Fit the return R of an episode (Eq. 6 of the paper), not its mean R/T (the published code for one agent)."""
+    """Fit an episode's return R (Eq. 6 of the paper), not R/T."""
     sampled_steps: Annotated[int, Field(ge=2, validation_alias=AliasChoices("sampled_steps", "drawn_steps"))] = 64
-    """K: the number of steps that RRD and its variants sample from an episode."""
+    """K: steps that RRD and its variants sample from an episode."""
     steps: Annotated[int, Field(ge=2)] = 256
-    """Steps in one update of the decoder: K steps from each of steps / K episodes, or whole episodes with about this many steps in
-    total. On particle tasks, whose episodes all have T = 25 steps: steps / T episodes, even if only K steps of each are sampled."""
+    """Steps in one update: K of each of steps / K episodes, or whole episodes with about this many. On particle tasks (T = 25):
+    steps / T episodes, even if only K steps of each are sampled."""
     episodes: Annotated[int, Field(ge=1)] = 8
-    """diaster, rudder, grd and rbt (single agents): whole episodes in one update of the decoder."""
+    """diaster, rudder, grd and rbt: whole episodes in one update."""
     score: Literal["auto", "sum", "average", "binary"] = "auto"
-    """Whether the score of an episode is a sum over its steps; an average or a grade, which does not grow with the number of steps;
-    or binary: won or lost. `auto`: the task's `score` or, without one, a sum or an average, whichever has predicted returns better
-    so far."""
+    """The score of an episode: a sum over its steps, an average, or binary (won or lost). `auto`: the task's `score` or,
+    without one, whichever of sum and average has predicted returns better."""
     exact: Literal["auto", "no", "last", "spread"] = "auto"
-    """Whether the proxy rewards of an episode are corrected, so that they add up to its return: by adding the difference to the
-    reward of its last step, or by spreading it over its steps. `auto`: `last` for bayes-progress and lare-bayes-progress, else
-    `no`."""
-    optimism: Annotated[float, Field(ge=0)] = 0.0
-    """lare-bayes and other methods in closed form: the algorithm's reward is the proxy reward plus its posterior standard
-    deviation times this factor. Uncertain steps thus look better."""
+    """Make the proxy rewards of an episode add up to its return, by a correction of its last step or of all steps. `auto`:
+    `last` for bayes-progress and lare-bayes-progress, else `no`."""
     encoder: tuple[Annotated[int, Field(ge=1)], ...] = (256, 256)
     """Widths of the hidden layers of VIB's encoder."""
     bottleneck: Annotated[int, Field(ge=1)] = 8
-    """Size of the code in the middle of VIB."""
+    """Size of VIB's code."""
     divergence: Annotated[float, Field(ge=0)] = 5e-3
-    """Weight of the code's divergence relative to the squared error of the mean (with `sum_form`: T^2 times as much)."""
+    """VIB: weight of the code's divergence against the squared error of the mean (with `sum_form`: T^2 times as much)."""
     sparsity: tuple[_Weight, _Weight, _Weight, _Weight, _Weight] = (1e-5, 1e-5, 1e-5, 1e-6, 1e-5)
-    """grd: weights of the sparsity of five groups of causes: those in the state and in the action for the reward; those in the
-    state for its other entries, for the entry itself, and in the action for the next state."""
+    """grd: sparsity weights of the causes of the reward in the state and in the action, and of those of an entry of the next
+    state in the other entries, in itself, and in the action."""
 
 
 MULTI_AGENT_CREDIT = CreditSettings(

@@ -25,16 +25,16 @@ import jax.numpy as jnp
 import optax
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
-from lare_rl.credit import closed_form, evidence
-from lare_rl.credit.basis import Basis
+from lare_rl.credit import closed_form
 from lare_rl.credit.closed_form import ClosedForm, LinearDecoder
 from lare_rl.credit.decoder_network import DecoderNetwork, DecoderOutput, DecoderShape
 from lare_rl.credit.decoder_settings import CreditSettings
 from lare_rl.credit.decoders import DECODERS
 from lare_rl.credit.levels import LevelMeans, add_returns, empty_level_means, level_offsets
 from lare_rl.credit.methods import Method
-from lare_rl.credit.prequential import WINDOW, Predictions, empty_predictions
+from lare_rl.credit.prequential import Predictions, empty_predictions
 from lare_rl.credit.score_type import ScoreType
+from lare_rl.credit.spec import CreditSpec
 from lare_rl.errors import LareError, short_repr
 from lare_rl.nn.networks import init_adam
 from lare_rl.nn.normalise import (
@@ -57,13 +57,11 @@ __all__ = [
     "decoder_rewards",
     "init",
     "is_normalised",
-    "is_optimistic",
     "level_effects",
     "level_returns",
     "normalise_inputs",
     "observe_returns",
     "observe_steps",
-    "optimistic_rewards",
     "reward_unit",
     "score_type_index",
     "step_rows",
@@ -129,31 +127,10 @@ class DecoderState(NamedTuple):
     """Predictions of returns by closed-form fits of all score types. Present if the score type must be determined."""
 
 
-def init(
-    key: PRNGKeyArray,
-    basis: Basis | int,
-    method: Method,
-    settings: CreditSettings,
-    max_steps: int,
-    n_agents: int,
-    score_types: tuple[int, ...] = (ScoreType.SUM,),
-    window: int = WINDOW,
-    inputs: tuple[tuple[str, int], ...] = (),
-) -> DecoderState:
-    """Return the state with an untrained decoder. All other functions need the same `settings` and `score_types`.
-
-    Args:
-        key: the random key of the weights.
-        basis: the features that a decoder in closed form computes, or the number of inputs, which are used unchanged.
-        settings: the settings of the decoder and its fit.
-        max_steps: the number of steps of the longest episode.
-        n_agents: the number of agents of a step.
-        score_types: the types that the score may have.
-        window: the number of last returns over which predictions of them are assessed.
-        inputs: the name and the size of each input. Only for decoders that tell their inputs apart.
-    """
-    basis = Basis(n_factors=0, n_raw=basis, extended=False) if isinstance(basis, int) else basis
-    shape = DecoderShape(basis, max_steps, n_agents, inputs)
+def init(key: PRNGKeyArray, spec: CreditSpec) -> DecoderState:
+    """Return the state with an untrained decoder. All other functions need the same settings and score types."""
+    method, settings, basis = spec.method, spec.settings, spec.basis
+    shape = DecoderShape(basis, spec.max_steps, spec.agents, spec.input_sizes)
     network = DECODERS[method.decoder].init_network(key, shape, settings)
     for leaf in jax.tree.leaves(network):
         if not eqx.is_array_like(leaf):
@@ -163,22 +140,20 @@ def init(
             )
     if not type(network).__module__.startswith("lare_rl."):
         _check_output(network, shape, method)
-    several = len(score_types) > 1
-    closed = None
-    if several or not method.uses_gradient:
-        closed = closed_form.init(basis, score_types, with_covariance=is_optimistic(method, settings))
+    several = len(spec.score_types) > 1
+    closed = closed_form.init(basis, spec.score_types) if several or not method.uses_gradient else None
     return DecoderState(
         network=network,
         optimizer=init_adam(network, settings.learning_rate) if method.uses_gradient else (),
         statistics=empty_mean_std(basis.n_standardised),
         scale=empty_scale(),
         return_scale=empty_scale(),
-        is_average=jnp.asarray(score_types == (ScoreType.AVERAGE,)),
+        is_average=jnp.asarray(spec.score_types == (ScoreType.AVERAGE,)),
         is_log_odds=jnp.asarray(False),
-        predictions=empty_predictions(1, window),
+        predictions=empty_predictions(1, spec.window),
         closed_form=closed,
         levels=empty_level_means(basis.n_levels) if basis.n_levels and method.uses_gradient else None,
-        score_type_predictions=empty_predictions(len(score_types), window) if several else None,
+        score_type_predictions=empty_predictions(len(spec.score_types), spec.window) if several else None,
     )
 
 
@@ -193,11 +168,6 @@ def _check_output(network: DecoderNetwork, shape: DecoderShape, method: Method) 
                 f"the decoder {method.decoder!r} must return DecoderOutput(r_hat, penalty), both of the shape {rows.shape[:-1]} for "
                 f"inputs of the shape {rows.shape}: it returned {short_repr(output)}"
             )
-
-
-def is_optimistic(method: Method, settings: CreditSettings) -> bool:
-    """Return whether uncertain steps get higher rewards."""
-    return settings.optimism > 0 and "optimism" in method.settings
 
 
 def score_type_index(state: DecoderState, n_score_types: int) -> Int[Array, ""] | int:
@@ -308,37 +278,7 @@ def decoder_rewards(
     `length` is T, the number of steps of each row's episode. Without it, the score is treated as a sum.
     """
     output = decode(state.network, state, inputs, settings).r_hat
-    return _per_step(reward_unit(state, settings) * output, state, length)
-
-
-def optimistic_rewards(
-    state: DecoderState,
-    inputs: Float[Array, "rows *agents inputs"],
-    settings: CreditSettings,
-    length: Float[Array, " rows"] | Int[Array, " rows"] | None = None,
-) -> Float[Array, "rows *agents"]:
-    """Return r_hat + c sigma: optimism in the face of uncertainty (OFUL: Abbasi-Yadkori, Pal and Szepesvari, NeurIPS 2011).
-
-    sigma is the posterior standard deviation of r_hat, and c is `settings.optimism`. These rewards no longer add up to the return:
-    they are too high for uncertain steps, on purpose. The decoder must be in closed form, and `init` must have had the same
-    optimism.
-    """
-    r_hat = decoder_rewards(state, inputs, settings, length)
-    assert state.closed_form is not None
-    assert state.closed_form.covariance is not None
-    assert isinstance(state.network, LinearDecoder)
-    index = score_type_index(state, len(state.closed_form.covariance.centre_variance))
-    covariance = jax.tree.map(lambda leaf: leaf[index], state.closed_form.covariance)
-    std = evidence.posterior_std(covariance, state.network.features(inputs))
-    return r_hat + settings.optimism * _per_step(std, state, length)
-
-
-def _per_step(
-    output: Float[Array, "rows *agents"],
-    state: DecoderState,
-    length: Float[Array, " rows"] | Int[Array, " rows"] | None,
-) -> Float[Array, "rows *agents"]:
-    """Return the decoder's output for each step as a part of R: divided by T if the score is a mean."""
+    output = reward_unit(state, settings) * output
     if length is None:
         return output
     divisor = jnp.where(state.is_average, length, 1).astype(jnp.float32)

@@ -112,7 +112,7 @@ def _decoder_loss(
     """Return the decoder's `loss` on whole episodes, which are padded to the same length."""
     target = _targets(state, episodes, settings)
     inputs = normalise_inputs(state, episodes.inputs, settings)
-    inputs = inputs.reshape(len(target), -1, inputs.shape[-1])  # the axis of the single agent is merged
+    inputs = inputs.reshape(len(target), -1, inputs.shape[-1])  # without the axis of the single agent
     return network.loss(inputs, episodes.length, target, episodes.mask, key)
 
 

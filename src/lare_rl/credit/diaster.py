@@ -13,12 +13,12 @@ the steps of a piece, with an initial state of zeros.
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
+from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
 from lare_rl.credit.decoder_network import DecoderOutput, DecoderShape
 from lare_rl.credit.decoder_settings import CreditSettings
-from lare_rl.credit.losses import batch_mean
-from lare_rl.credit.step_targets import step_loss
+from lare_rl.credit.losses import PerEpisode, batch_mean
+from lare_rl.credit.step_targets import EpisodeInputs, EpisodeLengths, step_loss
 from lare_rl.nn.networks import GRU, MLP, Linear
 
 __all__ = ["Diaster"]
@@ -44,7 +44,7 @@ class Diaster(eqx.Module):
         return DecoderOutput(self.step_model(inputs)[..., 0], jnp.zeros(inputs.shape[:-1]))
 
     def piece_rewards(
-        self, inputs: Float[Array, "episodes steps inputs"], begins: Bool[Array, "episodes steps"]
+        self, inputs: EpisodeInputs, begins: Bool[Array, "episodes steps"]
     ) -> Float[Array, "episodes steps"]:
         """Return F of the piece that ends with each step. Pieces begin at the first step, and where `begins` is true."""
 
@@ -58,12 +58,7 @@ class Diaster(eqx.Module):
         return jax.lax.scan(body, h, (projected, begins.T))[1].T
 
     def loss(
-        self,
-        inputs: Float[Array, "episodes steps inputs"],
-        length: Int[Array, " episodes"],
-        target: Float[Array, " episodes"],
-        mask: Float[Array, " episodes"],
-        key: PRNGKeyArray,
+        self, inputs: EpisodeInputs, length: EpisodeLengths, target: PerEpisode, mask: PerEpisode, key: PRNGKeyArray
     ) -> Float[Array, ""]:
         """Return the sum of both losses, as the mean over the episodes where `mask` is 1.
 

@@ -1,11 +1,11 @@
 """The rewards that credit assignment pays for steps: one engine for the trainer, `CreditAssigner`, logs and explanations.
 
-A `CreditSpec` says what is fitted to what. With a decoder (`decomposition.py`) and the scale of R/T, the functions here turn steps
-into the rewards that an algorithm is trained on:
+A `CreditSpec` (`spec.py`) says what is fitted to what. With a decoder (`decomposition.py`) and the scale of R/T, the functions here turn
+steps into the rewards that an algorithm is trained on:
 
     proxy reward       r_hat of each agent, by the method
-    training reward    + optimism,  averaged over the agents if the method shares credit,  0 for agents that are not alive,
-                       divided by the scale of R/T if that is asked for
+    training reward    averaged over the agents if the method shares credit,  0 for agents that are not alive,  divided by the
+                       scale of R/T if that is asked for
 
 With `exact`, what the proxy rewards of an episode lack to its return, R - sum_t r_hat_t, is added to them: to that of the last step
 (RUDDER: Arjona-Medina et al., 2019), or divided among all steps. They then add up to the return whatever the decoder's error is.
@@ -14,9 +14,6 @@ TAR2 pays shares of the return instead (`shares.py`), which add up to it, too.
 Batches have an axis of agents, of length 1 for a single agent. For credit to whole teams it has length 1 too.
 """
 
-from collections.abc import Mapping
-from dataclasses import dataclass
-from functools import cached_property
 from typing import Any, NamedTuple
 
 import jax.numpy as jnp
@@ -25,28 +22,22 @@ from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 from lare_rl.credit import closed_form, decomposition
 from lare_rl.credit.basis import Basis
 from lare_rl.credit.closed_form import ClosedForm
-from lare_rl.credit.decoder_settings import CreditSettings
 from lare_rl.credit.decomposition import CreditBatch, DecoderState
 from lare_rl.credit.explanation import Explanation, StepStatistics, add_steps, empty_step_statistics, explain
-from lare_rl.credit.explanation_text import raw_feature_names
-from lare_rl.credit.input_names import input_size, input_sizes, tracked_size
-from lare_rl.credit.methods import Fit, Method, Reward
-from lare_rl.credit.prequential import WINDOW
+from lare_rl.credit.methods import Reward
 from lare_rl.credit.returns import add_to_sums
-from lare_rl.credit.score_type import ScoreType, score_types_to_fit
+from lare_rl.credit.score_type import ScoreType
 from lare_rl.credit.shares import return_shares
+from lare_rl.credit.spec import CreditSpec
 from lare_rl.envs.interface import alive_mean
 from lare_rl.nn.normalise import RunningMeanStd, Scale, min_max_scale, root_mean_square
-from lare_rl.tasks.spec import ScoredObservation
 
 __all__ = [
-    "CreditSpec",
     "ExplanationState",
     "RewardSource",
     "StepBatch",
     "add_to_explanation",
     "correction",
-    "credit_spec",
     "explain_returns",
     "init_decoder",
     "init_explanation",
@@ -57,112 +48,9 @@ __all__ = [
 ]
 
 
-@dataclass(frozen=True)
-class CreditSpec:
-    """What is fitted to what: the static part of credit assignment for one team."""
-
-    method: Method
-    settings: CreditSettings
-    inputs: tuple[str, ...]
-    """The names of the decoder's inputs (`input_names.py`)."""
-    sizes: tuple[tuple[str, int], ...]
-    """The sizes of `factors`, `observation` and `action`."""
-    score_types: tuple[int, ...]
-    """The score types that are fitted."""
-    max_steps: int
-    agents: int
-    """The number of proxy rewards of a step."""
-    window: int = WINDOW
-    """The number of last returns over which predictions of them are assessed."""
-    n_levels: int = 0
-    """The number of levels that episodes may belong to."""
-    scale_rewards: bool = False
-    """Whether training rewards are divided by the running root mean square of R/T."""
-
-    @cached_property
-    def basis(self) -> Basis:
-        """The features that a closed-form decoder computes from a row of inputs."""
-        sizes = dict(self.sizes)
-        n_factors = sizes["factors"] if "factors" in self.inputs else 0
-        n_raw = input_size(tuple(name for name in self.inputs if name not in ("factors", "history")), sizes)
-        n_tracked = tracked_size(self.inputs, sizes)
-        n_levels = 0 if self.method.fit is Fit.SIGNS else self.n_levels
-        return Basis(
-            n_factors,
-            n_raw,
-            extended=self.method.extended_basis,
-            n_tracked=n_tracked,
-            n_levels=n_levels,
-            prefixes=self.method.fit is Fit.PREFIX_EVIDENCE,
-        )
-
-    def raw_feature_names(self, observation: str, action: str) -> list[str]:
-        """Return names of the raw features, from a task's texts; none if they are not entries of observations and actions."""
-        if not self.basis.n_raw_used or "observation_change" in self.inputs:
-            return []
-        sizes = dict(input_sizes(self.inputs, dict(self.sizes)))
-        raw = {name: size for name, size in sizes.items() if name not in ("factors", "history")}
-        return raw_feature_names(observation, action, raw)
-
-
-def credit_spec(
-    method: Method,
-    settings: CreditSettings,
-    sizes: Mapping[str, int],
-    *,
-    scored_observation: ScoredObservation,
-    single_agent: bool,
-    agents: int,
-    max_steps: int,
-    fixed_length: bool,
-    scale_rewards: bool,
-    window: int = WINDOW,
-    n_levels: int = 0,
-) -> CreditSpec:
-    """Return the spec of a method for one team. The arguments that a spec has too are described there.
-
-    Args:
-        sizes: the sizes of `factors`, `observation` (the state, for credit to whole teams) and `action`.
-        scored_observation: which observations the task names.
-        single_agent: whether the task has a single agent.
-        agents: the number of proxy rewards of a step.
-        max_steps: the number of steps of the longest episode.
-        fixed_length: whether all episodes have the same length. A sum and a mean are then the same.
-        scale_rewards: whether training rewards are divided by the scale of R/T.
-    """
-    inputs = method.inputs.resolve(scored_observation, single_agent=single_agent) if method.inputs is not None else ()
-    score_types = (ScoreType.SUM,)
-    if "score" in method.settings:
-        score_types = score_types_to_fit(settings.score, fixed_length, allow_log_odds=not method.uses_gradient)
-    return CreditSpec(
-        method=method,
-        settings=settings,
-        inputs=inputs,
-        sizes=tuple(sizes.items()),
-        score_types=score_types,
-        max_steps=max_steps,
-        agents=agents,
-        window=window,
-        n_levels=n_levels,
-        scale_rewards=scale_rewards,
-    )
-
-
 def init_decoder(key: PRNGKeyArray, spec: CreditSpec) -> DecoderState | None:
     """Return an untrained decoder. Return None for a method that fits nothing."""
-    if spec.method.reward is not Reward.PROXY:
-        return None
-    return decomposition.init(
-        key,
-        spec.basis,
-        spec.method,
-        spec.settings,
-        max_steps=spec.max_steps,
-        n_agents=spec.agents,
-        score_types=spec.score_types,
-        window=spec.window,
-        inputs=input_sizes(spec.inputs, dict(spec.sizes)),
-    )
+    return decomposition.init(key, spec) if spec.method.reward is Reward.PROXY else None
 
 
 class StepBatch(NamedTuple):
@@ -193,13 +81,8 @@ def return_scale(source: RewardSource) -> Scale:
     return source.scale if isinstance(source, DecoderState) else source
 
 
-def proxy_rewards(
-    source: RewardSource, steps: StepBatch, spec: CreditSpec, *, optimistic: bool = False
-) -> Float[Array, "*batch agents"]:
-    """Return r_hat of each agent, in the unit of the true rewards if the method's rewards have one.
-
-    If `optimistic`, the optimism that the settings ask for is added.
-    """
+def proxy_rewards(source: RewardSource, steps: StepBatch, spec: CreditSpec) -> Float[Array, "*batch agents"]:
+    """Return r_hat of each agent, in the unit of the true rewards if the method's rewards have one."""
     match spec.method.reward:
         case Reward.DESIGNED:
             return steps.inputs[..., 0]
@@ -209,9 +92,7 @@ def proxy_rewards(
             return jnp.broadcast_to(share[..., None], steps.inputs.shape[:-1])
     assert isinstance(source, DecoderState)
     rows = steps.inputs.reshape(-1, *steps.inputs.shape[-2:])
-    with_optimism = optimistic and decomposition.is_optimistic(spec.method, spec.settings)
-    compute = decomposition.optimistic_rewards if with_optimism else decomposition.decoder_rewards
-    r_hat = compute(source, rows, spec.settings, steps.length.ravel())
+    r_hat = decomposition.decoder_rewards(source, rows, spec.settings, steps.length.ravel())
     r_hat = r_hat.reshape(steps.inputs.shape[:-1])
     return _pay_shares(r_hat, steps, spec.max_steps) if spec.method.pays_shares else r_hat
 
@@ -233,7 +114,7 @@ def training_rewards(
     source: RewardSource, steps: StepBatch, spec: CreditSpec, alive: Bool[Array, "*batch team"]
 ) -> Float[Array, "*batch team"]:
     """Return the rewards that an algorithm is trained on, for each agent of the team. `alive` says which agents acted."""
-    r_hat = jnp.broadcast_to(proxy_rewards(source, steps, spec, optimistic=True), alive.shape)
+    r_hat = jnp.broadcast_to(proxy_rewards(source, steps, spec), alive.shape)
     if steps.residual is not None:
         r_hat = r_hat + correction(steps.residual, steps.last, steps.length, spec.settings.exact)[..., None]
     if spec.method.shared:

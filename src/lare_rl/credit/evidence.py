@@ -33,7 +33,6 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jax.scipy.linalg import solve_triangular
 from jaxtyping import Array, Bool, Float, Int
 
@@ -41,6 +40,7 @@ from lare_rl.credit.precisions import (
     JITTER,
     TOLERANCE,
     Backend,
+    FeatureIndex,
     Posterior,
     Regression,
     clip_precisions,
@@ -56,9 +56,7 @@ from lare_rl.nn.normalise import merge_means
 
 __all__ = [
     "JAX",
-    "Posterior",
     "PosteriorCovariance",
-    "Regression",
     "SufficientStatistics",
     "add_episodes",
     "add_prefixes",
@@ -81,9 +79,7 @@ MANY_EPISODES_PER_FEATURE = 2
 """With more episodes than this for each feature, and an earlier fit, the second and third iterations have one round each."""
 
 
-def _add_groups(
-    values: Float[Array, " features"], group_index: Int[np.ndarray, " features"], n_groups: int
-) -> Float[Array, " groups"]:
+def _add_groups(values: Float[Array, " features"], group_index: FeatureIndex, n_groups: int) -> Float[Array, " groups"]:
     return jnp.zeros(n_groups).at[group_index].add(values)
 
 
@@ -157,15 +153,17 @@ def _add_cases(
     )
 
 
-def init_posterior(n_features: int, n_groups: int) -> Posterior:
+def init_posterior(group_index: FeatureIndex) -> Posterior:
     """Return the posterior before the first episode. Its precisions are 0, which means that they have no value yet."""
     zero = jnp.zeros(())
-    groups = jnp.zeros(n_groups)
-    return Posterior(jnp.zeros(n_features), bias=zero, alpha=groups, beta=zero, n_determined=groups, log_evidence=zero)
+    groups = jnp.zeros(int(group_index.max(initial=-1)) + 1)
+    return Posterior(
+        jnp.zeros(len(group_index)), bias=zero, alpha=groups, beta=zero, n_determined=groups, log_evidence=zero
+    )
 
 
 def regression(
-    statistics: SufficientStatistics, score_type: Int[Array, ""] | int, group_index: Int[np.ndarray, " features"]
+    statistics: SufficientStatistics, score_type: Int[Array, ""] | int, group_index: FeatureIndex
 ) -> Regression:
     """Return the regression of R/T for a score that is a sum, or of R for a score that is a mean."""
     n_features = len(group_index)
@@ -193,7 +191,7 @@ def regression(
 def fit(
     statistics: SufficientStatistics,
     score_type: Int[Array, ""] | int,
-    group_index: Int[np.ndarray, " features"],
+    group_index: FeatureIndex,
     start: Posterior,
     max_rounds: int | Int[Array, ""],
     *,
@@ -291,10 +289,7 @@ class PosteriorCovariance(NamedTuple):
 
 
 def posterior_covariance(
-    statistics: SufficientStatistics,
-    score_type: Int[Array, ""] | int,
-    group_index: Int[np.ndarray, " features"],
-    posterior: Posterior,
+    statistics: SufficientStatistics, score_type: Int[Array, ""] | int, group_index: FeatureIndex, posterior: Posterior
 ) -> PosteriorCovariance:
     """Return the covariance of a posterior. It is 0 as long as all returns are equal.
 

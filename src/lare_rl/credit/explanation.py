@@ -33,7 +33,8 @@ from jaxtyping import Array, Bool, Float, Int
 
 from lare_rl.credit import evidence, relevance
 from lare_rl.credit.basis import N_FREQUENCIES, Basis
-from lare_rl.credit.evidence import Posterior, Regression, SufficientStatistics
+from lare_rl.credit.evidence import SufficientStatistics
+from lare_rl.credit.precisions import FeatureIndex, Posterior, Regression
 from lare_rl.credit.score_type import ScoreType
 
 __all__ = ["Explanation", "StepStatistics", "add_steps", "empty_step_statistics", "explain"]
@@ -173,16 +174,16 @@ class _Fit(NamedTuple):
 def _fit(
     statistics: SufficientStatistics,
     score_type: Int[Array, ""] | int,
-    group_index: Int[np.ndarray, " features"],
-    strength_index: Int[np.ndarray, " features"],
+    group_index: FeatureIndex,
+    strength_index: FeatureIndex,
 ) -> _Fit:
     problem = evidence.regression(statistics, score_type, group_index)
-    start = evidence.init_posterior(len(group_index), int(group_index.max()) + 1)
+    start = evidence.init_posterior(group_index)
     posterior = evidence.fit(statistics, score_type, group_index, start, MAX_EXPLANATION_ROUNDS)
     has_own_strengths = jnp.array(False)
     if not np.array_equal(group_index, strength_index):
         groups, indices = posterior, (group_index, strength_index)
-        start = evidence.init_posterior(len(strength_index), int(strength_index.max()) + 1)
+        start = evidence.init_posterior(strength_index)
         separate = relevance.fit_strengths(statistics, score_type, *indices, groups, start, MAX_EXPLANATION_ROUNDS)
         has_own_strengths = relevance.is_better(separate, groups)
         posterior = relevance.select(separate, groups, *indices)

@@ -8,10 +8,10 @@ import numpy as np
 from lare_rl.credit.explanation import Explanation
 from lare_rl.credit.score_type import ScoreType, ScoreTypeEstimate
 from lare_rl.tasks.spec import base_name, entry_meanings
-from lare_rl.util.findings import Finding, render
+from lare_rl.util.findings import Finding
 from lare_rl.util.statistics import round_shares
 
-__all__ = ["MESSAGES", "MIN_EXPLAINED_EPISODES", "explanation_findings", "explanation_lines", "raw_feature_names"]
+__all__ = ["MESSAGES", "MIN_EXPLAINED_EPISODES", "explanation_findings", "raw_feature_names"]
 
 MIN_EXPLAINED_EPISODES = 20
 """With fewer episodes, nothing is said."""
@@ -39,17 +39,17 @@ N_GROUPS = 8
 """The number of groups of episodes that are named."""
 
 _SET_SCORE_TYPE = (
-    'This may change. If you know which of them it is, set it: `score = "sum"` or `score = "average"` in the task file, '
+    'This may change. If you know which it is, set it: `score = "sum"` or `score = "average"` in the task file, '
     "`--credit.score`, or `CreditSettings(score=...)`."
 )
 
 MESSAGES = {
     "equal_returns": (
-        "There is nothing to explain: in all episodes the return is the same or, if the score is a sum, the mean reward of a step is "
-        "the same."
+        "There is nothing to explain: all episodes have the same return or, if the score is a sum, the same mean reward of a "
+        "step."
     ),
     "score_type_is_certain": (
-        "The score is treated as {this} over the steps of an episode: so far, this predicts returns better than {other}. "
+        "The score is treated as {this} over the steps of an episode, which so far predicts returns better than {other}. "
         f"{_SET_SCORE_TYPE}"
     ),
     "score_type_is_uncertain": (
@@ -57,16 +57,16 @@ MESSAGES = {
         f"{_SET_SCORE_TYPE}"
     ),
     "score_is_log_odds": (
-        "Steps are paid for what they add to the log odds of the higher score: so far, this predicts returns better than a sum. The "
-        "shares and effects below are those of a sum."
+        "Steps are paid for what they add to the log odds of the higher score, which so far predicts returns better than a sum. "
+        "The shares and effects below are those of a sum."
     ),
     "score_is_not_log_odds": (
-        "The score is treated as {this} over the steps of an episode: so far, this predicts returns at least as well as what steps "
-        "add to the log odds of the higher score. This may change."
+        "The score is treated as {this} over the steps of an episode, which so far predicts returns at least as well as the log "
+        "odds of the higher score. This may change."
     ),
     "looks_binary": (
-        "The last returns have only two values. If the score is won or lost, the odds often predict it better than a sum: set "
-        '`score = "binary"` in the task file, `--credit.score`, or `CreditSettings(score=...)`.'
+        'The last returns have only two values. If the score is won or lost, set it: `score = "binary"` in the task file, '
+        "`--credit.score`, or `CreditSettings(score=...)`."
     ),
     "groups_differ": "Beside what its steps earn, an episode returns: {groups}{more}. No step is paid for this.",
     "group_effect": "{value:+.3g} in group {name}",
@@ -80,13 +80,13 @@ MESSAGES = {
     "factors_explain": "The factors explain {share:.0%} of the variation of {target}{raw}.",
     "raw_features_add": ", raw entries another {share:.0%}",
     "phi_explains_little": (
-        "Warning: phi explains next to nothing of the score. Its factors are not what the score is made of, or the episodes are too "
-        "few or too much alike to show it."
+        "Warning: phi explains next to nothing of the score. Its factors miss the score, or the episodes are too few or too "
+        "much alike."
     ),
     "about_factors": (
-        "For each factor: its share of the variation (0%: it does not matter, or its mean hardly differed between episodes; below "
-        "0%: it offsets others), and its effect: by how much a step's reward rises with one standard deviation of it. A factor with "
-        "a share of 0% may still tell steps apart:"
+        "For each factor: its share of the variation (0%: it does not matter, or its mean hardly differed between episodes, and "
+        "it may still tell steps apart; below 0%: it offsets others), and by how much a step's reward rises with one standard "
+        "deviation of it:"
     ),
     "unknown_factor": "- {name}: {effect}",
     "factor": "- {name}: {share:z.0%}, {effect}{states}{shape}",
@@ -105,9 +105,7 @@ MESSAGES = {
         "In a fit on factors and raw entries, these entries have the largest shares: {features}. phi may lack a factor that is "
         "computed from them."
     ),
-    "unused_raw_features": (
-        "{n_unused} of {n_raw} raw entries are switched off, because they explain nothing beside the others: {names}{more}."
-    ),
+    "unused_raw_features": "{n_unused} of {n_raw} raw entries are switched off, because they explain nothing more: {names}{more}.",
     "more_names": " and {count} more",
     "high_when_large": (
         "Returns are higher than the factors predict when {name} is large (correlation {correlation:+.2f}): a factor may be missing"
@@ -141,22 +139,6 @@ def raw_feature_names(observation: str, action: str, sizes: Mapping[str, int]) -
     kinds = {"observation": before, "next_observation": after, "action": "action"}
     texts = {"observation": observation, "next_observation": observation, "action": action}
     return [entry for name, size in sizes.items() for entry in names(texts[name], size, kinds[name])]
-
-
-def explanation_lines(
-    explanation: Explanation,
-    score_type: ScoreTypeEstimate | None,
-    factors: Sequence[str],
-    raw_features: Sequence[str],
-    *,
-    looks_binary: bool = False,
-    groups: Mapping[Any, float] | None = None,
-) -> list[str]:
-    """Return the sentences of `explanation_findings`."""
-    findings = explanation_findings(
-        explanation, score_type, factors, raw_features, looks_binary=looks_binary, groups=groups
-    )
-    return [render(finding, MESSAGES) for finding in findings]
 
 
 def explanation_findings(

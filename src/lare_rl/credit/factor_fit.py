@@ -21,8 +21,9 @@ from jaxtyping import Array, Bool, Float, Int
 from lare_rl.credit import evidence
 from lare_rl.credit.basis import Basis
 from lare_rl.credit.closed_form import FIT_GROWTH, MAX_EVIDENCE_ROUNDS, LinearDecoder
-from lare_rl.credit.evidence import Posterior, SufficientStatistics
+from lare_rl.credit.evidence import SufficientStatistics
 from lare_rl.credit.explanation import Explanation, StepStatistics, add_steps, empty_step_statistics, explain
+from lare_rl.credit.precisions import Posterior
 from lare_rl.credit.score_type import (
     MAX_ERROR_RATIO,
     ROUNDING,
@@ -134,8 +135,7 @@ def predict_returns(
     `features` are the means of each episode. Only functions of factors are used.
     """
     features, group_index = features[:, basis.is_factor_feature], basis.group_index[basis.is_factor_feature]
-    n_features, n_groups = len(group_index), int(group_index.max()) + 1
-    state = evidence.empty_statistics(n_features), evidence.init_posterior(n_features, n_groups)
+    state = evidence.empty_statistics(len(group_index)), evidence.init_posterior(group_index)
     statistics, posterior = jax.tree.map(lambda leaf: leaf.astype(float), state)
     blocks = list(_growing_blocks(len(returns)))
     max_size = max((end - start for start, end in blocks), default=1)

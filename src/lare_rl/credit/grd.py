@@ -25,21 +25,19 @@ choose the entries that the policy sees, which is not done here.
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
+from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
 from lare_rl.credit.decoder_network import DecoderOutput, DecoderShape
 from lare_rl.credit.decoder_settings import CreditSettings
-from lare_rl.credit.losses import batch_mean
-from lare_rl.credit.step_targets import is_step
-from lare_rl.nn.networks import MLP, smooth_clip
+from lare_rl.credit.losses import PerEpisode, batch_mean
+from lare_rl.credit.step_targets import EpisodeInputs, EpisodeLengths, is_step
+from lare_rl.nn.networks import MLP, bound_log_std
 
 __all__ = ["GRD", "causes", "sample_mask"]
 
 TEMPERATURE = 0.01
 COMPONENTS = 3
 """The number of Gaussians in the mixture of a next state's entry."""
-MAX_LOG_STD = 5.0
-"""The deviation of a Gaussian is between exp(-5) and exp(5), so that no likelihood is infinite."""
 DYNAMICS_STEPS = 256
 """The number of steps, drawn from an update's episodes, whose next states are predicted."""
 REWARD_THRESHOLD, DYNAMICS_THRESHOLD = 1e-4, 0.5
@@ -120,18 +118,13 @@ class GRD(eqx.Module):
         state, action, next_state = self._split(inputs)
         masked = [mask.T[:, None] * x for mask, x in ((state_mask, state), (action_mask, action))]
         log_weight, mean, log_std = jnp.split(self.dynamics(jnp.concatenate(masked, axis=-1)), 3, axis=-1)
-        log_std = smooth_clip(log_std, MAX_LOG_STD)
+        log_std = bound_log_std(log_std)
         error = (next_state.T[..., None] - mean) * jnp.exp(-log_std)
         log_density = -0.5 * error**2 - log_std - 0.5 * jnp.log(2 * jnp.pi)
         return jax.nn.logsumexp(jax.nn.log_softmax(log_weight) + log_density, axis=-1)
 
     def loss(
-        self,
-        inputs: Float[Array, "episodes steps inputs"],
-        length: Int[Array, " episodes"],
-        target: Float[Array, " episodes"],
-        mask: Float[Array, " episodes"],
-        key: PRNGKeyArray,
+        self, inputs: EpisodeInputs, length: EpisodeLengths, target: PerEpisode, mask: PerEpisode, key: PRNGKeyArray
     ) -> Float[Array, ""]:
         """Return the loss. The arguments are those of `Diaster.loss`. `key` is also for the steps whose next states are predicted."""
         keys = jax.random.split(key, 5)

@@ -19,27 +19,9 @@ from typing import Any
 from lare_rl.errors import LareError
 from lare_rl.tasks.spec import ScoredObservation, select_states
 
-__all__ = [
-    "FACTORS",
-    "FACTORS_AND_SCORED",
-    "FACTORS_SCORED_AND_HISTORY",
-    "NEXT_OBSERVATION_ACTION",
-    "OBSERVATION_ACTION",
-    "RAW",
-    "SCORED",
-    "SCORED_AND_HISTORY",
-    "TRANSITION",
-    "InputNames",
-    "input_arrays",
-    "input_size",
-    "input_sizes",
-    "tracked_size",
-]
+__all__ = ["InputNames", "input_arrays", "input_size", "input_sizes", "tracked_size"]
 
-_NAMES = (
-    *("factors", "observation", "action", "next_observation", "observation_change", "scored_observation"),
-    "history",
-)
+_NAMES = "factors", "observation", "action", "next_observation", "observation_change", "scored_observation", "history"
 
 
 @dataclass(frozen=True)
@@ -84,18 +66,6 @@ class InputNames:
     def depends_on_scored_observation(self) -> bool:
         """Whether the raw features depend on which observations the task's `scored_observation` names."""
         return "scored_observation" in self.names
-
-
-RAW = InputNames(("observation", "action", "observation_change"), ("next_observation",))
-"""As published for RD and RRD."""
-OBSERVATION_ACTION = InputNames(("observation", "action"))
-TRANSITION = InputNames(("observation", "action", "next_observation"))
-NEXT_OBSERVATION_ACTION = InputNames(("next_observation", "action"))
-SCORED = InputNames(("scored_observation", "action"))
-FACTORS = InputNames(("factors",))
-FACTORS_AND_SCORED = InputNames(("factors", "scored_observation", "action"))
-SCORED_AND_HISTORY = InputNames(("scored_observation", "action", "history"))
-FACTORS_SCORED_AND_HISTORY = InputNames(("factors", "scored_observation", "action", "history"))
 
 
 def input_sizes(inputs: tuple[str, ...], sizes: Mapping[str, int]) -> tuple[tuple[str, int], ...]:

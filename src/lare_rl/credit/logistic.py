@@ -64,11 +64,11 @@ class LogOddsFit(NamedTuple):
     """root^T root = Sigma, the covariance of the weights."""
 
 
-def init(n_columns: int, group_index: Int[np.ndarray, " columns"]) -> LogOddsFit:
+def init(group_index: Int[np.ndarray, " columns"]) -> LogOddsFit:
     """Return the state without episodes."""
-    posterior = evidence.init_posterior(n_columns, int(group_index.max()) + 1)
+    n_columns = len(group_index)
     empty = jnp.zeros((WINDOW, n_columns)), jnp.zeros(WINDOW), jnp.zeros(())
-    return LogOddsFit(*empty, posterior, root=jnp.zeros((n_columns, n_columns)))
+    return LogOddsFit(*empty, evidence.init_posterior(group_index), root=jnp.zeros((n_columns, n_columns)))
 
 
 def remove_episodes(state: LogOddsFit) -> LogOddsFit:

@@ -11,6 +11,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
 __all__ = [
+    "PerEpisode",
     "batch_mean",
     "episode_means",
     "episode_weight",
@@ -20,15 +21,17 @@ __all__ = [
     "unbiased_squared_error",
 ]
 
+PerEpisode = Float[Array, " episodes"]
 
-def batch_mean(values: Float[Array, " episodes"], weight: Float[Array, " episodes"]) -> Float[Array, ""]:
+
+def batch_mean(values: PerEpisode, weight: PerEpisode) -> Float[Array, ""]:
     """Return the sum of values, divided by the number of episodes whose weight is not zero."""
     return jnp.sum(values) / jnp.maximum(jnp.sum(weight > 0), 1)
 
 
 def episode_means(
     r_hat: Float[Array, " steps"], episode_index: Int[Array, " steps"], n_steps: Int[Array, " episodes"]
-) -> Float[Array, " episodes"]:
+) -> PerEpisode:
     """Return mean_t r_hat_t of each episode over its steps in the batch: all T of them, or K sampled ones.
 
     `n_steps` is the number of steps of each episode in the batch. Steps whose `episode_index` is not in 0..B-1 are ignored.
@@ -37,9 +40,7 @@ def episode_means(
     return total / jnp.maximum(n_steps, 1)
 
 
-def squared_error(
-    mean: Float[Array, " episodes"], target: Float[Array, " episodes"], weight: Float[Array, " episodes"]
-) -> Float[Array, ""]:
+def squared_error(mean: PerEpisode, target: PerEpisode, weight: PerEpisode) -> Float[Array, ""]:
     """Return sum_b w_b (mean_b - target_b)^2 / B, over the B episodes whose weight is not zero.
 
     With `mean` over all T steps and `target` = R/T, this is the loss of RD (Efroni et al., 2021; LaRe, Eq. 6). With `mean` over K
@@ -48,9 +49,7 @@ def squared_error(
     return batch_mean(weight * (mean - target) ** 2, weight)
 
 
-def subsampling_variance(
-    r_hat: Float[Array, "episodes K"], length: Int[Array, " episodes"]
-) -> Float[Array, " episodes"]:
+def subsampling_variance(r_hat: Float[Array, "episodes K"], length: Int[Array, " episodes"]) -> PerEpisode:
     """Return Var_K(r_hat) (1 - K/T) / K, which sampling K of T steps adds to the squared error (Ren et al., 2022, Appendix).
 
     Var_K is the sample variance (divided by K - 1). The finite-population factor (1 - K/T) is due to sampling without replacement.
@@ -62,21 +61,14 @@ def subsampling_variance(
 
 
 def unbiased_squared_error(
-    mean: Float[Array, " episodes"],
-    target: Float[Array, " episodes"],
-    weight: Float[Array, " episodes"],
-    variance: Float[Array, " episodes"],
+    mean: PerEpisode, target: PerEpisode, weight: PerEpisode, variance: PerEpisode
 ) -> Float[Array, ""]:
     """Return the loss of RRD-unbiased: RRD's loss minus the `subsampling_variance`. Its expectation is RD's loss."""
     return squared_error(mean, target, weight) - batch_mean(weight * variance, weight)
 
 
 def leave_one_out_likelihood(
-    mean: Float[Array, " episodes"],
-    target: Float[Array, " episodes"],
-    weight: Float[Array, " episodes"],
-    precision: Float[Array, " episodes"],
-    log_std: Float[Array, " episodes"],
+    mean: PerEpisode, target: PerEpisode, weight: PerEpisode, precision: PerEpisode, log_std: PerEpisode
 ) -> Float[Array, ""]:
     """Return the negative log likelihood of LRR without its constant: the mean of w_b (mean_b - target_b)^2 p_b / 2 + l_b.
 
@@ -86,8 +78,6 @@ def leave_one_out_likelihood(
     return batch_mean(loss, weight)
 
 
-def episode_weight(
-    length: Int[Array, " episodes"], mask: Float[Array, " episodes"], sum_form: bool
-) -> Float[Array, " episodes"]:
+def episode_weight(length: Int[Array, " episodes"], mask: PerEpisode, sum_form: bool) -> PerEpisode:
     """Return the weight of each episode: 1 if R/T is fitted, T^2 if the sum R is fitted (`sum_form`), 0 where `mask` is 0."""
     return mask * length.astype(jnp.float32) ** 2 if sum_form else mask

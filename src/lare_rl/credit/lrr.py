@@ -21,12 +21,9 @@ from jaxtyping import Array, Float, PRNGKeyArray
 
 from lare_rl.credit.decoder_network import DecoderOutput, DecoderShape
 from lare_rl.credit.decoder_settings import CreditSettings
-from lare_rl.nn.networks import MLP, smooth_clip
+from lare_rl.nn.networks import MLP, bound_log_std
 
-__all__ = ["LRR", "MAX_LOG_STD"]
-
-MAX_LOG_STD = 5.0
-"""The deviation is between exp(-5) and exp(5), so that no likelihood is infinite."""
+__all__ = ["LRR"]
 
 
 class LRR(eqx.Module):
@@ -44,5 +41,5 @@ class LRR(eqx.Module):
 
     def __call__(self, inputs: Float[Array, "rows *agents inputs"], key: PRNGKeyArray | None) -> DecoderOutput:
         output = self.mlp(inputs)
-        log_std = smooth_clip(output[..., 1], MAX_LOG_STD)
+        log_std = bound_log_std(output[..., 1])
         return DecoderOutput(self.gain * output[..., 0], jnp.zeros_like(log_std), log_std)

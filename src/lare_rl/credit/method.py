@@ -21,15 +21,15 @@ class Fit(StrEnum):
     SAMPLED_STEPS_UNBIASED = "sampled steps, unbiased"
     """RRD-unbiased: as RRD, minus the variance that the sampling adds."""
     LIKELIHOOD = "likelihood of sampled steps"
-    """LRR: as RRD, but the likelihood of the return, under rewards whose uncertainty the decoder learns (equations in `lrr.py`)."""
+    """LRR: the likelihood of the return under rewards whose uncertainty the decoder learns (`lrr.py`)."""
     DECODER_LOSS = "the decoder's loss"
-    """Diaster, RUDDER, GRD and RBT: the `loss` of the decoder, on whole episodes (equations in the files of these names)."""
+    """Diaster, RUDDER, GRD and RBT: the decoder's `loss` on whole episodes (in the files of these names)."""
     EVIDENCE = "evidence"
-    """In closed form, on all episodes (equations in `evidence.py`)."""
+    """In closed form, on all episodes (`evidence.py`)."""
     PREFIX_EVIDENCE = "evidence of prefixes"
-    """In closed form, on all prefixes of all episodes: a step is paid the change of the expected return (`returns.py`)."""
+    """In closed form, on all prefixes: a step is paid the change of the expected return (`returns.py`)."""
     SIGNS = "best signs"
-    """In closed form: the best signs of a sum of the factors (equation in `closed_form.py`)."""
+    """The best signs of a sum of the factors (`closed_form.py`)."""
 
     @property
     def closed_form(self) -> bool:
@@ -53,7 +53,7 @@ class Fit(StrEnum):
             case Fit.DECODER_LOSS:
                 names = {"episodes", "exact"}
             case Fit.EVIDENCE:
-                names = {"score", "optimism", "exact"}
+                names = {"score", "exact"}
             case Fit.PREFIX_EVIDENCE | Fit.SIGNS:
                 names = {"exact"}
             case _:
@@ -168,5 +168,5 @@ class Method:
 
     @property
     def single_agent_only(self) -> bool:
-        """Whether it works for a single agent only."""
-        return DECODERS[self.decoder].single_agent_only
+        """Whether it works for a single agent only: `Fit.DECODER_LOSS` has no axis of agents."""
+        return self.fit is Fit.DECODER_LOSS or DECODERS[self.decoder].single_agent_only

@@ -18,6 +18,9 @@ __all__ = [
     "PRIOR_RANGE",
     "TOLERANCE",
     "Backend",
+    "FeatureIndex",
+    "Features",
+    "Groups",
     "Moments",
     "Posterior",
     "Regression",
@@ -46,6 +49,10 @@ MIN_NOISE = 1e-10
 
 Array = Any
 """An array of NumPy or of JAX. (jaxtyping's `Array` would import JAX.)"""
+Features = Float[Array, " features"]
+Groups = Float[Array, " groups"]
+FeatureIndex = Int[np.ndarray, " features"]
+"""The index of each feature's group, or of its strength (`relevance.py`)."""
 
 
 class Backend(NamedTuple):
@@ -81,23 +88,23 @@ class Regression(NamedTuple):
     """A regression problem. S, p and q are those of `evidence.py`, with y in units of its standard deviation."""
 
     s: Float[Array, "features features"]
-    p: Float[Array, " features"]
+    p: Features
     q: Float[Array, ""]
     dof: Float[Array, ""]
     """N - 1 degrees of freedom, for N episodes."""
     y_mean: Float[Array, ""]
     y_std: Float[Array, ""]
-    group_index: Int[np.ndarray, " features"]
+    group_index: FeatureIndex
     """The index of each feature's group."""
-    equal_alpha: Float[Array, " groups"]
+    equal_alpha: Groups
     """The alpha of each group by which all groups explain equal parts of the returns, and together half of them."""
 
 
 class Moments(NamedTuple):
     """What a round needs of a posterior under some precisions."""
 
-    weight: Float[Array, " features"]
-    variance: Float[Array, " features"]
+    weight: Features
+    variance: Features
     """The diagonal of Sigma."""
     log_det: Float[Array, ""]
     """log det Sigma^-1."""
@@ -105,23 +112,19 @@ class Moments(NamedTuple):
     """q - 2 mu . p + mu . S mu."""
 
 
-def varies(variance: Float[Array, " features"], mean_square: Any) -> Any:
+def varies(variance: Features, mean_square: Any) -> Any:
     """Return which features vary between cases by more than rounding errors, which grow with `mean_square`."""
     return variance > MIN_VARIATION**2 * (1 + mean_square)
 
 
-def equal_shares(
-    backend: Backend, diagonal: Float[Array, " features"], q: Any, group_index: Int[np.ndarray, " features"]
-) -> Float[Array, " groups"]:
+def equal_shares(backend: Backend, diagonal: Features, q: Any, group_index: FeatureIndex) -> Groups:
     """Return `Regression.equal_alpha` from the diagonal of S."""
     n_groups = int(group_index.max()) + 1
     trace = backend.group_sums(diagonal, group_index, n_groups)
     return backend.xp.where(trace > 0, 2 * n_groups * trace / q, 1)
 
 
-def clip_precisions(
-    backend: Backend, problem: Regression, alpha: Float[Array, " groups"], beta: Any
-) -> tuple[Float[Array, " groups"], Any]:
+def clip_precisions(backend: Backend, problem: Regression, alpha: Groups, beta: Any) -> tuple[Groups, Any]:
     """Clip precisions to a range that float32 can represent."""
     xp = backend.xp
     noise_only = xp.maximum(problem.dof, 1) / problem.q  # beta if all variation is noise
@@ -138,7 +141,7 @@ def inverse_root(backend: Backend, precision: Float[Array, "n n"]) -> tuple[Floa
     return root, 2 * xp.sum(xp.log(xp.diagonal(factor)) + xp.log(scale))
 
 
-def dense_moments(backend: Backend, problem: Regression, alpha: Float[Array, " groups"], beta: Any) -> Moments:
+def dense_moments(backend: Backend, problem: Regression, alpha: Groups, beta: Any) -> Moments:
     """Return the moments of the posterior under some precisions, from the whole matrix S."""
     xp = backend.xp
     root, log_det = inverse_root(backend, beta * problem.s + xp.diag(alpha[problem.group_index]))
@@ -148,12 +151,8 @@ def dense_moments(backend: Backend, problem: Regression, alpha: Float[Array, " g
 
 
 def count_determined(
-    backend: Backend,
-    group_index: Int[np.ndarray, " features"],
-    alpha: Float[Array, " groups"],
-    weight: Float[Array, " features"],
-    variance: Float[Array, " features"],
-) -> tuple[Float[Array, " groups"], Float[Array, " groups"], Float[Array, " groups"]]:
+    backend: Backend, group_index: FeatureIndex, alpha: Groups, weight: Features, variance: Features
+) -> tuple[Groups, Groups, Groups]:
     """Return n_g, gamma_g and |mu_g|^2 of each group."""
     xp, n_groups = backend.xp, len(alpha)
     size = backend.group_sums(xp.ones_like(weight), group_index, n_groups)
@@ -162,11 +161,7 @@ def count_determined(
 
 
 def next_posterior(
-    backend: Backend,
-    problem: Regression,
-    alpha: Float[Array, " groups"],
-    beta: Any,
-    moments: Callable[[Float[Array, " groups"], Any], Moments],
+    backend: Backend, problem: Regression, alpha: Groups, beta: Any, moments: Callable[[Groups, Any], Moments]
 ) -> Posterior:
     """Compute the posterior under some precisions, and the precisions that follow from it."""
     xp = backend.xp
@@ -180,18 +175,11 @@ def next_posterior(
     noise_dof = xp.maximum(problem.dof - xp.sum(n_determined), 0.5)
     alpha, beta = clip_precisions(backend, problem, n_determined / xp.maximum(squares, 1e-30), noise_dof / residual)
     return Posterior(
-        weight=weight,
-        bias=xp.zeros(()),
-        alpha=alpha,
-        beta=beta,
-        n_determined=n_determined,
-        log_evidence=log_evidence,
+        weight=weight, bias=xp.zeros(()), alpha=alpha, beta=beta, n_determined=n_determined, log_evidence=log_evidence
     )
 
 
-def expand_groups(
-    groups: Posterior, group_index: Int[np.ndarray, " features"], strength_index: Int[np.ndarray, " features"]
-) -> Posterior:
+def expand_groups(groups: Posterior, group_index: FeatureIndex, strength_index: FeatureIndex) -> Posterior:
     """Return a fit by groups in the form of a fit by strengths (`relevance.py`): each strength has the precision of its group."""
     group = np.zeros(int(strength_index.max(initial=-1)) + 1, int)
     group[strength_index] = group_index

@@ -24,6 +24,7 @@ __all__ = [
     "add_predictions",
     "empty_predictions",
     "gain",
+    "metrics",
     "r2",
     "ring_slots",
     "squared_errors",
@@ -93,6 +94,12 @@ def r2(predictions: Predictions) -> Float[Array, " decoders"]:
     total = jnp.sum(jnp.where(valid, (predictions.returns - mean) ** 2, 0))
     is_defined = (count >= MIN_R2_EPISODES) & (total > 1e-10 * count * mean**2)
     return jnp.where(is_defined, 1 - squared_errors(predictions) / jnp.where(is_defined, total, 1), jnp.nan)
+
+
+def metrics(predictions: Predictions) -> dict[str, Float[Array, ""]]:
+    """Return R^2 and the gain of the first decoder, under the keys of metrics.jsonl."""
+    ratio, error = gain(predictions)
+    return {"credit/return_r2": r2(predictions)[0], "credit/gain": ratio, "credit/gain_error": error}
 
 
 def gain(predictions: Predictions) -> tuple[Float[Array, ""], Float[Array, ""]]:

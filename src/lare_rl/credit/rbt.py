@@ -19,13 +19,13 @@ from functools import partial
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
+from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
 from lare_rl.credit.decoder_network import DecoderOutput, DecoderShape
 from lare_rl.credit.decoder_settings import CreditSettings
 from lare_rl.credit.decoders import RBT_STEPS
-from lare_rl.credit.losses import batch_mean
-from lare_rl.credit.step_targets import is_step, step_loss
+from lare_rl.credit.losses import PerEpisode, batch_mean
+from lare_rl.credit.step_targets import EpisodeInputs, EpisodeLengths, is_step, step_loss
 from lare_rl.nn.attention import LayerNorm, attend, causal_mask
 from lare_rl.nn.networks import MLP, Linear
 
@@ -132,12 +132,7 @@ class RBT(eqx.Module):
         return (jax.nn.softmax(scores) @ value)[..., 0], self.next_state(at_action)
 
     def loss(
-        self,
-        inputs: Float[Array, "episodes steps inputs"],
-        length: Int[Array, " episodes"],
-        target: Float[Array, " episodes"],
-        mask: Float[Array, " episodes"],
-        key: PRNGKeyArray,
+        self, inputs: EpisodeInputs, length: EpisodeLengths, target: PerEpisode, mask: PerEpisode, key: PRNGKeyArray
     ) -> Float[Array, ""]:
         """Return the loss of the transformer plus that of the step model.
 

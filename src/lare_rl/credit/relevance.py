@@ -12,12 +12,11 @@ evidence, so the iteration starts from the precisions of the groups, and its res
 """
 
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, Bool, Int
 
 from lare_rl.credit import evidence
-from lare_rl.credit.evidence import Posterior, SufficientStatistics
-from lare_rl.credit.precisions import expand_groups
+from lare_rl.credit.evidence import SufficientStatistics
+from lare_rl.credit.precisions import FeatureIndex, Posterior, expand_groups
 from lare_rl.nn import masks
 
 __all__ = ["MIN_GAIN", "fit_strengths", "is_better", "select"]
@@ -30,8 +29,8 @@ later episodes best on eight scores (`benchmarks/relevance.py`)."""
 def fit_strengths(
     statistics: SufficientStatistics,
     score_type: Int[Array, ""] | int,
-    group_index: Int[np.ndarray, " features"],
-    strength_index: Int[np.ndarray, " features"],
+    group_index: FeatureIndex,
+    strength_index: FeatureIndex,
     groups: Posterior,
     earlier: Posterior,
     max_rounds: int,
@@ -64,10 +63,7 @@ def is_better(strengths: Posterior, groups: Posterior) -> Bool[Array, "*score_ty
 
 
 def select(
-    strengths: Posterior,
-    groups: Posterior,
-    group_index: Int[np.ndarray, " features"],
-    strength_index: Int[np.ndarray, " features"],
+    strengths: Posterior, groups: Posterior, group_index: FeatureIndex, strength_index: FeatureIndex
 ) -> Posterior:
     """Return the fit that is used, with a precision for each strength. The posteriors may have a leading axis of score types."""
     shared = expand_groups(groups, group_index, strength_index)

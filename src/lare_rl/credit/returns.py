@@ -32,13 +32,7 @@ from lare_rl.credit.decomposition import (
 )
 from lare_rl.credit.methods import Fit, Method
 from lare_rl.credit.prequential import Predictions, add_predictions, squared_errors
-from lare_rl.credit.score_type import (
-    MAX_ERROR_RATIO,
-    ROUNDING,
-    ScoreType,
-    ScoreTypeEstimate,
-    compare_score_types,
-)
+from lare_rl.credit.score_type import MAX_ERROR_RATIO, ROUNDING, ScoreType, ScoreTypeEstimate, compare_score_types
 
 __all__ = [
     "MIN_GROWTH",

@@ -22,12 +22,12 @@ L, which is not published, keeps g of the size of its target from the first upda
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, Int, PRNGKeyArray
+from jaxtyping import Array, Float, PRNGKeyArray
 
 from lare_rl.credit.decoder_network import DecoderOutput, DecoderShape
 from lare_rl.credit.decoder_settings import CreditSettings
-from lare_rl.credit.losses import batch_mean
-from lare_rl.credit.step_targets import is_step, step_loss
+from lare_rl.credit.losses import PerEpisode, batch_mean
+from lare_rl.credit.step_targets import EpisodeInputs, EpisodeLengths, is_step, step_loss
 from lare_rl.nn.networks import MLP, Linear
 
 __all__ = ["RUDDER"]
@@ -71,7 +71,7 @@ class RUDDER(eqx.Module):
         """Return the output of the step model, which has no noise and no penalty."""
         return DecoderOutput(self.step_model(inputs)[..., 0], jnp.zeros(inputs.shape[:-1]))
 
-    def predictions(self, inputs: Float[Array, "episodes steps inputs"]) -> Float[Array, "episodes steps"]:
+    def predictions(self, inputs: EpisodeInputs) -> Float[Array, "episodes steps"]:
         """Return g after each step."""
         max_steps = inputs.shape[1]
 
@@ -83,12 +83,7 @@ class RUDDER(eqx.Module):
         return jax.lax.scan(body, jnp.zeros_like(z[0]), z)[1].T
 
     def loss(
-        self,
-        inputs: Float[Array, "episodes steps inputs"],
-        length: Int[Array, " episodes"],
-        target: Float[Array, " episodes"],
-        mask: Float[Array, " episodes"],
-        key: PRNGKeyArray,
+        self, inputs: EpisodeInputs, length: EpisodeLengths, target: PerEpisode, mask: PerEpisode, key: PRNGKeyArray
     ) -> Float[Array, ""]:
         """Return the loss of the LSTM plus that of the step model. The arguments are those of `Diaster.loss`."""
         max_steps, n_steps = inputs.shape[1], jnp.maximum(length, 1)

@@ -15,19 +15,19 @@ from jaxtyping import Array, Bool, Float, Int
 
 from lare_rl.nn.networks import MLP
 
-__all__ = ["is_step", "step_loss"]
+__all__ = ["EpisodeInputs", "EpisodeLengths", "is_step", "step_loss"]
+
+EpisodeInputs = Float[Array, "episodes steps inputs"]
+EpisodeLengths = Int[Array, " episodes"]
 
 
-def is_step(length: Int[Array, " episodes"], max_steps: int) -> Bool[Array, "episodes steps"]:
+def is_step(length: EpisodeLengths, max_steps: int) -> Bool[Array, "episodes steps"]:
     """Return which rows are steps of the episodes. The others are padding."""
     return jnp.arange(max_steps) < length[:, None]
 
 
 def step_loss(
-    step_model: MLP,
-    inputs: Float[Array, "episodes steps inputs"],
-    prefix: Float[Array, "episodes steps"],
-    length: Int[Array, " episodes"],
+    step_model: MLP, inputs: EpisodeInputs, prefix: Float[Array, "episodes steps"], length: EpisodeLengths
 ) -> Float[Array, " episodes"]:
     """Return the mean squared error of the step model over the steps of each episode. No gradient goes to `prefix`, which is F."""
     max_steps = inputs.shape[1]

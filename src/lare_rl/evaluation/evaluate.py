@@ -19,10 +19,10 @@ from lare_rl.runs.directory import Run, as_run
 from lare_rl.tasks.spec import TaskSpec
 from lare_rl.tasks.trust import trust_environment, untrusted_module
 from lare_rl.training.collect_device import DeviceCollector, make_jax_env
-from lare_rl.training.evaluate_host import evaluate_policy_on_host
 from lare_rl.training.evaluation import Evaluation
 from lare_rl.training.saved_state import load_actor
 from lare_rl.training.streams import Stream, episode_seed
+from lare_rl.training.unroll_host import evaluate_policy_on_host
 from lare_rl.util.statistics import grouped_standard_error, standard_error
 
 __all__ = [

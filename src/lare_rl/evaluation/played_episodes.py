@@ -20,7 +20,6 @@ from lare_rl.runs.directory import Run
 from lare_rl.training.collect_device import make_jax_env, unroll_on_device
 from lare_rl.training.compiled import training_module
 from lare_rl.training.episodes import predict_returns
-from lare_rl.training.evaluate_host import policy_turns
 from lare_rl.training.evaluation import EpisodeBatch
 from lare_rl.training.factors import compute_host_factors
 from lare_rl.training.learner import Learner, empty_replay, store_with_factors
@@ -29,7 +28,7 @@ from lare_rl.training.saved_state import load_learner
 from lare_rl.training.seed_axis import select_seed
 from lare_rl.training.static_config import TrainConfig
 from lare_rl.training.streams import Stream, episode_seed
-from lare_rl.training.unroll_host import record_on_host
+from lare_rl.training.unroll_host import policy_turns, record_on_host
 from lare_rl.util.statistics import column_correlations
 
 __all__ = [

@@ -45,7 +45,7 @@ def missing_reward_reason(method: Method) -> str | None:
 
 
 def reward_graph(credit: DecoderState | None, config: TrainConfig, team_index: int, phi: Graph | None = None) -> Graph:
-    """Return the graph of a team's proxy rewards, without optimism.
+    """Return the graph of a team's proxy rewards.
 
     Args:
         credit: the decoder of one seed, or None if phi itself is the reward.
@@ -102,7 +102,7 @@ class _StepInputs(dict[str, Any]):
                 n_agents = self.config.env.n_agents if self.config.team_level else 1
                 self[name] = graph_input("action", (*self.rows, n_agents * self.config.env.action_size))
             case _:
-                self[name] = graph_input(name, (*self.rows, self.config.observed_size))
+                self[name] = graph_input(name, (*self.rows, self.config.credit_specs[0].observation_size))
         return self[name]
 
     def _action(self) -> Any:

@@ -81,7 +81,7 @@ def infer_layout(name: str, values: Mapping[str, Any], role: TaskSpec | None) ->
         if is_discrete and kind not in sizes:
             raise LareError(
                 f"{name}: {kind}s are whole numbers, and the number of choices is unknown: write it into a task file ({kind}_size; "
-                "docs/tutorials/your-own-logs.md), and give it with --task FILE"
+                "docs/reference/logs.md), and give it with --task FILE"
             )
         if is_discrete and sizes[kind] != 1:
             layouts[kind] = SpaceLayout(kind="choices", choices=(sizes[kind],), first=(0,))

@@ -109,7 +109,7 @@ def _open_path(source: str | Path, role: TaskSpec | None) -> Log:
     path = Path(source)
     if path.is_file() and path.suffix.lower() in (".csv", ".tsv", ".txt", ".json", ".jsonl"):
         raise LareError(
-            f"{path} is text, which cannot be read: write the log as .npz or Parquet (docs/tutorials/your-own-logs.md, Formats)"
+            f"{path} is text, which cannot be read: write the log as .npz or Parquet (docs/reference/logs.md)"
         )
     if path.is_file() or any(path.glob("*.parquet")):
         from lare_rl.logs.tables import ParquetLog

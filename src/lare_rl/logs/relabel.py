@@ -45,8 +45,10 @@ MIN_R2 = 0.1
 MESSAGES = {
     "relabelled": "{method} gave rewards to {steps:count step} of {episodes:count episode}.",
     "cut": "Cut before their end, and not learned from: {episodes:count episode}.",
-    "too_few": "How well new returns are predicted is unknown: {episodes:count episode} held out, and {needed} are needed. Hold out "
-    "a larger share (--hold-out 0.2, hold_out=0.2 in Python).",
+    "too_few": (
+        "How well new returns are predicted is unknown: {episodes:count episode} held out, and {needed} are needed (--hold-out "
+        "0.2, hold_out=0.2 in Python)."
+    ),
     "constant": "The returns of {episodes:count episode} held out, or their predictions, are all equal: nothing can be said about "
     "these rewards.",
     "correlation": "The returns of {episodes:count episode} held out of the fit and their predictions have a correlation of "
@@ -137,7 +139,7 @@ def relabel(
 
     Args:
         source: a directory of .npz or Parquet files, a Parquet file, a Hugging Face data set on the disk, a Minari id or data set,
-            flat arrays by name, or a list of mappings of arrays (docs/tutorials/your-own-logs.md).
+            flat arrays by name, or a list of mappings of arrays (docs/reference/logs.md).
         out: the path to write, or the id of the new Minari data set. It is written completely or not at all.
         method: how credit is assigned; the default is `lare-bayes` with a `phi`, and `bayes` without.
         phi: the latent function; it needs its `task`.

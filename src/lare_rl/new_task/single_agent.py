@@ -39,7 +39,7 @@ def draft_task(environment_id: str) -> Draft:
 
         return draft_jax_task(environment_id)
     if (family := environment_id.partition("/")[0]) in FAMILIES:
-        raise LareError(f"new-task cannot draft a task of {family}: write its file by hand (docs/how-to/extend.md)")
+        raise LareError(f"new-task cannot draft a task of {family}: write its file by hand (docs/reference/tasks.md)")
     with contextlib.closing(make_gymnasium(environment_id)) as env:
         return _write_draft(environment_id, env)
 

@@ -14,13 +14,15 @@ __all__ = [
     "MLP",
     "Linear",
     "adam_step",
+    "bound_log_std",
     "clip_gradient",
     "copy_networks",
     "init_adam",
     "init_orthogonal",
     "polyak_update",
-    "smooth_clip",
 ]
+
+MAX_LOG_STD = 5.0
 
 
 class Linear(eqx.Module):
@@ -120,9 +122,12 @@ def init_orthogonal(network: MLP, last_gain: float, *, key: PRNGKeyArray) -> MLP
     return eqx.tree_at(lambda network: network.layers, network, tuple(map(init_layer, network.layers, gains, keys)))
 
 
-def smooth_clip(x: Float[Array, "*shape"], limit: float) -> Float[Array, "*shape"]:
-    """Return x bounded by ±limit, with a gradient everywhere. It is nearly x where x is far from the bounds."""
-    return limit * jnp.tanh(x / limit)
+def bound_log_std(x: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
+    """Return the log of a standard deviation within ±5, so that no likelihood is infinite, with a gradient everywhere.
+
+    It is nearly x where x is far from the bounds.
+    """
+    return MAX_LOG_STD * jnp.tanh(x / MAX_LOG_STD)
 
 
 Parameters = TypeVar("Parameters")

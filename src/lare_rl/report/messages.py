@@ -12,7 +12,7 @@ MESSAGES = {
     "headline_equal_returns": "Nothing can be learned",
     "equal_returns": (
         "All episodes, of the policy and of random actions, have the return {return_:number}. Next: does the environment give "
-        "rewards, and does it before its time limit (`max_episode_steps`)?"
+        "rewards, and before its time limit (`max_episode_steps`)?"
     ),
     # The outcome
     "headline_outcome_unknown": "Trained",
@@ -60,14 +60,14 @@ MESSAGES = {
         "{r2:.2f}."
     ),
     "decoder_is_outdated": (
-        "Its proxy rewards, from {inputs}, usually explain {amount} of the score (median R² of returns: {r2:.2f}), but not the last "
-        "episodes (R² {last_r2:.2f}): perhaps the policy has changed, and the decoder has not adapted yet."
+        "Its proxy rewards, from {inputs}, usually explain {amount} of the score (median R² of returns: {r2:.2f}), but not the "
+        "last episodes (R² {last_r2:.2f}): the decoder may not have adapted to a new policy yet."
     ),
     "worse_than_mean": (
-        "Warning: R² of returns is far below 0 ({r2:.2f}): the proxy rewards predict the last returns worse than the mean of these "
-        "returns does. That is no harm if these returns hardly differ, or if the policy has just changed and R² rises again. Otherwise, "
-        "the proxy rewards mislead the policy: check `score` and `group` in the task file (docs/how-to/scores.md), and compare with "
-        "`--method episodic`."
+        "Warning: the proxy rewards predict the last returns worse than their mean does (R² {r2:.2f}). That is no harm if "
+        "these returns hardly differ, or if the policy has just changed and R² rises again. Otherwise, they mislead the "
+        "policy: check `score` and `group` in the task file (docs/how-to/scores.md), and compare with `--method "
+        "episodic`."
     ),
     "steps_agree": "In single steps, proxy and true rewards agree: their correlation is {correlation:r2}.",
     "single_steps": (
@@ -109,8 +109,8 @@ MESSAGES = {
     # The next step
     "explains_little": "Next: {remedy}, because {cause}.",
     "try_closed_form": (
-        "Next: `--method {method}`, whose decoder needs no updates. If that explains the score, this decoder has not learned it yet: "
-        "more `--steps`. If not, {cause}: {remedy}."
+        "Next: `--method {method}`, whose decoder needs no updates. If it explains the score, this decoder needs more "
+        "`--steps`. If not, {cause}: {remedy}."
     ),
     "bad_phi": "phi misses what the score depends on",
     "replace_phi": "another phi (`lare-rl design {task} --reflect 2 --model NAME`), or none (`--method bayes`)",
@@ -120,15 +120,15 @@ MESSAGES = {
     "resume": "`lare-rl train --resume {directory}`",
     "resume_longer": "`lare-rl train --resume {directory} --steps {steps}`",
     "one_seed_was_better": (
-        "Next: one seed was better than random actions at step {step:,} ({return_:number}). `lare-rl evaluate {directory} --best` "
-        "plays the best policy of each seed. To continue: more `--steps`, or another `--algorithm`."
+        "Next: one seed was better than random actions at step {step:,} ({return_:number}). `lare-rl evaluate {directory} "
+        "--best` plays the best policy of each seed. Then more `--steps`, or another `--algorithm`."
     ),
     "has_fallen": (
         "Next: it was better before, {return_:number} at step {step:,}. `lare-rl evaluate {directory} --best` plays the best policy "
         "of each seed."
     ),
     "is_stuck": (
-        "Next: {cause}. More `--steps` alone will not change that. Bring observations to about -1 to 1, or try another `--algorithm` "
+        "Next: {cause}. More `--steps` alone will not help. Bring observations to about -1 to 1, or try another `--algorithm` "
         "(`lare-rl algorithms`), or more random steps at first."
     ),
     "saturated": "the policy chooses the same action in every state{seeds}, with each entry at a bound",
@@ -150,7 +150,7 @@ MESSAGES = {
         "times power, needs a phi (`lare-rl prompt`)."
     ),
     "needs_baseline": (
-        "Next: better than random actions may be far from good: compare it with a rule of your own "
+        "Next: better than random actions may be far from good. Compare it with a rule of your own "
         "(docs/how-to/poor-policies.md).{best}"
     ),
     "best_evaluation": (

@@ -30,54 +30,49 @@ METRIC_GROUPS: dict[str, dict[str, str]] = {
     "All runs": {
         "step": "Environment steps of the seed.",
         "seed": "The seed.",
-        "time/steps_per_second": "Environment steps of a seed per second since the last evaluation, with the time of that evaluation.",
-        RETURN: "The mean true return of the episodes. For many agents, the return of a team is the sum over the steps of the mean over "
-        "its agents that are alive.",
-        RETURN_STD: "The standard deviation of the true return over these episodes, with n in the denominator.",
-        LENGTH: "The mean length of these episodes (steps).",
-        SUMMED_RETURN: "Many agents: the sum of the true rewards over all steps and all agents of the team.",
-        DETERMINISTIC_RETURN: "The mean true return of the most likely actions, if the policy samples its actions. Only on the host, "
-        "at the last evaluation.",
+        "time/steps_per_second": "Environment steps of a seed per second since the last evaluation, which is included.",
+        RETURN: "Mean true return of the episodes. A team's return is the sum over steps of the mean over its living agents.",
+        RETURN_STD: "Standard deviation of the true return over these episodes (n in the denominator).",
+        LENGTH: "Mean length of these episodes (steps).",
+        SUMMED_RETURN: "Many agents: the true rewards, summed over steps and agents of the team.",
+        DETERMINISTIC_RETURN: "Mean true return of the most likely actions, if the policy samples. On the host, at the last evaluation.",
     },
     "Methods with proxy rewards": {
-        RETURN_R2: "R² of the last 32 returns, each predicted before the decoder was fitted to it. Null until 8 returns have been "
-        "predicted.",
-        "credit/gain": "The share of the squared error that these predictions remove from the mean return of the level.",
-        "credit/gain_error": "The standard error of `credit/gain`.",
-        CREDIT_CORRELATION: "Pearson's correlation of proxy and true rewards over the newest 5,000 steps. Null if the environment pays "
-        "only at the end.",
-        CREDIT_ERROR: "The mean of |proxy reward - true reward| over these steps, if both have the same unit. Null if the environment "
-        "pays only at the end.",
-        "credit/loss": "The loss of a decoder that is fitted by gradient descent, in units of the squared scale of R/T: the mean over "
-        "the last updates.",
-        "credit/average": "1 if the score is now treated as an average over the steps, 0 if as a sum. If the task has no `score`.",
-        "credit/log_odds": "1 if steps are now paid for the log odds of the higher score, else 0. If the score is binary.",
+        RETURN_R2: "R² of the last 32 returns, each predicted before the decoder was fitted to it. Null until 8 are predicted.",
+        "credit/gain": "Share of the squared error of the level's mean return that these predictions remove.",
+        "credit/gain_error": "Standard error of `credit/gain`.",
+        CREDIT_CORRELATION: (
+            "Pearson's correlation of proxy and true rewards over the newest 5,000 steps. Null if the environment pays only at the "
+            "end."
+        ),
+        CREDIT_ERROR: "Mean of |proxy reward - true reward| over these steps, if both have the same unit. Null in the same case.",
+        "credit/loss": "Gradient descent: the decoder's loss in units of the squared scale of R/T, mean over the last updates.",
+        "credit/average": "1 if the score is now treated as an average over the steps, 0 if as a sum. Only without `score` in the task.",
+        "credit/log_odds": "1 if steps are now paid for the log odds of the higher score, else 0. Only for binary scores.",
     },
     "TD3, DDPG and SAC": {
-        "critic/loss": "The sum of the critics' mean squared errors: the mean over the updates of the last iteration.",
-        "critic/value": "The mean target of the critics, over the same updates.",
-        ACTOR_SATURATION: "The share of an action's entries that are at the same bound in all of the newest 1,000 states. At 1, the "
-        "policy chooses the same action everywhere.",
-        "actor/entropy": "SAC: minus the mean log probability of the policy's actions (nats).",
+        "critic/loss": "Sum of the critics' mean squared errors, mean over the updates of the last iteration.",
+        "critic/value": "Mean target of the critics over these updates.",
+        ACTOR_SATURATION: "Share of an action's entries at the same bound in all of the newest 1,000 states. 1: always the same action.",
+        "actor/entropy": "SAC: minus the mean log probability of actions (nats).",
         "actor/temperature": "SAC: alpha, the weight of the entropy.",
     },
     "PPO and IPPO": {
-        "critic/loss": "The loss of the value, in squared standard deviations of the return: the mean over the gradient steps of the last "
-        "update.",
-        "critic/explained_variance": "The share of the variance of the rollout's returns that the critic explained before the update.",
-        "actor/objective": "The clipped objective: the mean over the same gradient steps.",
-        "actor/entropy": "The entropy of the policy (nats), over the same gradient steps.",
-        "actor/approx_kl": "The divergence from the policy that collected the rollout.",
-        "actor/clip_fraction": "The share of steps whose probability ratio is outside the clip range.",
+        "critic/loss": "Loss of the value, in squared standard deviations of the return: mean over the gradient steps of the last update.",
+        "critic/explained_variance": "Share of the variance of the rollout's returns that the critic explained before the update.",
+        "actor/objective": "The clipped objective, over these gradient steps.",
+        "actor/entropy": "Entropy of the policy (nats), over these gradient steps.",
+        "actor/approx_kl": "Divergence from the policy that collected the rollout.",
+        "actor/clip_fraction": "Share of steps whose probability ratio is outside the clip range.",
     },
     "QMIX and VDN": {
-        "critic/loss": "Half the mean squared error of the team's value, over the steps of the last update's episodes.",
-        "critic/value": "The mean target of the team's value, over the same steps.",
+        "critic/loss": "Half the mean squared error of the team's value, over the steps of the last update.",
+        "critic/value": "Mean target of the team's value, over these steps.",
     },
     "CreditAssigner only": {
-        "credit/episodes": "The number of episodes that have ended.",
-        "credit/dropped": "The number of episodes that were dropped.",
-        "credit/fits": "The number of fits or updates of the decoder.",
+        "credit/episodes": "Number of episodes that have ended.",
+        "credit/dropped": "Number of episodes that were dropped.",
+        "credit/fits": "Number of fits or updates of the decoder.",
     },
 }
 """What each metric means, by who writes it. Names have no teams; a task's own measures are not listed."""

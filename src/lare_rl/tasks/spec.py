@@ -104,19 +104,19 @@ class TaskSpec(CheckedModel):
     model_config = ConfigDict(str_strip_whitespace=True)
 
     name: Annotated[str, Field(min_length=1, pattern=r"^[\w.\-]+$")]
-    """The name of the task, in commands and in the names of runs."""
+    """Name in commands and of runs."""
     environment: Annotated[str, Field(min_length=1)]
-    """A Gymnasium id (`module:id` first imports the module that registers it), or the name of another family's environment, such as
-    `particles/CN-6`, or `none` if there are only logs. Functions are then designed and logs relabelled, but nothing is trained."""
+    """A Gymnasium id (`module:id` first imports the module that registers it), another family's name, such as `particles/CN-6`,
+    or `none` for logs only: functions are designed and logs relabelled, but nothing is trained."""
     evaluation_environment: str | None = None
-    """The environment that policies are evaluated in, such as held-out maps, years or demand. It is of the same module, and has the
-    same sizes. By default, `environment`. Only for environments on the host."""
+    """The environment of evaluations, such as held-out maps, years or demand, with the same module and sizes. Only on the host.
+    By default, `environment`."""
     observation_size: Annotated[int, Field(ge=1)]
-    """The number of entries of an observation."""
+    """Number of entries of an observation."""
     action_size: Annotated[int, Field(ge=1)]
-    """The number of entries of a continuous action, or the number of discrete actions."""
+    """Number of entries of a continuous action, or of discrete actions."""
     scored_observation: ScoredObservation = "after"
-    """The observations of a step that factors and raw features are computed from: before the action, after it, or both."""
+    """Observations of a step that factors and raw features are computed from: before the action, after it, or both."""
     description: Annotated[str, Field(min_length=1)]
     """The task and its goal, without a word about the reward."""
     observation: Annotated[str, Field(min_length=1)]
@@ -124,38 +124,38 @@ class TaskSpec(CheckedModel):
     action: Annotated[str, Field(min_length=1)]
     """What each entry of the action means."""
     max_episode_steps: Annotated[int | None, Field(ge=1)] = None
-    """The time limit (steps) of an environment without its own limit, or of the episodes of logs."""
+    """Time limit (steps) of an environment without its own, or of the episodes of logs."""
     score: Literal["sum", "average", "binary"] | None = None
-    """Whether the return of an episode is a sum over its steps; an average or grade that does not grow with its length; or binary, won
-    or lost. By default, training determines whether a sum or an average predicts returns better."""
+    """Whether the return of an episode is a sum over its steps; an average or grade that does not grow with its length; or
+    binary, won or lost. By default, training finds which of sum and average predicts returns better."""
     payments: Literal["end", "nonzero"] | Annotated[StrictInt, Field(ge=1)] = "end"
-    """When the environment pays: once, at the end of an episode; with every reward that is not 0; or every so many steps and at the
-    end. Rewards between payments are added up."""
+    """When the environment pays: once, at the end of an episode; with every reward that is not 0; or every so many steps and at
+    the end. Rewards between payments are added up."""
     paid_for: Literal["since_last"] | PaidSteps = "since_last"
-    """The steps that a payment is for: all steps since the last payment, or `{ steps = 20 }`, the last 20 steps."""
+    """Steps that a payment is for: all since the last payment, or `{ steps = 20 }`, the last 20."""
     group: str | None = None
-    """The key of `info` that tells the group of an episode, a whole number from 0 to 63: its level, map, weather or demand. Returns of
-    episodes of the same group share an intercept, so that an easy level does not credit what happens on it."""
+    """Key of `info` with the group of an episode, a whole number from 0 to 63: its level, map, weather or demand. Groups have
+    intercepts, so that an easy level does not credit what happens on it."""
     measures: tuple[str, ...] = ()
-    """Keys of the last step's `info` whose values are averaged and reported in addition to the return."""
+    """Keys of the last step's `info` whose values are averaged and reported beside the return."""
     processes: Literal["auto", "separate"] = "auto"
-    """`separate`: every environment needs a process of its own, because its simulator allows a single simulation in a process. `auto`: so
-    does an environment of a package that LaRe does not know, if its steps are slow, or if a second one in its process fails, hangs or
-    changes the first."""
+    """`separate`: every environment runs in a process of its own, because its simulator allows one simulation in a process.
+    `auto`: also if an unknown package's steps are slow, or a second environment in its process fails, hangs or changes the
+    first."""
     timeout: Annotated[float, Field(gt=0, allow_inf_nan=False)] = 120.0
-    """The time (s) within which an environment in another process must reply. After it, the run stops with a message."""
+    """Time (s) within which an environment in another process must reply; else the run stops with a message."""
     arguments: dict[str, Any] = Field(default_factory=dict)
-    """Keyword arguments of the environment. Only for families that have them (`pettingzoo/...`, `gymnax/...`, `jumanji/...` and
+    """Keyword arguments of the environment, for families that have them (`pettingzoo/...`, `gymnax/...`, `jumanji/...` and
     others)."""
     agents: tuple[str, ...] = ()
-    """The names of the agents that this file describes, or patterns of names such as `prey_*`. By default all agents. Only for
-    environments whose agents have names (`pettingzoo/...`, `jaxmarl/...`)."""
+    """Names of the agents that this file describes, or patterns such as `prey_*`. By default all. For environments whose agents
+    have names (`pettingzoo/...`, `jaxmarl/...`)."""
     credit_scope: CreditScope = "observation"
     """Whether `phi` reads each agent's observation and action, or the global state and all actions of the team."""
     teams: tuple["TaskSpec", ...] = ()
-    """One task for each team, with its own texts, if several teams learn separately. In TOML, the names of their files."""
+    """One task for each team that learns separately, with its own texts. In TOML, the names of their files."""
     team: str | None = None
-    """The team that this file describes, if its environment has several teams."""
+    """The team that this file describes, if its environment has several."""
 
     @field_validator("arguments")
     @classmethod

@@ -46,13 +46,17 @@ MESSAGES = {
     "steps so far random": "all {step:,} steps so far were random ({algorithm}.warmup is {warmup:,})",
     "too few episodes": "the policy has not been updated in {step:,} steps: {algorithm} needs {batch_size} finished episodes for "
     "its first update ({algorithm}.batch_size)",
-    "large observations": "Observations are large: the root mean square of {feature} is {rms:.3g} in the first steps, and "
-    "{algorithm} does not normalise observations. Its actions may stay at their bounds. Let the environment divide each entry by "
-    "its range, so that it is within about -1 and 1{alternative}.",
+    "large observations": (
+        "Observations are large: the root mean square of {feature} is {rms:.3g} in the first steps, and {algorithm} does not "
+        "normalise observations. Its actions may stay at their bounds. Let the environment divide each entry by its "
+        "range{alternative}."
+    ),
     "normalise": ", or set --{algorithm}.normalise-observations True",
     "use ppo": ", or use --algorithm ppo, which normalises observations",
-    "saturated policies": "{policies} chooses the same action in every state, with each entry at a bound. If the task needs more "
-    "than that, the policy is stuck, and more steps seldom help: see docs/how-to/poor-policies.md.",
+    "saturated policies": (
+        "{policies} chooses the same action in every state, with each entry at a bound. If the task needs more, the policy is "
+        "stuck, and more steps seldom help: see docs/how-to/poor-policies.md."
+    ),
     "one policy": "The policy",
     "policies of seeds": "The policy of {noun} {seeds}",
     "equal returns": "Every episode of every evaluation has the return {return_:number}. If training episodes have it too, nothing can be "
@@ -60,8 +64,10 @@ MESSAGES = {
     "(docs/how-to/scores.md)?",
     "slow evaluations": "An evaluation takes {seconds:.0f} s, {share:.0%} of the time: --evaluation-episodes (now {n_episodes}) or "
     "--evaluate-every (now {every:,}) changes that.",
-    "constant returns": "The last {n_evaluations} evaluations of every seed have the same return: the policy does not change what "
-    "it does. If this return is not a good one, the policy is stuck: see docs/how-to/poor-policies.md.",
+    "constant returns": (
+        "The last {n_evaluations} evaluations of every seed have the same return: the behaviour does not change. If this return "
+        "is not good, the policy is stuck: see docs/how-to/poor-policies.md."
+    ),
 }
 
 

@@ -21,12 +21,11 @@ from lare_rl.envs.placement import make_vec_env, n_open_envs
 from lare_rl.envs.vec_env import VecEnv
 from lare_rl.errors import LareError
 from lare_rl.tasks.spec import TaskSpec
-from lare_rl.training.evaluate_host import evaluate_policy_on_host
 from lare_rl.training.evaluation import Evaluation
 from lare_rl.training.host_policy import init_host_memory, make_policy
 from lare_rl.training.static_config import TrainConfig
 from lare_rl.training.streams import Stream, episode_seed, host_noise, numpy_generator
-from lare_rl.training.unroll_host import add_seed_axis, check_finite
+from lare_rl.training.unroll_host import add_seed_axis, check_finite, evaluate_policy_on_host
 
 __all__ = ["HostCollector", "HostVecEnv", "make_host_collector"]
 
@@ -84,11 +83,7 @@ class HostVecEnv:
         return steps
 
     def _collect_step(
-        self,
-        policy: Callable[..., Any],
-        noise: Float[np.ndarray, "seeds envs agents noise"],
-        steps: Trajectory,
-        t: int,
+        self, policy: Callable[..., Any], noise: Float[np.ndarray, "seeds envs agents noise"], steps: Trajectory, t: int
     ) -> None:
         """Make a step, and write it into row `t` of the steps."""
         action = policy(self._timestep, noise, self._episode_start)
@@ -175,13 +170,7 @@ class HostVecEnv:
 class HostCollector:
     """The training environments, the policy that acts in them, and environments to evaluate it in."""
 
-    def __init__(
-        self,
-        envs: VecEnv,
-        evaluation_envs: VecEnv,
-        config: TrainConfig,
-        seeds: Sequence[int],
-    ):
+    def __init__(self, envs: VecEnv, evaluation_envs: VecEnv, config: TrainConfig, seeds: Sequence[int]):
         self._config, self._seeds = config, list(seeds)
         self._envs, self._evaluation_envs = HostVecEnv(envs, seeds, config.n_envs), evaluation_envs
         self._memory = init_host_memory(config, *self._envs.shape)

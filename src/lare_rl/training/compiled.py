@@ -70,11 +70,8 @@ class CompiledFunctions(NamedTuple):
 
 def training_module(config: TrainConfig) -> ModuleType:
     """Return the module for the data that the run's algorithm consumes."""
-    return {
-        Consumes.TRANSITIONS: off_policy,
-        Consumes.ROLLOUTS: on_policy,
-        Consumes.SEQUENCES: sequences,
-    }[config.algorithm.consumes]
+    modules = {Consumes.TRANSITIONS: off_policy, Consumes.ROLLOUTS: on_policy, Consumes.SEQUENCES: sequences}
+    return modules[config.algorithm.consumes]
 
 
 def init_memory(config: TrainConfig, *lead: int) -> Any:
@@ -88,12 +85,7 @@ def policy_function(config: TrainConfig, deterministic: bool) -> Callable[..., t
     module = training_module(config)
 
     def act(
-        actor: Any,
-        memory: Any,
-        observation: Array,
-        available: Array,
-        noise: Array | None,
-        is_new: Bool[Array, " envs"],
+        actor: Any, memory: Any, observation: Array, available: Array, noise: Array | None, is_new: Bool[Array, " envs"]
     ) -> tuple[Array, Any]:
         memory = select(is_new, module.init_memory(config), memory)
         return module.act(actor, memory, observation, available, noise, config)

@@ -84,7 +84,7 @@ def predict_returns(
 
     assert buffer.predicted_return is not None
     states = tuple((decoder, buffer.predicted_return[..., i]) for i, decoder in enumerate(decoders))
-    states = _fold(states, buffer, since, body, config, None)
+    states = fold_episodes(states, buffer, since, body, config)
     return jnp.stack([predicted for _, predicted in states], axis=-1)
 
 
@@ -110,7 +110,7 @@ def fold_episodes(
     states: tuple[State, ...],
     buffer: Replay,
     since: Int[Array, " envs"],
-    body: Callable[[State, CreditBatch], State],
+    body: Callable[[State, CreditBatch, Index], State],
     config: TrainConfig,
     expected: int | None = None,
 ) -> tuple[State, ...]:
@@ -118,25 +118,9 @@ def fold_episodes(
 
     Args:
         since: the number of the first episode, in each environment.
-        body: the function from a state and a batch of whole episodes to the next state.
+        body: the function from a state, a batch of whole episodes, and the first step of each, to the next state.
         expected: about how many episodes there are; None if they may be many.
     """
-
-    def without_index(state: State, episodes: CreditBatch, first: Index) -> State:
-        return body(state, episodes)
-
-    return _fold(states, buffer, since, without_index, config, expected)
-
-
-def _fold(
-    states: tuple[State, ...],
-    buffer: Replay,
-    since: Int[Array, " envs"],
-    body: Callable[[State, CreditBatch, Index], State],
-    config: TrainConfig,
-    expected: int | None,
-) -> tuple[State, ...]:
-    """Do as `fold_episodes`, with a `body` that also gets the first step of each episode."""
     buffer, longest, n_episodes = replay.by_payment(buffer), config.longest_segment, config.credit_window
     expected = n_episodes if expected is None else max(1, expected)
     rows = max(1, min(expected, n_episodes, MAX_ROWS // (config.credit_rows * longest))) * longest
@@ -157,7 +141,9 @@ def _fold(
 def _predict_then_update(
     decoders: Decoders, buffer: Replay, since: Int[Array, " envs"], config: TrainConfig
 ) -> Decoders:
-    body = partial(returns.predict_then_update, settings=config.credit)
+    def body(decoder: DecoderState, episodes: CreditBatch, first: Index) -> DecoderState:
+        return returns.predict_then_update(decoder, episodes, config.credit)
+
     expected = config.n_envs * config.rollout_steps // config.longest_segment
     return fold_episodes(decoders, buffer, since, body, config, expected)
 
@@ -166,7 +152,7 @@ def _rebuild_statistics(decoders: Decoders, buffer: Replay, is_stale: Bool[Array
     """Add all stored episodes to new sums if `is_stale` is true, with features standardised by the current statistics."""
     empty = tuple(map(returns.reset_statistics, decoders))
     since = jnp.where(is_stale, buffer.oldest, buffer.episodes)
-    rebuilt = fold_episodes(empty, buffer, since, returns.add_episodes, config)
+    rebuilt = fold_episodes(empty, buffer, since, lambda state, batch, _: returns.add_episodes(state, batch), config)
     return select(is_stale, rebuilt, decoders)
 
 

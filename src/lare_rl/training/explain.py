@@ -14,7 +14,7 @@ from lare_rl.credit.engine import add_to_explanation, explain_returns, init_expl
 from lare_rl.credit.explanation import Explanation
 from lare_rl.credit.explanation_text import MESSAGES, MIN_EXPLAINED_EPISODES, explanation_findings
 from lare_rl.credit.methods import METHODS, find_method
-from lare_rl.data.replay import Replay, by_payment
+from lare_rl.data.replay import Index, Replay, by_payment
 from lare_rl.nn.normalise import RunningMeanStd, empty_mean_std, update_mean_std
 from lare_rl.runs.directory import Run
 from lare_rl.training.compile_cache import cache_by_value
@@ -141,10 +141,12 @@ def _explain_first_seed(
     # The inputs are standardised first, because the run's decoder may have other inputs, or statistics of earlier steps.
     statistics = fold_episodes(empty, buffer, buffer.oldest, _observe, config)
     states = tuple(init_explanation(team, basis) for team, basis in zip(statistics, bases, strict=True))
-    states = fold_episodes(states, buffer, buffer.oldest, add_to_explanation, config)
+    states = fold_episodes(
+        states, buffer, buffer.oldest, lambda state, batch, _: add_to_explanation(state, batch), config
+    )
     return [explain_returns(state, mean.astype(int)) for state, mean in zip(states, is_average, strict=True)]
 
 
-def _observe(statistics: RunningMeanStd, episodes: CreditBatch) -> RunningMeanStd:
+def _observe(statistics: RunningMeanStd, episodes: CreditBatch, first: Index) -> RunningMeanStd:
     rows = episodes.inputs.reshape(-1, episodes.inputs.shape[-1])
     return update_mean_std(statistics, rows, valid_rows(episodes).ravel())

@@ -1,7 +1,7 @@
 """The first fit of gradient-trained decoders for many agents: it lasts until the error on held-out episodes stops falling.
 
 As published, a decoder is fitted in 50 updates to the first episodes and, after every tenth iteration, in 50 more. With
-15 agents that is too few: the policy has settled before the decoder is accurate (docs/results/agents.md).
+15 agents that is too few: the policy has settled before the decoder is accurate (benchmarks/results/agents.md).
 """
 
 from collections.abc import Callable
@@ -13,9 +13,11 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int, Key
 
+from lare_rl.config.settings import ResolvedSettings
 from lare_rl.credit import returns
+from lare_rl.credit.decomposition import CreditBatch, DecoderState
 from lare_rl.credit.prequential import empty_predictions, squared_errors
-from lare_rl.data.replay import Replay, by_payment, hide_newest, n_finished
+from lare_rl.data.replay import Index, Replay, by_payment, hide_newest, n_finished
 from lare_rl.nn.masks import select
 from lare_rl.nn.normalise import root_mean_square
 from lare_rl.training.episodes import Decoders, fold_episodes
@@ -23,7 +25,7 @@ from lare_rl.training.learner import Learner
 from lare_rl.training.seed_axis import jit_over_seeds
 from lare_rl.training.static_config import TrainConfig
 
-__all__ = ["FirstFitStoppedError", "config_of_first_fit", "fit_until_converged", "has_enough_episodes"]
+__all__ = ["FirstFitStoppedError", "config_of_first_fit", "fit_until_converged", "has_enough_episodes", "has_first_fit"]
 
 MIN_FIRST_EPISODES = 10
 """With fewer finished episodes of a seed, none are held out."""
@@ -40,6 +42,11 @@ FitFunction = Callable[[Learner, Key[Array, " seeds"]], tuple[Learner, dict[str,
 
 class FirstFitStoppedError(Exception):
     """The user asked the run to stop during the first fit. Nothing of this iteration is kept."""
+
+
+def has_first_fit(settings: ResolvedSettings, config: TrainConfig) -> bool:
+    """Return whether the decoders have a first fit, which lasts until it brings no improvement."""
+    return config.fits_separately and settings.first_fit == "held-out"
 
 
 def has_enough_episodes(learner: Learner) -> bool:
@@ -111,7 +118,10 @@ def _held_out_error(
     """Return the squared error of the returns of held-out episodes, summed over the teams, each in units of its returns."""
     empty = empty_predictions(1, config.credit_window)
     decoders, replay = tuple(decoder._replace(predictions=empty) for decoder in decoders), by_payment(replay)
-    predict = partial(returns.predict, settings=config.credit)
+
+    def predict(decoder: DecoderState, episodes: CreditBatch, first: Index) -> DecoderState:
+        return returns.predict(decoder, episodes, config.credit)
+
     decoders = fold_episodes(decoders, replay, replay.episodes - n_hidden, predict, config)
     errors = [
         squared_errors(decoder.predictions)[0] / root_mean_square(decoder.return_scale) ** 2 for decoder in decoders

@@ -306,10 +306,4 @@ ELEMENTWISE = {
     "sub": "subtract",
 }
 """From operations on each number to functions of NumPy."""
-REDUCTIONS = {
-    "reduce_and": "all",
-    "reduce_max": "max",
-    "reduce_min": "min",
-    "reduce_or": "any",
-    "reduce_sum": "sum",
-}
+REDUCTIONS = {"reduce_and": "all", "reduce_max": "max", "reduce_min": "min", "reduce_or": "any", "reduce_sum": "sum"}

@@ -20,9 +20,9 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
 from lare_rl.algorithms.registry import ALGORITHMS
-from lare_rl.config.validity import check_credit
+from lare_rl.config.validity import CreditContext, check_credit
 from lare_rl.credit.decoder_settings import CreditSettings, default_credit
-from lare_rl.credit.methods import find_method
+from lare_rl.credit.methods import Method, find_method
 from lare_rl.data.replay import StoredSteps, by_payment, mean_length, required_capacity
 from lare_rl.data.trajectory import Trajectory
 from lare_rl.envs.interface import EnvSpec, Team, Timestep, to_env_action
@@ -121,26 +121,7 @@ def pure_credit(
         LareError: the arguments do not go together.
     """
     chosen, credit = find_method(method), settings or default_credit(agents)
-    if phi is not None and tuple(phi.sizes) != (observation_size, action_size):
-        raise LareError(
-            f"phi reads observations and actions of the sizes {phi.sizes[0]} and {phi.sizes[1]}, not {observation_size} and "
-            f"{action_size}"
-        )
-    check_credit(
-        chosen,
-        credit,
-        n_agents=agents,
-        n_raw_features=observation_size + action_size,
-        scored_observation=scored_observation,
-        scale_rewards=scale_rewards,
-        discrete_actions=discrete,
-        max_steps=max_steps,
-        step_at_a_time=True,
-    )
-    if chosen.needs_phi and phi is None:
-        raise LareError(f"{method} needs a latent function: phi=...")
-    phi = phi if chosen.needs_phi else None
-    shape = (agents, action_size)
+    phi = _check_phi(chosen, phi, (observation_size, action_size))
     env = EnvSpec(
         teams=(Team("agent", 0, agents),),
         observation_size=observation_size,
@@ -148,8 +129,8 @@ def pure_credit(
         discrete=discrete,
         max_steps=max_steps,
         agents_leave=phi is not None,  # steps with an invalid factor are stored as steps of agents that have left
-        low=np.broadcast_to(np.asarray(low, np.float32), shape),
-        high=np.broadcast_to(np.asarray(high, np.float32), shape),
+        low=np.broadcast_to(np.asarray(low, np.float32), (agents, action_size)),
+        high=np.broadcast_to(np.asarray(high, np.float32), (agents, action_size)),
         is_jax=True,
     )
     algorithm = ALGORITHMS["ppo" if agents == 1 else "ippo"]  # on-policy, so that only what the decoder reads is stored
@@ -169,7 +150,34 @@ def pure_credit(
         steps=0,
         fit_updates=fit_updates,
     )
+    _check_method(config)
     return _make_functions(config, () if phi is None else (phi.graph,))
+
+
+def _check_phi(method: Method, phi: LatentFunction | None, sizes: tuple[int, int]) -> LatentFunction | None:
+    """Return the function, if the method reads it. Raises `LareError` if it does not fit, or is missing."""
+    if phi is not None and tuple(phi.sizes) != sizes:
+        raise LareError(
+            f"phi reads observations and actions of the sizes {phi.sizes[0]} and {phi.sizes[1]}, not {sizes[0]} and {sizes[1]}"
+        )
+    if method.needs_phi and phi is None:
+        raise LareError(f"{method.name} needs a latent function: phi=...")
+    return phi if method.needs_phi else None
+
+
+def _check_method(config: TrainConfig) -> None:
+    """Raise `LareError` if the method cannot compute the reward of a step from this step alone, or does not fit the environment."""
+    env = config.env
+    context = CreditContext(
+        n_agents=env.n_agents,
+        n_raw_features=env.observation_size + env.action_size,
+        scored_observation=config.scored_observation,
+        scale_rewards=config.scale_rewards,
+        discrete_actions=env.discrete,
+        max_steps=env.max_steps,
+        step_at_a_time=True,
+    )
+    check_credit(config.method, config.credit, context)
 
 
 def _make_functions(config: TrainConfig, phi: tuple[Graph, ...]) -> PureCredit:

@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Float
 
 from lare_rl.credit.basis import Basis
-from lare_rl.credit.explanation_text import MIN_EXPLAINED_EPISODES, explanation_lines, raw_feature_names
+from lare_rl.credit.explanation_text import MESSAGES, MIN_EXPLAINED_EPISODES, explanation_findings, raw_feature_names
 from lare_rl.credit.factor_fit import assess_factors
 from lare_rl.envs.load import resolve_task
 from lare_rl.envs.play import Episode, Policy, play_episodes
@@ -23,6 +23,7 @@ from lare_rl.llm.model import Model, ModelFunction, as_model
 from lare_rl.runs.directory import Run
 from lare_rl.tasks.spec import TaskSpec, require_role, select_states
 from lare_rl.training.stored_episodes import stored_role_episodes
+from lare_rl.util.findings import render
 
 __all__ = ["FunctionAssessment", "assess_function", "reflect"]
 
@@ -102,10 +103,10 @@ def assess_function(function: LatentFunction, role: TaskSpec, episodes: Sequence
     if len(episodes) < MIN_EXPLAINED_EPISODES:
         raise LareError(f"{len(episodes)} episodes say too little of a function: {MIN_EXPLAINED_EPISODES} are needed")
     factors = [_compute_factors(function, role, episode) for episode in episodes]
-    inputs = [
-        np.concatenate([z, *_scored_observations(role, episode), episode.env_action], axis=-1)
-        for z, episode in zip(factors, episodes, strict=True)
-    ]
+    inputs = []
+    for z, episode in zip(factors, episodes, strict=True):
+        observed = select_states(role.scored_observation, episode.observation, episode.next_observation)
+        inputs.append(np.concatenate([z, *observed, episode.env_action], axis=-1))
     n_factors = factors[0].shape[-1]
     basis = Basis(n_factors, inputs[0].shape[-1] - n_factors, extended=True)
     alive, returns = [episode.alive for episode in episodes], np.array([episode.return_ for episode in episodes])
@@ -115,17 +116,14 @@ def assess_function(function: LatentFunction, role: TaskSpec, episodes: Sequence
     sizes = dict.fromkeys(observed, role.observation_size) | {"action": role.action_size}
     raw_names = raw_feature_names(role.observation, role.action, sizes) if basis.n_raw_used else []
     valid_factors = np.concatenate([z[mask] for z, mask in zip(factors, alive, strict=True)])
+    findings = explanation_findings(fit.explanation, fit.score_type, names, raw_names)
     return FunctionAssessment(
         r2=fit.r2,
         r2_error=fit.r2_error,
         length_r2=fit.length_r2,
-        sentences=explanation_lines(fit.explanation, fit.score_type, names, raw_names),
+        sentences=[render(finding, MESSAGES) for finding in findings],
         ranges=_describe_ranges(names, valid_factors),
     )
-
-
-def _scored_observations(role: TaskSpec, episode: Episode) -> list[np.ndarray]:
-    return select_states(role.scored_observation, episode.observation, episode.next_observation)
 
 
 def _compute_factors(

@@ -40,7 +40,7 @@ def rewards(
 def team_proxy_rewards(
     steps: StoredSteps, sources: tuple[RewardSource, ...], config: TrainConfig, team_index: int
 ) -> Float[Array, "*batch rows"]:
-    """Return r_hat of a team, without optimism: one for each of its agents, or one for all if credit goes to whole teams."""
+    """Return r_hat of a team: one for each of its agents, or one for all if credit goes to whole teams."""
     batch, spec = step_batch(steps, config, team_index), config.credit_specs[team_index]
     return engine.proxy_rewards(sources[team_index], batch, spec)
 
@@ -71,8 +71,7 @@ def assess(learner: Learner, config: TrainConfig) -> dict[str, Float[Array, ""]]
         )
         if learner.decoders:
             decoder = learner.decoders[i]
-            metrics[-1]["credit/return_r2"] = prequential.r2(decoder.predictions)[0]
-            metrics[-1]["credit/gain"], metrics[-1]["credit/gain_error"] = prequential.gain(decoder.predictions)
+            metrics[-1] |= prequential.metrics(decoder.predictions)
             if decoder.score_type_predictions is not None:
                 metrics[-1]["credit/average"] = decoder.is_average.astype(jnp.float32)
                 metrics[-1]["credit/log_odds"] = decoder.is_log_odds.astype(jnp.float32)

@@ -3,7 +3,7 @@
 import time
 from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import Any
 
 import jax
@@ -21,31 +21,26 @@ from lare_rl.runs.best_policy import BEST_FILE, BestPolicy, empty_best, load_bes
 from lare_rl.runs.directory import Run
 from lare_rl.runs.metric_names import ACTOR_SATURATION, DETERMINISTIC_RETURN
 from lare_rl.training import first_fit, iteration, saturation
-from lare_rl.training.batching import is_batching_faster
-from lare_rl.training.collect_device import DeviceCollector, is_reset_cheap, make_jax_env
-from lare_rl.training.collect_host import HostCollector, make_host_collector
+from lare_rl.training.collect_device import DeviceCollector
+from lare_rl.training.collect_host import HostCollector
 from lare_rl.training.compile_cache import cache_by_value
 from lare_rl.training.compiled import (
     CompiledFunctions,
-    compile_ahead,
     compile_functions,
-    init_seeds,
     learner_shape,
     steps_shape,
 )
-from lare_rl.training.compiled_loop import CompiledLoop, compile_loop, init_loop
+from lare_rl.training.compiled_loop import CompiledLoop, init_loop
 from lare_rl.training.evaluation import metrics_lines
 from lare_rl.training.explain import compile_explanation
 from lare_rl.training.factors import compute_host_factors
 from lare_rl.training.iteration import IterationFunctions, when_on_host
 from lare_rl.training.learner import Learner, abandon_episodes
-from lare_rl.training.saved_state import actor_shape, load_learner, make_train_config
-from lare_rl.training.seed_axis import count_seed_devices
+from lare_rl.training.saved_state import actor_shape
 from lare_rl.training.static_config import TrainConfig
-from lare_rl.training.streams import seed_keys
 from lare_rl.util.float64 import one_blas_thread
 
-__all__ = ["Session", "restore_session", "start_session"]
+__all__ = ["Session"]
 
 MAX_CALL_S = 5.0
 """About how long one compiled call may take. Until it returns, the user cannot stop the run."""
@@ -113,7 +108,7 @@ class Session:
     @property
     def _is_before_first_fit(self) -> bool:
         """Whether the decoders' first fit is still to be made. The host decides when it ends."""
-        return _has_first_fit(self.run, self.config) and not self.first_fit_done
+        return first_fit.has_first_fit(self.settings, self.config) and not self.first_fit_done
 
     def _iterate_compiled(self, max_iterations: int) -> None:
         """Make iterations in one compiled call, for about `MAX_CALL_S`."""
@@ -280,57 +275,6 @@ class Session:
         self.collector.close()
         self._threads.shutdown()
         self.finish_saving()
-
-
-def start_session(run: Run) -> Session:
-    """Return a session before its first step."""
-    config = replace(make_train_config(run), n_devices=count_seed_devices(len(run.seeds)))
-    config = replace(config, batched=is_batching_faster(config, len(run.seeds)))
-    return _make_session(run, config, None)
-
-
-def restore_session(run: Run) -> tuple[Session, list[str]]:
-    """Return a session at the last checkpoint, and messages for the user.
-
-    Raises:
-        LareError: there is no checkpoint, or it cannot be used.
-    """
-    config, learner, metadata, arrays = load_learner(run, count_seed_devices(len(run.seeds)))
-    session = _make_session(run, config, learner)
-    try:
-        return session, session.restore(metadata, arrays)
-    except checkpoint.DAMAGED_FILE_ERRORS as error:
-        session.close()
-        raise LareError(
-            f"the checkpoint in {run.checkpoint} does not fit its environments ({type(error).__name__}: {error}): start a new run, or "
-            "install the version that the run names"
-        ) from error
-
-
-def _make_session(run: Run, config: TrainConfig, learner: Learner | None) -> Session:
-    """Compile the functions of a session and make its environments. Without a learner, start with an untrained one."""
-    task, settings, n_seeds = run.config.task, run.config.settings, len(run.seeds)
-    iterates_on_host = not config.env.is_jax or _has_first_fit(run, config)
-    env = make_jax_env(task) if config.env.is_jax else None
-    if env is not None and config.batched:
-        n_envs = config.n_envs * n_seeds // config.n_devices
-        config = replace(config, resets_with_steps=is_reset_cheap(env, n_envs))
-    functions = compile_ahead(config, run.graphs, n_seeds, iterates_on_host=iterates_on_host)
-    loop = None if env is None else compile_loop(env, config, run.graphs, settings.fit_every, n_seeds)
-    learner = learner or init_seeds(functions, seed_keys(jnp.asarray(run.seeds), 0))
-    if env is None:
-        collector = make_host_collector(task, config, run.seeds, settings.evaluation_episodes)
-    else:
-        collector = DeviceCollector(env, config, run.seeds)
-    session = Session(run, config, functions, learner, collector, loop)
-    if env is None and learner.decoders:
-        session.compile_while_collecting()
-    return session
-
-
-def _has_first_fit(run: Run, config: TrainConfig) -> bool:
-    """Whether the decoders have a first fit, which lasts until it brings no improvement."""
-    return config.fits_separately and run.config.settings.first_fit == "held-out"
 
 
 @cache_by_value

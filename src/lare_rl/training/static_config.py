@@ -1,6 +1,6 @@
 """The static configuration of a run's compiled functions."""
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 
 import jax
@@ -8,9 +8,9 @@ import numpy as np
 
 from lare_rl.algorithms.registry import Algorithm, AlgorithmSettings, Consumes, Noise
 from lare_rl.credit.decoder_settings import CreditSettings
-from lare_rl.credit.engine import CreditSpec, credit_spec
 from lare_rl.credit.methods import Method
-from lare_rl.credit.score_type import ScoreType, prediction_window
+from lare_rl.credit.score_type import prediction_window
+from lare_rl.credit.spec import CreditSpec
 from lare_rl.envs.interface import EnvSpec
 from lare_rl.tasks.payments import PAID_AT_END, PaymentRule
 from lare_rl.tasks.spec import MAX_LEVELS, CreditScope, ScoredObservation
@@ -139,24 +139,17 @@ class TrainConfig:
         """The number of entries of a row whose history is stored; 0 for a method that does not read it."""
         return max(spec.basis.n_tracked for spec in self.credit_specs)
 
-    @property
-    def observed_size(self) -> int:
-        """Size of the observation or of the global state that credit is assigned by."""
-        return self.env.state_size if self.team_level else self.env.observation_size
-
     @cached_property
     def credit_specs(self) -> tuple[CreditSpec, ...]:
         """What is fitted to the returns of each team."""
         env = self.env
-        specs = tuple(
-            credit_spec(
-                self.method,
-                self.credit,
-                {
-                    "factors": n_factors,
-                    "observation": self.observed_size,
-                    "action": env.action_size * (env.n_agents if self.team_level else 1),
-                },
+        return tuple(
+            CreditSpec(
+                method=self.method,
+                settings=self.credit,
+                n_factors=n_factors,
+                observation_size=env.state_size if self.team_level else env.observation_size,
+                action_size=env.action_size * (env.n_agents if self.team_level else 1),
                 scored_observation=self.scored_observation,
                 single_agent=env.n_agents == 1 and not self.team_level,
                 agents=1 if self.team_level else team.n_agents,
@@ -168,9 +161,6 @@ class TrainConfig:
             )
             for team, n_factors in zip(env.teams, self.n_factors or (0,) * len(env.teams), strict=True)
         )
-        if all(spec.basis.n_features for spec in specs):
-            return specs
-        return tuple(replace(spec, score_types=(ScoreType.SUM,)) for spec in specs)
 
     @property
     def score_types(self) -> tuple[int, ...]:

@@ -17,7 +17,8 @@ from lare_rl.training.latent_functions import FunctionOrPath, choose_functions
 from lare_rl.training.loop import run_session
 from lare_rl.training.process import catch_stop_signals, report_full_memory
 from lare_rl.training.progress import Listener, TensorBoard, Terminal, import_summary_writer
-from lare_rl.training.session import Session, restore_session, start_session
+from lare_rl.training.session import Session
+from lare_rl.training.start_session import restore_session, start_session
 from lare_rl.util import compilation
 
 __all__ = ["resume", "train"]

@@ -7,16 +7,16 @@ MESSAGES = {
     "grpo": "The advantage is the outcome minus the mean of its group, as in GRPO: {reason}.",
     "chosen": "it was set by the caller. The measurement says: {measured}",
     "unknown": (
-        "there are {n_rollouts:count rollout} whose outcomes have a standard deviation of {outcome_std:.2g}, from which nothing can be "
-        "said about the values"
+        "the outcomes of {n_rollouts:count rollout} have a standard deviation of {outcome_std:.2g}, which says nothing "
+        "about the values"
     ),
     "unclear_gain": (
-        "it is not clear that values of prefixes predict outcomes better than the mean of the group does (gain {gain:.1%} ± "
-        "{gain_error:.1%}). More rollouts help, and features of events: what happened in a turn"
+        "it is not clear that values of prefixes predict outcomes better than the group's mean (gain {gain:.1%} ± "
+        "{gain_error:.1%}). More rollouts help, and features of events"
     ),
     "small_gain": (
-        "values of prefixes remove only {gain:.1%} ± {gain_error:.1%} of the squared error of the group's mean. Features of events help: "
-        "what happened in a turn"
+        "values of prefixes remove only {gain:.1%} ± {gain_error:.1%} of the squared error of the group's mean. Features of "
+        "events help"
     ),
     "surprised": (
         "values of prefixes remove {gain:.1%} ± {gain_error:.1%} of the squared error of the group's mean, but outcomes are "

@@ -6,29 +6,29 @@ __all__ = ["VARIABLES", "VARIABLE_GROUPS", "read_variable"]
 
 VARIABLE_GROUPS: dict[str, dict[str, str]] = {
     "LaRe": {
-        "LARE_TRUST": "Modules, separated by commas, that a run directory or another file may import. Without it, a command that reads "
-        "such a file imports installed packages only, and `lare-rl report` imports none.",
-        "LARE_PLUGINS": "Modules, separated by commas, whose import registers methods, decoders, algorithms or families.",
-        "LARE_CACHE": "The directory of compiled programs. By default, the user's cache directory. `off`: none.",
+        "LARE_TRUST": (
+            "Modules, separated by commas, that a file such as a run's may import. Without it, commands that read such a file "
+            "import installed packages only, and `lare-rl report` none."
+        ),
+        "LARE_PLUGINS": "Modules, separated by commas, that register methods, decoders, algorithms or families.",
+        "LARE_CACHE": "Directory of compiled programs; by default, in the user's cache directory. `off`: none.",
     },
     "Language model": {
-        "OPENAI_API_KEY": "The key of the model. It is sent in the header of a request, and written nowhere. A server of your own may "
-        "need none.",
-        "OPENAI_BASE_URL": "The address of the model's server, without `--base-url`. By default, OpenAI's.",
+        "OPENAI_API_KEY": "Key of the model. It is sent in the header of requests and written nowhere. A server of your own may need none.",
+        "OPENAI_BASE_URL": "Address of the model's server, without `--base-url`. By default, OpenAI's.",
     },
     "Simulators": {
         "MUJOCO_GL": "How MuJoCo draws films: `egl`, `osmesa` or `glfw`. On Linux without a screen, LaRe sets `egl`.",
         "DISPLAY": "The screen, under X11.",
         "WAYLAND_DISPLAY": "The screen, under Wayland.",
-        "SC2PATH": "The folder of StarCraft II, for SMAC. By default, `~/StarCraftII`.",
+        "SC2PATH": "Folder of StarCraft II, for SMAC. By default, `~/StarCraftII`.",
     },
     "Processors": {
         "JAX_COMPILATION_CACHE_DIR": "JAX's own cache of compiled programs. If it is set, LaRe keeps none.",
-        "OMP_NUM_THREADS": "Threads of the numerical libraries in a process. By default, 1 in worker processes of environments.",
-        "CUDA_VISIBLE_DEVICES": "The accelerators of NVIDIA that a process sees. A sweep divides these among its runs.",
+        "OMP_NUM_THREADS": "Threads of numerical libraries in a process. By default, 1 in worker processes of environments.",
+        "CUDA_VISIBLE_DEVICES": "NVIDIA's accelerators that a process sees. A sweep divides them among its runs.",
         "HIP_VISIBLE_DEVICES": "The same for AMD.",
-        "XLA_PYTHON_CLIENT_PREALLOCATE": "`false`: JAX takes memory of an accelerator only as it is needed. A sweep sets this if runs "
-        "share an accelerator.",
+        "XLA_PYTHON_CLIENT_PREALLOCATE": "`false`: JAX takes an accelerator's memory as needed. A sweep sets this if runs share one.",
     },
 }
 """What each variable means, by subject."""

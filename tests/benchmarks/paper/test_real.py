@@ -13,29 +13,22 @@ from paper.reproduce import reproduce
 STUDY = real.read_study()
 
 
-@pytest.fixture
-def only_jobshop(monkeypatch):
-    pytest.importorskip("jumanji")
-    study = STUDY.model_copy(update={"tasks": {"jobshop": STUDY.tasks["jobshop"]}})
-    monkeypatch.setattr(real, "read_study", lambda: study)
-
-
-@pytest.mark.usefixtures("only_jobshop")
 def test_page(monkeypatch, tmp_path):
+    pytest.importorskip("jumanji")
     train = invent_training(lambda job, seed: {RETURN: float(len(job.directory.name))})
     monkeypatch.setattr(processes, "train_in_process", train)
-    page = reproduce("real", "smoke", Resources(), tmp_path / "runs", tmp_path / "out")
+    page = reproduce("real-jobshop", "smoke", Resources(), tmp_path / "runs", tmp_path / "out")
     text = page.read_text()
-    assert text.startswith(f"# {real.TITLE}\n\nBy `lare-rl reproduce real --budget smoke`. Seeds: 1. LaRe ")
+    assert text.startswith(f"# {real.TITLE}\n\nBy `lare-rl reproduce real-jobshop --budget smoke`. Seeds: 1. LaRe ")
     assert ", jumanji 1" in text
     assert all(f"| {label} | " in text for label in (*STUDY.methods, "random", "rule: most work remaining"))
     assert "it runs, and learns nothing" in text
     assert (page.parent / "real-jobshop.svg").is_file()
 
 
-@pytest.mark.usefixtures("only_jobshop")
 def test_plan(tmp_path):
-    jobs = real.plan_jobs("laptop", tmp_path)["jobshop"]
+    pytest.importorskip("jumanji")
+    jobs = real.plan_jobs("laptop", tmp_path, ["jobshop"])["jobshop"]
     assert list(jobs) == list(STUDY.methods)
     assert [list(job.resolved.all_seeds) for job in jobs["LaRe, closed form"]] == [list(range(5)), list(range(5, 10))]
     assert len({job.directory for group in jobs.values() for job in group}) == 2 * len(jobs)
@@ -47,7 +40,7 @@ def test_plan(tmp_path):
 def test_missing_package(monkeypatch, tmp_path):
     monkeypatch.setattr(real, "find_spec", lambda name: None)
     with pytest.raises(LareError, match="pip install -e 'benchmarks/real"):
-        real.plan_jobs("smoke", tmp_path)
+        real.plan_jobs("smoke", tmp_path, list(STUDY.tasks))
 
 
 def test_merge_settings():

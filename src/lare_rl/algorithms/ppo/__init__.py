@@ -21,13 +21,13 @@ class PPOSettings(AlgorithmSettings):
     hidden: tuple[Annotated[int, Field(ge=1)], ...] = (64, 64)
     """Widths of the hidden layers of actor and critic."""
     learning_rate: Annotated[float, Field(gt=0)] = 3e-4
-    """Learning rate of Adam, for actor and critic."""
+    """Learning rate of Adam."""
     gamma: Annotated[float, Field(ge=0, le=1)] = 0.99
     """Discount factor."""
     gae_lambda: Annotated[float, Field(ge=0, le=1)] = 0.95
-    """Lambda of the generalised advantage estimates: 0 relies on the critic, 1 on the rewards."""
+    """Lambda of the advantage estimates (GAE): 0 relies on the critic, 1 on the rewards."""
     epochs: Annotated[int, Field(ge=1)] = 10
-    """Number of passes over the rollout in one update."""
+    """Passes over the rollout in one update."""
     minibatch_size: Annotated[int, Field(ge=1)] = 64
     """Samples per gradient step; each agent's step is one sample."""
     clip: Annotated[float, Field(gt=0)] = 0.2
@@ -39,13 +39,13 @@ class PPOSettings(AlgorithmSettings):
     entropy_coef: Annotated[float, Field(ge=0)] = 0.01
     """Coefficient of the entropy bonus."""
     huber_delta: Annotated[float, Field(gt=0)] = 10.0
-    """Error at which the value loss turns from quadratic to linear, in standard deviations of the return."""
+    """Error at which the value loss becomes linear, in standard deviations of the return."""
     max_grad_norm: Annotated[float, Field(gt=0)] = 0.5
-    """Largest norm of the gradient of actor and critic together; a larger gradient is scaled down to it."""
+    """Largest norm of the joint gradient of actor and critic."""
     anneal: bool = True
     """Let learning rate and clip fall linearly to 0 over the run."""
     normalise_observations: bool = False
-    """Normalise the networks' observations by their running mean and standard deviation."""
+    """Normalise observations by their running mean and standard deviation."""
 
 
 def _whole_episodes(env: "EnvSpec", n_steps: int) -> int:
@@ -96,13 +96,7 @@ register_algorithm(
     Algorithm(
         name="ippo",
         consumes=Consumes.ROLLOUTS,
-        settings=PPOSettings(
-            learning_rate=1e-4,
-            gamma=1.0,
-            minibatch_size=128,
-            clip=0.5,
-            max_grad_norm=10.0,
-        ),
+        settings=PPOSettings(learning_rate=1e-4, gamma=1.0, minibatch_size=128, clip=0.5, max_grad_norm=10.0),
         module="lare_rl.algorithms.ppo.ppo",
         run_defaults=_ippo_defaults,
         summary="PPO for every agent, with shared parameters",

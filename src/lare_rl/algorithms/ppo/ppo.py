@@ -141,10 +141,7 @@ def _return_std(return_rms: RunningMeanStd) -> Float[Array, " 1"]:
 
 
 def advantages(
-    rollout: Rollout,
-    value: Float[Array, "time actors"],
-    next_value: Float[Array, "time actors"],
-    settings: PPOSettings,
+    rollout: Rollout, value: Float[Array, "time actors"], next_value: Float[Array, "time actors"], settings: PPOSettings
 ) -> Float[Array, "time actors"]:
     """Return generalised advantage estimates (Schulman et al., 2016, Eq. 16), computed backwards through time.
 

@@ -18,31 +18,31 @@ class QMIXSettings(AlgorithmSettings):
     hidden: Annotated[int, Field(ge=1)] = 64
     """Width of the agents' network and of its memory."""
     monotonic: bool = True
-    """Mix the agents' values by a monotonic network; otherwise add them up, which is VDN."""
+    """Mix the agents' values by a monotonic network; else add them up (VDN)."""
     embed: Annotated[int, Field(ge=1)] = 32
     """Width of the mixer."""
     hypernet: Annotated[int, Field(ge=1)] = 64
-    """Width of the hidden layers of the hypernetworks, which compute the mixer's weights."""
+    """Width of the hidden layers of the hypernetworks, which give the mixer's weights."""
     learning_rate: Annotated[float, Field(gt=0)] = 1e-3
-    """Learning rate of Adam, for all networks."""
+    """Learning rate of Adam."""
     gamma: Annotated[float, Field(ge=0, le=1)] = 0.99
     """Discount factor."""
     td_lambda: Annotated[float, Field(ge=0, le=1)] = 0.6
     """Lambda of the TD(lambda) targets: 0 relies on the target networks, 1 on the rewards."""
     max_grad_norm: Annotated[float, Field(gt=0)] = 10.0
-    """Largest norm of the gradient of agents and mixer together; a larger gradient is scaled down to it."""
+    """Largest norm of the joint gradient of agents and mixer."""
     batch_size: Annotated[int, Field(ge=1)] = 128
     """Episodes in one update."""
     update_every: Annotated[int, Field(ge=1)] = 8
-    """Number of new episodes for each update."""
+    """New episodes for each update."""
     target_every: Annotated[int, Field(ge=1)] = 200
-    """Episodes between two copies of the online networks to the target networks. A copy waits for the next update."""
+    """Episodes between two copies to the target networks, each after an update."""
     epsilon_start: Annotated[float, Field(ge=0, le=1)] = 1.0
     """Probability that an agent explores, at the start."""
     epsilon_end: Annotated[float, Field(ge=0, le=1)] = 0.05
     """Probability that an agent explores, at the end."""
     epsilon_steps: Annotated[int, Field(ge=1)] = 100_000
-    """Environment steps over which `epsilon_start` falls linearly to `epsilon_end`."""
+    """Environment steps of the linear fall from `epsilon_start` to `epsilon_end`."""
 
 
 def _run_defaults(env: "EnvSpec", environments: int) -> dict[str, Any]:
@@ -65,7 +65,7 @@ register_algorithm(
         settings=QMIXSettings(),
         module="lare_rl.algorithms.qmix.qmix",
         run_defaults=_run_defaults,
-        summary="a team's value as a monotonic mixture of its agents' values, each with a memory of its episode",
+        summary="a team's value as a monotonic mixture of its agents' values; recurrent agents",
         source="Rashid et al., ICML 2018; hyperparameters of PyMARL2 (Hu et al., 2021)",
         continuous=False,
         multi_agent=True,

@@ -138,11 +138,7 @@ def action_values(agent: RecurrentNetwork, batch: Sequences) -> Float[Array, "ep
 
 
 def lambda_returns(
-    reward: Steps,
-    done: Steps,
-    mask: Steps,
-    value: Float[Array, "episodes steps+1"],
-    settings: QMIXSettings,
+    reward: Steps, done: Steps, mask: Steps, value: Float[Array, "episodes steps+1"], settings: QMIXSettings
 ) -> Steps:
     """Return G, computed backwards from the end of the padding (PyMARL2's `build_td_lambda_targets`).
 

@@ -14,7 +14,7 @@ class SACSettings(OffPolicySettings):
     """Hyperparameters, as the LaRe paper sets them."""
 
     target_every: Annotated[int, Field(ge=1)] = 2
-    """Number of updates between two moves of the target critics."""
+    """Updates between two moves of the target critics."""
     temperature: Annotated[float, Field(gt=0)] = 1.0
     """Temperature alpha at the start."""
 

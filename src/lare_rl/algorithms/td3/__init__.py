@@ -14,13 +14,13 @@ class TD3Settings(OffPolicySettings):
     """Hyperparameters, as the LaRe paper sets them. The targets move at each policy update."""
 
     policy_noise: Annotated[float, Field(ge=0)] = 0.2
-    """Standard deviation of the noise on the target action, in units of the action bound."""
+    """Standard deviation of the noise on the target action, in action bounds."""
     noise_clip: Annotated[float, Field(ge=0)] = 0.5
     """Bound of that noise."""
     policy_delay: Annotated[int, Field(ge=1)] = 2
     """Critic updates for each update of actor and targets."""
     exploration_noise: Annotated[float, Field(ge=0)] = 0.1
-    """Standard deviation of the noise on the actions that are taken, in units of the action bound."""
+    """Standard deviation of the noise on actions, in action bounds."""
 
 
 register_algorithm(

@@ -1,0 +1,86 @@
+"""What is fitted to what, for one team: a method, its settings, and the sizes of a task. All that follows from them is computed here."""
+
+from dataclasses import dataclass
+from functools import cached_property
+
+from lare_rl.credit.basis import Basis
+from lare_rl.credit.decoder_settings import CreditSettings
+from lare_rl.credit.explanation_text import raw_feature_names
+from lare_rl.credit.input_names import input_size, input_sizes, tracked_size
+from lare_rl.credit.methods import Fit, Method
+from lare_rl.credit.prequential import WINDOW
+from lare_rl.credit.score_type import ScoreType, score_types_to_fit
+from lare_rl.tasks.spec import ScoredObservation
+
+__all__ = ["CreditSpec"]
+
+
+@dataclass(frozen=True, kw_only=True)
+class CreditSpec:
+    """What is fitted to what: the static part of credit assignment for one team."""
+
+    method: Method
+    settings: CreditSettings
+    n_factors: int = 0
+    observation_size: int
+    """The size of an observation or, for credit to whole teams, of the global state."""
+    action_size: int
+    scored_observation: ScoredObservation = "after"
+    """Which observations the task names."""
+    single_agent: bool
+    """Whether the task has a single agent."""
+    agents: int
+    """The number of proxy rewards of a step."""
+    max_steps: int
+    """The number of steps of the longest episode."""
+    fixed_length: bool = False
+    """Whether all episodes have the same length. A sum and a mean are then the same."""
+    window: int = WINDOW
+    """The number of last returns over which predictions of them are assessed."""
+    n_levels: int = 0
+    """The number of levels that episodes may belong to."""
+    scale_rewards: bool = False
+    """Whether training rewards are divided by the running root mean square of R/T."""
+
+    @cached_property
+    def inputs(self) -> tuple[str, ...]:
+        """The names of the decoder's inputs (`input_names.py`)."""
+        names = self.method.inputs
+        return () if names is None else names.resolve(self.scored_observation, single_agent=self.single_agent)
+
+    @property
+    def _sizes(self) -> dict[str, int]:
+        return {"factors": self.n_factors, "observation": self.observation_size, "action": self.action_size}
+
+    @property
+    def input_sizes(self) -> tuple[tuple[str, int], ...]:
+        """The name and the size of each input."""
+        return input_sizes(self.inputs, self._sizes)
+
+    @cached_property
+    def basis(self) -> Basis:
+        """The features that a closed-form decoder computes from a row of inputs."""
+        raw = tuple(name for name in self.inputs if name not in ("factors", "history"))
+        return Basis(
+            n_factors=self.n_factors if "factors" in self.inputs else 0,
+            n_raw=input_size(raw, self._sizes),
+            extended=self.method.extended_basis,
+            n_tracked=tracked_size(self.inputs, self._sizes),
+            n_levels=0 if self.method.fit is Fit.SIGNS else self.n_levels,
+            prefixes=self.method.fit is Fit.PREFIX_EVIDENCE,
+        )
+
+    @cached_property
+    def score_types(self) -> tuple[ScoreType, ...]:
+        """The score types that are fitted. Without features, no fit in closed form can compare them."""
+        if "score" not in self.method.settings or not self.basis.n_features:
+            return (ScoreType.SUM,)
+        allow_log_odds = not self.method.uses_gradient
+        return score_types_to_fit(self.settings.score, self.fixed_length, allow_log_odds=allow_log_odds)
+
+    def raw_feature_names(self, observation: str, action: str) -> list[str]:
+        """Return names of the raw features, from a task's texts; none if they are not entries of observations and actions."""
+        if not self.basis.n_raw_used or "observation_change" in self.inputs:
+            return []
+        raw = {name: size for name, size in self.input_sizes if name not in ("factors", "history")}
+        return raw_feature_names(observation, action, raw)
