@@ -155,7 +155,11 @@ def mean_returns(directory: Path, after: float) -> list[float]:
 
 
 def main(
-    kind: tyro.conf.Positional[Kind], out: Path = Path("runs/scores"), seeds: int = 10, only: tuple[str, ...] = ()
+    kind: tyro.conf.Positional[Kind],
+    out: Path = Path("runs/scores"),
+    seeds: int = 10,
+    tables: tuple[str, ...] = (),
+    labels: tuple[str, ...] = (),
 ) -> None:
     """Train and tabulate.
 
@@ -163,9 +167,10 @@ def main(
         kind: the rows.
         out: the directory of the runs.
         seeds: seeds 0 to N - 1.
-        only: labels of rows, or of tables; all by default.
+        tables: names of tables; all by default.
+        labels: labels of rows; all by default.
     """
-    rows = [row for row in KINDS[kind]() if not only or {row.label, row.table} & {*only}]
+    rows = [row for row in KINDS[kind]() if (not tables or row.table in tables) and (not labels or row.label in labels)]
     scores: dict[str, dict[str, list[float]]] = {}
     for row in rows:
         directory = out / kind / row.table.replace(" ", "") / row.label.replace(" ", "")
