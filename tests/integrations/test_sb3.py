@@ -17,6 +17,7 @@ from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.noise import NormalActionNoise
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
+from helpers.assigner_episodes import SMALL_CREDIT
 from helpers.logged_envs import LoggedEnv, RecordingAssigner, check_episodes
 from helpers.long_tests import long_case
 from helpers.toy_envs import Chase, Pick, toy_spec
@@ -143,7 +144,8 @@ class Grouped(gymnasium.Wrapper):
 
 @pytest.mark.parametrize("kind", [SAC, PPO])
 def test_groups_are_read_from_info(kind):
-    env, credit = Grouped(TimeLimit(Chase(), EPISODE_STEPS)), CreditAssigner("bayes", task=toy_spec(group="level"))
+    env = Grouped(TimeLimit(Chase(), EPISODE_STEPS))
+    credit = CreditAssigner("bayes", task=toy_spec(group="level"), settings=SMALL_CREDIT)
     if kind is PPO:
         on_policy(env, PPO, "MlpPolicy").learn(64, callback=CreditCallback(credit))
     else:

@@ -1,10 +1,12 @@
 """Finished runs that many tests read. They share one compiled program; a test that changes files works on a copy."""
 
+import shutil
+
 import pytest
 
 import lare_rl
 from helpers.jax_toy_envs import echo_spec
-from helpers.listeners import MessageListener
+from helpers.listeners import AtStep, MessageListener
 from helpers.toy_envs import toy_spec
 from helpers.training_runs import CHASE, ECHO_PHI, QUICK_CREDIT, train_quietly
 from lare_rl.credit.decoder_settings import CreditSettings
@@ -32,10 +34,15 @@ def dense_run(dense_training):
 
 @pytest.fixture(scope="session")
 def factor_run(small, phi, tmp_path_factory):
-    """A run of 240 steps with a latent function from a file, which scores the observations before and after a step."""
+    """A run of 240 steps with a latent function from a file, which scores the observations before and after a step.
+
+    Its files at step 156 are in the directory `killed` beside it.
+    """
     directory = tmp_path_factory.mktemp("factors")
     phi.save(directory / "phi.py")
-    return train_quietly(toy_spec(), small(scored_observation="both"), directory / "run", directory / "phi.py")
+    copy = AtStep(156, lambda: shutil.copytree(directory / "run", directory / "killed"))
+    settings = small(scored_observation="both")
+    return train_quietly(toy_spec(), settings, directory / "run", directory / "phi.py", listeners=[copy])
 
 
 @pytest.fixture(scope="session")

@@ -14,7 +14,6 @@ from helpers.small_configs import (
     LENGTHS,
     ONE_AGENT,
     ONE_TEAM,
-    SUM_CREDIT,
     TOTAL,
     TWO_TEAMS,
     add_steps,
@@ -191,7 +190,7 @@ def test_assess_reads_the_newest_steps():
 @pytest.mark.long
 @pytest.mark.parametrize("method", [*map(long_case, ("rd", "rrdu", "lare-rd", "ircr")), "lare-linear"])
 def test_two_environments_equal_one_twice_as_long(method):
-    wide, long = small_config(method, n_envs=2, credit=SUM_CREDIT), small_config(method, credit=SUM_CREDIT)
+    wide, long = small_config(method, n_envs=2), small_config(method)
     steps = random_steps(envs=2)
     factors = random_factors(wide, steps)
 
@@ -396,7 +395,7 @@ def test_optimism_adds_deviations_to_training_rewards_only(env, score):
 
 
 def test_optimism_before_two_returns():
-    config = small_config("bayes", credit=CreditSettings(optimism=2.0))
+    config = small_config("bayes", credit=CreditSettings(score="sum", optimism=2.0))
     learner = untrained_learner(config)
     reward = jitted(rewards, config)(steps_as_stored(config), learner.reward_state)
     np.testing.assert_array_equal(reward, 0)
