@@ -100,8 +100,8 @@ def check_shown(credit, envs):
         (TD3, Chase, 1, {"action_noise": NormalActionNoise(np.zeros(1), np.ones(1))}),
         (TD3, DictChase, 2, {"buffer": CreditDictReplayBuffer, "policy": "MultiInputPolicy"}),
         long_case(SAC, Chase, 2, {}),
-        (sb3_contrib.TQC, Chase, 3, {}),
-        (sb3_contrib.CrossQ, Chase, 2, {}),
+        long_case(sb3_contrib.TQC, Chase, 3, {}),
+        long_case(sb3_contrib.CrossQ, Chase, 2, {}),
         (DQN, Pick, 2, {}),
         long_case(sb3_contrib.QRDQN, Pick, 2, {}),
     ],
@@ -246,7 +246,7 @@ class RolloutRecorder(BaseCallback):
 
 
 @pytest.mark.parametrize(
-    ("kind", "normalised"), [(PPO, True), (A2C, False), (sb3_contrib.TRPO, False), long_case(A2C, True)]
+    ("kind", "normalised"), [(PPO, True), (A2C, False), long_case(sb3_contrib.TRPO, False), long_case(A2C, True)]
 )
 def test_rewards_and_advantages_by_hand(kind, normalised):
     env, envs = make_envs(2)
