@@ -38,7 +38,7 @@ from lare_rl.training.iteration import IterationFunctions, when_on_host
 from lare_rl.training.learner import Learner, abandon_episodes
 from lare_rl.training.saved_state import actor_shape
 from lare_rl.training.static_config import TrainConfig
-from lare_rl.util.float64 import one_blas_thread
+from lare_rl.util.float64 import load_linear_algebra, one_blas_thread
 
 __all__ = ["Session"]
 
@@ -186,6 +186,7 @@ class Session:
     def compile_while_collecting(self) -> None:
         """Compile in threads what the first finished episodes need. Until then, the processor often waits for a simulator."""
         shape = learner_shape(self.config, len(self.run.seeds))
+        load_linear_algebra()
         self._threads.submit(self.functions.compile_learning, shape)
         if self.config.n_devices == 1:
             self._threads.submit(compile_explanation, shape, self.config)

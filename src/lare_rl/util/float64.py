@@ -8,7 +8,7 @@ from typing import Any
 import jax
 from threadpoolctl import ThreadpoolController
 
-__all__ = ["float64", "one_blas_thread"]
+__all__ = ["float64", "load_linear_algebra", "one_blas_thread"]
 
 
 @contextlib.contextmanager
@@ -27,8 +27,12 @@ def one_blas_thread() -> contextlib.AbstractContextManager[Any]:
     return _linear_algebra_libraries().limit(limits=1, user_api="blas")
 
 
-@cache
-def _linear_algebra_libraries() -> ThreadpoolController:
+def load_linear_algebra() -> None:
+    """Import SciPy's linear algebra before threads compile. JAX imports it when it compiles, and two threads that do so may fail."""
     import scipy.linalg  # noqa: F401 - JAX calls the LAPACK that SciPy loads
 
+
+@cache
+def _linear_algebra_libraries() -> ThreadpoolController:
+    load_linear_algebra()
     return ThreadpoolController()
