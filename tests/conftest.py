@@ -13,6 +13,7 @@ import pytest
 
 from helpers.jax_toy_envs import echo_spec
 from helpers.toy_envs import PHI, REWARD, toy_spec
+from helpers.training_runs import QUICK_CREDIT
 from helpers.untrained_runs import write_run
 from lare_rl import cli
 from lare_rl.algorithms.ppo import PPOSettings
@@ -60,10 +61,10 @@ MODULE_NUMBERS = itertools.count(1)
 
 @pytest.fixture(autouse=True, scope="module")
 def clear_compiled_programs():
-    """Free the memory of compiled programs, which would grow to gigabytes. Four modules share JAX's own, mostly small, programs."""
+    """Free the memory of compiled programs, which would grow to gigabytes, after every four modules, which share them."""
     yield
-    clear_compile_cache()
     if next(MODULE_NUMBERS) % 4 == 0:
+        clear_compile_cache()
         jax.clear_caches()
         gc.collect()
 
@@ -158,7 +159,7 @@ def small():
                 for name in ("td3", "ddpg", "sac")
             },
             "ppo": PPOSettings(hidden=(8,), minibatch_size=16, epochs=2),
-            "credit": {"hidden": (8,), "sampled_steps": 4, "steps": 16},
+            "credit": QUICK_CREDIT,
         }
         return Settings(**(values | changes))
 
@@ -185,7 +186,7 @@ def small_many():
             "capacity": 400,
             "ippo": PPOSettings(hidden=(8,), minibatch_size=100, epochs=1),
             **{name: ALGORITHMS[name].settings.model_copy(update=quick) for name in ("qmix", "vdn")},
-            "credit": {"hidden": (8,), "steps": 50, "sampled_steps": 5},
+            "credit": QUICK_CREDIT | {"steps": 50, "sampled_steps": 5},
         }
         return Settings(**(values | changes))
 

@@ -102,12 +102,14 @@ def test_host_environment_in_worker_processes(run_elsewhere, tmp_path):
         "report run",
         "compare run",
         "sweep study.toml",
+        "design CN-6 --out cn.py",
     )
     assert "over 2 episodes" in output
     assert (tmp_path / "run" / "report.html").stat().st_size > 10_000
     assert (tmp_path / "runs" / "study" / "results.csv").is_file()
 
 
+@pytest.mark.long
 def test_compiled_environment(run_elsewhere, tmp_path):
     run_elsewhere(
         PROGRAM,

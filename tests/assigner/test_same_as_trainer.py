@@ -87,11 +87,12 @@ EVERY_5 = PaymentRule(period=5)
 @pytest.mark.parametrize(
     ("method", "env", "changes"),
     [
-        ("lare-bayes", PHI_ENV, {"score": "auto"}),
-        ("rd-linear", ONE_AGENT, {"payments": EVERY_5, "exact": "spread"}),
+        ("lare-bayes", PHI_ENV, {"score": "auto", "payments": EVERY_5, "exact": "spread"}),
         ("bayes-history", ONE_AGENT, {"payments": EVERY_5}),
         ("bayes-progress", ONE_AGENT, {"exact": "last"}),
         ("bayes", ONE_AGENT, {"score": "binary", "group": "map"}),
+        long_case("rd-linear", ONE_AGENT, {"payments": EVERY_5, "exact": "spread"}),
+        long_case("lare-bayes", PHI_ENV, {"score": "auto"}),
         long_case("bayes", ONE_AGENT, {"group": "map"}),
         long_case("lare-bayes-progress", PHI_ENV, {"payments": EVERY_5}),
         long_case("bayes-progress", ONE_TEAM, {"exact": "spread"}),

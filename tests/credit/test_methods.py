@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from jaxtyping import Array, Float
 
+from helpers.assigner_episodes import SMALL_CREDIT
 from lare_rl import CreditAssigner
 from lare_rl.config.settings import Settings
 from lare_rl.credit import input_names, methods
@@ -77,7 +78,7 @@ def test_registered_method_is_trained(fit, registered):
     register_decoder(Decoder("squares", lambda key, shape, settings: Squares(shape.gain * jnp.ones(shape.n_inputs))))
     register_method(Method(f"squares {fit}", "squares", "this test", inputs=methods.RAW, fit=fit, decoder="squares"))
     assert Settings(method=f"squares {fit}").method == f"squares {fit}"
-    credit = CreditAssigner(f"squares {fit}", observation_space=2, action_space=1)
+    credit = CreditAssigner(f"squares {fit}", observation_space=2, action_space=1, settings=SMALL_CREDIT)
     random = np.random.default_rng(0)
     for _ in range(4):
         s, a, reward = random.normal(size=(10, 2)), random.normal(size=(10, 1)), random.normal(size=10)

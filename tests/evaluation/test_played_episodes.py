@@ -22,7 +22,7 @@ def run(tmp_path_factory):
         environments=2,
         evaluate_every=240,
         evaluation_episodes=2,
-        credit={"exact": "last"},
+        credit={"exact": "last", "score": "sum"},
         ippo={"hidden": (8,), "minibatch_size": 60, "epochs": 1},
     )
     return lare_rl.train(TASK, settings, out=tmp_path_factory.mktemp("runs") / "echo", listeners=[])

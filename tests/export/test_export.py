@@ -19,6 +19,7 @@ from helpers.jax_toy_envs import echo_spec
 from helpers.long_tests import long_case
 from helpers.small_configs import ONE_TEAM, TOTAL, TWO_TEAMS, random_steps, small_config, untrained_learner
 from helpers.toy_envs import pick_spec, toy_spec
+from helpers.training_runs import QUICK_CREDIT
 from lare_rl.algorithms.ppo import ppo
 from lare_rl.credit import decomposition
 from lare_rl.credit.methods import METHODS
@@ -101,9 +102,9 @@ def export_run(small, small_many, tmp_path_factory):
         if METHODS[method].needs_phi:
             functions = [verify_function(source, role, phi_kind) for role in task.roles]
             function = functions if len(functions) > 1 else functions[0]
-        settings = (small if single else small_many)(
-            method=method, algorithm=kind.partition("-")[0], steps=120 if single else 200
-        )
+        values = {"method": method, "algorithm": kind.partition("-")[0], "steps": 120 if single else 200}
+        # The lengths of the toy with many agents differ, so that the type of the score can be found.
+        settings = small(**values) if single else small_many(**values, credit=QUICK_CREDIT | {"score": "auto"})
         directory = tmp_path_factory.mktemp("export")
         run = lare_rl.train(task, settings, function=function, out=directory / "run", listeners=[])
         result = lare_rl.export_run(run, directory / "out", seed=1)

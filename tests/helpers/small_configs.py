@@ -47,6 +47,7 @@ SMALL_SETTINGS = {
 
 SUM_CREDIT = CreditSettings(hidden=(8,), sampled_steps=4, steps=24, score="sum")
 """Nothing is fitted to find out the type of the score, which takes seconds to compile."""
+ANY_SCORE = SUM_CREDIT.model_copy(update={"score": "auto"})
 
 
 def small_config(method, algorithm="td3", env=ONE_AGENT, **changes):
@@ -56,7 +57,7 @@ def small_config(method, algorithm="td3", env=ONE_AGENT, **changes):
         "method": METHODS[method],
         "algorithm": ALGORITHMS[algorithm],
         "hyperparameters": SMALL_SETTINGS[algorithm],
-        "credit": CreditSettings(hidden=(8,), sampled_steps=4, steps=24),
+        "credit": SUM_CREDIT,
         "scale_rewards": False,
         "n_factors": tuple(2 + i for i in range(len(env.teams))) if METHODS[method].needs_phi else (),
         "scored_observation": "after",

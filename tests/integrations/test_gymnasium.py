@@ -14,7 +14,6 @@ from gymnasium.wrappers.vector import RecordEpisodeStatistics
 
 from helpers.logged_envs import LoggedEnv, RandomEnv, RecordingAssigner, check_episodes, recording_assigner
 from helpers.toy_envs import Levels, levels_spec, toy_spec
-from lare_rl.assigner.assigner import CreditAssigner
 from lare_rl.envs.episodic import TRUE_REWARD, EpisodicReward
 from lare_rl.errors import LareError
 from lare_rl.integrations.gymnasium import Credit, VectorCredit
@@ -201,7 +200,7 @@ class Ended(gymnasium.Wrapper):
 @all_modes
 @pytest.mark.parametrize("payments", ["end", 2])
 def test_groups_are_read_from_info(mode, payments):
-    levels, credit = [], CreditAssigner("bayes", task=levels_spec(payments=payments))
+    levels, credit = [], RecordingAssigner("bayes", task=levels_spec(payments=payments))
     vector = SyncVectorEnv([lambda n=n: Ended(TimeLimit(Levels(), n), levels) for n in (3, 4)], autoreset_mode=mode)
     play(VectorCredit(vector, credit, pay="environment"), 20)
     names, episodes = list(credit.group_names), list(credit.store.episodes.values())

@@ -8,7 +8,6 @@ from pettingzoo.test import parallel_api_test
 from helpers.logged_envs import RecordingAssigner
 from helpers.parallel_toy_envs import Toy
 from helpers.toy_envs import toy_spec
-from lare_rl.assigner.assigner import CreditAssigner
 from lare_rl.envs.episodic import TRUE_REWARD
 from lare_rl.errors import LareError
 from lare_rl.integrations.pettingzoo import CreditParallel
@@ -127,7 +126,7 @@ def test_team_of_one():
 def test_groups_are_read_from_info():
     """Here from that of any agent that has it."""
     task = toy_spec(observation_size=2, action_size=3, group="level")
-    credit = CreditAssigner("bayes", task=task, observation_space=2, action_space=spaces.Discrete(3), agents=3)
+    credit = make_assigner("bayes", task=task)
     team = LoggedTeam(NAMES)
     wrapped = CreditParallel(team, credit)
     for level in (5, 7, 5):

@@ -17,6 +17,7 @@ from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.noise import NormalActionNoise
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
+from helpers.assigner_episodes import SMALL_CREDIT
 from helpers.logged_envs import LoggedEnv, RecordingAssigner, check_episodes
 from helpers.long_tests import long_case
 from helpers.toy_envs import Chase, Pick, toy_spec
@@ -99,8 +100,8 @@ def check_shown(credit, envs):
         (TD3, Chase, 1, {"action_noise": NormalActionNoise(np.zeros(1), np.ones(1))}),
         (TD3, DictChase, 2, {"buffer": CreditDictReplayBuffer, "policy": "MultiInputPolicy"}),
         long_case(SAC, Chase, 2, {}),
-        (sb3_contrib.TQC, Chase, 3, {}),
-        (sb3_contrib.CrossQ, Chase, 2, {}),
+        long_case(sb3_contrib.TQC, Chase, 3, {}),
+        long_case(sb3_contrib.CrossQ, Chase, 2, {}),
         (DQN, Pick, 2, {}),
         long_case(sb3_contrib.QRDQN, Pick, 2, {}),
     ],
@@ -143,7 +144,8 @@ class Grouped(gymnasium.Wrapper):
 
 @pytest.mark.parametrize("kind", [SAC, PPO])
 def test_groups_are_read_from_info(kind):
-    env, credit = Grouped(TimeLimit(Chase(), EPISODE_STEPS)), CreditAssigner("bayes", task=toy_spec(group="level"))
+    env = Grouped(TimeLimit(Chase(), EPISODE_STEPS))
+    credit = CreditAssigner("bayes", task=toy_spec(group="level"), settings=SMALL_CREDIT)
     if kind is PPO:
         on_policy(env, PPO, "MlpPolicy").learn(64, callback=CreditCallback(credit))
     else:
@@ -244,7 +246,7 @@ class RolloutRecorder(BaseCallback):
 
 
 @pytest.mark.parametrize(
-    ("kind", "normalised"), [(PPO, True), (A2C, False), (sb3_contrib.TRPO, False), long_case(A2C, True)]
+    ("kind", "normalised"), [(PPO, True), (A2C, False), long_case(sb3_contrib.TRPO, False), long_case(A2C, True)]
 )
 def test_rewards_and_advantages_by_hand(kind, normalised):
     env, envs = make_envs(2)

@@ -15,7 +15,6 @@ from torchrl.envs.utils import step_mdp
 
 from helpers.logged_envs import LoggedEnv, RandomEnv, RecordingAssigner, check_episodes, recording_assigner
 from helpers.toy_envs import Levels, levels_spec
-from lare_rl.assigner.assigner import CreditAssigner
 from lare_rl.errors import LareError
 from lare_rl.integrations.torchrl import CREDIT_STEP, REWARD, CreditTransform
 
@@ -71,7 +70,7 @@ def test_collector(env_spaces, categorical, n_envs):
 
 
 def test_groups_are_read_from_the_next_state():
-    credit = CreditAssigner("bayes", task=levels_spec())
+    credit = RecordingAssigner("bayes", task=levels_spec())
     batch = roll_out(20, TimeLimit(Levels(), 5))
     batch["next", "level"] = 7 + torch.arange(20) // 10
     make_buffer(credit).extend(batch)

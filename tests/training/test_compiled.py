@@ -10,7 +10,6 @@ import pytest
 from helpers.numpy_twins import assert_close
 from helpers.small_configs import (
     ONE_AGENT,
-    SUM_CREDIT,
     TOTAL,
     TWO_TEAMS,
     add_steps,
@@ -32,7 +31,7 @@ from lare_rl.training.decoder_fits import fit_repeatedly
 def test_train_step_of_seeds_in_lockstep(method, algorithm, env):
     fits_first = algorithm != "td3"
     changes = {"rollout_steps": TOTAL, "n_envs": 2} if fits_first else {}
-    config = small_config(method, algorithm, env, credit=SUM_CREDIT, **changes)
+    config = small_config(method, algorithm, env, **changes)
     functions = compile_functions(config)
     keys = jax.vmap(jax.random.key)(jnp.arange(3))
     start, steps = functions.init(keys), random_steps(env, config.n_envs)

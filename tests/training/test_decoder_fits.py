@@ -10,7 +10,6 @@ import pytest
 from helpers.numpy_twins import assert_close
 from helpers.small_configs import (
     ONE_AGENT,
-    SUM_CREDIT,
     add_steps,
     learner_with_episodes,
     random_steps,
@@ -38,7 +37,7 @@ def test_update_in_chunks_is_that_of_the_batch(monkeypatch):
 
 
 def test_seeds_are_fitted_at_once_or_one_after_the_other():
-    config = small_config("rd", fit_updates=2, credit=SUM_CREDIT)
+    config = small_config("rd", fit_updates=2)
     seeds = jax.tree.map(lambda *leaves: np.stack(leaves), *(learner_with_episodes(config, seed) for seed in (0, 1)))
     results = []
     for batched in (False, True):

@@ -40,6 +40,7 @@ FORGETFUL = CHASE.model_copy(update={"environment": "toys/Forgetful-v0"})
 
 IN_WORKERS = toy_spec(environment="helpers.toy_envs:toys/Chase-v0")
 
+
 KILLED = """
 import json, os, signal
 from helpers.listeners import AtStep
@@ -177,7 +178,7 @@ def test_extend_refuses_fewer_steps(dense_run, tmp_path):
     assert open_run(run.directory).config == run.config
 
 
-@pytest.mark.parametrize("anneal", [True, False])
+@pytest.mark.parametrize("anneal", [True, long_case(False)])
 def test_extending_a_run_whose_learning_rate_fell_is_no_long_run(small, tmp_path, anneal):
     """Steps are rounded up, and a message says so."""
     ppo = {"hidden": (8,), "minibatch_size": 20, "epochs": 1, "anneal": anneal}

@@ -13,7 +13,6 @@ from helpers.numpy_twins import assert_close, equal
 from helpers.small_configs import (
     LENGTHS,
     ONE_TEAM,
-    SUM_CREDIT,
     TOTAL,
     add_steps,
     jitted,
@@ -170,7 +169,7 @@ def test_cut_lengths_change_nothing(monkeypatch):
 @pytest.mark.long
 def test_train_step_of_seeds_in_lockstep():
     # The seeds have different numbers of updates, and batches of different lengths.
-    config = qmix_config("lare-rrdu", rollout_steps=TOTAL, credit=SUM_CREDIT)
+    config = qmix_config("lare-rrdu", rollout_steps=TOTAL)
     functions, keys = compile_functions(config), jax.vmap(jax.random.key)(jnp.arange(2))
     start = functions.init(keys)
     steps = [random_steps(ONE_TEAM, 2, seed) for seed in (0, 1)]

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 import lare_rl
+from helpers.long_tests import long_case
 from helpers.toy_envs import levels_spec, pick_spec, toy_spec
 from helpers.training_runs import QUICK_CREDIT, train_quietly
 from lare_rl.errors import LareError
@@ -34,7 +35,7 @@ def test_old_episodes_are_overwritten(dense_run, factor_run):
         np.testing.assert_array_equal(episode["observations"], expected["observations"])
 
 
-@pytest.mark.parametrize("payments", ["end", 2])
+@pytest.mark.parametrize("payments", [long_case("end"), 2])
 def test_groups(small, tmp_path, payments):
     settings = small(method="bayes", seeds=1, steps=48, credit=QUICK_CREDIT)
     run = train_quietly(levels_spec(payments=payments), settings, tmp_path / "run")

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from envs.particles import twin as slow
+from helpers.long_tests import long_case
 from lare_rl.envs.particles.catalogue import TASKS, find_particle_task
 from lare_rl.envs.particles.navigation import N_LAYOUTS, make_layouts
 from lare_rl.envs.particles.predator_prey import SIZES, observe_preys
@@ -30,6 +31,8 @@ EXPECTED = {
     "TriangleArea": (3, 14, 0.2, 1.5),
 }
 FAR = 50.0
+CASES = [long_case(name) if name in ("CN-30", "PP-30") else name for name in TASKS]
+"""The largest tasks repeat those of 15 agents, which observe only the nearest entities too."""
 
 
 def test_catalogue():
@@ -108,7 +111,7 @@ def test_speed_limit():
 # Slow twins
 
 
-@pytest.mark.parametrize("name", TASKS)
+@pytest.mark.parametrize("name", CASES)
 def test_task_equals_its_twin(name):
     task, twin = TASKS[name], slow.TWINS[name]
     assert slow.learners(twin) == list(range(task.n_agents))
@@ -150,7 +153,7 @@ def starts(name: str) -> np.ndarray:
     return np.asarray(state.position)
 
 
-@pytest.mark.parametrize("name", TASKS)
+@pytest.mark.parametrize("name", CASES)
 def test_starts_are_uniform(name):
     n_moving, (*_, radius, landmark_radius) = TASKS[name].world.n_moving, EXPECTED[name]
     positions = [starts(name)[:, :n_moving] / radius]
@@ -162,7 +165,9 @@ def test_starts_are_uniform(name):
         assert position.std((0, 1)) == pytest.approx(3**-0.5, rel=0.03)
 
 
-@pytest.mark.parametrize(("agents", "radius", "to_nearest"), [(6, 1.5, 0.939), (15, 2.2, 0.874), (30, 3.0, 0.843)])
+@pytest.mark.parametrize(
+    ("agents", "radius", "to_nearest"), [(6, 1.5, 0.939), (15, 2.2, 0.874), long_case(30, 3.0, 0.843)]
+)
 def test_landmarks_of_navigation_are_separated(agents, radius, to_nearest):
     position = starts(f"CN-{agents}")[:, agents:]
     assert np.abs(position).max() <= radius
@@ -215,7 +220,7 @@ def test_greedy_predator_moves_along_the_longer_axis():
     assert actions.tolist() == [2, 1, 4, 3]
 
 
-@pytest.mark.parametrize("name", ["PP-6", pytest.param("PP-30", marks=pytest.mark.long)])
+@pytest.mark.parametrize("name", ["PP-6", long_case("PP-30")])
 def test_shipped_prey_is_harder_to_catch_than_a_random_one(name):
     task, size = TASKS[name], SIZES[name]
 
