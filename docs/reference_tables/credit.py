@@ -41,7 +41,6 @@ FAMILIES = {
 }
 
 UNMEASURED = (
-    "lrr",
     "rudder",
     "grd",
     "rbt",
