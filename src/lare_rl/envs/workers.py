@@ -63,8 +63,8 @@ class SubprocVecEnv(VecEnv):
                 key. Empty: end them.
 
         Raises:
-            LareError: an environment cannot be made, or `reuse_key` needs more processes. Later calls raise it if an environment raises an error, dies or does not
-                reply in time. All workers have then ended.
+            LareError: an environment cannot be made, or `reuse_key` needs more processes. Later calls raise it if an environment
+                raises an error, dies or does not reply in time. All workers have then ended.
         """
         self.timeout = timeout
         self._timeout_hint, self._reuse_key = timeout_hint, reuse_key
