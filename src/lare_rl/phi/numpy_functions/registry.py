@@ -174,7 +174,13 @@ def as_sizes(value: Any) -> list[int]:
 
 
 def as_float(value: Any) -> float:
-    """Return a number, or an array that is one number for all rows, as a float. Raises `TypeError` for other values."""
+    """Return a number, or an array with one number, as a float.
+
+    Raises:
+        TypeError: another value.
+        ValueError: an array with several numbers.
+        RefusedError: an array that differs from row to row.
+    """
     if not isinstance(value, (bool, int, float, Array)):
         raise TypeError(f"a number is needed, not {describe(value)}")
     return float(value)
