@@ -10,7 +10,7 @@ from lare_rl.compare.comparison import Comparison, compare
 from lare_rl.compare.messages import find_small_samples, to_text
 from lare_rl.compare.rank_test import mann_whitney, mann_whitney_u
 from lare_rl.compare.results import read_run_results
-from lare_rl.compare.scores import Group
+from lare_rl.compare.scores import LabelScores
 from lare_rl.envs.families import load_env_spec
 from lare_rl.report import figures
 from lare_rl.runs.directory import Run, open_without_functions
@@ -234,7 +234,7 @@ def claimed(claim: Claim, other: str, exhibit: Exhibit, comparison: Mapping[str,
     ]
 
 
-def units(entry: Group, other: Group) -> tuple[np.ndarray, np.ndarray]:
+def units(entry: LabelScores, other: LabelScores) -> tuple[np.ndarray, np.ndarray]:
     """The scores by which two labels are compared at the last step: by draw if both have several draws, else by seed."""
     axis = 1 if min(len(entry.draws), len(other.draws)) > 1 else 0
     is_lare, paper_steps = (group.scores[..., 0, -1].mean(axis=axis) for group in (entry, other))

@@ -7,14 +7,15 @@ from contextvars import ContextVar
 from inspect import cleandoc, isclass
 from pathlib import Path
 from textwrap import fill
-from typing import TYPE_CHECKING, Any, get_args
+from typing import TYPE_CHECKING, Annotated, Any, get_args
 
-from pydantic import BaseModel, ConfigDict, GetCoreSchemaHandler, ValidationError
+from pydantic import BaseModel, ConfigDict, Field, GetCoreSchemaHandler, ValidationError
 from pydantic.fields import FieldInfo
 from pydantic_core import core_schema
 
 __all__ = [
     "CheckedModel",
+    "Count",
     "LareError",
     "check_count",
     "did_you_mean",
@@ -30,6 +31,9 @@ MAX_REPR = 100
 
 MAX_PROBLEMS = 3
 """Problems that a message lists."""
+
+Count = Annotated[int, Field(ge=1)]
+"""The type of a field of a checked model: a whole number, 1 or more."""
 
 
 class LareError(Exception):

@@ -69,7 +69,7 @@ def test_score_meaning(make_run):
     for options, text in (
         ({}, "on Chase at step 100, the last"),
         ({"step": 50}, "on Chase at step 50."),
-        ({"late": True}, "on Chase averaged over the evaluations after three quarters of 100 steps"),
+        ({"average_last_quarter": True}, "on Chase averaged over the evaluations after three quarters of 100 steps"),
     ):
         assert text in to_text([find_score_meaning(compare(results, **options))])
     first = replace(compare(results), step=0)

@@ -77,7 +77,7 @@ def test_other_tasks_and_steps(write_csv, run):
 
 def test_same_seed_twice(write_csv, run):
     path = write_csv(method_rows("dense"))
-    with pytest.raises(LareError, match=rf"{path} and {run.directory} .*dense on Chase with seed 0: .*rename"):
+    with pytest.raises(LareError, match=rf"{path} and {run.directory} .*dense on Chase with seed 0 .*rename"):
         compare(collect_results((run.directory, path))[0])
 
 

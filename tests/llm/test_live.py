@@ -452,3 +452,21 @@ def test_invalid_endpoint(monkeypatch, url, n_pauses):
         LiveModel("m", url, budget=budget, sleep=pauses.append).reply(REQUEST, 0)
     assert "\n" not in str(error.value)
     assert (len(pauses), budget.tokens_out) == (n_pauses, 0)
+
+
+@pytest.mark.parametrize(
+    "address",
+    [
+        "http://user:secret@127.0.0.1:notaport/v1",
+        "http://user:secret@[",
+        "user:secret@127.0.0.1/v1",
+        "http://user:secret@x@127.0.0.1:notaport/v1",
+        "http://user:secret@127.0.0.1:1/v1",
+    ],
+)
+def test_password_in_an_address_is_removed(monkeypatch, address):
+    monkeypatch.setenv("OPENAI_API_KEY", KEY)
+    messages = []
+    with pytest.raises(ModelError) as error:
+        LiveModel("m", address, sleep=lambda _: None, on_message=messages.append).reply(REQUEST, 0)
+    assert "secret" not in " ".join([str(error.value), *messages])

@@ -84,6 +84,9 @@ BODIES = {
     "return [np.dtype]": "E-FORM line 3: not np.dtype",
     "return [observation.tolist(1)]": "E-RUN line 3: too many positional arguments",
     "return [len(1, 2)]": "E-RUN line 3: len",
+    "return [observation.astype(None)]": "E-NUMPY line 3: None is",
+    "return [observation.astype([1])]": "E-NUMPY line 3: a list is",
+    "return [observation.astype(lambda x: x)]": "E-NUMPY line 3: a function is",
     "return [np.linspace('a', 1)]": "E-RUN line 3: not a str",
 }
 CASES = SOURCES | {"import math, numpy as np\n" + phi_source(body): words for body, words in BODIES.items()}

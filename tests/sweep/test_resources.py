@@ -50,6 +50,34 @@ def test_assign_cards_of_the_user():
     assert all(resources.PREALLOCATE not in process for process in variables)
 
 
+def test_stale_variable_of_the_other_vendor():
+    assert assign_cards(2, None, 4, {SECOND: "0"}) == [{FIRST: "0,1"}, {FIRST: "2,3"}]
+
+
+@pytest.mark.parametrize(
+    ("program", "words"),
+    [
+        ("print('a warning'); print(1/0)", "ZeroDivisionError"),
+        ("print('a warning'); raise SystemExit(3)", "exit status 3"),
+        ("print('a warning')", "a warning"),
+    ],
+)
+def test_cards_that_cannot_be_counted(monkeypatch, program, words):
+    monkeypatch.setattr(resources, "COUNT_CARDS", program)
+    monkeypatch.setattr(resources, "usable_cores", lambda: None)
+    with pytest.raises(LareError, match=f"cards.*{words}") as error:
+        assign_slots(Resources(processes=2))
+    assert "\n" not in str(error.value)
+
+
+def test_cards_are_counted_after_other_output(monkeypatch):
+    for name in (FIRST, SECOND):
+        monkeypatch.delenv(name, raising=False)
+    monkeypatch.setattr(resources, "COUNT_CARDS", "print('a warning'); print(2)")
+    monkeypatch.setattr(resources, "usable_cores", lambda: None)
+    assert visible([slot.variables for slot in assign_slots(Resources(processes=2))]) == ["0", "1"]
+
+
 @pytest.mark.parametrize(("processes", "cards", "n_cards"), [(3, 2.0, 4), (9, 0.5, 4), (1, 1.0, 0)])
 def test_too_few_cards(processes, cards, n_cards):
     with pytest.raises(LareError, match=f"{processes} processes .* the {n_cards} cards"):

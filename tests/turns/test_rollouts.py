@@ -63,8 +63,33 @@ def test_results_without_identifier_follow_the_order_of_calls():
 
 @pytest.mark.parametrize("value", [float("nan"), 1e200, "y", None])
 def test_numbers_of_a_phi_are_checked(value):
-    with pytest.raises(LareError, match=r"it, phi: turns\[0\]"):
+    with pytest.raises(LareError, match=r"it: 'event' .* phi .* turn 0"):
         read_rollout({"messages": MESSAGES, "outcome": 1}, "it", lambda turn: {"event": value})
+
+
+@pytest.mark.parametrize("events", [3, None, {"": 1}])
+def test_results_of_a_phi_are_checked(events):
+    with pytest.raises(LareError, match=r"it: .* phi .* turn 0") as error:
+        read_rollout({"messages": MESSAGES, "outcome": 1}, "it", lambda turn: events)
+    assert "turns[" not in str(error.value)
+
+
+def test_phi_that_fails():
+    with pytest.raises(LareError, match=r"^rollout 1, turn 2: .*KeyError: 'a'$"):
+        read_rollouts(
+            [{"messages": MESSAGES[:-1], "outcome": 1}, {"messages": MESSAGES, "outcome": 1}],
+            lambda turn: {} if turn.calls else {}["a"],
+        )
+
+
+def test_numbers_of_numpy():
+    plain = {"turns": [{"a": 1}], "outcome": 1, "group": 3, "truncated": True}
+    numpy = {"turns": [{"a": np.int8(1)}], "outcome": np.float32(1), "group": np.int64(3), "truncated": np.bool_(True)}
+    (rollout,) = read_rollouts([numpy])
+    assert read_rollouts([plain]) == [rollout]
+    assert type(rollout.truncated) is bool
+    with pytest.raises(LareError, match="group"):
+        read_rollouts([plain | {"group": np.bool_(True)}])
 
 
 def test_turns_of_messages():
@@ -95,6 +120,10 @@ def test_numbers_of_the_user_come_on_top_and_win():
     assert rollout.turns[0]["tests pass"] == 1
     assert rollout.turns[0]["tokens"] == 7
     assert "call read" in rollout.turns[0]
+    rollout = read_rollout({"messages": MESSAGES, "outcome": 1}, "it", lambda turn: {"tokens": 5})
+    assert rollout.turns[0]["tokens"] == 5
+    rollout = read_rollout({"messages": MESSAGES, "turns": numbers, "outcome": 1}, "it", lambda turn: {"tokens": 5})
+    assert [row["tokens"] for row in rollout.turns] == [7, 5, 5]
 
 
 def test_content_may_be_a_list():
@@ -140,12 +169,13 @@ BAD = [
     ({"outcome": "good"}, ["outcome", "'good'"]),
     ({"outcome": float("nan")}, ["outcome", "nan"]),
     ({"outcome": 1e300}, ["outcome", "1e+09"]),
+    ({"outcome": -1e10}, ["outcome", "between -1e+09 and 1e+09"]),
     (OUTCOME, ["neither messages nor turns"]),
     ({**OUTCOME, "turns": []}, ["no turn"]),
     ({**OUTCOME, "turns": 3}, ["turns must be a list"]),
     ({**OUTCOME, "turns": [3]}, ["turns[0]", "3"]),
-    ({**OUTCOME, "turns": [{"a": "b"}]}, ["turns[0]['a']", "'b'"]),
-    ({**OUTCOME, "turns": [{"a": float("inf")}]}, ["turns[0]['a']", "inf"]),
+    ({**OUTCOME, "turns": [{"a": "b"}]}, ["turns[0]", "'a'", "'b'"]),
+    ({**OUTCOME, "turns": [{"a": float("inf")}]}, ["turns[0]", "'a'", "inf"]),
     ({**OUTCOME, "turns": [{"": 1}]}, ["turns[0]", "''"]),
     ({**OUTCOME, "turns": [{"a\nb": 1}]}, ["turns[0]", "one line"]),
     ({**OUTCOME, "turns": [{}], "group": [1]}, ["group", "[1]"]),
@@ -166,6 +196,12 @@ def test_bad_rollouts(rollout, words):
         read_rollouts([rollout])
     assert all(word in str(error.value) for word in words), str(error.value)
     assert "\n" not in str(error.value)
+
+
+def test_turns_without_messages_have_no_assistant():
+    with pytest.raises(LareError, match="no turn") as error:
+        read_rollouts([{**OUTCOME, "turns": []}])
+    assert "assistant" not in str(error.value)
 
 
 @pytest.mark.parametrize("rollouts", [3, None, "text", {"outcome": 1}])

@@ -5,6 +5,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 from pydantic import Field
 
 from lare_rl.algorithms.registry import AlgorithmSettings
+from lare_rl.errors import Count
 
 if TYPE_CHECKING:
     from lare_rl.envs.interface import EnvSpec
@@ -15,13 +16,13 @@ __all__ = ["OffPolicySettings", "run_defaults"]
 class OffPolicySettings(AlgorithmSettings):
     """The hyperparameters that these algorithms share; none of them depends on the task."""
 
-    hidden: tuple[Annotated[int, Field(ge=1)], ...] = (256, 256)
+    hidden: tuple[Count, ...] = (256, 256)
     """Widths of the hidden layers of actor and critics."""
-    critics: Annotated[int, Field(ge=1)] = 2
+    critics: Count = 2
     """Number of critics. The target uses their smallest value."""
     learning_rate: Annotated[float, Field(gt=0)] = 3e-4
     """Learning rate of Adam."""
-    batch_size: Annotated[int, Field(ge=1)] = 256
+    batch_size: Count = 256
     """Transitions in one update."""
     gamma: Annotated[float, Field(ge=0, le=1)] = 0.99
     """Discount factor."""

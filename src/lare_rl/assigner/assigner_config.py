@@ -20,7 +20,7 @@ from lare_rl.credit.score_type import prediction_window
 from lare_rl.credit.spec import CreditSpec
 from lare_rl.envs.families import find_score_type, load_env_spec
 from lare_rl.envs.load import resolve_task
-from lare_rl.errors import CheckedModel, LareError, short_repr
+from lare_rl.errors import CheckedModel, Count, LareError, short_repr
 from lare_rl.latent.function import LatentFunction, check_task
 from lare_rl.tasks.payments import PAID_AT_END, PaymentRule
 from lare_rl.tasks.spec import MAX_LEVELS, ScoredObservation, TaskSpec
@@ -40,9 +40,9 @@ class AssignerConfig(CheckedModel):
     observation: SpaceLayout
     action: SpaceLayout
     scored_observation: ScoredObservation
-    agents: Annotated[int, Field(ge=1)]
-    max_steps: Annotated[int, Field(ge=1)] | None
-    capacity: Annotated[int, Field(ge=1)]
+    agents: Count
+    max_steps: Count | None
+    capacity: Count
     settings: CreditSettings
     seed: Annotated[int, Field(ge=0)]
     fits_per_step: Annotated[float, Field(ge=0, allow_inf_nan=False)]

@@ -10,7 +10,7 @@ import tyro
 from pydantic import Field
 from tyro.conf import Positional
 
-from lare_rl.errors import CheckedModel, LareError
+from lare_rl.errors import CheckedModel, Count, LareError
 from lare_rl.llm.budget import Budget
 from lare_rl.util.durations import format_seconds
 from lare_rl.util.files import check_new_path
@@ -35,8 +35,6 @@ FIRST_PROGRESS_S, PROGRESS_S = 5.0, 20.0
 _TABLE_WIDTH = 200
 """Characters in a line of a table, where the output is not a terminal."""
 
-
-_Count = Annotated[int, Field(ge=1)]
 _NonNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
 
 
@@ -45,9 +43,9 @@ class LiveOptions(CheckedModel):
 
     base_url: str | None = None
     """the endpoint; the default is OPENAI_BASE_URL, or else OpenAI's. Ollama's is http://localhost:11434/v1."""
-    budget: _Count = Budget.tokens
+    budget: Count = Budget.tokens
     """largest number of tokens, in and out together; a request that might exceed it is not sent."""
-    requests: _Count = Budget.requests
+    requests: Count = Budget.requests
     """largest number of requests."""
     minutes: Annotated[float, Field(gt=0, allow_inf_nan=False)] = Budget.seconds / 60
     """longest time to wait for the model, over all requests and retries. One reply may take an eighth of it, and at least 120 s:

@@ -21,7 +21,7 @@ from lare_rl.compare.bootstrap import (
 )
 from lare_rl.compare.rank_test import mann_whitney
 from lare_rl.compare.results import LearningCurves
-from lare_rl.compare.scores import Group, group_results
+from lare_rl.compare.scores import LabelScores, group_results
 from lare_rl.evaluation.reference_returns import REFERENCE_RETURNS
 from lare_rl.runs.metric_names import RETURN
 from lare_rl.util.statistics import Band, sample_std
@@ -74,12 +74,12 @@ class Comparison:
     """Interquartile mean by step, of each label."""
     profiles: Mapping[str, Band]
     """Share of runs that score more than x, of each label."""
-    groups: Mapping[str, Group]
+    groups: Mapping[str, LabelScores]
     """The scores, by label."""
     metric: str
     step: int | None
     """The step at which runs are compared; None for the last one that all runs have."""
-    late: bool
+    average_last_quarter: bool
     """Whether scores are means over the last quarter of the steps."""
 
     @property
@@ -99,16 +99,16 @@ class Comparison:
 
 
 def compare(
-    results: Sequence[LearningCurves], metric: str = RETURN, step: int | None = None, late: bool = False
+    results: Sequence[LearningCurves], metric: str = RETURN, step: int | None = None, average_last_quarter: bool = False
 ) -> Comparison:
     """Compare results by their labels. The first label is the baseline.
 
-    All labels have the same tasks. `step` and `late` choose what a score is (`group_results`).
+    All labels have the same tasks. `step` and `average_last_quarter` choose what a score is (`group_results`).
 
     Raises:
         LareError: some results are missing.
     """
-    groups = group_results(results, metric, step, late)
+    groups = group_results(results, metric, step, average_last_quarter)
     final = {group.label: group.final_scores.mean(axis=0) for group in groups}
     baseline = final[groups[0].label]
     steps = np.array(groups[0].steps, float)
@@ -124,18 +124,21 @@ def compare(
         groups={group.label: group for group in groups},
         metric=metric,
         step=step,
-        late=late,
+        average_last_quarter=average_last_quarter,
     )
 
 
 def compare_tasks(
-    results: Sequence[LearningCurves], metric: str = RETURN, step: int | None = None, late: bool = False
+    results: Sequence[LearningCurves], metric: str = RETURN, step: int | None = None, average_last_quarter: bool = False
 ) -> list[Comparison]:
     """Compare all tasks together, or each task alone if their scores have no common scale."""
     tasks = sorted({result.task for result in results})
     if len(tasks) == 1 or (metric == RETURN and all(task in REFERENCE_RETURNS for task in tasks)):
-        return [compare(results, metric, step, late)]
-    return [compare([result for result in results if result.task == task], metric, step, late) for task in tasks]
+        return [compare(results, metric, step, average_last_quarter)]
+    return [
+        compare([result for result in results if result.task == task], metric, step, average_last_quarter)
+        for task in tasks
+    ]
 
 
 def compare_over_tasks(comparisons: Sequence[Comparison]) -> list[OverallRow]:
@@ -163,7 +166,7 @@ def compare_over_tasks(comparisons: Sequence[Comparison]) -> list[OverallRow]:
     return rows
 
 
-def _make_row(group: Group, baseline: Scores | None) -> Row:
+def _make_row(group: LabelScores, baseline: Scores | None) -> Row:
     scores = group.final_scores.mean(axis=0)
     seed_means = scores.mean(axis=1)
     draw_mean = difference = improvement = p_value = None

@@ -65,7 +65,7 @@ def to_text(findings: Iterable[Finding]) -> str:
 
 def find_score_meaning(comparison: Comparison) -> Finding:
     """Return what the scores are, at which step."""
-    when = "late" if comparison.late else "at_step" if comparison.step is not None else "at_last_step"
+    when = "late" if comparison.average_last_quarter else "at_step" if comparison.step is not None else "at_last_step"
     values = {
         "metric": Finding("true_returns") if comparison.metric == RETURN else comparison.metric,
         "when": Finding(when, {"step": comparison.last_step}),

@@ -27,14 +27,14 @@ def write_comparisons(
     metric: str = RETURN,
     findings: Iterable[Finding] = (),
     step: int | None = None,
-    late: bool = False,
+    average_last_quarter: bool = False,
 ) -> list[Comparison]:
     """Compare results (`compare_tasks`), and write the page, with the findings about the results at its end.
 
     Raises:
         LareError: the results cannot be compared, or the file cannot be written.
     """
-    comparisons = compare_tasks(results, metric, step, late)
+    comparisons = compare_tasks(results, metric, step, average_last_quarter)
     tasks = ", ".join(task for comparison in comparisons for task in comparison.tasks)
     title = f"{tasks}: {len({result.label for result in results})} methods"
     notes = [f"Note: {render(finding, MESSAGES)}" for finding in findings]

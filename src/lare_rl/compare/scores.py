@@ -13,16 +13,16 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from lare_rl.compare.results import LearningCurves
+from lare_rl.compare.results import LearningCurves, group_pairs
 from lare_rl.errors import LareError
 from lare_rl.evaluation.reference_returns import REFERENCE_RETURNS
 from lare_rl.runs.metric_names import RETURN
 
-__all__ = ["Group", "group_results", "last_quarter"]
+__all__ = ["LabelScores", "group_results", "last_quarter"]
 
 
 @dataclass(frozen=True)
-class Group:
+class LabelScores:
     """The scores of one label."""
 
     label: str
@@ -51,15 +51,15 @@ class _Curve(NamedTuple):
 
 
 def group_results(
-    results: Sequence[LearningCurves], metric: str = RETURN, step: int | None = None, late: bool = False
-) -> list[Group]:
-    """Group results by label.
+    results: Sequence[LearningCurves], metric: str = RETURN, step: int | None = None, average_last_quarter: bool = False
+) -> list[LabelScores]:
+    """LabelScores results by label.
 
     Args:
         results: the curves of runs, each with a label: the name of its method in the comparison.
         metric: the name of the metric. Only returns are scaled.
         step: the step at which results are compared. The default is the last step at which all of them have a value.
-        late: whether the final scores are means over the last quarter of the steps up to `step`.
+        average_last_quarter: whether the final scores are means over the last quarter of the steps up to `step`.
 
     Raises:
         LareError: a label lacks a task, draw or seed, or not all results have a value at `step`.
@@ -68,26 +68,14 @@ def group_results(
     _check_tasks(results, tasks, metric)
     curves = _index_curves(results, metric)
     steps = _shared_steps(curves, metric, step)
-    n_final = len(last_quarter(steps)) if late else 1
+    n_final = len(last_quarter(steps)) if average_last_quarter else 1
     groups = []
     for label in dict.fromkeys(result.label for result in results):
         keys = [key for key in curves if key.label == label]
         draws, seeds = (tuple(sorted(values)) for values in ({key.draw for key in keys}, {key.seed for key in keys}))
-        scores = np.empty((len(draws), len(seeds), len(tasks), len(steps)))
-        for (i, draw), (j, seed), (k, task) in product(enumerate(draws), enumerate(seeds), enumerate(tasks)):
-            key = _Key(label, task, draw, seed)
-            if key not in curves:
-                hint = ", or compare each task alone" if len(tasks) > 1 else ""
-                raise LareError(
-                    f"{label} has no run on {task} with seed {seed} and draw {draw}, and needs the same seeds for every task and "
-                    f"draw: train it{hint}"
-                )
-            scores[i, j, k] = [curves[key].values[step] for step in steps]
-        if len(tasks) > 1:
-            low, high = np.transpose([REFERENCE_RETURNS[task] for task in tasks])[..., None]  # each [tasks 1]
-            scores = (scores - low) / (high - low)
+        scores = _fill_scores(label, draws, seeds, tasks, steps, curves)
         groups.append(
-            Group(
+            LabelScores(
                 label=label,
                 tasks=tasks,
                 seeds=seeds,
@@ -98,6 +86,31 @@ def group_results(
             )
         )
     return groups
+
+
+def _fill_scores(
+    label: str,
+    draws: Sequence[int],
+    seeds: Sequence[int],
+    tasks: Sequence[str],
+    steps: Sequence[int],
+    curves: Mapping[_Key, _Curve],
+) -> Float[np.ndarray, "draws seeds tasks steps"]:
+    """Return the scores of a label. Raises `LareError` if it lacks a task, draw or seed."""
+    scores = np.empty((len(draws), len(seeds), len(tasks), len(steps)))
+    for (i, draw), (j, seed), (k, task) in product(enumerate(draws), enumerate(seeds), enumerate(tasks)):
+        key = _Key(label, task, draw, seed)
+        if key not in curves:
+            hint = ", or compare each task alone" if len(tasks) > 1 else ""
+            raise LareError(
+                f"{label} has no run on {task} with seed {seed} and draw {draw}, and needs the same seeds for every task and "
+                f"draw: train it{hint}"
+            )
+        scores[i, j, k] = [curves[key].values[step] for step in steps]
+    if len(tasks) > 1:
+        low, high = np.transpose([REFERENCE_RETURNS[task] for task in tasks])[..., None]  # each [tasks 1]
+        scores = (scores - low) / (high - low)
+    return scores
 
 
 def last_quarter(steps: Sequence[int]) -> list[int]:
@@ -123,7 +136,8 @@ def _check_tasks(results: Sequence[LearningCurves], tasks: Sequence[str], metric
 
 def _index_curves(results: Sequence[LearningCurves], metric: str) -> dict[_Key, _Curve]:
     curves: dict[_Key, _Curve] = {}
-    run_sources = {result.label: result.source for result in reversed(results) if result.draw}
+    # A table counts as draw 0. Its method lacks the other draws, so it cannot share a label with runs that have them.
+    run_sources = {result.label: result.source for result in reversed(results) if result.draw != 0}
     for result in results:
         if result.config is None and result.label in run_sources:
             raise LareError(
@@ -137,7 +151,8 @@ def _index_curves(results: Sequence[LearningCurves], metric: str) -> dict[_Key, 
                 from_table = result.config is None or other.suffix == ".csv"
                 hint = ", or rename the method in the .csv file" if from_table else ""
                 raise LareError(
-                    f"{result.source} and {other} both have {key.label} on {key.task} with seed {seed}: leave out one{hint}"
+                    f"{result.source} and {other} both have {key.label} on {key.task} with seed {seed} and draw {key.draw}: leave "
+                    f"out one{hint}"
                 )
             if not values:
                 raise LareError(f"{result.source} has no {metric} of seed {seed}: leave it out")
@@ -149,9 +164,14 @@ def _shared_steps(curves: Mapping[_Key, _Curve], metric: str, step: int | None) 
     """Return the steps at which all curves have a value, up to `step`."""
     steps = sorted(set.intersection(*(set(curve.values) for curve in curves.values())))
     if not steps:
-        spans = {curve.source: f"{min(curve.values):,} to {max(curve.values):,}" for curve in curves.values()}
-        text = "; ".join(f"{source}: {span}" for source, span in spans.items())
-        raise LareError(f"no step has a value of {metric} in all runs ({text})")
+        steps_of_seeds = group_pairs(
+            ((key.label, key.task, curve.source), curve.values) for key, curve in curves.items()
+        )
+        spans = [
+            f"{label} on {task} in {source}: {min(map(min, values)):,} to {max(map(max, values)):,}"
+            for (label, task, source), values in steps_of_seeds.items()
+        ]
+        raise LareError(f"no step has a value of {metric} in all runs ({'; '.join(spans)})")
     if step is None:
         return steps
     if step not in steps:

@@ -9,7 +9,7 @@ from pydantic import ConfigDict, Field, SerializeAsAny, create_model, field_vali
 from lare_rl.algorithms.registry import ALGORITHMS, AlgorithmSettings
 from lare_rl.credit.decoder_settings import CreditSettings
 from lare_rl.credit.methods import find_method
-from lare_rl.errors import CheckedModel
+from lare_rl.errors import CheckedModel, Count
 from lare_rl.llm.prompts import N_CANDIDATES
 from lare_rl.tasks.spec import ScoredObservation, TaskSpec
 
@@ -18,8 +18,6 @@ __all__ = ["ResolvedSettings", "Settings", "round_up"]
 MAX_SEED = 2**31 - 1
 MAX_SEEDS = 1000
 """In one process."""
-
-Count = Annotated[int, Field(ge=1)]
 
 Open = TypeVar("Open")
 """The type of an open value: None in `Settings`, and Never in `ResolvedSettings`."""

@@ -4,7 +4,7 @@ from typing import Annotated, Literal
 
 from pydantic import AliasChoices, Field
 
-from lare_rl.errors import CheckedModel
+from lare_rl.errors import CheckedModel, Count
 
 __all__ = ["MULTI_AGENT_CREDIT", "RECENT_STEPS", "CreditSettings", "default_credit"]
 
@@ -17,7 +17,7 @@ _Weight = Annotated[float, Field(ge=0)]
 class CreditSettings(CheckedModel):
     """How the decoder is fitted."""
 
-    hidden: tuple[Annotated[int, Field(ge=1)], ...] = (256, 256)
+    hidden: tuple[Count, ...] = (256, 256)
     """Widths of the decoder's hidden layers."""
     learning_rate: Annotated[float, Field(gt=0)] = 3e-4
     """Adam's step size."""
@@ -32,7 +32,7 @@ class CreditSettings(CheckedModel):
     steps: Annotated[int, Field(ge=2)] = 256
     """Steps in one update: K of each of steps / K episodes, or whole episodes with about this many. On particle tasks (T = 25):
     steps / T episodes, even if only K steps of each are sampled."""
-    episodes: Annotated[int, Field(ge=1)] = 8
+    episodes: Count = 8
     """diaster, rudder, grd and rbt: whole episodes in one update."""
     score: Literal["auto", "sum", "average", "binary"] = "auto"
     """The score of an episode: a sum over its steps, an average, or binary (won or lost). `auto`: the task's `score` or,
@@ -40,9 +40,9 @@ class CreditSettings(CheckedModel):
     exact: Literal["auto", "no", "last", "spread"] = "auto"
     """Make the proxy rewards of an episode add up to its return, by a correction of its last step or of all steps. `auto`:
     `last` for bayes-progress and lare-bayes-progress, else `no`."""
-    encoder: tuple[Annotated[int, Field(ge=1)], ...] = (256, 256)
+    encoder: tuple[Count, ...] = (256, 256)
     """Widths of the hidden layers of VIB's encoder."""
-    bottleneck: Annotated[int, Field(ge=1)] = 8
+    bottleneck: Count = 8
     """Size of VIB's code."""
     divergence: Annotated[float, Field(ge=0)] = 5e-3
     """VIB: weight of the code's divergence against the squared error of the mean (with `sum_form`: T^2 times as much)."""

@@ -23,14 +23,15 @@ class VecEnv(ABC):
     episode has ended are not reset: the caller does it.
     """
 
+    stop_requested: Callable[[], bool] = staticmethod(lambda: False)
+    """Whether the user wants to stop. Environments in other processes must then reply soon; `LocalVecEnv` ignores it."""
+
     def __init__(self, spec: EnvSpec, batch: Timestep):
         self.spec = spec
         self.batch = batch
         """The last timestep of each environment."""
         self._length = np.zeros(len(batch.terminated), int)
         """The steps of each environment's running episode."""
-        self.stop_requested: Callable[[], bool] = lambda: False
-        """Whether the user wants to stop. Environments in other processes must then reply soon; `LocalVecEnv` ignores it."""
 
     def reset(self, where: Bool[np.ndarray, " n"], seeds: Integer[np.ndarray, " n"]) -> Timestep:
         """Start an episode in the selected environments."""

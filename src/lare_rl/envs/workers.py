@@ -5,9 +5,10 @@ which one died.
 """
 
 import atexit
+import contextlib
 import time
 from collections import defaultdict
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from multiprocessing.connection import wait
 from typing import Any
 
@@ -15,7 +16,7 @@ import numpy as np
 from jaxtyping import Bool, Shaped
 
 from lare_rl.envs.interface import EnvSpec
-from lare_rl.envs.shared_arrays import MAX_WORKERS, map_arrays, open_shared_memory
+from lare_rl.envs.shared_arrays import MAX_WORKERS, SharedArrays, map_arrays, open_shared_memory
 from lare_rl.envs.vec_env import Maker, VecEnv, check_same_sizes
 from lare_rl.envs.worker_process import Worker, end_workers, pickle_maker
 from lare_rl.errors import LareError
@@ -62,45 +63,53 @@ class SubprocVecEnv(VecEnv):
                 key. Empty: end them.
 
         Raises:
-            LareError: an environment cannot be made. Later calls raise it if an environment raises an error, dies or does not
-                reply in time. All workers have then ended.
+            LareError: an environment cannot be made, or `reuse_key` needs more processes. Later calls raise it if an environment
+                raises an error, dies or does not reply in time. All workers have then ended.
         """
         self.timeout = timeout
         self._timeout_hint, self._reuse_key = timeout_hint, reuse_key
-        self.stop_requested = lambda: False
         self._workers: list[Worker] = []
         n_envs, n_workers = len(makers), min(len(makers), processes or n_usable_cores(), MAX_WORKERS)
         if reuse_key and n_workers < n_envs:
-            raise LareError(f"{n_envs} environments need a process each, and a batch has at most {MAX_WORKERS}")
+            limit = f"at most {MAX_WORKERS}" if n_envs > MAX_WORKERS else f"{n_workers}: set processes = {n_envs}"
+            raise LareError(f"{n_envs} environments need a process each, and the batch has {limit}")
         try:
             with open_shared_memory() as memory:
                 for _ in range(n_workers):
                     self._workers.append(_find_idle_worker(reuse_key) or Worker())
                 for worker_index, worker in enumerate(self._workers):
                     worker.attach(range(worker_index, n_envs, n_workers), memory, worker_index)
-                for worker in self._workers:
-                    if not worker.specs:
-                        worker.send("make", {index: pickle_maker(index, makers[index]) for index in worker.env_indices})
-                for worker, reply in self._receive("make"):
-                    worker.specs, worker.make_s = reply
-                by_index = {
-                    i: spec
-                    for worker in self._workers
-                    for i, spec in zip(worker.env_indices, worker.specs, strict=True)
-                }
-                specs: list[EnvSpec] = [by_index[index] for index in range(n_envs)]
-                check_same_sizes(specs)
-                self._shared = map_arrays(memory, specs[0], n_envs)
-                self._shared.batch.available[:] = True
+                specs = self._make_envs(makers)
+                self._shared = self._share_memory(memory, specs)
                 super().__init__(specs[0], self._shared.batch)
-                for worker in self._workers:
-                    worker.send("share", (specs[0], n_envs))
-                self._receive("share")
         except BaseException as error:
             self._kill()
             if isinstance(error, OSError):
                 raise LareError(f"worker processes cannot be started: {error}") from error
             raise
+
+    def _make_envs(self, makers: Sequence[Maker]) -> list[EnvSpec]:
+        """Make the environments that the workers do not have yet. Return the specifications of all."""
+        for worker in self._workers:
+            if not worker.specs:
+                worker.send("make", {index: pickle_maker(index, makers[index]) for index in worker.env_indices})
+        for worker, reply in self._receive("make"):
+            worker.specs, worker.make_s = reply
+        by_index = {
+            i: spec for worker in self._workers for i, spec in zip(worker.env_indices, worker.specs, strict=True)
+        }
+        specs = [by_index[index] for index in range(len(makers))]
+        check_same_sizes(specs)
+        return specs
+
+    def _share_memory(self, memory: str, specs: Sequence[EnvSpec]) -> SharedArrays:
+        """Map the arrays of the environments in this process and in the workers."""
+        shared = map_arrays(memory, specs[0], len(specs))
+        shared.batch.available[:] = True
+        for worker in self._workers:
+            worker.send("share", (specs[0], len(specs)))
+        self._receive("share")
+        return shared
 
     @property
     def pids(self) -> list[int]:
@@ -113,12 +122,9 @@ class SubprocVecEnv(VecEnv):
 
     def measure_step_s(self) -> float:
         """Return the time that a step of the first environment takes (s), in its process. Raises `LareError` like `step`."""
-        try:
-            self._workers[0].send("time steps")
+        with self._open_workers() as workers:
+            workers[0].send("time steps")
             return self._receive("step")[0][1]
-        except BaseException:
-            self._kill()
-            raise
 
     def find_interference(self, maker: Maker, timeout: float) -> str | None:
         """Make a second environment beside the only one, in its process. Return what goes wrong within `timeout` (s), or None.
@@ -129,22 +135,28 @@ class SubprocVecEnv(VecEnv):
             LareError: the process died or hangs.
         """
         self.timeout = timeout
-        try:
-            self._workers[0].send("second", pickle_maker(0, maker))
-            return self._receive("a second environment")[0][1]
-        finally:
-            self._kill()
+        with self._open_workers() as workers:
+            workers[0].send("second", pickle_maker(0, maker))
+            problem = self._receive("a second environment")[0][1]
+        self._kill()
+        return problem
 
     def _call(self, command: str, arguments: Shaped[np.ndarray, "n *rest"], where: Bool[np.ndarray, " n"]) -> None:
-        if not self._workers:
-            raise LareError("the worker processes have ended. Make the environments again.")
-        self._shared.arguments(command)[:] = arguments
-        self._shared.where[:] = where
-        try:
-            for worker in self._workers:
+        with self._open_workers() as workers:
+            self._shared.arguments(command)[:] = arguments
+            self._shared.where[:] = where
+            for worker in workers:
                 if where[worker.env_indices].any():
                     worker.send(command)
             self._receive(command)
+
+    @contextlib.contextmanager
+    def _open_workers(self) -> Iterator[list[Worker]]:
+        """Yield the workers. Kill them if the block fails. Raises `LareError` if they have ended."""
+        if not self._workers:
+            raise LareError("the worker processes have ended. Make the environments again.")
+        try:
+            yield self._workers
         except BaseException:  # Ctrl-C too: a pending reply would be taken for the next one
             self._kill()
             raise

@@ -86,14 +86,17 @@ class Budget:
         timeout_s = min(self.reply_timeout_s, self.seconds_left)
         return f"{timeout_s:.0f} s at most ({format_seconds(self.seconds_left)} are left for all)"
 
-    def count_reply(self, usage: Any, messages: Sequence[Message], reply: str) -> None:
-        """Add the tokens of a request and its reply: those that the server reports as `usage`, or else their bytes."""
+    def count_reply(self, usage: Any, messages: Sequence[Message], reply_bytes: int) -> None:
+        """Add the tokens of a request and its reply: those that the server reports as `usage`, or else their bytes.
+
+        `reply_bytes` is an upper bound on the tokens of the reply.
+        """
         try:
             tokens_in, tokens_out = int(usage["prompt_tokens"]), int(usage["completion_tokens"])
             if not (0 <= tokens_in <= _MAX_REPORTED_TOKENS and 0 <= tokens_out <= _MAX_REPORTED_TOKENS):
                 raise ValueError("not a number of tokens")
         except (TypeError, KeyError, ValueError, OverflowError):
-            tokens_in, tokens_out = max_request_tokens(messages), len(reply.encode(errors="replace"))
+            tokens_in, tokens_out = max_request_tokens(messages), reply_bytes
             self.estimated = True
         self.tokens_in += tokens_in
         self.tokens_out += tokens_out

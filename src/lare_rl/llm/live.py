@@ -6,7 +6,7 @@
     requests     of the strictest kind that the server supports: see `request_forms`
     the key      see `key`
 
-`reply` reads every reply, however its structure was requested.
+The module `reply` parses every reply, however its structure was requested.
 """
 
 import re
@@ -59,7 +59,7 @@ class _Failure(NamedTuple):
     pause_s: float | None = None
     """The pause that the server asks for before the next attempt."""
     request_changed: bool = False
-    """Whether the next request differs from this one. It is then sent at once, and is no further attempt."""
+    """Whether the next request has another form. It is sent at once and does not count as an attempt."""
 
 
 @dataclass
@@ -68,6 +68,9 @@ class LiveModel:
 
     The key is that of the environment variable OPENAI_API_KEY. A server of your own may need none. The default of `base_url` is
     OPENAI_BASE_URL, or else OpenAI's.
+
+    Raises:
+        ModelError: the name, the key or the address cannot be used, a key is needed and missing, or OpenAI's client is not installed.
     """
 
     name: str
@@ -94,7 +97,8 @@ class LiveModel:
         except ImportError:
             raise ModelError(f"a live model needs an extra: {install_command('llm')}") from None
         except Exception as error:  # the client raises errors of several kinds for a bad address
-            raise ModelError(f"the endpoint {self.base_url!r} cannot be used: {_safe_text(error)}") from None
+            url = _without_password(str(self.base_url))
+            raise ModelError(f"the endpoint {url!r} cannot be used: {_safe_text(error)}") from None
         self._forms = find_forms(str(self._client.base_url), self.name)
         if not hasattr(self._client, "responses"):  # in versions of the client before 1.66
             self._forms = self._forms.without_responses()
@@ -163,22 +167,22 @@ class LiveModel:
         try:
             answer = self._forms.read_answer(body)
         except FailedResponseError as error:
-            self.budget.count_reply(None, messages, body.decode(errors="replace"))
+            self.budget.count_reply(None, messages, len(body))
             return _Failure(_safe_text(f"the model failed: {error}"), retry=True)
         except (ValueError, TypeError, KeyError, IndexError, AttributeError) as error:
-            page = body.decode(errors="replace")
-            self.budget.count_reply(None, messages, page)
+            self.budget.count_reply(None, messages, len(body))
             kind = "response" if self._forms.api == "responses" else "chat completion"
             reason = f"the answer is not a {kind} ({type(error).__name__}: {error})"
             is_missing = self._forms.api == "responses" and not self._forms.is_verified
             if is_missing:  # some servers answer any request for an unknown address
                 self._forms = self._forms.without_responses()
-            return _Failure(_safe_text(f"{reason}: {_excerpt(page)}"), retry=True, request_changed=is_missing)
+            page = _excerpt(body.decode(errors="replace"))
+            return _Failure(_safe_text(f"{reason}: {page}"), retry=True, request_changed=is_missing)
         if not self._forms.is_verified:
             self._forms = replace(self._forms, is_verified=True)
         store_forms(str(self._client.base_url), self.name, self._forms)
         text = answer.text.encode(errors="replace").decode()  # replaces lone surrogates
-        self.budget.count_reply(answer.usage, messages, text)
+        self.budget.count_reply(answer.usage, messages, len(text.encode()))
         if answer.is_cut_off:
             self.on_message(f"{self.name}: a reply was cut off at the {max_tokens:,} tokens that it was allowed")
         return text
@@ -191,16 +195,15 @@ class LiveModel:
         if isinstance(error, RedirectError):
             return _Failure(_safe_text(error), retry=False)
         if isinstance(error, BodyTooLargeError):
-            self.budget.count_reply(None, messages, "x" * MAX_BODY_BYTES)
+            self.budget.count_reply(None, messages, MAX_BODY_BYTES)
             return _Failure(str(error), retry=False)
         if name.startswith(_NOT_SENT_ERRORS):
-            server = re.sub(r"//[^/@]*@", "//", str(self._client.base_url))  # without a password
-            message = f"{server} cannot be reached: {error}"
+            message = f"{_without_password(str(self._client.base_url))} cannot be reached: {error}"
             return _Failure(_safe_text(message), retry=not name.startswith(_PERMANENT_ERRORS))
         if isinstance(error, TimeoutError):  # a thread may still read with the old client
             self._client.close()
             self._client = self._connect()
-        self.budget.count_reply(None, messages, "x" * max_tokens)  # the server may have answered
+        self.budget.count_reply(None, messages, max_tokens)  # the server may have answered
         return _Failure(_safe_text(f"{name}: {error}"), retry=True)
 
     def _refusal(self, error: StatusError) -> _Failure:
@@ -218,6 +221,11 @@ class LiveModel:
 def _safe_text(text: object) -> str:
     """Return a message in one line, without the key and without control characters."""
     return redact_key(one_line(text))[:_MAX_MESSAGE]
+
+
+def _without_password(url: str) -> str:
+    """Return an address without the name and the password of its user."""
+    return re.sub(r"(?s)^([^/:]*://)?.*@", r"\1", url)
 
 
 def _excerpt(body: str) -> str:

@@ -8,8 +8,9 @@ from typing import Annotated, NamedTuple
 
 from pydantic import AfterValidator, Field
 
-from lare_rl.errors import CheckedModel, LareError
+from lare_rl.errors import CheckedModel, Count, LareError, short_repr
 from lare_rl.util.processes import usable_cores
+from lare_rl.util.sanitize import one_line
 
 __all__ = ["Resources", "Slot", "assign_cards", "assign_cores", "assign_slots"]
 
@@ -30,13 +31,14 @@ def _check_cards(cards: float) -> float:
 class Resources(CheckedModel):
     """The part of the machine that runs use."""
 
-    processes: Annotated[int, Field(ge=1)] = 1
+    processes: Count = 1
     """Runs at a time."""
-    cores: Annotated[int, Field(ge=1)] = 1
+    cores: Count = 1
     """Cores of each run."""
     cards: Annotated[float, Field(ge=0), AfterValidator(_check_cards)] | None = None
     """Cards (accelerators) of each run: a whole number, or less than 1 if runs share a card. By default, each run gets
-    an equal share of this machine's cards. On a Ray cluster, it gets none by default."""
+    an equal share of this machine's cards. On a Ray cluster, it gets none by default. No effect on TPUs: every run sees all
+    of them."""
 
 
 class Slot(NamedTuple):
@@ -49,7 +51,7 @@ class Slot(NamedTuple):
 
 
 def assign_slots(resources: Resources) -> list[Slot]:
-    """Divide this machine among processes. Raises `LareError` if there are not enough cores or cards."""
+    """Divide this machine among processes. Raises `LareError` if there are not enough cores or cards, or none can be counted."""
     cores = assign_cores(resources.processes, resources.cores)
     if resources.cards is None and resources.processes == 1:  # JAX uses all cards
         return [Slot(cores[0], {})]
@@ -105,6 +107,8 @@ def _card_variables(process: int, share: float, n_cards: int, variables: Mapping
     chosen = {}
     for name in VISIBLE_CARDS:
         visible = variables[name].split(",") if variables.get(name) else list(map(str, range(n_cards)))
+        if len(visible) < n_cards:  # it chooses cards of another vendor
+            continue
         chosen[name] = ",".join(visible[i] for i in indices)
     if 0 < share < 1 and PREALLOCATE not in variables:
         chosen[PREALLOCATE] = "false"
@@ -112,6 +116,20 @@ def _card_variables(process: int, share: float, n_cards: int, variables: Mapping
 
 
 def _count_cards() -> int:
-    """Return the number of cards that JAX sees. Another process asks it, because JAX reserves memory of the cards."""
-    process = subprocess.run([sys.executable, "-P", "-c", COUNT_CARDS], capture_output=True, encoding="utf-8")
-    return int(process.stdout) if process.stdout.strip().isdecimal() else 0
+    """Return the number of cards that JAX sees. Another process asks it, because JAX reserves memory of the cards.
+
+    Raises:
+        LareError: JAX fails in that process.
+    """
+    process = subprocess.run(
+        [sys.executable, "-P", "-c", COUNT_CARDS], capture_output=True, encoding="utf-8", errors="replace"
+    )
+    count = _last_line(process.stdout)  # libraries may print other lines before it
+    if process.returncode or not count.isdecimal():
+        reason = _last_line(process.stderr) or f"exit status {process.returncode}, output {short_repr(count)}"
+        raise LareError(f"JAX cannot count the cards of this machine: {one_line(reason)}")
+    return int(count)
+
+
+def _last_line(text: str) -> str:
+    return text.strip().rpartition("\n")[2]

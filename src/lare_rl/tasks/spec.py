@@ -8,7 +8,7 @@ from typing import Annotated, Any, Literal, TypeVar
 
 from pydantic import ConfigDict, Field, StrictInt, field_validator, model_validator
 
-from lare_rl.errors import CheckedModel, LareError
+from lare_rl.errors import CheckedModel, Count, LareError
 from lare_rl.tasks.payments import PaymentRule
 
 __all__ = [
@@ -111,9 +111,9 @@ class TaskSpec(CheckedModel):
     evaluation_environment: str | None = None
     """The environment of evaluations, such as held-out maps, years or demand, with the same module and sizes. Only on the host.
     By default, `environment`."""
-    observation_size: Annotated[int, Field(ge=1)]
+    observation_size: Count
     """Number of entries of an observation."""
-    action_size: Annotated[int, Field(ge=1)]
+    action_size: Count
     """Number of entries of a continuous action, or of discrete actions."""
     scored_observation: ScoredObservation = "after"
     """Observations of a step that factors and raw features are computed from: before the action, after it, or both."""

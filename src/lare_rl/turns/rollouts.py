@@ -9,12 +9,15 @@ A rollout is a mapping:
      "truncated": False}            # optional: whether it was cut off, so that the agent did not stop by itself
 
 Other keys are ignored. A turn is an assistant's message with the messages that answer it, up to the next assistant's message.
+If a name occurs twice, the number of `turns` replaces that of a phi, and both replace the feature of the messages.
 """
 
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
+
+import numpy as np
 
 from lare_rl.errors import LareError, short_repr
 from lare_rl.turns.messages import Turn, check_list, message_features, split_turns
@@ -29,6 +32,8 @@ MIN_NUMBER = 1e-9
 MAX_TURNS = 10_000
 MAX_NAME = 80
 
+Row = dict[str, float]
+"""The numbers of a turn, by their names."""
 Phi = Callable[[Turn], Mapping[str, float]]
 """A function that names events of a turn, and gives a number to each of them."""
 
@@ -48,7 +53,7 @@ def read_rollouts(rollouts: Any, phi: Phi | None = None) -> list[Rollout]:
     """Check rollouts and return them.
 
     Raises:
-        LareError: a rollout is malformed. The message names it, starting with rollout 0.
+        LareError: a rollout is malformed, or `phi` fails. The message names the rollout, starting with rollout 0.
     """
     if isinstance(rollouts, Mapping | str | bytes) or not isinstance(rollouts, Iterable):
         raise LareError(f"rollouts must be a list of mappings, and not {short_repr(rollouts)}")
@@ -56,18 +61,22 @@ def read_rollouts(rollouts: Any, phi: Phi | None = None) -> list[Rollout]:
 
 
 def read_rollout(rollout: Any, where: str, phi: Phi | None = None) -> Rollout:
-    """Check one rollout and return it. `where` names it in messages."""
+    """Check one rollout and return it. `where` names it in messages.
+
+    Raises:
+        LareError: the rollout is malformed, or `phi` fails.
+    """
     if not isinstance(rollout, Mapping):
         raise LareError(f"{where} must be a mapping with outcome and messages or turns, and is {short_repr(rollout)}")
     outcome = _read_number(rollout.get("outcome"), f"{where}: outcome")
     group = rollout.get("group", "")
-    if not isinstance(group, str | int) or isinstance(group, bool):
+    if not isinstance(group, str | int | np.integer) or isinstance(group, bool):
         raise LareError(f"{where}: group must be a text or a whole number, and is {short_repr(group)}")
     truncated = rollout.get("truncated", False)
-    if not isinstance(truncated, bool):
+    if not isinstance(truncated, bool | np.bool_):
         raise LareError(f"{where}: truncated must be true or false, and is {short_repr(truncated)}")
     turn_numbers = rollout.get("turns")
-    numbers = None if turn_numbers is None else _read_numbers(turn_numbers, where)
+    numbers = None if turn_numbers is None else _read_turns(turn_numbers, where)
     messages = rollout.get("messages")
     if messages is None:
         if numbers is None:
@@ -84,41 +93,51 @@ def read_rollout(rollout: Any, where: str, phi: Phi | None = None) -> Rollout:
             )
         features = message_features(turns)
         if phi is not None:
-            events = _read_numbers(_evaluate(phi, turns, where), f"{where}, phi")
-            features = [{**row, **extra} for row, extra in zip(features, events, strict=True)]
+            features = _merge(features, _evaluate(phi, turns, where))
         if numbers is not None:
-            features = [{**row, **extra} for row, extra in zip(features, numbers, strict=True)]
+            features = _merge(features, numbers)
     if not features:
-        raise LareError(f"{where} has no turn: the assistant says nothing")
-    return Rollout(tuple(features), outcome, str(group), truncated)
+        reason = "" if messages is None else ": the assistant says nothing"
+        raise LareError(f"{where} has no turn{reason}")
+    return Rollout(tuple(features), outcome, str(group), bool(truncated))
 
 
-def _evaluate(phi: Phi, turns: Sequence[Turn], where: str) -> list[Any]:
-    """Return the events of each turn, which are not checked yet. An error names the turn."""
-    events = []
-    for t, turn in enumerate(turns):
-        try:
-            events.append(phi(turn))
-        except LareError as error:
-            raise LareError(f"{where}, turn {t}: {error}") from error
-    return events
+def _merge(rows: Sequence[Row], extra_rows: Sequence[Row]) -> list[Row]:
+    """Add the names of extra rows. If both have a name, the extra row's number replaces the other."""
+    return [row | extra for row, extra in zip(rows, extra_rows, strict=True)]
 
 
-def _read_numbers(turns: Any, where: str) -> list[dict[str, float]]:
-    check_list(turns, "turns", MAX_TURNS, where)
+def _evaluate(phi: Phi, turns: Sequence[Turn], where: str) -> list[Row]:
+    """Return the events of each turn. An error names the turn."""
     rows = []
     for t, turn in enumerate(turns):
-        if not isinstance(turn, Mapping):
-            raise LareError(f"{where}: turns[{t}] must map names to numbers, and is {short_repr(turn)}")
-        row = {}
-        for name, value in turn.items():
-            if not isinstance(name, str) or not 0 < len(name) <= MAX_NAME or name != one_line(name):
-                raise LareError(
-                    f"{where}: turns[{t}] has the name {short_repr(name)}: a text of 1 to {MAX_NAME} characters in one line is needed"
-                )
-            row[name] = _read_number(value, f"{where}: turns[{t}][{name!r}]")
-        rows.append(row)
+        try:
+            events = phi(turn)
+        except LareError as error:
+            raise LareError(f"{where}, turn {t}: {error}") from error
+        except Exception as error:  # phi is the user's function
+            raise LareError(f"{where}, turn {t}: phi failed: {type(error).__name__}: {one_line(error)}") from error
+        rows.append(_read_row(events, f"the result of phi for turn {t}", where))
     return rows
+
+
+def _read_turns(turns: Any, where: str) -> list[Row]:
+    check_list(turns, "turns", MAX_TURNS, where)
+    return [_read_row(turn, f"turns[{t}]", where) for t, turn in enumerate(turns)]
+
+
+def _read_row(row: Any, what: str, where: str) -> Row:
+    """Check the numbers of a turn and return them. `what` names them in messages."""
+    if not isinstance(row, Mapping):
+        raise LareError(f"{where}: {what} must map names to numbers, and is {short_repr(row)}")
+    numbers = {}
+    for name, value in row.items():
+        if not isinstance(name, str) or not 0 < len(name) <= MAX_NAME or name != one_line(name):
+            raise LareError(
+                f"{where}: {what} has the name {short_repr(name)}: a text of 1 to {MAX_NAME} characters in one line is needed"
+            )
+        numbers[name] = _read_number(value, f"{where}: {name!r} in {what}")
+    return numbers
 
 
 def _read_number(value: Any, where: str) -> float:
@@ -127,5 +146,7 @@ def _read_number(value: Any, where: str) -> float:
     except (TypeError, ValueError, OverflowError):
         number = math.nan
     if not abs(number) <= MAX_NUMBER:
-        raise LareError(f"{where} must be a number of at most {MAX_NUMBER:g}, and is {short_repr(value)}")
+        raise LareError(
+            f"{where} must be a number between -{MAX_NUMBER:g} and {MAX_NUMBER:g}, and is {short_repr(value)}"
+        )
     return number if abs(number) >= MIN_NUMBER else 0.0

@@ -5,6 +5,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 from pydantic import Field
 
 from lare_rl.algorithms.registry import Algorithm, AlgorithmSettings, Consumes, register_algorithm
+from lare_rl.errors import Count
 
 if TYPE_CHECKING:
     from lare_rl.envs.interface import EnvSpec
@@ -13,12 +14,14 @@ __all__ = ["PPOSettings"]
 
 MIN_ROLLOUT_STEPS = 16
 """The least number of steps of each environment between two updates, by default: advantages need some steps in a row."""
+ROLLOUT_STEPS = 2000
+"""The steps of all environments together between two updates, by default."""
 
 
 class PPOSettings(AlgorithmSettings):
     """Hyperparameters of PPO."""
 
-    hidden: tuple[Annotated[int, Field(ge=1)], ...] = (64, 64)
+    hidden: tuple[Count, ...] = (64, 64)
     """Widths of the hidden layers of actor and critic."""
     learning_rate: Annotated[float, Field(gt=0)] = 3e-4
     """Learning rate of Adam."""
@@ -26,9 +29,9 @@ class PPOSettings(AlgorithmSettings):
     """Discount factor."""
     gae_lambda: Annotated[float, Field(ge=0, le=1)] = 0.95
     """Lambda of the advantage estimates (GAE): 0 relies on the critic, 1 on the rewards."""
-    epochs: Annotated[int, Field(ge=1)] = 10
+    epochs: Count = 10
     """Passes over the rollout in one update."""
-    minibatch_size: Annotated[int, Field(ge=1)] = 64
+    minibatch_size: Count = 64
     """Samples per gradient step; each agent's step is one sample."""
     clip: Annotated[float, Field(gt=0)] = 0.2
     """How far the probability ratio may move from 1."""
@@ -57,7 +60,7 @@ def _ppo_defaults(env: "EnvSpec", environments: int) -> dict[str, Any]:
     environments = environments or 1
     return {
         "environments": environments,
-        "rollout_steps": _whole_episodes(env, max(MIN_ROLLOUT_STEPS, 2000 // environments)),
+        "rollout_steps": _whole_episodes(env, max(MIN_ROLLOUT_STEPS, ROLLOUT_STEPS // environments)),
         "fit_updates": 500,
         "evaluate_iterations": 5,
         "capacity": 1_000_000,
@@ -67,7 +70,7 @@ def _ppo_defaults(env: "EnvSpec", environments: int) -> dict[str, Any]:
 def _ippo_defaults(env: "EnvSpec", environments: int) -> dict[str, Any]:
     # In JAX, as published for particle tasks: 82 episodes of 25 steps between two updates.
     environments = environments or (82 if env.is_jax else 1)
-    n_steps = max(MIN_ROLLOUT_STEPS, (2050 if env.is_jax else 2000) // environments)
+    n_steps = max(MIN_ROLLOUT_STEPS, (2050 if env.is_jax else ROLLOUT_STEPS) // environments)
     return {
         "environments": environments,
         "rollout_steps": env.max_steps if env.fixed_length else n_steps,

@@ -5,6 +5,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 from pydantic import Field
 
 from lare_rl.algorithms.registry import Algorithm, AlgorithmSettings, Consumes, register_algorithm
+from lare_rl.errors import Count
 
 if TYPE_CHECKING:
     from lare_rl.envs.interface import EnvSpec
@@ -15,13 +16,13 @@ __all__ = ["QMIXSettings"]
 class QMIXSettings(AlgorithmSettings):
     """Hyperparameters, as PyMARL2 sets them for most maps of the StarCraft challenge."""
 
-    hidden: Annotated[int, Field(ge=1)] = 64
+    hidden: Count = 64
     """Width of the agents' network and of its memory."""
     monotonic: bool = True
     """Mix the agents' values by a monotonic network; else add them up (VDN)."""
-    embed: Annotated[int, Field(ge=1)] = 32
+    embed: Count = 32
     """Width of the mixer."""
-    hypernet: Annotated[int, Field(ge=1)] = 64
+    hypernet: Count = 64
     """Width of the hidden layers of the hypernetworks, which give the mixer's weights."""
     learning_rate: Annotated[float, Field(gt=0)] = 1e-3
     """Learning rate of Adam."""
@@ -31,17 +32,17 @@ class QMIXSettings(AlgorithmSettings):
     """Lambda of the TD(lambda) targets: 0 relies on the target networks, 1 on the rewards."""
     max_grad_norm: Annotated[float, Field(gt=0)] = 10.0
     """Largest norm of the joint gradient of agents and mixer."""
-    batch_size: Annotated[int, Field(ge=1)] = 128
+    batch_size: Count = 128
     """Episodes in one update."""
-    update_every: Annotated[int, Field(ge=1)] = 8
+    update_every: Count = 8
     """New episodes for each update."""
-    target_every: Annotated[int, Field(ge=1)] = 200
+    target_every: Count = 200
     """Episodes between two copies to the target networks, each after an update."""
     epsilon_start: Annotated[float, Field(ge=0, le=1)] = 1.0
     """Probability that an agent explores, at the start."""
     epsilon_end: Annotated[float, Field(ge=0, le=1)] = 0.05
     """Probability that an agent explores, at the end."""
-    epsilon_steps: Annotated[int, Field(ge=1)] = 100_000
+    epsilon_steps: Count = 100_000
     """Environment steps of the linear fall from `epsilon_start` to `epsilon_end`."""
 
 

@@ -6,6 +6,7 @@ from pydantic import Field
 
 from lare_rl.algorithms.off_policy import OffPolicySettings, run_defaults
 from lare_rl.algorithms.registry import Algorithm, Consumes, register_algorithm
+from lare_rl.errors import Count
 
 __all__ = ["SACSettings"]
 
@@ -13,7 +14,7 @@ __all__ = ["SACSettings"]
 class SACSettings(OffPolicySettings):
     """Hyperparameters, as the LaRe paper sets them."""
 
-    target_every: Annotated[int, Field(ge=1)] = 2
+    target_every: Count = 2
     """Updates between two moves of the target critics."""
     temperature: Annotated[float, Field(gt=0)] = 1.0
     """Temperature alpha at the start."""

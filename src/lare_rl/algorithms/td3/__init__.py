@@ -6,6 +6,7 @@ from pydantic import Field
 
 from lare_rl.algorithms.off_policy import OffPolicySettings, run_defaults
 from lare_rl.algorithms.registry import Algorithm, Consumes, register_algorithm
+from lare_rl.errors import Count
 
 __all__ = ["TD3Settings"]
 
@@ -17,7 +18,7 @@ class TD3Settings(OffPolicySettings):
     """Standard deviation of the noise on the target action, in action bounds."""
     noise_clip: Annotated[float, Field(ge=0)] = 0.5
     """Bound of that noise."""
-    policy_delay: Annotated[int, Field(ge=1)] = 2
+    policy_delay: Count = 2
     """Critic updates for each update of actor and targets."""
     exploration_noise: Annotated[float, Field(ge=0)] = 0.1
     """Standard deviation of the noise on actions, in action bounds."""

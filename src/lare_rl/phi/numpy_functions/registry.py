@@ -18,7 +18,7 @@ from lare_rl.phi.builder import current_builder
 from lare_rl.phi.graph import NumberKind
 from lare_rl.phi.limits import RefusedError
 from lare_rl.phi.operand import Operand
-from lare_rl.phi.values import describe
+from lare_rl.phi.values import Symbol, describe
 
 Function = Callable[..., Any]
 
@@ -46,13 +46,13 @@ HINTS = {
     "np.nanquantile": "replace NaN first, then use np.quantile",
     "np.histogram": "count with comparisons, such as ((x >= low) & (x < high)).sum(axis=1)",
     "np.linalg.svd": "for 2 x 2 matrices, use np.linalg.eigvalsh; else sums of squares, np.trace or np.linalg.det",
-    "np.linalg.eig": "for symmetric 2 x 2 matrices, use np.linalg.eigvalsh; else np.trace or np.linalg.det",
-    "np.linalg.eigh": "for symmetric 2 x 2 matrices, use np.linalg.eigvalsh; else np.trace or np.linalg.det",
-    "np.linalg.eigvals": "for symmetric 2 x 2 matrices, use np.linalg.eigvalsh; else np.trace or np.linalg.det",
+    **dict.fromkeys(
+        ["np.linalg.eig", "np.linalg.eigh", "np.linalg.eigvals"],
+        "for symmetric 2 x 2 matrices, use np.linalg.eigvalsh; else np.trace or np.linalg.det",
+    ),
     "np.linalg.lstsq": "use np.linalg.solve for at most 4 x 4 numbers",
-    "np.load": "a program has no files", "np.save": "a program has no files", "np.memmap": "a program has no files",
-    "np.fromfile": "a program has no files", "np.loadtxt": "a program has no files", "np.savetxt": "a program has no files",
-}  # fmt: skip
+    **dict.fromkeys("np.load np.save np.memmap np.fromfile np.loadtxt np.savetxt".split(), "a program has no files"),
+}
 """What to write instead of some names that are not available, or only for constants."""
 
 UFUNCS: set[str] = set()
@@ -94,19 +94,19 @@ def numpy_variants(table: Mapping[str, Any]) -> Callable[[Function], Function]:
     return register
 
 
-def numpy_functions(table: Mapping[str, Function], converts: bool = False) -> None:
-    """Register functions under names that are separated by spaces. `converts`: arguments without a default become arrays."""
+def numpy_functions(table: Mapping[str, Function]) -> None:
+    """Register functions under NumPy's names, separated by spaces."""
     for names, function in table.items():
         numpy_function(*names.split())(function)
-        if converts:
-            parameters = inspect.signature(function).parameters
-            converters = {key: as_array for key, p in parameters.items() if p.default is p.empty}
-            _CONVERTERS.update(dict.fromkeys(names.split(), converters))
 
 
 def array_functions(table: Mapping[str, Function]) -> None:
     """Register functions whose arguments without a default become arrays."""
-    numpy_functions(table, converts=True)
+    numpy_functions(table)
+    for names, function in table.items():
+        parameters = inspect.signature(function).parameters
+        converters = {key: as_array for key, p in parameters.items() if p.default is p.empty}
+        _CONVERTERS.update(dict.fromkeys(names.split(), converters))
 
 
 def call_numpy(name: str, args: Sequence[Any], kwargs: Mapping[str, Any]) -> Any:
@@ -151,10 +151,12 @@ def _signature_text(name: str) -> str:
 
 
 def as_operand(value: Any) -> Any:
+    """Return an operand or a complex number as it is, and other values as an array. Raises `TypeError` like `as_array`."""
     return value if isinstance(value, (Operand, complex)) else as_array(value)
 
 
 def as_arrays(values: Any) -> list[Array]:
+    """Return the entries of a list, tuple or array as arrays. Raises `TypeError` for other values."""
     if not isinstance(values, (list, tuple, Array)):
         raise TypeError("a list or tuple of arrays is needed")
     return [as_array(value) for value in values]
@@ -172,12 +174,20 @@ def as_sizes(value: Any) -> list[int]:
 
 
 def as_float(value: Any) -> float:
+    """Return a number, or an array with one number, as a float.
+
+    Raises:
+        TypeError: another value.
+        ValueError: an array with several numbers.
+        RefusedError: an array that differs from row to row.
+    """
     if not isinstance(value, (bool, int, float, Array)):
         raise TypeError(f"a number is needed, not {describe(value)}")
     return float(value)
 
 
 def astype(x: Any, dtype: Any) -> Array:
+    """Convert an array to the kind of a type. Raises `RefusedError` for types that `dtype_kind` refuses."""
     array = as_array(x)
     return Array(current_builder().cast(array.node, dtype_kind(dtype)), array.batch_axis)
 
@@ -191,14 +201,14 @@ def dtype_kind(dtype: Any) -> NumberKind:
     """Return the kind of a type: "float32", np.float32, float, x.dtype. Raises `RefusedError` for other types."""
     name = dtype_name(dtype)
     if name not in KIND_OF_DTYPE:
-        raise RefusedError("E-NUMPY", f"{name[:40]!r} is no available type: use float, np.float32, int or bool")
+        text = repr(name[:40]) if name else describe(dtype)
+        raise RefusedError("E-NUMPY", f"{text} is no available type: use float, np.float32, int or bool")
     return KIND_OF_DTYPE[name]
 
 
 def dtype_name(dtype: Any) -> str:
-    """Return the name of a type without np., if it is a text or a symbol; else an empty text."""
-    name = dtype if isinstance(dtype, str) else getattr(dtype, "name", "")
-    return name.removeprefix("np.") if isinstance(name, str) else ""
+    """Return the name of a type without np.: a string such as "float32", or a symbol such as np.float32. Else an empty text."""
+    return str(dtype).removeprefix("np.") if isinstance(dtype, (str, Symbol)) else ""
 
 
 def find_hint(name: str) -> str:
