@@ -80,6 +80,17 @@ def test_lengths_of_a_running_episode_is_the_mean():
     assert store.lengths(np.arange(10)).tolist() == [3] * 3 + [6] * 6 + [4]
 
 
+def test_lengths_of_a_long_running_episode_is_its_steps_since_the_last_payment():
+    store, row = Store(9, (1,), payments=PaymentRule(nonzero=True)), [np.zeros((1, 1), np.float32)] * 3
+    for i in range(12):
+        env_id = "b" if i in {5, 11} else "a"
+        list(store.extend([env_id], store.add(1), row, np.array([float(i == 1)]), np.zeros(1, bool)))
+    assert store.mean_length == 2
+    assert store.lengths(store.rows(np.arange(3, 12))).tolist() == [8, 8, 2, 8, 8, 8, 8, 8, 2]
+    store.drop("a")
+    assert store.lengths(store.rows(np.arange(3, 12))).tolist() == [2] * 9
+
+
 @pytest.mark.parametrize(
     ("rule", "steps", "scores"),
     [
@@ -101,6 +112,17 @@ def test_payments_are_stored_as_episodes(rule, steps, scores):
     assert [episode.score for episode in at_once.add_paid_episode(at_once.add(5), reward, rule)] == scores
     np.testing.assert_array_equal(step_by_step.mean_reward, at_once.mean_reward)
     assert step_by_step.length[4] == len(steps[-1])
+
+
+def test_late_payment_leaves_steps_of_other_environments():
+    """A payment for the last steps comes when most steps since the last payment are not stored any more."""
+    store, row = Store(10, (1,), payments=PaymentRule(nonzero=True, window=3)), [np.zeros((1, 1), np.float32)] * 3
+    for i in range(21):
+        env_id, reward = "b" if 9 <= i < 12 else "a", {11: 200.0, 20: 9.0}.get(i, 0.0)
+        list(store.extend([env_id], store.add(1), row, np.array([reward]), np.zeros(1, bool)))
+    rows = store.rows(np.arange(11, 21))
+    assert store.episode[rows].tolist() == [0] + 9 * [1]
+    np.testing.assert_allclose(store.mean_reward[rows], [200 / 3] + 9 * [3], rtol=1e-6)
 
 
 def test_end_needs_steps_that_are_not_paid():

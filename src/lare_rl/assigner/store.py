@@ -91,7 +91,7 @@ class Store:
         self.ended = 0
         """The number of episodes that have ever ended."""
         self.ended_steps = 0
-        """The number of steps of these episodes."""
+        """The number of steps of these episodes. Each step counts once, even if payments for windows read it often or never."""
         self.oldest: list[tuple[int, int]] = []
         """A heap of the stored episodes: first step, and number."""
         self.running: dict[Hashable, RunningEpisode] = {}
@@ -220,8 +220,8 @@ class Store:
             )
         self.restore_episode(self.ended, episode)
         self.ended += 1
-        self.ended_steps += len(steps)
-        rows = since_last % self.capacity
+        self.ended_steps += len(since_last)
+        rows = since_last[since_last >= self.steps - self.capacity] % self.capacity
         self.episode[rows] = self.ended - 1
         self.length[rows] = len(steps)
         self.mean_reward[rows] = episode.score / len(steps)
@@ -275,8 +275,16 @@ class Store:
         return steps % self.capacity
 
     def lengths(self, rows: Int[np.ndarray, "*batch"]) -> Int[np.ndarray, "*batch"]:
-        """Return T of each step's episode; for a running episode, the mean length of the episodes that have ended."""
-        return np.where(self.length[rows] > 0, self.length[rows], self.mean_length)
+        """Return T of each step's episode; for a running one, the number of its steps so far, but at least the mean length."""
+        length, mean_length = self.length[rows], self.mean_length
+        is_running = length == 0
+        length = np.where(is_running, mean_length, length)
+        for episode in self.running.values() if is_running.any() else ():
+            n_steps = len(episode.steps) - episode.n_paid
+            if n_steps > mean_length:
+                unpaid = np.array(episode.steps[episode.n_paid :])
+                length[np.isin(rows, unpaid[unpaid >= self.steps - self.capacity] % self.capacity)] = n_steps
+        return length
 
     @property
     def mean_length(self) -> int:
