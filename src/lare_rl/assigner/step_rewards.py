@@ -31,7 +31,7 @@ class StepRewards:
         self._flat_cache: tuple[Any, list[Array], Any] = None, [], None
         """A decoder or a scale, its leaves, and its structure. Flattening it anew for every call would take longer than the call."""
         self._residual_cache: tuple[DecoderState | None, dict[int, float]] = None, {}
-        """A decoder, and what its proxy rewards lack to the returns of episodes, by their numbers."""
+        """A decoder, and the residuals R - sum_t r_hat_t of episodes, by their numbers."""
 
     def rewards_at(self, step_ids: Int[np.ndarray, " n"]) -> Float[np.ndarray, "n *agents"]:
         """Return the rewards of stored steps. Raises `LareError` if a step is not stored."""

@@ -280,11 +280,11 @@ def _round(problem: Regression, alpha: Float[Array, " groups"], beta: Float[Arra
 class PosteriorCovariance(NamedTuple):
     """The posterior variance of b + w . f is |root (f - centre)|^2 + centre_variance, in squared units of y."""
 
-    root: Float[Array, "*score_types features features"]
+    root: Float[Array, "features features"]
     """root^T root = Sigma."""
-    centre: Float[Array, "*score_types features"]
+    centre: Float[Array, " features"]
     """m'."""
-    centre_variance: Float[Array, "*score_types"]
+    centre_variance: Float[Array, ""]
     """The variance of y', the mean reward at the centre."""
 
 
@@ -312,5 +312,5 @@ def posterior_std(covariance: PosteriorCovariance, features: Float[Array, "*batc
     `features` may lack the last columns, such as the intercepts of levels. Their uncertainty is left out.
     """
     n_features = features.shape[-1]
-    distance = (features - covariance.centre[..., :n_features]) @ covariance.root[..., :n_features].T
+    distance = (features - covariance.centre[:n_features]) @ covariance.root[:, :n_features].T
     return jnp.sqrt(jnp.sum(distance**2, axis=-1) + covariance.centre_variance)

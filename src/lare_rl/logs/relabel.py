@@ -327,9 +327,11 @@ def _make_exact(
     r_hat: Float[np.ndarray, " steps"], reward: Float[np.ndarray, " steps"], config: AssignerConfig
 ) -> Float[np.ndarray, " steps"]:
     """Return proxy rewards that add up to each payment."""
+    exact = config.settings.exact
+    assert exact in ("last", "spread")
     begins = _segment_begins(reward, config)
     lengths = _segment_lengths(begins)
     residual = np.add.reduceat(reward - r_hat.astype(np.float64), np.flatnonzero(begins))
     residual, length = (np.repeat(values, lengths) for values in (residual, lengths))
-    change = correction(residual, np.append(begins[1:], True), length, config.settings.exact)
+    change = correction(residual, np.append(begins[1:], True), length, exact)
     return (r_hat + change).astype(r_hat.dtype)

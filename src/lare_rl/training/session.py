@@ -66,7 +66,7 @@ class Session:
     latest_metrics: Metrics = field(default_factory=dict)
     """The metrics of the last updates."""
     best: BestPolicy | None = None
-    """The best evaluations so far. None before the first evaluation, and if several teams learn, whose returns depend on each
+    """The best evaluations so far. None before the first evaluation, and always with several teams, whose returns depend on each
     other."""
 
     _unchecked: tuple[Any, Trajectory] | None = None
@@ -272,9 +272,11 @@ class Session:
 
     def close(self) -> None:
         """Close the environments, and finish the last checkpoint. Raises `LareError` if it cannot be written."""
-        self.collector.close()
-        self._threads.shutdown()
-        self.finish_saving()
+        try:
+            self.collector.close()
+        finally:
+            self._threads.shutdown()
+            self.finish_saving()
 
 
 @cache_by_value
