@@ -74,7 +74,8 @@ def test_lengths_of_a_running_episode_is_the_mean():
     store = Store(20, (1,))
     assert store.mean_length == 1
     for length in (3, 6):
-        store.get_running(0, np.zeros(1, np.float32)).steps += store.add(length).tolist()
+        step_ids = store.add(length).tolist()
+        store.get_running(0, np.zeros(1, np.float32)).steps += step_ids
         store.end(0, 1.0)
     store.add(1)
     assert store.lengths(np.arange(10)).tolist() == [3] * 3 + [6] * 6 + [4]
@@ -112,6 +113,14 @@ def test_payments_are_stored_as_episodes(rule, steps, scores):
     assert [episode.score for episode in at_once.add_paid_episode(at_once.add(5), reward, rule)] == scores
     np.testing.assert_array_equal(step_by_step.mean_reward, at_once.mean_reward)
     assert step_by_step.length[4] == len(steps[-1])
+
+
+def test_extend_raises_the_first_refusal():
+    store, rows = Store(9, (1,), longest=1), [np.zeros((5, 1), np.float32)] * 3
+    with pytest.raises(LareError, match="this one is for 2:"):
+        list(store.extend("abbaa", store.add(5), rows, np.ones(5), np.array([0, 0, 1, 0, 1], bool)))
+    assert store.dropped == 2
+    assert not store.running
 
 
 def test_late_payment_leaves_steps_of_other_environments():

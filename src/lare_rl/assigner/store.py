@@ -7,7 +7,6 @@ are stored as an episode of their own.
 """
 
 import heapq
-import sys
 from collections.abc import Hashable, Iterator, Sequence
 from dataclasses import dataclass, field
 from typing import NamedTuple
@@ -45,11 +44,6 @@ class RunningEpisode:
     """The sum of its rewards since the last payment."""
     last_observation: Float[np.ndarray, "*agents observation"] | None = None
     """The observation after its last step."""
-
-    @property
-    def newest(self) -> int:
-        """The number of its last step; `sys.maxsize` before the first step."""
-        return self.steps[-1] if self.steps else sys.maxsize
 
 
 class Store:
@@ -97,7 +91,7 @@ class Store:
         self.running: dict[Hashable, RunningEpisode] = {}
         """The running episodes by environment. The environment whose last step is the oldest comes first."""
         self.dropped = 0
-        """Episodes that were abandoned."""
+        """Abandoned episodes and refused payments."""
 
     @property
     def bytes_per_step(self) -> int:
@@ -106,14 +100,16 @@ class Store:
         return sum(array.nbytes for array in arrays) // self.capacity
 
     def add(self, n_steps: int, alive: Bool[np.ndarray, "n_steps agents"] | None = None) -> Int[np.ndarray, " n_steps"]:
-        """Return numbers for new steps. Episodes whose steps are all too old to be stored are removed.
+        """Return numbers for new steps.
+
+        Ended episodes are removed once a step of them is overwritten, running ones once all are.
 
         Raises:
             LareError: there are more steps than can be stored.
         """
         if n_steps > self.capacity:
             raise LareError(f"{n_steps} steps at once are more than capacity = {self.capacity}: make capacity larger")
-        while self.running and next(iter(self.running.values())).newest < self.steps - self.capacity:
+        while self.running and next(iter(self.running.values())).steps[-1] < self.steps - self.capacity:
             self.drop(next(iter(self.running)))
         step_ids = np.arange(self.steps, self.steps + n_steps)
         self.steps += n_steps
@@ -139,8 +135,8 @@ class Store:
     ) -> Iterator[StoredEpisode]:
         """Add new steps to the running episodes of their environments. Yield each episode that is paid.
 
-        `step_ids` are from `add`. `steps` are observations, actions and next observations. Raises `LareError` like `end`, once all
-        steps are added.
+        `step_ids` are from `add`. `steps` are observations, actions and next observations. Once all steps are added, raises the first
+        `LareError` of their payments, like `end`.
         """
         observation, _, next_observation = steps
         error = None
@@ -152,7 +148,7 @@ class Store:
             try:
                 payment = self._add_step(episode, int(step_ids[i]), float(reward[i]), self.payments, bool(ended[i]))
             except LareError as refusal:
-                error = refusal
+                error = error or refusal
                 self.dropped += 1
             if ended[i]:
                 del self.running[env_id]
@@ -164,7 +160,7 @@ class Store:
     def _add_step(
         self, episode: RunningEpisode, step_id: int, reward: float, payments: PaymentRule, ended: bool
     ) -> StoredEpisode | None:
-        """Add a step to an episode. Return the steps of the payment that comes with it, if there is one."""
+        """Add a step to an episode. Return the paid episode if the step is paid, else None."""
         if len(episode.steps) > episode.n_paid:
             self.previous[step_id % self.capacity] = episode.steps[-1]
         episode.steps.append(step_id)
@@ -262,16 +258,15 @@ class Store:
 
     def drop(self, env_id: Hashable) -> None:
         """Abandon the running episode of an environment. Its steps stay stored, and are never learned from."""
-        run = self.running.pop(env_id, None)
-        self.dropped += bool(run and run.steps)
+        self.dropped += self.running.pop(env_id, None) is not None
 
     def rows(self, steps: Int[np.ndarray, "*batch"]) -> Int[np.ndarray, "*batch"]:
         """Return the rows of stored steps. Raises `LareError` if a step was never stored, or is not stored any more."""
         oldest = max(0, self.steps - self.capacity)
-        if steps.size and (steps.max() >= self.steps or steps.min() < oldest):
-            missing = steps.max() if steps.max() >= self.steps else steps.min()
+        missing = steps[(steps < oldest) | (steps >= self.steps)]
+        if missing.size:
             stored = f"steps {oldest} to {self.steps - 1} are" if self.steps else "no step is"
-            raise LareError(f"step {missing} is not stored: {stored} (capacity = {self.capacity})")
+            raise LareError(f"step {missing[0]} is not stored: {stored} (capacity = {self.capacity})")
         return steps % self.capacity
 
     def lengths(self, rows: Int[np.ndarray, "*batch"]) -> Int[np.ndarray, "*batch"]:

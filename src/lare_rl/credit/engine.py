@@ -83,7 +83,10 @@ def return_scale(source: RewardSource) -> Scale:
 
 
 def proxy_rewards(source: RewardSource, steps: StepBatch, spec: CreditSpec) -> Float[Array, "*batch agents"]:
-    """Return r_hat of each agent, in the unit of the true rewards if the method's rewards have one."""
+    """Return r_hat of each agent, in the unit of the true rewards if `method.calibrated`.
+
+    Else `UNIFORM` gives numbers from 0 to 1, and `DESIGNED` what the function returns.
+    """
     match spec.method.reward:
         case Reward.DESIGNED:
             return steps.inputs[..., 0]

@@ -53,6 +53,7 @@ from lare_rl.credit.precisions import (
 from lare_rl.nn.leading_axis import map_leading_axis
 from lare_rl.nn.masks import select
 from lare_rl.nn.normalise import merge_means
+from lare_rl.util.statistics import FLOAT32_NOISE
 
 __all__ = [
     "JAX",
@@ -73,10 +74,10 @@ __all__ = [
 ]
 
 FIRST_GROUP_GAIN, OTHER_GROUPS_LOSS, LOW_NOISE = 100, 1e4, 1e-6
-"""The third start of a fit: the first group may explain `FIRST_GROUP_GAIN` times its equal share, each other group its equal share
+"""Start 3 of `fit`: the first group may explain `FIRST_GROUP_GAIN` times its equal share, each other group its equal share
 divided by `OTHER_GROUPS_LOSS`, and the noise `LOW_NOISE` times the variance of the returns."""
 MANY_EPISODES_PER_FEATURE = 2
-"""With more episodes than this for each feature, and an earlier fit, the second and third iterations have one round each."""
+"""With more episodes than this for each feature, and an earlier fit, starts 2 and 3 of `fit` have one round each."""
 
 
 def _add_groups(values: Float[Array, " features"], group_index: FeatureIndex, n_groups: int) -> Float[Array, " groups"]:
@@ -172,7 +173,7 @@ def regression(
     n_steps = jnp.maximum(statistics.n_steps, 1)
     y_mean = statistics.mean[column]
     y_std = jnp.sqrt(statistics.products[column, column] / n_steps)
-    y_std = jnp.where(y_std > 1e-6 * jnp.abs(y_mean), y_std, 0)  # a constant may vary by this much in float32
+    y_std = jnp.where(y_std > FLOAT32_NOISE * jnp.abs(y_mean), y_std, 0)
     s, p = statistics.products[:n_features, :n_features], statistics.products[:n_features, column]
     is_used = varies(jnp.diagonal(s) / n_steps, statistics.mean[:n_features] ** 2)
     s = jnp.where(jnp.outer(is_used, is_used), s + JITTER * jnp.diag(jnp.diagonal(s)), 0)
@@ -200,10 +201,15 @@ def fit(
     """Return the posterior under the precisions that maximise the evidence.
 
     While episodes are few, the evidence may have several maxima: one where all variation is noise, and one where none is. An
-    iteration that starts near such a maximum stays there, however many episodes follow. So there are three iterations: from
-    `start`, from equal shares of the groups with half of the variation as noise, and from the first group with almost no noise. The
-    largest evidence wins. Without an earlier fit, the second is the same as the first, and has one round. With an earlier fit and
-    more than `MANY_EPISODES_PER_FEATURE` episodes for each feature, the second and third have one round each.
+    iteration that starts near such a maximum stays there, however many episodes follow. So there are three starts, and the largest
+    evidence wins:
+
+    1. `start`;
+    2. equal shares, half of the variance noise;
+    3. first group alone, almost no noise.
+
+    Without an earlier fit, start 1 is start 2, which then has one round. With an earlier fit and more than
+    `MANY_EPISODES_PER_FEATURE` episodes for each feature, starts 2 and 3 have one round each.
 
     Args:
         group_index: the index of each feature's group.
@@ -220,7 +226,7 @@ def fit(
 
 
 def starting_precisions(problem: Regression, start: Posterior) -> tuple[Float[Array, "3 groups"], Float[Array, "3"]]:
-    """Return alpha and beta of the three starts of `fit`. The first two are the same without an earlier fit."""
+    """Return alpha and beta of the three starts of `fit`."""
     has_start = start.beta > 0
     equal = problem.equal_alpha, 2 * problem.dof / problem.q
     earlier = jax.tree.map(lambda old, new: jnp.where(has_start, old, new), (start.alpha, start.beta), equal)

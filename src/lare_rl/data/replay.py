@@ -33,7 +33,7 @@ STEP_COLUMNS = ("observation", "state", "available", "alive")
 
 
 class Segments(NamedTuple):
-    """The steps between payments. Each field but the last has the name and the form of the field of `Replay` for episodes."""
+    """The steps between payments. Every field has the name and form of the field of `Replay` for episodes."""
 
     episode: Int[Array, "envs rows"]
     first: Int[Array, "envs segments"]
@@ -120,7 +120,17 @@ def init_replay(
     with_predictions: bool = False,
     with_levels: bool = False,
 ) -> Replay:
-    """Return an empty replay. `columns` are the shapes of a single row."""
+    """Return an empty replay.
+
+    Args:
+        columns: shape and type of a single row of each column.
+        envs: the number of environments.
+        capacity: rows of each environment. An episode of T steps takes T + 1.
+        teams: the number of teams, each with its own return.
+        payments: when the environment pays. If not only at the end of an episode, there are segments.
+        with_predictions: whether the sums of proxy rewards are stored (`predicted_return`).
+        with_levels: whether the levels of episodes are stored (`level`).
+    """
 
     def zeros(*shape: int, dtype: DTypeLike = jnp.int32) -> Array:
         return jnp.zeros((envs, *shape), dtype)

@@ -82,7 +82,7 @@ def init_learner(key: PRNGKeyArray, config: TrainConfig, init_algorithm: Callabl
 
 def empty_replay(config: TrainConfig, n_envs: int, capacity: int) -> Replay:
     """Return a replay for steps of these environments, with all that the method reads of them."""
-    with_predictions, with_levels = config.is_exact, config.n_levels > 0
+    with_predictions, with_levels = config.is_exact, config.group is not None
     n_teams = len(config.env.teams)
     return replay.init_replay(config.columns, n_envs, capacity, n_teams, config.payments, with_predictions, with_levels)
 

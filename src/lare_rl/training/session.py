@@ -209,6 +209,9 @@ class Session:
 
         Returns:
             One line of metrics.jsonl for each seed.
+
+        Raises:
+            LareError: a factor is not finite, an environment fails, or the best policies cannot be written.
         """
         self._check_factors()
         evaluation = self.collector.evaluate(self.actor, self.settings.evaluation_episodes)
@@ -217,6 +220,8 @@ class Session:
         metrics = evaluation.drop_group(self.run.config.task).metrics(self.config.env)
         metrics |= self.functions.assess(self.learner) | self.latest_metrics
         is_last, is_sampled = self.step == self.settings.steps, not self.config.deterministic_evaluation
+        # Only at the end, because it takes as long as the evaluation of sampled actions. Not in JAX, where it would be a program of its own
+        # to compile.
         if is_last and is_sampled and isinstance(self.collector, HostCollector):
             deterministic = self.collector.evaluate(self.actor, self.settings.evaluation_episodes, deterministic=True)
             metrics[DETERMINISTIC_RETURN] = deterministic.returns[..., 0].mean(axis=1)
