@@ -109,7 +109,7 @@ def test_rewards_agree(method, env, changes, phi):
     learner, config, credit = learn(method, env, phi if METHODS[method].needs_phi else None, **changes)
     expected = np.asarray(jitted(rewards, config)(stored_steps(learner), learner.reward_state))
     expected = expected if env.n_agents > 1 else expected[..., 0]
-    r_hat = credit.rewards_at(np.arange(credit.store.steps))
+    r_hat = credit.rewards_at(np.arange(credit.store.n_added))
     rtol = 1e-3 if changes.get("score") == "binary" else 1e-4
     np.testing.assert_allclose(r_hat, expected, rtol=rtol, atol=0.1 * rtol * np.abs(expected).max())
     assert np.abs(expected).max() > 0
@@ -135,5 +135,5 @@ def test_lengths_agree(payments, n_running):
     learner, _, credit = learn("rd-linear", ONE_AGENT, payments=payments, n_running=n_running)
     steps = stored_steps(learner)
     assert (~steps.finished).sum() == (n_running if payments == PAID_AT_END else n_running % 5)
-    lengths = credit.store.lengths(np.arange(credit.store.steps))
+    lengths = credit.store.lengths(np.arange(credit.store.n_added))
     np.testing.assert_array_equal(lengths, np.asarray(steps.length).ravel())

@@ -23,7 +23,7 @@ def test_store_matches_a_twin_that_stores_all_steps(moves, capacity):
             running = {name: numbers for name, numbers in running.items() if name not in idle}
             dropped += len(idle)
             (number,) = store.add(1)
-            store.get_running(env_id, np.zeros(1, np.float32)).steps.append(int(number))
+            store.get_running(env_id, np.zeros(1, np.float32)).step_ids.append(int(number))
             running.setdefault(env_id, []).append(n_steps)
             n_steps += 1
         elif move == "drop":
@@ -37,10 +37,10 @@ def test_store_matches_a_twin_that_stores_all_steps(moves, capacity):
             store.end(env_id, float(len(ended)))
             ended.append((tuple(running.pop(env_id)), float(len(ended))))
         stored = sorted((steps, score) for steps, score in ended if steps[0] >= n_steps - capacity)
-        assert sorted((tuple(e.steps.tolist()), e.score) for e in store.episodes.values()) == stored
-        assert {name: episode.steps for name, episode in store.running.items()} == running
-        assert (store.steps, store.ended, store.dropped) == (n_steps, len(ended), dropped)
-        assert store.ended_steps == sum(len(steps) for steps, _ in ended)
+        assert sorted((tuple(e.step_ids.tolist()), e.return_) for e in store.episodes.values()) == stored
+        assert {name: episode.step_ids for name, episode in store.running.items()} == running
+        assert (store.n_added, store.n_ended, store.dropped) == (n_steps, len(ended), dropped)
+        assert store.n_ended_steps == sum(len(steps) for steps, _ in ended)
         assert sorted(number for _, number in store.oldest) == sorted(store.episodes)
         for steps, score in stored:
             rows = store.rows(np.array(steps))
@@ -61,7 +61,7 @@ def test_rows_and_add_refuse():
     assert store.rows(np.zeros(0, np.int64)).tolist() == []
     with pytest.raises(LareError, match=r"6 .*capacity = 5"):
         store.add(6)
-    assert store.steps == 8
+    assert store.n_added == 8
 
 
 def test_bytes_per_step():
@@ -75,7 +75,7 @@ def test_lengths_of_a_running_episode_is_the_mean():
     assert store.mean_length == 1
     for length in (3, 6):
         step_ids = store.add(length).tolist()
-        store.get_running(0, np.zeros(1, np.float32)).steps += step_ids
+        store.get_running(0, np.zeros(1, np.float32)).step_ids += step_ids
         store.end(0, 1.0)
     store.add(1)
     assert store.lengths(np.arange(10)).tolist() == [3] * 3 + [6] * 6 + [4]
@@ -107,10 +107,10 @@ def test_payments_are_stored_as_episodes(rule, steps, scores):
     step_by_step, at_once = Store(9, (1,), payments=rule), Store(9, (1,), payments=rule)
     numbers = step_by_step.add(5)
     stored = list(step_by_step.extend(["a"] * 5, numbers, [rows] * 3, reward, np.arange(5) == 4))
-    assert [episode.steps.tolist() for episode in stored] == steps
-    assert [episode.score for episode in stored] == scores
+    assert [episode.step_ids.tolist() for episode in stored] == steps
+    assert [episode.return_ for episode in stored] == scores
     assert not step_by_step.running
-    assert [episode.score for episode in at_once.add_paid_episode(at_once.add(5), reward, rule)] == scores
+    assert [episode.return_ for episode in at_once.add_paid_episode(at_once.add(5), reward, rule)] == scores
     np.testing.assert_array_equal(step_by_step.mean_reward, at_once.mean_reward)
     assert step_by_step.length[4] == len(steps[-1])
 
