@@ -107,7 +107,7 @@ EVERY_5 = PaymentRule(period=5)
 )
 def test_rewards_agree(method, env, changes, phi):
     learner, config, credit = learn(method, env, phi if METHODS[method].needs_phi else None, **changes)
-    expected = np.asarray(jitted(rewards, config)(stored_steps(learner), learner.reward_state))
+    expected = np.asarray(jitted(rewards, config)(stored_steps(learner), learner.reward_sources))
     expected = expected if env.n_agents > 1 else expected[..., 0]
     r_hat = credit.rewards_at(np.arange(credit.store.n_added))
     rtol = 1e-3 if changes.get("score") == "binary" else 1e-4

@@ -208,7 +208,8 @@ class Store:
         step_ids = episode.step_ids
         if self.longest is not None and len(step_ids) > self.longest:
             raise LareError(
-                f"the decoder reads at most {self.longest} steps for one payment, and this one is for {len(step_ids)}: use rudder, or payments"
+                f"the decoder reads at most {self.longest} steps for one payment, and this one is for {len(step_ids)}: use rudder, or "
+                "payments"
             )
         if self.n_added - step_ids[0] > self.capacity:
             raise LareError(

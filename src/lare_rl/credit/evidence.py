@@ -56,7 +56,7 @@ from lare_rl.nn.normalise import merge_means
 from lare_rl.util.statistics import FLOAT32_NOISE
 
 __all__ = [
-    "JAX",
+    "JAX_BACKEND",
     "PosteriorCovariance",
     "SufficientStatistics",
     "add_episodes",
@@ -70,7 +70,7 @@ __all__ = [
     "posterior_std",
     "regression",
     "starting_precisions",
-    "to_return_units",
+    "unscale",
 ]
 
 FIRST_GROUP_GAIN, OTHER_GROUPS_LOSS, LOW_NOISE = 100, 1e4, 1e-6
@@ -84,7 +84,7 @@ def _add_groups(values: Float[Array, " features"], group_index: FeatureIndex, n_
     return jnp.zeros(n_groups).at[group_index].add(values)
 
 
-JAX = Backend(jnp, _add_groups, partial(solve_triangular, lower=True))
+JAX_BACKEND = Backend(jnp, _add_groups, partial(solve_triangular, lower=True))
 
 
 class SufficientStatistics(NamedTuple):
@@ -159,7 +159,7 @@ def init_posterior(group_index: FeatureIndex) -> Posterior:
     zero = jnp.zeros(())
     groups = jnp.zeros(int(group_index.max(initial=-1)) + 1)
     return Posterior(
-        jnp.zeros(len(group_index)), bias=zero, alpha=groups, beta=zero, n_determined=groups, log_evidence=zero
+        jnp.zeros(len(group_index)), bias=zero, alpha=groups, beta=zero, n_effective=groups, log_evidence=zero
     )
 
 
@@ -185,7 +185,7 @@ def regression(
         y_mean=y_mean,
         y_std=y_std,
         group_index=group_index,
-        equal_alpha=equal_shares(JAX, jnp.diagonal(s), n_steps, group_index),
+        equal_alpha=equal_shares(JAX_BACKEND, jnp.diagonal(s), n_steps, group_index),
     )
 
 
@@ -222,7 +222,7 @@ def fit(
     limits = jnp.where(jnp.stack([jnp.array(True), has_start & few, ~has_start | few]), max_rounds, 1)
     starts = starting_precisions(problem, start)
     candidates = map_leading_axis(lambda args: fixed_point(problem, *args), (*starts, limits), batched=batched)
-    return to_return_units(statistics, problem, most_likely(candidates), fallback=start)
+    return unscale(statistics, problem, most_likely(candidates), fallback=start)
 
 
 def starting_precisions(problem: Regression, start: Posterior) -> tuple[Float[Array, "3 groups"], Float[Array, "3"]]:
@@ -243,7 +243,7 @@ def most_likely(candidates: Posterior) -> Posterior:
     return jax.tree.map(lambda leaf: leaf[best], candidates)
 
 
-def to_return_units(
+def unscale(
     statistics: SufficientStatistics, problem: Regression, posterior: Posterior, fallback: Posterior
 ) -> Posterior:
     """Return a posterior with its weights in the unit of y, and b = y' - mu . m'.
@@ -280,7 +280,7 @@ def fixed_point(
 
 
 def _round(problem: Regression, alpha: Float[Array, " groups"], beta: Float[Array, ""]) -> Posterior:
-    return next_posterior(JAX, problem, alpha, beta, partial(dense_moments, JAX, problem))
+    return next_posterior(JAX_BACKEND, problem, alpha, beta, partial(dense_moments, JAX, problem))
 
 
 class PosteriorCovariance(NamedTuple):
@@ -302,8 +302,8 @@ def posterior_covariance(
     The weight of a feature without data has its prior standard deviation.
     """
     problem = regression(statistics, score_type, group_index)
-    alpha, beta = clip_precisions(JAX, problem, posterior.alpha, posterior.beta)
-    root, _ = inverse_root(JAX, beta * problem.s + jnp.diag(alpha[group_index]))
+    alpha, beta = clip_precisions(JAX_BACKEND, problem, posterior.alpha, posterior.beta)
+    root, _ = inverse_root(JAX_BACKEND, beta * problem.s + jnp.diag(alpha[group_index]))
     covariance = PosteriorCovariance(
         root=problem.y_std * root,
         centre=statistics.mean[: len(group_index)],
