@@ -37,7 +37,9 @@ def untrained(learner: Learner, config: TrainConfig, key: jax.Array) -> Learner:
     """The learner with a new decoder, which has the statistics of all stored steps."""
     (credit,) = init_decoders([key], config)
     stored_replay = learner.replay
-    valid = replay.read(stored_replay, replay.newest_steps(stored_replay, int(replay.n_transitions(stored_replay)[0])))
+    valid = replay.read(
+        stored_replay, replay.newest_steps(stored_replay, int(replay.n_stored_transitions(stored_replay)[0]))
+    )
     credit = decomposition.observe_steps(credit, decoder_inputs(valid, config, 0))
     return learner._replace(decoders=(credit._replace(scale=learner.decoders[0].scale),))
 
@@ -56,7 +58,7 @@ def curve(learner: Learner, config: TrainConfig, fits: tuple[int, ...], seed: in
             credit, _ = fit_some(learner, jax.random.key(1000 * seed + done), config=config)
             learner = learner._replace(decoders=credit)
             done += AT_A_TIME
-        r_hat = team_proxy_rewards(recent, learner.reward_state, config, 0)[:, 0]
+        r_hat = team_proxy_rewards(recent, learner.reward_sources, config, 0)[:, 0]
         accuracies.append(
             {
                 "fits": done,

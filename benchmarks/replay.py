@@ -74,8 +74,8 @@ def filled(transitions: int) -> Replay:
         first=np.asarray(stored_replay.first.at[0, :episodes].set(EPISODE * np.arange(episodes))),
         episode_return=numbers(stored_replay.episode_return),
         next_row=jnp.asarray([episodes * (EPISODE + 1)]),
-        transitions=jnp.asarray([transitions]),
-        episodes=jnp.asarray([episodes]),
+        next_transition=jnp.asarray([transitions]),
+        current_episode=jnp.asarray([episodes]),
     )
     return jax.tree.map(lambda leaf: jnp.asarray(leaf)[None], stored_replay)
 
@@ -163,7 +163,7 @@ def memory(transitions: int) -> None:
         session.close()
     arrays = sum(leaf.nbytes for leaf in jax.tree.leaves(session.learner.replay))
     stored_replay = session.learner.replay
-    stored = int(jax.vmap(replay.n_transitions)(stored_replay)[0, 0])
+    stored = int(jax.vmap(replay.n_stored_transitions)(stored_replay)[0, 0])
     print(f"{stored:,} transitions stored; the arrays of the replay: {arrays / 1e9:.3f} GB")
     for stage, bytes_used in stages.items():
         print(f"{stage:28s} resident {bytes_used['resident'] / 1e9:.3f} GB, peak {bytes_used['peak'] / 1e9:.3f} GB")

@@ -42,7 +42,7 @@ def from_fewer(count: int, sums: SufficientStatistics, basis: Basis, start: Post
     candidates = jax.lax.map(
         lambda args: evidence.fixed_point(problem, args[0], args[1], MAX_EVIDENCE_ROUNDS), (alpha[:count], beta[:count])
     )
-    return evidence.to_return_units(sums, problem, evidence.most_likely(candidates), fallback=start)
+    return evidence.unscale(sums, problem, evidence.most_likely(candidates), fallback=start)
 
 
 def from_three(sums: SufficientStatistics, basis: Basis, start: Posterior) -> Posterior:

@@ -49,7 +49,7 @@ def function(request, phi, reward):
 
 def stored(credit):
     """Return length and score of each stored episode."""
-    return [(len(episode.steps), episode.score) for episode in credit.store.episodes.values()]
+    return [(len(episode.step_ids), episode.return_) for episode in credit.store.episodes.values()]
 
 
 def add_episodes(credit, episodes):
@@ -182,7 +182,7 @@ def test_steps_episodes_and_scores_give_the_same_rewards(method, function):
         by_score.add_episode(*episode[:3], episode.reward.sum())
         for credit in (by_step, by_episode, by_score):
             credit.fit_pending()
-    steps = np.arange(by_step.store.steps)
+    steps = np.arange(by_step.store.n_added)
     np.testing.assert_array_equal(by_episode.store.inputs, by_step.store.inputs)
     np.testing.assert_array_equal(by_episode.rewards_at(steps), by_step.rewards_at(steps))
     np.testing.assert_allclose(by_score.rewards_at(steps), by_step.rewards_at(steps), rtol=1e-3, atol=1e-4)
@@ -322,7 +322,7 @@ def test_several_threads_may_use_an_assigner():
     assert credit.store.dropped == 0
     expected = [sum(episode.reward.tolist()) for env_episodes in episodes.values() for episode in env_episodes]
     assert sorted(score for _, score in stored(credit)) == sorted(expected)
-    assert np.isfinite(credit.rewards_at(np.arange(credit.store.steps))).all()
+    assert np.isfinite(credit.rewards_at(np.arange(credit.store.n_added))).all()
 
 
 # Steps and episodes
@@ -334,7 +334,7 @@ def test_add_gives_no_number_to_rows_that_are_not_valid():
     rows[0][1] = np.nan
     numbers = credit.add(*rows, [False, True, True], [False] * 3, valid=[True, False, True], lanes=[0, 1, 2])
     assert numbers.tolist() == [0, -1, 1]
-    assert credit.store.ended == 1
+    assert credit.store.n_ended == 1
     assert list(credit.store.running) == [0]
     assert credit.rewards_at(numbers).shape == (3,)
     assert credit.add(*rows, [True] * 3, [False] * 3, valid=[False] * 3).tolist() == [-1] * 3
@@ -384,7 +384,7 @@ def test_end_with_late_scores():
 def test_capacity_removes_the_oldest_episodes():
     credit = small_assigner(capacity=20)
     numbers = [add_episode(credit, episode) for episode in random_episodes([6] * 5)]
-    assert [episode.steps.tolist() for episode in credit.store.episodes.values()] == numbers[2:]
+    assert [episode.step_ids.tolist() for episode in credit.store.episodes.values()] == numbers[2:]
     credit.fit()
     assert np.isfinite(credit.rewards_at(numbers[2:])).all()
     with pytest.raises(LareError, match=r"step 6 .*capacity = 20"):
@@ -428,7 +428,7 @@ def test_add_refuses(changes, message):
     credit = small_assigner()
     with pytest.raises(LareError, match=message):
         credit.add(**(ROWS | changes))
-    assert credit.store.steps == 0
+    assert credit.store.n_added == 0
     credit.add(**ROWS)
 
 
@@ -447,9 +447,9 @@ def test_add_episode_refuses(changes, message):
     values = {name: ROWS[name] for name in ("observation", "action", "next_observation")} | {"reward": 1.0}
     with pytest.raises(LareError, match=message):
         credit.add_episode(**(values | changes))
-    assert credit.store.steps == 0
+    assert credit.store.n_added == 0
     credit.add_episode(**(values | {"next_observation": np.ones((2, 2))}))  # steps need not follow each other
-    assert (credit.store.ended, credit.store.dropped) == (1, 0)
+    assert (credit.store.n_ended, credit.store.dropped) == (1, 0)
 
 
 # Configuration
@@ -465,7 +465,7 @@ def test_an_episode_that_is_too_long_leaves_the_others():
             credit.add(*rows, *flags, env_ids=["long", "short"])
     with pytest.raises(LareError, match="capacity larger"):
         credit.add(*rows, *flags, env_ids=["long", "short"])
-    assert (credit.store.ended, credit.store.dropped, credit.store.running) == (4, 1, {})
+    assert (credit.store.n_ended, credit.store.dropped, credit.store.running) == (4, 1, {})
 
 
 NO_TASK = {"task": None, "observation_space": 2, "action_space": 1}
@@ -595,9 +595,9 @@ def test_team_with_one_reward():
         episode, _ = team_episode(6, random)
         credit.add_episode(*episode[:3], episode.reward.mean(axis=1))
     assert credit.store.alive is None
-    assert credit.store.episodes[2].score == pytest.approx(episode.reward.mean(axis=1).sum())
+    assert credit.store.episodes[2].return_ == pytest.approx(episode.reward.mean(axis=1).sum())
     credit.add_episode(*episode[:3], 5.0)
-    assert credit.store.episodes[3].score == 5.0
+    assert credit.store.episodes[3].return_ == 5.0
     assert (credit.rewards_at([0, -1])[1] == 0).all()
     assert credit.rewards_at([0, -1]).shape == (2, 3)
     with pytest.raises(LareError, match=r"\(2, 2\).*\(steps, 3, 2\)"):
@@ -702,7 +702,7 @@ def test_groups_that_do_not_fit_are_refused():
         credit.add_episode(*episode)
     with pytest.raises(LareError, match=r"2 entries.* 5 steps"):
         credit.add(*episode, np.zeros(5, bool), np.zeros(5, bool), group=["a", "b"])
-    assert (credit.store.steps, credit.learner.n_pending_steps) == (0, 0)
+    assert (credit.store.n_added, credit.learner.n_pending_steps) == (0, 0)
     is_valid = np.arange(5) == 0
     credit.add(*episode, is_valid, ~is_valid, valid=is_valid, group=["g0", "a", "b", "c", "d"])
     assert list(credit.group_names) == ["g0"]

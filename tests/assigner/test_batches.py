@@ -26,7 +26,7 @@ def filled_store(capacity=100, agents=1):
         alive = None if agents == 1 else np.array([[True] + [i < 2] * (agents - 1)])
         (step,) = store.add(1, alive)
         store.inputs[step % capacity] = number, i
-        store.get_running(number, np.zeros(1, np.float32)).steps.append(int(step))
+        store.get_running(number, np.zeros(1, np.float32)).step_ids.append(int(step))
         if i == length - 1:
             store.end(number, 10.0 * number)
     return store

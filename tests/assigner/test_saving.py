@@ -34,10 +34,10 @@ def test_load_gives_the_same_rewards_and_goes_on(method, capacity, tmp_path, phi
     directory = tmp_path / "some" / "where"
     credit.save(directory)
     again = CreditAssigner.load(directory)
-    stored = np.arange(max(0, credit.store.steps - capacity), credit.store.steps)
+    stored = np.arange(max(0, credit.store.n_added - capacity), credit.store.n_added)
     np.testing.assert_array_equal(again.rewards_at(stored), credit.rewards_at(stored))
     episodes = (
-        [episode.steps.tolist() for episode in assigner.store.episodes.values()] for assigner in (again, credit)
+        [episode.step_ids.tolist() for episode in assigner.store.episodes.values()] for assigner in (again, credit)
     )
     assert next(episodes) == next(episodes)
     assert again.metrics().keys() == credit.metrics().keys()
@@ -81,7 +81,7 @@ def test_state_without_episodes_gives_the_same_rewards(is_pickled, tmp_path, phi
     np.testing.assert_array_equal(again.rewards(*new[:3]), credit.rewards(*new[:3]))
     assert again.rewards(*new[:3]).any()
     assert again.score_type == ("sum" if is_pickled else "average")
-    assert again.store.steps == 0
+    assert again.store.n_added == 0
     assert again.metrics()["credit/episodes"] == 24
     again.fit()
     numbers = again.add_episode(*new)

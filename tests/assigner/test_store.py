@@ -23,7 +23,7 @@ def test_store_matches_a_twin_that_stores_all_steps(moves, capacity):
             running = {name: numbers for name, numbers in running.items() if name not in idle}
             dropped += len(idle)
             (number,) = store.add(1)
-            store.get_running(env_id, np.zeros(1, np.float32)).steps.append(int(number))
+            store.get_running(env_id, np.zeros(1, np.float32)).step_ids.append(int(number))
             running.setdefault(env_id, []).append(n_steps)
             n_steps += 1
         elif move == "drop":
@@ -37,10 +37,10 @@ def test_store_matches_a_twin_that_stores_all_steps(moves, capacity):
             store.end(env_id, float(len(ended)))
             ended.append((tuple(running.pop(env_id)), float(len(ended))))
         stored = sorted((steps, score) for steps, score in ended if steps[0] >= n_steps - capacity)
-        assert sorted((tuple(e.steps.tolist()), e.score) for e in store.episodes.values()) == stored
-        assert {name: episode.steps for name, episode in store.running.items()} == running
-        assert (store.steps, store.ended, store.dropped) == (n_steps, len(ended), dropped)
-        assert store.ended_steps == sum(len(steps) for steps, _ in ended)
+        assert sorted((tuple(e.step_ids.tolist()), e.return_) for e in store.episodes.values()) == stored
+        assert {name: episode.step_ids for name, episode in store.running.items()} == running
+        assert (store.n_added, store.n_ended, store.dropped) == (n_steps, len(ended), dropped)
+        assert store.n_ended_steps == sum(len(steps) for steps, _ in ended)
         assert sorted(number for _, number in store.oldest) == sorted(store.episodes)
         for steps, score in stored:
             rows = store.rows(np.array(steps))
@@ -61,7 +61,7 @@ def test_rows_and_add_refuse():
     assert store.rows(np.zeros(0, np.int64)).tolist() == []
     with pytest.raises(LareError, match=r"6 .*capacity = 5"):
         store.add(6)
-    assert store.steps == 8
+    assert store.n_added == 8
 
 
 def test_bytes_per_step():
@@ -74,10 +74,22 @@ def test_lengths_of_a_running_episode_is_the_mean():
     store = Store(20, (1,))
     assert store.mean_length == 1
     for length in (3, 6):
-        store.get_running(0, np.zeros(1, np.float32)).steps += store.add(length).tolist()
+        step_ids = store.add(length).tolist()
+        store.get_running(0, np.zeros(1, np.float32)).step_ids += step_ids
         store.end(0, 1.0)
     store.add(1)
     assert store.lengths(np.arange(10)).tolist() == [3] * 3 + [6] * 6 + [4]
+
+
+def test_lengths_of_a_long_running_episode_is_its_steps_since_the_last_payment():
+    store, row = Store(9, (1,), payments=PaymentRule(nonzero=True)), [np.zeros((1, 1), np.float32)] * 3
+    for i in range(12):
+        env_id = "b" if i in {5, 11} else "a"
+        list(store.extend([env_id], store.add(1), row, np.array([float(i == 1)]), np.zeros(1, bool)))
+    assert store.mean_length == 2
+    assert store.lengths(store.rows(np.arange(3, 12))).tolist() == [8, 8, 2, 8, 8, 8, 8, 8, 2]
+    store.drop("a")
+    assert store.lengths(store.rows(np.arange(3, 12))).tolist() == [2] * 9
 
 
 @pytest.mark.parametrize(
@@ -95,12 +107,31 @@ def test_payments_are_stored_as_episodes(rule, steps, scores):
     step_by_step, at_once = Store(9, (1,), payments=rule), Store(9, (1,), payments=rule)
     numbers = step_by_step.add(5)
     stored = list(step_by_step.extend(["a"] * 5, numbers, [rows] * 3, reward, np.arange(5) == 4))
-    assert [episode.steps.tolist() for episode in stored] == steps
-    assert [episode.score for episode in stored] == scores
+    assert [episode.step_ids.tolist() for episode in stored] == steps
+    assert [episode.return_ for episode in stored] == scores
     assert not step_by_step.running
-    assert [episode.score for episode in at_once.add_paid_episode(at_once.add(5), reward, rule)] == scores
+    assert [episode.return_ for episode in at_once.add_paid_episode(at_once.add(5), reward, rule)] == scores
     np.testing.assert_array_equal(step_by_step.mean_reward, at_once.mean_reward)
     assert step_by_step.length[4] == len(steps[-1])
+
+
+def test_extend_raises_the_first_refusal():
+    store, rows = Store(9, (1,), longest=1), [np.zeros((5, 1), np.float32)] * 3
+    with pytest.raises(LareError, match="this one is for 2:"):
+        list(store.extend("abbaa", store.add(5), rows, np.ones(5), np.array([0, 0, 1, 0, 1], bool)))
+    assert store.dropped == 2
+    assert not store.running
+
+
+def test_late_payment_leaves_steps_of_other_environments():
+    """A payment for the last steps comes when most steps since the last payment are not stored any more."""
+    store, row = Store(10, (1,), payments=PaymentRule(nonzero=True, window=3)), [np.zeros((1, 1), np.float32)] * 3
+    for i in range(21):
+        env_id, reward = "b" if 9 <= i < 12 else "a", {11: 200.0, 20: 9.0}.get(i, 0.0)
+        list(store.extend([env_id], store.add(1), row, np.array([reward]), np.zeros(1, bool)))
+    rows = store.rows(np.arange(11, 21))
+    assert store.episode[rows].tolist() == [0] + 9 * [1]
+    np.testing.assert_allclose(store.mean_reward[rows], [200 / 3] + 9 * [3], rtol=1e-6)
 
 
 def test_end_needs_steps_that_are_not_paid():

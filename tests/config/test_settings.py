@@ -39,6 +39,7 @@ def test_settings_complete_hyperparameters_from_the_algorithm(name):
         ({"td3": 3}, ["td3 = 3", "table"]),
         ({"algorithm": "dqn"}, ["'dqn'", "td3, ddpg"]),
         ({"method": "lare"}, ["'lare'", "lare-bayes"]),
+        ({"steps": 2**30 + 1}, ["steps = 1073741825", "1073741824"]),
         ({"seeds": 1001}, ["seeds = 1001", "1000"]),
         ({"seed": 2**31 - 1, "seeds": 2}, ["seeds = 2", "2147483647"]),
         ({"steps": 0, "stepz": 2, "seed": -1, "rollout_steps": -1}, ["'stepz'", "steps = 0", "and 1 more"]),

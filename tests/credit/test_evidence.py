@@ -114,8 +114,8 @@ def test_fit_recovers_rewards_and_switches_off_a_useless_group():
     np.testing.assert_allclose(posterior.weight, weight, atol=1e-4)
     assert float(posterior.bias) == pytest.approx(0.7, abs=1e-4)
     noisy = fit(sample_statistics(count=100))
-    assert noisy.n_determined[0] > 2.9
-    assert noisy.n_determined[1] < 0.5
+    assert noisy.n_effective[0] > 2.9
+    assert noisy.n_effective[1] < 0.5
     assert np.abs(noisy.weight[3:7]).max() < 0.01  # the useless group is switched off
 
 

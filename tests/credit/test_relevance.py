@@ -60,9 +60,9 @@ def test_few_relevant_features_get_strengths_of_their_own():
     assert bool(has_own)
     errors = [np.abs(np.asarray(fit.weight) - weight).sum() for fit in (groups, refined)]
     assert errors[1] < 0.5 * errors[0]
-    n_determined = np.asarray(refined.n_determined)
-    assert n_determined[1] > 0.9  # strength 0 is that of the factors
-    assert np.median(n_determined[2:]) < 0.1
+    n_effective = np.asarray(refined.n_effective)
+    assert n_effective[1] > 0.9  # strength 0 is that of the factors
+    assert np.median(n_effective[2:]) < 0.1
     np.testing.assert_allclose(again.weight, refined.weight, atol=1e-3)
 
 
@@ -72,7 +72,7 @@ def test_fit_by_groups_is_unchanged_without_a_gain():
     assert not bool(has_own)
     np.testing.assert_array_equal(refined.weight, groups.weight)
     np.testing.assert_allclose(refined.alpha, np.asarray(groups.alpha)[[0, *[1] * 10]])
-    assert float(refined.n_determined.sum()) == pytest.approx(float(groups.n_determined.sum()))
+    assert float(refined.n_effective.sum()) == pytest.approx(float(groups.n_effective.sum()))
 
 
 @given(

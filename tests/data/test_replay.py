@@ -36,13 +36,16 @@ def test_replay_matches_slow_twin(lengths_by_env, chunks):
     ends = [[i + 1 for i, row in enumerate(env_rows) if row[3]] for env_rows in rows]
     mean_length = sum(env_ends[-1] for env_ends in ends if env_ends) // max(1, sum(map(len, ends)))
     assert replay.mean_length(buffer) == max(1, mean_length)
-    n_transitions, n_finished = np.asarray(replay.n_transitions(buffer)), np.asarray(replay.n_finished(buffer))
+    n_stored_transitions, n_stored_episodes = (
+        np.asarray(replay.n_stored_transitions(buffer)),
+        np.asarray(replay.n_stored_episodes(buffer)),
+    )
     for env in range(ENVS):
         finished, running = slow_replay(rows[env], chunks, CAPACITY)
         episodes = [*finished, running] if running else finished
         stored = [step for episode in episodes for step in episode]
-        assert n_finished[env] == len(finished)
-        assert n_transitions[env] == len(stored)
+        assert n_stored_episodes[env] == len(finished)
+        assert n_stored_transitions[env] == len(stored)
         at = env, slice(len(stored))
         columns, next_columns, *_ = replay_columns([stored])
         for name in COLUMNS:
@@ -84,7 +87,9 @@ def test_segments_match_slow_twin(rule, data):
     rows = [[(*row[:2], row[2] * pays[env, i], row[3]) for i, row in enumerate(rows[env])] for env in range(ENVS)]
     buffer = filled_replay(rows, chunks, CAPACITY, rule)
     start, limits = jnp.zeros(ENVS, int), (ENVS * MAX_STEPS, ENVS * MAX_STEPS * LONGEST)
-    sample = jax.tree.map(np.asarray, episodes_in_order(replay.by_payment(buffer), start, jnp.array(0), *limits))
+    sample = jax.tree.map(
+        np.asarray, episodes_in_order(replay.segments_as_episodes(buffer), start, jnp.array(0), *limits)
+    )
     observation = np.asarray(read(buffer, sample.steps).columns["observation"])[:, 0, 0]
     all_steps, expected = read_all(buffer), []
     for env in range(ENVS):
@@ -110,13 +115,13 @@ def test_segments_match_slow_twin(rule, data):
 
 def test_abandon_running_forgets_its_payments():
     buffer = filled_replay([stream([2, 5])] * ENVS, [6], CAPACITY, PaymentRule(period=2))
-    assert replay.by_payment(buffer).episodes.tolist() == [3] * ENVS
+    assert replay.segments_as_episodes(buffer).current_episode.tolist() == [3] * ENVS
     abandoned = abandon_running(buffer, jnp.array([True, False, True]))
-    assert replay.by_payment(abandoned).episodes.tolist() == [1, 3, 1]
+    assert replay.segments_as_episodes(abandoned).current_episode.tolist() == [1, 3, 1]
     longer = extend(
         abandoned, *replay_columns([stream([7], env)[:3] for env in (7, 8, 9)]), payments=PaymentRule(period=2)
     )
-    assert replay.by_payment(longer).episodes.tolist() == [2, 4, 2]
+    assert replay.segments_as_episodes(longer).current_episode.tolist() == [2, 4, 2]
     assert read(longer, replay.newest_steps(longer, 3)).last.tolist()[::2] == [[False, True, False]] * 2
 
 
@@ -124,7 +129,7 @@ def test_abandon_running():
     buffer = filled_replay([stream([2, 5], 0), stream([4, 3], 1), stream([3, 1, 9], 2)], [7], CAPACITY)
     assert buffer.running.tolist() == [True, True, True]
     abandoned = abandon_running(buffer, jnp.array([True, False, True]))
-    assert replay.n_transitions(abandoned).tolist() == [2, 7, 4]
+    assert replay.n_stored_transitions(abandoned).tolist() == [2, 7, 4]
     assert abandoned.next_row.tolist() == [3, int(buffer.next_row[1]), 6]
     assert abandoned.running.tolist() == [False, True, False]
     longer = extend(abandoned, *replay_columns([stream([7], env)[:3] for env in (7, 8, 9)]))
@@ -140,9 +145,9 @@ def test_abandon_running():
 def test_hide_newest():
     buffer = filled_replay([stream([2, 3, 2, 1])[:7]] * ENVS, [7], CAPACITY)
     hidden = replay.hide_newest(buffer, jnp.array([2, 0, 1]))
-    assert replay.n_finished(hidden).tolist() == [1, 3, 2]
+    assert replay.n_stored_episodes(hidden).tolist() == [1, 3, 2]
     assert hidden.running.tolist() == [True, False, True]
     finished = read(hidden, replay.newest_steps(hidden, 7)).finished
     assert finished.sum(axis=1).tolist() == [2, 7, 5]
-    restored = hidden._replace(episodes=buffer.episodes, running=buffer.running)
+    restored = hidden._replace(current_episode=buffer.current_episode, running=buffer.running)
     assert jax.tree.all(jax.tree.map(np.array_equal, restored, buffer))

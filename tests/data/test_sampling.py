@@ -115,7 +115,7 @@ def test_sample_packed(buffer, steps, rows):
 
 
 def test_episodes_in_order(buffer):
-    since = jnp.array([0, buffer.episodes[1] - 2, 100])  # all that are stored, the newest two, and none
+    since = jnp.array([0, buffer.current_episode[1] - 2, 100])  # all that are stored, the newest two, and none
     stored = [[first for first in FIRST if first[0] == env] for env in (0, 1)]
     assert sampling.count_episodes_since(buffer, since).tolist() == [len(stored[0]), 2, 0]
     expected = stored[0] + stored[1][-2:]

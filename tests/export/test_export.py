@@ -162,7 +162,7 @@ def test_export_agrees_with_jax(kind, method, export_run):
     steps = jax.tree.map(lambda leaf: np.concatenate(np.swapaxes(leaf, 0, 1)), steps)
     # Exported rewards are in the unit of the true rewards, before they are scaled.
     unscaled = replace(config, scale_rewards=False)
-    expected = np.asarray(rewards(stored, seed_learner.reward_state, unscaled))
+    expected = np.asarray(rewards(stored, seed_learner.reward_sources, unscaled))
     for team_index, name in enumerate(names):
         check_reward(exported, name, config, steps, np.asarray(stored.length, np.float32), expected, team_index)
 

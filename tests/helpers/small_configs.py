@@ -250,7 +250,7 @@ def learner_with_episodes(config, seed=0):
 def stored_steps(learner):
     """Return all stored steps of the first environment, in order."""
     buffer = learner.replay
-    number = np.arange(int(replay.oldest_transition(buffer)[0]), int(buffer.transitions[0]))
+    number = np.arange(int(replay.oldest_transition(buffer)[0]), int(buffer.next_transition[0]))
     return read(buffer, replay.Index(np.zeros_like(number), number))
 
 

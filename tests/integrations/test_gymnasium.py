@@ -85,7 +85,7 @@ def test_single_steps_of_spaces(kind):
     check_episodes(credit, [env])
     logged_rewards = [step[3] for step in env.all_steps()]
     assert [reward for reward, _ in results] == [info[TRUE_REWARD] for _, info in results] == logged_rewards
-    assert [info[CREDIT_STEP] for _, info in results] == list(range(credit.store.steps))
+    assert [info[CREDIT_STEP] for _, info in results] == list(range(credit.store.n_added))
     assert credit.store.dropped == credit.n_fits == 0
 
 
@@ -106,9 +106,9 @@ def test_vector_rewards(mode):
         assert r_hat.dtype == reward.dtype
     numbers = np.concatenate([infos[CREDIT_STEP] for *_, infos in results])
     assert (numbers < 0).any() == (mode == NEXT_STEP)
-    assert sorted(numbers[numbers >= 0].tolist()) == list(range(credit.store.steps))
+    assert sorted(numbers[numbers >= 0].tolist()) == list(range(credit.store.n_added))
     assert (credit.n_fits, credit.store.dropped) == (40, 0)
-    assert credit.store.steps == sum(len(env.all_steps()) for env in envs)
+    assert credit.store.n_added == sum(len(env.all_steps()) for env in envs)
     assert (results[0][1] == 0).all()  # before the first fit
     assert results[-1][1].any()
     np.testing.assert_allclose(results[-1][1], credit.rewards_at(results[-1][-1][CREDIT_STEP]), rtol=1e-6)
@@ -165,8 +165,8 @@ def test_single_rewards_and_reset():
     wrapped.step(env.action_space.sample())
     results = play_episodes(wrapped, 12)
     check_episodes(credit, [env])
-    assert (credit.store.dropped, credit.n_fits) == (1, credit.store.steps)
-    assert results[-1][0] == pytest.approx(float(credit.rewards_at([credit.store.steps - 1])[0])) != 0
+    assert (credit.store.dropped, credit.n_fits) == (1, credit.store.n_added)
+    assert results[-1][0] == pytest.approx(float(credit.rewards_at([credit.store.n_added - 1])[0])) != 0
 
 
 @all_modes

@@ -63,7 +63,7 @@ def test_steps(presence):
         team.log.clear()
         results = play(wrapped, seed)
         returns.append(sum(np.mean([reward for *_, reward in step.values()]) for step in team.log))
-        first = credit.store.steps - len(team.log)
+        first = credit.store.n_added - len(team.log)
         for number, (step, result) in enumerate(zip(team.log, results, strict=True), start=first):
             assert credit.store.alive[number].tolist() == [name in step for name in NAMES]
             for index, name in enumerate(NAMES):
@@ -74,7 +74,7 @@ def test_steps(presence):
                 expected = np.concatenate([observation, np.eye(3)[action], next_observation])
                 np.testing.assert_array_equal(credit.recorded[number][index], expected)
                 assert result[1][name] == reward
-    assert [episode.score for episode in credit.store.episodes.values()] == pytest.approx(returns)
+    assert [episode.return_ for episode in credit.store.episodes.values()] == pytest.approx(returns)
     assert credit.store.dropped == credit.n_fits == 0
 
 
@@ -90,7 +90,7 @@ def test_rewards():
         for agent in rewards:
             assert infos[agent][TRUE_REWARD] == step[agent][3]
             assert "count" in infos[agent]
-    assert credit.n_fits == credit.store.steps
+    assert credit.n_fits == credit.store.n_added
     _, rewards, _, _, infos = results[-1]
     for agent, reward in rewards.items():
         r_hat = credit.rewards_at(infos[agent][CREDIT_STEP])
@@ -113,14 +113,14 @@ def test_reset_drops_episode():
     wrapped.reset(seed=0)
     wrapped.step(dict.fromkeys(NAMES, 0))
     play(wrapped)
-    assert (credit.store.ended, credit.store.dropped) == (1, 1)
+    assert (credit.store.n_ended, credit.store.dropped) == (1, 1)
 
 
 def test_team_of_one():
     team, credit = LoggedTeam(("a_0",)), make_assigner(agents=1, max_steps=None)
     play(CreditParallel(team, credit))
     (episode,) = credit.store.episodes.values()
-    assert episode.score == sum(step["a_0"][3] for step in team.log)
+    assert episode.return_ == sum(step["a_0"][3] for step in team.log)
 
 
 def test_groups_are_read_from_info():

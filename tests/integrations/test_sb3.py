@@ -233,7 +233,7 @@ class RolloutRecorder(BaseCallback):
         return True
 
     def _on_rollout_end(self):
-        buffer, n_steps = self.model.rollout_buffer, self.credit.store.steps
+        buffer, n_steps = self.model.rollout_buffer, self.credit.store.n_added
         names = ("rewards", "values", "advantages", "episode_starts")
         self.buffer = {name: getattr(buffer, name).copy() for name in names}
         self.r_hat = self.credit.rewards_at(
@@ -272,7 +272,7 @@ def learn_again(model, credit, n_steps, resets, **options):
     for reset in resets:
         model.learn(n_steps, reset_num_timesteps=reset, **options)
         n_dropped.append(credit.metrics()["credit/dropped"])
-    assert {len(episode.steps) for episode in credit.store.episodes.values()} == {EPISODE_STEPS}
+    assert {len(episode.step_ids) for episode in credit.store.episodes.values()} == {EPISODE_STEPS}
     return n_dropped
 
 
@@ -328,7 +328,7 @@ def test_save_and_load(tmp_path):
 
     loaded = TD3.load(tmp_path / "model.zip", env=make_env(), device="cpu")
     credit_1 = loaded.replay_buffer.credit
-    assert credit_1.store.steps == 0
+    assert credit_1.store.n_added == 0
     np.testing.assert_array_equal(credit_1.rewards(*steps), credit.rewards(*steps))
     loaded.learn(60)
     assert credit_1.metrics()["credit/episodes"] == 4 + 3
@@ -363,7 +363,7 @@ def test_full_buffer():
     credit = make_assigner(capacity=99)
     buffer = off_policy(make_envs(3)[0], credit, buffer_size=100).learn(250).replay_buffer
     assert buffer.full
-    assert buffer.steps.min() == credit.store.steps - 99
+    assert buffer.steps.min() == credit.store.n_added - 99
     assert np.isfinite(buffer.sample(64).rewards.numpy()).all()
     options = {"optimize_memory_usage": True, "buffer_options": {"handle_timeout_termination": False}}
     buffer = off_policy(make_env(), make_assigner(), buffer_size=50, **options).learn(120).replay_buffer

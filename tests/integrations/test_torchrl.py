@@ -65,7 +65,7 @@ def test_collector(env_spaces, categorical, n_envs):
     for batch in collector:
         buffer.extend(batch.reshape(-1))
     check_episodes(credit, envs)
-    assert (credit.store.dropped, credit.store.steps) == (0, 50 * n_envs)
+    assert (credit.store.dropped, credit.store.n_added) == (0, 50 * n_envs)
     collector.shutdown()
 
 
@@ -91,7 +91,7 @@ def test_time_is_last_dimension():
         start = env.maybe_reset(step_mdp(batch[..., -1]))
         buffer.extend(batch.exclude("collector"))
     check_episodes(credit, envs)
-    assert (credit.store.steps, credit.store.dropped) == (63, 0)
+    assert (credit.store.n_added, credit.store.dropped) == (63, 0)
 
 
 def test_single_steps():
@@ -107,7 +107,7 @@ def test_done_alone_ends_an_episode():
     batch = roll_out(30).exclude(("next", "terminated"), ("next", "truncated"))
     credit = recording_assigner(make_env())
     make_buffer(credit).extend(batch)
-    assert credit.store.ended == int(batch["next", "done"].sum()) > 0
+    assert credit.store.n_ended == int(batch["next", "done"].sum()) > 0
 
 
 def test_samples():

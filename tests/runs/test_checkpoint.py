@@ -1,6 +1,7 @@
 """Checkpoints: rows that come back, files of killed processes, and damaged files."""
 
 import json
+import re
 from dataclasses import replace
 from typing import Any, NamedTuple
 
@@ -78,6 +79,19 @@ def test_learner_comes_back(payments, tmp_path):
     config = replace(config, credit=config.credit.model_copy(update={"exact": "last"}))
     learner = jax.tree.map(lambda leaf: jnp.asarray(leaf)[None], learner_with_episodes(config))
     checkpoint.write(tmp_path, checkpoint.take_snapshot(tmp_path, learner, {}, {}))
+    loaded, _, _ = checkpoint.load(tmp_path, learner_shape(config, 1))
+    jax.tree.map(np.testing.assert_array_equal, loaded, learner)
+
+
+@pytest.mark.parametrize(("method", "payments"), [("bayes", PaymentRule(period=4)), ("ircr", PAID_AT_END)])
+def test_learner_of_an_earlier_version_comes_back(method, payments, tmp_path):
+    config = small_config(method, payments=payments)
+    learner = jax.tree.map(lambda leaf: jnp.asarray(leaf)[None], learner_with_episodes(config))
+    checkpoint.write(tmp_path, checkpoint.take_snapshot(tmp_path, learner, {}, {}))
+    old_names = {"next_transition": "transitions", "current_episode": "episodes", "n_effective": "n_determined"}
+    with np.load(tmp_path / "state.npz") as saved:
+        arrays = {re.sub(r"(?<=\.)\w+", lambda m: old_names.get(m[0], m[0]), name): saved[name] for name in saved.files}
+    np.savez(tmp_path / "state.npz", **{name.replace(".scales[", ".scale["): array for name, array in arrays.items()})
     loaded, _, _ = checkpoint.load(tmp_path, learner_shape(config, 1))
     jax.tree.map(np.testing.assert_array_equal, loaded, learner)
 

@@ -103,7 +103,7 @@ def test_learn_returns_keeps_the_statistics_from_scratch(method, algorithm, env,
         n_steps.add(float(closed.n_steps))
         least = float(learner.decoders[0].statistics.n_rows) / closed_form.STATISTICS_GROWTH - 3 * 12
         assert float(closed.n_steps) >= least
-        if int(learner.n_learned.sum()) < int(replay.by_payment(learner.replay).episodes.sum()):
+        if int(learner.n_learned.sum()) < int(replay.segments_as_episodes(learner.replay).current_episode.sum()):
             continue  # payments are learned from when they are 2% of all
         for a, b in zip(statistics_of_decoder(learner), statistics_from_scratch(learner, config), strict=True):
             np.testing.assert_allclose(a, b, rtol=1e-5, atol=1e-5)  # features are of float32
@@ -232,7 +232,7 @@ def test_proxy_rewards_of_the_right_score_type_add_up_to_the_return(score, setti
     config = small_config("lare-linear", capacity=2000, credit=CreditSettings(score=setting))
     steps, factors, step_score, lengths = scored_episodes(config, score)
     learner = list(learn_in_chunks(config, steps, factors, 6))[-1]
-    r_hat = np.asarray(jitted(rewards, config)(stored_steps(learner), learner.reward_state))[:, 0]
+    r_hat = np.asarray(jitted(rewards, config)(stored_steps(learner), learner.reward_sources))[:, 0]
     ends = np.cumsum(lengths)
     total = np.array([episode.sum() for episode in np.split(r_hat, ends[:-1])])
     score_of_episode = steps.next_timestep.reward[ends - 1, 0, 0]

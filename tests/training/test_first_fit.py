@@ -37,7 +37,7 @@ from lare_rl.training.first_fit import PATIENCE, config_of_first_fit, fit_until_
     ],
 )
 def test_count_held_out(n_episodes, n_held_out):
-    buffer = replay.init_replay({}, len(n_episodes), 100, 1)._replace(episodes=jnp.array(n_episodes))
+    buffer = replay.init_replay({}, len(n_episodes), 100, 1)._replace(current_episode=jnp.array(n_episodes))
     assert first_fit._count_held_out(buffer, window=32).tolist() == n_held_out
 
 
@@ -56,7 +56,9 @@ def test_fit_until_converged_keeps_the_best_decoders():
         seeds = [jax.tree.map(lambda leaf, seed=seed: leaf[seed], learner) for seed in (0, 1)]
         pairs = zip(seeds, errors[len(rounds)], strict=True)
         fitted = stack_seeds(*[with_factor_decoders(seed, [1 + error]) for seed, error in pairs])
-        rounds.append((np.asarray(learner.replay.episodes).sum(axis=1).tolist(), jax.random.key_data(keys).tolist()))
+        rounds.append(
+            (np.asarray(learner.replay.current_episode).sum(axis=1).tolist(), jax.random.key_data(keys).tolist())
+        )
         return fitted, {"credit/loss": jnp.zeros(2)}
 
     keys = jax.random.split(jax.random.key(0), 2)
@@ -66,7 +68,7 @@ def test_fit_until_converged_keeps_the_best_decoders():
     assert len({str(keys) for _, keys in rounds}) == len(rounds)
     # The first seed has stopped before its error would have fallen again.
     np.testing.assert_array_equal(fitted.decoders[0].network.weight, [[2.0], [3.0]])
-    np.testing.assert_array_equal(fitted.replay.episodes, [learner.replay.episodes] * 2)
+    np.testing.assert_array_equal(fitted.replay.current_episode, [learner.replay.current_episode] * 2)
     np.testing.assert_array_equal(fitted.replay.running, [learner.replay.running] * 2)
     assert "credit/loss" in metrics
 

@@ -85,7 +85,7 @@ def test_unbiased_loss_has_the_expectation_of_the_full_loss(n_steps):
         _, metrics = jitted(fit_decoders, config)(learner.decoders, learner.replay, first, jax.random.key(0))
         losses[name] = float(metrics["credit/loss"])
     steps, unit = stored_steps(learner), float(root_mean_square(learner.decoders[0].scale))
-    r_hat = np.asarray(jitted(proxy_rewards, config)(steps, learner.reward_state))[:, 0] / unit
+    r_hat = np.asarray(jitted(proxy_rewards, config)(steps, learner.reward_sources))[:, 0] / unit
     r = np.asarray(steps.columns["reward"])[:, 0] / unit
     errors = [(a.mean() - b.mean()) ** 2 for a, b in zip(np.split(r_hat, ENDS), np.split(r, ENDS), strict=True)]
     chosen = np.bincount(np.searchsorted(ENDS, draws.episodes.first.number[0], side="right"), minlength=5) / 40_000
@@ -117,8 +117,8 @@ def test_fit_ignores_padding(method):
 def test_rewards(method, scale_rewards):
     config = small_config(method, scale_rewards=scale_rewards)
     learner, steps = learner_with_episodes(config), random_steps()
-    unit = root_mean_square(return_scale(learner.reward_state[0])) if scale_rewards else 1
-    reward = jitted(rewards, config)(stored_steps(learner), learner.reward_state)
+    unit = root_mean_square(return_scale(learner.reward_sources[0])) if scale_rewards else 1
+    reward = jitted(rewards, config)(stored_steps(learner), learner.reward_sources)
     assert reward.shape == (TOTAL, 1)
     reward = np.asarray(reward)[:, 0] * unit
     match method:
@@ -127,7 +127,7 @@ def test_rewards(method, scale_rewards):
         case "llm-reward":
             np.testing.assert_allclose(reward, random_factors(config, steps)[:, 0, 0, 0], rtol=1e-5)
         case _:
-            r_hat = jitted(proxy_rewards, config)(stored_steps(learner), learner.reward_state)
+            r_hat = jitted(proxy_rewards, config)(stored_steps(learner), learner.reward_sources)
             np.testing.assert_allclose(reward, r_hat[:, 0], rtol=1e-5)
             assert reward.std() > 0
 
@@ -141,7 +141,7 @@ def with_running_episode(config):
 def test_ircr_pays_half_until_an_episode_ends():
     config = small_config("ircr")
     learner, _ = with_running_episode(config)
-    reward = jitted(rewards, config)(stored_steps(learner), learner.reward_state)[:, 0]
+    reward = jitted(rewards, config)(stored_steps(learner), learner.reward_sources)[:, 0]
     np.testing.assert_array_equal(reward[-2:], [0.5, 0.5])
     assert float(reward[0]) != 0.5
 
@@ -165,7 +165,7 @@ def test_abandon_episodes_does_not_change_the_fit():
     longer, learner = with_running_episode(config)
     shorter = abandon_episodes(longer, jnp.array([True]))
     jax.tree.map(np.testing.assert_array_equal, shorter.decoders[0].closed_form, learner.decoders[0].closed_form)
-    assert shorter.replay.transitions.tolist() == learner.replay.transitions.tolist()
+    assert shorter.replay.next_transition.tolist() == learner.replay.next_transition.tolist()
 
 
 def test_assess_reads_the_newest_steps():
@@ -205,7 +205,7 @@ def test_two_environments_equal_one_twice_as_long(method):
         (first, wide, replay.Index(env, number)),
         (second, long, replay.Index(0 * env, number + TOTAL * env)),
     ):
-        r_hats.append(jitted(rewards, config)(read(learner.replay, index), learner.reward_state))
+        r_hats.append(jitted(rewards, config)(read(learner.replay, index), learner.reward_sources))
     assert_close(*r_hats, 1e-3, 1e-4)
 
 
@@ -228,7 +228,7 @@ def test_teams_have_separate_decoders_and_returns():
 def test_rewards_of_teams(method):
     config, steps = TEAMS(method), random_steps(TWO_TEAMS)
     learner, alive = learner_with_episodes(config), steps.timestep.alive[:, 0]
-    reward = np.asarray(jitted(rewards, config)(stored_steps(learner), learner.reward_state))
+    reward = np.asarray(jitted(rewards, config)(stored_steps(learner), learner.reward_sources))
     assert not alive.all()
     for team in TWO_TEAMS.teams:
         episode_rewards = np.split(team_rewards(steps, team), ENDS)
@@ -252,7 +252,7 @@ def test_rewards_of_each_agent_and_shared_among_agents_that_are_alive():
         add_steps(untrained_learner(config), config, steps, number[..., None], learn=False), [1.0, -1.0]
     )
     r_hat, alive = number[:, 0] * np.repeat([1.0, -1.0], [3, 2]), steps.timestep.alive[:, 0]
-    stored, state = stored_steps(learner), learner.reward_state
+    stored, state = stored_steps(learner), learner.reward_sources
     np.testing.assert_array_equal(jitted(rewards, config)(stored, state), r_hat * alive)
     shared = replace(config, method=replace(config.method, shared=True))
     reward = np.asarray(jitted(rewards, shared)(stored, state))
@@ -331,10 +331,10 @@ def test_values_of_dead_agents_change_nothing(method):
     results = []
     for trajectory, z in ((steps, factors), (changed, np.where(dead[..., None], 99, factors).astype(np.float32))):
         learner = add_steps(untrained_learner(config), config, trajectory, z)
-        reward = jitted(rewards, config)(stored_steps(learner), learner.reward_state)
+        reward = jitted(rewards, config)(stored_steps(learner), learner.reward_sources)
         assert not np.asarray(reward)[dead[:, 0]].any()
         update = update_once(learner, config) if config.method.uses_gradient else ()
-        results.append((learner.reward_state, reward, update, jitted(assess, config)(learner)))
+        results.append((learner.reward_sources, reward, update, jitted(assess, config)(learner)))
     assert_close(*results)
 
 
@@ -349,7 +349,7 @@ def team_level_config(method, **changes):
 def test_team_level_rewards_are_the_same_for_all_alive_agents(method):
     config = team_level_config(method, n_factors=(2,) if method[0] == "l" else ())
     learner, alive = learner_with_episodes(config), random_steps(ONE_TEAM).timestep.alive[:, 0]
-    reward = np.asarray(jitted(rewards, config)(stored_steps(learner), learner.reward_state))
+    reward = np.asarray(jitted(rewards, config)(stored_steps(learner), learner.reward_sources))
     team_reward = reward.sum(axis=1) / np.maximum(alive.sum(axis=1), 1)
     np.testing.assert_allclose(reward, team_reward[:, None] * alive, rtol=1e-5, atol=1e-6)
     assert team_reward[alive.any(axis=1)].std() > 0

@@ -53,7 +53,7 @@ def test_rollout_has_the_newest_steps_with_the_rewards_of_the_method(method):
     np.testing.assert_array_equal(rollout.next_observation, last.next_timestep.observation[:, 0])
     np.testing.assert_array_equal(rollout.action, last.action[:, 0])
     np.testing.assert_array_equal(rollout.done, last.ended)
-    expected = jitted(rewards, config)(stored_steps(learner), learner.reward_state)[-20:]
+    expected = jitted(rewards, config)(stored_steps(learner), learner.reward_sources)[-20:]
     np.testing.assert_allclose(rollout.reward, expected, rtol=1e-5)
     if method == "episodic":
         episodes = np.split(steps.next_timestep.reward.ravel(), np.cumsum(LENGTHS)[:-1])

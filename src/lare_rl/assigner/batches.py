@@ -40,7 +40,7 @@ def sample_batch(store: Store, spec: CreditSpec, random: np.random.Generator, lo
 
 def whole_episodes(store: Store, spec: CreditSpec, episodes: Sequence[StoredEpisode]) -> Iterator[CreditBatch]:
     """Yield batches of whole episodes, in their order. Rows are padded to one of two sizes, so that few programs are compiled."""
-    lengths = [len(episode.steps) for episode in episodes]
+    lengths = [len(episode.step_ids) for episode in episodes]
     longest = max(lengths, default=1)
     rows = padded_size(longest)
     if sum(lengths) > rows:
@@ -53,8 +53,8 @@ def pack_in_order(store: Store, episodes: Sequence[StoredEpisode], n_slots: int,
     start = 0
     while start < len(episodes):
         end, n_steps = start, 0
-        while end < len(episodes) and end - start < n_slots and n_steps + len(episodes[end].steps) <= rows:
-            n_steps += len(episodes[end].steps)
+        while end < len(episodes) and end - start < n_slots and n_steps + len(episodes[end].step_ids) <= rows:
+            n_steps += len(episodes[end].step_ids)
             end += 1
         yield _pack(store, episodes[start:end], n_slots, rows)
         start = end
@@ -65,7 +65,7 @@ def _sample_episodes(store: Store, count: int, random: np.random.Generator) -> l
 
 
 def _lengths(episodes: Sequence[StoredEpisode]) -> Int[np.ndarray, " episodes"]:
-    return np.array([len(episode.steps) for episode in episodes])
+    return np.array([len(episode.step_ids) for episode in episodes])
 
 
 def _pack(store: Store, episodes: Sequence[StoredEpisode], n_slots: int, rows: int) -> CreditBatch:
@@ -85,10 +85,10 @@ def _gather(store: Store, episodes: Sequence[StoredEpisode], layout: Layout, n_s
     count = len(episodes)
     first = np.cumsum(_lengths(episodes)) - _lengths(episodes)
     slot = np.arange(count)[:, None] if layout.slot.ndim > 1 else np.minimum(layout.slot, count - 1)
-    steps = np.concatenate([episode.steps for episode in episodes])[first[slot] + layout.step].ravel()
+    steps = np.concatenate([episode.step_ids for episode in episodes])[first[slot] + layout.step].ravel()
     rows = steps % store.capacity
     length, score = np.ones(n_slots, np.int32), np.zeros(n_slots)
-    length[:count], score[:count] = _lengths(episodes), [episode.score for episode in episodes]
+    length[:count], score[:count] = _lengths(episodes), [episode.return_ for episode in episodes]
     level = np.zeros(n_slots, np.int32)
     level[:count] = [episode.level for episode in episodes]
     return CreditBatch(

@@ -97,13 +97,15 @@ class DecoderLearner:
             if not batch:
                 self._pending_episodes.append(batch)
             batch.append(episode)
-            self._pending_returns.append((episode.score / len(episode.steps), len(episode.steps), episode.level))
+            self._pending_returns.append(
+                (episode.return_ / len(episode.step_ids), len(episode.step_ids), episode.level)
+            )
 
     def flush_large_queues(self) -> None:
         """Process the queues that have become long."""
         if self.n_pending_steps >= MAX_PENDING_STEPS:
             self.flush_inputs()
-        if sum(len(episode.steps) for episode in chain.from_iterable(self._pending_episodes)) >= MAX_CALL_ROWS:
+        if sum(len(episode.step_ids) for episode in chain.from_iterable(self._pending_episodes)) >= MAX_CALL_ROWS:
             self.learn_returns()
 
     def flush_inputs(self) -> None:
@@ -180,8 +182,8 @@ class DecoderLearner:
         """
         self.flush_inputs()
         self.flush_statistics()
-        oldest = self.store.steps - self.store.capacity
-        calls = [[episode for episode in batch if episode.steps[0] >= oldest] for batch in self._pending_episodes]
+        oldest = self.store.n_added - self.store.capacity
+        calls = [[episode for episode in batch if episode.step_ids[0] >= oldest] for batch in self._pending_episodes]
         calls = [batch for batch in calls if batch]
         self._pending_episodes.clear()
         with on_cpu(), float64():
@@ -208,7 +210,7 @@ class DecoderLearner:
             decoder = compiled.predict_then_update(decoder, batch, settings=self.config.settings)
         if decoder.closed_form is None:
             return decoder
-        may_rebuild = self.config.forget or self.store.steps <= self.store.capacity
+        may_rebuild = self.config.forget or self.store.n_added <= self.store.capacity
         if self.config.method.fit is not Fit.SIGNS and may_rebuild and compiled.is_stale(decoder):
             decoder = compiled.reset_statistics(decoder)
             later_ids = set(map(id, later))
@@ -245,7 +247,7 @@ class DecoderLearner:
         assert self.decoder is not None
         spec, seed = self.config.spec, self.config.seed
         rng = np.random.default_rng([seed, self.n_updates])
-        longest = padded_size(max(len(episode.steps) for episode in self.store.episodes.values()))
+        longest = padded_size(max(len(episode.step_ids) for episode in self.store.episodes.values()))
         with on_cpu():
             samples = [sample_batch(self.store, spec, rng, longest) for _ in range(n_updates)]
             stacked = jax.tree.map(lambda *leaves: np.stack(leaves), *samples)
@@ -267,7 +269,7 @@ class DecoderLearner:
                 }
         return {
             **predicted,
-            "credit/episodes": float(self.store.ended),
+            "credit/episodes": float(self.store.n_ended),
             "credit/dropped": float(self.store.dropped),
             "credit/fits": float(self.n_updates),
             "credit/loss": self.loss,

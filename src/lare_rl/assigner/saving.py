@@ -71,7 +71,7 @@ def get_state(learner: DecoderLearner, group_names: Iterable[Hashable], *, episo
     store = learner.store
     leaves = named_leaves((learner.decoder, learner.scale))
     arrays = {LEARNED + name: np.asarray(leaf) for name, leaf in leaves.items()}
-    arrays["counts"] = np.array([store.ended, store.ended_steps, store.dropped + len(store.running)])
+    arrays["counts"] = np.array([store.n_ended, store.n_ended_steps, store.dropped + len(store.running)])
     for name, chunks in zip(PHI_SAMPLE, zip(*learner.phi_sample, strict=True), strict=False):
         arrays[name] = np.concatenate(chunks)
     if episodes:
@@ -89,7 +89,7 @@ def restore(learner: DecoderLearner, state: AssignerState) -> None:
     learned = {name.removeprefix(LEARNED): array for name, array in arrays.items()}
     learner.decoder, learner.scale = fill_template((learner.decoder, learner.scale), learned)
     store = learner.store
-    store.ended, store.ended_steps, store.dropped = map(int, arrays["counts"])
+    store.n_ended, store.n_ended_steps, store.dropped = map(int, arrays["counts"])
     if "steps" in arrays:
         _restore_store(store, arrays)
 
@@ -169,23 +169,23 @@ def _config_values(state: AssignerState) -> dict[str, Any]:
 
 
 def _store_arrays(store: Store) -> dict[str, np.ndarray]:
-    rows = np.arange(max(0, store.steps - store.capacity), store.steps) % store.capacity
+    rows = np.arange(max(0, store.n_added - store.capacity), store.n_added) % store.capacity
     episodes = list(store.episodes.values())
     return {
         **{name: getattr(store, field)[rows] for name, field in STORE_ARRAYS.items()},
         **({} if store.alive is None else {"alive": store.alive[rows]}),
-        "steps": np.array(store.steps),
+        "steps": np.array(store.n_added),
         "numbers": np.array(list(store.episodes), np.int64),
-        "episodes": np.concatenate([np.zeros(0, np.int64), *(episode.steps for episode in episodes)]),
-        "lengths": np.array([len(episode.steps) for episode in episodes], np.int64),
-        "scores": np.array([episode.score for episode in episodes], np.float64),
+        "episodes": np.concatenate([np.zeros(0, np.int64), *(episode.step_ids for episode in episodes)]),
+        "lengths": np.array([len(episode.step_ids) for episode in episodes], np.int64),
+        "scores": np.array([episode.return_ for episode in episodes], np.float64),
         "levels": np.array([episode.level for episode in episodes], np.int64),
     }
 
 
 def _restore_store(store: Store, arrays: dict[str, np.ndarray]) -> None:
-    store.steps = int(arrays["steps"])
-    rows = np.arange(max(0, store.steps - store.capacity), store.steps) % store.capacity
+    store.n_added = int(arrays["steps"])
+    rows = np.arange(max(0, store.n_added - store.capacity), store.n_added) % store.capacity
     for name, field in STORE_ARRAYS.items():
         if name in arrays:  # earlier versions did not save every array
             getattr(store, field)[rows] = arrays[name]
@@ -195,9 +195,9 @@ def _restore_store(store: Store, arrays: dict[str, np.ndarray]) -> None:
     ends = np.cumsum(arrays["lengths"])
     # Earlier versions saved neither levels nor numbers.
     levels = arrays.get("levels", np.zeros(len(ends), np.int64)).tolist()
-    numbers = arrays.get("numbers", store.ended - len(ends) + np.arange(len(ends))).tolist()
+    numbers = arrays.get("numbers", store.n_ended - len(ends) + np.arange(len(ends))).tolist()
     for end, length, score, level, number in zip(
         ends, arrays["lengths"], arrays["scores"], levels, numbers, strict=True
     ):
         steps = arrays["episodes"][end - length : end]
-        store.restore_episode(number, StoredEpisode(steps, float(score), level))
+        store.put_episode(number, StoredEpisode(steps, float(score), level))

@@ -31,13 +31,13 @@ class StepRewards:
         self._flat_cache: tuple[Any, list[Array], Any] = None, [], None
         """A decoder or a scale, its leaves, and its structure. Flattening it anew for every call would take longer than the call."""
         self._residual_cache: tuple[DecoderState | None, dict[int, float]] = None, {}
-        """A decoder, and what its proxy rewards lack to the returns of episodes, by their numbers."""
+        """A decoder, and the residuals R - sum_t r_hat_t of episodes, by their numbers."""
 
     def rewards_at(self, step_ids: Int[np.ndarray, " n"]) -> Float[np.ndarray, "n *agents"]:
         """Return the rewards of stored steps. Raises `LareError` if a step is not stored."""
         store = self.store
         rows = store.rows(step_ids)
-        if len(rows) and step_ids.max() >= store.steps - self.learner.n_pending_steps:
+        if len(rows) and step_ids.max() >= store.n_added - self.learner.n_pending_steps:
             self.learner.flush_inputs()
         is_exact = self.config.is_exact and self.learner.is_fitted
         last, residual = self._residuals(step_ids, rows) if is_exact else (None, None)
@@ -88,7 +88,7 @@ class StepRewards:
         """Return which steps are the last ones of their episodes, and the residuals of these. Those that are not used are 0."""
         number = self.store.episode[rows]
         stored = [self.store.episodes.get(k) for k in number.tolist()]
-        last = np.array([e is not None and e.steps[-1] == k for e, k in zip(stored, step_ids, strict=True)], bool)
+        last = np.array([e is not None and e.step_ids[-1] == k for e, k in zip(stored, step_ids, strict=True)], bool)
         is_used = last if self.config.settings.exact == "last" else np.array([e is not None for e in stored], bool)
         numbers = np.unique(number[is_used])
         residual = np.zeros(len(rows), np.float32)
@@ -108,7 +108,7 @@ class StepRewards:
             for batch in whole_episodes(self.store, self.config.spec, episodes):
                 sums = compiled.predicted_returns(decoder, batch, settings=self.config.settings)
                 predicted += np.asarray(sums)[np.asarray(batch.mask) > 0].tolist()
-        scores = [episode.score for episode in episodes]
+        scores = [episode.return_ for episode in episodes]
         residuals.update(zip(new, np.subtract(scores, predicted).tolist(), strict=True))
         return np.array([residuals[number] for number in numbers], np.float32)
 

@@ -7,7 +7,6 @@ are stored as an episode of their own.
 """
 
 import heapq
-import sys
 from collections.abc import Hashable, Iterator, Sequence
 from dataclasses import dataclass, field
 from typing import NamedTuple
@@ -24,32 +23,28 @@ __all__ = ["RunningEpisode", "Store", "StoredEpisode"]
 class StoredEpisode(NamedTuple):
     """An episode that has ended, or the steps that a payment is for."""
 
-    steps: Int[np.ndarray, " steps"]
+    step_ids: Int[np.ndarray, " steps"]
     """The numbers of its steps."""
-    score: float
-    """Its return R."""
+    return_: float
+    """R."""
     level: int = 0
-    """The number of its group."""
+    """Its level."""
 
 
 @dataclass
 class RunningEpisode:
     """An episode that has not ended."""
 
-    steps: list[int] = field(default_factory=list)
+    step_ids: list[int] = field(default_factory=list)
+    """The numbers of its steps."""
     level: int = 0
-    """The number of its group."""
+    """Its level."""
     n_paid: int = 0
     """The number of steps up to the last payment."""
     return_: float = 0.0
     """The sum of its rewards since the last payment."""
     last_observation: Float[np.ndarray, "*agents observation"] | None = None
     """The observation after its last step."""
-
-    @property
-    def newest(self) -> int:
-        """The number of its last step; `sys.maxsize` before the first step."""
-        return self.steps[-1] if self.steps else sys.maxsize
 
 
 class Store:
@@ -84,20 +79,20 @@ class Store:
         """The number of each step's episode; -1 before it is paid."""
         self.previous = np.full(capacity, -1, np.int64)
         """The number of the step before each step since the last payment; -1 for the first one."""
-        self.steps = 0
+        self.n_added = 0
         """The number of steps that were ever added."""
         self.episodes: dict[int, StoredEpisode] = {}
         """The episodes whose steps are all stored, by number."""
-        self.ended = 0
+        self.n_ended = 0
         """The number of episodes that have ever ended."""
-        self.ended_steps = 0
-        """The number of steps of these episodes."""
+        self.n_ended_steps = 0
+        """The number of steps of these episodes. Each step counts once, even if payments for windows read it often or never."""
         self.oldest: list[tuple[int, int]] = []
         """A heap of the stored episodes: first step, and number."""
         self.running: dict[Hashable, RunningEpisode] = {}
         """The running episodes by environment. The environment whose last step is the oldest comes first."""
         self.dropped = 0
-        """Episodes that were abandoned."""
+        """Abandoned episodes and refused payments."""
 
     @property
     def bytes_per_step(self) -> int:
@@ -106,18 +101,20 @@ class Store:
         return sum(array.nbytes for array in arrays) // self.capacity
 
     def add(self, n_steps: int, alive: Bool[np.ndarray, "n_steps agents"] | None = None) -> Int[np.ndarray, " n_steps"]:
-        """Return numbers for new steps. Episodes whose steps are all too old to be stored are removed.
+        """Return numbers for new steps.
+
+        Ended episodes are removed once a step of them is overwritten, running ones once all are.
 
         Raises:
             LareError: there are more steps than can be stored.
         """
         if n_steps > self.capacity:
             raise LareError(f"{n_steps} steps at once are more than capacity = {self.capacity}: make capacity larger")
-        while self.running and next(iter(self.running.values())).newest < self.steps - self.capacity:
+        while self.running and next(iter(self.running.values())).step_ids[-1] < self.n_added - self.capacity:
             self.drop(next(iter(self.running)))
-        step_ids = np.arange(self.steps, self.steps + n_steps)
-        self.steps += n_steps
-        while self.oldest and self.oldest[0][0] < self.steps - self.capacity:
+        step_ids = np.arange(self.n_added, self.n_added + n_steps)
+        self.n_added += n_steps
+        while self.oldest and self.oldest[0][0] < self.n_added - self.capacity:
             del self.episodes[heapq.heappop(self.oldest)[1]]
         self.length[step_ids % self.capacity] = 0
         self.episode[step_ids % self.capacity] = -1
@@ -132,17 +129,17 @@ class Store:
         self,
         env_ids: Sequence[Hashable],
         step_ids: Int[np.ndarray, " n"],
-        steps: Sequence[np.ndarray],
+        transition: Sequence[np.ndarray],
         reward: Float[np.ndarray, " n"],
         ended: Bool[np.ndarray, " n"],
         level: Int[np.ndarray, " n"] | None = None,
     ) -> Iterator[StoredEpisode]:
         """Add new steps to the running episodes of their environments. Yield each episode that is paid.
 
-        `step_ids` are from `add`. `steps` are observations, actions and next observations. Raises `LareError` like `end`, once all
-        steps are added.
+        `step_ids` are from `add`. `transition` holds observations, actions and next observations. Once all steps are added, raises the
+        first `LareError` of their payments, like `end`.
         """
-        observation, _, next_observation = steps
+        observation, _, next_observation = transition
         error = None
         for i, env_id in enumerate(env_ids):
             episode = self.get_running(env_id, observation[i])
@@ -152,7 +149,7 @@ class Store:
             try:
                 payment = self._add_step(episode, int(step_ids[i]), float(reward[i]), self.payments, bool(ended[i]))
             except LareError as refusal:
-                error = refusal
+                error = error or refusal
                 self.dropped += 1
             if ended[i]:
                 del self.running[env_id]
@@ -164,12 +161,12 @@ class Store:
     def _add_step(
         self, episode: RunningEpisode, step_id: int, reward: float, payments: PaymentRule, ended: bool
     ) -> StoredEpisode | None:
-        """Add a step to an episode. Return the steps of the payment that comes with it, if there is one."""
-        if len(episode.steps) > episode.n_paid:
-            self.previous[step_id % self.capacity] = episode.steps[-1]
-        episode.steps.append(step_id)
+        """Add a step to an episode. Return the paid episode if the step is paid, else None."""
+        if len(episode.step_ids) > episode.n_paid:
+            self.previous[step_id % self.capacity] = episode.step_ids[-1]
+        episode.step_ids.append(step_id)
         episode.return_ += reward
-        is_payment = is_paid(payments, len(episode.steps) - 1, np.array([reward]), ended)
+        is_payment = is_paid(payments, len(episode.step_ids) - 1, np.array([reward]), ended)
         return self._pay(episode, episode.return_) if is_payment else None
 
     def end(self, env_id: Hashable, score: float | None = None) -> StoredEpisode:
@@ -189,7 +186,7 @@ class Store:
         if score is not None and not np.isfinite(score):
             raise LareError(f"the score of the environment {env_id!r} is {score}: give a finite number")
         episode = self.running.pop(env_id)
-        if len(episode.steps) == episode.n_paid:
+        if len(episode.step_ids) == episode.n_paid:
             raise LareError(
                 f"the last step of the environment {env_id!r} was paid already: end the episode with this step"
             )
@@ -197,54 +194,55 @@ class Store:
 
     def _pay(self, episode: RunningEpisode, payment: float) -> StoredEpisode:
         """Store the steps that a payment is for."""
-        since_last = np.array(episode.steps[episode.n_paid :], np.int64)
+        since_last = np.array(episode.step_ids[episode.n_paid :], np.int64)
         window = self.payments.window
-        episode.n_paid, episode.return_ = len(episode.steps), 0.0
-        steps = since_last if window is None else np.array(episode.steps[-window:], np.int64)
-        return self._store(StoredEpisode(steps, payment, episode.level), since_last)
+        episode.n_paid, episode.return_ = len(episode.step_ids), 0.0
+        step_ids = since_last if window is None else np.array(episode.step_ids[-window:], np.int64)
+        return self._finish_payment(StoredEpisode(step_ids, payment, episode.level), since_last)
 
-    def _store(self, episode: StoredEpisode, since_last: Int[np.ndarray, " since"]) -> StoredEpisode:
+    def _finish_payment(self, episode: StoredEpisode, since_last: Int[np.ndarray, " since"]) -> StoredEpisode:
         """Store an episode that has just been paid. Raises `LareError` like `end`.
 
         `since_last` are the steps since the last payment, which need not be the steps that this one is for.
         """
-        steps = episode.steps
-        if self.longest is not None and len(steps) > self.longest:
+        step_ids = episode.step_ids
+        if self.longest is not None and len(step_ids) > self.longest:
             raise LareError(
-                f"the decoder reads at most {self.longest} steps for one payment, and this one is for {len(steps)}: use rudder, or payments"
+                f"the decoder reads at most {self.longest} steps for one payment, and this one is for {len(step_ids)}: use rudder, or "
+                "payments"
             )
-        if self.steps - steps[0] > self.capacity:
+        if self.n_added - step_ids[0] > self.capacity:
             raise LareError(
-                f"an episode of {len(steps)} steps has ended, and its first steps are not stored any more: "
+                f"an episode of {len(step_ids)} steps has ended, and its first steps are not stored any more: "
                 f"make capacity larger than {self.capacity}"
             )
-        self.restore_episode(self.ended, episode)
-        self.ended += 1
-        self.ended_steps += len(steps)
-        rows = since_last % self.capacity
-        self.episode[rows] = self.ended - 1
-        self.length[rows] = len(steps)
-        self.mean_reward[rows] = episode.score / len(steps)
+        self.put_episode(self.n_ended, episode)
+        self.n_ended += 1
+        self.n_ended_steps += len(since_last)
+        rows = since_last[since_last >= self.n_added - self.capacity] % self.capacity
+        self.episode[rows] = self.n_ended - 1
+        self.length[rows] = len(step_ids)
+        self.mean_reward[rows] = episode.return_ / len(step_ids)
         return episode
 
     def add_paid_episode(
         self,
-        steps: Int[np.ndarray, " steps"],
+        step_ids: Int[np.ndarray, " steps"],
         reward: Float[np.ndarray, " steps"],
         payments: PaymentRule,
         level: int = 0,
     ) -> Iterator[StoredEpisode]:
         """Store an episode that has just ended, by the reward of each of its steps. Yield the steps of each payment."""
         episode = RunningEpisode(level=level)
-        for i, step_id in enumerate(steps.tolist()):
-            payment = self._add_step(episode, step_id, float(reward[i]), payments, i == len(steps) - 1)
+        for i, step_id in enumerate(step_ids.tolist()):
+            payment = self._add_step(episode, step_id, float(reward[i]), payments, i == len(step_ids) - 1)
             if payment is not None:
                 yield payment
 
-    def restore_episode(self, number: int, episode: StoredEpisode) -> None:
+    def put_episode(self, number: int, episode: StoredEpisode) -> None:
         """Store an episode under its number."""
         self.episodes[number] = episode
-        heapq.heappush(self.oldest, (int(episode.steps[0]), number))
+        heapq.heappush(self.oldest, (int(episode.step_ids[0]), number))
 
     def get_running(self, env_id: Hashable, observation: Float[np.ndarray, "*agents observation"]) -> RunningEpisode:
         """Return the running episode of an environment, for a next step that begins at this observation.
@@ -262,23 +260,30 @@ class Store:
 
     def drop(self, env_id: Hashable) -> None:
         """Abandon the running episode of an environment. Its steps stay stored, and are never learned from."""
-        run = self.running.pop(env_id, None)
-        self.dropped += bool(run and run.steps)
+        self.dropped += self.running.pop(env_id, None) is not None
 
-    def rows(self, steps: Int[np.ndarray, "*batch"]) -> Int[np.ndarray, "*batch"]:
+    def rows(self, step_ids: Int[np.ndarray, "*batch"]) -> Int[np.ndarray, "*batch"]:
         """Return the rows of stored steps. Raises `LareError` if a step was never stored, or is not stored any more."""
-        oldest = max(0, self.steps - self.capacity)
-        if steps.size and (steps.max() >= self.steps or steps.min() < oldest):
-            missing = steps.max() if steps.max() >= self.steps else steps.min()
-            stored = f"steps {oldest} to {self.steps - 1} are" if self.steps else "no step is"
-            raise LareError(f"step {missing} is not stored: {stored} (capacity = {self.capacity})")
-        return steps % self.capacity
+        oldest = max(0, self.n_added - self.capacity)
+        missing = step_ids[(step_ids < oldest) | (step_ids >= self.n_added)]
+        if missing.size:
+            stored = f"steps {oldest} to {self.n_added - 1} are" if self.n_added else "no step is"
+            raise LareError(f"step {missing[0]} is not stored: {stored} (capacity = {self.capacity})")
+        return step_ids % self.capacity
 
     def lengths(self, rows: Int[np.ndarray, "*batch"]) -> Int[np.ndarray, "*batch"]:
-        """Return T of each step's episode; for a running episode, the mean length of the episodes that have ended."""
-        return np.where(self.length[rows] > 0, self.length[rows], self.mean_length)
+        """Return T of each step's episode; for a running one, the number of its steps so far, but at least the mean length."""
+        length, mean_length = self.length[rows], self.mean_length
+        is_running = length == 0
+        length = np.where(is_running, mean_length, length)
+        for episode in self.running.values() if is_running.any() else ():
+            n_steps = len(episode.step_ids) - episode.n_paid
+            if n_steps > mean_length:
+                unpaid = np.array(episode.step_ids[episode.n_paid :])
+                length[np.isin(rows, unpaid[unpaid >= self.n_added - self.capacity] % self.capacity)] = n_steps
+        return length
 
     @property
     def mean_length(self) -> int:
         """The mean length of the episodes that have ended."""
-        return max(1, self.ended_steps // max(1, self.ended))
+        return max(1, self.n_ended_steps // max(1, self.n_ended))

@@ -15,6 +15,8 @@ from lare_rl.tasks.spec import ScoredObservation, TaskSpec
 
 __all__ = ["ResolvedSettings", "Settings", "round_up"]
 
+MAX_STEPS = 2**30
+"""Steps and rows of the replay are counted in int32, and an episode of one step takes two rows."""
 MAX_SEED = 2**31 - 1
 MAX_SEEDS = 1000
 """In one process."""
@@ -31,7 +33,7 @@ class _RunSettings(CheckedModel, Generic[Open]):
     algorithm: str | Open = OPEN
     """What trains the policy (`lare-rl algorithms`). By default, for one agent, ppo with discrete actions, else td3; for many,
     qmix with a global state and action masks, else ippo."""
-    steps: Count | Open = OPEN
+    steps: Annotated[int, Field(ge=1, le=MAX_STEPS)] | Open = OPEN
     """Environment steps of each seed; all agents act in one step. By default 1,000,000 for one agent, about 2,000,000 for
     many."""
     seeds: Count = 1

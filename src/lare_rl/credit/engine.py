@@ -7,16 +7,17 @@ steps into the rewards that an algorithm is trained on:
     training reward    averaged over the agents if the method shares credit,  0 for agents that are not alive,  divided by the
                        scale of R/T if that is asked for
 
-With `exact`, what the proxy rewards of an episode lack to its return, R - sum_t r_hat_t, is added to them: to that of the last step
-(RUDDER: Arjona-Medina et al., 2019), or divided among all steps. They then add up to the return whatever the decoder's error is.
+With `exact`, the residual R - sum_t r_hat_t is added to the reward of the last step (RUDDER: Arjona-Medina et al., 2019), or spread
+evenly over all steps. The proxy rewards of an episode then add up to the return whatever the decoder's error is.
 TAR2 pays shares of the return instead (`shares.py`), which add up to it, too.
 
 Batches have an axis of agents, of length 1 for a single agent. For credit to whole teams it has length 1 too.
 """
 
-from typing import Any, NamedTuple
+from typing import Literal, NamedTuple
 
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
 from lare_rl.credit import closed_form, decomposition
@@ -82,7 +83,10 @@ def return_scale(source: RewardSource) -> Scale:
 
 
 def proxy_rewards(source: RewardSource, steps: StepBatch, spec: CreditSpec) -> Float[Array, "*batch agents"]:
-    """Return r_hat of each agent, in the unit of the true rewards if the method's rewards have one."""
+    """Return r_hat of each agent, in the unit of the true rewards if `method.calibrated`.
+
+    Else `UNIFORM` gives numbers from 0 to 1, and `DESIGNED` what the function returns.
+    """
     match spec.method.reward:
         case Reward.DESIGNED:
             return steps.inputs[..., 0]
@@ -116,18 +120,30 @@ def training_rewards(
     """Return the rewards that an algorithm is trained on, for each agent of the team. `alive` says which agents acted."""
     r_hat = jnp.broadcast_to(proxy_rewards(source, steps, spec), alive.shape)
     if steps.residual is not None:
-        r_hat = r_hat + correction(steps.residual, steps.last, steps.length, spec.settings.exact)[..., None]
+        exact = spec.settings.exact
+        assert steps.last is not None
+        assert exact in ("last", "spread")
+        r_hat = r_hat + correction(steps.residual, steps.last, steps.length, exact)[..., None]
     if spec.method.shared:
         r_hat = jnp.broadcast_to(alive_mean(r_hat, alive)[..., None], alive.shape)
     return scale_and_mask(r_hat, return_scale(source), alive, scale_rewards=spec.scale_rewards)
 
 
-def correction(residual: Any, last: Any, length: Any, exact: str) -> Any:
+def correction(
+    residual: Float[Array | np.ndarray, "*batch"],
+    last: Bool[Array | np.ndarray, "*batch"],
+    length: Int[Array | np.ndarray, "*batch"],
+    exact: Literal["last", "spread"],
+) -> Float[Array | np.ndarray, "*batch"]:
     """Return what is added to each step's proxy reward, so that those of an episode add up to its return.
 
-    The arguments are those of `StepBatch`, as arrays of NumPy or of JAX, and the setting `exact`.
+    The arguments are those of `StepBatch`, and the setting `exact`.
     """
-    return residual / length if exact == "spread" else residual * last
+    match exact:
+        case "last":
+            return residual * last
+        case "spread":
+            return residual / length
 
 
 def scale_and_mask(

@@ -53,9 +53,10 @@ from lare_rl.credit.precisions import (
 from lare_rl.nn.leading_axis import map_leading_axis
 from lare_rl.nn.masks import select
 from lare_rl.nn.normalise import merge_means
+from lare_rl.util.statistics import FLOAT32_NOISE
 
 __all__ = [
-    "JAX",
+    "JAX_BACKEND",
     "PosteriorCovariance",
     "SufficientStatistics",
     "add_episodes",
@@ -69,21 +70,21 @@ __all__ = [
     "posterior_std",
     "regression",
     "starting_precisions",
-    "to_return_units",
+    "unscale",
 ]
 
 FIRST_GROUP_GAIN, OTHER_GROUPS_LOSS, LOW_NOISE = 100, 1e4, 1e-6
-"""The third start of a fit: the first group may explain `FIRST_GROUP_GAIN` times its equal share, each other group its equal share
+"""Start 3 of `fit`: the first group may explain `FIRST_GROUP_GAIN` times its equal share, each other group its equal share
 divided by `OTHER_GROUPS_LOSS`, and the noise `LOW_NOISE` times the variance of the returns."""
 MANY_EPISODES_PER_FEATURE = 2
-"""With more episodes than this for each feature, and an earlier fit, the second and third iterations have one round each."""
+"""With more episodes than this for each feature, and an earlier fit, starts 2 and 3 of `fit` have one round each."""
 
 
 def _add_groups(values: Float[Array, " features"], group_index: FeatureIndex, n_groups: int) -> Float[Array, " groups"]:
     return jnp.zeros(n_groups).at[group_index].add(values)
 
 
-JAX = Backend(jnp, _add_groups, partial(solve_triangular, lower=True))
+JAX_BACKEND = Backend(jnp, _add_groups, partial(solve_triangular, lower=True))
 
 
 class SufficientStatistics(NamedTuple):
@@ -158,7 +159,7 @@ def init_posterior(group_index: FeatureIndex) -> Posterior:
     zero = jnp.zeros(())
     groups = jnp.zeros(int(group_index.max(initial=-1)) + 1)
     return Posterior(
-        jnp.zeros(len(group_index)), bias=zero, alpha=groups, beta=zero, n_determined=groups, log_evidence=zero
+        jnp.zeros(len(group_index)), bias=zero, alpha=groups, beta=zero, n_effective=groups, log_evidence=zero
     )
 
 
@@ -172,7 +173,7 @@ def regression(
     n_steps = jnp.maximum(statistics.n_steps, 1)
     y_mean = statistics.mean[column]
     y_std = jnp.sqrt(statistics.products[column, column] / n_steps)
-    y_std = jnp.where(y_std > 1e-6 * jnp.abs(y_mean), y_std, 0)  # a constant may vary by this much in float32
+    y_std = jnp.where(y_std > FLOAT32_NOISE * jnp.abs(y_mean), y_std, 0)
     s, p = statistics.products[:n_features, :n_features], statistics.products[:n_features, column]
     is_used = varies(jnp.diagonal(s) / n_steps, statistics.mean[:n_features] ** 2)
     s = jnp.where(jnp.outer(is_used, is_used), s + JITTER * jnp.diag(jnp.diagonal(s)), 0)
@@ -184,7 +185,7 @@ def regression(
         y_mean=y_mean,
         y_std=y_std,
         group_index=group_index,
-        equal_alpha=equal_shares(JAX, jnp.diagonal(s), n_steps, group_index),
+        equal_alpha=equal_shares(JAX_BACKEND, jnp.diagonal(s), n_steps, group_index),
     )
 
 
@@ -200,10 +201,15 @@ def fit(
     """Return the posterior under the precisions that maximise the evidence.
 
     While episodes are few, the evidence may have several maxima: one where all variation is noise, and one where none is. An
-    iteration that starts near such a maximum stays there, however many episodes follow. So there are three iterations: from
-    `start`, from equal shares of the groups with half of the variation as noise, and from the first group with almost no noise. The
-    largest evidence wins. Without an earlier fit, the second is the same as the first, and has one round. With an earlier fit and
-    more than `MANY_EPISODES_PER_FEATURE` episodes for each feature, the second and third have one round each.
+    iteration that starts near such a maximum stays there, however many episodes follow. So there are three starts, and the largest
+    evidence wins:
+
+    1. `start`;
+    2. equal shares, half of the variance noise;
+    3. first group alone, almost no noise.
+
+    Without an earlier fit, start 1 is start 2, which then has one round. With an earlier fit and more than
+    `MANY_EPISODES_PER_FEATURE` episodes for each feature, starts 2 and 3 have one round each.
 
     Args:
         group_index: the index of each feature's group.
@@ -216,11 +222,11 @@ def fit(
     limits = jnp.where(jnp.stack([jnp.array(True), has_start & few, ~has_start | few]), max_rounds, 1)
     starts = starting_precisions(problem, start)
     candidates = map_leading_axis(lambda args: fixed_point(problem, *args), (*starts, limits), batched=batched)
-    return to_return_units(statistics, problem, most_likely(candidates), fallback=start)
+    return unscale(statistics, problem, most_likely(candidates), fallback=start)
 
 
 def starting_precisions(problem: Regression, start: Posterior) -> tuple[Float[Array, "3 groups"], Float[Array, "3"]]:
-    """Return alpha and beta of the three starts of `fit`. The first two are the same without an earlier fit."""
+    """Return alpha and beta of the three starts of `fit`."""
     has_start = start.beta > 0
     equal = problem.equal_alpha, 2 * problem.dof / problem.q
     earlier = jax.tree.map(lambda old, new: jnp.where(has_start, old, new), (start.alpha, start.beta), equal)
@@ -237,7 +243,7 @@ def most_likely(candidates: Posterior) -> Posterior:
     return jax.tree.map(lambda leaf: leaf[best], candidates)
 
 
-def to_return_units(
+def unscale(
     statistics: SufficientStatistics, problem: Regression, posterior: Posterior, fallback: Posterior
 ) -> Posterior:
     """Return a posterior with its weights in the unit of y, and b = y' - mu . m'.
@@ -274,17 +280,17 @@ def fixed_point(
 
 
 def _round(problem: Regression, alpha: Float[Array, " groups"], beta: Float[Array, ""]) -> Posterior:
-    return next_posterior(JAX, problem, alpha, beta, partial(dense_moments, JAX, problem))
+    return next_posterior(JAX_BACKEND, problem, alpha, beta, partial(dense_moments, JAX, problem))
 
 
 class PosteriorCovariance(NamedTuple):
     """The posterior variance of b + w . f is |root (f - centre)|^2 + centre_variance, in squared units of y."""
 
-    root: Float[Array, "*score_types features features"]
+    root: Float[Array, "features features"]
     """root^T root = Sigma."""
-    centre: Float[Array, "*score_types features"]
+    centre: Float[Array, " features"]
     """m'."""
-    centre_variance: Float[Array, "*score_types"]
+    centre_variance: Float[Array, ""]
     """The variance of y', the mean reward at the centre."""
 
 
@@ -296,8 +302,8 @@ def posterior_covariance(
     The weight of a feature without data has its prior standard deviation.
     """
     problem = regression(statistics, score_type, group_index)
-    alpha, beta = clip_precisions(JAX, problem, posterior.alpha, posterior.beta)
-    root, _ = inverse_root(JAX, beta * problem.s + jnp.diag(alpha[group_index]))
+    alpha, beta = clip_precisions(JAX_BACKEND, problem, posterior.alpha, posterior.beta)
+    root, _ = inverse_root(JAX_BACKEND, beta * problem.s + jnp.diag(alpha[group_index]))
     covariance = PosteriorCovariance(
         root=problem.y_std * root,
         centre=statistics.mean[: len(group_index)],
@@ -312,5 +318,5 @@ def posterior_std(covariance: PosteriorCovariance, features: Float[Array, "*batc
     `features` may lack the last columns, such as the intercepts of levels. Their uncertainty is left out.
     """
     n_features = features.shape[-1]
-    distance = (features - covariance.centre[..., :n_features]) @ covariance.root[..., :n_features].T
+    distance = (features - covariance.centre[:n_features]) @ covariance.root[:, :n_features].T
     return jnp.sqrt(jnp.sum(distance**2, axis=-1) + covariance.centre_variance)

@@ -199,12 +199,12 @@ def _is_used(fit: _Fit, basis: Basis) -> Bool[Array, " raw"]:
     """Return which raw features the returns determine to a part that is larger than `MIN_DETERMINED`."""
     group_index, strength_index = basis.group_index, basis.strength_index
     names, n_raw = list(basis.group_sizes), basis.n_raw_used
-    n_determined = jnp.zeros(n_raw)
+    n_effective = jnp.zeros(n_raw)
     for name in ("raw features", "shapes of raw features"):
         if name in names:
             first = int(strength_index[group_index == names.index(name)][0])
-            n_determined = n_determined + fit.posterior.n_determined[first : first + n_raw]
-    return ~fit.has_own_strengths | (n_determined > MIN_DETERMINED)
+            n_effective = n_effective + fit.posterior.n_effective[first : first + n_raw]
+    return ~fit.has_own_strengths | (n_effective > MIN_DETERMINED)
 
 
 def _lengths_differ(statistics: SufficientStatistics) -> Bool[Array, ""]:

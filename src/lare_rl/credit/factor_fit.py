@@ -33,7 +33,7 @@ from lare_rl.credit.score_type import (
     score_types_to_fit,
 )
 from lare_rl.util.float64 import float64
-from lare_rl.util.statistics import r_squared
+from lare_rl.util.statistics import FLOAT32_NOISE, r_squared
 
 __all__ = ["FactorAssessment", "assess_factors", "mean_features", "predict_returns"]
 
@@ -99,7 +99,7 @@ def mean_features(
     """Return the mean features of each episode, with inputs standardised over all steps, and the sums over all steps."""
     valid = np.concatenate([rows[mask] for rows, mask in zip(inputs, alive, strict=True)]).astype(np.float64)
     mean, std = valid.mean(axis=0), valid.std(axis=0)
-    std = np.where(std > 1e-6 * np.abs(mean), std, 0)  # a constant may vary by this much in float32
+    std = np.where(std > FLOAT32_NOISE * np.abs(mean), std, 0)
     leaves = (jnp.asarray(leaf, jnp.float32) for leaf in (mean, std, np.zeros(basis.n_features), 0))
     decoder, max_steps = LinearDecoder(basis, *leaves), max(map(len, inputs))
     means, statistics = [], empty_step_statistics(basis)

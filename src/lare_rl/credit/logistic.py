@@ -28,8 +28,8 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from lare_rl.credit import evidence
-from lare_rl.credit.evidence import JAX, PosteriorCovariance
-from lare_rl.credit.precisions import JITTER, PRIOR_RANGE, Posterior, count_determined, inverse_root, varies
+from lare_rl.credit.evidence import JAX_BACKEND, PosteriorCovariance
+from lare_rl.credit.precisions import JITTER, PRIOR_RANGE, Posterior, count_effective, inverse_root, varies
 from lare_rl.credit.prequential import ring_slots
 
 __all__ = [
@@ -134,18 +134,18 @@ def fit(state: LogOddsFit, group_index: Int[np.ndarray, " columns"], max_rounds:
         weighted = precision[:, None] * difference
         s = weighted.T @ difference
         alpha = posterior.alpha
-        root, log_det = inverse_root(JAX, s + jnp.diag(JITTER * jnp.diagonal(s) + alpha[group_index]))
+        root, log_det = inverse_root(JAX_BACKEND, s + jnp.diag(JITTER * jnp.diagonal(s) + alpha[group_index]))
         weight = (root @ (weighted.T @ (target - target_mean))) @ root
         eta = target_mean + difference @ weight
         variance = jnp.sum((difference @ root.T) ** 2, axis=1) + 1 / total
-        size, n_determined, squares = count_determined(JAX, group_index, alpha, weight, jnp.sum(root**2, axis=0))
+        size, n_effective, squares = count_effective(JAX_BACKEND, group_index, alpha, weight, jnp.sum(root**2, axis=0))
         likelihood = jnp.sum(jnp.where(valid, jax.nn.log_sigmoid((2 * won - 1) * eta), 0))
         posterior = Posterior(
             weight=weight,
             bias=target_mean - x_mean @ weight,
-            alpha=jnp.clip(n_determined / jnp.maximum(squares, 1e-30), *limits),
+            alpha=jnp.clip(n_effective / jnp.maximum(squares, 1e-30), *limits),
             beta=jnp.ones(()),
-            n_determined=n_determined,
+            n_effective=n_effective,
             log_evidence=likelihood + 0.5 * (size @ jnp.log(alpha) - log_det - alpha @ squares),
         )
         new_xi = jnp.sqrt(eta**2 + variance)

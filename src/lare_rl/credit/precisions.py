@@ -25,7 +25,7 @@ __all__ = [
     "Posterior",
     "Regression",
     "clip_precisions",
-    "count_determined",
+    "count_effective",
     "dense_moments",
     "equal_shares",
     "expand_groups",
@@ -78,7 +78,7 @@ class Posterior(NamedTuple):
     """The precision of the weights of each group, in units of the standard deviation of y."""
     beta: Float[Array, "*batch"]
     """The precision of a step's noise, in the same unit."""
-    n_determined: Float[Array, "*batch groups"]
+    n_effective: Float[Array, "*batch groups"]
     """gamma: how many features of each group the data determine."""
     log_evidence: Float[Array, "*batch"]
     """The log evidence, up to a constant that does not depend on groups and precisions."""
@@ -150,14 +150,14 @@ def dense_moments(backend: Backend, problem: Regression, alpha: Groups, beta: An
     return Moments(weight, xp.sum(root**2, axis=0), log_det, residual)
 
 
-def count_determined(
+def count_effective(
     backend: Backend, group_index: FeatureIndex, alpha: Groups, weight: Features, variance: Features
 ) -> tuple[Groups, Groups, Groups]:
     """Return n_g, gamma_g and |mu_g|^2 of each group."""
     xp, n_groups = backend.xp, len(alpha)
     size = backend.group_sums(xp.ones_like(weight), group_index, n_groups)
-    n_determined = xp.clip(size - alpha * backend.group_sums(variance, group_index, n_groups), 0, size)
-    return size, n_determined, backend.group_sums(weight**2, group_index, n_groups)
+    n_effective = xp.clip(size - alpha * backend.group_sums(variance, group_index, n_groups), 0, size)
+    return size, n_effective, backend.group_sums(weight**2, group_index, n_groups)
 
 
 def next_posterior(
@@ -168,14 +168,14 @@ def next_posterior(
     alpha, beta = clip_precisions(backend, problem, alpha, beta)
     weight, variance, log_det, residual = moments(alpha, beta)
     residual = xp.maximum(residual, MIN_NOISE * problem.q)
-    size, n_determined, squares = count_determined(backend, problem.group_index, alpha, weight, variance)
+    size, n_effective, squares = count_effective(backend, problem.group_index, alpha, weight, variance)
     log_evidence = 0.5 * (
         problem.dof * xp.log(beta) + size @ xp.log(alpha) - log_det - beta * residual - alpha @ squares
     )
-    noise_dof = xp.maximum(problem.dof - xp.sum(n_determined), 0.5)
-    alpha, beta = clip_precisions(backend, problem, n_determined / xp.maximum(squares, 1e-30), noise_dof / residual)
+    noise_dof = xp.maximum(problem.dof - xp.sum(n_effective), 0.5)
+    alpha, beta = clip_precisions(backend, problem, n_effective / xp.maximum(squares, 1e-30), noise_dof / residual)
     return Posterior(
-        weight=weight, bias=xp.zeros(()), alpha=alpha, beta=beta, n_determined=n_determined, log_evidence=log_evidence
+        weight=weight, bias=xp.zeros(()), alpha=alpha, beta=beta, n_effective=n_effective, log_evidence=log_evidence
     )
 
 
@@ -184,4 +184,4 @@ def expand_groups(groups: Posterior, group_index: FeatureIndex, strength_index: 
     group = np.zeros(int(strength_index.max(initial=-1)) + 1, int)
     group[strength_index] = group_index
     n_strengths = np.bincount(group, minlength=groups.alpha.shape[-1])
-    return groups._replace(alpha=groups.alpha[..., group], n_determined=(groups.n_determined / n_strengths)[..., group])
+    return groups._replace(alpha=groups.alpha[..., group], n_effective=(groups.n_effective / n_strengths)[..., group])

@@ -52,7 +52,7 @@ def fit_strengths(
         jnp.where(continues, old, new) for old, new in ((earlier.alpha, start.alpha), (earlier.beta, start.beta))
     )
     posterior = evidence.fixed_point(problem, alpha, beta, max_rounds)
-    return evidence.to_return_units(statistics, problem, posterior, fallback=start)
+    return evidence.unscale(statistics, problem, posterior, fallback=start)
 
 
 def is_better(strengths: Posterior, groups: Posterior) -> Bool[Array, "*score_types"]:

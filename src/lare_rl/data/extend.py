@@ -62,7 +62,7 @@ def _extend_env(
     """Store the steps of one environment, all at once. Remove the oldest episodes if their rows are needed."""
     rows, steps = replay.row.shape[0], ended.shape[0]
     row = replay.next_row + jnp.arange(steps) + jnp.cumsum(ended) - ended
-    number = replay.transitions + jnp.arange(steps)
+    number = replay.next_transition + jnp.arange(steps)
     oldest = _remove_oldest(replay, row[-1] + 1)
     stored = dict(replay.columns)
     for name, values in next_columns.items():  # first, because the next step of the same episode overwrites the row
@@ -74,7 +74,7 @@ def _extend_env(
         columns=stored,
         row=replay.row.at[number % rows].set(row),
         next_row=row[-1] + 1 + ended[-1],
-        transitions=replay.transitions + steps,
+        next_transition=replay.next_transition + steps,
         oldest=oldest,
         **episodes,
     )
@@ -92,7 +92,7 @@ def _extend_episodes(
 ) -> dict[str, Any]:
     """Return the changed fields of the episodes, or of the segments, of one environment after new steps."""
     slots, n_ended = replay.first.shape[0], jnp.cumsum(ended)
-    episode = replay.episodes + n_ended - ended
+    episode = replay.current_episode + n_ended - ended
     is_first = jnp.append(~replay.running, ended[:-1])
     slot = episode % slots
     first_slot = jnp.where(is_first, slot, slots)  # other steps get an index out of range, which is dropped
@@ -103,7 +103,7 @@ def _extend_episodes(
         "episode": replay.episode.at[number % replay.episode.shape[0]].set(episode),
         "first": replay.first.at[first_slot].set(number, mode="drop"),
         "episode_return": replay.episode_return.at[first_slot].set(0, mode="drop").at[slot].add(team_reward),
-        "episodes": replay.episodes + n_ended[-1],
+        "current_episode": replay.current_episode + n_ended[-1],
         "running": ~ended[-1],
         "predicted_return": None if predicted is None else predicted.at[first_slot].set(jnp.nan, mode="drop"),
         "level": levels,
@@ -120,7 +120,7 @@ def _extend_segments(
 ) -> Segments:
     """Return the segments of one environment after new steps, which are already part of the replay's episodes."""
     rows, slots = replay.row.shape[0], segments.first.shape[0]
-    number = replay.transitions - len(ended) + jnp.arange(len(ended))
+    number = replay.next_transition - len(ended) + jnp.arange(len(ended))
     begin = replay.first[replay.episode[number % rows] % replay.first.shape[0]]
     pays = is_paid(payments, number - begin, team_reward, ended)
     new = segments._replace(**_extend_episodes(segments, number, team_reward, pays, level))
@@ -131,7 +131,7 @@ def _extend_segments(
 
     def is_removed(oldest: Int[Array, ""]) -> Bool[Array, ""]:
         # The fields before the new steps, which may have overwritten these segments.
-        return (oldest < segments.episodes) & (segments.first_paid[oldest % slots] < oldest_step)
+        return (oldest < segments.current_episode) & (segments.first_paid[oldest % slots] < oldest_step)
 
     return new._replace(oldest=jax.lax.while_loop(is_removed, lambda oldest: oldest + 1, segments.oldest))
 
@@ -142,22 +142,22 @@ def _remove_oldest(replay: Replay, last: Int[Array, ""]) -> Int[Array, ""]:
 
     def is_overwritten(oldest: Int[Array, ""]) -> Bool[Array, ""]:
         row = replay.row[replay.first[oldest % slots] % rows]
-        return (oldest < replay.episodes) & (last - row >= rows)
+        return (oldest < replay.current_episode) & (last - row >= rows)
 
     return jax.lax.while_loop(is_overwritten, lambda oldest: oldest + 1, replay.oldest)
 
 
 def abandon_running(replay: Replay, abandoned: Bool[Array, " envs"]) -> Replay:
     """Forget the running episodes of some environments."""
-    env, first = jnp.arange(len(abandoned)), first_transition(replay, replay.episodes)
+    env, first = jnp.arange(len(abandoned)), first_transition(replay, replay.current_episode)
     removed, segments = abandoned & replay.running, replay.segments
     if segments is not None:
         segments = segments._replace(
-            episodes=jnp.where(removed, look_up(segments.episode, env, first), segments.episodes),
+            current_episode=jnp.where(removed, look_up(segments.episode, env, first), segments.current_episode),
             running=segments.running & ~removed,
         )
     return replay._replace(
-        transitions=jnp.where(removed, first, replay.transitions),
+        next_transition=jnp.where(removed, first, replay.next_transition),
         next_row=jnp.where(removed, look_up(replay.row, env, first), replay.next_row),
         running=replay.running & ~removed,
         segments=segments,

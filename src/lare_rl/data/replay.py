@@ -14,7 +14,7 @@ end, and each is stored at its number modulo the capacity. When no row is free, 
 environment has its own rows. Everything here is for one seed; callers `vmap`.
 
 An environment that pays before the end of an episode has *segments*: each holds the steps that one payment is for. They are stored
-in the same form as episodes. `by_payment` returns the replay with its segments in place of its episodes, so that all functions
+in the same form as episodes. `segments_as_episodes` returns the replay with its segments in place of its episodes, so that all functions
 that read episodes read segments.
 """
 
@@ -33,13 +33,13 @@ STEP_COLUMNS = ("observation", "state", "available", "alive")
 
 
 class Segments(NamedTuple):
-    """The steps between payments. Each field but the last has the name and the form of the field of `Replay` for episodes."""
+    """The steps between payments. Every field has the name and form of the field of `Replay` for episodes."""
 
     episode: Int[Array, "envs rows"]
     first: Int[Array, "envs segments"]
     episode_return: Float[Array, "envs segments teams"]
     oldest: Int[Array, " envs"]
-    episodes: Int[Array, " envs"]
+    current_episode: Int[Array, " envs"]
     running: Bool[Array, " envs"]
     first_paid: Int[Array, "envs segments"]
     """Number of the first transition that the payment is for."""
@@ -61,11 +61,11 @@ class Replay(NamedTuple):
     episode_return: Float[Array, "envs episodes teams"]
     """Sum of an episode's true rewards, so far."""
     next_row: Int[Array, " envs"]
-    transitions: Int[Array, " envs"]
+    next_transition: Int[Array, " envs"]
     """Transitions ever added."""
     oldest: Int[Array, " envs"]
     """The oldest episode that is still stored."""
-    episodes: Int[Array, " envs"]
+    current_episode: Int[Array, " envs"]
     """Episodes ever finished; also the number of the running one."""
     running: Bool[Array, " envs"]
     """Whether an episode has begun and not ended."""
@@ -120,7 +120,17 @@ def init_replay(
     with_predictions: bool = False,
     with_levels: bool = False,
 ) -> Replay:
-    """Return an empty replay. `columns` are the shapes of a single row."""
+    """Return an empty replay.
+
+    Args:
+        columns: shape and type of a single row of each column.
+        envs: the number of environments.
+        capacity: rows of each environment. An episode of T steps takes T + 1.
+        teams: the number of teams, each with its own return.
+        payments: when the environment pays. If not only at the end of an episode, there are segments.
+        with_predictions: whether the sums of proxy rewards are stored (`predicted_return`).
+        with_levels: whether the levels of episodes are stored (`level`).
+    """
 
     def zeros(*shape: int, dtype: DTypeLike = jnp.int32) -> Array:
         return jnp.zeros((envs, *shape), dtype)
@@ -132,7 +142,7 @@ def init_replay(
             "first": zeros(slots),
             "episode_return": zeros(slots, teams, dtype=jnp.float32),
             "oldest": zeros(),
-            "episodes": zeros(),
+            "current_episode": zeros(),
             "running": zeros(dtype=bool),
             "predicted_return": unknown if with_predictions and are_paid else None,
             "level": zeros(slots) if with_levels and are_paid else None,
@@ -143,19 +153,19 @@ def init_replay(
         columns={name: zeros(capacity, *row.shape, dtype=row.dtype) for name, row in columns.items()},
         row=zeros(capacity),
         next_row=zeros(),
-        transitions=zeros(),
+        next_transition=zeros(),
         segments=None if payments.only_at_end else segments,
         # The shortest episode takes two rows; one more is running.
         **episode_fields(capacity // 2 + 1, are_paid=payments.only_at_end),
     )
 
 
-def by_payment(replay: Replay) -> Replay:
+def segments_as_episodes(replay: Replay) -> Replay:
     """Return the replay with its segments in place of its episodes. With one payment for each episode, return it unchanged."""
     return replay if replay.segments is None else replay._replace(**replay.segments._asdict(), segments=None)
 
 
-def replace_payments(replay: Replay, **fields: Any) -> Replay:
+def replace_payment_fields(replay: Replay, **fields: Any) -> Replay:
     """Return the replay with these fields of its episodes or, if it has segments, of its segments."""
     if replay.segments is None:
         return replay._replace(**fields)
@@ -182,24 +192,24 @@ def first_transition(replay: Replay, episode: Int[Array, " envs"]) -> Int[Array,
 
 def oldest_transition(replay: Replay) -> Int[Array, " envs"]:
     """Return the number of the oldest transition that is still stored."""
-    has_episode = replay.oldest < replay.episodes + replay.running
-    return jnp.where(has_episode, first_transition(replay, replay.oldest), replay.transitions)
+    has_episode = replay.oldest < replay.current_episode + replay.running
+    return jnp.where(has_episode, first_transition(replay, replay.oldest), replay.next_transition)
 
 
-def n_transitions(replay: Replay) -> Int[Array, " envs"]:
+def n_stored_transitions(replay: Replay) -> Int[Array, " envs"]:
     """Return the number of transitions that can be sampled."""
-    return replay.transitions - oldest_transition(replay)
+    return replay.next_transition - oldest_transition(replay)
 
 
-def n_finished(replay: Replay) -> Int[Array, " envs"]:
+def n_stored_episodes(replay: Replay) -> Int[Array, " envs"]:
     """Return the number of finished episodes that can be sampled."""
-    return replay.episodes - replay.oldest
+    return replay.current_episode - replay.oldest
 
 
 def mean_length(replay: Replay) -> Int[Array, ""]:
     """Return the mean number of steps of the episodes that have ever finished; 1 before the first."""
-    n_steps = jnp.where(replay.running, first_transition(replay, replay.episodes), replay.transitions)
-    return jnp.maximum(jnp.sum(n_steps) // jnp.maximum(jnp.sum(replay.episodes), 1), 1)
+    n_steps = jnp.where(replay.running, first_transition(replay, replay.current_episode), replay.next_transition)
+    return jnp.maximum(jnp.sum(n_steps) // jnp.maximum(jnp.sum(replay.current_episode), 1), 1)
 
 
 def required_capacity(steps: int, longest: int) -> int:
@@ -210,18 +220,20 @@ def required_capacity(steps: int, longest: int) -> int:
 def hide_newest(replay: Replay, count: Int[Array, "*seeds envs"]) -> Replay:
     """Return the replay as if the newest payments of each environment, `count` of them, had not been made yet.
 
-    Nothing is removed: the same columns with the earlier `episodes`, `running` and `segments` show these episodes again.
+    Nothing is removed: the same columns with the earlier `current_episode`, `running` and `segments` show these episodes again.
     """
-    before = by_payment(replay)
-    return replace_payments(replay, episodes=before.episodes - count, running=before.running | (count > 0))
+    before = segments_as_episodes(replay)
+    return replace_payment_fields(
+        replay, current_episode=before.current_episode - count, running=before.running | (count > 0)
+    )
 
 
 def read(replay: Replay, index: Index) -> StoredSteps:
     """Read the transitions at this index."""
-    replay, (env, number) = by_payment(replay), index
+    replay, (env, number) = segments_as_episodes(replay), index
     row, episode = look_up(replay.row, env, number), look_up(replay.episode, env, number)
-    end, finished = end_of_episode(replay, env, episode), episode < replay.episodes[env]
-    return_, length = look_up(replay.episode_return, env, episode), end - segment_start(replay, env, episode)
+    end, finished = end_of_episode(replay, env, episode), episode < replay.current_episode[env]
+    return_, length = look_up(replay.episode_return, env, episode), end - payment_start(replay, env, episode)
     last = (number + 1 == end) & finished
     residual = None
     if replay.predicted_return is not None:
@@ -243,19 +255,19 @@ def read(replay: Replay, index: Index) -> StoredSteps:
 
 def end_of_episode(replay: Replay, env: Int[Array, "*batch"], episode: Int[Array, "*batch"]) -> Int[Array, "*batch"]:
     """Return the number of the transition after an episode's last one."""
-    newest = replay.episodes + replay.running - 1
-    return jnp.where(episode >= newest[env], replay.transitions[env], look_up(replay.first, env, episode + 1))
+    newest = replay.current_episode + replay.running - 1
+    return jnp.where(episode >= newest[env], replay.next_transition[env], look_up(replay.first, env, episode + 1))
 
 
-def segment_start(replay: Replay, env: Int[Array, "*batch"], episode: Int[Array, "*batch"]) -> Int[Array, "*batch"]:
+def payment_start(replay: Replay, env: Int[Array, "*batch"], episode: Int[Array, "*batch"]) -> Int[Array, "*batch"]:
     """Return the number of the first transition that an episode's payment is for; of a running episode, its first transition."""
     first = look_up(replay.first, env, episode)
     if replay.first_paid is None:
         return first
-    return jnp.where(episode < replay.episodes[env], look_up(replay.first_paid, env, episode), first)
+    return jnp.where(episode < replay.current_episode[env], look_up(replay.first_paid, env, episode), first)
 
 
 def newest_steps(replay: Replay, steps: int) -> Index:
     """Return the index of the last steps of every environment: [envs steps]. At least `steps` of each must have been stored."""
-    number = replay.transitions[:, None] - steps + jnp.arange(steps)
+    number = replay.next_transition[:, None] - steps + jnp.arange(steps)
     return Index(jnp.broadcast_to(jnp.arange(len(number))[:, None], number.shape), number)

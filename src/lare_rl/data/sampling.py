@@ -12,10 +12,10 @@ from lare_rl.data.replay import (
     Replay,
     end_of_episode,
     look_up,
-    n_finished,
-    n_transitions,
+    n_stored_episodes,
+    n_stored_transitions,
     oldest_transition,
-    segment_start,
+    payment_start,
 )
 
 __all__ = [
@@ -67,18 +67,18 @@ def _sample_items(counts: Int[Array, " envs"], key: PRNGKeyArray, shape: tuple[i
 
 def sample_transitions(replay: Replay, key: PRNGKeyArray, shape: tuple[int, ...]) -> Index:
     """Sample transitions uniformly, of finished and of running episodes."""
-    item = _sample_items(n_transitions(replay), key, shape)
+    item = _sample_items(n_stored_transitions(replay), key, shape)
     return Index(item.env, oldest_transition(replay)[item.env] + item.number)
 
 
 def sample_episodes(replay: Replay, key: PRNGKeyArray, shape: tuple[int, ...]) -> EpisodeSample:
     """Sample finished episodes uniformly, with replacement."""
-    return get_episodes(replay, _sample_items(n_finished(replay), key, shape))
+    return get_episodes(replay, _sample_items(n_stored_episodes(replay), key, shape))
 
 
 def sample_distinct_episodes(replay: Replay, key: PRNGKeyArray, count: int) -> EpisodeSample:
     """Sample finished episodes uniformly, without replacement. If there are fewer than `count`, the mask of the others is 0."""
-    available, slots = n_finished(replay), replay.first.shape[-1]
+    available, slots = n_stored_episodes(replay), replay.first.shape[-1]
     has_episode = jnp.arange(slots) < available[:, None]
     # The first episodes of a random order of all slots.
     order = jnp.where(has_episode, jax.random.uniform(key, has_episode.shape), jnp.inf).ravel()
@@ -91,9 +91,9 @@ def sample_distinct_episodes(replay: Replay, key: PRNGKeyArray, count: int) -> E
 def get_episodes(replay: Replay, index: Index) -> EpisodeSample:
     """Return finished episodes. `index.number` counts from the oldest episode of each environment."""
     episode = replay.oldest[index.env] + index.number
-    first = segment_start(replay, index.env, episode)
+    first = payment_start(replay, index.env, episode)
     length = jnp.maximum(end_of_episode(replay, index.env, episode) - first, 1)
-    has_episodes = jnp.sum(n_finished(replay)) > 0
+    has_episodes = jnp.sum(n_stored_episodes(replay)) > 0
     return EpisodeSample(
         first=Index(index.env, first),
         length=length,
@@ -132,7 +132,7 @@ def sample_packed(replay: Replay, key: PRNGKeyArray, updates: int, steps: int, l
 
     def sample_update(key: PRNGKeyArray) -> CreditSample:
         episodes = sample_episodes(replay, key, (steps,))
-        count = steps * jnp.sum(n_finished(replay)) // jnp.maximum(_n_finished_steps(replay), 1)
+        count = steps * jnp.sum(n_stored_episodes(replay)) // jnp.maximum(_n_finished_steps(replay), 1)
         mask = episodes.mask * (jnp.arange(steps) < jnp.maximum(count, 1))
         return _pack(episodes._replace(mask=mask), max(steps, longest))
 
@@ -149,7 +149,7 @@ def _pack(episodes: EpisodeSample, rows: int) -> CreditSample:
 
 def count_episodes_since(replay: Replay, since: Int[Array, " envs"]) -> Int[Array, " envs"]:
     """Return how many finished episodes of each environment have this number or a later one, and are still stored."""
-    return jnp.maximum(replay.episodes - jnp.maximum(since, replay.oldest), 0)
+    return jnp.maximum(replay.current_episode - jnp.maximum(since, replay.oldest), 0)
 
 
 def episodes_in_order(
@@ -170,5 +170,5 @@ def episodes_in_order(
 
 def _n_finished_steps(replay: Replay) -> Int[Scalar, ""]:
     """Return the number of steps of the finished episodes that are stored."""
-    end = end_of_episode(replay, jnp.arange(len(replay.episodes)), replay.episodes - 1)
+    end = end_of_episode(replay, jnp.arange(len(replay.current_episode)), replay.current_episode - 1)
     return jnp.sum(end - oldest_transition(replay))

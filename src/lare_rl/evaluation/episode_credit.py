@@ -91,9 +91,9 @@ def load_episode_credit(run: Run) -> EpisodeCredit | None:
 def _find_newest_episode(learner: Learner) -> Index | None:
     """Return the steps of the last finished episode of a seed's first environment. None if none has finished."""
     buffer = learner.replay
-    if not int(replay.n_finished(buffer)[0]):
+    if not int(replay.n_stored_episodes(buffer)[0]):
         return None
-    env_index, episode = np.int32(0), np.asarray(buffer.episodes)[0] - 1
+    env_index, episode = np.int32(0), np.asarray(buffer.current_episode)[0] - 1
     start = int(np.asarray(buffer.first)[0, episode % buffer.first.shape[-1]])
     number = jnp.arange(start, int(jax.jit(replay.end_of_episode)(buffer, env_index, episode)))
     return Index(jnp.zeros(len(number), int), number)
@@ -104,7 +104,7 @@ def _read_rewards(
 ) -> tuple[StoredSteps, Float[Array, "steps agents"]]:
     """Read steps of one seed's replay, and compute their training rewards."""
     steps = replay.read(learner.replay, index)
-    return steps, rewards(steps, learner.reward_state, config)
+    return steps, rewards(steps, learner.reward_sources, config)
 
 
 def _posterior_std(decoder: DecoderState, steps: StoredSteps, config: TrainConfig) -> Float[Array, " steps"]:
@@ -120,7 +120,7 @@ def _factor_correlations(learners: Learner, config: TrainConfig) -> Float[np.nda
     if not config.method.needs_phi or config.credit_rows > 1 or config.env.n_agents > 1:
         return np.zeros(0)
     buffers = learners.replay
-    n_stored = int(np.min(jax.jit(jax.vmap(replay.n_transitions))(buffers)))
+    n_stored = int(np.min(jax.jit(jax.vmap(replay.n_stored_transitions))(buffers)))
     n_steps = min(RECENT_STEPS, n_stored)
     steps = jax.jit(jax.vmap(lambda buffer: replay.read(buffer, replay.newest_steps(buffer, n_steps))))(buffers)
     reward, last = np.asarray(steps.columns["reward"]).ravel(), np.asarray(steps.last).ravel()

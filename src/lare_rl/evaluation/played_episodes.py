@@ -150,10 +150,10 @@ def compute_training_rewards(
     def compute(steps: Trajectory, factors: Array) -> Array:
         filled = store_with_factors(learner._replace(replay=buffer), steps, factors, config).replay
         if config.is_exact:
-            predicted = predict_returns(learner.decoders, filled, replay.by_payment(filled).oldest, config)
-            filled = replay.replace_payments(filled, predicted_return=predicted)
+            predicted = predict_returns(learner.decoders, filled, replay.segments_as_episodes(filled).oldest, config)
+            filled = replay.replace_payment_fields(filled, predicted_return=predicted)
         stored = replay.read(filled, replay.newest_steps(filled, n_steps))
-        return jnp.swapaxes(rewards(stored, learner.reward_state, config), 0, 1)
+        return jnp.swapaxes(rewards(stored, learner.reward_sources, config), 0, 1)
 
     return np.asarray(compute(jax.tree.map(jnp.asarray, steps), jnp.asarray(factors)))
 

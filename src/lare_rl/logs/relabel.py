@@ -27,7 +27,7 @@ from lare_rl.logs.log import Log, batch_by_steps, open_log
 from lare_rl.tasks.payments import is_paid
 from lare_rl.tasks.spec import TaskSpec
 from lare_rl.util.findings import Finding, render
-from lare_rl.util.statistics import correlation, r_squared
+from lare_rl.util.statistics import FLOAT32_NOISE, correlation, r_squared
 
 __all__ = ["MESSAGES", "Relabelled", "hold_out_flags", "predicted_return_statistics", "relabel"]
 
@@ -116,7 +116,7 @@ def predicted_return_statistics(returns: Sequence[float], predictions: Sequence[
     if len(returns) < MIN_HELD_OUT:
         return math.nan, math.nan, math.nan
     y, predicted = np.array(returns), np.array(predictions)
-    varies = all(np.ptp(values) > 1e-6 * np.abs(values).max() for values in (y, predicted))
+    varies = all(np.ptp(values) > FLOAT32_NOISE * np.abs(values).max() for values in (y, predicted))
     return *r_squared(y, predicted), correlation(y, predicted) if varies else math.nan
 
 
@@ -327,9 +327,11 @@ def _make_exact(
     r_hat: Float[np.ndarray, " steps"], reward: Float[np.ndarray, " steps"], config: AssignerConfig
 ) -> Float[np.ndarray, " steps"]:
     """Return proxy rewards that add up to each payment."""
+    exact = config.settings.exact
+    assert exact in ("last", "spread")
     begins = _segment_begins(reward, config)
     lengths = _segment_lengths(begins)
     residual = np.add.reduceat(reward - r_hat.astype(np.float64), np.flatnonzero(begins))
     residual, length = (np.repeat(values, lengths) for values in (residual, lengths))
-    change = correction(residual, np.append(begins[1:], True), length, config.settings.exact)
+    change = correction(residual, np.append(begins[1:], True), length, exact)
     return (r_hat + change).astype(r_hat.dtype)

@@ -5,6 +5,8 @@ from typing import Any, NamedTuple
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
+from lare_rl.util.statistics import FLOAT32_NOISE
+
 __all__ = [
     "CLIP",
     "RunningMeanStd",
@@ -69,8 +71,7 @@ def merge_means(n: Any, mean: Any, n_new: Any, new_mean: Any) -> tuple[Any, Any,
 def running_std(statistics: RunningMeanStd) -> Float[Array, " features"]:
     """Return the standard deviations. That of a feature that has never varied is 0."""
     std = jnp.sqrt(statistics.sum_squares / jnp.maximum(statistics.n_rows, 1))
-    # A deviation within float32's rounding of the mean is noise, whatever its absolute size.
-    return jnp.where(std > 1e-6 * jnp.abs(statistics.mean), std, 0)
+    return jnp.where(std > FLOAT32_NOISE * jnp.abs(statistics.mean), std, 0)
 
 
 def standardise(statistics: RunningMeanStd, rows: Float[Array, "*batch features"]) -> Float[Array, "*batch features"]:

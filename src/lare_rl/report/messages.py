@@ -83,8 +83,8 @@ MESSAGES = {
     "period": ", paid every {period} steps",
     "period_nonzero": ", paid with every reward that is not 0",
     "with_groups": ", with an intercept for each group of episodes",
-    "exact_last": "; what rewards lack to it is paid at the last step",
-    "exact_spread": "; what rewards lack to it is spread over the steps",
+    "exact_last": "; the rest of the return is added to the reward of the last step",
+    "exact_spread": "; the rest of the return is spread evenly over the steps",
     "trust_nothing": (
         "Do not trust the credit: returns are not predicted better than by {baseline} (squared error removed: {gain:.0%} ± "
         "{error:.0%})."

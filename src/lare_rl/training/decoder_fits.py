@@ -28,7 +28,7 @@ def sample_credit(buffer: Replay, key: PRNGKeyArray, updates: int, config: Train
     fit, longest = config.method.fit, config.longest_segment
     if fit is None or not config.method.uses_gradient:
         return None
-    buffer = replay.by_payment(buffer)
+    buffer = replay.segments_as_episodes(buffer)
     plan = plan_batch(fit, config.credit, longest, fixed_length=config.has_fixed_segments)
     match plan.layout:
         case "sampled":

@@ -44,18 +44,18 @@ def learn_returns(
     Returns:
         The decoders of each team, how many episodes they have learned from, and the predicted returns of the replay.
     """
-    buffer = replay.by_payment(buffer)
+    buffer = replay.segments_as_episodes(buffer)
     n_before = jnp.sum(n_learned, axis=1)
-    n_new = jnp.sum(buffer.episodes, axis=1) - n_before
+    n_new = jnp.sum(buffer.current_episode, axis=1) - n_before
     is_due = n_new >= jnp.maximum(returns.MIN_GROWTH * n_before, 1)
     learn = partial(_learn_if_due, buffer=buffer, n_learned=n_learned, is_due=is_due, config=config)
     learned = jax.lax.cond(jnp.any(is_due), learn, lambda unchanged: unchanged, decoders)
-    n_now = jnp.where(is_due[:, None], buffer.episodes, n_learned).astype(n_learned.dtype)
+    n_now = jnp.where(is_due[:, None], buffer.current_episode, n_learned).astype(n_learned.dtype)
     predicted = buffer.predicted_return
     if predicted is not None and config.predicts_ahead:
         # A new fit changes the proxy rewards of all episodes.
         is_new = jax.vmap(_is_refitted)(decoders[0], learned[0])[:, None]
-        since = jnp.where(is_new, buffer.oldest, jnp.where(is_due[:, None], n_learned, buffer.episodes))
+        since = jnp.where(is_new, buffer.oldest, jnp.where(is_due[:, None], n_learned, buffer.current_episode))
         predicted = jax.vmap(partial(predict_returns, config=config))(learned, buffer, since)
     return learned, n_now, predicted
 
@@ -70,7 +70,7 @@ def predict_returns(
     decoders: Decoders, buffer: Replay, since: Int[Array, " envs"], config: TrainConfig
 ) -> Float[Array, "envs episodes teams"]:
     """Return the predicted returns of the replay of one seed, with those of the episodes from `since` on computed anew."""
-    buffer = replay.by_payment(buffer)
+    buffer = replay.segments_as_episodes(buffer)
     slots = buffer.first.shape[-1]
 
     def body(state: tuple[DecoderState, Array], episodes: CreditBatch, first: Index) -> tuple[DecoderState, Array]:
@@ -95,7 +95,7 @@ def _learn_if_due(
     is_due: Bool[Array, " seeds"],
     config: TrainConfig,
 ) -> Decoders:
-    since = jnp.where(is_due[:, None], n_learned, buffer.episodes)
+    since = jnp.where(is_due[:, None], n_learned, buffer.current_episode)
     decoders = jax.vmap(partial(_predict_then_update, config=config))(decoders, buffer, since)
     if decoders[0].closed_form is None:
         return decoders
@@ -121,7 +121,7 @@ def fold_episodes(
         body: the function from a state, a batch of whole episodes, and the first step of each, to the next state.
         expected: about how many episodes there are; None if they may be many.
     """
-    buffer, longest, n_episodes = replay.by_payment(buffer), config.longest_segment, config.credit_window
+    buffer, longest, n_episodes = replay.segments_as_episodes(buffer), config.longest_segment, config.credit_window
     expected = n_episodes if expected is None else max(1, expected)
     rows = max(1, min(expected, n_episodes, MAX_ROWS // (config.credit_rows * longest))) * longest
     total = jnp.sum(count_episodes_since(buffer, since))
@@ -151,7 +151,7 @@ def _predict_then_update(
 def _rebuild_statistics(decoders: Decoders, buffer: Replay, is_stale: Bool[Array, ""], config: TrainConfig) -> Decoders:
     """Add all stored episodes to new sums if `is_stale` is true, with features standardised by the current statistics."""
     empty = tuple(map(returns.reset_statistics, decoders))
-    since = jnp.where(is_stale, buffer.oldest, buffer.episodes)
+    since = jnp.where(is_stale, buffer.oldest, buffer.current_episode)
     rebuilt = fold_episodes(empty, buffer, since, lambda state, batch, _: returns.add_episodes(state, batch), config)
     return select(is_stale, rebuilt, decoders)
 

@@ -14,7 +14,7 @@ from lare_rl.credit.engine import add_to_explanation, explain_returns, init_expl
 from lare_rl.credit.explanation import Explanation
 from lare_rl.credit.explanation_text import MESSAGES, MIN_EXPLAINED_EPISODES, explanation_findings
 from lare_rl.credit.methods import METHODS, find_method
-from lare_rl.data.replay import Index, Replay, by_payment
+from lare_rl.data.replay import Index, Replay, segments_as_episodes
 from lare_rl.nn.normalise import RunningMeanStd, empty_mean_std, update_mean_std
 from lare_rl.runs.directory import Run
 from lare_rl.training.compile_cache import cache_by_value
@@ -91,8 +91,8 @@ def explain_stored_returns(learner: Learner, config: TrainConfig) -> list[Explan
 
     The list is empty for a method that fits nothing to returns, and for fewer than `MIN_EXPLAINED_EPISODES` episodes.
     """
-    config, replay = _explanation_config(config), by_payment(learner.replay)
-    n_stored = np.sum(np.asarray(replay.episodes)[0] - np.asarray(replay.oldest)[0])
+    config, replay = _explanation_config(config), segments_as_episodes(learner.replay)
+    n_stored = np.sum(np.asarray(replay.current_episode)[0] - np.asarray(replay.oldest)[0])
     has_features = all(spec.basis.n_features for spec in config.credit_specs)
     if not learner.decoders or not has_features or n_stored < MIN_EXPLAINED_EPISODES:
         return []
@@ -104,7 +104,7 @@ def explain_stored_returns(learner: Learner, config: TrainConfig) -> list[Explan
 
 def compile_explanation(learner: Learner, config: TrainConfig) -> None:
     """Compile `explain_stored_returns` for a learner of these shapes, on one device, also in another thread."""
-    config, replay = _explanation_config(config), by_payment(learner.replay)
+    config, replay = _explanation_config(config), segments_as_episodes(learner.replay)
     if not learner.decoders or not all(spec.basis.n_features for spec in config.credit_specs):
         return
     inputs = replay, tuple(decoder.is_average for decoder in learner.decoders)

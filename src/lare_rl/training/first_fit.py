@@ -17,7 +17,7 @@ from lare_rl.config.settings import ResolvedSettings
 from lare_rl.credit import returns
 from lare_rl.credit.decomposition import CreditBatch, DecoderState
 from lare_rl.credit.prequential import empty_predictions, squared_errors
-from lare_rl.data.replay import Index, Replay, by_payment, hide_newest, n_finished
+from lare_rl.data.replay import Index, Replay, hide_newest, n_stored_episodes, segments_as_episodes
 from lare_rl.nn.masks import select
 from lare_rl.nn.normalise import root_mean_square
 from lare_rl.training.episodes import Decoders, fold_episodes
@@ -51,7 +51,10 @@ def has_first_fit(settings: ResolvedSettings, config: TrainConfig) -> bool:
 
 def has_enough_episodes(learner: Learner) -> bool:
     """Return whether every seed has episodes to hold out."""
-    return int(jnp.min(jnp.sum(jax.vmap(n_finished)(by_payment(learner.replay)), axis=1))) >= MIN_FIRST_EPISODES
+    return (
+        int(jnp.min(jnp.sum(jax.vmap(n_stored_episodes)(segments_as_episodes(learner.replay)), axis=1)))
+        >= MIN_FIRST_EPISODES
+    )
 
 
 def config_of_first_fit(config: TrainConfig) -> TrainConfig:
@@ -78,9 +81,9 @@ def fit_until_converged(
     Raises:
         FirstFitStoppedError: the user has asked the run to stop.
     """
-    hidden_fields = {name: getattr(learner.replay, name) for name in ("episodes", "running", "segments")}
+    hidden_fields = {name: getattr(learner.replay, name) for name in ("current_episode", "running", "segments")}
     unhidden, n_seeds = jax.tree.map(jnp.copy, hidden_fields), len(learner.n_learned)
-    n_hidden = jax.vmap(partial(_count_held_out, window=config.credit_window))(by_payment(learner.replay))
+    n_hidden = jax.vmap(partial(_count_held_out, window=config.credit_window))(segments_as_episodes(learner.replay))
     compute_error = jit_over_seeds(jax.vmap(partial(_held_out_error, config=config)), config.n_devices)
     best_decoders, best_error = jax.tree.map(jnp.copy, learner.decoders), np.full(n_seeds, np.inf)
     rounds_without_gain = np.zeros(n_seeds, int)
@@ -106,7 +109,7 @@ def fit_until_converged(
 
 def _count_held_out(replay: Replay, window: int) -> Int[Array, " envs"]:
     """Return how many of each environment's newest episodes are held out: a fifth of all, from the last environments first."""
-    available = n_finished(replay)
+    available = n_stored_episodes(replay)
     count = jnp.minimum(jnp.sum(available) // 5, window)
     in_later_envs = jnp.cumsum(available[::-1])[::-1] - available
     return jnp.clip(count - in_later_envs, 0, available)
@@ -117,12 +120,12 @@ def _held_out_error(
 ) -> Float[Array, ""]:
     """Return the squared error of the returns of held-out episodes, summed over the teams, each in units of its returns."""
     empty = empty_predictions(1, config.credit_window)
-    decoders, replay = tuple(decoder._replace(predictions=empty) for decoder in decoders), by_payment(replay)
+    decoders, replay = tuple(decoder._replace(predictions=empty) for decoder in decoders), segments_as_episodes(replay)
 
     def predict(decoder: DecoderState, episodes: CreditBatch, first: Index) -> DecoderState:
         return returns.predict(decoder, episodes, config.credit)
 
-    decoders = fold_episodes(decoders, replay, replay.episodes - n_hidden, predict, config)
+    decoders = fold_episodes(decoders, replay, replay.current_episode - n_hidden, predict, config)
     errors = [
         squared_errors(decoder.predictions)[0] / root_mean_square(decoder.return_scale) ** 2 for decoder in decoders
     ]

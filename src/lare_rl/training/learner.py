@@ -48,16 +48,16 @@ class Learner(NamedTuple):
     """The state of the algorithm."""
     decoders: tuple[DecoderState, ...]
     """The decoders, one for each team; empty for a method that fits nothing."""
-    scale: tuple[Scale, ...]
+    scales: tuple[Scale, ...]
     """The scale of each team's R/T, for a method that fits nothing. A decoder has its own."""
     replay: Replay
     n_learned: Int[Array, " envs"]
     """Payments of each environment that the decoders have learned from: finished episodes, if each is paid once."""
 
     @property
-    def reward_state(self) -> tuple[RewardSource, ...]:
+    def reward_sources(self) -> tuple[RewardSource, ...]:
         """What the rewards of each team are computed from."""
-        return self.decoders or self.scale
+        return self.decoders or self.scales
 
 
 def init_decoders(keys: Sequence[PRNGKeyArray], config: TrainConfig) -> tuple[DecoderState, ...]:
@@ -74,7 +74,7 @@ def init_learner(key: PRNGKeyArray, config: TrainConfig, init_algorithm: Callabl
     return Learner(
         algorithm=init_algorithm(algorithm_key),
         decoders=decoders,
-        scale=() if decoders else tuple(empty_scale() for _ in config.env.teams),
+        scales=() if decoders else tuple(empty_scale() for _ in config.env.teams),
         replay=empty_replay(config, config.n_envs, config.capacity),
         n_learned=jnp.zeros(config.n_envs, jnp.int32),
     )
@@ -82,7 +82,7 @@ def init_learner(key: PRNGKeyArray, config: TrainConfig, init_algorithm: Callabl
 
 def empty_replay(config: TrainConfig, n_envs: int, capacity: int) -> Replay:
     """Return a replay for steps of these environments, with all that the method reads of them."""
-    with_predictions, with_levels = config.is_exact, config.n_levels > 0
+    with_predictions, with_levels = config.is_exact, config.group is not None
     n_teams = len(config.env.teams)
     return replay.init_replay(config.columns, n_envs, capacity, n_teams, config.payments, with_predictions, with_levels)
 
@@ -119,17 +119,17 @@ def store_with_factors(
     new_steps = jax.tree.map(lambda rows: jnp.swapaxes(rows, 0, 1), new_steps)
     scales = tuple(
         update_scale(scale, new_steps.mean_reward[..., i].ravel(), new_steps.last.ravel())
-        for i, scale in enumerate(learner.scale)
+        for i, scale in enumerate(learner.scales)
     )
     decoders = tuple(_observe(decoder, new_steps, config, i) for i, decoder in enumerate(learner.decoders))
-    return learner._replace(decoders=decoders, scale=scales, replay=buffer)
+    return learner._replace(decoders=decoders, scales=scales, replay=buffer)
 
 
 def _with_history(before: Replay, buffer: Replay, n_steps: int, config: TrainConfig) -> Replay:
     """Return the replay with the history of its newest steps, which `before` does not have yet."""
     last_step = replay.read(before, replay.newest_steps(before, 1))
     new_steps = replay.read(buffer, replay.newest_steps(buffer, n_steps))
-    first = jnp.append(~replay.by_payment(before).running[:, None], new_steps.last[:, :-1], axis=1)
+    first = jnp.append(~replay.segments_as_episodes(before).running[:, None], new_steps.last[:, :-1], axis=1)
     last_history = next_history(last_step.columns["history"][:, 0], tracked_inputs(last_step, config)[:, 0])
     entries = jnp.swapaxes(tracked_inputs(new_steps, config), 0, 1)
     history = scan_history(last_history, entries, jnp.broadcast_to(first.T[..., None], entries.shape[:-1]))
@@ -187,7 +187,7 @@ def with_learned_returns(
     predicted: Float[Array, "*seeds envs episodes teams"] | None,
 ) -> Learner:
     """Return the learner with the results of `learn_returns`."""
-    buffer = replay.replace_payments(learner.replay, predicted_return=predicted)
+    buffer = replay.replace_payment_fields(learner.replay, predicted_return=predicted)
     return learner._replace(decoders=decoders, n_learned=n_learned, replay=buffer)
 
 
@@ -195,5 +195,5 @@ def abandon_episodes(learner: Learner, abandoned: Bool[Array, " envs"]) -> Learn
     """Return the learner without the running episodes of some environments."""
     buffer = abandon_running(learner.replay, abandoned)
     # Payments of these episodes may have been learned from.
-    n_learned = jnp.minimum(learner.n_learned, replay.by_payment(buffer).episodes)
+    n_learned = jnp.minimum(learner.n_learned, replay.segments_as_episodes(buffer).current_episode)
     return learner._replace(replay=buffer, n_learned=n_learned)

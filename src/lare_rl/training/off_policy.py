@@ -84,7 +84,7 @@ def _train_seed(
         if sample.credit is not None:
             decoders, metrics = fit_decoders(decoders, buffer, sample.credit, fit_key, config)
         steps = replay.read(buffer, sample.batch)
-        reward = rewards(steps, decoders or learner.scale, config)
+        reward = rewards(steps, decoders or learner.scales, config)
         batch = _transitions(steps, reward)
         state, algorithm_metrics = algorithm.update(state, batch, key, update_index, settings)
         return (state, decoders), metrics | algorithm_metrics

@@ -76,17 +76,17 @@ def _train_seed(
 
 def _with_predicted_returns(learner: Learner, config: TrainConfig) -> Replay:
     """Return the replay with the sums of proxy rewards of all episodes that end in the newest steps."""
-    buffer = replay.by_payment(learner.replay)
-    since = replay.look_up(buffer.episode, jnp.arange(config.n_envs), buffer.transitions - config.rollout_steps)
+    buffer = replay.segments_as_episodes(learner.replay)
+    since = replay.look_up(buffer.episode, jnp.arange(config.n_envs), buffer.next_transition - config.rollout_steps)
     predicted = predict_returns(learner.decoders, buffer, since, config)
-    return replay.replace_payments(learner.replay, predicted_return=predicted)
+    return replay.replace_payment_fields(learner.replay, predicted_return=predicted)
 
 
 def _rollout(learner: Learner, steps: Trajectory, config: TrainConfig) -> Rollout:
     """Return the newest steps with the method's rewards. Each agent of each environment is one actor of the rollout."""
     buffer = _with_predicted_returns(learner, config) if config.is_exact else learner.replay
     stored = replay.read(buffer, replay.newest_steps(buffer, config.rollout_steps))
-    reward = rewards(stored, learner.reward_state, config)  # [envs time agents]
+    reward = rewards(stored, learner.reward_sources, config)  # [envs time agents]
     n_agents, agents_leave = config.env.n_agents, config.env.agents_leave
 
     def for_each_agent(values: Array) -> Float[Array, "time envs agents"]:

@@ -23,7 +23,7 @@ from lare_rl.algorithms.registry import ALGORITHMS
 from lare_rl.config.validity import CreditContext, check_credit
 from lare_rl.credit.decoder_settings import CreditSettings, default_credit
 from lare_rl.credit.methods import Method, find_method
-from lare_rl.data.replay import StoredSteps, by_payment, mean_length, required_capacity
+from lare_rl.data.replay import StoredSteps, mean_length, required_capacity, segments_as_episodes
 from lare_rl.data.trajectory import Trajectory
 from lare_rl.envs.interface import EnvSpec, Team, Timestep, to_env_action
 from lare_rl.errors import LareError
@@ -204,7 +204,7 @@ def _make_functions(config: TrainConfig, phi: tuple[Graph, ...]) -> PureCredit:
         trajectory = _trajectory(steps, config)
         factors, is_valid = _valid_factors(phi, trajectory, config)
         columns = replay_columns(trajectory, factors, config, is_valid)
-        r_hat = rewards(_stored_steps(state.learner, *columns), state.learner.reward_state, config)
+        r_hat = rewards(_stored_steps(state.learner, *columns), state.learner.reward_sources, config)
         return r_hat if config.env.n_agents > 1 else r_hat[..., 0]
 
     return PureCredit(init, observe, refit, reward)
@@ -263,7 +263,7 @@ def _stored_steps(learner: Learner, columns: dict[str, Any], next_columns: dict[
         last=jnp.zeros(lead, bool),
         residual=None,
         level=None,
-        length=jnp.broadcast_to(mean_length(by_payment(learner.replay)), lead),
+        length=jnp.broadcast_to(mean_length(segments_as_episodes(learner.replay)), lead),
     )
 
 
@@ -301,6 +301,6 @@ def _refit(learner: Learner, key: PRNGKeyArray, learn_returns: Callable[..., Any
     learner = learner._replace(decoders=decoders, n_learned=n_learned)
     if not config.method.uses_gradient:
         return learner
-    has_episode = jnp.any(by_payment(learner.replay).episodes > 0)
+    has_episode = jnp.any(segments_as_episodes(learner.replay).current_episode > 0)
     fitted = jax.lax.cond(has_episode, lambda: fit_repeatedly(learner, key, config)[0], lambda: learner.decoders)
     return learner._replace(decoders=fitted)

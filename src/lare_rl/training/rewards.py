@@ -18,31 +18,31 @@ __all__ = ["assess", "rewards", "team_metrics", "team_proxy_rewards"]
 
 
 def rewards(
-    steps: StoredSteps, sources: tuple[RewardSource, ...], config: TrainConfig
+    steps: StoredSteps, reward_sources: tuple[RewardSource, ...], config: TrainConfig
 ) -> Float[Array, "*batch agents"]:
-    """Return the rewards that the algorithm is trained on, for each agent, by `Learner.reward_state`."""
+    """Return the rewards that the algorithm is trained on, for each agent, by `Learner.reward_sources`."""
     alive = alive_agents(steps, config)
     team_rewards = []
     for i, team in enumerate(config.env.teams):
         team_alive = alive[..., team.agents]
         if config.method.has_proxy_rewards:
             batch, spec = step_batch(steps, config, i), config.credit_specs[i]
-            team_rewards.append(engine.training_rewards(sources[i], batch, spec, team_alive))
+            team_rewards.append(engine.training_rewards(reward_sources[i], batch, spec, team_alive))
             continue
         is_dense = config.method.reward is Reward.TRUE
         reward = steps.columns["reward"][..., team.agents] if is_dense else steps.episodic_reward[..., i, None]
         reward = jnp.broadcast_to(reward, team_alive.shape)
-        scale = engine.return_scale(sources[i])
+        scale = engine.return_scale(reward_sources[i])
         team_rewards.append(engine.scale_and_mask(reward, scale, team_alive, scale_rewards=config.scale_rewards))
     return jnp.concatenate(team_rewards, axis=-1)
 
 
 def team_proxy_rewards(
-    steps: StoredSteps, sources: tuple[RewardSource, ...], config: TrainConfig, team_index: int
+    steps: StoredSteps, reward_sources: tuple[RewardSource, ...], config: TrainConfig, team_index: int
 ) -> Float[Array, "*batch rows"]:
     """Return r_hat of a team: one for each of its agents, or one for all if credit goes to whole teams."""
     batch, spec = step_batch(steps, config, team_index), config.credit_specs[team_index]
-    return engine.proxy_rewards(sources[team_index], batch, spec)
+    return engine.proxy_rewards(reward_sources[team_index], batch, spec)
 
 
 def assess(learner: Learner, config: TrainConfig) -> dict[str, Float[Array, ""]]:
@@ -56,13 +56,13 @@ def assess(learner: Learner, config: TrainConfig) -> dict[str, Float[Array, ""]]
     oldest = replay.oldest_transition(buffer)[:, None]
     is_stored = (index.number >= oldest)[..., None]
     steps = replay.read(buffer, index._replace(number=jnp.maximum(index.number, oldest)))
-    alive, state = alive_agents(steps, config), learner.reward_state
+    alive = alive_agents(steps, config)
     metrics = []
     for i, team in enumerate(config.env.teams):
         reward, mask = steps.columns["reward"][..., team.agents], is_stored & alive[..., team.agents]
         if config.team_level:
             reward, mask = team_mean(steps.columns["reward"], alive, team)[..., None], is_stored
-        r_hat = jnp.broadcast_to(team_proxy_rewards(steps, state, config, i), reward.shape)
+        r_hat = jnp.broadcast_to(team_proxy_rewards(steps, learner.reward_sources, config, i), reward.shape)
         last = jnp.broadcast_to(steps.last[..., None], reward.shape)
         metrics.append(
             accuracy.metrics(

@@ -114,8 +114,8 @@ def train_step(
     the longest episode of any seed.
     """
     settings, n_before = _settings(config), learner.algorithm.n_due
-    n_due = jnp.sum(learner.replay.episodes, axis=1) // settings.update_every
-    has_batch = jnp.sum(jax.vmap(replay.n_finished)(learner.replay), axis=1) >= settings.batch_size
+    n_due = jnp.sum(learner.replay.current_episode, axis=1) // settings.update_every
+    has_batch = jnp.sum(jax.vmap(replay.n_stored_episodes)(learner.replay), axis=1) >= settings.batch_size
     n_updates = jnp.where(has_batch, n_due - n_before, 0)
     statistics = jax.vmap(partial(_observe_states, config=config))(learner.algorithm.mixer_statistics, steps)
     learner = learner._replace(algorithm=learner.algorithm._replace(mixer_statistics=statistics, n_due=n_due))
@@ -180,7 +180,7 @@ def _update_seed(
         sample = jax.tree.map(lambda leaf: leaf[0], samples)
         decoders, metrics = fit_decoders(decoders, learner.replay, sample, fit_key, config)
     state, settings = learner.algorithm, _settings(config)
-    batch = _sequences(learner.replay, episodes, n_steps, decoders or learner.scale, state.mixer_statistics, config)
+    batch = _sequences(learner.replay, episodes, n_steps, decoders or learner.scales, state.mixer_statistics, config)
     n_episodes = number * settings.update_every
     copy_target = n_episodes // settings.target_every > (n_episodes - settings.update_every) // settings.target_every
     networks, algorithm_metrics = config.algorithm.load().update(state.networks, batch, copy_target, settings)
@@ -191,7 +191,7 @@ def _sequences(
     buffer: Replay,
     episodes: EpisodeSample,
     n_steps: int,
-    reward_state: tuple[RewardSource, ...],
+    reward_sources: tuple[RewardSource, ...],
     mixer_statistics: RunningMeanStd,
     config: TrainConfig,
 ) -> Sequences:
@@ -200,7 +200,7 @@ def _sequences(
     env = jnp.broadcast_to(episodes.first.env[:, None], step.shape)
     steps = replay.read(buffer, Index(env, episodes.first.number[:, None] + step))
     mask = (jnp.arange(n_steps) < episodes.length[:, None]) * episodes.mask[:, None]
-    reward = rewards(steps, reward_state, config)
+    reward = rewards(steps, reward_sources, config)
 
     def with_last_timestep(name: str) -> Array:
         return jnp.concatenate([steps.columns[name][:, :1], steps.next_columns[name]], axis=1)

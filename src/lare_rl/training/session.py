@@ -66,7 +66,7 @@ class Session:
     latest_metrics: Metrics = field(default_factory=dict)
     """The metrics of the last updates."""
     best: BestPolicy | None = None
-    """The best evaluations so far. None before the first evaluation, and if several teams learn, whose returns depend on each
+    """The best evaluations so far. None before the first evaluation, and always with several teams, whose returns depend on each
     other."""
 
     _unchecked: tuple[Any, Trajectory] | None = None
@@ -210,6 +210,9 @@ class Session:
 
         Returns:
             One line of metrics.jsonl for each seed.
+
+        Raises:
+            LareError: a factor is not finite, an environment fails, or the best policies cannot be written.
         """
         self._check_factors()
         evaluation = self.collector.evaluate(self.actor, self.settings.evaluation_episodes)
@@ -218,6 +221,8 @@ class Session:
         metrics = evaluation.drop_group(self.run.config.task).metrics(self.config.env)
         metrics |= self.functions.assess(self.learner) | self.latest_metrics
         is_last, is_sampled = self.step == self.settings.steps, not self.config.deterministic_evaluation
+        # Only at the end, because it takes as long as the evaluation of sampled actions. Not in JAX, where it would be a program of its own
+        # to compile.
         if is_last and is_sampled and isinstance(self.collector, HostCollector):
             deterministic = self.collector.evaluate(self.actor, self.settings.evaluation_episodes, deterministic=True)
             metrics[DETERMINISTIC_RETURN] = deterministic.returns[..., 0].mean(axis=1)
@@ -273,9 +278,11 @@ class Session:
 
     def close(self) -> None:
         """Close the environments, and finish the last checkpoint. Raises `LareError` if it cannot be written."""
-        self.collector.close()
-        self._threads.shutdown()
-        self.finish_saving()
+        try:
+            self.collector.close()
+        finally:
+            self._threads.shutdown()
+            self.finish_saving()
 
 
 @cache_by_value

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Int
 
-from lare_rl.data.replay import Replay, by_payment, end_of_episode, look_up
+from lare_rl.data.replay import Replay, end_of_episode, look_up, segments_as_episodes
 from lare_rl.envs.interface import EnvSpec, Timestep, to_env_action
 from lare_rl.envs.play import Episode, make_episode
 from lare_rl.errors import LareError
@@ -103,8 +103,8 @@ def _finished_episodes(
     The row after the last one has the final observation.
     """
     row, first = np.asarray(replay.row[env_index]), np.asarray(replay.first[env_index])
-    episode = jnp.arange(int(replay.oldest[env_index]), int(replay.episodes[env_index]))
-    env, payments = jnp.full_like(episode, env_index), by_payment(replay)
+    episode = jnp.arange(int(replay.oldest[env_index]), int(replay.current_episode[env_index]))
+    env, payments = jnp.full_like(episode, env_index), segments_as_episodes(replay)
     ends = end_of_episode(replay, env, episode)
     groups: list[dict[str, np.ndarray]] = [{}] * len(episode)
     if payments.level is not None:

@@ -11,7 +11,7 @@ by a step of Newton's method, which needs the curvature of the likelihood, not o
 import numpy as np
 from jaxtyping import Float, Int
 
-from lare_rl.credit.precisions import NUMPY, TOLERANCE, count_determined
+from lare_rl.credit.precisions import NUMPY, TOLERANCE, count_effective
 from lare_rl.turns.regression import Elimination, GroupSums, PrefixFit, eliminate_groups, sum_up
 
 __all__ = ["fit_logistic", "logistic"]
@@ -66,14 +66,14 @@ def fit_logistic(
             sums = regress()
         solution = np.concatenate([posterior.weight[:-1], posterior.intercept])
         index = sums.problem.group_index
-        size, n_determined, squares = count_determined(NUMPY, index, alpha, solution, posterior.variance)
+        size, n_effective, squares = count_effective(NUMPY, index, alpha, solution, posterior.variance)
         p = np.clip(logistic(eta), 1e-12, 1 - 1e-12)
         log_likelihood = weight @ (y * np.log(p) + (1 - y) * np.log(1 - p))
         log_evidence = log_likelihood + 0.5 * (size @ np.log(alpha) - alpha @ squares - posterior.log_det)
         if abs(log_evidence - previous) <= 10 * TOLERANCE or n_rounds == MAX_ROUNDS:
             return _to_fit(sums.x_mean, mean, posterior)
         previous = log_evidence
-        alpha = np.clip(n_determined / np.maximum(squares, 1e-30), first * WEAKEST, first * STRONGEST)
+        alpha = np.clip(n_effective / np.maximum(squares, 1e-30), first * WEAKEST, first * STRONGEST)
         sums = regress()
 
 

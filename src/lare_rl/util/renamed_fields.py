@@ -21,7 +21,7 @@ _RENAMED_FIELDS = {
     "closed": "closed_form",
     "counted": "n_learned",
     "credit": "decoders",
-    "determined": "n_determined",
+    "determined": "n_effective",
     "deviation": "std",
     "done": "n_due",
     "fitted": "n_fitted",
@@ -29,6 +29,7 @@ _RENAMED_FIELDS = {
     "kept": "hidden_projection",
     "log_deviation": "log_std",
     "memory": "gru",
+    "n_determined": "n_effective",
     "of_mean": "centre_variance",
     "recurrent": "gru",
     "over_agents": "agent_blocks",
@@ -59,7 +60,10 @@ _RENAMED_PATHS = {
     rf"{_NETWORK}\.last(?=\.(weight|bias)$)": r"\1.head",
     rf"{_NETWORK}\.value\.": r"\1.readout.",  # Diaster
     rf"{_NETWORK}\.step\.": r"\1.step_model.",
-    r"(?<!\.replay)\.episodes\b": ".n_episodes",
+    r"^\.replay\.transitions\b": ".replay.next_transition",
+    r"^\.replay((?:\.segments)?)\.episodes\b": r".replay\1.current_episode",
+    r"\.episodes\b": ".n_episodes",
+    r"^\.scale\b": ".scales",
     r"(^|\.algorithm|\.actor)\.(return|observation)s(?=\.(n_rows|mean|sum_squares)$)": r"\1.\2_rms",  # PPO
 }
 """From patterns of old names to new names, in the order in which they are applied."""

@@ -8,6 +8,7 @@ import numpy as np
 from jaxtyping import Float
 
 __all__ = [
+    "FLOAT32_NOISE",
     "Band",
     "column_correlations",
     "correlation",
@@ -22,6 +23,8 @@ __all__ = [
     "wins",
 ]
 
+FLOAT32_NOISE = 1e-6
+"""In float32, a constant may vary by this fraction of its size."""
 CONSTANT = 1e-10
 """Values are taken as equal if the sum of their squared deviations is below this fraction of the sum of their squares."""
 
