@@ -49,7 +49,6 @@ _BAND_NOTE = (
 )
 _OBSERVATIONS = {"before": "before", "after": "after", "both": "before and the observation after"}
 """Texts of the observations that phi reads."""
-_TWO_CORRELATIONS = " Correlations are of its value before, and after."
 _IN_BARS = ("factor", "unknown_factor", "about_factors", "about_shares", "about_states")
 """Findings that the bars show."""
 _SUMMARIES = ("factors_explain", "raw_features_explain")
@@ -214,7 +213,8 @@ def _render_factor_table(
         rows.append((name, label.meaning, label.reads, *numbers, text))
     header = ("factor", "meaning", "entries that it reads", "share", "effect", "correlation with the true reward")
     yield render_table(header, rows, numbers=(3, 4, 5))
-    yield render_note(f"phi scores the observation {_OBSERVATIONS[run.scored_observation]} the step.{_TWO_CORRELATIONS if run.scored_observation == "both" else ""}")
+    two = " Correlations are of the factor before it, and after it." if run.scored_observation == "both" else ""
+    yield render_note(f"phi scores the observation {_OBSERVATIONS[run.scored_observation]} the step.{two}")
 
 
 def _render_agents(run: Run, played: PlayedEpisodes, trust: Sequence[str]) -> Iterable[str]:
