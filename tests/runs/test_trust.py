@@ -5,6 +5,7 @@ import sys
 
 import pytest
 
+import lare_rl
 from helpers import parallel_toy_envs
 from helpers.toy_envs import PHI, toy_spec
 from helpers.untrained_runs import write_changed_run
@@ -151,3 +152,12 @@ def test_module_that_a_new_process_would_not_trust(monkeypatch):
     assert trust.module_to_trust(toy_spec(environment="Pendulum-v1")) is None
     monkeypatch.setenv("LARE_TRUST", "helpers.toy_envs")
     assert trust.module_to_trust(task) is None
+
+
+def test_train_ends_with_a_command_that_can_be_copied(write_run, command, monkeypatch):
+    """A new process trusts only what it is told to."""
+    directory = write_run("helpers.toy_envs:toys/Chase-v0")
+    monkeypatch.setattr(lare_rl, "resume", lambda path, **_: open_run(path))
+    assert command("train", "--resume", directory)[1].endswith(
+        f": LARE_TRUST=helpers.toy_envs lare-rl report {directory}\n"
+    )
