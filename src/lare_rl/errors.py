@@ -35,6 +35,9 @@ MAX_PROBLEMS = 3
 Count = Annotated[int, Field(ge=1)]
 """The type of a field of a checked model: a whole number, 1 or more."""
 
+CLOSE_RATIO = 0.7
+"""A name is close enough to be suggested if difflib's ratio is at least this."""
+
 
 class LareError(Exception):
     """An error that the user can correct.
@@ -73,7 +76,7 @@ def did_you_mean(name: str, known_names: Iterable[str]) -> str:
     names = list(known_names)
     suffixed = [other for other in names if other.endswith(f".{name.lstrip('-')}")]
     containing = [other for other in names if len(name) > 2 and name.lower() in other.lower()]
-    close = suffixed[:1] or difflib.get_close_matches(name, names, n=1) or containing[:1]
+    close = suffixed[:1] or difflib.get_close_matches(name, names, 1, CLOSE_RATIO) or containing[:1]
     return f" (did you mean {close[0]!r}?)" if close else ""
 
 

@@ -15,6 +15,7 @@ FACTORS, RAW_FEATURES = ["speed", "cost"], ["entry 0", "entry 1 (the foot)"]
 BOTH_STATES = ["speed (before)", "speed (after)"]
 WELL_EXPLAINED = {"factors_r2": 0.99, "total_r2": 0.99, "factor_shares": np.array([0.34, 0.65])}
 ONE_VARIES = WELL_EXPLAINED | {"factor_varies": np.array([True, False])}
+CANCELLING = WELL_EXPLAINED | {"slope": np.array([-20.5, 20.1])}
 NO_RESIDUAL = {"residual_correlation": np.zeros(2)}
 
 
@@ -58,18 +59,24 @@ LACKING = NO_RESIDUAL | {"factors_r2": 0.8, "raw_feature_shares": np.array([0.02
 @pytest.mark.parametrize(
     ("changes", "factors", "raw_features", "codes"),
     [
-        ({}, FACTORS, RAW_FEATURES, f"{ABOUT} factor factor high_when_small"),
-        ({}, FACTORS, [], f"{ABOUT} factor factor"),
-        ({"residual_correlation": np.array([0.5, 0])}, FACTORS, RAW_FEATURES, f"{ABOUT} factor factor high_when_large"),
+        ({}, FACTORS, RAW_FEATURES, f"{ABOUT} factor factor about_shares high_when_small"),
+        ({}, FACTORS, [], f"{ABOUT} factor factor about_shares"),
+        (
+            {"residual_correlation": np.array([0.5, 0])},
+            FACTORS,
+            RAW_FEATURES,
+            f"{ABOUT} factor factor about_shares high_when_large",
+        ),
         (NO_RESIDUAL | {"factors_r2": 0.05}, FACTORS, [], "factors_explain phi_explains_little"),
-        (WELL_EXPLAINED, FACTORS, RAW_FEATURES, f"{ABOUT} factor factor"),
-        (LACKING, FACTORS, RAW_FEATURES, f"{ABOUT} factor factor phi_lacks_features"),
-        (WELL_EXPLAINED, BOTH_STATES, [], f"{ABOUT} factor about_states"),
-        (ONE_VARIES, BOTH_STATES, [], f"{ABOUT} factor"),
-        (ONE_VARIES, FACTORS, [], f"{ABOUT} unknown_factor factor"),
+        (WELL_EXPLAINED, FACTORS, RAW_FEATURES, f"{ABOUT} factor factor about_shares"),
+        (LACKING, FACTORS, RAW_FEATURES, f"{ABOUT} factor factor about_shares phi_lacks_features"),
+        (WELL_EXPLAINED, BOTH_STATES, [], f"{ABOUT} factor about_shares about_states"),
+        (CANCELLING, BOTH_STATES, [], f"{ABOUT} factor about_shares"),
+        (ONE_VARIES, BOTH_STATES, [], f"{ABOUT} factor about_shares"),
+        (ONE_VARIES, FACTORS, [], f"{ABOUT} unknown_factor factor about_shares"),
         ({}, [], [], "raw_features_explain"),
         ({"raw_feature_used": np.array([True, False])}, [], RAW_FEATURES, "raw_features_explain unused_raw_features"),
-        (WELL_EXPLAINED | {"raw_feature_used": np.zeros(2, bool)}, FACTORS, [], f"{ABOUT} factor factor"),
+        (WELL_EXPLAINED | {"raw_feature_used": np.zeros(2, bool)}, FACTORS, [], f"{ABOUT} factor factor about_shares"),
         ({"n_episodes": 19}, FACTORS, RAW_FEATURES, ""),
         ({"n_episodes": 20}, [], [], "raw_features_explain"),
         ({"total_r2": np.nan}, FACTORS, RAW_FEATURES, "equal_returns"),
@@ -109,7 +116,7 @@ def test_score_type():
 
 
 def test_factors_are_in_order_of_shares():
-    cost, speed = find({})[2:]
+    cost, speed = find({})[2:4]
     assert (cost.values["name"], cost.values["share"], cost.values["shape"]) == ("cost", 0.65, None)
     assert cost.values["effect"].values == pytest.approx({"slope": 2.0, "std": 0.1})
     assert speed.values["name"] == "speed"
@@ -134,8 +141,10 @@ def test_factor_before_and_after():
     assert values["effect"].values == pytest.approx({"slope": 3.0, "std": 0.02})
     assert values["states"].values["after"].values == pytest.approx({"slope": 2.0, "std": 0.1})
     for slope, cancels in (([-20.5, 20.1], True), ([-0.15, 0.15], False), ([-20.5, 17.0], False)):
-        effect = find(WELL_EXPLAINED | {"slope": np.array(slope)}, BOTH_STATES)[2].values["effect"]
-        assert (effect == Finding("change_pays")) == cancels
+        values = find(WELL_EXPLAINED | {"slope": np.array(slope)}, BOTH_STATES)[2].values
+        assert (values["effect"].code == "change_pays") == (values["states"] is None) == cancels
+    effect = find(CANCELLING, BOTH_STATES)[2].values["effect"]
+    assert effect.values["slope"] == pytest.approx(20.3)
     assert find(ONE_VARIES, BOTH_STATES)[2].values["states"].values["after"] == Finding("equal_means")
 
 

@@ -205,3 +205,11 @@ def test_evaluation_environment_is_for_the_host():
     task = read_task("CN-6").model_copy(update={"evaluation_environment": "particles/CN-6"})
     with pytest.raises(LareError, match="evaluation_environment has no effect on particles/CN-6"):
         load_env_spec(task)
+
+
+@pytest.mark.parametrize(("name", "hint"), [("HalfCheeta-v4", "HalfCheetah-v4"), ("Nope-v0", None)])
+def test_close_names_alone_are_suggested(name, hint):
+    with pytest.raises(LareError) as error:
+        read_task(name)
+    assert ("did you mean" in str(error.value)) == (hint is not None)
+    assert hint is None or f"did you mean {hint!r}" in str(error.value)

@@ -27,6 +27,7 @@ from lare_rl.evaluation.evaluate import (
     evaluate_run,
     gain_over_random,
     measure_random_returns,
+    n_random_episodes,
     play_random,
 )
 from lare_rl.evaluation.policy import load_policy
@@ -162,6 +163,15 @@ def test_random_play_is_bounded(monkeypatch):
     assert numbers == [1, 2, 3]
     monkeypatch.setattr(module, "MAX_RANDOM_PLAY_S", -1.0)
     assert play_random(TASK) == [[]]
+
+
+@pytest.mark.parametrize(
+    ("run_steps", "longest", "n_episodes"), [(50_000, 120, 50), (12_240, 120, 25), (1_000, 1_000, 10), (0, 5, 10)]
+)
+def test_number_of_random_episodes(run_steps, longest, n_episodes):
+    """It follows from numbers of steps, not from a stopwatch."""
+    assert n_random_episodes(run_steps, longest) == n_episodes
+    assert measure_random_returns(TASK, 12).shape == (1, 12)
 
 
 def test_random_returns_of_each_team():

@@ -98,11 +98,28 @@ def test_outcome_values():
     assert reached["std"].values["std"] == pytest.approx(np.sqrt(2))
     assert reached["seeds"].values["n_seeds"] == 2
     assert reached["deterministic"] is None
-    text = render(find(RISING_2, deterministic_return=80.0)["learned"], MESSAGES)
+    text = render(find(RISING_2, deterministic_returns=np.full(2, 80.0))["learned"], MESSAGES)
     for words in ("the most likely action gets 80", "71 ± 1.4", "8,000 steps", "2 seeds", "0 ± 1 in 3 episodes"):
         assert words in text
     assert (baseline["return_"], baseline["std"], baseline["n_episodes"]) == (0, 1, 3)
     assert baseline["initial"].values["returns"] == (3, 4)
+
+
+@pytest.mark.parametrize(
+    ("likeliest", "outcome", "named"),
+    [(30.0, "learned", "deterministic_is_judged"), (-3.0, "not_learned", "deterministic")],
+)
+def test_better_of_sampled_and_most_likely_actions_is_judged(likeliest, outcome, named):
+    """Sampled actions have a final return of 0. Random actions have 0 ± 1/sqrt(3), and an evaluation an error of 2."""
+    findings = find(FLAT - 51, deterministic_returns=np.array([likeliest]), episode_error=2.0)
+    assert next(iter(findings)) == outcome
+    finding = findings[outcome].values["reached"].values["deterministic"]
+    assert (finding.code, finding.values["return_"]) == (named, likeliest)
+
+
+def test_seeds_that_learned_by_most_likely_actions_are_counted():
+    finding = find(FLAT_2, deterministic_returns=np.array([90.0, 0.5]))["some_seeds_learned"]
+    assert finding.values["n_learned"] == 1
 
 
 def test_seeds_that_learned_are_counted():

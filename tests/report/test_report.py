@@ -18,6 +18,7 @@ from helpers.untrained_runs import write_run
 from lare_rl.config.resolve import resolve
 from lare_rl.config.settings import Settings
 from lare_rl.envs.load import load_task
+from lare_rl.evaluation.episode_credit import FactorLabel
 from lare_rl.evaluation.played_episodes import TeamSample
 from lare_rl.evaluation.video import encode_film
 from lare_rl.report import live_page, run_details
@@ -284,3 +285,16 @@ def test_page_fits_phone_and_desktop(runs, tmp_path, width, columns):
     assert int(match[1]) <= width
     assert int(match[2]) >= 11
     assert int(match[3]) == columns
+
+
+def test_factor_of_two_states_has_one_row_and_one_curve(make_run):
+    labels = [FactorLabel(f"f_late ({state})", "late orders", "observation[8]") for state in ("before", "after")]
+    change = Finding("change_pays", {"slope": -2.0})
+    finding = Finding("factor", {"name": "f_late", "share": 0.96, "effect": change, "states": None, "shape": None})
+    run = make_run("a", [1.0], scored_observation="both")
+    table = "".join(run_details._render_factor_table([finding], labels, np.array([0.25, -0.5]), run))
+    assert (table.count("f_late"), table.count("96%")) == (1, 1)
+    assert "0.25 / -0.50" in table
+    curves = "".join(run_details._draw_factors(np.arange(8.0).reshape(4, 2), np.arange(4.0), labels))
+    assert curves.count("<figure>") == 1
+    assert run_details._make_bar(finding, {}).sign == -1

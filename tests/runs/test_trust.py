@@ -5,6 +5,7 @@ import sys
 
 import pytest
 
+import lare_rl
 from helpers import parallel_toy_envs
 from helpers.toy_envs import PHI, toy_spec
 from helpers.untrained_runs import write_changed_run
@@ -106,6 +107,7 @@ def test_report_imports_no_module(write_run, foreign_file, environment):
     page = write_report([directory]).read_text(encoding="utf-8")
     module = environment.removeprefix("pettingzoo/").partition(":")[0]
     assert f"of the module {module}" in page
+    assert "differ from the defaults" not in page  # some defaults are the environment's
     assert module not in {*sys.modules} - modules
 
 
@@ -131,3 +133,31 @@ def test_report_command_names_what_it_omits(write_run, foreign_file, command):
     assert "--out" in messages
     assert (directory / "report.html").read_text() == "complete"
     assert command("report", directory, "--out", directory / "poorer.html")[0] == 0
+
+
+@pytest.mark.parametrize("arguments", [["evaluate"], ["export", "--out", "exported"]])
+def test_foreign_module_is_refused_at_once(write_run, foreign_file, command, monkeypatch, arguments):
+    """Before the imports that take seconds."""
+    directory = write_run("foreign_file:X-v0")
+    monkeypatch.setitem(sys.modules, "lare_rl.runs.directory", None)  # an import of it fails
+    status, _, message = command(arguments[0], directory, *arguments[1:])
+    assert status == 2
+    assert "LARE_TRUST=foreign_file" in message
+
+
+def test_module_that_a_new_process_would_not_trust(monkeypatch):
+    task = toy_spec(environment="helpers.toy_envs:toys/Chase-v0")
+    trust.trust_environment(task)
+    assert trust.module_to_trust(task) == "helpers.toy_envs"
+    assert trust.module_to_trust(toy_spec(environment="Pendulum-v1")) is None
+    monkeypatch.setenv("LARE_TRUST", "helpers.toy_envs")
+    assert trust.module_to_trust(task) is None
+
+
+def test_train_ends_with_a_command_that_can_be_copied(write_run, command, monkeypatch):
+    """A new process trusts only what it is told to."""
+    directory = write_run("helpers.toy_envs:toys/Chase-v0")
+    monkeypatch.setattr(lare_rl, "resume", lambda path, **_: open_run(path))
+    assert command("train", "--resume", directory)[1].endswith(
+        f": LARE_TRUST=helpers.toy_envs lare-rl report {directory}\n"
+    )

@@ -31,8 +31,13 @@ def test_line_per_evaluation(evaluation, line):
     text = io.StringIO()
     terminal = Terminal(Console(file=text))
     terminal.on_start("Task method", 0, 20_000)
+    compiled = metrics(2500, 5.0, **{"critic/loss": 1.0})
+    if "critic/loss" in evaluation[0]:
+        terminal.on_evaluation(compiled)
     terminal.on_evaluation(evaluation)
-    assert text.getvalue().splitlines() == ["Task method: step 0 of 20000", line]
+    first, *between, last = text.getvalue().splitlines()
+    assert (first, last) == ("Task method: step 0 of 20000", line)
+    assert not any("left" in other for other in between)  # that rate includes compiling
 
 
 def test_line_per_minute(monkeypatch):
@@ -41,12 +46,24 @@ def test_line_per_minute(monkeypatch):
     monkeypatch.setattr(time, "monotonic", lambda: float(next(terminal_time)))
     terminal = Terminal(Console(file=text))
     terminal.on_start("Task method", 0, 20_000)  # the clock moves on by 40 s whenever it is read
-    for step in (100, 200, 300, 400):
+    for step in (100, 200, 300):
         terminal.on_step(step)
-    for _ in range(2):
+    for _ in range(4):
         terminal.on_step(400)
-    assert text.getvalue().splitlines()[1:] == [
-        "step   200 of 20000: 2.5 steps/s, 2.2 h left",
-        "step   400 of 20000: 2.5 steps/s, 2.2 h left",
+    assert [line.partition(",")[0] for line in text.getvalue().splitlines()[1:]] == [
+        "step   300 of 20000: 2.5 steps/s",
         "step   400 of 20000: evaluating",
     ]
+
+
+def test_one_line_a_step(monkeypatch):
+    """A minute has passed when an iteration ends, and its evaluation follows."""
+    text, terminal_time = io.StringIO(), itertools.count(0, 35)
+    monkeypatch.setattr(time, "monotonic", lambda: float(next(terminal_time)))
+    terminal = Terminal(Console(file=text))
+    terminal.on_start("Task method", 0, 20_000)
+    for step in (2000, 4000):
+        for _ in range(2):  # when the iteration ends, and during the evaluation
+            terminal.on_step(step)
+        terminal.on_evaluation(metrics(step, 50.0))
+    assert [line.split()[1] for line in text.getvalue().splitlines()[1:]] == ["2000", "4000"]

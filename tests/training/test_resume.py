@@ -173,7 +173,7 @@ def test_extend_equals_longer_run(dense, dense_run, tmp_path, monkeypatch):
 
 def test_extend_refuses_fewer_steps(dense_run, tmp_path):
     run = copy_run(dense_run, tmp_path / "run")
-    with pytest.raises(LareError, match=r"steps = 228.*only be increased"):
+    with pytest.raises(LareError, match=r"steps = 228.*only be increased.*continue"):
         resume_quietly(run, steps=228)
     assert open_run(run.directory).config == run.config
 

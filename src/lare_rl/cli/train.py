@@ -14,6 +14,7 @@ from lare_rl.config.effective import unused_settings
 from lare_rl.config.settings import ResolvedSettings, Settings
 from lare_rl.errors import LareError
 from lare_rl.runs.plan import RunPlan, load_config
+from lare_rl.tasks.trust import TRUST_VARIABLE, module_to_trust
 
 if TYPE_CHECKING:
     from lare_rl.latent.function import LatentFunction
@@ -87,7 +88,9 @@ def train(
         start, directory, run_settings = _prepare(chosen_task, settings, function, out or plan.out, plan)
     listeners = [*_listeners(wandb, mlflow, run_settings), *_live_page(directory, watch)]
     run = start(tensorboard=tensorboard, listeners=listeners)
-    print_line(f"finished {run.directory}; to see it: lare-rl report {run.directory}")
+    module = module_to_trust(run.config.task)
+    trust = f"{TRUST_VARIABLE}={module} " if module else ""
+    print_line(f"finished {run.directory}; to see it: {trust}lare-rl report {run.directory}")
 
 
 def _prepare(

@@ -65,7 +65,8 @@ class _RunSettings(CheckedModel, Generic[Open]):
     (published)."""
     evaluate_every: Count | Open = OPEN
     """Environment steps between two evaluations; one also follows the last step. Each writes a checkpoint, as do five minutes
-    without one. By default 5000 for td3, ddpg and sac, about 10,000 for qmix, 10 iterations for ippo, and 5 for ppo."""
+    without one. By default 5000 for td3, ddpg and sac, about 10,000 for qmix, 10 iterations for ippo, and 5 for
+    ppo. If ippo or ppo would then have fewer than 5 evaluations, they are more frequent; in a short run, every iteration."""
     evaluation_episodes: Count | Open = OPEN
     """Episodes in one evaluation. By default 10; in JAX 50 for ippo and 32 for qmix."""
     capacity: Annotated[int, Field(ge=4)] | Open = OPEN

@@ -11,8 +11,10 @@ from lare_rl.tasks.spec import base_name, entry_meanings
 from lare_rl.util.findings import Finding
 from lare_rl.util.statistics import round_shares
 
-__all__ = ["MESSAGES", "MIN_EXPLAINED_EPISODES", "explanation_findings", "raw_feature_names"]
+__all__ = ["LEGEND_CODES", "MESSAGES", "MIN_EXPLAINED_EPISODES", "explanation_findings", "raw_feature_names"]
 
+LEGEND_CODES = ("about_shares", "about_states")
+"""Findings that explain how to read others. They need to be printed once."""
 MIN_EXPLAINED_EPISODES = 20
 """With fewer episodes, nothing is said."""
 LITTLE_SHARE = 0.1
@@ -84,22 +86,23 @@ MESSAGES = {
         "much alike."
     ),
     "about_factors": (
-        "For each factor: its share of the variation (0%: it does not matter, or its mean hardly differed between episodes, and "
-        "it may still tell steps apart; below 0%: it offsets others), and by how much a step's reward rises with one standard "
-        "deviation of it:"
+        "For each factor: its share of the variation, and by how much a step's reward rises with one standard deviation of it:"
+    ),
+    "about_shares": (
+        "A share of 0%: the factor does not matter, or its mean hardly differed between episodes, and it may still tell steps apart. "
+        "Below 0%: it offsets others."
     ),
     "unknown_factor": "- {name}: {effect}",
     "factor": "- {name}: {share:z.0%}, {effect}{states}{shape}",
     "effect": "{slope:+.3g} ± {std:.1g}",
-    "change_pays": "its change in a step is paid",
+    "change_pays": "its change in a step is paid, {slope:+.3g} for a change by one standard deviation",
     "equal_means": "its mean is the same in all episodes, so returns do not tell what it pays",
     "before_and_after": " (before: {before}; after: {after})",
     "depends_on_factor": " (its effect depends on another factor)",
     "is_curved": " (its effect is curved)",
     "about_states": (
         "In brackets are the parts of the states before and after the step. If their ± are as large as the numbers, the fit cannot "
-        "tell the two apart, and only their sum counts. If they are much larger than their sum, the change of the factor in a step "
-        "is paid."
+        "tell the two apart, and only their sum counts."
     ),
     "phi_lacks_features": (
         "In a fit on factors and raw entries, these entries have the largest shares: {features}. phi may lack a factor that is "
@@ -258,7 +261,8 @@ def _factor_findings(explanation: Explanation, names: Sequence[str], total: floa
     rounded = dict(zip(shares, round_shares(list(shares.values()), total), strict=True))
     order = sorted(indices, key=lambda name: -abs(float(explanation.factor_shares[indices[name]].sum())))
     findings = [_factor(explanation, name, indices[name], varied[name], rounded.get(name, 0.0)) for name in order]
-    if any(len(pair) == 2 and explanation.factor_varies[pair].all() for pair in indices.values()):
+    findings.append(Finding("about_shares"))
+    if any(len(varied[finding.values["name"]]) == 2 and finding.values.get("states") for finding in findings[:-1]):
         findings.append(Finding("about_states"))
     return findings
 
@@ -267,15 +271,15 @@ def _factor(explanation: Explanation, name: str, indices: list[int], varied: lis
     """Report a factor. It has one index, or two: before and after the step. `varied` holds the indices whose values varied."""
     if not varied:
         return Finding("unknown_factor", {"name": name, "effect": Finding("equal_means")})
-    states = None
-    if len(indices) == 2:
+    states, change = None, _change_effect(explanation, varied)
+    if len(indices) == 2 and change is None:
         before, after = (_effect(explanation, [i]) if i in varied else Finding("equal_means") for i in indices)
         states = Finding("before_and_after", {"before": before, "after": after})
     shapes = (_effect_shape(explanation, i) for i in varied)
     values = {
         "name": name,
         "share": share,
-        "effect": Finding("change_pays") if _change_pays(explanation, varied) else _effect(explanation, varied),
+        "effect": change or _effect(explanation, varied),
         "states": states,
         "shape": next((shape for shape in shapes if shape is not None), None),
     }
@@ -299,11 +303,15 @@ def _effect_shape(explanation: Explanation, i: int) -> Finding | None:
     return Finding("is_curved") if explanation.linear_share[i] < STRAIGHT_SHARE else None
 
 
-def _change_pays(explanation: Explanation, indices: list[int]) -> bool:
-    """Return whether the effects before and after a step cancel, so that only the change of the factor matters.
+def _change_effect(explanation: Explanation, indices: list[int]) -> Finding | None:
+    """Report the effect of the change of a factor, if its effects before and after a step cancel. None if they do not.
 
     Their sum says nothing then: it is small, and its sign may come from a difference between the two standard deviations.
     """
+    if len(indices) != 2:
+        return None
     slope, std = explanation.slope[indices], np.sqrt(np.diagonal(explanation.slope_covariance)[indices])
     is_clear = np.all(np.abs(slope) > CLEAR_STDS * std)
-    return bool(len(indices) == 2 and is_clear and abs(slope.sum()) < CANCELLED_FRACTION * np.abs(slope).max())
+    if not is_clear or abs(slope.sum()) >= CANCELLED_FRACTION * np.abs(slope).max():
+        return None
+    return Finding("change_pays", {"slope": float(slope[1] - slope[0]) / 2})

@@ -26,6 +26,7 @@ from lare_rl.training.unroll_host import evaluate_policy_on_host
 from lare_rl.util.statistics import grouped_standard_error, standard_error
 
 __all__ = [
+    "MAX_RANDOM_EPISODES",
     "MIN_RANDOM_EPISODES",
     "RANDOM_EPISODES",
     "evaluate_policy",
@@ -35,6 +36,7 @@ __all__ = [
     "mean_with_error",
     "measure_random_returns",
     "move_evaluations",
+    "n_random_episodes",
     "play_random",
 ]
 
@@ -42,6 +44,8 @@ MAX_OPEN_ENVS = 20
 """Environments of a seed that are open at the same time."""
 RANDOM_EPISODES = 10
 """The default number of episodes with random actions."""
+MAX_RANDOM_EPISODES = 50
+"""The largest number of episodes with random actions that a report plays."""
 MIN_RANDOM_EPISODES = 5
 """Fewer episodes with random actions are played only if these take longer than `MAX_RANDOM_PLAY_S`."""
 RANDOM_PLAY_LIMIT_S, MAX_RANDOM_PLAY_S = 5.0, 120.0
@@ -141,9 +145,15 @@ def mean_with_error(values: Float[np.ndarray, "seeds episodes"]) -> tuple[float,
     return float(values.mean()), grouped_standard_error(values.mean(axis=1), episode_error)
 
 
-def measure_random_returns(task: TaskSpec) -> Float[np.ndarray, "teams episodes"]:
-    """Return the returns of `play_random`."""
-    return np.array([[episode.return_ for episode in episodes] for episodes in play_random(task)])
+def measure_random_returns(task: TaskSpec, n_episodes: int = RANDOM_EPISODES) -> Float[np.ndarray, "teams episodes"]:
+    """Return the returns of `play_random`, whose limit of time rises with the number of episodes."""
+    limit_s = RANDOM_PLAY_LIMIT_S * n_episodes / RANDOM_EPISODES
+    return np.array([[episode.return_ for episode in episodes] for episodes in play_random(task, n_episodes, limit_s)])
+
+
+def n_random_episodes(run_steps: int, longest_episode: int) -> int:
+    """Return how many episodes of random actions are cheap beside a run: together at most a quarter of its steps, from 10 to 50."""
+    return min(max(run_steps // 4 // longest_episode, RANDOM_EPISODES), MAX_RANDOM_EPISODES)
 
 
 def play_random(

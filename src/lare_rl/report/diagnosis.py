@@ -77,9 +77,7 @@ def _outcome(run: RunSummary) -> Finding:
         "std": Finding("std", {"std": std}) if std else None,
         "steps": int(run.steps[-1]),
         "seeds": seeds if run.n_seeds > 1 else None,
-        "deterministic": None
-        if run.deterministic_return is None
-        else Finding("deterministic", {"return_": run.deterministic_return}),
+        "deterministic": _deterministic(run),
     }
     if not len(run.random_returns):
         return Finding("outcome_unknown", {"reached": Finding("reached", reached)})
@@ -95,11 +93,18 @@ def _outcome(run: RunSummary) -> Finding:
         return Finding("learned", values)
     if run.n_seeds_learned:
         return Finding("some_seeds_learned", values | {"n_learned": run.n_seeds_learned, "n_seeds": run.n_seeds})
-    if run.final_return < run.random_mean - CLEAR_ERRORS * run.gain_error:
+    if run.judged_return < run.random_mean - CLEAR_ERRORS * run.gain_error:
         return Finding("worse_than_random", values)
     if run.may_have_learned:
         return Finding("may_beat_initial_policy" if run.beats_random() else "may_beat_random", values)
     return Finding("not_learned", values)
+
+
+def _deterministic(run: RunSummary) -> Finding | None:
+    if run.deterministic_returns is None:
+        return None
+    code = "deterministic_is_judged" if run.judges_deterministic else "deterministic"
+    return Finding(code, {"return_": float(run.deterministic_returns.mean())})
 
 
 def _episodic_comparison(run: RunSummary) -> Finding | None:
@@ -229,7 +234,7 @@ def _needs_baseline(run: RunSummary) -> Finding | None:
         return None
     step, return_ = run.best_evaluation
     best = Finding("best_evaluation", {"step": step, "return_": return_, "directory": run.directory})
-    is_better = return_ - run.final_return > BETTER_FRACTION * (run.final_return - run.random_mean)
+    is_better = return_ - run.judged_return > BETTER_FRACTION * (run.judged_return - run.random_mean)
     return Finding("needs_baseline", {"best": best if is_better else None})
 
 

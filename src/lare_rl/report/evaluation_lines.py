@@ -80,7 +80,8 @@ def compare_actions(run: Run, sampled: Evaluation, likeliest: Evaluation) -> Ite
     for i, role in enumerate(run.config.task.roles):
         gain = mean_with_error((likeliest.returns - sampled.returns)[:, :, i])
         if gain is not None and abs(gain[0]) > CLEAR_ERRORS * gain[1]:
-            verdict = "better: use deterministic=True in load_policy" if gain[0] > 0 else "worse: let the policy sample"
+            better = "better: use `--deterministic` here, and `load_policy(..., deterministic=True)` in Python"
+            verdict = better if gain[0] > 0 else "worse: let the policy sample"
             yield f"{role.name}: the most likely actions are {verdict} ({format_plus_minus(*gain)})"
 
 

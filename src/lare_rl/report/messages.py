@@ -33,6 +33,10 @@ MESSAGES = {
     "not_learned": "{reached}; {baseline}.",
     "reached": "The return is {return_:number}{std} after {steps:,} steps{seeds}{deterministic}",
     "deterministic": ", by sampled actions as in training; the most likely action gets {return_:number}",
+    "deterministic_is_judged": (
+        ", by sampled actions as in training; the most likely action gets {return_:number} and is judged here (`lare-rl evaluate "
+        "--deterministic`)"
+    ),
     "std": " ± {std:std}",
     "over_seeds": " (mean over {n_seeds} seeds)",
     "baseline": "random actions get {return_:number} ± {std:std} in {n_episodes:count episode}{initial}",
@@ -144,7 +148,7 @@ MESSAGES = {
     ),
     "among_agents": ", or how the rewards are divided among the agents, which returns do not show",
     "own_rule": " (a rule of your own can tell: docs/how-to/poor-policies.md)",
-    "evaluate_more": "`lare-rl evaluate {directory} --episodes 50` tells more exactly; then ",
+    "evaluate_more": "run `lare-rl evaluate {directory} --episodes 50`. If it is still unclear, try ",
     "products_need_phi": (
         " If state and action have more than {n_features} entries together, a score that depends on products of them, such as price "
         "times power, needs a phi (`lare-rl prompt`)."

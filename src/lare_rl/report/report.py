@@ -8,7 +8,7 @@ from pathlib import Path
 
 from lare_rl.envs.families import load_env_spec
 from lare_rl.errors import LareError
-from lare_rl.evaluation.evaluate import measure_random_returns
+from lare_rl.evaluation.evaluate import measure_random_returns, n_random_episodes
 from lare_rl.evaluation.played_episodes import PlayedEpisodes, play_run
 from lare_rl.evaluation.video import encode_film, record_frames
 from lare_rl.report.html import render_film, render_fold, render_note, write_page
@@ -109,7 +109,8 @@ def _render_body(reported_runs: Sequence[ReportedRun], film: bool) -> Iterable[s
 def _render_task(runs: Sequence[ReportedRun], film: bool) -> Iterable[str]:
     """Yield the sections on runs of a task."""
     task = runs[0].run.config.task
-    random_returns = measure_random_returns(task)
+    n_random = max(n_random_episodes(reported.last_step, reported.run.config.longest_episode) for reported in runs)
+    random_returns = measure_random_returns(task, n_random)
     summaries = summarise_runs(runs, random_returns)
     all_played = [_play_run(reported.run) for reported in runs]
     filmed = [i for i, reported in enumerate(runs) if film and _can_load(reported.run)][:MAX_FILMS]

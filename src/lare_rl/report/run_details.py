@@ -49,7 +49,7 @@ _BAND_NOTE = (
 )
 _OBSERVATIONS = {"before": "before", "after": "after", "both": "before and the observation after"}
 """Texts of the observations that phi reads."""
-_IN_BARS = ("factor", "unknown_factor", "about_factors", "about_states")
+_IN_BARS = ("factor", "unknown_factor", "about_factors", "about_shares", "about_states")
 """Findings that the bars show."""
 _SUMMARIES = ("factors_explain", "raw_features_explain")
 """Findings that stand above the bars."""
@@ -126,10 +126,12 @@ def _draw_factors(
     factors: Float[np.ndarray, "steps factors"], x: Float[np.ndarray, " steps"], labels: Sequence[FactorLabel]
 ) -> Iterable[str]:
     yield '<div class="figures">'
-    for label, factor in zip(labels, factors.T, strict=True):
-        text = f"{label.name} over the steps of an episode"
+    # The values before a step are those after the previous one, so one curve of a factor is enough.
+    curves = {base_name(label.name): factor for label, factor in zip(labels, factors.T, strict=True)}
+    for name, factor in curves.items():
+        text = f"{name} over the steps of an episode"
         chart = Chart(lines=[Line(x, factor, "c0")], description=text, x_label="step", is_low=True).render()
-        yield f'<figure><figcaption class="title">{escape(label.name)}</figcaption>{chart}</figure>'
+        yield f'<figure><figcaption class="title">{escape(name)}</figcaption>{chart}</figure>'
     yield "</div>"
 
 
@@ -199,18 +201,20 @@ def _render_factor_table(
         return
     values = {finding.values["name"]: finding.values for finding in findings if finding.code == "factor"}
     rows = []
-    for label, correlation in zip(labels, correlations, strict=True):
-        described = values.get(base_name(label.name))
+    for name, label in {base_name(label.name): label for label in labels}.items():
+        described = values.get(name)
         numbers = (
             ("", "")
             if described is None
             else (f"{described['share']:z.0%}", render(described["effect"], explanation_text.MESSAGES))
         )
-        text = "" if np.isnan(correlation) else f"{correlation:.2f}"
-        rows.append((label.name, label.meaning, label.reads, *numbers, text))
+        of_states = [r for other, r in zip(labels, correlations, strict=True) if base_name(other.name) == name]
+        text = " / ".join(f"{r:.2f}" for r in of_states if not np.isnan(r))
+        rows.append((name, label.meaning, label.reads, *numbers, text))
     header = ("factor", "meaning", "entries that it reads", "share", "effect", "correlation with the true reward")
     yield render_table(header, rows, numbers=(3, 4, 5))
-    yield render_note(f"phi scores the observation {_OBSERVATIONS[run.scored_observation]} the step.")
+    two = " Correlations are of the factor before it, and after it." if run.scored_observation == "both" else ""
+    yield render_note(f"phi scores the observation {_OBSERVATIONS[run.scored_observation]} the step.{two}")
 
 
 def _render_agents(run: Run, played: PlayedEpisodes, trust: Sequence[str]) -> Iterable[str]:
@@ -281,9 +285,10 @@ def render_settings(runs: Sequence[ReportedRun]) -> Iterable[str]:
         rows = [
             (key, value)
             for key, value in values.items()
-            if value != defaults.get(key) or key in ("method", "algorithm")
+            if defaults is None or value != defaults.get(key) or key in ("method", "algorithm")
         ]
-        title, header = "Settings that differ from the defaults", ("setting", "value")
+        title = "Settings" if defaults is None else "Settings that differ from the defaults"
+        header = ("setting", "value")
     else:
         keys = dict.fromkeys(key for values in columns.values() for key in values)
         table = {key: [values.get(key, "") for values in columns.values()] for key in keys}
@@ -298,10 +303,11 @@ def render_settings(runs: Sequence[ReportedRun]) -> Iterable[str]:
     yield render_fold("All settings (config.json)", files)
 
 
-def _default_settings(run: Run) -> dict[str, str]:
+def _default_settings(run: Run) -> dict[str, str] | None:
+    """Return the defaults for a run's task. None if its environment, which decides some of them, must not be imported."""
     settings, task = run.config.settings, run.config.task
     if untrusted_module(task) is not None:
-        return {}
+        return None
     defaults = fill_in(Settings(method=settings.method, algorithm=settings.algorithm), task, load_env_spec(task))
     return {key: _to_text(value) for key, value in effective_settings(defaults).items()}
 

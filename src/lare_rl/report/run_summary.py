@@ -110,10 +110,11 @@ class RunSummary:
     """True returns of random actions. Empty if they are unknown."""
     initial_returns: Float[np.ndarray, " seeds"] | None = None
     """The returns of the policies before their first update, or None if they were not evaluated."""
-    deterministic_return: float | None = None
-    """The final return of the most likely actions, or None if the policy does not sample, or it was not measured."""
+    deterministic_returns: Float[np.ndarray, " seeds"] | None = None
+    """The final returns of the most likely actions, or None if the policy does not sample, or they were not measured."""
     episode_error: float = 0.0
-    """The standard error of the mean final return, from episode to episode of the last evaluation."""
+    """The standard error of the mean final return, from episode to episode of the last evaluation. The most likely actions are taken
+    to have the same."""
     episodic_return: float | None = None
     """The final return of another run, which was trained on the return of the episode alone. None without such a run."""
     return_r2: float | None = None
@@ -191,19 +192,35 @@ class RunSummary:
         return max(sample_std(self.random_returns), MIN_ERROR)
 
     @property
+    def judges_deterministic(self) -> bool:
+        """Whether the most likely actions have a higher return than sampled ones. The verdict is then about them."""
+        return self.deterministic_returns is not None and bool(self.deterministic_returns.mean() > self.final_return)
+
+    @property
+    def judged_returns(self) -> Float[np.ndarray, " seeds"]:
+        """The final returns that the verdict is about: those of sampled or of the most likely actions, whichever are higher."""
+        better = self.deterministic_returns if self.judges_deterministic else None
+        return self.returns[:, -1] if better is None else better
+
+    @property
+    def judged_return(self) -> float:
+        return float(finite(self.judged_returns).mean())
+
+    @property
     def gain_error(self) -> float:
-        """The standard error of the difference between the final return and the mean return of random actions."""
-        return max(math.hypot(standard_error(self.random_returns), self.final_error), MIN_ERROR)
+        """The standard error of the difference between the judged return and the mean return of random actions."""
+        error = grouped_standard_error(finite(self.judged_returns), self.episode_error)
+        return max(math.hypot(standard_error(self.random_returns), error), MIN_ERROR)
 
     def beats_random(self, n_errors: int = CLEAR_ERRORS) -> bool:
-        """Return whether the final return exceeds the mean return of random actions by more than `n_errors` standard errors."""
-        return bool(len(self.random_returns) and self.final_return > self.random_mean + n_errors * self.gain_error)
+        """Return whether the judged return exceeds the mean return of random actions by more than `n_errors` standard errors."""
+        return bool(len(self.random_returns) and self.judged_return > self.random_mean + n_errors * self.gain_error)
 
     def beats_initial_policy(self, n_errors: int = CLEAR_ERRORS) -> bool:
         """Return whether the mean gain of the seeds since before training exceeds `n_errors` of its standard errors."""
         if self.initial_returns is None:
             return True
-        gains = self.returns[:, -1] - self.initial_returns
+        gains = self.judged_returns - self.initial_returns
         error = grouped_standard_error(gains, max(math.sqrt(2) * self.episode_error, MIN_ERROR))
         return bool(np.nanmean(gains) > n_errors * error)
 
@@ -224,7 +241,7 @@ class RunSummary:
         if self.initial_returns is not None:
             seed_error = math.sqrt(2 * self.n_seeds) * self.episode_error
             threshold = np.maximum(threshold, self.initial_returns + CLEAR_ERRORS * seed_error)
-        return int(np.sum(self.returns[:, -1] > threshold))
+        return int(np.sum(self.judged_returns > threshold))
 
     @cached_property
     def best_evaluation(self) -> tuple[int, float]:
@@ -265,7 +282,7 @@ def summarise_run(
     if (curve := reported.curve(RETURN)) is None:
         return None
     steps, returns = curve
-    deterministic = reported.curve(DETERMINISTIC_RETURN)
+    deterministic = reported.final_values(DETERMINISTIC_RETURN)
     _, r2s = reported.curve(RETURN_R2) or (None, None)
     run, task, settings = reported.run, reported.run.config.task, reported.run.config.settings
     method = find_method(settings.method)
@@ -277,7 +294,7 @@ def summarise_run(
         # One episode has no deviation, so nothing can be compared with it.
         random_returns=random_returns if len(random_returns) > 1 else np.zeros(0),
         initial_returns=initial_returns if np.isfinite(initial_returns).all() else None,
-        deterministic_return=_last_mean(deterministic[1][:, -1:]) if deterministic else None,
+        deterministic_returns=deterministic if len(deterministic) == len(returns) else None,
         episode_error=_episode_error(reported),
         episodic_return=episodic_return,
         return_r2=None if r2s is None else _last_mean(r2s),

@@ -134,7 +134,10 @@ def extend_run(run: Run, steps: int) -> Run:
     if steps == settings.steps:
         return run
     if steps < settings.steps:
-        raise LareError(f"steps = {steps}: the run is planned for {settings.steps}, which can only be increased")
+        raise LareError(
+            f"steps = {steps}: the run is planned for {settings.steps}, which can only be increased; to continue it as planned, "
+            "leave the steps out"
+        )
     extended = ResolvedSettings(**{**dict(settings), "steps": steps})
     config = run.config.model_copy(update={"settings": extended, "ended_at": (*run.config.ended_at, settings.steps)})
     write_config(run.directory, config)

@@ -10,7 +10,14 @@ from lare_rl.errors import LareError
 from lare_rl.tasks.spec import PETTINGZOO_PREFIX, TaskSpec, split_environment
 from lare_rl.util.variables import read_variable
 
-__all__ = ["TRUST_VARIABLE", "check_trusted", "trust_environment", "trusted_modules", "untrusted_module"]
+__all__ = [
+    "TRUST_VARIABLE",
+    "check_trusted",
+    "module_to_trust",
+    "trust_environment",
+    "trusted_modules",
+    "untrusted_module",
+]
 
 TRUST_VARIABLE = "LARE_TRUST"
 """The environment variable with the modules, separated by commas, that run directories and other files may import."""
@@ -32,15 +39,21 @@ def trusted_modules() -> list[str]:
     return [name.strip() for name in read_variable(TRUST_VARIABLE).split(",")]
 
 
+def module_to_trust(task: TaskSpec) -> str | None:
+    """Return the module of a task's environment that a new process would not import for a report. None if there is none."""
+    module, _ = split_environment(task.environment)
+    return module if module and module not in trusted_modules() else None
+
+
 def untrusted_module(task: TaskSpec) -> str | None:
     """Return the module that a task's environment would import, or whose function it would call.
 
     Return None without such a module, and for one that the user trusts. PettingZoo's environments are made by a function that the
     task names, so this function must be known too. For Gymnasium, it is enough that this process has imported the module.
     """
-    module, _ = split_environment(task.environment)
+    module = module_to_trust(task)
     names = {task.environment, task.evaluation_task.environment}
-    if not module or module in trusted_modules() or names <= _own_environments:
+    if module is None or names <= _own_environments:
         return None
     return None if module in sys.modules and all(map(_makes_environment, names)) else module
 

@@ -12,7 +12,12 @@ from lare_rl.credit import returns
 from lare_rl.credit.decomposition import CreditBatch, level_effects, valid_rows
 from lare_rl.credit.engine import add_to_explanation, explain_returns, init_explanation
 from lare_rl.credit.explanation import Explanation
-from lare_rl.credit.explanation_text import MESSAGES, MIN_EXPLAINED_EPISODES, explanation_findings
+from lare_rl.credit.explanation_text import (
+    LEGEND_CODES,
+    MESSAGES,
+    MIN_EXPLAINED_EPISODES,
+    explanation_findings,
+)
 from lare_rl.credit.methods import METHODS, find_method
 from lare_rl.data.replay import Index, Replay, segments_as_episodes
 from lare_rl.nn.normalise import RunningMeanStd, empty_mean_std, update_mean_std
@@ -58,12 +63,13 @@ def explanation_source(run: Run) -> str:
     return text[:1].upper() + text[1:]
 
 
-def describe_returns(run: Run, learner: Learner, config: TrainConfig) -> list[str]:
-    """Return the explanation of the returns of a run's first seed, in sentences."""
+def describe_returns(run: Run, learner: Learner, config: TrainConfig, legend: bool = True) -> list[str]:
+    """Return the explanation of the returns of a run's first seed, in sentences; with or without how to read it."""
     lines = [
         f"{f'{team.name}: ' if len(run.config.task.roles) > 1 else ''}{render(finding, MESSAGES)}"
         for team, findings in zip(config.env.teams, _find_explanations(run, learner, config), strict=False)
         for finding in findings
+        if legend or finding.code not in LEGEND_CODES
     ]
     source = explanation_source(run)
     return [f"{source}:", *lines] if lines and source else lines

@@ -83,7 +83,7 @@ def run_session(session: Session, listeners: Sequence[Listener], stop: threading
         if len(evaluated_at) == 2:  # the first one compiles the policy
             report(advice.find_slow_evaluations(settings, saved_at - began_at, saved_at - evaluated_at[0]))
         if is_last or not explained:
-            sentences = _explain(session)
+            sentences = _explain(session, legend=not explained)
             say(sentences)
             explained = bool(sentences)
         if is_last:
@@ -126,11 +126,11 @@ def _evaluate(session: Session, rate: float) -> list[dict[str, Any]]:
     return lines
 
 
-def _explain(session: Session) -> list[str]:
+def _explain(session: Session, legend: bool) -> list[str]:
     """Describe how well factors explain the returns. It is empty before the first updates and for too few episodes."""
     if session.step < session.settings.warmup:
         return []
-    return describe_returns(session.run, session.learner, session.config)
+    return describe_returns(session.run, session.learner, session.config, legend)
 
 
 def _final_findings(run: Run, lines: Sequence[dict[str, Any]]) -> list[Finding]:

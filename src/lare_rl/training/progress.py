@@ -54,8 +54,12 @@ class Terminal(Listener):
         self._progress: Progress | None = None
         self._steps = 0
         self._has_evaluation = False
+        self._has_compiled = False
+        """Whether the updates were compiled before the last evaluation, so that rates do not include it."""
         self._line_step, self._line_time = 0, time.monotonic()
         """Step and time of the last line."""
+        self._due_step: int | None = None
+        """The first step more than a minute after the last line."""
 
     def on_start(self, name: str, step: int, steps: int) -> None:
         self._steps = steps
@@ -79,25 +83,35 @@ class Terminal(Listener):
             if not self._has_evaluation:
                 self._progress.update(self._progress.task_ids[0], figures="before the first evaluation")
         elif (seconds := time.monotonic() - self._line_time) > LINE_S:
-            n_steps, text = step - self._line_step, f"step {step:>{len(str(self._steps))}} of {self._steps}"
-            if n_steps:
-                self.on_message(f"{text}: {n_steps / seconds:.3g} steps/s{self._time_left(step, n_steps / seconds)}")
-            else:
-                self.on_message(f"{text}: evaluating")
-            self._line_step, self._line_time = step, time.monotonic()
+            self._print_minute(step, seconds)
+
+    def _print_minute(self, step: int, seconds: float) -> None:
+        """Print a line at the next step, or after another minute without one. An evaluation that ends before has its own line."""
+        if self._due_step is None:
+            self._due_step = step
+            return
+        n_steps, text = step - self._line_step, f"step {step:>{len(str(self._steps))}} of {self._steps}"
+        if step > self._due_step:
+            self.on_message(f"{text}: {n_steps / seconds:.3g} steps/s{self._time_left(step, n_steps / seconds)}")
+        elif seconds > 2 * LINE_S:
+            self.on_message(f"{text}: evaluating")
+        else:
+            return
+        self._line_step, self._line_time, self._due_step = step, time.monotonic(), None
 
     def on_evaluation(self, metrics: MetricLines) -> None:
-        self._has_evaluation = True
+        self._has_evaluation, self._due_step = True, None
         self._line_step, self._line_time = metrics[0]["step"], time.monotonic()
         if self._progress:
             self._progress.update(self._progress.task_ids[0], figures=_summarise(metrics))
         else:
             step, steps = metrics[0]["step"], self._steps
-            # Updates take most of the time, so the rate before the first one is no estimate.
             is_trained = _mean(metrics, "critic/loss") is not None
-            rate = (_mean(metrics, "time/steps_per_second") or 0.0) if is_trained else 0.0
+            rate = _mean(metrics, "time/steps_per_second") or 0.0 if self._has_compiled else 0.0
+            compiling = " with compiling" if is_trained and not self._has_compiled else ""
+            self._has_compiled |= is_trained
             self.on_message(
-                f"step {step:>{len(str(steps))}} of {steps}: {_summarise(metrics)}{self._time_left(step, rate)}"
+                f"step {step:>{len(str(steps))}} of {steps}: {_summarise(metrics, compiling)}{self._time_left(step, rate)}"
             )
 
     def on_message(self, message: str) -> None:
@@ -124,11 +138,11 @@ _SUMMARY = {
 }
 
 
-def _summarise(metrics: MetricLines) -> str:
-    """Return the main metrics in one line, as means over the seeds."""
+def _summarise(metrics: MetricLines, remark: str = "") -> str:
+    """Return the main metrics in one line, as means over the seeds, with a remark on the rate."""
     means = {template: _mean(metrics, key) for key, template in _SUMMARY.items()}
     texts = [template.format(mean) for template, mean in means.items() if mean is not None]
-    return ", ".join([f"{_mean(metrics, 'time/steps_per_second') or 0:.0f} steps/s", *texts])
+    return ", ".join([f"{_mean(metrics, 'time/steps_per_second') or 0:.0f} steps/s{remark}", *texts])
 
 
 def _mean(metrics: MetricLines, key: str) -> float | None:
