@@ -280,7 +280,7 @@ def fixed_point(
 
 
 def _round(problem: Regression, alpha: Float[Array, " groups"], beta: Float[Array, ""]) -> Posterior:
-    return next_posterior(JAX_BACKEND, problem, alpha, beta, partial(dense_moments, JAX, problem))
+    return next_posterior(JAX_BACKEND, problem, alpha, beta, partial(dense_moments, JAX_BACKEND, problem))
 
 
 class PosteriorCovariance(NamedTuple):
