@@ -208,8 +208,8 @@ def _render_factor_table(
             if described is None
             else (f"{described['share']:z.0%}", render(described["effect"], explanation_text.MESSAGES))
         )
-        of_states = [r for other, r in zip(labels, correlations, strict=True) if base_name(other.name) == name]
-        text = " / ".join(f"{r:.2f}" for r in of_states if not np.isnan(r))
+        both = [r for other, r in zip(labels, correlations, strict=True) if base_name(other.name) == name]
+        text = " / ".join(f"{r:.2f}" for r in both if not np.isnan(r))
         rows.append((name, label.meaning, label.reads, *numbers, text))
     header = ("factor", "meaning", "entries that it reads", "share", "effect", "correlation with the true reward")
     yield render_table(header, rows, numbers=(3, 4, 5))
