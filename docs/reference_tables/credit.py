@@ -42,7 +42,6 @@ FAMILIES = {
 
 UNMEASURED = (
     "rudder",
-    "grd",
     "rbt",
     "tar2",
     "lare-bayes-history",
