@@ -118,7 +118,7 @@ def fit(state: LogOddsFit, group_index: Int[np.ndarray, " columns"], max_rounds:
     squares = jnp.sum(jnp.where(valid[:, None], x - jnp.sum(x, axis=0) / n_episodes, 0) ** 2, axis=0)
     is_used = varies(squares / n_episodes, jnp.sum(x**2) / (n_episodes * x.shape[1]))
     x = jnp.where(is_used, x, 0)
-    trace = JAX.group_sums(jnp.where(is_used, squares, 0), group_index, n_groups)
+    trace = JAX_BACKEND.group_sums(jnp.where(is_used, squares, 0), group_index, n_groups)
     # By this alpha, each group changes the log odds of an episode by about 1.
     equal_alpha = jnp.where(trace > 0, n_groups * trace / n_episodes, 1)
     limits = equal_alpha / PRIOR_RANGE, equal_alpha * PRIOR_RANGE
