@@ -2,6 +2,7 @@
 
 import json
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
@@ -134,7 +135,7 @@ def trained(monkeypatch):
 
     def record(task, settings, **options):
         calls.append((task, settings, options))
-        return type("Run", (), {"directory": options["out"]})
+        return SimpleNamespace(directory=options["out"], config=SimpleNamespace(task=toy_spec()))
 
     monkeypatch.setattr(lare_rl, "train", record, raising=False)
     return calls
