@@ -35,7 +35,7 @@ MAX_PROBLEMS = 3
 Count = Annotated[int, Field(ge=1)]
 """The type of a field of a checked model: a whole number, 1 or more."""
 
-CLOSE_RATIO = 0.7
+CLOSE_RATIO = 0.65
 """A name is close enough to be suggested if difflib's ratio is at least this."""
 
 

@@ -207,8 +207,8 @@ def dtype_kind(dtype: Any) -> NumberKind:
 
 
 def dtype_name(dtype: Any) -> str:
-    """Return the name of a type without np.: a string such as "float32", or a symbol such as np.float32. Else an empty text."""
-    return str(dtype).removeprefix("np.") if isinstance(dtype, (str, Symbol)) else ""
+    """Return the name of a type without np.: of a string, a dtype, or a symbol such as np.float32. Else an empty text."""
+    return str(dtype).removeprefix("np.") if isinstance(dtype, (str, Symbol, np.dtype)) else ""
 
 
 def find_hint(name: str) -> str:
