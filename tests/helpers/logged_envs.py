@@ -117,7 +117,7 @@ def check_episodes(credit, envs, use_score=False, atol=0.0):
             rows = [np.concatenate(list(map(flatten, spaces, step))) for step in steps]
             expected.append((score if use_score else sum(step[3] for step in steps), np.stack(rows)))
     stored = [
-        (episode.return_, np.stack([credit.recorded[number] for number in episode.steps.tolist()]))
+        (episode.return_, np.stack([credit.recorded[number] for number in episode.step_ids.tolist()]))
         for episode in credit.store.episodes.values()
     ]
     assert len(stored) == len(expected) > 0

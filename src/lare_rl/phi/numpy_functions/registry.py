@@ -13,6 +13,8 @@ import operator
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
+import numpy as np
+
 from lare_rl.phi.arrays import Array, as_array, elementwise
 from lare_rl.phi.builder import current_builder
 from lare_rl.phi.graph import NumberKind
