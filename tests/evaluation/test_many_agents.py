@@ -20,7 +20,7 @@ from lare_rl.evaluation.policy import load_policy
 from lare_rl.evaluation.video import record_video, render_played
 from lare_rl.report import run_details
 from lare_rl.report.overview import render_learning_curves
-from lare_rl.report.run_summary import ReportedRun
+from lare_rl.report.reported_run import ReportedRun
 from lare_rl.training.collect_device import unroll_on_device
 from lare_rl.training.compiled import training_module
 from lare_rl.training.saved_state import load_actor, load_learner

@@ -26,7 +26,7 @@ from lare_rl.report.html import render_table
 from lare_rl.report.live_page import LivePage
 from lare_rl.report.messages import MESSAGES
 from lare_rl.report.overview import compare_runs, render_learning_curves, sort_runs, summarise_runs
-from lare_rl.report.run_summary import ReportedRun
+from lare_rl.report.reported_run import ReportedRun
 from lare_rl.runs.directory import open_without_functions
 from lare_rl.util.findings import Finding
 

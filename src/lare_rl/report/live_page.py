@@ -10,7 +10,7 @@ from lare_rl.errors import LareError
 from lare_rl.evaluation.evaluate import measure_random_returns
 from lare_rl.report.html import render_note, write_page
 from lare_rl.report.overview import render_learning_curves, render_verdict, summarise_runs
-from lare_rl.report.run_summary import ReportedRun
+from lare_rl.report.reported_run import ReportedRun
 from lare_rl.runs.config_file import read_config
 from lare_rl.runs.directory import open_without_functions
 from lare_rl.training.progress import MetricLines

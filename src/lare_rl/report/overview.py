@@ -12,7 +12,8 @@ from lare_rl.report.charts import N_COLOURS, Chart, Line, draw_legend, format_nu
 from lare_rl.report.diagnosis import CREDIT_CODES, NEXT_CODES, diagnose
 from lare_rl.report.html import render_fold, render_note, render_table, render_tiles
 from lare_rl.report.messages import MESSAGES, WORDS
-from lare_rl.report.run_summary import Curve, ReportedRun, RunSummary, finite, summarise_run
+from lare_rl.report.reported_run import Curve, ReportedRun, finite
+from lare_rl.report.run_summary import RunSummary, summarise_run
 from lare_rl.runs.metric_names import CREDIT_CORRELATION, CREDIT_ERROR, RETURN, RETURN_R2, RETURN_STD
 from lare_rl.tasks.spec import TaskSpec
 from lare_rl.util.durations import format_seconds

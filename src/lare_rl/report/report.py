@@ -23,8 +23,8 @@ from lare_rl.report.overview import (
     sort_runs,
     summarise_runs,
 )
+from lare_rl.report.reported_run import ReportedRun
 from lare_rl.report.run_details import describe_method, render_details, render_settings
-from lare_rl.report.run_summary import ReportedRun
 from lare_rl.runs.checkpoint import STATE_FILE
 from lare_rl.runs.directory import Run, find_run_directories, open_run, open_without_functions
 from lare_rl.tasks.trust import untrusted_module

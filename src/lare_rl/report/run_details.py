@@ -30,7 +30,7 @@ from lare_rl.report.charts import (
     visible_steps,
 )
 from lare_rl.report.html import render_fold, render_function, render_note, render_table
-from lare_rl.report.run_summary import ReportedRun
+from lare_rl.report.reported_run import ReportedRun
 from lare_rl.runs.directory import Run, function_paths
 from lare_rl.tasks.spec import base_name
 from lare_rl.tasks.trust import TRUST_VARIABLE, untrusted_module

@@ -1,0 +1,68 @@
+"""A run in a report: its curves by name."""
+
+import math
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+
+from lare_rl.runs.directory import Run
+from lare_rl.runs.metric_names import RETURN
+
+__all__ = ["Curve", "ReportedRun", "finite"]
+
+Curve = tuple[Float[np.ndarray, " evaluations"], Float[np.ndarray, "seeds evaluations"]]
+"""Steps, and the values that were measured at them."""
+
+
+@dataclass(frozen=True)
+class ReportedRun:
+    """A run under its name in a report. Its metrics are read once."""
+
+    name: str
+    run: Run
+
+    @cached_property
+    def metrics(self) -> list[dict[str, Any]]:
+        """The lines of metrics.jsonl."""
+        return self.run.metrics()
+
+    @property
+    def last_step(self) -> int:
+        """The step of the last evaluation; 0 before the first."""
+        return self.metrics[-1]["step"] if self.metrics else 0
+
+    def curve(self, key: str) -> Curve | None:
+        """Return a metric over the steps, with NaN where it is missing. None if it was never measured."""
+        values = {(x["step"], x["seed"]): x.get(key) for x in self.metrics if x["seed"] in self.run.seeds}
+        if all(value is None for value in values.values()):
+            return None
+        steps = sorted({step for step, _ in values})
+        rows = [[values.get((step, seed)) for step in steps] for seed in self.run.seeds]
+        return np.array(steps, float), np.array(rows, float)
+
+    def final_values(self, key: str) -> Float[np.ndarray, " seeds"]:
+        """Return the values of a metric at the last evaluation, for the seeds for which it is known."""
+        curve = self.curve(key)
+        return np.zeros(0) if curve is None else finite(curve[1][:, -1])
+
+    @property
+    def final_return(self) -> float:
+        """The mean return of the seeds at the last evaluation; -inf if it is unknown."""
+        returns = self.final_values(RETURN)
+        return float(returns.mean()) if len(returns) else -math.inf
+
+    def training_seconds(self) -> float | None:
+        """Return how long the run has trained, by its rate between evaluations. None if that is unknown."""
+        rates = {line["step"]: line.get("time/steps_per_second") for line in self.metrics}
+        if not rates or not all(rates.values()):
+            return None
+        steps = sorted(rates)
+        return sum((step - previous) / rates[step] for previous, step in zip([0, *steps], steps, strict=False))
+
+
+def finite(values: np.ndarray) -> Float[np.ndarray, " values"]:
+    """Return the finite ones of some values."""
+    return values[np.isfinite(values)]
