@@ -90,7 +90,7 @@ COMPARISONS = {
         30_000,
         [f"{TEN_SEEDS}/episodic"],
         [f"{TEN_SEEDS}/dense"],
-        {method: [f"{TEN_SEEDS}/{method}"] for method in ("rrdu", "lrr", "grd")},
+        {method: [f"{TEN_SEEDS}/{method}"] for method in ("rrdu", "lrr", "grd", "rudder")},
         [f"{TEN_SEEDS}/lare-rrdu"],
         [f"{TEN_SEEDS}/lare-bayes"],
         [f"{TEN_SEEDS}/bayes"],

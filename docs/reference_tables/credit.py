@@ -41,7 +41,6 @@ FAMILIES = {
 }
 
 UNMEASURED = (
-    "rudder",
     "rbt",
     "tar2",
     "lare-bayes-history",
