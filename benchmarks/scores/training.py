@@ -28,8 +28,10 @@ import tyro
 import lare_rl
 from lare_rl.compare.bootstrap import estimate, interquartile_mean, probability_of_improvement
 from lare_rl.compare.rank_test import mann_whitney
+from lare_rl.config.resolve import resolve
 from lare_rl.envs.load import read_task
 from lare_rl.runs.directory import open_without_functions
+from lare_rl.sweep.jobs import Job
 from lare_rl.tasks.spec import TaskSpec
 from measure import write
 from scores.environments import corridor_task, level_task
@@ -137,12 +139,6 @@ KINDS: dict[str, Callable[[], Iterator[Row]]] = {
 }
 
 
-def is_finished(directory: Path) -> bool:
-    """Return whether the run has reached its last step. Kept runs have no weights to continue from."""
-    run = open_without_functions(directory)
-    return run.metrics()[-1]["step"] == run.config.settings.steps
-
-
 def mean_returns(directory: Path, after: float) -> list[float]:
     """Return the mean return of each seed's evaluations after this share of the steps."""
     run = open_without_functions(directory)
@@ -174,9 +170,11 @@ def main(
     scores: dict[str, dict[str, list[float]]] = {}
     for row in rows:
         directory = out / kind / row.table.replace(" ", "") / row.label.replace(" ", "")
-        if not (directory / "config.json").exists():
-            lare_rl.train(row.task, lare_rl.Settings(**row.settings, seeds=seeds), out=directory)
-        elif not is_finished(directory):
+        settings = lare_rl.Settings(**row.settings, seeds=seeds)
+        job = Job(directory, row.task, settings, resolve(settings, row.task))
+        if not job.started:
+            lare_rl.train(row.task, settings, out=directory)
+        elif not job.done:
             lare_rl.resume(directory)
         for measure, after in (("late", 0.75), ("area", 0.0)):
             returns = mean_returns(directory, after)

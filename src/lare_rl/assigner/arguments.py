@@ -124,7 +124,7 @@ def to_levels(
     group = [group[row] for row in new.rows.tolist()]
     names = [name for name in dict.fromkeys(group) if name is not None and name not in group_names]
     if len(group_names) + len(names) > MAX_LEVELS:
-        raise LareError(f"there are more than {MAX_LEVELS} groups, of which {names[-1]!r} is one: merge some of them")
+        raise LareError(f"there are more than {MAX_LEVELS} groups, such as {names[-1]!r}: merge some of them")
     group_names |= {name: len(group_names) + i for i, name in enumerate(names)}
     level = np.array([-1 if name is None else group_names[name] for name in group], np.int32)
     if np.any((level < 0) & (new.ended | (not config.payments.only_at_end))):

@@ -53,7 +53,7 @@ class _Curve(NamedTuple):
 def group_results(
     results: Sequence[LearningCurves], metric: str = RETURN, step: int | None = None, average_last_quarter: bool = False
 ) -> list[LabelScores]:
-    """LabelScores results by label.
+    """Group results by label.
 
     Args:
         results: the curves of runs, each with a label: the name of its method in the comparison.

@@ -47,8 +47,8 @@ class CreditSettings(CheckedModel):
     divergence: Annotated[float, Field(ge=0)] = 5e-3
     """VIB: weight of the code's divergence against the squared error of the mean (with `sum_form`: T^2 times as much)."""
     sparsity: tuple[_Weight, _Weight, _Weight, _Weight, _Weight] = (1e-5, 1e-5, 1e-5, 1e-6, 1e-5)
-    """grd: sparsity weights of the causes of the reward in the state and in the action, and of those of an entry of the next
-    state in the other entries, in itself, and in the action."""
+    """grd: sparsity weights of five groups of causes. Of the reward: the state, the action. Of an entry of the next state: the other
+    entries, the entry itself, the action."""
 
 
 MULTI_AGENT_CREDIT = CreditSettings(

@@ -87,7 +87,7 @@ class Budget:
         return f"{timeout_s:.0f} s at most ({format_seconds(self.seconds_left)} are left for all)"
 
     def count_reply(self, usage: Any, messages: Sequence[Message], reply_bytes: int) -> None:
-        """Add the tokens of a request and its reply: those that the server reports as `usage`, or else their bytes.
+        """Add the tokens of a request and its reply. `usage` is what the server reports. Without it, bytes count as tokens.
 
         `reply_bytes` is an upper bound on the tokens of the reply.
         """

@@ -25,7 +25,7 @@ from lare_rl.training.evaluation import Evaluation
 from lare_rl.training.host_policy import init_host_memory, make_policy
 from lare_rl.training.static_config import TrainConfig
 from lare_rl.training.streams import Stream, episode_seed, host_noise, numpy_generator
-from lare_rl.training.unroll_host import add_seed_axis, check_finite, evaluate_policy_on_host
+from lare_rl.training.unroll_host import add_seed_axis, check_actions, evaluate_policy_on_host
 
 __all__ = ["HostCollector", "HostVecEnv", "make_host_collector"]
 
@@ -77,9 +77,9 @@ class HostVecEnv:
                 self._collect_step(policy, noise_t, steps, t)
                 on_step((t + 1) * self._n_envs)
         except LareError:
-            check_finite(steps.action, self._seeds)  # such actions may be the reason
+            check_actions(steps.action, self._seeds)  # such actions may be the reason
             raise
-        check_finite(steps.action, self._seeds)
+        check_actions(steps.action, self._seeds)
         return steps
 
     def _collect_step(

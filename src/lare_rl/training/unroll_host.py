@@ -21,7 +21,7 @@ from lare_rl.training.streams import Stream, episode_seed
 __all__ = [
     "DivergedError",
     "add_seed_axis",
-    "check_finite",
+    "check_actions",
     "evaluate_on_host",
     "evaluate_policy_on_host",
     "record_on_host",
@@ -60,7 +60,7 @@ def unroll_on_host(
     while running.any():
         timestep = jax.tree.map(np.copy, next_timestep)
         action = policy(timestep, episode_start)
-        check_finite(action, seeds)
+        check_actions(action, seeds)
         env_action = to_env_action(action, envs.spec)
         number += 1
         with name_step(number):
@@ -171,7 +171,7 @@ def add_seed_axis(timestep: Timestep, shape: tuple[int, int]) -> Timestep:
     return jax.tree.map(lambda leaf: leaf.reshape(*shape, *leaf.shape[1:]), timestep)
 
 
-def check_finite(action: Float[np.ndarray, "seeds *rest"], seeds: Sequence[int]) -> None:
+def check_actions(action: Float[np.ndarray, "seeds *rest"], seeds: Sequence[int]) -> None:
     """Raise `DivergedError` if the actions of a seed's policy are not finite."""
     for seed, action_of_seed in zip(seeds, action, strict=True):
         if not np.isfinite(action_of_seed).all():
