@@ -253,6 +253,9 @@ def test_verify_with_returns(command, phi, spec_file):
     assert "(before)" not in out
     _, both, _ = command("verify", phi, "--task", spec_file(), "--fit", "30", "--scored-observation", "both")
     assert "before" in both.partition("Fitted to all 30 episodes")[2]
+    levels = spec_file(environment="toys/Levels-v0", group="level")
+    _, grouped, _ = command("verify", phi, "--task", levels, "--fit", "30")
+    assert "by the groups alone" in grouped
 
 
 SAVED_REPLY = to_reply("def evaluation_func(o, a):\n    return [a[:, 0]]")

@@ -3,6 +3,9 @@
     corridor/SCORE       one agent on a line, from -1 to 1, which goes left, stays, or goes right for 40 steps
     levels/CN-6          cooperative navigation whose agents start inside, around or far outside the square of the landmarks
 
+    scores/HalfCheetahScaled-v4     HalfCheetah-v4 with 0.3 of each reward
+    scores/HalfCheetahSmoothed-v4   HalfCheetah-v4 with the mean of the last 10 rewards
+
 In the corridor, a key lies at the left end, and a door at the right end opens only with the key. The scores:
 
     sum       the mean position
@@ -12,8 +15,10 @@ In the corridor, a key lies at the left end, and a door at the right end opens o
     odds      1 with the probability sigmoid(4 mean position - 3), else 0
 """
 
+from collections import deque
 from typing import Any, NamedTuple
 
+import gymnasium
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -155,6 +160,35 @@ class LevelEnv:
         return timestep._replace(measures={"level": level.astype(jnp.float32)})
 
 
+class SmoothedReward(gymnasium.Wrapper):
+    """Pay the mean of the rewards of the last steps."""
+
+    def __init__(self, env: gymnasium.Env, n_steps: int):
+        super().__init__(env)
+        self.rewards: deque[float] = deque(maxlen=n_steps)
+
+    def reset(self, **arguments: Any) -> tuple[Any, dict[str, Any]]:
+        self.rewards.clear()
+        return self.env.reset(**arguments)
+
+    def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
+        observation, reward, terminated, truncated, info = self.env.step(action)
+        self.rewards.append(float(reward))
+        return observation, float(np.mean(self.rewards)), terminated, truncated, info
+
+
+def make_scaled(**arguments: Any) -> gymnasium.Env:
+    return gymnasium.wrappers.TransformReward(
+        gymnasium.make("HalfCheetah-v4", **arguments), lambda reward: 0.3 * reward
+    )
+
+
+def make_smoothed(**arguments: Any) -> gymnasium.Env:
+    return SmoothedReward(gymnasium.make("HalfCheetah-v4", **arguments), 10)
+
+
+gymnasium.register("scores/HalfCheetahScaled-v4", make_scaled)
+gymnasium.register("scores/HalfCheetahSmoothed-v4", make_smoothed)
 register_family("corridor", Corridor, single_agent=True)
 register_family("levels", LevelEnv, score="sum")
 

@@ -11,6 +11,7 @@ Kinds:
 * `groups`: CN-6 in levels.
 * `published`: published methods in the corridor, on CN-6 and on PP-6.
 * `cheetah`: HalfCheetah-v4 paid once, every 50 and every 200 steps.
+* `true-rewards`: HalfCheetah-v4, true rewards as they are, 0.3 of them, and the mean of the last 10.
 * `threshold`: HalfCheetah, paid for steps faster than 2 m/s.
 
 Finished runs in RUNS are not trained again, and stopped ones continue. Kept runs are in `results/scores`: copy them to RUNS first. `late`
@@ -39,7 +40,9 @@ from scores.environments import corridor_task, level_task
 PARTICLE_STEPS = 205_000
 CORRIDOR: dict[str, Any] = {"algorithm": "ppo", "steps": 64_000, "environments": 20, "evaluation_episodes": 100}
 CHEETAH: dict[str, Any] = {"algorithm": "td3", "steps": 30_000, "evaluate_every": 2_500, "evaluation_episodes": 3}
-Kind = Literal["not-a-sum", "binary", "payments", "exact", "groups", "published", "cheetah", "threshold"]
+Kind = Literal[
+    "not-a-sum", "binary", "payments", "exact", "groups", "published", "cheetah", "true-rewards", "threshold"
+]
 
 
 class Row(NamedTuple):
@@ -120,6 +123,15 @@ def cheetah() -> Iterator[Row]:
             yield row(method, period, method, "episodic")
 
 
+def true_rewards() -> Iterator[Row]:
+    for label, variant in (("true", ""), ("0.3 of true", "Scaled"), ("mean of 10", "Smoothed")):
+        task = read_task("HalfCheetah-v4")
+        if variant:
+            keys = {"environment": f"scores/HalfCheetah{variant}-v4", "evaluation_environment": task.environment}
+            task = task.model_copy(update=keys)
+        yield Row("HalfCheetah-v4", label, task, {"method": "dense", **CHEETAH}, is_baseline=label == "true")
+
+
 def threshold() -> Iterator[Row]:
     for method in ("lare-bayes", "lare-bayes-history", "dense", "rrdu"):
         settings = {"method": method, **CHEETAH, "steps": 60_000, "evaluate_every": 5_000}
@@ -135,6 +147,7 @@ KINDS: dict[str, Callable[[], Iterator[Row]]] = {
     "groups": groups,
     "published": published_methods,
     "cheetah": cheetah,
+    "true-rewards": true_rewards,
     "threshold": threshold,
 }
 

@@ -79,6 +79,21 @@ def test_length_r2():
     assert assess_factors(*equal, 3.0 * length, BASIS).length_r2 is None
 
 
+def test_levels_have_intercepts():
+    inputs, alive, returns = sample_episodes("average")
+    level = np.arange(len(returns)) % 3
+    returns = returns + 10.0 * level
+    without, with_levels = (
+        assess_factors(inputs, alive, returns, BASIS, "average", levels) for levels in (None, level)
+    )
+    assert with_levels.r2 > 0.99
+    assert without.r2 < 0.5
+    assert without.level_r2 is None
+    assert 0.8 < with_levels.level_r2 < 0.98
+    noise = assess_factors(inputs, alive, np.random.default_rng(0).normal(size=len(returns)), BASIS, "average", level)
+    assert noise.level_r2 < 0.2
+
+
 def test_agents_that_are_not_alive_are_ignored():
     inputs, alive, _ = sample_episodes(agents=2)
     padded = [np.concatenate([episode, np.full_like(episode[:, :1], 9.0)], axis=1) for episode in inputs]

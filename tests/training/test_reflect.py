@@ -64,6 +64,18 @@ def test_assessment_describes_factors(episodes):
     assert "+1.00 with f_1" in second
 
 
+def test_groups_have_intercepts(episodes):
+    shift = [np.full(20, float(number % 2)) for number in range(N_EPISODES)]
+    grouped = [
+        replace(episode, team_reward=episode.team_reward + shift_t, group=f"level {shift_t[0]:g}")
+        for episode, shift_t in zip(episodes, shift, strict=True)
+    ]
+    assessment = assess(RIGHT, grouped)
+    assert assessment.r2 > 0.98
+    assert 0.5 < assessment.level_r2 < assessment.r2
+    assert assess(RIGHT, episodes).level_r2 is None
+
+
 @pytest.mark.long
 def test_assessment_distinguishes_observations(episodes):
     ranges = assess(WRONG, episodes, toy_spec(scored_observation="both")).ranges

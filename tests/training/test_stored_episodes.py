@@ -42,6 +42,8 @@ def test_groups(small, tmp_path, payments):
     episodes = lare_rl.stored_episodes(run)
     groups = [int(episode["group"]) for episode in episodes]
     assert len(set(groups)) > 1
+    role_episodes = stored_role_episodes(run, run.config.task)
+    assert [episode.group for episode in role_episodes] == groups
     assert groups == [round(40 * float(episode["observations"][0, 1])) for episode in episodes]
 
 

@@ -222,8 +222,11 @@ def _print_assessment(function: "LatentFunction", role: "TaskSpec", episodes: Se
         if assessment.length_r2 is not None:
             length_r2 = format_for_reader(assessment.length_r2, "r2")
             print_line(f"Predicted by the lengths of these episodes alone, without a factor: R² = {length_r2}.")
-        if role.group is not None:
-            print_line("This fit ignores groups. In training, each has an intercept, so R² may be higher there.")
+        if assessment.level_r2 is not None:
+            level_r2 = format_for_reader(assessment.level_r2, "r2")
+            print_line(
+                f"Each group has an intercept in this fit. Predicted by the groups alone, without a factor: R² = {level_r2}."
+            )
         print_line(
             f"Fitted to all {len(episodes)} episodes (shares may be high where R² is low, because these returns were seen):"
         )

@@ -6,9 +6,12 @@ R_hat_k is predicted by a closed-form fit, on the factors alone, to episodes bef
 of the Royal Statistical Society A 147, 1984). The fit is repeated whenever the number of episodes has grown by a twentieth. Returns
 are predicted before a fit sees them, but the factors are standardised over all episodes. R^2 thus allows comparing two functions
 with different numbers of factors.
+
+If episodes belong to levels, each level has an intercept beside the factors, as in training (`closed_form.py`).
 """
 
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from functools import partial
 from itertools import pairwise
 from typing import NamedTuple
@@ -50,6 +53,8 @@ class FactorAssessment(NamedTuple):
     """The standard error of `r2` over the episodes."""
     length_r2: float | None
     """R^2 of predictions from the lengths of the episodes alone. None if all lengths are equal, or if the score is a mean."""
+    level_r2: float | None
+    """R^2 of predictions from the levels alone. None if there are no levels."""
     score_type: ScoreTypeEstimate | None
     """None if the type is given, or if it makes no difference because all episodes have the same length."""
     explanation: Explanation
@@ -61,6 +66,7 @@ def assess_factors(
     returns: Float[np.ndarray, " episodes"],
     basis: Basis,
     score: str | None = None,
+    level: Int[np.ndarray, " episodes"] | None = None,
 ) -> FactorAssessment:
     """Assess the factors of some episodes, which must be in the order in which they were played.
 
@@ -70,27 +76,34 @@ def assess_factors(
         returns: R of each episode.
         basis: the features that are computed from the inputs.
         score: `sum` or `average`, if the type of the score is known, or `binary`, which says nothing about these two.
+        level: the level of each episode, from 0 on, if there are levels.
     """
     length = np.array([len(episode) for episode in inputs])
     lengths_differ = len(set(length)) > 1
     score_types = score_types_to_fit(score or "auto", fixed_length=not lengths_differ, allow_log_odds=False)
     with float64():
         features, step_statistics = mean_features(inputs, alive, basis)
-        predict = partial(predict_returns, returns=returns, length=length, basis=basis)
-        predicted = {score_type: predict(features, score_type=score_type) for score_type in score_types}
+        one_hot = np.zeros((len(returns), 0)) if level is None else np.eye(int(level.max()) + 1)[level]
+        columns, with_levels = np.append(features, one_hot, axis=1), replace(basis, n_levels=one_hot.shape[1])
+        predict = partial(predict_returns, returns=returns, length=length, basis=with_levels)
+        predicted = {score_type: predict(columns, score_type=score_type) for score_type in score_types}
         margin = ROUNDING * np.sum(returns[N_FIRST:] ** 2)
         errors = {key: float(np.sum((returns[N_FIRST:] - values) ** 2) + margin) for key, values in predicted.items()}
         is_average = errors.get(ScoreType.AVERAGE, np.inf) < MAX_ERROR_RATIO * errors.get(ScoreType.SUM, np.inf)
         score_type = ScoreType(int(is_average))
         length_r2 = None
         if score_type is ScoreType.SUM and lengths_differ:
-            length_r2 = r_squared(returns[N_FIRST:], predict(np.zeros_like(features), score_type=ScoreType.SUM))[0]
+            length_r2 = r_squared(returns[N_FIRST:], predict(np.zeros_like(columns), score_type=ScoreType.SUM))[0]
+        level_r2 = None
+        if level is not None:
+            levels_alone = np.append(np.zeros_like(features), one_hot, axis=1)
+            level_r2 = r_squared(returns[N_FIRST:], predict(levels_alone, score_type=score_type))[0]
         explanation = _explain(features, returns, length, step_statistics, score_type, basis=basis)
         explanation = jax.tree.map(np.asarray, explanation)
 
     r2, r2_error = r_squared(returns[N_FIRST:], predicted[score_type])
     estimate = compare_score_types(errors, score_type) if len(score_types) > 1 else None
-    return FactorAssessment(r2, r2_error, length_r2=length_r2, score_type=estimate, explanation=explanation)
+    return FactorAssessment(r2, r2_error, length_r2, level_r2, score_type=estimate, explanation=explanation)
 
 
 def mean_features(
@@ -124,7 +137,7 @@ def _add_episode(
 
 
 def predict_returns(
-    features: Float[np.ndarray, "episodes features"],
+    columns: Float[np.ndarray, "episodes columns"],
     returns: Float[np.ndarray, " episodes"],
     length: Int[np.ndarray, " episodes"],
     basis: Basis,
@@ -132,9 +145,9 @@ def predict_returns(
 ) -> Float[np.ndarray, " later_episodes"]:
     """Return R_hat of all episodes but the first `N_FIRST`, each by a fit to episodes before it. Call this within `float64()`.
 
-    `features` are the means of each episode. Only functions of factors are used.
+    `columns` are the mean features of each episode, and which level it has. Only functions of factors, and levels, are used.
     """
-    features, group_index = features[:, basis.is_factor_feature], basis.group_index[basis.is_factor_feature]
+    features, group_index = columns[:, _is_used(basis)], basis.column_group_index[_is_used(basis)]
     state = evidence.empty_statistics(len(group_index)), evidence.init_posterior(group_index)
     statistics, posterior = jax.tree.map(lambda leaf: leaf.astype(float), state)
     blocks = list(_growing_blocks(len(returns)))
@@ -150,6 +163,10 @@ def predict_returns(
     return np.concatenate(predicted)
 
 
+def _is_used(basis: Basis) -> Bool[np.ndarray, " columns"]:
+    return np.append(basis.is_factor_feature, np.ones(basis.n_levels, bool))
+
+
 @partial(jax.jit, static_argnames="basis")
 def _add_and_fit(
     statistics: SufficientStatistics,
@@ -161,7 +178,7 @@ def _add_and_fit(
     basis: Basis,
 ) -> tuple[SufficientStatistics, Posterior]:
     statistics = evidence.add_episodes(statistics, features, returns, length)
-    group_index = basis.group_index[basis.is_factor_feature]
+    group_index = basis.column_group_index[_is_used(basis)]
     return statistics, evidence.fit(statistics, score_type, group_index, posterior, MAX_EVIDENCE_ROUNDS)
 
 

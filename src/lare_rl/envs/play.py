@@ -64,6 +64,8 @@ class Episode:
     team_reward: Float[np.ndarray, " steps"]
     measures: Mapping[str, float] = field(default_factory=dict)
     """The task's measures, from the last step."""
+    group: str | int | float | None = None
+    """The group of the episode, if the task or the log has groups."""
 
     @property
     def return_(self) -> float:
@@ -135,7 +137,9 @@ def make_episode(
     alive, reward = timestep.alive[:, team.agents], next_timestep.reward[:, team.agents]
     if scope == "state":
         alive, reward = np.ones((len(alive), 1), bool), team_reward[:, None]
-    return Episode(observation, action, next_observation, alive, reward, team_reward, measures or {})
+    measures = measures or {}
+    group = None if role.group is None else measures.get(role.group)
+    return Episode(observation, action, next_observation, alive, reward, team_reward, measures, group)
 
 
 def _stack(timesteps: Sequence[Timestep]) -> Timestep:

@@ -57,6 +57,7 @@ def logged_episodes(source: Any, task: TaskSpec, count: int) -> list[Episode]:
             alive=np.ones((len(episode), 1), bool),
             reward=episode.reward[:, None],
             team_reward=episode.reward,
+            group=episode.group,
         )
         for episode in itertools.islice(complete, count)
     ]

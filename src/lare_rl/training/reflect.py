@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
 from lare_rl.credit.basis import Basis
 from lare_rl.credit.explanation_text import MESSAGES, MIN_EXPLAINED_EPISODES, explanation_findings, raw_feature_names
@@ -88,6 +88,8 @@ class FunctionAssessment(NamedTuple):
     """Its standard error over the episodes."""
     length_r2: float | None
     """R^2 of predictions by the lengths of the episodes alone; None if all lengths are equal."""
+    level_r2: float | None
+    """R^2 of predictions by the groups of the episodes alone; None without groups."""
     sentences: list[str]
     """Sentences for the user; empty if the returns are all the same."""
     ranges: list[str]
@@ -110,7 +112,7 @@ def assess_function(function: LatentFunction, role: TaskSpec, episodes: Sequence
     n_factors = factors[0].shape[-1]
     basis = Basis(n_factors, inputs[0].shape[-1] - n_factors, extended=True)
     alive, returns = [episode.alive for episode in episodes], np.array([episode.return_ for episode in episodes])
-    fit = assess_factors(inputs, alive, returns, basis, role.score)
+    fit = assess_factors(inputs, alive, returns, basis, role.score, _levels(episodes))
     names = function.factor_columns(role.scored_observation)
     observed = select_states(role.scored_observation, "observation", "next_observation")
     sizes = dict.fromkeys(observed, role.observation_size) | {"action": role.action_size}
@@ -121,9 +123,19 @@ def assess_function(function: LatentFunction, role: TaskSpec, episodes: Sequence
         r2=fit.r2,
         r2_error=fit.r2_error,
         length_r2=fit.length_r2,
+        level_r2=fit.level_r2,
         sentences=[render(finding, MESSAGES) for finding in findings],
         ranges=_describe_ranges(names, valid_factors),
     )
+
+
+def _levels(episodes: Sequence[Episode]) -> Int[np.ndarray, " episodes"] | None:
+    """Return the number of each episode's group; None if an episode has no group, or if there is only one group."""
+    groups = [episode.group for episode in episodes]
+    numbers = {group: i for i, group in enumerate(dict.fromkeys(groups))}
+    if None in numbers or len(numbers) < 2:
+        return None
+    return np.array([numbers[group] for group in groups])
 
 
 def _compute_factors(

@@ -1,6 +1,7 @@
 """The episodes that the replay of a run holds: as logs, and for reflection."""
 
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import jax.numpy as jnp
@@ -52,9 +53,10 @@ def stored_episodes(run: Run | str | Path, seed: int | None = None) -> list[Log]
     replay = select_seed(learner.replay, seed_index)
     _check_columns(run, replay, "observation", "action", "reward")
     return [
-        _make_log(_env_columns(replay, env_index), rows, config.env) | group
+        _make_log(_env_columns(replay, env_index), rows, config.env)
+        | ({} if level is None else {"group": np.array(level)})
         for env_index in range(len(replay.row))
-        for rows, group in _finished_episodes(replay, env_index)
+        for rows, level in _finished_episodes(replay, env_index)
     ]
 
 
@@ -79,7 +81,8 @@ def stored_role_episodes(run: Run, role: TaskSpec) -> list[Episode]:
             newest = list(_finished_episodes(replay, env_index))[-n_newest:]
             # The last episodes of each environment were played at about the same time.
             episodes += [
-                (i - len(newest), _make_episode(columns, rows, config.env, role)) for i, (rows, _) in enumerate(newest)
+                (i - len(newest), replace(_make_episode(columns, rows, config.env, role), group=level))
+                for i, (rows, level) in enumerate(newest)
             ]
     return [episode for _, episode in sorted(episodes, key=lambda pair: pair[0])]
 
@@ -95,10 +98,8 @@ def _env_columns(replay: Replay, env_index: int) -> dict[str, np.ndarray]:
     return {name: np.asarray(column[env_index]) for name, column in replay.columns.items()}
 
 
-def _finished_episodes(
-    replay: Replay, env_index: int
-) -> Iterator[tuple[Int[np.ndarray, " steps"], dict[str, np.ndarray]]]:
-    """Yield the rows of the steps of each finished episode, and its group, if there are groups.
+def _finished_episodes(replay: Replay, env_index: int) -> Iterator[tuple[Int[np.ndarray, " steps"], int | None]]:
+    """Yield the rows of the steps of each finished episode, and its level, if there are levels.
 
     The row after the last one has the final observation.
     """
@@ -106,12 +107,11 @@ def _finished_episodes(
     episode = jnp.arange(int(replay.oldest[env_index]), int(replay.current_episode[env_index]))
     env, payments = jnp.full_like(episode, env_index), segments_as_episodes(replay)
     ends = end_of_episode(replay, env, episode)
-    groups: list[dict[str, np.ndarray]] = [{}] * len(episode)
+    levels: list[int | None] = [None] * len(episode)
     if payments.level is not None:
-        levels = look_up(payments.level, env, look_up(payments.episode, env, ends - 1))
-        groups = [{"group": level} for level in np.asarray(levels)]
-    for begin, end, group in zip(first[episode % len(first)], np.asarray(ends), groups, strict=True):
-        yield row[np.arange(begin, end) % len(row)], group
+        levels = look_up(payments.level, env, look_up(payments.episode, env, ends - 1)).tolist()
+    for begin, end, level in zip(first[episode % len(first)], np.asarray(ends), levels, strict=True):
+        yield row[np.arange(begin, end) % len(row)], level
 
 
 def _make_log(columns: Log, rows: Int[np.ndarray, " steps"], env: EnvSpec) -> Log:
