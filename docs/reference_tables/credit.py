@@ -137,9 +137,9 @@ def built_in_tasks_page() -> str:
     specs = [read_task(name) for name in sorted(shipped_tasks(), key=natural_order)]
     lines = [
         "# Built-in tasks",
-        "`lare-rl tasks` lists these names. In parentheses: agents, if there are several; entries of the observation and the action "
-        "that `phi` reads, or of the state and the joint action, if credit goes to the team. Then: recorded replies, which replace a "
-        "language model; `--draw` chooses one.",
+        "`lare-rl tasks` lists these names. In parentheses: agents, if several; entries of the observation and the action that `phi` "
+        "reads, or of the state and the joint action, if credit goes to the team. Then: recorded replies, instead of a language "
+        "model; `--draw` chooses one.",
         "`scored_observation` is `after`"
         + "".join(
             f", `{value}` for {codes(spec.name for spec in specs if spec.scored_observation == value)}"

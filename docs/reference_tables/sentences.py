@@ -37,8 +37,8 @@ def metrics_page() -> str:
     lines += [
         "## Which credit metric to trust",
         "`credit/return_r2` is out of sample, but tests sums over episodes: neither single steps nor the division among agents. It is "
-        "near 1 whatever the features are if returns depend on the length of episodes. `credit/correlation` and `credit/error`, the "
-        "only use of true rewards, are in sample, on the steps of each method's own policy (IPPO: the newest rollout).",
+        "near 1 whatever the features are if returns depend on the length of episodes. `credit/correlation` and `credit/error` are "
+        "the only use of true rewards. They are in sample, on steps of the method's own policy (IPPO: the newest rollout).",
     ]
     return "\n\n".join(lines)
 
@@ -47,8 +47,8 @@ def findings_page() -> str:
     """Return the page about the sentences of reports and of commands."""
     lines = [
         "# Findings",
-        "When a report says what, and the codes of findings in Python. N is a number, a word in italics a name, and … further words. "
-        "Other sentences explain themselves.",
+        "The conditions of a report's sentences, and the codes of findings in Python. N is a number, a word in italics a name, "
+        "… further words.",
         "## The diagnosis of a run",
         "`lare-rl report` begins with at most one sentence of each group. *Final return*: the mean over seeds at the last "
         "evaluation; its standard error is that over seeds or over episodes, whichever is larger. *Usual change*: the median "
@@ -65,7 +65,7 @@ def findings_page() -> str:
 def diagnosis(name: str) -> str:
     """Return the headline of a finding or, if it has none, the first words of its sentence."""
     text = sentence(REPORT.get(f"headline_{name}", REPORT[name]), REPORT)
-    start = " ".join(re.findall(r"(?:`[^`]*`|\S)+", re.sub(r"(?<=\. ).*", "…", text))[:9])
+    start = " ".join(re.findall(r"(?:`[^`]*`|\S)+", re.sub(r"(?<=\. ).*", "…", text))[:8])
     return start if start == text or start.endswith("…") else f"{start} …"
 
 

@@ -41,8 +41,7 @@ class _RunSettings(CheckedModel, Generic[Open]):
     seed: Annotated[int, Field(ge=0, le=MAX_SEED)] = 0
     """The first seed; the others follow it."""
     scored_observation: ScoredObservation | None = None
-    """Overrides the task's key: factors and raw features are computed from the observation before the action, after it, or
-    both."""
+    """Overrides the task's key: which observations factors and raw features are computed from."""
     draw: Annotated[int, Field(ge=0)] = 0
     """The recorded reply that phi comes from (0 to 4); independent of the seed."""
     candidates: Count = N_CANDIDATES
@@ -64,9 +63,9 @@ class _RunSettings(CheckedModel, Generic[Open]):
     """For ippo: the first fit lasts until the held-out error stops falling (held-out, the default), or for fit_updates
     (published)."""
     evaluate_every: Count | Open = OPEN
-    """Environment steps between two evaluations; one also follows the last step. Each writes a checkpoint, as do five minutes
-    without one. By default 5000 for td3, ddpg and sac, about 10,000 for qmix, 10 iterations for ippo, and 5 for
-    ppo. If ippo or ppo would then have fewer than 5 evaluations, they are more frequent; in a short run, every iteration."""
+    """Environment steps between two evaluations; one also follows the last step. By default 5000 for td3, ddpg and sac, about
+    10,000 for qmix, 10 iterations for ippo, and 5 for ppo. If ippo or ppo would then have fewer than 5 evaluations, they are
+    more frequent; in a short run, every iteration."""
     evaluation_episodes: Count | Open = OPEN
     """Episodes in one evaluation. By default 10; in JAX 50 for ippo and 32 for qmix."""
     capacity: Annotated[int, Field(ge=4)] | Open = OPEN
@@ -75,8 +74,8 @@ class _RunSettings(CheckedModel, Generic[Open]):
     scale_rewards: bool = False
     """Divide rewards by the running root mean square of R/T. No effect with ppo and ippo."""
     overlap_collection: bool = False
-    """Collect the next steps on the host while the device updates: faster on a card, with a policy one update older. For
-    algorithms that consume transitions, in an environment on the host."""
+    """Collect the next steps while the device updates: faster on a card, with a policy one update older. For algorithms that
+    consume transitions, in an environment on the host."""
     credit: CreditSettings | Open = OPEN
     """How the decoder is fitted. The algorithm decides each of these settings that is not given."""
 

@@ -35,10 +35,10 @@ class CreditSettings(CheckedModel):
     episodes: Count = 8
     """diaster, rudder, grd and rbt: whole episodes in one update."""
     score: Literal["auto", "sum", "average", "binary"] = "auto"
-    """The score of an episode: a sum over its steps, an average, or binary (won or lost). `auto`: the task's `score` or,
-    without one, whichever of sum and average has predicted returns better."""
+    """The form of the score: `sum`, `average` or `binary`. `auto`: the task's `score` or, without one, whichever of sum and
+    average has predicted returns better."""
     exact: Literal["auto", "no", "last", "spread"] = "auto"
-    """Make the proxy rewards of an episode add up to its return, by a correction of its last step or of all steps. `auto`:
+    """Make proxy rewards add up to the return: correct the `last` step, or `spread` the correction over all steps. `auto`:
     `last` for bayes-progress and lare-bayes-progress, else `no`."""
     encoder: tuple[Count, ...] = (256, 256)
     """Widths of the hidden layers of VIB's encoder."""

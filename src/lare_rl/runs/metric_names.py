@@ -30,11 +30,11 @@ METRIC_GROUPS: dict[str, dict[str, str]] = {
     "All runs": {
         "step": "Environment steps of the seed.",
         "seed": "The seed.",
-        "time/steps_per_second": "Environment steps of a seed per second since the last evaluation, which is included.",
-        RETURN: "Mean true return of the episodes. A team's return is the sum over steps of the mean over its living agents.",
+        "time/steps_per_second": "Environment steps of a seed per second since the last evaluation, this evaluation included.",
+        RETURN: "Mean true return of the episodes; of a team, the sum over steps of the mean over its living agents.",
         RETURN_STD: "Standard deviation of the true return over these episodes (n in the denominator).",
         LENGTH: "Mean length of these episodes (steps).",
-        SUMMED_RETURN: "Many agents: the true rewards, summed over steps and agents of the team.",
+        SUMMED_RETURN: "Many agents: true rewards, summed over the team's steps and agents.",
         DETERMINISTIC_RETURN: "Mean true return of the most likely actions, if the policy samples. On the host, at the last evaluation.",
     },
     "Methods with proxy rewards": {

@@ -107,7 +107,7 @@ class TaskSpec(CheckedModel):
     """Name in commands and of runs."""
     environment: Annotated[str, Field(min_length=1)]
     """A Gymnasium id (`module:id` first imports the module that registers it), another family's name, such as `particles/CN-6`,
-    or `none` for logs only: functions are designed and logs relabelled, but nothing is trained."""
+    or `none` for logs: `design` and `relabel` work, `train` does not."""
     evaluation_environment: str | None = None
     """The environment of evaluations, such as held-out maps, years or demand, with the same module and sizes. Only on the host.
     By default, `environment`."""
@@ -126,27 +126,25 @@ class TaskSpec(CheckedModel):
     max_episode_steps: Annotated[int | None, Field(ge=1)] = None
     """Time limit (steps) of an environment without its own, or of the episodes of logs."""
     score: Literal["sum", "average", "binary"] | None = None
-    """Whether the return of an episode is a sum over its steps; an average or grade that does not grow with its length; or
-    binary, won or lost. By default, training finds which of sum and average predicts returns better."""
+    """The form of an episode's return: a sum over its steps; an average or grade, which does not grow with its length; or binary,
+    won or lost. By default, whichever of sum and average predicts returns better."""
     payments: Literal["end", "nonzero"] | Annotated[StrictInt, Field(ge=1)] = "end"
     """When the environment pays: once, at the end of an episode; with every reward that is not 0; or every so many steps and at
     the end. Rewards between payments are added up."""
     paid_for: Literal["since_last"] | PaidSteps = "since_last"
     """Steps that a payment is for: all since the last payment, or `{ steps = 20 }`, the last 20."""
     group: str | None = None
-    """Key of `info` with the group of an episode, a whole number from 0 to 63: its level, map, weather or demand. Groups have
-    intercepts, so that an easy level does not credit what happens on it."""
+    """Key of `info` with the group of an episode, a whole number from 0 to 63: its level, map, weather or demand. Each group has
+    an intercept, so that an easy level does not credit its steps."""
     measures: tuple[str, ...] = ()
     """Keys of the last step's `info` whose values are averaged and reported beside the return."""
     processes: Literal["auto", "separate"] = "auto"
-    """`separate`: every environment runs in a process of its own, because its simulator allows one simulation in a process.
-    `auto`: also if an unknown package's steps are slow, or a second environment in its process fails, hangs or changes the
-    first."""
+    """`separate`: every environment has a process of its own, for a simulator that allows one in a process. `auto`: only if an
+    unknown package's environment starts or steps slowly, or if a second one in its process fails, hangs or changes it."""
     timeout: Annotated[float, Field(gt=0, allow_inf_nan=False)] = 120.0
     """Time (s) within which an environment in another process must reply; else the run stops with a message."""
     arguments: dict[str, Any] = Field(default_factory=dict)
-    """Keyword arguments of the environment, for families that have them (`pettingzoo/...`, `gymnax/...`, `jumanji/...` and
-    others)."""
+    """Keyword arguments of the environment, for families that take them, such as `pettingzoo/...` and `gymnax/...`."""
     agents: tuple[str, ...] = ()
     """Names of the agents that this file describes, or patterns such as `prey_*`. By default all. For environments whose agents
     have names (`pettingzoo/...`, `jaxmarl/...`)."""

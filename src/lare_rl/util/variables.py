@@ -14,7 +14,7 @@ VARIABLE_GROUPS: dict[str, dict[str, str]] = {
         "LARE_CACHE": "Directory of compiled programs; by default, in the user's cache directory. `off`: none.",
     },
     "Language model": {
-        "OPENAI_API_KEY": "Key of the model. It is sent in the header of requests and written nowhere. A server of your own may need none.",
+        "OPENAI_API_KEY": "Key of the model, sent in the header of requests and written nowhere. Your own server may need none.",
         "OPENAI_BASE_URL": "Address of the model's server, without `--base-url`. By default, OpenAI's.",
     },
     "Simulators": {
