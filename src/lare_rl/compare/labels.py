@@ -71,7 +71,9 @@ def find_differences(runs: Sequence[Run]) -> list[Difference]:
         for values in map(_effective_settings, runs)
         for name in values.keys() - _ignored_settings(values) - {"method"}
     )
-    differing = group_pairs((key[0], pair) for key, pairs in by_setting.items() if len(dict(pairs)) > 1 for pair in pairs)
+    differing = group_pairs(
+        (key[0], pair) for key, pairs in by_setting.items() if len(dict(pairs)) > 1 for pair in pairs
+    )
     differences = [_make_difference(name, pairs) for name, pairs in sorted(differing.items())]
     return differences + _find_function_differences(runs)
 
