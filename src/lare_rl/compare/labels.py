@@ -136,9 +136,10 @@ def _split_by_directory(label: str, runs: Sequence[Run]) -> dict[str, list[Run]]
     """
     paths = [run.directory.resolve() for run in runs]
     common = Path(os.path.commonpath(paths))
-    tails = [path.relative_to(common.parent if common in paths else common).parts for path in paths]
+    root = common.parent if common in paths else common
+    tails = [str(path.relative_to(root)).split(os.sep) for path in paths]
     for depth in range(max(map(len, tails)) + 1):
-        names = [f"{label}, {Path(*tail[:depth])}" if depth else label for tail in tails]
+        names = [f"{label}, {os.sep.join(tail[:depth])}" if depth else label for tail in tails]
         groups = group_pairs(zip(names, runs, strict=True))
         if not any(map(_have_equal_seeds, groups.values())):
             return groups
