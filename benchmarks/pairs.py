@@ -1,4 +1,4 @@
-"""Two groups of kept runs, every run against every run: means, their ratio, won pairs, and the probability of these by chance.
+"""Two groups of kept runs, every run against every run: means, their ratio, won pairs, and p.
 
     python benchmarks/pairs.py DIRECTORY ... --over DIRECTORY ... [--key KEY] [--late]
 
@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 import tyro
 
-from lare_rl.compare.rank_test import mann_whitney, mann_whitney_u
+from lare_rl.compare.rank_test import mann_whitney_u, two_sided_p
 from lare_rl.compare.scores import last_quarter
 from learning_curves import mean_and_spread, read
 
@@ -56,9 +56,8 @@ def main(
         print(f"{mean:,.5g} ± {spread:,.3g} ({', '.join(f'{value:,.5g}' for value in values)})")
     positive = min(np.mean(scores), np.mean(reference)) > 0
     print(f"ratio of the means {np.mean(scores) / np.mean(reference) if positive else math.nan:.3g}, at step {last:,}")
-    more, fewer = mann_whitney([(scores, reference)])
     won, pairs = mann_whitney_u(scores, reference), scores.size * reference.size
-    print(f"{won:g} of {pairs} pairs won; p of this many or more {more:.2g}, of this many or fewer {fewer:.2g}")
+    print(f"{won:g} of {pairs} pairs won; two-sided p {two_sided_p([(scores, reference)]):.2g}")
 
 
 if __name__ == "__main__":

@@ -225,6 +225,7 @@ def test_design(command, tmp_path):
     status, out, err = command("design", "Reacher-v4", "--draw", 1, "--out", "phi")
     assert (status, out) == (2, "")
     assert "phi.py exists" in err
+    assert "--function 'my phi.py'" in command("design", "Reacher-v4", "--candidates", 1, "--out", "my phi.py")[1]
     assert {name: (tmp_path / name).read_bytes() for name in content} == content
     (tmp_path / "phi.json").unlink()
     assert command("design", "Reacher-v4", "--out", "phi.py")[:2] == (2, "")  # not even printed

@@ -177,7 +177,7 @@ def _compare(name: str, runs: Mapping[str, Sequence[Job]]) -> Comparison:
     opened = {label: [open_without_functions(job.directory) for job in jobs] for label, jobs in runs.items()}
     # The task with the proxy is another file, but its evaluations are the same.
     results = [replace(result, task=name, config=None) for result in read_run_results(opened, RETURN)]
-    return compare(results, RETURN)
+    return compare(results)
 
 
 def _play_rules(name: str, n_episodes: int) -> Iterator[tuple[str, str]]:

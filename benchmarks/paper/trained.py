@@ -10,7 +10,7 @@ from lare_rl.compare.comparison import Comparison, compare
 from lare_rl.compare.messages import find_small_samples, to_text
 from lare_rl.compare.rank_test import mann_whitney, mann_whitney_u
 from lare_rl.compare.results import read_run_results
-from lare_rl.compare.scores import LabelScores
+from lare_rl.compare.scores import LabelScores, ScoreChoice
 from lare_rl.envs.families import load_env_spec
 from lare_rl.report import figures
 from lare_rl.runs.directory import Run, open_without_functions
@@ -68,7 +68,8 @@ def make_page(name: str, exhibit: Exhibit, budget: Budget, jobs: Jobs, command: 
     }
     all_runs = [run for task_runs in runs.values() for contender_runs in task_runs.values() for run in contender_runs]
     comparison = {
-        task: compare(read_run_results(task_runs, exhibit.measure), exhibit.measure) for task, task_runs in runs.items()
+        task: compare(read_run_results(task_runs, exhibit.measure), ScoreChoice(exhibit.measure))
+        for task, task_runs in runs.items()
     }
     pictures = {f"{name}-{task}.svg": picture(entry, exhibit) for task, entry in comparison.items()}
     is_lare = exhibit.source == LARE_SOURCE

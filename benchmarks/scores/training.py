@@ -28,7 +28,7 @@ import tyro
 
 import lare_rl
 from lare_rl.compare.bootstrap import estimate, interquartile_mean, probability_of_improvement
-from lare_rl.compare.rank_test import mann_whitney
+from lare_rl.compare.rank_test import two_sided_p
 from lare_rl.config.resolve import resolve
 from lare_rl.envs.load import read_task
 from lare_rl.runs.directory import open_without_functions
@@ -226,7 +226,7 @@ def describe(values: list[float], baseline: list[float] | None) -> dict[str, Any
     if baseline is not None and baseline is not values:
         other = np.array(baseline)[:, None]
         row["above baseline"] = float(probability_of_improvement(array, other))
-        row["p"] = min(mann_whitney([(array[:, 0], other[:, 0])]))
+        row["p"] = two_sided_p([(array[:, 0], other[:, 0])])
     return row
 
 

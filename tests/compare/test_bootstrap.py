@@ -13,7 +13,7 @@ from lare_rl.compare.bootstrap import (
     performance_profile,
     probability_of_improvement,
 )
-from lare_rl.compare.rank_test import mann_whitney
+from lare_rl.compare.rank_test import mann_whitney, two_sided_p
 
 SCORES = np.array([[4.0, 0.5], [2.0, 2.5], [7.0, 1.5], [1.0, 3.0], [9.0, 1.5]])
 BASELINE = np.array([[3.0, 1.5], [2.0, 0.0], [5.0, 2.0]])
@@ -141,6 +141,7 @@ def test_mann_whitney_by_hand():
     assert mann_whitney([(low, high)]) == pytest.approx((1, 1 / 20))
     assert mann_whitney([(high, low), (high, low)])[0] == pytest.approx(1 / 400)
     assert min(mann_whitney([(low, low)])) > 0.5
+    assert (two_sided_p([(low, high)]), two_sided_p([(low, low)])) == (pytest.approx(2 / 20), 1.0)
 
 
 def test_mann_whitney_of_many_seeds():

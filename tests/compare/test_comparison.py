@@ -11,6 +11,7 @@ from lare_rl.compare.bootstrap import Estimate
 from lare_rl.compare.comparison import compare, compare_over_tasks, compare_tasks
 from lare_rl.compare.labels import label_runs
 from lare_rl.compare.results import read_run_results
+from lare_rl.compare.scores import ScoreChoice
 from lare_rl.errors import LareError
 from lare_rl.runs.directory import Run
 from lare_rl.runs.metric_names import RETURN
@@ -75,7 +76,7 @@ def test_tasks_without_common_scale(make_run):
     first, second = compare_over_tasks(comparisons)  # without rrd, which has fewer seeds on one of the tasks
     assert (first.label, first.improvement, first.p_value) == ("dense", None, None)
     assert (second.label, second.n_seeds, second.improvement.value) == ("rd", 3, 1)
-    assert second.p_value == pytest.approx(1 / 400)
+    assert second.p_value == pytest.approx(1 / 200)
     assert compare_over_tasks(compare_tasks(read(runs[:2] + runs[4:]))) == []  # dense is not on Depot
     assert compare_over_tasks(comparisons[:1]) == []
 
@@ -95,25 +96,25 @@ def test_step_and_last_quarter(make_run):
     """The scores at the five evaluations are a fifth, two fifths, ... of the last one."""
     steps = (20, 40, 60, 80, 100)
     runs = [make_run("a", [5.0, 15.0], steps=steps), make_run("b", [10.0, 20.0], method="rd", steps=steps)]
-    assert [row.mean for row in compare(read(runs), average_last_quarter=True).rows] == pytest.approx(
+    assert [row.mean for row in compare(read(runs), ScoreChoice(average_last_quarter=True)).rows] == pytest.approx(
         [9.0, 13.5]
     )  # steps 80 and 100
-    early = compare(read(runs), step=60)
+    early = compare(read(runs), ScoreChoice(step=60))
     assert [row.mean for row in early.rows] == pytest.approx([6.0, 9.0])
     assert list(early.curves["rd"].x) == [20, 40, 60]
     with pytest.raises(LareError, match=r"at step 50; .*20, 40, 60, 80, 100"):
-        compare(read(runs), step=50)
+        compare(read(runs), ScoreChoice(step=50))
 
 
 def test_other_metric(make_run):
     run = make_run("a", [1.0, 3.0])
     lines = [line | {"credit/error": 2 * line["seed"]} for line in run.metrics()]
     (run.directory / "metrics.jsonl").write_text("".join(json.dumps(line) + "\n" for line in lines))
-    assert compare(read([run], "credit/error"), "credit/error").rows[0].mean == 1.0
+    assert compare(read([run], "credit/error"), ScoreChoice("credit/error")).rows[0].mean == 1.0
     lines = [line | ({"credit/error": None} if line["seed"] == 1 else {}) for line in lines]
     (run.directory / "metrics.jsonl").write_text("".join(json.dumps(line) + "\n" for line in lines))
     with pytest.raises(LareError, match="Chase/a has no credit/error of seed 1"):
-        compare(read([run], "credit/error"), "credit/error")
+        compare(read([run], "credit/error"), ScoreChoice("credit/error"))
 
 
 @pytest.mark.parametrize(
@@ -131,8 +132,9 @@ def test_other_metric(make_run):
     ],
 )
 def test_bad_runs(runs, metric, message, make_run):
+    runs = [make_run(name, [1.0, 2.0], task, **settings) for name, task, settings in runs]
     with pytest.raises(LareError, match=message):
-        compare(read([make_run(name, [1.0, 2.0], task, **settings) for name, task, settings in runs], metric), metric)
+        compare(read(runs, metric), ScoreChoice(metric))
 
 
 def test_draw_without_a_seed(make_run):

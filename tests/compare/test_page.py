@@ -13,6 +13,7 @@ from lare_rl.compare.labels import label_runs
 from lare_rl.compare.messages import MESSAGES, find_min_p, find_score_meaning, find_small_samples, to_text
 from lare_rl.compare.page import comparison_table, describe, overall_table, write_comparisons
 from lare_rl.compare.results import read_run_results
+from lare_rl.compare.scores import ScoreChoice
 from lare_rl.errors import LareError
 from lare_rl.runs.metric_names import RETURN
 
@@ -45,7 +46,7 @@ def test_page_of_tasks_without_common_scale(make_run, tmp_path):
         for name, values, method in (("a", low, "dense"), ("b", high, "rd"))
     ]
     comparisons = write_comparisons(read(runs), tmp_path / "page.html")
-    assert overall_table(comparisons) == [("dense (baseline)", "3", "-", "-"), ("rd", "3", "1.000", "0.0025")]
+    assert overall_table(comparisons) == [("dense (baseline)", "3", "-", "-"), ("rd", "3", "1.000", "0.005")]
     page = (tmp_path / "page.html").read_text()
     assert re.findall("<h2>(.*?)</h2>", page) == ["Chase", "Depot", "All tasks"]
     write_comparisons(read([runs[0], runs[3]]), tmp_path / "page.html")
@@ -71,8 +72,8 @@ def test_score_meaning(make_run):
         ({"step": 50}, "on Chase at step 50."),
         ({"average_last_quarter": True}, "on Chase averaged over the evaluations after three quarters of 100 steps"),
     ):
-        assert text in to_text([find_score_meaning(compare(results, **options))])
-    first = replace(compare(results), step=0)
+        assert text in to_text([find_score_meaning(compare(results, ScoreChoice(**options)))])
+    first = replace(compare(results), choice=ScoreChoice(step=0))
     assert "the last" not in to_text([find_score_meaning(first)])
 
 
@@ -90,17 +91,17 @@ def test_comparison_table(make_run):
 
 
 def test_smallest_p(make_run):
-    """Two seeds above two others: one of the six ways to deal four numbers."""
+    """Two seeds above two others, or below them: two of the six ways to deal four numbers."""
     runs = [make_run("a", [1.0, 2.0]), make_run("b", [3.0, 4.0], method="rd"), make_run("c", [0.0, 0.5], method="rrdu")]
     comparison = compare(read(runs))
     _, better, worse = comparison.rows
-    assert (str(better.improvement), better.p_value) == ("1.000", pytest.approx(1 / 6))
-    assert (str(worse.improvement), worse.p_value) == ("0.000", pytest.approx(1 / 6))
+    assert (str(better.improvement), better.p_value) == ("1.000", pytest.approx(1 / 3))
+    assert (str(worse.improvement), worse.p_value) == ("0.000", pytest.approx(1 / 3))
     header, rows = comparison_table(comparison)
-    assert (header[-1], rows[1][-1]) == ("p", "0.17")
+    assert (header[-1], rows[1][-1]) == ("p", "0.33")
     (finding,) = find_min_p(comparison)
-    assert finding.values["p"] == pytest.approx(1 / 6)
-    assert describe(comparison).endswith("p is at least 0.17.")
+    assert finding.values["p"] == pytest.approx(1 / 3)
+    assert describe(comparison).endswith("p is at least 0.33.")
     many = [make_run("d", [1.0, 2, 3, 4]), make_run("e", [1.0, 2, 3, 4], method="rd")]
     assert codes(find_min_p(compare(read(many)))) == []
 

@@ -91,6 +91,8 @@ def test_draws_and_kinds():
     assert (reward.kind, reward.size) == ("reward", 1)
     with pytest.raises(LareError, match=r"no recorded reply.*--model.*--function.*--method bayes"):
         design(toy_spec())
+    with pytest.raises(LareError, match="have 1 or 5 candidates"):
+        design(task, candidates=3)
 
 
 def test_error_goes_back(chase):

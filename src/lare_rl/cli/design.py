@@ -1,5 +1,6 @@
 """The command `design`: a latent function from recorded replies or from a live model."""
 
+import shlex
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -15,7 +16,7 @@ from lare_rl.cli.terminal import (
     LiveOptions,
     Task,
     find_free_path,
-    load_policy,
+    load_playing_policy,
     load_steps,
     print_error,
     print_line,
@@ -34,7 +35,7 @@ if TYPE_CHECKING:
 def design(
     task: Task,
     kind: FunctionKind = "factors",
-    model: str | None = None,
+    model_name: Annotated[str | None, tyro.conf.arg(name="model", metavar="STR")] = None,
     live: Annotated[LiveOptions, tyro.conf.arg(name="")] = DEFAULT_LIVE,
     draw: int = 0,
     candidates: int = 5,
@@ -54,7 +55,7 @@ def design(
     Args:
         task: a shipped name (see `lare-rl tasks`), or the path of a task file.
         kind: what the function returns: several factors, or one reward.
-        model: "recorded" (the shipped recordings, and the default), the path of a recording (.json), or the name of a model
+        model_name: "recorded" (the shipped recordings, and the default), the path of a recording (.json), or the name of a model
             behind an OpenAI-compatible endpoint.
         live: options of a live model.
         draw: which of the shipped recordings answers (0 to 4).
@@ -73,20 +74,20 @@ def design(
     from lare_rl.envs.load import read_task
     from lare_rl.llm.model import RECORDED, recorded_model
 
-    model = RECORDED if model is None else model
-    is_live = model != RECORDED and not model.endswith(".json")
+    model_name = RECORDED if model_name is None else model_name
+    is_live = model_name != RECORDED and not model_name.endswith(".json")
     _check_options(is_live, live, draw, reflect, policy, data)
     _check_files(out, record)
     spec = lare_rl.load_task(task) if data is None else read_task(task)
-    play, steps = load_policy(policy, spec), load_steps(data, spec)
-    path = None if model == RECORDED else Path(model)
-    author = live.open(model) if is_live else recorded_model(spec.name, kind, draw, path)
+    play, steps = load_playing_policy(policy, spec), load_steps(data, spec)
+    path = None if model_name == RECORDED else Path(model_name)
+    model = live.open(model_name) if is_live else recorded_model(spec.name, kind, draw, path)
     common: dict[str, Any] = {"record": record, "on_message": print_progress}
     options: dict[str, Any] = {"candidates": candidates, "pre_verification": pre_verification, "steps": steps, **common}
-    with _after_requests(spec, author, live):
-        function = lare_rl.design(spec, kind, author, **options)
+    with _after_requests(spec, model, live):
+        function = lare_rl.design(spec, kind, model, **options)
         if reflect:
-            function = lare_rl.reflect(function, spec, author, reflect, policy=play, **common)
+            function = lare_rl.reflect(function, spec, model, reflect, policy=play, **common)
     if out is None:
         _print_function(function, find_free_path(Path(f"{spec.name}.py")))
     else:
@@ -94,7 +95,7 @@ def design(
 
 
 @contextmanager
-def _after_requests(spec: "TaskSpec", author: "Model", live: LiveOptions) -> Iterator[None]:
+def _after_requests(spec: "TaskSpec", model: "Model", live: LiveOptions) -> Iterator[None]:
     """Keep the replies of a design that fails, because they were paid for. Print what a live model has cost."""
     from lare_rl.latent.design import DesignError
     from lare_rl.llm.live import LiveModel
@@ -106,18 +107,19 @@ def _after_requests(spec: "TaskSpec", author: "Model", live: LiveOptions) -> Ite
         _save_attempts(error, find_free_path(Path(f"{spec.name}.attempts.json")))
         sys.exit(error.status)
     finally:
-        if isinstance(author, LiveModel) and author.budget.requests_used:
-            print_progress(f"{author.name}: {author.budget.summary(live.price)}")
+        if isinstance(model, LiveModel) and model.budget.requests_used:
+            print_progress(f"{model.name}: {model.budget.summary(live.price)}")
 
 
 def _next_command(task: str, spec: "TaskSpec", out: Path, kind: FunctionKind, data: str | None) -> str:
     """Return what to do with a new function."""
+    task, function = shlex.quote(task), shlex.quote(str(out))
     if spec.team is not None:
-        return f"to train with it: lare-rl train TASK --function {out}, with a --function for each team of TASK"
+        return f"to train with it: lare-rl train TASK --function {function}, with a --function for each team of TASK"
     if data is not None:
-        return f"to use it: lare-rl relabel {data} --task {task} --function {out} --out NEW"
+        return f"to use it: lare-rl relabel {shlex.quote(data)} --task {task} --function {function} --out NEW"
     method = " --method llm-reward" if kind == "reward" else ""
-    return f"to train with it: lare-rl train {task} --function {out}{method}"
+    return f"to train with it: lare-rl train {task} --function {function}{method}"
 
 
 def _check_options(

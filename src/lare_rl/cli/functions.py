@@ -15,7 +15,7 @@ from lare_rl.cli.terminal import (
     EpisodeProgress,
     FunctionKind,
     Task,
-    load_policy,
+    load_playing_policy,
     load_steps,
     print_line,
     print_messages,
@@ -156,7 +156,7 @@ def verify(
     spec = load_task(task) if data is None else read_task(task)
     if scored_observation is not None:
         spec = spec.model_copy(update={"scored_observation": scored_observation})
-    play, role = load_policy(policy, spec), require_role(spec)
+    play, role = load_playing_policy(policy, spec), require_role(spec)
     if changed:
         print_line("note    the source was changed after it was saved: its hash differs")
     if saved_task not in (None, role.name):

@@ -87,12 +87,13 @@ def compare(
     from lare_rl.compare import page
     from lare_rl.compare.collect import collect_results
     from lare_rl.compare.messages import MESSAGES
+    from lare_rl.compare.scores import ScoreChoice
     from lare_rl.util.findings import render
 
     results, findings = collect_results(runs, metric)
     for finding in findings:
         print_progress(render(finding, MESSAGES))
-    comparisons = page.write_comparisons(results, out, metric, findings, at, late)
+    comparisons = page.write_comparisons(results, out, ScoreChoice(metric, at, late), findings)
     for comparison in comparisons:
         if len(comparisons) > 1:
             print_line(f"\n{comparison.tasks[0]}")

@@ -124,7 +124,7 @@ def load_steps(data: str | None, task: "TaskSpec") -> "Steps | None":
     return logged_steps(data, task)
 
 
-def load_policy(run: Path | None, spec: "TaskSpec") -> "Policy | None":
+def load_playing_policy(run: Path | None, spec: "TaskSpec") -> "Policy | None":
     """Load the policy of a run that is to play a task."""
     if run is None:
         return None
@@ -134,7 +134,7 @@ def load_policy(run: Path | None, spec: "TaskSpec") -> "Policy | None":
     opened = open_run(run)
     if opened.config.task.environment != spec.environment:
         raise LareError(f"{run} is a run of {opened.config.task.name}: its policy cannot play {spec.name}")
-    return RunPolicy(opened, 0, best=False)
+    return RunPolicy(opened)
 
 
 def find_free_path(path: Path) -> Path:

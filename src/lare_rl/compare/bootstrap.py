@@ -102,31 +102,31 @@ def bootstrap(function: Callable[..., Float[np.ndarray, "*_"]], *scores: Float[n
 
         x*_nm = x_(i_nm) m,   i_nm uniform in 1 .. N, independent for each run n and task m
 
-    A sample of a learning curve has whole runs: further axes of `scores` share the draws. The draws are always the same.
+    A sample of a learning curve has whole runs: further axes of `scores` share the indices, which are the same in every call.
 
     Args:
         function: one of the statistics above, or a combination of them. The first axis of its arguments is the sample.
-        scores: the runs of each array are drawn independently.
+        scores: the runs of each array are sampled independently.
     """
     random = np.random.RandomState(0)  # NumPy keeps the stream of this generator unchanged
     samples = []
     for start in range(0, REPETITIONS, CHUNK):
-        draws = [_draw_runs(random, scores) for _ in range(min(CHUNK, REPETITIONS - start))]
-        samples.append(function(*map(_take_runs, scores, zip(*draws, strict=True))))
+        indices = [_sample_indices(random, scores) for _ in range(min(CHUNK, REPETITIONS - start))]
+        samples.append(function(*map(_resample, scores, zip(*indices, strict=True))))
     low, high = np.percentile(np.concatenate(samples), PERCENTILES, axis=0)
     return Intervals(function(*(array[None] for array in scores))[0], low, high)
 
 
-def _draw_runs(
+def _sample_indices(
     random: np.random.RandomState, scores: tuple[Float[np.ndarray, "*_"], ...]
 ) -> list[Int[np.ndarray, "_ _"]]:
-    """Draw the indices of as many runs as each array has, on each task."""
+    """Sample the indices of as many runs as each array has, on each task."""
     return [random.randint(array.shape[-2], size=array.shape[-2:]) for array in scores]
 
 
-def _take_runs(
-    scores: Float[np.ndarray, "*batch runs tasks"], draws: tuple[Int[np.ndarray, "runs tasks"], ...]
+def _resample(
+    scores: Float[np.ndarray, "*batch runs tasks"], indices: tuple[Int[np.ndarray, "runs tasks"], ...]
 ) -> Float[np.ndarray, "samples *batch runs tasks"]:
-    index = np.stack(draws)
-    index = index.reshape(len(draws), *(scores.ndim - 2) * [1], *scores.shape[-2:])
+    index = np.stack(indices)
+    index = index.reshape(len(indices), *(scores.ndim - 2) * [1], *scores.shape[-2:])
     return np.take_along_axis(scores[None], index, axis=-2)

@@ -19,9 +19,9 @@ from lare_rl.compare.bootstrap import (
     performance_profile,
     probability_of_improvement,
 )
-from lare_rl.compare.rank_test import mann_whitney
+from lare_rl.compare.rank_test import two_sided_p
 from lare_rl.compare.results import LearningCurves
-from lare_rl.compare.scores import LabelScores, group_results
+from lare_rl.compare.scores import LAST_RETURN, LabelScores, ScoreChoice, group_results
 from lare_rl.evaluation.reference_returns import REFERENCE_RETURNS
 from lare_rl.runs.metric_names import RETURN
 from lare_rl.util.statistics import Band, sample_std
@@ -44,14 +44,11 @@ class Row:
     draw_mean: Estimate | None
     """The mean, its interval over the draws; None for a single draw."""
     difference: Estimate | None
-    """The interquartile mean minus the interquartile mean of the baseline; None for the baseline and for single seeds."""
+    """The difference of the interquartile means to the baseline's; None for the baseline and for single seeds."""
     improvement: Estimate | None
     """Probability that a run scores more than a run of the baseline; None like `difference`."""
     p_value: float | None
-    """Probability that chance wins as many pairs of runs or, if fewer than half were won, loses as many (`mann_whitney`).
-
-    None like `difference`.
-    """
+    """The two-sided p-value of the exact Mann-Whitney test against the baseline. None like `difference`."""
 
 
 @dataclass(frozen=True)
@@ -76,11 +73,7 @@ class Comparison:
     """Share of runs that score more than x, of each label."""
     groups: Mapping[str, LabelScores]
     """The scores, by label."""
-    metric: str
-    step: int | None
-    """The step at which runs are compared; None for the last one that all runs have."""
-    average_last_quarter: bool
-    """Whether scores are means over the last quarter of the steps."""
+    choice: ScoreChoice
 
     @property
     def tasks(self) -> tuple[str, ...]:
@@ -98,18 +91,14 @@ class Comparison:
         return self.groups[self.rows[0].label].steps[-1]
 
 
-def compare(
-    results: Sequence[LearningCurves], metric: str = RETURN, step: int | None = None, average_last_quarter: bool = False
-) -> Comparison:
-    """Compare results by their labels. The first label is the baseline.
-
-    All labels have the same tasks. `step` and `average_last_quarter` choose what a score is (`group_results`).
+def compare(results: Sequence[LearningCurves], choice: ScoreChoice = LAST_RETURN) -> Comparison:
+    """Compare results by their labels. The first label is the baseline. All labels have the same tasks.
 
     Raises:
         LareError: some results are missing.
     """
-    groups = group_results(results, metric, step, average_last_quarter)
-    final = {group.label: group.final_scores.mean(axis=0) for group in groups}
+    groups = group_results(results, choice)
+    final = {group.label: group.run_scores for group in groups}
     baseline = final[groups[0].label]
     steps = np.array(groups[0].steps, float)
     thresholds = np.linspace(min(map(np.min, final.values())), max(map(np.max, final.values())), 101)
@@ -122,23 +111,16 @@ def compare(
             for label, scores in final.items()
         },
         groups={group.label: group for group in groups},
-        metric=metric,
-        step=step,
-        average_last_quarter=average_last_quarter,
+        choice=choice,
     )
 
 
-def compare_tasks(
-    results: Sequence[LearningCurves], metric: str = RETURN, step: int | None = None, average_last_quarter: bool = False
-) -> list[Comparison]:
+def compare_tasks(results: Sequence[LearningCurves], choice: ScoreChoice = LAST_RETURN) -> list[Comparison]:
     """Compare all tasks together, or each task alone if their scores have no common scale."""
     tasks = sorted({result.task for result in results})
-    if len(tasks) == 1 or (metric == RETURN and all(task in REFERENCE_RETURNS for task in tasks)):
-        return [compare(results, metric, step, average_last_quarter)]
-    return [
-        compare([result for result in results if result.task == task], metric, step, average_last_quarter)
-        for task in tasks
-    ]
+    if len(tasks) == 1 or (choice.metric == RETURN and all(task in REFERENCE_RETURNS for task in tasks)):
+        return [compare(results, choice)]
+    return [compare([result for result in results if result.task == task], choice) for task in tasks]
 
 
 def compare_over_tasks(comparisons: Sequence[Comparison]) -> list[OverallRow]:
@@ -154,28 +136,26 @@ def compare_over_tasks(comparisons: Sequence[Comparison]) -> list[OverallRow]:
     for label in comparisons[0].groups:
         groups = [comparison.groups[label] for comparison in comparisons if label in comparison.groups]
         if len(groups) == len(comparisons) and len({len(group.seeds) for group in groups}) == 1:
-            final[label] = np.concatenate([group.final_scores.mean(axis=0) for group in groups], axis=1)
+            final[label] = np.concatenate([group.run_scores for group in groups], axis=1)
     baselines = {comparison.rows[0].label for comparison in comparisons}
     if len(baselines) > 1 or not final.keys() > baselines:
         return []
     (baseline,) = baselines
-    rows = []
-    for label, scores in final.items():
-        improvement, p_value = (None, None) if label == baseline else _improvement(scores, final[baseline])
-        rows.append(OverallRow(label=label, n_seeds=len(scores), improvement=improvement, p_value=p_value))
-    return rows
+    return [
+        OverallRow(label, len(scores), *_improvement(scores, None if label == baseline else final[baseline]))
+        for label, scores in final.items()
+    ]
 
 
 def _make_row(group: LabelScores, baseline: Scores | None) -> Row:
-    scores = group.final_scores.mean(axis=0)
+    scores = group.run_scores
     seed_means = scores.mean(axis=1)
-    draw_mean = difference = improvement = p_value = None
+    draw_mean = difference = None
     if len(group.draws) > 1:
-        draw_mean = estimate(lambda draws: draws.mean(axis=(-2, -1)), group.final_scores.mean(axis=1))
+        draw_mean = estimate(lambda samples: samples.mean(axis=(-2, -1)), group.final_scores.mean(axis=1))
     if baseline is not None and min(len(scores), len(baseline)) > 1:
         difference = estimate(lambda a, b: interquartile_mean(a) - interquartile_mean(b), scores, baseline)
-    if baseline is not None:
-        improvement, p_value = _improvement(scores, baseline)
+    improvement, p_value = _improvement(scores, baseline)
     return Row(
         label=group.label,
         n_seeds=len(group.seeds),
@@ -190,9 +170,9 @@ def _make_row(group: LabelScores, baseline: Scores | None) -> Row:
     )
 
 
-def _improvement(scores: Scores, baseline: OtherScores) -> tuple[Estimate | None, float | None]:
+def _improvement(scores: Scores, baseline: OtherScores | None) -> tuple[Estimate | None, float | None]:
     """Return `Row.improvement` and `Row.p_value`."""
-    if min(len(scores), len(baseline)) < 2:
+    if baseline is None or min(len(scores), len(baseline)) < 2:
         return None, None
     improvement = estimate(probability_of_improvement, scores, baseline)
-    return improvement, min(mann_whitney(list(zip(scores.T, baseline.T, strict=True))))
+    return improvement, two_sided_p(list(zip(scores.T, baseline.T, strict=True)))

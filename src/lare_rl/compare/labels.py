@@ -3,7 +3,7 @@
 import os
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from itertools import combinations, permutations
+from pathlib import Path
 from typing import Any
 
 from lare_rl.compare.results import group_pairs
@@ -67,13 +67,14 @@ def label_runs(runs: Sequence[Run]) -> dict[str, list[Run]]:
 def find_differences(runs: Sequence[Run]) -> list[Difference]:
     """Return the settings, apart from the method, in which runs of one algorithm differ, and differences of latent functions."""
     by_setting = group_pairs(
-        (name, (str(settings[name]), settings["method"]))
-        for settings, other in permutations(map(_effective_settings, runs), 2)
-        if settings["algorithm"] == other["algorithm"]
-        for name in settings.keys() & other.keys() - _ignored_settings(settings) - {"method"}
-        if settings[name] != other[name]
+        ((name, values["algorithm"]), (str(values[name]), values["method"]))
+        for values in map(_effective_settings, runs)
+        for name in values.keys() - _ignored_settings(values) - {"method"}
     )
-    differences = [_make_difference(name, pairs) for name, pairs in sorted(by_setting.items())]
+    differing = group_pairs(
+        (key[0], pair) for key, pairs in by_setting.items() if len(dict(pairs)) > 1 for pair in pairs
+    )
+    differences = [_make_difference(name, pairs) for name, pairs in sorted(differing.items())]
     return differences + _find_function_differences(runs)
 
 
@@ -131,19 +132,22 @@ def _split_by_function(label: str, runs: Sequence[Run]) -> dict[str, list[Run]]:
 def _split_by_directory(label: str, runs: Sequence[Run]) -> dict[str, list[Run]]:
     """Split runs with equal settings and functions if two of them have the same task, draw and seed: the method was trained twice.
 
-    The labels end in the first name in which the paths of these two differ.
+    The labels end in the shortest part of the paths by which no two such runs have the same label.
     """
-    paths = [str(run.directory.resolve()).split(os.sep) for run in runs]
-    seeds = [
-        {(run.config.task.name, run.config.settings.draw, seed) for seed in run.config.settings.all_seeds}
-        for run in runs
-    ]
-    depths = [
-        next((depth for depth, names in enumerate(zip(*pair, strict=False)) if names[0] != names[1]), None)
-        for pair, (first, second) in zip(combinations(paths, 2), combinations(seeds, 2), strict=True)
-        if first & second
-    ]
-    if not depths or None in depths:
-        return {label: list(runs)}
-    depth = min(depth for depth in depths if depth is not None)
-    return group_pairs((f"{label}, {path[depth]}", run) for run, path in zip(runs, paths, strict=True))
+    paths = [run.directory.resolve() for run in runs]
+    common = Path(os.path.commonpath(paths))
+    root = common.parent if common in paths else common
+    tails = [str(path.relative_to(root)).split(os.sep) for path in paths]
+    for depth in range(max(map(len, tails)) + 1):
+        names = [f"{label}, {os.sep.join(tail[:depth])}" if depth else label for tail in tails]
+        groups = group_pairs(zip(names, runs, strict=True))
+        if not any(map(_have_equal_seeds, groups.values())):
+            return groups
+    return {label: list(runs)}
+
+
+def _have_equal_seeds(runs: Iterable[Run]) -> bool:
+    """Return whether two runs have the same task, draw and seed."""
+    configs = [run.config for run in runs]
+    seeds = [(config.task.name, config.settings.draw, seed) for config in configs for seed in config.settings.all_seeds]
+    return len(set(seeds)) < len(seeds)

@@ -10,7 +10,7 @@ from lare_rl.util.findings import Finding, render
 
 __all__ = ["MESSAGES", "find_min_p", "find_score_meaning", "find_small_samples", "to_text"]
 
-MIN_CERTAIN_P = 0.025
+MIN_CERTAIN_P = 0.05
 """If p cannot be lower than this, the reader is told."""
 
 MESSAGES = {
@@ -47,9 +47,8 @@ MESSAGES = {
     "the seeds (n - 1). Minus baseline: the IQM minus the IQM of the baseline, the first method; its interval is too narrow for two or "
     "three seeds. Above baseline: the probability that a run scores more than a run of the baseline; without an interval if it is 0 "
     "or 1 on every task. Neither is computed for a single seed. If the score is an error or a loss, a low probability is good. p: "
-    "the probability that chance wins at least as many pairs of runs or, if fewer than half were won, loses at least as many (exact "
-    "Mann-Whitney test; one-sided: a two-sided p is twice as large). If a method has several draws of the language model, the mean "
-    "over the draws of a seed counts as one run.",
+    "exact two-sided Mann-Whitney test. If a method has several draws of the language model, the mean over the draws of a seed counts "
+    "as one run.",
     "intervals": "Intervals: stratified bootstrap over the seeds, {repetitions} repetitions; in the column with draws, over the draws "
     "of the language model.",
     "curves": "Lines: IQM over the seeds. Bands: its 95% intervals.",
@@ -65,9 +64,10 @@ def to_text(findings: Iterable[Finding]) -> str:
 
 def find_score_meaning(comparison: Comparison) -> Finding:
     """Return what the scores are, at which step."""
-    when = "late" if comparison.average_last_quarter else "at_step" if comparison.step is not None else "at_last_step"
+    choice = comparison.choice
+    when = "late" if choice.average_last_quarter else "at_step" if choice.step is not None else "at_last_step"
     values = {
-        "metric": Finding("true_returns") if comparison.metric == RETURN else comparison.metric,
+        "metric": Finding("true_returns") if choice.metric == RETURN else choice.metric,
         "when": Finding(when, {"step": comparison.last_step}),
     }
     if not comparison.normalised:
@@ -98,5 +98,5 @@ def find_min_p(comparison: Comparison) -> Iterator[Finding]:
     """Yield the lowest possible p, if it is not low."""
     n_seeds = comparison.rows[0].n_seeds
     n_splits = [math.comb(n_seeds + row.n_seeds, row.n_seeds) for row in comparison.rows if row.p_value is not None]
-    if n_splits and (min_p := max(n_splits) ** -len(comparison.tasks)) > MIN_CERTAIN_P:
+    if n_splits and (min_p := 2 * max(n_splits) ** -len(comparison.tasks)) > MIN_CERTAIN_P:
         yield Finding("min_p", {"p": min_p})

@@ -8,6 +8,7 @@ from lare_rl.compare.bootstrap import REPETITIONS, Estimate
 from lare_rl.compare.comparison import Comparison, compare_over_tasks, compare_tasks
 from lare_rl.compare.messages import MESSAGES, find_min_p, find_score_meaning, find_small_samples, to_text
 from lare_rl.compare.results import LearningCurves
+from lare_rl.compare.scores import LAST_RETURN, ScoreChoice
 from lare_rl.report import figures
 from lare_rl.report.html import render_note, render_table, write_page
 from lare_rl.runs.metric_names import RETURN
@@ -24,17 +25,15 @@ OVERALL_HEADER = ("all tasks", "seeds", "above baseline [95%]", "p")
 def write_comparisons(
     results: Sequence[LearningCurves],
     out: Path,
-    metric: str = RETURN,
+    choice: ScoreChoice = LAST_RETURN,
     findings: Iterable[Finding] = (),
-    step: int | None = None,
-    average_last_quarter: bool = False,
 ) -> list[Comparison]:
     """Compare results (`compare_tasks`), and write the page, with the findings about the results at its end.
 
     Raises:
         LareError: the results cannot be compared, or the file cannot be written.
     """
-    comparisons = compare_tasks(results, metric, step, average_last_quarter)
+    comparisons = compare_tasks(results, choice)
     tasks = ", ".join(task for comparison in comparisons for task in comparison.tasks)
     title = f"{tasks}: {len({result.label for result in results})} methods"
     notes = [f"Note: {render(finding, MESSAGES)}" for finding in findings]
@@ -106,7 +105,7 @@ def _body(comparisons: Sequence[Comparison]) -> Iterator[str]:
         yield render_table(header, rows, range(1, len(header)))
         yield render_note(describe(comparison))
         scale = "score" if comparison.normalised else "true return"
-        score = scale if comparison.metric == RETURN else comparison.metric
+        score = scale if comparison.choice.metric == RETURN else comparison.choice.metric
         yield f"<h{level}>Learning</h{level}>"
         yield figures.draw_bands(comparison.curves, "environment steps", f"IQM of the {score}", x_is_steps=True)
         yield render_note(MESSAGES["curves"])

@@ -8,7 +8,7 @@ from jaxtyping import Float
 
 from lare_rl.util.statistics import wins
 
-__all__ = ["mann_whitney", "mann_whitney_u"]
+__all__ = ["mann_whitney", "mann_whitney_u", "two_sided_p"]
 
 
 def mann_whitney_u(a: Float[np.ndarray, " a"], b: Float[np.ndarray, " b"]) -> float:
@@ -30,6 +30,11 @@ def mann_whitney(tasks: Sequence[tuple[Float[np.ndarray, " _"], Float[np.ndarray
         probabilities = np.convolve(probabilities, _distribution(np.concatenate([a, b]), len(a)))
     at_least, at_most = probabilities[double_u:].sum(), probabilities[: double_u + 1].sum()
     return min(1.0, float(at_least)), min(1.0, float(at_most))
+
+
+def two_sided_p(tasks: Sequence[tuple[Float[np.ndarray, " _"], Float[np.ndarray, " _"]]]) -> float:
+    """Return the two-sided p-value: twice the smaller probability of `mann_whitney`, but at most 1."""
+    return min(1.0, 2 * min(mann_whitney(tasks)))
 
 
 def _distribution(values: Float[np.ndarray, " values"], n_a: int) -> Float[np.ndarray, " sums"]:

@@ -18,7 +18,22 @@ from lare_rl.errors import LareError
 from lare_rl.evaluation.reference_returns import REFERENCE_RETURNS
 from lare_rl.runs.metric_names import RETURN
 
-__all__ = ["LabelScores", "group_results", "last_quarter"]
+__all__ = ["LAST_RETURN", "LabelScores", "ScoreChoice", "group_results", "last_quarter"]
+
+
+class ScoreChoice(NamedTuple):
+    """Which values of the runs are compared."""
+
+    metric: str = RETURN
+    """The name of the metric. Only returns are scaled."""
+    step: int | None = None
+    """The step at which runs are compared; None for the last one at which all have a value."""
+    average_last_quarter: bool = False
+    """Whether the final scores are means over the last quarter of the steps up to `step`."""
+
+
+LAST_RETURN = ScoreChoice()
+"""The true return at the last step."""
 
 
 @dataclass(frozen=True)
@@ -33,6 +48,11 @@ class LabelScores:
     scores: Float[np.ndarray, "draws seeds tasks steps"]
     final_scores: Float[np.ndarray, "draws seeds tasks"]
     """The scores at the last step, or their means over the last quarter of the steps."""
+
+    @property
+    def run_scores(self) -> Float[np.ndarray, "seeds tasks"]:
+        """The final scores, averaged over the draws."""
+        return self.final_scores.mean(axis=0)
 
 
 class _Key(NamedTuple):
@@ -50,25 +70,17 @@ class _Curve(NamedTuple):
     """From step to value."""
 
 
-def group_results(
-    results: Sequence[LearningCurves], metric: str = RETURN, step: int | None = None, average_last_quarter: bool = False
-) -> list[LabelScores]:
-    """Group results by label.
-
-    Args:
-        results: the curves of runs, each with a label: the name of its method in the comparison.
-        metric: the name of the metric. Only returns are scaled.
-        step: the step at which results are compared. The default is the last step at which all of them have a value.
-        average_last_quarter: whether the final scores are means over the last quarter of the steps up to `step`.
+def group_results(results: Sequence[LearningCurves], choice: ScoreChoice = LAST_RETURN) -> list[LabelScores]:
+    """Group the curves of runs by label: the name of the method in the comparison.
 
     Raises:
-        LareError: a label lacks a task, draw or seed, or not all results have a value at `step`.
+        LareError: a label lacks a task, draw or seed, or not all results have a value at the chosen step.
     """
     tasks = tuple(sorted({result.task for result in results}))
-    _check_tasks(results, tasks, metric)
-    curves = _index_curves(results, metric)
-    steps = _shared_steps(curves, metric, step)
-    n_final = len(last_quarter(steps)) if average_last_quarter else 1
+    _check_tasks(results, tasks, choice.metric)
+    curves = _index_curves(results, choice.metric)
+    steps = _shared_steps(curves, choice)
+    n_final = len(last_quarter(steps)) if choice.average_last_quarter else 1
     groups = []
     for label in dict.fromkeys(result.label for result in results):
         keys = [key for key in curves if key.label == label]
@@ -160,8 +172,9 @@ def _index_curves(results: Sequence[LearningCurves], metric: str) -> dict[_Key, 
     return curves
 
 
-def _shared_steps(curves: Mapping[_Key, _Curve], metric: str, step: int | None) -> list[int]:
-    """Return the steps at which all curves have a value, up to `step`."""
+def _shared_steps(curves: Mapping[_Key, _Curve], choice: ScoreChoice) -> list[int]:
+    """Return the steps at which all curves have a value, up to the chosen step."""
+    metric, step, _ = choice
     steps = sorted(set.intersection(*(set(curve.values) for curve in curves.values())))
     if not steps:
         steps_of_seeds = group_pairs(

@@ -20,35 +20,31 @@ from lare_rl.util.shapes import padded_size
 __all__ = ["RunPolicy", "load_policy"]
 
 
-def load_policy(
-    run: Run | str | Path, seed: int | None = None, best: bool = False, deterministic: bool = False
-) -> "RunPolicy":
-    """Load the policy of a seed: a function from an observation to an action, or from a batch to a batch.
+class RunPolicy:
+    """The policy of a seed: a function from an observation to an action, or from a batch to a batch.
 
     An action is what the environment's package takes in its own `step`: a discrete action is its number, or an array of numbers if
     there are several choices at a time. The policy acts as in evaluations: PPO's choices are sampled, and all other actions are
     deterministic. Observations that are not one row of numbers must be flattened first (`gymnasium.spaces.flatten`). Environments
     in which actions may be unavailable (Jumanji's) also need the mask, `policy(observation, available)`.
 
-    Args:
-        seed: one of the run's seeds; the default is the first.
-        best: load the policy of the seed's best evaluation, instead of the last policy.
-        deterministic: always take the most likely choice, which PPO's policy samples otherwise.
-
-    Raises:
-        LareError: the run has several agents, or has no such seed, or no checkpoint.
-    """
-    run = as_run(run)
-    return RunPolicy(run, run.seed_index(seed), best, deterministic)
-
-
-class RunPolicy:
-    """The policy of one seed, which acts as in evaluations (`load_policy`).
-
     A recurrent policy (`qmix`, `vdn`) takes observations one at a time, in order, and `reset` begins a new episode.
     """
 
-    def __init__(self, run: Run, seed_index: int, best: bool, deterministic: bool = False):
+    def __init__(self, run: Run | str | Path, seed: int | None = None, best: bool = False, deterministic: bool = False):
+        """Load the policy.
+
+        Args:
+            run: the run, or its directory.
+            seed: one of the run's seeds; the default is the first.
+            best: load the policy of the seed's best evaluation, instead of the last policy.
+            deterministic: always take the most likely choice, which PPO's policy samples otherwise.
+
+        Raises:
+            LareError: the run has several agents, or has no such seed, or no checkpoint.
+        """
+        run = as_run(run)
+        seed_index = run.seed_index(seed)
         self._env = load_env_spec(run.config.task)
         if self._env.n_agents > 1:
             raise LareError(
@@ -152,6 +148,9 @@ class RunPolicy:
         if not np.isfinite(rows).all():
             raise LareError("an observation holds a number that is not finite")
         return np.atleast_2d(rows), rows.ndim == 1
+
+
+load_policy = RunPolicy
 
 
 def _pad(array: np.ndarray, n_rows: int) -> np.ndarray:

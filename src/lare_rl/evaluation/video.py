@@ -88,7 +88,7 @@ def record_frames(
         frames = render_played(run, played or play_run(run))
         assert frames is not None
         return frames[:max_frames], 1 / FRAMES_PER_SECOND
-    policy = RunPolicy(run, 0, best, deterministic)
+    policy = RunPolicy(run, best=best, deterministic=deterministic)
     if spec.is_jax:
         return _play_and_draw(run, policy, min(max_frames or MAX_DRAWINGS, MAX_DRAWINGS)), 1 / MAX_GIF_FRAMES_PER_SECOND
     camera = {"camera_name": "track", **FRAME_SIZE} if _has_tracking_camera(run) else {}

@@ -10,7 +10,7 @@ from typing import Literal
 
 from lare_rl.errors import CheckedModel, LareError
 from lare_rl.llm.key import redact_key
-from lare_rl.llm.prompts import Message, Stage
+from lare_rl.llm.prompts import N_CANDIDATES, Message, Stage
 from lare_rl.util.files import check_new_path, write_atomically
 from lare_rl.util.safe_io import read_json
 
@@ -116,8 +116,11 @@ class RecordedModel:
             if sample < len(replies):
                 self.name = f"{recording.model}, recorded {recording.recorded}, draw {recording.draw}"
                 return replies[sample]
+        reason = "most shipped tasks have some, for their exact texts"
+        if self.name != RECORDED:  # an earlier request was answered
+            reason = f"shipped recordings have 1 or {N_CANDIDATES} candidates, and no reflection"
         raise LareError(
-            f"no recorded reply fits task {self.task!r} (reply {sample + 1}): most shipped tasks have some, for their exact texts. "
+            f"no recorded reply fits task {self.task!r} (reply {sample + 1}): {reason}. "
             "Ask a model (lare_rl.design(task, model=...), or lare-rl design TASK --model NAME --out phi.py), train with a "
             "function of your own (--function phi.py; in a sweep file, the table [functions]), or with a method that needs none "
             "(--method bayes)"
