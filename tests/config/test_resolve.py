@@ -30,6 +30,7 @@ def resolve_named(task, settings):
         ("Reacher-v4", {"method": "llm-reward", "scored_observation": "both"}, ["llm-reward", "scored_observation"]),
         ("Reacher-v4", {"method": "ircr", "scale_rewards": True}, ["scale_rewards", "ircr"]),
         ("Reacher-v4", {"method": "rrd", "credit": {"steps": 16}}, ["steps = 16", "sampled_steps = 64"]),
+        ("Reacher-v4", {"overlap_collection": True, "td3": {"warmup": 0}}, ["overlap_collection", "td3.warmup to 1"]),
         ("Reacher-v4", {"rollout_steps": 20, "steps": 20}, ["steps = 20", "50"]),
         ("CN-6", {"capacity": 6149, "method": "rd"}, ["capacity = 6149", "rollout", "6150"]),
         ("CN-6", {"algorithm": "vdn", "vdn": {"monotonic": True}}, ["vdn.monotonic = True", "use --algorithm qmix"]),

@@ -58,6 +58,10 @@ def resolve(settings: Settings, task: TaskSpec) -> ResolvedSettings:
             f"overlap_collection needs td3, ddpg or sac and an environment on the host: remove it for {resolved.algorithm} on "
             f"{task.name}"
         )
+    if resolved.overlap_collection and not resolved.warmup:
+        raise LareError(
+            f"overlap_collection updates before the first steps are stored: set {resolved.algorithm}.warmup to 1 or more"
+        )
     _check_size(resolved, task, env)
     return resolved
 
