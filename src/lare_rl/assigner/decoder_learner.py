@@ -161,7 +161,7 @@ class DecoderLearner:
         size = padded_size(len(mean_reward))
         mask = np.arange(size) < len(mean_reward)
         mean_reward, length = pad(mean_reward.astype(np.float32), size), pad(length.astype(np.int32), size)
-        level = pad(level.astype(np.int32), size) if self.config.n_levels else None
+        level = pad(level.astype(np.int32), size) if self.config.groups else None
         with on_cpu():
             if self.decoder is not None:
                 self.decoder = compiled.observe_returns(self.decoder, mean_reward, length, mask, level)

@@ -29,7 +29,6 @@ from lare_rl.credit import closed_form
 from lare_rl.credit.closed_form import ClosedForm, LinearDecoder
 from lare_rl.credit.decoder_network import DecoderNetwork, DecoderOutput, DecoderShape
 from lare_rl.credit.decoder_settings import CreditSettings
-from lare_rl.credit.decoders import DECODERS
 from lare_rl.credit.levels import LevelMeans, add_returns, empty_level_means, level_offsets
 from lare_rl.credit.methods import Method
 from lare_rl.credit.prequential import Predictions, empty_predictions
@@ -52,7 +51,7 @@ __all__ = [
     "CreditBatch",
     "DecoderState",
     "agent_mean",
-    "agent_shares",
+    "agent_weights",
     "decode",
     "decoder_rewards",
     "init",
@@ -131,7 +130,7 @@ def init(key: PRNGKeyArray, spec: CreditSpec) -> DecoderState:
     """Return the state with an untrained decoder. All other functions need the same settings and score types."""
     method, settings, basis = spec.method, spec.settings, spec.basis
     shape = DecoderShape(basis, spec.max_steps, spec.agents, spec.input_sizes)
-    network = DECODERS[method.decoder].init_network(key, shape, settings)
+    network = method.decoder_kind.init_network(key, shape, settings)
     for leaf in jax.tree.leaves(network):
         if not eqx.is_array_like(leaf):
             raise LareError(
@@ -159,7 +158,7 @@ def init(key: PRNGKeyArray, spec: CreditSpec) -> DecoderState:
 
 def _check_output(network: DecoderNetwork, shape: DecoderShape, method: Method) -> None:
     """Raise `LareError` if a plugin's decoder does not return what it should."""
-    n_rows = shape.max_steps if method.needs_whole_episodes else 2
+    n_rows = shape.max_steps if method.decoder_kind.whole_episodes else 2
     for agents in [(shape.n_agents,), ()] if shape.n_agents == 1 else [(shape.n_agents,)]:  # () in CreditAssigner
         rows = jax.ShapeDtypeStruct((n_rows, *agents, shape.n_inputs), jnp.float32)
         output = jax.eval_shape(lambda rows: network(rows, None), rows)
@@ -194,18 +193,18 @@ def observe_returns(
     state: DecoderState,
     mean_reward: Float[Array, " batch"],
     length: Int[Array, " batch"],
-    finished: Bool[Array, " batch"],
+    ended: Bool[Array, " batch"],
     level: Int[Array, " batch"] | None = None,
 ) -> DecoderState:
-    """Add newly finished episodes, as R/T and T, to the scales and to the means of their levels. Add each episode exactly once.
+    """Add episodes that have just ended, as R/T and T, to the scales and to the means of their levels. Add each episode exactly once.
 
-    Episodes where `finished` is false are ignored.
+    Episodes where `ended` is false are ignored.
     """
     if state.levels is not None and level is not None:
-        state = state._replace(levels=add_returns(state.levels, level, mean_reward, finished))
+        state = state._replace(levels=add_returns(state.levels, level, mean_reward, ended))
     return state._replace(
-        scale=update_scale(state.scale, mean_reward, finished),
-        return_scale=update_scale(state.return_scale, mean_reward * length, finished),
+        scale=update_scale(state.scale, mean_reward, ended),
+        return_scale=update_scale(state.return_scale, mean_reward * length, ended),
     )
 
 
@@ -288,12 +287,13 @@ def decoder_rewards(
 def agent_mean(
     values: Float[Array, "rows *agents"], alive: Bool[Array, "rows *agents"] | None
 ) -> Float[Array, " rows"]:
-    """Return the mean over the agents that are alive."""
+    """Return the mean over the agents that are alive. Values of other agents may be NaN."""
     if alive is None:
         return jnp.mean(values.reshape(len(values), -1), axis=1)
-    return jnp.sum((values * agent_shares(alive)).reshape(len(values), -1), axis=1)
+    weighted = jnp.where(alive, values, 0) * agent_weights(alive)
+    return jnp.sum(weighted.reshape(len(values), -1), axis=1)
 
 
-def agent_shares(alive: Bool[Array, "*batch agents"]) -> Float[Array, "*batch agents"]:
-    """Return each agent's share of the team's reward: 1/n for each of n agents that are alive, else 0."""
+def agent_weights(alive: Bool[Array, "*batch agents"]) -> Float[Array, "*batch agents"]:
+    """Return each agent's weight in a mean over the team: 1/n for each of n agents that are alive, else 0."""
     return (alive / alive.sum(axis=-1, keepdims=True).clip(1)).astype(jnp.float32)

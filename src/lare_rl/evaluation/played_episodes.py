@@ -182,7 +182,7 @@ def sample_steps(run: Run, actor: Any = None) -> list[TeamSample]:
     for team_index, role in enumerate(run.config.task.roles):
         rows = make_episode(role, config.env, steps.timestep, steps.env_action, steps.next_timestep)
         n_factors = config.n_factors[team_index] if config.n_factors else 0
-        factors = played.factors[played.mask][:, config.team_rows(team_index), :n_factors]
+        factors = played.factors[played.mask][:, config.team_slice(team_index), :n_factors]
         next_observation, factors, reward = (x[rows.alive] for x in (rows.next_observation, factors, rows.reward))
         samples.append(TeamSample(next_observation=next_observation, factors=factors, reward=reward))
     return samples

@@ -303,7 +303,7 @@ def _compute_rewards(
                 level = None if episode.group is None else credit.group_names.get(episode.group)
                 unpaid = credit.step_rewards.unpaid_return(level, payments)
                 counts.predictions.append(float(reward.sum(dtype=np.float64)) + unpaid)
-            if episode.complete and credit.config.is_exact:
+            if episode.complete and credit.config.spec.is_exact:
                 reward = _make_exact(reward, episode.reward, credit.config)
             yield RelabelledEpisode(episode, reward)
             listener("write", counts.episodes, size[0])

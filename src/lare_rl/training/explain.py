@@ -8,16 +8,10 @@ import jax
 import numpy as np
 from jaxtyping import Array, Bool
 
-from lare_rl.credit import returns
-from lare_rl.credit.decomposition import CreditBatch, level_effects, valid_rows
-from lare_rl.credit.engine import add_to_explanation, explain_returns, init_explanation
+from lare_rl.credit.decomposition import CreditBatch, valid_rows
+from lare_rl.credit.explain_returns import add_to_explanation, explain_returns, init_explanation, returns_findings
 from lare_rl.credit.explanation import Explanation
-from lare_rl.credit.explanation_text import (
-    LEGEND_CODES,
-    MESSAGES,
-    MIN_EXPLAINED_EPISODES,
-    explanation_findings,
-)
+from lare_rl.credit.explanation_text import LEGEND_CODES, MESSAGES, MIN_EXPLAINED_EPISODES
 from lare_rl.credit.methods import METHODS, find_method
 from lare_rl.data.replay import Index, Replay, segments_as_episodes
 from lare_rl.nn.normalise import RunningMeanStd, empty_mean_std, update_mean_std
@@ -82,13 +76,8 @@ def _find_explanations(run: Run, learner: Learner, config: TrainConfig) -> list[
         factor_names = [] if function is None else function.factor_columns(run.scored_observation)
         raw_names = [] if config.team_level else specs[i].raw_feature_names(role.observation, role.action)
         decoder = select_seed(first_shard(learner.decoders[i]))
-        score_type, looks_binary = returns.estimate_score_type(decoder), returns.looks_binary(decoder, config.method)
-        groups = dict(enumerate(level_effects(decoder, float(explanation.mean_length)).tolist()))
-        findings.append(
-            explanation_findings(
-                explanation, score_type, factor_names, raw_names, looks_binary=looks_binary, groups=groups
-            )
-        )
+        levels = range(config.credit_specs[i].n_levels)
+        findings.append(returns_findings(explanation, decoder, config.method, factor_names, raw_names, levels))
     return findings
 
 

@@ -24,6 +24,7 @@ from lare_rl.data.trajectory import Trajectory
 from lare_rl.envs.interface import team_mean
 from lare_rl.nn.normalise import Scale, empty_scale, update_scale
 from lare_rl.phi.graph import Graph
+from lare_rl.tasks.spec import MAX_LEVELS
 from lare_rl.training.decoder_inputs import decoder_inputs, row_mask, tracked_inputs
 from lare_rl.training.factors import compute_factors
 from lare_rl.training.static_config import TrainConfig
@@ -168,7 +169,7 @@ def _levels(steps: Trajectory, config: TrainConfig) -> Int[Array, "time envs"] |
     """Return the level of each step's episode, which is valid at the steps that are paid."""
     if config.group is None:
         return None
-    return jnp.clip(jnp.asarray(steps.next_timestep.measures[config.group]).astype(jnp.int32), 0, config.n_levels - 1)
+    return jnp.clip(jnp.asarray(steps.next_timestep.measures[config.group]).astype(jnp.int32), 0, MAX_LEVELS - 1)
 
 
 def _observe(decoder: DecoderState, steps: StoredSteps, config: TrainConfig, team_index: int) -> DecoderState:

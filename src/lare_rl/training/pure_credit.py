@@ -259,7 +259,7 @@ def _stored_steps(learner: Learner, columns: dict[str, Any], next_columns: dict[
         next_columns=next_columns,
         episodic_reward=zeros,
         mean_reward=zeros,
-        finished=jnp.zeros(lead, bool),
+        episode_ended=jnp.zeros(lead, bool),
         last=jnp.zeros(lead, bool),
         residual=None,
         level=None,
