@@ -239,7 +239,7 @@ def with_factor_decoders(learner, weights):
         )
         for team, weight in zip(learner.decoders, weights, strict=True)
     )
-    return learner._replace(decoders=decoders)
+    return learner._replace(reward_sources=decoders)
 
 
 def learner_with_episodes(config, seed=0):

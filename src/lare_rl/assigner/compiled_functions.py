@@ -19,7 +19,7 @@ from lare_rl.nn.normalise import update_scale
 MAX_CALL_ROWS = 8192
 """Rows that are processed in one call."""
 
-init_decoder = jax.jit(engine.init_decoder, static_argnames="spec")
+init_source = jax.jit(engine.init_source, static_argnames="spec")
 observe_steps = jax.jit(decomposition.observe_steps)
 observe_returns = jax.jit(decomposition.observe_returns)
 observe_scale = jax.jit(update_scale)

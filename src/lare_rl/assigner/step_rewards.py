@@ -74,9 +74,9 @@ class StepRewards:
 
     def _flat_state(self) -> tuple[list[Array], Any]:
         """Return the leaves and the structure of what rewards are computed from."""
-        newest = self.learner.scale if self.learner.decoder is None else self.learner.decoder
-        if self._flat_cache[0] is not newest:
-            source = newest
+        source = self.learner.source
+        if self._flat_cache[0] is not source:
+            newest = source
             if isinstance(source, DecoderState):
                 source = source._replace(optimizer=(), score_type_predictions=None, closed_form=None)
             self._flat_cache = newest, *jax.tree.flatten(source)

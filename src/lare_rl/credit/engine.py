@@ -14,6 +14,7 @@ TAR2 pays shares of the return instead (`shares.py`), which add up to it, too.
 Batches have an axis of agents, of length 1 for a single agent. For credit to whole teams it has length 1 too.
 """
 
+from collections.abc import Sequence
 from typing import Literal, NamedTuple
 
 import jax.numpy as jnp
@@ -26,23 +27,19 @@ from lare_rl.credit.methods import Reward
 from lare_rl.credit.shares import return_shares
 from lare_rl.credit.spec import CreditSpec
 from lare_rl.envs.interface import alive_mean
-from lare_rl.nn.normalise import Scale, min_max_scale, root_mean_square
+from lare_rl.nn.normalise import Scale, empty_scale, min_max_scale, root_mean_square
 
 __all__ = [
     "RewardSource",
     "StepBatch",
     "correction",
-    "init_decoder",
+    "init_source",
     "proxy_rewards",
     "return_scale",
     "scale_and_mask",
+    "select_decoders",
     "training_rewards",
 ]
-
-
-def init_decoder(key: PRNGKeyArray, spec: CreditSpec) -> DecoderState | None:
-    """Return an untrained decoder. Return None for a method that fits nothing."""
-    return decomposition.init(key, spec) if spec.method.reward is Reward.PROXY else None
 
 
 class StepBatch(NamedTuple):
@@ -66,6 +63,16 @@ class StepBatch(NamedTuple):
 
 RewardSource = DecoderState | Scale
 """A decoder; for a method that fits nothing, the scale of R/T."""
+
+
+def init_source(key: PRNGKeyArray, spec: CreditSpec) -> RewardSource:
+    """Return an untrained decoder or, for a method that fits nothing, an empty scale."""
+    return decomposition.init(key, spec) if spec.method.reward is Reward.PROXY else empty_scale()
+
+
+def select_decoders(sources: Sequence[RewardSource]) -> tuple[DecoderState, ...]:
+    """Return the decoders of some teams; none for a method that fits nothing."""
+    return tuple(source for source in sources if isinstance(source, DecoderState))
 
 
 def return_scale(source: RewardSource) -> Scale:

@@ -106,7 +106,7 @@ def fit_until_converged(
         rounds_without_gain = np.where(is_better, 0, rounds_without_gain + 1)
         if (rounds_without_gain >= PATIENCE).all():
             break
-    return learner._replace(decoders=best_decoders), metrics
+    return learner._replace(reward_sources=best_decoders), metrics
 
 
 def _count_held_out(replay: Replay, window: int) -> Int[Array, " envs"]:

@@ -298,9 +298,9 @@ def _refit(learner: Learner, key: PRNGKeyArray, learn_returns: Callable[..., Any
         return learner
     inputs = jax.tree.map(lambda leaf: leaf[None], (learner.decoders, learner.replay, learner.n_learned))
     decoders, n_learned, _ = jax.tree.map(lambda leaf: leaf[0], learn_returns(*inputs))
-    learner = learner._replace(decoders=decoders, n_learned=n_learned)
+    learner = learner._replace(reward_sources=decoders, n_learned=n_learned)
     if not config.method.uses_gradient:
         return learner
     has_episode = jnp.any(segments_as_episodes(learner.replay).current_episode > 0)
     fitted = jax.lax.cond(has_episode, lambda: fit_repeatedly(learner, key, config)[0], lambda: learner.decoders)
-    return learner._replace(decoders=fitted)
+    return learner._replace(reward_sources=fitted)
