@@ -16,7 +16,7 @@ import numpy as np
 from lare_rl.algorithms.registry import ALGORITHMS
 from lare_rl.credit import arel
 from lare_rl.credit.decoder_settings import CreditSettings
-from lare_rl.credit.methods import find_method
+from lare_rl.credit.methods import METHODS
 from lare_rl.data.trajectory import Trajectory
 from lare_rl.envs.particles.particle_env import ParticleEnv
 from lare_rl.envs.particles.task import MAX_STEPS
@@ -41,7 +41,7 @@ def make_config(name: str) -> TrainConfig:
         env=ENV.spec,
         credit_scope="observation",
         scored_observation="after",
-        method=find_method(name),
+        method=METHODS.find(name),
         algorithm=ippo,
         hyperparameters=ippo.settings,
         credit=CreditSettings(steps=32 * MAX_STEPS),

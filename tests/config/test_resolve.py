@@ -8,7 +8,7 @@ from lare_rl.config.resolve import replay_rows, resolve
 from lare_rl.config.settings import Settings
 from lare_rl.config.validity import CreditContext, check_credit
 from lare_rl.credit.decoder_settings import MULTI_AGENT_CREDIT, RECENT_STEPS, CreditSettings
-from lare_rl.credit.methods import find_method
+from lare_rl.credit.methods import METHODS
 from lare_rl.envs.load import read_task
 from lare_rl.errors import LareError
 
@@ -164,7 +164,7 @@ def check(method, changes):
         changes.get("credit", CreditSettings()),
         {name: v for name, v in changes.items() if name != "credit"},
     )
-    check_credit(find_method(method), credit, CreditContext(**{"n_agents": 1, "n_raw_features": 9} | context))
+    check_credit(METHODS.find(method), credit, CreditContext(**{"n_agents": 1, "n_raw_features": 9} | context))
 
 
 @pytest.mark.parametrize(

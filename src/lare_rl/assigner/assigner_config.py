@@ -15,7 +15,7 @@ from lare_rl.config.validity import CreditContext, check_credit, check_factors
 from lare_rl.credit.decoder_settings import CreditSettings, default_credit
 from lare_rl.credit.history import next_history_columns
 from lare_rl.credit.input_names import input_arrays
-from lare_rl.credit.methods import Method, find_method
+from lare_rl.credit.methods import METHODS, Method
 from lare_rl.credit.spec import CreditSpec
 from lare_rl.envs.families import find_score_type, load_env_spec
 from lare_rl.envs.load import resolve_task
@@ -128,7 +128,7 @@ def resolve_config(
     Raises:
         LareError: there is no such method or task, or the spaces are not those of the task.
     """
-    task, chosen = None if task is None else resolve_task(task, playable=False), find_method(method)
+    task, chosen = None if task is None else resolve_task(task, playable=False), METHODS.find(method)
     if phi is not None and not isinstance(phi, LatentFunction):
         raise LareError(f"phi is {short_repr(phi)}: give a function from lare_rl.design or lare_rl.load_function")
     settings = default_credit(agents) if settings is None else CreditSettings.model_validate(settings)

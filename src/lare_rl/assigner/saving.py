@@ -20,7 +20,7 @@ from lare_rl.assigner.decoder_learner import DecoderLearner
 from lare_rl.assigner.space_layout import SpaceLayout
 from lare_rl.assigner.store import Store, StoredEpisode
 from lare_rl.credit.decoder_settings import CreditSettings
-from lare_rl.credit.methods import find_method
+from lare_rl.credit.methods import METHODS
 from lare_rl.errors import LareError, short_repr
 from lare_rl.latent.saved import load_function
 from lare_rl.runs.checkpoint import DAMAGED_FILE_ERRORS, fill_template, named_leaves, open_npz
@@ -127,7 +127,7 @@ def read_state(directory: Path) -> AssignerState:
             sample = (arrays[PHI_SAMPLE[0]], arrays[PHI_SAMPLE[1]]) if set(PHI_SAMPLE) <= set(arrays) else None
             phi = load_function(directory / FUNCTION_FILE, task, steps=sample)
         config = AssignerConfig(
-            method=find_method(values["method"]),
+            method=METHODS.find(values["method"]),
             phi=phi,
             task=task,
             observation=SpaceLayout(**values["observation"]),

@@ -1,5 +1,6 @@
 """What is fitted to what, for one team: a method, its settings, and the sizes of a task. All that follows from them is computed here."""
 
+import math
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -10,6 +11,7 @@ from lare_rl.credit.input_names import input_size, input_sizes, tracked_size
 from lare_rl.credit.methods import Fit, Method
 from lare_rl.credit.prequential import SEGMENT_WINDOW, WINDOW
 from lare_rl.credit.score_type import ScoreType, score_types_to_fit
+from lare_rl.errors import LareError
 from lare_rl.tasks.payments import PAID_AT_END, PaymentRule
 from lare_rl.tasks.spec import MAX_LEVELS, ScoredObservation
 
@@ -93,6 +95,25 @@ class CreditSpec:
             return (ScoreType.SUM,)
         allow_log_odds = not self.method.uses_gradient
         return score_types_to_fit(self.settings.score, self.fixed_length, allow_log_odds=allow_log_odds)
+
+    def sizes(self, *names: str) -> list[int]:
+        """Return the sizes of the inputs. Raises `LareError` if their names, in order, are not `names`."""
+        if self.inputs != names:
+            raise LareError(
+                f"this decoder reads the inputs {', '.join(names)}, and its method has {dict(self.input_sizes)}: register the method "
+                f"with inputs=InputNames({names!r})"
+            )
+        return [size for _, size in self.input_sizes]
+
+    @property
+    def n_inputs(self) -> int:
+        """The number of inputs of a step."""
+        return self.basis.n_inputs
+
+    @property
+    def output_scale(self) -> float:
+        """The factor of the output of decoders for several agents (see `decomposition.py`)."""
+        return 1.0 if self.agents == 1 else math.sqrt(self.max_steps * self.agents)
 
     def raw_feature_names(self, observation: str, action: str) -> list[str]:
         """Return names of the raw features, from a task's texts; none if they are not entries of observations and actions."""

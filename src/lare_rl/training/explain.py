@@ -12,7 +12,7 @@ from lare_rl.credit.decomposition import CreditBatch, valid_rows
 from lare_rl.credit.explain_returns import add_to_explanation, explain_returns, init_explanation, returns_findings
 from lare_rl.credit.explanation import Explanation
 from lare_rl.credit.explanation_text import LEGEND_CODES, MESSAGES, MIN_EXPLAINED_EPISODES
-from lare_rl.credit.methods import METHODS, find_method
+from lare_rl.credit.methods import METHODS
 from lare_rl.data.replay import Index, Replay, segments_as_episodes
 from lare_rl.nn.normalise import RunningMeanStd, empty_mean_std, update_mean_std
 from lare_rl.runs.directory import Run
@@ -49,7 +49,7 @@ def find_explanations(run: Run) -> list[list[Finding]]:
 
 def explanation_source(run: Run) -> str:
     """Return which seed and which fit an explanation is of. It is empty where that goes without saying."""
-    method = find_method(run.config.settings.method)
+    method = METHODS.find(run.config.settings.method)
     remarks = [f"of seed {run.seeds[0]} alone"] if len(run.seeds) > 1 else []
     if method.uses_gradient:
         remarks.append(f"by a closed-form fit to the stored returns, which is not the decoder of {method.name}")

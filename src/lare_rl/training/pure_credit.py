@@ -22,7 +22,7 @@ from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 from lare_rl.algorithms.registry import ALGORITHMS
 from lare_rl.config.validity import CreditContext, check_credit
 from lare_rl.credit.decoder_settings import CreditSettings, default_credit
-from lare_rl.credit.methods import Method, find_method
+from lare_rl.credit.methods import METHODS, Method
 from lare_rl.data.replay import StoredSteps, mean_length, required_capacity, segments_as_episodes
 from lare_rl.data.trajectory import Trajectory
 from lare_rl.envs.interface import EnvSpec, Team, Timestep, to_env_action
@@ -120,7 +120,7 @@ def pure_credit(
     Raises:
         LareError: the arguments do not go together.
     """
-    chosen, credit = find_method(method), settings or default_credit(agents)
+    chosen, credit = METHODS.find(method), settings or default_credit(agents)
     phi = _check_phi(chosen, phi, (observation_size, action_size))
     env = EnvSpec(
         teams=(Team("agent", 0, agents),),
