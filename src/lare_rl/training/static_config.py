@@ -51,8 +51,8 @@ class TrainConfig:
     """When the environment pays."""
     group: str | None = None
     """The measure that tells the level of an episode."""
-    deterministic: bool = False
-    """Whether a policy acts without noise outside training, even if its algorithm says otherwise."""
+    deterministic: bool | None = None
+    """Whether a policy acts without noise outside training. None: its algorithm decides."""
 
     @property
     def noise(self) -> Noise:
@@ -62,7 +62,9 @@ class TrainConfig:
     @property
     def deterministic_evaluation(self) -> bool:
         """Whether the policy acts without noise outside training."""
-        return self.deterministic or self.algorithm.deterministic_evaluation(self.env.discrete)
+        if self.deterministic is not None:
+            return self.deterministic
+        return self.algorithm.deterministic_evaluation(self.env.discrete)
 
     @property
     def noise_size(self) -> int:
