@@ -107,7 +107,7 @@ def test_must_learn_credit_among_agents_from_the_mean_return(name):
         two_inputs = replace(method, inputs=InputNames(("observation", "action")))
         state = decomposition.init(KEY, replace(spec, method=two_inputs, action_size=1))
         state = decomposition.observe_steps(state, jnp.asarray(rows))
-        state = decomposition.observe_returns(state, jnp.asarray(mean_reward), length, jnp.ones(n_episodes, bool))
+        state = decomposition.observe_returns(state, jnp.asarray(mean_reward), length, jnp.ones(n_episodes, bool), None)
         state, losses = jax.lax.scan(body, state, jax.random.split(jax.random.key(0), n_updates))
         return decomposition.decoder_rewards(state, jnp.asarray(rows).reshape(-1, AGENTS, 2), settings), losses
 

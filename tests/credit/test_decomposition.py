@@ -34,7 +34,7 @@ def fit_batches(state, batches, fit, settings):
 @jax.jit
 def observe(state, rows, mean_reward, length):
     state = decomposition.observe_steps(state, rows)
-    return decomposition.observe_returns(state, mean_reward, length, jnp.ones(len(length), bool))
+    return decomposition.observe_returns(state, mean_reward, length, jnp.ones(len(length), bool), None)
 
 
 def train(fit, settings, reward_scale=1.0, feature_scale=1.0, updates=400):

@@ -193,11 +193,11 @@ def observe_returns(
     mean_reward: Float[Array, " batch"],
     length: Int[Array, " batch"],
     ended: Bool[Array, " batch"],
-    level: Int[Array, " batch"] | None = None,
+    level: Int[Array, " batch"] | None,
 ) -> DecoderState:
     """Add episodes that have just ended, as R/T and T, to the scales and to the means of their levels. Add each episode exactly once.
 
-    Episodes where `ended` is false are ignored.
+    Episodes where `ended` is false are ignored. `level` is None if levels make no difference.
     """
     if state.levels is not None and level is not None:
         state = state._replace(levels=add_returns(state.levels, level, mean_reward, ended))

@@ -87,28 +87,26 @@ class Index(NamedTuple):
 
 
 class StoredSteps(NamedTuple):
-    """Transitions, read from the replay."""
+    """Transitions, read from the replay. If the environment pays before the end, "episode" means segment in all fields."""
 
     columns: dict[str, Array]
     """Every column, [*batch ...], of the step's row: the observation before the step, the action, the reward."""
     next_columns: dict[str, Array]
     """The columns of `STEP_COLUMNS` that are stored, after the step."""
     episodic_reward: Float[Array, "*batch teams"]
-    """The whole return at the last step of a finished episode, else 0. With payments before the end, what is paid at this step.
-
-    Segments then take the place of episodes in the fields below, too."""
+    """The return at the last step of an episode that has ended, else 0."""
     mean_reward: Float[Array, "*batch teams"]
-    """R/T of the step's episode; if it has not finished, of its steps so far."""
+    """R/T of the step's episode; if it has not ended, of its steps so far."""
     episode_ended: Bool[Array, "*batch"]
-    """Whether the step's episode has finished."""
+    """Whether the step's episode has ended."""
     last: Bool[Array, "*batch"]
-    """Whether the step is the last one of a finished episode."""
+    """Whether the step is the last one of an episode that has ended."""
     residual: Float[Array, "*batch teams"] | None
     """The return of the step's episode, less the sum of its proxy rewards; 0 if that is unknown. None if nobody asks for it."""
     level: Int[Array, "*batch"] | None
     """The level of the step's episode. Valid at the last step."""
     length: Int[Array, "*batch"]
-    """Steps of its episode; if that has not finished, at least the mean length of the finished ones."""
+    """Steps of its episode; if that has not ended, at least the mean length of those that have."""
 
 
 def init_replay(

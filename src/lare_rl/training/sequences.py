@@ -14,7 +14,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, Key, PRNGKeyArray, Scalar
 
 from lare_rl.algorithms.batches import Metrics, Sequences
-from lare_rl.algorithms.qmix import QMIXSettings
+from lare_rl.algorithms.sequences import SequenceSettings
 from lare_rl.credit.engine import RewardSource
 from lare_rl.data import replay
 from lare_rl.data.layouts import lay_out_padded
@@ -58,8 +58,8 @@ class Actor(NamedTuple):
     epsilon: Float[Array, ""]
 
 
-def _settings(config: TrainConfig) -> QMIXSettings:
-    assert isinstance(config.hyperparameters, QMIXSettings)
+def _settings(config: TrainConfig) -> SequenceSettings:
+    assert isinstance(config.hyperparameters, SequenceSettings)
     return config.hyperparameters
 
 
