@@ -16,7 +16,7 @@ import numpy as np
 from lare_rl.algorithms.registry import ALGORITHMS
 from lare_rl.credit import arel
 from lare_rl.credit.decoder_settings import CreditSettings
-from lare_rl.credit.methods import find_method
+from lare_rl.credit.methods import METHODS
 from lare_rl.data.trajectory import Trajectory
 from lare_rl.envs.particles.particle_env import ParticleEnv
 from lare_rl.envs.particles.task import MAX_STEPS
@@ -41,7 +41,7 @@ def make_config(name: str) -> TrainConfig:
         env=ENV.spec,
         credit_scope="observation",
         scored_observation="after",
-        method=find_method(name),
+        method=METHODS.find(name),
         algorithm=ippo,
         hyperparameters=ippo.settings,
         credit=CreditSettings(steps=32 * MAX_STEPS),
@@ -84,7 +84,7 @@ def curve(name: str, updates: int) -> Iterator[tuple[int, tuple[float, float]]]:
     fit = jax.jit(partial(fit_repeatedly, config=config))
     for done in range(AT_A_TIME, updates + 1, AT_A_TIME):
         credit, _ = fit(learner, jax.random.key(done))
-        learner = learner._replace(decoders=credit)
+        learner = learner._replace(reward_sources=credit)
         if (done // AT_A_TIME).bit_count() == 1:
             yield done, correlations(learner, test_steps, config)
 

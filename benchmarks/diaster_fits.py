@@ -22,7 +22,7 @@ from lare_rl.data import replay
 from lare_rl.runs.directory import open_run
 from lare_rl.training.decoder_fits import fit_repeatedly
 from lare_rl.training.decoder_inputs import decoder_inputs
-from lare_rl.training.learner import Learner, init_decoders
+from lare_rl.training.learner import Learner
 from lare_rl.training.rewards import team_proxy_rewards
 from lare_rl.training.saved_state import load_learner
 from lare_rl.training.seed_axis import select_seed
@@ -35,13 +35,13 @@ AT_A_TIME = 50
 
 def untrained(learner: Learner, config: TrainConfig, key: jax.Array) -> Learner:
     """The learner with a new decoder, which has the statistics of all stored steps."""
-    (credit,) = init_decoders([key], config)
+    credit = decomposition.init(key, config.credit_specs[0])
     stored_replay = learner.replay
     valid = replay.read(
         stored_replay, replay.newest_steps(stored_replay, int(replay.n_stored_transitions(stored_replay)[0]))
     )
     credit = decomposition.observe_steps(credit, decoder_inputs(valid, config, 0))
-    return learner._replace(decoders=(credit._replace(scale=learner.decoders[0].scale),))
+    return learner._replace(reward_sources=(credit._replace(scale=learner.decoders[0].scale),))
 
 
 def curve(learner: Learner, config: TrainConfig, fits: tuple[int, ...], seed: int) -> list[dict[str, float]]:
@@ -56,7 +56,7 @@ def curve(learner: Learner, config: TrainConfig, fits: tuple[int, ...], seed: in
     for n_fits in fits:
         while done < n_fits:
             credit, _ = fit_some(learner, jax.random.key(1000 * seed + done), config=config)
-            learner = learner._replace(decoders=credit)
+            learner = learner._replace(reward_sources=credit)
             done += AT_A_TIME
         r_hat = team_proxy_rewards(recent, learner.reward_sources, config, 0)[:, 0]
         accuracies.append(

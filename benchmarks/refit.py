@@ -24,7 +24,7 @@ from lare_rl.data.sampling import CreditSample, sample_episode_steps
 from lare_rl.nn.normalise import Scale
 from lare_rl.runs.directory import open_run
 from lare_rl.training.decoder_inputs import decoder_inputs
-from lare_rl.training.learner import Learner, init_decoders
+from lare_rl.training.learner import Learner
 from lare_rl.training.saved_state import load_learner
 from lare_rl.training.seed_axis import select_seed
 from lare_rl.training.static_config import TrainConfig
@@ -58,7 +58,7 @@ def newest(learner: Learner, config: TrainConfig) -> tuple[jax.Array, jax.Array]
 def refit(learner: Learner, config: TrainConfig, fit: Fit, scale: Scale) -> list[dict[str, float]]:
     (decoder,) = learner.decoders
     (features, reward), valid = newest(learner, config), jnp.ones(RECENT_STEPS, bool)
-    (credit,) = init_decoders([jax.random.key(0)], config)
+    credit = decomposition.init(jax.random.key(0), config.credit_specs[0])
     credit = credit._replace(statistics=decoder.statistics, scale=scale)
     rows = []
     for number in range(UPDATES // STRETCH):

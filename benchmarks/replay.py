@@ -27,7 +27,7 @@ import lare_rl
 from lare_rl.algorithms.registry import ALGORITHMS
 from lare_rl.algorithms.td3 import TD3Settings
 from lare_rl.credit.decoder_settings import CreditSettings
-from lare_rl.credit.methods import find_method
+from lare_rl.credit.methods import METHODS
 from lare_rl.data import replay
 from lare_rl.data.replay import Replay
 from lare_rl.data.trajectory import Trajectory
@@ -44,7 +44,7 @@ CONFIG = TrainConfig(
     env=EnvSpec((Team("agent", 0, 1),), observation_size=17, action_size=6, discrete=False, max_steps=EPISODE),
     credit_scope="observation",
     scored_observation="after",
-    method=find_method("lare-rrdu"),
+    method=METHODS.find("lare-rrdu"),
     algorithm=ALGORITHMS["td3"],
     hyperparameters=TD3Settings(),
     credit=CreditSettings(),

@@ -14,7 +14,7 @@ from pydantic import Field, field_validator
 
 from lare_rl.config.resolve import choose_algorithm
 from lare_rl.config.settings import Settings
-from lare_rl.credit.methods import find_method
+from lare_rl.credit.methods import METHODS
 from lare_rl.envs.families import load_env_spec
 from lare_rl.envs.load import load_task
 from lare_rl.errors import CheckedModel, LareError
@@ -193,7 +193,7 @@ def jobs_of_contender(contender: Contender, budget: Budget, name: str, root: Pat
         "seeds": budget.seeds,
     }
     shared_settings |= budget.algorithms.get(choose_algorithm(contender.algorithm, load_env_spec(task)), {})
-    latent = find_method(contender.method).needs_phi
+    latent = METHODS.find(contender.method).needs_phi
     for draw in range(min(budget.draws, contender.draws) if latent else 1):
         job = make_job(
             root, task, Settings(**{**contender.settings, **budget.settings, **shared_settings, "draw": draw})

@@ -56,7 +56,7 @@ def test_register_algorithm_refuses_used_name():
         register_algorithm(replace(ALGORITHMS["sac"], name="td3"))
 
 
-@pytest.mark.parametrize(("name", "base"), [("td3", "OffPolicySettings"), ("vdn", "QMIXSettings")])
+@pytest.mark.parametrize(("name", "base"), [("td3", "OffPolicySettings"), ("vdn", "SequenceSettings")])
 def test_settings_must_derive_from_those_of_the_loop(name, base):
     with pytest.raises(
         LareError, match=f"algorithm mine: .* consumes {ALGORITHMS[name].consumes} derive from .*:{base}"

@@ -30,7 +30,7 @@ from lare_rl.credit.methods import METHODS
 from lare_rl.errors import LareError
 from lare_rl.latent.function import LatentFunction, verify_function
 
-METHODS_FOR_STEPS = [m for m in METHODS.values() if m.has_proxy_rewards and not m.needs_whole_episodes]
+METHODS_FOR_STEPS = [m for m in METHODS.values() if m.has_proxy_rewards and not m.decoder_kind.whole_episodes]
 SINGLE_AGENT_KINDS = {"rd", "rrdu", "diaster", "lare-bayes", "lare-signs", "ircr", "llm-reward"}
 MANY_AGENT_KINDS = {"bayes", "lare-rd-shared", "ircr"}
 """Methods with all kinds of inputs, batches, fits and rewards."""

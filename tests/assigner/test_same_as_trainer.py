@@ -135,6 +135,6 @@ def test_lengths_agree(payments, n_running):
     """Also those of a running episode that is longer than most."""
     learner, _, credit = learn("rd-linear", ONE_AGENT, payments=payments, n_running=n_running)
     steps = stored_steps(learner)
-    assert (~steps.finished).sum() == (n_running if payments == PAID_AT_END else n_running % 5)
+    assert (~steps.episode_ended).sum() == (n_running if payments == PAID_AT_END else n_running % 5)
     lengths = credit.store.lengths(np.arange(credit.store.n_added))
     np.testing.assert_array_equal(lengths, np.asarray(steps.length).ravel())

@@ -8,7 +8,7 @@ from lare_rl.config.resolve import replay_rows, resolve
 from lare_rl.config.settings import Settings
 from lare_rl.config.validity import CreditContext, check_credit
 from lare_rl.credit.decoder_settings import MULTI_AGENT_CREDIT, RECENT_STEPS, CreditSettings
-from lare_rl.credit.methods import find_method
+from lare_rl.credit.methods import METHODS
 from lare_rl.envs.load import read_task
 from lare_rl.errors import LareError
 
@@ -30,6 +30,7 @@ def resolve_named(task, settings):
         ("Reacher-v4", {"method": "llm-reward", "scored_observation": "both"}, ["llm-reward", "scored_observation"]),
         ("Reacher-v4", {"method": "ircr", "scale_rewards": True}, ["scale_rewards", "ircr"]),
         ("Reacher-v4", {"method": "rrd", "credit": {"steps": 16}}, ["steps = 16", "sampled_steps = 64"]),
+        ("Reacher-v4", {"overlap_collection": True, "td3": {"warmup": 0}}, ["overlap_collection", "td3.warmup to 1"]),
         ("Reacher-v4", {"rollout_steps": 20, "steps": 20}, ["steps = 20", "50"]),
         ("CN-6", {"capacity": 6149, "method": "rd"}, ["capacity = 6149", "rollout", "6150"]),
         ("CN-6", {"algorithm": "vdn", "vdn": {"monotonic": True}}, ["vdn.monotonic = True", "use --algorithm qmix"]),
@@ -163,7 +164,7 @@ def check(method, changes):
         changes.get("credit", CreditSettings()),
         {name: v for name, v in changes.items() if name != "credit"},
     )
-    check_credit(find_method(method), credit, CreditContext(**{"n_agents": 1, "n_raw_features": 9} | context))
+    check_credit(METHODS.find(method), credit, CreditContext(**{"n_agents": 1, "n_raw_features": 9} | context))
 
 
 @pytest.mark.parametrize(

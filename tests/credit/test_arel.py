@@ -39,7 +39,7 @@ def test_loss_is_the_published_one_in_other_units():
     def compute():
         state = decomposition.init(KEY, observation_spec(FEATURES, method, settings, STEPS, AGENTS))
         state = decomposition.observe_steps(state, jnp.asarray(ROWS))
-        state = decomposition.observe_returns(state, mean_reward, length, jnp.ones(EPISODES, bool))
+        state = decomposition.observe_returns(state, mean_reward, length, jnp.ones(EPISODES, bool), None)
         episode_index = jnp.repeat(jnp.arange(EPISODES), STEPS)
         batch = CreditBatch(jnp.asarray(ROWS), episode_index, length, mean_reward, mask=jnp.ones(EPISODES))
         loss, _ = descent.loss_and_gradient(state, batch, KEY, Fit.ALL_STEPS, settings)

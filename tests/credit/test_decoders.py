@@ -87,7 +87,7 @@ QUICK = {DISTINCT[Fit.ALL_STEPS, "step"]}
 def test_must_learn_credit_among_agents_from_the_mean_return(name):
     """Each agent's reward is the first feature. Only the return of all agents is observed."""
     settings, method = CreditSettings(hidden=(16,), learning_rate=3e-3), METHODS[name]
-    n_episodes, n_updates = 64, 20 if method.needs_whole_episodes else 300
+    n_episodes, n_updates = 64, 20 if method.decoder_kind.whole_episodes else 300
     rows = np.random.default_rng(0).normal(size=(n_episodes, STEPS, AGENTS, 2)).astype(np.float32)
     reward, length = rows[..., 0], jnp.full(n_episodes, STEPS)
     mean_reward = reward.mean(axis=(1, 2))
@@ -107,7 +107,7 @@ def test_must_learn_credit_among_agents_from_the_mean_return(name):
         two_inputs = replace(method, inputs=InputNames(("observation", "action")))
         state = decomposition.init(KEY, replace(spec, method=two_inputs, action_size=1))
         state = decomposition.observe_steps(state, jnp.asarray(rows))
-        state = decomposition.observe_returns(state, jnp.asarray(mean_reward), length, jnp.ones(n_episodes, bool))
+        state = decomposition.observe_returns(state, jnp.asarray(mean_reward), length, jnp.ones(n_episodes, bool), None)
         state, losses = jax.lax.scan(body, state, jax.random.split(jax.random.key(0), n_updates))
         return decomposition.decoder_rewards(state, jnp.asarray(rows).reshape(-1, AGENTS, 2), settings), losses
 

@@ -34,7 +34,7 @@ def fit_batches(state, batches, fit, settings):
 @jax.jit
 def observe(state, rows, mean_reward, length):
     state = decomposition.observe_steps(state, rows)
-    return decomposition.observe_returns(state, mean_reward, length, jnp.ones(len(length), bool))
+    return decomposition.observe_returns(state, mean_reward, length, jnp.ones(len(length), bool), None)
 
 
 def train(fit, settings, reward_scale=1.0, feature_scale=1.0, updates=400):
@@ -179,3 +179,8 @@ def test_gradient_in_chunks_is_that_of_the_batch(name, sum_form):
     )
     for a, b in zip(jax.tree.leaves((unsplit, whole_loss)), jax.tree.leaves((chunked, chunked_loss)), strict=True):
         np.testing.assert_allclose(a, b, rtol=1e-4, atol=1e-6)
+
+
+def test_values_of_agents_that_have_left_make_no_difference():
+    values, alive = jnp.array([[1.0, jnp.nan, 3.0]]), jnp.array([[True, False, True]])
+    assert decomposition.agent_mean(values, alive).tolist() == [2.0]

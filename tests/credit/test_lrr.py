@@ -91,7 +91,7 @@ def test_must_learn_rewards_and_where_they_are_uncertain():
     def train():
         state = decomposition.init(KEY, observation_spec(FEATURES, METHODS["lrr"], SETTINGS, steps))
         state = decomposition.observe_steps(state, jnp.asarray(rows[0]))
-        state = decomposition.observe_returns(state, mean_reward[0], length, jnp.ones(n_episodes, bool))
+        state = decomposition.observe_returns(state, mean_reward[0], length, jnp.ones(n_episodes, bool), None)
         return jax.lax.scan(body, state, (jnp.asarray(rows), mean_reward))[0]
 
     state = train()

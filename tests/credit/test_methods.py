@@ -10,7 +10,7 @@ from lare_rl.config.settings import Settings
 from lare_rl.credit import input_names, methods
 from lare_rl.credit.decoder_network import DecoderOutput
 from lare_rl.credit.decoders import DECODERS, Decoder, register_decoder
-from lare_rl.credit.methods import METHODS, Fit, Method, Reward, find_method, register_method
+from lare_rl.credit.methods import METHODS, Fit, Method, Reward, register_method
 from lare_rl.errors import LareError
 
 
@@ -48,7 +48,7 @@ def test_encoder_with_unknown_names():
 @pytest.mark.parametrize(("name", "words"), [("lare_rrdu", "'lare_rrdu' .*'lare-rrdu'"), ("", "dense, episodic, ")])
 def test_find_method_unknown(name, words):
     with pytest.raises(LareError, match=words):
-        find_method(name)
+        METHODS.find(name)
 
 
 class Squares(eqx.Module):
@@ -75,7 +75,7 @@ def registered(monkeypatch):
 
 @pytest.mark.parametrize("fit", [Fit.ALL_STEPS, Fit.SAMPLED_STEPS_UNBIASED, Fit.DECODER_LOSS])
 def test_registered_method_is_trained(fit, registered):
-    register_decoder(Decoder("squares", lambda key, shape, settings: Squares(shape.gain * jnp.ones(shape.n_inputs))))
+    register_decoder(Decoder("squares", lambda key, spec: Squares(spec.output_scale * jnp.ones(spec.n_inputs))))
     register_method(Method(f"squares {fit}", "squares", "this test", inputs=methods.RAW, fit=fit, decoder="squares"))
     assert Settings(method=f"squares {fit}").method == f"squares {fit}"
     credit = CreditAssigner(f"squares {fit}", observation_space=2, action_space=1, settings=SMALL_CREDIT)
@@ -89,14 +89,14 @@ def test_registered_method_is_trained(fit, registered):
 
 def test_loss_of_a_decoder_is_for_a_single_agent(registered):
     """Steps of several agents would be mixed with each other: `loss` has an axis of steps, and none of agents."""
-    register_decoder(Decoder("squares", lambda key, shape, settings: Squares(jnp.ones(shape.n_inputs))))
+    register_decoder(Decoder("squares", lambda key, spec: Squares(jnp.ones(spec.n_inputs))))
     register_method(Method("mine", "squares", "this test", inputs=methods.RAW, fit=Fit.DECODER_LOSS, decoder="squares"))
     with pytest.raises(LareError, match="mine assigns credit to a single agent, and the task has 2 agents"):
         CreditAssigner("mine", observation_space=2, action_space=1, agents=2, max_steps=5)
 
 
 def test_decoder_with_functions_is_refused_in_one_line(registered):
-    register_decoder(Decoder("mlp", lambda key, shape, settings: eqx.nn.MLP(shape.n_inputs, 1, 4, 1, key=key)))
+    register_decoder(Decoder("mlp", lambda key, spec: eqx.nn.MLP(spec.n_inputs, 1, 4, 1, key=key)))
     register_method(Method("mlp", "mlp", "this test", inputs=methods.RAW, fit=Fit.ALL_STEPS, decoder="mlp"))
     with pytest.raises(LareError, match=r"'mlp' holds .* instead of eqx.nn.MLP.*, use lare_rl.nn.networks.MLP"):
         CreditAssigner("mlp", observation_space=2, action_space=1)
@@ -114,7 +114,7 @@ def test_decoder_with_functions_is_refused_in_one_line(registered):
 )
 def test_output_of_a_decoder_is_checked(call, agents, registered, monkeypatch):
     monkeypatch.setattr(Squares, "__call__", call)
-    register_decoder(Decoder("mine", lambda key, shape, settings: Squares(jnp.ones(shape.n_inputs))))
+    register_decoder(Decoder("mine", lambda key, spec: Squares(jnp.ones(spec.n_inputs))))
     register_method(Method("mine", "mine", "this test", inputs=methods.RAW, fit=Fit.ALL_STEPS, decoder="mine"))
     with pytest.raises(LareError, match=rf"'mine' must return DecoderOutput.* both of the shape \(2, {agents}\) for "):
         CreditAssigner("mine", observation_space=2, action_space=1, agents=agents, max_steps=5)
@@ -126,7 +126,7 @@ def test_register_refuses(registered):
     with pytest.raises(LareError, match="no decoder 'nothing'"):
         register_method(Method("new", "mine", "this test", decoder="nothing"))
     with pytest.raises(LareError, match="whole_episodes"):
-        Decoder("shares", lambda key, shape, settings: None, pays_shares=True)
+        Decoder("shares", lambda key, spec: None, pays_shares=True)
     with pytest.raises(LareError, match=r"decoder mine: settings = .*'temperature'.*: give a set of names of hidden, "):
         Decoder("mine", "mine:init", settings=frozenset({"hidden", "temperature"}))
     register_method(METHODS["rd"])

@@ -13,7 +13,7 @@ def sample_predictions(count):
 
 def add(predictions, returns, predicted, mask=None):
     mask = np.ones(len(returns), bool) if mask is None else mask
-    return add_predictions(predictions, *map(jnp.asarray, (returns, predicted, mask)))
+    return add_predictions(predictions, *map(jnp.asarray, (returns, predicted, mask)), None)
 
 
 @pytest.mark.parametrize("count", [8, 30, WINDOW, WINDOW + 5, 3 * WINDOW - 1])

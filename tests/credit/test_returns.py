@@ -14,15 +14,17 @@ from lare_rl.credit.decomposition import CreditBatch
 from lare_rl.credit.methods import METHODS, Fit
 from lare_rl.credit.prequential import WINDOW, Predictions
 from lare_rl.credit.score_type import ScoreType, ScoreTypeEstimate
+from lare_rl.tasks.spec import MAX_LEVELS
 from lare_rl.util.float64 import float64
 
-METHOD, SETTINGS, SCORE_TYPES = METHODS["rd-linear"], CreditSettings(), (0, 1)
+METHOD, SETTINGS = METHODS["rd-linear"], CreditSettings()
+SPEC = observation_spec(2, METHOD, SETTINGS, 4, fixed_length=False)
 init = jax.jit(decomposition.init, static_argnames="spec")
 
 
 @jax.jit
 def fit(state):
-    return returns.fit_closed_form(state, METHOD, SCORE_TYPES)
+    return returns.fit_closed_form(state, SPEC)
 
 
 @jax.jit
@@ -31,7 +33,7 @@ def learn(state, episode):
 
 
 def untrained():
-    return init(jax.random.key(0), observation_spec(2, METHOD, SETTINGS, 4, fixed_length=False))
+    return init(jax.random.key(0), SPEC)
 
 
 @pytest.mark.parametrize(("ratio", "is_average"), [(1.03, False), (0.97, False), (0.93, True)])
@@ -63,7 +65,7 @@ def test_prefixes_are_summed_like_separate_cases():
     """The sums over prefixes equal those of every prefix as a case of its own, whatever the packing of the rows is."""
     rng, lengths = np.random.default_rng(0), [3, 1, 4]
     method = replace(METHOD, fit=Fit.PREFIX_EVIDENCE)
-    decoder = init(jax.random.key(0), observation_spec(3, method, SETTINGS, 4, n_levels=2))
+    decoder = init(jax.random.key(0), observation_spec(3, method, SETTINGS, 4, has_groups=True))
     rows = rng.normal(size=(10, 3)).astype(np.float32)
     scores, level = np.float32([2, -1, 5]), np.int32([1, 0, 1])
     batch = CreditBatch(
@@ -80,7 +82,7 @@ def test_prefixes_are_summed_like_separate_cases():
     cases = []
     for first, k in ((0, 0), (4, 2)):
         for t in range(1, lengths[k] + 1):
-            one_hot = np.eye(2)[level[k]]
+            one_hot = np.eye(MAX_LEVELS)[level[k]]
             cases.append(np.concatenate([rows[first : first + t].sum(axis=0), [t], one_hot, [scores[k]] * 2]))
     cases = np.array(cases, np.float64)
     assert statistics.n_episodes == 2

@@ -75,15 +75,16 @@ def test_rewards_add_up_to_the_return():
     # Two environments, two episodes each.
     returns = np.repeat(rng.normal(size=(2, 2)), STEPS, axis=1).astype(np.float32)
     inputs = rng.normal(size=(2, 2 * STEPS, AGENTS, 4)).astype(np.float32)
-    steps = StepBatch(inputs, np.full(returns.shape, STEPS), returns / STEPS, np.ones(returns.shape, bool), alive=alive)
-    unfinished = steps._replace(finished=~steps.finished)  # the return is not known yet
+    ended, last = np.ones(returns.shape, bool), np.tile(np.arange(STEPS) == STEPS - 1, (2, 2))
+    steps = StepBatch(inputs, np.full(returns.shape, STEPS), returns / STEPS, ended, last, alive)
+    unfinished = steps._replace(episode_ended=~steps.episode_ended)  # the return is not known yet
 
     @jax.jit
     def compute(steps):
         decoder = decomposition.init(
             jax.random.key(0), observation_spec(4, METHODS["rd"], CreditSettings(hidden=(4,)), STEPS, AGENTS)
         )
-        return engine.training_rewards(decoder, steps, spec, steps.alive)
+        return engine.training_rewards(decoder, steps, spec)
 
     rewards, contributions = np.asarray(compute(jax.tree.map(lambda *pair: jnp.stack(pair), steps, unfinished)))
     step_rewards = rewards.sum(axis=-1) / np.maximum(alive.sum(axis=-1), 1)

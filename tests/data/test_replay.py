@@ -60,7 +60,7 @@ def test_replay_matches_slow_twin(lengths_by_env, chunks):
         np.testing.assert_array_equal(steps.last[at], is_last)
         np.testing.assert_allclose(steps.episodic_reward[at], return_ * is_last[:, None], rtol=1e-6)
         is_finished = np.arange(len(stored)) < len(stored) - len(running)
-        np.testing.assert_array_equal(steps.finished[at], is_finished)
+        np.testing.assert_array_equal(steps.episode_ended[at], is_finished)
         expected_length = np.where(is_finished, length, np.maximum(length, mean_length))
         np.testing.assert_array_equal(steps.length[at], expected_length)
     assert set(steps.next_columns) == {"observation", "state"}
@@ -100,7 +100,7 @@ def test_segments_match_slow_twin(rule, data):
         steps = jax.tree.map(lambda rows, env=env, n=n_stored: rows[env, :n], all_steps)
         last = np.concatenate([np.arange(len(unpaid)) == len(unpaid) - 1 for _, unpaid, _ in segments] or [[]])
         np.testing.assert_array_equal(steps.last[: len(last)], last)
-        np.testing.assert_array_equal(steps.finished, np.arange(n_stored) < len(last))
+        np.testing.assert_array_equal(steps.episode_ended, np.arange(n_stored) < len(last))
         length = np.concatenate([np.full(len(unpaid), len(paid_for)) for _, unpaid, paid_for in segments] or [[]])
         np.testing.assert_array_equal(steps.length[: len(last)], length)
         payments = [payment for payment, _, _ in segments]
@@ -147,7 +147,7 @@ def test_hide_newest():
     hidden = replay.hide_newest(buffer, jnp.array([2, 0, 1]))
     assert replay.n_stored_episodes(hidden).tolist() == [1, 3, 2]
     assert hidden.running.tolist() == [True, False, True]
-    finished = read(hidden, replay.newest_steps(hidden, 7)).finished
+    finished = read(hidden, replay.newest_steps(hidden, 7)).episode_ended
     assert finished.sum(axis=1).tolist() == [2, 7, 5]
     restored = hidden._replace(current_episode=buffer.current_episode, running=buffer.running)
     assert jax.tree.all(jax.tree.map(np.array_equal, restored, buffer))

@@ -265,7 +265,7 @@ def test_evaluate_in_several_batches(run, returns):
 def test_evaluate_continues_after_initial_states_of_run(run, returns):
     state = load_learner(run)
     functions = compile_functions(state.config)
-    policy = EvaluationPolicy(state.config, functions.get_actor(state.learner, 60), run.seeds, 4)
+    policy = EvaluationPolicy(state.config, functions.get_actor(state.learner, 60), run.seeds, np.arange(4), 4)
     with LocalVecEnv([partial(make_host_env, TASK)] * 8) as envs:
         first_returns = evaluate_on_host(envs, policy, run.seeds, 4).returns[..., 0]
     last_evaluation = [line["evaluation/return"] for line in run.metrics()[-2:]]

@@ -1,21 +1,32 @@
 """Decoders for tests, and what their losses have in common (`from helpers.decoder_toys import ...`)."""
 
+from dataclasses import replace
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from lare_rl.credit.basis import Basis
-from lare_rl.credit.decoder_network import DecoderShape
 from lare_rl.credit.decoder_settings import CreditSettings
 from lare_rl.credit.decoders import DECODERS
+from lare_rl.credit.input_names import InputNames
+from lare_rl.credit.methods import METHODS
+from lare_rl.credit.spec import CreditSpec
 from lare_rl.nn.networks import adam_step, init_adam
 
 
 def make_decoder(name, sizes, steps, agents=1, seed=0, **settings):
     """Return an untrained decoder for inputs of these sizes, which is one number or numbers by names."""
     sizes = sizes if isinstance(sizes, dict) else {"observation": sizes}
-    shape = DecoderShape(Basis(0, sum(sizes.values()), extended=False), steps, agents, tuple(sizes.items()))
-    return DECODERS[name].init_network(jax.random.key(seed), shape, CreditSettings(**settings))
+    spec = CreditSpec(
+        method=replace(METHODS["rd"], inputs=InputNames(tuple(sizes)), decoder=name),
+        settings=CreditSettings(**settings),
+        observation_size=sizes["observation"],
+        action_size=sizes.get("action", 0),
+        single_agent=agents == 1,
+        agents=agents,
+        max_steps=steps,
+    )
+    return DECODERS[name].init_network(jax.random.key(seed), spec)
 
 
 def train_by_loss(decoder, rows, target, learning_rate):

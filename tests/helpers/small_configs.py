@@ -146,7 +146,7 @@ def with_other_dead_values(steps):
 
 def random_factors(config, steps, seed=1):
     """Return random factors of every row."""
-    shape = (*steps.ended.shape, config.credit_rows, max(config.n_factors, default=0))
+    shape = (*steps.ended.shape, config.n_proxy_rewards, max(config.n_factors, default=0))
     return np.random.default_rng(seed).normal(size=shape).astype(np.float32)
 
 
@@ -178,7 +178,7 @@ def steps_as_stored(config, steps=None, factors=None):
         next_columns={name: jnp.asarray(next_timestep[name]) for name in STEP_COLUMNS if name in config.columns},
         episodic_reward=jnp.asarray(np.where(last[:, None], np.repeat(total, length, axis=0), 0)),
         mean_reward=jnp.asarray(np.repeat(total / length[:, None], length, axis=0), jnp.float32),
-        finished=jnp.ones(len(last), bool),
+        episode_ended=jnp.ones(len(last), bool),
         last=jnp.asarray(last),
         residual=None,
         level=None,
@@ -239,7 +239,7 @@ def with_factor_decoders(learner, weights):
         )
         for team, weight in zip(learner.decoders, weights, strict=True)
     )
-    return learner._replace(decoders=decoders)
+    return learner._replace(reward_sources=decoders)
 
 
 def learner_with_episodes(config, seed=0):

@@ -91,7 +91,8 @@ def test_learner_of_an_earlier_version_comes_back(method, payments, tmp_path):
     old_names = {"next_transition": "transitions", "current_episode": "episodes", "n_effective": "n_determined"}
     with np.load(tmp_path / "state.npz") as saved:
         arrays = {re.sub(r"(?<=\.)\w+", lambda m: old_names.get(m[0], m[0]), name): saved[name] for name in saved.files}
-    np.savez(tmp_path / "state.npz", **{name.replace(".scales[", ".scale["): array for name, array in arrays.items()})
+    old = ".scale[" if method == "ircr" else ".decoders["
+    np.savez(tmp_path / "state.npz", **{name.replace(".reward_sources[", old): arrays[name] for name in arrays})
     loaded, _, _ = checkpoint.load(tmp_path, learner_shape(config, 1))
     jax.tree.map(np.testing.assert_array_equal, loaded, learner)
 

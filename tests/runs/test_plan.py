@@ -156,7 +156,7 @@ def test_command_trains_what_the_file_says(write, spec_file, command, trained, t
 
 @pytest.mark.parametrize("method", METHODS)
 def test_settings_of_a_run_are_those_of_its_repetition(method, phi, reward, tmp_path):
-    if METHODS[method].multi_agent_only or METHODS[method].needs_whole_episodes:
+    if METHODS[method].multi_agent_only or METHODS[method].decoder_kind.whole_episodes:
         pytest.skip("a method for other tasks")
     task = toy_spec()
     settings = Settings(method=method, steps=240, rollout_steps=12, evaluate_every=60, seed=3, td3={"gamma": 0.9})

@@ -41,7 +41,7 @@ def test_train_step_of_seeds_in_lockstep(method, algorithm, env):
     together = functions.learn_returns(store_seeds(config)(start, *stacked))
     if fits_first:
         together, _ = functions.fit(together, keys)
-        alone = alone._replace(decoders=jax.jit(partial(fit_repeatedly, config=config))(alone, keys[1])[0])
+        alone = alone._replace(reward_sources=jax.jit(partial(fit_repeatedly, config=config))(alone, keys[1])[0])
         train = jax.jit(partial(on_policy._train_seed, config=config))
         alone, _ = train(alone, steps, keys[1], jnp.array(40))
     else:

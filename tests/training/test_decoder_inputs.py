@@ -69,7 +69,7 @@ def test_decoder_inputs(build, observed, method, scored_observation, expected):
     expected = np.concatenate(expected(before, steps.action[:, 0], after, random_factors(config, steps)[:, 0]), axis=-1)
     np.testing.assert_array_equal(decoder_inputs(steps_as_stored(config, steps), config, 0), expected)
     assert expected.shape[-1] == config.credit_specs[0].basis.n_inputs
-    assert expected.shape[-2] == (config.credit_rows if observed == "state" else config.env.n_agents)
+    assert expected.shape[-2] == (config.n_proxy_rewards if observed == "state" else config.env.n_agents)
     assert config.credit_specs[0].basis.extended == (method in ("bayes", "lare-bayes"))
 
 

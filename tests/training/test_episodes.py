@@ -119,7 +119,7 @@ def test_a_seed_without_new_episodes_does_not_change():
     learned = learner_with_episodes(config)
     decoder = learned.decoders[0]
     statistics = decoder.statistics._replace(n_rows=10 * decoder.statistics.n_rows)
-    learned = learned._replace(decoders=(decoder._replace(statistics=statistics),))
+    learned = learned._replace(reward_sources=(decoder._replace(statistics=statistics),))
     new = learned._replace(n_learned=jnp.zeros_like(learned.n_learned))
     seeds = jax.tree.map(lambda *leaves: jnp.stack(leaves), new, learned)
     with jax.enable_x64(True):
@@ -141,7 +141,7 @@ def test_rebuild_statistics_standardises_by_the_newest_statistics():
         rebuilt, same = (rebuild(credit, learner.replay, jnp.array(is_stale)) for is_stale in (True, False))
     np.testing.assert_allclose(rebuilt[0].closed_form.decoder.mean, statistics.mean + 1)
     shift = np.asarray(1 / rebuilt[0].closed_form.decoder.std)
-    before, after = map(statistics_of_decoder, (learner, learner._replace(decoders=rebuilt)))
+    before, after = map(statistics_of_decoder, (learner, learner._replace(reward_sources=rebuilt)))
     np.testing.assert_allclose(after.mean[:-2], before.mean[:-2] - shift, atol=1e-5)
     for a, b in zip(jax.tree.leaves(same), jax.tree.leaves(credit), strict=True):
         np.testing.assert_array_equal(a, b)

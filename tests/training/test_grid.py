@@ -82,7 +82,7 @@ def test_method_with_agents_that_leave(credit_scope, method_name, small_many, ec
     def train():
         return train_quietly(task, settings, tmp_path / "run", make_functions(method, task))
 
-    if method.needs_whole_episodes or (method.multi_agent_only and from_state):
+    if method.decoder_kind.whole_episodes or (method.multi_agent_only and from_state):
         with pytest.raises(LareError, match=f"^{method_name} (reads whole episodes|assigns credit among agents)"):
             train()
         return

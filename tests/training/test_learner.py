@@ -79,7 +79,7 @@ def test_unbiased_loss_has_the_expectation_of_the_full_loss(n_steps):
         learner = learner_with_episodes(config)
         # The rewards of steps shall differ.
         steep = jax.tree.map(lambda weight: 6 * weight, learner.decoders[0].network)
-        learner = learner._replace(decoders=(learner.decoders[0]._replace(network=steep),))
+        learner = learner._replace(reward_sources=(learner.decoders[0]._replace(network=steep),))
         draws = sample_episode_steps(learner.replay, jax.random.key(3), 1, 40_000, n_steps)
         first = jax.tree.map(lambda leaf: leaf[0], draws)
         _, metrics = jitted(fit_decoders, config)(learner.decoders, learner.replay, first, jax.random.key(0))
@@ -313,7 +313,7 @@ def test_must_learn_which_agent_earned_the_reward(method, fixed_length):
         untrained_learner(config), config, steps, np.stack([steps.next_timestep.reward, noise], axis=-1)
     )
     decoders, _ = jax.jit(partial(fit_repeatedly, config=config))(learner, jax.random.key(2))
-    results = jitted(assess, config)(learner._replace(decoders=decoders))
+    results = jitted(assess, config)(learner._replace(reward_sources=decoders))
     assert float(results["credit/correlation"]) > 0.9
     assert float(results["credit/error"]) < 0.35  # untrained, it is 0.8 and more
 

@@ -6,7 +6,7 @@ used: listing the algorithms does not import JAX. The training loop calls these 
 
     TRANSITIONS    init, get_actor, act, explore, update     as in `td3/td3.py`; the settings derive from `OffPolicySettings`
     ROLLOUTS       init, get_actor, act, explore, update     as in `ppo/ppo.py`
-    SEQUENCES      init, get_actor, act, init_memory, epsilon, update     as in `qmix/qmix.py`; the settings derive from `QMIXSettings`
+    SEQUENCES      init, get_actor, act, init_memory, epsilon, update     as in `qmix/qmix.py`; the settings derive from `SequenceSettings`
 
 `lare-rl export` also writes the result of `logits(actor, observation, available)`, if the module has this function.
 """
@@ -66,8 +66,9 @@ class Algorithm:
     module: str
     """The module with the functions that the training loop calls (see above)."""
     run_defaults: "Callable[[EnvSpec, int], dict[str, Any]]"
-    """Return default settings of a run, from an environment and the requested number of its copies (0: not requested). They have the
-    names of `Settings`; `steps_iterations` and `evaluate_iterations` count iterations, and `credit` holds changes."""
+    """From an environment and the requested number of copies (0 if none was requested) to the defaults of `Settings`, by name. In place
+    of `steps` and `evaluate_every`, `steps_iterations` and `evaluate_iterations` may count iterations. `credit` holds only the settings
+    that differ."""
     summary: str
     source: str
     continuous: bool = True
@@ -105,7 +106,7 @@ ALGORITHMS = Registry[Algorithm]("algorithm")
 _SETTINGS = {
     Consumes.TRANSITIONS: "lare_rl.algorithms.off_policy:OffPolicySettings",
     Consumes.ROLLOUTS: "lare_rl.algorithms.registry:AlgorithmSettings",
-    Consumes.SEQUENCES: "lare_rl.algorithms.qmix:QMIXSettings",
+    Consumes.SEQUENCES: "lare_rl.algorithms.sequences:SequenceSettings",
 }
 """The classes that the settings of algorithms derive from. Their modules import this one."""
 

@@ -26,7 +26,6 @@ from lare_rl.assigner.saving import AssignerState
 from lare_rl.assigner.step_rewards import StepRewards
 from lare_rl.assigner.store import Store
 from lare_rl.credit.decoder_settings import CreditSettings
-from lare_rl.credit.decoders import DECODERS
 from lare_rl.credit.methods import Reward
 from lare_rl.errors import LareError
 from lare_rl.latent.function import LatentFunction
@@ -112,7 +111,7 @@ class CreditAssigner:
         check_config(config)
         self.config = config
         row_shape = (*config.agent_axis, config.spec.basis.n_inputs)
-        longest = DECODERS[config.method.decoder].longest_segment
+        longest = config.method.decoder_kind.longest_segment
         self.store = Store(
             config.capacity, row_shape, config.agents, config.payments, has_levels=config.groups, longest=longest
         )

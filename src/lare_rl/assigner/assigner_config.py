@@ -15,15 +15,14 @@ from lare_rl.config.validity import CreditContext, check_credit, check_factors
 from lare_rl.credit.decoder_settings import CreditSettings, default_credit
 from lare_rl.credit.history import next_history_columns
 from lare_rl.credit.input_names import input_arrays
-from lare_rl.credit.methods import Method, find_method
-from lare_rl.credit.score_type import prediction_window
+from lare_rl.credit.methods import METHODS, Method
 from lare_rl.credit.spec import CreditSpec
 from lare_rl.envs.families import find_score_type, load_env_spec
 from lare_rl.envs.load import resolve_task
 from lare_rl.errors import CheckedModel, Count, LareError, short_repr
 from lare_rl.latent.function import LatentFunction, check_task
 from lare_rl.tasks.payments import PAID_AT_END, PaymentRule
-from lare_rl.tasks.spec import MAX_LEVELS, ScoredObservation, TaskSpec
+from lare_rl.tasks.spec import ScoredObservation, TaskSpec
 
 __all__ = ["AssignerConfig", "Space", "check_config", "resolve_config"]
 
@@ -69,25 +68,15 @@ class AssignerConfig(CheckedModel):
             single_agent=self.agents == 1,
             agents=self.agents,
             max_steps=self.max_steps or 1,
-            window=prediction_window(self.payments, self.settings.score),
-            n_levels=self.n_levels,
+            payments=self.payments,
+            has_groups=self.groups,
             scale_rewards=self.scale_rewards,
         )
-
-    @property
-    def n_levels(self) -> int:
-        """The number of levels that episodes may belong to."""
-        return MAX_LEVELS if self.groups else 0
 
     @property
     def group_key(self) -> str:
         """The key of an episode's group in `info`."""
         return "group" if self.task is None or self.task.group is None else self.task.group
-
-    @property
-    def is_exact(self) -> bool:
-        """Whether the proxy rewards of an episode are corrected to add up to its return."""
-        return self.method.is_exact(self.settings.exact)
 
     @property
     def raw_feature_names(self) -> list[str]:
@@ -139,7 +128,7 @@ def resolve_config(
     Raises:
         LareError: there is no such method or task, or the spaces are not those of the task.
     """
-    task, chosen = None if task is None else resolve_task(task, playable=False), find_method(method)
+    task, chosen = None if task is None else resolve_task(task, playable=False), METHODS.find(method)
     if phi is not None and not isinstance(phi, LatentFunction):
         raise LareError(f"phi is {short_repr(phi)}: give a function from lare_rl.design or lare_rl.load_function")
     settings = default_credit(agents) if settings is None else CreditSettings.model_validate(settings)

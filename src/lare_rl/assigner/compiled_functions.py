@@ -7,9 +7,9 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Key
+from jaxtyping import Array, Float, Key
 
-from lare_rl.credit import closed_form, decomposition, descent, engine, returns
+from lare_rl.credit import decomposition, descent, engine, explain_returns, returns
 from lare_rl.credit.decomposition import CreditBatch, DecoderState
 from lare_rl.credit.engine import StepBatch
 from lare_rl.credit.spec import CreditSpec
@@ -19,32 +19,21 @@ from lare_rl.nn.normalise import update_scale
 MAX_CALL_ROWS = 8192
 """Rows that are processed in one call."""
 
-init_decoder = jax.jit(engine.init_decoder, static_argnames="spec")
+init_source = jax.jit(engine.init_source, static_argnames="spec")
 observe_steps = jax.jit(decomposition.observe_steps)
 observe_returns = jax.jit(decomposition.observe_returns)
 observe_scale = jax.jit(update_scale)
 predict_then_update = jax.jit(returns.predict_then_update, static_argnames="settings")
 predicted_returns = jax.jit(returns.predicted_returns, static_argnames="settings")
 add_episodes = jax.jit(returns.add_episodes)
+fit_closed_form = jax.jit(returns.fit_closed_form, static_argnames="spec")
+is_due = jax.jit(returns.is_due)
 is_stale = jax.jit(returns.is_stale)
 reset_statistics = jax.jit(returns.reset_statistics)
-init_explanation = jax.jit(engine.init_explanation, static_argnames="basis")
-add_to_explanation = jax.jit(engine.add_to_explanation)
-explain_returns = jax.jit(engine.explain_returns)
+init_explanation = jax.jit(explain_returns.init_explanation, static_argnames="basis")
+add_to_explanation = jax.jit(explain_returns.add_to_explanation)
+explain = jax.jit(explain_returns.explain_returns)
 sample_steps = jax.jit(_sample_steps, static_argnames="steps")
-
-
-@partial(jax.jit, static_argnames="spec")
-def fit_closed_form(state: DecoderState, spec: CreditSpec) -> DecoderState:
-    """Fit the decoder to its sufficient statistics."""
-    return returns.fit_closed_form(state, spec.method, spec.score_types)
-
-
-@jax.jit
-def is_due(state: DecoderState) -> Bool[Array, ""]:
-    """Return whether there are enough new episodes for another closed-form fit."""
-    assert state.closed_form is not None
-    return closed_form.is_due(state.closed_form)
 
 
 @partial(jax.jit, static_argnames="spec")
@@ -65,12 +54,10 @@ def fit_by_gradient(
 
 @partial(jax.jit, static_argnames=("structure", "spec"))
 def training_rewards(
-    leaves: list[Array], steps: StepBatch, alive: Bool[Array, "rows agents"] | None, structure: Any, spec: CreditSpec
+    leaves: list[Array], steps: StepBatch, structure: Any, spec: CreditSpec
 ) -> Float[Array, "rows agents"]:
     """Return the rewards of steps by a flat `RewardSource`: its leaves and structure, from `jax.tree.flatten`."""
-    source = jax.tree.unflatten(structure, leaves)
-    alive = jnp.ones(steps.inputs.shape[:-1], bool) if alive is None else alive
-    return engine.training_rewards(source, steps, spec, alive)
+    return engine.training_rewards(jax.tree.unflatten(structure, leaves), steps, spec)
 
 
 def on_cpu() -> AbstractContextManager:

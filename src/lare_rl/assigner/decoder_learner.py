@@ -23,9 +23,9 @@ from lare_rl.assigner.compiled_functions import MAX_CALL_ROWS, on_cpu, pad
 from lare_rl.assigner.store import Store, StoredEpisode
 from lare_rl.credit import closed_form, prequential, returns
 from lare_rl.credit.decomposition import DecoderState
+from lare_rl.credit.engine import RewardSource
 from lare_rl.credit.history import next_history_columns
 from lare_rl.credit.methods import Fit
-from lare_rl.nn.normalise import empty_scale
 from lare_rl.util.float64 import float64
 from lare_rl.util.shapes import padded_size
 
@@ -47,10 +47,8 @@ class DecoderLearner:
     def __init__(self, config: AssignerConfig, store: Store):
         self.config, self.store = config, store
         with on_cpu():
-            self.decoder: DecoderState | None = compiled.init_decoder(jax.random.key(config.seed), spec=config.spec)
-        """None for a method that has no decoder."""
-        self.scale = empty_scale() if self.decoder is None else None
-        """The scale of R/T, if there is no decoder. A decoder has its own."""
+            self.source: RewardSource = compiled.init_source(jax.random.key(config.seed), spec=config.spec)
+        """What rewards are computed from."""
         self.n_learned = 0
         """Episodes that the decoder has learned from."""
         self.n_updates = 0
@@ -70,6 +68,11 @@ class DecoderLearner:
         """Episodes that the decoder has not learned from yet. Episodes that ended in one call are together."""
         self._pending_updates = 0.0
         self._is_fitted = False
+
+    @property
+    def decoder(self) -> DecoderState | None:
+        """The decoder. None for a method that fits nothing."""
+        return self.source if isinstance(self.source, DecoderState) else None
 
     @property
     def is_fitted(self) -> bool:
@@ -151,7 +154,7 @@ class DecoderLearner:
             chunk = slice(start, start + MAX_CALL_ROWS)
             size = padded_size(len(inputs[chunk]))
             with on_cpu():
-                self.decoder = compiled.observe_steps(self.decoder, pad(inputs[chunk], size), pad(alive[chunk], size))
+                self.source = compiled.observe_steps(self.source, pad(inputs[chunk], size), pad(alive[chunk], size))
 
     def _flush_returns(self) -> None:
         if not self._pending_returns:
@@ -161,12 +164,12 @@ class DecoderLearner:
         size = padded_size(len(mean_reward))
         mask = np.arange(size) < len(mean_reward)
         mean_reward, length = pad(mean_reward.astype(np.float32), size), pad(length.astype(np.int32), size)
-        level = pad(level.astype(np.int32), size) if self.config.n_levels else None
+        level = pad(level.astype(np.int32), size) if self.config.groups else None
         with on_cpu():
-            if self.decoder is not None:
-                self.decoder = compiled.observe_returns(self.decoder, mean_reward, length, mask, level)
+            if self.decoder is None:
+                self.source = compiled.observe_scale(self.source, mean_reward, mask)
             else:
-                self.scale = compiled.observe_scale(self.scale, mean_reward, mask)
+                self.source = compiled.observe_returns(self.source, mean_reward, length, mask, level)
 
     def learn_if_due(self) -> None:
         """Add pending returns to the scales, and let the decoder learn if there are enough new episodes."""
@@ -194,7 +197,7 @@ class DecoderLearner:
                 self.n_learned += len(new)
                 if self.decoder is not None:
                     later = list(chain.from_iterable(calls))
-                    self.decoder = jax.block_until_ready(self._learn(self.decoder, new, later))
+                    self.source = jax.block_until_ready(self._learn(self.decoder, new, later))
 
     def _episodes_until_fit(self) -> float:
         """Return the number of new episodes until the next fit in closed form. Other decoders are not fitted here."""
@@ -225,7 +228,7 @@ class DecoderLearner:
             return
         if not self.config.method.uses_gradient:
             with on_cpu(), float64():
-                self.decoder = jax.block_until_ready(compiled.fit_closed_form(self.decoder, spec=self.config.spec))
+                self.source = jax.block_until_ready(compiled.fit_closed_form(self.decoder, spec=self.config.spec))
             return
         self._pending_updates = 0.0
         for start in range(0, n_updates, CHUNK_UPDATES):
@@ -252,7 +255,7 @@ class DecoderLearner:
             samples = [sample_batch(self.store, spec, rng, longest) for _ in range(n_updates)]
             stacked = jax.tree.map(lambda *leaves: np.stack(leaves), *samples)
             keys = jax.random.split(jax.random.fold_in(jax.random.key(seed), self.n_updates), n_updates)
-            self.decoder, loss = compiled.fit_by_gradient(self.decoder, stacked, keys, spec=spec)
+            self.source, loss = compiled.fit_by_gradient(self.source, stacked, keys, spec=spec)
         self.n_updates += n_updates
         self.loss = float(loss)
 

@@ -10,10 +10,9 @@ from lare_rl.assigner import compiled_functions as compiled
 from lare_rl.assigner.batches import whole_episodes
 from lare_rl.assigner.compiled_functions import on_cpu
 from lare_rl.assigner.decoder_learner import DecoderLearner
-from lare_rl.credit.decomposition import level_effects
+from lare_rl.credit.explain_returns import returns_findings
 from lare_rl.credit.explanation import Explanation
-from lare_rl.credit.explanation_text import MESSAGES, explanation_findings
-from lare_rl.credit.returns import estimate_score_type, looks_binary
+from lare_rl.credit.explanation_text import MESSAGES
 from lare_rl.util.findings import render
 from lare_rl.util.float64 import float64
 
@@ -26,15 +25,9 @@ def describe_returns(learner: DecoderLearner, group_names: Iterable[Hashable]) -
     explanation, decoder, config = explain(learner), learner.decoder, learner.config
     if explanation is None or decoder is None:
         return []
-    effects = level_effects(decoder, float(explanation.mean_length)).tolist()
-    findings = explanation_findings(
-        explanation,
-        estimate_score_type(decoder),
-        [] if config.phi is None else config.phi.factor_columns(config.scored_observation),
-        config.raw_feature_names,
-        looks_binary=looks_binary(decoder, config.method),
-        groups=dict(zip(group_names, effects, strict=False)),
-    )
+    factor_names = [] if config.phi is None else config.phi.factor_columns(config.scored_observation)
+    raw_names = config.raw_feature_names
+    findings = returns_findings(explanation, decoder, config.method, factor_names, raw_names, group_names)
     return [render(finding, MESSAGES) for finding in findings]
 
 
@@ -49,4 +42,4 @@ def explain(learner: DecoderLearner) -> Explanation | None:
         state = compiled.init_explanation(decoder.statistics, basis=basis)
         for batch in whole_episodes(store, spec, list(store.episodes.values())):
             state = compiled.add_to_explanation(state, batch)
-        return jax.tree.map(np.asarray, compiled.explain_returns(state, decoder.is_average.astype(int)))
+        return jax.tree.map(np.asarray, compiled.explain(state, decoder.is_average.astype(int)))

@@ -20,7 +20,7 @@ from lare_rl.assigner.decoder_learner import DecoderLearner
 from lare_rl.assigner.space_layout import SpaceLayout
 from lare_rl.assigner.store import Store, StoredEpisode
 from lare_rl.credit.decoder_settings import CreditSettings
-from lare_rl.credit.methods import find_method
+from lare_rl.credit.methods import METHODS
 from lare_rl.errors import LareError, short_repr
 from lare_rl.latent.saved import load_function
 from lare_rl.runs.checkpoint import DAMAGED_FILE_ERRORS, fill_template, named_leaves, open_npz
@@ -46,7 +46,7 @@ PLAIN_FIELDS = (
 )
 """The fields of a configuration that are JSON values."""
 LEARNED = "learned"
-"""The names of the arrays of the decoder and the scale begin with it."""
+"""The names of the arrays of the decoder, or of the scale, begin with it."""
 STORE_ARRAYS = {"features": "inputs", "length": "length", "mean_reward": "mean_reward", "episode": "episode"}
 """The arrays of a store by their names in the file."""
 PHI_SAMPLE = ("tried/observation", "tried/action")
@@ -69,7 +69,7 @@ def get_state(learner: DecoderLearner, group_names: Iterable[Hashable], *, episo
     """Return the state of an assigner, with stored steps and episodes if `episodes` is true."""
     learner.learn_returns()
     store = learner.store
-    leaves = named_leaves((learner.decoder, learner.scale))
+    leaves = named_leaves((learner.source,))
     arrays = {LEARNED + name: np.asarray(leaf) for name, leaf in leaves.items()}
     arrays["counts"] = np.array([store.n_ended, store.n_ended_steps, store.dropped + len(store.running)])
     for name, chunks in zip(PHI_SAMPLE, zip(*learner.phi_sample, strict=True), strict=False):
@@ -87,7 +87,7 @@ def restore(learner: DecoderLearner, state: AssignerState) -> None:
     if set(PHI_SAMPLE) <= set(arrays):
         learner.phi_sample.append((arrays[PHI_SAMPLE[0]], arrays[PHI_SAMPLE[1]]))
     learned = {name.removeprefix(LEARNED): array for name, array in arrays.items()}
-    learner.decoder, learner.scale = fill_template((learner.decoder, learner.scale), learned)
+    (learner.source,) = fill_template((learner.source,), learned)
     store = learner.store
     store.n_ended, store.n_ended_steps, store.dropped = map(int, arrays["counts"])
     if "steps" in arrays:
@@ -127,7 +127,7 @@ def read_state(directory: Path) -> AssignerState:
             sample = (arrays[PHI_SAMPLE[0]], arrays[PHI_SAMPLE[1]]) if set(PHI_SAMPLE) <= set(arrays) else None
             phi = load_function(directory / FUNCTION_FILE, task, steps=sample)
         config = AssignerConfig(
-            method=find_method(values["method"]),
+            method=METHODS.find(values["method"]),
             phi=phi,
             task=task,
             observation=SpaceLayout(**values["observation"]),

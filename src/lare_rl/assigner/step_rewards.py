@@ -39,44 +39,44 @@ class StepRewards:
         rows = store.rows(step_ids)
         if len(rows) and step_ids.max() >= store.n_added - self.learner.n_pending_steps:
             self.learner.flush_inputs()
-        is_exact = self.config.is_exact and self.learner.is_fitted
-        last, residual = self._residuals(step_ids, rows) if is_exact else (None, None)
-        finished, alive = store.length[rows] > 0, None if store.alive is None else store.alive[rows]
-        arrays: Any = store.inputs[rows], store.lengths(rows), store.mean_reward[rows], finished, last, residual
-        return self._compute(StepBatch(*arrays), alive)
+        is_exact = self.config.spec.is_exact and self.learner.is_fitted
+        last, residual = self._residuals(step_ids, rows) if is_exact else (np.zeros(len(rows), bool), None)
+        alive = np.ones((len(rows), self.config.agents), bool) if store.alive is None else store.alive[rows]
+        ended, inputs, mean_reward = store.length[rows] > 0, store.inputs[rows], store.mean_reward[rows]
+        arrays: Any = inputs, store.lengths(rows), mean_reward, ended, last, alive, residual
+        return self._compute(StepBatch(*arrays))
 
     def rewards(
         self, inputs: Float[np.ndarray, "n *agents inputs"], length: Int[np.ndarray, " n"]
     ) -> Float[np.ndarray, "n *agents"]:
         """Return the rewards of any steps, whose episodes have these lengths. The method must not need their returns."""
-        arrays: Any = inputs, length, np.zeros(len(length), np.float32), np.ones(len(length), bool)
+        ended, alive = np.ones(len(length), bool), np.ones((len(length), self.config.agents), bool)
+        arrays: Any = inputs, length, np.zeros(len(length), np.float32), ended, ended, alive
         return self._compute(StepBatch(*arrays))
 
-    def _compute(
-        self, steps: StepBatch, alive: Bool[np.ndarray, "n agents"] | None = None
-    ) -> Float[np.ndarray, "n *agents"]:
+    def _compute(self, steps: StepBatch) -> Float[np.ndarray, "n *agents"]:
         """Return the rewards of steps (NumPy arrays), in chunks of few sizes, so that few programs are compiled; 0 before the first fit."""
         reward = np.zeros(steps.inputs.shape[:-1], np.float32)
         if self.config.method.reward is Reward.PROXY and not self.learner.is_fitted:
             return reward
         inputs = steps.inputs.reshape(len(reward), self.config.agents, steps.inputs.shape[-1])
-        arrays = steps._replace(inputs=inputs, length=steps.length.astype(np.int32)), alive
+        steps = steps._replace(inputs=inputs, length=steps.length.astype(np.int32))
         for start in range(0, len(reward), MAX_CALL_ROWS):
             chunk = slice(start, start + MAX_CALL_ROWS)
-            selected = jax.tree.map(itemgetter(chunk), arrays)
-            count = len(selected[0].length)
+            selected = jax.tree.map(itemgetter(chunk), steps)
+            count = len(selected.length)
             padded = jax.tree.map(partial(pad, size=padded_size(count)), selected)
             with on_cpu():
                 leaves, structure = self._flat_state()
-                r_hat = compiled.training_rewards(leaves, *padded, structure=structure, spec=self.config.spec)
+                r_hat = compiled.training_rewards(leaves, padded, structure=structure, spec=self.config.spec)
             reward[chunk] = np.asarray(r_hat)[:count].reshape(reward[chunk].shape)
         return reward
 
     def _flat_state(self) -> tuple[list[Array], Any]:
         """Return the leaves and the structure of what rewards are computed from."""
-        newest = self.learner.scale if self.learner.decoder is None else self.learner.decoder
-        if self._flat_cache[0] is not newest:
-            source = newest
+        source = self.learner.source
+        if self._flat_cache[0] is not source:
+            newest = source
             if isinstance(source, DecoderState):
                 source = source._replace(optimizer=(), score_type_predictions=None, closed_form=None)
             self._flat_cache = newest, *jax.tree.flatten(source)

@@ -8,7 +8,7 @@ from typing import Any
 
 from lare_rl.compare.results import group_pairs
 from lare_rl.config.effective import effective_settings
-from lare_rl.credit.methods import find_method
+from lare_rl.credit.methods import METHODS
 from lare_rl.runs.config_file import Config
 from lare_rl.runs.directory import Run
 
@@ -114,7 +114,7 @@ def _find_function_differences(runs: Sequence[Run]) -> list[Difference]:
             (_function_name(run), method.name),
         )
         for run, settings in ((run, run.config.settings) for run in runs)
-        if (method := find_method(settings.method)).needs_phi
+        if (method := METHODS.find(settings.method)).needs_phi
     )
     differences = (_make_difference(f"phi on {task}", pairs) for (task, *_), pairs in pairs_by_draw.items())
     return [difference for difference in differences if len(set(difference.methods.values())) > 1]

@@ -6,7 +6,7 @@ from typing import Any
 from lare_rl.algorithms.registry import ALGORITHMS, Consumes
 from lare_rl.config.settings import ResolvedSettings, Settings
 from lare_rl.credit.decoder_settings import CreditSettings
-from lare_rl.credit.methods import find_method
+from lare_rl.credit.methods import METHODS
 from lare_rl.tasks.spec import TaskSpec
 
 __all__ = ["effective_settings", "needs_replay", "unused_names", "unused_settings", "warmup_warning"]
@@ -42,7 +42,7 @@ def unused_settings(settings: Settings, resolved: ResolvedSettings, task: TaskSp
 
 def unused_names(settings: ResolvedSettings) -> list[str]:
     """Return the dotted names of settings that this algorithm and method do not use."""
-    method, algorithm = find_method(settings.method), ALGORITHMS[settings.algorithm]
+    method, algorithm = METHODS.find(settings.method), ALGORITHMS[settings.algorithm]
     on_policy = algorithm.consumes is Consumes.ROLLOUTS
     separate_fit = method.fit is not None and method.fit.separate
     has_mixer = getattr(settings.hyperparameters, "monotonic", True)
@@ -66,7 +66,7 @@ def unused_names(settings: ResolvedSettings) -> list[str]:
 def needs_replay(settings: ResolvedSettings) -> bool:
     """Return whether updates read steps of earlier iterations."""
     consumes = ALGORITHMS[settings.algorithm].consumes
-    return consumes is not Consumes.ROLLOUTS or find_method(settings.method).fit is not None
+    return consumes is not Consumes.ROLLOUTS or METHODS.find(settings.method).fit is not None
 
 
 def warmup_warning(settings: ResolvedSettings) -> str | None:

@@ -7,7 +7,7 @@ from lare_rl.config.effective import needs_replay, unused_names
 from lare_rl.config.settings import ResolvedSettings, Settings, round_up
 from lare_rl.config.validity import CreditContext, check_credit
 from lare_rl.credit.decoder_settings import MULTI_AGENT_CREDIT, RECENT_STEPS, CreditSettings
-from lare_rl.credit.methods import find_method
+from lare_rl.credit.methods import METHODS
 from lare_rl.data.replay import required_capacity
 from lare_rl.envs.families import find_score_type, load_env_spec
 from lare_rl.envs.interface import EnvSpec
@@ -47,7 +47,7 @@ def resolve(settings: Settings, task: TaskSpec) -> ResolvedSettings:
         rollout_steps=resolved.rollout_steps,
         off_policy=consumes is not Consumes.ROLLOUTS,
     )
-    check_credit(find_method(resolved.method), resolved.credit, context)
+    check_credit(METHODS.find(resolved.method), resolved.credit, context)
     monotonic = getattr(resolved.hyperparameters, "monotonic", None)
     if monotonic != getattr(ALGORITHMS[resolved.algorithm].settings, "monotonic", None):
         raise LareError(
@@ -57,6 +57,10 @@ def resolve(settings: Settings, task: TaskSpec) -> ResolvedSettings:
         raise LareError(
             f"overlap_collection needs td3, ddpg or sac and an environment on the host: remove it for {resolved.algorithm} on "
             f"{task.name}"
+        )
+    if resolved.overlap_collection and not resolved.warmup:
+        raise LareError(
+            f"overlap_collection updates before the first steps are stored: set {resolved.algorithm}.warmup to 1 or more"
         )
     _check_size(resolved, task, env)
     return resolved
@@ -95,7 +99,7 @@ def _apply_defaults(settings: Settings, env: EnvSpec) -> ResolvedSettings:
     if row.consumes is Consumes.ROLLOUTS:
         n_iterations = min(n_iterations, max(1, defaults["steps"] // (MIN_EVALUATIONS * iteration)))
     defaults["evaluate_every"] = round_up(settings.evaluate_every or n_iterations * iteration, iteration)
-    method = find_method(settings.method or defaults["method"])
+    method = METHODS.find(settings.method or defaults["method"])
     if method.fit is not None and method.fit.separate:
         defaults["fit_updates"] = max(1, iteration // 50)
 
@@ -120,7 +124,7 @@ def _normalise(resolved: ResolvedSettings, task: TaskSpec, env: EnvSpec) -> Reso
         changes["scored_observation"] = None
     if "first_fit" in unused_names(resolved):
         changes["first_fit"] = None
-    score, method = resolved.credit.score, find_method(resolved.method)
+    score, method = resolved.credit.score, METHODS.find(resolved.method)
     if score == "auto":
         score = find_score_type(task) or score
     if score != "binary" and env.fixed_length and task.payment_rule.is_regular(env.max_steps):

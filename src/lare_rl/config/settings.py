@@ -8,7 +8,7 @@ from pydantic import ConfigDict, Field, SerializeAsAny, create_model, field_vali
 
 from lare_rl.algorithms.registry import ALGORITHMS, AlgorithmSettings
 from lare_rl.credit.decoder_settings import CreditSettings
-from lare_rl.credit.methods import find_method
+from lare_rl.credit.methods import METHODS
 from lare_rl.errors import CheckedModel, Count
 from lare_rl.llm.prompts import N_CANDIDATES
 from lare_rl.tasks.spec import ScoredObservation, TaskSpec
@@ -83,7 +83,7 @@ class _RunSettings(CheckedModel, Generic[Open]):
     @classmethod
     def _find_name(cls, name: Any, info: Any) -> Any:
         if name is not None:
-            (find_method if info.field_name == "method" else ALGORITHMS.find)(name)
+            {"method": METHODS, "algorithm": ALGORITHMS}[info.field_name].find(name)
         return name
 
     @model_validator(mode="after")
@@ -95,7 +95,19 @@ class _RunSettings(CheckedModel, Generic[Open]):
         return self
 
 
-class _Settings(_RunSettings[None]):
+_HYPERPARAMETERS: dict[str, Any] = {name: (type(row.settings), row.settings) for name, row in ALGORITHMS.items()}
+
+
+class Settings(create_model("Settings", __base__=_RunSettings[None], __module__=__name__, **_HYPERPARAMETERS)):
+    """The settings of `lare-rl train` and `lare_rl.train`. If a setting is None, the task and the algorithm decide it.
+
+    The hyperparameters of an algorithm have its name: `Settings(td3={"gamma": 0.98})` changes one, and keeps the others as published.
+    """
+
+    if TYPE_CHECKING:  # plugins add fields, which type checkers cannot know
+
+        def __init__(self, **values: Any) -> None: ...
+
     @model_validator(mode="before")
     @classmethod
     def _complete_hyperparameters(cls, values: Any) -> Any:
@@ -111,20 +123,6 @@ class _Settings(_RunSettings[None]):
             if isinstance(changes, Mapping):
                 completed[name] = {**dict(default), **changes}
         return completed
-
-
-_HYPERPARAMETERS: dict[str, Any] = {name: (type(row.settings), row.settings) for name, row in ALGORITHMS.items()}
-
-
-class Settings(create_model("Settings", __base__=_Settings, __module__=__name__, **_HYPERPARAMETERS)):
-    """The settings of `lare-rl train` and `lare_rl.train`. If a setting is None, the task and the algorithm decide it.
-
-    The hyperparameters of an algorithm have its name: `Settings(td3={"gamma": 0.98})` changes one, and keeps the others as published.
-    """
-
-    if TYPE_CHECKING:  # plugins add fields, which type checkers cannot know
-
-        def __init__(self, **values: Any) -> None: ...
 
 
 def round_up(steps: int, iteration_steps: int) -> int:

@@ -9,7 +9,6 @@ from dataclasses import dataclass
 from lare_rl.credit.basis import MAX_RAW_FEATURES
 from lare_rl.credit.closed_form import MAX_SIGNED_FACTORS
 from lare_rl.credit.decoder_settings import CreditSettings
-from lare_rl.credit.decoders import DECODERS
 from lare_rl.credit.methods import Fit, Method, Reward
 from lare_rl.errors import LareError
 from lare_rl.tasks.payments import PAID_AT_END, PaymentRule
@@ -55,7 +54,9 @@ def check_credit(method: Method, credit: CreditSettings, context: CreditContext)
 def _reward_problems(method: Method, credit: CreditSettings, context: CreditContext) -> Iterator[str]:
     name = method.name
     if context.step_at_a_time:
-        reads_history = method.needs_whole_episodes or (method.inputs is not None and "history" in method.inputs.names)
+        reads_history = method.decoder_kind.whole_episodes or (
+            method.inputs is not None and "history" in method.inputs.names
+        )
         if method.reward not in (Reward.PROXY, Reward.DESIGNED) or reads_history:
             yield f"{name} does not compute the reward of a step from this step alone: use bayes or lare-bayes"
         if credit.exact not in ("auto", "no"):
@@ -83,13 +84,13 @@ def _agent_problems(method: Method, credit: CreditSettings, context: CreditConte
 
 def _episode_problems(method: Method, credit: CreditSettings, context: CreditContext) -> Iterator[str]:
     name, max_steps, rollout_steps = method.name, context.max_steps, context.rollout_steps
-    if method.needs_whole_episodes and not context.fixed_length:
+    if method.decoder_kind.whole_episodes and not context.fixed_length:
         yield f"{name} reads whole episodes of one length: use it with `lare_rl.train` on particle tasks"
-    if method.needs_whole_episodes and not context.payments.only_at_end:
+    if method.decoder_kind.whole_episodes and not context.payments.only_at_end:
         yield f"{name} reads whole episodes, and the task pays before their end: use a method that reads steps"
-    if method.needs_whole_episodes and rollout_steps and max_steps and rollout_steps % max_steps:
+    if method.decoder_kind.whole_episodes and rollout_steps and max_steps and rollout_steps % max_steps:
         yield f"{name} reads whole episodes: rollout_steps = {rollout_steps} is not a multiple of their length, {max_steps}"
-    longest = DECODERS[method.decoder].longest_segment
+    longest = method.decoder_kind.longest_segment
     if longest is not None and max_steps is not None and context.payments.longest_segment(max_steps) > longest:
         yield (
             f"{name} reads at most {longest} steps of one payment, and the task pays for up to "
@@ -99,7 +100,7 @@ def _episode_problems(method: Method, credit: CreditSettings, context: CreditCon
 
 def _decoder_problems(method: Method, credit: CreditSettings, context: CreditContext) -> Iterator[str]:
     name, n_raw = method.name, context.n_raw_features
-    if DECODERS[method.decoder].predicts_actions and not context.discrete_actions:
+    if method.decoder_kind.predicts_actions and not context.discrete_actions:
         yield f"{name} learns which of its actions an agent took, and the task has continuous ones: use stas"
     if "sampled_steps" in method.settings and not context.fixed_length and credit.steps < credit.sampled_steps:
         yield (

@@ -20,8 +20,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
-from lare_rl.credit.decoder_network import DecoderOutput, DecoderShape
-from lare_rl.credit.decoder_settings import CreditSettings
+from lare_rl.credit.decoder_network import DecoderOutput
+from lare_rl.credit.spec import CreditSpec
 from lare_rl.nn.attention import LayerNorm, attend, causal_mask
 from lare_rl.nn.networks import MLP, Linear
 
@@ -72,11 +72,11 @@ class AREL(eqx.Module):
     agent_blocks: tuple[Block, ...]
     read_out: tuple[Linear, Linear, Linear]
 
-    def __init__(self, key: PRNGKeyArray, shape: DecoderShape, settings: CreditSettings):
-        size = min(shape.n_inputs, MAX_WIDTH)
+    def __init__(self, key: PRNGKeyArray, spec: CreditSpec):
+        size = min(spec.n_inputs, MAX_WIDTH)
         embed_key, position_key, time_key, agents_key, *read_keys = jax.random.split(key, 7)
-        self.embed = Linear(shape.n_inputs, size, key=embed_key)
-        self.position = jax.random.normal(position_key, (shape.max_steps, size))
+        self.embed = Linear(spec.n_inputs, size, key=embed_key)
+        self.position = jax.random.normal(position_key, (spec.max_steps, size))
         self.time_blocks = tuple(Block(size, key=key) for key in jax.random.split(time_key, DEPTH))
         self.agent_blocks = tuple(Block(size, key=key) for key in jax.random.split(agents_key, DEPTH))
         self.read_out = (

@@ -33,12 +33,12 @@ from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
 from lare_rl.credit import evidence, logistic, relevance
 from lare_rl.credit.basis import Basis, expand, expand_history
-from lare_rl.credit.decoder_network import DecoderOutput, DecoderShape
-from lare_rl.credit.decoder_settings import CreditSettings
+from lare_rl.credit.decoder_network import DecoderOutput
 from lare_rl.credit.evidence import SufficientStatistics
 from lare_rl.credit.logistic import LogOddsFit
 from lare_rl.credit.precisions import Posterior
 from lare_rl.credit.score_type import ScoreType
+from lare_rl.credit.spec import CreditSpec
 from lare_rl.nn.leading_axis import map_leading_axis
 from lare_rl.nn.normalise import RunningMeanStd, running_std
 
@@ -260,6 +260,6 @@ def select_score_type(decoder: LinearDecoder, index: Int[Array, ""] | int) -> Li
     return eqx.tree_at(lambda d: (d.weight, d.bias), decoder, (decoder.weight[index], decoder.bias[index]))
 
 
-def init_linear_decoder(key: PRNGKeyArray, shape: DecoderShape, settings: CreditSettings) -> LinearDecoder:
-    """Return the decoder before the first fit. `key` and `settings` are not used."""
-    return select_score_type(init(shape.basis, (ScoreType.SUM,)).decoder, 0)
+def init_linear_decoder(key: PRNGKeyArray, spec: CreditSpec) -> LinearDecoder:
+    """Return the decoder before the first fit. `key` is not used."""
+    return select_score_type(init(spec.basis, (ScoreType.SUM,)).decoder, 0)

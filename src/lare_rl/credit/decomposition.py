@@ -8,9 +8,9 @@ x are the method's inputs: the factors z = phi(s, a), or raw features. `scale` i
 With n agents, each agent has its own proxy rewards, R is the mean of the agents' returns, and the mean of the agents' r_hat is
 fitted to it. The equations stay the same and assign credit over time and among agents.
 
-With several agents, r_hat is also multiplied by the gain sqrt(nT). R/T is then the mean of nT rewards, and a rare reward of a few
-agents is larger than this mean by about that factor. Adam changes an output by steps of the same size in any unit, and the decoder
-of many agents is seldom fitted. Without the gain, its output would need dozens of updates of the policy to reach
+With several agents, r_hat is also multiplied by `output_scale`, sqrt(nT). R/T is then the mean of nT rewards, and a rare reward of a
+few agents is larger than this mean by about that factor. Adam changes an output by steps of the same size in any unit, and the decoder
+of many agents is seldom fitted. Without this factor, its output would need dozens of updates of the policy to reach
 the size of a rare reward.
 
 Inputs and targets are normalised by statistics in the state. Scaling the return, or a factor, therefore changes only the scale of
@@ -27,11 +27,9 @@ from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
 from lare_rl.credit import closed_form
 from lare_rl.credit.closed_form import ClosedForm, LinearDecoder
-from lare_rl.credit.decoder_network import DecoderNetwork, DecoderOutput, DecoderShape
+from lare_rl.credit.decoder_network import DecoderNetwork, DecoderOutput
 from lare_rl.credit.decoder_settings import CreditSettings
-from lare_rl.credit.decoders import DECODERS
 from lare_rl.credit.levels import LevelMeans, add_returns, empty_level_means, level_offsets
-from lare_rl.credit.methods import Method
 from lare_rl.credit.prequential import Predictions, empty_predictions
 from lare_rl.credit.score_type import ScoreType
 from lare_rl.credit.spec import CreditSpec
@@ -52,7 +50,7 @@ __all__ = [
     "CreditBatch",
     "DecoderState",
     "agent_mean",
-    "agent_shares",
+    "agent_weights",
     "decode",
     "decoder_rewards",
     "init",
@@ -130,8 +128,7 @@ class DecoderState(NamedTuple):
 def init(key: PRNGKeyArray, spec: CreditSpec) -> DecoderState:
     """Return the state with an untrained decoder. All other functions need the same settings and score types."""
     method, settings, basis = spec.method, spec.settings, spec.basis
-    shape = DecoderShape(basis, spec.max_steps, spec.agents, spec.input_sizes)
-    network = DECODERS[method.decoder].init_network(key, shape, settings)
+    network = method.decoder_kind.init_network(key, spec)
     for leaf in jax.tree.leaves(network):
         if not eqx.is_array_like(leaf):
             raise LareError(
@@ -139,7 +136,7 @@ def init(key: PRNGKeyArray, spec: CreditSpec) -> DecoderState:
                 "fields; instead of eqx.nn.MLP, which holds functions, use lare_rl.nn.networks.MLP"
             )
     if not type(network).__module__.startswith("lare_rl."):
-        _check_output(network, shape, method)
+        _check_output(network, spec)
     several = len(spec.score_types) > 1
     closed = closed_form.init(basis, spec.score_types) if several or not method.uses_gradient else None
     return DecoderState(
@@ -157,11 +154,12 @@ def init(key: PRNGKeyArray, spec: CreditSpec) -> DecoderState:
     )
 
 
-def _check_output(network: DecoderNetwork, shape: DecoderShape, method: Method) -> None:
+def _check_output(network: DecoderNetwork, spec: CreditSpec) -> None:
     """Raise `LareError` if a plugin's decoder does not return what it should."""
-    n_rows = shape.max_steps if method.needs_whole_episodes else 2
-    for agents in [(shape.n_agents,), ()] if shape.n_agents == 1 else [(shape.n_agents,)]:  # () in CreditAssigner
-        rows = jax.ShapeDtypeStruct((n_rows, *agents, shape.n_inputs), jnp.float32)
+    method = spec.method
+    n_rows = spec.max_steps if method.decoder_kind.whole_episodes else 2
+    for agents in [(spec.agents,), ()] if spec.agents == 1 else [(spec.agents,)]:  # () in CreditAssigner
+        rows = jax.ShapeDtypeStruct((n_rows, *agents, spec.n_inputs), jnp.float32)
         output = jax.eval_shape(lambda rows: network(rows, None), rows)
         if not isinstance(output, DecoderOutput) or not output.r_hat.shape == output.penalty.shape == rows.shape[:-1]:
             raise LareError(
@@ -194,18 +192,18 @@ def observe_returns(
     state: DecoderState,
     mean_reward: Float[Array, " batch"],
     length: Int[Array, " batch"],
-    finished: Bool[Array, " batch"],
-    level: Int[Array, " batch"] | None = None,
+    ended: Bool[Array, " batch"],
+    level: Int[Array, " batch"] | None,
 ) -> DecoderState:
-    """Add newly finished episodes, as R/T and T, to the scales and to the means of their levels. Add each episode exactly once.
+    """Add episodes that have just ended, as R/T and T, to the scales and to the means of their levels. Add each episode exactly once.
 
-    Episodes where `finished` is false are ignored.
+    Episodes where `ended` is false are ignored. `level` is None if levels make no difference.
     """
     if state.levels is not None and level is not None:
-        state = state._replace(levels=add_returns(state.levels, level, mean_reward, finished))
+        state = state._replace(levels=add_returns(state.levels, level, mean_reward, ended))
     return state._replace(
-        scale=update_scale(state.scale, mean_reward, finished),
-        return_scale=update_scale(state.return_scale, mean_reward * length, finished),
+        scale=update_scale(state.scale, mean_reward, ended),
+        return_scale=update_scale(state.return_scale, mean_reward * length, ended),
     )
 
 
@@ -288,12 +286,13 @@ def decoder_rewards(
 def agent_mean(
     values: Float[Array, "rows *agents"], alive: Bool[Array, "rows *agents"] | None
 ) -> Float[Array, " rows"]:
-    """Return the mean over the agents that are alive."""
+    """Return the mean over the agents that are alive. Values of other agents may be NaN."""
     if alive is None:
         return jnp.mean(values.reshape(len(values), -1), axis=1)
-    return jnp.sum((values * agent_shares(alive)).reshape(len(values), -1), axis=1)
+    weighted = jnp.where(alive, values, 0) * agent_weights(alive)
+    return jnp.sum(weighted.reshape(len(values), -1), axis=1)
 
 
-def agent_shares(alive: Bool[Array, "*batch agents"]) -> Float[Array, "*batch agents"]:
-    """Return each agent's share of the team's reward: 1/n for each of n agents that are alive, else 0."""
+def agent_weights(alive: Bool[Array, "*batch agents"]) -> Float[Array, "*batch agents"]:
+    """Return each agent's weight in a mean over the team: 1/n for each of n agents that are alive, else 0."""
     return (alive / alive.sum(axis=-1, keepdims=True).clip(1)).astype(jnp.float32)

@@ -15,9 +15,9 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
-from lare_rl.credit.decoder_network import DecoderOutput, DecoderShape
-from lare_rl.credit.decoder_settings import CreditSettings
+from lare_rl.credit.decoder_network import DecoderOutput
 from lare_rl.credit.losses import PerEpisode, batch_mean
+from lare_rl.credit.spec import CreditSpec
 from lare_rl.credit.step_targets import EpisodeInputs, EpisodeLengths, step_loss
 from lare_rl.nn.networks import GRU, MLP, Linear
 
@@ -32,8 +32,8 @@ class Diaster(eqx.Module):
     """From the state of the GRU to F."""
     step_model: MLP
 
-    def __init__(self, key: PRNGKeyArray, shape: DecoderShape, settings: CreditSettings):
-        n_inputs, hidden = shape.n_inputs, settings.hidden
+    def __init__(self, key: PRNGKeyArray, spec: CreditSpec):
+        n_inputs, hidden = spec.n_inputs, spec.settings.hidden
         gru_key, readout_key, step_key = jax.random.split(key, 3)
         self.gru = GRU(n_inputs, hidden[0], key=gru_key)
         self.readout = Linear(hidden[0], 1, key=readout_key)

@@ -1,4 +1,4 @@
-"""The rewards that credit assignment pays for steps: one engine for the trainer, `CreditAssigner`, logs and explanations.
+"""The rewards that credit assignment pays for steps: one engine for the trainer, `CreditAssigner` and logs.
 
 A `CreditSpec` (`spec.py`) says what is fitted to what. With a decoder (`decomposition.py`) and the scale of R/T, the functions here turn
 steps into the rewards that an algorithm is trained on:
@@ -14,44 +14,32 @@ TAR2 pays shares of the return instead (`shares.py`), which add up to it, too.
 Batches have an axis of agents, of length 1 for a single agent. For credit to whole teams it has length 1 too.
 """
 
+from collections.abc import Sequence
 from typing import Literal, NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
-from lare_rl.credit import closed_form, decomposition
-from lare_rl.credit.basis import Basis
-from lare_rl.credit.closed_form import ClosedForm
-from lare_rl.credit.decomposition import CreditBatch, DecoderState
-from lare_rl.credit.explanation import Explanation, StepStatistics, add_steps, empty_step_statistics, explain
+from lare_rl.credit import decomposition
+from lare_rl.credit.decomposition import DecoderState
 from lare_rl.credit.methods import Reward
-from lare_rl.credit.returns import add_to_sums
-from lare_rl.credit.score_type import ScoreType
 from lare_rl.credit.shares import return_shares
 from lare_rl.credit.spec import CreditSpec
 from lare_rl.envs.interface import alive_mean
-from lare_rl.nn.normalise import RunningMeanStd, Scale, min_max_scale, root_mean_square
+from lare_rl.nn.normalise import Scale, empty_scale, min_max_scale, root_mean_square
 
 __all__ = [
-    "ExplanationState",
     "RewardSource",
     "StepBatch",
-    "add_to_explanation",
     "correction",
-    "explain_returns",
-    "init_decoder",
-    "init_explanation",
+    "init_source",
     "proxy_rewards",
     "return_scale",
     "scale_and_mask",
+    "select_decoders",
     "training_rewards",
 ]
-
-
-def init_decoder(key: PRNGKeyArray, spec: CreditSpec) -> DecoderState | None:
-    """Return an untrained decoder. Return None for a method that fits nothing."""
-    return decomposition.init(key, spec) if spec.method.reward is Reward.PROXY else None
 
 
 class StepBatch(NamedTuple):
@@ -63,18 +51,28 @@ class StepBatch(NamedTuple):
     """T of the step's episode; an estimate while it is running."""
     mean_reward: Float[Array, "*batch"]
     """R/T of the step's episode."""
-    finished: Bool[Array, "*batch"]
+    episode_ended: Bool[Array, "*batch"]
     """Whether the step's episode has ended."""
-    last: Bool[Array, "*batch"] | None = None
-    """Whether the step is the last one of an episode that has ended. Only for `exact`."""
+    last: Bool[Array, "*batch"]
+    """Whether the step is the last one of an episode that has ended. Only read for `exact`."""
+    alive: Bool[Array, "*batch team"]
+    """Which agents of the team acted. For credit to whole teams, these are more than the agents of `inputs`."""
     residual: Float[Array, "*batch"] | None = None
     """R of the step's episode, less the sum of its proxy rewards; 0 if that is unknown. Only for `exact`."""
-    alive: Bool[Array, "*batch agents"] | None = None
-    """Which agents acted. None means all. Only for methods that pay shares of the return."""
 
 
 RewardSource = DecoderState | Scale
 """A decoder; for a method that fits nothing, the scale of R/T."""
+
+
+def init_source(key: PRNGKeyArray, spec: CreditSpec) -> RewardSource:
+    """Return an untrained decoder or, for a method that fits nothing, an empty scale."""
+    return decomposition.init(key, spec) if spec.method.reward is Reward.PROXY else empty_scale()
+
+
+def select_decoders(sources: Sequence[RewardSource]) -> tuple[DecoderState, ...]:
+    """Return the decoders of some teams; none for a method that fits nothing."""
+    return tuple(source for source in sources if isinstance(source, DecoderState))
 
 
 def return_scale(source: RewardSource) -> Scale:
@@ -92,13 +90,13 @@ def proxy_rewards(source: RewardSource, steps: StepBatch, spec: CreditSpec) -> F
             return steps.inputs[..., 0]
         case Reward.UNIFORM:
             # The return of a running episode is not known yet.
-            share = jnp.where(steps.finished, min_max_scale(return_scale(source), steps.mean_reward), 0.5)
+            share = jnp.where(steps.episode_ended, min_max_scale(return_scale(source), steps.mean_reward), 0.5)
             return jnp.broadcast_to(share[..., None], steps.inputs.shape[:-1])
     assert isinstance(source, DecoderState)
     rows = steps.inputs.reshape(-1, *steps.inputs.shape[-2:])
     r_hat = decomposition.decoder_rewards(source, rows, spec.settings, steps.length.ravel())
     r_hat = r_hat.reshape(steps.inputs.shape[:-1])
-    return _pay_shares(r_hat, steps, spec.max_steps) if spec.method.pays_shares else r_hat
+    return _pay_shares(r_hat, steps, spec.max_steps) if spec.method.decoder_kind.pays_shares else r_hat
 
 
 def _pay_shares(
@@ -108,20 +106,17 @@ def _pay_shares(
 
     The mean over the agents that are alive is the share of the step, and R is the sum of these means.
     """
-    alive = jnp.ones(r_hat.shape, bool) if steps.alive is None else steps.alive
-    shares = return_shares(*(values.reshape(-1, max_steps, values.shape[-1]) for values in (r_hat, alive)))
-    total = steps.mean_reward * steps.length * jnp.sum(alive, axis=-1)
-    return jnp.where(steps.finished[..., None], shares.reshape(r_hat.shape) * total[..., None], r_hat)
+    shares = return_shares(*(values.reshape(-1, max_steps, values.shape[-1]) for values in (r_hat, steps.alive)))
+    total = steps.mean_reward * steps.length * jnp.sum(steps.alive, axis=-1)
+    return jnp.where(steps.episode_ended[..., None], shares.reshape(r_hat.shape) * total[..., None], r_hat)
 
 
-def training_rewards(
-    source: RewardSource, steps: StepBatch, spec: CreditSpec, alive: Bool[Array, "*batch team"]
-) -> Float[Array, "*batch team"]:
-    """Return the rewards that an algorithm is trained on, for each agent of the team. `alive` says which agents acted."""
+def training_rewards(source: RewardSource, steps: StepBatch, spec: CreditSpec) -> Float[Array, "*batch team"]:
+    """Return the rewards that an algorithm is trained on, for each agent of the team."""
+    alive = steps.alive
     r_hat = jnp.broadcast_to(proxy_rewards(source, steps, spec), alive.shape)
     if steps.residual is not None:
         exact = spec.settings.exact
-        assert steps.last is not None
         assert exact in ("last", "spread")
         r_hat = r_hat + correction(steps.residual, steps.last, steps.length, exact)[..., None]
     if spec.method.shared:
@@ -152,30 +147,3 @@ def scale_and_mask(
     """Return rewards with 0 for agents that are not alive, divided by the scale of R/T if `scale_rewards` is true."""
     reward = jnp.where(alive, reward, 0)
     return reward / root_mean_square(scale) if scale_rewards else reward
-
-
-class ExplanationState(NamedTuple):
-    """Sums over episodes and over steps. They explain the returns."""
-
-    closed_form: ClosedForm
-    steps: StepStatistics
-
-
-def init_explanation(statistics: RunningMeanStd, basis: Basis) -> ExplanationState:
-    """Return empty sums. `statistics` standardise the inputs, and the features of `basis` explain the returns."""
-    closed = closed_form.reset_statistics(closed_form.init(basis, (ScoreType.SUM,)), statistics)
-    return ExplanationState(closed, empty_step_statistics(basis))
-
-
-def add_to_explanation(state: ExplanationState, episodes: CreditBatch) -> ExplanationState:
-    """Add whole episodes to the sums, without their levels. Call this with float64 enabled."""
-    decoder = state.closed_form.decoder
-    rows = decomposition.valid_rows(episodes)
-    steps = add_steps(state.steps, decoder.features(episodes.inputs), rows, decoder.basis)
-    return ExplanationState(add_to_sums(state.closed_form, episodes), steps)
-
-
-def explain_returns(state: ExplanationState, score_type: Int[Array, ""]) -> Explanation:
-    """Explain the returns of the episodes in the sums by their features. Call this with float64 enabled."""
-    closed = state.closed_form
-    return explain(closed_form.to_float64(closed.sufficient_statistics), state.steps, score_type, closed.decoder.basis)

@@ -27,9 +27,9 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
-from lare_rl.credit.decoder_network import DecoderOutput, DecoderShape
-from lare_rl.credit.decoder_settings import CreditSettings
+from lare_rl.credit.decoder_network import DecoderOutput
 from lare_rl.credit.losses import PerEpisode, batch_mean
+from lare_rl.credit.spec import CreditSpec
 from lare_rl.credit.step_targets import EpisodeInputs, EpisodeLengths, is_step
 from lare_rl.nn.networks import MLP, bound_log_std
 
@@ -77,17 +77,17 @@ class GRD(eqx.Module):
     sparsity: tuple[float, ...] = eqx.field(static=True)
     """lambda_sr, lambda_ar, lambda_ss, lambda_ii and lambda_as."""
 
-    def __init__(self, key: PRNGKeyArray, shape: DecoderShape, settings: CreditSettings):
+    def __init__(self, key: PRNGKeyArray, spec: CreditSpec):
         """Make an untrained model. Raises `LareError` if its inputs are not s, a and the next s."""
-        n_states, n_actions, _ = shape.sizes("observation", "action", "next_observation")
+        n_states, n_actions, _ = spec.sizes("observation", "action", "next_observation")
         keys = jax.random.split(key, 6)
         self.state_reward = _init_logits(n_states, key=keys[0])
         self.action_reward = _init_logits(n_actions, key=keys[1])
         self.state_state = _init_logits(n_states, n_states, key=keys[2])
         self.action_state = _init_logits(n_actions, n_states, key=keys[3])
-        self.reward_model = MLP(n_states + n_actions, settings.hidden, 1, key=keys[4])
-        self.dynamics = MLP(n_states + n_actions, settings.hidden, 3 * COMPONENTS, key=keys[5])
-        self.sparsity = settings.sparsity
+        self.reward_model = MLP(n_states + n_actions, spec.settings.hidden, 1, key=keys[4])
+        self.dynamics = MLP(n_states + n_actions, spec.settings.hidden, 3 * COMPONENTS, key=keys[5])
+        self.sparsity = spec.settings.sparsity
 
     def _split(self, inputs: Float[Array, "*rows inputs"]) -> list[Float[Array, "*rows entries"]]:
         """Return s, a and the next s."""

@@ -19,27 +19,27 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float, PRNGKeyArray
 
-from lare_rl.credit.decoder_network import DecoderOutput, DecoderShape
-from lare_rl.credit.decoder_settings import CreditSettings
+from lare_rl.credit.decoder_network import DecoderOutput
+from lare_rl.credit.spec import CreditSpec
 from lare_rl.nn.networks import MLP, bound_log_std
 
 __all__ = ["LRR"]
 
 
 class LRR(eqx.Module):
-    """An MLP with two outputs: mu times a gain, and log sigma.
+    """An MLP with two outputs: mu times `spec.output_scale`, and log sigma.
 
     sigma is in T times the unit of r_hat, because R is T times R/T.
     """
 
     mlp: MLP
-    gain: float = eqx.field(static=True)
+    output_scale: float = eqx.field(static=True)
 
-    def __init__(self, key: PRNGKeyArray, shape: DecoderShape, settings: CreditSettings):
-        self.gain = shape.gain
-        self.mlp = MLP(shape.n_inputs, settings.hidden, 2, key=key)
+    def __init__(self, key: PRNGKeyArray, spec: CreditSpec):
+        self.output_scale = spec.output_scale
+        self.mlp = MLP(spec.n_inputs, spec.settings.hidden, 2, key=key)
 
     def __call__(self, inputs: Float[Array, "rows *agents inputs"], key: PRNGKeyArray | None) -> DecoderOutput:
         output = self.mlp(inputs)
         log_std = bound_log_std(output[..., 1])
-        return DecoderOutput(self.gain * output[..., 0], jnp.zeros_like(log_std), log_std)
+        return DecoderOutput(self.output_scale * output[..., 0], jnp.zeros_like(log_std), log_std)

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 from enum import StrEnum
 from typing import Literal
 
-from lare_rl.credit.decoders import DECODERS
+from lare_rl.credit.decoders import DECODERS, Decoder
 from lare_rl.credit.input_names import InputNames
 from lare_rl.errors import LareError, short_repr
 
@@ -129,17 +129,17 @@ class Method:
         return self.fit is not None and not self.fit.closed_form
 
     @property
+    def decoder_kind(self) -> Decoder:
+        """What is registered about its decoder."""
+        return DECODERS[self.decoder]
+
+    @property
     def settings(self) -> frozenset[str]:
         """The names of the `CreditSettings` that the method reads."""
         if self.fit is None:
             return frozenset()
-        names = self.fit.settings | DECODERS[self.decoder].settings
-        return names - {"exact"} if self.pays_shares else names
-
-    @property
-    def pays_shares(self) -> bool:
-        """Whether the rewards of an episode are shares of its return, so that they always add up to it."""
-        return DECODERS[self.decoder].pays_shares
+        names = self.fit.settings | self.decoder_kind.settings
+        return names - {"exact"} if self.decoder_kind.pays_shares else names  # shares always add up to the return
 
     def is_exact(self, exact: str) -> bool:
         """Return whether the setting `exact` corrects proxy rewards to add up to the return."""
@@ -152,21 +152,11 @@ class Method:
         return "last" if self.fit is Fit.PREFIX_EVIDENCE else "no"
 
     @property
-    def extended_basis(self) -> bool:
-        """Whether its closed-form decoder has shapes and pairs of its inputs as features."""
-        return DECODERS[self.decoder].extended_basis
-
-    @property
-    def needs_whole_episodes(self) -> bool:
-        """Whether its decoder reads whole episodes, all of the same length."""
-        return DECODERS[self.decoder].whole_episodes
-
-    @property
     def multi_agent_only(self) -> bool:
         """Whether it needs several agents."""
-        return self.shared or self.needs_whole_episodes
+        return self.shared or self.decoder_kind.whole_episodes
 
     @property
     def single_agent_only(self) -> bool:
         """Whether it works for a single agent only: `Fit.DECODER_LOSS` has no axis of agents."""
-        return self.fit is Fit.DECODER_LOSS or DECODERS[self.decoder].single_agent_only
+        return self.fit is Fit.DECODER_LOSS or self.decoder_kind.single_agent_only

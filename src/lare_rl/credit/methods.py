@@ -12,7 +12,7 @@ from lare_rl.credit.input_names import InputNames
 from lare_rl.credit.method import Fit, Method, Reward
 from lare_rl.util.plugins import Registry
 
-__all__ = ["METHODS", "Fit", "Method", "Reward", "find_method", "register_method"]
+__all__ = ["METHODS", "Fit", "Method", "Reward", "register_method"]
 
 
 METHODS = Registry[Method]("method")
@@ -26,15 +26,6 @@ def register_method(method: Method) -> None:
     """
     DECODERS.find(method.decoder)
     METHODS.register(method.name, method)
-
-
-def find_method(name: str) -> Method:
-    """Return the method of this name.
-
-    Raises:
-        LareError: no method has this name. The message lists all methods.
-    """
-    return METHODS.find(name)
 
 
 RAW = InputNames(("observation", "action", "observation_change"), ("next_observation",))

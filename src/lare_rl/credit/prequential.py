@@ -59,9 +59,12 @@ def add_predictions(
     returns: Float[Array, " episodes"],
     predicted: Float[Array, "episodes decoders"],
     mask: Bool[Array, " episodes"],
-    level: Int[Array, " episodes"] | None = None,
+    level: Int[Array, " episodes"] | None,
 ) -> Predictions:
-    """Add new episodes, at most as many as the window has. Episodes where `mask` is false are ignored."""
+    """Add new episodes, at most as many as the window has. Episodes where `mask` is false are ignored.
+
+    `level` is None if levels make no difference.
+    """
     slot = ring_slots(predictions.n_episodes, mask, len(predictions.returns))
     return Predictions(
         predictions.n_episodes + jnp.sum(mask),

@@ -21,10 +21,10 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
-from lare_rl.credit.decoder_network import DecoderOutput, DecoderShape
-from lare_rl.credit.decoder_settings import CreditSettings
+from lare_rl.credit.decoder_network import DecoderOutput
 from lare_rl.credit.decoders import RBT_STEPS
 from lare_rl.credit.losses import PerEpisode, batch_mean
+from lare_rl.credit.spec import CreditSpec
 from lare_rl.credit.step_targets import EpisodeInputs, EpisodeLengths, is_step, step_loss
 from lare_rl.nn.attention import LayerNorm, attend, causal_mask
 from lare_rl.nn.networks import MLP, Linear
@@ -88,16 +88,16 @@ class RBT(eqx.Module):
     """B"""
     step_model: MLP
 
-    def __init__(self, key: PRNGKeyArray, shape: DecoderShape, settings: CreditSettings):
+    def __init__(self, key: PRNGKeyArray, spec: CreditSpec):
         """Make an untrained model. Raises `LareError` if its inputs are not s, a and the next s."""
-        n_states, n_actions, _ = shape.sizes("observation", "action", "next_observation")
-        size, keys = settings.hidden[0], jax.random.split(key, 5 + LAYERS)
+        n_states, n_actions, _ = spec.sizes("observation", "action", "next_observation")
+        size, keys = spec.settings.hidden[0], jax.random.split(key, 5 + LAYERS)
         self.embed_state = Linear(n_states, size, key=keys[0])
         self.embed_action = Linear(n_actions, size, key=keys[1])
         self.first_norm, self.last_norm = LayerNorm(size), LayerNorm(size)
         self.bag_attention = Linear(size, 2 * size + 1, key=keys[2])
         self.next_state = Linear(size, n_states, key=keys[3])
-        self.step_model = MLP(n_states + n_actions, settings.hidden, 1, key=keys[4])
+        self.step_model = MLP(n_states + n_actions, spec.settings.hidden, 1, key=keys[4])
         self.blocks = tuple(Block(size, key=block_key) for block_key in keys[5:])
 
     def _split(self, inputs: Float[Array, "*rows inputs"]) -> list[Float[Array, "*rows entries"]]:

@@ -24,7 +24,7 @@ from lare_rl.credit.decomposition import (
     CreditBatch,
     DecoderState,
     agent_mean,
-    agent_shares,
+    agent_weights,
     decoder_rewards,
     level_returns,
     score_type_index,
@@ -33,6 +33,7 @@ from lare_rl.credit.decomposition import (
 from lare_rl.credit.methods import Fit, Method
 from lare_rl.credit.prequential import Predictions, add_predictions, squared_errors
 from lare_rl.credit.score_type import MAX_ERROR_RATIO, ROUNDING, ScoreType, ScoreTypeEstimate, compare_score_types
+from lare_rl.credit.spec import CreditSpec
 
 __all__ = [
     "MIN_GROWTH",
@@ -40,6 +41,7 @@ __all__ = [
     "add_to_sums",
     "estimate_score_type",
     "fit_closed_form",
+    "is_due",
     "is_fitted",
     "is_stale",
     "looks_binary",
@@ -136,9 +138,11 @@ def _team_features(decoder: LinearDecoder, episodes: CreditBatch) -> Float[Array
     features = decoder.features(episodes.inputs)
     if features.ndim == 2:
         return features
-    n_agents = features.shape[1]
-    share = jnp.full(features.shape[:2], 1 / n_agents) if episodes.alive is None else agent_shares(episodes.alive)
-    return jnp.einsum("raf,ra->rf", features, share)
+    if episodes.alive is None:
+        weights = jnp.full(features.shape[:2], 1 / features.shape[1])
+    else:
+        features, weights = jnp.where(episodes.alive[..., None], features, 0), agent_weights(episodes.alive)
+    return jnp.einsum("raf,ra->rf", features, weights)
 
 
 def _prefix_columns(decoder: LinearDecoder, episodes: CreditBatch) -> Float[Array, "rows columns"]:
@@ -173,6 +177,12 @@ def is_stale(state: DecoderState) -> Bool[Array, ""]:
     return closed_form.is_stale(state.closed_form, state.statistics)
 
 
+def is_due(state: DecoderState) -> Bool[Array, ""]:
+    """Return whether there are enough new episodes for another closed-form fit."""
+    assert state.closed_form is not None
+    return closed_form.is_due(state.closed_form)
+
+
 def reset_statistics(state: DecoderState) -> DecoderState:
     """Set the sums to zero, and standardise features by the newest statistics. All stored episodes must then be added again."""
     assert state.closed_form is not None
@@ -203,14 +213,13 @@ def add_to_sums(closed: ClosedForm, episodes: CreditBatch) -> ClosedForm:
     return closed._replace(sufficient_statistics=closed_form.split_double(statistics), log_odds=log_odds)
 
 
-def fit_closed_form(
-    state: DecoderState, method: Method, score_types: tuple[int, ...], *, batched: bool = False
-) -> DecoderState:
+def fit_closed_form(state: DecoderState, spec: CreditSpec, *, batched: bool = False) -> DecoderState:
     """Fit in closed form to all episodes that have been added, and determine the type of the score.
 
     `batched` is as in `evidence.fit`.
     """
     assert state.closed_form is not None
+    method, score_types = spec.method, spec.score_types
     if method.fit is Fit.SIGNS:
         closed = closed_form.fit_signs(state.closed_form)
     else:
@@ -261,9 +270,7 @@ def _score_type_errors(predictions: Predictions) -> Float[Array, " score_types"]
     return squared_errors(predictions) + ROUNDING * jnp.sum(predictions.returns**2)
 
 
-def reward_std(
-    state: DecoderState, rows: Float[Array, "rows inputs"], score_types: tuple[int, ...]
-) -> Float[Array, " rows"]:
+def reward_std(state: DecoderState, rows: Float[Array, "rows inputs"], spec: CreditSpec) -> Float[Array, " rows"]:
     """Return the posterior standard deviation of r_hat, or of T r_hat if the score is a mean.
 
     The method's fit must be `Fit.EVIDENCE` or `Fit.PREFIX_EVIDENCE`. Call this within `float64()`.
@@ -274,7 +281,7 @@ def reward_std(
     index = state.is_average.astype(int) if n_linear > 1 else 0
     covariance = evidence.posterior_covariance(
         closed_form.to_float64(state.closed_form.sufficient_statistics),
-        jnp.asarray(score_types)[index],
+        jnp.asarray(spec.score_types)[index],
         state.network.basis.column_strength_index,
         jax.tree.map(lambda leaf: leaf[index].astype(float), closed_form.best_posterior(state.closed_form)),
     )

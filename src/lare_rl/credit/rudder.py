@@ -24,9 +24,9 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, PRNGKeyArray
 
-from lare_rl.credit.decoder_network import DecoderOutput, DecoderShape
-from lare_rl.credit.decoder_settings import CreditSettings
+from lare_rl.credit.decoder_network import DecoderOutput
 from lare_rl.credit.losses import PerEpisode, batch_mean
+from lare_rl.credit.spec import CreditSpec
 from lare_rl.credit.step_targets import EpisodeInputs, EpisodeLengths, is_step, step_loss
 from lare_rl.nn.networks import MLP, Linear
 
@@ -59,8 +59,8 @@ class RUDDER(eqx.Module):
     """From the state h of the LSTM to g."""
     step_model: MLP
 
-    def __init__(self, key: PRNGKeyArray, shape: DecoderShape, settings: CreditSettings):
-        n_inputs, hidden = shape.n_inputs, settings.hidden
+    def __init__(self, key: PRNGKeyArray, spec: CreditSpec):
+        n_inputs, hidden = spec.n_inputs, spec.settings.hidden
         cell_key, gate_key, readout_key, step_key = jax.random.split(key, 4)
         self.cell_input = _init_normal(n_inputs, hidden[0], 0.0, key=cell_key)
         self.input_gate = _init_normal(hidden[0], hidden[0], GATE_BIAS, key=gate_key)

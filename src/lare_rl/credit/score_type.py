@@ -4,16 +4,12 @@ from collections.abc import Mapping
 from enum import IntEnum
 from typing import NamedTuple
 
-from lare_rl.credit.prequential import SEGMENT_WINDOW, WINDOW
-from lare_rl.tasks.payments import PaymentRule
-
 __all__ = [
     "MAX_ERROR_RATIO",
     "ROUNDING",
     "ScoreType",
     "ScoreTypeEstimate",
     "compare_score_types",
-    "prediction_window",
     "score_types_to_fit",
 ]
 
@@ -63,8 +59,3 @@ def compare_score_types(errors: Mapping[ScoreType, float], chosen: ScoreType) ->
     """Compare the chosen type with the others, by the squared error of each type's predictions of returns."""
     rival = min((other for other in errors if other != chosen), key=lambda other: errors[other])
     return ScoreTypeEstimate(chosen, errors[chosen] < MAX_ERROR_RATIO * errors[rival], rival)
-
-
-def prediction_window(payments: PaymentRule, score: str) -> int:
-    """Return the number of last returns over which predictions of them are assessed: more if a single return says little."""
-    return WINDOW if payments.only_at_end and score != "binary" else SEGMENT_WINDOW

@@ -1,5 +1,6 @@
 """What is fitted to what, for one team: a method, its settings, and the sizes of a task. All that follows from them is computed here."""
 
+import math
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -8,9 +9,11 @@ from lare_rl.credit.decoder_settings import CreditSettings
 from lare_rl.credit.explanation_text import raw_feature_names
 from lare_rl.credit.input_names import input_size, input_sizes, tracked_size
 from lare_rl.credit.methods import Fit, Method
-from lare_rl.credit.prequential import WINDOW
+from lare_rl.credit.prequential import SEGMENT_WINDOW, WINDOW
 from lare_rl.credit.score_type import ScoreType, score_types_to_fit
-from lare_rl.tasks.spec import ScoredObservation
+from lare_rl.errors import LareError
+from lare_rl.tasks.payments import PAID_AT_END, PaymentRule
+from lare_rl.tasks.spec import MAX_LEVELS, ScoredObservation
 
 __all__ = ["CreditSpec"]
 
@@ -35,12 +38,27 @@ class CreditSpec:
     """The number of steps of the longest episode."""
     fixed_length: bool = False
     """Whether all episodes have the same length. A sum and a mean are then the same."""
-    window: int = WINDOW
-    """The number of last returns over which predictions of them are assessed."""
-    n_levels: int = 0
-    """The number of levels that episodes may belong to."""
+    payments: PaymentRule = PAID_AT_END
+    """When the environment pays."""
+    has_groups: bool = False
+    """Whether episodes may belong to groups, whose returns differ in level."""
     scale_rewards: bool = False
     """Whether training rewards are divided by the running root mean square of R/T."""
+
+    @property
+    def is_exact(self) -> bool:
+        """Whether the proxy rewards of an episode are corrected to add up to its return."""
+        return self.method.is_exact(self.settings.exact)
+
+    @property
+    def window(self) -> int:
+        """The number of last payments over which predictions of them are assessed: more if a single one says little."""
+        return WINDOW if self.payments.only_at_end and self.settings.score != "binary" else SEGMENT_WINDOW
+
+    @property
+    def n_levels(self) -> int:
+        """The number of levels that episodes may belong to."""
+        return MAX_LEVELS if self.has_groups else 0
 
     @cached_property
     def inputs(self) -> tuple[str, ...]:
@@ -64,7 +82,7 @@ class CreditSpec:
         return Basis(
             n_factors=self.n_factors if "factors" in self.inputs else 0,
             n_raw=input_size(raw, self._sizes),
-            extended=self.method.extended_basis,
+            extended=self.method.decoder_kind.extended_basis,
             n_tracked=tracked_size(self.inputs, self._sizes),
             n_levels=0 if self.method.fit is Fit.SIGNS else self.n_levels,
             prefixes=self.method.fit is Fit.PREFIX_EVIDENCE,
@@ -77,6 +95,25 @@ class CreditSpec:
             return (ScoreType.SUM,)
         allow_log_odds = not self.method.uses_gradient
         return score_types_to_fit(self.settings.score, self.fixed_length, allow_log_odds=allow_log_odds)
+
+    def sizes(self, *names: str) -> list[int]:
+        """Return the sizes of the inputs. Raises `LareError` if their names, in order, are not `names`."""
+        if self.inputs != names:
+            raise LareError(
+                f"this decoder reads the inputs {', '.join(names)}, and its method has {dict(self.input_sizes)}: register the method "
+                f"with inputs=InputNames({names!r})"
+            )
+        return [size for _, size in self.input_sizes]
+
+    @property
+    def n_inputs(self) -> int:
+        """The number of inputs of a step."""
+        return self.basis.n_inputs
+
+    @property
+    def output_scale(self) -> float:
+        """The factor of the output of decoders for several agents (see `decomposition.py`)."""
+        return 1.0 if self.agents == 1 else math.sqrt(self.max_steps * self.agents)
 
     def raw_feature_names(self, observation: str, action: str) -> list[str]:
         """Return names of the raw features, from a task's texts; none if they are not entries of observations and actions."""

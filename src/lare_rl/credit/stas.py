@@ -16,8 +16,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, PRNGKeyArray
 
-from lare_rl.credit.decoder_network import DecoderOutput, DecoderShape
-from lare_rl.credit.decoder_settings import CreditSettings
+from lare_rl.credit.decoder_network import DecoderOutput
+from lare_rl.credit.spec import CreditSpec
 from lare_rl.nn.attention import LayerNorm, attend, causal_mask
 from lare_rl.nn.networks import MLP, Linear
 
@@ -118,16 +118,16 @@ class STAS(eqx.Module):
     layers: tuple[TimeLayer, ...]
     coalitions: Coalitions
     head: Linear
-    gain: float = eqx.field(static=True)
+    output_scale: float = eqx.field(static=True)
 
-    def __init__(self, key: PRNGKeyArray, shape: DecoderShape, settings: CreditSettings):
-        self.gain = shape.gain
+    def __init__(self, key: PRNGKeyArray, spec: CreditSpec):
+        self.output_scale = spec.output_scale
         embed_key, position_key, number_key, layers_key, coalitions_key, head_key = jax.random.split(key, 6)
-        self.embed = Linear(shape.n_inputs, SIZE, key=embed_key)
-        self.position = jax.random.normal(position_key, (shape.max_steps, SIZE))
-        self.agent_number = jax.random.normal(number_key, (shape.n_agents, SIZE))
+        self.embed = Linear(spec.n_inputs, SIZE, key=embed_key)
+        self.position = jax.random.normal(position_key, (spec.max_steps, SIZE))
+        self.agent_number = jax.random.normal(number_key, (spec.agents, SIZE))
         self.layers = tuple(TimeLayer(key=key) for key in jax.random.split(layers_key, LAYERS))
-        self.coalitions = Coalitions(shape.n_agents, key=coalitions_key)
+        self.coalitions = Coalitions(spec.agents, key=coalitions_key)
         self.head = Linear(SIZE, 1, key=head_key)
 
     def __call__(self, inputs: Float[Array, "rows agents inputs"], key: PRNGKeyArray | None) -> DecoderOutput:
@@ -151,4 +151,7 @@ class STAS(eqx.Module):
         """Return the agents' rewards for one sample of coalitions and of agent numbers."""
         coalitions_key, order_key = jax.random.split(key)
         order = jax.random.permutation(order_key, len(self.agent_number))
-        return self.gain * self.head(self.coalitions(x + self.agent_number[order], coalitions_key, dropout_key))[..., 0]
+        return (
+            self.output_scale
+            * self.head(self.coalitions(x + self.agent_number[order], coalitions_key, dropout_key))[..., 0]
+        )

@@ -5,26 +5,26 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, PRNGKeyArray
 
-from lare_rl.credit.basis import Basis
-from lare_rl.credit.decoder_network import DecoderOutput, DecoderShape
-from lare_rl.credit.decoder_settings import CreditSettings
+from lare_rl.credit.decoder_network import DecoderOutput
+from lare_rl.credit.spec import CreditSpec
 from lare_rl.nn.networks import MLP
 
 __all__ = ["Bottleneck", "StepDecoder"]
 
 
 class StepDecoder(eqx.Module):
-    """f_psi: an MLP, times a gain."""
+    """f_psi: an MLP, times `spec.output_scale`."""
 
     mlp: MLP
-    gain: float = eqx.field(static=True)
+    output_scale: float = eqx.field(static=True)
 
-    def __init__(self, key: PRNGKeyArray, shape: DecoderShape, settings: CreditSettings):
-        self.gain = shape.gain
-        self.mlp = MLP(shape.n_inputs, settings.hidden, 1, key=key)
+    def __init__(self, key: PRNGKeyArray, spec: CreditSpec, n_inputs: int | None = None):
+        """Make an MLP for the inputs of a method, or for `n_inputs` other numbers."""
+        self.output_scale = spec.output_scale
+        self.mlp = MLP(n_inputs or spec.n_inputs, spec.settings.hidden, 1, key=key)
 
     def __call__(self, inputs: Float[Array, "rows *agents inputs"], key: PRNGKeyArray | None) -> DecoderOutput:
-        return DecoderOutput(self.gain * self.mlp(inputs)[..., 0], jnp.zeros(inputs.shape[:-1]))
+        return DecoderOutput(self.output_scale * self.mlp(inputs)[..., 0], jnp.zeros(inputs.shape[:-1]))
 
 
 class Bottleneck(eqx.Module):
@@ -39,12 +39,11 @@ class Bottleneck(eqx.Module):
     step_decoder: StepDecoder
     beta: float = eqx.field(static=True)
 
-    def __init__(self, key: PRNGKeyArray, shape: DecoderShape, settings: CreditSettings):
-        self.beta, size = settings.divergence, settings.bottleneck
+    def __init__(self, key: PRNGKeyArray, spec: CreditSpec):
+        self.beta, size = spec.settings.divergence, spec.settings.bottleneck
         encoder_key, decoder_key = jax.random.split(key)
-        self.encoder = MLP(shape.n_inputs, settings.encoder, 2 * size, key=encoder_key)
-        code = shape._replace(basis=Basis(n_factors=0, n_raw=size, extended=False))
-        self.step_decoder = StepDecoder(decoder_key, code, settings)
+        self.encoder = MLP(spec.n_inputs, spec.settings.encoder, 2 * size, key=encoder_key)
+        self.step_decoder = StepDecoder(decoder_key, spec, size)
 
     def __call__(self, inputs: Float[Array, "rows *agents inputs"], key: PRNGKeyArray | None) -> DecoderOutput:
         mean, log_variance = jnp.split(self.encoder(inputs), 2, axis=-1)

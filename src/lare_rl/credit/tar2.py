@@ -20,8 +20,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, PRNGKeyArray
 
-from lare_rl.credit.decoder_network import DecoderOutput, DecoderShape
-from lare_rl.credit.decoder_settings import CreditSettings
+from lare_rl.credit.decoder_network import DecoderOutput
+from lare_rl.credit.spec import CreditSpec
 from lare_rl.credit.stas import REWARD_SAMPLES, Coalitions, TimeLayer, gelu
 from lare_rl.nn.networks import MLP, Linear
 
@@ -45,21 +45,19 @@ class TAR2(eqx.Module):
     agent_layers: tuple[Coalitions, ...]
     contribution_model: MLP
     action_model: MLP
-    gain: float = eqx.field(static=True)
+    output_scale: float = eqx.field(static=True)
 
-    def __init__(self, key: PRNGKeyArray, shape: DecoderShape, settings: CreditSettings):
+    def __init__(self, key: PRNGKeyArray, spec: CreditSpec):
         """Make an untrained network. Raises `LareError` if its inputs are not observation and action."""
-        n_observations, n_actions = shape.sizes("observation", "action")
-        self.gain = shape.gain
+        n_observations, n_actions = spec.sizes("observation", "action")
+        self.output_scale = spec.output_scale
         keys = jax.random.split(key, 8)
         self.embed_observation = Linear(n_observations, SIZE, key=keys[0])
         self.embed_action = Linear(n_actions, SIZE, key=keys[1])
-        self.position = jax.random.normal(keys[2], (shape.max_steps, SIZE))
-        self.agent_numbers = jax.random.normal(keys[3], (LAYERS, shape.n_agents, SIZE))
+        self.position = jax.random.normal(keys[2], (spec.max_steps, SIZE))
+        self.agent_numbers = jax.random.normal(keys[3], (LAYERS, spec.agents, SIZE))
         self.time_layers = tuple(TimeLayer(SIZE, key=key) for key in jax.random.split(keys[4], LAYERS))
-        self.agent_layers = tuple(
-            Coalitions(shape.n_agents, SIZE, key=key) for key in jax.random.split(keys[5], LAYERS)
-        )
+        self.agent_layers = tuple(Coalitions(spec.agents, SIZE, key=key) for key in jax.random.split(keys[5], LAYERS))
         self.contribution_model = MLP(2 * LAYERS * SIZE, (SIZE,), 1, key=keys[6], activation=gelu)
         self.action_model = MLP((1 + LAYERS) * SIZE, (SIZE,), n_actions, key=keys[7], activation=gelu)
 
@@ -72,7 +70,7 @@ class TAR2(eqx.Module):
         if key is None:
             sample_keys = jax.random.split(jax.random.key(jnp.uint32(0)), REWARD_SAMPLES)
             samples = jax.lax.map(lambda key: self._contributions(self._attend(tokens, key)), sample_keys)
-            r_hat = self.gain * jnp.mean(samples, axis=0).reshape(inputs.shape[:2])
+            r_hat = self.output_scale * jnp.mean(samples, axis=0).reshape(inputs.shape[:2])
             return DecoderOutput(r_hat, jnp.zeros_like(r_hat))
         h = self._attend(tokens, key)
         past = jnp.pad(h[:, :-1], ((0, 0), (1, 0), (0, 0), (0, 0)))
@@ -81,7 +79,7 @@ class TAR2(eqx.Module):
         # Standardised or not, the largest entry of a one-hot action is the one of the action that was taken.
         chosen = jnp.argmax(action, axis=-1).reshape(*shape, 1)
         penalty = -ACTION_WEIGHT * jnp.take_along_axis(log_p, chosen, axis=-1)
-        r_hat = self.gain * self._contributions(h)
+        r_hat = self.output_scale * self._contributions(h)
         return DecoderOutput(r_hat.reshape(inputs.shape[:2]), penalty.reshape(inputs.shape[:2]))
 
     def _attend(

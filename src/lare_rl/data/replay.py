@@ -87,28 +87,26 @@ class Index(NamedTuple):
 
 
 class StoredSteps(NamedTuple):
-    """Transitions, read from the replay."""
+    """Transitions, read from the replay. If the environment pays before the end, "episode" means segment in all fields."""
 
     columns: dict[str, Array]
     """Every column, [*batch ...], of the step's row: the observation before the step, the action, the reward."""
     next_columns: dict[str, Array]
     """The columns of `STEP_COLUMNS` that are stored, after the step."""
     episodic_reward: Float[Array, "*batch teams"]
-    """The whole return at the last step of a finished episode, else 0. With payments before the end, what is paid at this step.
-
-    Segments then take the place of episodes in the fields below, too."""
+    """The return at the last step of an episode that has ended, else 0."""
     mean_reward: Float[Array, "*batch teams"]
-    """R/T of the step's episode; if it has not finished, of its steps so far."""
-    finished: Bool[Array, "*batch"]
-    """Whether the step's episode has finished."""
+    """R/T of the step's episode; if it has not ended, of its steps so far."""
+    episode_ended: Bool[Array, "*batch"]
+    """Whether the step's episode has ended."""
     last: Bool[Array, "*batch"]
-    """Whether the step is the last one of a finished episode."""
+    """Whether the step is the last one of an episode that has ended."""
     residual: Float[Array, "*batch teams"] | None
     """The return of the step's episode, less the sum of its proxy rewards; 0 if that is unknown. None if nobody asks for it."""
     level: Int[Array, "*batch"] | None
     """The level of the step's episode. Valid at the last step."""
     length: Int[Array, "*batch"]
-    """Steps of its episode; if that has not finished, at least the mean length of the finished ones."""
+    """Steps of its episode; if that has not ended, at least the mean length of those that have."""
 
 
 def init_replay(
@@ -232,24 +230,24 @@ def read(replay: Replay, index: Index) -> StoredSteps:
     """Read the transitions at this index."""
     replay, (env, number) = segments_as_episodes(replay), index
     row, episode = look_up(replay.row, env, number), look_up(replay.episode, env, number)
-    end, finished = end_of_episode(replay, env, episode), episode < replay.current_episode[env]
+    end, ended = end_of_episode(replay, env, episode), episode < replay.current_episode[env]
     return_, length = look_up(replay.episode_return, env, episode), end - payment_start(replay, env, episode)
-    last = (number + 1 == end) & finished
+    last = (number + 1 == end) & ended
     residual = None
     if replay.predicted_return is not None:
         difference = return_ - look_up(replay.predicted_return, env, episode)
-        residual = jnp.where(finished[..., None] & jnp.isfinite(difference), difference, 0)
+        residual = jnp.where(ended[..., None] & jnp.isfinite(difference), difference, 0)
     stored = replay.columns.items()
     return StoredSteps(
         columns={name: look_up(values, env, row) for name, values in stored},
         next_columns={name: look_up(values, env, row + 1) for name, values in stored if name in STEP_COLUMNS},
         episodic_reward=jnp.where(last[..., None], return_, 0),
         mean_reward=return_ / jnp.maximum(length, 1)[..., None],
-        finished=finished,
+        episode_ended=ended,
         last=last,
         residual=residual,
         level=None if replay.level is None else look_up(replay.level, env, episode),
-        length=jnp.where(finished, length, jnp.maximum(length, mean_length(replay))),
+        length=jnp.where(ended, length, jnp.maximum(length, mean_length(replay))),
     )
 
 

@@ -73,7 +73,7 @@ def load_episode_credit(run: Run) -> EpisodeCredit | None:
         return None
     steps, training_reward = jax.jit(partial(_read_rewards, config=config))(learner, index)
     uncertainty = None
-    if learner.decoders and config.method.fit in (Fit.EVIDENCE, Fit.PREFIX_EVIDENCE) and config.credit_rows == 1:
+    if learner.decoders and config.method.fit in (Fit.EVIDENCE, Fit.PREFIX_EVIDENCE) and config.n_proxy_rewards == 1:
         with float64():
             std = np.asarray(jax.jit(partial(_posterior_std, config=config))(learner.decoders[0], steps))
         uncertainty = 2 * std / np.where(learner.decoders[0].is_average, steps.length, 1)
@@ -109,7 +109,7 @@ def _read_rewards(
 
 def _posterior_std(decoder: DecoderState, steps: StoredSteps, config: TrainConfig) -> Float[Array, " steps"]:
     """Compute the posterior standard deviation of a single agent's proxy rewards, in float64."""
-    return reward_std(decoder, decoder_inputs(steps, config, 0)[:, 0], config.score_types)
+    return reward_std(decoder, decoder_inputs(steps, config, 0)[:, 0], config.credit_specs[0])
 
 
 def _factor_correlations(learners: Learner, config: TrainConfig) -> Float[np.ndarray, " factors"]:
@@ -117,7 +117,7 @@ def _factor_correlations(learners: Learner, config: TrainConfig) -> Float[np.nda
 
     They are NaN if only returns are known. The array is empty for many agents.
     """
-    if not config.method.needs_phi or config.credit_rows > 1 or config.env.n_agents > 1:
+    if not config.method.needs_phi or config.n_proxy_rewards > 1 or config.env.n_agents > 1:
         return np.zeros(0)
     buffers = learners.replay
     n_stored = int(np.min(jax.jit(jax.vmap(replay.n_stored_transitions))(buffers)))

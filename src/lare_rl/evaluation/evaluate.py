@@ -106,7 +106,7 @@ def evaluate_policy(
     task = run.config.task
     check_environment(task)
     config, actor, _ = load_actor(run, best)
-    config = replace(config, deterministic=deterministic)
+    config = replace(config, deterministic=deterministic or None)
     if load_env_spec(task).is_jax:
         return DeviceCollector(make_jax_env(task), config, run.seeds).evaluate(actor, episodes, number=1)
     task, first = task.evaluation_task, run.config.settings.evaluation_episodes

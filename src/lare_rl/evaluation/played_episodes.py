@@ -1,7 +1,7 @@
 """New episodes of a run's policy, with the credit of each agent, and samples of their steps."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from operator import itemgetter
 from typing import Any
@@ -115,7 +115,7 @@ def _unroll_on_host(run: Run, config: TrainConfig, actor: Any, n_episodes: int) 
     """Play as many episodes at a time as environments may be open. An episode does not depend on how many these are."""
     seeds, task, batches = run.seeds[:1], run.config.task, []
     with make_vec_env(task, n_open_envs(task, 1, n_episodes)) as envs:
-        for numbers, policy in policy_turns(envs, config, actor, seeds, n_episodes, deterministic=False):
+        for numbers, policy in policy_turns(envs, replace(config, deterministic=False), actor, seeds, n_episodes):
             episode_seeds = [episode_seed(seeds[0], Stream.TRAINING_EPISODES, number) for number in numbers]
             batch = _drop_seed_axis(record_on_host(envs, policy, seeds, episode_seeds))
             batches.append(jax.tree.map(itemgetter(np.s_[:, : len(numbers)]), batch))
@@ -182,7 +182,7 @@ def sample_steps(run: Run, actor: Any = None) -> list[TeamSample]:
     for team_index, role in enumerate(run.config.task.roles):
         rows = make_episode(role, config.env, steps.timestep, steps.env_action, steps.next_timestep)
         n_factors = config.n_factors[team_index] if config.n_factors else 0
-        factors = played.factors[played.mask][:, config.team_rows(team_index), :n_factors]
+        factors = played.factors[played.mask][:, config.team_slice(team_index), :n_factors]
         next_observation, factors, reward = (x[rows.alive] for x in (rows.next_observation, factors, rows.reward))
         samples.append(TeamSample(next_observation=next_observation, factors=factors, reward=reward))
     return samples

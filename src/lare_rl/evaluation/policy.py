@@ -52,7 +52,7 @@ class RunPolicy:
                 "export the run (lare-rl export)"
             )
         config, actors, _ = load_actor(run, best)
-        self._config = replace(config, deterministic=deterministic)
+        self._config = replace(config, deterministic=deterministic or None)
         self._actor = jax.tree.map(lambda leaf: leaf[seed_index : seed_index + 1], actors)
         self._rng = numpy_generator(run.seeds[seed_index], Stream.EVALUATION_NOISE, 0)
         self._policies: dict[int, HostPolicy] = {}
@@ -92,9 +92,9 @@ class RunPolicy:
         return self._select_actions(rows, available)[0]
 
     def _select_actions(
-        self, rows: Float[np.ndarray, "batch observation"], available: Any
+        self, observations: Float[np.ndarray, "batch observation"], available: Any
     ) -> Float[np.ndarray, "batch action"]:
-        n_rows = len(rows)
+        n_rows = len(observations)
         if n_rows > 1 and jax.tree.leaves(self._memory):
             name = self._config.algorithm.name
             raise LareError(
@@ -104,13 +104,14 @@ class RunPolicy:
         mask = self._check_mask(available, n_rows)
         noise = None if deterministic else draw_noise(self._config, [self._rng], n_rows)
         n_padded = padded_size(n_rows)
+        padded = np.minimum(np.arange(n_padded), n_rows - 1)  # the last row is repeated
         if n_padded not in self._policies:
             self._policies[n_padded] = make_policy(self._config, self._actor, n_padded, deterministic=deterministic)
         action, self._memory = self._policies[n_padded](
             self._memory,
-            _pad(rows[None, :, None], n_padded),
-            _pad(mask[None, :, None], n_padded),
-            None if noise is None else _pad(noise, n_padded),
+            observations[None, padded, None],
+            mask[None, padded, None],
+            None if noise is None else noise[:, padded],
             np.zeros((1, n_padded), bool),
         )
         return to_env_action(action[0, :n_rows, 0], self._env)
@@ -151,8 +152,3 @@ class RunPolicy:
 
 
 load_policy = RunPolicy
-
-
-def _pad(array: np.ndarray, n_rows: int) -> np.ndarray:
-    """Repeat the last row of an array [1 rows ...] until there are `n_rows`."""
-    return np.concatenate([array, np.repeat(array[:, -1:], n_rows - array.shape[1], axis=1)], axis=1)

@@ -15,7 +15,6 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 
-from lare_rl.credit.decoders import DECODERS
 from lare_rl.credit.decomposition import DecoderState, decoder_rewards
 from lare_rl.credit.input_names import input_arrays
 from lare_rl.credit.methods import Method, Reward
@@ -39,7 +38,7 @@ def missing_reward_reason(method: Method) -> str | None:
         return f"{method.name} takes the reward of a step from the return of its episode"
     if method.inputs is not None and "history" in method.inputs.names:
         return f"{method.name} takes the reward of a step from the history of its episode"
-    if method.reward is Reward.PROXY and DECODERS[method.decoder].whole_episodes:
+    if method.reward is Reward.PROXY and method.decoder_kind.whole_episodes:
         return f"the decoder of {method.name} ({method.decoder}) reads whole episodes"
     return None
 

@@ -18,7 +18,7 @@ from lare_rl.assigner.assigner import CreditAssigner
 from lare_rl.assigner.assigner_config import AssignerConfig
 from lare_rl.credit.decoder_settings import CreditSettings
 from lare_rl.credit.engine import correction
-from lare_rl.credit.methods import Reward, find_method
+from lare_rl.credit.methods import METHODS, Reward
 from lare_rl.envs.load import resolve_task
 from lare_rl.errors import LareError
 from lare_rl.latent.function import LatentFunction
@@ -224,7 +224,7 @@ def _create_assigner(
     seed: int,
 ) -> CreditAssigner:
     """Create an assigner whose steps take about `memory` GiB."""
-    if find_method(method).reward is Reward.UNIFORM:
+    if METHODS.find(method).reward is Reward.UNIFORM:
         raise LareError(
             f"{method} gives all steps of an episode the same reward, and needs no relabelling: compute it from the return"
         )
@@ -303,7 +303,7 @@ def _compute_rewards(
                 level = None if episode.group is None else credit.group_names.get(episode.group)
                 unpaid = credit.step_rewards.unpaid_return(level, payments)
                 counts.predictions.append(float(reward.sum(dtype=np.float64)) + unpaid)
-            if episode.complete and credit.config.is_exact:
+            if episode.complete and credit.config.spec.is_exact:
                 reward = _make_exact(reward, episode.reward, credit.config)
             yield RelabelledEpisode(episode, reward)
             listener("write", counts.episodes, size[0])

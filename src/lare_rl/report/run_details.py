@@ -12,7 +12,7 @@ from lare_rl.config.effective import effective_settings
 from lare_rl.config.resolve import fill_in
 from lare_rl.config.settings import Settings
 from lare_rl.credit import explanation_text
-from lare_rl.credit.methods import find_method
+from lare_rl.credit.methods import METHODS
 from lare_rl.envs.families import load_env_spec
 from lare_rl.errors import install_command
 from lare_rl.evaluation.episode_credit import FactorLabel, label_factors, load_episode_credit
@@ -318,7 +318,7 @@ def _to_text(value: Any) -> str:
 
 def describe_method(run: Run) -> str:
     """Return what the run's method does, its source, and where policies are evaluated, if it is elsewhere."""
-    method, task = find_method(run.config.settings.method), run.config.task
+    method, task = METHODS.find(run.config.settings.method), run.config.task
     source = "" if method.source == "-" else f" Source: {method.source}."
     environments = (
         f" Trained in {task.environment}, evaluated in {task.evaluation_environment}."

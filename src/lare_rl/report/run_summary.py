@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from lare_rl.credit.methods import find_method
+from lare_rl.credit.methods import METHODS
 from lare_rl.envs.load import shipped_tasks
 from lare_rl.report.reported_run import ReportedRun, finite
 from lare_rl.report.score_use import CLEAR_ERRORS, ScoreUse, summarise_score_use
@@ -233,7 +233,7 @@ def summarise_run(
     deterministic = reported.final_values(DETERMINISTIC_RETURN)
     _, r2s = reported.curve(RETURN_R2) or (None, None)
     run, task, settings = reported.run, reported.run.config.task, reported.run.config.settings
-    method = find_method(settings.method)
+    method = METHODS.find(settings.method)
     is_initial = steps <= settings.warmup
     initial_returns = returns[:, is_initial].mean(axis=1) if is_initial.any() else np.full(1, np.nan)
     return RunSummary(

@@ -11,7 +11,7 @@ from pydantic import Field, field_validator
 
 from lare_rl.config.migrate import CONFIG
 from lare_rl.config.settings import ResolvedSettings, Settings
-from lare_rl.credit.methods import find_method
+from lare_rl.credit.methods import METHODS
 from lare_rl.envs.load import resolve_path
 from lare_rl.errors import LareError
 from lare_rl.llm.prompts import N_CANDIDATES
@@ -56,7 +56,7 @@ class RunPlan:
 
     def function_for(self, settings: ResolvedSettings) -> "tuple[Path | LatentFunction, ...]":
         """Return the functions of the file for the settings of a run. There are none if another method needs none."""
-        replaced = settings.method != self.settings.method and not find_method(settings.method).needs_phi
+        replaced = settings.method != self.settings.method and not METHODS.find(settings.method).needs_phi
         return () if replaced else self.function or ()
 
 

@@ -9,7 +9,7 @@ import lare_rl
 from lare_rl.config.effective import effective_settings
 from lare_rl.config.resolve import resolve
 from lare_rl.config.settings import ResolvedSettings, Settings
-from lare_rl.credit.methods import find_method
+from lare_rl.credit.methods import METHODS
 from lare_rl.errors import LareError
 from lare_rl.latent.design import check_recorded
 from lare_rl.llm.prompts import N_CANDIDATES
@@ -79,7 +79,7 @@ def make_job(root: Path, task: TaskSpec, settings: Settings, functions: Sequence
     """
     resolved = resolve(settings, task)
     name = f"{resolved.method}-{resolved.algorithm}"
-    needs_phi = find_method(resolved.method).needs_phi
+    needs_phi = METHODS.find(resolved.method).needs_phi
     if needs_phi and not functions:
         name += f"-draw{resolved.draw}"
         name += f"-candidates{resolved.candidates}" if resolved.candidates != N_CANDIDATES else ""
@@ -94,7 +94,7 @@ def make_job(root: Path, task: TaskSpec, settings: Settings, functions: Sequence
 
 def check_job(job: Job) -> None:
     """Raise `LareError` if a job could not be trained, or if its directory holds another run or other files."""
-    method = find_method(job.resolved.method)
+    method = METHODS.find(job.resolved.method)
     functions = choose_functions(job.task, job.resolved, job.functions) if job.functions else ()
     if not job.started:
         if job.directory.exists():

@@ -14,7 +14,7 @@ from pydantic import Field, model_validator
 
 from lare_rl.config.effective import unused_settings
 from lare_rl.config.settings import Settings
-from lare_rl.credit.methods import find_method
+from lare_rl.credit.methods import METHODS
 from lare_rl.envs.load import load_task, resolve_path
 from lare_rl.errors import LareError
 from lare_rl.sweep.jobs import Job, check_job, make_job
@@ -116,7 +116,7 @@ def run_sweep(
 
 def _check_functions(sweep: Sweep) -> None:
     """Raise `LareError` if draws or functions affect no run."""
-    if any(find_method(method).needs_phi for method in sweep.methods):
+    if any(METHODS.find(method).needs_phi for method in sweep.methods):
         return
     for name, is_set in (("functions", bool(sweep.functions)), ("draws", sweep.draws != (0,))):
         if is_set:
@@ -134,7 +134,7 @@ def _make_jobs(sweep: Sweep, path: Path) -> Iterator[Job]:
         raise LareError("draws choose recorded functions, but all tasks have some in [functions]: leave out either")
     for task, method, algorithm in product(tasks, sweep.methods, sweep.algorithms or (None,)):
         functions = [path.parent / function for function in sweep.functions.get(task.name, ())]
-        for draw in sweep.draws if find_method(method).needs_phi and not functions else (0,):
+        for draw in sweep.draws if METHODS.find(method).needs_phi and not functions else (0,):
             chosen = {"method": method, "algorithm": algorithm, "draw": draw}
             settings = Settings(**rename_keys(sweep.settings) | chosen)
             try:

@@ -22,9 +22,9 @@ from lare_rl.envs.vec_env import VecEnv
 from lare_rl.errors import LareError
 from lare_rl.tasks.spec import TaskSpec
 from lare_rl.training.evaluation import Evaluation
-from lare_rl.training.host_policy import init_host_memory, make_policy
+from lare_rl.training.host_policy import draw_noise, init_host_memory, make_policy
 from lare_rl.training.static_config import TrainConfig
-from lare_rl.training.streams import Stream, episode_seed, host_noise, numpy_generator
+from lare_rl.training.streams import Stream, episode_seed, numpy_generator
 from lare_rl.training.unroll_host import add_seed_axis, check_actions, evaluate_policy_on_host
 
 __all__ = ["HostCollector", "HostVecEnv", "make_host_collector"]
@@ -199,7 +199,7 @@ class HostCollector:
             action = np.stack(uniform, axis=1).astype(np.float32)
             return self._envs.collect(lambda timestep, action_t, episode_start: action_t, action, report)
         policy = make_policy(config, actor, config.n_envs, deterministic=False)
-        noise = np.stack([host_noise(rng, config.noise, (*shape, config.noise_size)) for rng in rngs], axis=1)
+        noise = np.moveaxis(draw_noise(config, rngs, config.rollout_steps, config.n_envs), 1, 0)
 
         def explore(timestep: Timestep, noise_t: np.ndarray, episode_start: np.ndarray) -> np.ndarray:
             action, self._memory = policy(

@@ -79,7 +79,7 @@ def fit_seeds(
     decoders, metrics = map_leading_axis(
         lambda pair: fit_repeatedly(*pair, config), (learner, keys), batched=config.batched
     )
-    return learner._replace(decoders=decoders), metrics
+    return learner._replace(reward_sources=decoders), metrics
 
 
 def fit_repeatedly(

@@ -25,9 +25,9 @@ def decoder_inputs(steps: StoredSteps, config: TrainConfig, team_index: int) -> 
 def _read_inputs(
     steps: StoredSteps, config: TrainConfig, team_index: int, names: tuple[str, ...]
 ) -> Float[Array, "*batch rows inputs"]:
-    spec, agents = config.credit_specs[team_index], config.team_rows(team_index)
+    spec, agents = config.credit_specs[team_index], config.team_slice(team_index)
     if not names:
-        return jnp.zeros((*steps.finished.shape, spec.agents, 0))
+        return jnp.zeros((*steps.episode_ended.shape, spec.agents, 0))
     columns, next_columns = steps.columns, steps.next_columns
     arrays = {}
     if "factors" in names:
@@ -48,11 +48,11 @@ def _read_inputs(
 
 def tracked_inputs(steps: StoredSteps, config: TrainConfig) -> Float[Array, "*batch rows entries"]:
     """Return the entries whose history is stored, of all teams, padded to the largest number."""
-    entries = jnp.zeros((*steps.finished.shape, config.credit_rows, config.n_tracked))
+    entries = jnp.zeros((*steps.episode_ended.shape, config.n_proxy_rewards, config.n_tracked))
     for i, spec in enumerate(config.credit_specs):
         n_tracked = spec.basis.n_tracked
         inputs = _read_inputs(steps, config, i, spec.inputs[:-1])
-        entries = entries.at[..., config.team_rows(i), :n_tracked].set(inputs[..., :n_tracked])
+        entries = entries.at[..., config.team_slice(i), :n_tracked].set(inputs[..., :n_tracked])
     return entries
 
 
@@ -60,14 +60,14 @@ def alive_agents(steps: StoredSteps, config: TrainConfig) -> Bool[Array, "*batch
     """Return which agents acted."""
     if "alive" in steps.columns:
         return steps.columns["alive"]
-    return jnp.ones((*steps.finished.shape, config.env.n_agents), bool)
+    return jnp.ones((*steps.episode_ended.shape, config.env.n_agents), bool)
 
 
 def row_mask(steps: StoredSteps, config: TrainConfig, team_index: int) -> Bool[Array, "*batch rows"] | None:
     """Return which rows of a team's decoder inputs count. None means all."""
     if "alive" not in steps.columns or config.team_level:
         return None
-    return steps.columns["alive"][..., config.team_rows(team_index)]
+    return steps.columns["alive"][..., config.team_slice(team_index)]
 
 
 def step_batch(steps: StoredSteps, config: TrainConfig, team_index: int) -> StepBatch:
@@ -76,10 +76,10 @@ def step_batch(steps: StoredSteps, config: TrainConfig, team_index: int) -> Step
         inputs=decoder_inputs(steps, config, team_index),
         length=steps.length,
         mean_reward=steps.mean_reward[..., team_index],
-        finished=steps.finished,
+        episode_ended=steps.episode_ended,
         last=steps.last,
+        alive=alive_agents(steps, config)[..., config.env.teams[team_index].agents],
         residual=None if steps.residual is None else steps.residual[..., team_index],
-        alive=row_mask(steps, config, team_index),
     )
 
 

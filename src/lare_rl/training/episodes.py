@@ -15,9 +15,10 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from lare_rl.credit import closed_form, returns
+from lare_rl.credit import returns
 from lare_rl.credit.decomposition import CreditBatch, DecoderState
 from lare_rl.credit.methods import Fit
+from lare_rl.credit.spec import CreditSpec
 from lare_rl.data import replay
 from lare_rl.data.replay import Index, Replay
 from lare_rl.data.sampling import count_episodes_since, episodes_in_order
@@ -103,7 +104,8 @@ def _learn_if_due(
         is_stale = is_due & jax.vmap(returns.is_stale)(decoders[0])
         rebuild = jax.vmap(partial(_rebuild_statistics, config=config))
         decoders = jax.lax.cond(jnp.any(is_stale), rebuild, lambda unchanged, *_: unchanged, decoders, buffer, is_stale)
-    return tuple(_fit_closed_forms(decoder, is_due, config) for decoder in decoders)
+    fit_teams = zip(decoders, config.credit_specs, strict=True)
+    return tuple(_fit_closed_forms(decoder, is_due, spec, config.batched) for decoder, spec in fit_teams)
 
 
 def fold_episodes(
@@ -121,9 +123,13 @@ def fold_episodes(
         body: the function from a state, a batch of whole episodes, and the first step of each, to the next state.
         expected: about how many episodes there are; None if they may be many.
     """
-    buffer, longest, n_episodes = replay.segments_as_episodes(buffer), config.longest_segment, config.credit_window
+    buffer, longest, n_episodes = (
+        replay.segments_as_episodes(buffer),
+        config.longest_segment,
+        config.credit_specs[0].window,
+    )
     expected = n_episodes if expected is None else max(1, expected)
-    rows = max(1, min(expected, n_episodes, MAX_ROWS // (config.credit_rows * longest))) * longest
+    rows = max(1, min(expected, n_episodes, MAX_ROWS // (config.n_proxy_rewards * longest))) * longest
     total = jnp.sum(count_episodes_since(buffer, since))
 
     def read_batch(carry: tuple[Int[Array, ""], tuple[State, ...]]) -> tuple[Int[Array, ""], tuple[State, ...]]:
@@ -156,14 +162,14 @@ def _rebuild_statistics(decoders: Decoders, buffer: Replay, is_stale: Bool[Array
     return select(is_stale, rebuilt, decoders)
 
 
-def _fit_closed_forms(decoder: DecoderState, is_due: Bool[Array, " seeds"], config: TrainConfig) -> DecoderState:
+def _fit_closed_forms(
+    decoder: DecoderState, is_due: Bool[Array, " seeds"], spec: CreditSpec, batched: bool
+) -> DecoderState:
     """Make the closed-form fits of a team's decoder for the seeds that are due."""
-    batched = config.batched
-    fit = partial(returns.fit_closed_form, method=config.method, score_types=config.score_types, batched=batched)
+    fit = partial(returns.fit_closed_form, spec=spec, batched=batched)
 
     def fit_seed(seed: tuple[DecoderState, Bool[Array, ""]]) -> DecoderState:
         decoder, is_due = seed
-        assert decoder.closed_form is not None
-        return jax.lax.cond(is_due & closed_form.is_due(decoder.closed_form), fit, lambda unchanged: unchanged, decoder)
+        return jax.lax.cond(is_due & returns.is_due(decoder), fit, lambda unchanged: unchanged, decoder)
 
     return map_leading_axis(fit_seed, (decoder, is_due), batched=batched)

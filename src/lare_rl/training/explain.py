@@ -8,17 +8,11 @@ import jax
 import numpy as np
 from jaxtyping import Array, Bool
 
-from lare_rl.credit import returns
-from lare_rl.credit.decomposition import CreditBatch, level_effects, valid_rows
-from lare_rl.credit.engine import add_to_explanation, explain_returns, init_explanation
+from lare_rl.credit.decomposition import CreditBatch, valid_rows
+from lare_rl.credit.explain_returns import add_to_explanation, explain_returns, init_explanation, returns_findings
 from lare_rl.credit.explanation import Explanation
-from lare_rl.credit.explanation_text import (
-    LEGEND_CODES,
-    MESSAGES,
-    MIN_EXPLAINED_EPISODES,
-    explanation_findings,
-)
-from lare_rl.credit.methods import METHODS, find_method
+from lare_rl.credit.explanation_text import LEGEND_CODES, MESSAGES, MIN_EXPLAINED_EPISODES
+from lare_rl.credit.methods import METHODS
 from lare_rl.data.replay import Index, Replay, segments_as_episodes
 from lare_rl.nn.normalise import RunningMeanStd, empty_mean_std, update_mean_std
 from lare_rl.runs.directory import Run
@@ -55,7 +49,7 @@ def find_explanations(run: Run) -> list[list[Finding]]:
 
 def explanation_source(run: Run) -> str:
     """Return which seed and which fit an explanation is of. It is empty where that goes without saying."""
-    method = find_method(run.config.settings.method)
+    method = METHODS.find(run.config.settings.method)
     remarks = [f"of seed {run.seeds[0]} alone"] if len(run.seeds) > 1 else []
     if method.uses_gradient:
         remarks.append(f"by a closed-form fit to the stored returns, which is not the decoder of {method.name}")
@@ -82,13 +76,8 @@ def _find_explanations(run: Run, learner: Learner, config: TrainConfig) -> list[
         factor_names = [] if function is None else function.factor_columns(run.scored_observation)
         raw_names = [] if config.team_level else specs[i].raw_feature_names(role.observation, role.action)
         decoder = select_seed(first_shard(learner.decoders[i]))
-        score_type, looks_binary = returns.estimate_score_type(decoder), returns.looks_binary(decoder, config.method)
-        groups = dict(enumerate(level_effects(decoder, float(explanation.mean_length)).tolist()))
-        findings.append(
-            explanation_findings(
-                explanation, score_type, factor_names, raw_names, looks_binary=looks_binary, groups=groups
-            )
-        )
+        levels = range(config.credit_specs[i].n_levels)
+        findings.append(returns_findings(explanation, decoder, config.method, factor_names, raw_names, levels))
     return findings
 
 

@@ -40,12 +40,12 @@ def compute_factors(
     They are padded to the largest number of factors.
     """
     lead = steps.next_timestep.terminated.shape
-    factors = jnp.zeros((*lead, config.credit_rows, max(config.n_factors, default=0)), jnp.float32)
+    factors = jnp.zeros((*lead, config.n_proxy_rewards, max(config.n_factors, default=0)), jnp.float32)
     for i, (graph, team) in enumerate(zip(graphs, config.env.teams, strict=False)):
         timesteps = select_states(config.scored_observation, steps.timestep, steps.next_timestep)
         inputs = [phi_inputs(config.credit_scope, team, timestep, steps.env_action) for timestep in timesteps]
         columns = jnp.concatenate([_evaluate_graph(graph, *arrays) for arrays in inputs], axis=-1)
-        factors = factors.at[..., config.team_rows(i), : columns.shape[-1]].set(columns)
+        factors = factors.at[..., config.team_slice(i), : columns.shape[-1]].set(columns)
     return factors
 
 
@@ -69,7 +69,7 @@ def compute_host_factors(run: Run, config: TrainConfig, steps: Trajectory) -> Fl
     """
     steps = jax.tree.map(np.asarray, steps)
     lead = steps.env_action.shape[:-2]
-    factors = np.zeros((*lead, config.credit_rows, max(config.n_factors, default=0)), np.float32)
+    factors = np.zeros((*lead, config.n_proxy_rewards, max(config.n_factors, default=0)), np.float32)
     for i, (function, team) in enumerate(zip(run.functions, config.env.teams, strict=False)):
         before, action = phi_inputs(config.credit_scope, team, steps.timestep, steps.env_action)
         after, _ = phi_inputs(config.credit_scope, team, steps.next_timestep, steps.env_action)
@@ -79,5 +79,5 @@ def compute_host_factors(run: Run, config: TrainConfig, steps: Trajectory) -> Fl
             path, batch = run.directory / FAILED_BATCH, {"observation": error.observation, "action": error.action}
             replace_npz(path, batch)
             raise LareError(f"{error}; it was given the batch in {path}; the last checkpoint is whole") from error
-        factors[..., config.team_rows(i), : columns.shape[-1]] = columns
+        factors[..., config.team_slice(i), : columns.shape[-1]] = columns
     return factors

@@ -83,7 +83,9 @@ def fit_until_converged(
     """
     hidden_fields = {name: getattr(learner.replay, name) for name in ("current_episode", "running", "segments")}
     unhidden, n_seeds = jax.tree.map(jnp.copy, hidden_fields), len(learner.n_learned)
-    n_hidden = jax.vmap(partial(_count_held_out, window=config.credit_window))(segments_as_episodes(learner.replay))
+    n_hidden = jax.vmap(partial(_count_held_out, window=config.credit_specs[0].window))(
+        segments_as_episodes(learner.replay)
+    )
     compute_error = jit_over_seeds(jax.vmap(partial(_held_out_error, config=config)), config.n_devices)
     best_decoders, best_error = jax.tree.map(jnp.copy, learner.decoders), np.full(n_seeds, np.inf)
     rounds_without_gain = np.zeros(n_seeds, int)
@@ -104,7 +106,7 @@ def fit_until_converged(
         rounds_without_gain = np.where(is_better, 0, rounds_without_gain + 1)
         if (rounds_without_gain >= PATIENCE).all():
             break
-    return learner._replace(decoders=best_decoders), metrics
+    return learner._replace(reward_sources=best_decoders), metrics
 
 
 def _count_held_out(replay: Replay, window: int) -> Int[Array, " envs"]:
@@ -119,7 +121,7 @@ def _held_out_error(
     decoders: Decoders, replay: Replay, n_hidden: Int[Array, " envs"], config: TrainConfig
 ) -> Float[Array, ""]:
     """Return the squared error of the returns of held-out episodes, summed over the teams, each in units of its returns."""
-    empty = empty_predictions(1, config.credit_window)
+    empty = empty_predictions(1, config.credit_specs[0].window)
     decoders, replay = tuple(decoder._replace(predictions=empty) for decoder in decoders), segments_as_episodes(replay)
 
     def predict(decoder: DecoderState, episodes: CreditBatch, first: Index) -> DecoderState:

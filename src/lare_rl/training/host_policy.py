@@ -63,8 +63,7 @@ def _translate_policy(
 class EvaluationPolicy:
     """The policy of all seeds for whole episodes, which all begin with its first call. It holds the memory of the actors.
 
-    It acts without noise if `deterministic` is true; by default as in evaluations, where only PPO's policy has noise. `noise_rows` says
-    which rows of the noise of how many episodes these episodes get, by default all.
+    The noise of these episodes is `noise_rows` of that of `n_noise_rows` episodes.
     """
 
     def __init__(
@@ -72,22 +71,19 @@ class EvaluationPolicy:
         config: TrainConfig,
         actor: Any,
         seeds: Sequence[int],
-        n_episodes: int,
-        deterministic: bool | None = None,
-        noise_rows: tuple[int, Int[np.ndarray, " episodes"]] | None = None,
+        noise_rows: Int[np.ndarray, " episodes"],
+        n_noise_rows: int,
     ):
-        self._config = config
-        self._n_noise_rows, self._noise_rows = noise_rows or (n_episodes, np.arange(n_episodes))
-        self._deterministic = config.deterministic_evaluation if deterministic is None else deterministic
-        self._policy = make_policy(config, actor, n_episodes, deterministic=self._deterministic)
-        self._memory = init_host_memory(config, len(seeds), n_episodes)
+        self._config, self._noise_rows, self._n_noise_rows = config, noise_rows, n_noise_rows
+        self._policy = make_policy(config, actor, len(noise_rows), deterministic=config.deterministic_evaluation)
+        self._memory = init_host_memory(config, len(seeds), len(noise_rows))
         self._rngs = [numpy_generator(seed, Stream.EVALUATION_NOISE, 0) for seed in seeds]
 
     def __call__(
         self, timestep: Timestep, episode_start: Bool[np.ndarray, "seeds envs"]
     ) -> Float[np.ndarray, "seeds envs agents action"]:
         noise = None
-        if not self._deterministic:
+        if not self._config.deterministic_evaluation:
             noise = draw_noise(self._config, self._rngs, self._n_noise_rows)[:, self._noise_rows]
         action, self._memory = self._policy(
             self._memory, timestep.observation, timestep.available, noise, episode_start
@@ -101,8 +97,8 @@ def init_host_memory(config: TrainConfig, *lead: int) -> Any:
 
 
 def draw_noise(
-    config: TrainConfig, rngs: Sequence[np.random.Generator], n_envs: int
-) -> Float[np.ndarray, "seeds envs agents noise"]:
-    """Draw the noise of a step. `rngs` has a generator for each seed."""
-    shape = n_envs, config.env.n_agents, config.noise_size
+    config: TrainConfig, rngs: Sequence[np.random.Generator], *lead: int
+) -> Float[np.ndarray, "seeds *lead agents noise"]:
+    """Draw the noise of some steps, which are an array of shape `lead`. `rngs` has a generator for each seed."""
+    shape = *lead, config.env.n_agents, config.noise_size
     return np.stack([host_noise(rng, config.noise, shape) for rng in rngs])

@@ -90,5 +90,4 @@ def update(
         learner, metrics = functions.train_step(learner, steps, keys, env_steps)
         return learner, record(measured, metrics, metrics.get("algorithm/updates"))
 
-    learner, measured = when(env_steps >= config.warmup, fit_and_update, learner, measured)
-    return learner, measured
+    return when(env_steps >= config.warmup, fit_and_update, learner, measured)

@@ -6,7 +6,7 @@ from pathlib import Path
 
 from lare_rl.config.settings import ResolvedSettings
 from lare_rl.config.validity import check_factors
-from lare_rl.credit.methods import find_method
+from lare_rl.credit.methods import METHODS
 from lare_rl.errors import LareError, short_repr
 from lare_rl.latent.design import design
 from lare_rl.latent.function import LatentFunction, check_task, pair_with_roles
@@ -30,7 +30,7 @@ def choose_functions(
     Raises:
         LareError: a function cannot be used, or the method needs none.
     """
-    method = find_method(settings.method)
+    method = METHODS.find(settings.method)
     if not method.needs_phi:
         if function is not None:
             raise LareError(f"{method.name} needs no latent function, and one is given: leave it out")

@@ -15,15 +15,16 @@ from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
 from lare_rl.credit import decomposition
 from lare_rl.credit.decomposition import DecoderState
-from lare_rl.credit.engine import RewardSource, init_decoder
+from lare_rl.credit.engine import RewardSource, init_source, select_decoders
 from lare_rl.credit.history import next_history, scan_history
 from lare_rl.data import replay
 from lare_rl.data.extend import abandon_running, extend, set_newest
 from lare_rl.data.replay import STEP_COLUMNS, Replay, StoredSteps
 from lare_rl.data.trajectory import Trajectory
 from lare_rl.envs.interface import team_mean
-from lare_rl.nn.normalise import Scale, empty_scale, update_scale
+from lare_rl.nn.normalise import update_scale
 from lare_rl.phi.graph import Graph
+from lare_rl.tasks.spec import MAX_LEVELS
 from lare_rl.training.decoder_inputs import decoder_inputs, row_mask, tracked_inputs
 from lare_rl.training.factors import compute_factors
 from lare_rl.training.static_config import TrainConfig
@@ -32,7 +33,6 @@ __all__ = [
     "Learner",
     "abandon_episodes",
     "empty_replay",
-    "init_decoders",
     "init_learner",
     "replay_columns",
     "store",
@@ -46,35 +46,24 @@ class Learner(NamedTuple):
 
     algorithm: Any
     """The state of the algorithm."""
-    decoders: tuple[DecoderState, ...]
-    """The decoders, one for each team; empty for a method that fits nothing."""
-    scales: tuple[Scale, ...]
-    """The scale of each team's R/T, for a method that fits nothing. A decoder has its own."""
+    reward_sources: tuple[RewardSource, ...]
+    """What the rewards of each team are computed from: its decoder or, for a method that fits nothing, the scale of its R/T."""
     replay: Replay
     n_learned: Int[Array, " envs"]
     """Payments of each environment that the decoders have learned from: finished episodes, if each is paid once."""
 
     @property
-    def reward_sources(self) -> tuple[RewardSource, ...]:
-        """What the rewards of each team are computed from."""
-        return self.decoders or self.scales
-
-
-def init_decoders(keys: Sequence[PRNGKeyArray], config: TrainConfig) -> tuple[DecoderState, ...]:
-    """Return untrained decoders, one for each team; none for a method that fits nothing."""
-    decoders = (init_decoder(key, spec) for key, spec in zip(keys, config.credit_specs, strict=True))
-    return tuple(decoder for decoder in decoders if decoder is not None)
+    def decoders(self) -> tuple[DecoderState, ...]:
+        """The decoders, one for each team; none for a method that fits nothing."""
+        return select_decoders(self.reward_sources)
 
 
 def init_learner(key: PRNGKeyArray, config: TrainConfig, init_algorithm: Callable[[PRNGKeyArray], Any]) -> Learner:
     """Return an untrained learner."""
-    n_teams = len(config.env.teams)
-    algorithm_key, *keys = jax.random.split(key, 1 + n_teams)
-    decoders = init_decoders(keys, config)
+    algorithm_key, *keys = jax.random.split(key, 1 + len(config.env.teams))
     return Learner(
         algorithm=init_algorithm(algorithm_key),
-        decoders=decoders,
-        scales=() if decoders else tuple(empty_scale() for _ in config.env.teams),
+        reward_sources=tuple(map(init_source, keys, config.credit_specs)),
         replay=empty_replay(config, config.n_envs, config.capacity),
         n_learned=jnp.zeros(config.n_envs, jnp.int32),
     )
@@ -117,12 +106,8 @@ def store_with_factors(
         buffer = _with_history(learner.replay, buffer, len(steps.ended), config)
     new_steps = replay.read(buffer, replay.newest_steps(buffer, len(steps.ended)))
     new_steps = jax.tree.map(lambda rows: jnp.swapaxes(rows, 0, 1), new_steps)
-    scales = tuple(
-        update_scale(scale, new_steps.mean_reward[..., i].ravel(), new_steps.last.ravel())
-        for i, scale in enumerate(learner.scales)
-    )
-    decoders = tuple(_observe(decoder, new_steps, config, i) for i, decoder in enumerate(learner.decoders))
-    return learner._replace(decoders=decoders, scales=scales, replay=buffer)
+    sources = tuple(_observe(source, new_steps, config, i) for i, source in enumerate(learner.reward_sources))
+    return learner._replace(reward_sources=sources, replay=buffer)
 
 
 def _with_history(before: Replay, buffer: Replay, n_steps: int, config: TrainConfig) -> Replay:
@@ -168,15 +153,17 @@ def _levels(steps: Trajectory, config: TrainConfig) -> Int[Array, "time envs"] |
     """Return the level of each step's episode, which is valid at the steps that are paid."""
     if config.group is None:
         return None
-    return jnp.clip(jnp.asarray(steps.next_timestep.measures[config.group]).astype(jnp.int32), 0, config.n_levels - 1)
+    return jnp.clip(jnp.asarray(steps.next_timestep.measures[config.group]).astype(jnp.int32), 0, MAX_LEVELS - 1)
 
 
-def _observe(decoder: DecoderState, steps: StoredSteps, config: TrainConfig, team_index: int) -> DecoderState:
-    """Add new steps, and the episodes that were paid in them, to the statistics of a team's decoder."""
+def _observe(source: RewardSource, steps: StoredSteps, config: TrainConfig, team_index: int) -> RewardSource:
+    """Add new steps, and the episodes that were paid in them, to the statistics of a team's decoder, or to its scale."""
+    mean_reward = steps.mean_reward[..., team_index].ravel()
+    if not isinstance(source, DecoderState):
+        return update_scale(source, mean_reward, steps.last.ravel())
     rows, mask = decoder_inputs(steps, config, team_index), row_mask(steps, config, team_index)
-    decoder = decomposition.observe_steps(decoder, rows, mask)
-    mean_reward, level = steps.mean_reward[..., team_index].ravel(), steps.level
-    level = None if level is None else level.ravel()
+    decoder = decomposition.observe_steps(source, rows, mask)
+    level = None if steps.level is None else steps.level.ravel()
     return decomposition.observe_returns(decoder, mean_reward, steps.length.ravel(), steps.last.ravel(), level)
 
 
@@ -188,7 +175,7 @@ def with_learned_returns(
 ) -> Learner:
     """Return the learner with the results of `learn_returns`."""
     buffer = replay.replace_payment_fields(learner.replay, predicted_return=predicted)
-    return learner._replace(decoders=decoders, n_learned=n_learned, replay=buffer)
+    return learner._replace(reward_sources=decoders, n_learned=n_learned, replay=buffer)
 
 
 def abandon_episodes(learner: Learner, abandoned: Bool[Array, " envs"]) -> Learner:

@@ -12,7 +12,7 @@ from jaxtyping import Array, Float, Int, Key, PRNGKeyArray, Scalar
 
 from lare_rl.algorithms.batches import Transitions
 from lare_rl.algorithms.off_policy import OffPolicySettings
-from lare_rl.credit.decomposition import DecoderState
+from lare_rl.credit.engine import RewardSource, select_decoders
 from lare_rl.data import replay
 from lare_rl.data.replay import Index, Replay, StoredSteps
 from lare_rl.data.sampling import CreditSample, sample_transitions
@@ -75,24 +75,24 @@ def _train_seed(
     n_updates = config.rollout_steps * config.n_envs
 
     def update(
-        carry: tuple[Any, tuple[DecoderState, ...]], inputs: tuple[Int[Scalar, ""], UpdateSample, PRNGKeyArray]
+        carry: tuple[Any, tuple[RewardSource, ...]], inputs: tuple[Int[Scalar, ""], UpdateSample, PRNGKeyArray]
     ) -> tuple[Any, dict[str, Array]]:
-        state, decoders = carry
+        state, sources = carry
         update_index, sample, key = inputs
         fit_key, key = jax.random.split(key)
         metrics = {}
         if sample.credit is not None:
-            decoders, metrics = fit_decoders(decoders, buffer, sample.credit, fit_key, config)
+            sources, metrics = fit_decoders(select_decoders(sources), buffer, sample.credit, fit_key, config)
         steps = replay.read(buffer, sample.batch)
-        reward = rewards(steps, decoders or learner.scales, config)
+        reward = rewards(steps, sources, config)
         batch = _transitions(steps, reward)
         state, algorithm_metrics = algorithm.update(state, batch, key, update_index, settings)
-        return (state, decoders), metrics | algorithm_metrics
+        return (state, sources), metrics | algorithm_metrics
 
     update_index = env_steps - settings.warmup + jnp.arange(n_updates)
     inputs = (update_index, _sample(buffer, sample_key, n_updates, config), jax.random.split(noise_key, n_updates))
-    (state, decoders), metrics = jax.lax.scan(update, (learner.algorithm, learner.decoders), inputs)
-    return learner._replace(algorithm=state, decoders=decoders), jax.tree.map(jnp.mean, metrics)
+    (state, sources), metrics = jax.lax.scan(update, (learner.algorithm, learner.reward_sources), inputs)
+    return learner._replace(algorithm=state, reward_sources=sources), jax.tree.map(jnp.mean, metrics)
 
 
 def _sample(buffer: Replay, key: PRNGKeyArray, n_updates: int, config: TrainConfig) -> UpdateSample:

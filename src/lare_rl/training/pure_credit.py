@@ -22,7 +22,7 @@ from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 from lare_rl.algorithms.registry import ALGORITHMS
 from lare_rl.config.validity import CreditContext, check_credit
 from lare_rl.credit.decoder_settings import CreditSettings, default_credit
-from lare_rl.credit.methods import Method, find_method
+from lare_rl.credit.methods import METHODS, Method
 from lare_rl.data.replay import StoredSteps, mean_length, required_capacity, segments_as_episodes
 from lare_rl.data.trajectory import Trajectory
 from lare_rl.envs.interface import EnvSpec, Team, Timestep, to_env_action
@@ -120,7 +120,7 @@ def pure_credit(
     Raises:
         LareError: the arguments do not go together.
     """
-    chosen, credit = find_method(method), settings or default_credit(agents)
+    chosen, credit = METHODS.find(method), settings or default_credit(agents)
     phi = _check_phi(chosen, phi, (observation_size, action_size))
     env = EnvSpec(
         teams=(Team("agent", 0, agents),),
@@ -259,7 +259,7 @@ def _stored_steps(learner: Learner, columns: dict[str, Any], next_columns: dict[
         next_columns=next_columns,
         episodic_reward=zeros,
         mean_reward=zeros,
-        finished=jnp.zeros(lead, bool),
+        episode_ended=jnp.zeros(lead, bool),
         last=jnp.zeros(lead, bool),
         residual=None,
         level=None,
@@ -298,9 +298,9 @@ def _refit(learner: Learner, key: PRNGKeyArray, learn_returns: Callable[..., Any
         return learner
     inputs = jax.tree.map(lambda leaf: leaf[None], (learner.decoders, learner.replay, learner.n_learned))
     decoders, n_learned, _ = jax.tree.map(lambda leaf: leaf[0], learn_returns(*inputs))
-    learner = learner._replace(decoders=decoders, n_learned=n_learned)
+    learner = learner._replace(reward_sources=decoders, n_learned=n_learned)
     if not config.method.uses_gradient:
         return learner
     has_episode = jnp.any(segments_as_episodes(learner.replay).current_episode > 0)
     fitted = jax.lax.cond(has_episode, lambda: fit_repeatedly(learner, key, config)[0], lambda: learner.decoders)
-    return learner._replace(decoders=fitted)
+    return learner._replace(reward_sources=fitted)

@@ -27,7 +27,7 @@ def rewards(
         team_alive = alive[..., team.agents]
         if config.method.has_proxy_rewards:
             batch, spec = step_batch(steps, config, i), config.credit_specs[i]
-            team_rewards.append(engine.training_rewards(reward_sources[i], batch, spec, team_alive))
+            team_rewards.append(engine.training_rewards(reward_sources[i], batch, spec))
             continue
         is_dense = config.method.reward is Reward.TRUE
         reward = steps.columns["reward"][..., team.agents] if is_dense else steps.episodic_reward[..., i, None]

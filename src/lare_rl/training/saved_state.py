@@ -9,7 +9,7 @@ from jaxtyping import Int
 
 from lare_rl.algorithms.registry import ALGORITHMS
 from lare_rl.config.resolve import replay_rows
-from lare_rl.credit.methods import find_method
+from lare_rl.credit.methods import METHODS
 from lare_rl.envs.families import load_env_spec
 from lare_rl.errors import LareError
 from lare_rl.runs import checkpoint
@@ -41,7 +41,7 @@ def make_train_config(run: Run) -> TrainConfig:
         env=env,
         credit_scope=task.credit_scope,
         scored_observation=run.scored_observation,
-        method=find_method(settings.method),
+        method=METHODS.find(settings.method),
         algorithm=ALGORITHMS[settings.algorithm],
         hyperparameters=settings.hyperparameters,
         credit=settings.credit,

@@ -14,8 +14,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, Key, PRNGKeyArray, Scalar
 
 from lare_rl.algorithms.batches import Metrics, Sequences
-from lare_rl.algorithms.qmix import QMIXSettings
-from lare_rl.credit.decomposition import DecoderState
+from lare_rl.algorithms.sequences import SequenceSettings
 from lare_rl.credit.engine import RewardSource
 from lare_rl.data import replay
 from lare_rl.data.layouts import lay_out_padded
@@ -33,8 +32,8 @@ from lare_rl.training.static_config import TrainConfig
 
 __all__ = ["SequenceState", "act", "get_actor", "init", "init_memory", "train_step"]
 
-Updated = tuple[Any, tuple[DecoderState, ...]]
-"""The state of the algorithm, and the decoders."""
+Updated = tuple[Any, tuple[RewardSource, ...]]
+"""The state of the algorithm, and what rewards are computed from."""
 
 MIN_CUT_LENGTH = 32
 """Batches are cut to shorter lengths only if the longest episode has at least this many steps. Each length compiles
@@ -59,8 +58,8 @@ class Actor(NamedTuple):
     epsilon: Float[Array, ""]
 
 
-def _settings(config: TrainConfig) -> QMIXSettings:
-    assert isinstance(config.hyperparameters, QMIXSettings)
+def _settings(config: TrainConfig) -> SequenceSettings:
+    assert isinstance(config.hyperparameters, SequenceSettings)
     return config.hyperparameters
 
 
@@ -123,9 +122,9 @@ def train_step(
     branches = [jax.vmap(partial(_update_seed, config=config, n_steps=length)) for length in _cut_lengths(config)]
 
     def make_update(
-        number: Int[Scalar, ""], networks: Any, decoders: tuple[DecoderState, ...]
+        number: Int[Scalar, ""], networks: Any, sources: tuple[RewardSource, ...]
     ) -> tuple[Updated, Metrics]:
-        current = learner._replace(algorithm=learner.algorithm._replace(networks=networks), decoders=decoders)
+        current = learner._replace(algorithm=learner.algorithm._replace(networks=networks), reward_sources=sources)
         pairs = jax.vmap(lambda key: jax.random.split(jax.random.fold_in(key, number)))(keys)
         sample_keys, update_keys = jnp.unstack(pairs, axis=1)
         sample = partial(sample_distinct_episodes, count=settings.batch_size)
@@ -141,10 +140,10 @@ def train_step(
         sums = {name: sums[name] + jnp.where(is_due, values, 0) for name, values in metrics.items()}
         return select(is_due, updated, before), sums
 
-    start = learner.algorithm.networks, learner.decoders
+    start = learner.algorithm.networks, learner.reward_sources
     zeros = jax.tree.map(jnp.zeros_like, jax.eval_shape(make_update, jnp.int32(0), *start)[1])
-    (networks, decoders), sums = jax.lax.fori_loop(0, jnp.max(n_updates), update, (start, zeros))
-    learner = learner._replace(algorithm=learner.algorithm._replace(networks=networks), decoders=decoders)
+    (networks, sources), sums = jax.lax.fori_loop(0, jnp.max(n_updates), update, (start, zeros))
+    learner = learner._replace(algorithm=learner.algorithm._replace(networks=networks), reward_sources=sources)
     metrics = {name: total / n_updates for name, total in sums.items()}  # NaN where there was no update
     return learner, metrics | {"algorithm/updates": n_updates.astype(jnp.float32)}
 
@@ -174,17 +173,17 @@ def _update_seed(
 ) -> tuple[Updated, Metrics]:
     """Update the decoder and then the algorithm of one seed. Return only what changes: the learner holds much more."""
     sample_key, fit_key = jax.random.split(key)
-    decoders, metrics = learner.decoders, {}
+    sources, metrics = learner.reward_sources, {}
     samples = sample_credit(learner.replay, sample_key, 1, config)
     if samples is not None:
         sample = jax.tree.map(lambda leaf: leaf[0], samples)
-        decoders, metrics = fit_decoders(decoders, learner.replay, sample, fit_key, config)
+        sources, metrics = fit_decoders(learner.decoders, learner.replay, sample, fit_key, config)
     state, settings = learner.algorithm, _settings(config)
-    batch = _sequences(learner.replay, episodes, n_steps, decoders or learner.scales, state.mixer_statistics, config)
+    batch = _sequences(learner.replay, episodes, n_steps, sources, state.mixer_statistics, config)
     n_episodes = number * settings.update_every
     copy_target = n_episodes // settings.target_every > (n_episodes - settings.update_every) // settings.target_every
     networks, algorithm_metrics = config.algorithm.load().update(state.networks, batch, copy_target, settings)
-    return (networks, decoders), metrics | algorithm_metrics
+    return (networks, sources), metrics | algorithm_metrics
 
 
 def _sequences(

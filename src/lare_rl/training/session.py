@@ -184,7 +184,10 @@ class Session:
         )
 
     def compile_while_collecting(self) -> None:
-        """Compile in threads what the first finished episodes need. Until then, the processor often waits for a simulator."""
+        """Compile in threads what the first finished episodes need. Until then, the processor often waits for a simulator.
+
+        An error is left to the call that needs the program: it compiles again.
+        """
         shape = learner_shape(self.config, len(self.run.seeds))
         load_linear_algebra()
         self._threads.submit(self.functions.compile_learning, shape)

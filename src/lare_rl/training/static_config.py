@@ -9,11 +9,10 @@ import numpy as np
 from lare_rl.algorithms.registry import Algorithm, AlgorithmSettings, Consumes, Noise
 from lare_rl.credit.decoder_settings import CreditSettings
 from lare_rl.credit.methods import Method
-from lare_rl.credit.score_type import prediction_window
 from lare_rl.credit.spec import CreditSpec
 from lare_rl.envs.interface import EnvSpec
 from lare_rl.tasks.payments import PAID_AT_END, PaymentRule
-from lare_rl.tasks.spec import MAX_LEVELS, CreditScope, ScoredObservation
+from lare_rl.tasks.spec import CreditScope, ScoredObservation
 
 
 @dataclass(frozen=True)
@@ -52,8 +51,8 @@ class TrainConfig:
     """When the environment pays."""
     group: str | None = None
     """The measure that tells the level of an episode."""
-    deterministic: bool = False
-    """Whether a policy acts without noise outside training, even if its algorithm says otherwise."""
+    deterministic: bool | None = None
+    """Whether a policy acts without noise outside training. None: its algorithm decides."""
 
     @property
     def noise(self) -> Noise:
@@ -63,7 +62,9 @@ class TrainConfig:
     @property
     def deterministic_evaluation(self) -> bool:
         """Whether the policy acts without noise outside training."""
-        return self.deterministic or self.algorithm.deterministic_evaluation(self.env.discrete)
+        if self.deterministic is not None:
+            return self.deterministic
+        return self.algorithm.deterministic_evaluation(self.env.discrete)
 
     @property
     def noise_size(self) -> int:
@@ -76,12 +77,12 @@ class TrainConfig:
         return self.credit_scope == "state"
 
     @property
-    def credit_rows(self) -> int:
-        """Proxy rewards of a step: one for each agent, or one for each team."""
+    def n_proxy_rewards(self) -> int:
+        """The number of proxy rewards of a step: one for each agent, or one for each team."""
         return len(self.env.teams) if self.team_level else self.env.n_agents
 
-    def team_rows(self, team_index: int) -> slice:
-        """Return the rows of `credit_rows` that belong to a team."""
+    def team_slice(self, team_index: int) -> slice:
+        """Return which of a step's proxy rewards belong to a team."""
         return slice(team_index, team_index + 1) if self.team_level else self.env.teams[team_index].agents
 
     @property
@@ -110,24 +111,14 @@ class TrainConfig:
         return self.payments.longest_segment(self.env.max_steps)
 
     @property
-    def n_levels(self) -> int:
-        """The number of levels that episodes may belong to."""
-        return 0 if self.group is None else MAX_LEVELS
-
-    @property
     def is_exact(self) -> bool:
         """Whether the proxy rewards of an episode are corrected to add up to its return."""
-        return self.method.is_exact(self.credit.exact)
+        return self.credit_specs[0].is_exact
 
     @property
     def predicts_ahead(self) -> bool:
         """Whether the sums of proxy rewards are computed after each fit. For rollouts, they are computed with each update."""
         return self.is_exact and self.algorithm.consumes is not Consumes.ROLLOUTS
-
-    @property
-    def credit_window(self) -> int:
-        """The number of last payments over which predictions of them are assessed."""
-        return prediction_window(self.payments, self.credit.score)
 
     @property
     def has_fixed_segments(self) -> bool:
@@ -154,18 +145,13 @@ class TrainConfig:
                 single_agent=env.n_agents == 1 and not self.team_level,
                 agents=1 if self.team_level else team.n_agents,
                 max_steps=self.longest_segment,
-                window=self.credit_window,
-                n_levels=self.n_levels,
+                payments=self.payments,
+                has_groups=self.group is not None,
                 fixed_length=self.has_fixed_segments,
                 scale_rewards=self.scale_rewards,
             )
             for team, n_factors in zip(env.teams, self.n_factors or (0,) * len(env.teams), strict=True)
         )
-
-    @property
-    def score_types(self) -> tuple[int, ...]:
-        """The score types that are fitted."""
-        return self.credit_specs[0].score_types
 
     @property
     def columns(self) -> dict[str, jax.ShapeDtypeStruct]:
@@ -176,13 +162,13 @@ class TrainConfig:
         has_raw_features = any(name not in ("factors", "history") for name in inputs)
         observed = (env.n_agents, env.observation_size)
         actions = (env.n_agents, env.action_size)
-        factors = (self.credit_rows, max(self.n_factors, default=0))
+        factors = (self.n_proxy_rewards, max(self.n_factors, default=0))
         reads_state = consumes is Consumes.SEQUENCES or (has_raw_features and self.team_level)
         columns = {
             "observation": (is_replayed or (has_raw_features and not self.team_level), observed, np.float32),
             "action": (is_replayed or "action" in inputs, actions, np.float32),
             "factors": (self.method.needs_phi, factors, np.float32),
-            "history": (self.n_tracked > 0, (self.credit_rows, 3, self.n_tracked), np.float32),
+            "history": (self.n_tracked > 0, (self.n_proxy_rewards, 3, self.n_tracked), np.float32),
             "reward": (True, (env.n_agents,), np.float32),
             "state": (env.state_size > 0 and reads_state, (env.state_size,), np.float32),
             "available": (env.masks_actions and consumes is Consumes.SEQUENCES, actions, np.bool_),

@@ -114,12 +114,7 @@ def evaluate_on_host(
 
 
 def policy_turns(
-    envs: VecEnv,
-    config: TrainConfig,
-    actor: Any,
-    seeds: Sequence[int],
-    n_episodes: int,
-    deterministic: bool | None = None,
+    envs: VecEnv, config: TrainConfig, actor: Any, seeds: Sequence[int], n_episodes: int
 ) -> Iterator[tuple[range, EvaluationPolicy]]:
     """Yield the numbers of the episodes that begin together, and their policy, until each seed has `n_episodes`.
 
@@ -128,8 +123,7 @@ def policy_turns(
     width = len(envs.batch.terminated) // len(seeds)
     for start in range(0, n_episodes, width):
         rows = np.minimum(np.arange(start, start + width), n_episodes - 1)
-        policy = EvaluationPolicy(config, actor, seeds, width, deterministic, noise_rows=(n_episodes, rows))
-        yield range(start, min(start + width, n_episodes)), policy
+        yield range(start, min(start + width, n_episodes)), EvaluationPolicy(config, actor, seeds, rows, n_episodes)
 
 
 def evaluate_policy_on_host(

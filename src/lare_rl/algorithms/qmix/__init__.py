@@ -4,7 +4,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 from pydantic import Field
 
-from lare_rl.algorithms.registry import Algorithm, AlgorithmSettings, Consumes, register_algorithm
+from lare_rl.algorithms.registry import Algorithm, Consumes, register_algorithm
+from lare_rl.algorithms.sequences import SequenceSettings
 from lare_rl.errors import Count
 
 if TYPE_CHECKING:
@@ -13,7 +14,7 @@ if TYPE_CHECKING:
 __all__ = ["QMIXSettings"]
 
 
-class QMIXSettings(AlgorithmSettings):
+class QMIXSettings(SequenceSettings):
     """Hyperparameters, as PyMARL2 sets them for most maps of the StarCraft challenge."""
 
     hidden: Count = 64
@@ -32,12 +33,6 @@ class QMIXSettings(AlgorithmSettings):
     """Lambda of the TD(lambda) targets: 0 relies on the target networks, 1 on the rewards."""
     max_grad_norm: Annotated[float, Field(gt=0)] = 10.0
     """Largest norm of the joint gradient of agents and mixer."""
-    batch_size: Count = 128
-    """Episodes in one update."""
-    update_every: Count = 8
-    """New episodes for each update."""
-    target_every: Count = 200
-    """Episodes between two copies to the target networks, each after an update."""
     epsilon_start: Annotated[float, Field(ge=0, le=1)] = 1.0
     """Probability that an agent explores, at the start."""
     epsilon_end: Annotated[float, Field(ge=0, le=1)] = 0.05
