@@ -9,7 +9,7 @@ import pytest
 from gymnasium.spaces import Box, Discrete
 
 from helpers.toy_envs import Chase, toy_spec
-from lare_rl.envs.env_errors import EnvOutputError, check_finite
+from lare_rl.envs.env_errors import MAX_ERROR, EnvOutputError, check_finite
 from lare_rl.envs.gymnasium_env import GymnasiumEnv, make_gymnasium
 from lare_rl.envs.interface import Team
 from lare_rl.errors import LareError
@@ -192,6 +192,7 @@ def test_measures_are_those_of_the_last_step():
         ({"terminated": np.array([True, False])}, "failed in step: The truth value"),
         ({"reset": [0.5, 0.25]}, "info 0.25, which is not a dictionary"),
         ({"fail_in": "reset", "error": OSError("no asset\ntrack.bin")}, "reset: no asset track.bin$"),
+        ({"fail_in": "reset", "error": OSError("x" * 1000)}, f"reset: {'x' * MAX_ERROR}...$"),
         ({"fail_in": "step", "error": ZeroDivisionError()}, "step: ZeroDivisionError$"),
         ({"fail_in": "step", "error": SystemExit(0)}, "step: 0$"),
         ({"fail_in": "step", "error": LareError("no battery")}, "^no battery$"),

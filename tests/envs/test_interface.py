@@ -102,6 +102,8 @@ def test_environment_has_one_kind(make, is_jax):
 
 # JaxOnHost
 
+ON_HOST = JaxOnHost(Echo())
+
 
 def assert_equal(actual, expected) -> None:
     jax.tree.map(np.testing.assert_array_equal, actual, expected)
@@ -109,33 +111,31 @@ def assert_equal(actual, expected) -> None:
 
 def test_jax_on_host_equals_the_functions():
     """A key is split before the start and before each step, so that no two of them share a key."""
-    on_host, env = JaxOnHost(Echo()), Echo()
+    env = Echo()
     reset, step = jax.jit(env.reset), jax.jit(env.step)
     reset_key, key = jax.random.split(jax.random.key(3))
     state, expected = reset(reset_key)
-    assert_equal(on_host.reset(3), expected)
+    assert_equal(ON_HOST.reset(3), expected)
     for number in range(3):
         key, step_key = jax.random.split(key)
         action = np.eye(3, dtype=np.float32)[[number % 2, 0, 1]]
         state, expected = step(state, action, step_key)
-        timestep = on_host.step(action)
+        timestep = ON_HOST.step(action)
         assert_equal(timestep, expected)
         # Code on the host computes with NumPy, also in worker processes without JAX.
         assert all(isinstance(leaf, np.ndarray) for leaf in jax.tree.leaves(timestep))
 
 
 def test_jax_on_host_repeats_the_episode_of_a_seed():
-    env = JaxOnHost(Echo())
-
     def play(seed):
-        return [step for *_, step in play_steps(env, None, np.random.default_rng(0), seed)]
+        return [step for *_, step in play_steps(ON_HOST, None, np.random.default_rng(0), seed)]
 
     first = play(5)
-    env.reset(9)
-    env.step(np.eye(3, dtype=np.float32))
+    ON_HOST.reset(9)
+    ON_HOST.step(np.eye(3, dtype=np.float32))
     assert_equal(play(5), first)
     observations = [[step.observation.tolist() for step in episode] for episode in (first, play(6), play(7))]
     assert observations[0] not in observations[1:]
     with pytest.raises(LareError, match="frames"):
-        env.render()
-    env.close()
+        ON_HOST.render()
+    ON_HOST.close()

@@ -285,14 +285,6 @@ def test_full_disk_leaves_last_checkpoint(dense, dense_run, tmp_path, monkeypatc
     assert_equal_runs(resume_quietly(tmp_path / "run"), dense_run)
 
 
-@pytest.mark.parametrize("config", [{"lare": "0.9"}, {"lare": "0.9", "format": 1}])
-def test_too_old_run_is_refused(config, tmp_path):
-    (tmp_path / "config.json").write_text(json.dumps({"settings": {"chunk": 50}, "discrete": False, **config}))
-    for read in (open_run, resume_quietly):
-        with pytest.raises(LareError, match=r"another version of LaRe \(0\.9\)"):
-            read(tmp_path)
-
-
 def test_best_policy_is_saved(dense_run):
     """It is the policy of the first of the highest evaluations of each seed."""
     with np.load(dense_run.checkpoint / "best.npz") as best:

@@ -2,6 +2,8 @@
 
 import json
 import re
+from concurrent.futures import Future, ThreadPoolExecutor
+from types import SimpleNamespace
 
 import gymnasium
 import jax
@@ -190,6 +192,21 @@ def test_diverged_loss_is_not_saved(dense, tmp_path, monkeypatch):
         train_and_stop(CHASE, dense(), tmp_path / "run", 84)
     run = open_run(tmp_path / "run")
     assert read_metadata(run.checkpoint)["step"] == run.metrics()[-1]["step"] < 84
+
+
+def test_close_reports_a_failed_checkpoint_after_an_error_of_the_environments():
+    def fail():
+        raise RuntimeError("a worker does not answer")
+
+    saving, threads = Future(), ThreadPoolExecutor(1)
+    saving.set_exception(LareError("No space left"))
+    session = Session.__new__(Session)  # without the run and the learner that a session needs
+    vars(session).update(collector=SimpleNamespace(close=fail), _threads=threads, _saving=saving)
+    with pytest.raises(LareError, match="No space left") as error:
+        session.close()
+    assert isinstance(error.value.__context__, RuntimeError)
+    with pytest.raises(RuntimeError, match="shutdown"):
+        threads.submit(fail)
 
 
 @pytest.mark.parametrize("error", [MemoryError(), jax.errors.JaxRuntimeError("RESOURCE_EXHAUSTED: Out of memory")])
