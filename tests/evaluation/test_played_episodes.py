@@ -16,12 +16,12 @@ N_EPISODES = 12
 @pytest.fixture(scope="module")
 def run(tmp_path_factory):
     settings = lare_rl.Settings(
-        method="bayes",
+        method="rd-linear",
         algorithm="ippo",
-        steps=240,
+        steps=120,
         rollout_steps=60,
         environments=2,
-        evaluate_every=240,
+        evaluate_every=120,
         evaluation_episodes=2,
         credit={"exact": "last", "score": "sum"},
         ippo={"hidden": (8,), "minibatch_size": 60, "epochs": 1},

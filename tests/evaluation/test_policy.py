@@ -7,8 +7,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-import lare_rl
 from helpers.toy_envs import toy_spec
+from helpers.training_runs import start_run
 from lare_rl.envs.families import register_family
 from lare_rl.envs.jax_spaces import agent_spec, agent_timestep, make_choices
 from lare_rl.envs.play import play_episodes
@@ -49,8 +49,7 @@ TASK = toy_spec(environment="dials/two", observation_size=2, action_size=6)
 
 @pytest.fixture(scope="module")
 def run(small, tmp_path_factory):
-    settings = small(method="dense", algorithm="ppo", steps=80, rollout_steps=40, evaluate_every=80)
-    return lare_rl.train(TASK, settings, out=tmp_path_factory.mktemp("dials") / "run", listeners=[])
+    return start_run(TASK, small(method="dense", algorithm="ppo"), tmp_path_factory.mktemp("dials") / "run")
 
 
 def test_actions_are_available_and_those_of_the_package(run):

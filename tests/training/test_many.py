@@ -1,7 +1,5 @@
 """Whole runs of many agents: particle tasks, teams, a toy whose agents leave."""
 
-from dataclasses import replace
-
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -18,31 +16,29 @@ from lare_rl.errors import LareError
 from lare_rl.latent.function import verify_function
 from lare_rl.runs.directory import create_run, open_run
 from lare_rl.training import factors
+from lare_rl.training.iteration import IterationFunctions, update, when_on_host
 from lare_rl.training.latent_functions import choose_functions
 from lare_rl.training.saved_state import load_learner
-from lare_rl.training.start_session import restore_session
 
 
-def test_advance_fits_decoders_before_the_update(echo_run):
-    config = echo_run.config
-    settings = config.settings.model_copy(update={"fit_every": 2})
-    session, _ = restore_session(replace(echo_run, config=config.model_copy(update={"settings": settings})))
-    calls = []
+def test_update_fits_decoders_before_the_algorithm():
+    """Iterations have 20 steps, and the decoders are fitted in every second of them."""
+    config, steps, measured, calls = small_config("lare-rd", "ippo", rollout_steps=20), random_steps(), {}, []
 
     def fit(learner, keys):
-        calls.append(("fit", session.step))
-        return learner, {"credit/loss": jnp.zeros(2)}
+        calls.append("fit")
+        return learner, {"credit/loss": 1.0}
 
     def train_step(learner, steps, keys, step):
         calls.append(("train", step))
         return learner, {}
 
-    session.functions, session.loop = session.functions._replace(fit=fit, train_step=train_step), None
-    for _ in range(3):
-        session.advance(140)
-    session.close()
-    assert calls == [("fit", 80), ("train", 80), ("train", 100), ("fit", 120), ("train", 120)]
-    assert "credit/loss" in session.latest_metrics
+    functions = IterationFunctions(lambda *_: None, lambda *_: None, fit, train_step)
+    for step in (80, 100, 120):
+        arguments = jnp.arange(2), step, functions, when_on_host, lambda old, new, _: old | new, config, 2
+        _, measured = update(None, measured, steps, *arguments)
+    assert calls == ["fit", ("train", 80), ("train", 100), "fit", ("train", 120)]
+    assert measured == {"credit/loss": 1.0}
 
 
 @pytest.mark.long
