@@ -295,25 +295,6 @@ def test_policy_checks_observations(run, observation, words):
         load_policy(run)(observation)
 
 
-@pytest.mark.long
-def test_policy_with_discrete_actions(small, tmp_path):
-    spec = toy_spec(environment="toys/Pick-v0", observation_size=4, action_size=4)
-    settings = small(method="dense", algorithm="ppo", steps=60)
-    run = lare_rl.train(spec, settings, out=tmp_path / "run", listeners=[])
-    policy, observation = load_policy(run), np.eye(4, dtype=np.float32)[2]
-    assert gymnasium.make("toys/Pick-v0").action_space.contains(np.int64(policy(observation)))
-    np.testing.assert_array_equal(np.sort(policy.select_env_action(observation)), [0, 0, 0, 1])
-    # A policy that has hardly been trained makes every choice, in training's evaluations and here.
-    batch = np.tile(observation, (400, 1))
-    choices = load_policy(run)(batch)
-    assert np.bincount(choices).min() > 60
-    np.testing.assert_array_equal(load_policy(run)(batch), choices)
-    # Without noise it makes the likeliest choice alone, and so do evaluations.
-    assert set(load_policy(run, deterministic=True)(batch)) == {np.argmax(np.bincount(choices))}
-    sampled, likeliest = (evaluate_run(run, 4, deterministic=flag)["Chase"] for flag in (False, True))
-    assert not np.array_equal(sampled, likeliest)
-
-
 def test_policies_and_random_actions_are_evaluated_in_the_evaluation_environment(small, tmp_path):
     gymnasium.register("toys/FarChase-v0", entry_point=lambda: Chase(scale=1000.0), max_episode_steps=20)
     task = TASK.model_copy(update={"evaluation_environment": "toys/FarChase-v0"})

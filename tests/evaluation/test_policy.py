@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from scipy.stats import mode
 
 from helpers.toy_envs import toy_spec
 from helpers.training_runs import start_run
@@ -58,6 +59,8 @@ def test_actions_are_available_and_those_of_the_package(run):
     mask[:, [1, 5]] = True
     actions = policy(np.ones((n_rows, 2)), mask)
     assert {tuple(action) for action in actions.tolist()} == {(0, 1), (1, 2)}
+    likeliest = load_policy(run, deterministic=True)(np.ones((n_rows, 2)), mask)
+    np.testing.assert_array_equal(likeliest, np.tile(mode(actions).mode, (n_rows, 1)))
     assert policy(np.ones(2), np.arange(6) == 3).tolist() == [1, 0]
     np.testing.assert_array_equal(policy.select_env_action(np.ones(2), np.arange(6) == 3), np.arange(6) == 3)
     assert policy(np.ones(2), np.zeros(6, bool)).tolist() == [0, 0]  # as in training
