@@ -18,7 +18,6 @@ from lare_rl.runs.directory import create_run, open_run
 from lare_rl.training import factors
 from lare_rl.training.iteration import IterationFunctions, update, when_on_host
 from lare_rl.training.latent_functions import choose_functions
-from lare_rl.training.saved_state import load_learner
 
 
 def test_update_fits_decoders_before_the_algorithm():
@@ -57,18 +56,6 @@ def test_particle_task_trains_with_recorded_functions(task, small_many, tmp_path
     assert [function.task for function in open_run(run.directory).functions] == [
         role.name for role in run.config.task.roles
     ]
-
-
-def test_stored_factors_follow_scored_observation(echo_run):
-    """A row has the factors of the observations before and after a step: the second factor is the time, 0 after an
-    agent left."""
-    config, learner, _, _ = load_learner(echo_run)
-    assert config.n_factors == (4,)
-    alive, z = (np.asarray(learner.replay.columns[name])[0, :, :10] for name in ("alive", "factors"))
-    time_before, time_after = 6 * z[..., 1], 6 * z[..., 3]
-    goes_on = alive[:, 1:] & alive[:, :-1] & np.isclose(time_before[:, 1:], 1 + time_before[:, :-1])
-    assert goes_on.mean() > 0.3
-    np.testing.assert_allclose(time_after[:, :-1][goes_on], time_before[:, 1:][goes_on], atol=1e-5)
 
 
 def test_create_run_with_one_function_per_team(tmp_path):

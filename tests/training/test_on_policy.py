@@ -121,15 +121,6 @@ def test_act_with_and_without_noise(discrete):
         np.testing.assert_allclose(explored - greedy, noise, rtol=1e-4, atol=1e-5)
 
 
-def test_act_chooses_available_actions():
-    config = ippo_config("dense", env=ONE_TEAM)
-    actor, steps = on_policy.get_actor(untrained_learner(config), 0, config), random_steps(ONE_TEAM)
-    observation, available = map(jnp.asarray, (steps.timestep.observation, steps.timestep.available))
-    for noise in (jax.random.gumbel(jax.random.key(0), steps.action.shape), None):
-        action, _ = on_policy.act(actor, (), observation, available, noise, config)
-        assert (steps.timestep.available & (np.asarray(action) > 0)).sum(axis=-1).all()
-
-
 def test_rollout_of_many_agents():
     config, steps = ippo_config("lare-rd", env=TWO_TEAMS, n_envs=2), random_steps(TWO_TEAMS, 2)
     reward = np.arange(TOTAL * 2 * 5, dtype=np.float32).reshape(TOTAL, 2, 5)
