@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 import lare_rl
-from helpers.listeners import AtStep, metrics_without_times
+from helpers.listeners import metrics_without_times
 from helpers.long_tests import long_case
 from helpers.toy_envs import PHI, pick_spec, toy_spec
 from helpers.training_runs import CHASE, copy_run, resume_quietly, train_and_stop, train_quietly
@@ -106,22 +106,6 @@ def test_messages_of_dense_run(dense_training):
     assert re.match(r"fit_updates .* dense .*\(and \d+ more\)", messages[0])
     assert "first 36 steps are random" in messages[1]
     assert not any(message.startswith("Observations are large") for message in messages)
-
-
-@pytest.mark.long
-def test_warmup_of_the_whole_run(dense, tmp_path):
-    """The policy is never trained, which is announced. Another process cannot resume the run meanwhile."""
-
-    def intrude():
-        with pytest.raises(LareError, match="another process is training"):
-            resume_quietly(tmp_path / "run")
-
-    listener = AtStep(12, intrude)
-    run = train_quietly(CHASE, dense(steps=24, evaluate_every=12), tmp_path / "run", listeners=[listener])
-    (message,) = listener.messages
-    assert "all 24 steps are random" in message
-    assert "td3.warmup is 36" in message
-    assert ACTOR_SATURATION not in run.metrics()[-1]
 
 
 def test_metrics(dense, dense_run, echo_run, tmp_path):
