@@ -49,7 +49,7 @@ def test_fit_until_converged_keeps_the_best_decoders():
     """The only factor is the true reward, so a decoder's error is the distance of its weight from 1."""
     config = small_config("lare-linear", "ippo", ONE_TEAM, n_factors=(1,), n_envs=10)
     steps = random_steps(ONE_TEAM, 10, lengths=(12,))
-    learner = add_steps(untrained_learner(config), config, steps, steps.next_timestep.reward[..., None], learn=False)
+    learner = add_steps(untrained_learner(config), config, steps, steps.next_timestep.reward[..., None])
     errors, rounds = [[3.0, 3.0], [1.0, 4.0], [2.0, 2.0], [5.0, 5.0], [0.0, 6.0]], []
 
     def fit(learner, keys):

@@ -8,7 +8,7 @@ import pytest
 import lare_rl
 from helpers.jax_toy_envs import Echo
 from helpers.long_tests import long_case
-from helpers.small_configs import random_steps, small_config
+from helpers.small_configs import random_steps, small_config, untrained_learner
 from helpers.training_runs import ECHO_PHI, train_quietly
 from lare_rl.config.resolve import resolve
 from lare_rl.envs.particles.catalogue import TASKS
@@ -35,7 +35,7 @@ def test_update_fits_decoders_before_the_algorithm():
     functions = IterationFunctions(lambda *_: None, lambda *_: None, fit, train_step)
     for step in (80, 100, 120):
         arguments = jnp.arange(2), step, functions, when_on_host, lambda old, new, _: old | new, config, 2
-        _, measured = update(None, measured, steps, *arguments)
+        _, measured = update(untrained_learner(config), measured, steps, *arguments)
     assert calls == ["fit", ("train", 80), ("train", 100), "fit", ("train", 120)]
     assert measured == {"credit/loss": 1.0}
 
