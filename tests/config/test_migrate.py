@@ -31,17 +31,8 @@ def test_migrate_through_all_formats():
     current = {"format": FORMAT, "settings": {"first_fit": None}}
     assert migrate(current) == current
     assert migrate(current | {"format": 4}) == current
-
-
-def test_migrate_renamed_keys():
-    old = {"settings": {"judges": None}, "task": {"judged_from": "state", "teams": [{"judges": "both"}]}}
-    new = {
-        "settings": {"scored_observation": None},
-        "task": {"credit_scope": "state", "teams": [{"scored_observation": "both"}]},
-    }
+    old = {"settings": {"judges": None, "credit": {"optimism": 0.0}}, "task": {"judged_from": "state"}}
+    new = {"settings": {"scored_observation": None, "credit": {"exact": "no"}}, "task": {"credit_scope": "state"}}
     assert migrate({"format": 5, **old}) == {"format": FORMAT, **new}
-
-
-def test_migrate_removed_settings():
-    old = {"settings": {"credit": {"exact": "no", "optimism": 0.0}}}
-    assert migrate({"format": 7, **old}) == {"format": FORMAT, "settings": {"credit": {"exact": "no"}}}
+    teams = [{"task": {"teams": [{name: "both"}]}} for name in ("judges", "scored_observation")]
+    assert migrate({"format": 5, **teams[0]}) == {"format": FORMAT, **teams[1]}

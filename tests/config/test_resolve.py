@@ -186,8 +186,6 @@ def test_check_credit_refuses(method, changes, texts):
 
 def test_check_credit_accepts():
     cases = [
-        ("llm-reward", {}),
-        ("dense", {"scale_rewards": True, "n_agents": 3}),
         ("lare-bayes", {"n_raw_features": 7057}),
         ("bayes", {"n_raw_features": 1024, "team_level": True}),
         ("rrdu", {"n_raw_features": 7057}),

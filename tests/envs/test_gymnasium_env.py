@@ -9,7 +9,7 @@ import pytest
 from gymnasium.spaces import Box, Discrete
 
 from helpers.toy_envs import Chase, toy_spec
-from lare_rl.envs.env_errors import EnvOutputError, check_finite
+from lare_rl.envs.env_errors import MAX_ERROR, EnvOutputError, check_finite
 from lare_rl.envs.gymnasium_env import GymnasiumEnv, make_gymnasium
 from lare_rl.envs.interface import Team
 from lare_rl.errors import LareError
@@ -68,28 +68,14 @@ class OutOfItsSpace(Chase):
         return 7
 
 
-class Precise(Chase):
-    action_space = Box(np.array([1 / 3], np.float64), np.array([2 / 3], np.float64), dtype=np.float64)
-
-
-class Integers(Chase):
-    action_space = Box(-3, 3, (1,), np.int8)
-
-
-class Counts(Chase):
-    action_space = Box(0, 5, (2,), np.int64)
+class OtherActions(Chase):
+    def __init__(self, action_space):
+        super().__init__()
+        self.action_space = action_space
 
     def step(self, action):
         assert self.action_space.contains(action)
         return super().step(action[:1])
-
-
-class Scalar(Chase):
-    action_space = Box(-1, 1, (), np.float32)
-
-
-class Plane(Chase):
-    action_space = Box(-1, 1, (2, 2), np.float32)
 
 
 class Undrawable(Chase):
@@ -100,7 +86,7 @@ class Undrawable(Chase):
         self.render_mode = render_mode
 
 
-for maker in (Invalid, Reuses, OutOfItsSpace, Precise, Integers, Counts, Scalar, Plane, Undrawable):
+for maker in (Invalid, Reuses, OutOfItsSpace, OtherActions, Undrawable):
     checks = {"disable_env_checker": maker in (Invalid, Reuses, OutOfItsSpace)}
     gymnasium.register(f"foreign/{maker.__name__}-v0", entry_point=maker, max_episode_steps=20, **checks)
 
@@ -134,7 +120,9 @@ def test_environment_that_cannot_be_drawn_is_made_without_a_warning():
 
 def test_precision_of_bounds():
     """A third in float32 is beyond a third in float64. Actions are scaled as floats, also to integer bounds."""
-    precise, integers = make_env("Precise").spec, make_env("Integers").spec
+    third = np.array([1 / 3])
+    boxes = Box(third, 2 * third, dtype=np.float64), Box(-3, 3, (1,), np.int8)
+    precise, integers = (make_env("OtherActions", action_space=box).spec for box in boxes)
     assert (precise.low.dtype, precise.low[0, 0]) == (np.float64, 1 / 3)
     assert (integers.low.dtype, integers.low[0, 0]) == (np.float32, -3)
 
@@ -192,6 +180,7 @@ def test_measures_are_those_of_the_last_step():
         ({"terminated": np.array([True, False])}, "failed in step: The truth value"),
         ({"reset": [0.5, 0.25]}, "info 0.25, which is not a dictionary"),
         ({"fail_in": "reset", "error": OSError("no asset\ntrack.bin")}, "reset: no asset track.bin$"),
+        ({"fail_in": "reset", "error": OSError("x" * 1000)}, f"reset: {'x' * MAX_ERROR}...$"),
         ({"fail_in": "step", "error": ZeroDivisionError()}, "step: ZeroDivisionError$"),
         ({"fail_in": "step", "error": SystemExit(0)}, "step: 0$"),
         ({"fail_in": "step", "error": LareError("no battery")}, "^no battery$"),
@@ -221,13 +210,13 @@ def test_invalid_value_or_failure(kwargs, content):
 def test_spaces_that_are_refused():
     with pytest.raises(LareError, match=r"observation is 7, which is not in Discrete\(4\)"):
         make_env("OutOfItsSpace").reset(0)
-    for name in ("Plane", "Scalar"):
+    for shape in ((), (2, 2)):
         with pytest.raises(LareError, match="one axis"):
-            make_env(name)
+            make_env("OtherActions", action_space=Box(-1, 1, shape, np.float32))
 
 
 def test_integer_actions_are_rounded():
-    env = make_env("Counts")
+    env = make_env("OtherActions", action_space=Box(0, 5, (2,), np.int64))
     env.reset(0)
     env.step(np.array([[3.25, 4.75]], np.float32))
 

@@ -8,11 +8,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as arrays
 
-from helpers.host_envs import ToyHostEnv
 from helpers.jax_toy_envs import Echo
-from lare_rl.envs.interface import EnvSpec, HostEnv, JaxEnv, Team, team_mean, to_env_action, to_package_action
+from lare_rl.envs.interface import EnvSpec, Team, team_mean, to_env_action, to_package_action
 from lare_rl.envs.jax_on_host import JaxOnHost
-from lare_rl.envs.particles.particle_env import ParticleEnv
 from lare_rl.envs.play import play_steps
 from lare_rl.errors import LareError
 
@@ -41,15 +39,6 @@ def steps(draw):
 def test_team_mean_equals_its_twin(samples):
     # Values of up to 1000 may cancel. float32 represents each of them with an error of 3e-5.
     np.testing.assert_allclose(team_mean(*samples), slow_team_mean(*samples), atol=2e-4)
-
-
-def test_compiled_functions_equal_numpy():
-    """Tracers are not arrays of NumPy, so the functions of JAX must be chosen for them."""
-    values, alive, team = np.array([[1, 0, 8]], np.float32), np.array([[True, False, True]]), Team("all", 0, 3)
-    assert jax.jit(lambda values, alive: team_mean(values, alive, team))(values, alive).tolist() == [4.5]
-    action = np.array([[0.1, 0.3, 0.2], [0.5, -1, 0]], np.float32)
-    one_hot = jax.jit(lambda action: to_env_action(action, DISCRETE))(action)
-    np.testing.assert_array_equal(one_hot, to_env_action(action, DISCRETE))
 
 
 def test_discrete_action_is_the_first_largest():
@@ -90,17 +79,9 @@ def test_continuous_action_is_scaled_to_the_bounds_of_each_agent():
     np.testing.assert_allclose(to_env_action(jnp.array(action), spec), env_action, rtol=1e-6)
 
 
-@pytest.mark.parametrize(
-    ("make", "is_jax"),
-    [(lambda: ParticleEnv("CN-6"), True), (Echo, True), (ToyHostEnv, False), (lambda: JaxOnHost(Echo()), False)],
-)
-def test_environment_has_one_kind(make, is_jax):
-    """`make_env` closes only a `HostEnv`, and `make_host_env` wraps all others."""
-    env = make()
-    assert (isinstance(env, JaxEnv), isinstance(env, HostEnv)) == (is_jax, not is_jax)
-
-
 # JaxOnHost
+
+ON_HOST = JaxOnHost(Echo())
 
 
 def assert_equal(actual, expected) -> None:
@@ -109,33 +90,31 @@ def assert_equal(actual, expected) -> None:
 
 def test_jax_on_host_equals_the_functions():
     """A key is split before the start and before each step, so that no two of them share a key."""
-    on_host, env = JaxOnHost(Echo()), Echo()
+    env = Echo()
     reset, step = jax.jit(env.reset), jax.jit(env.step)
     reset_key, key = jax.random.split(jax.random.key(3))
     state, expected = reset(reset_key)
-    assert_equal(on_host.reset(3), expected)
+    assert_equal(ON_HOST.reset(3), expected)
     for number in range(3):
         key, step_key = jax.random.split(key)
         action = np.eye(3, dtype=np.float32)[[number % 2, 0, 1]]
         state, expected = step(state, action, step_key)
-        timestep = on_host.step(action)
+        timestep = ON_HOST.step(action)
         assert_equal(timestep, expected)
         # Code on the host computes with NumPy, also in worker processes without JAX.
         assert all(isinstance(leaf, np.ndarray) for leaf in jax.tree.leaves(timestep))
 
 
 def test_jax_on_host_repeats_the_episode_of_a_seed():
-    env = JaxOnHost(Echo())
-
     def play(seed):
-        return [step for *_, step in play_steps(env, None, np.random.default_rng(0), seed)]
+        return [step for *_, step in play_steps(ON_HOST, None, np.random.default_rng(0), seed)]
 
     first = play(5)
-    env.reset(9)
-    env.step(np.eye(3, dtype=np.float32))
+    ON_HOST.reset(9)
+    ON_HOST.step(np.eye(3, dtype=np.float32))
     assert_equal(play(5), first)
     observations = [[step.observation.tolist() for step in episode] for episode in (first, play(6), play(7))]
     assert observations[0] not in observations[1:]
     with pytest.raises(LareError, match="frames"):
-        env.render()
-    env.close()
+        ON_HOST.render()
+    ON_HOST.close()

@@ -170,17 +170,6 @@ def test_like_cycle(tmp_path, circle):
         read_task(files[0])
 
 
-def test_time_limit_of_the_task_comes_first():
-    assert load_env_spec(toy_spec()).max_steps == 20
-    assert load_env_spec(toy_spec(max_episode_steps=7)).max_steps == 7
-    assert load_env_spec(toy_spec(environment="misfits/Endless-v0", max_episode_steps=7)).max_steps == 7
-
-
-def test_environment_with_module(spec_file):
-    environment = "helpers.toy_envs:toys/Chase-v0"
-    assert load_task(spec_file(environment=environment)).environment == environment
-
-
 # Tasks as values
 
 
@@ -205,11 +194,3 @@ def test_evaluation_environment_is_for_the_host():
     task = read_task("CN-6").model_copy(update={"evaluation_environment": "particles/CN-6"})
     with pytest.raises(LareError, match="evaluation_environment has no effect on particles/CN-6"):
         load_env_spec(task)
-
-
-@pytest.mark.parametrize(("name", "hint"), [("HalfCheeta-v4", "HalfCheetah-v4"), ("Nope-v0", None)])
-def test_close_names_alone_are_suggested(name, hint):
-    with pytest.raises(LareError) as error:
-        read_task(name)
-    assert ("did you mean" in str(error.value)) == (hint is not None)
-    assert hint is None or f"did you mean {hint!r}" in str(error.value)

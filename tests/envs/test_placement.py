@@ -11,7 +11,7 @@ from helpers.single_instance import N_STEPS, simulations, single_spec
 from helpers.toy_envs import toy_spec
 from lare_rl.envs import placement, workers
 from lare_rl.envs.families import load_env_spec, make_host_env
-from lare_rl.envs.placement import SeparateEnv, make_vec_env, measure_step_s, n_open_envs, needs_process
+from lare_rl.envs.placement import make_vec_env, measure_step_s, n_open_envs, needs_process
 from lare_rl.envs.play import play_episodes
 from lare_rl.envs.vec_env import LocalVecEnv
 from lare_rl.envs.workers import close_idle_workers
@@ -102,16 +102,10 @@ def test_separate_by_the_task_file_starts_once(starts, tmp_path):
     assert len(starts()) == 3
 
 
-def test_separate_environment_equals_local():
-    with contextlib.closing(SeparateEnv(single_spec("Many"))) as remote:
-        with contextlib.closing(make_host_env(single_spec("Many"))) as local:
-            assert not isinstance(local, SeparateEnv)
-            for env_step in (lambda env: env.reset(3), lambda env: env.step(np.float32([[0, 0, 1]]))):
-                first, second = env_step(remote), env_step(local)
-                for name in first._fields:
-                    np.testing.assert_array_equal(getattr(first, name), getattr(second, name))
-        with pytest.raises(LareError, match="cannot be drawn"):
-            remote.render()
+def test_separate_environment_cannot_be_drawn():
+    task = single_spec("Many", processes="separate")
+    with contextlib.closing(make_host_env(task)) as env, pytest.raises(LareError, match="cannot be drawn"):
+        env.render()
 
 
 def test_workers_use_the_timeout_of_the_task():

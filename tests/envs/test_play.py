@@ -27,8 +27,8 @@ class Hunt:
 
     spec = EnvSpec((CAT, MICE), 2, 2, discrete=True, max_steps=3, state_size=1, agents_leave=True)
 
-    def __init__(self, end="terminated"):
-        self.end, self.seeds, self.closed = end, [], False
+    def __init__(self):
+        self.seeds, self.closed = [], False
 
     def reset(self, seed):
         self.seeds.append(seed)
@@ -40,15 +40,14 @@ class Hunt:
         return self.make_timestep()
 
     def make_timestep(self):
-        ended = self.time == 3
         return Timestep(
             observation=np.array([[self.time, agent] for agent in range(3)], np.float32) * ALIVE[self.time][:, None],
             state=np.array([10 * self.time], np.float32),
             available=np.ones((3, 2), bool),
             alive=ALIVE[self.time],
             reward=REWARD[self.time],
-            terminated=np.array(ended and self.end == "terminated"),
-            truncated=np.array(ended and self.end == "truncated"),
+            terminated=np.array(self.time == 3),
+            truncated=np.array(False),
             measures={},
         )
 
@@ -112,15 +111,6 @@ def test_phi_inputs_of_batches():
     np.testing.assert_array_equal(phi_action, action[:, 1:])
     state, phi_action = phi_inputs("state", MICE, timestep, action)
     assert (state.tolist(), phi_action.tolist()) == ([[[7]], [[8]]], [[[2, 3, 4, 5]], [[8, 9, 10, 11]]])
-
-
-@pytest.mark.parametrize("end", ["terminated", "truncated"])
-def test_play_steps_stops_at_the_end(end):
-    env = Hunt(end)
-    steps = list(play_steps(env, None, np.random.default_rng(0), 5))
-    assert [timestep.observation[0, 0] for timestep, *_ in steps] == [0, 1, 2]
-    assert [next_timestep.observation[0, 0] for *_, next_timestep in steps] == [1, 2, 3]
-    assert env.seeds == [5]
 
 
 # Several episodes

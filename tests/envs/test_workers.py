@@ -180,16 +180,9 @@ def test_close(tmp_path):
     assert [note.read_text() for note in notes] == ["closed", "closed"]
     assert not is_running(pid)
     envs.close()
-
-
-@pytest.mark.parametrize(
-    "call", [SubprocVecEnv.measure_step_s, lambda envs: envs.find_interference(ToyHostEnv, 1.0), walk]
-)
-def test_calls_after_close(call):
-    envs = SubprocVecEnv([ToyHostEnv])
-    envs.close()
-    with pytest.raises(LareError, match="the worker processes have ended"):
-        call(envs)
+    for call in (SubprocVecEnv.measure_step_s, lambda envs: envs.find_interference(ToyHostEnv, 1.0), walk):
+        with pytest.raises(LareError, match="the worker processes have ended"):
+            call(envs)
 
 
 @pytest.mark.parametrize("processes", [1, None])

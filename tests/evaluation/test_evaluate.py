@@ -87,19 +87,14 @@ def test_write_video(tmp_path):
         write_video(tmp_path / "none" / "film.gif", frames, 0.05)
 
 
-@pytest.mark.parametrize(("name", "words"), [("film.xyz", r"\.gif, or in \.mp4"), ("none/film.gif", "no directory")])
-def test_check_video_path(tmp_path, name, words):
-    with pytest.raises(LareError, match=words):
-        check_video_path(tmp_path / name)
-
-
-@pytest.mark.parametrize(
-    ("name", "package", "extra"), [("film.gif", "PIL", "report"), ("film.mp4", "imageio", "video")]
-)
-def test_check_video_path_without_the_package(tmp_path, monkeypatch, name, package, extra):
-    monkeypatch.setattr("lare_rl.evaluation.video.find_spec", {package: None}.get)
-    with pytest.raises(LareError, match=re.escape(install_command(extra))):
-        check_video_path(tmp_path / name)
+def test_check_video_path(tmp_path, monkeypatch):
+    for name, words in (("film.xyz", r"\.gif, or in \.mp4"), ("none/film.gif", "no directory")):
+        with pytest.raises(LareError, match=words):
+            check_video_path(tmp_path / name)
+    monkeypatch.setattr(video, "find_spec", lambda package: None)
+    for name, extra in (("film.gif", "report"), ("film.mp4", "video")):
+        with pytest.raises(LareError, match=re.escape(install_command(extra))):
+            check_video_path(tmp_path / name)
 
 
 def test_record_video(run, tmp_path):
@@ -108,14 +103,20 @@ def test_record_video(run, tmp_path):
     with Image.open(tmp_path / "film.gif") as film:
         assert (film.n_frames, film.info["duration"]) == (10, 40)
     assert not FilmedChase.open_envs
-    with pytest.raises(LareError, match=r"toys/Chase-v0.* cannot be made"):
-        record_video(replace_task(run, toy_spec()), tmp_path / "film.gif")
 
 
-def test_environment_that_renders_nothing_is_not_filmed(run, tmp_path, monkeypatch):
+def test_record_video_refuses(run, tmp_path, monkeypatch):
+    """Of many agents on the host, none plays first."""
     monkeypatch.setattr(FilmedChase, "render", lambda env: None)
-    with pytest.raises(LareError, match="returns no picture"):
-        record_video(run, tmp_path / "film.gif")
+    monkeypatch.setattr(video, "play_run", lambda run: pytest.fail("an episode was played"))
+    toy = toy_spec(environment="pettingzoo/helpers.parallel_toy_envs:Toy", observation_size=2, action_size=3)
+    for task, words in (
+        (TASK, "returns no picture"),
+        (toy_spec(), r"toys/Chase-v0.* cannot be made"),
+        (toy, "leave the video out"),
+    ):
+        with pytest.raises(LareError, match=words):
+            record_video(replace_task(run, task), tmp_path / "film.gif")
 
 
 class Painted:
@@ -157,6 +158,7 @@ def test_random_play_is_bounded(monkeypatch):
     assert len(episodes) == RANDOM_EPISODES
     assert not FilmedChase.open_envs
     assert measure_random_returns(toy_spec(environment="no-such-environment")).shape == (1, 0)
+    assert measure_random_returns(TASK, 12).shape == (1, 12)
     assert len(play_random(TASK, limit_s=-1.0)[0]) == MIN_RANDOM_EPISODES
     numbers = []
     play_random(TASK, 3, on_episode=numbers.append)
@@ -171,7 +173,6 @@ def test_random_play_is_bounded(monkeypatch):
 def test_number_of_random_episodes(run_steps, longest, n_episodes):
     """It follows from numbers of steps, not from a stopwatch."""
     assert n_random_episodes(run_steps, longest) == n_episodes
-    assert measure_random_returns(TASK, 12).shape == (1, 12)
 
 
 def test_random_returns_of_each_team():
@@ -185,7 +186,7 @@ def test_random_returns_of_each_team():
 def test_most_likely_actions_beside_sampled_ones(small, tmp_path, command):
     """Of a policy over choices: at the last evaluation, and by `lare-rl evaluate`, with the difference from random actions."""
     run = lare_rl.train(
-        pick_spec(), small(algorithm="ppo", method="bayes", steps=120), out=tmp_path / "run", listeners=[]
+        pick_spec(), small(algorithm="ppo", method="dense", steps=120), out=tmp_path / "run", listeners=[]
     )
     has_likeliest = [DETERMINISTIC_RETURN in line for line in run.metrics()]
     assert has_likeliest == [False, False, True, True]
@@ -244,13 +245,6 @@ def test_the_better_actions_are_named(run, gain, text):
     assert all(text in line for line in lines)
 
 
-def test_film_of_many_agents_on_the_host_is_refused_before_they_play(run, tmp_path, monkeypatch):
-    monkeypatch.setattr(video, "play_run", lambda run: pytest.fail("an episode was played"))
-    toy = toy_spec(environment="pettingzoo/helpers.parallel_toy_envs:Toy", observation_size=2, action_size=3)
-    with pytest.raises(LareError, match="leave the video out"):
-        record_video(replace_task(run, toy), tmp_path / "film.gif")
-
-
 def test_evaluate_in_several_batches(run, returns):
     """Every episode begins from a different initial state, and no environment stays open."""
     assert returns.shape == (2, 21)
@@ -301,28 +295,9 @@ def test_policy_checks_observations(run, observation, words):
         load_policy(run)(observation)
 
 
-@pytest.mark.long
-def test_policy_with_discrete_actions(small, tmp_path):
-    spec = toy_spec(environment="toys/Pick-v0", observation_size=4, action_size=4)
-    settings = small(method="dense", algorithm="ppo", steps=60)
-    run = lare_rl.train(spec, settings, out=tmp_path / "run", listeners=[])
-    policy, observation = load_policy(run), np.eye(4, dtype=np.float32)[2]
-    assert gymnasium.make("toys/Pick-v0").action_space.contains(np.int64(policy(observation)))
-    np.testing.assert_array_equal(np.sort(policy.select_env_action(observation)), [0, 0, 0, 1])
-    # A policy that has hardly been trained makes every choice, in training's evaluations and here.
-    batch = np.tile(observation, (400, 1))
-    choices = load_policy(run)(batch)
-    assert np.bincount(choices).min() > 60
-    np.testing.assert_array_equal(load_policy(run)(batch), choices)
-    # Without noise it makes the likeliest choice alone, and so do evaluations.
-    assert set(load_policy(run, deterministic=True)(batch)) == {np.argmax(np.bincount(choices))}
-    sampled, likeliest = (evaluate_run(run, 4, deterministic=flag)["Chase"] for flag in (False, True))
-    assert not np.array_equal(sampled, likeliest)
-
-
 def test_policies_and_random_actions_are_evaluated_in_the_evaluation_environment(small, tmp_path):
     gymnasium.register("toys/FarChase-v0", entry_point=lambda: Chase(scale=1000.0), max_episode_steps=20)
-    task = toy_spec(evaluation_environment="toys/FarChase-v0")
+    task = TASK.model_copy(update={"evaluation_environment": "toys/FarChase-v0"})
     run = lare_rl.train(task, small(method="dense", steps=60), out=tmp_path / "run", listeners=[])
     evaluations = [line["evaluation/return"] for line in run.metrics()]
     assert max(evaluations) < -500  # a thousand times the training rewards

@@ -1,4 +1,4 @@
-"""Rollouts of runs whose agents leave, or whose episodes are paid several times."""
+"""Rollouts of runs whose agents leave, and whose episodes are paid several times."""
 
 import numpy as np
 import pytest
@@ -7,20 +7,21 @@ import lare_rl
 from helpers.jax_toy_envs import echo_spec
 from helpers.numpy_twins import assert_close
 from lare_rl.evaluation import played_episodes as module
-from lare_rl.evaluation.played_episodes import N_SAMPLE_EPISODES, play_run, sample_steps
+from lare_rl.evaluation.played_episodes import play_run, sample_steps
 
 TASK = echo_spec(environment="hosted/three", credit_scope="state", observation_size=9, action_size=9, payments=2)
+N_EPISODES = 12
 
 
 @pytest.fixture(scope="module")
 def run(tmp_path_factory):
     settings = lare_rl.Settings(
-        method="bayes",
+        method="rd-linear",
         algorithm="ippo",
-        steps=240,
+        steps=120,
         rollout_steps=60,
         environments=2,
-        evaluate_every=240,
+        evaluate_every=120,
         evaluation_episodes=2,
         credit={"exact": "last", "score": "sum"},
         ippo={"hidden": (8,), "minibatch_size": 60, "epochs": 1},
@@ -28,39 +29,38 @@ def run(tmp_path_factory):
     return lare_rl.train(TASK, settings, out=tmp_path_factory.mktemp("runs") / "echo", listeners=[])
 
 
-def test_exact_rewards_add_up_to_payments(run):
-    played = play_run(run, N_SAMPLE_EPISODES, key=1)  # the shapes of the other test: they are compiled once
+@pytest.fixture(scope="module")
+def played(run):
+    return play_run(run, N_EPISODES)
+
+
+def test_exact_rewards_add_up_to_payments(played):
     sums, payments = [], []
-    for episode in range(N_SAMPLE_EPISODES):
-        alive, true, training = (
-            played.select_episode(values, episode)
-            for values in (np.asarray(played.steps.timestep.alive), played.reward, played.training_reward)
-        )
-        for start in range(0, len(true), 2):
-            agents = alive[start : start + 2]
-            sums.append(((training[start : start + 2] * agents).sum(axis=1) / agents.sum(axis=1)).sum())
-            payments.append(((true[start : start + 2] * agents).sum(axis=1) / agents.sum(axis=1)).sum())
+    for episode in range(N_EPISODES):
+        values = np.asarray(played.steps.timestep.alive), played.reward, played.training_reward
+        alive, true, training = (played.select_episode(x, episode) for x in values)
+        for total, rewards in ((sums, training), (payments, true)):
+            team_reward = (rewards * alive).sum(axis=1) / alive.sum(axis=1)
+            total += [team_reward[start : start + 2].sum() for start in range(0, len(true), 2)]
     assert np.std(payments) > 0.1
     scale = np.dot(sums, payments) / np.dot(payments, payments)  # rewards are divided by their deviation
     np.testing.assert_allclose(sums, scale * np.array(payments), atol=1e-4)
 
 
-def test_sampled_reward_of_a_team_is_the_mean_over_agents_that_are_alive(run):
+def test_sampled_reward_of_a_team_is_the_mean_over_agents_that_are_alive(run, played, monkeypatch):
+    monkeypatch.setattr(module, "N_SAMPLE_EPISODES", N_EPISODES)
     (sample,) = sample_steps(run)
-    played = play_run(run, N_SAMPLE_EPISODES, key=1)
     alive = np.asarray(played.steps.timestep.alive)
     expected = (played.reward * alive).sum(axis=-1) / alive.sum(axis=-1)
     assert not alive[played.mask].all()
     np.testing.assert_allclose(sample.reward.ravel(), expected[played.mask], rtol=1e-6)
 
 
-def test_an_episode_does_not_depend_on_the_number_of_environments(run, monkeypatch):
+def test_an_episode_does_not_depend_on_the_number_of_environments(run, played, monkeypatch):
     """Environments in processes of their own are few, and play some episodes after others."""
-    batches = []
-    for width in (7, 3):
-        monkeypatch.setattr(module, "n_open_envs", lambda task, n_seeds, n_episodes, width=width: width)
-        batches.append(play_run(run, 7))
-    assert len({int(mask.sum()) for mask in batches[0].mask.T}) > 1
-    for episode in range(7):
-        together, few = (played.select_episode((played.steps, played.training_reward), episode) for played in batches)
-        assert_close(together, few)
+    monkeypatch.setattr(module, "n_open_envs", lambda task, n_seeds, n_episodes: 5)
+    few = play_run(run, N_EPISODES)
+    assert len({int(mask.sum()) for mask in played.mask.T}) > 1
+    for episode in range(N_EPISODES):
+        pair = (batch.select_episode((batch.steps, batch.training_reward), episode) for batch in (played, few))
+        assert_close(*pair)

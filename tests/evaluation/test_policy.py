@@ -6,9 +6,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from scipy.stats import mode
 
-import lare_rl
 from helpers.toy_envs import toy_spec
+from helpers.training_runs import start_run
 from lare_rl.envs.families import register_family
 from lare_rl.envs.jax_spaces import agent_spec, agent_timestep, make_choices
 from lare_rl.envs.play import play_episodes
@@ -49,8 +50,7 @@ TASK = toy_spec(environment="dials/two", observation_size=2, action_size=6)
 
 @pytest.fixture(scope="module")
 def run(small, tmp_path_factory):
-    settings = small(method="dense", algorithm="ppo", steps=80, rollout_steps=40, evaluate_every=80)
-    return lare_rl.train(TASK, settings, out=tmp_path_factory.mktemp("dials") / "run", listeners=[])
+    return start_run(TASK, small(method="dense", algorithm="ppo"), tmp_path_factory.mktemp("dials") / "run")
 
 
 def test_actions_are_available_and_those_of_the_package(run):
@@ -59,6 +59,8 @@ def test_actions_are_available_and_those_of_the_package(run):
     mask[:, [1, 5]] = True
     actions = policy(np.ones((n_rows, 2)), mask)
     assert {tuple(action) for action in actions.tolist()} == {(0, 1), (1, 2)}
+    likeliest = load_policy(run, deterministic=True)(np.ones((n_rows, 2)), mask)
+    np.testing.assert_array_equal(likeliest, np.tile(mode(actions).mode, (n_rows, 1)))
     assert policy(np.ones(2), np.arange(6) == 3).tolist() == [1, 0]
     np.testing.assert_array_equal(policy.select_env_action(np.ones(2), np.arange(6) == 3), np.arange(6) == 3)
     assert policy(np.ones(2), np.zeros(6, bool)).tolist() == [0, 0]  # as in training

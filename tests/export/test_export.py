@@ -36,41 +36,24 @@ from lare_rl.training.rewards import rewards
 from lare_rl.training.saved_state import load_learner
 from lare_rl.training.seed_axis import select_seed
 
-CASES = [
-    long_case("td3", "lare-bayes"),
-    long_case("ddpg", "rrdu"),
-    long_case("sac", "vib-rrdu"),
-    long_case("td3", "lare-signs"),
-    long_case("td3", "diaster"),
-    long_case("td3", "rudder"),
-    long_case("td3", "lrr"),
-    long_case("td3", "grd"),
-    long_case("td3", "rbt"),
-    long_case("sac", "dense"),
-    ("ppo", "lare-linear"),
-    long_case("ppo", "bayes"),
-    long_case("ppo", "llm-reward"),
-    long_case("ppo", "rrdu-next"),
-    long_case("ippo", "lare-bayes"),
-    long_case("ippo", "lare-rd-shared"),
-    long_case("ippo-teams", "lare-rd"),
-    long_case("ippo-state", "rrdu-next"),
-    long_case("qmix", "lare-bayes"),
-    long_case("vdn", "ircr"),
-]
+LONG_CASES = {
+    "td3": ("lare-bayes", "lare-signs", "diaster", "rudder", "lrr", "grd", "rbt"),
+    "ddpg": ("rrdu",),
+    "sac": ("vib-rrdu", "dense"),
+    "ppo": ("bayes", "llm-reward", "rrdu-next"),
+    "ippo": ("lare-bayes", "lare-rd-shared"),
+    "ippo-teams": ("lare-rd",),
+    "ippo-state": ("rrdu-next",),
+    "qmix": ("lare-bayes",),
+    "vdn": ("ircr",),
+}
+CASES = [("ppo", "lare-linear"), *(long_case(kind, method) for kind in LONG_CASES for method in LONG_CASES[kind])]
 """Every kind of policy, of decoder and of decoder input."""
 
-NO_REWARD = {
-    "dense": "rewards of the environment",
-    "ircr": "return of its episode",
-}
+NO_REWARD = {"dense": "rewards of the environment", "ircr": "return of its episode"}
 """Why there is no reward function."""
 
-PHI = """import numpy as np
-
-def evaluation_func(o, a):
-    return [o[:, 0:1] * np.sum(a, axis=1, keepdims=True), o[:, 1:2]]
-"""
+PHI = "def evaluation_func(o, a):\n    return [o[:, 0:1] * np.sum(a, axis=1, keepdims=True), o[:, 1:2]]\n"
 MEDIAN = PHI.replace("np.sum(a", "np.median(a")
 
 
@@ -78,14 +61,13 @@ def make_task(kind, method):
     match kind:
         case "ppo":
             return pick_spec(scored_observation="after" if method == "llm-reward" else "both")
-        case "ippo" | "qmix" | "vdn":
-            return echo_spec()
-        case "ippo-state":
-            return echo_spec(credit_scope="state", observation_size=9, action_size=9)
+        case "td3" | "ddpg" | "sac":
+            return toy_spec(scored_observation="both" if method == "lare-signs" else "before")
         case "ippo-teams":
             return read_task("CompetitivePP-6")
-        case _:
-            return toy_spec(scored_observation="both" if method == "lare-signs" else "before")
+        case "ippo-state":
+            return echo_spec(credit_scope="state", observation_size=9, action_size=9)
+    return echo_spec()
 
 
 @pytest.fixture(scope="module")
@@ -320,21 +302,19 @@ def test_command(export, command, monkeypatch, tmp_path):
 
 def test_invalid_inputs(export):
     _, exported = export
-    with pytest.raises(ValueError, match="'nope', only policy, reward"):
-        exported.load("nope")
-    policy, observation = exported.load("policy"), np.zeros((1, 2))
-    with pytest.raises(ValueError, match="observation is missing"):
-        policy(obs=observation)
-    with pytest.raises(ValueError, match="there is no input obs"):
-        policy(observation=observation, obs=observation)
-    with pytest.raises(ValueError, match=r"\(batch, 2\).*\(5, 3\)"):
-        policy(observation=np.zeros((5, 3)))
-    with pytest.raises(ValueError, match=r"action .*\(batch, 1\)"):
-        exported.reward(observation, 0.5, observation)
-    with pytest.raises(ValueError, match=r"same batch.*before \(4,\), action \(3,\)"):
-        exported.reward(np.zeros((4, 2)), np.zeros((3, 1)), np.zeros((4, 2)))
-    rows = exported.reward(np.zeros((4, 2)), np.zeros(1), np.zeros((4, 2)))  # one action for all steps
-    np.testing.assert_array_equal(rows, exported.reward(np.zeros((4, 2)), np.zeros((4, 1)), np.zeros((4, 2))))
+    policy, rows = exported.load("policy"), np.zeros((4, 2))
+    for call, message in (
+        (lambda: exported.load("nope"), "'nope', only policy, reward"),
+        (lambda: policy(obs=rows), "observation is missing"),
+        (lambda: policy(observation=rows, obs=rows), "there is no input obs"),
+        (lambda: policy(observation=np.zeros((5, 3))), r"\(batch, 2\).*\(5, 3\)"),
+        (lambda: exported.reward(rows, 0.5, rows), r"action .*\(batch, 1\)"),
+        (lambda: exported.reward(rows, np.zeros((3, 1)), rows), r"same batch.*before \(4,\), action \(3,\)"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            call()
+    r_hat = exported.reward(rows, np.zeros(1), rows)  # a single action for all steps
+    np.testing.assert_array_equal(r_hat, exported.reward(rows, np.zeros((4, 1)), rows))
 
 
 def test_trained_example_has_the_exported_programs():

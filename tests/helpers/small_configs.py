@@ -56,7 +56,7 @@ def small_config(method, algorithm="td3", env=ONE_AGENT, **changes):
         "credit_scope": "observation",
         "method": METHODS[method],
         "algorithm": ALGORITHMS[algorithm],
-        "hyperparameters": SMALL_SETTINGS[algorithm],
+        "hyperparameters": SMALL_SETTINGS.get(algorithm),
         "credit": SUM_CREDIT,
         "scale_rewards": False,
         "n_factors": tuple(2 + i for i in range(len(env.teams))) if METHODS[method].needs_phi else (),

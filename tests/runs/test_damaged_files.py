@@ -41,15 +41,12 @@ def refusal(read, *arguments) -> str:
     ("content", "message"),
     [
         (b"", "line 1 column 1"),
-        (b'{"format": 3', "line 1 column 13"),
         (DEEP.encode(), TOO_DEEP),
         (b'{"format": ' + b"[" * 988 + b"]" * 988 + b"}", TOO_DEEP),
         (b"[]", "not an object"),
-        (b"null", "not an object"),
         (b"\xff", "byte 0xff"),
         (b'{"format": ' + b"9" * 5000 + b"}", "5,000 digits"),
         (f'{{"format": {FORMAT}}}'.encode(), "'lare', 'settings', 'task'"),
-        (b'{"format": 4, "settings": []}', "'lare'"),
         (b'{"format": 1, "lare": "0.1"}', "another version of LaRe (0.1)"),
         (b"x" * (MAX_CONFIG_BYTES + 1), "is larger than 8 MB"),
     ],
@@ -65,7 +62,6 @@ def test_config_content(tmp_path, content, message):
     ("changes", "message"),
     [
         ({"longest_episode": "many"}, "longest_episode = 'many'"),
-        ({"settings": []}, "settings = []"),
         ({"settings": {"seeds": 2_000_000_000}}, "seeds = 2000000000"),
         ({"versions": {"jax": {}}}, "versions.jax = {}"),
         ({"more": 1}, "'more'"),
@@ -96,20 +92,10 @@ def test_html_is_escaped(tmp_path):
         (DEEP, TOO_DEEP),
         ("{", "line 1 column 2 (char 1) in line 2"),
         ("9" * 5000, "in line 2"),
-        *(
-            (json.dumps(line), "line 2 is no evaluation")
-            for line in (
-                [],
-                LINE | {"step": True},
-                LINE | {"step": -1},
-                LINE | {"step": 1.5},
-                LINE | {"step": 10**400},
-                LINE | {"seed": "0"},
-                LINE | {"evaluation/return": "<script>"},
-                LINE | {"evaluation/return": [1]},
-                LINE | {"evaluation/return": 10**400},
-            )
-        ),
+        ("[]", "line 2 is no evaluation"),
+        *((json.dumps(LINE | {"step": step}), "line 2 is no evaluation") for step in (True, -1, 1.5, 10**400)),
+        *((json.dumps(LINE | {name: "0"}), "line 2 is no evaluation") for name in ("seed", "evaluation/return")),
+        *((json.dumps(LINE | {"evaluation/return": x}), "line 2 is no evaluation") for x in ([1], 10**400)),
     ],
 )
 def test_metrics_line(tmp_path, line, message):

@@ -2,10 +2,13 @@
 
 import json
 import os
+import re
+from pathlib import Path
 
 import numpy as np
 import pytest
 
+import lare_rl
 from helpers.toy_envs import PHI, toy_spec
 from lare_rl.config.resolve import resolve
 from lare_rl.config.settings import Settings
@@ -14,6 +17,7 @@ from lare_rl.latent.function import verify_function
 from lare_rl.runs import config_file
 from lare_rl.runs.config_file import make_config
 from lare_rl.runs.directory import RunBusyError, as_run, create_run, find_run_directories, lock_run, open_run
+from lare_rl.runs.metric_names import DETERMINISTIC_RETURN, METRIC_GROUPS
 from lare_rl.runs.metrics_file import append_metrics, read_metrics, truncate_metrics
 
 
@@ -59,6 +63,18 @@ def test_metrics_are_parsed_once_per_file_state(run, monkeypatch):
     path.write_text(json.dumps(line | {"evaluation/return": 2.0}) + "\n")  # of the same size
     os.utime(path, ns=(stat.st_atime_ns, stat.st_mtime_ns + 1))
     assert read_metrics(run.directory)[0]["evaluation/return"] == 2.0
+    path.write_text(json.dumps(line | {"evaluation/likeliest_return": 2.0}) + "\n")  # of an earlier version
+    assert read_metrics(run.directory) == [line | {DETERMINISTIC_RETURN: 2.0}]
+
+
+METRIC = re.compile(r'"((?:evaluation|credit|critic|actor|time)/\w+)"')
+
+
+def test_every_metric_has_a_meaning():
+    files = Path(lare_rl.__file__).parent.rglob("*.py")
+    names = {name for path in files for name in METRIC.findall(path.read_text(encoding="utf-8"))}
+    documented = {name for group in METRIC_GROUPS.values() for name in group}
+    assert names - {"evaluation/won"} == documented - {"step", "seed"}  # tasks name their own measures
 
 
 def test_lock_refuses_second_process(run):

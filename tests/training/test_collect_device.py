@@ -12,7 +12,7 @@ from helpers.jax_toy_envs import Echo
 from helpers.small_configs import ONE_AGENT, SMALL_SETTINGS, small_config
 from lare_rl.algorithms.qmix import qmix
 from lare_rl.algorithms.td3 import TD3Settings
-from lare_rl.envs.interface import Timestep
+from lare_rl.envs.jax_spaces import agent_timestep
 from lare_rl.training import collect_device
 from lare_rl.training.collect_device import DeviceCollector, unroll_on_device
 from lare_rl.training.compiled import compile_functions
@@ -163,18 +163,7 @@ class Still:
     spec = ONE_AGENT
 
     def reset(self, key):
-        zeros = jnp.zeros((1, 3))
-        timestep = Timestep(
-            observation=zeros,
-            state=jnp.zeros(0),
-            available=jnp.ones((1, 2), bool),
-            alive=jnp.ones(1, bool),
-            reward=jnp.zeros(1),
-            terminated=jnp.array(False),
-            truncated=jnp.array(False),
-            measures={},
-        )
-        return (), timestep
+        return (), agent_timestep(self.spec, jnp.zeros(3))
 
     def step(self, state, action, key):
         return self.reset(key)

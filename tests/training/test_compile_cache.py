@@ -62,7 +62,7 @@ def test_run_shares_functions_but_not_phi():
 
 def test_learning_is_compiled_while_steps_are_collected():
     """A thread compiles it from shapes. The first call then compiles nothing."""
-    config = small_config("bayes")
+    config = small_config("rd-linear")
     functions = compile_functions(config)
     thread = threading.Thread(target=functions.compile_learning, args=(learner_shape(config, 2),))
     thread.start()

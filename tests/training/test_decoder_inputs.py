@@ -5,17 +5,13 @@ from functools import partial
 import numpy as np
 import pytest
 
-from helpers.long_tests import long_case
 from helpers.small_configs import (
     ONE_TEAM,
     TOTAL,
-    TWO_TEAMS,
-    learner_with_episodes,
     random_factors,
     random_steps,
     small_config,
     steps_as_stored,
-    stored_steps,
 )
 from lare_rl.training.decoder_inputs import decoder_inputs
 
@@ -71,24 +67,3 @@ def test_decoder_inputs(build, observed, method, scored_observation, expected):
     assert expected.shape[-1] == config.credit_specs[0].basis.n_inputs
     assert expected.shape[-2] == (config.n_proxy_rewards if observed == "state" else config.env.n_agents)
     assert config.credit_specs[0].basis.extended == (method in ("bayes", "lare-bayes"))
-
-
-@pytest.mark.parametrize(
-    "config",
-    [
-        long_case(small_config("lare-rrdu")),
-        small_config("lare-rd", "ippo", TWO_TEAMS),
-        long_case(small_config("rd", "qmix", ONE_TEAM, credit_scope="state")),
-    ],
-)
-def test_store_keeps_the_steps(config):
-    stored, expected = stored_steps(learner_with_episodes(config)), steps_as_stored(config)
-    for values, expected_values in zip(stored, expected, strict=True):
-        if isinstance(values, dict):
-            assert set(values) == set(expected_values)
-            for name, column in values.items():
-                np.testing.assert_array_equal(column, expected_values[name])
-        elif values is None:
-            assert expected_values is None
-        else:
-            np.testing.assert_allclose(values, expected_values, rtol=1e-4, atol=1e-6)

@@ -13,7 +13,6 @@ from helpers.numpy_twins import assert_close
 from helpers.small_configs import (
     LENGTHS,
     ONE_TEAM,
-    SUM_CREDIT,
     TOTAL,
     TWO_TEAMS,
     add_steps,
@@ -21,7 +20,6 @@ from helpers.small_configs import (
     learner_with_episodes,
     random_factors,
     random_steps,
-    read,
     small_config,
     stored_steps,
     team_rewards,
@@ -32,8 +30,6 @@ from helpers.small_configs import (
 from lare_rl.credit import closed_form
 from lare_rl.credit.decoder_settings import CreditSettings
 from lare_rl.credit.engine import return_scale
-from lare_rl.data import replay
-from lare_rl.data.sampling import sample_episode_steps
 from lare_rl.envs.interface import EnvSpec, Team
 from lare_rl.nn.normalise import root_mean_square
 from lare_rl.training.decoder_fits import fit_decoders, fit_repeatedly, sample_credit
@@ -57,41 +53,6 @@ def update_once(learner, config, key=0):
 
 
 # A single agent
-
-
-def test_store_updates_statistics():
-    config = small_config("lare-rrdu")
-    learner, steps = learner_with_episodes(config), random_steps()
-    factors = random_factors(config, steps)
-    np.testing.assert_allclose(learner.decoders[0].statistics.mean, factors.mean(axis=(0, 1, 2)), rtol=1e-4)
-    assert float(learner.decoders[0].statistics.n_rows) == TOTAL
-    means = [episode.mean() for episode in np.split(steps.next_timestep.reward.ravel(), ENDS)]
-    assert float(learner.decoders[0].scale.mean_square) == pytest.approx(np.mean(np.square(means)), rel=1e-4)
-
-
-@pytest.mark.long
-@pytest.mark.parametrize("n_steps", [long_case(4), 10])
-def test_unbiased_loss_has_the_expectation_of_the_full_loss(n_steps):
-    # Lengths are 3 to 12: with K = 10, three of the five episodes are shorter. RRD's loss is larger.
-    losses = {}
-    for name in ("rrd", "rrdu"):
-        config = small_config(name)
-        learner = learner_with_episodes(config)
-        # The rewards of steps shall differ.
-        steep = jax.tree.map(lambda weight: 6 * weight, learner.decoders[0].network)
-        learner = learner._replace(reward_sources=(learner.decoders[0]._replace(network=steep),))
-        draws = sample_episode_steps(learner.replay, jax.random.key(3), 1, 40_000, n_steps)
-        first = jax.tree.map(lambda leaf: leaf[0], draws)
-        _, metrics = jitted(fit_decoders, config)(learner.decoders, learner.replay, first, jax.random.key(0))
-        losses[name] = float(metrics["credit/loss"])
-    steps, unit = stored_steps(learner), float(root_mean_square(learner.decoders[0].scale))
-    r_hat = np.asarray(jitted(proxy_rewards, config)(steps, learner.reward_sources))[:, 0] / unit
-    r = np.asarray(steps.columns["reward"])[:, 0] / unit
-    errors = [(a.mean() - b.mean()) ** 2 for a, b in zip(np.split(r_hat, ENDS), np.split(r, ENDS), strict=True)]
-    chosen = np.bincount(np.searchsorted(ENDS, draws.episodes.first.number[0], side="right"), minlength=5) / 40_000
-    expected = float(chosen @ errors)
-    assert losses["rrdu"] == pytest.approx(expected, rel=0.02)
-    assert losses["rrd"] > 1.025 * expected
 
 
 @pytest.mark.parametrize("method", ["rd", *map(long_case, ("rrd", "rrdu", "vib-rd", "vib-rrdu"))])
@@ -182,41 +143,17 @@ def test_assess_reads_the_newest_steps():
     assert float(recent["credit/error"]) == pytest.approx((7 * (TOTAL - 10) + 5) / TOTAL, rel=1e-5)
 
 
-# Several environments
-
-
-@pytest.mark.long
-@pytest.mark.parametrize("method", [*map(long_case, ("rd", "rrdu", "lare-rd", "ircr")), "lare-linear"])
-def test_two_environments_equal_one_twice_as_long(method):
-    wide, long = small_config(method, n_envs=2, credit=SUM_CREDIT), small_config(method, credit=SUM_CREDIT)
-    steps = random_steps(envs=2)
-    factors = random_factors(wide, steps)
-
-    def join_envs(rows):
-        return np.swapaxes(rows, 0, 1).reshape(2 * TOTAL, 1, *rows.shape[2:])
-
-    first = add_steps(untrained_learner(wide), wide, steps, factors)
-    second = add_steps(untrained_learner(long), long, jax.tree.map(join_envs, steps), join_envs(factors))
-    assert_close(first.decoders, second.decoders, 1e-3, 1e-4)
-    number = jnp.broadcast_to(jnp.arange(TOTAL), (2, TOTAL))
-    env = jnp.broadcast_to(jnp.arange(2)[:, None], (2, TOTAL))
-    r_hats = []
-    for learner, config, index in (
-        (first, wide, replay.Index(env, number)),
-        (second, long, replay.Index(0 * env, number + TOTAL * env)),
-    ):
-        r_hats.append(jitted(rewards, config)(read(learner.replay, index), learner.reward_sources))
-    assert_close(*r_hats, 1e-3, 1e-4)
-
-
 # Many agents
 
 
 def test_teams_have_separate_decoders_and_returns():
     config, steps = TEAMS("lare-rd"), random_steps(TWO_TEAMS)
     learner = learner_with_episodes(config)
-    assert [credit.statistics.mean.shape for credit in learner.decoders] == [(2,), (3,)]
-    for credit, team in zip(learner.decoders, TWO_TEAMS.teams, strict=True):
+    factors, alive = random_factors(config, steps)[:, 0], steps.timestep.alive[:, 0]
+    for credit, team, size in zip(learner.decoders, TWO_TEAMS.teams, (2, 3), strict=True):
+        rows = factors[:, team.agents, :size][alive[:, team.agents]]
+        np.testing.assert_allclose(credit.statistics.mean, rows.mean(axis=0), rtol=1e-4)
+        assert float(credit.statistics.n_rows) == len(rows)
         means = np.array([episode.mean() for episode in np.split(team_rewards(steps, team), ENDS)])
         assert float(credit.scale.mean_square) == pytest.approx(float((means**2).mean()), rel=1e-4)
     updated, _ = update_once(learner, config)
@@ -224,7 +161,7 @@ def test_teams_have_separate_decoders_and_returns():
         assert not jax.tree.all(jax.tree.map(jnp.array_equal, before.network, after.network))
 
 
-@pytest.mark.parametrize("method", [long_case("dense"), "episodic", "ircr"])
+@pytest.mark.parametrize("method", ["episodic", "ircr"])
 def test_rewards_of_teams(method):
     config, steps = TEAMS(method), random_steps(TWO_TEAMS)
     learner, alive = learner_with_episodes(config), steps.timestep.alive[:, 0]
@@ -232,12 +169,9 @@ def test_rewards_of_teams(method):
     assert not alive.all()
     for team in TWO_TEAMS.teams:
         episode_rewards = np.split(team_rewards(steps, team), ENDS)
-        if method == "dense":
-            expected = steps.next_timestep.reward[:, 0, team.agents]
-        elif method == "episodic":
-            expected = np.where(
-                steps.ended, np.repeat([episode.sum() for episode in episode_rewards], LENGTHS)[:, None], 0
-            )
+        if method == "episodic":
+            sums = np.repeat([episode.sum() for episode in episode_rewards], LENGTHS)
+            expected = np.where(steps.ended, sums[:, None], 0)
         else:
             means = np.array([episode.mean() for episode in episode_rewards])
             expected = np.repeat((means - means.min()) / (means.max() - means.min()), LENGTHS)[:, None]

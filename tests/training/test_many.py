@@ -1,7 +1,5 @@
 """Whole runs of many agents: particle tasks, teams, a toy whose agents leave."""
 
-from dataclasses import replace
-
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -10,7 +8,7 @@ import pytest
 import lare_rl
 from helpers.jax_toy_envs import Echo
 from helpers.long_tests import long_case
-from helpers.small_configs import random_steps, small_config
+from helpers.small_configs import random_steps, small_config, untrained_learner
 from helpers.training_runs import ECHO_PHI, train_quietly
 from lare_rl.config.resolve import resolve
 from lare_rl.envs.particles.catalogue import TASKS
@@ -18,31 +16,28 @@ from lare_rl.errors import LareError
 from lare_rl.latent.function import verify_function
 from lare_rl.runs.directory import create_run, open_run
 from lare_rl.training import factors
+from lare_rl.training.iteration import IterationFunctions, update, when_on_host
 from lare_rl.training.latent_functions import choose_functions
-from lare_rl.training.saved_state import load_learner
-from lare_rl.training.start_session import restore_session
 
 
-def test_advance_fits_decoders_before_the_update(echo_run):
-    config = echo_run.config
-    settings = config.settings.model_copy(update={"fit_every": 2})
-    session, _ = restore_session(replace(echo_run, config=config.model_copy(update={"settings": settings})))
-    calls = []
+def test_update_fits_decoders_before_the_algorithm():
+    """Iterations have 20 steps, and the decoders are fitted in every second of them."""
+    config, steps, measured, calls = small_config("lare-rd", "ippo", rollout_steps=20), random_steps(), {}, []
 
     def fit(learner, keys):
-        calls.append(("fit", session.step))
-        return learner, {"credit/loss": jnp.zeros(2)}
+        calls.append("fit")
+        return learner, {"credit/loss": 1.0}
 
     def train_step(learner, steps, keys, step):
         calls.append(("train", step))
         return learner, {}
 
-    session.functions, session.loop = session.functions._replace(fit=fit, train_step=train_step), None
-    for _ in range(3):
-        session.advance(140)
-    session.close()
-    assert calls == [("fit", 80), ("train", 80), ("train", 100), ("fit", 120), ("train", 120)]
-    assert "credit/loss" in session.latest_metrics
+    functions = IterationFunctions(lambda *_: None, lambda *_: None, fit, train_step)
+    for step in (80, 100, 120):
+        arguments = jnp.arange(2), step, functions, when_on_host, lambda old, new, _: old | new, config, 2
+        _, measured = update(untrained_learner(config), measured, steps, *arguments)
+    assert calls == ["fit", ("train", 80), ("train", 100), "fit", ("train", 120)]
+    assert measured == {"credit/loss": 1.0}
 
 
 @pytest.mark.long
@@ -61,18 +56,6 @@ def test_particle_task_trains_with_recorded_functions(task, small_many, tmp_path
     assert [function.task for function in open_run(run.directory).functions] == [
         role.name for role in run.config.task.roles
     ]
-
-
-def test_stored_factors_follow_scored_observation(echo_run):
-    """A row has the factors of the observations before and after a step: the second factor is the time, 0 after an
-    agent left."""
-    config, learner, _, _ = load_learner(echo_run)
-    assert config.n_factors == (4,)
-    alive, z = (np.asarray(learner.replay.columns[name])[0, :, :10] for name in ("alive", "factors"))
-    time_before, time_after = 6 * z[..., 1], 6 * z[..., 3]
-    goes_on = alive[:, 1:] & alive[:, :-1] & np.isclose(time_before[:, 1:], 1 + time_before[:, :-1])
-    assert goes_on.mean() > 0.3
-    np.testing.assert_allclose(time_after[:, :-1][goes_on], time_before[:, 1:][goes_on], atol=1e-5)
 
 
 def test_create_run_with_one_function_per_team(tmp_path):

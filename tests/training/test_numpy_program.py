@@ -5,15 +5,12 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from helpers.toy_envs import toy_spec
-from lare_rl.config.resolve import resolve
-from lare_rl.config.settings import Settings
-from lare_rl.runs.directory import create_run
+from helpers.small_configs import small_config
+from lare_rl.algorithms.registry import ALGORITHMS
 from lare_rl.training import host_policy
 from lare_rl.training.compiled import compile_functions, init_seeds
 from lare_rl.training.host_policy import make_policy
 from lare_rl.training.numpy_program import UnsupportedOperationError, to_numpy
-from lare_rl.training.saved_state import make_train_config
 from lare_rl.training.streams import seed_keys
 
 RNG = np.random.default_rng(0)
@@ -53,17 +50,20 @@ def test_other_operations_are_refused(function):
         to_numpy(function, draw(4), draw(4))
 
 
-@pytest.mark.parametrize("deterministic", [True, False])
 @pytest.mark.parametrize("algorithm", ["td3", "sac", "ppo"])
-def test_policy_on_host_equals_compiled_policy(algorithm, deterministic, tmp_path, monkeypatch):
-    settings = resolve(Settings(method="dense", algorithm=algorithm, seeds=2, capacity=4000), toy_spec())
-    config = make_train_config(create_run(tmp_path / "run", toy_spec(), settings, ()))
+def test_policy_on_host_equals_compiled_policy(algorithm, monkeypatch):
+    hyperparameters = ALGORITHMS[algorithm].settings.model_copy(update={"hidden": (8,)})
+    config = small_config("dense", algorithm, hyperparameters=hyperparameters)
     functions = compile_functions(config)
     actor = functions.get_actor(init_seeds(functions, seed_keys(jnp.arange(2), 0)), 0)
-    noise = None if deterministic else draw(2, 3, 1, config.noise_size)
-    inputs = (), draw(2, 3, 1, 2), np.ones((2, 3, 1, config.env.action_size), bool), noise, np.zeros((2, 3), bool)
-    assert host_policy._translate_policy(config, 2, 3, deterministic) is not None
-    action, _ = make_policy(config, actor, 3, deterministic=deterministic)(*inputs)
-    monkeypatch.setattr(host_policy, "_translate_policy", lambda *_: None)
-    expected, _ = make_policy(config, actor, 3, deterministic=deterministic)(*inputs)
-    np.testing.assert_allclose(action, expected, atol=1e-6)
+    inputs = (), draw(2, 3, 1, 3), np.ones((2, 3, 1, 2), bool)
+    for deterministic in (True, False):
+        noise = None if deterministic else draw(2, 3, 1, config.noise_size)
+        assert host_policy._translate_policy(config, 2, 3, deterministic) is not None
+        results = []
+        for _ in range(2):
+            policy = make_policy(config, actor, 3, deterministic=deterministic)
+            results.append(policy(*inputs, noise, np.zeros((2, 3), bool))[0])
+            monkeypatch.setattr(host_policy, "_translate_policy", lambda *_: None)
+        np.testing.assert_allclose(*results, atol=1e-6)
+        monkeypatch.undo()

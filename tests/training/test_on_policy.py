@@ -8,10 +8,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from helpers.long_tests import long_case
 from helpers.numpy_twins import assert_close
 from helpers.small_configs import (
-    LENGTHS,
     ONE_AGENT,
     ONE_TEAM,
     SMALL_SETTINGS,
@@ -44,9 +42,8 @@ def store_and_roll_out(config, steps, factors=None):
     return learner, jitted(on_policy._rollout, config)(learner, newest(steps))
 
 
-@pytest.mark.parametrize("method", [*map(long_case, ("dense", "episodic")), "lare-rrdu"])
-def test_rollout_has_the_newest_steps_with_the_rewards_of_the_method(method):
-    config, steps = ppo_config(method), random_steps()
+def test_rollout_has_the_newest_steps_with_the_rewards_of_the_method():
+    config, steps = ppo_config("lare-rrdu"), random_steps()
     learner, rollout = store_and_roll_out(config, steps)
     last = newest(steps)
     np.testing.assert_array_equal(rollout.observation, last.timestep.observation[:, 0])
@@ -55,9 +52,6 @@ def test_rollout_has_the_newest_steps_with_the_rewards_of_the_method(method):
     np.testing.assert_array_equal(rollout.done, last.ended)
     expected = jitted(rewards, config)(stored_steps(learner), learner.reward_sources)[-20:]
     np.testing.assert_allclose(rollout.reward, expected, rtol=1e-5)
-    if method == "episodic":
-        episodes = np.split(steps.next_timestep.reward.ravel(), np.cumsum(LENGTHS)[:-1])
-        np.testing.assert_allclose(rollout.reward[last.ended], [e.sum() for e in episodes[-2:]], rtol=1e-4)
     assert rollout.mask is rollout.available is None
 
 
@@ -125,23 +119,6 @@ def test_act_with_and_without_noise(discrete):
         np.testing.assert_array_equal(greedy, np.broadcast_to(greedy[:1], greedy.shape))
     else:
         np.testing.assert_allclose(explored - greedy, noise, rtol=1e-4, atol=1e-5)
-
-
-def test_act_chooses_available_actions():
-    config = ippo_config("dense", env=ONE_TEAM)
-    actor, steps = on_policy.get_actor(untrained_learner(config), 0, config), random_steps(ONE_TEAM)
-    observation, available = map(jnp.asarray, (steps.timestep.observation, steps.timestep.available))
-    for noise in (jax.random.gumbel(jax.random.key(0), steps.action.shape), None):
-        action, _ = on_policy.act(actor, (), observation, available, noise, config)
-        assert (steps.timestep.available & (np.asarray(action) > 0)).sum(axis=-1).all()
-
-
-def test_policy_input_of_several_teams_has_the_agent():
-    single, several = ippo_config("dense", env=ONE_TEAM), ippo_config("dense", env=TWO_TEAMS)
-    rows = jnp.zeros((2, 5, 3))
-    assert on_policy.policy_input(rows, single) is rows
-    one_hot = on_policy.policy_input(rows, several)[..., 3:]
-    np.testing.assert_array_equal(one_hot, np.broadcast_to(np.eye(5), (2, 5, 5)))
 
 
 def test_rollout_of_many_agents():

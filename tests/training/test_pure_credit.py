@@ -55,14 +55,6 @@ def test_rewards_are_recovered_from_returns():
     assert correlation(r_hat, true_reward) > 0.9
 
 
-def test_rewards_of_many_agents():
-    settings = default_credit(3).model_copy(update={"score": "sum"})
-    credit = pure_credit("bayes", **SIZES, settings=settings, agents=3)
-    state = jax.jit(lambda key: train(credit, key, make=partial(make_steps, agents=(3,))))(jax.random.key(0))
-    steps, true_reward = make_steps(jax.random.key(1), (3,))
-    assert correlation(jax.jit(credit.reward)(state, steps), true_reward) > 0.9
-
-
 def test_phi_reads_actions_in_the_units_of_the_environment(reward):
     credit = pure_credit("llm-reward", reward, **SIZES, low=-3.0, high=1.0)
     steps, _ = make_steps(jax.random.key(1))
@@ -101,13 +93,14 @@ def test_invalid_factors_are_counted_and_not_used(phi):
 
 
 def test_functions_are_mapped_over_seeds():
-    """`vmap` within `shard_map` gives what single calls give: the rewards behind the returns."""
-    credit = pure_credit("bayes", **SUM)
+    """`vmap` within `shard_map` gives what single calls give: the rewards of many agents behind the returns."""
+    settings = default_credit(3).model_copy(update={"score": "sum"})
+    credit = pure_credit("bayes", **SIZES, settings=settings, agents=3)
     keys = jax.random.split(jax.random.key(0), 2)
-    steps, true_reward = make_steps(jax.random.key(1))
-    run = jax.jit(lambda key: credit.reward(train(credit, key), steps))
+    steps, true_reward = make_steps(jax.random.key(1), (3,))
+    run = jax.jit(lambda key: credit.reward(train(credit, key, make=partial(make_steps, agents=(3,))), steps))
     expected = jnp.stack([run(key) for key in keys])
-    assert correlation(expected[0], true_reward) > 0.99
+    assert correlation(expected[0], true_reward) > 0.9
     mesh = jax.sharding.Mesh(jax.devices()[:1], ("seeds",))
     sharded = jax.shard_map(
         jax.vmap(run), mesh=mesh, in_specs=PartitionSpec("seeds"), out_specs=PartitionSpec("seeds"), check_vma=False

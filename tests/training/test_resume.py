@@ -220,7 +220,7 @@ def change_state(run, change):
     np.savez(run.checkpoint / "state.npz", **arrays)
 
 
-@pytest.mark.parametrize("changed", [np.zeros(7), np.array("text"), np.zeros((2, 1), complex), None])
+@pytest.mark.parametrize("changed", [np.zeros(7), np.array("text"), None])
 def test_checkpoint_of_other_environments_is_refused(changed, dense_run, tmp_path):
     run = copy_run(dense_run, tmp_path / "run")
 
@@ -257,9 +257,6 @@ def test_missing_files_are_refused(dense_run, tmp_path):
     path.write_text(text.splitlines(keepends=True)[0])
     with pytest.raises(LareError, match=f"bytes, and the checkpoint needs {len(text)}"):
         resume_quietly(run)
-    path.unlink()
-    with pytest.raises(LareError, match="has 0 bytes"):
-        resume_quietly(run)
     path.write_text(text)
     shutil.rmtree(run.checkpoint)
     with pytest.raises(LareError, match="no checkpoint any more"):
@@ -283,14 +280,6 @@ def test_full_disk_leaves_last_checkpoint(dense, dense_run, tmp_path, monkeypatc
     assert not list((tmp_path / "run" / "checkpoint").glob("*.new"))
     assert open_run(tmp_path / "run").has_checkpoint()
     assert_equal_runs(resume_quietly(tmp_path / "run"), dense_run)
-
-
-@pytest.mark.parametrize("config", [{"lare": "0.9"}, {"lare": "0.9", "format": 1}])
-def test_too_old_run_is_refused(config, tmp_path):
-    (tmp_path / "config.json").write_text(json.dumps({"settings": {"chunk": 50}, "discrete": False, **config}))
-    for read in (open_run, resume_quietly):
-        with pytest.raises(LareError, match=r"another version of LaRe \(0\.9\)"):
-            read(tmp_path)
 
 
 def test_best_policy_is_saved(dense_run):

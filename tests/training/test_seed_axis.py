@@ -13,8 +13,7 @@ from helpers.jax_toy_envs import echo_spec
 from helpers.listeners import metrics_without_times
 from helpers.long_tests import long_case
 from helpers.toy_envs import toy_spec
-from helpers.training_runs import QUICK_CREDIT, resume_quietly, train_and_stop, train_quietly
-from lare_rl.runs.directory import open_run
+from helpers.training_runs import QUICK_CREDIT, resume_quietly, train_quietly
 from lare_rl.training import seed_axis
 
 N_DEVICES = 4
@@ -28,9 +27,8 @@ from lare_rl.tasks.spec import TaskSpec
 from lare_rl.training.start_session import restore_session
 
 task, settings = TaskSpec(**json.loads(sys.argv[1])), lare_rl.Settings(**json.loads(sys.argv[2]))
-train_and_stop(task, settings, "from-devices", settings.evaluate_every)
-lare_rl.resume("to-devices", listeners=[])
-opened, _ = restore_session(open_run("from-devices"))
+train_and_stop(task, settings, "run", settings.evaluate_every)
+opened, _ = restore_session(open_run("run"))
 functions = opened.functions
 compiled = [functions.store, functions.train_step] if opened.loop is None else [opened.loop.run]
 collective = re.compile("all-gather|all-reduce|all-to-all|collective-permute|reduce-scatter")
@@ -58,9 +56,7 @@ def test_devices_train_as_a_single_device(task, changes, small, small_many, tmp_
     make_settings = small if changes["algorithm"] in ("td3", "sac") else small_many
     settings = make_settings(seeds=N_DEVICES, credit=QUICK_CREDIT, **changes)
     task = lare_rl.load_task(task) if isinstance(task, str) else task
-    run = train_quietly(task, settings, tmp_path / "run")
-    train_and_stop(task, settings, tmp_path / "to-devices", settings.evaluate_every)
-
+    expected_run = train_quietly(task, settings, tmp_path / "expected")
     flags = f"{os.environ['XLA_FLAGS']} --xla_force_host_platform_device_count={N_DEVICES}"
     arguments = task.model_dump_json(), settings.model_dump_json(exclude_unset=True)
     process = subprocess.run(
@@ -73,12 +69,10 @@ def test_devices_train_as_a_single_device(task, changes, small, small_many, tmp_
     assert process.returncode == 0, process.stderr
     assert json.loads(process.stdout) == {"devices": N_DEVICES, "collectives": []}
 
-    resume_quietly(tmp_path / "from-devices")
-    for name in ("to-devices", "from-devices"):
-        other = open_run(tmp_path / name)
-        for line, expected in zip(metrics_without_times(other), metrics_without_times(run), strict=True):
-            assert line.keys() == expected.keys()
-            assert read_numbers(line) == pytest.approx(read_numbers(expected), rel=1e-3, abs=1e-4, nan_ok=True)
+    lines, expected_lines = map(metrics_without_times, (resume_quietly(tmp_path / "run"), expected_run))
+    for line, expected in zip(lines, expected_lines, strict=True):
+        assert line.keys() == expected.keys()
+        assert read_numbers(line) == pytest.approx(read_numbers(expected), rel=1e-3, abs=1e-4, nan_ok=True)
 
 
 def read_numbers(line):

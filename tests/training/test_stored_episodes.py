@@ -37,7 +37,7 @@ def test_old_episodes_are_overwritten(dense_run, factor_run):
 
 @pytest.mark.parametrize("payments", [long_case("end"), 2])
 def test_groups(small, tmp_path, payments):
-    settings = small(method="bayes", seeds=1, steps=48, credit=QUICK_CREDIT)
+    settings = small(method="dense", seeds=1, steps=48)
     run = train_quietly(levels_spec(payments=payments), settings, tmp_path / "run")
     episodes = lare_rl.stored_episodes(run)
     groups = [int(episode["group"]) for episode in episodes]

@@ -1,6 +1,6 @@
 """Metrics in Weights & Biases and MLflow, without a network."""
 
-import builtins
+import sys
 from itertools import groupby
 
 import pytest
@@ -61,14 +61,7 @@ def test_wandb_gets_every_number(dense_run, tmp_path, monkeypatch):
 
 @pytest.mark.parametrize(("listener", "library"), [(WeightsAndBiases, "wandb"), (MLflow, "mlflow")])
 def test_missing_library(listener, library, monkeypatch):
-    real_import = builtins.__import__
-
-    def import_without_library(name, *args, **kwargs):
-        if name.partition(".")[0] == library:
-            raise ImportError(name)
-        return real_import(name, *args, **kwargs)
-
-    monkeypatch.setattr(builtins, "__import__", import_without_library)
+    monkeypatch.setitem(sys.modules, library, None)
     with pytest.raises(LareError, match=rf"needs an extra: .*\[{library}\]"):
         listener()
 

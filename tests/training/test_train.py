@@ -2,6 +2,8 @@
 
 import json
 import re
+from concurrent.futures import Future, ThreadPoolExecutor
+from types import SimpleNamespace
 
 import gymnasium
 import jax
@@ -9,7 +11,7 @@ import numpy as np
 import pytest
 
 import lare_rl
-from helpers.listeners import AtStep, metrics_without_times
+from helpers.listeners import metrics_without_times
 from helpers.long_tests import long_case
 from helpers.toy_envs import PHI, pick_spec, toy_spec
 from helpers.training_runs import CHASE, copy_run, resume_quietly, train_and_stop, train_quietly
@@ -106,22 +108,6 @@ def test_messages_of_dense_run(dense_training):
     assert not any(message.startswith("Observations are large") for message in messages)
 
 
-@pytest.mark.long
-def test_warmup_of_the_whole_run(dense, tmp_path):
-    """The policy is never trained, which is announced. Another process cannot resume the run meanwhile."""
-
-    def intrude():
-        with pytest.raises(LareError, match="another process is training"):
-            resume_quietly(tmp_path / "run")
-
-    listener = AtStep(12, intrude)
-    run = train_quietly(CHASE, dense(steps=24, evaluate_every=12), tmp_path / "run", listeners=[listener])
-    (message,) = listener.messages
-    assert "all 24 steps are random" in message
-    assert "td3.warmup is 36" in message
-    assert ACTOR_SATURATION not in run.metrics()[-1]
-
-
 def test_metrics(dense, dense_run, echo_run, tmp_path):
     assert all(line["evaluation/distance"] > 0 and ACTOR_SATURATION in line for line in dense_run.metrics())
     # An update for each step after the warmup.
@@ -190,6 +176,21 @@ def test_diverged_loss_is_not_saved(dense, tmp_path, monkeypatch):
         train_and_stop(CHASE, dense(), tmp_path / "run", 84)
     run = open_run(tmp_path / "run")
     assert read_metadata(run.checkpoint)["step"] == run.metrics()[-1]["step"] < 84
+
+
+def test_close_reports_a_failed_checkpoint_after_an_error_of_the_environments():
+    def fail():
+        raise RuntimeError("a worker does not answer")
+
+    saving, threads = Future(), ThreadPoolExecutor(1)
+    saving.set_exception(LareError("No space left"))
+    session = Session.__new__(Session)  # without the run and the learner that a session needs
+    vars(session).update(collector=SimpleNamespace(close=fail), _threads=threads, _saving=saving)
+    with pytest.raises(LareError, match="No space left") as error:
+        session.close()
+    assert isinstance(error.value.__context__, RuntimeError)
+    with pytest.raises(RuntimeError, match="shutdown"):
+        threads.submit(fail)
 
 
 @pytest.mark.parametrize("error", [MemoryError(), jax.errors.JaxRuntimeError("RESOURCE_EXHAUSTED: Out of memory")])

@@ -14,7 +14,7 @@ from lare_rl.envs.particles.navigation import N_LAYOUTS, make_layouts
 from lare_rl.envs.particles.predator_prey import SIZES, observe_preys
 from lare_rl.envs.particles.prey import logits, sample_actions, shipped_prey
 from lare_rl.envs.particles.task import MAX_STEPS
-from lare_rl.envs.particles.world import State, at_rest, contact_force, move, push
+from lare_rl.envs.particles.world import State, at_rest, move, push
 from lare_rl.errors import LareError
 from train_prey import chase
 
@@ -30,7 +30,6 @@ EXPECTED = {
     "CompetitivePP-6": (8, 24, 1.5, 1.4),
     "TriangleArea": (3, 14, 0.2, 1.5),
 }
-FAR = 50.0
 CASES = [long_case(name) if name in ("CN-30", "PP-30") else name for name in TASKS]
 """The largest tasks repeat those of 15 agents, which observe only the nearest entities too."""
 
@@ -44,68 +43,6 @@ def test_catalogue():
         assert [team.start for team in task.teams] == [0, *(team.stop for team in task.teams)][:-1]
     with pytest.raises(LareError, match=r"no particle task 'CN-60' \(did you mean 'CN-6'\?\).* CN-6, CN-15,"):
         find_particle_task("CN-60")
-
-
-# Physics by hand
-
-
-def make_state(name: str, *positions: tuple[float, float]) -> State:
-    """Return a state at rest: the first entities at these positions, the others far from them and from each other."""
-    entities = len(TASKS[name].world.radius)
-    position = FAR * (1 + np.arange(entities))[:, None] * np.ones(2)
-    position[: len(positions)] = positions
-    return at_rest(jnp.asarray(position, jnp.float32))
-
-
-move_once = jax.jit(move, static_argnums=0)
-
-
-def step(name: str, state: State, *actions: int) -> State:
-    world = TASKS[name].world
-    return move_once(world, state, push(world, jnp.array([*actions, *[0] * (world.n_moving - len(actions))])))
-
-
-def test_velocity_changes_before_position():
-    state = step("CN-6", make_state("CN-6", (0, 0)), 2)
-    np.testing.assert_allclose([state.velocity[0], state.position[0]], [(0.5, 0), (0.05, 0)], rtol=1e-6)
-    state = step("CN-6", state, 2)
-    np.testing.assert_allclose([state.velocity[0], state.position[0]], [(0.875, 0), (0.1375, 0)], rtol=1e-6)
-
-
-def test_directions_of_actions():
-    state = step("CN-6", make_state("CN-6", (0, 0)), 0, 1, 2, 3, 4)
-    np.testing.assert_allclose(state.velocity[:5], [(0, 0), (-0.5, 0), (0.5, 0), (0, -0.5), (0, 0.5)], rtol=1e-6)
-
-
-def test_overlapping_agents_push_each_other():
-    state = step("CN-6", make_state("CN-6", (0, 0), (0.2, 0)))
-    np.testing.assert_allclose(state.velocity[:2], [(-1, 0), (1, 0)], rtol=1e-5)
-    assert state.position[1, 0] - state.position[0, 0] == pytest.approx(0.4)
-    state = step("CN-6", make_state("CN-6", (0, 0), (0, 0)))  # in the same place, they stay finite
-    np.testing.assert_array_equal(state.position[:2], np.zeros((2, 2)))
-
-
-@pytest.mark.parametrize(
-    ("name", "distance", "force"),
-    [
-        ("PP-6", 0.2, 0),  # obstacles push from the distance at which two predators touch
-        ("PP-6", 0.1, -5),
-        ("TriangleArea", 0.5, -5),  # obstacles push from the sum of the radii
-    ],
-)
-def test_contact_with_an_obstacle(name, distance, force):
-    world = TASKS[name].world
-    far = [(FAR * i, 0.0) for i in range(1, world.n_moving)]
-    position = make_state(name, (0.0, 0.0), *far, (distance, 0.0)).position
-    np.testing.assert_allclose(contact_force(world, position)[0], (force, 0), rtol=1e-5, atol=1e-9)
-
-
-def test_speed_limit():
-    state, speeds = make_state("PP-6", (0, 0)), []
-    for _ in range(8):
-        state = step("PP-6", state, 2)
-        speeds.append(float(state.velocity[0, 0]))
-    np.testing.assert_allclose(speeds, [0.3, 0.525, 0.69375, 0.8203125, 0.915234, 0.986426, 1, 1], rtol=1e-6)
 
 
 # Slow twins
@@ -141,6 +78,12 @@ def test_task_equals_its_twin(name):
             rewards = [slow.reward(twin, position, i) for i in range(task.n_agents)]
             np.testing.assert_allclose(reward, rewards, rtol=1e-5, atol=1e-5)
     np.testing.assert_array_equal(state.position[task.world.n_moving :], before[0][task.world.n_moving :])
+
+
+def test_agents_in_the_same_place_stay_finite():
+    world = TASKS["CN-6"].world
+    state = move(world, at_rest(jnp.zeros((len(world.radius), 2))), push(world, jnp.zeros(world.n_moving, int)))
+    np.testing.assert_array_equal(state.position, 0)
 
 
 # Where episodes start

@@ -11,7 +11,6 @@ from helpers.fake_smac import compiled_smax
 from lare_rl.envs.interface import Timestep
 from lare_rl.envs.smax import SCENARIO_NAMES
 from lare_rl.envs.smax.battle import ATTACK, STOP
-from lare_rl.envs.smax.scenarios import UNIT_TYPES
 from lare_rl.envs.smax.smax_env import SMAX, SmaxState
 
 BATTLES = 8
@@ -84,44 +83,6 @@ def test_random_battles(name):
     assert timestep.reward.max(axis=2).sum(axis=1).max() <= 20 + 1e-4
 
 
-@pytest.mark.parametrize("name", PLAYED)
-def test_layout_of_states_and_observations(name):
-    env, (battle, _), timestep = play(name)
-    scenario = env.scenario
-    width = 4 + scenario.n_unit_types
-    types = list(UNIT_TYPES)
-    assert width == (11 if name == "1c3s5z" else 10)
-    assert timestep.state.shape[-1] == scenario.n_units * (width + 2)
-    for unit, unit_type in enumerate((*scenario.ally_types, *scenario.enemy_types)):
-        entries = timestep.state[..., unit * width : (unit + 1) * width]
-        alive = battle.health[..., unit] > 0
-        np.testing.assert_allclose(entries[..., 0], battle.health[..., unit] / UNIT_TYPES[unit_type].health, rtol=1e-6)
-        np.testing.assert_array_equal(entries[alive][:, 1:3], battle.position[alive][:, unit])
-        np.testing.assert_array_equal(entries[alive][:, 3], battle.cooldown[alive][:, unit])
-        one_hot = np.eye(width)[{"stalker": 6, "zealot": 7, "colossus": 10}[unit_type]]
-        np.testing.assert_array_equal(entries[alive][:, 4:], np.tile(one_hot[4:], (alive.sum(), 1)))
-        assert (entries[~alive] == 0).all()
-        sides = scenario.n_units * width
-        assert (timestep.state[..., sides + unit] == (unit >= scenario.n_allies)).all()
-        assert (timestep.state[..., sides + scenario.n_units + unit] == types.index(unit_type)).all()
-    assert (np.abs(timestep.observation) <= 1).all()
-    self_features = timestep.observation[..., -width:]
-    position = battle.position[:, :, : env.spec.n_agents]
-    np.testing.assert_allclose(self_features[timestep.alive][:, 1:3], position[timestep.alive] / 32, rtol=1e-6)
-
-
-def test_single_battle_equals_the_batch():
-    env, states, _ = play("2s3z")
-    _, reset, step = compiled_smax("2s3z")
-    start_key, steps_key = jax.random.split(jax.random.split(jax.random.key(0), BATTLES)[1])
-    state, timestep = reset(start_key)
-    for number, key in enumerate(jax.random.split(steps_key, env.spec.max_steps)[:3], 1):
-        action_key, step_key = jax.random.split(key)
-        state, timestep = step(state, sample_actions(env, timestep, action_key), step_key)
-        expected = jax.tree.map(lambda leaf, number=number: leaf[1, number], states)
-        jax.tree.map(partial(np.testing.assert_allclose, atol=1e-5), state, expected)
-
-
 def test_reset_and_step_return_the_same_types():
     """Otherwise a step is compiled twice."""
     env, key = SMAX("3s_vs_5z"), jax.random.key(0)
@@ -177,14 +138,3 @@ def test_time_limit():
     assert not timestep.truncated
     _, timestep = step(state, STOPS, jax.random.key(1))
     assert (bool(timestep.truncated), bool(timestep.terminated)) == (True, False)
-
-
-def test_cooldowns_fall_by_half_a_second_without_hits():
-    _, reset, step = compiled_smax("2s3z")
-    state, _ = reset(jax.random.key(0))
-    cooldowns = []
-    for action in (STOPS, STOPS, ATTACKS):  # the attack is out of reach
-        state, timestep = step(state, action, jax.random.key(1))
-        cooldowns.append(float(timestep.state[3]))
-        assert (timestep.reward == 0).all()
-    assert cooldowns == [-0.5, -1.0, -1.5]
