@@ -17,11 +17,6 @@ def load(name):
     return SimpleNamespace(**runpy.run_path(str(EXAMPLES / name)))
 
 
-@pytest.mark.parametrize("name", ["turn_credit_prime_rl.py", "turn_credit_trl.py"])
-def test_examples_are_python(name):
-    compile((EXAMPLES / name).read_text(encoding="utf-8"), name, "exec")
-
-
 def make_messages(passes):
     call = {"id": "1", "name": "test", "arguments": "{}"}
     return [
@@ -39,15 +34,10 @@ class FakeMessage(SimpleNamespace):
 
 def fake_trace(passes):
     """Return an object with what the example reads of a trace of verifiers."""
-    nodes = [
-        SimpleNamespace(
-            message=FakeMessage(**message),
-            token_ids=[0, 1, 2],
-            mask=[message["role"] == "assistant" and i > 0 for i in range(3)],
-            advantages=None,
-        )
-        for message in make_messages(passes)
-    ]
+    nodes = []
+    for message in make_messages(passes):
+        mask = [message["role"] == "assistant" and i > 0 for i in range(3)]
+        nodes.append(SimpleNamespace(message=FakeMessage(**message), token_ids=[0, 1, 2], mask=mask, advantages=None))
     return SimpleNamespace(
         nodes=nodes, info={}, reward=float(passes), is_truncated=False, num_branches=1, has_error=False
     )
@@ -69,14 +59,15 @@ def fake_prime_rl(monkeypatch):
         def __init__(self, config, policy_pool):
             self.config = config
 
-    base = SimpleNamespace(
-        Algorithm=Algorithm, iter_trainable_traces=lambda episodes: [(e, trace) for e in episodes for trace in e.traces]
-    )
+    base = {
+        "Algorithm": Algorithm,
+        "iter_trainable_traces": lambda episodes: [(e, trace) for e in episodes for trace in e.traces],
+    }
     modules = {
         "prime_rl": {},
         "prime_rl.orchestrator": {},
         "prime_rl.orchestrator.algo": {"ALGORITHM_CLASSES": {"grpo": Algorithm}},
-        "prime_rl.orchestrator.algo.base": vars(base),
+        "prime_rl.orchestrator.algo.base": base,
         "prime_rl.orchestrator.algo.routing": {"assign_advantages": assign_advantages},
     }
     for name, values in modules.items():
@@ -110,22 +101,14 @@ def test_traces_of_verifiers():
     nodes = []
     for i, message in enumerate(make_messages(True)):
         is_sampled = message["role"] == "assistant"
-        nodes.append(
-            graph.MessageNode(
-                parent=i - 1 if i else None,
-                message=kinds[message["role"]](**message),
-                sampled=is_sampled,
-                token_ids=[0, 1, 2],
-                mask=[False, is_sampled, is_sampled],
-            )
-        )
+        tokens = {"token_ids": [0, 1, 2], "mask": [False, is_sampled, is_sampled], "sampled": is_sampled}
+        message = kinds[message["role"]](**message)
+        nodes.append(graph.MessageNode(parent=i - 1 if i else None, message=message, **tokens))
     trace = vf.Trace.model_construct(nodes=nodes, rewards={}, info={}, calls=[], stop_condition=None, errors=[])
     assert example.is_linear(trace)
     assert example.token_advantages(trace, [0.5, -1.0]) == [0.5, 0.5, -1.0, -1.0]
-    messages = example.trace_rollout(SimpleNamespace(nodes=nodes, reward=1.0, info={}, is_truncated=False), "a")[
-        "messages"
-    ]
-    assert messages[1]["tool_calls"][0]["name"] == "test"
+    rollout = example.trace_rollout(SimpleNamespace(nodes=nodes, reward=1.0, info={}, is_truncated=False), "a")
+    assert rollout["messages"][1]["tool_calls"][0]["name"] == "test"
 
 
 @pytest.mark.filterwarnings("ignore")  # of the library
