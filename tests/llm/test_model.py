@@ -25,12 +25,6 @@ def test_function_is_a_model():
     assert requests == [["system", "user"], ["system", "user", "assistant", "user"]]
 
 
-def test_reflection_asks_a_function(phi):
-    requests = []
-    lare_rl.reflect(phi, toy_spec(), lambda messages: requests.append(messages) or REPLY)
-    assert requests
-
-
 def test_replies_before_an_error_are_recorded():
     replies = ["no"]
     with pytest.raises(DesignModelError, match="the model <lambda> failed: IndexError: pop from empty list") as error:
