@@ -165,6 +165,7 @@ def test_sample_steps_evenly_spaced(chase):
         (np.zeros((5, 2)), np.zeros((4, 1)), r"actions .*\(n, 1\)"),
         (np.zeros((0, 2)), np.zeros((0, 1)), r"observations .*\(n, 2\)"),
         (np.full((5, 2), np.nan), np.zeros((5, 1)), "observations .*not finite"),
+        (np.zeros((5, 2)), np.full((5, 1), np.inf), "actions .*not finite"),
     ],
 )
 def test_invalid_sample_steps(chase, observations, actions, words):

@@ -177,14 +177,6 @@ def test_findings(changes, expected):
     assert "1 episode." in result.summary[0]
 
 
-def test_failure_writes_nothing(folder, tmp_path):
-    path = folder(logged_episodes(20))
-    (path / "0019.npz").write_bytes(b"not an archive")
-    with pytest.raises(LareError, match=r"0019\.npz is not an \.npz file"):
-        relabel(path, tmp_path / "new")
-    assert list(tmp_path.iterdir()) == [path]
-
-
 def test_failure_in_second_pass_keeps_old_output(tmp_path):
     class ChangingLog:
         passes = 0

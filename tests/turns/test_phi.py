@@ -128,5 +128,4 @@ def test_tool_sets_and_their_recorded_replies(name):
     recording = read_recording(path.read_text(encoding="utf-8"), path.name)
     model = RecordedModel([recording], name)
     designed = design_turn_phi(tool_set.goal, tool_set.tools, tool_set.turns, model, examples=tool_set.examples)
-    assert find_problems(designed.phi.source, tool_set.turns) == ""
     assert designed.model == f"{recording.model}, recorded {recording.recorded}, draw {recording.draw}"
