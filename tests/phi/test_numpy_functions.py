@@ -224,7 +224,7 @@ def check_onnx(graph, sizes):
     np.testing.assert_allclose(factors, evaluate(graph, inputs)["factors"], rtol=2e-3, atol=2e-4)
 
 
-@pytest.mark.parametrize("name", list(CASES)[::2])
+@pytest.mark.parametrize("name", CASES)
 def test_onnx_model_of_functions(name):
     check_onnx(read_case(name)[1], (6, 3))
 
