@@ -68,8 +68,9 @@ def test_draws_and_kinds():
     assert functions[0].digest != functions[1].digest
     reward = design(task, "reward", candidates=1)
     assert (reward.kind, reward.size) == ("reward", 1)
-    with pytest.raises(LareError, match=r"no recorded reply.*--model.*--function.*--method bayes"):
+    with pytest.raises(LareError, match=r"'Chase'.*model=.*--model NAME.*--function phi\.py.*bayes") as error:
         design(toy_spec())
+    assert "\n" not in str(error.value)
 
 
 def test_error_goes_back(chase):

@@ -134,12 +134,6 @@ def test_random_steps_of_scored_observation(scored_observation, counts):
     assert np.bincount(observation[:, 1].astype(int)).tolist() == counts
 
 
-def test_random_steps_include_first_and_last():
-    longer = toy_spec(max_episode_steps=1000)
-    for rows, selected in zip(random_steps(longer, 1000), random_steps(longer, 50), strict=True):
-        np.testing.assert_array_equal(selected[[0, -1]], rows[[0, -1]])
-
-
 def test_random_steps_of_an_agent_that_never_acts(monkeypatch):
     monkeypatch.setattr(verify_module, "_MAX_PLAYED_STEPS", 50)
     team = toy_spec(**PARALLEL, arguments={"joins": {"a_1": 9}}, agents=("a_1",), team="late")
