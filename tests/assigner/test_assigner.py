@@ -665,7 +665,7 @@ def test_must_learn_what_wins():
     sums, odds = (
         small_assigner("bayes", settings=SMALL_CREDIT.model_copy(update={"score": s})) for s in ("sum", "binary")
     )
-    for episode in random_episodes([12] * 200):
+    for episode in random_episodes(rng.integers(5, 17, 300)):
         log_odds = 3 * episode.next_observation[:, 0].sum() - 2
         for credit in (sums, odds):
             rows = credit.add_episode(*episode[:3], float(rng.random() < 1 / (1 + np.exp(-log_odds))))

@@ -90,8 +90,7 @@ EVERY_5 = PaymentRule(period=5)
 @pytest.mark.parametrize(
     ("method", "env", "changes"),
     [
-        ("lare-bayes", PHI_ENV, {"score": "auto", "payments": EVERY_5, "exact": "spread"}),
-        ("bayes-history", ONE_AGENT, {"payments": PaymentRule(period=5, window=2), "n_running": 4}),
+        ("lare-bayes-history", PHI_ENV, {"score": "auto", "payments": EVERY_5, "exact": "spread", "n_running": 4}),
         ("bayes-progress", ONE_AGENT, {"exact": "last", "n_running": 11}),
         ("bayes", ONE_AGENT, {"score": "binary", "group": "map"}),
         long_case("rd-linear", ONE_AGENT, {"payments": EVERY_5, "exact": "spread"}),
@@ -99,8 +98,9 @@ EVERY_5 = PaymentRule(period=5)
         long_case("bayes", ONE_AGENT, {"group": "map"}),
         long_case("lare-bayes-progress", PHI_ENV, {"payments": EVERY_5}),
         long_case("bayes-progress", ONE_TEAM, {"exact": "spread"}),
-        long_case("lare-bayes-history", PHI_ENV, {}),
+        long_case("lare-bayes", PHI_ENV, {"score": "auto", "payments": EVERY_5, "exact": "spread"}),
         long_case("bayes-history", ONE_TEAM, {}),
+        long_case("bayes-history", ONE_AGENT, {"payments": PaymentRule(period=5, window=2), "n_running": 4}),
         long_case("rd-linear", ONE_AGENT, {"exact": "last", "score": "auto"}),
         long_case("rd-linear", ONE_TEAM, {"score": "auto"}),
         long_case("rd-linear", ONE_AGENT, {"group": "map", "score": "auto"}),
