@@ -372,50 +372,42 @@ ROWS = {
 }
 
 
+STEPS = {name: ROWS[name] for name in ("observation", "action", "next_observation")}
+
+
 @pytest.mark.parametrize(
-    ("changes", "message"),
+    ("values", "message"),
     [
-        ({"observation": np.zeros((2, 3))}, r"observation .*\(2, 3\).* 2 numbers"),
-        ({"observation": np.zeros(2)}, r"observation .*\(2,\).*\(steps, 2\)"),
-        ({"action": np.zeros((3, 1))}, r"action .*\(3, 1\).*\(steps, 1\)"),
-        ({"next_observation": np.zeros((2, 1))}, r"next_observation .*\(2, 1\).* 2 numbers"),
-        ({"reward": np.zeros((2, 1))}, r"reward .*\(2, 1\).* 2 steps"),
-        ({"terminated": np.zeros(3)}, r"terminated .*\(3,\).* 2 steps"),
-        ({"truncated": False}, r"truncated .*\(\).* 2 steps"),
-        ({"valid": [True]}, r"valid .*\(1,\).* 2 steps"),
-        ({"env_ids": [0]}, "env_ids has 1 .* 2 steps"),
-        ({"alive": np.ones((2, 1))}, r"alive .*\(2, 1\)"),
-        ({"observation": [[0, 0], [0, np.nan]]}, "observation of row 1 .*nan"),
-        ({"action": [[np.inf], [0]]}, "action of row 0 .*inf"),
-        ({"next_observation": [[0, 0], [0, 1e300]]}, "next_observation of row 1 .*inf"),
-        ({"reward": [0, -np.inf], "valid": [False, True]}, "reward of row 1 .*-inf"),
+        (ROWS | {"observation": np.zeros((2, 3))}, r"observation .*\(2, 3\).* 2 numbers"),
+        (ROWS | {"observation": np.zeros(2)}, r"observation .*\(2,\).*\(steps, 2\)"),
+        (ROWS | {"action": np.zeros((3, 1))}, r"action .*\(3, 1\).*\(steps, 1\)"),
+        (ROWS | {"next_observation": np.zeros((2, 1))}, r"next_observation .*\(2, 1\).* 2 numbers"),
+        (ROWS | {"reward": np.zeros((2, 1))}, r"reward .*\(2, 1\).* 2 steps"),
+        (ROWS | {"terminated": np.zeros(3)}, r"terminated .*\(3,\).* 2 steps"),
+        (ROWS | {"truncated": False}, r"truncated .*\(\).* 2 steps"),
+        (ROWS | {"valid": [True]}, r"valid .*\(1,\).* 2 steps"),
+        (ROWS | {"env_ids": [0]}, "env_ids has 1 .* 2 steps"),
+        (ROWS | {"alive": np.ones((2, 1))}, r"alive .*\(2, 1\)"),
+        (ROWS | {"observation": [[0, 0], [0, np.nan]]}, "observation of row 1 .*nan"),
+        (ROWS | {"action": [[np.inf], [0]]}, "action of row 0 .*inf"),
+        (ROWS | {"next_observation": [[0, 0], [0, 1e300]]}, "next_observation of row 1 .*inf"),
+        (ROWS | {"reward": [0, -np.inf], "valid": [False, True]}, "reward of row 1 .*-inf"),
+        (STEPS | {"reward": np.nan}, "score is nan"),
+        (STEPS | {"reward": [0.0, np.inf]}, "reward of row 1 .*inf"),
+        (STEPS | {"reward": 1.0, "next_observation": np.full((2, 2), np.nan)}, "next_observation of row 0 .*nan"),
+        (STEPS | {"reward": [1.0]}, r"reward .*\(1,\).* 2 steps"),
+        ({name: rows[:0] for name, rows in STEPS.items()} | {"reward": 1.0}, "no step"),
     ],
 )
-def test_add_refuses(changes, message):
+def test_add_and_add_episode_refuse(values, message):
     credit = small_assigner()
     with pytest.raises(LareError, match=message):
-        credit.add(**(ROWS | changes))
+        (credit.add if "terminated" in values else credit.add_episode)(**values)
     assert credit.store.n_added == 0
     credit.add(**ROWS)
-
-
-@pytest.mark.parametrize(
-    ("changes", "message"),
-    [
-        ({"reward": np.nan}, "score is nan"),
-        ({"reward": [0.0, np.inf]}, "reward of row 1 .*inf"),
-        ({"next_observation": np.full((2, 2), np.nan)}, "next_observation of row 0 .*nan"),
-        ({"reward": [1.0]}, r"reward .*\(1,\).* 2 steps"),
-        ({name: ROWS[name][:0] for name in ("observation", "action", "next_observation")}, "no step"),
-    ],
-)
-def test_add_episode_refuses(changes, message):
-    credit = small_assigner()
-    values = {name: ROWS[name] for name in ("observation", "action", "next_observation")} | {"reward": 1.0}
-    with pytest.raises(LareError, match=message):
-        credit.add_episode(**(values | changes))
-    assert credit.store.n_added == 0
-    credit.add_episode(**(values | {"next_observation": np.ones((2, 2))}))  # steps need not follow each other
+    credit.add_episode(
+        **STEPS | {"next_observation": np.ones((2, 2)), "reward": 1.0}
+    )  # steps need not follow each other
     assert (credit.store.n_ended, credit.store.dropped) == (1, 0)
 
 

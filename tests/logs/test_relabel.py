@@ -37,7 +37,7 @@ def test_linear_score(folder, tmp_path):
     for number in (20, 21):
         episodes[number] |= {key: np.zeros_like(episodes[number][key]) for key in ("terminations", "truncations")}
     stages = []
-    result = relabel(folder(episodes), tmp_path / "new", listener=lambda *stage: stages.append(stage))
+    result = relabel(folder(episodes), tmp_path / "new", settings=SUM, listener=lambda *stage: stages.append(stage))
     assert stages == [(stage, n, 120) for stage in ("fit", "write") for n in range(1, 121)]
     assert (result.method, result.out, result.episodes, result.cut) == ("bayes", tmp_path / "new", 120, 5)
     assert (result.held_out, result.steps) == (11, sum(len(episode["actions"]) for episode in episodes))
@@ -74,7 +74,7 @@ def test_predicted_returns_have_the_part_that_no_step_is_paid_for(method, is_bin
     for episode in episodes:
         score = 100 + episode.pop("rewards").sum()
         episode["score"] = np.array(float(score > 104) if is_binary else score)
-    settings = CreditSettings(score="binary" if is_binary else "auto")
+    settings = CreditSettings(score="binary" if is_binary else "sum")
     result = relabel(episodes, tmp_path / "new", method=method, settings=settings, hold_out=0.2)
     assert result.return_r2 > 0.3
 
@@ -93,7 +93,7 @@ def test_mean_scores_that_are_paid_several_times(task, tmp_path):
 
 
 def test_score_of_noise(tmp_path):
-    result = relabel(list(logged_episodes(120, noise=True)), tmp_path / "new")
+    result = relabel(list(logged_episodes(120, noise=True)), tmp_path / "new", settings=SUM)
     assert result.return_r2 < 0.1
     assert 0.05 < result.return_r2_error < 1
     assert codes(result) == ["relabelled", "r2", "worthless"]

@@ -112,53 +112,44 @@ def test_traces_of_verifiers():
 
 
 @pytest.mark.filterwarnings("ignore")  # of the library
-def test_trl_trainer(monkeypatch):
-    torch = pytest.importorskip("torch")
-    pytest.importorskip("trl", reason="TRL is not installed")
-    example = load("turn_credit_trl.py")
-    mask = torch.tensor([1, 1, 0, 0, 1, 0])
-    assert example.spread_over_tokens([0.5, -1.0], mask).tolist() == [0.5, 0.5, 0, 0, -1.0, 0]
-    assert example.spread_over_tokens([0.5], mask) is None
-
-    from trl import GRPOTrainer
-
+def test_trainer_of_trl_has_the_methods_that_the_example_changes():
+    trainer = pytest.importorskip("trl", reason="TRL is not installed").GRPOTrainer
     for name, parameters in {
         "_generate_and_score_completions": ["self", "inputs"],
         "_calculate_rewards": ["self", "inputs", "prompts", "completions", "completion_ids_list"],
     }.items():
-        assert list(inspect.signature(getattr(GRPOTrainer, name)).parameters) == parameters
-    source = inspect.getsource(GRPOTrainer._compute_loss)
+        assert list(inspect.signature(getattr(trainer, name)).parameters) == parameters
+    source = inspect.getsource(trainer._compute_loss)
     assert "advantages.dim() == 1" in source
     assert '"tool_mask"' in source
 
+
+def test_trl_trainer(monkeypatch):
+    torch = pytest.importorskip("torch")
+    mask = torch.tensor([1, 1, 0, 0, 1, 0])
     prompts = [[{"role": "user", "content": str(k // 8)}] for k in range(32)]
     completions = [make_messages(k % 2)[1:] for k in range(32)]
 
-    class Parent:
+    class Trainer:
         """Does what GRPOTrainer does with these two methods, without a model."""
+
+        accelerator, model = SimpleNamespace(process_index=0), SimpleNamespace(training=True)
+        reward_weights, scale_rewards = torch.ones(1), "none"
 
         def _calculate_rewards(self, inputs, prompts, completions, completion_ids_list):
             return torch.tensor([[float(k % 2)] for k in range(len(prompts))])
 
         def _generate_and_score_completions(self, inputs):
             rewards = self._calculate_rewards(inputs, prompts, completions, None)
-            ones = torch.ones(len(inputs), 6, dtype=torch.long)
-            return {
-                "advantages": rewards[:, 0] - rewards.mean(),
-                "completion_mask": ones,
-                "tool_mask": mask.repeat(len(inputs), 1),
-            }
+            masks = {"completion_mask": torch.ones(len(inputs), 6).long(), "tool_mask": mask.repeat(len(inputs), 1)}
+            return {"advantages": rewards[:, 0] - rewards.mean(), **masks}
 
-    for name in ("_calculate_rewards", "_generate_and_score_completions"):
-        monkeypatch.setattr(GRPOTrainer, name, getattr(Parent, name))
-    trainer = object.__new__(example.TurnCreditGRPOTrainer)
-    trainer.turn_credit = example.TurnCredit()
-    trainer.accelerator = SimpleNamespace(process_index=0)
-    trainer.reward_weights = torch.ones(1)
-    trainer.scale_rewards = "none"
-    trainer.model = SimpleNamespace(training=True)
-    output = trainer._generate_and_score_completions([{"prompt": prompt} for prompt in prompts])
-    advantages = output["advantages"]
+    monkeypatch.setitem(sys.modules, "trl", SimpleNamespace(GRPOTrainer=Trainer))
+    example = load("turn_credit_trl.py")
+    assert example.spread_over_tokens([0.5, -1.0], mask).tolist() == [0.5, 0.5, 0, 0, -1.0, 0]
+    assert example.spread_over_tokens([0.5], mask) is None
+    trainer = example.TurnCreditGRPOTrainer()
+    advantages = trainer._generate_and_score_completions([{"prompt": prompt} for prompt in prompts])["advantages"]
     assert advantages.shape == (32, 6)
     assert (advantages[:, [2, 3, 5]] == 0).all()
     assert (advantages[1::2, 0] > 0).all()
