@@ -11,7 +11,7 @@ from lare_rl.phi.evaluate import evaluate
 from lare_rl.phi.limits import UNLIMITED, GraphLimits, RefusedError
 from lare_rl.phi.read import read
 
-PROGRAMS = {p.name: p for p in (*benign_programs()[:6], *varied_programs()[5::24])}
+PROGRAMS = {p.name: p for p in (*benign_programs()[:6], *varied_programs()[5::20])}
 
 
 def test_equal_operations_are_added_once():
