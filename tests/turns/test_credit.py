@@ -9,7 +9,7 @@ import pytest
 import lare_rl
 from helpers.turn_toys import sample_table, table_rollouts
 from lare_rl.errors import LareError
-from lare_rl.turns.trust import Errors, Trust, choose_lambda, group_means, summarise
+from lare_rl.turns.trust import Errors, Trust, choose_lambda, group_means, measure_errors, summarise
 
 
 @pytest.fixture
@@ -90,6 +90,12 @@ def test_choice_of_lambda(gain, surprise, lambda_, code):
     trust = Trust(gain=gain, gain_error=0.02, surprise=surprise, outcome_std=0.5, n_rollouts=100)
     chosen, finding = choose_lambda(trust)
     assert (chosen, finding.code) == (lambda_, code)
+
+
+def test_surprise_is_that_of_agents_that_stopped_by_themselves():
+    table = sample_table()
+    errors = measure_errors(table, np.zeros(len(table.features)))
+    np.testing.assert_array_equal(errors.surprise, table.outcome[~table.truncated])
 
 
 def test_gain_is_a_ratio_of_sums():
