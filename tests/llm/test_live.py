@@ -429,10 +429,10 @@ def test_key_is_required_for_openai_only(start, monkeypatch):
         (" ", 0),
         ("http://[", 5),
         ("http://127.0.0.1:99999/v1", 5),
-        ("http://user:secret@127.0.0.1:notaport/v1", 5),
+        ("http://user:secret@127.0.0.1:notaport/v1", 0),
         ("http://user:secret@[", 5),
         ("user:secret@127.0.0.1/v1", 0),
-        ("http://user:secret@x@127.0.0.1:notaport/v1", 5),
+        ("http://user:secret@x@127.0.0.1:notaport/v1", 0),
         ("http://user:secret@127.0.0.1:1/v1", 5),
     ],
 )
