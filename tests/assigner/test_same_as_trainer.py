@@ -28,7 +28,7 @@ PHI_ENV = replace(ONE_AGENT, observation_size=2, action_size=1, low=ONE_AGENT.lo
 """The sizes that `phi` is for. The bounds are -1 and 1, so that actions need no scaling."""
 
 
-def learn(method, env, phi=None, payments=PAID_AT_END, exact="no", group=None, score="sum", n_running=0):
+def learn(method, env, phi=None, payments=PAID_AT_END, exact="no", group=None, score="sum", n_running=2):
     """Return a learner and an assigner that have learned from the same steps. The last episode has `n_running` steps so far."""
     scored_observation = "after" if phi is None else toy_spec().scored_observation
     algorithm = "td3" if env.n_agents == 1 else "ippo"
@@ -47,7 +47,9 @@ def learn(method, env, phi=None, payments=PAID_AT_END, exact="no", group=None, s
         groups=group is not None,
         **({} if env.n_agents == 1 else {"agents": env.n_agents, "max_steps": env.max_steps}),
     )
-    learner, steps = untrained_learner(config), random_steps(env, lengths=(*LENGTHS * 6, n_running + 1))
+    learner = untrained_learner(config)
+    # 12 chunks of 21 steps: each length of a chunk would be compiled.
+    steps = random_steps(env, lengths=(*LENGTHS * 5, 12, 12, 11, 12 - n_running, n_running + 1))
     steps = jax.tree.map(lambda leaf: leaf[:-1], steps)
     episode = np.cumsum(steps.ended[:, 0]) - steps.ended[:, 0]
     level = np.where(episode % 3 == 0, 0, 1)  # in the order in which an assigner counts its groups
@@ -88,17 +90,17 @@ EVERY_5 = PaymentRule(period=5)
 @pytest.mark.parametrize(
     ("method", "env", "changes"),
     [
-        ("lare-bayes", PHI_ENV, {"score": "auto", "payments": EVERY_5, "exact": "spread"}),
-        ("bayes-history", ONE_AGENT, {"payments": EVERY_5}),
-        ("bayes-progress", ONE_AGENT, {"exact": "last"}),
+        ("lare-bayes-history", PHI_ENV, {"score": "auto", "payments": EVERY_5, "exact": "spread", "n_running": 4}),
+        ("bayes-progress", ONE_AGENT, {"exact": "last", "n_running": 11}),
         ("bayes", ONE_AGENT, {"score": "binary", "group": "map"}),
         long_case("rd-linear", ONE_AGENT, {"payments": EVERY_5, "exact": "spread"}),
         long_case("lare-bayes", PHI_ENV, {"score": "auto"}),
         long_case("bayes", ONE_AGENT, {"group": "map"}),
         long_case("lare-bayes-progress", PHI_ENV, {"payments": EVERY_5}),
         long_case("bayes-progress", ONE_TEAM, {"exact": "spread"}),
-        long_case("lare-bayes-history", PHI_ENV, {}),
+        long_case("lare-bayes", PHI_ENV, {"score": "auto", "payments": EVERY_5, "exact": "spread"}),
         long_case("bayes-history", ONE_TEAM, {}),
+        long_case("bayes-history", ONE_AGENT, {"payments": PaymentRule(period=5, window=2), "n_running": 4}),
         long_case("rd-linear", ONE_AGENT, {"exact": "last", "score": "auto"}),
         long_case("rd-linear", ONE_TEAM, {"score": "auto"}),
         long_case("rd-linear", ONE_AGENT, {"group": "map", "score": "auto"}),
@@ -106,9 +108,16 @@ EVERY_5 = PaymentRule(period=5)
         long_case("rd-linear", ONE_AGENT, {"payments": PaymentRule(period=4, window=6), "exact": "last"}),
     ],
 )
-def test_rewards_agree(method, env, changes, phi):
+def test_rewards_and_lengths_agree(method, env, changes, phi):
+    """Also those of a running episode, which may be longer than most."""
     learner, config, credit = learn(method, env, phi if METHODS[method].needs_phi else None, **changes)
-    expected = np.asarray(jitted(rewards, config)(stored_steps(learner), learner.reward_sources))
+    steps = stored_steps(learner)
+    n_running = changes.get("n_running", 2)
+    n_unpaid = n_running % 5 if "payments" in changes else n_running
+    assert (~steps.finished).sum() == n_unpaid
+    lengths = credit.store.lengths(np.arange(credit.store.n_added))
+    np.testing.assert_array_equal(lengths, np.asarray(steps.length).ravel())
+    expected = np.asarray(jitted(rewards, config)(steps, learner.reward_sources))
     expected = expected if env.n_agents > 1 else expected[..., 0]
     r_hat = credit.rewards_at(np.arange(credit.store.n_added))
     rtol = 1e-3 if changes.get("score") == "binary" else 1e-4
@@ -127,14 +136,3 @@ def test_rewards_agree(method, env, changes, phi):
         intercept = np.asarray(fits[0].intercept)[0]
         assert intercept[1] - intercept[0] > 1.0
         assert not intercept[2:].any()
-
-
-@pytest.mark.parametrize("payments", [PAID_AT_END, PaymentRule(period=5, window=2)], ids=str)
-@pytest.mark.parametrize("n_running", [2, 4, 11])
-def test_lengths_agree(payments, n_running):
-    """Also those of a running episode that is longer than most."""
-    learner, _, credit = learn("rd-linear", ONE_AGENT, payments=payments, n_running=n_running)
-    steps = stored_steps(learner)
-    assert (~steps.episode_ended).sum() == (n_running if payments == PAID_AT_END else n_running % 5)
-    lengths = credit.store.lengths(np.arange(credit.store.n_added))
-    np.testing.assert_array_equal(lengths, np.asarray(steps.length).ravel())

@@ -17,7 +17,7 @@ from lare_rl.errors import LareError
 def trained_assigner(method, phi=None, is_average=False, **changes):
     """Return an assigner with some episodes and one that goes on, and new steps."""
     credit = small_assigner(method, phi, **changes)
-    for *steps, reward in random_episodes([7, 4, 9, 6] * 6):
+    for *steps, reward in random_episodes([7, 5, 8, 6] * 6):
         credit.add_episode(*steps, reward.mean() if is_average else reward)
         credit.fit_pending()
     add_episode(credit, random_episodes([3])[0], end=False)
@@ -103,7 +103,7 @@ def test_save_replaces_an_earlier_save(tmp_path):
 def saved(tmp_path_factory, phi):
     directory = tmp_path_factory.mktemp("saved")
     credit = small_assigner("lare-bayes", phi)
-    for episode in random_episodes([7, 4, 9]):
+    for episode in random_episodes([7, 5, 8]):
         credit.add_episode(*episode)
     credit.save(directory)
     return directory

@@ -116,11 +116,11 @@ def test_payments_are_stored_as_episodes(rule, steps, scores):
 
 
 def test_extend_raises_the_first_refusal():
-    store, rows = Store(9, (1,), longest=1), [np.zeros((5, 1), np.float32)] * 3
+    """The other episodes of the call are stored."""
+    store, rows = Store(9, (1,), longest=1), [np.zeros((6, 1), np.float32)] * 3
     with pytest.raises(LareError, match="this one is for 2:"):
-        list(store.extend("abbaa", store.add(5), rows, np.ones(5), np.array([0, 0, 1, 0, 1], bool)))
-    assert store.dropped == 2
-    assert not store.running
+        list(store.extend("abbaac", store.add(6), rows, np.ones(6), np.array([0, 0, 1, 0, 1, 1], bool)))
+    assert (store.n_ended, store.dropped, store.running) == (1, 2, {})
 
 
 def test_late_payment_leaves_steps_of_other_environments():

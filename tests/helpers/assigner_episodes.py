@@ -30,6 +30,7 @@ def random_episode(length, random):
 
 
 def random_episodes(lengths, seed=0):
+    """Return random episodes. Lengths between the same powers of two share compiled programs."""
     random = np.random.default_rng(seed)
     return [random_episode(int(length), random) for length in lengths]
 

@@ -15,6 +15,8 @@ from lare_rl.envs.load import read_task, shipped_tasks
 from lare_rl.latent.function import normalise_source
 from lare_rl.llm.recording import SHIPPED_RECORDINGS, read_recording
 from lare_rl.llm.reply import MalformedReplyError, parse_reply
+from lare_rl.phi.graph import Graph
+from lare_rl.phi.read import read
 
 HERE = Path(__file__).parent
 
@@ -74,6 +76,12 @@ def recorded_programs() -> list[Program]:
                 name = f"{path.parent.name}/{path.stem}/{exchange.stage}{number}"
                 programs.append(Program(name, (role.observation_size, role.action_size), source))
     return programs
+
+
+@cache
+def read_program(program: Program) -> Graph:
+    """Read a program. Several tests use its graph."""
+    return read(program.source, *program.sizes)
 
 
 def execute_program(source: str, observation: np.ndarray, action: np.ndarray) -> np.ndarray:

@@ -11,16 +11,18 @@ def to_reply(source: str) -> str:
 
 
 class ScriptedModel:
-    """Replies with one function after the other. When none is left, it raises `LareError`."""
+    """Replies with one function after the other, and then with some texts. When none is left, it raises an error."""
 
     name = "scripted"
 
-    def __init__(self, *sources):
-        self.replies = list(map(to_reply, sources))
-        self.requests = []
+    def __init__(self, *sources, replies=(), error: BaseException | None = None):
+        self.replies = [*map(to_reply, sources), *replies]
+        self.error = error or LareError("no reply is left")
+        self.requests, self.samples = [], []
 
     def reply(self, messages, sample):
         self.requests.append(messages)
+        self.samples.append(sample)
         if not self.replies:
-            raise LareError("no reply is left")
+            raise self.error
         return self.replies.pop(0)

@@ -20,7 +20,7 @@ def logged_episodes(count, seed=0, noise=False, max_length=30):
     """Yield episodes of two observation entries and one action. A reward is 1 plus twice the first entry after the step, or noise."""
     random = np.random.default_rng(seed)
     for number in range(count):
-        steps = int(random.integers(max_length // 2, max_length))
+        steps = int(random.integers(max_length // 2 + 2, max_length))
         observations = random.normal(size=(steps + 1, 2)).astype(np.float32)
         # Episodes differ by more than chance.
         observations += random.normal(size=2).astype(np.float32)
@@ -44,10 +44,10 @@ def check_log(log, episodes):
         np.testing.assert_allclose(episode.reward, arrays["rewards"])
 
 
-def write_rewards_plus_one(source, out, comment=""):
+def write_rewards_plus_one(source, out, comment="", overwrite=False):
     """Write a log as `relabel` does. The new rewards are the old ones plus one, without a fit."""
     log = open_log(source)
-    return log.write(out, (RelabelledEpisode(item, item.reward + 1) for item in log.episodes()), False, comment)
+    return log.write(out, (RelabelledEpisode(item, item.reward + 1) for item in log.episodes()), overwrite, comment)
 
 
 def read_directory(path):

@@ -157,7 +157,7 @@ def test_reset_mask_drops_one_episode():
 
 def test_single_rewards_and_reset():
     """A reset drops the running episode, also if all observations are the same."""
-    env = LoggedEnv(RandomEnv(spaces.Discrete(1)))
+    env = LoggedEnv(RandomEnv(spaces.Box(0, 0, (2,), np.float32)))
     credit = recording_assigner(env, "rd-linear")
     wrapped = Credit(env, credit)
     wrapped.reset()

@@ -125,10 +125,9 @@ def test_team_of_one():
 
 def test_groups_are_read_from_info():
     """Here from that of any agent that has it."""
-    task = toy_spec(observation_size=2, action_size=3, group="level")
-    credit = make_assigner("bayes", task=task)
+    credit = make_assigner("bayes", task=toy_spec(observation_size=2, action_size=3, group="level"))
     team = LoggedTeam(NAMES)
-    wrapped = CreditParallel(team, credit)
+    wrapped = CreditParallel(team, credit, pay="environment")
     for level in (5, 7, 5):
         team.level = level
         play(wrapped)

@@ -147,9 +147,9 @@ def test_groups_are_read_from_info(kind):
     env = Grouped(TimeLimit(Chase(), EPISODE_STEPS))
     credit = CreditAssigner("bayes", task=toy_spec(group="level"), settings=SMALL_CREDIT)
     if kind is PPO:
-        on_policy(env, PPO, "MlpPolicy").learn(64, callback=CreditCallback(credit))
+        on_policy(env, n_steps=64).learn(64, callback=CreditCallback(credit))
     else:
-        off_policy(env, credit, SAC).learn(60)
+        off_policy(env, credit, SAC, learning_starts=100).learn(60)
     assert set(credit.group_names) == {0, 1}
     assert {episode.level for episode in credit.store.episodes.values()} == {0, 1}
 

@@ -1,11 +1,11 @@
 """The loop of candidates, combination and correction."""
 
-import json
 import re
 
 import pytest
 
 from helpers.long_tests import long_case
+from helpers.scripted_model import ScriptedModel, to_reply
 from helpers.toy_envs import PHI, phi_source, toy_spec
 from lare_rl.envs.load import read_task, shipped_tasks
 from lare_rl.errors import LareError
@@ -15,39 +15,23 @@ from lare_rl.llm.prompts import candidate, combine, correct
 from lare_rl.llm.recording import read_recording
 
 
-def reply(source: str) -> str:
-    return json.dumps({"Understand": "u", "Analyze": "a", "Functions": source})
-
-
 def failing_reply(name: str) -> str:
-    return reply(phi_source(f"return [{name}]"))
+    return to_reply(phi_source(f"return [{name}]"))
 
 
 def error_text(name: str) -> str:
     return f"E-RUN line 2: {name} is not defined, or not available"
 
 
-GOOD = reply(PHI)
-OTHER = reply(PHI.replace("f_effort", "f_exertion"))
+GOOD = to_reply(PHI)
+OTHER = to_reply(PHI.replace("f_effort", "f_exertion"))
 MALFORMED = "Here is the function."
 NOT_JSON = "the reply is not one JSON object: Expecting value: line 1 column 1 (char 0)"
 ATTEMPTS, MAX_QUOTE = 5, 20_000
 
 
-class ScriptedModel:
-    """Gives its replies one after the other, then raises `error`. It records the requests."""
-
-    name = "scripted"
-
-    def __init__(self, *replies: str, error: BaseException | None = None):
-        self.replies, self.error = list(replies), error
-        self.requests = []
-
-    def reply(self, messages, sample):
-        self.requests.append((list(messages), sample))
-        if self.error is not None and not self.replies:
-            raise self.error
-        return self.replies.pop(0)
+def scripted(*replies, **options):
+    return ScriptedModel(replies=replies, **options)
 
 
 QUICK_TASKS = ("CompetitivePP-6", "HalfCheetah-v4", "Reacher-v4", "TriangleArea")
@@ -78,31 +62,27 @@ def test_shipped_task(name):
     assert all(check.passed for check in function.checks)
 
 
-@pytest.mark.parametrize("body", ["HalfCheetah", "Walker2d"])
-def test_versions_with_the_same_observation_share_their_recordings(body):
-    assert design(f"{body}-v5").source == design(f"{body}-v4").source
-
-
 def test_draws_and_kinds():
     task = read_task("Reacher-v4")
     functions = [design(task, draw=draw) for draw in (0, 1)]
     assert functions[0].digest != functions[1].digest
     reward = design(task, "reward", candidates=1)
     assert (reward.kind, reward.size) == ("reward", 1)
-    with pytest.raises(LareError, match=r"no recorded reply.*--model.*--function.*--method bayes"):
+    with pytest.raises(LareError, match=r"'Chase'.*model=.*--model NAME.*--function phi\.py.*bayes") as error:
         design(toy_spec())
+    assert "\n" not in str(error.value)
     with pytest.raises(LareError, match="have 1 or 5 candidates"):
         design(task, candidates=3)
 
 
 def test_error_goes_back(chase):
     bad = failing_reply("no_idea")
-    model = ScriptedModel(GOOD, OTHER, bad, GOOD)
+    model = scripted(GOOD, OTHER, bad, GOOD)
     function = design(chase, model=model, candidates=2)
     first = candidate(chase)
     second = combine(chase, [GOOD, OTHER])
     third = correct(second, bad, error_text("no_idea"))
-    assert model.requests == [(first, 0), (first, 1), (second, 0), (third, 0)]
+    assert (model.requests, model.samples) == ([first, first, second, third], [0, 1, 0, 0])
     assert function.exchanges == (
         {"stage": "candidate", "messages": first, "replies": [GOOD, OTHER]},
         {"stage": "combine", "messages": second, "replies": [bad]},
@@ -121,24 +101,24 @@ def test_error_goes_back(chase):
     ids=["malformed", "long", "empty"],
 )
 def test_correction_request(chase, bad, quote, errors):
-    model = ScriptedModel(bad, GOOD)
+    model = scripted(bad, GOOD)
     function = design(chase, model=model, candidates=1)
-    assert model.requests == [(candidate(chase), 0), (correct(candidate(chase), quote, errors), 0)]
+    assert model.requests == [candidate(chase), correct(candidate(chase), quote, errors)]
     assert [exchange["stage"] for exchange in function.exchanges] == ["candidate", "correct"]
 
 
 def test_surrogates_go_back_as_an_error(chase, tmp_path):
-    model = ScriptedModel(GOOD.replace('"u"', '"\\ud800"'), "\ud800", GOOD)
+    model = scripted(GOOD.replace('""', '"\\ud800"', 1), "\ud800", GOOD)
     function = design(chase, model=model, candidates=1)
-    assert "surrogate" in model.requests[1][0][-1]["content"]
+    assert "surrogate" in model.requests[1][-1]["content"]
     function.save(tmp_path / "phi.py")
 
 
 def test_passing_candidates_are_combined(chase):
     candidates = [GOOD, failing_reply("no_idea"), MALFORMED, OTHER]
-    model, messages = ScriptedModel(*candidates, GOOD), []
+    model, messages = scripted(*candidates, GOOD), []
     function = design(chase, model=model, candidates=4, on_message=messages.append)
-    assert model.requests[-1] == (combine(chase, [GOOD, OTHER]), 0)
+    assert model.requests[-1] == combine(chase, [GOOD, OTHER])
     assert function.exchanges[0]["replies"] == candidates
     assert messages == [
         "candidate 1: passes",
@@ -150,32 +130,31 @@ def test_passing_candidates_are_combined(chase):
 
 
 def test_all_candidates_are_combined_if_none_passes(chase):
-    two_errors = reply("import os\n" + phi_source("return [action, np.two(3)]"))
-    model, messages = ScriptedModel(MALFORMED, two_errors, "x" * (MAX_QUOTE + 5), GOOD), []
+    two_errors = to_reply("import os\n" + phi_source("return [action, np.two(3)]"))
+    model, messages = scripted(MALFORMED, two_errors, "x" * (MAX_QUOTE + 5), GOOD), []
     design(chase, model=model, candidates=3, on_message=messages.append)
-    assert model.requests[-1] == (combine(chase, [MALFORMED, two_errors, "x" * MAX_QUOTE]), 0)
+    assert model.requests[-1] == combine(chase, [MALFORMED, two_errors, "x" * MAX_QUOTE])
     assert messages[1].endswith("(and 1 more)")
 
 
 def test_reward_has_its_own_request_and_check(chase):
-    model = ScriptedModel(GOOD, reply(phi_source("return [action]")))
+    model = scripted(GOOD, to_reply(phi_source("return [action]")))
     function = design(chase, "reward", model=model, candidates=1)
     error = verify(PHI, chase, "reward").errors
     request = candidate(chase, "reward")
-    assert [messages for messages, _ in model.requests] == [request, correct(request, GOOD, error)]
+    assert model.requests == [request, correct(request, GOOD, error)]
     assert (function.kind, function.size) == ("reward", 1)
 
 
 def test_attempts_end(chase):
     bad = [failing_reply(f"attempt_{number}") for number in range(1, ATTEMPTS + 1)]
-    assert len(design(chase, model=ScriptedModel(*bad[1:], GOOD), candidates=1).exchanges) == ATTEMPTS
-    model, messages = ScriptedModel(*bad, GOOD), []
+    assert len(design(chase, model=scripted(*bad[1:], GOOD), candidates=1).exchanges) == ATTEMPTS
+    model, messages = scripted(*bad, GOOD), []
     with pytest.raises(DesignError, match=r"'Chase'.*attempt_5 is not defined") as error:
         design(chase, model=model, candidates=1, on_message=messages.append)
     assert messages == [f"attempt {number}: {error_text(f'attempt_{number}')}" for number in range(1, 6)]
     assert model.replies == [GOOD]
-    last_request, _ = model.requests[-1]
-    assert [message["content"] for message in last_request if message["role"] == "assistant"] == bad[:-1]
+    assert [message["content"] for message in model.requests[-1] if message["role"] == "assistant"] == bad[:-1]
     assert [exchange.replies for exchange in error.value.recorder.exchanges] == [[text] for text in bad]
     assert error.value.model == "scripted"
 
@@ -188,13 +167,13 @@ def test_record(chase, tmp_path):
             existed.append(path.exists())
             return super().reply(messages, sample)
 
-    function = design(chase, model=CheckingModel(MALFORMED, GOOD), candidates=1, record=path)
+    function = design(chase, model=CheckingModel(replies=[MALFORMED, GOOD]), candidates=1, record=path)
     assert existed == [False, True]
     content = path.read_text(encoding="utf-8")
     recording = read_recording(content, "record.json")
     assert tuple(exchange.model_dump() for exchange in recording.exchanges) == function.exchanges
     with pytest.raises(LareError, match="not overwritten"):
-        design(chase, model=CheckingModel(GOOD), candidates=1, record=path)
+        design(chase, model=CheckingModel(PHI), candidates=1, record=path)
     assert len(existed) == 2  # the model was not asked
     assert path.read_text(encoding="utf-8") == content
 
@@ -205,18 +184,20 @@ def test_record(chase, tmp_path):
 def test_without_pre_verification(chase):
     source = phi_source("return [action * np.nan, action]")
     assert not verify(source, chase).passed
-    model = ScriptedModel(failing_reply("a"), GOOD, reply(source))
+    model = scripted(failing_reply("a"), GOOD, to_reply(source))
     function = design(chase, model=model, candidates=2, pre_verification=False)
     assert (function.source, function.size) == (source, 2)
     assert function.checks == (Check("read", True),)
     assert function.names == ["factor_1", "action"]
-    assert model.requests[-1][0] == combine(chase, [failing_reply("a"), GOOD])
+    assert model.requests[-1] == combine(chase, [failing_reply("a"), GOOD])
 
 
-@pytest.mark.parametrize("text", [MALFORMED, reply("import os\nos.listdir('/')"), reply(phi_source("return action"))])
+@pytest.mark.parametrize(
+    "text", [MALFORMED, to_reply("import os\nos.listdir('/')"), to_reply(phi_source("return action"))]
+)
 def test_unreadable_reply_without_pre_verification(chase, text):
     with pytest.raises(DesignError, match="cannot be read"):
-        design(chase, model=ScriptedModel(text), candidates=1, pre_verification=False)
+        design(chase, model=scripted(text), candidates=1, pre_verification=False)
 
 
 # --- a model or an environment that fails ----------------------------------------------------------------------------
@@ -228,16 +209,16 @@ def test_unreadable_reply_without_pre_verification(chase, text):
 )
 def test_replies_survive_an_error(chase, error, design_error, status):
     with pytest.raises(design_error) as raised:
-        design(chase, model=ScriptedModel(GOOD, failing_reply("a"), error=error), candidates=3)
+        design(chase, model=scripted(GOOD, failing_reply("a"), error=error), candidates=3)
     assert [exchange.replies for exchange in raised.value.recorder.exchanges] == [[GOOD, failing_reply("a")]]
     assert raised.value.status == status
     with pytest.raises(type(error)) as raised:
-        design(chase, model=ScriptedModel(error=error), candidates=3)
+        design(chase, model=scripted(error=error), candidates=3)
     assert raised.value is error
 
 
 def test_environment_is_checked_first():
-    model = ScriptedModel(GOOD)
+    model = scripted(GOOD)
     with pytest.raises(LareError, match="nothing/Here-v0"):
         design(toy_spec(environment="nothing/Here-v0"), model=model, candidates=1)
     assert model.replies == [GOOD]

@@ -134,12 +134,6 @@ def test_random_steps_of_scored_observation(scored_observation, counts):
     assert np.bincount(observation[:, 1].astype(int)).tolist() == counts
 
 
-def test_random_steps_include_first_and_last():
-    longer = toy_spec(max_episode_steps=1000)
-    for rows, selected in zip(random_steps(longer, 1000), random_steps(longer, 50), strict=True):
-        np.testing.assert_array_equal(selected[[0, -1]], rows[[0, -1]])
-
-
 def test_random_steps_of_an_agent_that_never_acts(monkeypatch):
     monkeypatch.setattr(verify_module, "_MAX_PLAYED_STEPS", 50)
     team = toy_spec(**PARALLEL, arguments={"joins": {"a_1": 9}}, agents=("a_1",), team="late")
@@ -165,6 +159,7 @@ def test_sample_steps_evenly_spaced(chase):
         (np.zeros((5, 2)), np.zeros((4, 1)), r"actions .*\(n, 1\)"),
         (np.zeros((0, 2)), np.zeros((0, 1)), r"observations .*\(n, 2\)"),
         (np.full((5, 2), np.nan), np.zeros((5, 1)), "observations .*not finite"),
+        (np.zeros((5, 2)), np.full((5, 1), np.inf), "actions .*not finite"),
     ],
 )
 def test_invalid_sample_steps(chase, observations, actions, words):

@@ -104,12 +104,6 @@ def test_reply_text(start_either, answer, text):
     assert "temperature" not in server.requests[0]
 
 
-def test_compressed_reply(start):
-    body = gzip.compress(json.dumps(text_completion("hello")).encode())
-    _, model, _ = start(raw_answer(body, Content_Encoding="gzip"))
-    assert model.reply(REQUEST, 0) == "hello"
-
-
 def test_truncated_reply_is_reported(start_either):
     def cut_off(handler):
         completion, response = text_completion("half of"), text_response("half of")
@@ -121,31 +115,36 @@ def test_truncated_reply_is_reported(start_either):
     _, model, _ = start_either(cut_off, on_message=messages.append)
     assert model.reply(REQUEST, 0) == "half of"
     assert len(messages) == 2
-    assert "cut off" in messages[1]
-    assert "16,384" in messages[1]
+    assert all(words in messages[1] for words in ("cut off", "16,384"))
 
 
-def test_temporary_error_is_retried(start):
-    for statuses in ((408, 409, 429), (500, 503, 529)):
-        server, model, pauses = start(*map(refuse, statuses), reply_with("hello"))
-        assert model.reply(REQUEST, 0) == "hello"
-        assert len(server.requests) == model.budget.requests_used == 4
-        assert pauses == [0.5, 1.0, 2.0]
+REDIRECT = raw_answer(b"", 307, Location="/v2/chat")
+COMPRESSED = gzip.compress(json.dumps(text_completion("hello")).encode())
 
 
-def test_retry_after(start_either):
-    answers = [refuse(429, Retry_After=value) for value in ("3", "9999", "Wed, 21 Oct 2015 07:28:00 GMT")]
-    _, model, pauses = start_either(*answers, reply_with("hello"))
+@pytest.mark.parametrize(
+    ("answers", "expected_pauses"),
+    [
+        ([raw_answer(COMPRESSED, Content_Encoding="gzip")], []),
+        ([REDIRECT, reply_with("hello")], []),
+        ([*map(refuse, (408, 409, 429)), reply_with("hello")], [0.5, 1.0, 2.0]),
+        ([*map(refuse, (500, 503, 529)), reply_with("hello")], [0.5, 1.0, 2.0]),
+        (
+            [refuse(429, Retry_After=after) for after in ("3", "9999", "Wed, 21 Oct 2015 07:28:00 GMT")]
+            + [reply_with("hello")],
+            [3.0, 60.0, 2.0],
+        ),
+        *(([answer, reply_with("hello")], [0.5]) for answer in (hang_up, reset_connection, break_off)),
+    ],
+)
+def test_reply_after_temporary_errors(start, answers, expected_pauses):
+    server, model, pauses = start(*answers)
     assert model.reply(REQUEST, 0) == "hello"
-    assert pauses == [3.0, 60.0, 2.0]
-
-
-@pytest.mark.parametrize("answer", [hang_up, reset_connection, break_off])
-def test_broken_connection_is_retried_and_counted(start_either, answer):
-    server, model, pauses = start_either(answer, reply_with("hello"))
-    assert model.reply(REQUEST, 0) == "hello"
-    assert (len(server.requests), pauses) == (2, [0.5])
-    assert model.budget.tokens_out == REPLY_TOKENS + 10
+    assert (len(server.requests), pauses) == (len(answers), expected_pauses)
+    assert server.requests[0] == server.requests[-1]
+    assert model.budget.requests_used == len(answers) - (answers[0] is REDIRECT)
+    if answers[0] in (hang_up, reset_connection, break_off):
+        assert model.budget.tokens_out == REPLY_TOKENS + 10
 
 
 @pytest.mark.parametrize(
@@ -196,8 +195,7 @@ def test_retries_end(start_either):
     server, model, pauses = start_either(refuse(503))
     with pytest.raises(ModelError, match="HTTP 503"):
         model.reply(REQUEST, 0)
-    assert len(server.requests) == ATTEMPTS
-    assert pauses == [0.5, 1, 2, 4, 8]
+    assert (len(server.requests), pauses) == (ATTEMPTS, [0.5, 1, 2, 4, 8])
     server, model, _ = start_either(refuse(503), budget=Budget(requests=3))
     with pytest.raises(BudgetExceededError, match=r"3 requests.*HTTP 503"):
         model.reply(REQUEST, 0)
@@ -232,14 +230,6 @@ def test_server_without_the_responses_api(serve, answer):
     assert server.apis[4:] == ["responses", "completions"]
 
 
-def test_all_forms(serve):
-    server, model, pauses = serve(*[refuse(400, "this format is not supported")] * 3, reply_with("hello"))
-    assert model.reply(REQUEST, 0) == "hello"
-    formats = [request.get("response_format", {}).get("type") for request in server.requests]
-    assert server.apis == ["responses", *["completions"] * 3]
-    assert (formats, pauses) == ([None, "json_schema", "json_object", None], [])
-
-
 def test_refused_options_of_a_response(serve):
     refusals = [
         refuse(400, "Unsupported parameter: 'temperature' is not supported with this model."),
@@ -257,14 +247,11 @@ def test_error_of_a_known_responses_api_is_retried(serve):
     server, model, pauses = serve(reply_with("hello"), refuse(500), raw_answer(b"{}"), reply_with("again"))
     assert [model.reply(REQUEST, number) for number in range(2)] == ["hello", "again"]
     assert (server.apis, pauses) == (["responses"] * 4, [0.5, 1.0])
-
-
-def test_failed_response(serve):
     failed = {"status": "failed", "error": {"code": "server_error", "message": "The model crashed."}, "output": []}
-    server, model, pauses = serve(raw_answer(json.dumps(failed).encode()))
+    _, model, pauses = serve(raw_answer(json.dumps(failed).encode()))
     with pytest.raises(ModelError, match="The model crashed"):
         model.reply(REQUEST, 0)
-    assert (server.apis, len(pauses)) == (["responses"] * ATTEMPTS, ATTEMPTS - 1)
+    assert len(pauses) == ATTEMPTS - 1
 
 
 @pytest.mark.parametrize("status", [403, 404])
@@ -299,8 +286,7 @@ def test_closed_port(start_either):
     server.stop()
     with pytest.raises(ModelError, match=r"http://127\.0\.0\.1:\d+/v1/ cannot be reached"):
         model.reply(REQUEST, 0)
-    assert len(pauses) == ATTEMPTS - 1
-    assert model.budget.tokens_out == 0
+    assert (len(pauses), model.budget.tokens_out) == (ATTEMPTS - 1, 0)
 
 
 @pytest.mark.parametrize("answer", [drip_body(200), drip_body(500), drip_headers, hang])
@@ -347,8 +333,9 @@ def test_unsupported_options_are_dropped_for_good(start):
         return reply_with("hello")(handler)
 
     server, model, pauses = start(answer, temperature=1.0)
-    assert model.reply(REQUEST, 0) == "hello"
-    assert model.reply(REQUEST, 1) == "hello"
+    assert [model.reply(REQUEST, number) for number in range(2)] == ["hello"] * 2
+    formats = [request.get("response_format", {}).get("type") for request in server.requests]
+    assert formats[:3] == ["json_schema", "json_object", None]
     assert server.requests[-2:] == [{"model": "m", "messages": REQUEST, "max_tokens": 4096}] * 2
     assert pauses == []
 
@@ -400,8 +387,7 @@ def test_pauses_count_as_waiting(start_either):
     with pytest.raises(BudgetExceededError, match="3 min"):
         model.reply(REQUEST, 0)
     assert pauses == [60.0, 60.0]
-    assert "120 s at most" in messages[0]
-    assert messages[1].endswith("60.0 s")
+    assert ("120 s at most" in messages[0], messages[1][-6:]) == (True, "60.0 s")
 
 
 @pytest.mark.parametrize(
@@ -413,12 +399,6 @@ def test_redirect_to_another_server(start_either, status, location):
     with pytest.raises(ModelError, match="redirects to http"):
         model.reply(REQUEST, 0)
     assert (len(server.requests), pauses) == (1, [])
-
-
-def test_redirect_within_a_server(start):
-    server, model, _ = start(raw_answer(b"", 307, Location="/v2/chat"), reply_with("hello"))
-    assert model.reply(REQUEST, 0) == "hello"
-    assert server.requests[0] == server.requests[1]
 
 
 @pytest.mark.parametrize(
@@ -443,30 +423,25 @@ def test_key_is_required_for_openai_only(start, monkeypatch):
 
 @pytest.mark.parametrize(
     ("url", "n_pauses"),
-    [("nowhere", 0), ("ftp://127.0.0.1:1/v1", 0), (" ", 0), ("http://[", 5), ("http://127.0.0.1:99999/v1", 5)],
-)
-def test_invalid_endpoint(monkeypatch, url, n_pauses):
-    monkeypatch.setenv("OPENAI_API_KEY", KEY)
-    budget, pauses = Budget(), []
-    with pytest.raises(ModelError) as error:
-        LiveModel("m", url, budget=budget, sleep=pauses.append).reply(REQUEST, 0)
-    assert "\n" not in str(error.value)
-    assert (len(pauses), budget.tokens_out) == (n_pauses, 0)
-
-
-@pytest.mark.parametrize(
-    "address",
     [
-        "http://user:secret@127.0.0.1:notaport/v1",
-        "http://user:secret@[",
-        "user:secret@127.0.0.1/v1",
-        "http://user:secret@x@127.0.0.1:notaport/v1",
-        "http://user:secret@127.0.0.1:1/v1",
+        ("nowhere", 0),
+        ("ftp://127.0.0.1:1/v1", 0),
+        (" ", 0),
+        ("http://[", 5),
+        ("http://127.0.0.1:99999/v1", 5),
+        ("http://user:secret@127.0.0.1:notaport/v1", 0),
+        ("http://user:secret@[", 5),
+        ("user:secret@127.0.0.1/v1", 0),
+        ("http://user:secret@x@127.0.0.1:notaport/v1", 0),
+        ("http://user:secret@127.0.0.1:1/v1", 5),
     ],
 )
-def test_password_in_an_address_is_removed(monkeypatch, address):
+def test_invalid_endpoint(monkeypatch, url, n_pauses):
+    """The messages have no password."""
     monkeypatch.setenv("OPENAI_API_KEY", KEY)
-    messages = []
+    budget, pauses, messages = Budget(), [], []
     with pytest.raises(ModelError) as error:
-        LiveModel("m", address, sleep=lambda _: None, on_message=messages.append).reply(REQUEST, 0)
+        LiveModel("m", url, budget=budget, sleep=pauses.append, on_message=messages.append).reply(REQUEST, 0)
+    assert "\n" not in str(error.value)
     assert "secret" not in " ".join([str(error.value), *messages])
+    assert (len(pauses), budget.tokens_out) == (n_pauses, 0)

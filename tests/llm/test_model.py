@@ -6,7 +6,6 @@ import lare_rl
 from helpers.scripted_model import ScriptedModel, to_reply
 from helpers.toy_envs import PHI, toy_spec
 from lare_rl.errors import LareError
-from lare_rl.latent.design import DesignModelError
 from lare_rl.llm.live import LiveModel
 from lare_rl.llm.model import as_model
 
@@ -23,19 +22,6 @@ def test_function_is_a_model():
     phi = lare_rl.design(toy_spec(), model=my_model, candidates=1)
     assert (phi.source, phi.model) == (PHI.strip("\n"), "my_model")
     assert requests == [["system", "user"], ["system", "user", "assistant", "user"]]
-
-
-def test_reflection_asks_a_function(phi):
-    requests = []
-    lare_rl.reflect(phi, toy_spec(), lambda messages: requests.append(messages) or REPLY)
-    assert requests
-
-
-def test_replies_before_an_error_are_recorded():
-    replies = ["no"]
-    with pytest.raises(DesignModelError, match="the model <lambda> failed: IndexError: pop from empty list") as error:
-        lare_rl.design(toy_spec(), model=lambda messages: replies.pop(), candidates=1)
-    assert error.value.recorder.exchanges[0].replies == ["no"]
 
 
 def test_key_is_removed(monkeypatch):
@@ -55,12 +41,6 @@ def test_function_must_return_a_text(reply):
 def test_other_values_are_refused(model):
     with pytest.raises(LareError, match="a model must be a function from messages to a text"):
         as_model(model)
-
-
-def test_own_task_without_a_model():
-    with pytest.raises(LareError, match=r"'Chase'.*model=.*--model NAME.*--function phi\.py.*bayes") as error:
-        lare_rl.design(toy_spec())
-    assert "\n" not in str(error.value)
 
 
 def test_objects_with_a_name_are_used_as_they_are(monkeypatch):

@@ -24,8 +24,13 @@ def test_recorded_requests():
         assert name == f"{recording.kind}/{recording.task}.draw{recording.draw}.json"
 
 
-def test_sparse_task_has_the_same_request():
-    assert candidate(read_task("HalfCheetahSparse-v4")) == candidate(read_task("HalfCheetah-v4"))
+@pytest.mark.parametrize(
+    ("task", "other"),
+    [("HalfCheetahSparse-v4", "HalfCheetah-v4"), ("HalfCheetah-v5", "HalfCheetah-v4"), ("Walker2d-v5", "Walker2d-v4")],
+)
+def test_tasks_with_the_same_observation_have_the_same_request(task, other):
+    """So they share their recordings."""
+    assert candidate(read_task(task)) == candidate(read_task(other))
 
 
 @pytest.mark.parametrize("errors", ["form: wrong", "KeyError: {error}", "{0} {} {{'a': 1}}", "100 % \\1"])

@@ -21,25 +21,15 @@ def recorded_model(**changes) -> RecordedModel:
     return RecordedModel([read_recording(json.dumps(RECORDING | changes), "Chase.draw3.json")], "Chase")
 
 
-def test_reply():
-    model = recorded_model()
-    assert [model.reply(REQUEST, sample) for sample in (0, 1, 0)] == ["one", "two", "one"]
-    assert model.name == "A model, recorded 2026-01-31, draw 3"
-
-
-@pytest.mark.parametrize(
-    ("messages", "sample"),
-    [([{"role": "system", "content": "Write some."}], 0), ([*REQUEST, *REQUEST], 0), ([], 0), (REQUEST, 2)],
-)
-def test_unknown_request(messages, sample):
-    with pytest.raises(LareError, match=rf"'Chase' \(reply {sample + 1}\)"):
-        recorded_model().reply(messages, sample)
-
-
-def test_repeated_request_has_all_replies():
+def test_replies():
+    """A repeated request has all replies. Other requests have none."""
     other, later = EXCHANGE | {"messages": [], "replies": ["else"]}, EXCHANGE | {"replies": ["three"]}
     model = recorded_model(exchanges=[EXCHANGE, other, later])
-    assert [model.reply(REQUEST, sample) for sample in range(3)] == ["one", "two", "three"]
+    assert [model.reply(REQUEST, sample) for sample in (0, 1, 2, 0)] == ["one", "two", "three", "one"]
+    assert model.name == "A model, recorded 2026-01-31, draw 3"
+    for messages, sample in (([REQUEST[0] | {"role": "system"}], 0), (REQUEST * 2, 0), ([], 1), (REQUEST, 3)):
+        with pytest.raises(LareError, match=rf"'Chase' \(reply {sample + 1}\)"):
+            model.reply(messages, sample)
 
 
 def test_shipped_recordings():
@@ -105,11 +95,3 @@ def test_failed_write_loses_no_reply(tmp_path, monkeypatch):
     assert list(tmp_path.iterdir()) == [path]
     recorder.save(path, "A model", new=False)
     assert read_recording(path.read_text(), "talk.json").exchanges[0].replies == ["one", "two", "three"]
-
-
-def test_existing_file_is_kept(tmp_path):
-    path = tmp_path / "talk.json"
-    path.write_text("mine")
-    with pytest.raises(LareError, match="not overwritten"):
-        Recorder("Chase", "factors", path=path).add("candidate", REQUEST, "one", "A model")
-    assert path.read_text() == "mine"

@@ -4,9 +4,8 @@ import numpy as np
 import pytest
 
 import lare_rl
-from helpers.toy_logs import PHI, logged_episodes
+from helpers.toy_logs import logged_episodes
 from lare_rl import LareError
-from lare_rl.latent.verify import verify
 from lare_rl.logs import steps
 from lare_rl.logs.draft_from_log import draft_log_task
 
@@ -27,18 +26,6 @@ def test_logged_steps(task, scored_observation):
     after = distinct(row for episode in episodes for row in episode[1:])
     assert distinct(first) <= (after if scored_observation == "after" else before)
     assert distinct(second) <= (before if scored_observation == "before" else after)
-
-
-@pytest.mark.parametrize(
-    ("bad_steps", "message"),
-    [
-        ((np.zeros((3, 4)), np.zeros((3, 1))), r"observations .*\(n, 2\)"),
-        ((np.zeros((3, 2)), np.full((3, 1), np.inf)), "actions .*not finite"),
-    ],
-)
-def test_bad_steps(task, bad_steps, message):
-    with pytest.raises(LareError, match=message):
-        verify(PHI, task, steps=bad_steps)
 
 
 def test_logged_episodes_are_complete(task):

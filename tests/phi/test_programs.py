@@ -10,6 +10,7 @@ from helpers.phi_programs import (
     benign_programs,
     execute_program,
     random_inputs,
+    read_program,
     recorded_programs,
     repaired_programs,
     varied_programs,
@@ -31,7 +32,7 @@ REFUSED = {
 }
 """Varied programs that are refused, and why."""
 PROGRAMS = {p.name: p for p in (*benign_programs(), *varied_programs(), *recorded_programs()) if p.name not in REFUSED}
-SHORT = {p.name for p in (*benign_programs(), *varied_programs()[::2], *recorded_programs()[::24])} & set(PROGRAMS)
+SHORT = {p.name for p in (*benign_programs(), *varied_programs()[::4], *recorded_programs()[::48])} & set(PROGRAMS)
 SINGLE = ("float32", "single", "float16")
 """Programs with these words compute in single precision here and there. Graphs do not follow that."""
 
@@ -49,8 +50,7 @@ def make_inputs(program, **kwargs):
 @pytest.mark.parametrize("name", [name if name in SHORT else long_case(name) for name in PROGRAMS])
 def test_program_agrees_with_numpy(name):
     program = PROGRAMS[name]
-    graph = read(program.source, *program.sizes)
-    inputs = make_inputs(program, dtype=np.float32)
+    graph, inputs = read_program(program), make_inputs(program, dtype=np.float32)
     # A third of the rows each: as they are, ten times as large, and zeros.
     scales = np.repeat(np.array([1, 10, 0], np.float32), 16)[:, None]
     inputs = {key: (array * scales).astype(np.float64) for key, array in inputs.items()}
@@ -62,7 +62,7 @@ def test_program_agrees_with_numpy(name):
 @pytest.mark.parametrize("name", [p.name for p in recorded_programs()[::60]])
 def test_rows_are_independent_in_any_batch_shape(name):
     program = PROGRAMS[name]
-    graph, inputs = read(program.source, *program.sizes), make_inputs(program, rows=24, dtype=np.float32)
+    graph, inputs = read_program(program), make_inputs(program, rows=24, dtype=np.float32)
     factors = evaluate(graph, inputs)["factors"]
     shaped = evaluate(graph, {key: array.reshape(2, 3, 4, -1) for key, array in inputs.items()})["factors"]
     single = evaluate(graph, {key: array[5] for key, array in inputs.items()})["factors"]
@@ -73,10 +73,10 @@ def test_rows_are_independent_in_any_batch_shape(name):
     assert factors.dtype == np.float32
 
 
-@pytest.mark.parametrize("index", range(9))
+@pytest.mark.parametrize("index", range(6))
 def test_program_agrees_in_jax(index):
-    program = PROGRAMS[sorted(SHORT)[3 + 16 * index]]
-    graph, inputs = read(program.source, *program.sizes), make_inputs(program, dtype=np.float32)
+    program = PROGRAMS[sorted(SHORT)[3 + 12 * index]]
+    graph, inputs = read_program(program), make_inputs(program, dtype=np.float32)
     expected = evaluate(graph, inputs)["factors"]
     transform = jax.vmap if index % 2 else lambda function: function
     result = np.asarray(jax.jit(transform(lambda inputs: evaluate(graph, inputs, jnp)["factors"]))(inputs))
@@ -115,9 +115,10 @@ def test_program_is_refused(name):
         read(program.source, *program.sizes)
 
 
-@pytest.mark.parametrize("entry", repaired_programs(), ids=lambda entry: entry["name"])
-def test_refusal_was_enough_to_mend_the_program(entry):
+@pytest.mark.parametrize("number", [n if n < 4 else long_case(n) for n in range(len(repaired_programs()))])
+def test_refusal_was_enough_to_mend_the_program(number):
     """A language model that saw a refused program and its errors, and nothing else, wrote `mended.json` at the first try."""
+    entry = repaired_programs()[number]
     program = next(p for p in varied_programs() if p.name == entry["name"])
     graph, inputs = read(entry["code"], *program.sizes), make_inputs(program)
     check_equal(evaluate(graph, inputs, dtype=np.float64)["factors"], execute_program(program.source, **inputs), 1e-6)

@@ -54,8 +54,13 @@ def test_command(command, tmp_path, file, rollouts):
     html = page.read_text()
     assert "works" in html
     assert html.count("<svg") == 6
-    status, _, error = command("turn-credit", file, "--out", out)
-    assert (status, "--overwrite" in error) == (2, True)
+    for source, target, words in (
+        (file, out, "--overwrite"),
+        (tmp_path / "none.jsonl", tmp_path / "out.jsonl", "none.jsonl"),
+        (file, tmp_path / "none" / "out.jsonl", "no directory"),
+    ):
+        status, _, error = command("turn-credit", source, "--out", target)
+        assert (status, error.count("\n"), words in error) == (2, 1, True)
 
 
 @pytest.mark.parametrize(
@@ -75,13 +80,6 @@ def test_bad_files(tmp_path, content, words):
         read_rollout_file(path)
     assert all(word in str(error.value) for word in words)
     assert "\n" not in str(error.value)
-
-
-def test_missing_files(command, tmp_path, file):
-    status, _, error = command("turn-credit", tmp_path / "none.jsonl", "--out", tmp_path / "out.jsonl")
-    assert (status, error.count("\n")) == (2, 1)
-    status, _, error = command("turn-credit", file, "--out", tmp_path / "none" / "out.jsonl")
-    assert (status, "no directory" in error) == (2, True)
 
 
 def test_turn_phi_prints_the_request(command, tmp_path, file):
@@ -105,18 +103,13 @@ def test_turn_phi_asks_a_model(monkeypatch, command, tmp_path, file):
     tools, out = tmp_path / "tools.json", tmp_path / "new.py"
     tools.write_text('[{"name": "try"}]')
     options = ["--tools", tools, "--goal", "Make it work.", "--model", "some", "--out", out]
-    status, _, _ = command("turn-phi", file, *options)
-    assert status == 0
+    assert command("turn-phi", file, *options)[0] == 0
     assert out.read_text().endswith(PHI)
     assert json.loads(out.with_suffix(".json").read_text())["kind"] == "events"
-    status, _, error = command("turn-phi", file, *options)
-    assert (status, "not overwritten" in error) == (2, True)
-    status, _, error = command("turn-phi", file, *options[:-1], tmp_path / "none" / "a.py")
-    assert (status, "no directory" in error) == (2, True)
-    status, _, error = command("turn-credit", file, "--out", tmp_path / "c.jsonl", "--function", out)
-    assert (status, error) == (0, "")
-    status, _, error = command("turn-phi", file, *options)
-    assert (status, "exists" in error) == (2, True)
+    for target, words in ((out, "not overwritten"), (tmp_path / "none" / "a.py", "no directory")):
+        status, _, error = command("turn-phi", file, *options[:-1], target)
+        assert (status, words in error) == (2, True)
+    assert command("turn-credit", file, "--out", tmp_path / "c.jsonl", "--function", out)[::2] == (0, "")
 
 
 def test_half_characters_are_written(tmp_path):

@@ -2,7 +2,6 @@
 
 import subprocess
 import sys
-from itertools import product
 
 import numpy as np
 import pytest
@@ -10,7 +9,7 @@ import pytest
 import lare_rl
 from helpers.turn_toys import sample_table, table_rollouts
 from lare_rl.errors import LareError
-from lare_rl.turns.trust import Errors, Trust, choose_lambda, group_means, summarise
+from lare_rl.turns.trust import Errors, Trust, choose_lambda, group_means, measure_errors, summarise
 
 
 @pytest.fixture
@@ -18,34 +17,19 @@ def rollouts():
     return table_rollouts(sample_table(n_groups=20))
 
 
-@pytest.mark.parametrize("logistic", [False, True])
-def test_progress_adds_up_exactly(rollouts, logistic):
-    for rollout in rollouts:
-        rollout["outcome"] = float(rollout["outcome"] > 0.2)
-    result = lare_rl.TurnCredit(logistic=logistic)(rollouts)
-    for rollout, progress, value in zip(rollouts, result.progress, result.value, strict=True):
-        assert progress.sum() == pytest.approx(rollout["outcome"] - value[0], abs=1e-12)
-        assert len(progress) == len(rollout["turns"])
-
-
-def test_order_of_rollouts_does_not_matter(rollouts):
+def test_order_units_and_names_of_groups_do_not_matter(rollouts):
     order = np.random.default_rng(0).permutation(len(rollouts))
     first = lare_rl.TurnCredit()(rollouts)
-    second = lare_rl.TurnCredit()([rollouts[k] for k in order])
+    second = lare_rl.TurnCredit()(
+        [
+            {**rollouts[k], "outcome": 100 * rollouts[k]["outcome"] - 7, "group": f"task {rollouts[k]['group']}"}
+            for k in order
+        ]
+    )
     assert first.lambda_ == second.lambda_
     for position, k in enumerate(order):
-        np.testing.assert_allclose(first.advantage[k], second.advantage[position], rtol=1e-6, atol=1e-9)
-        np.testing.assert_allclose(first.deviation[k], second.deviation[position], rtol=1e-6, atol=1e-9)
-
-
-def test_units_of_outcomes_and_names_of_groups_do_not_matter(rollouts):
-    scaled = [
-        {**rollout, "outcome": 100 * rollout["outcome"] - 7, "group": f"task {rollout['group']}"}
-        for rollout in rollouts
-    ]
-    first, second = lare_rl.TurnCredit()(rollouts), lare_rl.TurnCredit()(scaled)
-    for k in range(len(rollouts)):
-        np.testing.assert_allclose(100 * first.advantage[k], second.advantage[k], rtol=1e-6, atol=1e-7)
+        np.testing.assert_allclose(100 * first.advantage[k], second.advantage[position], rtol=1e-6, atol=1e-7)
+        np.testing.assert_allclose(100 * first.deviation[k], second.deviation[position], rtol=1e-6, atol=1e-7)
 
 
 def test_an_event_that_matters_gets_the_credit(rollouts):
@@ -59,19 +43,17 @@ def test_an_event_that_matters_gets_the_credit(rollouts):
     assert result.lambda_ == 0.8
 
 
-def test_a_fixed_lambda_is_used(rollouts):
-    result = lare_rl.TurnCredit(0.5)(rollouts)
-    assert result.lambda_ == 0.5
-    assert "set by the caller" in result.words[0]
-    assert result.advantage[0][-1] == pytest.approx(result.progress[0][-1])
-
-
-def test_few_rollouts_get_the_outcome_minus_the_mean_of_their_group():
-    table = sample_table(n_groups=2, group_size=3)
-    result = lare_rl.TurnCredit()(table_rollouts(table))
-    assert result.lambda_ == 1
-    for k, advantage in enumerate(result.advantage):
-        np.testing.assert_allclose(advantage, (table.outcome - group_means(table))[k])
+def test_only_the_guard_turns_to_grpo():
+    """The advantage of few rollouts is the outcome minus the mean of their group."""
+    table = sample_table(n_groups=3)
+    guarded, chosen = (lare_rl.TurnCredit(lambda_)(table_rollouts(table)) for lambda_ in (None, 1.0))
+    assert guarded.lambda_ == chosen.lambda_ == 1
+    assert (guarded.is_grpo, chosen.is_grpo) == (True, False)
+    assert ["GRPO" in result.words[0] for result in (guarded, chosen)] == [True, False]
+    assert "set by the caller" in chosen.words[0]
+    for advantage, expected in zip(guarded.advantage, table.outcome - group_means(table), strict=True):
+        np.testing.assert_allclose(advantage, expected)
+    assert max(np.ptp(advantage) for advantage in chosen.advantage) > 0.01
 
 
 def test_one_rollout_and_equal_outcomes_get_no_advantage():
@@ -90,21 +72,7 @@ def test_trust_is_measured_over_the_window():
 
 
 def test_noise_is_not_trusted():
-    table = sample_table(n_groups=40, effect=0.0)
-    result = lare_rl.TurnCredit()(table_rollouts(table))
-    assert result.lambda_ > 0.9
-
-
-def test_only_the_guard_turns_to_grpo():
-    table = sample_table(n_groups=3)  # too few
-    guarded, chosen = (lare_rl.TurnCredit(lambda_)(table_rollouts(table)) for lambda_ in (None, 1.0))
-    assert guarded.lambda_ == chosen.lambda_ == 1
-    assert guarded.is_grpo
-    assert "GRPO" in guarded.words[0]
-    assert all(np.ptp(advantage) == 0 for advantage in guarded.advantage)
-    assert not chosen.is_grpo
-    assert "GRPO" not in chosen.words[0]
-    assert max(np.ptp(advantage) for advantage in chosen.advantage) > 0.01
+    assert lare_rl.TurnCredit()(table_rollouts(sample_table(n_groups=40, effect=0.0))).lambda_ > 0.9
 
 
 @pytest.mark.parametrize(
@@ -124,6 +92,12 @@ def test_choice_of_lambda(gain, surprise, lambda_, code):
     assert (chosen, finding.code) == (lambda_, code)
 
 
+def test_surprise_is_that_of_agents_that_stopped_by_themselves():
+    table = sample_table()
+    errors = measure_errors(table, np.zeros(len(table.features)))
+    np.testing.assert_array_equal(errors.surprise, table.outcome[~table.truncated])
+
+
 def test_gain_is_a_ratio_of_sums():
     random = np.random.default_rng(0)
     baseline = random.random(50)
@@ -136,27 +110,18 @@ def test_gain_is_a_ratio_of_sums():
 
 
 @pytest.mark.parametrize(
-    ("options", "words"),
+    ("options", "outcomes", "words"),
     [
-        ({"lambda_": 1.5}, ["lambda_", "0 to 1", "1.5"]),
-        ({"lambda_": float("nan")}, ["lambda_", "nan"]),
-        ({"window": 0}, ["window", "at least 1"]),
+        ({"lambda_": 1.5}, [1], "lambda_ .*0 to 1.* 1.5"),
+        ({"lambda_": float("nan")}, [1], "lambda_ .*nan"),
+        ({"window": 0}, [1], "window .*at least 1"),
+        ({"logistic": True}, [3.0, 1.0], "between 0 and 1"),
+        ({}, [], "no rollouts"),
     ],
 )
-def test_bad_options(options, words):
-    with pytest.raises(LareError) as error:
-        lare_rl.TurnCredit(**options)
-    assert all(word in str(error.value) for word in words)
-
-
-def test_logistic_values_need_probabilities(rollouts):
-    with pytest.raises(LareError, match="between 0 and 1"):
-        lare_rl.TurnCredit(logistic=True)([{**rollouts[0], "outcome": 3.0}, rollouts[1]])
-
-
-def test_no_rollouts():
-    with pytest.raises(LareError, match="no rollouts"):
-        lare_rl.TurnCredit()([])
+def test_bad_options_and_outcomes(options, outcomes, words):
+    with pytest.raises(LareError, match=words):
+        lare_rl.TurnCredit(**options)([{"turns": [{}], "outcome": outcome} for outcome in outcomes])
 
 
 PROGRAM = """
@@ -175,10 +140,10 @@ def test_it_needs_neither_jax_nor_torch():
     assert process.stdout.startswith("40 ")
 
 
-@pytest.mark.parametrize(("logistic", "n_features"), list(product([False, True], [0, 5])))
-def test_degenerate_features(logistic, n_features):
-    # Features that never vary, that copy each other, or that are missing.
-    turn = {f"x{i}": 1.0 for i in range(n_features)}
-    rollouts = [{"turns": [turn] * (1 + k % 3), "outcome": float(k % 2), "group": k // 4} for k in range(32)]
+@pytest.mark.parametrize("logistic", [False, True])
+def test_features_that_never_vary_and_copy_each_other(logistic):
+    rollouts = [
+        {"turns": [{"x": 1.0, "y": 1.0}] * (1 + k % 3), "outcome": float(k % 2), "group": k // 4} for k in range(32)
+    ]
     result = lare_rl.TurnCredit(logistic=logistic)(rollouts)
     assert np.isfinite(np.concatenate([*result.advantage, *result.deviation, *result.value])).all()

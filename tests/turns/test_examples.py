@@ -17,11 +17,6 @@ def load(name):
     return SimpleNamespace(**runpy.run_path(str(EXAMPLES / name)))
 
 
-@pytest.mark.parametrize("name", ["turn_credit_prime_rl.py", "turn_credit_trl.py"])
-def test_examples_are_python(name):
-    compile((EXAMPLES / name).read_text(encoding="utf-8"), name, "exec")
-
-
 def make_messages(passes):
     call = {"id": "1", "name": "test", "arguments": "{}"}
     return [
@@ -39,15 +34,10 @@ class FakeMessage(SimpleNamespace):
 
 def fake_trace(passes):
     """Return an object with what the example reads of a trace of verifiers."""
-    nodes = [
-        SimpleNamespace(
-            message=FakeMessage(**message),
-            token_ids=[0, 1, 2],
-            mask=[message["role"] == "assistant" and i > 0 for i in range(3)],
-            advantages=None,
-        )
-        for message in make_messages(passes)
-    ]
+    nodes = []
+    for message in make_messages(passes):
+        mask = [message["role"] == "assistant" and i > 0 for i in range(3)]
+        nodes.append(SimpleNamespace(message=FakeMessage(**message), token_ids=[0, 1, 2], mask=mask, advantages=None))
     return SimpleNamespace(
         nodes=nodes, info={}, reward=float(passes), is_truncated=False, num_branches=1, has_error=False
     )
@@ -69,14 +59,15 @@ def fake_prime_rl(monkeypatch):
         def __init__(self, config, policy_pool):
             self.config = config
 
-    base = SimpleNamespace(
-        Algorithm=Algorithm, iter_trainable_traces=lambda episodes: [(e, trace) for e in episodes for trace in e.traces]
-    )
+    base = {
+        "Algorithm": Algorithm,
+        "iter_trainable_traces": lambda episodes: [(e, trace) for e in episodes for trace in e.traces],
+    }
     modules = {
         "prime_rl": {},
         "prime_rl.orchestrator": {},
         "prime_rl.orchestrator.algo": {"ALGORITHM_CLASSES": {"grpo": Algorithm}},
-        "prime_rl.orchestrator.algo.base": vars(base),
+        "prime_rl.orchestrator.algo.base": base,
         "prime_rl.orchestrator.algo.routing": {"assign_advantages": assign_advantages},
     }
     for name, values in modules.items():
@@ -110,72 +101,55 @@ def test_traces_of_verifiers():
     nodes = []
     for i, message in enumerate(make_messages(True)):
         is_sampled = message["role"] == "assistant"
-        nodes.append(
-            graph.MessageNode(
-                parent=i - 1 if i else None,
-                message=kinds[message["role"]](**message),
-                sampled=is_sampled,
-                token_ids=[0, 1, 2],
-                mask=[False, is_sampled, is_sampled],
-            )
-        )
+        tokens = {"token_ids": [0, 1, 2], "mask": [False, is_sampled, is_sampled], "sampled": is_sampled}
+        message = kinds[message["role"]](**message)
+        nodes.append(graph.MessageNode(parent=i - 1 if i else None, message=message, **tokens))
     trace = vf.Trace.model_construct(nodes=nodes, rewards={}, info={}, calls=[], stop_condition=None, errors=[])
     assert example.is_linear(trace)
     assert example.token_advantages(trace, [0.5, -1.0]) == [0.5, 0.5, -1.0, -1.0]
-    messages = example.trace_rollout(SimpleNamespace(nodes=nodes, reward=1.0, info={}, is_truncated=False), "a")[
-        "messages"
-    ]
-    assert messages[1]["tool_calls"][0]["name"] == "test"
+    rollout = example.trace_rollout(SimpleNamespace(nodes=nodes, reward=1.0, info={}, is_truncated=False), "a")
+    assert rollout["messages"][1]["tool_calls"][0]["name"] == "test"
 
 
 @pytest.mark.filterwarnings("ignore")  # of the library
-def test_trl_trainer(monkeypatch):
-    torch = pytest.importorskip("torch")
-    pytest.importorskip("trl", reason="TRL is not installed")
-    example = load("turn_credit_trl.py")
-    mask = torch.tensor([1, 1, 0, 0, 1, 0])
-    assert example.spread_over_tokens([0.5, -1.0], mask).tolist() == [0.5, 0.5, 0, 0, -1.0, 0]
-    assert example.spread_over_tokens([0.5], mask) is None
-
-    from trl import GRPOTrainer
-
+def test_trainer_of_trl_has_the_methods_that_the_example_changes():
+    trainer = pytest.importorskip("trl", reason="TRL is not installed").GRPOTrainer
     for name, parameters in {
         "_generate_and_score_completions": ["self", "inputs"],
         "_calculate_rewards": ["self", "inputs", "prompts", "completions", "completion_ids_list"],
     }.items():
-        assert list(inspect.signature(getattr(GRPOTrainer, name)).parameters) == parameters
-    source = inspect.getsource(GRPOTrainer._compute_loss)
+        assert list(inspect.signature(getattr(trainer, name)).parameters) == parameters
+    source = inspect.getsource(trainer._compute_loss)
     assert "advantages.dim() == 1" in source
     assert '"tool_mask"' in source
 
+
+def test_trl_trainer(monkeypatch):
+    torch = pytest.importorskip("torch")
+    mask = torch.tensor([1, 1, 0, 0, 1, 0])
     prompts = [[{"role": "user", "content": str(k // 8)}] for k in range(32)]
     completions = [make_messages(k % 2)[1:] for k in range(32)]
 
-    class Parent:
+    class Trainer:
         """Does what GRPOTrainer does with these two methods, without a model."""
+
+        accelerator, model = SimpleNamespace(process_index=0), SimpleNamespace(training=True)
+        reward_weights, scale_rewards = torch.ones(1), "none"
 
         def _calculate_rewards(self, inputs, prompts, completions, completion_ids_list):
             return torch.tensor([[float(k % 2)] for k in range(len(prompts))])
 
         def _generate_and_score_completions(self, inputs):
             rewards = self._calculate_rewards(inputs, prompts, completions, None)
-            ones = torch.ones(len(inputs), 6, dtype=torch.long)
-            return {
-                "advantages": rewards[:, 0] - rewards.mean(),
-                "completion_mask": ones,
-                "tool_mask": mask.repeat(len(inputs), 1),
-            }
+            masks = {"completion_mask": torch.ones(len(inputs), 6).long(), "tool_mask": mask.repeat(len(inputs), 1)}
+            return {"advantages": rewards[:, 0] - rewards.mean(), **masks}
 
-    for name in ("_calculate_rewards", "_generate_and_score_completions"):
-        monkeypatch.setattr(GRPOTrainer, name, getattr(Parent, name))
-    trainer = object.__new__(example.TurnCreditGRPOTrainer)
-    trainer.turn_credit = example.TurnCredit()
-    trainer.accelerator = SimpleNamespace(process_index=0)
-    trainer.reward_weights = torch.ones(1)
-    trainer.scale_rewards = "none"
-    trainer.model = SimpleNamespace(training=True)
-    output = trainer._generate_and_score_completions([{"prompt": prompt} for prompt in prompts])
-    advantages = output["advantages"]
+    monkeypatch.setitem(sys.modules, "trl", SimpleNamespace(GRPOTrainer=Trainer))
+    example = load("turn_credit_trl.py")
+    assert example.spread_over_tokens([0.5, -1.0], mask).tolist() == [0.5, 0.5, 0, 0, -1.0, 0]
+    assert example.spread_over_tokens([0.5], mask) is None
+    trainer = example.TurnCreditGRPOTrainer()
+    advantages = trainer._generate_and_score_completions([{"prompt": prompt} for prompt in prompts])["advantages"]
     assert advantages.shape == (32, 6)
     assert (advantages[:, [2, 3, 5]] == 0).all()
     assert (advantages[1::2, 0] > 0).all()

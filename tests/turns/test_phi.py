@@ -1,14 +1,14 @@
 """A phi over turns: reading, checks, the request, the design, and the two tool sets."""
 
-import json
 from pathlib import Path
 
 import pytest
 
 import lare_rl
+from helpers.scripted_model import ScriptedModel, to_reply
 from lare_rl.errors import LareError
 from lare_rl.llm.recording import SHIPPED_RECORDINGS, RecordedModel, read_recording
-from lare_rl.turns.design import design_turn_phi, examine_turn_reply
+from lare_rl.turns.design import design_turn_phi
 from lare_rl.turns.messages import Call, Turn
 from lare_rl.turns.phi import find_problems, load_turn_phi, read_turn_phi
 from lare_rl.turns.prompt import choose_examples, turn_request
@@ -20,23 +20,6 @@ SOURCE = (
 )
 PASSED = Turn("", (Call("test", '{"a": 1}', "3 passed", False), Call("test", "not JSON", "2 passed", False)), "")
 FAILED = Turn("I give up", (), "")
-
-
-class ScriptedModel:
-    """Replies with the given texts, and remembers the requests."""
-
-    name = "scripted"
-
-    def __init__(self, *replies):
-        self.replies, self.requests = list(replies), []
-
-    def reply(self, messages, sample):
-        self.requests.append(messages)
-        return self.replies.pop(0)
-
-
-def reply_with(source):
-    return json.dumps({"Understand": "", "Analyze": "", "Functions": source})
 
 
 def test_events_of_calls_add_up():
@@ -51,22 +34,10 @@ def test_calls_of_a_turn_have_the_same_events():
     assert find_problems(OTHER_NAMES, [PASSED, FAILED]).startswith(
         "E-NAMES call 2: the events are not those of call 1 (a, b)"
     )
-    rollout = {
-        "messages": [
-            {"role": "assistant", "content": "I look."},
-            {
-                "role": "assistant",
-                "tool_calls": [
-                    {"id": str(k), "function": {"name": "test", "arguments": arguments}}
-                    for k, arguments in enumerate(('{"a": 1}', "{}"))
-                ],
-            },
-            *({"role": "tool", "tool_call_id": str(k), "content": ""} for k in range(2)),
-        ],
-        "outcome": 1,
-    }
+    calls = [{"function": {"name": "test", "arguments": arguments}} for arguments in ('{"a": 1}', "{}")]
+    messages = [{"role": "assistant", "content": "I look."}, {"role": "assistant", "tool_calls": calls}]
     with pytest.raises(LareError, match="rollout 0, turn 1: the phi over turns failed: E-NAMES call 2"):
-        lare_rl.TurnCredit(phi=read_turn_phi(OTHER_NAMES))([rollout])
+        lare_rl.TurnCredit(phi=read_turn_phi(OTHER_NAMES))([{"messages": messages, "outcome": 1}])
 
 
 def test_credit_uses_the_events():
@@ -117,7 +88,7 @@ def test_files(tmp_path):
 
 
 def test_design_corrects_until_a_program_passes():
-    model = ScriptedModel("no JSON", reply_with("x = 1"), reply_with(SOURCE))
+    model = ScriptedModel(replies=["no JSON", to_reply("x = 1"), to_reply(SOURCE)])
     designed = design_turn_phi("Repair it.", [{"name": "test"}], [PASSED, FAILED], model)
     assert designed.phi.source.strip() == SOURCE.strip()
     assert "not one JSON object" in model.requests[1][-1]["content"]
@@ -127,7 +98,7 @@ def test_design_corrects_until_a_program_passes():
 
 def test_design_gives_up():
     with pytest.raises(LareError, match="none of 5 attempts"):
-        design_turn_phi("Repair it.", [{"name": "test"}], [PASSED, FAILED], ScriptedModel(*["?"] * 5))
+        design_turn_phi("Repair it.", [{"name": "test"}], [PASSED, FAILED], ScriptedModel(replies=["?"] * 5))
     for turns in ([], [PASSED]):
         with pytest.raises(LareError, match=f"at least 2 turns, and not on {len(turns)}"):
             design_turn_phi("Repair it.", [{"name": "test"}], turns, ScriptedModel())
@@ -148,22 +119,13 @@ def test_examples_are_of_different_tools():
 
 
 @pytest.mark.parametrize("name", TOOL_SETS)
-def test_tool_sets(name):
+def test_tool_sets_and_their_recorded_replies(name):
     tool_set = load_tool_set(name)
     assert len(tool_set.examples) == 5
     phi = load_turn_phi(ROOT / "examples" / "phi" / f"turns_{name}.py")
     assert find_problems(phi.source, tool_set.turns) == ""
-
-
-@pytest.mark.parametrize("name", TOOL_SETS)
-def test_recorded_replies(name):
-    folder = SHIPPED_RECORDINGS / "events"
-    for path in folder.iterdir() if folder.is_dir() else ():
-        if not path.name.startswith(f"{name}."):
-            continue
-        recording = read_recording(path.read_text(encoding="utf-8"), path.name)
-        tool_set = load_tool_set(name)
-        model = RecordedModel([recording], name)
-        designed = design_turn_phi(tool_set.goal, tool_set.tools, tool_set.turns, model, examples=tool_set.examples)
-        assert examine_turn_reply(recording.exchanges[-1].replies[0], tool_set.turns)[1] == ""
-        assert designed.model == f"{recording.model}, recorded {recording.recorded}, draw {recording.draw}"
+    path = SHIPPED_RECORDINGS / "events" / f"{name}.draw0.json"
+    recording = read_recording(path.read_text(encoding="utf-8"), path.name)
+    model = RecordedModel([recording], name)
+    designed = design_turn_phi(tool_set.goal, tool_set.tools, tool_set.turns, model, examples=tool_set.examples)
+    assert designed.model == f"{recording.model}, recorded {recording.recorded}, draw {recording.draw}"

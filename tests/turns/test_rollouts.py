@@ -19,11 +19,7 @@ def call(name, arguments="{}", identifier="1"):
 
 
 def assistant(text="", *calls):
-    return (
-        {"role": "assistant", "content": text, "tool_calls": list(calls)}
-        if calls
-        else {"role": "assistant", "content": text}
-    )
+    return {"role": "assistant", "content": text} | ({"tool_calls": list(calls)} if calls else {})
 
 
 def tool(text, identifier="1"):
@@ -55,19 +51,14 @@ def test_features_of_messages():
 
 
 def test_results_without_identifier_follow_the_order_of_calls():
-    calls = [call("read", identifier=1), call("test", identifier=2)]
-    results = [tool("of read", 1), {"role": "tool", "content": "of test"}]
-    (turn,) = split_turns([assistant("", *calls), *results], "it")
-    assert [answered.result for answered in turn.calls] == ["of read", "of test"]
+    calls = [call(name, identifier=k) for k, name in enumerate("abc")]
+    for results in (["a", "b", "c"], [tool("b", 1), "a", "c"]):
+        answers = [result if isinstance(result, dict) else {"role": "tool", "content": result} for result in results]
+        (turn,) = split_turns([assistant("", *calls), *answers], "it")
+        assert [answered.result for answered in turn.calls] == ["a", "b", "c"]
 
 
-@pytest.mark.parametrize("value", [float("nan"), 1e200, "y", None])
-def test_numbers_of_a_phi_are_checked(value):
-    with pytest.raises(LareError, match=r"it: 'event' .* phi .* turn 0"):
-        read_rollout({"messages": MESSAGES, "outcome": 1}, "it", lambda turn: {"event": value})
-
-
-@pytest.mark.parametrize("events", [3, None, {"": 1}])
+@pytest.mark.parametrize("events", [3, {"": 1}, {"event": float("nan")}, {"event": 1e200}, {"event": "y"}])
 def test_results_of_a_phi_are_checked(events):
     with pytest.raises(LareError, match=r"it: .* phi .* turn 0") as error:
         read_rollout({"messages": MESSAGES, "outcome": 1}, "it", lambda turn: events)
@@ -77,7 +68,7 @@ def test_results_of_a_phi_are_checked(events):
 def test_phi_that_fails():
     with pytest.raises(LareError, match=r"^rollout 1, turn 2: .*KeyError: 'a'$"):
         read_rollouts(
-            [{"messages": MESSAGES[:-1], "outcome": 1}, {"messages": MESSAGES, "outcome": 1}],
+            [{"messages": messages, "outcome": 1} for messages in (MESSAGES[:-1], MESSAGES)],
             lambda turn: {} if turn.calls else {}["a"],
         )
 
@@ -92,36 +83,17 @@ def test_numbers_of_numpy():
         read_rollouts([plain | {"group": np.bool_(True)}])
 
 
-def test_turns_of_messages():
-    turns = split_turns(MESSAGES, "it")
-    assert [len(turn.calls) for turn in turns] == [1, 2, 0]
-    assert turns[1].calls[1].result == "def f(): pass"
-    assert turns[1].calls[0].failed
-
-
-def test_results_without_identifiers_are_in_the_order_of_calls():
-    answers = [{"role": "tool", "content": "first"}, {"role": "tool", "content": "second"}]
-    (turn,) = split_turns([assistant("", call("a"), call("b", "{}", "2")), *answers], "it")
-    assert [item.result for item in turn.calls] == ["first", "second"]
-
-
 def test_replies_of_the_user_belong_to_the_turn():
-    turns = split_turns([assistant("open door"), {"role": "user", "content": "It is locked."}] * 2, "it")
-    assert [turn.reply for turn in turns] == ["It is locked."] * 2
-    rollout = read_rollout(
-        {"messages": [assistant("open"), {"role": "user", "content": "No."}] * 2, "outcome": 0}, "it"
-    )
+    messages = [assistant("open door"), {"role": "user", "content": "It is locked."}] * 2
+    assert [turn.reply for turn in split_turns(messages, "it")] == ["It is locked."] * 2
+    rollout = read_rollout({"messages": messages, "outcome": 0}, "it")
     assert [turn["repeats a result"] for turn in rollout.turns] == [0, 1]
 
 
 def test_numbers_of_the_user_come_on_top_and_win():
     numbers = [{"tests pass": 1, "tokens": 7}, {}, {}]
     rollout = read_rollout({"messages": MESSAGES, "turns": numbers, "outcome": 1}, "it")
-    assert rollout.turns[0]["tests pass"] == 1
-    assert rollout.turns[0]["tokens"] == 7
-    assert "call read" in rollout.turns[0]
-    rollout = read_rollout({"messages": MESSAGES, "outcome": 1}, "it", lambda turn: {"tokens": 5})
-    assert rollout.turns[0]["tokens"] == 5
+    assert [rollout.turns[0][name] for name in ("tests pass", "tokens", "call read")] == [1, 7, 1]
     rollout = read_rollout({"messages": MESSAGES, "turns": numbers, "outcome": 1}, "it", lambda turn: {"tokens": 5})
     assert [row["tokens"] for row in rollout.turns] == [7, 5, 5]
 
@@ -171,7 +143,7 @@ BAD = [
     ({"outcome": 1e300}, ["outcome", "1e+09"]),
     ({"outcome": -1e10}, ["outcome", "between -1e+09 and 1e+09"]),
     (OUTCOME, ["neither messages nor turns"]),
-    ({**OUTCOME, "turns": []}, ["no turn"]),
+    ({**OUTCOME, "turns": []}, ["has no turn"]),
     ({**OUTCOME, "turns": 3}, ["turns must be a list"]),
     ({**OUTCOME, "turns": [3]}, ["turns[0]", "3"]),
     ({**OUTCOME, "turns": [{"a": "b"}]}, ["turns[0]", "'a'", "'b'"]),
@@ -182,7 +154,7 @@ BAD = [
     ({**OUTCOME, "turns": [{}], "truncated": "no"}, ["truncated", "'no'"]),
     ({**OUTCOME, "messages": "hello"}, ["messages must be a list", "'hello'"]),
     ({**OUTCOME, "messages": [3]}, ["messages[0]", "role"]),
-    ({**OUTCOME, "messages": [{"role": "user", "content": "hi"}]}, ["no turn"]),
+    ({**OUTCOME, "messages": [{"role": "user", "content": "hi"}]}, ["no turn", "assistant"]),
     ({**OUTCOME, "messages": [{"role": "assistant", "content": 3}]}, ["messages[0]", "content", "3"]),
     ({**OUTCOME, "messages": [{"role": "assistant", "tool_calls": 3}]}, ["messages[0]", "tool_calls", "3"]),
     ({**OUTCOME, "messages": [{"role": "assistant", "tool_calls": [{}]}]}, ["tool_calls[0]", "name"]),
@@ -196,12 +168,6 @@ def test_bad_rollouts(rollout, words):
         read_rollouts([rollout])
     assert all(word in str(error.value) for word in words), str(error.value)
     assert "\n" not in str(error.value)
-
-
-def test_turns_without_messages_have_no_assistant():
-    with pytest.raises(LareError, match="no turn") as error:
-        read_rollouts([{**OUTCOME, "turns": []}])
-    assert "assistant" not in str(error.value)
 
 
 @pytest.mark.parametrize("rollouts", [3, None, "text", {"outcome": 1}])
@@ -249,7 +215,7 @@ def test_foreign_rollouts_give_numbers_or_one_line(rollouts):
 NUMBERS = st.dictionaries(st.sampled_from("abc"), st.floats(-1e9, 1e9) | st.sampled_from([0.0, 1.0]), max_size=3)
 
 
-@settings(max_examples=100, deadline=None)
+@settings(max_examples=60, deadline=None)
 @given(
     st.lists(
         st.tuples(st.lists(NUMBERS, min_size=1, max_size=6), st.floats(-1e6, 1e6), st.integers(0, 3)),

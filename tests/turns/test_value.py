@@ -60,30 +60,31 @@ def test_prefixes_are_as_the_equation_says():
     np.testing.assert_array_equal(prefixes.features, slow[:, np.ptp(slow, axis=0) > 0])
 
 
-def test_changes_add_up_to_the_outcome_minus_the_first_value():
+@pytest.mark.parametrize("lambda_", [0.0, 0.8, 1.0])
+def test_advantages_are_discounted_sums_of_changes(lambda_):
     table = sample_table()
     value = np.random.default_rng(1).normal(size=len(table.features))
-    sums = np.bincount(table.rollout_index, changes(table, value))
-    np.testing.assert_allclose(sums, table.outcome - value[table.first])
-
-
-@pytest.mark.parametrize("lambda_", [0.0, 0.8, 1.0])
-def test_advantages_are_discounted_sums(lambda_):
-    table = sample_table()
-    change = np.random.default_rng(1).normal(size=len(table.features))
+    change = changes(table, value)
+    np.testing.assert_allclose(np.bincount(table.rollout_index, change), table.outcome - value[table.first])
     result = advantages(table, change, lambda_)
     for k in range(len(table.length)):
-        rollout_change = change[rows_of(table, k)]
-        for t in range(table.length[k]):
-            expected = sum(lambda_**i * rollout_change[t + i] for i in range(table.length[k] - t))
-            assert result[rows_of(table, k)][t] == pytest.approx(expected)
+        discount = lambda_ ** np.arange(table.length[k])
+        rows = change[rows_of(table, k)]
+        expected = [rows[t:] @ discount[: len(rows) - t] for t in range(len(rows))]
+        np.testing.assert_allclose(result[rows_of(table, k)], expected)
 
 
-def test_values_leave_out_the_rollout_itself():
-    # The intercept is that of a regression in which the rollout has no weight, with the same v and m.
+@pytest.fixture
+def problem():
+    """Return a table, its prefixes and a fit to them."""
     table = sample_table()
     x = build_prefixes(table).features
-    fit = linear_fit(table, x)
+    return table, x, linear_fit(table, x)
+
+
+def test_values_leave_out_the_rollout_itself(problem):
+    """The intercept is that of a regression in which the rollout has no weight, with the same v and m."""
+    table, x, fit = problem
     result = values(table, x, fit)
     index = table.rollout_index
     base = fit.mean + (x - fit.x_mean) @ fit.weight
@@ -95,10 +96,9 @@ def test_values_leave_out_the_rollout_itself():
         np.testing.assert_allclose(result[rows_of(table, k)], base[rows_of(table, k)] + intercept)
 
 
-def test_held_out_values_are_those_of_a_fit_without_the_rollout():
-    table = sample_table()
-    x = build_prefixes(table).features
-    result = held_out_values(table, x, linear_fit(table, x))
+def test_held_out_values_are_those_of_a_fit_without_the_rollout(problem):
+    table, x, fit = problem
+    result = held_out_values(table, x, fit)
     for k in range(len(table.length)):
         mean, _ = simple_fit(table, x, skip=k)
         n = x.shape[1]
@@ -106,11 +106,10 @@ def test_held_out_values_are_those_of_a_fit_without_the_rollout():
         np.testing.assert_allclose(result[rows_of(table, k)], expected, rtol=1e-6, atol=1e-8)
 
 
-def test_deviations_are_those_of_the_posterior():
-    table = sample_table()
-    x = build_prefixes(table).features
+def test_deviations_are_those_of_the_posterior(problem):
+    table, x, fit = problem
     _, covariance = simple_fit(table, x)
-    result = deviations(table, x, linear_fit(table, x))
+    result = deviations(table, x, fit)
     n_groups = table.group.max() + 1
     for k in range(len(table.length)):
         rows = x[rows_of(table, k)]
@@ -146,15 +145,11 @@ def test_held_out_logistic_values_are_near_those_of_a_fit_without_the_rollout():
     x = build_prefixes(table).features
     fit = fit_prefixes(table, x, is_logistic=True)
     held_out = held_out_values(table, x, fit)
-    rows = rows_of(table, 0)
-    without = ~np.isin(np.arange(len(x)), np.arange(len(x))[rows])
+    rows, n = rows_of(table, 0), table.length[0]
     smaller = table._replace(
-        features=table.features[without],
-        length=table.length[1:],
-        outcome=table.outcome[1:],
-        group=table.group[1:],
-        truncated=table.truncated[1:],
+        features=table.features[n:],
+        **{name: getattr(table, name)[1:] for name in ("length", "outcome", "group", "truncated")},
     )
-    again = fit_prefixes(smaller, x[without], is_logistic=True)
+    again = fit_prefixes(smaller, x[n:], is_logistic=True)
     expected = logistic(again.mean + (x[rows] - again.x_mean) @ again.weight + again.intercept[table.group[0]])
     np.testing.assert_allclose(held_out[rows], expected, atol=0.05)

@@ -1,6 +1,4 @@
 import importlib.metadata
-import os
-import subprocess
 import sys
 import types
 
@@ -86,13 +84,10 @@ def test_broken_plugin_of_an_installed_package(value, plugin, numbers):
         numbers.find("two")
 
 
-def test_command_with_a_broken_plugin_prints_one_line(tmp_path):
-    environment = {**os.environ, "LARE_PLUGINS": "no_such_plugin"}
-    command = [sys.executable, "-m", "lare_rl", "methods"]
-    process = subprocess.run(command, capture_output=True, text=True, env=environment, cwd=tmp_path, check=False)
-    assert process.returncode == 2
-    assert process.stderr.count("\n") == 1
-    assert "'no_such_plugin'" in process.stderr
+def test_command_with_a_broken_plugin_prints_one_line(plugin, command, monkeypatch):
+    monkeypatch.setenv("LARE_PLUGINS", "no_such_plugin")
+    status, _, error = command("methods")
+    assert (status, error.count("\n"), "'no_such_plugin'" in error) == (2, 1, True)
 
 
 def test_plural_of_a_registry():
