@@ -1,5 +1,3 @@
-"""The command line, in this process: what it prints, and that a mistake is one line and exit status 2."""
-
 import re
 import shutil
 import subprocess

@@ -1,5 +1,3 @@
-"""Every program in `examples/` runs."""
-
 import runpy
 from pathlib import Path
 

@@ -1,5 +1,3 @@
-"""Errors for optional libraries that are not installed."""
-
 import importlib
 import re
 import subprocess

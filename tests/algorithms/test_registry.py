@@ -1,5 +1,3 @@
-"""The registry of algorithms, and an algorithm from outside."""
-
 import subprocess
 import sys
 from dataclasses import replace

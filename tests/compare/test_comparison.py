@@ -1,5 +1,3 @@
-"""Statistics of runs with known answers."""
-
 import json
 
 import numpy as np
@@ -14,11 +12,6 @@ from lare_rl.compare.results import read_run_results
 from lare_rl.errors import LareError
 from lare_rl.runs.directory import Run
 from lare_rl.runs.metric_names import RETURN
-
-
-@pytest.fixture(autouse=True)
-def few_repetitions(monkeypatch):
-    monkeypatch.setattr(bootstrap, "REPETITIONS", 300)
 
 
 def read(runs, metric=RETURN):
@@ -80,8 +73,9 @@ def test_tasks_without_common_scale(make_run):
     assert compare_over_tasks(comparisons[:1]) == []
 
 
-def test_interval_of_difference(make_run):
+def test_interval_of_difference(make_run, monkeypatch):
     """Each method scores 0 or 10 more, so the difference is at most 10 less or 10 more than the difference of the means."""
+    monkeypatch.setattr(bootstrap, "REPETITIONS", 300)
     runs = [make_run("a", [0.0, 10.0]), make_run("b", [100.0, 110.0], method="rd"), make_run("c", [1.0], method="rrd")]
     _, second, single = compare(read(runs)).rows
     assert second.difference == Estimate(100.0, 90.0, 110.0)

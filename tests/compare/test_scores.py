@@ -1,5 +1,3 @@
-"""Scores as arrays, from curves that do not fit together."""
-
 from pathlib import Path
 
 import pytest

@@ -1,5 +1,3 @@
-"""Step rewards are learned from returns alone, at any scale; their units, and the rows of a batch."""
-
 from functools import partial
 
 import jax
@@ -99,22 +97,14 @@ def test_unit_of_proxy_rewards(score_type):
     np.testing.assert_allclose(proxy_rewards(state, rows, settings, length), unit * output, rtol=1e-5)
 
 
-@pytest.mark.parametrize("agents", [None, 2])
-def test_valid_rows(agents):
+def test_valid_rows():
     """Episode 1 is padding, and so are rows of episode 2, which does not exist. An agent that has left has no row."""
-    lead = (6,) if agents is None else (6, agents)
-    alive = None if agents is None else np.array([[True, False], *[[True, True]] * 5])
-    batch = CreditBatch(
-        inputs=np.zeros((*lead, FEATURES), np.float32),
-        episode_index=np.array([0, 0, 1, 1, 2, 3]),
-        length=np.array([2, 2]),
-        mean_reward=np.zeros(2, np.float32),
-        mask=np.array([1.0, 0.0], np.float32),
-        alive=alive,
-    )
-    rows = [True, True, False, False, False, False]
-    want = rows if agents is None else [[True, False], [True, True], *[[False, False]] * 4]
-    np.testing.assert_array_equal(jax.jit(decomposition.valid_rows)(batch), want)
+    episode_index, zeros = np.array([0, 0, 1, 1, 2, 3]), np.zeros((6, 2, FEATURES), np.float32)
+    alive = np.array([[True, False], *[[True, True]] * 5])
+    batch = CreditBatch(zeros, episode_index, np.array([2, 2]), zeros[0, :, 0], mask=np.float32([1, 0]), alive=alive)
+    np.testing.assert_array_equal(jax.jit(decomposition.valid_rows)(batch), [alive[0], alive[1], *[[False, False]] * 4])
+    batch = batch._replace(inputs=zeros[:, 0], alive=None)
+    np.testing.assert_array_equal(jax.jit(decomposition.valid_rows)(batch), [True, True, *[False] * 4])
 
 
 def test_decoder_of_many_agents_soon_reaches_the_size_of_rare_rewards():

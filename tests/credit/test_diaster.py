@@ -1,5 +1,3 @@
-"""Diaster against a slow NumPy twin, and what it must learn."""
-
 import equinox as eqx
 import jax
 import jax.numpy as jnp

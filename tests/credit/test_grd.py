@@ -1,5 +1,3 @@
-"""GRD against a slow NumPy twin, its samples of masks, and what it must learn."""
-
 import jax
 import jax.numpy as jnp
 import numpy as np

@@ -1,5 +1,3 @@
-"""RBT against a slow NumPy twin, what it must learn, and what it refuses."""
-
 from contextlib import nullcontext
 
 import jax
@@ -85,7 +83,10 @@ def test_must_learn_rewards_and_next_states(monkeypatch):
 
 
 def test_long_payments_are_refused():
-    credit, rows = CreditAssigner("rbt", observation_space=1, action_space=1), np.zeros((600, 1))
+    credit, rows = (
+        CreditAssigner("rbt", observation_space=1, action_space=1, settings=CreditSettings(hidden=(8,))),
+        np.zeros((600, 1)),
+    )
     with pytest.raises(LareError, match=r"at most 512 steps .* 600: use rudder"):
         credit.add_episode(rows, rows, rows, 1.0)
     assert not credit.store.episodes

@@ -1,5 +1,3 @@
-"""RUDDER against a slow NumPy twin, and what it must learn."""
-
 import jax.numpy as jnp
 import numpy as np
 import pytest

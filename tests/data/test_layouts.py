@@ -1,5 +1,3 @@
-"""Layouts of episodes in a batch, in NumPy and in JAX."""
-
 import jax
 import jax.numpy as jnp
 import numpy as np

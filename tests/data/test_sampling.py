@@ -1,5 +1,3 @@
-"""Which stored steps an update reads, against lists of the stored episodes."""
-
 import jax
 import jax.numpy as jnp
 import numpy as np

@@ -1,5 +1,3 @@
-"""The charts of pages."""
-
 import re
 
 import numpy as np

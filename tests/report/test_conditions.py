@@ -1,5 +1,3 @@
-"""The table of conditions has every finding of the diagnosis."""
-
 import ast
 import inspect
 

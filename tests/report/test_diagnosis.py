@@ -1,5 +1,3 @@
-"""The findings about made-up runs."""
-
 from collections import defaultdict
 from dataclasses import replace
 

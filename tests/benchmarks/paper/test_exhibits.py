@@ -1,5 +1,3 @@
-"""The exhibits fit together, and each becomes a page: from invented metrics, and one from trained runs."""
-
 import re
 from pathlib import Path
 
