@@ -24,8 +24,9 @@ predict = jax.jit(logistic.predict)
 
 
 def add(x, returns):
+    state = logistic.init(GROUP_INDEX)
     with float64():
-        return add_episodes(logistic.init(GROUP_INDEX), jnp.asarray(x), jnp.asarray(returns), jnp.ones(len(x), bool))
+        return add_episodes(state, jnp.asarray(x), jnp.asarray(returns), jnp.ones(len(x), bool))
 
 
 def fit(x, returns, rounds=ROUNDS):
