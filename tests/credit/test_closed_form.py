@@ -109,7 +109,9 @@ def test_is_due():
     state = init(PLAIN, (ScoreType.SUM,))
     assert not closed_form.is_due(state)
     reset = closed_form.reset_statistics(state._replace(n_fitted=jnp.array(100.0)), observed(np.ones((9, 3))))
-    statistics = state.sufficient_statistics._replace(n_episodes=jnp.array([100.0, 0.0]))
+    statistics = state.sufficient_statistics._replace(n_episodes=jnp.array([1.0, 0.0]))
+    assert closed_form.is_due(state._replace(sufficient_statistics=statistics))
+    statistics = statistics._replace(n_episodes=jnp.array([100.0, 0.0]))
     for n_fitted, due in ((0.0, True), (95.0, True), (96.0, False), (reset.n_fitted, True)):
         fitted = state._replace(sufficient_statistics=statistics, n_fitted=jnp.array(n_fitted))
         assert bool(closed_form.is_due(fitted)) == due
