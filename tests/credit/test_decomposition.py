@@ -122,7 +122,7 @@ def test_decoder_of_many_agents_soon_reaches_the_size_of_rare_rewards():
     assert r_hat.ravel()[rewarded.ravel()].mean() == pytest.approx(10, abs=3)  # 1.5 without the gain of sqrt(nT)
 
 
-def test_loss_of_packed_episodes_against_numpy():
+def test_losses_of_packed_and_sampled_episodes_against_numpy():
     """The mean r_hat of each episode is compared with R/T. Padding is ignored. An empty batch has no gradient."""
     rng, settings = np.random.default_rng(0), CreditSettings(hidden=(8,), normalise=False, weight_decay=0.1)
     length, returns = np.array([3, 1, 5]), np.array([6.0, -2.0, 1.0], np.float32)
@@ -140,6 +140,10 @@ def test_loss_of_packed_episodes_against_numpy():
     _, metrics = update(state, batch, KEY, fit=Fit.ALL_STEPS, settings=settings)
     want = np.mean((means - returns / length) ** 2)
     assert float(metrics["credit/loss"]) == pytest.approx(want, rel=1e-4)
+    sampled = batch._replace(episode_index=np.array([0, 0, 0, 3, 1, 3, 3, 3, 2, 2, 2, 2]))  # at most 4 of each
+    means = [r_hat[:3].mean(), r_hat[4], r_hat[8:].mean()]
+    _, metrics = update(state, sampled, KEY, fit=Fit.SAMPLED_STEPS, settings=settings)
+    assert float(metrics["credit/loss"]) == pytest.approx(np.mean((means - returns / length) ** 2), rel=1e-4)
     after, metrics = update(state, batch._replace(mask=np.zeros(3)), KEY, fit=Fit.ALL_STEPS, settings=settings)
     assert float(metrics["credit/loss"]) == 0.0
     for weight, new in zip(jax.tree.leaves(state.network), jax.tree.leaves(after.network), strict=True):
