@@ -1,6 +1,6 @@
 """Bad calls of public functions: each raises a `LareError` of one line.
 
-They run in another process, without the type checker of the tests.
+They run in another process, without the type checker of the tests. Its run is trained by an algorithm from outside.
 """
 
 import json
@@ -9,10 +9,24 @@ import subprocess
 import sys
 from pathlib import Path
 
+PLUGIN = """
+from dataclasses import replace
+from lare_rl.algorithms.registry import ALGORITHMS, register_algorithm
+from lare_rl.algorithms.td3.td3 import TD3Settings, act, get_actor, init, update
+
+class QuietSettings(TD3Settings):
+    shift: float = 0.5
+
+def explore(actor, observation, noise, settings):
+    return act(actor, observation) * settings.shift
+
+settings = QuietSettings(hidden=(8,), batch_size=8, warmup=36)
+register_algorithm(replace(ALGORITHMS["td3"], name="quiet", settings=settings, module=__name__, summary="a test"))
+"""
 SETUP = """
-import json, sys
+import contextlib, io, json, sys
 import numpy as np
-import lare_rl
+import lare_rl, lare_rl.cli
 from lare_rl.credit.decoders import Decoder
 from lare_rl.credit.input_names import InputNames
 from lare_rl.credit.methods import Fit, Method
@@ -22,9 +36,13 @@ from helpers.toy_envs import PHI, pick_spec, toy_spec
 task = toy_spec()
 phi = verify_function(PHI, task)
 tiny = dict(method="dense", steps=60, rollout_steps=12, evaluate_every=60, evaluation_episodes=1)
-td3 = {"hidden": (8,), "batch_size": 8, "warmup": 36}
-run = lare_rl.train(task, lare_rl.Settings(**tiny, td3=td3), out="run", listeners=[])
+run = lare_rl.train(task, lare_rl.Settings(algorithm="quiet", quiet={"shift": 0.25}, **tiny), out="run", listeners=[])
 policy = lare_rl.load_policy("run")
+def command(*arguments):
+    sys.argv[1:] = arguments
+    with contextlib.suppress(SystemExit), contextlib.redirect_stdout(io.StringIO()) as out:
+        lare_rl.cli.main()
+    return " ".join(out.getvalue().split())
 for call in json.load(sys.stdin):
     try:
         result = repr(eval(call))
@@ -88,10 +106,17 @@ GOOD_CALLS = {
     "policy([[0.5, 0]] * 3).shape": "(3, 1)",
     "bool(np.allclose(policy([[0.5, 0], [0, 1]])[1], policy([0, 1]), rtol=1e-5))": "True",
     "lare_rl.evaluate_run('run', 2)['Chase'].shape": "(1, 2)",
+    "run.config.settings.hyperparameters": "batch_size=8, ",
+    "run.config.settings.hyperparameters.shift": "0.25",
+    "lare_rl.open_run('run').config.settings == run.config.settings": "True",
+    "'a test' in command('algorithms')": "True",
+    "'--quiet.shift FLOAT' in command('train', '--algorithm', 'quiet', '--help')": "True",
 }
 
 
 def test_calls(tmp_path):
+    (tmp_path / "quiet_td3.py").write_text(PLUGIN)
+    paths = os.pathsep.join([str(tmp_path), str(Path(__file__).parent), *sys.path])
     calls = CALLS | GOOD_CALLS
     process = subprocess.run(
         [sys.executable, "-c", SETUP],
@@ -99,7 +124,7 @@ def test_calls(tmp_path):
         capture_output=True,
         text=True,
         cwd=tmp_path,
-        env=os.environ | {"PYTHONPATH": os.pathsep.join([str(Path(__file__).parent), *sys.path])},
+        env=os.environ | {"PYTHONPATH": paths, "LARE_PLUGINS": "quiet_td3"},
     )
     assert process.returncode == 0, process.stderr
     results = dict(zip(calls, map(json.loads, process.stdout.splitlines()[-len(calls) :]), strict=True))

@@ -1,5 +1,3 @@
-"""Links, Python and public names in the documentation; docstrings."""
-
 import ast
 import doctest
 import importlib

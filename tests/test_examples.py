@@ -1,5 +1,3 @@
-"""Every program in `examples/` runs."""
-
 import runpy
 from pathlib import Path
 
@@ -7,6 +5,7 @@ import numpy as np
 import pytest
 
 import lare_rl
+from helpers.long_tests import long_case
 from helpers.toy_logs import logged_episodes
 from lare_rl.sweep.sweep import read_sweep
 
@@ -39,7 +38,7 @@ def test_offline_td3_bc(tmp_path):
     [
         ("tianshou_td3.py", "tianshou", {"steps": 20}),
         ("skrl_td3.py", "skrl", {"steps": 1200}),
-        ("rllib_ppo.py", "ray.rllib.algorithms.ppo", {"iterations": 1}),
+        long_case("rllib_ppo.py", "ray.rllib.algorithms.ppo", {"iterations": 1}),
         ("wheat_sb3.py", "pcse", {"steps": 405, "episodes": 1}),
         ("traffic_sb3.py", "libsumo", {"steps": 360, "episodes": 1}),
     ],

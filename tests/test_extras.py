@@ -1,5 +1,3 @@
-"""Errors for optional libraries that are not installed."""
-
 import importlib
 import re
 import subprocess
@@ -21,7 +19,7 @@ for name in ("mujoco", "matplotlib", "PIL", "imageio", "torch", "openai", "petti
 import numpy as np
 import lare_rl, lare_rl.evaluation.video, lare_rl.training.train, lare_rl.cli.design, lare_rl.cli.runs, lare_rl.cli.train
 lare_rl.load_task("CN-6")
-credit = lare_rl.CreditAssigner("bayes", observation_space=3, action_space=1, settings={"score": "sum"})
+credit = lare_rl.CreditAssigner("ircr", observation_space=3, action_space=1)
 steps = credit.add_episode(np.ones((5, 3)), np.ones((5, 1)), np.ones((5, 3)), reward=1.0)
 print(credit.rewards_at(steps).shape)
 """

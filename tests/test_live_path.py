@@ -1,7 +1,7 @@
 """From a live model to a trained policy: a server on loopback gives the recorded replies."""
 
+import io
 import json
-import os
 import subprocess
 import sys
 from pathlib import Path
@@ -158,34 +158,17 @@ def test_files_are_checked_before_a_model_is_asked(command, tmp_path, arguments,
     assert words in err
 
 
-RUN_LARE = """
-import sys
-from lare_rl.cli import main
-for command in sys.argv[1:]:
-    sys.argv = ["lare-rl", *command.split()]
-    try:
-        main()
-    except SystemExit as exit_:
-        print("status", exit_.code, file=sys.stderr)
-"""
-
-
-def run_lare(*commands, **options):
-    """Run commands of `lare-rl` in another process, and return its standard output and the lines of its standard error."""
-    process = subprocess.run([sys.executable, "-c", RUN_LARE, *commands], stderr=subprocess.PIPE, **options)
-    return process.stdout, process.stderr.decode().splitlines()
-
-
-def test_terminal_without_unicode(tmp_path):
+def test_terminal_without_unicode(command, tmp_path, monkeypatch):
     source = "def evaluation_func(o, a):\n    # größe 漢字 😀\n    return [o[:, :1]]"
     messages = prompts.candidate(read_task("Reacher-v4"))
     exchange = {"stage": "candidate", "messages": messages, "replies": [to_reply(source)]}
     recording = shipped_recordings("factors", 0)[0].model_dump() | {"exchanges": [exchange]}
     (tmp_path / "r.json").write_text(json.dumps(recording))
-    plain = os.environ | {"PYTHONIOENCODING": "cp1252"}
-    command = "design Reacher-v4 --model r.json --candidates 1"
-    out, _ = run_lare(command, cwd=tmp_path, env=plain, stdout=subprocess.PIPE)
-    assert b"\\u6f22\\u5b57" in out
+    terminal = io.TextIOWrapper(io.BytesIO(), "cp1252")
+    monkeypatch.setattr(sys, "stdout", terminal)
+    assert command("design", "Reacher-v4", "--model", "r.json", "--candidates", 1)[0] == 0
+    terminal.flush()
+    assert b"\\u6f22\\u5b57" in terminal.buffer.getvalue()
 
 
 @pytest.mark.skipif(not Path("/proc/self").exists(), reason="no directory in which nobody can write")
@@ -201,11 +184,24 @@ def test_function_is_printed_if_it_cannot_be_written(command, tmp_path, monkeypa
     assert read_recording((tmp_path / "Reacher-v4.attempts.json").read_text(), "attempts").exchanges
 
 
+RUN_LARE = """
+import sys
+from lare_rl.cli import main
+for command in sys.argv[1:]:
+    sys.argv = ["lare-rl", *command.split()]
+    try:
+        main()
+    except SystemExit as exit_:
+        print("status", exit_.code, file=sys.stderr)
+"""
+
+
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="no disk that is always full")
 def test_function_is_saved_if_it_cannot_be_printed(tmp_path):
     with open("/dev/full", "w") as full:
-        _, err = run_lare("design Reacher-v4", "prompt Reacher-v4", cwd=tmp_path, stdout=full)
-    *_, design_error, design_status, prompt_error, prompt_status = err
+        commands = [sys.executable, "-c", RUN_LARE, "design Reacher-v4", "prompt Reacher-v4"]
+        process = subprocess.run(commands, cwd=tmp_path, stdout=full, stderr=subprocess.PIPE, text=True)
+    *_, design_error, design_status, prompt_error, prompt_status = process.stderr.splitlines()
     assert "kept in Reacher-v4.py" in design_error
     assert "No space left on device" in prompt_error
     assert design_status == prompt_status == "status 2"

@@ -13,9 +13,7 @@ BANNED = set(
     begin_again annotate joined asked""".split()
 )
 GENITIVE = re.compile(r"^_?of_\w+$")
-EXCEPTIONS: dict[str, int] = {
-    "src/lare_rl/phi/numpy_functions/tables.py": 3,
-}
+EXCEPTIONS: dict[str, int] = {"src/lare_rl/phi/numpy_functions/tables.py": 3}
 """How many banned identifiers a file may have. These numbers may only fall."""
 
 

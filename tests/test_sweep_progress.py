@@ -1,5 +1,3 @@
-"""The progress of a sweep on a terminal, and without one."""
-
 import io
 import json
 import threading

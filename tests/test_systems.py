@@ -9,6 +9,7 @@ from pathlib import Path
 import pytest
 
 import lare_rl
+from lare_rl.sweep.sweep import read_sweep
 
 PROGRAM = """
 import sys
@@ -24,10 +25,28 @@ PHI = """
     def evaluation_func(observation, action):
         return [observation[:, :1], action[:, :1] ** 2]
 """
+TASK = """
+    name = "Pendulum"
+    environment = "Pendulum-v1"
+    processes = "separate"
+    observation_size = 3
+    action_size = 1
+    scored_observation = "after"
+    description = "größe"
+    observation = "x, y, speed"
+    action = "torque"
+"""
 STUDY = """
     tasks = ["pendulum.toml"]
-    methods = ["episodic"]
-    settings = { steps = 100, rollout_steps = 50, evaluation_episodes = 1, td3 = { warmup = 50, hidden = [8], batch_size = 8 } }
+    methods = ["lare-linear"]
+    functions = { Pendulum = ["phi.py"] }
+    [settings]
+    steps = 200
+    environments = 2
+    evaluate_every = 100
+    evaluation_episodes = 1
+    td3 = { warmup = 100, hidden = [8], batch_size = 8 }
+    credit = { score = "sum" }
 """
 LOST = """
 import ctypes, os, signal, sys
@@ -87,25 +106,22 @@ def test_other_system(run_elsewhere):
 
 @pytest.mark.skipif(sys.platform == "win32", reason="this is the other system")
 def test_host_environment_in_worker_processes(run_elsewhere, tmp_path):
-    for name, text in (("phi.py", PHI), ("study.toml", STUDY)):
+    for name, text in (("phi.py", PHI), ("pendulum.toml", TASK), ("study.toml", STUDY)):
         (tmp_path / name).write_text(textwrap.dedent(text), encoding="utf-8")
-    run_elsewhere(PROGRAM, "new-task Pendulum-v1 --out pendulum.toml")
-    task = tmp_path / "pendulum.toml"
-    task.write_text('processes = "separate"\n' + task.read_text(encoding="utf-8"), encoding="utf-8")
+    (job,) = read_sweep(tmp_path / "study.toml")[1]
     output = run_elsewhere(
         PROGRAM,
+        "new-task Pendulum-v1 --out new.toml",
         "verify phi.py --task pendulum.toml",
-        "train pendulum.toml --function phi.py --steps 200 --environments 2 --evaluate-every 100 --evaluation-episodes 1 "
-        "--td3.warmup 100 --td3.hidden 8 --td3.batch-size 8 --credit.score sum --out run",
-        "train --resume run --steps 300",
-        "evaluate run --episodes 2",
-        "report run",
-        "compare run",
         "sweep study.toml",
+        f"train --resume {job.directory} --steps 300",
+        f"evaluate {job.directory} --episodes 2",
+        f"report {job.directory}",
+        f"compare {job.directory}",
         "design CN-6 --out cn.py",
     )
     assert "over 2 episodes" in output
-    assert (tmp_path / "run" / "report.html").stat().st_size > 10_000
+    assert (job.directory / "report.html").stat().st_size > 10_000
     assert (tmp_path / "runs" / "study" / "results.csv").is_file()
 
 

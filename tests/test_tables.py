@@ -1,5 +1,3 @@
-"""The reference pages that are made from the code are up to date."""
-
 import importlib.util
 from pathlib import Path
 

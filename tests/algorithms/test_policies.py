@@ -1,5 +1,3 @@
-"""Probabilities of stochastic policies."""
-
 import equinox as eqx
 import jax
 import jax.numpy as jnp

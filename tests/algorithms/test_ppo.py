@@ -1,5 +1,3 @@
-"""PPO's update against NumPy, its invariances, and a toy that it must learn."""
-
 import jax
 import jax.numpy as jnp
 import numpy as np

@@ -1,5 +1,3 @@
-"""SAC's update against a NumPy twin."""
-
 import equinox as eqx
 import jax
 import jax.numpy as jnp

@@ -1,5 +1,3 @@
-"""TD3's update against a NumPy twin."""
-
 import jax
 import jax.numpy as jnp
 import numpy as np

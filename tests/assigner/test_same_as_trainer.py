@@ -114,7 +114,7 @@ def test_rewards_and_lengths_agree(method, env, changes, phi):
     steps = stored_steps(learner)
     n_running = changes.get("n_running", 2)
     n_unpaid = n_running % 5 if "payments" in changes else n_running
-    assert (~steps.finished).sum() == n_unpaid
+    assert (~steps.episode_ended).sum() == n_unpaid
     lengths = credit.store.lengths(np.arange(credit.store.n_added))
     np.testing.assert_array_equal(lengths, np.asarray(steps.length).ravel())
     expected = np.asarray(jitted(rewards, config)(steps, learner.reward_sources))

@@ -1,5 +1,3 @@
-"""Shares of the gap between the total at the end and true rewards."""
-
 import numpy as np
 import pytest
 

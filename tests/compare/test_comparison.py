@@ -1,6 +1,5 @@
-"""Statistics of runs with known answers."""
-
 import json
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -10,16 +9,11 @@ from lare_rl.compare import bootstrap
 from lare_rl.compare.bootstrap import Estimate
 from lare_rl.compare.comparison import compare, compare_over_tasks, compare_tasks
 from lare_rl.compare.labels import label_runs
-from lare_rl.compare.results import read_run_results
-from lare_rl.compare.scores import ScoreChoice
+from lare_rl.compare.results import LearningCurves, read_run_results
+from lare_rl.compare.scores import ScoreChoice, group_results
 from lare_rl.errors import LareError
 from lare_rl.runs.directory import Run
 from lare_rl.runs.metric_names import RETURN
-
-
-@pytest.fixture(autouse=True)
-def few_repetitions(monkeypatch):
-    monkeypatch.setattr(bootstrap, "REPETITIONS", 300)
 
 
 def read(runs, metric=RETURN):
@@ -81,8 +75,9 @@ def test_tasks_without_common_scale(make_run):
     assert compare_over_tasks(comparisons[:1]) == []
 
 
-def test_interval_of_difference(make_run):
+def test_interval_of_difference(make_run, monkeypatch):
     """Each method scores 0 or 10 more, so the difference is at most 10 less or 10 more than the difference of the means."""
+    monkeypatch.setattr(bootstrap, "REPETITIONS", 300)
     runs = [make_run("a", [0.0, 10.0]), make_run("b", [100.0, 110.0], method="rd"), make_run("c", [1.0], method="rrd")]
     _, second, single = compare(read(runs)).rows
     assert second.difference == Estimate(100.0, 90.0, 110.0)
@@ -148,3 +143,23 @@ def test_two_tasks_with_one_name(make_run):
     second = Run(second.directory, second.config.model_copy(update={"task": toy_spec(scored_observation="after")}), ())
     with pytest.raises(LareError, match=r"different tasks .*Chase"):
         compare(read([first, second]))
+
+
+def curves(label, *steps_of_seeds):
+    """Return the curves of a method in a table, with the value 1 at some steps of each seed."""
+    values = {seed: dict.fromkeys(steps, 1.0) for seed, steps in enumerate(steps_of_seeds)}
+    return LearningCurves(label=label, source=Path("own.csv"), task="Chase", draw=0, curves=values)
+
+
+def test_steps_without_overlap_are_listed_by_method():
+    with pytest.raises(LareError) as error:
+        group_results([curves("A", (1000, 1500), (1500, 2000)), curves("B", (3000, 4000), (3000, 4000))])
+    first, second = str(error.value).split(";")
+    for text, words in ((first, ["A", "1,000 to 2,000"]), (second, ["B", "3,000 to 4,000"])):
+        assert all(word in text for word in ["Chase", "own.csv", *words]), text
+
+
+def test_same_draw_twice(make_run):
+    runs = [make_run(name, [1.0], method="lare-rrdu", draw=2) for name in "ab"]
+    with pytest.raises(LareError, match=r"seed 0 .*draw 2"):
+        group_results(read_run_results({"A": runs}, RETURN))

@@ -1,5 +1,3 @@
-"""Which runs have one label, and what distinguishes the others."""
-
 from pathlib import Path
 
 import pytest

@@ -1,5 +1,3 @@
-"""The tables, sentences and page of a comparison."""
-
 import json
 import re
 from dataclasses import replace

@@ -1,5 +1,3 @@
-"""Tables with the results of other programs, compared with runs."""
-
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st

@@ -1,5 +1,3 @@
-"""The layout and the size of a decoder's batch."""
-
 import pytest
 
 from lare_rl.credit.batch_plan import BatchPlan, plan_batch

@@ -1,5 +1,3 @@
-"""What all decoders have in common: shapes, causality, where they are random, and that they learn."""
-
 from dataclasses import replace
 
 import jax

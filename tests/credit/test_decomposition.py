@@ -1,5 +1,3 @@
-"""Step rewards are learned from returns alone, at any scale; their units, and the rows of a batch."""
-
 from functools import partial
 
 import jax
@@ -99,22 +97,14 @@ def test_unit_of_proxy_rewards(score_type):
     np.testing.assert_allclose(proxy_rewards(state, rows, settings, length), unit * output, rtol=1e-5)
 
 
-@pytest.mark.parametrize("agents", [None, 2])
-def test_valid_rows(agents):
+def test_valid_rows():
     """Episode 1 is padding, and so are rows of episode 2, which does not exist. An agent that has left has no row."""
-    lead = (6,) if agents is None else (6, agents)
-    alive = None if agents is None else np.array([[True, False], *[[True, True]] * 5])
-    batch = CreditBatch(
-        inputs=np.zeros((*lead, FEATURES), np.float32),
-        episode_index=np.array([0, 0, 1, 1, 2, 3]),
-        length=np.array([2, 2]),
-        mean_reward=np.zeros(2, np.float32),
-        mask=np.array([1.0, 0.0], np.float32),
-        alive=alive,
-    )
-    rows = [True, True, False, False, False, False]
-    want = rows if agents is None else [[True, False], [True, True], *[[False, False]] * 4]
-    np.testing.assert_array_equal(jax.jit(decomposition.valid_rows)(batch), want)
+    episode_index, zeros = np.array([0, 0, 1, 1, 2, 3]), np.zeros((6, 2, FEATURES), np.float32)
+    alive = np.array([[True, False], *[[True, True]] * 5])
+    batch = CreditBatch(zeros, episode_index, np.array([2, 2]), zeros[0, :, 0], mask=np.float32([1, 0]), alive=alive)
+    np.testing.assert_array_equal(jax.jit(decomposition.valid_rows)(batch), [alive[0], alive[1], *[[False, False]] * 4])
+    batch = batch._replace(inputs=zeros[:, 0], alive=None)
+    np.testing.assert_array_equal(jax.jit(decomposition.valid_rows)(batch), [True, True, *[False] * 4])
 
 
 def test_decoder_of_many_agents_soon_reaches_the_size_of_rare_rewards():
@@ -132,7 +122,7 @@ def test_decoder_of_many_agents_soon_reaches_the_size_of_rare_rewards():
     assert r_hat.ravel()[rewarded.ravel()].mean() == pytest.approx(10, abs=3)  # 1.5 without the gain of sqrt(nT)
 
 
-def test_loss_of_packed_episodes_against_numpy():
+def test_losses_of_packed_and_sampled_episodes_against_numpy():
     """The mean r_hat of each episode is compared with R/T. Padding is ignored. An empty batch has no gradient."""
     rng, settings = np.random.default_rng(0), CreditSettings(hidden=(8,), normalise=False, weight_decay=0.1)
     length, returns = np.array([3, 1, 5]), np.array([6.0, -2.0, 1.0], np.float32)
@@ -150,6 +140,10 @@ def test_loss_of_packed_episodes_against_numpy():
     _, metrics = update(state, batch, KEY, fit=Fit.ALL_STEPS, settings=settings)
     want = np.mean((means - returns / length) ** 2)
     assert float(metrics["credit/loss"]) == pytest.approx(want, rel=1e-4)
+    sampled = batch._replace(episode_index=np.array([0, 0, 0, 3, 1, 3, 3, 3, 2, 2, 2, 2]))  # at most 4 of each
+    means = [r_hat[:3].mean(), r_hat[4], r_hat[8:].mean()]
+    _, metrics = update(state, sampled, KEY, fit=Fit.SAMPLED_STEPS, settings=settings)
+    assert float(metrics["credit/loss"]) == pytest.approx(np.mean((means - returns / length) ** 2), rel=1e-4)
     after, metrics = update(state, batch._replace(mask=np.zeros(3)), KEY, fit=Fit.ALL_STEPS, settings=settings)
     assert float(metrics["credit/loss"]) == 0.0
     for weight, new in zip(jax.tree.leaves(state.network), jax.tree.leaves(after.network), strict=True):

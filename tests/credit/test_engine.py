@@ -1,5 +1,3 @@
-"""What `exact` adds to proxy rewards."""
-
 import numpy as np
 
 from lare_rl.credit.engine import correction

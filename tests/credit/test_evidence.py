@@ -1,5 +1,3 @@
-"""The fixed point of the evidence against plain NumPy, and on synthetic episodes whose rewards are known."""
-
 from functools import partial
 
 import jax

@@ -1,5 +1,3 @@
-"""Explanations of episodes whose rewards are known functions of the inputs."""
-
 from functools import partial
 
 import jax
@@ -145,10 +143,9 @@ def test_factor_that_offsets_another_has_a_negative_share():
     np.testing.assert_allclose(result.factor_shares, want, rtol=1e-2)
 
 
-@pytest.mark.parametrize("count", [30, 100])
-def test_slope_is_that_of_the_closest_line(count):
+def test_slope_is_that_of_the_closest_line():
     """|u| bends the shapes of all factors, and a sine then replaces the second factor's line."""
-    u, length = sample_inputs(count, 2)
+    u, length = sample_inputs(30, 2)
     effects = np.stack([-2 * np.abs(u[:, 0]), 0.5 * u[:, 1]], axis=1)
     result = explain_rewards(EXTENDED, u, length, effects.sum(axis=1))
     want = [np.polyfit(u[:, i], effects[:, i], 1)[0] for i in range(2)]
@@ -158,11 +155,10 @@ def test_slope_is_that_of_the_closest_line(count):
     np.testing.assert_allclose(result.pair_shares, 0, atol=0.02)
 
 
-@pytest.mark.parametrize("count", [30, 100])
-def test_effect_of_a_rare_event(count):
+def test_effect_of_a_rare_event():
     """An event has two values, so that all of its shapes are one line. Only the sum of its weights is determined."""
     random = np.random.default_rng(0)
-    length = random.integers(20, 40, size=count)
+    length = random.integers(20, 40, size=30)
     event = random.random(length.sum()) < 0.03
     std = event.std()
     u = np.stack([(event - event.mean()) / std, random.normal(size=len(event))], axis=1)

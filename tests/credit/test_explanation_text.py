@@ -1,5 +1,3 @@
-"""What the returns say about the factors, as findings."""
-
 import numpy as np
 import pytest
 

@@ -1,5 +1,3 @@
-"""How well factors predict returns, each before a fit sees it."""
-
 import jax
 import numpy as np
 import pytest

@@ -1,11 +1,9 @@
-"""GRD against a slow NumPy twin, its samples of masks, and what it must learn."""
-
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from helpers.decoder_toys import check_padding, make_decoder, train_by_loss
+from helpers.decoder_toys import MASK, TARGET, make_decoder, random_rows, train_by_loss
 from helpers.numpy_attention import numpy_mlp
 from lare_rl.credit import grd, input_names, methods
 from lare_rl.credit.grd import causes, sample_mask
@@ -13,6 +11,7 @@ from lare_rl.errors import LareError
 
 EPISODES, STEPS, STATES, ACTIONS = 4, 6, 3, 2
 LENGTH = np.array([6, 4, 2, 1])
+ROWS = random_rows(EPISODES, STEPS, 2 * STATES + ACTIONS)
 LAMBDAS = (0.1, 0.2, 0.3, 0.4, 0.5)
 KEY = jax.random.key(0)
 SIZES = {"observation": STATES, "action": ACTIONS, "next_observation": STATES}
@@ -21,11 +20,6 @@ SIZES = {"observation": STATES, "action": ACTIONS, "next_observation": STATES}
 @pytest.fixture(scope="module")
 def decoder():
     return make_decoder("grd", SIZES, STEPS, hidden=(5,), sparsity=LAMBDAS)
-
-
-@pytest.fixture(scope="module")
-def rows():
-    return np.random.default_rng(0).normal(size=(EPISODES, STEPS, 2 * STATES + ACTIONS)).astype(np.float32)
 
 
 def numpy_log_density(decoder, row, state_mask, action_mask):
@@ -47,40 +41,39 @@ def negative_log_absence(logits):
 
 
 @pytest.mark.parametrize("threshold", [0.0, 1e9])
-def test_loss_against_numpy(decoder, rows, threshold, monkeypatch):
+def test_loss_against_numpy(decoder, threshold, monkeypatch):
     """The third episode is padding. Below the threshold of a loss, sparsity counts."""
     monkeypatch.setattr(grd, "REWARD_THRESHOLD", threshold)
     monkeypatch.setattr(grd, "DYNAMICS_THRESHOLD", threshold)
-    target, mask, key = np.array([1.0, -0.5, 2.0, 0.3], np.float32), np.array([1.0, 1, 0, 1]), jax.random.key(3)
-    keys = jax.random.split(key, 5)
+    keys = jax.random.split(KEY, 5)
     logits = decoder.state_reward, decoder.action_reward, decoder.state_state, decoder.action_state
     masks = [np.asarray(sample_mask(*pair)) for pair in zip(logits, (keys[0], keys[1], keys[3], keys[4]), strict=True)]
     causes_of_reward = np.concatenate(masks[:2])
     errors = []
     for i in (0, 1, 3):
         r_hat = [
-            numpy_mlp(decoder.reward_model, causes_of_reward * x[: STATES + ACTIONS])[0] for x in rows[i, : LENGTH[i]]
+            numpy_mlp(decoder.reward_model, causes_of_reward * x[: STATES + ACTIONS])[0] for x in ROWS[i, : LENGTH[i]]
         ]
-        errors.append((np.mean(r_hat) - target[i]) ** 2)
-    valid = (np.arange(STEPS) < LENGTH[:, None]) & (mask > 0)[:, None]
+        errors.append((np.mean(r_hat) - TARGET[i]) ** 2)
+    valid = (np.arange(STEPS) < LENGTH[:, None]) & (MASK > 0)[:, None]
     row_index = jax.random.choice(keys[2], EPISODES * STEPS, (256,), p=valid.ravel() / valid.sum())
     log_density = np.mean(
-        [numpy_log_density(decoder, rows.reshape(-1, 8)[i], *masks[2:]) for i in np.asarray(row_index)]
+        [numpy_log_density(decoder, ROWS.reshape(-1, 8)[i], *masks[2:]) for i in np.asarray(row_index)]
     )
     want = np.mean(errors) - log_density
     if threshold:
         itself, ss = np.eye(STATES, dtype=bool), np.asarray(decoder.state_state)
         groups = decoder.state_reward, decoder.action_reward, ss[~itself], ss[itself], decoder.action_state
         want += sum(lam * negative_log_absence(np.asarray(group)) for lam, group in zip(LAMBDAS, groups, strict=True))
-    loss = jax.jit(lambda *args: decoder.loss(*args))(rows, jnp.asarray(LENGTH), target, mask, key)
+    loss = jax.jit(lambda *args: decoder.loss(*args))(ROWS, jnp.asarray(LENGTH), TARGET, MASK, KEY)
     assert float(loss) == pytest.approx(want, rel=1e-4)
 
 
-def test_rewards_are_those_of_the_causes(decoder, rows):
+def test_rewards_are_those_of_the_causes(decoder):
     mask = np.concatenate([causes(decoder.state_reward), causes(decoder.action_reward)])
     assert 0 < mask.sum() < STATES + ACTIONS
-    want = numpy_mlp(decoder.reward_model, mask * rows[..., : STATES + ACTIONS])[..., 0]
-    np.testing.assert_allclose(decoder(jnp.asarray(rows), None).r_hat, want, rtol=1e-4, atol=1e-5)
+    want = numpy_mlp(decoder.reward_model, mask * ROWS[..., : STATES + ACTIONS])[..., 0]
+    np.testing.assert_allclose(decoder(jnp.asarray(ROWS), None).r_hat, want, rtol=1e-4, atol=1e-5)
 
 
 def test_samples_of_masks():
@@ -95,12 +88,8 @@ def test_samples_of_masks():
     np.testing.assert_allclose(gradient[0], [soft * (1 - soft) / 0.01, -soft * (1 - soft) / 0.01], rtol=1e-2)
 
 
-def test_gradient_ignores_padding(decoder, rows):
-    check_padding(decoder, rows, LENGTH)
-
-
-def test_loss_without_episodes_is_finite(decoder, rows):
-    args = jnp.asarray(rows), jnp.asarray(LENGTH), jnp.ones(EPISODES), jnp.zeros(EPISODES), KEY
+def test_loss_without_episodes_is_finite(decoder):
+    args = jnp.asarray(ROWS), jnp.asarray(LENGTH), jnp.ones(EPISODES), jnp.zeros(EPISODES), KEY
     loss, gradient = jax.jit(jax.value_and_grad(lambda decoder: decoder.loss(*args)))(decoder)
     assert float(loss) == pytest.approx(
         0.1 * negative_log_absence(decoder.state_reward) + 0.2 * negative_log_absence(decoder.action_reward)

@@ -1,5 +1,4 @@
-"""The history of an episode, and the features of it: their sums over an episode are functions of its extremes and last values."""
-
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -7,9 +6,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
+from lare_rl.credit import history as histories
 from lare_rl.credit.basis import Basis, expand_history, fourier_terms
-from lare_rl.credit.history import next_history, scan_history
+from lare_rl.credit.history import next_history
 
+scan_history = jax.jit(histories.scan_history)
 VALUES = arrays(np.float32, (7, 2), elements=st.floats(-3, 3, width=32, allow_subnormal=False))
 BEGINS = st.lists(st.booleans(), min_size=7, max_size=7)
 

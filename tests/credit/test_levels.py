@@ -1,10 +1,8 @@
-"""Levels of episodes: intercepts that no step is paid for."""
-
-import jax.numpy as jnp
+import jax
 import numpy as np
-import pytest
 
-from lare_rl.credit.levels import add_returns, empty_level_means, level_offsets
+from lare_rl.credit import levels
+from lare_rl.credit.levels import empty_level_means
 
 
 def sample(counts, between, within, seed=0):
@@ -26,19 +24,20 @@ def numpy_offsets(level, y, n_levels):
     return np.where(n > 0, shrinkage * (means - y.mean()), 0)
 
 
-@pytest.mark.parametrize("n_chunks", [1, 4])
-def test_offsets_against_numpy(n_chunks):
+add, offsets = jax.jit(levels.add_returns), jax.jit(levels.level_offsets)
+
+
+def test_offsets_against_numpy():
     level, y = sample([3, 12, 0, 30], between=2.0, within=1.0)
     means = empty_level_means(4)
-    for chunk in np.array_split(np.arange(len(y)), n_chunks):
-        mask = np.append(np.ones(len(chunk), bool), False)  # the last row is ignored
-        rows = jnp.append(y[chunk], 1e6).astype(jnp.float32)
-        means = add_returns(means, jnp.append(level[chunk], 0), rows, jnp.asarray(mask))
-    np.testing.assert_allclose(level_offsets(means), numpy_offsets(level, y, 4), rtol=1e-3, atol=1e-4)
+    for chunk in np.split(np.arange(len(y)), 3):
+        ignored = np.arange(len(chunk) + 1) == len(chunk)
+        means = add(means, np.append(level[chunk], 0), np.append(y[chunk], 1e6).astype(np.float32), ~ignored)
+    np.testing.assert_allclose(offsets(means), numpy_offsets(level, y, 4), rtol=1e-3, atol=1e-4)
 
 
 def test_equal_levels_have_small_offsets():
     level, y = sample([20] * 8, between=0.0, within=1.0)
-    means = add_returns(empty_level_means(8), jnp.asarray(level), jnp.asarray(y), jnp.ones(len(y), bool))
-    assert np.abs(level_offsets(means)).max() < 0.2
-    assert not np.asarray(level_offsets(empty_level_means(3))).any()
+    means = add(empty_level_means(8), level, y.astype(np.float32), np.ones(len(y), bool))
+    assert np.abs(offsets(means)).max() < 0.2
+    assert not np.asarray(offsets(empty_level_means(3))).any()

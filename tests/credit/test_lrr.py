@@ -1,5 +1,3 @@
-"""LRR against a slow NumPy twin, its special case, and what it must learn."""
-
 import equinox as eqx
 import jax
 import jax.numpy as jnp

@@ -1,5 +1,3 @@
-"""One round of the evidence, in NumPy and in JAX."""
-
 import jax
 import jax.numpy as jnp
 import numpy as np

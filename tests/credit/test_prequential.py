@@ -1,8 +1,11 @@
-import jax.numpy as jnp
+import jax
 import numpy as np
 import pytest
 
-from lare_rl.credit.prequential import WINDOW, add_predictions, empty_predictions, gain, r2, squared_errors
+from lare_rl.credit import prequential
+from lare_rl.credit.prequential import WINDOW, add_predictions, empty_predictions, squared_errors
+
+gain, r2 = jax.jit(prequential.gain), jax.jit(prequential.r2)
 
 
 def sample_predictions(count):
@@ -11,9 +14,18 @@ def sample_predictions(count):
     return returns, np.stack([returns + 0.5 * random.normal(size=count), 0 * returns], axis=1).astype(np.float32)
 
 
-def add(predictions, returns, predicted, mask=None):
+@jax.jit
+def add_padded(predictions, *rows):
+    return add_predictions(predictions, *rows)
+
+
+def add(predictions, returns, predicted, mask=None, level=None):
+    """Add episodes, with padding, so that all calls have the same shapes."""
     mask = np.ones(len(returns), bool) if mask is None else mask
-    return add_predictions(predictions, *map(jnp.asarray, (returns, predicted, mask)), None)
+    level = np.zeros(len(returns), int) if level is None else level
+    padding = (0, WINDOW - len(returns))
+    rows = (np.pad(values, (padding, (0, 0))[: values.ndim]) for values in (returns, predicted, mask, level))
+    return add_padded(predictions, *rows)
 
 
 @pytest.mark.parametrize("count", [8, 30, WINDOW, WINDOW + 5, 3 * WINDOW - 1])
@@ -49,9 +61,7 @@ def test_gain_against_numpy():
     level[7] = 5  # alone in its level
     returns = (level + rng.normal(size=25)).astype(np.float32)
     predicted = (returns + rng.normal(size=25)).astype(np.float32)
-    predictions = add_predictions(
-        empty_predictions(1), *map(jnp.asarray, (returns, predicted[:, None], np.ones(25, bool), level))
-    )
+    predictions = add(empty_predictions(1), returns, predicted[:, None], level=level)
     peers = [[i for i in range(25) if i != k and (k == 7 or level[i] == level[k])] for k in range(25)]
     baseline = np.array([(returns[k] - returns[peers[k]].mean()) ** 2 for k in range(25)])
     error = (returns - predicted) ** 2
@@ -62,15 +72,13 @@ def test_gain_against_numpy():
 
 def test_gain_covers_the_true_gain():
     """Chance explains most of a won or lost score: the gain is small, and its standard error says how well it is known."""
-    rng, gains = np.random.default_rng(1), []
-    for _ in range(200):
-        chance = rng.choice([0.3, 0.7], 256)
-        won = (rng.random(256) < chance).astype(np.float32)
-        predictions = add(empty_predictions(1, 256), won, chance[:, None].astype(np.float32))
-        gains.append(gain(predictions))
-    gains = np.array(gains)
-    np.testing.assert_allclose(gains[:, 0].mean(), 0.16, atol=0.01)
-    np.testing.assert_allclose(gains[:, 1].mean(), gains[:, 0].std(), rtol=0.2)
+    rng = np.random.default_rng(1)
+    chance = rng.choice(np.float32([0.3, 0.7]), (200, 256))
+    won = (rng.random(chance.shape) < chance).astype(np.float32)
+    compute = jax.vmap(lambda *rows: gain(add_predictions(empty_predictions(1, 256), *rows)))
+    gains, errors = map(np.asarray, jax.jit(compute)(won, chance[..., None], np.ones(won.shape, bool)))
+    np.testing.assert_allclose(gains.mean(), 0.16, atol=0.01)
+    np.testing.assert_allclose(errors.mean(), gains.std(), rtol=0.2)
 
 
 def test_gain_is_nan_with_few_episodes():

@@ -1,5 +1,3 @@
-"""A strength for each raw feature: used where it helps, and equal to the fit by groups where it does not."""
-
 from functools import partial
 
 import jax

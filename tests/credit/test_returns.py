@@ -1,5 +1,3 @@
-"""When a score is treated as a mean, and from which episode on returns are predicted."""
-
 from dataclasses import replace
 
 import jax

@@ -1,5 +1,3 @@
-"""Shares of the return: against a slow NumPy twin, and their sum."""
-
 import jax
 import jax.numpy as jnp
 import numpy as np

@@ -3,22 +3,10 @@ import jax.numpy as jnp
 import numpy as np
 
 from helpers.decoder_toys import make_decoder
-from helpers.numpy_attention import numpy_coalitions, numpy_time_layer
-from lare_rl.credit.stas import Coalitions, TimeLayer, dropout
+from lare_rl.credit.stas import dropout
 
 STEPS, AGENTS = 5, 3
 KEY = jax.random.key(1)
-
-
-def test_layers_against_numpy():
-    rng = np.random.default_rng(0)
-    steps, agents = (rng.normal(size=(n, 128)).astype(np.float32) for n in (STEPS, AGENTS))
-    layer = TimeLayer(key=KEY)
-    np.testing.assert_allclose(layer(jnp.asarray(steps), None), numpy_time_layer(layer, steps), rtol=1e-3, atol=1e-4)
-    layer = Coalitions(AGENTS, key=KEY)
-    masks = np.asarray(jax.random.bernoulli(KEY, 0.5, (5, AGENTS, AGENTS))) | np.eye(AGENTS, dtype=bool)
-    want = numpy_coalitions(layer, agents, masks)
-    np.testing.assert_allclose(layer(jnp.asarray(agents), KEY, None), want, rtol=1e-4, atol=1e-5)
 
 
 def test_dropout_is_independent_for_each_entry():

@@ -1,5 +1,3 @@
-"""Layouts of episodes in a batch, in NumPy and in JAX."""
-
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -13,11 +11,7 @@ pack = jax.jit(lay_out_packed, static_argnums=2)
 sample_numbers = jax.jit(sample_steps, static_argnums=2)
 
 
-@given(
-    st.lists(st.integers(1, 9), min_size=6, max_size=6),
-    st.integers(0, 5),
-    st.sampled_from([9, 24, 60]),
-)
+@given(st.lists(st.integers(1, 9), min_size=6, max_size=6), st.integers(0, 5), st.sampled_from([9, 24, 60]))
 @settings(max_examples=60, deadline=None)
 def test_lay_out_packed(lengths, n_masked, rows):
     length, mask = np.array(lengths), (np.arange(6) < 6 - n_masked).astype(float)

@@ -1,5 +1,3 @@
-"""The replay against plain lists of episodes."""
-
 import jax
 import jax.numpy as jnp
 import numpy as np

@@ -1,5 +1,3 @@
-"""Which stored steps an update reads, against lists of the stored episodes."""
-
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -100,10 +98,10 @@ def assert_packed(sample, expected):
 @pytest.mark.parametrize(("steps", "rows"), [(60, 60), (5, LONGEST)])
 def test_sample_packed(buffer, steps, rows):
     """As many episodes as their mean length says, unless they do not fit; at least one."""
-    samples = jax.tree.map(np.asarray, sample_packed(buffer, jax.random.key(0), 8, steps, LONGEST))
+    samples = jax.tree.map(np.asarray, sample_packed(buffer, jax.random.key(0), 24, steps, LONGEST))
     requested = max(1, steps * len(FIRST) // sum(length for length, _ in FIRST.values()))
     counts = []
-    for i in range(8):
+    for i in range(24):
         sample = jax.tree.map(lambda leaf, i=i: leaf[i], samples)
         assert len(sample.episode) == rows
         firsts = pairs(sample.episodes.first)[:requested]
@@ -111,7 +109,7 @@ def test_sample_packed(buffer, steps, rows):
         assert_packed(sample, firsts[:n_fits])
         counts.append(n_fits)
     assert max(counts) == requested
-    assert len({tuple(first) for first in samples.episodes.first.number.tolist()}) == 8
+    assert len({tuple(first) for first in samples.episodes.first.number.tolist()}) == 24
 
 
 def test_episodes_in_order(buffer):

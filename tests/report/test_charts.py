@@ -1,20 +1,10 @@
-"""The charts of pages."""
-
 import re
 
 import numpy as np
 import pytest
 
 from helpers.markup import check_markup
-from lare_rl.report.charts import (
-    Bar,
-    Chart,
-    Line,
-    draw_bars,
-    draw_points,
-    draw_strips,
-    visible_steps,
-)
+from lare_rl.report.charts import Bar, Chart, Line, draw_bars, draw_points, draw_strips, visible_steps
 
 X = np.arange(3.0)
 

@@ -1,5 +1,5 @@
-"""The findings about made-up runs."""
-
+import ast
+import inspect
 from collections import defaultdict
 from dataclasses import replace
 
@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from reference_tables.conditions import CONDITIONS
 
+from lare_rl.report import diagnosis
 from lare_rl.report.diagnosis import diagnose
 from lare_rl.report.messages import MESSAGES
 from lare_rl.report.run_summary import RunSummary
@@ -243,3 +244,28 @@ def test_single_steps_are_compared_where_they_are_known():
     assert "steps_agree" in find(RISING_2, credit_error=1e-9, credit_correlation=0.999)
     finding = find(RISING_2, credit_error=0.25, credit_correlation=0.5)["single_steps"]
     assert (finding.values["error"], finding.values["correlation"]) == (0.25, 0.5)
+
+
+CODES = [code for group in CONDITIONS.values() for code in group]
+
+
+def returned_codes():
+    """Return the codes of the findings that rules return, by the source of the diagnosis."""
+    tree = ast.parse(inspect.getsource(diagnosis))
+    values = [node.value for node in ast.walk(tree) if isinstance(node, ast.Return)]
+    calls = [call for v in values for call in ((v.body, v.orelse) if isinstance(v, ast.IfExp) else (v,))]
+    return {
+        constant.value
+        for call in calls
+        if isinstance(call, ast.Call) and ast.unparse(call.func) == "Finding"
+        for constant in ast.walk(call.args[0])
+        if isinstance(constant, ast.Constant)
+    }
+
+
+def test_every_finding_has_a_condition():
+    assert set(CODES) <= set(MESSAGES)
+    assert len(CODES) == len(set(CODES))
+    assert returned_codes() <= set(CODES)
+    computed = {"above_episodic", "below_episodic", "like_episodic", "score_use"}
+    assert set(CODES) - returned_codes() == computed | {"trust_nothing", "trust_part", "trust_sums"}

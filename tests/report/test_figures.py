@@ -4,11 +4,7 @@ from xml.etree import ElementTree
 import numpy as np
 import pytest
 
-from lare_rl.report.figures import (
-    add_white_background,
-    draw_band_panels,
-    draw_bands,
-)
+from lare_rl.report.figures import add_white_background, draw_band_panels, draw_bands
 from lare_rl.util.statistics import Band
 
 X = np.arange(3.0)

@@ -1,5 +1,3 @@
-"""The pages, and how they look in a browser."""
-
 import os
 import re
 import shutil

@@ -1,5 +1,3 @@
-"""How the score was taken, as the report says it."""
-
 import pytest
 
 from helpers.toy_envs import toy_spec

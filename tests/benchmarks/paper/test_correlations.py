@@ -1,5 +1,3 @@
-"""Table 1: steps whose correlations are known, and the page."""
-
 import numpy as np
 
 from helpers.toy_envs import toy_spec

@@ -1,5 +1,3 @@
-"""The study of real simulators: its plan, and its page from invented metrics, with the job shop, whose simulator is installed."""
-
 import pytest
 
 from helpers.untrained_runs import invent_training

@@ -1,5 +1,3 @@
-"""The page about the propositions."""
-
 import numpy as np
 
 from paper import regret

@@ -1,5 +1,3 @@
-"""The estimator, its radius and OFUL, against plain NumPy and against what the propositions promise."""
-
 import itertools
 
 import jax

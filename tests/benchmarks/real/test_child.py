@@ -1,5 +1,3 @@
-"""Environments in processes of their own, with an environment of Gymnasium."""
-
 import signal
 
 import numpy as np
@@ -47,6 +45,8 @@ def test_errors_name_the_reason(cart):
 
 def test_hanging_process(cart, monkeypatch):
     monkeypatch.setattr(child, "TIMEOUT_S", 0.2)
+    wait = cart._process.wait
+    monkeypatch.setattr(cart._process, "wait", lambda timeout=None: wait(timeout and 0.1))
     cart._process.send_signal(signal.SIGSTOP)
     with pytest.raises(TimeoutError, match="no answer"):
         cart.reset(seed=1)

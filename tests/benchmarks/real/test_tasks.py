@@ -1,5 +1,3 @@
-"""What holds for all tasks, against the real simulators."""
-
 import gymnasium
 import numpy as np
 import pytest
