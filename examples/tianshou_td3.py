@@ -55,10 +55,10 @@ class CreditReplayBuffer(VectorReplayBuffer):
         self.steps = np.full(self.maxsize, -1)  # the assigner's number of each row
 
     def add(self, batch, buffer_ids=None):
-        lanes = range(self.buffer_num) if buffer_ids is None else list(buffer_ids)
+        env_ids = range(self.buffer_num) if buffer_ids is None else list(buffer_ids)
         action = self.in_units(batch.act)  # Tianshou stores actions between -1 and 1
         ends = batch.terminated, batch.truncated
-        steps = self.credit.add(batch.obs, action, batch.obs_next, batch.rew, *ends, lanes=lanes)
+        steps = self.credit.add(batch.obs, action, batch.obs_next, batch.rew, *ends, env_ids=env_ids)
         rows, *rest = super().add(batch, buffer_ids)
         self.steps[rows], self.rew[rows] = steps, 0  # the rewards of the environment are not kept
         return (rows, *rest)

@@ -387,6 +387,7 @@ STEPS = {name: ROWS[name] for name in ("observation", "action", "next_observatio
         (ROWS | {"truncated": False}, r"truncated .*\(\).* 2 steps"),
         (ROWS | {"valid": [True]}, r"valid .*\(1,\).* 2 steps"),
         (ROWS | {"env_ids": [0]}, "env_ids has 1 .* 2 steps"),
+        (ROWS | {"env_ids": [0, 1], "lanes": [0, 1]}, "env_ids and lanes"),
         (ROWS | {"alive": np.ones((2, 1))}, r"alive .*\(2, 1\)"),
         (ROWS | {"observation": [[0, 0], [0, np.nan]]}, "observation of row 1 .*nan"),
         (ROWS | {"action": [[np.inf], [0]]}, "action of row 0 .*inf"),
@@ -645,10 +646,31 @@ def test_groups_that_do_not_fit_are_refused():
     assert list(credit.group_names) == ["g0"]
     with pytest.raises(LareError, match="None when it is paid"):
         credit.add(*episode, is_valid, ~is_valid, valid=is_valid, group=[None, "a", "b", "c", "d"])
+    for group, message in (
+        ("abcde", "is one text"),
+        ([("a", 1)] * 5, "a text or a number"),
+        (["a", None, None, None, None], "None when it is paid"),
+    ):
+        with pytest.raises(LareError, match=message):
+            credit.add(*episode, np.ones(5, bool), np.zeros(5, bool), group=group)
+    assert list(credit.group_names) == ["g0"]
     for i in range(64):
         credit.add_episode(*episode, group=f"g{i}")
     with pytest.raises(LareError, match=r"more than 64 groups.*'new'"):
         credit.add_episode(*episode, group="new")
+
+
+def test_end_needs_the_group_of_a_step():
+    credit, (episode,) = small_assigner(groups=True), random_episodes([2])
+    for env_id, groups in {"a": ["easy", None], "b": ["hard", None], "c": [None, None]}.items():
+        for t, group in enumerate(groups):
+            credit.add(*(array[[t]] for array in episode), [False], [False], env_ids=[env_id], group=[group])
+    for env_id in "ab":
+        credit.end(env_id, 1.0)
+    assert [stored.level for stored in credit.store.episodes.values()] == [0, 1]
+    with pytest.raises(LareError, match="'c' has no group"):
+        credit.end("c", 1.0)
+    assert list(credit.store.running) == ["c"]
 
 
 def test_must_learn_what_wins():

@@ -65,7 +65,18 @@ def test_load_keeps_the_numbers_of_episodes(tmp_path):
         credit.add_episode(*episode)
     credit.save(tmp_path)
     assert list(credit.store.episodes) == [0, 2, 3, 4]
-    assert list(CreditAssigner.load(tmp_path).store.episodes) == [0, 2, 3, 4]
+    store = CreditAssigner.load(tmp_path).store
+    assert list(store.episodes) == [0, 2, 3, 4]
+    assert store.oldest == credit.store.oldest  # batches are sampled from it
+
+
+def test_load_keeps_groups_that_are_numpy_numbers(tmp_path):
+    credit, (episode,) = small_assigner(groups=True), random_episodes([3])
+    credit.add_episode(*episode, group=np.int64(3))
+    credit.save(tmp_path)
+    again = CreditAssigner.load(tmp_path)
+    again.add_episode(*episode, group=np.int64(3))
+    assert again.group_names == {3: 0}
 
 
 @pytest.mark.parametrize("is_pickled", [True, False])
@@ -127,13 +138,22 @@ def changed(**values):
 
 
 def test_load_reads_former_names(tmp_path, saved):
-    """The keys of tasks and assigners had other names."""
+    """The keys of tasks and assigners, and arrays, had other names."""
     directory = shutil.copytree(saved, tmp_path / "copy")
     text = (directory / TEXT_FILE).read_text()
     former = text.replace("scored_observation", "judges").replace("credit_scope", "judged_from")
     assert former.count("judge") == 3  # two in the task
-    (directory / TEXT_FILE).write_text(former)
-    assert CreditAssigner.load(directory).config == CreditAssigner.load(saved).config
+    (directory / TEXT_FILE).write_text(former.replace("n_learned", "told").replace("n_updates", "fits"))
+    names = {"inputs": "features", "n_added": "steps"}
+    names |= {f"phi_sample/{name}": f"tried/{name}" for name in ("observation", "action")}
+    with np.load(directory / ARRAYS_FILE) as arrays:
+        assert names.keys() < set(arrays.files)
+        np.savez(directory / ARRAYS_FILE, **{names.get(name, name): arrays[name] for name in arrays.files})
+    again, credit = CreditAssigner.load(directory), CreditAssigner.load(saved)
+    assert again.config == credit.config
+    assert again.learner.n_learned == credit.learner.n_learned == 3
+    np.testing.assert_array_equal(again.learner.phi_sample[0][1], credit.learner.phi_sample[0][1])
+    np.testing.assert_array_equal(again.rewards_at(np.arange(20)), credit.rewards_at(np.arange(20)))
 
 
 def without(name):

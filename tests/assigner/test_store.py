@@ -33,6 +33,7 @@ def test_store_matches_a_twin_that_stores_all_steps(moves, capacity):
             with pytest.raises(LareError, match="capacity larger"):
                 store.end(env_id, 1.0)
             del running[env_id]
+            dropped += 1
         elif steps is not None:
             store.end(env_id, float(len(ended)))
             ended.append((tuple(running.pop(env_id)), float(len(ended))))

@@ -12,7 +12,21 @@ from lare_rl.errors import LareError, short_repr
 from lare_rl.tasks.payments import PAID_AT_END, PaymentRule
 from lare_rl.tasks.spec import MAX_LEVELS
 
-__all__ = ["NewSteps", "read_episode", "read_steps", "to_flags", "to_lengths", "to_levels", "to_rows", "to_step_ids"]
+__all__ = [
+    "GroupName",
+    "NewSteps",
+    "read_episode",
+    "read_steps",
+    "to_flags",
+    "to_lengths",
+    "to_levels",
+    "to_rows",
+    "to_step_ids",
+]
+
+
+GroupName = str | int | float
+"""The name of a group."""
 
 
 class NewSteps(NamedTuple):
@@ -105,11 +119,12 @@ def to_rows(
 
 
 def to_levels(
-    config: AssignerConfig, group: Sequence[Hashable] | None, new: NewSteps, group_names: dict[Hashable, int]
+    config: AssignerConfig, group: Sequence[Hashable] | None, new: NewSteps, group_names: dict[GroupName, int]
 ) -> Int[np.ndarray, " steps"]:
     """Return the number of the group of each new step, and add new groups to `group_names`. It is -1 for None.
 
-    Raises `LareError` if there are too many groups, if they do not fit, or if a step that is paid has none.
+    Raises `LareError` if there are too many groups, if they do not fit, or if a step that is paid has none. `group_names` is then
+    unchanged.
     """
     if (group is not None) != config.groups:
         needs, has_none = (
@@ -119,17 +134,30 @@ def to_levels(
         raise LareError(f"this assigner {needs if config.groups else has_none}")
     if group is None:
         return np.zeros(len(new.rows), np.int32)
+    if isinstance(group, str):
+        raise LareError(f"group is one text, {short_repr(group)}: give a list with the group of each row")
     if len(group) != new.n_rows:
         raise LareError(f"group has {len(group)} entries, but there are {new.n_rows} steps")
-    group = [group[row] for row in new.rows.tolist()]
-    names = [name for name in dict.fromkeys(group) if name is not None and name not in group_names]
-    if len(group_names) + len(names) > MAX_LEVELS:
-        raise LareError(f"there are more than {MAX_LEVELS} groups, such as {names[-1]!r}: merge some of them")
-    group_names |= {name: len(group_names) + i for i, name in enumerate(names)}
-    level = np.array([-1 if name is None else group_names[name] for name in group], np.int32)
+    names = [_to_group_name(group[row]) for row in new.rows.tolist()]
+    numbers = dict(group_names)
+    for name in names:
+        if name is not None:
+            numbers.setdefault(name, len(numbers))
+    if len(numbers) > MAX_LEVELS:
+        raise LareError(f"there are more than {MAX_LEVELS} groups, such as {list(numbers)[-1]!r}: merge some of them")
+    level = np.array([-1 if name is None else numbers[name] for name in names], np.int32)
     if np.any((level < 0) & (new.ended | (not config.payments.only_at_end))):
         raise LareError("the group of an episode is None when it is paid: give the group of each row that is paid")
+    group_names |= numbers
     return level
+
+
+def _to_group_name(value: Any) -> GroupName | None:
+    """Return a group as a text or a number of Python, which stay the same in a file. Raises `LareError` for anything else."""
+    name = value.item() if isinstance(value, np.generic | np.ndarray) and value.size == 1 else value
+    if name is not None and (not isinstance(name, str | int | float) or name != name):  # NaN
+        raise LareError(f"a group is a text or a number, and not {short_repr(value)}")
+    return name
 
 
 def _to_team_reward(

@@ -19,6 +19,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from lare_rl.assigner import arguments, saving
+from lare_rl.assigner.arguments import GroupName
 from lare_rl.assigner.assigner_config import AssignerConfig, Space, check_config, resolve_config
 from lare_rl.assigner.decoder_learner import DecoderLearner
 from lare_rl.assigner.explain import describe_returns
@@ -115,7 +116,7 @@ class CreditAssigner:
         self.store = Store(
             config.capacity, row_shape, config.agents, config.payments, has_levels=config.groups, longest=longest
         )
-        self.group_names: dict[Hashable, int] = {}
+        self.group_names: dict[GroupName, int] = {}
         """The number of each group."""
         self.learner = DecoderLearner(config, self.store)
         self.step_rewards = StepRewards(self.learner)
@@ -163,8 +164,10 @@ class CreditAssigner:
             LareError: shapes do not fit, a number is not finite, or the steps or an episode are more than `capacity`.
         """
         with self.lock:
+            if env_ids is not None and lanes is not None:
+                raise LareError("both env_ids and lanes, its earlier name, were given: leave lanes out")
             steps = observation, action, next_observation
-            ids = lanes if env_ids is None else env_ids  # `lanes` is the earlier name
+            ids = lanes if env_ids is None else env_ids
             new = arguments.read_steps(self.config, steps, reward, terminated, truncated, ids, valid, alive)
             step_ids = np.full(new.n_rows, -1)
             if len(new.rows):
@@ -206,7 +209,7 @@ class CreditAssigner:
         Use this if the score is not part of the steps. If the score comes late, give every episode an `env_id` of its own.
 
         Raises:
-            LareError: no episode is running in this environment, or the score is not finite.
+            LareError: no episode is running in this environment, it has no group, or the score is not finite.
         """
         with self.lock:
             self.learner.queue_episodes([self.store.end(env_id, score)])

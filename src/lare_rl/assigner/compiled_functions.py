@@ -6,7 +6,6 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, Float, Key
 
 from lare_rl.credit import decomposition, descent, engine, explain_returns, returns
@@ -63,10 +62,3 @@ def training_rewards(
 def on_cpu() -> AbstractContextManager:
     """Compute on the CPU: decoders of steps are small, and another library may use the accelerator."""
     return jax.default_device("cpu")
-
-
-def pad(rows: np.ndarray, size: int) -> np.ndarray:
-    """Pad rows with zeros. `numpy.pad` takes ten times as long for a few rows."""
-    padded = np.zeros((size, *rows.shape[1:]), rows.dtype)
-    padded[: len(rows)] = rows
-    return padded

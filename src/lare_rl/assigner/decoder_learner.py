@@ -8,6 +8,7 @@ depends on them:
                    └─► pending episodes ──────────────────────────────────learn_returns─────► sufficient statistics, decoder
 """
 
+from collections import deque
 from collections.abc import Iterable, Sequence
 from itertools import chain
 from math import inf
@@ -19,7 +20,7 @@ from jaxtyping import Int
 from lare_rl.assigner import compiled_functions as compiled
 from lare_rl.assigner.assigner_config import AssignerConfig
 from lare_rl.assigner.batches import sample_batch, whole_episodes
-from lare_rl.assigner.compiled_functions import MAX_CALL_ROWS, on_cpu, pad
+from lare_rl.assigner.compiled_functions import MAX_CALL_ROWS, on_cpu
 from lare_rl.assigner.store import Store, StoredEpisode
 from lare_rl.credit import closed_form, prequential, returns
 from lare_rl.credit.decomposition import DecoderState
@@ -27,7 +28,7 @@ from lare_rl.credit.engine import RewardSource
 from lare_rl.credit.history import next_history_columns
 from lare_rl.credit.methods import Fit
 from lare_rl.util.float64 import float64
-from lare_rl.util.shapes import padded_size
+from lare_rl.util.shapes import pad_rows, padded_size
 
 __all__ = ["CHUNK_UPDATES", "DecoderLearner"]
 
@@ -64,7 +65,7 @@ class DecoderLearner:
         """Inputs of steps that are not in the running statistics yet, and which agents acted."""
         self._pending_returns: list[tuple[float, int, int]] = []
         """R/T, T and level of episodes that are not in the scales yet."""
-        self._pending_episodes: list[list[StoredEpisode]] = []
+        self._pending_episodes: deque[list[StoredEpisode]] = deque()
         """Episodes that the decoder has not learned from yet. Episodes that ended in one call are together."""
         self._pending_updates = 0.0
         self._is_fitted = False
@@ -154,7 +155,9 @@ class DecoderLearner:
             chunk = slice(start, start + MAX_CALL_ROWS)
             size = padded_size(len(inputs[chunk]))
             with on_cpu():
-                self.source = compiled.observe_steps(self.source, pad(inputs[chunk], size), pad(alive[chunk], size))
+                self.source = compiled.observe_steps(
+                    self.source, pad_rows(inputs[chunk], size), pad_rows(alive[chunk], size)
+                )
 
     def _flush_returns(self) -> None:
         if not self._pending_returns:
@@ -163,8 +166,8 @@ class DecoderLearner:
         self._pending_returns.clear()
         size = padded_size(len(mean_reward))
         mask = np.arange(size) < len(mean_reward)
-        mean_reward, length = pad(mean_reward.astype(np.float32), size), pad(length.astype(np.int32), size)
-        level = pad(level.astype(np.int32), size) if self.config.groups else None
+        mean_reward, length = pad_rows(mean_reward.astype(np.float32), size), pad_rows(length.astype(np.int32), size)
+        level = pad_rows(level.astype(np.int32), size) if self.config.groups else None
         with on_cpu():
             if self.decoder is None:
                 self.source = compiled.observe_scale(self.source, mean_reward, mask)
@@ -181,23 +184,21 @@ class DecoderLearner:
         """Let the decoder learn from pending episodes.
 
         If they are many, a decoder in closed form is fitted several times, so that every return is predicted before the decoder is
-        fitted to it. After a late call, these may be other fits than after prompt ones.
+        fitted to it. How many fits these are depends on when this is called.
         """
         self.flush_inputs()
         self.flush_statistics()
         oldest = self.store.n_added - self.store.capacity
         calls = [[episode for episode in batch if episode.step_ids[0] >= oldest] for batch in self._pending_episodes]
-        calls = [batch for batch in calls if batch]
-        self._pending_episodes.clear()
+        pending = self._pending_episodes = deque(filter(None, calls))
         with on_cpu(), float64():
-            while calls:
-                new = calls.pop(0)
-                while calls and len(new) < self._episodes_until_fit():
-                    new += calls.pop(0)
+            while pending:
+                new = pending.popleft()
+                while pending and len(new) < self._episodes_until_fit():
+                    new += pending.popleft()
                 self.n_learned += len(new)
                 if self.decoder is not None:
-                    later = list(chain.from_iterable(calls))
-                    self.source = jax.block_until_ready(self._learn(self.decoder, new, later))
+                    self.source = jax.block_until_ready(self._learn(self.decoder, new))
 
     def _episodes_until_fit(self) -> float:
         """Return the number of new episodes until the next fit in closed form. Other decoders are not fitted here."""
@@ -205,10 +206,8 @@ class DecoderLearner:
             return inf
         return (closed_form.FIT_GROWTH - 1) * self.n_learned
 
-    def _learn(
-        self, decoder: DecoderState, new: Sequence[StoredEpisode], later: Sequence[StoredEpisode]
-    ) -> DecoderState:
-        """Return a decoder that has learned from some new episodes, while later ones still wait."""
+    def _learn(self, decoder: DecoderState, new: Sequence[StoredEpisode]) -> DecoderState:
+        """Return a decoder that has learned from some new episodes, while later ones are still pending."""
         for batch in whole_episodes(self.store, self.config.spec, new):
             decoder = compiled.predict_then_update(decoder, batch, settings=self.config.settings)
         if decoder.closed_form is None:
@@ -216,8 +215,8 @@ class DecoderLearner:
         may_rebuild = self.config.forget or self.store.n_added <= self.store.capacity
         if self.config.method.fit is not Fit.SIGNS and may_rebuild and compiled.is_stale(decoder):
             decoder = compiled.reset_statistics(decoder)
-            later_ids = set(map(id, later))
-            earlier = [episode for episode in self.store.episodes.values() if id(episode) not in later_ids]
+            pending = set(map(id, chain.from_iterable(self._pending_episodes)))
+            earlier = [episode for episode in self.store.episodes.values() if id(episode) not in pending]
             for batch in whole_episodes(self.store, self.config.spec, earlier):
                 decoder = compiled.add_episodes(decoder, batch)
         return compiled.fit_closed_form(decoder, spec=self.config.spec) if compiled.is_due(decoder) else decoder
@@ -262,14 +261,9 @@ class DecoderLearner:
     def metrics(self) -> dict[str, float]:
         """Return metrics that need no true rewards. Returns are predicted before they are learned from."""
         self.learn_returns()
-        predicted: dict[str, float] = dict.fromkeys(
-            ("credit/return_r2", "credit/gain", "credit/gain_error"), float("nan")
-        )
-        if self.decoder is not None:
-            with on_cpu():
-                predicted = {
-                    name: float(value) for name, value in prequential.metrics(self.decoder.predictions).items()
-                }
+        predictions = prequential.empty_predictions(1) if self.decoder is None else self.decoder.predictions
+        with on_cpu():
+            predicted = {name: float(value) for name, value in prequential.metrics(predictions).items()}
         return {
             **predicted,
             "credit/episodes": float(self.store.n_ended),

@@ -7,7 +7,7 @@ DIRECTORY/
 """
 
 import json
-from collections.abc import Hashable, Iterable, Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -15,6 +15,7 @@ from typing import Any
 
 import numpy as np
 
+from lare_rl.assigner.arguments import GroupName
 from lare_rl.assigner.assigner_config import AssignerConfig
 from lare_rl.assigner.decoder_learner import DecoderLearner
 from lare_rl.assigner.space_layout import SpaceLayout
@@ -27,7 +28,7 @@ from lare_rl.runs.checkpoint import DAMAGED_FILE_ERRORS, fill_template, named_le
 from lare_rl.tasks.payments import PaymentRule
 from lare_rl.tasks.spec import TaskSpec
 from lare_rl.util.files import replace_npz, write_atomically
-from lare_rl.util.renamed_fields import rename_keys
+from lare_rl.util.renamed_fields import rename_assigner, rename_keys
 from lare_rl.util.safe_io import read_json, read_text
 
 __all__ = ["AssignerState", "get_state", "read_state", "report_damage", "restore", "write_state"]
@@ -47,9 +48,9 @@ PLAIN_FIELDS = (
 """The fields of a configuration that are JSON values."""
 LEARNED = "learned"
 """The names of the arrays of the decoder, or of the scale, begin with it."""
-STORE_ARRAYS = {"features": "inputs", "length": "length", "mean_reward": "mean_reward", "episode": "episode"}
-"""The arrays of a store by their names in the file."""
-PHI_SAMPLE = ("tried/observation", "tried/action")
+STORE_ARRAYS = ("inputs", "length", "mean_reward", "episode")
+"""The arrays of a store, for each step."""
+PHI_SAMPLE = ("phi_sample/observation", "phi_sample/action")
 """The steps on which `phi` is verified when it is loaded, because there may be no environment."""
 
 
@@ -61,11 +62,11 @@ class AssignerState:
     n_learned: int
     n_updates: int
     arrays: dict[str, np.ndarray]
-    group_names: tuple[str | int | float, ...] = ()
-    """The groups in the order of their numbers, as texts or numbers."""
+    group_names: tuple[GroupName, ...] = ()
+    """The groups in the order of their numbers."""
 
 
-def get_state(learner: DecoderLearner, group_names: Iterable[Hashable], *, episodes: bool) -> AssignerState:
+def get_state(learner: DecoderLearner, group_names: Iterable[GroupName], *, episodes: bool) -> AssignerState:
     """Return the state of an assigner, with stored steps and episodes if `episodes` is true."""
     learner.learn_returns()
     store = learner.store
@@ -76,13 +77,12 @@ def get_state(learner: DecoderLearner, group_names: Iterable[Hashable], *, episo
         arrays[name] = np.concatenate(chunks)
     if episodes:
         arrays |= _store_arrays(store)
-    names = (name if isinstance(name, str | int | float) else str(name) for name in group_names)
-    return AssignerState(learner.config, learner.n_learned, learner.n_updates, arrays, tuple(names))
+    return AssignerState(learner.config, learner.n_learned, learner.n_updates, arrays, tuple(group_names))
 
 
 def restore(learner: DecoderLearner, state: AssignerState) -> None:
     """Give a new learner the state of a saved one. Raises `KeyError` or `ValueError` if the arrays do not fit."""
-    arrays = state.arrays
+    arrays = rename_assigner(state.arrays)
     learner.n_learned, learner.n_updates = state.n_learned, state.n_updates
     if set(PHI_SAMPLE) <= set(arrays):
         learner.phi_sample.append((arrays[PHI_SAMPLE[0]], arrays[PHI_SAMPLE[1]]))
@@ -90,7 +90,7 @@ def restore(learner: DecoderLearner, state: AssignerState) -> None:
     (learner.source,) = fill_template((learner.source,), learned)
     store = learner.store
     store.n_ended, store.n_ended_steps, store.dropped = map(int, arrays["counts"])
-    if "steps" in arrays:
+    if "n_added" in arrays:
         _restore_store(store, arrays)
 
 
@@ -108,36 +108,36 @@ def write_state(state: AssignerState, directory: Path) -> None:
 
 
 def read_state(directory: Path) -> AssignerState:
-    """Read what `write_state` has written. `phi` is verified again.
+    """Read what `write_state` has written. `phi` is verified again. Damaged files raise many kinds of errors: see `report_damage`.
 
     Raises:
-        LareError: the directory does not exist, is damaged, or was written by another version.
+        LareError: another version has written the directory, or `phi` fails.
     """
     path = directory / TEXT_FILE
-    with report_damage(directory):
-        values = read_json(read_text(path))
-        values = rename_keys(values) if isinstance(values, dict) else {}
-        with open_npz(directory / ARRAYS_FILE) as saved:
-            arrays = {name: saved[name] for name in saved.files}
-        if values.get("format") != FORMAT:
-            raise LareError(f"{path} is not of format {FORMAT}: another version of LaRe has written it")
-        task = None if values["task"] is None else TaskSpec(**rename_keys(values["task"]))
-        phi = None
-        if task is not None and values["phi"]:
-            sample = (arrays[PHI_SAMPLE[0]], arrays[PHI_SAMPLE[1]]) if set(PHI_SAMPLE) <= set(arrays) else None
-            phi = load_function(directory / FUNCTION_FILE, task, steps=sample)
-        config = AssignerConfig(
-            method=METHODS.find(values["method"]),
-            phi=phi,
-            task=task,
-            observation=SpaceLayout(**values["observation"]),
-            action=SpaceLayout(**values["action"]),
-            settings=CreditSettings(**values["settings"]),
-            payments=PaymentRule(**values.get("payments", {})),
-            groups=values.get("groups", False),
-            **{name: values[name] for name in PLAIN_FIELDS},
-        )
-        return AssignerState(config, values["told"], values["fits"], arrays, tuple(values.get("group_names", ())))
+    values = read_json(read_text(path))
+    values = rename_assigner(rename_keys(values)) if isinstance(values, dict) else {}
+    with open_npz(directory / ARRAYS_FILE) as saved:
+        arrays = rename_assigner({name: saved[name] for name in saved.files})
+    if values.get("format") != FORMAT:
+        raise LareError(f"{path} is not of format {FORMAT}: another version of LaRe has written it")
+    task = None if values["task"] is None else TaskSpec(**rename_keys(values["task"]))
+    phi = None
+    if task is not None and values["phi"]:
+        sample = (arrays[PHI_SAMPLE[0]], arrays[PHI_SAMPLE[1]]) if set(PHI_SAMPLE) <= set(arrays) else None
+        phi = load_function(directory / FUNCTION_FILE, task, steps=sample)
+    config = AssignerConfig(
+        method=METHODS.find(values["method"]),
+        phi=phi,
+        task=task,
+        observation=SpaceLayout(**values["observation"]),
+        action=SpaceLayout(**values["action"]),
+        settings=CreditSettings(**values["settings"]),
+        payments=PaymentRule(**values.get("payments", {})),
+        groups=values.get("groups", False),
+        **{name: values[name] for name in PLAIN_FIELDS},
+    )
+    group_names = tuple(values.get("group_names", ()))
+    return AssignerState(config, values["n_learned"], values["n_updates"], arrays, group_names)
 
 
 @contextmanager
@@ -163,19 +163,20 @@ def _config_values(state: AssignerState) -> dict[str, Any]:
         "groups": config.groups,
         "group_names": list(state.group_names),
         "phi": config.phi is not None,
-        "told": state.n_learned,
-        "fits": state.n_updates,
+        "n_learned": state.n_learned,
+        "n_updates": state.n_updates,
     }
 
 
 def _store_arrays(store: Store) -> dict[str, np.ndarray]:
     rows = np.arange(max(0, store.n_added - store.capacity), store.n_added) % store.capacity
-    episodes = list(store.episodes.values())
+    numbers = [number for _, number in store.oldest]  # in the order from which batches are sampled
+    episodes = [store.episodes[number] for number in numbers]
     return {
-        **{name: getattr(store, field)[rows] for name, field in STORE_ARRAYS.items()},
+        **{name: getattr(store, name)[rows] for name in STORE_ARRAYS},
         **({} if store.alive is None else {"alive": store.alive[rows]}),
-        "steps": np.array(store.n_added),
-        "numbers": np.array(list(store.episodes), np.int64),
+        "n_added": np.array(store.n_added),
+        "numbers": np.array(numbers, np.int64),
         "episodes": np.concatenate([np.zeros(0, np.int64), *(episode.step_ids for episode in episodes)]),
         "lengths": np.array([len(episode.step_ids) for episode in episodes], np.int64),
         "scores": np.array([episode.return_ for episode in episodes], np.float64),
@@ -184,11 +185,11 @@ def _store_arrays(store: Store) -> dict[str, np.ndarray]:
 
 
 def _restore_store(store: Store, arrays: dict[str, np.ndarray]) -> None:
-    store.n_added = int(arrays["steps"])
+    store.n_added = int(arrays["n_added"])
     rows = np.arange(max(0, store.n_added - store.capacity), store.n_added) % store.capacity
-    for name, field in STORE_ARRAYS.items():
+    for name in STORE_ARRAYS:
         if name in arrays:  # earlier versions did not save every array
-            getattr(store, field)[rows] = arrays[name]
+            getattr(store, name)[rows] = arrays[name]
     if "alive" in arrays:
         store.alive = np.ones((store.capacity, store.agents), bool)
         store.alive[rows] = arrays["alive"]
@@ -201,3 +202,4 @@ def _restore_store(store: Store, arrays: dict[str, np.ndarray]) -> None:
     ):
         steps = arrays["episodes"][end - length : end]
         store.put_episode(number, StoredEpisode(steps, float(score), level))
+    store.episodes = dict(sorted(store.episodes.items()))

@@ -12,13 +12,13 @@ from jaxtyping import Array, Bool, Float, Int
 
 from lare_rl.assigner import compiled_functions as compiled
 from lare_rl.assigner.batches import whole_episodes
-from lare_rl.assigner.compiled_functions import MAX_CALL_ROWS, on_cpu, pad
+from lare_rl.assigner.compiled_functions import MAX_CALL_ROWS, on_cpu
 from lare_rl.assigner.decoder_learner import DecoderLearner
 from lare_rl.credit import decomposition
 from lare_rl.credit.decomposition import DecoderState
 from lare_rl.credit.engine import StepBatch
 from lare_rl.credit.methods import Reward
-from lare_rl.util.shapes import padded_size
+from lare_rl.util.shapes import pad_rows, padded_size
 
 __all__ = ["StepRewards"]
 
@@ -65,7 +65,7 @@ class StepRewards:
             chunk = slice(start, start + MAX_CALL_ROWS)
             selected = jax.tree.map(itemgetter(chunk), steps)
             count = len(selected.length)
-            padded = jax.tree.map(partial(pad, size=padded_size(count)), selected)
+            padded = jax.tree.map(partial(pad_rows, size=padded_size(count)), selected)
             with on_cpu():
                 leaves, structure = self._flat_state()
                 r_hat = compiled.training_rewards(leaves, padded, structure=structure, spec=self.config.spec)
@@ -123,5 +123,5 @@ class StepRewards:
         size = padded_size(len(length))
         with on_cpu():
             levels = None if level is None else jnp.full(size, level)
-            values = decomposition.level_returns(decoder, levels, jnp.asarray(pad(length, size)))
+            values = decomposition.level_returns(decoder, levels, jnp.asarray(pad_rows(length, size)))
         return float(np.sum(np.asarray(values)[: len(length)]))

@@ -37,8 +37,8 @@ class RunningEpisode:
 
     step_ids: list[int] = field(default_factory=list)
     """The numbers of its steps."""
-    level: int = 0
-    """Its level."""
+    level: int = -1
+    """Its level; -1 before a step has one."""
     n_paid: int = 0
     """The number of steps up to the last payment."""
     return_: float = 0.0
@@ -143,14 +143,16 @@ class Store:
         error = None
         for i, env_id in enumerate(env_ids):
             episode = self.get_running(env_id, observation[i])
-            episode.level = 0 if level is None else max(int(level[i]), 0)
+            if level is None:
+                episode.level = 0
+            elif level[i] >= 0:
+                episode.level = int(level[i])
             episode.last_observation = next_observation[i]
             payment = None
             try:
                 payment = self._add_step(episode, int(step_ids[i]), float(reward[i]), self.payments, bool(ended[i]))
             except LareError as refusal:
                 error = error or refusal
-                self.dropped += 1
             if ended[i]:
                 del self.running[env_id]
             if payment is not None:
@@ -175,8 +177,8 @@ class Store:
         Without a score, it is the sum of the rewards since the last payment.
 
         Raises:
-            LareError: no episode is running, the score is not finite, its first steps are not stored any more, or all of its steps
-                have been paid for.
+            LareError: no episode is running, the score is not finite, the episode has no level, its first steps are not stored any
+                more, or all of its steps have been paid for.
         """
         if env_id not in self.running:
             raise LareError(
@@ -185,8 +187,11 @@ class Store:
             )
         if score is not None and not np.isfinite(score):
             raise LareError(f"the score of the environment {env_id!r} is {score}: give a finite number")
+        if self.has_levels and self.running[env_id].level < 0:
+            raise LareError(f"the episode of the environment {env_id!r} has no group: give group= at a step of it")
         episode = self.running.pop(env_id)
         if len(episode.step_ids) == episode.n_paid:
+            self.dropped += 1
             raise LareError(
                 f"the last step of the environment {env_id!r} was paid already: end the episode with this step"
             )
@@ -207,11 +212,13 @@ class Store:
         """
         step_ids = episode.step_ids
         if self.longest is not None and len(step_ids) > self.longest:
+            self.dropped += 1
             raise LareError(
                 f"the decoder reads at most {self.longest} steps for one payment, and this one is for {len(step_ids)}: use rudder, or "
                 "payments"
             )
         if self.n_added - step_ids[0] > self.capacity:
+            self.dropped += 1
             raise LareError(
                 f"an episode of {len(step_ids)} steps has ended, and its first steps are not stored any more: "
                 f"make capacity larger than {self.capacity}"

@@ -83,9 +83,7 @@ class StepRecorder:
         config = self.credit.config
         if not config.groups:
             return None
-        groups = [info.get(config.group_key) for info in infos]
-        # A NumPy number is no longer one after the assigner was saved.
-        return [group.item() if isinstance(group, np.generic | np.ndarray) else group for group in groups]
+        return [info.get(config.group_key) for info in infos]
 
     def drop(self, env_index: int) -> None:
         """Give up the running episode of an environment, which was reset."""

@@ -4,7 +4,7 @@ import re
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-__all__ = ["rename_fields", "rename_keys", "rename_metrics", "rename_options"]
+__all__ = ["rename_assigner", "rename_fields", "rename_keys", "rename_metrics", "rename_options"]
 
 _RENAMED_KEYS = {"judged_from": "credit_scope", "judges": "scored_observation"}
 """From old to new keys of tasks, settings and assigners."""
@@ -14,6 +14,16 @@ _RENAMED_METRICS = {"likeliest_return": "deterministic_return"}
 
 _RENAMED_OPTIONS = {"--judges": "--scored-observation", "--credit.drawn-steps": "--credit.sampled-steps"}
 """From old to new options of the command line."""
+
+_RENAMED_ASSIGNER = {
+    "features": "inputs",
+    "fits": "n_updates",
+    "steps": "n_added",
+    "told": "n_learned",
+    "tried/action": "phi_sample/action",
+    "tried/observation": "phi_sample/observation",
+}
+"""From old to new names of keys and arrays in the files of a `CreditAssigner`."""
 
 _RENAMED_FIELDS = {
     "average": "is_average",
@@ -74,6 +84,11 @@ _RENAMED_PATHS = {
 def rename_keys(values: Mapping[str, Any]) -> dict[str, Any]:
     """Return the values of a table under the present names of its keys. A key beside its old name is not overwritten."""
     return {name if (new := _RENAMED_KEYS.get(name, name)) in values else new: value for name, value in values.items()}
+
+
+def rename_assigner(values: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the keys, or the arrays, of a saved `CreditAssigner` under their present names."""
+    return {_RENAMED_ASSIGNER.get(name, name): value for name, value in values.items()}
 
 
 def rename_metrics(line: Mapping[str, Any]) -> dict[str, Any]:
