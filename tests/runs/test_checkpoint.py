@@ -64,7 +64,8 @@ def test_rows_come_back(moves, tmp_path_factory):
         assert host == {"step": end.sum()}
         np.testing.assert_array_equal(learner.replay.next_row, [end])
         for env in (0, 1):
-            valid = np.arange(max(0, furthest[env] - CAPACITY + 1), end[env]) % CAPACITY
+            # The row after the last one holds the newest observation.
+            valid = np.arange(max(0, furthest[env] - CAPACITY + 1), end[env] + 1) % CAPACITY
             expected = rows[env, valid].astype(np.float32)
             np.testing.assert_array_equal(learner.replay.columns["reward"][0, env, valid], expected)
         with np.load(directory / "state.npz") as state:
