@@ -9,12 +9,14 @@ import pytest
 from scipy.stats import mode
 
 from helpers.toy_envs import toy_spec
-from helpers.training_runs import start_run
+from lare_rl.config.resolve import resolve
 from lare_rl.envs.families import register_family
 from lare_rl.envs.jax_spaces import agent_spec, agent_timestep, make_choices
 from lare_rl.envs.play import play_episodes
 from lare_rl.errors import LareError
 from lare_rl.evaluation.policy import load_policy
+from lare_rl.runs.directory import create_run
+from lare_rl.training.start_session import start_session
 
 CHOICES = make_choices((2, 3), (2,), "dials/two")
 
@@ -50,7 +52,13 @@ TASK = toy_spec(environment="dials/two", observation_size=2, action_size=6)
 
 @pytest.fixture(scope="module")
 def run(small, tmp_path_factory):
-    return start_run(TASK, small(method="dense", algorithm="ppo"), tmp_path_factory.mktemp("dials") / "run")
+    """A run with a checkpoint before its first step."""
+    settings = resolve(small(method="dense", algorithm="ppo"), TASK)
+    run = create_run(tmp_path_factory.mktemp("dials") / "run", TASK, settings, ())
+    session = start_session(run)
+    session.save()
+    session.close()
+    return run
 
 
 def test_actions_are_available_and_those_of_the_package(run):

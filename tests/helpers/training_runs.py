@@ -9,10 +9,8 @@ import pytest
 import lare_rl
 from helpers.listeners import AtStep, metrics_without_times
 from helpers.toy_envs import toy_spec
-from lare_rl.config.resolve import resolve
-from lare_rl.runs.directory import create_run, open_run
+from lare_rl.runs.directory import open_run
 from lare_rl.training.loop import RunInterruptedError
-from lare_rl.training.start_session import start_session
 
 QUICK_CREDIT = {"hidden": (8,), "sampled_steps": 4, "steps": 16, "score": "sum"}
 """To find out the type of the score would take seconds of compilation."""
@@ -28,15 +26,6 @@ def train_quietly(task, settings, out, function=None, listeners=(), **arguments)
 
 def resume_quietly(run, **arguments):
     return lare_rl.resume(run, **({"listeners": []} | arguments))
-
-
-def start_run(task, settings, directory):
-    """Return a run that has a checkpoint before its first step."""
-    run = create_run(directory, task, resolve(settings, task), ())
-    session = start_session(run)
-    session.save()
-    session.close()
-    return run
 
 
 def copy_run(run, directory):

@@ -59,12 +59,13 @@ def test_rows_come_back(moves, tmp_path_factory):
             furthest[env] = max(furthest[env], end[env])
             if move[env] < 0:
                 end[env] = max(end[env] + move[env], 0)
+            rows[env, end[env] % CAPACITY] = -n_written  # the newest observation, before its step is complete
         save(directory, rows, end)
         learner, host, _ = checkpoint.load(directory, template(1, 2, CAPACITY))
         assert host == {"step": end.sum()}
         np.testing.assert_array_equal(learner.replay.next_row, [end])
         for env in (0, 1):
-            valid = np.arange(max(0, furthest[env] - CAPACITY + 1), end[env]) % CAPACITY
+            valid = np.arange(max(0, furthest[env] - CAPACITY + 1), end[env] + 1) % CAPACITY
             expected = rows[env, valid].astype(np.float32)
             np.testing.assert_array_equal(learner.replay.columns["reward"][0, env, valid], expected)
         with np.load(directory / "state.npz") as state:

@@ -44,7 +44,7 @@ def assert_equal_sessions(training, other):
 @pytest.mark.parametrize(
     ("algorithm", "method"),
     [
-        ("ippo", "lare-linear"),
+        ("ippo", "lare-rd"),
         long_case("ippo", "lare-bayes"),
         long_case("qmix", "lare-rd"),
         long_case("qmix", "lare-bayes"),
@@ -63,7 +63,7 @@ def test_advance_equals_host_iterations(algorithm, method, begin, monkeypatch):
 
 
 def test_advance_stops_at_a_factor_that_is_not_finite(begin):
-    training = begin("ippo", "lare-linear")
+    training = begin("ippo", "lare-rd")
     training.advance(20)
     envs = training.collector.envs
     observation = envs.timestep.observation.at[1].set(np.inf)
