@@ -18,25 +18,11 @@ def make_episodes(n_episodes, seed=0, scale=1.0):
     return x, chance, 10.0 * (rng.random(n_episodes) < chance)
 
 
-add_episodes = jax.jit(logistic.add_episodes)
-fit_state = jax.jit(lambda state, rounds=ROUNDS: logistic.fit(state, GROUP_INDEX, rounds))
-
-
-@jax.jit
-def payments_and_predictions(state, x):
-    start_value, slope = logistic.to_returns(state)
-    return start_value + slope * (x @ state.posterior.weight), logistic.predict(state, x), slope
-
-
-def add(x, returns):
+def fit(x, returns, rounds=ROUNDS):
     state = logistic.init(GROUP_INDEX)
     with float64():
-        return add_episodes(state, jnp.asarray(x), jnp.asarray(returns), jnp.ones(len(x), bool))
-
-
-def fit(x, returns, rounds=ROUNDS):
-    with float64():
-        return fit_state(add(x, returns), rounds)
+        state = logistic.add_episodes(state, jnp.asarray(x), jnp.asarray(returns), jnp.ones(len(x), bool))
+        return logistic.fit(state, GROUP_INDEX, rounds)
 
 
 def slow_fit(x, won, rounds):
@@ -81,8 +67,7 @@ def test_fit_equals_the_slow_twin():
 def test_wins_are_predicted_better_than_by_least_squares(scale):
     x, _, returns = make_episodes(300, scale=scale)
     test_x, chance, _ = make_episodes(2000, seed=1, scale=scale)
-    with float64():
-        _, predicted, _ = payments_and_predictions(fit(x, returns), np.float32(test_x))
+    predicted = logistic.predict(fit(x, returns), jnp.asarray(test_x, jnp.float32))
     weights = np.linalg.lstsq(np.column_stack([np.ones(len(x)), x]), returns, rcond=None)[0]
     linear = np.column_stack([np.ones(len(test_x)), test_x]) @ weights
     error, linear_error = (np.mean((10 * chance - values) ** 2) for values in (np.asarray(predicted), linear))
@@ -98,18 +83,20 @@ def test_group_that_does_not_matter_is_switched_off():
 
 def test_payments_are_in_the_unit_of_the_return():
     x, _, returns = make_episodes(300, scale=1.5)
-    with float64():
-        payments, predicted, _ = payments_and_predictions(fit(x, returns), np.float32(x))
-    np.testing.assert_allclose(np.mean(payments), np.mean(predicted), rtol=1e-4)
+    state = fit(x, returns)
+    start_value, slope = logistic.to_returns(state)
+    payments = start_value + slope * (jnp.asarray(x, jnp.float32) @ state.posterior.weight)
+    np.testing.assert_allclose(
+        np.mean(payments), np.mean(logistic.predict(state, jnp.asarray(x, jnp.float32))), rtol=1e-4
+    )
     np.testing.assert_allclose(np.polyfit(payments, returns, 1)[0], 1, atol=0.15)
 
 
 def test_fit_changes_nothing_while_all_returns_are_equal():
     x, _, _ = make_episodes(20)
-    with float64():
-        state = fit(x, np.full(20, 3.0))
-        assert np.all(state.posterior.weight == 0)
-        assert payments_and_predictions(state, np.float32(x))[2] == 0
+    state = fit(x, np.full(20, 3.0))
+    assert np.all(state.posterior.weight == 0)
+    assert logistic.to_returns(state)[1] == 0
 
 
 def test_window_holds_the_last_episodes():
@@ -119,13 +106,14 @@ def test_window_holds_the_last_episodes():
         for start in range(0, len(x), 18):
             chunk = jnp.asarray(np.arange(18) + start < len(x))
             rows = np.minimum(np.arange(18) + start, len(x) - 1)
-            state = add_episodes(state, jnp.asarray(x[rows]), jnp.asarray(returns[rows]), chunk)
+            state = logistic.add_episodes(state, jnp.asarray(x[rows]), jnp.asarray(returns[rows]), chunk)
     assert sorted(np.asarray(state.columns)[:, 0]) == sorted(x[10:, 0].astype(np.float32))
 
 
 def test_fit_of_one_seed_is_that_of_several_under_vmap():
-    states = [add(*make_episodes(50, seed)[::2]) for seed in (1, 2)]
+    states = [fit(*make_episodes(50, seed)[::2], rounds=0) for seed in (1, 2)]
     with float64():
-        together = jax.vmap(fit_state)(jax.tree.map(lambda *leaves: jnp.stack(leaves), *states))
-        alone = fit_state(states[1])
+        stacked = jax.tree.map(lambda *leaves: jnp.stack(leaves), *states)
+        together = jax.vmap(lambda state: logistic.fit(state, GROUP_INDEX, ROUNDS))(stacked)
+        alone = logistic.fit(states[1], GROUP_INDEX, ROUNDS)
     np.testing.assert_allclose(together.posterior.weight[1], alone.posterior.weight, rtol=1e-4)
