@@ -83,9 +83,23 @@ def hidden(task: str, dense: Directories = (), on_gpu: bool = True) -> Compariso
     )
 
 
+def wheat(run: str, task: str = "Wheat") -> Directories:
+    """Seeds 0 to 4, and 5 to 9."""
+    return [f"{LAPTOP}/real/seeds-{first}/{task}/{run}" for first in (0, 5)]
+
+
 HALF_CHEETAH, WALKER, REACHER = "HalfCheetah-v4", "Walker2d-v4", "Reacher-v4"
 TEN_SEEDS = "scores/cheetah/HalfCheetah-v4,paidonce"
 COMPARISONS = {
+    "wheat, SAC": Comparison(
+        6_000,
+        wheat("episodic-sac"),
+        wheat("dense-sac", "WheatProxy"),  # what practitioners would pay a step; it adds up to the score
+        {"rrdu": wheat("rrdu-sac")},
+        wheat("lare-rrdu-sac-published"),
+        wheat("lare-bayes-sac"),
+        wheat("bayes-sac"),
+    ),
     f"{HALF_CHEETAH}, TD3, short": Comparison(
         30_000,
         [f"{TEN_SEEDS}/episodic"],
