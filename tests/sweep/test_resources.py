@@ -1,4 +1,4 @@
-"""Cores and cards, divided among processes."""
+"""Cores and accelerators, divided among processes."""
 
 import os
 
@@ -6,13 +6,13 @@ import pytest
 
 from lare_rl.errors import LareError
 from lare_rl.sweep import resources
-from lare_rl.sweep.resources import Resources, Slot, assign_cards, assign_cores, assign_slots
+from lare_rl.sweep.resources import Resources, Slot, assign_accelerators, assign_cores, assign_slots
 
-FIRST, SECOND = resources.VISIBLE_CARDS
+FIRST, SECOND = resources.VISIBLE_ACCELERATORS
 
 
 def visible(variables):
-    """Return the cards of each process."""
+    """Return the accelerators of each process."""
     assert all(process[FIRST] == process[SECOND] for process in variables)
     return [process[FIRST] for process in variables]
 
@@ -26,7 +26,7 @@ def test_assign_cores():
 
 
 @pytest.mark.parametrize(
-    ("processes", "cards", "expected"),
+    ("processes", "accelerators", "expected"),
     [
         (2, None, ["0,1", "2,3"]),
         (3, None, ["0", "1", "2"]),
@@ -36,22 +36,22 @@ def test_assign_cores():
         (2, 0.0, ["", ""]),
     ],
 )
-def test_assign_cards(processes, cards, expected):
-    variables = assign_cards(processes, cards, 4, {})
+def test_assign_accelerators(processes, accelerators, expected):
+    variables = assign_accelerators(processes, accelerators, 4, {})
     assert visible(variables) == expected
-    is_shared = processes > 4 or cards == 0.5
+    is_shared = processes > 4 or accelerators == 0.5
     assert all((process.get(resources.PREALLOCATE) == "false") == is_shared for process in variables)
 
 
-def test_assign_cards_of_the_user():
+def test_assign_accelerators_of_the_user():
     environment = {FIRST: "5,7", SECOND: "5,7", resources.PREALLOCATE: "true"}
-    variables = assign_cards(3, None, 2, environment)
+    variables = assign_accelerators(3, None, 2, environment)
     assert visible(variables) == ["5", "7", "5"]
     assert all(resources.PREALLOCATE not in process for process in variables)
 
 
 def test_stale_variable_of_the_other_vendor():
-    assert assign_cards(2, None, 4, {SECOND: "0"}) == [{FIRST: "0,1"}, {FIRST: "2,3"}]
+    assert assign_accelerators(2, None, 4, {SECOND: "0"}) == [{FIRST: "0,1"}, {FIRST: "2,3"}]
 
 
 @pytest.mark.parametrize(
@@ -62,40 +62,40 @@ def test_stale_variable_of_the_other_vendor():
         ("print('a warning')", "a warning"),
     ],
 )
-def test_cards_that_cannot_be_counted(monkeypatch, program, words):
-    monkeypatch.setattr(resources, "COUNT_CARDS", program)
+def test_accelerators_that_cannot_be_counted(monkeypatch, program, words):
+    monkeypatch.setattr(resources, "COUNT_ACCELERATORS", program)
     monkeypatch.setattr(resources, "usable_cores", lambda: None)
-    with pytest.raises(LareError, match=f"cards.*{words}") as error:
+    with pytest.raises(LareError, match=f"accelerators.*{words}") as error:
         assign_slots(Resources(processes=2))
     assert "\n" not in str(error.value)
 
 
-def test_cards_are_counted_after_other_output(monkeypatch):
+def test_accelerators_are_counted_after_other_output(monkeypatch):
     for name in (FIRST, SECOND):
         monkeypatch.delenv(name, raising=False)
-    monkeypatch.setattr(resources, "COUNT_CARDS", "print('a warning'); print(2)")
+    monkeypatch.setattr(resources, "COUNT_ACCELERATORS", "print('a warning'); print(2)")
     monkeypatch.setattr(resources, "usable_cores", lambda: None)
     assert visible([slot.variables for slot in assign_slots(Resources(processes=2))]) == ["0", "1"]
 
 
-@pytest.mark.parametrize(("processes", "cards", "n_cards"), [(3, 2.0, 4), (9, 0.5, 4), (1, 1.0, 0)])
-def test_too_few_cards(processes, cards, n_cards):
-    with pytest.raises(LareError, match=f"{processes} processes .* the {n_cards} cards"):
-        assign_cards(processes, cards, n_cards, {})
+@pytest.mark.parametrize(("processes", "accelerators", "n_accelerators"), [(3, 2.0, 4), (9, 0.5, 4), (1, 1.0, 0)])
+def test_too_few_accelerators(processes, accelerators, n_accelerators):
+    with pytest.raises(LareError, match=f"{processes} processes .* the {n_accelerators} accelerators"):
+        assign_accelerators(processes, accelerators, n_accelerators, {})
 
 
-def test_slots_without_cards(monkeypatch):
-    """On a machine without cards, processes have no variables. A single process does not even ask for cards."""
+def test_slots_without_accelerators(monkeypatch):
+    """Processes have no variables. A single process does not even count accelerators."""
     monkeypatch.setenv("JAX_PLATFORMS", "cpu")
-    with pytest.raises(LareError, match="the 0 cards"):
-        assign_slots(Resources(cards=1))
-    assert assign_cards(2, None, 0, {}) == [{}, {}]
-    monkeypatch.setattr(resources, "_count_cards", lambda: pytest.fail("asked"))
+    with pytest.raises(LareError, match="the 0 accelerators"):
+        assign_slots(Resources(accelerators=1))
+    assert assign_accelerators(2, None, 0, {}) == [{}, {}]
+    monkeypatch.setattr(resources, "_count_accelerators", lambda: pytest.fail("asked"))
     assert assign_slots(Resources()) == [Slot(assign_cores(1, 1)[0], {})]
 
 
 def test_resources_are_checked():
     with pytest.raises(LareError, match="cores = 0"):
         Resources(cores=0)
-    with pytest.raises(LareError, match=r"cards = 1\.5.* whole number, or less than 1"):
-        Resources(cards=1.5)
+    with pytest.raises(LareError, match=r"accelerators = 1\.5.* whole number, or less than 1"):
+        Resources(accelerators=1.5)

@@ -102,6 +102,8 @@ def test_jobs_of_file(file, tmp_path, command):
     assert re.search(r"1 processes with 1000 cores each need 1000 cores, and \d+ are usable", error)
     file.write_text(FILE.replace("[settings]", "[settings]\ncandidates = 1").replace("[0, 3]", "[0]"))
     assert read_sweep(file)[1][1].directory.name == "lare-linear-td3-draw0-candidates1"
+    file.write_text(FILE.replace("[settings]", "cards = 0.5\n[settings]"))  # the earlier name
+    assert read_sweep(file)[0].accelerators == 0.5
 
 
 def test_finished_runs_are_skipped_and_others_continue(file, copying_python):

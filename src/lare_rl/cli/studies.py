@@ -26,7 +26,7 @@ def sweep(
 
     Args:
         file: lists tasks, methods, algorithms, draws and settings, and how many processes run at a time, on how many cores and
-            cards each (docs/how-to/sweeps.md).
+            accelerators each (docs/how-to/sweeps.md).
         ray: the address of a Ray cluster to train on instead of this machine, or local (needs the extra lare-rl[ray]).
         check: only check the file, list its runs and how far they are, and train nothing.
     """
@@ -115,7 +115,7 @@ def reproduce(
     out: Path = Path("results"),
     processes: int = 1,
     cores: int = 1,
-    cards: float | None = None,
+    accelerators: float | None = None,
     ray: Ray = None,
 ) -> None:
     """Reproduce a figure or table of the LaRe paper: train its runs, and write a page that compares the results. Needs a checkout.
@@ -130,7 +130,7 @@ def reproduce(
         out: the directory of the pages: OUT/BUDGET/NAME.md, with its pictures and all metrics.
         processes: number of runs at a time.
         cores: number of cores for each run.
-        cards: number of cards (accelerators) for each run; less than 1 if runs share a card. By default, an equal share.
+        accelerators: number of accelerators for each run; less than 1 if runs share one. By default, an equal share.
         ray: the address of a Ray cluster to train on instead of this machine, or local (needs the extra lare-rl[ray]).
     """
     from lare_rl.cli.sweep_progress import show_progress
@@ -141,7 +141,7 @@ def reproduce(
     if exhibit is None:
         print_table(("exhibit", "of the paper", "what it shows"), paper.listed())
         return
-    resources = Resources(processes=processes, cores=cores, cards=cards)
+    resources = Resources(processes=processes, cores=cores, accelerators=accelerators)
 
     def write_page(name: str) -> None:
         print_line(f"wrote {paper.reproduce(name, budget, resources, runs, out, ray, show_progress)}")

@@ -1,4 +1,4 @@
-"""Training of jobs: on this machine, each in its own process, on its own cores and cards, or on a Ray cluster.
+"""Training of jobs: on this machine, each in its own process, on its own cores and accelerators, or on a Ray cluster.
 
 A process ends when its parent ends.
 """
@@ -38,7 +38,7 @@ def train_in_processes(
     Closing the generator stops all jobs. Running jobs save a checkpoint first.
 
     Raises:
-        LareError: there are not enough cores or cards.
+        LareError: there are not enough cores or accelerators.
     """
     free_slots: queue.Queue[Slot] = queue.Queue()
     for slot in assign_slots(resources):
@@ -146,7 +146,7 @@ def train_in_process(job: Job, slot: Slot, running: RunningProcesses) -> str | N
 def train_on_ray(
     jobs: Sequence[Job], resources: Resources, address: str
 ) -> Generator[tuple[Job, str | None], None, None]:
-    """Train jobs on a Ray cluster, each on its cores and cards. Yield each job when it ends, and its error or None.
+    """Train jobs on a Ray cluster, each on its cores and accelerators. Yield each job when it ends, and its error or None.
 
     All machines must share the directory of the runs.
 
@@ -164,11 +164,11 @@ def train_on_ray(
     except (ConnectionError, ValueError, RuntimeError) as error:
         raise LareError(f"there is no Ray cluster at {address}: {error}") from error
     try:
-        cards = resources.cards or 0
-        variables = {PREALLOCATE: "false"} if 0 < cards < 1 else {}
+        accelerators = resources.accelerators or 0
+        variables = {PREALLOCATE: "false"} if 0 < accelerators < 1 else {}
         options: dict[str, Any] = {
             "num_cpus": resources.cores,
-            "num_gpus": cards,
+            "num_gpus": accelerators,
             "runtime_env": {"env_vars": variables},
         }
         remote = ray.remote(**options, max_calls=1)(train_job)

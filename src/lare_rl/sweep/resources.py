@@ -1,4 +1,4 @@
-"""The cores and the cards (accelerators) of this machine, divided among the processes of a sweep."""
+"""The cores and the accelerators of this machine, divided among the processes of a sweep."""
 
 import os
 import subprocess
@@ -12,20 +12,20 @@ from lare_rl.errors import CheckedModel, Count, LareError, short_repr
 from lare_rl.util.processes import usable_cores
 from lare_rl.util.sanitize import one_line
 
-__all__ = ["Resources", "Slot", "assign_cards", "assign_cores", "assign_slots"]
+__all__ = ["Resources", "Slot", "assign_accelerators", "assign_cores", "assign_slots"]
 
-VISIBLE_CARDS = ("CUDA_VISIBLE_DEVICES", "HIP_VISIBLE_DEVICES")
-"""The variables by which a process sees only some cards, of the libraries that JAX drives them with."""
+VISIBLE_ACCELERATORS = ("CUDA_VISIBLE_DEVICES", "HIP_VISIBLE_DEVICES")
+"""The variables by which a process sees only some accelerators: of CUDA, and of ROCm."""
 PREALLOCATE = "XLA_PYTHON_CLIENT_PREALLOCATE"
-"""Unless this is false, a process takes most of the memory of its cards when it starts, also if others use them."""
+"""Unless this is false, a process takes most of the memory of its accelerators when it starts, also if others use them."""
 
-COUNT_CARDS = "import jax; print(0 if jax.default_backend() == 'cpu' else jax.local_device_count())"
+COUNT_ACCELERATORS = "import jax; print(0 if jax.default_backend() == 'cpu' else jax.local_device_count())"
 
 
-def _check_cards(cards: float) -> float:
-    if cards > 1 and not cards.is_integer():
+def _check_accelerators(accelerators: float) -> float:
+    if accelerators > 1 and not accelerators.is_integer():
         raise ValueError("must be a whole number, or less than 1")
-    return cards
+    return accelerators
 
 
 class Resources(CheckedModel):
@@ -35,10 +35,9 @@ class Resources(CheckedModel):
     """Runs at a time."""
     cores: Count = 1
     """Cores of each run."""
-    cards: Annotated[float, Field(ge=0), AfterValidator(_check_cards)] | None = None
-    """Cards (accelerators) of each run: a whole number, or less than 1 if runs share a card. By default, each run gets
-    an equal share of this machine's cards. On a Ray cluster, it gets none by default. No effect on TPUs: every run sees all
-    of them."""
+    accelerators: Annotated[float, Field(ge=0), AfterValidator(_check_accelerators)] | None = None
+    """Accelerators of each run: a whole number, or less than 1 if runs share one. By default, each run gets an equal share of this
+    machine's; on a Ray cluster, none. No effect on TPUs: every run sees all of them."""
 
 
 class Slot(NamedTuple):
@@ -47,16 +46,20 @@ class Slot(NamedTuple):
     cores: list[int]
     """Empty if the system cannot tell which cores are usable."""
     variables: dict[str, str]
-    """Environment variables that choose its cards."""
+    """Environment variables that choose its accelerators."""
 
 
 def assign_slots(resources: Resources) -> list[Slot]:
-    """Divide this machine among processes. Raises `LareError` if there are not enough cores or cards, or none can be counted."""
+    """Divide this machine among processes.
+
+    Raises:
+        LareError: there are not enough cores or accelerators, or accelerators cannot be counted.
+    """
     cores = assign_cores(resources.processes, resources.cores)
-    if resources.cards is None and resources.processes == 1:  # JAX uses all cards
+    if resources.accelerators is None and resources.processes == 1:  # JAX uses all accelerators
         return [Slot(cores[0], {})]
-    cards = assign_cards(resources.processes, resources.cards, _count_cards(), os.environ)
-    return [Slot(*pair) for pair in zip(cores, cards, strict=True)]
+    accelerators = assign_accelerators(resources.processes, resources.accelerators, _count_accelerators(), os.environ)
+    return [Slot(*pair) for pair in zip(cores, accelerators, strict=True)]
 
 
 def assign_cores(processes: int, cores: int) -> list[list[int]]:
@@ -76,38 +79,42 @@ def assign_cores(processes: int, cores: int) -> list[list[int]]:
     return [usable[start : start + cores] for start in range(0, processes * cores, cores)]
 
 
-def assign_cards(
-    processes: int, cards: float | None, n_cards: int, variables: Mapping[str, str]
+def assign_accelerators(
+    processes: int, accelerators: float | None, n_accelerators: int, variables: Mapping[str, str]
 ) -> list[dict[str, str]]:
-    """Return the environment variables that choose the cards of each process.
+    """Return the environment variables that choose the accelerators of each process.
 
     Args:
-        cards: the cards of each process; by default an equal share.
-        variables: the environment variables of this process, which may choose some of the machine's cards.
+        accelerators: the accelerators of each process; by default an equal share.
+        variables: the environment variables of this process, which may choose some of the machine's accelerators.
 
     Raises:
-        LareError: there are not enough cards.
+        LareError: there are not enough accelerators.
     """
-    share = n_cards / processes if cards is None else cards
-    n_processes_per_card = int(1 / share) if 0 < share < 1 else 1
-    capacity = n_cards * n_processes_per_card // max(1, int(share))
-    if cards and processes > capacity:
+    share = n_accelerators / processes if accelerators is None else accelerators
+    n_processes_per_accelerator = int(1 / share) if 0 < share < 1 else 1
+    capacity = n_accelerators * n_processes_per_accelerator // max(1, int(share))
+    if accelerators and processes > capacity:
         raise LareError(
-            f"{processes} processes with {cards:g} cards each need more than the {n_cards} cards that are usable here: lower "
-            "processes or cards"
+            f"{processes} processes with {accelerators:g} accelerators each need more than the {n_accelerators} accelerators that "
+            "are usable here: lower processes or accelerators"
         )
-    if not n_cards:
+    if not n_accelerators:
         return [{} for _ in range(processes)]
-    return [_card_variables(process, share, n_cards, variables) for process in range(processes)]
+    return [_accelerator_variables(process, share, n_accelerators, variables) for process in range(processes)]
 
 
-def _card_variables(process: int, share: float, n_cards: int, variables: Mapping[str, str]) -> dict[str, str]:
+def _accelerator_variables(
+    process: int, share: float, n_accelerators: int, variables: Mapping[str, str]
+) -> dict[str, str]:
     count = int(share)
-    indices = range(process * count, (process + 1) * count) if share >= 1 else [process % n_cards] if share else []
+    indices = (
+        range(process * count, (process + 1) * count) if share >= 1 else [process % n_accelerators] if share else []
+    )
     chosen = {}
-    for name in VISIBLE_CARDS:
-        visible = variables[name].split(",") if variables.get(name) else list(map(str, range(n_cards)))
-        if len(visible) < n_cards:  # it chooses cards of another vendor
+    for name in VISIBLE_ACCELERATORS:
+        visible = variables[name].split(",") if variables.get(name) else list(map(str, range(n_accelerators)))
+        if len(visible) < n_accelerators:  # it chooses accelerators of another vendor
             continue
         chosen[name] = ",".join(visible[i] for i in indices)
     if 0 < share < 1 and PREALLOCATE not in variables:
@@ -115,19 +122,19 @@ def _card_variables(process: int, share: float, n_cards: int, variables: Mapping
     return chosen
 
 
-def _count_cards() -> int:
-    """Return the number of cards that JAX sees. Another process asks it, because JAX reserves memory of the cards.
+def _count_accelerators() -> int:
+    """Return the number of accelerators that JAX sees. Another process asks JAX, which reserves their memory.
 
     Raises:
         LareError: JAX fails in that process.
     """
     process = subprocess.run(
-        [sys.executable, "-P", "-c", COUNT_CARDS], capture_output=True, encoding="utf-8", errors="replace"
+        [sys.executable, "-P", "-c", COUNT_ACCELERATORS], capture_output=True, encoding="utf-8", errors="replace"
     )
     count = _last_line(process.stdout)  # libraries may print other lines before it
     if process.returncode or not count.isdecimal():
         reason = _last_line(process.stderr) or f"exit status {process.returncode}, output {short_repr(count)}"
-        raise LareError(f"JAX cannot count the cards of this machine: {one_line(reason)}")
+        raise LareError(f"JAX cannot count the accelerators of this machine: {one_line(reason)}")
     return int(count)
 
 

@@ -72,7 +72,7 @@ def read_sweep(path: Path) -> tuple[Sweep, list[Job]]:
     """
     table = read_table(path)
     try:
-        sweep = Sweep(**table)
+        sweep = Sweep(**rename_keys(table))
         _check_functions(sweep)
         jobs = list(_make_jobs(sweep, path))
         directories: set[Path] = set()
@@ -94,7 +94,7 @@ def run_sweep(
 
     Raises:
         RunInterruptedError: the user stopped it.
-        LareError: there are not enough cores or cards, or Ray is not available.
+        LareError: there are not enough cores or accelerators, or Ray is not available.
     """
     todo = [job for job in jobs if not job.done]
     n_done = len(jobs) - len(todo)

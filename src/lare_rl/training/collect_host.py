@@ -232,8 +232,10 @@ class HostCollector:
 
     def close(self) -> None:
         """Close the environments."""
-        self._envs.close()
-        self._evaluation_envs.close()
+        try:
+            self._envs.close()
+        finally:
+            self._evaluation_envs.close()
 
 
 def _ignore_step(step: int) -> None: ...

@@ -6,13 +6,17 @@ from typing import Any
 
 __all__ = ["rename_assigner", "rename_fields", "rename_keys", "rename_metrics", "rename_options"]
 
-_RENAMED_KEYS = {"judged_from": "credit_scope", "judges": "scored_observation"}
-"""From old to new keys of tasks, settings and assigners."""
+_RENAMED_KEYS = {"cards": "accelerators", "judged_from": "credit_scope", "judges": "scored_observation"}
+"""From old to new keys of tasks, settings, sweeps and assigners."""
 
 _RENAMED_METRICS = {"likeliest_return": "deterministic_return"}
 """From old to new metrics, after the slash."""
 
-_RENAMED_OPTIONS = {"--judges": "--scored-observation", "--credit.drawn-steps": "--credit.sampled-steps"}
+_RENAMED_OPTIONS = {
+    "--cards": "--accelerators",
+    "--credit.drawn-steps": "--credit.sampled-steps",
+    "--judges": "--scored-observation",
+}
 """From old to new options of the command line."""
 
 _RENAMED_ASSIGNER = {
