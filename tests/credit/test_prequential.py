@@ -75,7 +75,7 @@ def test_gain_covers_the_true_gain():
     rng = np.random.default_rng(1)
     chance = rng.choice(np.float32([0.3, 0.7]), (200, 256))
     won = (rng.random(chance.shape) < chance).astype(np.float32)
-    compute = jax.vmap(lambda *rows: gain(add_predictions(empty_predictions(1, 256), *rows)))
+    compute = jax.vmap(lambda *rows: gain(add_predictions(empty_predictions(1, 256), *rows, None)))
     gains, errors = map(np.asarray, jax.jit(compute)(won, chance[..., None], np.ones(won.shape, bool)))
     np.testing.assert_allclose(gains.mean(), 0.16, atol=0.01)
     np.testing.assert_allclose(errors.mean(), gains.std(), rtol=0.2)

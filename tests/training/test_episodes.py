@@ -188,11 +188,11 @@ def test_learn_returns_finds_the_score_type(method, score):
 
 def test_score_types_that_are_fitted():
     fixed = replace(ONE_AGENT, fixed_length=True)
-    assert small_config("lare-linear", credit=ANY_SCORE).score_types == (0, 1)
-    assert small_config("lare-linear", credit=ANY_SCORE, env=fixed).score_types == (0,)
-    assert small_config("lare-linear", credit=CreditSettings(score="average")).score_types == (1,)
+    assert small_config("lare-linear", credit=ANY_SCORE).credit_specs[0].score_types == (0, 1)
+    assert small_config("lare-linear", credit=ANY_SCORE, env=fixed).credit_specs[0].score_types == (0,)
+    assert small_config("lare-linear", credit=CreditSettings(score="average")).credit_specs[0].score_types == (1,)
     for method in ("lare-signs", "dense"):
-        assert small_config(method, credit=ANY_SCORE).score_types == (0,)
+        assert small_config(method, credit=ANY_SCORE).credit_specs[0].score_types == (0,)
 
 
 @pytest.mark.long
