@@ -179,7 +179,7 @@ class SmoothedReward(gymnasium.Wrapper):
 
 def make_scaled(**arguments: Any) -> gymnasium.Env:
     return gymnasium.wrappers.TransformReward(
-        gymnasium.make("HalfCheetah-v4", **arguments), lambda reward: 0.3 * reward
+        gymnasium.make("HalfCheetah-v4", **arguments), lambda reward: 0.3 * float(reward)
     )
 
 

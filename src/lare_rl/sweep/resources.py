@@ -15,7 +15,7 @@ from lare_rl.util.sanitize import one_line
 __all__ = ["Resources", "Slot", "assign_accelerators", "assign_cores", "assign_slots"]
 
 VISIBLE_ACCELERATORS = ("CUDA_VISIBLE_DEVICES", "HIP_VISIBLE_DEVICES")
-"""The variables by which a process sees only some accelerators: of CUDA, and of ROCm."""
+"""The variables by which a process sees only some accelerators, by vendor."""
 PREALLOCATE = "XLA_PYTHON_CLIENT_PREALLOCATE"
 """Unless this is false, a process takes most of the memory of its accelerators when it starts, also if others use them."""
 
