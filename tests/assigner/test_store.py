@@ -122,6 +122,10 @@ def test_extend_raises_the_first_refusal():
     with pytest.raises(LareError, match="this one is for 2:"):
         list(store.extend("abbaac", store.add(6), rows, np.ones(6), np.array([0, 0, 1, 0, 1, 1], bool)))
     assert (store.n_ended, store.dropped, store.running) == (1, 2, {})
+    store = Store(9, (1,), longest=3)
+    with pytest.raises(LareError, match="this one is for 4:"):
+        list(store.add_paid_episode(store.add(5), np.array([0.0, 0, 0, 1, 1]), PaymentRule(nonzero=True)))
+    assert (store.n_ended, store.dropped) == (1, 1)
 
 
 def test_late_payment_leaves_steps_of_other_environments():

@@ -21,7 +21,7 @@ __all__ = ["pack_in_order", "sample_batch", "whole_episodes"]
 def sample_batch(store: Store, spec: CreditSpec, random: np.random.Generator, longest: int) -> CreditBatch:
     """Sample the steps of one gradient update, from episodes that are sampled uniformly with replacement.
 
-    The store needs an episode. `longest` is the largest number of steps of one. Batches with the same value have the same shape.
+    The store needs an episode. `longest` is the most steps of an episode; batches for the same `longest` have the same shape.
     """
     settings, fit = spec.settings, spec.method.fit
     assert fit is not None

@@ -85,7 +85,7 @@ class StepRewards:
     def _residuals(
         self, step_ids: Int[np.ndarray, " n"], rows: Int[np.ndarray, " n"]
     ) -> tuple[Bool[np.ndarray, " n"], Float[np.ndarray, " n"]]:
-        """Return which steps are the last ones of their episodes, and the residuals of these. Those that are not used are 0."""
+        """Return which steps are the last ones of their episodes, and the residual of each step's episode; 0 if it is not paid."""
         number = self.store.episode[rows]
         stored = [self.store.episodes.get(k) for k in number.tolist()]
         last = np.array([e is not None and e.step_ids[-1] == k for e, k in zip(stored, step_ids, strict=True)], bool)

@@ -84,9 +84,9 @@ class Store:
         self.episodes: dict[int, StoredEpisode] = {}
         """The episodes whose steps are all stored, by number."""
         self.n_ended = 0
-        """The number of episodes that have ever ended."""
+        """The number of payments that were ever stored: of episodes that have ended, if each is paid once."""
         self.n_ended_steps = 0
-        """The number of steps of these episodes. Each step counts once, even if payments for windows read it often or never."""
+        """The number of steps of these payments. Each step counts once, even if payments for windows read it often or never."""
         self.oldest: list[tuple[int, int]] = []
         """A heap of the stored episodes: first step, and number."""
         self.running: dict[Hashable, RunningEpisode] = {}
@@ -239,12 +239,21 @@ class Store:
         payments: PaymentRule,
         level: int = 0,
     ) -> Iterator[StoredEpisode]:
-        """Store an episode that has just ended, by the reward of each of its steps. Yield the steps of each payment."""
-        episode = RunningEpisode(level=level)
+        """Store an episode that has just ended, by the reward of each of its steps. Yield the steps of each payment.
+
+        Once all steps are added, raises the first `LareError` of the payments, like `end`.
+        """
+        episode, error = RunningEpisode(level=level), None
         for i, step_id in enumerate(step_ids.tolist()):
-            payment = self._add_step(episode, step_id, float(reward[i]), payments, i == len(step_ids) - 1)
+            payment = None
+            try:
+                payment = self._add_step(episode, step_id, float(reward[i]), payments, i == len(step_ids) - 1)
+            except LareError as refusal:
+                error = error or refusal
             if payment is not None:
                 yield payment
+        if error is not None:
+            raise error
 
     def put_episode(self, number: int, episode: StoredEpisode) -> None:
         """Store an episode under its number."""
@@ -292,5 +301,5 @@ class Store:
 
     @property
     def mean_length(self) -> int:
-        """The mean length of the episodes that have ended."""
+        """The mean number of steps of a payment: of an episode, if each is paid once."""
         return max(1, self.n_ended_steps // max(1, self.n_ended))

@@ -81,9 +81,9 @@ def return_scale(source: RewardSource) -> Scale:
 
 
 def proxy_rewards(source: RewardSource, steps: StepBatch, spec: CreditSpec) -> Float[Array, "*batch agents"]:
-    """Return r_hat of each agent, in the unit of the true rewards if `method.calibrated`.
+    """Return r_hat of each agent.
 
-    Else `UNIFORM` gives numbers from 0 to 1, and `DESIGNED` what the function returns.
+    It is in the unit of the true rewards if `method.calibrated`, from 0 to 1 for `UNIFORM`, and what the function returns for `DESIGNED`.
     """
     match spec.method.reward:
         case Reward.DESIGNED:

@@ -70,9 +70,9 @@ METRIC_GROUPS: dict[str, dict[str, str]] = {
         "critic/value": "Mean target of the team's value, over these steps.",
     },
     "CreditAssigner only": {
-        "credit/episodes": "Number of episodes that have ended.",
+        "credit/episodes": "Number of payments that were learned from or wait: of ended episodes, if each is paid once.",
         "credit/dropped": "Number of episodes that were dropped.",
-        "credit/fits": "Number of fits or updates of the decoder.",
+        "credit/fits": "Number of gradient updates of the decoder; 0 for a closed form.",
     },
 }
 """What each metric means, by who writes it. Names have no teams; a task's own measures are not listed."""

@@ -14,6 +14,7 @@ from lare_rl.runs.directory import Run
 from lare_rl.runs.metric_names import RETURN, RETURN_STD
 from lare_rl.training.static_config import TrainConfig
 from lare_rl.util.findings import Finding, render
+from lare_rl.util.statistics import FLOAT32_NOISE
 
 __all__ = [
     "MESSAGES",
@@ -34,8 +35,6 @@ N_EQUAL_EVALUATIONS = 5
 """The number of evaluations with equal returns that is reported."""
 MIN_EQUAL_EPISODES = 10
 """A run with fewer evaluated episodes is not reported for equal returns."""
-ROUNDING = 1e-6
-"""Returns of all episodes are the same if they differ by less than this fraction of their size."""
 EQUAL_RTOL = 1e-3
 """Returns are equal if they differ by less than this fraction of their size."""
 MAX_EVALUATION_SHARE, MIN_EVALUATION_S = 0.3, 5.0
@@ -151,7 +150,7 @@ def find_equal_returns(run: Run) -> list[Finding]:
     returns, stds = np.array([(line[RETURN], line[RETURN_STD]) for line in lines], float).reshape(-1, 2).T
     if len(lines) * run.config.settings.evaluation_episodes < MIN_EQUAL_EPISODES:
         return []
-    limit = ROUNDING * np.abs(returns).max()
+    limit = FLOAT32_NOISE * np.abs(returns).max()
     is_equal = np.ptp(returns) <= limit and stds.max() <= limit
     return [Finding("equal returns", {"return_": float(returns[0])})] if is_equal else []
 

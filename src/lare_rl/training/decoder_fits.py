@@ -19,8 +19,8 @@ from lare_rl.training.static_config import TrainConfig
 __all__ = ["fit_decoders", "fit_repeatedly", "fit_seeds", "sample_credit"]
 
 CHUNK_ROWS = 2400
-"""About how many rows each chunk of a decoder's gradient is computed from. More rows do not fit into the cache of a core,
-and fewer make the matrix products inefficient."""
+"""The size of a chunk of a decoder's gradient, in rows. More rows do not fit into the cache of a core, and fewer make the matrix products
+inefficient."""
 
 
 def sample_credit(buffer: Replay, key: PRNGKeyArray, updates: int, config: TrainConfig) -> CreditSample | None:

@@ -20,7 +20,7 @@ __all__ = ["IterationFunctions", "store_steps", "update", "when_compiled", "when
 
 Measured = TypeVar("Measured")
 When = Callable[..., tuple[Any, ...]]
-"""From a condition, a function and its arguments to the function's results or, if the condition is false, the arguments."""
+"""Called with a condition, a function and its arguments. Returns the function's results, or the arguments if the condition is false."""
 Record = Callable[[Measured, Metrics, Float[Array, " seeds"] | None], Measured]
 """From the metrics so far, new ones, and the number of updates that they are of (None: any) to both together."""
 

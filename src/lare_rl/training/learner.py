@@ -126,7 +126,7 @@ def replay_columns(
 ) -> tuple[dict[str, Any], dict[str, Any]]:
     """Return the replay's columns for new steps, and the columns of `STEP_COLUMNS` after the steps.
 
-    The column `alive` is false where `scored` is.
+    Where `scored` is false, the column `alive` is false as well.
     """
     columns = {
         **{name: getattr(steps.timestep, name) for name in STEP_COLUMNS},
