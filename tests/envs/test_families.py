@@ -179,6 +179,28 @@ def test_refused_environment_is_closed(log):
     assert log == [("made", {}), "closed"]
 
 
+class Incomplete:
+    """An environment without the functions of its kind."""
+
+    def __init__(self, task):
+        self.spec = replace(HUNT, is_jax=task.environment_name == "jax")
+
+    def reset(self, key): ...
+
+    def step(self, state, action, key): ...
+
+
+register_family("incomplete", Incomplete)
+
+
+@pytest.mark.parametrize(
+    ("name", "words"), [("jax", "JaxEnv .* no frames"), ("host", "HostEnv .* no render and no close")]
+)
+def test_missing_functions_are_named(name, words):
+    with pytest.raises(LareError, match=words):
+        make_env(make_task(environment=f"incomplete/{name}"))
+
+
 def test_sizes_are_read_once(log):
     """Some games take many seconds to start, and a run needs the sizes several times."""
     first = load_env_spec(make_toy_task(name="sizes", description="Walk."))

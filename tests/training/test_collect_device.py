@@ -8,13 +8,15 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from helpers.jax_toy_envs import Echo
+from helpers.jax_toy_envs import Echo, echo_spec
 from helpers.small_configs import ONE_AGENT, SMALL_SETTINGS, small_config
 from lare_rl.algorithms.qmix import qmix
 from lare_rl.algorithms.td3 import TD3Settings
+from lare_rl.envs.families import register_family
 from lare_rl.envs.jax_spaces import agent_timestep
+from lare_rl.errors import LareError
 from lare_rl.training import collect_device
-from lare_rl.training.collect_device import DeviceCollector, unroll_on_device
+from lare_rl.training.collect_device import DeviceCollector, make_jax_env, unroll_on_device
 from lare_rl.training.compiled import compile_functions
 from lare_rl.training.streams import Stream, stream_keys
 
@@ -215,3 +217,36 @@ def test_states_with_random_keys_are_restored(learner):
         np.testing.assert_array_equal(collectors[1].state_dict()[name], array)
     actions = [collector.collect(learner[1], ENVS * TIME).action for collector in collectors]
     np.testing.assert_array_equal(*actions)
+
+
+class BadEcho(Echo):
+    """The toy, whose timestep after a reset is changed as the name of the environment says."""
+
+    CHANGES = {  # noqa: RUF012
+        "scalar": lambda timestep: timestep._replace(reward=timestep.reward[0]),
+        "short": lambda timestep: timestep._replace(observation=timestep.observation[:, 1:]),
+        "unmeasured": lambda timestep: timestep._replace(measures={}),
+    }
+
+    def __init__(self, task):
+        self.change = self.CHANGES[task.environment_name]
+
+    def reset(self, key):
+        state, timestep = super().reset(key)
+        return state, self.change(timestep)
+
+
+register_family("bad-echo", BadEcho)
+
+
+@pytest.mark.parametrize(
+    ("name", "message"),
+    [
+        ("scalar", r"bad-echo/scalar: reward of reset .*\(\).*\(3,\)"),
+        ("short", r"observation .*\(3, 3\).*\(3, 4\)"),
+        ("unmeasured", "measure 'right'"),
+    ],
+)
+def test_arrays_have_the_shapes_of_the_spec(name, message):
+    with pytest.raises(LareError, match=message):
+        make_jax_env(echo_spec(environment=f"bad-echo/{name}"))

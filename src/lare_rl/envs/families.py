@@ -101,6 +101,7 @@ def make_env(task: TaskSpec, **kwargs: Any) -> JaxEnv | HostEnv:
         module, _, attribute = maker.partition(":")
         maker = getattr(importlib.import_module(module), attribute)
     env = maker(task, **kwargs)
+    _check_functions(task, env)
     try:
         _check_spec(task, env.spec)
         if task.evaluation_environment is not None and not isinstance(env, HostEnv):
@@ -112,6 +113,22 @@ def make_env(task: TaskSpec, **kwargs: Any) -> JaxEnv | HostEnv:
             env.close()
         raise
     return env
+
+
+def _check_functions(task: TaskSpec, env: Any) -> None:
+    """Raise `LareError` if an environment lacks a function of its kind, which `is_jax` of its spec says."""
+    is_jax = env.spec.is_jax
+    names = ("reset", "step", "frames") if is_jax else ("reset", "step", "render", "close")
+    if missing := [name for name in names if not callable(getattr(env, name, None))]:
+        hint = (
+            ""
+            if is_jax or not hasattr(env, "frames")
+            else ". If it has pure functions of JAX, its spec needs is_jax=True"
+        )
+        raise LareError(
+            f"{task.environment}: a {'JaxEnv' if is_jax else 'HostEnv'} needs {', '.join(names)}, and this environment has no "
+            f"{' and no '.join(missing)}{hint}"
+        )
 
 
 def make_host_env(task: TaskSpec, **kwargs: Any) -> HostEnv:

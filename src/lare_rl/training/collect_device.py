@@ -14,6 +14,7 @@ from lare_rl.algorithms.registry import Noise
 from lare_rl.data.trajectory import Trajectory
 from lare_rl.envs.families import make_env
 from lare_rl.envs.interface import JaxEnv, Timestep, team_mean, to_env_action
+from lare_rl.errors import LareError
 from lare_rl.nn.masks import select
 from lare_rl.tasks.spec import TaskSpec
 from lare_rl.training.compile_cache import cache_by_value
@@ -217,10 +218,39 @@ def _exploration_policy(env_steps: int | Int[Array, ""], config: TrainConfig) ->
 
 @cache_by_value
 def make_jax_env(task: TaskSpec) -> JaxEnv:
-    """Make an environment of pure functions. The same object serves all runs, so that their collectors compile once."""
+    """Make an environment of pure functions. The same object serves all runs, so that their collectors compile once.
+
+    Raises:
+        LareError: the environment cannot be made, or its arrays do not have the shapes of its spec.
+    """
     env = make_env(task)
     assert isinstance(env, JaxEnv)
+    _check_shapes(env, task)
     return env
+
+
+def _check_shapes(env: JaxEnv, task: TaskSpec) -> None:
+    """Raise `LareError` if `reset` or `step` returns arrays of other shapes than the spec says, or lacks a measure."""
+    spec, key = env.spec, jax.random.key(0)
+    n_agents = spec.n_agents
+    state, first = jax.eval_shape(env.reset, key)
+    action = jax.ShapeDtypeStruct((n_agents, spec.action_size), np.float32)
+    _, second = jax.eval_shape(env.step, state, action, key)
+    shapes = {
+        "observation": (n_agents, spec.observation_size),
+        "alive": (n_agents,),
+        "reward": (n_agents,),
+        "terminated": (),
+        "truncated": (),
+    }
+    for function, timestep in (("reset", first), ("step", second)):
+        for name, shape in shapes.items():
+            if (actual := jnp.shape(getattr(timestep, name))) != shape:
+                raise LareError(f"{task.environment}: {name} of {function} has the shape {actual}, and not {shape}")
+        if missing := set(spec.measures) - timestep.measures.keys():
+            raise LareError(
+                f"{task.environment}: {function} returns no measure {sorted(missing)[0]!r}, which its spec names"
+            )
 
 
 def is_reset_cheap(env: JaxEnv, n_envs: int) -> bool:
