@@ -35,6 +35,8 @@ def test_constants_are_folded():
         ("divide", ("int", "int"), "float"),
         ("power", ("int", "int"), "int"),
         ("less", ("float", "int"), "bool"),
+        ("fmax", ("bool", "bool"), "bool"),
+        ("fmin", ("bool", "bool"), "bool"),
         ("bitwise_and", ("bool", "bool"), "bool"),
         ("bitwise_and", ("int", "bool"), "int"),
         ("floor_divide", ("bool", "bool"), "int"),
@@ -89,6 +91,40 @@ def test_entries_read_are_exact_through_whole_arrays():
     )
     texts = [features_text(entries) for entries in read(source, 7, 1).entries_read("factors")]
     assert texts == ["observation[2, 5]", "observation[4:7], action[0]", "observation[0]"]
+
+
+@pytest.mark.parametrize(
+    "expression",
+    [
+        "y @ np.array([1.0, 2.0])",
+        "y @ np.array([[2.0, -1.0], [1.0, 3.0]])",
+        "np.einsum('bij,bij->bi', y, y)",
+        "np.einsum('bii->bi', y[:, :2])",
+        "np.einsum('bii->b', y[:, 1:])",
+        "np.einsum('...i,...i->...', y, y[:, :1])",
+        "np.einsum('...ij,...kj->...ik', z, z)",
+        "np.einsum('b...,...->b', x[:, :3], 3 * np.ones(3)) * np.einsum('b,->b', x[:, 8], 2.0)",
+        "np.linalg.det(z)",
+        "np.cumsum(x, axis=1)",
+        "np.cumprod(z, axis=-2)",
+        "np.cumsum(z, axis=1)",
+    ],
+)
+def test_entries_read_are_those_whose_change_matters(expression):
+    source = "import numpy as np\n" + phi_source(
+        f"x = observation\ny = x[:, :6].reshape(-1, 3, 2)\nz = x.reshape(-1, 3, 2, 2)\n"
+        f"w = ({expression}).reshape(len(x), -1)\nreturn [w[:, i : i + 1] for i in range(w.shape[1])]"
+    )
+    graph = read(source, 12, 1)
+    observation, action = random_inputs((12, 1), rows=9)
+    changed = np.repeat(observation[None], 12, axis=0)
+    changed[np.arange(12), :, np.arange(12)] += 0.7
+    rows = {"observation": observation, "action": action}
+    rows_changed = {"observation": changed, "action": np.repeat(action[None], 12, axis=0)}
+    before, after = (evaluate(graph, x, dtype=np.float64)["factors"] for x in (rows, rows_changed))
+    matters = np.any(np.abs(after - before) > 1e-9, axis=1)
+    entries = [entries["observation"] for entries in graph.entries_read("factors")]
+    assert entries == [np.flatnonzero(column).tolist() for column in matters.T]
 
 
 @pytest.mark.parametrize("name", PROGRAMS)

@@ -60,6 +60,7 @@ EXPRESSIONS = {
         np.isclose(x, a[:, :1], atol=0.3) | np.where(b, x, -x) | np.less(x, 0) | np.greater_equal(x, a[:, :1])
         np.not_equal(i, 2) | x == x | np.logical_and(b, x < 1) | np.logical_not(b) | ~b | b & (x < 1) | b ¦ (x < -1)
         b ^ (x < 1) | i & 1 | i ¦ 4 | i ^ 3 | ~i | i << 2 | i >> 1 | np.bitwise_and(i, 5) | np.invert(b) | b * x | b + b
+        ~np.fmax(b, x < -1) | ~np.fmin(b, x < 1)
         b * 1 | -(b * 1) | np.sum(b, axis=1) | b.mean(axis=1) | np.select([x > 1, x > 0], [x, 2 * x], default=-1)
         np.piecewise(x, [x < 0, x >= 0], [lambda v: -v, 3.0]) | np.choose(i % 3, [x, x * 2, -x])
         np.unwrap(x * 4, axis=1) | x.real | np.abs(x + 1j * a[:, :1]) | np.angle(np.exp(1j * x))
@@ -79,6 +80,7 @@ EXPRESSIONS = {
         x.cumprod(axis=1) | np.nancumsum(n, axis=1) | np.maximum.accumulate(x, axis=1)
         np.minimum.accumulate(y, axis=1) | np.add.accumulate(x, axis=1) | np.add.reduce(x, axis=1)
         np.maximum.reduce(x, axis=1) | np.logaddexp.reduce(x, axis=1) | np.multiply.reduce(x, 1)
+        ~np.fmax.accumulate(b, axis=1) | ~np.fmin.accumulate(b, axis=1)
         np.logical_or.reduce(b, axis=1) | np.maximum.reduce([x[:, 0], x[:, 1], x[:, 2]]) | np.diff(x, axis=1)
         np.diff(x, n=2) | np.diff(y, axis=1) | np.diff(x, axis=1, prepend=0) | np.diff(x, axis=1, append=x[:, -1:])
         np.gradient(x, axis=1) | np.gradient(x, 0.1, axis=1) | np.gradient(x, np.array([0, 1, 3, 4, 6, 7.0]), axis=1)

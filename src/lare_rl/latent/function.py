@@ -86,7 +86,7 @@ class LatentFunction:
 
     @property
     def features_read(self) -> list[dict[str, list[int]]]:
-        """For each factor, the indices of "observation" and "action" that it depends on."""
+        """For each factor, the indices of "observation" and "action" that it may depend on."""
         return self.graph.entries_read("factors")
 
     @property

@@ -99,7 +99,7 @@ class Graph:
         return max(depths, default=0)
 
     def entries_read(self, output: str) -> list[dict[str, list[int]]]:
-        """Return, for each number of an output, the entries of each input that it depends on."""
+        """Return, for each number of an output, the entries of each input that it may depend on."""
         inputs = [(i, node.option) for i, node in enumerate(self.nodes) if node.op == "input"]
         entries = []
         for number in range(math.prod(self.nodes[self.outputs[output]].shape)):
@@ -108,7 +108,10 @@ class Graph:
         return entries
 
     def needed_for(self, output: str, number: int) -> dict[int, np.ndarray]:
-        """Return the nodes that a number of an output depends on, and for each a mask of the numbers that it depends on."""
+        """Return, by the index of each node that the `number`-th entry of an output may depend on, a mask of that node's entries.
+
+        An entry that is multiplied by a constant zero counts too.
+        """
         last = self.outputs[output]
         needed = {last: np.arange(math.prod(self.nodes[last].shape)) == number}
         for i in range(last, -1, -1):
@@ -123,7 +126,7 @@ class Graph:
 
 
 def _needed_inputs(node: Node, needed: np.ndarray, shapes: Sequence[tuple[int, ...]]) -> list[np.ndarray]:
-    """Return masks of the numbers of an operation's inputs that its needed numbers depend on."""
+    """Return masks of the numbers of an operation's inputs that its needed numbers may depend on."""
     masks = [np.zeros(shape, bool) for shape in shapes]
     match node.op:
         case "gather":
@@ -132,11 +135,20 @@ def _needed_inputs(node: Node, needed: np.ndarray, shapes: Sequence[tuple[int, .
             masks = list(np.split(needed, np.cumsum([shape[0] for shape in shapes])[:-1]))
         case "take":
             masks = [np.ones(shapes[0], bool), _undo_broadcast(needed, shapes[1])]
-        case "einsum" | "det":
-            masks = [np.ones(shape, bool) for shape in shapes]
+        case "einsum":
+            terms, _, result = node.option.replace("...", "").partition("->")
+            for mask, term in zip(masks, terms.split(","), strict=True):
+                letters = "".join(dict.fromkeys(term))  # a repeated letter reads a diagonal
+                positions = np.einsum(f"{term}->{letters}", all_positions(mask.shape))
+                read = np.einsum(f"{result},{term}->{letters}", needed, np.ones(mask.shape, bool))
+                mask.reshape(-1)[positions] = read
+        case "det":
+            masks = [np.broadcast_to(needed[..., None, None], shapes[0])]
         case "sum" | "prod" | "max" | "min" | "any" | "all" | "argmax" | "argmin":
             masks[0] |= np.expand_dims(needed, node.option)
-        case "cumsum" | "cumprod" | "sort" | "argsort":
+        case "cumsum" | "cumprod":  # an entry reads those before it
+            masks = [np.flip(np.logical_or.accumulate(np.flip(needed, node.option), node.option), node.option)]
+        case "sort" | "argsort":
             masks[0] |= needed.any(node.option, keepdims=True)
         case _:
             masks = [_undo_broadcast(needed, shape) for shape in shapes]
@@ -189,7 +201,10 @@ ELEMENTWISE: dict[str, str] = {
 """Operations on each number by NumPy's names, and the kind of their results: float, that of the operands ("same"), or bool.
 Operands of "logical" operations become bool. Operands of "int" operations must be integers."""
 
-_ON_BOOL = {"add": "logical_or", "maximum": "logical_or", "multiply": "logical_and", "minimum": "logical_and"}
+_ON_BOOL = {
+    **dict.fromkeys(("add", "maximum", "fmax"), "logical_or"),
+    **dict.fromkeys(("multiply", "minimum", "fmin"), "logical_and"),
+}
 """What NumPy makes of arithmetic on bool arrays."""
 
 
