@@ -150,7 +150,7 @@ def test_initial_policy_as_good():
     ],
 )
 def test_seeds_are_compared_with_their_own_initial_policies(initial, episode_error, code, n_learned):
-    """The mean gain over the seeds hides that the first seed's untrained policy was as good."""
+    """The mean improvement over the seeds hides that the first seed's untrained policy was as good."""
     facts = {"random_returns": -43 + 15 * RANDOM, "initial_returns": np.array(initial), "episode_error": episode_error}
     finding = find(np.array([[-10.1], [-10.0]]) + np.zeros(8), **facts)[code]
     assert finding.values.get("n_learned") == n_learned
@@ -220,6 +220,16 @@ def test_best_evaluation_is_trained():
     assert "needs_training" in find(lucky, warmup=2000)
     assert find(FELL, warmup=2999)["has_fallen"].values["return_"] == 92
     assert find(FELL, warmup=4000)["has_fallen"].values["return_"] == 60
+
+
+def test_an_evaluation_without_a_return_is_no_fall():
+    returns = np.array([[1.0, 2, 3, 4, 5, 6, 7, 8, 9, 10, np.nan, 10]])
+    codes = list(find(returns, steps=np.arange(12) + 1.0))
+    assert codes == list(find(np.delete(returns, 10, axis=1), steps=np.arange(11) + 1.0))
+    assert "has_fallen" not in codes
+    assert "is_rising" in find(np.hstack([RISING, [[np.nan, 80]]]), steps=np.arange(10) + 1.0)
+    no_start = find(np.hstack([[[np.nan]], LEVEL]), steps=np.arange(9) + 1.0, random_returns=np.zeros(0))
+    assert "has_fallen" not in no_start
 
 
 def test_best_evaluation_of_own_task():

@@ -25,6 +25,7 @@ from lare_rl.report.live_page import LivePage
 from lare_rl.report.messages import MESSAGES
 from lare_rl.report.overview import compare_runs, render_learning_curves, sort_runs, summarise_runs
 from lare_rl.report.reported_run import ReportedRun
+from lare_rl.report.run_summary import summarise_run
 from lare_rl.runs.directory import open_without_functions
 from lare_rl.util.findings import Finding
 
@@ -153,6 +154,20 @@ def test_summary_of_runs(make_run):
     assert first.training_seconds() == pytest.approx(50 / 5 + 50 / 10)
 
 
+def test_error_of_the_mean_gain(make_run):
+    """It is an error over the seeds whose gain is known."""
+
+    def gain_and_error(*errors):
+        reported = ReportedRun("a", make_run(f"{errors}", [1.0] * len(errors), method="bayes"))
+        for line, error in zip(reported.metrics, 2 * errors, strict=True):
+            line |= {} if error is None else {"credit/gain": 0.3, "credit/gain_error": error}
+        score_use = summarise_run(reported, np.zeros(0), None).score_use
+        return score_use.gain, score_use.gain_error
+
+    assert gain_and_error(0.2) == gain_and_error(0.2, None, None, None) == pytest.approx((0.3, 0.2))
+    assert gain_and_error(0.3, 0.4) == pytest.approx((0.3, 0.25))
+
+
 def test_each_team_is_compared_with_its_own_random_returns(tmp_path):
     task = load_task("CompetitivePP-6")
     settings = resolve(Settings(method="dense"), task)
@@ -217,7 +232,7 @@ def test_unknown_step_rewards(runs, tmp_path):
 
 def test_equal_lengths_are_not_called_a_sum(runs, tmp_path):
     page = page_of(runs[1], tmp_path)
-    assert "rust the credit" in page
+    assert "credit can be trusted" in page or "Trust the credit in part" in page
     assert "The score was taken as" not in page
 
 

@@ -109,7 +109,9 @@ class Chart:
             )
         for line in self.lines:
             if line.band is not None:
-                edges = zip((line.x, line.x[::-1]), (line.y + line.band, (line.y - line.band)[::-1]), strict=True)
+                is_finite = np.isfinite(line.y + line.band)
+                x, y, band = line.x[is_finite], line.y[is_finite], line.band[is_finite]
+                edges = zip((x, x[::-1]), (y + band, (y - band)[::-1]), strict=True)
                 outline = " ".join(_points(across(x), down(y)) for x, y in edges)
                 shapes.append(f'<polygon class="band {line.style}" points="{outline}"/>')
         for line in self.lines:
@@ -118,7 +120,11 @@ class Chart:
             style = line.style if is_known.sum() > 1 else f"{line.style} dot"
             shapes.append(f'<polyline class="{style}" points="{points}{f" {points}" if is_known.sum() == 1 else ""}"/>')
         shapes += self._render_hovers(across)
-        labels = [(float(down(line.y[-1:])[0]) / 10, line) for line in self.lines if line.label]
+        labels = [
+            (float(down(y[-1:])[0]) / 10, line)
+            for line in self.lines
+            if line.label and len(y := line.y[np.isfinite(line.y)])
+        ]
         texts = [
             f'<span class="label {line.style}" style="top:{y:.1f}%">{escape(line.label)}</span>'
             for (_, line), y in zip(labels, _spread([y for y, _ in labels]), strict=True)
@@ -147,7 +153,8 @@ class Chart:
         low, high = float(np.nanmin(values)), float(np.nanmax(values))
         size = high - low or abs(high) or 1.0
         for line in self.lines:
-            if line.band is not None:  # a wide band must not flatten the lines
+            # A wide band must not flatten the lines.
+            if line.band is not None and np.isfinite(line.y + line.band).any():
                 low = max(min(low, float(np.nanmin(line.y - line.band))), low - size / 2)
                 high = min(max(high, float(np.nanmax(line.y + line.band))), high + size / 2)
         return low - 0.05 * size, high + 0.05 * size

@@ -37,9 +37,9 @@ EVALUATION_STDS = 3
 STUCK_FRACTION = 0.05
 """A policy is stuck if its last returns differ by less than this fraction of the standard deviation of random actions' returns."""
 FALL_FRACTION = 0.15
-"""The return has fallen if it lost more than this fraction of its best gain."""
+"""The return has fallen if it lost more than this fraction of its best improvement."""
 BETTER_FRACTION = 0.1
-"""The best evaluation is mentioned if it exceeds the last one by more than this fraction of the final gain."""
+"""The best evaluation is mentioned if it exceeds the last one by more than this fraction of the final improvement."""
 
 Rule = Callable[[RunSummary], Finding | None]
 
@@ -93,7 +93,7 @@ def _outcome(run: RunSummary) -> Finding:
         return Finding("learned", values)
     if run.n_seeds_learned:
         return Finding("some_seeds_learned", values | {"n_learned": run.n_seeds_learned, "n_seeds": run.n_seeds})
-    if run.judged_return < run.random_mean - CLEAR_ERRORS * run.gain_error:
+    if run.judged_return < run.random_mean - CLEAR_ERRORS * run.difference_error:
         return Finding("worse_than_random", values)
     if run.may_have_learned:
         return Finding("may_beat_initial_policy" if run.beats_random() else "may_beat_random", values)
@@ -164,7 +164,7 @@ def _is_rising(run: RunSummary) -> Finding | None:
     if run.trend is None:
         return None
     previous, last, change = run.trend
-    quarter = run.mean_returns[-max(2, len(run.mean_returns) // 4) :]
+    quarter = run.finite_means[-max(2, len(run.finite_means) // 4) :]
     if last - previous <= max(change, run.final_error) or quarter[-1] - quarter[0] <= change / 2:
         return None
     step, values = int(run.steps[-1]), {"directory": run.directory}
@@ -190,8 +190,8 @@ def _has_fallen(run: RunSummary) -> Finding | None:
         return None
     _, last, change = run.trend
     step, best = run.best_evaluation
-    start = run.random_mean if len(run.random_returns) else float(np.nanmean(run.returns[:, 0]))
-    if len(run.random_returns) and best <= start + CLEAR_ERRORS * run.gain_error:
+    start = run.random_mean if len(run.random_returns) else float(run.finite_means[0])
+    if len(run.random_returns) and best <= start + CLEAR_ERRORS * run.difference_error:
         return None
     if best - last <= max(FALL_FRACTION * abs(best - start), 2 * change, CLEAR_ERRORS * run.final_difference_error):
         return None

@@ -78,11 +78,11 @@ def _describe_returns(run: Run, evaluation: Evaluation, best_steps: Sequence[int
 def compare_actions(run: Run, sampled: Evaluation, likeliest: Evaluation) -> Iterator[str]:
     """Say which actions are better, if that is clear. Both evaluations play from the same initial states."""
     for i, role in enumerate(run.config.task.roles):
-        gain = mean_with_error((likeliest.returns - sampled.returns)[:, :, i])
-        if gain is not None and abs(gain[0]) > CLEAR_ERRORS * gain[1]:
+        difference = mean_with_error((likeliest.returns - sampled.returns)[:, :, i])
+        if difference is not None and abs(difference[0]) > CLEAR_ERRORS * difference[1]:
             better = "better: use `--deterministic` here, and `load_policy(..., deterministic=True)` in Python"
-            verdict = better if gain[0] > 0 else "worse: let the policy sample"
-            yield f"{role.name}: the most likely actions are {verdict} ({format_plus_minus(*gain)})"
+            verdict = better if difference[0] > 0 else "worse: let the policy sample"
+            yield f"{role.name}: the most likely actions are {verdict} ({format_plus_minus(*difference)})"
 
 
 def describe_evaluation(
@@ -100,8 +100,8 @@ def describe_evaluation(
         team = f"{role.name}, " if len(roles) > 1 else ""
         returns = np.array([episode.return_ for episode in episodes])
         yield f"{team}random actions: return {format_mean_std(returns)} over {format_for_reader(len(returns), 'count episode')}"
-        if (gain := gain_over_random(evaluation.returns[:, :, team_index], returns)) is not None:
-            yield f"{team}difference: {format_plus_minus(*gain)} (± is its standard error)"
+        if (difference := gain_over_random(evaluation.returns[:, :, team_index], returns)) is not None:
+            yield f"{team}difference: {format_plus_minus(*difference)} (± is its standard error)"
     if (group := task.group) is not None and random_episodes[0]:
         groups = Counter(np.asarray(evaluation.measures[group]).ravel().tolist())
         random_groups = Counter(episode.measures[group] for episode in random_episodes[0])

@@ -90,8 +90,8 @@ MESSAGES = {
     "exact_last": "; the rest of the return is added to the reward of the last step",
     "exact_spread": "; the rest of the return is spread evenly over the steps",
     "trust_nothing": (
-        "Do not trust the credit: returns are not predicted better than by {baseline} (squared error removed: {gain:.0%} ± "
-        "{error:.0%})."
+        "It is not clear that the credit can be trusted: predictions of returns remove {gain:.0%} ± {error:.0%} of the squared error "
+        "of {baseline}."
     ),
     "trust_part": (
         "Trust the credit in part: predictions of returns remove {gain:.0%} ± {error:.0%} of the squared error of {baseline}.{chance}"

@@ -12,7 +12,7 @@ from lare_rl.report.charts import N_COLOURS, Chart, Line, draw_legend, format_nu
 from lare_rl.report.diagnosis import CREDIT_CODES, NEXT_CODES, diagnose
 from lare_rl.report.html import render_fold, render_note, render_table, render_tiles
 from lare_rl.report.messages import MESSAGES, WORDS
-from lare_rl.report.reported_run import Curve, ReportedRun, finite
+from lare_rl.report.reported_run import Curve, ReportedRun, finite, mean_over_seeds
 from lare_rl.report.run_summary import RunSummary, summarise_run
 from lare_rl.runs.metric_names import CREDIT_CORRELATION, CREDIT_ERROR, RETURN, RETURN_R2, RETURN_STD
 from lare_rl.tasks.spec import TaskSpec
@@ -251,7 +251,7 @@ def _draw_metric(
         spread = reported.curve(RETURN_STD) if len(values) == 1 and metric.name == RETURN and n_coloured == 1 else None
         label = name if len(runs) > 1 and (colour != "grey" or len(runs) <= 2 * N_COLOURS) else ""
         style = "grey other" if colour == "grey" else colour
-        lines.append(Line(steps, _mean(values), style, label, None if spread is None else spread[1][0]))
+        lines.append(Line(steps, mean_over_seeds(values), style, label, None if spread is None else spread[1][0]))
     first_step = min(curve[0][0] for _, curve in curves.values())
     last_step = max(curve[0][-1] for _, curve in curves.values())
     extent = np.array([first_step if first_step < last_step else 0.0, last_step])
@@ -308,8 +308,3 @@ def render_words() -> str:
 def _format_spread(values: Float[np.ndarray, " values"]) -> str:
     """Write the mean of some values ± their standard deviation, or nothing without values."""
     return format_mean_std(values) if len(values) else ""
-
-
-def _mean(values: Float[np.ndarray, "seeds evaluations"]) -> Float[np.ndarray, " evaluations"]:
-    """Return the mean over the seeds that have a value, NaN where none has."""
-    return np.array([numbers.mean() if len(numbers := finite(column)) else np.nan for column in values.T])

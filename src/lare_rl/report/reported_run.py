@@ -11,7 +11,7 @@ from jaxtyping import Float
 from lare_rl.runs.directory import Run
 from lare_rl.runs.metric_names import RETURN
 
-__all__ = ["Curve", "ReportedRun", "finite"]
+__all__ = ["Curve", "ReportedRun", "finite", "mean_over_seeds"]
 
 Curve = tuple[Float[np.ndarray, " evaluations"], Float[np.ndarray, "seeds evaluations"]]
 """Steps, and the values that were measured at them."""
@@ -66,3 +66,8 @@ class ReportedRun:
 def finite(values: np.ndarray) -> Float[np.ndarray, " values"]:
     """Return the finite ones of some values."""
     return values[np.isfinite(values)]
+
+
+def mean_over_seeds(values: Float[np.ndarray, "seeds evaluations"]) -> Float[np.ndarray, " evaluations"]:
+    """Return the mean over the seeds that have a value, NaN where none has."""
+    return np.array([numbers.mean() if len(numbers := finite(column)) else np.nan for column in values.T])

@@ -10,7 +10,7 @@ from jaxtyping import Float
 
 from lare_rl.credit.methods import METHODS
 from lare_rl.envs.load import shipped_tasks
-from lare_rl.report.reported_run import ReportedRun, finite
+from lare_rl.report.reported_run import ReportedRun, finite, mean_over_seeds
 from lare_rl.report.score_use import CLEAR_ERRORS, ScoreUse, summarise_score_use
 from lare_rl.runs.metric_names import (
     ACTOR_SATURATION,
@@ -85,7 +85,7 @@ class RunSummary:
     untrained: str | None = None
     """Why the policy was never updated, or None if it was."""
     planned_steps: int = 0
-    """The number of environment steps of the whole run. It has more than `steps` says if it is unfinished."""
+    """The planned number of environment steps; more than the last of `steps` if the run is unfinished."""
     warmup: int = 0
     """The number of environment steps before the first update."""
     n_saturated: int = 0
@@ -104,8 +104,13 @@ class RunSummary:
 
     @cached_property
     def mean_returns(self) -> Float[np.ndarray, " evaluations"]:
-        """The mean over the seeds at each evaluation."""
-        return np.nanmean(self.returns, axis=0)
+        """The mean over the seeds at each evaluation, NaN where no seed has a return."""
+        return mean_over_seeds(self.returns)
+
+    @cached_property
+    def finite_means(self) -> Float[np.ndarray, " finite_evaluations"]:
+        """The finite ones of `mean_returns`."""
+        return finite(self.mean_returns)
 
     @cached_property
     def trained_returns(self) -> Float[np.ndarray, "seeds evaluations"]:
@@ -155,22 +160,24 @@ class RunSummary:
         return float(finite(self.judged_returns).mean())
 
     @property
-    def gain_error(self) -> float:
+    def difference_error(self) -> float:
         """The standard error of the difference between the judged return and the mean return of random actions."""
         error = grouped_standard_error(finite(self.judged_returns), self.episode_error)
         return max(math.hypot(standard_error(self.random_returns), error), MIN_ERROR)
 
     def beats_random(self, n_errors: int = CLEAR_ERRORS) -> bool:
         """Return whether the judged return exceeds the mean return of random actions by more than `n_errors` standard errors."""
-        return bool(len(self.random_returns) and self.judged_return > self.random_mean + n_errors * self.gain_error)
+        return bool(
+            len(self.random_returns) and self.judged_return > self.random_mean + n_errors * self.difference_error
+        )
 
     def beats_initial_policy(self, n_errors: int = CLEAR_ERRORS) -> bool:
-        """Return whether the mean gain of the seeds since before training exceeds `n_errors` of its standard errors."""
+        """Return whether the mean improvement of the seeds since before training exceeds `n_errors` of its standard errors."""
         if self.initial_returns is None:
             return True
-        gains = self.judged_returns - self.initial_returns
-        error = grouped_standard_error(gains, max(math.sqrt(2) * self.episode_error, MIN_ERROR))
-        return bool(np.nanmean(gains) > n_errors * error)
+        improvements = finite(self.judged_returns - self.initial_returns)
+        error = grouped_standard_error(improvements, max(math.sqrt(2) * self.episode_error, MIN_ERROR))
+        return bool(improvements.mean() > n_errors * error)
 
     @property
     def has_learned(self) -> bool:
@@ -194,21 +201,21 @@ class RunSummary:
     @cached_property
     def best_evaluation(self) -> tuple[int, float]:
         """Step and value of the highest mean over the seeds."""
-        means = np.nanmean(self.trained_returns, axis=0)
+        means = np.where(self.steps > self.warmup, self.mean_returns, -np.inf)
         best = int(np.nanargmax(means))
         return int(self.steps[best]), float(means[best])
 
     @cached_property
     def trend(self) -> tuple[float, float, float] | None:
-        """The means of the last two quarters of the evaluations, and the typical change from one evaluation to the next.
+        """The means of the last two quarters of `finite_means`, and the typical change from one evaluation to the next.
 
-        None if there are too few evaluations.
+        None if there are too few evaluations with a return.
         """
-        if len(self.steps) < MIN_EVALUATIONS:
+        if len(self.finite_means) < MIN_EVALUATIONS:
             return None
-        n_quarter = len(self.steps) // 4
-        half = self.mean_returns[-2 * n_quarter :]
-        change = np.nanmedian(np.abs(np.diff(half)))
+        n_quarter = len(self.finite_means) // 4
+        half = self.finite_means[-2 * n_quarter :]
+        change = np.median(np.abs(np.diff(half)))
         return float(half[:n_quarter].mean()), float(half[n_quarter:].mean()), float(change)
 
     @property
@@ -282,10 +289,10 @@ def _lengths_are_equal(reported: ReportedRun) -> bool:
 
 def _score_metrics(reported: ReportedRun) -> dict[str, float | None]:
     """Return the last metrics about the score: means over the seeds, and the standard error of the mean gain."""
-    values = {key: _last_value(reported, f"credit/{key}") for key in ("average", "log_odds", "gain", "gain_error")}
-    if values["gain_error"] is not None:
-        values["gain_error"] /= math.sqrt(len(reported.run.seeds))
-    return values
+    values = {key: _last_value(reported, f"credit/{key}") for key in ("average", "log_odds", "gain")}
+    _, errors = reported.curve("credit/gain_error") or (None, np.zeros((0, 0)))
+    errors = _last_finite(errors)
+    return values | {"gain_error": math.sqrt(np.sum(errors**2)) / len(errors) if len(errors) else None}
 
 
 def _last_value(reported: ReportedRun, key: str) -> float | None:
@@ -296,4 +303,10 @@ def _last_value(reported: ReportedRun, key: str) -> float | None:
 
 def _last_mean(values: Float[np.ndarray, "seeds evaluations"]) -> float | None:
     """Return the mean over the seeds at the last evaluation that has a finite value."""
-    return next((float(numbers.mean()) for column in values.T[::-1] if len(numbers := finite(column))), None)
+    numbers = _last_finite(values)
+    return float(numbers.mean()) if len(numbers) else None
+
+
+def _last_finite(values: Float[np.ndarray, "seeds evaluations"]) -> Float[np.ndarray, " finite_seeds"]:
+    """Return the finite values at the last evaluation that has any. Empty if none has."""
+    return next((numbers for column in values.T[::-1] if len(numbers := finite(column))), np.zeros(0))

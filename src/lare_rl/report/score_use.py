@@ -1,4 +1,4 @@
-"""As what a method explains the score of a task, and whether its credit can be trusted."""
+"""How a method models the score of a task, and whether its credit can be trusted."""
 
 import math
 from dataclasses import dataclass
@@ -13,7 +13,7 @@ __all__ = ["CLEAR_ERRORS", "CLEAR_GAIN", "ScoreUse", "summarise_score_use"]
 CLEAR_ERRORS = 2
 """A difference is clear if it exceeds this number of its standard errors."""
 CLEAR_GAIN = 0.8
-"""Predictions leave little of the score if they remove a larger share of the squared error of the mean return."""
+"""Credit is trusted as a whole if predictions remove more than this share of the baseline's squared error."""
 
 
 @dataclass(frozen=True, kw_only=True)
