@@ -60,7 +60,7 @@ def make_jaxmarl_env(scenario: Scenario) -> HeuristicEnemySMAX:
     figures = {
         "unit_type_velocities": [kind.speed for kind in table],
         "unit_type_attacks": [kind.damage for kind in table],
-        "unit_type_attack_ranges": [kind.reach for kind in table],
+        "unit_type_attack_ranges": [kind.attack_range for kind in table],
         "unit_type_sight_ranges": [kind.sight for kind in table],
         "unit_type_radiuses": [kind.radius for kind in table],
         "unit_type_health": [kind.health for kind in table],

@@ -1,5 +1,6 @@
 """When a diagnosis makes each of its findings. docs/reference/findings.md is made from this table."""
 
+from lare_rl.credit.prequential import LITTLE_R2
 from lare_rl.report.diagnosis import (
     BAD_R2,
     BETTER_FRACTION,
@@ -9,7 +10,7 @@ from lare_rl.report.diagnosis import (
     HIGH_R2,
     STUCK_FRACTION,
 )
-from lare_rl.report.run_summary import LITTLE_R2, MIN_EVALUATIONS, POSSIBLE_ERRORS, SEED_STDS
+from lare_rl.report.run_summary import MIN_EVALUATIONS, POSSIBLE_ERRORS, SEED_STDS
 from lare_rl.report.score_use import CLEAR_ERRORS, CLEAR_GAIN
 
 __all__ = ["CONDITIONS"]

@@ -22,7 +22,7 @@ monitoring.register_event_listener(lambda event, **_: hits.append(event) if even
 
 @jax.jit
 def slow(x):
-    for _ in range(60):
+    for _ in range(300):
         x = jax.numpy.sin(x) @ x
     return x
 

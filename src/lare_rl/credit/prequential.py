@@ -18,6 +18,8 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 __all__ = [
+    "LITTLE_R2",
+    "MIN_R2_EPISODES",
     "SEGMENT_WINDOW",
     "WINDOW",
     "Predictions",
@@ -36,6 +38,8 @@ SEGMENT_WINDOW = 256
 """The same for payments, if there are several in an episode, and for scores that are won or lost."""
 MIN_R2_EPISODES = 8
 """With fewer episodes, R^2 is NaN."""
+LITTLE_R2 = 0.1
+"""Proxy rewards explain next to nothing of the score if R^2 of the returns is lower."""
 
 
 class Predictions(NamedTuple):

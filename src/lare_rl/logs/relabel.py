@@ -19,6 +19,7 @@ from lare_rl.assigner.assigner_config import AssignerConfig
 from lare_rl.credit.decoder_settings import CreditSettings
 from lare_rl.credit.engine import correction
 from lare_rl.credit.methods import METHODS, Reward
+from lare_rl.credit.prequential import LITTLE_R2, MIN_R2_EPISODES
 from lare_rl.envs.load import resolve_task
 from lare_rl.errors import LareError
 from lare_rl.latent.function import LatentFunction
@@ -36,12 +37,6 @@ BLOCK_EPISODES = 10
 MIN_CAPACITY = 100_000
 UPDATES = 10_000
 """Gradient updates of a decoder."""
-MIN_HELD_OUT = 8
-"""The least number of held-out episodes for statistics of their returns."""
-
-MIN_R2 = 0.1
-"""Below this R², the rewards come with a warning."""
-
 MESSAGES = {
     "relabelled": "{method} gave rewards to {steps:count step} of {episodes:count episode}.",
     "cut": "Cut before their end, and not learned from: {episodes:count episode}.",
@@ -99,21 +94,21 @@ class Relabelled:
 
     def _prediction_findings(self) -> Iterator[Finding]:
         episodes = {"episodes": self.held_out}
-        if self.held_out < MIN_HELD_OUT:
-            yield Finding("too_few", {**episodes, "needed": MIN_HELD_OUT})
+        if self.held_out < MIN_R2_EPISODES:
+            yield Finding("too_few", {**episodes, "needed": MIN_R2_EPISODES})
         elif math.isnan(self.return_correlation):
             yield Finding("constant", episodes)
         elif math.isnan(self.return_r2):
             yield Finding("correlation", {**episodes, "correlation": self.return_correlation})
         else:
             yield Finding("r2", {**episodes, "r2": self.return_r2, "error": self.return_r2_error})
-            if self.return_r2 < MIN_R2:
+            if self.return_r2 < LITTLE_R2:
                 yield Finding("worthless")
 
 
 def predicted_return_statistics(returns: Sequence[float], predictions: Sequence[float]) -> tuple[float, float, float]:
     """Return R^2 of predicted returns, its standard error, and the correlation. NaN for fewer than 8 episodes."""
-    if len(returns) < MIN_HELD_OUT:
+    if len(returns) < MIN_R2_EPISODES:
         return math.nan, math.nan, math.nan
     y, predicted = np.array(returns), np.array(predictions)
     varies = all(np.ptp(values) > FLOAT32_NOISE * np.abs(values).max() for values in (y, predicted))

@@ -9,7 +9,8 @@ from collections.abc import Callable, Sequence
 import numpy as np
 
 from lare_rl.credit.basis import MAX_PAIRED_RAW_FEATURES
-from lare_rl.report.run_summary import LITTLE_R2, MIN_EVALUATIONS, RunSummary
+from lare_rl.credit.prequential import LITTLE_R2
+from lare_rl.report.run_summary import MIN_EVALUATIONS, RunSummary
 from lare_rl.report.score_use import CLEAR_ERRORS
 from lare_rl.util.findings import Finding
 from lare_rl.util.statistics import sample_std

@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import Float
 
 from lare_rl.credit.methods import METHODS
+from lare_rl.credit.prequential import LITTLE_R2
 from lare_rl.envs.load import shipped_tasks
 from lare_rl.report.reported_run import ReportedRun, finite, mean_over_seeds
 from lare_rl.report.score_use import CLEAR_ERRORS, ScoreUse, summarise_score_use
@@ -27,7 +28,6 @@ from lare_rl.training.advice import describe_untrained
 from lare_rl.util.statistics import grouped_standard_error, sample_std, standard_error
 
 __all__ = [
-    "LITTLE_R2",
     "MIN_EVALUATIONS",
     "POSSIBLE_ERRORS",
     "SEED_STDS",
@@ -41,8 +41,6 @@ SEED_STDS = 2
 """A seed has learned if its final return exceeds the mean of random actions by this number of deviations of their returns."""
 MIN_ERROR = 1e-9
 """The smallest standard error. With it, equal returns do not differ."""
-LITTLE_R2 = 0.1
-"""Proxy rewards explain next to nothing of the score if R^2 of the returns is lower."""
 MIN_EVALUATIONS = 5
 """With fewer evaluations, nothing is said about a trend."""
 

@@ -85,12 +85,13 @@ def test_overlapping_units_are_separated_and_dead_ones_are_not():
 
 def test_scenarios():
     stats = [
-        SCENARIOS["1c3s5z"].unit_stats(name)[[0, 1, 4]] for name in ("reach", "cooldown", "speed", "health", "damage")
+        SCENARIOS["1c3s5z"].unit_stats(name)[[0, 1, 4]]
+        for name in ("attack_range", "cooldown", "speed", "health", "damage")
     ]
     expected = [(7, 6, 2), (1.07, 1.87, 0.86), (3.15, 4.13, 3.15), (350, 160, 150), (20, 13, 8)]
     np.testing.assert_allclose(stats, expected, rtol=1e-6)
     sizes = [(scenario.n_allies, scenario.n_enemies, scenario.max_steps) for scenario in SCENARIOS.values()]
     assert sizes == [(5, 5, 120), (3, 5, 250), (9, 9, 180)]
     assert tuple(SCENARIOS) == SCENARIO_NAMES
-    with pytest.raises(LareError, match=r"no battle '2s3x' \(did you mean '2s3z'\?\).*3s_vs_5z"):
+    with pytest.raises(LareError, match=r"no scenario '2s3x' \(did you mean '2s3z'\?\).*3s_vs_5z"):
         find_scenario("2s3x")

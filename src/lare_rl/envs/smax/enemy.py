@@ -38,12 +38,15 @@ def choose_actions(
 ) -> tuple[Int[Array, " enemies"], Memory]:
     """Return the action of each enemy unit. Its attacks count our units from the last to the first."""
     n_allies = scenario.n_allies
-    reach, sight = scenario.unit_stats("reach")[n_allies:, None], scenario.unit_stats("sight")[n_allies:, None]
+    attack_range, sight = (
+        scenario.unit_stats("attack_range")[n_allies:, None],
+        scenario.unit_stats("sight")[n_allies:, None],
+    )
     is_alive = alive(battle)
     offset = battle.position[:n_allies] - battle.position[n_allies:, None]
     distance = jnp.sqrt(jnp.sum(offset**2, axis=-1))
     visible = (distance < sight) & is_alive[n_allies:, None] & is_alive[:n_allies]
-    in_range = visible & (distance < reach)
+    in_range = visible & (distance < attack_range)
 
     previous = jax.nn.one_hot(memory.attacked, n_allies, dtype=bool)
     keeps = jnp.any(previous & in_range, axis=1)

@@ -1,4 +1,4 @@
-"""The types of units, and the armies of each battle.
+"""The types of units, and the armies of each scenario.
 
 All stats except those of the colossus are the defaults of SMAX in JaxMARL 0.2.0 (Rutherford et al., 2024; `smax_env.py`,
 Apache-2.0), where shields count as health. JaxMARL has no colossus. Its stats here are those of StarCraft II: health (200, and
@@ -23,7 +23,7 @@ class UnitType(NamedTuple):
 
     speed: float
     damage: float
-    reach: float
+    attack_range: float
     """An attack hits a unit whose centre is nearer than this."""
     sight: float
     radius: float
@@ -46,7 +46,7 @@ UNIT_TYPES = {
 
 @dataclass(frozen=True, eq=False)
 class Scenario:
-    """A battle. Along an axis of units, ours come first."""
+    """Two armies and a time limit. Along an axis of units, ours come first."""
 
     name: str
     ally_types: tuple[str, ...]
@@ -96,15 +96,15 @@ SCENARIOS = {
         Scenario("1c3s5z", _army(1, 3, 5), _army(1, 3, 5), 180, n_unit_types=7),
     )
 }
-"""The battles, with their time limits in SMAC."""
+"""The scenarios, with their time limits in SMAC."""
 
 
 def find_scenario(name: str) -> Scenario:
-    """Return the battle of a name.
+    """Return the scenario of a name.
 
     Raises:
-        LareError: no battle has this name; the message lists all names.
+        LareError: no scenario has this name; the message lists all names.
     """
     if name in SCENARIOS:
         return SCENARIOS[name]
-    raise LareError(f"no battle {name!r}{did_you_mean(name, SCENARIOS)}. SMAX has {', '.join(SCENARIO_NAMES)}.")
+    raise LareError(f"no scenario {name!r}{did_you_mean(name, SCENARIOS)}. SMAX has {', '.join(SCENARIO_NAMES)}.")
