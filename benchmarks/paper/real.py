@@ -165,7 +165,7 @@ def make_page(page_name: str, budget_name: str, jobs: Jobs, command: str) -> Pag
 
 
 _MEANING = (
-    "Scores are of held-out years, maps, demand or instances, of which no method has seen one. A *dense proxy* is a reward of each step "
+    "Scores are of held-out years, maps, demand or instances, which no method has seen. A *dense proxy* is a reward of each step "
     "that a practitioner would use. It adds up to the score on wheat and jobshop, and differs from it on traffic, trains and grid, so it "
     "is no upper bound there. A method that is below the row of a rule has learned less than a person writes down in five lines. "
     "`phi` was written by a language model from the texts of the task alone. "

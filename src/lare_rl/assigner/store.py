@@ -7,7 +7,7 @@ are stored as an episode of their own.
 """
 
 import heapq
-from collections.abc import Hashable, Iterator, Sequence
+from collections.abc import Hashable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
@@ -45,6 +45,10 @@ class RunningEpisode:
     """The sum of its rewards since the last payment."""
     last_observation: Float[np.ndarray, "*agents observation"] | None = None
     """The observation after its last step."""
+
+
+_Step = tuple[RunningEpisode, int, float, bool]
+"""The episode of a step, the step's number and reward, and whether the episode ends with it."""
 
 
 class Store:
@@ -140,21 +144,30 @@ class Store:
         first `LareError` of their payments, like `end`.
         """
         observation, _, next_observation = transition
+
+        def read_steps() -> Iterator[_Step]:
+            for i, env_id in enumerate(env_ids):
+                episode = self.get_running(env_id, observation[i])
+                if level is None:
+                    episode.level = 0
+                elif level[i] >= 0:
+                    episode.level = int(level[i])
+                episode.last_observation = next_observation[i]
+                if ended[i]:
+                    del self.running[env_id]
+                yield episode, int(step_ids[i]), float(reward[i]), bool(ended[i])
+
+        return self._add_steps(read_steps(), self.payments)
+
+    def _add_steps(self, steps: Iterable[_Step], payments: PaymentRule) -> Iterator[StoredEpisode]:
+        """Add steps to their episodes. Yield each episode that is paid, and raise the first refusal of a payment at the end."""
         error = None
-        for i, env_id in enumerate(env_ids):
-            episode = self.get_running(env_id, observation[i])
-            if level is None:
-                episode.level = 0
-            elif level[i] >= 0:
-                episode.level = int(level[i])
-            episode.last_observation = next_observation[i]
-            payment = None
+        for episode, step_id, reward, ended in steps:
             try:
-                payment = self._add_step(episode, int(step_ids[i]), float(reward[i]), self.payments, bool(ended[i]))
+                payment = self._add_step(episode, step_id, reward, payments, ended)
             except LareError as refusal:
                 error = error or refusal
-            if ended[i]:
-                del self.running[env_id]
+                continue
             if payment is not None:
                 yield payment
         if error is not None:
@@ -243,17 +256,9 @@ class Store:
 
         Once all steps are added, raises the first `LareError` of the payments, like `end`.
         """
-        episode, error = RunningEpisode(level=level), None
-        for i, step_id in enumerate(step_ids.tolist()):
-            payment = None
-            try:
-                payment = self._add_step(episode, step_id, float(reward[i]), payments, i == len(step_ids) - 1)
-            except LareError as refusal:
-                error = error or refusal
-            if payment is not None:
-                yield payment
-        if error is not None:
-            raise error
+        episode, last = RunningEpisode(level=level), len(step_ids) - 1
+        steps = ((episode, step_id, float(reward[i]), i == last) for i, step_id in enumerate(step_ids.tolist()))
+        return self._add_steps(steps, payments)
 
     def put_episode(self, number: int, episode: StoredEpisode) -> None:
         """Store an episode under its number."""

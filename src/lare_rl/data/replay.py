@@ -106,7 +106,7 @@ class StoredSteps(NamedTuple):
     level: Int[Array, "*batch"] | None
     """The level of the step's episode. Valid at the last step."""
     length: Int[Array, "*batch"]
-    """Steps of its episode; if that has not ended, at least the mean length of those that have."""
+    """Steps of its episode. If it is running: at least the mean length of the ended episodes."""
 
 
 def init_replay(
