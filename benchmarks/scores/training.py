@@ -133,7 +133,7 @@ def true_rewards() -> Iterator[Row]:
 
 
 def threshold() -> Iterator[Row]:
-    for method in ("lare-bayes", "lare-bayes-history", "dense", "rrdu"):
+    for method in ("lare-bayes", "lare-bayes-history", "dense", "rrdu", "episodic", "lare-rrdu"):
         settings = {"method": method, **CHEETAH, "steps": 60_000, "evaluate_every": 5_000}
         task = read_task("HalfCheetahThreshold-v4")
         yield Row(task.name, method, task, settings, is_baseline=method == "lare-bayes")
