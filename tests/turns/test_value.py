@@ -1,4 +1,4 @@
-"""Values, changes, advantages and deviations against slow twins."""
+"""Values, changes, advantages and posterior standard deviations against slow twins."""
 
 import numpy as np
 import pytest
@@ -7,7 +7,7 @@ from helpers.turn_toys import dense_posterior, sample_table, slow_prefix
 from lare_rl.turns.features import build_prefixes
 from lare_rl.turns.logistic import logistic
 from lare_rl.turns.regression import PrefixFit
-from lare_rl.turns.value import advantages, changes, deviations, fit_prefixes, held_out_values, values
+from lare_rl.turns.value import advantages, changes, fit_prefixes, held_out_values, posterior_stds, values
 
 ALPHA, BETA = 2.0, 5.0
 
@@ -46,7 +46,7 @@ def linear_fit(table, x):
         root=np.linalg.cholesky(shift @ covariance[: n + 1, : n + 1] @ shift.T).T,
         group_row=rows,
         group_precision=precision,
-        noise=1 / BETA,
+        noise_variance=1 / BETA,
         is_logistic=False,
     )
 
@@ -106,10 +106,10 @@ def test_held_out_values_are_those_of_a_fit_without_the_rollout(problem):
         np.testing.assert_allclose(result[rows_of(table, k)], expected, rtol=1e-6, atol=1e-8)
 
 
-def test_deviations_are_those_of_the_posterior(problem):
+def test_posterior_stds_are_those_of_the_posterior(problem):
     table, x, fit = problem
     _, covariance = simple_fit(table, x)
-    result = deviations(table, x, fit)
+    result = posterior_stds(table, x, fit)
     n_groups = table.group.max() + 1
     for k in range(len(table.length)):
         rows = x[rows_of(table, k)]
@@ -136,7 +136,7 @@ def test_logistic_values_are_probabilities_and_follow_the_outcomes():
     assert abs(np.mean(table.outcome[index] - logistic(eta))) < 1e-3
     linear = values(table, x, fit_prefixes(table, x))
     assert np.corrcoef(value, linear)[0, 1] > 0.9
-    assert np.isfinite(deviations(table, x, fit)).all()
+    assert np.isfinite(posterior_stds(table, x, fit)).all()
 
 
 def test_held_out_logistic_values_are_near_those_of_a_fit_without_the_rollout():

@@ -9,7 +9,7 @@ from lare_rl.credit.explanation import Explanation
 from lare_rl.credit.score_type import ScoreType, ScoreTypeEstimate
 from lare_rl.tasks.spec import base_name, entry_meanings
 from lare_rl.util.findings import Finding
-from lare_rl.util.statistics import round_shares
+from lare_rl.util.statistics import CLEAR_ERRORS, round_shares
 
 __all__ = ["LEGEND_CODES", "MESSAGES", "MIN_EXPLAINED_EPISODES", "explanation_findings", "raw_feature_names"]
 
@@ -27,8 +27,6 @@ LARGE_SHARE = 0.1
 """Raw features are named if they add a larger share to the share of the factors."""
 STRAIGHT_SHARE = 0.8
 """The effect of a factor is curved if the closest line has a smaller share of its variance."""
-CLEAR_STDS = 2.0
-"""An effect is known if it is larger than this number of its posterior standard deviations."""
 CANCELLED_FRACTION = 0.1
 """The effects before and after a step cancel if their sum is smaller than this fraction of the larger effect."""
 STRIKING_CORRELATION = 0.3
@@ -311,7 +309,7 @@ def _change_effect(explanation: Explanation, indices: list[int]) -> Finding | No
     if len(indices) != 2:
         return None
     slope, std = explanation.slope[indices], np.sqrt(np.diagonal(explanation.slope_covariance)[indices])
-    is_clear = np.all(np.abs(slope) > CLEAR_STDS * std)
+    is_clear = np.all(np.abs(slope) > CLEAR_ERRORS * std)
     if not is_clear or abs(slope.sum()) >= CANCELLED_FRACTION * np.abs(slope).max():
         return None
     return Finding("change_pays", {"slope": float(slope[1] - slope[0]) / 2})

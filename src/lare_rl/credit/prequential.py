@@ -112,7 +112,7 @@ def metrics(predictions: Predictions) -> dict[str, Float[Array, ""]]:
 def gain(predictions: Predictions) -> tuple[Float[Array, ""], Float[Array, ""]]:
     """Return the gain of the first decoder, and its standard error over episodes. Both are NaN if R^2 is.
 
-    The standard error is that of a ratio of means, as in `statistics.r_squared`. An episode that is alone in its level is compared
+    The standard error is that of a ratio of means, as in `statistics.ratio_of_sums`. An episode that is alone in its level is compared
     with all other episodes.
     """
     valid = jnp.arange(len(predictions.returns)) < predictions.n_episodes

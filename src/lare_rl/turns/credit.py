@@ -15,9 +15,10 @@ from lare_rl.turns.features import COUNT, HAPPENED, LAST, Prefixes, TurnTable, b
 from lare_rl.turns.regression import PrefixFit
 from lare_rl.turns.rollouts import Phi, read_rollouts
 from lare_rl.turns.trust import UNTRUSTED, Errors, Trust
-from lare_rl.turns.value import advantages, changes, deviations, fit_prefixes, held_out_values, values
+from lare_rl.turns.value import advantages, changes, fit_prefixes, held_out_values, posterior_stds, values
 from lare_rl.turns.words import MESSAGES
 from lare_rl.util.findings import Finding, render
+from lare_rl.util.statistics import CLEAR_ERRORS
 
 __all__ = ["CreditedTurns", "FeatureEffect", "TurnCredit"]
 
@@ -38,13 +39,13 @@ class FeatureEffect(NamedTuple):
     """The share of these turns."""
     first: float
     """The change of value by the first turn with the feature."""
-    first_deviation: float
+    first_std: float
     lasting: float
     """What remains of it after further turns without the feature."""
-    lasting_deviation: float
+    lasting_std: float
     further: float
     """What each further turn with the feature adds."""
-    further_deviation: float
+    further_std: float
 
 
 @dataclass(frozen=True)
@@ -91,7 +92,7 @@ class CreditedTurns:
     @property
     def findings(self) -> list[Finding]:
         """The same as findings, whose sentences are in `turns/words.py`."""
-        clear = [effect for effect in self.effects if abs(effect.first) > CLEAR * effect.first_deviation]
+        clear = [effect for effect in self.effects if abs(effect.first) > CLEAR_ERRORS * effect.first_std]
         clear.sort(key=lambda effect: -abs(effect.first * effect.frequency))
         return [
             Finding("grpo" if self.is_grpo else "lambda", {"lambda_": self.lambda_, "reason": self.reason}),
@@ -99,8 +100,6 @@ class CreditedTurns:
         ]
 
 
-CLEAR = 2.0
-"""An effect of more than this many deviations is described in words."""
 MAX_SENTENCES = 8
 """The largest number of features that are described in words."""
 
@@ -175,7 +174,7 @@ class TurnCredit:
         return CreditedTurns(
             advantage=split(advantage),
             progress=split(progress),
-            deviation=split(deviations(table, x, fit)),
+            deviation=split(posterior_stds(table, x, fit)),
             value=split(value),
             lambda_=float(lambda_),
             trust=trust,

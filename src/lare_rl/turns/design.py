@@ -15,7 +15,7 @@ from lare_rl.turns.messages import Turn
 from lare_rl.turns.phi import TurnPhi, find_problems, read_turn_phi
 from lare_rl.turns.prompt import choose_examples, turn_request
 
-__all__ = ["MAX_ATTEMPTS", "DesignedTurnPhi", "design_turn_phi", "examine_turn_reply"]
+__all__ = ["MAX_ATTEMPTS", "DesignedTurnPhi", "design_turn_phi"]
 
 MAX_ATTEMPTS = 5
 """Attempts at a program that passes, the first included."""
@@ -29,15 +29,6 @@ class DesignedTurnPhi:
     phi: TurnPhi
     model: str
     recorder: Recorder
-
-
-def examine_turn_reply(reply: str, turns: Sequence[Turn]) -> tuple[str, str]:
-    """Return the source in a reply, and what is wrong with it: an empty text if it passes on these turns."""
-    try:
-        source = normalise_source(parse_reply(reply).functions)
-    except MalformedReplyError as error:
-        return "", str(error)
-    return source, find_problems(source, turns)
 
 
 def design_turn_phi(
@@ -71,8 +62,13 @@ def design_turn_phi(
     for attempt in range(MAX_ATTEMPTS):
         reply = model.reply(request, 0)
         recorder.add("correct" if attempt else "candidate", request, reply, model.name)
-        source, problems = examine_turn_reply(reply, turns)
-        if not problems:
-            return DesignedTurnPhi(read_turn_phi(source), model.name, recorder)
+        try:
+            source = normalise_source(parse_reply(reply).functions)
+            problems = find_problems(source, turns)
+        except MalformedReplyError as error:
+            problems = str(error)
+        else:
+            if not problems:
+                return DesignedTurnPhi(read_turn_phi(source), model.name, recorder)
         request = correct(request, reply[:MAX_QUOTE] if reply.strip() else "(an empty reply)", problems)
     raise LareError(f"none of {MAX_ATTEMPTS} attempts passed; the last one failed: {problems.splitlines()[0]}")

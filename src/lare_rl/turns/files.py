@@ -1,6 +1,7 @@
 """Files of rollouts: one JSON object in each line, and the same with the credit of each turn."""
 
 import json
+from itertools import count
 from pathlib import Path
 from typing import Any
 
@@ -27,7 +28,7 @@ def read_rollout_file(path: Path) -> list[dict[str, Any]]:
         if path.exists() and not path.is_file():
             raise LareError(f"{path} is not a file")
         with path.open("rb") as file:
-            for number in range(1, 1 << 62):
+            for number in count(1):
                 line = file.readline(MAX_LINE_BYTES + 1)
                 if not line:
                     break

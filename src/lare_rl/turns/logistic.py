@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from lare_rl.credit.precisions import NUMPY, TOLERANCE, count_effective
-from lare_rl.turns.regression import Elimination, GroupSums, PrefixFit, eliminate_groups, sum_up
+from lare_rl.turns.regression import GroupSums, PrefixFit, eliminate_groups, sum_up, to_fit
 
 __all__ = ["fit_logistic", "logistic"]
 
@@ -50,42 +50,26 @@ def fit_logistic(
         return sum_up(x, eta + (y - p) / curvature, weight * curvature, group, n_groups, n_rollouts, unit=1.0)
 
     sums = regress()
+    index = sums.problem.group_index
     first = np.append(np.diagonal(sums.problem.s) / sums.problem.q * x.shape[1], 1.0) + 1e-12
-    alpha, previous, n_rounds = first, -np.inf, 0
-    while True:
-        n_rounds, n_steps = n_rounds + 1, 0
-        while True:
-            n_steps += 1
+    alpha, previous = first, -np.inf
+    for n_rounds in range(MAX_ROUNDS):
+        for _ in range(NEXT_STEPS if n_rounds else FIRST_STEPS):
+            sums = regress()
             posterior = eliminate_groups(sums, alpha, 1.0)
-            mean = float(sums.problem.y_mean + posterior.weight[-1])
+            mean = sums.problem.y_mean + posterior.weight[-1]
             step = mean + (x - sums.x_mean) @ posterior.weight[:-1] + posterior.intercept[group] - eta
             largest = np.abs(step).max()
             eta = eta + step * min(1.0, MAX_STEP / max(largest, 1e-12))
-            if largest < 1e-3 or n_steps == (FIRST_STEPS if n_rounds == 1 else NEXT_STEPS):
+            if largest < 1e-3:
                 break
-            sums = regress()
         solution = np.concatenate([posterior.weight[:-1], posterior.intercept])
-        index = sums.problem.group_index
         size, n_effective, squares = count_effective(NUMPY, index, alpha, solution, posterior.variance)
         p = np.clip(logistic(eta), 1e-12, 1 - 1e-12)
         log_likelihood = weight @ (y * np.log(p) + (1 - y) * np.log(1 - p))
         log_evidence = log_likelihood + 0.5 * (size @ np.log(alpha) - alpha @ squares - posterior.log_det)
-        if abs(log_evidence - previous) <= 10 * TOLERANCE or n_rounds == MAX_ROUNDS:
-            return _to_fit(sums.x_mean, mean, posterior)
+        if abs(log_evidence - previous) <= 10 * TOLERANCE:
+            break
         previous = log_evidence
         alpha = np.clip(n_effective / np.maximum(squares, 1e-30), first * WEAKEST, first * STRONGEST)
-        sums = regress()
-
-
-def _to_fit(x_mean: Float[np.ndarray, " features"], mean: float, posterior: Elimination) -> PrefixFit:
-    return PrefixFit(
-        x_mean=x_mean,
-        weight=posterior.weight[:-1],
-        mean=mean,
-        intercept=posterior.intercept,
-        root=posterior.root,
-        group_row=posterior.group_row,
-        group_precision=posterior.group_precision,
-        noise=1.0,
-        is_logistic=True,
-    )
+    return to_fit(sums, posterior, 1.0, is_logistic=True)

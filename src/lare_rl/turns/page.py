@@ -33,8 +33,8 @@ NOTE_SUMS = (
     "rewards of lare-rl relabel are: such scores are for rewards, and must not be used as advantages of turns."
 )
 NOTE_DEVIATIONS = (
-    "Bars of two deviations contain the exact change of value in about half of the turns only, because they do not know of what the "
-    "features miss. A bar that does not touch 0 usually has the right sign."
+    "Bars of two posterior standard deviations contain the exact change of value in about half of the turns only, because they do not "
+    "know of what the features miss. A bar that does not touch 0 usually has the right sign."
 )
 
 
@@ -76,8 +76,8 @@ def write_turn_report(
 def choose_rollouts(checked: Sequence[Rollout], credit: CreditedTurns) -> list[int]:
     """Return rollouts to draw: alternately above and below the median outcome, those with the clearest turns first."""
     clarity = [
-        float(np.max(np.abs(progress[:-1]) - 2 * deviation[:-1], initial=-np.inf))
-        for progress, deviation in zip(credit.progress, credit.deviation, strict=True)
+        float(np.max(np.abs(progress[:-1]) - 2 * std[:-1], initial=-np.inf))
+        for progress, std in zip(credit.progress, credit.deviation, strict=True)
     ]
     middle = np.median([rollout.outcome for rollout in checked])
     order = sorted(range(len(checked)), key=lambda k: -clarity[k])
@@ -95,8 +95,8 @@ def _render_rollout(k: int, rollout: Mapping[str, Any], checked: Rollout, credit
     messages = rollout.get("messages")
     turns = [None] * len(value) if messages is None else split_turns(messages, f"rollout {k}")
     for t, (features, turn) in enumerate(zip(checked.turns, turns, strict=True)):
-        progress, deviation = credit.progress[k][t], credit.deviation[k][t]
-        numbers = f"{value[t]:.2f}", f"{progress:+.3f} ± {deviation:.3f}", f"{credit.advantage[k][t]:+.3f}"
+        progress, std = credit.progress[k][t], credit.deviation[k][t]
+        numbers = f"{value[t]:.2f}", f"{progress:+.3f} ± {std:.3f}", f"{credit.advantage[k][t]:+.3f}"
         rows.append((str(t + 1), _describe_turn(turn), _describe_features(features), *numbers))
     header = ("turn", "the assistant", "features", "value before", "progress", "advantage")
     table = render_table(header, rows[:MAX_TURNS], numbers=(0, 3, 4, 5))
@@ -107,12 +107,12 @@ def _render_rollout(k: int, rollout: Mapping[str, Any], checked: Rollout, credit
     ]
 
 
-def _draw_strip(progress: np.ndarray, deviation: np.ndarray) -> str:
-    """Draw the progress of each turn as a bar, with two deviations."""
+def _draw_strip(progress: np.ndarray, std: np.ndarray) -> str:
+    """Draw the progress of each turn as a bar, with two posterior standard deviations."""
     figure, (axes,) = make_figure(height=1.9)
     turns = np.arange(1, len(progress) + 1)
     colours = np.where(progress >= 0, COLOURS[0], COLOURS[1])
-    axes.bar(turns, progress, color=colours, yerr=2 * deviation, error_kw={"elinewidth": 1, "ecolor": "#777777"})
+    axes.bar(turns, progress, color=colours, yerr=2 * std, error_kw={"elinewidth": 1, "ecolor": "#777777"})
     axes.axhline(0, color="#777777", linewidth=0.8)
     axes.set(xlabel="turn", ylabel="progress", xlim=(0.4, len(progress) + 0.6))
     axes.xaxis.get_major_locator().set_params(integer=True)
@@ -134,11 +134,8 @@ def _describe_features(features: Mapping[str, float]) -> str:
 def _render_effects(credit: CreditedTurns) -> str:
     rows = []
     for effect in sorted(credit.effects, key=lambda effect: -abs(effect.first * effect.frequency)):
-        pairs = ((getattr(effect, x), getattr(effect, f"{x}_deviation")) for x in ("first", "lasting", "further"))
-        numbers = (
-            "0" if max(abs(number), deviation) < SMALL else f"{number:+.3f} ± {deviation:.3f}"
-            for number, deviation in pairs
-        )
+        pairs = ((getattr(effect, x), getattr(effect, f"{x}_std")) for x in ("first", "lasting", "further"))
+        numbers = ("0" if max(abs(number), std) < SMALL else f"{number:+.3f} ± {std:.3f}" for number, std in pairs)
         name = effect.name if effect.unit == 1 else f"{effect.name} ({effect.unit:.3g})"
         rows.append((name, f"{effect.frequency:.0%}", *numbers))
     header = ("feature of a turn", "turns with it", "the first one", "what lasts of it", "each further one")

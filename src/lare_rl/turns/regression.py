@@ -38,7 +38,6 @@ from lare_rl.credit.precisions import (
 )
 
 __all__ = [
-    "Elimination",
     "GroupSums",
     "PrefixFit",
     "eliminate_groups",
@@ -46,6 +45,7 @@ __all__ = [
     "fixed_point",
     "group_moments",
     "sum_up",
+    "to_fit",
 ]
 
 MAX_ROUNDS = 40
@@ -84,7 +84,7 @@ class PrefixFit(NamedTuple):
     """D^-1 B: how much the mean of b falls if an entry of (v, m) grows by 1."""
     group_precision: Float[np.ndarray, " groups"]
     """D: the precision of b for some (v, m)."""
-    noise: float
+    noise_variance: float
     """1 / beta, the variance of e. 1 if `is_logistic`."""
     is_logistic: bool
     """Whether m + b + v . (x - x') is the log odds of the outcome (`logistic.py`)."""
@@ -206,17 +206,22 @@ def fit_linear(
     candidates = [fixed_point(sums, problem.equal_alpha * factor, beta) for factor in (1.0, NOISE_ONLY)]
     best = max(candidates, key=lambda posterior: posterior.log_evidence)
     alpha, beta = clip_precisions(NUMPY, problem, best.alpha, best.beta)
-    posterior, unit = eliminate_groups(sums, alpha, beta), float(problem.y_std)
+    return to_fit(sums, eliminate_groups(sums, alpha, beta), float(beta), is_logistic=False)
+
+
+def to_fit(sums: GroupSums, posterior: Elimination, beta: float, *, is_logistic: bool) -> PrefixFit:
+    """Return a posterior in the unit of the outcomes or, if `is_logistic`, of log odds."""
+    unit = float(sums.problem.y_std)
     return PrefixFit(
         x_mean=sums.x_mean,
         weight=unit * posterior.weight[:-1],
-        mean=float(problem.y_mean + unit * posterior.weight[-1]),
+        mean=float(sums.problem.y_mean + unit * posterior.weight[-1]),
         intercept=unit * posterior.intercept,
         root=unit * posterior.root,
         group_row=posterior.group_row,
         group_precision=posterior.group_precision / (unit or 1) ** 2,
-        noise=(unit or 1) ** 2 / float(beta),
-        is_logistic=False,
+        noise_variance=(unit or 1) ** 2 / beta,
+        is_logistic=is_logistic,
     )
 
 

@@ -75,8 +75,10 @@ def read_rollout(rollout: Any, where: str, phi: Phi | None = None) -> Rollout:
     truncated = rollout.get("truncated", False)
     if not isinstance(truncated, bool | np.bool_):
         raise LareError(f"{where}: truncated must be true or false, and is {short_repr(truncated)}")
-    turn_numbers = rollout.get("turns")
-    numbers = None if turn_numbers is None else _read_turns(turn_numbers, where)
+    turn_numbers, numbers = rollout.get("turns"), None
+    if turn_numbers is not None:
+        check_list(turn_numbers, "turns", MAX_TURNS, where)
+        numbers = [_read_row(row, f"turns[{t}]", where) for t, row in enumerate(turn_numbers)]
     messages = rollout.get("messages")
     if messages is None:
         if numbers is None:
@@ -92,19 +94,13 @@ def read_rollout(rollout: Any, where: str, phi: Phi | None = None) -> Rollout:
                 "turns is needed for each message of the assistant"
             )
         features = message_features(turns)
-        if phi is not None:
-            features = _merge(features, _evaluate(phi, turns, where))
-        if numbers is not None:
-            features = _merge(features, numbers)
+        for rows in (None if phi is None else _evaluate(phi, turns, where), numbers):
+            if rows is not None:
+                features = [row | new for row, new in zip(features, rows, strict=True)]
     if not features:
         reason = "" if messages is None else ": the assistant says nothing"
         raise LareError(f"{where} has no turn{reason}")
     return Rollout(tuple(features), outcome, str(group), bool(truncated))
-
-
-def _merge(rows: Sequence[Row], extra_rows: Sequence[Row]) -> list[Row]:
-    """Add the names of extra rows. If both have a name, the extra row's number replaces the other."""
-    return [row | extra for row, extra in zip(rows, extra_rows, strict=True)]
 
 
 def _evaluate(phi: Phi, turns: Sequence[Turn], where: str) -> list[Row]:
@@ -119,11 +115,6 @@ def _evaluate(phi: Phi, turns: Sequence[Turn], where: str) -> list[Row]:
             raise LareError(f"{where}, turn {t}: phi failed: {type(error).__name__}: {one_line(error)}") from error
         rows.append(_read_row(events, f"the result of phi for turn {t}", where))
     return rows
-
-
-def _read_turns(turns: Any, where: str) -> list[Row]:
-    check_list(turns, "turns", MAX_TURNS, where)
-    return [_read_row(turn, f"turns[{t}]", where) for t, turn in enumerate(turns)]
 
 
 def _read_row(row: Any, what: str, where: str) -> Row:

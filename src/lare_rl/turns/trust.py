@@ -22,6 +22,7 @@ from jaxtyping import Float
 from lare_rl.turns.features import TurnTable
 from lare_rl.turns.regression import fit_linear
 from lare_rl.util.findings import Finding
+from lare_rl.util.statistics import CLEAR_ERRORS, ratio_of_sums
 
 __all__ = [
     "CAREFUL",
@@ -40,8 +41,6 @@ TRUSTING, CAREFUL, GRPO = 0.8, 0.95, 1.0
 """The values of lambda."""
 UNTRUSTED = ("unknown", "unclear_gain")
 """The reasons for which the advantage is GRPO's."""
-MIN_GAIN_Z = 2.0
-"""Values are used if their gain is above this many standard errors."""
 MIN_GAIN, MAX_SURPRISE = 0.05, 0.15
 """Lambda 0.8 needs a larger gain, and a smaller surprise in standard deviations of outcomes. These limits, and the window of `TurnCredit`,
 were chosen on the testbeds (a) and (b) of `benchmarks/turns`, with other seeds than those that are reported."""
@@ -79,7 +78,7 @@ def group_means(table: TurnTable) -> Float[np.ndarray, " rollouts"]:
     n, group, outcome = len(table.length), table.group, table.outcome
     fit = fit_linear(np.zeros((n, 0)), outcome, np.ones(n), group, n)
     size, total = (np.bincount(group, weights)[group] for weights in (None, outcome - fit.mean))
-    shrinkage = fit.noise * fit.group_precision[group] - size
+    shrinkage = fit.noise_variance * fit.group_precision[group] - size
     return fit.mean + (total - outcome + fit.mean) / (size - 1 + shrinkage)
 
 
@@ -95,16 +94,10 @@ def measure_errors(table: TurnTable, held_out: Float[np.ndarray, " turns"]) -> E
 def summarise(errors: Sequence[Errors]) -> Trust:
     """Return the trust in values from the errors of the latest calls."""
     reduction, baseline, surprise, outcome = (np.concatenate(values) for values in zip(*errors, strict=True))
-    n, total = len(reduction), baseline.sum()
-    is_measured = n >= MIN_ROLLOUTS and total > 0
-    gain = reduction.sum() / total if is_measured else math.nan
-    return Trust(
-        gain=float(gain),
-        gain_error=float((reduction - gain * baseline).std(ddof=1) * math.sqrt(n) / total) if is_measured else math.nan,
-        surprise=float(surprise.mean()) if len(surprise) else 0.0,
-        outcome_std=float(outcome.std()),
-        n_rollouts=n,
-    )
+    is_measured = len(baseline) >= MIN_ROLLOUTS and baseline.sum() > 0
+    gain, gain_error = ratio_of_sums(reduction, baseline) if is_measured else (math.nan, math.nan)
+    surprise = float(surprise.mean()) if len(surprise) else 0.0
+    return Trust(gain, gain_error, surprise, outcome_std=float(outcome.std()), n_rollouts=len(baseline))
 
 
 def choose_lambda(trust: Trust) -> tuple[float, Finding]:
@@ -112,7 +105,7 @@ def choose_lambda(trust: Trust) -> tuple[float, Finding]:
     values = trust._asdict()
     if math.isnan(trust.gain):
         return GRPO, Finding("unknown", values)
-    if trust.gain <= MIN_GAIN_Z * trust.gain_error:
+    if trust.gain <= CLEAR_ERRORS * trust.gain_error:
         return GRPO, Finding("unclear_gain", values)
     if trust.gain < MIN_GAIN:
         return CAREFUL, Finding("small_gain", values)

@@ -1,4 +1,4 @@
-"""Values of prefixes from a fit, and what follows from them: changes of value, advantages, deviations.
+"""Values of prefixes from a fit, and what follows from them: changes of value, advantages, posterior standard deviations.
 
 With b_(-k) the intercept of the group without rollout k itself:
 
@@ -6,8 +6,9 @@ With b_(-k) the intercept of the group without rollout k itself:
     delta_t = V_(t+1) - V_t,   and   R - V_t at the last turn         (they add up to R - V_0)
     A_t     = sum_l lambda^l delta_(t+l)                              (generalized advantages, Schulman et al., 2016)
 
-The deviation of a change is sqrt((x_(t+1) - x_t)^T Sigma (x_(t+1) - x_t)); at the last turn, that of V_t. If the log odds are linear,
-V is the logistic function of them, b_(-k) follows from one step of Newton's method, and deviations from the slopes of V.
+The posterior standard deviation of a change is sqrt((x_(t+1) - x_t)^T Sigma (x_(t+1) - x_t)); at the last turn, that of V_t. If the
+log odds are linear, V is the logistic function of them, b_(-k) follows from one step of Newton's method, and standard deviations from
+the slopes of V.
 """
 
 import itertools
@@ -20,7 +21,7 @@ from lare_rl.turns.features import TurnTable
 from lare_rl.turns.logistic import fit_logistic, logistic
 from lare_rl.turns.regression import PrefixFit, fit_linear
 
-__all__ = ["advantages", "changes", "deviations", "fit_prefixes", "held_out_values", "values"]
+__all__ = ["advantages", "changes", "fit_prefixes", "held_out_values", "posterior_stds", "values"]
 
 
 def fit_prefixes(table: TurnTable, x: Float[np.ndarray, "turns features"], *, is_logistic: bool = False) -> PrefixFit:
@@ -47,7 +48,7 @@ def _predict(table: TurnTable, x: Float[np.ndarray, "turns features"], fit: Pref
     eta = fit.mean + (x - fit.x_mean) @ fit.weight + fit.intercept[table.group][index]
     value = logistic(eta) if fit.is_logistic else eta
     slope = value * (1 - value) if fit.is_logistic else np.ones_like(eta)
-    weight = len(table.length) / len(x) / fit.noise
+    weight = len(table.length) / len(x) / fit.noise_variance
     return _Predictions(eta, value, slope, weight * (table.outcome[index] - value), weight * slope)
 
 
@@ -79,7 +80,9 @@ def advantages(table: TurnTable, change: Float[np.ndarray, " turns"], lambda_: f
     return advantage
 
 
-def deviations(table: TurnTable, x: Float[np.ndarray, "turns features"], fit: PrefixFit) -> Float[np.ndarray, " turns"]:
+def posterior_stds(
+    table: TurnTable, x: Float[np.ndarray, "turns features"], fit: PrefixFit
+) -> Float[np.ndarray, " turns"]:
     """Return the posterior standard deviation of each change of value."""
     slope, last = _predict(table, x, fit).slope, table.last
     rows = slope[:, None] * _rows(table, x, fit)

@@ -27,7 +27,7 @@ MESSAGES = {
         "by {surprise:+.2f} when agents stop"
     ),
     "effect": (
-        "The first `{name}` changes the value by {first:+.3f} ± {first_deviation:.3f}; {lasting:+.3f} ± {lasting_deviation:.3f} of it "
-        "lasts. Each further one adds {further:+.3f} ± {further_deviation:.3f}."
+        "The first `{name}` changes the value by {first:+.3f} ± {first_std:.3f}; {lasting:+.3f} ± {lasting_std:.3f} of it "
+        "lasts. Each further one adds {further:+.3f} ± {further_std:.3f}."
     ),
 }

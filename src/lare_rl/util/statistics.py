@@ -8,6 +8,7 @@ import numpy as np
 from jaxtyping import Float
 
 __all__ = [
+    "CLEAR_ERRORS",
     "FLOAT32_NOISE",
     "Band",
     "column_correlations",
@@ -17,12 +18,15 @@ __all__ = [
     "format_rounded",
     "grouped_standard_error",
     "r_squared",
+    "ratio_of_sums",
     "round_shares",
     "sample_std",
     "standard_error",
     "wins",
 ]
 
+CLEAR_ERRORS = 2
+"""A number is clear if it exceeds this many of its standard errors, or of its posterior standard deviations."""
 FLOAT32_NOISE = 1e-6
 """In float32, a constant may vary by this fraction of its size."""
 CONSTANT = 1e-10
@@ -90,20 +94,27 @@ def column_correlations(
 def r_squared(y: Float[np.ndarray, " values"], predicted: Float[np.ndarray, " values"]) -> tuple[float, float]:
     """Return R^2 of predictions and its standard error. Both are NaN if `y` never varies or has fewer than two values.
 
-        e_k = (y_k - y_hat_k)^2,   d_k = (y_k - mean y)^2,   R^2 = 1 - sum e / sum d
-        error^2 = n / (n - 1) * sum_k (e_k - (1 - R^2) d_k)^2 / (sum d)^2
-
-    1 - R^2 is a ratio of two means, and its error is the error of a linearised ratio (Cochran, Sampling Techniques, 3rd edition, 1977,
-    section 2.11).
+    R^2 = 1 - sum e / sum d,   e_k = (y_k - y_hat_k)^2,   d_k = (y_k - mean y)^2
     """
     if len(y) < 2:
         return math.nan, math.nan
     errors, deviations = (y - predicted) ** 2, (y - y.mean()) ** 2
     if not deviations.sum() > CONSTANT * np.sum(y**2):
         return math.nan, math.nan
-    ratio = errors.sum() / deviations.sum()
-    variance = np.sum((errors - ratio * deviations) ** 2) / deviations.sum() ** 2
-    return float(1 - ratio), float(np.sqrt(len(y) / (len(y) - 1) * variance))
+    ratio, error = ratio_of_sums(errors, deviations)
+    return 1 - ratio, error
+
+
+def ratio_of_sums(x: Float[np.ndarray, " values"], y: Float[np.ndarray, " values"]) -> tuple[float, float]:
+    """Return sum x / sum y and its standard error, for two or more pairs.
+
+        error^2 = n / (n - 1) * sum_k (x_k - ratio * y_k)^2 / (sum y)^2
+
+    This is the error of a linearised ratio (Cochran, Sampling Techniques, 3rd edition, 1977, section 2.11).
+    """
+    ratio = x.sum() / y.sum()
+    variance = np.sum((x - ratio * y) ** 2) / y.sum() ** 2
+    return float(ratio), float(np.sqrt(len(x) / (len(x) - 1) * variance))
 
 
 def format_rounded(number: float, spread: float) -> str:
