@@ -22,6 +22,7 @@ from helpers.toy_envs import toy_spec
 from lare_rl.assigner.assigner import CreditAssigner
 from lare_rl.credit.methods import METHODS
 from lare_rl.tasks.payments import PAID_AT_END, PaymentRule
+from lare_rl.training.decoder_inputs import step_batch
 from lare_rl.training.rewards import rewards
 
 PHI_ENV = replace(ONE_AGENT, observation_size=2, action_size=1, low=ONE_AGENT.low[:, :1], high=ONE_AGENT.high[:, :1])
@@ -105,7 +106,9 @@ EVERY_5 = PaymentRule(period=5)
         long_case("rd-linear", ONE_TEAM, {"score": "auto"}),
         long_case("rd-linear", ONE_AGENT, {"group": "map", "score": "auto"}),
         long_case("ircr", ONE_AGENT, {"payments": EVERY_5}),
-        long_case("rd-linear", ONE_AGENT, {"payments": PaymentRule(period=4, window=6), "exact": "last"}),
+        long_case(
+            "rd-linear", ONE_AGENT, {"payments": PaymentRule(period=4, window=6), "exact": "last", "score": "average"}
+        ),
     ],
 )
 def test_rewards_and_lengths_agree(method, env, changes, phi):
@@ -116,7 +119,7 @@ def test_rewards_and_lengths_agree(method, env, changes, phi):
     n_unpaid = n_running % 5 if "payments" in changes else n_running
     assert (~steps.episode_ended).sum() == n_unpaid
     lengths = credit.store.lengths(np.arange(credit.store.n_added))
-    np.testing.assert_array_equal(lengths, np.asarray(steps.length).ravel())
+    np.testing.assert_array_equal(lengths, np.asarray(step_batch(steps, config, 0).length).ravel())
     expected = np.asarray(jitted(rewards, config)(steps, learner.reward_sources))
     expected = expected if env.n_agents > 1 else expected[..., 0]
     r_hat = credit.rewards_at(np.arange(credit.store.n_added))

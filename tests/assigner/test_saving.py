@@ -187,7 +187,7 @@ DAMAGES = {
     "no method": (changed(method="magic"), "magic"),
     "other sizes": (changed(observation={"kind": "numbers", "shape": [3]}), None),
     "a smaller ring": (changed(capacity=5), "damaged"),
-    "no settings": (changed(settings=None), "damaged"),
+    "no settings": (changed(settings=None), "settings = None"),
     "another format": (changed(format=99), "not of format 1"),
     "a list": (lambda directory: (directory / TEXT_FILE).write_text("[]"), "not of format 1"),
     "deep": (lambda directory: (directory / TEXT_FILE).write_text("[" * 10_000), None),

@@ -84,20 +84,17 @@ def read_episode(
     config: AssignerConfig, steps: tuple[Any, Any, Any], reward: Any, alive: Any
 ) -> tuple[NewSteps, PaymentRule]:
     """Return the arguments of `CreditAssigner.add_episode`, and when the episode was paid. Raises `LareError` if they do not fit."""
-    observation, action, next_observation = (array.copy() for array in to_rows(config, *steps))
-    n_steps = len(observation)
+    n_steps = len(to_rows(config, *steps)[0])
     if not n_steps:
         raise LareError("the episode has no step")
-    is_score = np.ndim(reward) == 0
-    rewards, alive = _to_team_reward(config, np.zeros(n_steps) if is_score else reward, alive, n_steps)
-    rows, is_last = np.arange(n_steps), np.arange(n_steps) == n_steps - 1
-    new = NewSteps(rows, n_steps, [], (observation, action, next_observation), rewards, is_last, alive)
-    _check_finite(rows, new.steps, rewards)
-    score = float(reward) if is_score else float(rewards.sum())
+    is_score, is_last = np.ndim(reward) == 0, np.arange(n_steps) == n_steps - 1
+    rewards = np.zeros(n_steps) if is_score else reward
+    new = read_steps(config, steps, rewards, is_last, np.zeros(n_steps, bool), None, None, alive)
+    score = float(reward) if is_score else float(new.reward.sum())
     if not np.isfinite(score):
         raise LareError(f"the score is {score}: give a finite number")
     if is_score:
-        rewards[-1] = score
+        new.reward[-1] = score
     return new, PAID_AT_END if is_score else config.payments
 
 
@@ -170,24 +167,23 @@ def _to_team_reward(
         raise LareError(f"alive has the shape {mask.shape}: give it ({n_steps}, agents), of more than one agent")
     if config.agents > 1 and reward.shape == (n_steps, config.agents):
         return alive_mean(reward, np.ones(reward.shape, bool) if mask is None else mask), mask
-    if reward.shape != (n_steps,):
-        raise LareError(f"reward has the shape {reward.shape}: give one number for each of {n_steps} steps")
-    return reward, mask
+    return _check_shape(reward, "reward", "number", n_steps), mask
+
+
+def _check_shape(values: np.ndarray, name: str, noun: str, n_rows: int) -> np.ndarray:
+    if values.shape != (n_rows,):
+        raise LareError(f"{name} has the shape {values.shape}: give one {noun} for each of {n_rows} steps")
+    return values
 
 
 def to_flags(values: Any, name: str, n_rows: int) -> Bool[np.ndarray, " steps"]:
     """Return one flag for each row. Raises `LareError` if there are more or fewer."""
-    flags = np.asarray(values, bool)
-    if flags.shape != (n_rows,):
-        raise LareError(f"{name} has the shape {flags.shape}: give one flag for each of {n_rows} steps")
-    return flags
+    return _check_shape(np.asarray(values, bool), name, "flag", n_rows)
 
 
 def to_lengths(values: Any, n_rows: int) -> Int[np.ndarray, " steps"]:
     """Return the length of each row's episode. Raises `LareError` if there are more or fewer, or for one that is no length."""
-    lengths = np.asarray(values, np.float64)
-    if lengths.shape != (n_rows,):
-        raise LareError(f"length has the shape {lengths.shape}: give one number for each of {n_rows} steps")
+    lengths = _check_shape(np.asarray(values, np.float64), "length", "number", n_rows)
     wrong = np.flatnonzero(~((lengths >= 1) & (lengths < 2**31)) | (lengths != np.floor(lengths)))
     if len(wrong):
         raise LareError(f"length of row {wrong[0]} is {lengths[wrong[0]]:g}: give the number of steps of its episode")

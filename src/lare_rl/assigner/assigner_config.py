@@ -174,15 +174,16 @@ def check_config(config: AssignerConfig) -> None:
     method, phi, name = config.method, config.phi, config.method.name
     if not method.has_proxy_rewards:
         raise LareError(f"{name} assigns no credit: train on what the environment pays")
-    if method.needs_phi and phi is None:
-        raise LareError(f"{name} needs a phi; bayes, rd and rrdu need none")
-    if phi is not None and not method.needs_phi:
+    if phi is None:
+        if method.needs_phi:
+            raise LareError(f"{name} needs a phi; bayes, rd and rrdu need none")
+    elif not method.needs_phi:
         raise LareError(f"{name} needs no phi: leave it out, or use lare-bayes")
-    if phi is not None and phi.kind != method.phi_kind:
+    elif phi.kind != method.phi_kind:
         raise LareError(f"{name} needs a phi of the kind {method.phi_kind!r}, and this one is of the kind {phi.kind!r}")
-    if phi is not None and config.task is None:
+    elif config.task is None:
         raise LareError("a phi needs the task that it was designed for: CreditAssigner(..., phi, task=task)")
-    if phi is not None and config.task is not None:
+    else:
         check_task(phi, config.task)
     context = CreditContext(
         n_agents=config.agents,

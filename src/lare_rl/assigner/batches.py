@@ -27,8 +27,8 @@ def sample_batch(store: Store, spec: CreditSpec, random: np.random.Generator, lo
     assert fit is not None
     plan = plan_batch(fit, settings, longest, fixed_length=False)
     if plan.layout == "packed":
-        episodes = _sample_episodes(store, max(1, settings.steps // store.mean_length), random)[: plan.episodes]
-        return _pack(store, episodes, plan.episodes, plan.rows)
+        count = max(1, settings.steps * store.n_ended // store.n_ended_steps)
+        return _pack(store, _sample_episodes(store, count, random)[: plan.episodes], plan.episodes, plan.rows)
     episodes = _sample_episodes(store, plan.episodes, random)
     length = _lengths(episodes)
     if plan.layout == "padded":

@@ -9,23 +9,19 @@ DIRECTORY/
 import json
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from lare_rl.assigner.arguments import GroupName
 from lare_rl.assigner.assigner_config import AssignerConfig
 from lare_rl.assigner.decoder_learner import DecoderLearner
-from lare_rl.assigner.space_layout import SpaceLayout
 from lare_rl.assigner.store import Store, StoredEpisode
-from lare_rl.credit.decoder_settings import CreditSettings
 from lare_rl.credit.methods import METHODS
 from lare_rl.errors import LareError, short_repr
 from lare_rl.latent.saved import load_function
 from lare_rl.runs.checkpoint import DAMAGED_FILE_ERRORS, fill_template, named_leaves, open_npz
-from lare_rl.tasks.payments import PaymentRule
 from lare_rl.tasks.spec import TaskSpec
 from lare_rl.util.files import replace_npz, write_atomically
 from lare_rl.util.renamed_fields import rename_assigner, rename_keys
@@ -35,17 +31,6 @@ __all__ = ["AssignerState", "get_state", "read_state", "report_damage", "restore
 
 FORMAT = 1
 TEXT_FILE, ARRAYS_FILE, FUNCTION_FILE = "assigner.json", "state.npz", "phi.py"
-PLAIN_FIELDS = (
-    "scored_observation",
-    "agents",
-    "max_steps",
-    "capacity",
-    "seed",
-    "fits_per_step",
-    "scale_rewards",
-    "forget",
-)
-"""The fields of a configuration that are JSON values."""
 LEARNED = "learned"
 """The names of the arrays of the decoder, or of the scale, begin with it."""
 STORE_ARRAYS = ("inputs", "length", "mean_reward", "episode")
@@ -103,7 +88,16 @@ def write_state(state: AssignerState, directory: Path) -> None:
     if state.config.phi is not None:
         state.config.phi.save(directory / FUNCTION_FILE)
     replace_npz(directory / ARRAYS_FILE, state.arrays)
-    text = json.dumps(_config_values(state), indent=1).encode()
+    values = {
+        **state.config.model_dump(mode="json", exclude={"method", "phi"}),
+        "format": FORMAT,
+        "method": state.config.method.name,
+        "phi": state.config.phi is not None,
+        "group_names": list(state.group_names),
+        "n_learned": state.n_learned,
+        "n_updates": state.n_updates,
+    }
+    text = json.dumps(values, indent=1).encode()
     write_atomically(directory / TEXT_FILE, lambda file: file.write(text))
 
 
@@ -125,17 +119,8 @@ def read_state(directory: Path) -> AssignerState:
     if task is not None and values["phi"]:
         sample = (arrays[PHI_SAMPLE[0]], arrays[PHI_SAMPLE[1]]) if set(PHI_SAMPLE) <= set(arrays) else None
         phi = load_function(directory / FUNCTION_FILE, task, steps=sample)
-    config = AssignerConfig(
-        method=METHODS.find(values["method"]),
-        phi=phi,
-        task=task,
-        observation=SpaceLayout(**values["observation"]),
-        action=SpaceLayout(**values["action"]),
-        settings=CreditSettings(**values["settings"]),
-        payments=PaymentRule(**values.get("payments", {})),
-        groups=values.get("groups", False),
-        **{name: values[name] for name in PLAIN_FIELDS},
-    )
+    fields = {name: values[name] for name in AssignerConfig.model_fields.keys() & values.keys()}
+    config = AssignerConfig(**fields | {"method": METHODS.find(values["method"]), "phi": phi, "task": task})
     group_names = tuple(values.get("group_names", ()))
     return AssignerState(config, values["n_learned"], values["n_updates"], arrays, group_names)
 
@@ -149,23 +134,6 @@ def report_damage(directory: Path) -> Iterator[None]:
         raise LareError(
             f"{directory} holds no credit assigner, or one that is damaged or of another version: {short_repr(error)}"
         ) from error
-
-
-def _config_values(state: AssignerState) -> dict[str, Any]:
-    config = state.config
-    models = ("task", "observation", "action", "settings")
-    return {
-        "format": FORMAT,
-        "method": config.method.name,
-        **{name: model and model.model_dump(mode="json") for name in models for model in [getattr(config, name)]},
-        **{name: getattr(config, name) for name in PLAIN_FIELDS},
-        "payments": asdict(config.payments),
-        "groups": config.groups,
-        "group_names": list(state.group_names),
-        "phi": config.phi is not None,
-        "n_learned": state.n_learned,
-        "n_updates": state.n_updates,
-    }
 
 
 def _store_arrays(store: Store) -> dict[str, np.ndarray]:

@@ -90,7 +90,7 @@ class Store:
         self.n_ended = 0
         """The number of payments that were ever stored: of episodes that have ended, if each is paid once."""
         self.n_ended_steps = 0
-        """The number of steps of these payments. Each step counts once, even if payments for windows read it often or never."""
+        """The sum of the numbers of steps that these payments are for."""
         self.oldest: list[tuple[int, int]] = []
         """A heap of the stored episodes: first step, and number."""
         self.running: dict[Hashable, RunningEpisode] = {}
@@ -210,20 +210,12 @@ class Store:
             )
         return self._pay(episode, episode.return_ if score is None else float(score))
 
-    def _pay(self, episode: RunningEpisode, payment: float) -> StoredEpisode:
-        """Store the steps that a payment is for."""
+    def _pay(self, episode: RunningEpisode, return_: float) -> StoredEpisode:
+        """Store the steps that a payment is for. Raises `LareError` like `end`."""
         since_last = np.array(episode.step_ids[episode.n_paid :], np.int64)
         window = self.payments.window
-        episode.n_paid, episode.return_ = len(episode.step_ids), 0.0
         step_ids = since_last if window is None else np.array(episode.step_ids[-window:], np.int64)
-        return self._finish_payment(StoredEpisode(step_ids, payment, episode.level), since_last)
-
-    def _finish_payment(self, episode: StoredEpisode, since_last: Int[np.ndarray, " since"]) -> StoredEpisode:
-        """Store an episode that has just been paid. Raises `LareError` like `end`.
-
-        `since_last` are the steps since the last payment, which need not be the steps that this one is for.
-        """
-        step_ids = episode.step_ids
+        episode.n_paid, episode.return_ = len(episode.step_ids), 0.0
         if self.longest is not None and len(step_ids) > self.longest:
             self.dropped += 1
             raise LareError(
@@ -236,14 +228,15 @@ class Store:
                 f"an episode of {len(step_ids)} steps has ended, and its first steps are not stored any more: "
                 f"make capacity larger than {self.capacity}"
             )
-        self.put_episode(self.n_ended, episode)
-        self.n_ended += 1
-        self.n_ended_steps += len(since_last)
+        payment = StoredEpisode(step_ids, return_, episode.level)
+        self.put_episode(self.n_ended, payment)
         rows = since_last[since_last >= self.n_added - self.capacity] % self.capacity
-        self.episode[rows] = self.n_ended - 1
+        self.episode[rows] = self.n_ended
         self.length[rows] = len(step_ids)
-        self.mean_reward[rows] = episode.return_ / len(step_ids)
-        return episode
+        self.mean_reward[rows] = return_ / len(step_ids)
+        self.n_ended += 1
+        self.n_ended_steps += len(step_ids)
+        return payment
 
     def add_paid_episode(
         self,
@@ -293,9 +286,11 @@ class Store:
         return step_ids % self.capacity
 
     def lengths(self, rows: Int[np.ndarray, "*batch"]) -> Int[np.ndarray, "*batch"]:
-        """Return T of each step's episode; for a running one, the number of its steps so far, but at least the mean length."""
+        """Return T of each step's payment. Before it is paid: the window; without one, its steps so far, but at least the mean length."""
         length, mean_length = self.length[rows], self.mean_length
         is_running = length == 0
+        if self.payments.window is not None:
+            return np.where(is_running, self.payments.window, length)
         length = np.where(is_running, mean_length, length)
         for episode in self.running.values() if is_running.any() else ():
             n_steps = len(episode.step_ids) - episode.n_paid
@@ -306,5 +301,5 @@ class Store:
 
     @property
     def mean_length(self) -> int:
-        """The mean number of steps of a payment: of an episode, if each is paid once."""
+        """The mean number of steps that a payment is for: of an episode, if each is paid once."""
         return max(1, self.n_ended_steps // max(1, self.n_ended))

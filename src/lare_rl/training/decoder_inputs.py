@@ -72,9 +72,12 @@ def row_mask(steps: StoredSteps, config: TrainConfig, team_index: int) -> Bool[A
 
 def step_batch(steps: StoredSteps, config: TrainConfig, team_index: int) -> StepBatch:
     """Return the steps as the input of the engine."""
+    length = steps.length
+    if config.payments.window is not None:  # steps that are not paid yet: most payments are for the whole window
+        length = jnp.where(steps.episode_ended, length, config.longest_segment)
     return StepBatch(
         inputs=decoder_inputs(steps, config, team_index),
-        length=steps.length,
+        length=length,
         mean_reward=steps.mean_reward[..., team_index],
         episode_ended=steps.episode_ended,
         last=steps.last,
