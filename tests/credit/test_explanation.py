@@ -1,11 +1,12 @@
-from functools import partial
-
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from lare_rl.credit import evidence, explanation
-from lare_rl.credit.basis import Basis, expand
+from lare_rl.credit import explanation
+from lare_rl.credit.basis import Basis
+from lare_rl.credit.decomposition import CreditBatch
+from lare_rl.nn.normalise import RunningMeanStd
 
 pytestmark = pytest.mark.usefixtures("in_float64")
 
@@ -14,29 +15,29 @@ PLAIN, EXTENDED = Basis(2, 3, extended=False), Basis(2, 3, extended=True)
 MAX_STEPS, MAX_EPISODES = 4096, 256
 
 
-features_of = jax.jit(expand, static_argnums=0)
-
-
-@partial(jax.jit, static_argnums=0)
-def explain(basis, features, is_step, means, returns, length, score_type):
-    steps = explanation.add_steps(explanation.empty_step_statistics(basis), features, is_step, basis)
-    statistics = evidence.add_episodes(evidence.empty_statistics(basis.n_features), means, returns, length)
-    return explanation.explain(statistics, steps, score_type, basis)
-
-
-def pad(values, size):
-    return np.pad(values, ((0, size - len(values)), (0, 0))[: values.ndim])
+@jax.jit
+def explain(state, episodes, score_type):
+    return explanation.explain(explanation.add_to_explanation(state, episodes), score_type)
 
 
 def explain_rewards(basis, u, length, reward, score_type=0):
-    """Explain episodes with these inputs and rewards. The score is the sum or the mean of the rewards."""
-    u = np.pad(u, ((0, MAX_STEPS - len(u)), (0, basis.n_inputs - u.shape[1])))  # to the same shapes in all tests
-    features, is_step = np.asarray(features_of(basis, u)), np.arange(MAX_STEPS) < length.sum()
-    starts = np.append(0, np.cumsum(length)[:-1])
-    means = np.add.reduceat(features[is_step], starts) / length[:, None]
-    returns = np.add.reduceat(reward, starts) / (length if score_type else 1)
-    episodes = (pad(values, MAX_EPISODES) for values in (means, returns, length))
-    return jax.tree.map(np.asarray, explain(basis, features, is_step, *episodes, score_type))
+    """Explain episodes with these standardised inputs and rewards. The score is the sum or the mean of the rewards.
+
+    The arrays have the same shapes in all tests.
+    """
+    index = np.repeat(np.arange(len(length)), length)
+    returns = np.bincount(index, reward) / (length if score_type else 1)
+    n_rows, n_episodes = (0, MAX_STEPS - len(u)), (0, MAX_EPISODES - len(length))
+    length = np.pad(length, n_episodes)
+    episodes = CreditBatch(
+        inputs=np.pad(u, (n_rows, (0, basis.n_inputs - u.shape[1]))),
+        episode_index=np.pad(index, n_rows, constant_values=MAX_EPISODES),
+        length=length,
+        mean_reward=np.pad(returns, n_episodes) / np.maximum(length, 1),
+        mask=(length > 0).astype(float),
+    )
+    standard = RunningMeanStd(jnp.ones(()), jnp.zeros(basis.n_inputs), jnp.ones(basis.n_inputs))
+    return jax.tree.map(np.asarray, explain(explanation.init_explanation(standard, basis), episodes, score_type))
 
 
 def sample_inputs(count, n_inputs=5):

@@ -3,7 +3,8 @@ import pytest
 
 from lare_rl.credit.decoder_settings import CreditSettings
 from lare_rl.credit.explanation import Explanation
-from lare_rl.credit.explanation_text import MESSAGES, explanation_findings, raw_feature_names
+from lare_rl.credit.explanation_text import MESSAGES, explanation_findings
+from lare_rl.credit.input_names import raw_feature_names
 from lare_rl.credit.methods import METHODS
 from lare_rl.credit.score_type import ScoreType, ScoreTypeEstimate
 from lare_rl.credit.spec import CreditSpec

@@ -3,7 +3,7 @@ import numpy as np
 import pytest
 
 from lare_rl.credit.basis import Basis
-from lare_rl.credit.factor_fit import N_FIRST, assess_factors, mean_features, predict_returns
+from lare_rl.credit.factor_fit import N_FIRST, add_episodes, assess_factors, predict_returns
 from lare_rl.credit.score_type import ScoreType, ScoreTypeEstimate
 from lare_rl.util.statistics import r_squared
 
@@ -36,7 +36,7 @@ def test_returns_are_predicted_before_a_fit_sees_them():
     length = np.array([len(episode) for episode in inputs])
     changed = np.where(np.arange(60) < 40, returns, -returns)
     with jax.enable_x64(True):
-        features, _ = mean_features(inputs, alive, BASIS)
+        features, _ = add_episodes(inputs, alive, returns, BASIS)
         before, after = (predict_returns(features, r, length, BASIS, ScoreType.SUM) for r in (returns, changed))
     n_equal = int(np.argmax(before != after))
     assert 40 <= N_FIRST + n_equal <= 42  # the block of episode 40 is predicted as a whole
@@ -93,11 +93,11 @@ def test_levels_have_intercepts():
 
 
 def test_agents_that_are_not_alive_are_ignored():
-    inputs, alive, _ = sample_episodes(agents=2)
+    inputs, alive, returns = sample_episodes(agents=2)
     padded = [np.concatenate([episode, np.full_like(episode[:, :1], 9.0)], axis=1) for episode in inputs]
     masked = [np.concatenate([mask, np.zeros_like(mask[:, :1])], axis=1) for mask in alive]
     with jax.enable_x64(True):
-        results = mean_features(inputs, alive, BASIS), mean_features(padded, masked, BASIS)
+        results = [add_episodes(*episodes, returns, BASIS) for episodes in ((inputs, alive), (padded, masked))]
     for a, b in zip(*map(jax.tree.leaves, results), strict=True):
         np.testing.assert_allclose(a, b, rtol=1e-4, atol=1e-3)
     assert int(results[0][1].n_steps) == sum(map(np.sum, alive))

@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Key
 
-from lare_rl.credit import decomposition, descent, engine, explain_returns, returns
+from lare_rl.credit import decomposition, descent, engine, explanation, returns
 from lare_rl.credit.decomposition import CreditBatch, DecoderState
 from lare_rl.credit.engine import StepBatch
 from lare_rl.credit.spec import CreditSpec
@@ -29,9 +29,9 @@ fit_closed_form = jax.jit(returns.fit_closed_form, static_argnames="spec")
 is_due = jax.jit(returns.is_due)
 is_stale = jax.jit(returns.is_stale)
 reset_statistics = jax.jit(returns.reset_statistics)
-init_explanation = jax.jit(explain_returns.init_explanation, static_argnames="basis")
-add_to_explanation = jax.jit(explain_returns.add_to_explanation)
-explain = jax.jit(explain_returns.explain_returns)
+init_explanation = jax.jit(explanation.init_explanation, static_argnames="basis")
+add_to_explanation = jax.jit(explanation.add_to_explanation)
+explain = jax.jit(explanation.explain)
 sample_steps = jax.jit(_sample_steps, static_argnames="steps")
 
 

@@ -10,9 +10,8 @@ from lare_rl.assigner import compiled_functions as compiled
 from lare_rl.assigner.batches import whole_episodes
 from lare_rl.assigner.compiled_functions import on_cpu
 from lare_rl.assigner.decoder_learner import DecoderLearner
-from lare_rl.credit.explain_returns import returns_findings
 from lare_rl.credit.explanation import Explanation
-from lare_rl.credit.explanation_text import MESSAGES
+from lare_rl.credit.explanation_text import MESSAGES, returns_findings
 from lare_rl.util.findings import render
 from lare_rl.util.float64 import float64
 

@@ -31,13 +31,17 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from lare_rl.credit import evidence, relevance
+from lare_rl.credit import closed_form, evidence, relevance
 from lare_rl.credit.basis import N_FREQUENCIES, Basis
+from lare_rl.credit.closed_form import ClosedForm
+from lare_rl.credit.decomposition import CreditBatch, valid_rows
 from lare_rl.credit.evidence import SufficientStatistics
 from lare_rl.credit.precisions import FeatureIndex, Posterior, Regression
+from lare_rl.credit.returns import add_to_sums
 from lare_rl.credit.score_type import ScoreType
+from lare_rl.nn.normalise import RunningMeanStd
 
-__all__ = ["Explanation", "StepStatistics", "add_steps", "empty_step_statistics", "explain"]
+__all__ = ["Explanation", "ExplanationState", "add_to_explanation", "explain", "init_explanation"]
 
 MAX_EXPLANATION_ROUNDS = 100
 """The maximum number of rounds of the evidence's fixed point. It is large because there is no earlier fit to start from."""
@@ -49,12 +53,14 @@ MIN_DETERMINED = 0.05
 """A raw feature is switched off if the returns determine less than this part of one of its weights."""
 
 
-class StepStatistics(NamedTuple):
-    """Sums over steps of each factor's own features, which are the factor and its shapes, and of their products."""
+class ExplanationState(NamedTuple):
+    """Sums over episodes, and over steps of each factor's own features, which are the factor and its shapes."""
 
+    closed_form: ClosedForm
     n_steps: Float[Array, ""]
     total: Float[Array, "factors single"]
     products: Float[Array, "factors single single"]
+    """Of two features of the same factor."""
 
 
 class Explanation(NamedTuple):
@@ -90,28 +96,29 @@ class Explanation(NamedTuple):
     """The correlation of each raw feature with the residual of the fit on factors; 0 for a raw feature that has never varied."""
 
 
-def empty_step_statistics(basis: Basis) -> StepStatistics:
-    """Return the sums over no steps."""
+def init_explanation(statistics: RunningMeanStd, basis: Basis) -> ExplanationState:
+    """Return empty sums. `statistics` standardise the inputs, and the features of `basis` explain the returns."""
+    closed = closed_form.reset_statistics(closed_form.init(basis, (ScoreType.SUM,)), statistics)
     factors, single = _single_features(basis).shape
-    return StepStatistics(jnp.zeros(()), jnp.zeros((factors, single)), jnp.zeros((factors, single, single)))
+    return ExplanationState(closed, jnp.zeros(()), jnp.zeros((factors, single)), jnp.zeros((factors, single, single)))
 
 
-def add_steps(
-    statistics: StepStatistics, features: Float[Array, "*batch features"], mask: Bool[Array, "*batch"], basis: Basis
-) -> StepStatistics:
-    """Add the features of steps to the sums, within `float64()`. Steps where `mask` is false are ignored."""
-    single = jnp.where(mask[..., None, None], features[..., _single_features(basis)].astype(float), 0)
-    return StepStatistics(
-        statistics.n_steps + jnp.sum(mask),
-        statistics.total + jnp.einsum("...fi->fi", single),
-        statistics.products + jnp.einsum("...fi,...fj->fij", single, single),
+def add_to_explanation(state: ExplanationState, episodes: CreditBatch) -> ExplanationState:
+    """Add whole episodes to the sums, without their levels. Call this within `float64()`."""
+    decoder, valid = state.closed_form.decoder, valid_rows(episodes)
+    single = decoder.features(episodes.inputs)[..., _single_features(decoder.basis)].astype(float)
+    single = jnp.where(valid[..., None, None], single, 0)
+    return ExplanationState(
+        add_to_sums(state.closed_form, episodes),
+        state.n_steps + jnp.sum(valid),
+        state.total + jnp.einsum("...fi->fi", single),
+        state.products + jnp.einsum("...fi,...fj->fij", single, single),
     )
 
 
-def explain(
-    statistics: SufficientStatistics, step_statistics: StepStatistics, score_type: Int[Array, ""] | int, basis: Basis
-) -> Explanation:
-    """Explain returns by the features of a basis, from sums over episodes and over their steps. Call this within `float64()`."""
+def explain(state: ExplanationState, score_type: Int[Array, ""] | int) -> Explanation:
+    """Explain the returns of the episodes in the sums. Call this within `float64()`."""
+    statistics, basis = closed_form.to_float64(state.closed_form.sufficient_statistics), state.closed_form.decoder.basis
     is_factor, extended = basis.is_factor_feature, int(basis.extended)
     full = _fit(statistics, score_type, basis.group_index, basis.strength_index)
     raw_single, raw_pairs = _input_shares(
@@ -146,7 +153,7 @@ def explain(
         factors.feature_shares, basis.n_factors, extended * N_FREQUENCIES, extended * basis.n_factors
     )
     root = evidence.posterior_covariance(factor_statistics, score_type, group_index, factors.posterior).root
-    slope, slope_covariance, linear_share = _slopes(factors.posterior.weight, root.T @ root, step_statistics, basis)
+    slope, slope_covariance, linear_share = _slopes(factors.posterior.weight, root.T @ root, state)
     divisor = jnp.where(score_type == ScoreType.AVERAGE, mean_length, 1)  # r_hat of a mean is divided by T
     return explanation._replace(
         total_r2=jnp.maximum(full.r2, factors.r2),
@@ -241,16 +248,13 @@ def _input_shares(
 
 
 def _slopes(
-    weight: Float[Array, " features"],
-    sigma: Float[Array, "features features"],
-    statistics: StepStatistics,
-    basis: Basis,
+    weight: Float[Array, " features"], sigma: Float[Array, "features features"], state: ExplanationState
 ) -> tuple[Float[Array, " factors"], Float[Array, "factors factors"], Float[Array, " factors"]]:
     """Return the slope of each factor's effect, their posterior covariance, and the linear share of each effect's variance."""
-    single = _single_features(basis)
-    n_steps = jnp.maximum(statistics.n_steps, 1)
-    mean = statistics.total / n_steps
-    covariance = statistics.products / n_steps - mean[:, :, None] * mean[:, None, :]  # C_i
+    single = _single_features(state.closed_form.decoder.basis)
+    n_steps = jnp.maximum(state.n_steps, 1)
+    mean = state.total / n_steps
+    covariance = state.products / n_steps - mean[:, :, None] * mean[:, None, :]  # C_i
     single_weight, single_sigma = weight[single], sigma[single[:, :, None, None], single]
     variance = covariance[:, 0, 0]
     line = covariance[:, 0] / jnp.where(variance > 0, variance, 1)[:, None]  # e_i

@@ -1,17 +1,20 @@
 """What the returns say about the factors: how much they explain, which of them matter, and what may be missing."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Hashable, Iterable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
 
+from lare_rl.credit import decomposition, returns
+from lare_rl.credit.decomposition import DecoderState
 from lare_rl.credit.explanation import Explanation
+from lare_rl.credit.methods import Method
 from lare_rl.credit.score_type import ScoreType, ScoreTypeEstimate
-from lare_rl.tasks.spec import base_name, entry_meanings
+from lare_rl.tasks.spec import base_name
 from lare_rl.util.findings import Finding
 from lare_rl.util.statistics import CLEAR_ERRORS, round_shares
 
-__all__ = ["LEGEND_CODES", "MESSAGES", "MIN_EXPLAINED_EPISODES", "explanation_findings", "raw_feature_names"]
+__all__ = ["LEGEND_CODES", "MESSAGES", "MIN_EXPLAINED_EPISODES", "explanation_findings", "returns_findings"]
 
 LEGEND_CODES = ("about_shares", "about_states")
 """Findings that explain how to read others. They need to be printed once."""
@@ -121,25 +124,27 @@ MESSAGES = {
 """The sentences, by the codes of the findings."""
 
 
-def raw_feature_names(observation: str, action: str, sizes: Mapping[str, int]) -> list[str]:
-    """Return names of the raw features, from a task's texts: the line `7: angle of the foot` names entry 7.
+def returns_findings(
+    explanation: Explanation,
+    decoder: DecoderState,
+    method: Method,
+    factor_names: Sequence[str],
+    raw_names: Sequence[str],
+    group_names: Iterable[Hashable],
+) -> list[Finding]:
+    """Return what `explanation_findings` says about returns: by an explanation, and by the decoder that was fitted to them.
 
-    Args:
-        observation: the text that describes the observation.
-        action: the text that describes the action.
-        sizes: the number of entries of `observation`, `next_observation` and `action`, in their order, as far as they are inputs.
+    `group_names` are the names of the first levels, or of all.
     """
-
-    def names(text: str, size: int, kind: str) -> list[str]:
-        meanings = entry_meanings(text)
-        return [f"entry {i} of the {kind}" + (f" ({meanings[i]})" if i in meanings else "") for i in range(size)]
-
-    before, after = "observation", "observation"
-    if {"observation", "next_observation"} <= set(sizes):
-        before, after = "observation before the step", "observation after the step"
-    kinds = {"observation": before, "next_observation": after, "action": "action"}
-    texts = {"observation": observation, "next_observation": observation, "action": action}
-    return [entry for name, size in sizes.items() for entry in names(texts[name], size, kinds[name])]
+    effects = decomposition.level_effects(decoder, float(explanation.mean_length)).tolist()
+    return explanation_findings(
+        explanation,
+        returns.estimate_score_type(decoder),
+        factor_names,
+        raw_names,
+        looks_binary=returns.looks_binary(decoder, method),
+        groups=dict(zip(group_names, effects, strict=False)),
+    )
 
 
 def explanation_findings(

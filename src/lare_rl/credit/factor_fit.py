@@ -21,12 +21,14 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from lare_rl.credit import evidence
+from lare_rl.credit import evidence, explanation
 from lare_rl.credit.basis import Basis
-from lare_rl.credit.closed_form import FIT_GROWTH, MAX_EVIDENCE_ROUNDS, LinearDecoder
+from lare_rl.credit.closed_form import FIT_GROWTH, MAX_EVIDENCE_ROUNDS
+from lare_rl.credit.decomposition import CreditBatch
 from lare_rl.credit.evidence import SufficientStatistics
-from lare_rl.credit.explanation import Explanation, StepStatistics, add_steps, empty_step_statistics, explain
+from lare_rl.credit.explanation import Explanation, ExplanationState
 from lare_rl.credit.precisions import Posterior
+from lare_rl.credit.returns import mean_features
 from lare_rl.credit.score_type import (
     MAX_ERROR_RATIO,
     ROUNDING,
@@ -35,10 +37,11 @@ from lare_rl.credit.score_type import (
     compare_score_types,
     score_types_to_fit,
 )
+from lare_rl.nn.normalise import RunningMeanStd
 from lare_rl.util.float64 import float64
-from lare_rl.util.statistics import FLOAT32_NOISE, r_squared
+from lare_rl.util.statistics import r_squared
 
-__all__ = ["FactorAssessment", "assess_factors", "mean_features", "predict_returns"]
+__all__ = ["FactorAssessment", "add_episodes", "assess_factors", "predict_returns"]
 
 N_FIRST = 10
 """The number of episodes before the first prediction."""
@@ -82,7 +85,7 @@ def assess_factors(
     lengths_differ = len(set(length)) > 1
     score_types = score_types_to_fit(score or "auto", fixed_length=not lengths_differ, allow_log_odds=False)
     with float64():
-        features, step_statistics = mean_features(inputs, alive, basis)
+        features, state = add_episodes(inputs, alive, returns, basis)
         one_hot = np.zeros((len(returns), 0)) if level is None else np.eye(int(level.max()) + 1)[level]
         columns, with_levels = np.append(features, one_hot, axis=1), replace(basis, n_levels=one_hot.shape[1])
         predict = partial(predict_returns, returns=returns, length=length, basis=with_levels)
@@ -98,42 +101,48 @@ def assess_factors(
         if level is not None:
             levels_alone = np.append(np.zeros_like(features), one_hot, axis=1)
             level_r2 = r_squared(returns[N_FIRST:], predict(levels_alone, score_type=score_type))[0]
-        explanation = _explain(features, returns, length, step_statistics, score_type, basis=basis)
-        explanation = jax.tree.map(np.asarray, explanation)
+        explained = jax.tree.map(np.asarray, _explain(state, score_type))
 
     r2, r2_error = r_squared(returns[N_FIRST:], predicted[score_type])
     estimate = compare_score_types(errors, score_type) if len(score_types) > 1 else None
-    return FactorAssessment(r2, r2_error, length_r2, level_r2, score_type=estimate, explanation=explanation)
+    return FactorAssessment(r2, r2_error, length_r2, level_r2, score_type=estimate, explanation=explained)
 
 
-def mean_features(
-    inputs: Sequence[Float[np.ndarray, "_ agents inputs"]], alive: Sequence[Bool[np.ndarray, "_ agents"]], basis: Basis
-) -> tuple[Float[np.ndarray, "episodes features"], StepStatistics]:
-    """Return the mean features of each episode, with inputs standardised over all steps, and the sums over all steps."""
+def add_episodes(
+    inputs: Sequence[Float[np.ndarray, "_ agents inputs"]],
+    alive: Sequence[Bool[np.ndarray, "_ agents"]],
+    returns: Float[np.ndarray, " episodes"],
+    basis: Basis,
+) -> tuple[Float[np.ndarray, "episodes features"], ExplanationState]:
+    """Return the mean features of each episode, with inputs standardised over all steps, and the sums that explain the returns."""
     valid = np.concatenate([rows[mask] for rows, mask in zip(inputs, alive, strict=True)]).astype(np.float64)
-    mean, std = valid.mean(axis=0), valid.std(axis=0)
-    std = np.where(std > FLOAT32_NOISE * np.abs(mean), std, 0)
-    leaves = (jnp.asarray(leaf, jnp.float32) for leaf in (mean, std, np.zeros(basis.n_features), 0))
-    decoder, max_steps = LinearDecoder(basis, *leaves), max(map(len, inputs))
-    means, statistics = [], empty_step_statistics(basis)
-    for rows, mask in zip(inputs, alive, strict=True):
-        share = mask / np.maximum(mask.sum(axis=1, keepdims=True), 1) / len(rows)
+    moments = len(valid), valid.mean(axis=0), len(valid) * valid.var(axis=0)
+    state = explanation.init_explanation(
+        RunningMeanStd(*(jnp.asarray(values, jnp.float32) for values in moments)), basis
+    )
+    means, max_steps = [], max(map(len, inputs))
+    for rows, mask, return_ in zip(inputs, alive, returns, strict=True):
         padding = (0, max_steps - len(rows)), (0, 0)  # to one length, so that `_add_episode` is compiled once
-        rows = np.pad(rows, (*padding, (0, 0))).astype(np.float32)
-        episode_mean, statistics = _add_episode(decoder, statistics, rows, np.pad(share, padding))
-        means.append(episode_mean)
-    return np.stack(means), statistics
+        episode = CreditBatch(
+            inputs=jnp.asarray(np.pad(rows, (*padding, (0, 0))), jnp.float32),
+            episode_index=jnp.asarray(np.arange(max_steps) >= len(rows), jnp.int32),
+            length=jnp.array([len(rows)], jnp.int32),
+            mean_reward=jnp.array([return_ / len(rows)]),
+            mask=jnp.ones(1),
+            alive=jnp.asarray(np.pad(mask, padding)),
+        )
+        mean, state = _add_episode(state, episode)
+        means.append(mean)
+    return np.stack(means), state
 
 
 @jax.jit
-def _add_episode(
-    decoder: LinearDecoder,
-    statistics: StepStatistics,
-    inputs: Float[Array, "steps agents inputs"],
-    share: Float[Array, "steps agents"],
-) -> tuple[Float[Array, " features"], StepStatistics]:
-    features = decoder.features(inputs).astype(float)
-    return jnp.einsum("taf,ta->f", features, share), add_steps(statistics, features, share > 0, decoder.basis)
+def _add_episode(state: ExplanationState, episode: CreditBatch) -> tuple[Float[Array, " features"], ExplanationState]:
+    mean = mean_features(state.closed_form.decoder, episode)[0]
+    return mean, explanation.add_to_explanation(state, episode)
+
+
+_explain = jax.jit(explanation.explain)
 
 
 def predict_returns(
@@ -180,19 +189,6 @@ def _add_and_fit(
     statistics = evidence.add_episodes(statistics, features, returns, length)
     group_index = basis.column_group_index[_is_used(basis)]
     return statistics, evidence.fit(statistics, score_type, group_index, posterior, MAX_EVIDENCE_ROUNDS)
-
-
-@partial(jax.jit, static_argnames="basis")
-def _explain(
-    features: Float[Array, "episodes features"],
-    returns: Float[Array, " episodes"],
-    length: Int[Array, " episodes"],
-    step_statistics: StepStatistics,
-    score_type: Int[Array, ""] | int,
-    basis: Basis,
-) -> Explanation:
-    statistics = evidence.add_episodes(evidence.empty_statistics(basis.n_features), features, returns, length)
-    return explain(statistics, step_statistics, score_type, basis=basis)
 
 
 def _growing_blocks(count: int) -> Iterator[tuple[int, int]]:

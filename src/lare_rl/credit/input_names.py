@@ -17,9 +17,9 @@ from dataclasses import dataclass
 from typing import Any
 
 from lare_rl.errors import LareError
-from lare_rl.tasks.spec import ScoredObservation, select_states
+from lare_rl.tasks.spec import ScoredObservation, entry_meanings, select_states
 
-__all__ = ["InputNames", "input_arrays", "input_size", "input_sizes", "tracked_size"]
+__all__ = ["InputNames", "input_arrays", "input_size", "input_sizes", "raw_feature_names", "tracked_size"]
 
 _NAMES = "factors", "observation", "action", "next_observation", "observation_change", "scored_observation", "history"
 
@@ -96,3 +96,24 @@ def input_arrays(inputs: tuple[str, ...], step: Mapping[str, Any]) -> list[Any]:
         step["observation"] - step["next_observation"] if name == "observation_change" else step[name]
         for name in inputs
     ]
+
+
+def raw_feature_names(observation: str, action: str, sizes: Mapping[str, int]) -> list[str]:
+    """Return names of the raw features, from a task's texts: the line `7: angle of the foot` names entry 7.
+
+    Args:
+        observation: the text that describes the observation.
+        action: the text that describes the action.
+        sizes: the number of entries of `observation`, `next_observation` and `action`, in their order, as far as they are inputs.
+    """
+
+    def names(text: str, size: int, kind: str) -> list[str]:
+        meanings = entry_meanings(text)
+        return [f"entry {i} of the {kind}" + (f" ({meanings[i]})" if i in meanings else "") for i in range(size)]
+
+    before, after = "observation", "observation"
+    if {"observation", "next_observation"} <= set(sizes):
+        before, after = "observation before the step", "observation after the step"
+    kinds = {"observation": before, "next_observation": after, "action": "action"}
+    texts = {"observation": observation, "next_observation": observation, "action": action}
+    return [entry for name, size in sizes.items() for entry in names(texts[name], size, kinds[name])]

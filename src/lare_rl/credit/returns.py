@@ -45,6 +45,7 @@ __all__ = [
     "is_fitted",
     "is_stale",
     "looks_binary",
+    "mean_features",
     "predict",
     "predict_then_update",
     "predicted_returns",
@@ -126,7 +127,7 @@ def predicted_returns(
     return jax.ops.segment_sum(r_hat, episodes.episode_index, n_episodes)
 
 
-def _mean_features(decoder: LinearDecoder, episodes: CreditBatch) -> Float[Array, "episodes features"]:
+def mean_features(decoder: LinearDecoder, episodes: CreditBatch) -> Float[Array, "episodes features"]:
     """Return the mean of a linear decoder's features over the steps of each episode, and over the agents that are alive."""
     features = _team_features(decoder, episodes)
     total = jax.ops.segment_sum(features.astype(float), episodes.episode_index, len(episodes.length))
@@ -163,7 +164,7 @@ def _prefix_columns(decoder: LinearDecoder, episodes: CreditBatch) -> Float[Arra
 
 def _columns(decoder: LinearDecoder, episodes: CreditBatch) -> Float[Array, "episodes columns"]:
     """Return the mean features of each episode, and which level it has."""
-    features, n_levels = _mean_features(decoder, episodes), decoder.basis.n_levels
+    features, n_levels = mean_features(decoder, episodes), decoder.basis.n_levels
     if not n_levels:
         return features
     assert episodes.level is not None

@@ -6,8 +6,7 @@ from functools import cached_property
 
 from lare_rl.credit.basis import Basis
 from lare_rl.credit.decoder_settings import CreditSettings
-from lare_rl.credit.explanation_text import raw_feature_names
-from lare_rl.credit.input_names import input_size, input_sizes, tracked_size
+from lare_rl.credit.input_names import input_size, input_sizes, raw_feature_names, tracked_size
 from lare_rl.credit.methods import Fit, Method
 from lare_rl.credit.prequential import SEGMENT_WINDOW, WINDOW
 from lare_rl.credit.score_type import ScoreType, score_types_to_fit

@@ -9,9 +9,8 @@ import numpy as np
 from jaxtyping import Array, Bool
 
 from lare_rl.credit.decomposition import CreditBatch, valid_rows
-from lare_rl.credit.explain_returns import add_to_explanation, explain_returns, init_explanation, returns_findings
-from lare_rl.credit.explanation import Explanation
-from lare_rl.credit.explanation_text import LEGEND_CODES, MESSAGES, MIN_EXPLAINED_EPISODES
+from lare_rl.credit.explanation import Explanation, add_to_explanation, explain, init_explanation
+from lare_rl.credit.explanation_text import LEGEND_CODES, MESSAGES, MIN_EXPLAINED_EPISODES, returns_findings
 from lare_rl.credit.methods import METHODS
 from lare_rl.data.replay import Index, Replay, segments_as_episodes
 from lare_rl.nn.normalise import RunningMeanStd, empty_mean_std, update_mean_std
@@ -139,7 +138,7 @@ def _explain_first_seed(
     states = fold_episodes(
         states, buffer, buffer.oldest, lambda state, batch, _: add_to_explanation(state, batch), config
     )
-    return [explain_returns(state, mean.astype(int)) for state, mean in zip(states, is_average, strict=True)]
+    return [explain(state, mean.astype(int)) for state, mean in zip(states, is_average, strict=True)]
 
 
 def _observe(statistics: RunningMeanStd, episodes: CreditBatch, first: Index) -> RunningMeanStd:

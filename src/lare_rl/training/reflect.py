@@ -12,8 +12,9 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from lare_rl.credit.basis import Basis
-from lare_rl.credit.explanation_text import MESSAGES, MIN_EXPLAINED_EPISODES, explanation_findings, raw_feature_names
+from lare_rl.credit.explanation_text import MESSAGES, MIN_EXPLAINED_EPISODES, explanation_findings
 from lare_rl.credit.factor_fit import assess_factors
+from lare_rl.credit.input_names import raw_feature_names
 from lare_rl.envs.load import resolve_task
 from lare_rl.envs.play import Episode, Policy, play_episodes
 from lare_rl.errors import LareError
