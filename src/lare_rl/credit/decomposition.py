@@ -33,6 +33,7 @@ from lare_rl.credit.levels import LevelMeans, add_returns, empty_level_means, le
 from lare_rl.credit.prequential import Predictions, empty_predictions
 from lare_rl.credit.score_type import ScoreType
 from lare_rl.credit.spec import CreditSpec
+from lare_rl.envs.interface import alive_mean
 from lare_rl.errors import LareError, short_repr
 from lare_rl.nn.networks import init_adam
 from lare_rl.nn.normalise import (
@@ -50,7 +51,6 @@ __all__ = [
     "CreditBatch",
     "DecoderState",
     "agent_mean",
-    "agent_weights",
     "decode",
     "decoder_rewards",
     "init",
@@ -286,13 +286,5 @@ def decoder_rewards(
 def agent_mean(
     values: Float[Array, "rows *agents"], alive: Bool[Array, "rows *agents"] | None
 ) -> Float[Array, " rows"]:
-    """Return the mean over the agents that are alive. Values of other agents may be NaN."""
-    if alive is None:
-        return jnp.mean(values.reshape(len(values), -1), axis=1)
-    weighted = jnp.where(alive, values, 0) * agent_weights(alive)
-    return jnp.sum(weighted.reshape(len(values), -1), axis=1)
-
-
-def agent_weights(alive: Bool[Array, "*batch agents"]) -> Float[Array, "*batch agents"]:
-    """Return each agent's weight in a mean over the team: 1/n for each of n agents that are alive, else 0."""
-    return (alive / alive.sum(axis=-1, keepdims=True).clip(1)).astype(jnp.float32)
+    """Return the mean over the agents that are alive; None means all."""
+    return jnp.mean(values.reshape(len(values), -1), axis=1) if alive is None else alive_mean(values, alive)

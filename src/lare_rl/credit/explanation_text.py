@@ -202,8 +202,12 @@ def _groups(effects: Mapping[Any, float]) -> list[Finding]:
     if not largest:
         return []
     named = tuple(Finding("group_effect", {"name": str(name), "value": observed[name]}) for name in largest)
-    more = Finding("more_names", {"count": len(observed) - N_GROUPS}) if len(observed) > N_GROUPS else None
-    return [Finding("groups_differ", {"groups": named, "more": more})]
+    return [Finding("groups_differ", {"groups": named, "more": _more(len(observed) - N_GROUPS)})]
+
+
+def _more(count: int) -> Finding | None:
+    """Report how many names are left out."""
+    return Finding("more_names", {"count": count}) if count > 0 else None
 
 
 def _unused_raw_features(explanation: Explanation, names: Sequence[str]) -> list[Finding]:
@@ -211,9 +215,8 @@ def _unused_raw_features(explanation: Explanation, names: Sequence[str]) -> list
     unused = [name for name, used in zip(names, explanation.raw_feature_used, strict=False) if not used]
     if not unused:
         return []
-    more = Finding("more_names", {"count": len(unused) - N_UNUSED}) if len(unused) > N_UNUSED else None
-    values = {"n_unused": len(unused), "n_raw": len(names), "names": ", ".join(unused[:N_UNUSED]), "more": more}
-    return [Finding("unused_raw_features", values)]
+    values = {"n_unused": len(unused), "n_raw": len(names), "names": ", ".join(unused[:N_UNUSED])}
+    return [Finding("unused_raw_features", {**values, "more": _more(len(unused) - N_UNUSED)})]
 
 
 def _score_type(estimate: ScoreTypeEstimate) -> Finding:

@@ -24,7 +24,6 @@ from lare_rl.credit.decomposition import (
     CreditBatch,
     DecoderState,
     agent_mean,
-    agent_weights,
     decoder_rewards,
     level_returns,
     score_type_index,
@@ -142,7 +141,9 @@ def _team_features(decoder: LinearDecoder, episodes: CreditBatch) -> Float[Array
     if episodes.alive is None:
         weights = jnp.full(features.shape[:2], 1 / features.shape[1])
     else:
-        features, weights = jnp.where(episodes.alive[..., None], features, 0), agent_weights(episodes.alive)
+        features = jnp.where(episodes.alive[..., None], features, 0)
+        n_alive = jnp.maximum(episodes.alive.sum(axis=-1, keepdims=True), 1)
+        weights = (episodes.alive / n_alive).astype(jnp.float32)
     return jnp.einsum("raf,ra->rf", features, weights)
 
 
