@@ -7,8 +7,8 @@ from helpers.decoder_toys import make_decoder
 from helpers.numpy_attention import numpy_coalitions, numpy_gelu, numpy_linear, numpy_mlp, numpy_time_layer
 from lare_rl.config.validity import CreditContext, check_credit
 from lare_rl.credit.decoder_settings import CreditSettings
+from lare_rl.credit.engine import return_shares
 from lare_rl.credit.methods import METHODS
-from lare_rl.credit.shares import return_shares
 from lare_rl.errors import LareError
 from lare_rl.nn.networks import adam_step, init_adam
 

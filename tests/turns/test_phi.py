@@ -8,10 +8,9 @@ import lare_rl
 from helpers.scripted_model import ScriptedModel, to_reply
 from lare_rl.errors import LareError
 from lare_rl.llm.recording import SHIPPED_RECORDINGS, RecordedModel, read_recording
-from lare_rl.turns.design import design_turn_phi
+from lare_rl.turns.design import choose_examples, design_turn_phi, turn_request
 from lare_rl.turns.messages import Call, Turn
 from lare_rl.turns.phi import find_problems, load_turn_phi, read_turn_phi
-from lare_rl.turns.prompt import choose_examples, turn_request
 from lare_rl.turns.tool_sets import TOOL_SETS, load_tool_set
 
 ROOT = Path(__file__).parents[2]

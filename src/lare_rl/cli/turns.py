@@ -85,10 +85,9 @@ def turn_phi(
         out: a .py file to write, with the model's replies in a .json beside it; they must not exist. The default is to print the function.
     """
     from lare_rl.errors import LareError
-    from lare_rl.turns.design import design_turn_phi
+    from lare_rl.turns.design import choose_examples, design_turn_phi, turn_request
     from lare_rl.turns.files import read_rollout_file, read_tool_file
     from lare_rl.turns.messages import split_turns
-    from lare_rl.turns.prompt import choose_examples, turn_request
 
     descriptions, turns = read_tool_file(tools), []
     for number, rollout in enumerate(read_rollout_file(rollouts)):

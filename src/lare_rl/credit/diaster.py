@@ -6,7 +6,7 @@ add up to the return:
     (F[0:c] + F[c:T] - R)^2,    c uniform in {1, ..., T - 1}
 
 The reward of a step is the difference of F for two prefixes, F[0:t+1] - F[0:t]. A step model learns it from the step alone: see
-`step_targets.py`, also for the units. At the last step, the return R is known and replaces F[0:T]. F is a GRU (Cho et al., 2014) over
+`losses.step_loss`, also for the units. At the last step, the return R is known and replaces F[0:T]. F is a GRU (Cho et al., 2014) over
 the steps of a piece, with an initial state of zeros.
 """
 
@@ -16,9 +16,8 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
 from lare_rl.credit.decoder_network import DecoderOutput
-from lare_rl.credit.losses import PerEpisode, batch_mean
+from lare_rl.credit.losses import EpisodeInputs, EpisodeLengths, PerEpisode, batch_mean, step_loss
 from lare_rl.credit.spec import CreditSpec
-from lare_rl.credit.step_targets import EpisodeInputs, EpisodeLengths, step_loss
 from lare_rl.nn.networks import GRU, MLP, Linear
 
 __all__ = ["Diaster"]

@@ -9,7 +9,7 @@ steps into the rewards that an algorithm is trained on:
 
 With `exact`, the residual R - sum_t r_hat_t is added to the reward of the last step (RUDDER: Arjona-Medina et al., 2019), or spread
 evenly over all steps. The proxy rewards of an episode then add up to the return whatever the decoder's error is.
-TAR2 pays shares of the return instead (`shares.py`), which add up to it, too.
+TAR2 pays shares of the return instead (`return_shares`), which add up to it, too.
 
 Batches have an axis of agents, of length 1 for a single agent. For credit to whole teams it has length 1 too.
 """
@@ -24,7 +24,6 @@ from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 from lare_rl.credit import decomposition
 from lare_rl.credit.decomposition import DecoderState
 from lare_rl.credit.methods import Reward
-from lare_rl.credit.shares import return_shares
 from lare_rl.credit.spec import CreditSpec
 from lare_rl.envs.interface import alive_mean
 from lare_rl.nn.normalise import Scale, empty_scale, min_max_scale, root_mean_square
@@ -36,6 +35,7 @@ __all__ = [
     "init_source",
     "proxy_rewards",
     "return_scale",
+    "return_shares",
     "scale_and_mask",
     "select_decoders",
     "training_rewards",
@@ -109,6 +109,34 @@ def _pay_shares(
     shares = return_shares(*(values.reshape(-1, max_steps, values.shape[-1]) for values in (r_hat, steps.alive)))
     total = steps.mean_reward * steps.length * jnp.sum(steps.alive, axis=-1)
     return jnp.where(steps.episode_ended[..., None], shares.reshape(r_hat.shape) * total[..., None], r_hat)
+
+
+def return_shares(
+    contributions: Float[Array, "episodes steps agents"], alive: Bool[Array, "episodes steps agents"]
+) -> Float[Array, "episodes steps agents"]:
+    """Return the share of each agent at each step: the deterministic normalisation of TAR2 (Kapoor et al., 2025, arXiv 2502.04864).
+
+    A decoder gives contributions c_{i,t}. Those of a step, and those of the agents of a step, become weights that add up to 1:
+
+        w_t     = (C_t - min C) / sum_u (C_u - min C),              C_t = sum_i c_{i,t}
+        w_{i,t} = (c_{i,t} - min_j c_{j,t}) / sum_j (c_{j,t} - min_k c_{k,t})
+
+    The share of agent i at step t is w_t w_{i,t}. The shares of an episode add up to 1 whatever the contributions are, so that the
+    rewards share * R add up to the return. Only agents that are alive have a share. If all contributions of a sum are equal, their
+    weights are equal, too: the authors' code pays nothing then, and adds 1e-5 to each denominator.
+    """
+    step_contribution = jnp.sum(jnp.where(alive, contributions, 0), axis=-1)
+    step_weight = _weights(step_contribution, jnp.any(alive, axis=-1))
+    return step_weight[..., None] * _weights(contributions, alive)
+
+
+def _weights(values: Float[Array, "*batch size"], mask: Bool[Array, "*batch size"]) -> Float[Array, "*batch size"]:
+    """Return weights over the last axis that add up to 1: how much each value exceeds the least one. 0 where `mask` is false."""
+    lowest = jnp.min(jnp.where(mask, values, jnp.inf), axis=-1, keepdims=True)
+    excess = jnp.where(mask, values - lowest, 0)
+    total = jnp.sum(excess, axis=-1, keepdims=True)
+    equal = mask / jnp.maximum(jnp.sum(mask, axis=-1, keepdims=True), 1)
+    return jnp.where(total > 0, excess / jnp.where(total > 0, total, 1), equal)
 
 
 def training_rewards(source: RewardSource, steps: StepBatch, spec: CreditSpec) -> Float[Array, "*batch team"]:

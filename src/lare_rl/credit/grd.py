@@ -28,9 +28,8 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
 from lare_rl.credit.decoder_network import DecoderOutput
-from lare_rl.credit.losses import PerEpisode, batch_mean
+from lare_rl.credit.losses import EpisodeInputs, EpisodeLengths, PerEpisode, batch_mean, is_step
 from lare_rl.credit.spec import CreditSpec
-from lare_rl.credit.step_targets import EpisodeInputs, EpisodeLengths, is_step
 from lare_rl.nn.networks import MLP, bound_log_std
 
 __all__ = ["GRD", "causes", "sample_mask"]

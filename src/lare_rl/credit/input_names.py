@@ -19,7 +19,7 @@ from typing import Any
 from lare_rl.errors import LareError
 from lare_rl.tasks.spec import ScoredObservation, entry_meanings, select_states
 
-__all__ = ["InputNames", "input_arrays", "input_size", "input_sizes", "raw_feature_names", "tracked_size"]
+__all__ = ["InputNames", "input_arrays", "input_sizes", "raw_feature_names"]
 
 _NAMES = "factors", "observation", "action", "next_observation", "observation_change", "scored_observation", "history"
 
@@ -69,22 +69,16 @@ class InputNames:
 
 
 def input_sizes(inputs: tuple[str, ...], sizes: Mapping[str, int]) -> tuple[tuple[str, int], ...]:
-    """Return the name of each input and how many numbers it has, by the sizes of `factors`, `observation` and `action`."""
-    same_size = {"next_observation": "observation", "observation_change": "observation"}
-    history = 3 * tracked_size(inputs, sizes)
-    return tuple((name, history if name == "history" else sizes[same_size.get(name, name)]) for name in inputs)
+    """Return the name of each input and how many numbers it has, by the sizes of `factors`, `observation` and `action`.
 
-
-def input_size(inputs: tuple[str, ...], sizes: Mapping[str, int]) -> int:
-    """Return how many numbers the inputs have together."""
-    return sum(size for _, size in input_sizes(inputs, sizes))
-
-
-def tracked_size(inputs: tuple[str, ...], sizes: Mapping[str, int]) -> int:
-    """Return the number of entries whose history is an input: the factors or, without factors, all other inputs."""
-    if "history" not in inputs:
-        return 0
-    return sizes["factors"] if "factors" in inputs else input_size(inputs[:-1], sizes)
+    The entries whose history is an input are the factors or, without factors, all other inputs.
+    """
+    observation = dict.fromkeys(("observation", "next_observation", "observation_change"), sizes["observation"])
+    named = [(name, {**sizes, **observation}[name]) for name in inputs if name != "history"]
+    if "history" in inputs:
+        n_tracked = sizes["factors"] if "factors" in inputs else sum(size for _, size in named)
+        named.append(("history", 3 * n_tracked))
+    return tuple(named)
 
 
 def input_arrays(inputs: tuple[str, ...], step: Mapping[str, Any]) -> list[Any]:

@@ -7,21 +7,30 @@ The published code fits R/T, the mean reward of a step, rather than R (Eq. 6 of 
 and has the same minimiser if all episodes have the same length. `sum_form` fits R.
 """
 
+import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Float, Int
+
+from lare_rl.nn.networks import MLP
 
 __all__ = [
+    "EpisodeInputs",
+    "EpisodeLengths",
     "PerEpisode",
     "batch_mean",
     "episode_means",
     "episode_weight",
+    "is_step",
     "leave_one_out_likelihood",
     "squared_error",
+    "step_loss",
     "subsampling_variance",
     "unbiased_squared_error",
 ]
 
 PerEpisode = Float[Array, " episodes"]
+EpisodeInputs = Float[Array, "episodes steps inputs"]
+EpisodeLengths = Int[Array, " episodes"]
 
 
 def batch_mean(values: PerEpisode, weight: PerEpisode) -> Float[Array, ""]:
@@ -81,3 +90,28 @@ def leave_one_out_likelihood(
 def episode_weight(length: Int[Array, " episodes"], mask: PerEpisode, sum_form: bool) -> PerEpisode:
     """Return the weight of each episode: 1 if R/T is fitted, T^2 if the sum R is fitted (`sum_form`), 0 where `mask` is 0."""
     return mask * length.astype(jnp.float32) ** 2 if sum_form else mask
+
+
+def is_step(length: EpisodeLengths, max_steps: int) -> Bool[Array, "episodes steps"]:
+    """Return which rows are steps of the episodes. The others are padding."""
+    return jnp.arange(max_steps) < length[:, None]
+
+
+def step_loss(
+    step_model: MLP, inputs: EpisodeInputs, prefix: Float[Array, "episodes steps"], length: EpisodeLengths
+) -> Float[Array, " episodes"]:
+    """Return the mean squared error of a step model over the steps of each episode, for Diaster, RUDDER and RBT.
+
+    A recurrent model reads an episode from its beginning, so that it cannot judge a single stored step. An algorithm that samples
+    transitions needs just that. The step model therefore learns the mean of the differences from the step alone:
+
+        (r_hat(x_t) - L (F_t - F_{t-1}))^2,    F_{-1} = 0
+
+    `prefix` is F_t, what the recurrent model gives to the steps 0 to t; no gradient goes to it. It is in units of L times the scale,
+    where L is the number of steps of the longest episode, so that it is at most about 1. The step model is in units of the scale, the
+    root mean square of R/T.
+    """
+    max_steps = inputs.shape[1]
+    target = max_steps * jnp.diff(jax.lax.stop_gradient(prefix), axis=1, prepend=0)
+    squared_error = (step_model(inputs)[..., 0] - target) ** 2
+    return jnp.sum(is_step(length, max_steps) * squared_error, axis=1) / jnp.maximum(length, 1)

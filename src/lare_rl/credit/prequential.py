@@ -52,6 +52,11 @@ class Predictions(NamedTuple):
     level: Int[Array, " window"]
     """The level of each episode; 0 if levels make no difference."""
 
+    @property
+    def valid(self) -> Bool[Array, " window"]:
+        """Which slots have an episode."""
+        return jnp.arange(len(self.returns)) < self.n_episodes
+
 
 def empty_predictions(n_decoders: int, window: int = WINDOW) -> Predictions:
     """Return the state before the first prediction."""
@@ -88,15 +93,13 @@ def ring_slots(n_before: Float[Array, ""], mask: Bool[Array, " episodes"], windo
 
 def squared_errors(predictions: Predictions) -> Float[Array, " decoders"]:
     """Return sum_k (R_k - R_hat_k)^2 of each decoder."""
-    valid = jnp.arange(len(predictions.returns)) < predictions.n_episodes
     errors = (predictions.returns[:, None] - predictions.predicted) ** 2
-    return jnp.sum(jnp.where(valid[:, None], errors, 0), axis=0)
+    return jnp.sum(jnp.where(predictions.valid[:, None], errors, 0), axis=0)
 
 
 def r2(predictions: Predictions) -> Float[Array, " decoders"]:
     """Return R^2 of each decoder, or NaN if there are too few episodes or all returns are equal."""
-    valid = jnp.arange(len(predictions.returns)) < predictions.n_episodes
-    count = jnp.sum(valid)
+    valid, count = predictions.valid, jnp.sum(predictions.valid)
     mean = jnp.sum(jnp.where(valid, predictions.returns, 0)) / jnp.maximum(count, 1)
     total = jnp.sum(jnp.where(valid, (predictions.returns - mean) ** 2, 0))
     is_defined = (count >= MIN_R2_EPISODES) & (total > 1e-10 * count * mean**2)
@@ -115,7 +118,7 @@ def gain(predictions: Predictions) -> tuple[Float[Array, ""], Float[Array, ""]]:
     The standard error is that of a ratio of means, as in `statistics.ratio_of_sums`. An episode that is alone in its level is compared
     with all other episodes.
     """
-    valid = jnp.arange(len(predictions.returns)) < predictions.n_episodes
+    valid = predictions.valid
     different = valid[None] & ~jnp.eye(len(valid), dtype=bool)
     same = different & (predictions.level[:, None] == predictions.level[None])
     peers = jnp.where(jnp.any(same, axis=1, keepdims=True), same, different).astype(jnp.float32)

@@ -8,7 +8,7 @@ a_0, s_0, a_1, s_1, ... Its outputs are h_t at s_t and g_t at a_t. The steps of 
 
 The transformer is GPT-2 (Radford et al., 2019): x + attention(LN(x)), then x + F2 relu(F1 LN(x)), three times, with a tenth of
 all activations dropped in an update. It cannot judge a single stored step, so that a step model learns r_t from s_t and a_t: see
-`step_targets.py`. r_t is in units of the scale, the root mean square of R/T.
+`losses.step_loss`. r_t is in units of the scale, the root mean square of R/T.
 
 The equations and settings are those of the authors' code (github.com/Tang-Yuting/RLBR, commit fac908f); of the text of the paper only
 the abstract could be read. docs/reference/differences.md lists the differences.
@@ -23,9 +23,8 @@ from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
 from lare_rl.credit.decoder_network import DecoderOutput
 from lare_rl.credit.decoders import RBT_STEPS
-from lare_rl.credit.losses import PerEpisode, batch_mean
+from lare_rl.credit.losses import EpisodeInputs, EpisodeLengths, PerEpisode, batch_mean, is_step, step_loss
 from lare_rl.credit.spec import CreditSpec
-from lare_rl.credit.step_targets import EpisodeInputs, EpisodeLengths, is_step, step_loss
 from lare_rl.nn.attention import LayerNorm, attend, causal_mask
 from lare_rl.nn.networks import MLP, Linear
 

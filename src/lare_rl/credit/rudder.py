@@ -16,7 +16,7 @@ compared.
 
 g is in units of L times the scale, where L is the number of steps of the longest episode. h grows with the steps, and the division by
 L, which is not published, keeps g of the size of its target from the first update. A step model learns r_t from the step alone: see
-`step_targets.py`.
+`losses.step_loss`.
 """
 
 import equinox as eqx
@@ -25,9 +25,8 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from lare_rl.credit.decoder_network import DecoderOutput
-from lare_rl.credit.losses import PerEpisode, batch_mean
+from lare_rl.credit.losses import EpisodeInputs, EpisodeLengths, PerEpisode, batch_mean, is_step, step_loss
 from lare_rl.credit.spec import CreditSpec
-from lare_rl.credit.step_targets import EpisodeInputs, EpisodeLengths, is_step, step_loss
 from lare_rl.nn.networks import MLP, Linear
 
 __all__ = ["RUDDER"]

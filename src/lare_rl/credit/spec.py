@@ -6,7 +6,7 @@ from functools import cached_property
 
 from lare_rl.credit.basis import Basis
 from lare_rl.credit.decoder_settings import CreditSettings
-from lare_rl.credit.input_names import input_size, input_sizes, raw_feature_names, tracked_size
+from lare_rl.credit.input_names import input_sizes, raw_feature_names
 from lare_rl.credit.methods import Fit, Method
 from lare_rl.credit.prequential import SEGMENT_WINDOW, WINDOW
 from lare_rl.credit.score_type import ScoreType, score_types_to_fit
@@ -65,24 +65,25 @@ class CreditSpec:
         names = self.method.inputs
         return () if names is None else names.resolve(self.scored_observation, single_agent=self.single_agent)
 
-    @property
-    def _sizes(self) -> dict[str, int]:
-        return {"factors": self.n_factors, "observation": self.observation_size, "action": self.action_size}
-
-    @property
+    @cached_property
     def input_sizes(self) -> tuple[tuple[str, int], ...]:
         """The name and the size of each input."""
-        return input_sizes(self.inputs, self._sizes)
+        sizes = {"factors": self.n_factors, "observation": self.observation_size, "action": self.action_size}
+        return input_sizes(self.inputs, sizes)
+
+    @property
+    def _raw_sizes(self) -> dict[str, int]:
+        return {name: size for name, size in self.input_sizes if name not in ("factors", "history")}
 
     @cached_property
     def basis(self) -> Basis:
         """The features that a closed-form decoder computes from a row of inputs."""
-        raw = tuple(name for name in self.inputs if name not in ("factors", "history"))
+        sizes = dict(self.input_sizes)
         return Basis(
-            n_factors=self.n_factors if "factors" in self.inputs else 0,
-            n_raw=input_size(raw, self._sizes),
+            n_factors=sizes.get("factors", 0),
+            n_raw=sum(self._raw_sizes.values()),
             extended=self.method.decoder_kind.extended_basis,
-            n_tracked=tracked_size(self.inputs, self._sizes),
+            n_tracked=sizes.get("history", 0) // 3,
             n_levels=0 if self.method.fit is Fit.SIGNS else self.n_levels,
             prefixes=self.method.fit is Fit.PREFIX_EVIDENCE,
         )
@@ -118,5 +119,4 @@ class CreditSpec:
         """Return names of the raw features, from a task's texts; none if they are not entries of observations and actions."""
         if not self.basis.n_raw_used or "observation_change" in self.inputs:
             return []
-        raw = {name: size for name, size in self.input_sizes if name not in ("factors", "history")}
-        return raw_feature_names(observation, action, raw)
+        return raw_feature_names(observation, action, self._raw_sizes)

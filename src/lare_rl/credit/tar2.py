@@ -8,7 +8,8 @@ the return. The states and the past must tell which action an agent takes next:
     p(a_{i,t}) = softmax(MLP([mean_j e_{j,t}, h_{i,t-1}])),    h_{i,-1} = 0
     (sum_{i,t} c_{i,t} - R)^2 - 0.05 mean_{i,t} log p(a_{i,t})
 
-e is the embedding of an observation and its position. The rewards of an episode are not c, but shares of the return: see `shares.py`.
+e is the embedding of an observation and its position. The rewards of an episode are not c, but shares of the return
+(`engine.return_shares`).
 
 The network, the loss and the settings are those of the authors' code (github.com/AdityaKapoor74/MARL_Agent_Temporal_Credit_Assignment,
 `TARR_v2` at commit 2708495; the commit after it leaves out the outcome, as an ablation). The text of the paper could not be read, but

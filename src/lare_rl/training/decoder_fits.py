@@ -5,8 +5,8 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Key, PRNGKeyArray
 
 from lare_rl.credit import descent
-from lare_rl.credit.batch_plan import plan_batch
 from lare_rl.credit.decomposition import CreditBatch, DecoderState
+from lare_rl.credit.descent import plan_batch
 from lare_rl.data import replay
 from lare_rl.data.replay import Replay
 from lare_rl.data.sampling import CreditSample, sample_episode_steps, sample_packed, sample_padded

@@ -4,8 +4,8 @@ from importlib.resources import files
 from typing import NamedTuple
 
 from lare_rl.llm.prompts import Message
+from lare_rl.turns.design import turn_request
 from lare_rl.turns.messages import Turn, split_turns
-from lare_rl.turns.prompt import turn_request
 from lare_rl.util.safe_io import read_json
 
 __all__ = ["TOOL_SETS", "ToolSet", "load_tool_set"]

@@ -1,7 +1,7 @@
 import pytest
 
-from lare_rl.credit.batch_plan import BatchPlan, plan_batch
 from lare_rl.credit.decoder_settings import CreditSettings
+from lare_rl.credit.descent import BatchPlan, plan_batch
 from lare_rl.credit.methods import Fit
 
 
