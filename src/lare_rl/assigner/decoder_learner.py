@@ -63,8 +63,8 @@ class DecoderLearner:
         """Number, observation, action and next observation of steps that have no inputs yet."""
         self._pending_inputs: list[tuple[np.ndarray, np.ndarray]] = []
         """Inputs of steps that are not in the running statistics yet, and which agents acted."""
-        self._pending_returns: list[tuple[float, int, int]] = []
-        """R/T, T and level of episodes that are not in the scales yet."""
+        self._pending_returns: list[StoredEpisode] = []
+        """Episodes whose returns are not in the scales yet."""
         self._pending_episodes: deque[list[StoredEpisode]] = deque()
         """Episodes that the decoder has not learned from yet. Episodes that ended in one call are together."""
         self._pending_updates = 0.0
@@ -101,9 +101,7 @@ class DecoderLearner:
             if not batch:
                 self._pending_episodes.append(batch)
             batch.append(episode)
-            self._pending_returns.append(
-                (episode.return_ / len(episode.step_ids), len(episode.step_ids), episode.level)
-            )
+            self._pending_returns.append(episode)
 
     def flush_large_queues(self) -> None:
         """Process the queues that have become long."""
@@ -162,12 +160,13 @@ class DecoderLearner:
     def _flush_returns(self) -> None:
         if not self._pending_returns:
             return
-        mean_reward, length, level = np.array(self._pending_returns).T
+        values = [(len(episode.step_ids), episode.level, episode.return_) for episode in self._pending_returns]
         self._pending_returns.clear()
-        size = padded_size(len(mean_reward))
-        mask = np.arange(size) < len(mean_reward)
-        mean_reward, length = pad_rows(mean_reward.astype(np.float32), size), pad_rows(length.astype(np.int32), size)
-        level = pad_rows(level.astype(np.int32), size) if self.config.groups else None
+        size = padded_size(len(values))
+        length, level, return_ = pad_rows(np.array(values), size).T
+        mask = length > 0
+        mean_reward = (return_ / np.maximum(length, 1)).astype(np.float32)
+        length, level = length.astype(np.int32), level.astype(np.int32) if self.config.groups else None
         with on_cpu():
             if self.decoder is None:
                 self.source = compiled.observe_scale(self.source, mean_reward, mask)

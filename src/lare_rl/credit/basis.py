@@ -31,7 +31,6 @@ from jaxtyping import Array, Bool, Float, Int
 from lare_rl.credit.history import next_history
 
 __all__ = [
-    "HALF_PERIOD",
     "MAX_RAW_FEATURES",
     "N_FREQUENCIES",
     "Basis",

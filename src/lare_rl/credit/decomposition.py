@@ -54,7 +54,6 @@ __all__ = [
     "decode",
     "decoder_rewards",
     "init",
-    "is_normalised",
     "level_effects",
     "level_returns",
     "normalise_inputs",

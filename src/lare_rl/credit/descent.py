@@ -41,12 +41,7 @@ def plan_batch(fit: Fit, settings: CreditSettings, longest: int, *, fixed_length
     """Return which steps an update reads, so that it reads about `settings.steps` of them.
 
     A decoder with a loss of its own reads `settings.episodes` whole episodes. RRD reads a sample of each episode's steps. Other fits
-    read whole episodes, as many as there is room for.
-
-    Args:
-        fit: the fit, by gradient descent.
-        longest: the largest number of steps of an episode.
-        fixed_length: whether all episodes have this length.
+    read whole episodes, as many as there is room for. `longest` is the number of steps of the longest episode; if `fixed_length`, of all.
     """
     if fit is Fit.DECODER_LOSS:
         return BatchPlan("padded", settings.episodes, longest)

@@ -44,10 +44,7 @@ def scan_history(
 ) -> Float[Array, "time *batch 3 entries"]:
     """Return the history of each of some successive steps.
 
-    Args:
-        before: the history of the first step, if it does not begin an episode.
-        entries: the entries that are tracked.
-        begins: whether a step is the first one of an episode, or of the steps of a payment.
+    `before` is that of the first step, if it does not begin an episode. `begins` is true for the first step of an episode or a payment.
     """
 
     def body(history: Array, step: tuple[Array, Array]) -> tuple[Array, Array]:

@@ -95,10 +95,7 @@ def input_arrays(inputs: tuple[str, ...], step: Mapping[str, Any]) -> list[Any]:
 def raw_feature_names(observation: str, action: str, sizes: Mapping[str, int]) -> list[str]:
     """Return names of the raw features, from a task's texts: the line `7: angle of the foot` names entry 7.
 
-    Args:
-        observation: the text that describes the observation.
-        action: the text that describes the action.
-        sizes: the number of entries of `observation`, `next_observation` and `action`, in their order, as far as they are inputs.
+    `sizes` are the numbers of entries of `observation`, `next_observation` and `action`, in their order, as far as they are inputs.
     """
 
     def names(text: str, size: int, kind: str) -> list[str]:

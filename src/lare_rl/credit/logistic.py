@@ -16,8 +16,8 @@ Newton's method, which needs the curvature of the likelihood, not of the bound.
 
 The fit reads the last `WINDOW` episodes, because it needs their features again in each round, and not only sums over them.
 
-Proxy rewards are in the unit of the return. R = a + c w . x is the
-regression of the expected returns on what steps add to the log odds; a step is paid c w . f_t.
+Proxy rewards are in the unit of the return: a step is paid c w . f_t, where R = a + c w . x is the regression of the expected returns
+on what steps add to the log odds.
 """
 
 from typing import NamedTuple
@@ -106,10 +106,6 @@ def fit(state: LogOddsFit, group_index: Int[np.ndarray, " columns"], max_rounds:
     """Fit to the episodes, from the precisions of the last fit. Call this with float64 enabled.
 
     Returns are divided into won and lost halfway between the lowest and the highest. While all are equal, nothing changes.
-
-    Args:
-        state: the episodes, and the last fit.
-        group_index: the index of each column's group.
     """
     valid, low, high = _values(state)
     n_episodes, n_groups = jnp.maximum(jnp.sum(valid), 1), int(group_index.max()) + 1

@@ -12,8 +12,6 @@ from jaxtyping import Float, Int
 
 __all__ = [
     "JITTER",
-    "MIN_NOISE",
-    "MIN_VARIATION",
     "NUMPY",
     "PRIOR_RANGE",
     "TOLERANCE",

@@ -38,8 +38,6 @@ def fit_strengths(
     """Return the fit with a precision for each strength, whether it is better than that by groups or not.
 
     Args:
-        group_index: the index of each feature's group.
-        strength_index: the index of each feature's strength.
         groups: the fit by groups, from whose precisions the iteration starts.
         earlier: an earlier result, or `evidence.init_posterior`. With more than `evidence.MANY_EPISODES_PER_FEATURE` episodes for
             each feature, the iteration continues from it instead.

@@ -82,12 +82,7 @@ def design_turn_phi(
 
 
 def turn_request(goal: str, tools: Sequence[Mapping[str, Any]], turns: Sequence[Turn]) -> list[Message]:
-    """Return the messages that ask for a phi over turns. The same arguments always give the same request, byte for byte.
-
-    Args:
-        goal: what the agent is to do.
-        tools: the descriptions of the tools, in the form of OpenAI's chat completions.
-        turns: example turns.
+    """Return the messages that ask for a phi over turns, with example turns. The same arguments always give the same request.
 
     Raises:
         LareError: a tool has no name.

@@ -41,13 +41,7 @@ NOTE_DEVIATIONS = (
 def write_turn_report(
     path: Path, rollouts: Sequence[Mapping[str, Any]], checked: Sequence[Rollout], credit: CreditedTurns
 ) -> Path:
-    """Write one self-contained HTML file.
-
-    Args:
-        path: the file.
-        rollouts: the rollouts as they were read.
-        checked: the same, checked (`read_rollouts`).
-        credit: their credit.
+    """Write one self-contained HTML file about rollouts as they were read, and checked (`read_rollouts`), and their credit.
 
     Raises:
         LareError: the file cannot be written. An older file is left unchanged.

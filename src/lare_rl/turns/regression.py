@@ -101,14 +101,8 @@ def sum_up(
 ) -> GroupSums:
     """Return the sums over prefixes. Groups without a prefix are allowed.
 
-    Args:
-        x: features of prefixes.
-        y: the outcome of each prefix's rollout.
-        weight: of each prefix.
-        group: the index of each prefix's group.
-        n_groups: the number of groups.
-        n_rollouts: the number of rollouts, which are the degrees of freedom: all prefixes of a rollout have the same outcome.
-        unit: the unit of y. If it is None, the standard deviation of y.
+    Each prefix has the outcome y of its rollout, in `unit`, or else in its standard deviations. The degrees of freedom are the rollouts,
+    because all prefixes of a rollout have the same outcome.
     """
     total = weight.sum()
     x_mean, y_mean = weight @ x / total, weight @ y / total

@@ -25,9 +25,7 @@ from lare_rl.util.findings import Finding
 from lare_rl.util.statistics import CLEAR_ERRORS, ratio_of_sums
 
 __all__ = [
-    "CAREFUL",
     "GRPO",
-    "TRUSTING",
     "UNTRUSTED",
     "Errors",
     "Trust",
