@@ -36,7 +36,7 @@ def fit(means, returns, length, group, strength):
     sums = evidence.add_episodes(evidence.empty_statistics(len(group)), means, returns, length)
     starts = [evidence.init_posterior(index) for index in (group_index, strength_index)]
     groups = evidence.fit(sums, 0, group_index, starts[0], 3 * ROUNDS)
-    separate = relevance.fit_strengths(sums, 0, group_index, strength_index, groups, starts[1], ROUNDS)
+    groups, separate = relevance.fit(sums, 0, group_index, strength_index, groups, starts[1], ROUNDS)
     return [(fit.weight, fit.bias, fit.log_evidence) for fit in (groups, separate)]
 
 

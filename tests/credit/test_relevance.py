@@ -27,12 +27,9 @@ def episodes(count, relevant, noise, seed):
 @partial(jax.jit, static_argnames="basis")
 def fits(means, mean_reward, length, basis=BASIS):
     statistics = evidence.add_episodes(evidence.empty_statistics(basis.n_features), means, mean_reward * length, length)
-    start = evidence.init_posterior(basis.group_index)
-    groups = evidence.fit(statistics, 0, basis.group_index, start, 60)
-    earlier = evidence.init_posterior(basis.strength_index)
     indices = basis.group_index, basis.strength_index
-    separate = relevance.fit_strengths(statistics, 0, *indices, groups, earlier, 60)
-    again = relevance.fit_strengths(statistics, 0, *indices, groups, separate, 60)
+    groups, separate = relevance.fit(statistics, 0, *indices, *map(evidence.init_posterior, indices), 60)
+    _, again = relevance.fit(statistics, 0, *indices, groups, separate, 60)
     return groups, relevance.select(separate, groups, *indices), again, relevance.is_better(separate, groups)
 
 

@@ -199,14 +199,9 @@ def fit(
     group_index, strength_index = basis.column_group_index, basis.column_strength_index
 
     def fit_score_type(args: tuple[Int[Array, ""], Posterior, Posterior]) -> tuple[Posterior, Posterior]:
-        score_type, start, earlier = args
-        start, earlier = jax.tree.map(lambda leaf: leaf.astype(float), (start, earlier))
-        groups = evidence.fit(statistics, score_type, group_index, start, max_rounds, batched=batched)
-        if np.array_equal(group_index, strength_index):
-            return groups, groups
-        return groups, relevance.fit_strengths(
-            statistics, score_type, group_index, strength_index, groups, earlier, max_rounds
-        )
+        score_type, *starts = args
+        starts = jax.tree.map(lambda leaf: leaf.astype(float), starts)
+        return relevance.fit(statistics, score_type, group_index, strength_index, *starts, max_rounds, batched=batched)
 
     fits = map_leading_axis(
         fit_score_type, (jnp.asarray(linear_types), state.posterior, state.strengths), batched=batched

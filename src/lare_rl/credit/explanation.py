@@ -184,21 +184,16 @@ def _fit(
     group_index: FeatureIndex,
     strength_index: FeatureIndex,
 ) -> _Fit:
-    problem = evidence.regression(statistics, score_type, group_index)
-    start = evidence.init_posterior(group_index)
-    posterior = evidence.fit(statistics, score_type, group_index, start, MAX_EXPLANATION_ROUNDS)
-    has_own_strengths = jnp.array(False)
-    if not np.array_equal(group_index, strength_index):
-        groups, indices = posterior, (group_index, strength_index)
-        start = evidence.init_posterior(strength_index)
-        separate = relevance.fit_strengths(statistics, score_type, *indices, groups, start, MAX_EXPLANATION_ROUNDS)
-        has_own_strengths = relevance.is_better(separate, groups)
-        posterior = relevance.select(separate, groups, *indices)
+    problem, indices = evidence.regression(statistics, score_type, group_index), (group_index, strength_index)
+    starts = map(evidence.init_posterior, indices)
+    groups, strengths = relevance.fit(statistics, score_type, *indices, *starts, MAX_EXPLANATION_ROUNDS)
+    posterior = relevance.select(strengths, groups, *indices)
     r2 = 1 - problem.dof / (problem.q * jnp.where(posterior.beta > 0, posterior.beta, 1))
     r2 = jnp.where((problem.dof > 1) & (problem.y_std > 0), jnp.clip(r2, 0, 1), jnp.nan)
     weight = posterior.weight / jnp.where(problem.y_std > 0, problem.y_std, 1)
     covariance = weight * (problem.s @ weight)
     total = jnp.sum(covariance)
+    has_own_strengths = relevance.is_better(strengths, groups)
     return _Fit(problem, posterior, has_own_strengths, r2, r2 * covariance / jnp.where(total > 0, total, 1))
 
 

@@ -12,6 +12,7 @@ evidence, so the iteration starts from the precisions of the groups, and its res
 """
 
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Int
 
 from lare_rl.credit import evidence
@@ -19,29 +20,33 @@ from lare_rl.credit.evidence import SufficientStatistics
 from lare_rl.credit.precisions import FeatureIndex, Posterior, expand_groups
 from lare_rl.nn import masks
 
-__all__ = ["MIN_GAIN", "fit_strengths", "is_better", "select"]
+__all__ = ["fit", "is_better", "select"]
 
 MIN_GAIN = 0.5
 """The least gain in log evidence for each additional precision. Of 0.1, 0.25, 0.5 and 1, the middle two predicted the rewards of
 later episodes best on eight scores (`benchmarks/relevance.py`)."""
 
 
-def fit_strengths(
+def fit(
     statistics: SufficientStatistics,
     score_type: Int[Array, ""] | int,
     group_index: FeatureIndex,
     strength_index: FeatureIndex,
-    groups: Posterior,
+    earlier_groups: Posterior,
     earlier: Posterior,
     max_rounds: int,
-) -> Posterior:
-    """Return the fit with a precision for each strength, whether it is better than that by groups or not.
+    *,
+    batched: bool = False,
+) -> tuple[Posterior, Posterior]:
+    """Return the fit by groups, and the fit with a precision for each strength, whether it is better than that by groups or not.
 
-    Args:
-        groups: the fit by groups, from whose precisions the iteration starts.
-        earlier: an earlier result, or `evidence.init_posterior`. With more than `evidence.MANY_EPISODES_PER_FEATURE` episodes for
-            each feature, the iteration continues from it instead.
+    Both are the same if each group has one strength. The arguments are those of `evidence.fit`, and the index of each feature's strength.
+    `earlier_groups` and `earlier` are earlier results, or `evidence.init_posterior`. The iteration for the strengths starts from the
+    precisions of the groups. With more than `evidence.MANY_EPISODES_PER_FEATURE` episodes for each feature, it continues from `earlier`.
     """
+    groups = evidence.fit(statistics, score_type, group_index, earlier_groups, max_rounds, batched=batched)
+    if np.array_equal(group_index, strength_index):
+        return groups, groups
     start = expand_groups(groups, group_index, strength_index)
     problem = evidence.regression(statistics, score_type, strength_index)
     many = problem.dof >= evidence.MANY_EPISODES_PER_FEATURE * len(group_index)
@@ -50,7 +55,7 @@ def fit_strengths(
         jnp.where(continues, old, new) for old, new in ((earlier.alpha, start.alpha), (earlier.beta, start.beta))
     )
     posterior = evidence.fixed_point(problem, alpha, beta, max_rounds)
-    return evidence.unscale(statistics, problem, posterior, fallback=start)
+    return groups, evidence.unscale(statistics, problem, posterior, fallback=start)
 
 
 def is_better(strengths: Posterior, groups: Posterior) -> Bool[Array, "*score_types"]:

@@ -142,6 +142,8 @@ class TurnCredit:
             raise LareError("there are no rollouts: credit needs some, and several of each group")
         return self.assign(tabulate(checked))
 
+    # The matrices are small: several threads would mostly wait for each other (`util/float64.py`).
+    @threadpool_limits.wrap(limits=1, user_api="blas")
     def assign(self, table: TurnTable) -> CreditedTurns:
         """Return the credit of turns that are arrays already.
 
@@ -150,11 +152,6 @@ class TurnCredit:
         """
         if self.logistic and not np.all((table.outcome >= 0) & (table.outcome <= 1)):
             raise LareError("logistic values need outcomes between 0 and 1: use logistic=False, or scale the outcomes")
-        # The matrices are small: several threads would mostly wait for each other (`util/float64.py`).
-        with threadpool_limits(limits=1, user_api="blas"):
-            return self._assign(table)
-
-    def _assign(self, table: TurnTable) -> CreditedTurns:
         prefixes = build_prefixes(table)
         x = prefixes.features
         fit = fit_prefixes(table, x, is_logistic=self.logistic)
