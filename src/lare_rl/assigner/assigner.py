@@ -274,10 +274,9 @@ class CreditAssigner:
                 if begins is None:
                     raise LareError(f"{method.name} reads the history of an episode: give begins, or call rewards_at")
                 inputs = self.config.add_history(inputs, arguments.to_flags(begins, "begins", len(inputs)))
-            length = arguments.to_lengths(
-                [self.store.mean_length] * len(inputs) if length is None else length, len(inputs)
-            )
-            return self.step_rewards.rewards(inputs, length)
+            mean_length = np.full(len(inputs), self.store.mean_length)
+            lengths = mean_length if length is None else arguments.to_lengths(length, len(inputs))
+            return self.step_rewards.rewards(inputs, lengths)
 
     def metrics(self) -> dict[str, float]:
         """Return metrics of the decoder, which need no true rewards.

@@ -1,6 +1,7 @@
 """Batches of stored episodes, for the fits of a decoder."""
 
 from collections.abc import Iterator, Sequence
+from typing import Any
 
 import jax
 import numpy as np
@@ -13,7 +14,7 @@ from lare_rl.credit.decomposition import CreditBatch
 from lare_rl.credit.descent import plan_batch
 from lare_rl.credit.spec import CreditSpec
 from lare_rl.data.layouts import Layout, lay_out_packed, lay_out_padded, lay_out_sampled
-from lare_rl.util.shapes import padded_size
+from lare_rl.util.shapes import pad_rows, padded_size
 
 __all__ = ["pack_in_order", "sample_batch", "whole_episodes"]
 
@@ -49,15 +50,12 @@ def whole_episodes(store: Store, spec: CreditSpec, episodes: Sequence[StoredEpis
 
 
 def pack_in_order(store: Store, episodes: Sequence[StoredEpisode], n_slots: int, rows: int) -> Iterator[CreditBatch]:
-    """Yield whole episodes in their order, in batches of at most `n_slots` episodes in `rows` rows."""
+    """Yield whole episodes in their order, in batches of at most `n_slots` episodes in `rows` rows, which the longest must fit."""
     start = 0
     while start < len(episodes):
-        end, n_steps = start, 0
-        while end < len(episodes) and end - start < n_slots and n_steps + len(episodes[end].step_ids) <= rows:
-            n_steps += len(episodes[end].step_ids)
-            end += 1
-        yield _pack(store, episodes[start:end], n_slots, rows)
-        start = end
+        batch = _pack(store, episodes[start : start + n_slots], n_slots, rows)
+        yield batch
+        start += int(batch.mask.sum())
 
 
 def _sample_episodes(store: Store, count: int, random: np.random.Generator) -> list[StoredEpisode]:
@@ -82,21 +80,21 @@ def _gather(store: Store, episodes: Sequence[StoredEpisode], layout: Layout, n_s
 
     The layout has an axis of episodes, or none. Padding reads some stored step. The arrays have room for `n_slots` episodes.
     """
-    count = len(episodes)
-    first = np.cumsum(_lengths(episodes)) - _lengths(episodes)
+    count, lengths = len(episodes), _lengths(episodes)
+    first = np.cumsum(lengths) - lengths
     slot = np.arange(count)[:, None] if layout.slot.ndim > 1 else np.minimum(layout.slot, count - 1)
     steps = np.concatenate([episode.step_ids for episode in episodes])[first[slot] + layout.step].ravel()
-    rows = steps % store.capacity
-    length, score = np.ones(n_slots, np.int32), np.zeros(n_slots)
-    length[:count], score[:count] = _lengths(episodes), [episode.return_ for episode in episodes]
-    level = np.zeros(n_slots, np.int32)
-    level[:count] = [episode.level for episode in episodes]
-    return CreditBatch(
-        inputs=store.inputs[rows],  # pyright: ignore[reportArgumentType]
-        episode_index=layout.slot.ravel().astype(np.int32),
-        length=length,  # pyright: ignore[reportArgumentType]
-        mean_reward=(score / length).astype(np.float32),  # pyright: ignore[reportArgumentType]
-        level=level if store.has_levels else None,  # pyright: ignore[reportArgumentType]
-        mask=(np.arange(n_slots) < count).astype(np.float32),  # pyright: ignore[reportArgumentType]
-        alive=None if store.alive is None else store.alive[rows],  # pyright: ignore[reportArgumentType]
-    )
+    rows, mask = steps % store.capacity, np.arange(n_slots) < count
+    length = np.where(mask, pad_rows(lengths, n_slots), 1).astype(np.int32)
+    score = pad_rows(np.array([episode.return_ for episode in episodes]), n_slots)
+    level = pad_rows(np.array([episode.level for episode in episodes], np.int32), n_slots)
+    arrays: dict[str, Any] = {
+        "inputs": store.inputs[rows],
+        "episode_index": layout.slot.ravel().astype(np.int32),
+        "length": length,
+        "mean_reward": (score / length).astype(np.float32),
+        "mask": mask.astype(np.float32),
+        "alive": None if store.alive is None else store.alive[rows],
+        "level": level if store.has_levels else None,
+    }
+    return CreditBatch(**arrays)
