@@ -3,7 +3,7 @@
 import numpy as np
 from jaxtyping import Float, Int
 
-from lare_rl.credit.precisions import JITTER, NUMPY, Regression, dense_moments, equal_shares, next_posterior
+from lare_rl.credit.precisions import JITTER, NUMPY, Regression
 from turns.finite_task import Rollouts, Task
 
 __all__ = ["gigpo", "grpo", "summed_credit"]
@@ -52,12 +52,12 @@ def _fit(
     s = (weight[:, None] * x).T @ x
     s += JITTER * np.diag(np.diagonal(s))
     p = (weight[:, None] * x).T @ y / y_std
-    shares = equal_shares(NUMPY, np.diagonal(s), total, group_index)
+    shares = NUMPY.equal_shares(np.diagonal(s), total, group_index)
     problem = Regression(s, p, total, np.asarray(len(y) - 1.0), np.zeros(()), y_std, group_index, shares)
     alpha, beta = shares, 2 * problem.dof / total
     weight = np.zeros(x.shape[1])
     for _ in range(ROUNDS):
-        posterior = next_posterior(NUMPY, problem, alpha, beta, lambda a, b: dense_moments(NUMPY, problem, a, b))
+        posterior = NUMPY.next_posterior(problem, alpha, beta, lambda a, b: NUMPY.dense_moments(problem, a, b))
         weight, alpha, beta = posterior.weight, posterior.alpha, posterior.beta
     return y_std * weight
 

@@ -106,9 +106,7 @@ EVERY_5 = PaymentRule(period=5)
         long_case("rd-linear", ONE_TEAM, {"score": "auto"}),
         long_case("rd-linear", ONE_AGENT, {"group": "map", "score": "auto"}),
         long_case("ircr", ONE_AGENT, {"payments": EVERY_5}),
-        long_case(
-            "rd-linear", ONE_AGENT, {"payments": PaymentRule(period=4, window=6), "exact": "last", "score": "average"}
-        ),
+        ("rd-linear", ONE_AGENT, {"payments": PaymentRule(period=4, window=6), "exact": "last", "score": "average"}),
     ],
 )
 def test_rewards_and_lengths_agree(method, env, changes, phi):

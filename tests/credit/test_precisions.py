@@ -4,16 +4,7 @@ import numpy as np
 import pytest
 
 from lare_rl.credit import evidence
-from lare_rl.credit.precisions import (
-    NUMPY,
-    Posterior,
-    Regression,
-    clip_precisions,
-    dense_moments,
-    equal_shares,
-    expand_groups,
-    next_posterior,
-)
+from lare_rl.credit.precisions import NUMPY, Posterior, Regression, expand_groups
 
 GROUP_INDEX = np.array([0, 0, 1, 2, 2])
 
@@ -25,14 +16,14 @@ def problem():
     y = x @ random.normal(size=5) + random.normal(size=40)
     x, y = x - x.mean(axis=0), (y - y.mean()) / y.std()
     s = x.T @ x
-    shares = equal_shares(NUMPY, np.diagonal(s), 40.0, GROUP_INDEX)
+    shares = NUMPY.equal_shares(np.diagonal(s), 40.0, GROUP_INDEX)
     return Regression(s, x.T @ y, np.array(40.0), np.array(39.0), np.array(0.0), np.array(1.0), GROUP_INDEX, shares)
 
 
 def run_rounds(backend, problem, n_rounds):
     alpha, beta = problem.equal_alpha, 2 * problem.dof / problem.q
     for _ in range(n_rounds):
-        posterior = next_posterior(backend, problem, alpha, beta, lambda a, b: dense_moments(backend, problem, a, b))
+        posterior = backend.next_posterior(problem, alpha, beta, lambda a, b: backend.dense_moments(problem, a, b))
         alpha, beta = posterior.alpha, posterior.beta
     return posterior
 
@@ -50,7 +41,7 @@ def test_rounds_of_numpy_and_jax_are_the_same(problem):
 
 def test_moments_are_those_of_the_inverse(problem):
     alpha, beta = np.array([1.0, 2.0, 3.0]), 5.0
-    moments = dense_moments(NUMPY, problem, alpha, beta)
+    moments = NUMPY.dense_moments(problem, alpha, beta)
     precision = beta * problem.s + np.diag(alpha[GROUP_INDEX])
     mean = beta * np.linalg.solve(precision, problem.p)
     np.testing.assert_allclose(moments.weight, mean)
@@ -66,7 +57,7 @@ def test_equal_shares_explain_half_of_the_returns(problem):
 
 
 def test_precisions_are_clipped(problem):
-    alpha, beta = clip_precisions(NUMPY, problem, np.array([0.0, np.inf, 1.0]), 0.0)
+    alpha, beta = NUMPY.clip_precisions(problem, np.array([0.0, np.inf, 1.0]), 0.0)
     assert alpha[0] == problem.equal_alpha[0] / 1e6
     assert alpha[1] == problem.equal_alpha[1] * 1e6
     assert beta == problem.dof / problem.q / 2

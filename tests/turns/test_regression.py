@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from helpers.turn_toys import dense_posterior, sample_table
-from lare_rl.credit.precisions import NUMPY, Regression, dense_moments
+from lare_rl.credit.precisions import NUMPY, Regression
 from lare_rl.turns.features import build_prefixes
 from lare_rl.turns.regression import eliminate_groups, fit_linear, fixed_point, group_moments, sum_up
 
@@ -44,7 +44,7 @@ def test_moments_are_those_of_the_engine(prefixes, beta):
     x, y, weight, group, n = prefixes
     sums = sum_up(x, y, weight, group, int(group.max()) + 1, n)
     alpha = np.random.default_rng(0).lognormal(size=x.shape[1] + 1)
-    dense = dense_moments(NUMPY, dense_problem(x, y, weight, group, sums), alpha, beta)
+    dense = NUMPY.dense_moments(dense_problem(x, y, weight, group, sums), alpha, beta)
     for name, expected in dense._asdict().items():
         np.testing.assert_allclose(getattr(group_moments(sums, alpha, beta), name), expected, rtol=1e-6, atol=1e-7)
 

@@ -36,20 +36,7 @@ import jax.numpy as jnp
 from jax.scipy.linalg import solve_triangular
 from jaxtyping import Array, Bool, Float, Int
 
-from lare_rl.credit.precisions import (
-    JITTER,
-    TOLERANCE,
-    Backend,
-    FeatureIndex,
-    Posterior,
-    Regression,
-    clip_precisions,
-    dense_moments,
-    equal_shares,
-    inverse_root,
-    next_posterior,
-    varies,
-)
+from lare_rl.credit.precisions import JITTER, TOLERANCE, Backend, FeatureIndex, Posterior, Regression, varies
 from lare_rl.nn.leading_axis import map_leading_axis
 from lare_rl.nn.masks import select
 from lare_rl.nn.normalise import merge_means
@@ -185,7 +172,7 @@ def regression(
         y_mean=y_mean,
         y_std=y_std,
         group_index=group_index,
-        equal_alpha=equal_shares(JAX_BACKEND, jnp.diagonal(s), n_steps, group_index),
+        equal_alpha=JAX_BACKEND.equal_shares(jnp.diagonal(s), n_steps, group_index),
     )
 
 
@@ -280,7 +267,7 @@ def fixed_point(
 
 
 def _round(problem: Regression, alpha: Float[Array, " groups"], beta: Float[Array, ""]) -> Posterior:
-    return next_posterior(JAX_BACKEND, problem, alpha, beta, partial(dense_moments, JAX_BACKEND, problem))
+    return JAX_BACKEND.next_posterior(problem, alpha, beta, partial(JAX_BACKEND.dense_moments, problem))
 
 
 class PosteriorCovariance(NamedTuple):
@@ -302,8 +289,8 @@ def posterior_covariance(
     The weight of a feature without data has its prior standard deviation.
     """
     problem = regression(statistics, score_type, group_index)
-    alpha, beta = clip_precisions(JAX_BACKEND, problem, posterior.alpha, posterior.beta)
-    root, _ = inverse_root(JAX_BACKEND, beta * problem.s + jnp.diag(alpha[group_index]))
+    alpha, beta = JAX_BACKEND.clip_precisions(problem, posterior.alpha, posterior.beta)
+    root, _ = JAX_BACKEND.inverse_root(beta * problem.s + jnp.diag(alpha[group_index]))
     covariance = PosteriorCovariance(
         root=problem.y_std * root,
         centre=statistics.mean[: len(group_index)],

@@ -29,7 +29,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from lare_rl.credit import evidence
 from lare_rl.credit.evidence import JAX_BACKEND, PosteriorCovariance
-from lare_rl.credit.precisions import JITTER, PRIOR_RANGE, Posterior, count_effective, inverse_root, varies
+from lare_rl.credit.precisions import JITTER, PRIOR_RANGE, Posterior, varies
 from lare_rl.credit.prequential import ring_slots
 
 __all__ = [
@@ -130,11 +130,11 @@ def fit(state: LogOddsFit, group_index: Int[np.ndarray, " columns"], max_rounds:
         weighted = precision[:, None] * difference
         s = weighted.T @ difference
         alpha = posterior.alpha
-        root, log_det = inverse_root(JAX_BACKEND, s + jnp.diag(JITTER * jnp.diagonal(s) + alpha[group_index]))
+        root, log_det = JAX_BACKEND.inverse_root(s + jnp.diag(JITTER * jnp.diagonal(s) + alpha[group_index]))
         weight = (root @ (weighted.T @ (target - target_mean))) @ root
         eta = target_mean + difference @ weight
         variance = jnp.sum((difference @ root.T) ** 2, axis=1) + 1 / total
-        size, n_effective, squares = count_effective(JAX_BACKEND, group_index, alpha, weight, jnp.sum(root**2, axis=0))
+        size, n_effective, squares = JAX_BACKEND.count_effective(group_index, alpha, weight, jnp.sum(root**2, axis=0))
         likelihood = jnp.sum(jnp.where(valid, jax.nn.log_sigmoid((2 * won - 1) * eta), 0))
         posterior = Posterior(
             weight=weight,

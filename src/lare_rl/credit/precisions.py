@@ -1,6 +1,6 @@
 """One round of the evidence's fixed point (`evidence.py`), for arrays of NumPy and of JAX.
 
-The equations are those of `evidence.py`. Here they have no loop and no array library of their own: the caller gives a `Backend`, and the
+The equations are those of `evidence.py`. Here they have no loop: they are methods of a `Backend`, an array library. The caller gives the
 `Moments` of the posterior, which a special structure of the features may allow to compute faster than `dense_moments` does.
 """
 
@@ -22,13 +22,7 @@ __all__ = [
     "Moments",
     "Posterior",
     "Regression",
-    "clip_precisions",
-    "count_effective",
-    "dense_moments",
-    "equal_shares",
     "expand_groups",
-    "inverse_root",
-    "next_posterior",
     "varies",
 ]
 
@@ -51,20 +45,6 @@ Features = Float[Array, " features"]
 Groups = Float[Array, " groups"]
 FeatureIndex = Int[np.ndarray, " features"]
 """The index of each feature's group, or of its strength (`relevance.py`)."""
-
-
-class Backend(NamedTuple):
-    """An array library, and the two functions that NumPy and JAX name differently."""
-
-    xp: Any
-    """`numpy` or `jax.numpy`."""
-    group_sums: Callable[[Array, Array, int], Array]
-    """(values, group_index, n_groups) -> the sum of the values of each group."""
-    solve_lower: Callable[[Array, Array], Array]
-    """(L, B) -> L^-1 B for a lower triangle L."""
-
-
-NUMPY = Backend(np, lambda values, group_index, n_groups: np.bincount(group_index, values, n_groups), np.linalg.solve)
 
 
 class Posterior(NamedTuple):
@@ -115,66 +95,74 @@ def varies(variance: Features, mean_square: Any) -> Any:
     return variance > MIN_VARIATION**2 * (1 + mean_square)
 
 
-def equal_shares(backend: Backend, diagonal: Features, q: Any, group_index: FeatureIndex) -> Groups:
-    """Return `Regression.equal_alpha` from the diagonal of S."""
-    n_groups = int(group_index.max()) + 1
-    trace = backend.group_sums(diagonal, group_index, n_groups)
-    return backend.xp.where(trace > 0, 2 * n_groups * trace / q, 1)
+class Backend(NamedTuple):
+    """An array library, the two functions that NumPy and JAX name differently, and the equations of a round."""
+
+    xp: Any
+    """`numpy` or `jax.numpy`."""
+    group_sums: Callable[[Array, Array, int], Array]
+    """(values, group_index, n_groups) -> the sum of the values of each group."""
+    solve_lower: Callable[[Array, Array], Array]
+    """(L, B) -> L^-1 B for a lower triangle L."""
+
+    def equal_shares(self, diagonal: Features, q: Any, group_index: FeatureIndex) -> Groups:
+        """Return `Regression.equal_alpha` from the diagonal of S."""
+        n_groups = int(group_index.max()) + 1
+        trace = self.group_sums(diagonal, group_index, n_groups)
+        return self.xp.where(trace > 0, 2 * n_groups * trace / q, 1)
+
+    def clip_precisions(self, problem: Regression, alpha: Groups, beta: Any) -> tuple[Groups, Any]:
+        """Clip precisions to a range that float32 can represent."""
+        xp = self.xp
+        noise_only = xp.maximum(problem.dof, 1) / problem.q  # beta if all variation is noise
+        alpha = xp.clip(alpha, problem.equal_alpha / PRIOR_RANGE, problem.equal_alpha * PRIOR_RANGE)
+        return alpha, xp.clip(beta, noise_only / 2, noise_only / MIN_NOISE)
+
+    def inverse_root(self, precision: Float[Array, "n n"]) -> tuple[Float[Array, "n n"], Any]:
+        """Return L with L^T L the inverse of a precision matrix, and the log of the matrix's determinant."""
+        xp = self.xp
+        scale = xp.sqrt(xp.diagonal(precision))  # a diagonal of ones makes the factorisation accurate
+        factor = xp.linalg.cholesky(precision / xp.outer(scale, scale))
+        root = self.solve_lower(factor, xp.diag(1 / scale))
+        return root, 2 * xp.sum(xp.log(xp.diagonal(factor)) + xp.log(scale))
+
+    def dense_moments(self, problem: Regression, alpha: Groups, beta: Any) -> Moments:
+        """Return the moments of the posterior under some precisions, from the whole matrix S."""
+        xp = self.xp
+        root, log_det = self.inverse_root(beta * problem.s + xp.diag(alpha[problem.group_index]))
+        weight = beta * ((root @ problem.p) @ root)
+        residual = problem.q - 2 * weight @ problem.p + weight @ problem.s @ weight
+        return Moments(weight, xp.sum(root**2, axis=0), log_det, residual)
+
+    def count_effective(
+        self, group_index: FeatureIndex, alpha: Groups, weight: Features, variance: Features
+    ) -> tuple[Groups, Groups, Groups]:
+        """Return n_g, gamma_g and |mu_g|^2 of each group."""
+        xp, n_groups = self.xp, len(alpha)
+        size = self.group_sums(xp.ones_like(weight), group_index, n_groups)
+        n_effective = xp.clip(size - alpha * self.group_sums(variance, group_index, n_groups), 0, size)
+        return size, n_effective, self.group_sums(weight**2, group_index, n_groups)
+
+    def next_posterior(
+        self, problem: Regression, alpha: Groups, beta: Any, moments: Callable[[Groups, Any], Moments]
+    ) -> Posterior:
+        """Compute the posterior under some precisions, and the precisions that follow from it."""
+        xp = self.xp
+        alpha, beta = self.clip_precisions(problem, alpha, beta)
+        weight, variance, log_det, residual = moments(alpha, beta)
+        residual = xp.maximum(residual, MIN_NOISE * problem.q)
+        size, n_effective, squares = self.count_effective(problem.group_index, alpha, weight, variance)
+        log_evidence = 0.5 * (
+            problem.dof * xp.log(beta) + size @ xp.log(alpha) - log_det - beta * residual - alpha @ squares
+        )
+        noise_dof = xp.maximum(problem.dof - xp.sum(n_effective), 0.5)
+        alpha, beta = self.clip_precisions(problem, n_effective / xp.maximum(squares, 1e-30), noise_dof / residual)
+        return Posterior(
+            weight=weight, bias=xp.zeros(()), alpha=alpha, beta=beta, n_effective=n_effective, log_evidence=log_evidence
+        )
 
 
-def clip_precisions(backend: Backend, problem: Regression, alpha: Groups, beta: Any) -> tuple[Groups, Any]:
-    """Clip precisions to a range that float32 can represent."""
-    xp = backend.xp
-    noise_only = xp.maximum(problem.dof, 1) / problem.q  # beta if all variation is noise
-    alpha = xp.clip(alpha, problem.equal_alpha / PRIOR_RANGE, problem.equal_alpha * PRIOR_RANGE)
-    return alpha, xp.clip(beta, noise_only / 2, noise_only / MIN_NOISE)
-
-
-def inverse_root(backend: Backend, precision: Float[Array, "n n"]) -> tuple[Float[Array, "n n"], Any]:
-    """Return L with L^T L the inverse of a precision matrix, and the log of the matrix's determinant."""
-    xp = backend.xp
-    scale = xp.sqrt(xp.diagonal(precision))  # a diagonal of ones makes the factorisation accurate
-    factor = xp.linalg.cholesky(precision / xp.outer(scale, scale))
-    root = backend.solve_lower(factor, xp.diag(1 / scale))
-    return root, 2 * xp.sum(xp.log(xp.diagonal(factor)) + xp.log(scale))
-
-
-def dense_moments(backend: Backend, problem: Regression, alpha: Groups, beta: Any) -> Moments:
-    """Return the moments of the posterior under some precisions, from the whole matrix S."""
-    xp = backend.xp
-    root, log_det = inverse_root(backend, beta * problem.s + xp.diag(alpha[problem.group_index]))
-    weight = beta * ((root @ problem.p) @ root)
-    residual = problem.q - 2 * weight @ problem.p + weight @ problem.s @ weight
-    return Moments(weight, xp.sum(root**2, axis=0), log_det, residual)
-
-
-def count_effective(
-    backend: Backend, group_index: FeatureIndex, alpha: Groups, weight: Features, variance: Features
-) -> tuple[Groups, Groups, Groups]:
-    """Return n_g, gamma_g and |mu_g|^2 of each group."""
-    xp, n_groups = backend.xp, len(alpha)
-    size = backend.group_sums(xp.ones_like(weight), group_index, n_groups)
-    n_effective = xp.clip(size - alpha * backend.group_sums(variance, group_index, n_groups), 0, size)
-    return size, n_effective, backend.group_sums(weight**2, group_index, n_groups)
-
-
-def next_posterior(
-    backend: Backend, problem: Regression, alpha: Groups, beta: Any, moments: Callable[[Groups, Any], Moments]
-) -> Posterior:
-    """Compute the posterior under some precisions, and the precisions that follow from it."""
-    xp = backend.xp
-    alpha, beta = clip_precisions(backend, problem, alpha, beta)
-    weight, variance, log_det, residual = moments(alpha, beta)
-    residual = xp.maximum(residual, MIN_NOISE * problem.q)
-    size, n_effective, squares = count_effective(backend, problem.group_index, alpha, weight, variance)
-    log_evidence = 0.5 * (
-        problem.dof * xp.log(beta) + size @ xp.log(alpha) - log_det - beta * residual - alpha @ squares
-    )
-    noise_dof = xp.maximum(problem.dof - xp.sum(n_effective), 0.5)
-    alpha, beta = clip_precisions(backend, problem, n_effective / xp.maximum(squares, 1e-30), noise_dof / residual)
-    return Posterior(
-        weight=weight, bias=xp.zeros(()), alpha=alpha, beta=beta, n_effective=n_effective, log_evidence=log_evidence
-    )
+NUMPY = Backend(np, lambda values, group_index, n_groups: np.bincount(group_index, values, n_groups), np.linalg.solve)
 
 
 def expand_groups(groups: Posterior, group_index: FeatureIndex, strength_index: FeatureIndex) -> Posterior:

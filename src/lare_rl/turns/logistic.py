@@ -11,7 +11,7 @@ by a step of Newton's method, which needs the curvature of the likelihood, not o
 import numpy as np
 from jaxtyping import Float, Int
 
-from lare_rl.credit.precisions import NUMPY, TOLERANCE, count_effective
+from lare_rl.credit.precisions import NUMPY, TOLERANCE
 from lare_rl.turns.regression import GroupSums, PrefixFit, eliminate_groups, sum_up, to_fit
 
 __all__ = ["fit_logistic", "logistic"]
@@ -64,7 +64,7 @@ def fit_logistic(
             if largest < 1e-3:
                 break
         solution = np.concatenate([posterior.weight[:-1], posterior.intercept])
-        size, n_effective, squares = count_effective(NUMPY, index, alpha, solution, posterior.variance)
+        size, n_effective, squares = NUMPY.count_effective(index, alpha, solution, posterior.variance)
         p = np.clip(logistic(eta), 1e-12, 1 - 1e-12)
         log_likelihood = weight @ (y * np.log(p) + (1 - y) * np.log(1 - p))
         log_evidence = log_likelihood + 0.5 * (size @ np.log(alpha) - alpha @ squares - posterior.log_det)

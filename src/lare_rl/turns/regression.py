@@ -23,19 +23,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float, Int
 
-from lare_rl.credit.precisions import (
-    JITTER,
-    NUMPY,
-    TOLERANCE,
-    Moments,
-    Posterior,
-    Regression,
-    clip_precisions,
-    equal_shares,
-    inverse_root,
-    next_posterior,
-    varies,
-)
+from lare_rl.credit.precisions import JITTER, NUMPY, TOLERANCE, Moments, Posterior, Regression, varies
 
 __all__ = [
     "GroupSums",
@@ -130,7 +118,7 @@ def sum_up(
         y_mean=y_mean,
         y_std=np.asarray(y_std),
         group_index=strengths,
-        equal_alpha=equal_shares(NUMPY, diagonal, total, strengths),
+        equal_alpha=NUMPY.equal_shares(diagonal, total, strengths),
     )
     return GroupSums(x_mean, group_x, group_y, group_weight, problem)
 
@@ -162,7 +150,7 @@ def eliminate_groups(sums: GroupSums, alpha: Float[np.ndarray, " strengths"], be
     precision = np.diag(np.append(alpha[:-1], beta * problem.q))
     precision[:n, :n] += beta * problem.s
     group_row = rows / d[:, None]
-    root, log_det = inverse_root(NUMPY, precision - rows.T @ group_row)
+    root, log_det = NUMPY.inverse_root(precision - rows.T @ group_row)
     right = beta * (np.append(problem.p[:n], 0) - group_row.T @ sums.group_y)
     weight = root.T @ (root @ right)
     intercept = beta * sums.group_y / d - group_row @ weight
@@ -199,7 +187,7 @@ def fit_linear(
     beta = 2 * problem.dof / problem.q  # the features explain half of the variance
     candidates = [fixed_point(sums, problem.equal_alpha * factor, beta) for factor in (1.0, NOISE_ONLY)]
     best = max(candidates, key=lambda posterior: posterior.log_evidence)
-    alpha, beta = clip_precisions(NUMPY, problem, best.alpha, best.beta)
+    alpha, beta = NUMPY.clip_precisions(problem, best.alpha, best.beta)
     return to_fit(sums, eliminate_groups(sums, alpha, beta), float(beta), is_logistic=False)
 
 
@@ -224,9 +212,9 @@ def fixed_point(
 ) -> Posterior:
     """Iterate from some precisions until the evidence stops changing: `evidence.fixed_point`, in NumPy."""
     moments = partial(group_moments, sums)
-    posterior = next_posterior(NUMPY, sums.problem, alpha, beta, moments)
+    posterior = NUMPY.next_posterior(sums.problem, alpha, beta, moments)
     for _ in range(max_rounds - 1):
-        previous, posterior = posterior, next_posterior(NUMPY, sums.problem, posterior.alpha, posterior.beta, moments)
+        previous, posterior = posterior, NUMPY.next_posterior(sums.problem, posterior.alpha, posterior.beta, moments)
         if abs(posterior.log_evidence - previous.log_evidence) <= TOLERANCE:
             break
     return posterior
