@@ -35,17 +35,9 @@ from lare_rl.credit.score_type import ScoreType
 from lare_rl.credit.spec import CreditSpec
 from lare_rl.envs.interface import alive_mean
 from lare_rl.errors import LareError, short_repr
+from lare_rl.nn import normalise
 from lare_rl.nn.networks import init_adam
-from lare_rl.nn.normalise import (
-    RunningMeanStd,
-    Scale,
-    empty_mean_std,
-    empty_scale,
-    root_mean_square,
-    standardise,
-    update_mean_std,
-    update_scale,
-)
+from lare_rl.nn.normalise import RunningMeanStd, Scale
 
 __all__ = [
     "CreditBatch",
@@ -141,9 +133,9 @@ def init(key: PRNGKeyArray, spec: CreditSpec) -> DecoderState:
     return DecoderState(
         network=network,
         optimizer=init_adam(network, settings.learning_rate) if method.uses_gradient else (),
-        statistics=empty_mean_std(basis.n_standardised),
-        scale=empty_scale(),
-        return_scale=empty_scale(),
+        statistics=normalise.empty_mean_std(basis.n_standardised),
+        scale=normalise.empty_scale(),
+        return_scale=normalise.empty_scale(),
         is_average=jnp.asarray(spec.score_types == (ScoreType.AVERAGE,)),
         is_log_odds=jnp.asarray(False),
         predictions=empty_predictions(1, spec.window),
@@ -184,7 +176,7 @@ def observe_steps(
     # A history has no statistics of its own.
     rows = inputs.reshape(-1, inputs.shape[-1])[:, : len(state.statistics.mean)]
     mask = None if mask is None else mask.ravel()
-    return state._replace(statistics=update_mean_std(state.statistics, rows, mask))
+    return state._replace(statistics=normalise.update_mean_std(state.statistics, rows, mask))
 
 
 def observe_returns(
@@ -201,8 +193,8 @@ def observe_returns(
     if state.levels is not None and level is not None:
         state = state._replace(levels=add_returns(state.levels, level, mean_reward, ended))
     return state._replace(
-        scale=update_scale(state.scale, mean_reward, ended),
-        return_scale=update_scale(state.return_scale, mean_reward * length, ended),
+        scale=normalise.update_scale(state.scale, mean_reward, ended),
+        return_scale=normalise.update_scale(state.return_scale, mean_reward * length, ended),
     )
 
 
@@ -243,14 +235,15 @@ def reward_unit(state: DecoderState, settings: CreditSettings) -> Float[Array, "
     """Return the unit of the decoder's output: the root mean square of R/T, or of R if the score is a mean."""
     if not is_normalised(state, settings):
         return jnp.ones(())
-    return jnp.where(state.is_average, root_mean_square(state.return_scale), root_mean_square(state.scale))
+    return_unit, mean_unit = map(normalise.root_mean_square, (state.return_scale, state.scale))
+    return jnp.where(state.is_average, return_unit, mean_unit)
 
 
 def normalise_inputs(
     state: DecoderState, inputs: Float[Array, "*batch inputs"], settings: CreditSettings
 ) -> Float[Array, "*batch inputs"]:
     """Return the inputs as the decoder receives them."""
-    return standardise(state.statistics, inputs) if is_normalised(state, settings) else inputs
+    return normalise.standardise(state.statistics, inputs) if is_normalised(state, settings) else inputs
 
 
 def decode(

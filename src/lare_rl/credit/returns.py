@@ -17,18 +17,10 @@ import numpy as np
 import optax
 from jaxtyping import Array, Bool, Float
 
-from lare_rl.credit import closed_form, evidence, logistic
+from lare_rl.credit import closed_form, decomposition, evidence, logistic
 from lare_rl.credit.closed_form import ClosedForm, LinearDecoder
 from lare_rl.credit.decoder_settings import CreditSettings
-from lare_rl.credit.decomposition import (
-    CreditBatch,
-    DecoderState,
-    agent_mean,
-    decoder_rewards,
-    level_returns,
-    score_type_index,
-    step_rows,
-)
+from lare_rl.credit.decomposition import CreditBatch, DecoderState
 from lare_rl.credit.methods import Fit, Method
 from lare_rl.credit.prequential import Predictions, add_predictions, squared_errors
 from lare_rl.credit.score_type import MAX_ERROR_RATIO, ROUNDING, ScoreType, ScoreTypeEstimate, compare_score_types
@@ -80,7 +72,8 @@ def predict(state: DecoderState, episodes: CreditBatch, settings: CreditSettings
     first fit all of them.
     """
     is_new, returns = episodes.mask > 0, episodes.mean_reward * episodes.length
-    predicted = predicted_returns(state, episodes, settings) + level_returns(state, episodes.level, episodes.length)
+    predicted = predicted_returns(state, episodes, settings)
+    predicted = predicted + decomposition.level_returns(state, episodes.level, episodes.length)
     closed = state.closed_form
     if state.score_type_predictions is not None and closed is not None:
         by_score_type = _predict_by_score_type(closed, episodes)
@@ -122,8 +115,9 @@ def predicted_returns(
     """Return the sum of each episode's proxy rewards, which are the mean over the agents that are alive."""
     n_episodes = len(episodes.length)
     row_length = episodes.length[jnp.clip(episodes.episode_index, 0, n_episodes - 1)]
-    r_hat = agent_mean(decoder_rewards(state, episodes.inputs, settings, row_length), episodes.alive)
-    return jax.ops.segment_sum(r_hat, episodes.episode_index, n_episodes)
+    r_hat = decomposition.decoder_rewards(state, episodes.inputs, settings, row_length)
+    team_r_hat = decomposition.agent_mean(r_hat, episodes.alive)
+    return jax.ops.segment_sum(team_r_hat, episodes.episode_index, n_episodes)
 
 
 def mean_features(decoder: LinearDecoder, episodes: CreditBatch) -> Float[Array, "episodes features"]:
@@ -203,7 +197,7 @@ def add_to_sums(closed: ClosedForm, episodes: CreditBatch) -> ClosedForm:
     returns, mask = episodes.mean_reward * episodes.length, episodes.mask > 0
     if closed.decoder.basis.prefixes:
         index = jnp.minimum(episodes.episode_index, len(mask) - 1)
-        columns, is_step = _prefix_columns(closed.decoder, episodes), step_rows(episodes)
+        columns, is_step = _prefix_columns(closed.decoder, episodes), decomposition.step_rows(episodes)
         statistics = evidence.add_prefixes(statistics, columns, returns[index], is_step, jnp.sum(mask))
         return closed._replace(sufficient_statistics=closed_form.split_double(statistics))
     columns = _columns(closed.decoder, episodes)
@@ -235,7 +229,7 @@ def fit_closed_form(state: DecoderState, spec: CreditSpec, *, batched: bool = Fa
         is_average = (errors[1] < MAX_ERROR_RATIO * errors[0]) & ~is_log_odds if len(errors) > 1 else state.is_average
         state = state._replace(is_average=is_average, is_log_odds=is_log_odds)
     if not method.uses_gradient:
-        index = score_type_index(state, len(score_types))
+        index = decomposition.score_type_index(state, len(score_types))
         state = state._replace(network=closed_form.select_score_type(closed.decoder, index))
     return state
 
@@ -248,7 +242,7 @@ def estimate_score_type(state: DecoderState) -> ScoreTypeEstimate | None:
     if state.score_type_predictions is None:
         return None
     errors = np.asarray(_score_type_errors(state.score_type_predictions))
-    index = int(score_type_index(state, len(errors)))
+    index = int(decomposition.score_type_index(state, len(errors)))
     if np.allclose(errors[index], np.delete(errors, index), rtol=1e-3):
         return None
     assert state.closed_form is not None
