@@ -257,7 +257,7 @@ class CreditAssigner:
     ) -> Float[np.ndarray, "n *agents"]:
         """Return r_hat of any steps by the newest decoder: (n,), for many agents (n, agents). The steps are not stored.
 
-        `length` is T of each step's episode, (n,): if a score is a mean over steps, r_hat is divided by T. The default is the mean
+        `length` is T of each step's episode, (n,): if a score is an average over steps, r_hat is divided by T. The default is the mean
         length of the episodes so far. `begins`, (n,), is true for the first step of each episode, if the steps are those of whole
         episodes, in order. Only methods that read the history of an episode need it.
 

@@ -193,7 +193,7 @@ def is_due(state: ClosedForm) -> Bool[Array, ""]:
 def fit(
     state: ClosedForm, score_types: tuple[int, ...], max_rounds: int = MAX_EVIDENCE_ROUNDS, *, batched: bool = False
 ) -> ClosedForm:
-    """Fit the decoder of each score type. If `batched` is true, sums and means are fitted at once."""
+    """Fit the decoder of each score type. If `batched` is true, sums and averages are fitted at once."""
     linear_types = tuple(score_type for score_type in score_types if score_type != ScoreType.LOG_ODDS)
     basis, statistics = state.decoder.basis, to_float64(state.sufficient_statistics)
     group_index, strength_index = basis.column_group_index, basis.column_strength_index

@@ -103,7 +103,7 @@ class DecoderState(NamedTuple):
     return_scale: Scale
     """The scale of R."""
     is_average: Bool[Array, ""]
-    """Whether the score is treated as a mean over the steps. r_hat is then the output of the decoder, divided by T."""
+    """Whether the score is treated as an average over the steps. r_hat is then the output of the decoder, divided by T."""
     is_log_odds: Bool[Array, ""]
     """Whether steps are paid for what they add to the log odds of the higher score."""
     predictions: Predictions
@@ -232,7 +232,7 @@ def is_normalised(state: DecoderState, settings: CreditSettings) -> bool:
 
 
 def reward_unit(state: DecoderState, settings: CreditSettings) -> Float[Array, ""]:
-    """Return the unit of the decoder's output: the root mean square of R/T, or of R if the score is a mean."""
+    """Return the unit of the decoder's output: the root mean square of R/T, or of R if the score is an average."""
     if not is_normalised(state, settings):
         return jnp.ones(())
     return_unit, mean_unit = map(normalise.root_mean_square, (state.return_scale, state.scale))

@@ -134,7 +134,7 @@ def _decoder_loss(
 
 
 def _targets(state: DecoderState, episodes: CreditBatch, settings: CreditSettings) -> Float[Array, " episodes"]:
-    """Return R/T of each episode, or R if the score is a mean, in the decoder's unit, without what its level explains."""
+    """Return R/T of each episode, or R if the score is an average, in the decoder's unit, without what its level explains."""
     mean_reward = episodes.mean_reward
     if episodes.level is not None:
         level_return = decomposition.level_returns(state, episodes.level, episodes.length)

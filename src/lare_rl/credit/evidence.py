@@ -24,7 +24,7 @@ a group and gamma_g of them determined by the data (MacKay, Neural Computation 4
 The data switch off a group that does not help (its alpha grows), and switch on a group that is needed. Law et al. (NeurIPS 2018)
 regress on sums over groups of cases. Efroni et al. (AAAI 2021) show that such a regression recovers rewards.
 
-A score may instead be a mean over the steps: R_k = b + w . m_k + N(0, 1 / (beta T_k)). The equations are the same, with y_k = R_k
+A score may instead be an average over the steps: R_k = b + w . m_k + N(0, 1 / (beta T_k)). The equations are the same, with y_k = R_k
 and the same S. The reward of a step is then (b + w . f) / T.
 """
 
@@ -153,7 +153,7 @@ def init_posterior(group_index: FeatureIndex) -> Posterior:
 def regression(
     statistics: SufficientStatistics, score_type: Int[Array, ""] | int, group_index: FeatureIndex
 ) -> Regression:
-    """Return the regression of R/T for a score that is a sum, or of R for a score that is a mean."""
+    """Return the regression of R/T for a score that is a sum, or of R for a score that is an average."""
     n_features = len(group_index)
     assert len(statistics.mean) == n_features + 2
     column = n_features + score_type

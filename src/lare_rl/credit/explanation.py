@@ -87,7 +87,7 @@ class Explanation(NamedTuple):
     """The part of `factor_shares` that comes from the factor's pairs with other factors."""
     slope: Float[Array, " factors"]
     """How much a step's reward rises if a factor rises by one standard deviation: the slope of the line that is closest to its effect
-    in the fit on factors; 0 if its mean does not vary. If the score is a mean, it is that of a step of an episode of average length."""
+    in the fit on factors; 0 if its mean does not vary. If the score is an average, it is that of a step of an episode of average length."""
     slope_covariance: Float[Array, "factors factors"]
     """The posterior covariance of `slope`."""
     linear_share: Float[Array, " factors"]
@@ -154,7 +154,7 @@ def explain(state: ExplanationState, score_type: Int[Array, ""] | int) -> Explan
     )
     root = evidence.posterior_covariance(factor_statistics, score_type, group_index, factors.posterior).root
     slope, slope_covariance, linear_share = _slopes(factors.posterior.weight, root.T @ root, state)
-    divisor = jnp.where(score_type == ScoreType.AVERAGE, mean_length, 1)  # r_hat of a mean is divided by T
+    divisor = jnp.where(score_type == ScoreType.AVERAGE, mean_length, 1)  # r_hat of an average is divided by T
     return explanation._replace(
         total_r2=jnp.maximum(full.r2, factors.r2),
         factors_r2=factors.r2,

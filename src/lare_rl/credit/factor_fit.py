@@ -55,7 +55,7 @@ class FactorAssessment(NamedTuple):
     r2_error: float
     """The standard error of `r2` over the episodes."""
     length_r2: float | None
-    """R^2 of predictions from the lengths of the episodes alone. None if all lengths are equal, or if the score is a mean."""
+    """R^2 of predictions from the lengths of the episodes alone. None if all lengths are equal, or if the score is an average."""
     level_r2: float | None
     """R^2 of predictions from the levels alone. None if there are no levels."""
     score_type: ScoreTypeEstimate | None

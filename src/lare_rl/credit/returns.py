@@ -88,7 +88,7 @@ def predict(state: DecoderState, episodes: CreditBatch, settings: CreditSettings
 
 
 def _predict_by_score_type(closed: ClosedForm, episodes: CreditBatch) -> Float[Array, "episodes score_types"]:
-    """Return the returns of episodes as each score type predicts them: as a sum, as a mean, and by the log odds."""
+    """Return the returns of episodes as each score type predicts them: as a sum, as an average, and by the log odds."""
     decoder, columns = closed.decoder, _columns(closed.decoder, episodes)
     n_linear = len(closed.posterior.bias)
     weights = jnp.concatenate([decoder.weight, closed.intercept], axis=1)
@@ -237,7 +237,7 @@ def fit_closed_form(state: DecoderState, spec: CreditSpec, *, batched: bool = Fa
 def estimate_score_type(state: DecoderState) -> ScoreTypeEstimate | None:
     """Return the score type that the decoder uses, or None if the settings give it or it makes no difference.
 
-    A sum and a mean make no difference as long as all episodes have the same length.
+    A sum and an average make no difference as long as all episodes have the same length.
     """
     if state.score_type_predictions is None:
         return None
@@ -267,7 +267,7 @@ def _score_type_errors(predictions: Predictions) -> Float[Array, " score_types"]
 
 
 def reward_std(state: DecoderState, rows: Float[Array, "rows inputs"], spec: CreditSpec) -> Float[Array, " rows"]:
-    """Return the posterior standard deviation of r_hat, or of T r_hat if the score is a mean.
+    """Return the posterior standard deviation of r_hat, or of T r_hat if the score is an average.
 
     The method's fit must be `Fit.EVIDENCE` or `Fit.PREFIX_EVIDENCE`. Call this within `float64()`.
     """

@@ -1,4 +1,4 @@
-"""How the score of an episode follows from its steps: a sum over them, a mean, or a success whose odds they change."""
+"""How the score of an episode follows from its steps: a sum over them, an average, or a success whose odds they change."""
 
 from collections.abc import Mapping
 from enum import IntEnum

@@ -36,7 +36,7 @@ class CreditSpec:
     max_steps: int
     """The number of steps of the longest episode."""
     fixed_length: bool = False
-    """Whether all episodes have the same length. A sum and a mean are then the same."""
+    """Whether all episodes have the same length. A sum and an average are then the same."""
     payments: PaymentRule = PAID_AT_END
     """When the environment pays."""
     has_groups: bool = False
