@@ -200,8 +200,10 @@ def fit(
 
     def fit_score_type(args: tuple[Int[Array, ""], Posterior, Posterior]) -> tuple[Posterior, Posterior]:
         score_type, *starts = args
-        starts = jax.tree.map(lambda leaf: leaf.astype(float), starts)
-        return relevance.fit(statistics, score_type, group_index, strength_index, *starts, max_rounds, batched=batched)
+        start, earlier = jax.tree.map(lambda leaf: leaf.astype(float), starts)
+        return relevance.fit(
+            statistics, score_type, group_index, strength_index, start, earlier, max_rounds, batched=batched
+        )
 
     fits = map_leading_axis(
         fit_score_type, (jnp.asarray(linear_types), state.posterior, state.strengths), batched=batched

@@ -185,8 +185,8 @@ def _fit(
     strength_index: FeatureIndex,
 ) -> _Fit:
     problem, indices = evidence.regression(statistics, score_type, group_index), (group_index, strength_index)
-    starts = map(evidence.init_posterior, indices)
-    groups, strengths = relevance.fit(statistics, score_type, *indices, *starts, MAX_EXPLANATION_ROUNDS)
+    start, earlier = map(evidence.init_posterior, indices)
+    groups, strengths = relevance.fit(statistics, score_type, *indices, start, earlier, MAX_EXPLANATION_ROUNDS)
     posterior = relevance.select(strengths, groups, *indices)
     r2 = 1 - problem.dof / (problem.q * jnp.where(posterior.beta > 0, posterior.beta, 1))
     r2 = jnp.where((problem.dof > 1) & (problem.y_std > 0), jnp.clip(r2, 0, 1), jnp.nan)

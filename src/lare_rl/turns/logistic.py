@@ -52,24 +52,22 @@ def fit_logistic(
     sums = regress()
     index = sums.problem.group_index
     first = np.append(np.diagonal(sums.problem.s) / sums.problem.q * x.shape[1], 1.0) + 1e-12
-    alpha, previous = first, -np.inf
-    for n_rounds in range(MAX_ROUNDS):
-        for _ in range(NEXT_STEPS if n_rounds else FIRST_STEPS):
-            sums = regress()
-            posterior = eliminate_groups(sums, alpha, 1.0)
-            mean = sums.problem.y_mean + posterior.weight[-1]
-            step = mean + (x - sums.x_mean) @ posterior.weight[:-1] + posterior.intercept[group] - eta
-            largest = np.abs(step).max()
-            eta = eta + step * min(1.0, MAX_STEP / max(largest, 1e-12))
-            if largest < 1e-3:
-                break
-        solution = np.concatenate([posterior.weight[:-1], posterior.intercept])
-        size, n_effective, squares = NUMPY.count_effective(index, alpha, solution, posterior.variance)
-        p = np.clip(logistic(eta), 1e-12, 1 - 1e-12)
-        log_likelihood = weight @ (y * np.log(p) + (1 - y) * np.log(1 - p))
-        log_evidence = log_likelihood + 0.5 * (size @ np.log(alpha) - alpha @ squares - posterior.log_det)
-        if abs(log_evidence - previous) <= 10 * TOLERANCE:
-            break
-        previous = log_evidence
-        alpha = np.clip(n_effective / np.maximum(squares, 1e-30), first * WEAKEST, first * STRONGEST)
-    return to_fit(sums, posterior, 1.0, is_logistic=True)
+    alpha, previous, n_rounds, n_steps = first, -np.inf, 1, FIRST_STEPS
+    while True:
+        posterior = eliminate_groups(sums, alpha, 1.0)
+        mean = sums.problem.y_mean + posterior.weight[-1]
+        step = mean + (x - sums.x_mean) @ posterior.weight[:-1] + posterior.intercept[group] - eta
+        largest = np.abs(step).max()
+        eta = eta + step * min(1.0, MAX_STEP / max(largest, 1e-12))
+        n_steps -= 1
+        if largest < 1e-3 or not n_steps:
+            solution = np.concatenate([posterior.weight[:-1], posterior.intercept])
+            size, n_effective, squares = NUMPY.count_effective(index, alpha, solution, posterior.variance)
+            p = np.clip(logistic(eta), 1e-12, 1 - 1e-12)
+            log_likelihood = weight @ (y * np.log(p) + (1 - y) * np.log(1 - p))
+            log_evidence = log_likelihood + 0.5 * (size @ np.log(alpha) - alpha @ squares - posterior.log_det)
+            if abs(log_evidence - previous) <= 10 * TOLERANCE or n_rounds == MAX_ROUNDS:
+                return to_fit(sums, posterior, 1.0, is_logistic=True)
+            previous, n_rounds, n_steps = log_evidence, n_rounds + 1, NEXT_STEPS
+            alpha = np.clip(n_effective / np.maximum(squares, 1e-30), first * WEAKEST, first * STRONGEST)
+        sums = regress()
