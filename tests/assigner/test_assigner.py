@@ -389,7 +389,7 @@ STEPS = {name: ROWS[name] for name in ("observation", "action", "next_observatio
         (ROWS | {"env_ids": [0]}, "env_ids has 1 .* 2 steps"),
         (ROWS | {"env_ids": [0, 1], "lanes": [0, 1]}, "env_ids and lanes"),
         (ROWS | {"alive": np.ones((2, 1))}, r"alive .*\(2, 1\)"),
-        (ROWS | {"observation": [[0, 0], [0, np.nan]]}, "observation of row 1 .*nan"),
+        (ROWS | {"observation": [[0, 0], [0, np.nan]]}, "observation of row 1 .*nan in entry 1"),
         (ROWS | {"action": [[np.inf], [0]]}, "action of row 0 .*inf"),
         (ROWS | {"next_observation": [[0, 0], [0, 1e300]]}, "next_observation of row 1 .*inf"),
         (ROWS | {"reward": [0, -np.inf], "valid": [False, True]}, "reward of row 1 .*-inf"),

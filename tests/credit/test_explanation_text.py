@@ -85,6 +85,11 @@ def test_codes(changes, factors, raw_features, codes):
     assert [finding.code for finding in find(changes, factors, raw_features)] == codes.split()
 
 
+def test_missing_pairs_are_named():
+    findings = explanation_findings(explanation(), None, (), RAW_FEATURES, lacks_pairs=True)
+    assert findings[-1] == Finding("products_not_read", {"n_raw": 2, "most": 12})
+
+
 def test_shares():
     values = find({}, raw_features=RAW_FEATURES)[0].values
     assert (values["share"], values["target"]) == (0.9, Finding("returns", {"n_episodes": 40}))
@@ -162,7 +167,7 @@ ANYTHING = {
     **dict.fromkeys(
         ("this", "other", "target", "largest", "features", "name", "names", "raw", "effect", "groups"), "x"
     ),
-    **dict.fromkeys(("n_episodes", "n_unused", "n_raw", "count"), 3),
+    **dict.fromkeys(("n_episodes", "n_unused", "n_raw", "most", "count"), 3),
     **dict.fromkeys(("more", "states", "shape", "before", "after", "scored_observation"), None),
 }
 

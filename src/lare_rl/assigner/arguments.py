@@ -207,4 +207,5 @@ def _check_finite(rows: np.ndarray, steps: Sequence[np.ndarray], reward: np.ndar
     for name, values in zip(names, (*steps, reward), strict=True):
         if not np.isfinite(values).all():
             index = np.argwhere(~np.isfinite(values))[0]
-            raise LareError(f"{name} of row {rows[index[0]]} has {values[tuple(index)]}: give finite numbers")
+            entry = f" in entry {', '.join(map(str, index[1:]))}" if len(index) > 1 else ""
+            raise LareError(f"{name} of row {rows[index[0]]} has {values[tuple(index)]}{entry}: give finite numbers")

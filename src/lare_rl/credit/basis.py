@@ -31,6 +31,7 @@ from jaxtyping import Array, Bool, Float, Int
 from lare_rl.credit.history import next_history
 
 __all__ = [
+    "MAX_PAIRED_RAW_FEATURES",
     "MAX_RAW_FEATURES",
     "N_FREQUENCIES",
     "Basis",

@@ -6,6 +6,7 @@ from typing import Any
 import numpy as np
 
 from lare_rl.credit import decomposition, returns
+from lare_rl.credit.basis import MAX_PAIRED_RAW_FEATURES
 from lare_rl.credit.decomposition import DecoderState
 from lare_rl.credit.explanation import Explanation
 from lare_rl.credit.methods import Method
@@ -16,7 +17,7 @@ from lare_rl.util.statistics import CLEAR_ERRORS, round_shares
 
 __all__ = ["LEGEND_CODES", "MESSAGES", "MIN_EXPLAINED_EPISODES", "explanation_findings", "returns_findings"]
 
-LEGEND_CODES = ("about_shares", "about_states")
+LEGEND_CODES = ("about_shares", "about_states", "products_not_read")
 """Findings that explain how to read others. They need to be printed once."""
 MIN_EXPLAINED_EPISODES = 20
 """With fewer episodes, nothing is said."""
@@ -109,7 +110,13 @@ MESSAGES = {
         "In a fit on factors and raw entries, these entries have the largest shares: {features}. phi may lack a factor that is "
         "computed from them."
     ),
-    "unused_raw_features": "{n_unused} of {n_raw} raw entries are switched off, because they explain nothing more: {names}{more}.",
+    "unused_raw_features": (
+        "Raw entries that are switched off, because they explain nothing more ({n_unused} of {n_raw}): {names}{more}."
+    ),
+    "products_not_read": (
+        "With more than {most} raw entries ({n_raw} here), products of two are not among the features. If only such a product says "
+        "which action is best in which state, one action is preferred everywhere: write a phi that has it as a factor."
+    ),
     "more_names": " and {count} more",
     "high_when_large": (
         "Returns are higher than the factors predict when {name} is large (correlation {correlation:+.2f}): a factor may be missing"
@@ -144,6 +151,7 @@ def returns_findings(
         raw_names,
         looks_binary=returns.looks_binary(decoder, method),
         groups=dict(zip(group_names, effects, strict=False)),
+        lacks_pairs=method.decoder_kind.extended_basis and len(raw_names) > MAX_PAIRED_RAW_FEATURES,
     )
 
 
@@ -155,6 +163,7 @@ def explanation_findings(
     *,
     looks_binary: bool = False,
     groups: Mapping[Any, float] | None = None,
+    lacks_pairs: bool = False,
 ) -> list[Finding]:
     """Return what an explanation says.
 
@@ -165,6 +174,7 @@ def explanation_findings(
         raw_features: names of the raw features; empty if they have none. Then nothing is said of single features.
         looks_binary: whether the score should be tried as one that is won or lost (`returns.looks_binary`).
         groups: what an episode of each group returns beside its steps (`decomposition.level_effects`), by the group's name.
+        lacks_pairs: whether pairs of raw features are left out, because there are too many raw features.
     """
     n_episodes, factors_r2 = int(explanation.n_episodes), float(explanation.factors_r2)
     if n_episodes < MIN_EXPLAINED_EPISODES:
@@ -179,7 +189,9 @@ def explanation_findings(
     if not factors:
         largest_features = Finding("largest", {"features": largest}) if largest else None
         values = {"share": float(explanation.total_r2), "target": target, "largest": largest_features}
-        return [*findings, Finding("raw_features_explain", values), *_unused_raw_features(explanation, raw_features)]
+        findings += [Finding("raw_features_explain", values), *_unused_raw_features(explanation, raw_features)]
+        most = {"n_raw": len(raw_features), "most": MAX_PAIRED_RAW_FEATURES}
+        return [*findings, Finding("products_not_read", most)] if lacks_pairs else findings
     added = float(explanation.total_r2) - factors_r2
     shares = round_shares([factors_r2, added, 1 - factors_r2 - added])
     raw = Finding("raw_features_add", {"share": shares[1]}) if raw_features and added >= 0.01 else None
