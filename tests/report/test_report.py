@@ -310,4 +310,4 @@ def test_factor_of_two_states_has_one_row_and_one_curve(make_run):
     assert "0.25 / -0.50" in table
     curves = "".join(run_details._draw_factors(np.arange(8.0).reshape(4, 2), np.arange(4.0), labels))
     assert curves.count("<figure>") == 1
-    assert run_details._make_bar(finding, {}).sign == -1
+    assert run_details._make_bar(finding, {}).style == "minus"

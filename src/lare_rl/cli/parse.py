@@ -30,6 +30,14 @@ _RULES = ConstructorRegistry()
 _NUMBERS = {int: "a whole number, such as 10000", float: "a number, such as 0.5"}
 
 
+class _InvalidValueError(LareError):
+    """A word of the command line is not a number, or none of the choices. Unlike a `ValueError`, tyro does not catch it."""
+
+    def __init__(self, text: str, expected: str):
+        super().__init__(f"{text!r} is not {expected}")
+        self.text = text
+
+
 def parse(
     commands: Mapping[str, Callable[..., None]], description: str, arguments: Sequence[str]
 ) -> Callable[[], None]:
@@ -51,6 +59,8 @@ def parse(
         try:
             deferred_command = _defer(commands[name], options)
             command, unknown = tyro.cli(deferred_command, prog=prog, args=options, return_unknown_args=True)
+        except _InvalidValueError as error:
+            raise LareError(f"{_find_option(error.text, options)}{error}; see {prog} --help") from None
         except LareError as error:
             raise LareError(f"{error}; see {prog} --help") from None
         except SystemExit as exit_:
@@ -82,6 +92,17 @@ def _hidden_algorithms(options: Sequence[str]) -> frozenset[str]:
         return frozenset()  # their options can be set
     _, _, name = " ".join(options).replace("=", " ").partition("--algorithm ")
     return frozenset(ALGORITHMS) - {name.partition(" ")[0]}
+
+
+def _find_option(value: str, options: Sequence[str]) -> str:
+    """Return the name of the first option with this value and a colon, or an empty text if no option has it."""
+    name = ""
+    for word in options:
+        if word.startswith("--"):
+            name, _, word = word.partition("=")
+        if name and word == value:
+            return f"{name}: "
+    return ""
 
 
 def _first_paragraph(box: str) -> str:
@@ -176,7 +197,7 @@ def _read_model(info: StructTypeInfo) -> StructConstructorSpec | None:
 
 @_RULES.primitive_rule
 def _read_value(info: PrimitiveTypeInfo) -> PrimitiveConstructorSpec | None:
-    """Convert numbers and choices. A `LareError` is not caught by tyro, as a `ValueError` would be."""
+    """Convert numbers and choices."""
     choices = get_args(info.type) if info.type_origin is Literal else ()
     if choices:
         expected = f"one of {', '.join(choices)}"
@@ -189,7 +210,7 @@ def _read_value(info: PrimitiveTypeInfo) -> PrimitiveConstructorSpec | None:
         try:
             return choices[choices.index(texts[0])] if choices else info.type(texts[0])
         except ValueError:
-            raise LareError(f"{texts[0]!r} is not {expected}") from None
+            raise _InvalidValueError(texts[0], expected) from None
 
     return PrimitiveConstructorSpec(
         nargs=1,

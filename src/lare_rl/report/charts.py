@@ -171,12 +171,12 @@ class Chart:
 
 @dataclass(frozen=True)
 class Bar:
-    """A bar of the length |amount|, to the right for a sign of 1 and to the left for -1. A sign of 0 has no side."""
+    """A bar of the length |amount|, to the left if it is negative. The style is a class of report.css: `minus` has another colour."""
 
     text: str
     name: str
     amount: float
-    sign: int
+    style: str
     hover: str
 
 
@@ -196,19 +196,17 @@ def draw_legend(entries: Iterable[tuple[str, str]]) -> str:
 
 def draw_bars(bars: Sequence[Bar]) -> str:
     """Draw bars below each other, with their amounts as percentages."""
-    longest = max([abs(bar.amount) for bar in bars] + [1e-9])
-    has_left = any(bar.sign < 0 and bar.amount for bar in bars)
+    low, high = min([0.0, *(bar.amount for bar in bars)]), max([0.0, *(bar.amount for bar in bars)])
+    extent = max(high - low, 1e-9)
     items = []
     for bar in bars:
-        width = abs(bar.amount) / longest * (50 if has_left else 100)
-        start = (50 - width if bar.sign < 0 else 50) if has_left else 0
-        side = "minus" if bar.sign < 0 else "plus"
+        start, width = (min(bar.amount, 0.0) - low) / extent, abs(bar.amount) / extent
         shape = (
-            f'<i class="{side}" style="left:{start:.1f}%;width:{width:.1f}%"></i>' if round(100 * bar.amount) else ""
+            f'<i class="{bar.style}" style="left:{start:.1%};width:{width:.1%}"></i>' if round(100 * bar.amount) else ""
         )
         items.append(
             f'<li title="{escape(bar.hover)}"><span class="meaning">{escape(bar.text)} <code>{escape(bar.name)}</code></span>'
-            f'<span class="track{" both" if has_left else ""}">{shape}</span><span class="amount">{bar.amount:z.0%}</span></li>'
+            f'<span class="track" style="--zero:{-low / extent:.1%}">{shape}</span><span class="amount">{bar.amount:z.0%}</span></li>'
         )
     return f'<ul class="bars">{"".join(items)}</ul>'
 

@@ -11,9 +11,8 @@ import numpy as np
 from lare_rl.credit.basis import MAX_PAIRED_RAW_FEATURES
 from lare_rl.credit.prequential import LITTLE_R2
 from lare_rl.report.run_summary import MIN_EVALUATIONS, RunSummary
-from lare_rl.report.score_use import CLEAR_ERRORS
 from lare_rl.util.findings import Finding
-from lare_rl.util.statistics import sample_std
+from lare_rl.util.statistics import CLEAR_ERRORS, sample_std
 
 __all__ = ["CREDIT_CODES", "NEXT_CODES", "diagnose"]
 

@@ -12,7 +12,7 @@ from lare_rl.credit.methods import METHODS
 from lare_rl.credit.prequential import LITTLE_R2
 from lare_rl.envs.load import shipped_tasks
 from lare_rl.report.reported_run import ReportedRun, finite, mean_over_seeds
-from lare_rl.report.score_use import CLEAR_ERRORS, ScoreUse, summarise_score_use
+from lare_rl.report.score_use import ScoreUse, summarise_score_use
 from lare_rl.runs.metric_names import (
     ACTOR_SATURATION,
     CREDIT_CORRELATION,
@@ -25,7 +25,7 @@ from lare_rl.runs.metric_names import (
     SUMMED_RETURN,
 )
 from lare_rl.training.advice import describe_untrained
-from lare_rl.util.statistics import grouped_standard_error, sample_std, standard_error
+from lare_rl.util.statistics import CLEAR_ERRORS, episode_error, grouped_standard_error, sample_std, standard_error
 
 __all__ = [
     "MIN_EVALUATIONS",
@@ -205,7 +205,7 @@ class RunSummary:
 
     @cached_property
     def trend(self) -> tuple[float, float, float] | None:
-        """The means of the last two quarters of `finite_means`, and the typical change from one evaluation to the next.
+        """The means of the last two quarters (n // 4) of the n `finite_means`, and the typical change from one evaluation to the next.
 
         None if there are too few evaluations with a return.
         """
@@ -275,8 +275,8 @@ def _episode_error(reported: ReportedRun) -> float:
     stds = reported.final_values(RETURN_STD)
     if len(stds) < len(reported.run.seeds):
         return 0.0
-    n_free = max(1, reported.run.config.settings.evaluation_episodes - 1)  # the deviations have n in the denominator
-    return math.sqrt(np.mean(stds**2) / n_free / len(stds))
+    n = reported.run.config.settings.evaluation_episodes
+    return episode_error(stds**2 * n / max(1, n - 1), n)  # the deviations have n in the denominator
 
 
 def _lengths_are_equal(reported: ReportedRun) -> bool:

@@ -7,11 +7,10 @@ from lare_rl.config.settings import ResolvedSettings
 from lare_rl.credit.methods import Fit, Method
 from lare_rl.tasks.spec import TaskSpec
 from lare_rl.util.findings import Finding
+from lare_rl.util.statistics import CLEAR_ERRORS
 
-__all__ = ["CLEAR_ERRORS", "CLEAR_GAIN", "ScoreUse", "summarise_score_use"]
+__all__ = ["CLEAR_GAIN", "ScoreUse", "summarise_score_use"]
 
-CLEAR_ERRORS = 2
-"""A difference is clear if it exceeds this number of its standard errors."""
 CLEAR_GAIN = 0.8
 """Credit is trusted as a whole if predictions remove more than this share of the baseline's squared error."""
 
