@@ -43,8 +43,7 @@ def parse(
 ) -> Callable[[], None]:
     """Return the requested command with its options, ready to be called. A request for help prints the help and exits.
 
-    Raises:
-        LareError: the arguments cannot be read.
+    Raises `LareError` if the arguments cannot be read.
     """
     name, *options = rename_options(arguments) or [""]
     if name in ("-h", "--help"):

@@ -19,8 +19,7 @@ def collect_results(paths: Sequence[Path], metric: str = RETURN) -> tuple[list[L
 
     The first label is the baseline. Runs come before tables, unless the first path is a table: its first method is the baseline.
 
-    Raises:
-        LareError: there is nothing to compare, or a table cannot be read.
+    Raises `LareError` if there is nothing to compare, or a table cannot be read.
     """
     tables = [path for path in paths if path.suffix == ".csv"]
     directories = [path for path in paths if path not in tables]
@@ -46,8 +45,7 @@ def collect_results(paths: Sequence[Path], metric: str = RETURN) -> tuple[list[L
 def select_runs(runs: Sequence[Run], metric: str = RETURN) -> tuple[list[Run], list[Finding]]:
     """Select the runs that have a metric, and find runs that were not trained to their end.
 
-    Raises:
-        LareError: no run has an evaluation, or none has a value of the metric.
+    Raises `LareError` if no run has an evaluation, or none has a value of the metric.
     """
     selected, without_metric, findings, names = [], [], [], set()
     for run in runs:

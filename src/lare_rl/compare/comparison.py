@@ -94,8 +94,7 @@ class Comparison:
 def compare(results: Sequence[LearningCurves], choice: ScoreChoice = LAST_RETURN) -> Comparison:
     """Compare results by their labels. The first label is the baseline. All labels have the same tasks.
 
-    Raises:
-        LareError: some results are missing.
+    Raises `LareError` if some results are missing.
     """
     groups = group_results(results, choice)
     final = {group.label: group.run_scores for group in groups}

@@ -30,8 +30,7 @@ def write_comparisons(
 ) -> list[Comparison]:
     """Compare results (`compare_tasks`), and write the page, with the findings about the results at its end.
 
-    Raises:
-        LareError: the results cannot be compared, or the file cannot be written.
+    Raises `LareError` if the results cannot be compared, or the file cannot be written.
     """
     comparisons = compare_tasks(results, choice)
     tasks = ", ".join(task for comparison in comparisons for task in comparison.tasks)

@@ -54,11 +54,7 @@ def group_pairs(pairs: Iterable[tuple[_Key, _Value]]) -> dict[_Key, list[_Value]
 
 
 def read_run_results(runs: Mapping[str, Sequence[Run]], metric: str) -> list[LearningCurves]:
-    """Read the values of a metric in runs. `runs` maps each label to its runs.
-
-    Raises:
-        LareError: a file is damaged.
-    """
+    """Read the values of a metric in runs. `runs` maps each label to its runs. Raises `LareError` if a file is damaged."""
     results = []
     for label, run in ((label, run) for label, group in runs.items() for run in group):
         curves: dict[int, dict[int, float]] = {seed: {} for seed in run.seeds}
@@ -77,8 +73,7 @@ def read_run_results(runs: Mapping[str, Sequence[Run]], metric: str) -> list[Lea
 def read_results_table(path: Path, metric: str) -> list[LearningCurves]:
     """Read the curves of each method and task in a table.
 
-    Raises:
-        LareError: the file cannot be read, a column is missing, or a line is not valid.
+    Raises `LareError` if the file cannot be read, a column is missing, or a line is not valid.
     """
     rows = csv.DictReader(io.StringIO(read_text(path, MAX_TABLE_BYTES), newline=""), restkey="")
     try:

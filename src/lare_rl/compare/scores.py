@@ -73,8 +73,7 @@ class _Curve(NamedTuple):
 def group_results(results: Sequence[LearningCurves], choice: ScoreChoice = LAST_RETURN) -> list[LabelScores]:
     """Group the curves of runs by label: the name of the method in the comparison.
 
-    Raises:
-        LareError: a label lacks a task, draw or seed, or not all results have a value at the chosen step.
+    Raises `LareError` if a label lacks a task, draw or seed, or not all results have a value at the chosen step.
     """
     tasks = tuple(sorted({result.task for result in results}))
     _check_tasks(results, tasks, choice.metric)

@@ -47,8 +47,7 @@ def record_video(run: Run, path: str | Path, best: bool = False, deterministic: 
 
     A film of a particle task shows each agent's credit, as number and colour.
 
-    Raises:
-        LareError: the environment cannot be drawn on this machine, or the file cannot be written.
+    Raises `LareError` if the environment cannot be drawn on this machine, or the file cannot be written.
     """
     path = Path(path)
     check_video_path(path)

@@ -273,8 +273,7 @@ def _compute_rewards(
 ) -> Iterator[RelabelledEpisode]:
     """Yield every episode with its rewards, and add it to `counts`.
 
-    Raises:
-        LareError: the log has another `size` than in the first pass.
+    Raises `LareError` if the log has another `size` than in the first pass.
     """
     # `phi` takes about as long for many steps as for few.
     for batch in batch_by_steps(log.episodes(), len):

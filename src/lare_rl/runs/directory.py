@@ -126,8 +126,7 @@ def create_run(directory: Path, task: TaskSpec, settings: ResolvedSettings, func
 def extend_run(run: Run, steps: int) -> Run:
     """Return the run with a larger number of steps, rounded up to whole iterations. It is written to config.json.
 
-    Raises:
-        LareError: the number is smaller than before.
+    Raises `LareError` if the number is smaller than before.
     """
     settings = run.config.settings
     steps = round_up(steps, settings.iteration_steps)
@@ -190,8 +189,7 @@ def function_filename(task: TaskSpec, role: TaskSpec) -> str:
 def function_paths(directory: Path, config: Config) -> list[tuple[TaskSpec, Path]]:
     """Return each role with the file of its latent function. Nothing is executed.
 
-    Raises:
-        LareError: a file cannot be read, or was changed.
+    Raises `LareError` if a file cannot be read, or was changed.
     """
     digests, roles = config.function_sha256, config.task.roles
     if not digests:
@@ -230,8 +228,7 @@ def find_run_directories(paths: Sequence[Path]) -> list[Path]:
     A run that is found twice counts once, at its first path. The log that a sweep writes next to the directory of a run is
     skipped, so `DIRECTORY/*` may be passed.
 
-    Raises:
-        LareError: there is no path, or a path contains no run.
+    Raises `LareError` if there is no path, or a path contains no run.
     """
     directories: dict[Path, Path] = {}  # by resolved path
     for path in paths:

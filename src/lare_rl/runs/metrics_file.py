@@ -28,8 +28,7 @@ _parsed: dict[Path, tuple[tuple[int, ...], list[dict[str, Any]]]] = {}
 def read_metrics(directory: Path) -> list[dict[str, Any]]:
     """Return every complete line of a run's metrics.jsonl, in order. The lines are shared: do not change them.
 
-    Raises:
-        LareError: the file cannot be read, or a line is not valid.
+    Raises `LareError` if the file cannot be read, or a line is not valid.
     """
     path = (directory / METRICS_FILE).absolute()
     if not path.exists():
@@ -60,8 +59,7 @@ def append_metrics(directory: Path, lines: Sequence[dict[str, Any]]) -> int:
 def truncate_metrics(directory: Path, n_bytes: int) -> None:
     """Remove the lines that were written after a checkpoint. Resumed training writes them again.
 
-    Raises:
-        LareError: lines from before the checkpoint are missing.
+    Raises `LareError` if lines from before the checkpoint are missing.
     """
     path = directory / METRICS_FILE
     size = path.stat().st_size if path.exists() else 0

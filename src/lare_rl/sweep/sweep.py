@@ -67,8 +67,7 @@ class Sweep(Resources):
 def read_sweep(path: Path) -> tuple[Sweep, list[Job]]:
     """Read a file, and check all of its runs before any is trained.
 
-    Raises:
-        LareError: the file cannot be read, a run could not be trained, or a setting affects no run.
+    Raises `LareError` if the file cannot be read, a run could not be trained, or a setting affects no run.
     """
     table = read_table(path)
     try:

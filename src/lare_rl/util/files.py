@@ -47,8 +47,7 @@ def _check_writable(directory: Path) -> None:
 def write_atomically(path: Path, write: Callable[[Any], object]) -> None:
     """Let `write` fill a new file, and move it to `path` when it is complete on the disk.
 
-    Raises:
-        LareError: the file cannot be written.
+    Raises `LareError` if the file cannot be written.
     """
     new = path.with_name(f"{path.name}.{uuid4().hex}.new")  # unique: another process may write the same file
     try:
