@@ -16,7 +16,6 @@ from lare_rl.report.reported_run import Curve, ReportedRun, finite, mean_over_se
 from lare_rl.report.run_summary import RunSummary, summarise_run
 from lare_rl.runs.metric_names import CREDIT_CORRELATION, CREDIT_ERROR, RETURN, RETURN_R2, RETURN_STD
 from lare_rl.tasks.spec import TaskSpec
-from lare_rl.util.durations import format_seconds
 from lare_rl.util.findings import Finding, format_for_reader, render
 from lare_rl.util.statistics import format_mean_std, wins
 
@@ -101,7 +100,7 @@ def _tiles(reported: ReportedRun, summary: RunSummary) -> Iterable[tuple[str, st
     if summary.return_r2 is not None:
         yield "R² of returns", format_for_reader(summary.return_r2, "r2"), "of new episodes; 1 is perfect"
     if (seconds := reported.training_seconds()) is not None:
-        yield "Time trained", format_seconds(seconds), f"{int(summary.steps[-1]):,} steps for each seed"
+        yield "Time trained", format_for_reader(seconds, "seconds"), f"{int(summary.steps[-1]):,} steps for each seed"
 
 
 def render_headline(summary: RunSummary) -> str:

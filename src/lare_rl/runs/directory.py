@@ -25,7 +25,7 @@ from lare_rl.runs.config_file import CONFIG, Config, make_config, read_config, w
 from lare_rl.runs.metrics_file import read_metrics
 from lare_rl.tasks.spec import ScoredObservation, TaskSpec
 from lare_rl.tasks.trust import check_trusted, trust_environment
-from lare_rl.util.locks import try_lock
+from lare_rl.util.processes import try_lock
 
 __all__ = [
     "CHECKPOINT",

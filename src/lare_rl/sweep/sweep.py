@@ -135,7 +135,7 @@ def _make_jobs(sweep: Sweep, path: Path) -> Iterator[Job]:
         functions = [path.parent / function for function in sweep.functions.get(task.name, ())]
         for draw in sweep.draws if METHODS.find(method).needs_phi and not functions else (0,):
             chosen = {"method": method, "algorithm": algorithm, "draw": draw}
-            settings = Settings(**rename_keys(sweep.settings) | chosen)
+            settings = Settings(**sweep.settings | chosen)
             try:
                 yield make_job(root, task, settings, functions)
             except LareError as error:
