@@ -14,34 +14,25 @@ def tasks() -> None:
     from lare_rl.envs.families import has_single_agent
     from lare_rl.envs.load import read_task, shipped_tasks
 
-    specs = [read_task(name) for name in shipped_tasks()]
-    print_table(
-        ("task", "observation", "action", "scored_observation", "agents"),
-        (
-            (
-                spec.name,
-                str(spec.observation_size),
-                str(spec.action_size),
-                spec.scored_observation,
-                "of one team" if spec.team else "one" if has_single_agent(spec) else "many",
-            )
-            for spec in specs
-        ),
-    )
+    head = ("task", "observation", "action", "scored_observation", "agents")
+    rows = []
+    for task in map(read_task, shipped_tasks()):
+        agents = "of one team" if task.team else "one" if has_single_agent(task) else "many"
+        rows.append((task.name, str(task.observation_size), str(task.action_size), task.scored_observation, agents))
+    print_table(head, rows)
 
 
 def methods() -> None:
     """List the ways to assign credit, and where each comes from."""
     from lare_rl.credit.methods import METHODS
 
+    def note(method: "Method") -> str:
+        return " (many agents)" if method.multi_agent_only else " (one agent)" if method.single_agent_only else ""
+
     print_table(
         ("method", "what the algorithm is trained on", "source"),
-        ((method.name, method.summary + _agents_note(method), method.source) for method in METHODS.values()),
+        ((method.name, method.summary + note(method), method.source) for method in METHODS.values()),
     )
-
-
-def _agents_note(method: "Method") -> str:
-    return " (many agents)" if method.multi_agent_only else " (one agent)" if method.single_agent_only else ""
 
 
 def algorithms() -> None:

@@ -6,7 +6,6 @@ import inspect
 import io
 import itertools
 from collections.abc import Callable, Iterator, Mapping, Sequence, Set
-from contextvars import ContextVar
 from types import NoneType
 from typing import Annotated, Any, Literal, get_args, get_origin
 
@@ -26,7 +25,6 @@ from lare_rl.util.renamed_fields import rename_options
 
 __all__ = ["parse"]
 
-_RULES = ConstructorRegistry()
 _NUMBERS = {int: "a whole number, such as 10000", float: "a number, such as 0.5"}
 
 
@@ -48,13 +46,13 @@ def parse(
     name, *options = rename_options(arguments) or [""]
     if name in ("-h", "--help"):
         deferred = {name: _defer(command) for name, command in commands.items()}
-        with _RULES:
+        with _make_rules():
             tyro.extras.subcommand_cli_from_dict(deferred, prog="lare-rl", description=description, args=[name])
     if name not in commands:
         problem = f"there is no command {name!r}{did_you_mean(name, commands)}" if name else "there is no command"
         raise LareError(f"{problem}; see lare-rl --help")
     prog = f"lare-rl {name}"
-    with _RULES, _hide(_hidden_algorithms(options)), contextlib.redirect_stderr(io.StringIO()) as stderr:
+    with _make_rules(_hidden_algorithms(options)), contextlib.redirect_stderr(io.StringIO()) as stderr:
         try:
             deferred_command = _defer(commands[name], options)
             command, unknown = tyro.cli(deferred_command, prog=prog, args=options, return_unknown_args=True)
@@ -72,17 +70,12 @@ def parse(
     return command
 
 
-_hidden_groups: ContextVar[frozenset[str]] = ContextVar("hidden_groups", default=frozenset())
-"""The names of options with settings of their own that the help leaves out."""
-
-
-@contextlib.contextmanager
-def _hide(names: frozenset[str]) -> Iterator[None]:
-    token = _hidden_groups.set(names)
-    try:
-        yield
-    finally:
-        _hidden_groups.reset(token)
+def _make_rules(hidden: frozenset[str] = frozenset()) -> ConstructorRegistry:
+    """Return tyro's rules for models, numbers and choices. The help leaves out the models with the names `hidden`."""
+    rules = ConstructorRegistry()
+    rules.struct_rule(functools.partial(_read_model, hidden=hidden))
+    rules.primitive_rule(_read_value)
+    return rules
 
 
 def _hidden_algorithms(options: Sequence[str]) -> frozenset[str]:
@@ -166,8 +159,7 @@ def _option_names(command: Callable[..., None]) -> Iterator[str]:
             yield f"--{key.replace('_', '-')}"
 
 
-@_RULES.struct_rule
-def _read_model(info: StructTypeInfo) -> StructConstructorSpec | None:
+def _read_model(info: StructTypeInfo, hidden: frozenset[str]) -> StructConstructorSpec | None:
     """Make an option of each field of a model. If the model itself may be None, so may all of its fields."""
     if not (isinstance(info.type, type) and issubclass(info.type, CheckedModel)):
         return None
@@ -177,7 +169,7 @@ def _read_model(info: StructTypeInfo) -> StructConstructorSpec | None:
         default, doc = None if may_be_none else getattr(info.default, name), field.description
         if model := nested_model(field):
             kind: Any = model
-            if name in _hidden_groups.get():
+            if name in hidden:
                 kind = Annotated[kind, tyro.conf.Suppress]
             default = tyro.MISSING if default is None else default
             doc = doc or inspect.cleandoc(model.__doc__ or "").split("\n\n")[0]
@@ -194,7 +186,6 @@ def _read_model(info: StructTypeInfo) -> StructConstructorSpec | None:
     return StructConstructorSpec(instantiate=collect, fields=tuple(fields))
 
 
-@_RULES.primitive_rule
 def _read_value(info: PrimitiveTypeInfo) -> PrimitiveConstructorSpec | None:
     """Convert numbers and choices."""
     choices = get_args(info.type) if info.type_origin is Literal else ()

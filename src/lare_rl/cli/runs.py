@@ -39,7 +39,6 @@ def evaluate(
             that of the run's evaluations.
         video: a .gif to write of one episode of the first seed (.mp4 with the extra lare-rl[video]).
     """
-    _refuse_untrusted(run)
     from lare_rl.evaluation.evaluate import move_evaluations
     from lare_rl.evaluation.video import check_video_path
     from lare_rl.report.evaluation_lines import evaluation_lines
@@ -56,20 +55,6 @@ def evaluate(
         print_line(f"Credit, judged on the stored training episodes of seed {opened.seeds[0]}:")
     for line in explanation:
         print_line(line)
-
-
-def _refuse_untrusted(directory: Path) -> None:
-    """Refuse a run of an untrusted module before the slow imports. `open_run` refuses all that this cannot read."""
-    from lare_rl.config.migrate import CONFIG, migrate
-    from lare_rl.tasks.spec import TaskSpec
-    from lare_rl.tasks.trust import check_trusted
-    from lare_rl.util.safe_io import read_json, read_text
-
-    try:
-        task = TaskSpec(**migrate(read_json(read_text(directory / CONFIG)))["task"])
-    except (LareError, OSError, ValueError, TypeError, KeyError, AttributeError):
-        return
-    check_trusted(task, directory)
 
 
 def _film(run: "Run", video: Path, best: bool, deterministic: bool) -> None:
@@ -136,7 +121,6 @@ def export(
         seed: the seed whose policy and decoder are written; the default is the first.
         best: write the policy of the seed's best evaluation, instead of the last policy. Proxy rewards are always the last ones.
     """
-    _refuse_untrusted(run)
     import lare_rl
     from lare_rl.runs.directory import open_run
 
