@@ -182,15 +182,11 @@ class Bar:
 
 def draw_legend(entries: Iterable[tuple[str, str]]) -> str:
     """Draw the meaning of the styles of lines, and of the styles `shade` and `band ...` of areas."""
-
-    def draw_key(style: str) -> str:
+    items = []
+    for style, text in entries:
         is_area = style.startswith(("shade", "band"))
-        return (
-            f'<rect class="{style}" width="26" height="12"/>' if is_area else f'<path class="key {style}" d="M0 6h26"/>'
-        )
-
-    keys = ((draw_key(style), text) for style, text in entries)
-    items = (f'<li><svg viewBox="0 0 26 12">{key}</svg>{escape(text)}</li>' for key, text in keys)
+        key = f'rect class="{style}" width="26" height="12"' if is_area else f'path class="key {style}" d="M0 6h26"'
+        items.append(f'<li><svg viewBox="0 0 26 12"><{key}/></svg>{escape(text)}</li>')
     return f'<ul class="legend">{"".join(items)}</ul>'
 
 
@@ -217,7 +213,8 @@ def draw_strips(rows: Mapping[str, Float[np.ndarray, "steps agents"]], shared_sc
     Args:
         shared_scale: whether a colour means the same in all strips.
     """
-    pooled = {name: _average_steps(values) for name, values in rows.items()}
+    chunks = {name: np.array_split(values, min(len(values), MAX_STRIP_COLUMNS)) for name, values in rows.items()}
+    pooled = {name: np.stack([chunk.mean(axis=0) for chunk in parts]) for name, parts in chunks.items()}
     scales = {name: (float(values.min()), float(values.max())) for name, values in pooled.items()}
     if shared_scale:
         scale = min(low for low, _ in scales.values()), max(high for _, high in scales.values())
@@ -271,11 +268,6 @@ def _encode_png(image: Image.Image) -> str:
     file = io.BytesIO()
     image.quantize(64, Image.Quantize.FASTOCTREE).save(file, "PNG", optimize=True)
     return f"data:image/png;base64,{base64.b64encode(file.getvalue()).decode()}"
-
-
-def _average_steps(values: Float[np.ndarray, "steps agents"]) -> Float[np.ndarray, "columns agents"]:
-    n_columns = min(len(values), MAX_STRIP_COLUMNS)
-    return np.stack([chunk.mean(axis=0) for chunk in np.array_split(values, n_columns)])
 
 
 def _points(x: np.ndarray, y: np.ndarray) -> str:

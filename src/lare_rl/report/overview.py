@@ -62,12 +62,8 @@ def summarise_runs(
     Each is compared with a run on the return of the episode alone, if there is one.
     """
     episodic = [run for run in runs if run.run.config.settings.method == "episodic" and np.isfinite(run.final_return)]
-    return [
-        summarise_run(
-            run, random_returns[0], next((other.final_return for other in episodic if other is not run), None)
-        )
-        for run in runs
-    ]
+    others = [next((other.final_return for other in episodic if other is not run), None) for run in runs]
+    return [summarise_run(run, random_returns[0], other) for run, other in zip(runs, others, strict=True)]
 
 
 def render_verdict(
@@ -123,32 +119,19 @@ def compare_runs(runs: Sequence[ReportedRun]) -> list[Finding]:
         return []
     counts = {len(values) for values in finals.values()}
     n_seeds = Finding("seeds_each", {"n_seeds": counts.pop()}) if len(counts) == 1 else None
-    ranked = tuple(
-        Finding(
-            "ranked",
-            {
-                "name": name,
-                "return_": float(values.mean()),
-                "seeds": None if n_seeds else Finding("seeds", {"n_seeds": len(values)}),
-            },
-        )
-        for name, values in list(finals.items())[:MAX_RANKED]
-    )
-    n_more = len(finals) - len(ranked)
+    ranked = []
+    for name, values in list(finals.items())[:MAX_RANKED]:
+        seeds = None if n_seeds else Finding("seeds", {"n_seeds": len(values)})
+        ranked.append(Finding("ranked", {"name": name, "return_": float(values.mean()), "seeds": seeds}))
     (best, best_returns), (second, second_returns), *_ = finals.items()
     pairs = wins(best_returns[:, None], second_returns)
     probability, last = float(pairs.mean()), float(list(finals.values())[-1].mean())
+    n_more = len(finals) - len(ranked)
+    more = Finding("and_more", {"count": n_more, "last": last}) if n_more else None
     names = {"best": best, "second": second}
     findings = [
         Finding("is_best" if probability >= CLEAR_PROBABILITY and pairs.size > 1 else "none_is_best", names),
-        Finding(
-            "ranking",
-            {
-                "runs": ranked,
-                "more": Finding("and_more", {"count": n_more, "last": last}) if n_more else None,
-                "seeds": n_seeds,
-            },
-        ),
+        Finding("ranking", {"runs": tuple(ranked), "more": more, "seeds": n_seeds}),
         Finding("improvement", names | {"probability": probability, "n_pairs": pairs.size}),
     ]
     steps = {reported.last_step for reported in runs if reported.metrics}
@@ -203,11 +186,10 @@ def render_learning_curves(
         title = f"True return, team of {role.team}" if task.teams else "True return"
         if chart := _draw_metric(_Metric(name, title), runs, colours, reference, warmup):
             yield render_note(title) + chart
-    charts = {metric.title: _draw_metric(metric, runs, colours, {}, warmup) for metric in _other_metrics(task)}
     figures = [
-        f'<figure><figcaption class="title">{escape(title)}</figcaption>{chart}</figure>'
-        for title, chart in charts.items()
-        if chart
+        f'<figure><figcaption class="title">{escape(metric.title)}</figcaption>{chart}</figure>'
+        for metric in _other_metrics(task)
+        if (chart := _draw_metric(metric, runs, colours, {}, warmup))
     ]
     if task.name in REFERENCE_RETURNS:
         published = format_number(REFERENCE_RETURNS[task.name].trained)
