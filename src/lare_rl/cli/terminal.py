@@ -139,15 +139,6 @@ def load_playing_policy(run: Path | None, spec: "TaskSpec") -> "Policy | None":
     return RunPolicy(opened)
 
 
-def find_free_path(path: Path) -> Path:
-    """Return the path, or if it exists, the first free one with a number appended."""
-    number, free = 1, path
-    while free.exists():
-        number += 1
-        free = path.with_name(f"{path.stem}-{number}{path.suffix}")
-    return free
-
-
 def write_new_file(path: Path, text: str, option: str) -> None:
     """Write a file that must not exist. `option` is the command-line option that names it."""
     check_new_path(path, option)

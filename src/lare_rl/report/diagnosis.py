@@ -176,8 +176,9 @@ def _one_seed_was_better(run: RunSummary) -> Finding | None:
     """Report the best evaluation of any seed, if it beats random actions and the final mean does not."""
     if not len(run.random_returns) or run.beats_random():
         return None
-    seed_index, best = np.unravel_index(np.nanargmax(run.trained_returns), run.returns.shape)
-    return_ = float(run.trained_returns[seed_index, best])
+    trained_returns = np.where(run.steps > run.warmup, run.returns, -np.inf)  # -inf before the first update
+    seed_index, best = np.unravel_index(np.nanargmax(trained_returns), run.returns.shape)
+    return_ = float(trained_returns[seed_index, best])
     if return_ <= run.random_mean + EVALUATION_STDS * run.random_std:
         return None
     values = {"step": int(run.steps[best]), "return_": return_, "directory": run.directory}

@@ -111,14 +111,9 @@ class RunSummary:
         return finite(self.mean_returns)
 
     @cached_property
-    def trained_returns(self) -> Float[np.ndarray, "seeds evaluations"]:
-        """The returns, with -inf before the first update of a policy."""
-        return np.where(self.steps > self.warmup, self.returns, -np.inf)
-
-    @cached_property
     def final_returns(self) -> Float[np.ndarray, " finite_seeds"]:
         """The seeds' returns at the last evaluation, as far as they are finite."""
-        return self.returns[np.isfinite(self.returns[:, -1]), -1]
+        return finite(self.returns[:, -1])
 
     @property
     def final_return(self) -> float:

@@ -25,6 +25,7 @@ from lare_rl.runs.config_file import CONFIG, Config, make_config, read_config, w
 from lare_rl.runs.metrics_file import read_metrics
 from lare_rl.tasks.spec import ScoredObservation, TaskSpec
 from lare_rl.tasks.trust import check_trusted, trust_environment
+from lare_rl.util.files import find_free_path
 from lare_rl.util.processes import try_lock
 
 __all__ = [
@@ -175,10 +176,7 @@ def as_run(run: Run | str | Path) -> Run:
 def default_directory(task: TaskSpec, settings: ResolvedSettings) -> Path:
     """Return runs/TASK-METHOD-ALGORITHM-sSEED, with a number appended if that exists."""
     name = f"{task.name}-{settings.method}-{settings.algorithm}-s{settings.seed}"
-    number = 1
-    while (directory := Path("runs") / (name if number == 1 else f"{name}-{number}")).exists():
-        number += 1
-    return directory
+    return find_free_path(Path("runs"), name)
 
 
 def function_filename(task: TaskSpec, role: TaskSpec) -> str:
