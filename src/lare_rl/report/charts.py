@@ -214,7 +214,7 @@ def draw_strips(rows: Mapping[str, Float[np.ndarray, "steps agents"]], shared_sc
         shared_scale: whether a colour means the same in all strips.
     """
     chunks = {name: np.array_split(values, min(len(values), MAX_STRIP_COLUMNS)) for name, values in rows.items()}
-    pooled = {name: np.stack([chunk.mean(axis=0) for chunk in parts]) for name, parts in chunks.items()}
+    pooled = {name: np.stack([chunk.mean(axis=0) for chunk in strip]) for name, strip in chunks.items()}
     scales = {name: (float(values.min()), float(values.max())) for name, values in pooled.items()}
     if shared_scale:
         scale = min(low for low, _ in scales.values()), max(high for _, high in scales.values())

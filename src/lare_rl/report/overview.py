@@ -62,8 +62,8 @@ def summarise_runs(
     Each is compared with a run on the return of the episode alone, if there is one.
     """
     episodic = [run for run in runs if run.run.config.settings.method == "episodic" and np.isfinite(run.final_return)]
-    others = [next((other.final_return for other in episodic if other is not run), None) for run in runs]
-    return [summarise_run(run, random_returns[0], other) for run, other in zip(runs, others, strict=True)]
+    baselines = [next((other.final_return for other in episodic if other is not run), None) for run in runs]
+    return [summarise_run(run, random_returns[0], baseline) for run, baseline in zip(runs, baselines, strict=True)]
 
 
 def render_verdict(
