@@ -6,10 +6,9 @@ from collections.abc import Iterator, Mapping, Sequence
 import numpy as np
 
 from lare_rl.algorithms.registry import ALGORITHMS, Consumes
-from lare_rl.compare.bootstrap import REPETITIONS
+from lare_rl.compare.bootstrap import REPETITIONS, mann_whitney, mann_whitney_u
 from lare_rl.compare.comparison import Comparison, compare
 from lare_rl.compare.messages import find_small_samples, to_text
-from lare_rl.compare.rank_test import mann_whitney, mann_whitney_u
 from lare_rl.compare.results import read_run_results
 from lare_rl.compare.scores import LabelScores, ScoreChoice
 from lare_rl.envs.families import load_env_spec

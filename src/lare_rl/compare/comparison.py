@@ -18,8 +18,8 @@ from lare_rl.compare.bootstrap import (
     interquartile_mean,
     performance_profile,
     probability_of_improvement,
+    two_sided_p,
 )
-from lare_rl.compare.rank_test import two_sided_p
 from lare_rl.compare.results import LearningCurve
 from lare_rl.compare.scores import LAST_RETURN, LabelScores, ScoreChoice, group_results
 from lare_rl.evaluation.reference_returns import REFERENCE_RETURNS

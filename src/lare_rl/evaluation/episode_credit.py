@@ -71,7 +71,13 @@ def load_episode_credit(run: Run) -> EpisodeCredit | None:
     index = _find_newest_episode(learner)
     if not config.method.has_proxy_rewards or index is None:
         return None
-    steps, training_reward = jax.jit(partial(_read_rewards, config=config))(learner, index)
+
+    @jax.jit
+    def read_rewards(learner: Learner, index: Index) -> tuple[StoredSteps, Float[Array, "steps agents"]]:
+        steps = replay.read(learner.replay, index)
+        return steps, rewards(steps, learner.reward_sources, config)
+
+    steps, training_reward = read_rewards(learner, index)
     uncertainty = None
     if learner.decoders and config.method.fit in (Fit.EVIDENCE, Fit.PREFIX_EVIDENCE) and config.n_proxy_rewards == 1:
         with float64():
@@ -97,14 +103,6 @@ def _find_newest_episode(learner: Learner) -> Index | None:
     start = int(np.asarray(buffer.first)[0, episode % buffer.first.shape[-1]])
     number = jnp.arange(start, int(jax.jit(replay.end_of_episode)(buffer, env_index, episode)))
     return Index(jnp.zeros(len(number), int), number)
-
-
-def _read_rewards(
-    learner: Learner, index: Index, config: TrainConfig
-) -> tuple[StoredSteps, Float[Array, "steps agents"]]:
-    """Read steps of one seed's replay, and compute their training rewards."""
-    steps = replay.read(learner.replay, index)
-    return steps, rewards(steps, learner.reward_sources, config)
 
 
 def _posterior_std(decoder: DecoderState, steps: StoredSteps, config: TrainConfig) -> Float[Array, " steps"]:
