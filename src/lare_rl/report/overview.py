@@ -219,33 +219,34 @@ def _draw_metric(
     metric: _Metric, runs: Sequence[ReportedRun], colours: dict[str, str], references: dict[str, float], warmup: int
 ) -> str:
     """Draw a metric of all runs: the mean over seeds and, of few runs, each seed. Return nothing if no run has it."""
-    curves = {reported.name: (reported, curve) for reported in runs if (curve := reported.curve(metric.name))}
+    curves = {reported.name: curve for reported in runs if (curve := reported.curve(metric.name))}
     if not curves:
         return ""
     lines, n_coloured = [], sum(colours[name] != "grey" for name in curves)
-    for name, (reported, (steps, values)) in sorted(
-        curves.items(), key=lambda item: colours[item[0]] != "grey", reverse=True
-    ):
-        colour = colours[name]
+    spreads = {reported.name: reported.curve(RETURN_STD) for reported in runs} if metric.name == RETURN else {}
+    for name in sorted(curves, key=lambda name: colours[name] == "grey"):
+        (steps, values), colour = curves[name], colours[name]
         if len(values) > 1 and len(runs) <= N_COLOURS:
             lines += [Line(steps, row, f"{colour} thin") for row in values]
-        spread = reported.curve(RETURN_STD) if len(values) == 1 and metric.name == RETURN and n_coloured == 1 else None
+        spread = spreads.get(name) if len(values) == 1 and n_coloured == 1 else None
         label = name if len(runs) > 1 and (colour != "grey" or len(runs) <= 2 * N_COLOURS) else ""
         style = "grey other" if colour == "grey" else colour
         lines.append(Line(steps, mean_over_seeds(values), style, label, None if spread is None else spread[1][0]))
-    first_step = min(curve[0][0] for _, curve in curves.values())
-    last_step = max(curve[0][-1] for _, curve in curves.values())
+    first_step, last_step = (
+        min(steps[0] for steps, _ in curves.values()),
+        max(steps[-1] for steps, _ in curves.values()),
+    )
     extent = np.array([first_step if first_step < last_step else 0.0, last_step])
     lines += [Line(extent, np.full(2, value), "grey dashed", name) for name, value in references.items()]
     has_negative = any((line.y[np.isfinite(line.y)] < 0).any() for line in lines)
     limits = (-1.0, 1.0) if metric.limits and has_negative else metric.limits
-    final = ", ".join(f"{name} {_format_spread(finite(curve[1][:, -1]))}" for name, (_, curve) in curves.items())
+    final = ", ".join(f"{name} {_format_spread(finite(values[:, -1]))}" for name, (_, values) in curves.items())
     return Chart(
         lines=lines,
         description=f"{metric.title} over environment steps. Last values: {final}",
         x_label="environment steps",
         limits=limits,
-        hovers=_hovers({name: curve for name, (_, curve) in curves.items()}),
+        hovers=_hovers(curves),
         shaded_until=float(warmup),
     ).render()
 
