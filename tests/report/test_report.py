@@ -3,6 +3,7 @@ import re
 import shutil
 import subprocess
 import webbrowser
+from dataclasses import replace
 
 import gymnasium
 import numpy as np
@@ -186,6 +187,15 @@ def test_default_settings_are_not_listed(make_run, tmp_path):
     differing = page[page.index("differ from the defaults") :].partition("</table>")[0]
     assert "method" in differing
     assert "credit." not in differing
+
+
+def test_environment_that_is_not_installed(make_run, tmp_path):
+    """The report has what the files of the run tell, and all of its settings."""
+    run = make_run("a", [1.0], method="bayes")
+    config = run.config.model_copy(update={"task": toy_spec(environment="not-installed/Chase-v0")})
+    page = page_of(replace(run, config=config), tmp_path)
+    assert 'class="chart' in page
+    assert "credit." in page[page.index("<summary>Settings") :].partition("</table>")[0]
 
 
 @pytest.mark.parametrize(("n_rows", "n_factors", "n_pictures"), [(40, 2, 2), (40, 1, 1), (30, 2, 0)])

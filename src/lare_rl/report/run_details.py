@@ -14,7 +14,7 @@ from lare_rl.config.settings import Settings
 from lare_rl.credit import explanation_text
 from lare_rl.credit.methods import METHODS
 from lare_rl.envs.families import load_env_spec
-from lare_rl.errors import install_command
+from lare_rl.errors import LareError, install_command
 from lare_rl.evaluation.episode_credit import FactorLabel, label_factors, load_episode_credit
 from lare_rl.evaluation.played_episodes import PlayedEpisodes, TeamSample, sample_steps
 from lare_rl.latent.saved import read_source
@@ -304,11 +304,15 @@ def render_settings(runs: Sequence[ReportedRun]) -> Iterable[str]:
 
 
 def _default_settings(run: Run) -> dict[str, str] | None:
-    """Return the defaults for a run's task. None if its environment, which decides some of them, must not be imported."""
+    """Return the defaults for a run's task. None if its environment, which decides some, must not be imported, or is not installed."""
     settings, task = run.config.settings, run.config.task
     if untrusted_module(task) is not None:
         return None
-    defaults = fill_in(Settings(method=settings.method, algorithm=settings.algorithm), task, load_env_spec(task))
+    try:
+        env = load_env_spec(task)
+    except LareError:
+        return None
+    defaults = fill_in(Settings(method=settings.method, algorithm=settings.algorithm), task, env)
     return {key: _to_text(value) for key, value in effective_settings(defaults).items()}
 
 
