@@ -82,7 +82,8 @@ def _render_untrusted(run: Run, module: str) -> Iterable[str]:
         f"Its environment is of the module {module}, which is not imported for a report. Set {TRUST_VARIABLE}={module} to have it "
         "imported: random play, credit, factors and what the returns say of them then appear here."
     )
-    for role, path in function_paths(run.directory, run.config):
+    has_files = any(run.directory.glob("latent_function*.py"))  # the runs of published results have none
+    for role, path in function_paths(run.directory, run.config) if has_files else ():
         source = f"<pre>{escape(read_source(path).source)}</pre>"
         yield render_fold(f"The latent function{f' of {role.team}' if role.team else ''}", [source])
 
