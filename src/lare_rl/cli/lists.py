@@ -5,7 +5,6 @@ from typing import TYPE_CHECKING
 from lare_rl.cli.terminal import print_table
 
 if TYPE_CHECKING:
-    from lare_rl.algorithms.registry import Algorithm
     from lare_rl.credit.methods import Method
 
 
@@ -39,13 +38,9 @@ def algorithms() -> None:
     """List the reinforcement learning algorithms, and where each comes from."""
     from lare_rl.algorithms.registry import ALGORITHMS
 
-    print_table(
-        ("algorithm", "consumes", "agents", "actions", "what it is", "source"),
-        (_algorithm_row(algorithm) for algorithm in ALGORITHMS.values()),
-    )
-
-
-def _algorithm_row(algorithm: "Algorithm") -> tuple[str, ...]:
-    agents = "one" if not algorithm.multi_agent else "any" if algorithm.single_agent else "many"
-    actions = "discrete" if not algorithm.continuous else "any" if algorithm.discrete else "continuous"
-    return algorithm.name, algorithm.consumes, agents, actions, algorithm.summary, algorithm.source
+    rows = []
+    for row in ALGORITHMS.values():
+        agents = "one" if not row.multi_agent else "any" if row.single_agent else "many"
+        actions = "discrete" if not row.continuous else "any" if row.discrete else "continuous"
+        rows.append((row.name, row.consumes, agents, actions, row.summary, row.source))
+    print_table(("algorithm", "consumes", "agents", "actions", "what it is", "source"), rows)
