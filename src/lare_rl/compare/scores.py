@@ -71,8 +71,8 @@ def group_results(results: Sequence[LearningCurve], choice: ScoreChoice = LAST_R
     n_final = len(last_quarter(steps)) if choice.average_last_quarter else 1
     groups = []
     for label in dict.fromkeys(result.label for result in results):
-        keys = [key for key in curves if key[0] == label]
-        draws, seeds = (tuple(sorted({key[i] for key in keys})) for i in (2, 3))
+        group = [curve for curve in curves.values() if curve.label == label]
+        draws, seeds = tuple(sorted({curve.draw for curve in group})), tuple(sorted({curve.seed for curve in group}))
         scores = _fill_scores(label, draws, seeds, tasks, steps, curves)
         groups.append(
             LabelScores(
