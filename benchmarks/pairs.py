@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 import tyro
 
-from lare_rl.compare.rank_test import mann_whitney_u, two_sided_p
+from lare_rl.compare.bootstrap import mann_whitney_u, two_sided_p
 from lare_rl.compare.scores import last_quarter
 from learning_curves import mean_and_spread, read
 

@@ -36,12 +36,13 @@ def first_column(table):
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
-        ("train Task --steps 1e5", ["'1e5'", "whole number"]),
+        ("train Task --steps 1e5", ["--steps: '1e5'", "whole number"]),
+        ("train Task --steps 9 --td3.hidden 8 8,9", ["--td3.hidden: '8,9'", "whole number"]),
         ("train Task --step 9", ["--step, 9", "'--steps'"]),
         ("train Task --td3.gama 9", ["--td3.gama", "'--td3.gamma'"]),
-        ("train Task --td3.gamma high", ["'high'", "number"]),
+        ("train Task --td3.gamma high", ["--td3.gamma: 'high'", "number"]),
         ("train Task --td3.gamma 3", ["td3.gamma = 3.0"]),
-        ("train Task --scored-observation left", ["'left'", "before, after, both"]),
+        ("train Task --scored-observation=left", ["--scored-observation: 'left'", "before, after, both"]),
         ("train Task --algorithm dqn", ["'dqn'", *ALGORITHMS]),
         ("train Task --seeds", ["--seeds"]),
         ("", ["--help"]),

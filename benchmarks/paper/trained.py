@@ -1,14 +1,14 @@
 """The page of an exhibit: the results of its runs, beside those of the paper."""
 
+import math
 from collections.abc import Iterator, Mapping, Sequence
 
 import numpy as np
 
 from lare_rl.algorithms.registry import ALGORITHMS, Consumes
-from lare_rl.compare.bootstrap import REPETITIONS
+from lare_rl.compare.bootstrap import REPETITIONS, mann_whitney, mann_whitney_u
 from lare_rl.compare.comparison import Comparison, compare
 from lare_rl.compare.messages import find_small_samples, to_text
-from lare_rl.compare.rank_test import mann_whitney, mann_whitney_u
 from lare_rl.compare.results import read_run_results
 from lare_rl.compare.scores import LabelScores, ScoreChoice
 from lare_rl.envs.families import load_env_spec
@@ -207,8 +207,24 @@ def picture(comparison: Comparison, exhibit: Exhibit) -> str:
         panel = panels.setdefault(entry.algorithm or "", {})
         panel[label.removesuffix(f", {entry.algorithm}")] = comparison.curves[label]
     if len(panels) > 1:
-        return figures.draw_band_panels(panels, across, up)
+        return draw_panels(panels, across, up)
     return figures.draw_bands(comparison.curves, across, up, x_is_steps=True, log_scale=exhibit.measure == CREDIT_ERROR)
+
+
+def draw_panels(panels: Mapping[str, Mapping[str, Band]], x_label: str, y_label: str) -> str:
+    """Draw panels of curves over steps, by title, two in a row. They share their axes and the meaning of the colours."""
+    n_rows = math.ceil(len(panels) / 2)
+    figure, all_axes = figures.make_figure(n_rows, height=0.6 + 2.2 * n_rows, columns=2)
+    for axes in all_axes[len(panels) :]:
+        axes.set_visible(False)
+    for axes, (title, bands) in zip(all_axes, panels.items(), strict=False):
+        figures.draw_bands_on(axes, bands, x_is_steps=True)
+        axes.set_title(title, fontsize=11, loc="left")
+    figure.supxlabel(x_label, fontsize=11)
+    figure.supylabel(y_label, fontsize=11)
+    legend = all_axes[0].get_legend_handles_labels()
+    figure.legend(*legend, loc="outside upper left", ncols=4, fontsize=10, frameon=False)
+    return figures.to_svg(figure)
 
 
 def claimed(claim: Claim, other: str, exhibit: Exhibit, comparison: Mapping[str, Comparison]) -> list[str]:

@@ -27,8 +27,7 @@ import numpy as np
 import tyro
 
 import lare_rl
-from lare_rl.compare.bootstrap import estimate, interquartile_mean, probability_of_improvement
-from lare_rl.compare.rank_test import two_sided_p
+from lare_rl.compare.bootstrap import estimate, interquartile_mean, probability_of_improvement, two_sided_p
 from lare_rl.config.resolve import resolve
 from lare_rl.envs.load import read_task
 from lare_rl.runs.directory import open_without_functions

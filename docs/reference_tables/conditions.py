@@ -11,7 +11,8 @@ from lare_rl.report.diagnosis import (
     STUCK_FRACTION,
 )
 from lare_rl.report.run_summary import MIN_EVALUATIONS, POSSIBLE_ERRORS, SEED_STDS
-from lare_rl.report.score_use import CLEAR_ERRORS, CLEAR_GAIN
+from lare_rl.report.score_use import CLEAR_GAIN
+from lare_rl.util.statistics import CLEAR_ERRORS
 
 __all__ = ["CONDITIONS"]
 

@@ -3,8 +3,14 @@ import pytest
 from scipy.stats import mannwhitneyu
 
 from lare_rl.compare import bootstrap
-from lare_rl.compare.bootstrap import estimate, interquartile_mean, performance_profile, probability_of_improvement
-from lare_rl.compare.rank_test import mann_whitney, two_sided_p
+from lare_rl.compare.bootstrap import (
+    estimate,
+    interquartile_mean,
+    mann_whitney,
+    performance_profile,
+    probability_of_improvement,
+    two_sided_p,
+)
 
 SCORES = np.array([[4.0, 0.5], [2.0, 2.5], [7.0, 1.5], [1.0, 3.0], [9.0, 1.5]])
 BASELINE = np.array([[3.0, 1.5], [2.0, 0.0], [5.0, 2.0]])

@@ -9,7 +9,7 @@ from lare_rl.compare import bootstrap
 from lare_rl.compare.bootstrap import Estimate
 from lare_rl.compare.comparison import compare, compare_over_tasks, compare_tasks
 from lare_rl.compare.labels import label_runs
-from lare_rl.compare.results import LearningCurves, read_run_results
+from lare_rl.compare.results import LearningCurve, read_run_results
 from lare_rl.compare.scores import ScoreChoice, group_results
 from lare_rl.errors import LareError
 from lare_rl.runs.directory import Run
@@ -147,13 +147,13 @@ def test_two_tasks_with_one_name(make_run):
 
 def curves(label, *steps_of_seeds):
     """Return the curves of a method in a table, with the value 1 at some steps of each seed."""
-    values = {seed: dict.fromkeys(steps, 1.0) for seed, steps in enumerate(steps_of_seeds)}
-    return LearningCurves(label=label, source=Path("own.csv"), task="Chase", draw=0, curves=values)
+    values = (dict.fromkeys(steps, 1.0) for steps in steps_of_seeds)
+    return [LearningCurve(label, Path("own.csv"), "Chase", 0, *item) for item in enumerate(values)]
 
 
 def test_steps_without_overlap_are_listed_by_method():
     with pytest.raises(LareError) as error:
-        group_results([curves("A", (1000, 1500), (1500, 2000)), curves("B", (3000, 4000), (3000, 4000))])
+        group_results(curves("A", (1000, 1500), (1500, 2000)) + curves("B", (3000, 4000), (3000, 4000)))
     first, second = str(error.value).split(";")
     for text, words in ((first, ["A", "1,000 to 2,000"]), (second, ["B", "3,000 to 4,000"])):
         assert all(word in text for word in ["Chase", "own.csv", *words]), text

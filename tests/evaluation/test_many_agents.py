@@ -17,7 +17,7 @@ from lare_rl.errors import LareError
 from lare_rl.evaluation.cross_play import combine_policies, cross_play
 from lare_rl.evaluation.played_episodes import N_SAMPLE_EPISODES, play_run, sample_steps
 from lare_rl.evaluation.policy import load_policy
-from lare_rl.evaluation.video import record_video, render_played
+from lare_rl.evaluation.video import record_frames, record_video
 from lare_rl.report import run_details
 from lare_rl.report.overview import render_learning_curves
 from lare_rl.report.reported_run import ReportedRun
@@ -46,7 +46,7 @@ def test_rollout(runs):
     assert played.reward.shape == played.training_reward.shape == played.credit.shape == (25, 1, 8)
     assert played.training_reward.std() > 0
     assert played.select_episode(played.reward).shape == (25, 8)
-    assert [frame.shape for frame in render_played(runs[0], played)] == [(400, 400, 3)] * 25
+    assert [frame.shape for frame in record_frames(runs[0], played=played)[0]] == [(400, 400, 3)] * 25
 
 
 @pytest.mark.long

@@ -77,15 +77,15 @@ def test_labels_do_not_overlap():
     assert max(tops) <= 100
 
 
-def test_bars_have_sides():
-    html = draw_bars([Bar("<speed>", "f", 0.9, 1, "more"), Bar("cost", "g", 0.45, -1, "less")])
+def test_bars_point_to_the_side_of_their_amounts():
+    html = draw_bars([Bar("<speed>", "f", 0.9, "plus", "more"), Bar("cost", "g", -0.3, "minus", "less")])
     check_markup(html)
     bars = re.findall(r'<i class="(\w+)" style="left:([\d.]+)%;width:([\d.]+)%"', html)
-    assert bars == [("plus", "50.0", "50.0"), ("minus", "25.0", "25.0")]
-    assert "90%" in html
-    assert "<i" not in draw_bars([Bar("speed", "f", 0.001, 1, "")])
-    assert '<span class="amount">-45%</span>' in draw_bars([Bar("offsets", "f", -0.45, 1, "")])
-    only_right = draw_bars([Bar("speed", "f", 0.9, 1, "")])
+    assert bars == [("plus", "25.0", "75.0"), ("minus", "0.0", "25.0")]
+    assert html.count("--zero:25.0%") == 2
+    assert '<span class="amount">-30%</span>' in html
+    assert "<i" not in draw_bars([Bar("speed", "f", 0.001, "plus", "")])
+    only_right = draw_bars([Bar("speed", "f", 0.9, "plus", "")])
     assert "left:0.0%;width:100.0%" in only_right
 
 

@@ -164,6 +164,9 @@ def test_proxy_rewards_values():
     assert inputs_and_amount(return_r2=0.05) == ("raw_features", "little", 0.05)
     assert inputs_and_amount(return_r2=0.5, **FACTORS) == ("all_inputs", "a_part", 0.5)
     assert inputs_and_amount(return_r2=0.9, sees_raw_features=False, **FACTORS) == ("factors", "nearly_all", 0.9)
+    assert "R² of the last returns, before they were learned from, is 0.998." in render(
+        find(FLAT - 51, return_r2=0.998)["explained"], MESSAGES
+    )
     outdated = find(FLAT - 51, return_r2=-1.15, median_r2=0.24)["decoder_is_outdated"].values
     assert (outdated["amount"].code, outdated["r2"], outdated["last_r2"]) == ("a_part", 0.24, -1.15)
 

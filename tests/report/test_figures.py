@@ -4,7 +4,7 @@ from xml.etree import ElementTree
 import numpy as np
 import pytest
 
-from lare_rl.report.figures import add_white_background, draw_band_panels, draw_bands
+from lare_rl.report.figures import add_white_background, draw_bands
 from lare_rl.util.statistics import Band
 
 X = np.arange(3.0)
@@ -30,10 +30,3 @@ def test_white_background():
     assert (background.tag.rpartition("}")[2], background.attrib["fill"]) == ("rect", "#ffffff")
     elements = [(element.tag, element.attrib) for element in (root, *rest)]
     assert elements == [(element.tag, element.attrib) for element in ElementTree.fromstring(svg).iter()]
-
-
-def test_panels_share_legend_and_labels():
-    panels = {title: {"one": Band(X, X, X, X), "other": Band(X, 2 * X, X, 3 * X)} for title in ("td3", "sac", "ppo")}
-    svg = draw_band_panels(panels, "environment steps", "true return")
-    for text in (*panels, "one", "other", "environment steps", "true return"):
-        assert svg.count(f">{text}</text>") == 1, text

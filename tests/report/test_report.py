@@ -3,6 +3,7 @@ import re
 import shutil
 import subprocess
 import webbrowser
+from dataclasses import replace
 
 import gymnasium
 import numpy as np
@@ -188,6 +189,15 @@ def test_default_settings_are_not_listed(make_run, tmp_path):
     assert "credit." not in differing
 
 
+def test_environment_that_is_not_installed(make_run, tmp_path):
+    """The report has what the files of the run tell, and all of its settings."""
+    run = make_run("a", [1.0], method="bayes")
+    config = run.config.model_copy(update={"task": toy_spec(environment="not-installed/Chase-v0")})
+    page = page_of(replace(run, config=config), tmp_path)
+    assert 'class="chart' in page
+    assert "credit." in page[page.index("<summary>Settings") :].partition("</table>")[0]
+
+
 @pytest.mark.parametrize(("n_rows", "n_factors", "n_pictures"), [(40, 2, 2), (40, 1, 1), (30, 2, 0)])
 def test_tsne_needs_two_columns_and_some_rows(n_rows, n_factors, n_pictures):
     pytest.importorskip("sklearn")
@@ -310,4 +320,4 @@ def test_factor_of_two_states_has_one_row_and_one_curve(make_run):
     assert "0.25 / -0.50" in table
     curves = "".join(run_details._draw_factors(np.arange(8.0).reshape(4, 2), np.arange(4.0), labels))
     assert curves.count("<figure>") == 1
-    assert run_details._make_bar(finding, {}).sign == -1
+    assert run_details._make_bar(finding, {}).style == "minus"

@@ -119,6 +119,8 @@ def test_report_shows_function_without_import(write_run, foreign_file):
     path.write_text(PHI.replace("near", "far"))
     with pytest.raises(LareError, match="its hash changed"):
         write_report([path.parent])
+    path.unlink()  # as in published results
+    assert "of the module foreign_file" in write_report([path.parent]).read_text(encoding="utf-8")
 
 
 def test_report_command_names_what_it_omits(write_run, foreign_file, command):

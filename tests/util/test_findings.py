@@ -47,6 +47,11 @@ def test_render_incomplete():
         (float("nan"), "error", "nan"),
         (2, "count day", "2 days"),
         (0.5, ".0%", "50%"),
+        (0.4, "seconds", "0 s"),
+        (59.7, "seconds", "1 min"),
+        (61.0, "seconds", "2 min"),
+        (5399.0, "seconds", "90 min"),
+        (7920.0, "seconds", "2.2 h"),
     ],
 )
 def test_format_for_reader(value, spec, text):

@@ -114,7 +114,7 @@ def read_state(directory: Path) -> AssignerState:
         arrays = rename_assigner({name: saved[name] for name in saved.files})
     if values.get("format") != FORMAT:
         raise LareError(f"{path} is not of format {FORMAT}: another version of LaRe has written it")
-    task = None if values["task"] is None else TaskSpec(**rename_keys(values["task"]))
+    task = None if values["task"] is None else TaskSpec(**values["task"])
     phi = None
     if task is not None and values["phi"]:
         sample = (arrays[PHI_SAMPLE[0]], arrays[PHI_SAMPLE[1]]) if set(PHI_SAMPLE) <= set(arrays) else None

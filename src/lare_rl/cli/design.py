@@ -15,7 +15,6 @@ from lare_rl.cli.terminal import (
     FunctionKind,
     LiveOptions,
     Task,
-    find_free_path,
     load_playing_policy,
     load_steps,
     print_error,
@@ -23,7 +22,7 @@ from lare_rl.cli.terminal import (
     print_progress,
 )
 from lare_rl.errors import LareError
-from lare_rl.util.files import check_new_path
+from lare_rl.util.files import check_new_path, find_free_path
 
 if TYPE_CHECKING:
     from lare_rl.latent.design import DesignError
@@ -89,7 +88,7 @@ def design(
         if reflect:
             function = lare_rl.reflect(function, spec, model, reflect, policy=play, **common)
     if out is None:
-        _print_function(function, find_free_path(Path(f"{spec.name}.py")))
+        _print_function(function, find_free_path(Path(), spec.name, ".py"))
     else:
         _save_function(function, out, _next_command(task, spec, out.with_suffix(".py"), kind, data))
 
@@ -104,7 +103,7 @@ def _after_requests(spec: "TaskSpec", model: "Model", live: LiveOptions) -> Iter
         yield
     except DesignError as error:
         print_error(error)
-        _save_attempts(error, find_free_path(Path(f"{spec.name}.attempts.json")))
+        _save_attempts(error, find_free_path(Path(), f"{spec.name}.attempts", ".json"))
         sys.exit(error.status)
     finally:
         if isinstance(model, LiveModel) and model.budget.requests_used:

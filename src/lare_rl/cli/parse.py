@@ -6,7 +6,6 @@ import inspect
 import io
 import itertools
 from collections.abc import Callable, Iterator, Mapping, Sequence, Set
-from contextvars import ContextVar
 from types import NoneType
 from typing import Annotated, Any, Literal, get_args, get_origin
 
@@ -26,8 +25,15 @@ from lare_rl.util.renamed_fields import rename_options
 
 __all__ = ["parse"]
 
-_RULES = ConstructorRegistry()
 _NUMBERS = {int: "a whole number, such as 10000", float: "a number, such as 0.5"}
+
+
+class _InvalidValueError(LareError):
+    """A word of the command line is not a number, or none of the choices. Unlike a `ValueError`, tyro does not catch it."""
+
+    def __init__(self, text: str, expected: str):
+        super().__init__(f"{text!r} is not {expected}")
+        self.text = text
 
 
 def parse(
@@ -35,24 +41,25 @@ def parse(
 ) -> Callable[[], None]:
     """Return the requested command with its options, ready to be called. A request for help prints the help and exits.
 
-    Raises:
-        LareError: the arguments cannot be read.
+    Raises `LareError` if the arguments cannot be read.
     """
     name, *options = rename_options(arguments) or [""]
     if name in ("-h", "--help"):
         deferred = {name: _defer(command) for name, command in commands.items()}
         for command in deferred.values():
             command.__doc__ = (command.__doc__ or "").partition("\n\n")[0]  # the help of each command has all of it
-        with _RULES:
+        with _make_rules():
             tyro.extras.subcommand_cli_from_dict(deferred, prog="lare-rl", description=description, args=[name])
     if name not in commands:
         problem = f"there is no command {name!r}{did_you_mean(name, commands)}" if name else "there is no command"
         raise LareError(f"{problem}; see lare-rl --help")
     prog = f"lare-rl {name}"
-    with _RULES, _hide(_hidden_algorithms(options)), contextlib.redirect_stderr(io.StringIO()) as stderr:
+    with _make_rules(_hidden_algorithms(options)), contextlib.redirect_stderr(io.StringIO()) as stderr:
         try:
             deferred_command = _defer(commands[name], options)
             command, unknown = tyro.cli(deferred_command, prog=prog, args=options, return_unknown_args=True)
+        except _InvalidValueError as error:
+            raise LareError(f"{_find_option(error.text, options)}{error}; see {prog} --help") from None
         except LareError as error:
             raise LareError(f"{error}; see {prog} --help") from None
         except SystemExit as exit_:
@@ -65,17 +72,12 @@ def parse(
     return command
 
 
-_hidden_groups: ContextVar[frozenset[str]] = ContextVar("hidden_groups", default=frozenset())
-"""The names of options with settings of their own that the help leaves out."""
-
-
-@contextlib.contextmanager
-def _hide(names: frozenset[str]) -> Iterator[None]:
-    token = _hidden_groups.set(names)
-    try:
-        yield
-    finally:
-        _hidden_groups.reset(token)
+def _make_rules(hidden: frozenset[str] = frozenset()) -> ConstructorRegistry:
+    """Return tyro's rules for models, numbers and choices. The help leaves out the models with the names `hidden`."""
+    rules = ConstructorRegistry()
+    rules.struct_rule(functools.partial(_read_model, hidden=hidden))
+    rules.primitive_rule(_read_value)
+    return rules
 
 
 def _hidden_algorithms(options: Sequence[str]) -> frozenset[str]:
@@ -84,6 +86,17 @@ def _hidden_algorithms(options: Sequence[str]) -> frozenset[str]:
         return frozenset()  # their options can be set
     _, _, name = " ".join(options).replace("=", " ").partition("--algorithm ")
     return frozenset(ALGORITHMS) - {name.partition(" ")[0]}
+
+
+def _find_option(value: str, options: Sequence[str]) -> str:
+    """Return the name of the first option with this value and a colon, or an empty text if no option has it."""
+    name = ""
+    for word in options:
+        if word.startswith("--"):
+            name, _, word = word.partition("=")
+        if name and word == value:
+            return f"{name}: "
+    return ""
 
 
 def _first_paragraph(box: str) -> str:
@@ -148,8 +161,7 @@ def _option_names(command: Callable[..., None]) -> Iterator[str]:
             yield f"--{key.replace('_', '-')}"
 
 
-@_RULES.struct_rule
-def _read_model(info: StructTypeInfo) -> StructConstructorSpec | None:
+def _read_model(info: StructTypeInfo, hidden: frozenset[str]) -> StructConstructorSpec | None:
     """Make an option of each field of a model. If the model itself may be None, so may all of its fields."""
     if not (isinstance(info.type, type) and issubclass(info.type, CheckedModel)):
         return None
@@ -159,7 +171,7 @@ def _read_model(info: StructTypeInfo) -> StructConstructorSpec | None:
         default, doc = None if may_be_none else getattr(info.default, name), field.description
         if model := nested_model(field):
             kind: Any = model
-            if name in _hidden_groups.get():
+            if name in hidden:
                 kind = Annotated[kind, tyro.conf.Suppress]
             default = tyro.MISSING if default is None else default
             doc = doc or inspect.cleandoc(model.__doc__ or "").split("\n\n")[0]
@@ -176,9 +188,8 @@ def _read_model(info: StructTypeInfo) -> StructConstructorSpec | None:
     return StructConstructorSpec(instantiate=collect, fields=tuple(fields))
 
 
-@_RULES.primitive_rule
 def _read_value(info: PrimitiveTypeInfo) -> PrimitiveConstructorSpec | None:
-    """Convert numbers and choices. A `LareError` is not caught by tyro, as a `ValueError` would be."""
+    """Convert numbers and choices."""
     choices = get_args(info.type) if info.type_origin is Literal else ()
     if choices:
         expected = f"one of {', '.join(choices)}"
@@ -191,7 +202,7 @@ def _read_value(info: PrimitiveTypeInfo) -> PrimitiveConstructorSpec | None:
         try:
             return choices[choices.index(texts[0])] if choices else info.type(texts[0])
         except ValueError:
-            raise LareError(f"{texts[0]!r} is not {expected}") from None
+            raise _InvalidValueError(texts[0], expected) from None
 
     return PrimitiveConstructorSpec(
         nargs=1,

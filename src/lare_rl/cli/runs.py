@@ -3,16 +3,13 @@
 import os
 import sys
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import tyro
 
 from lare_rl.cli.terminal import EpisodeProgress, RunDirectories, RunDirectory, print_line, print_progress, print_table
 from lare_rl.errors import LareError, install_command
 from lare_rl.util.variables import read_variable
-
-if TYPE_CHECKING:
-    from lare_rl.runs.directory import Run
 
 
 def evaluate(
@@ -40,8 +37,9 @@ def evaluate(
         video: a .gif to write of one episode of the first seed (.mp4 with the extra lare-rl[video]).
     """
     _refuse_untrusted(run)
+    from lare_rl.envs.families import load_env_spec
     from lare_rl.evaluation.evaluate import move_evaluations
-    from lare_rl.evaluation.video import check_video_path
+    from lare_rl.evaluation.video import check_video_path, record_video
     from lare_rl.report.evaluation_lines import evaluation_lines
     from lare_rl.runs.directory import open_run
     from lare_rl.training.explain import explain_run
@@ -49,7 +47,11 @@ def evaluate(
     opened = move_evaluations(open_run(run), environment)
     if video is not None:
         check_video_path(video)
-        _film(opened, video, best, deterministic)
+        if load_env_spec(opened.config.task).n_agents == 1:
+            _render_without_screen()
+            print_progress("filming an episode; without a graphics card that may take minutes")
+        record_video(opened, video, best, deterministic)
+        print_line(f"wrote {video}")
     for line in evaluation_lines(opened, episodes, best, deterministic, EpisodeProgress):
         print_line(line)
     if explanation := explain_run(opened):
@@ -70,17 +72,6 @@ def _refuse_untrusted(directory: Path) -> None:
     except (LareError, OSError, ValueError, TypeError, KeyError, AttributeError):
         return
     check_trusted(task, directory)
-
-
-def _film(run: "Run", video: Path, best: bool, deterministic: bool) -> None:
-    from lare_rl.envs.families import load_env_spec
-    from lare_rl.evaluation.video import record_video
-
-    if load_env_spec(run.config.task).n_agents == 1:
-        _render_without_screen()
-        print_progress("filming an episode; without a graphics card that may take minutes")
-    record_video(run, video, best, deterministic)
-    print_line(f"wrote {video}")
 
 
 def _render_without_screen() -> None:

@@ -12,8 +12,8 @@ from tyro.conf import Positional
 
 from lare_rl.errors import CheckedModel, Count, LareError
 from lare_rl.llm.budget import Budget
-from lare_rl.util.durations import format_seconds
 from lare_rl.util.files import check_new_path
+from lare_rl.util.findings import format_for_reader
 from lare_rl.util.sanitize import one_line, sanitize
 
 if TYPE_CHECKING:
@@ -107,7 +107,9 @@ class EpisodeProgress:
         wait_s = PROGRESS_S if self._line_time > self._start else FIRST_PROGRESS_S
         if now - self._line_time > wait_s and seconds_left > 1:
             self._line_time = now
-            print_progress(f"played {n_done} of {self._n_episodes} episodes, {format_seconds(seconds_left)} left")
+            print_progress(
+                f"played {n_done} of {self._n_episodes} episodes, {format_for_reader(seconds_left, 'seconds')} left"
+            )
 
 
 def print_error(error: Exception) -> None:
@@ -135,15 +137,6 @@ def load_playing_policy(run: Path | None, spec: "TaskSpec") -> "Policy | None":
     if opened.config.task.environment != spec.environment:
         raise LareError(f"{run} is a run of {opened.config.task.name}: its policy cannot play {spec.name}")
     return RunPolicy(opened)
-
-
-def find_free_path(path: Path) -> Path:
-    """Return the path, or if it exists, the first free one with a number appended."""
-    number, free = 1, path
-    while free.exists():
-        number += 1
-        free = path.with_name(f"{path.stem}-{number}{path.suffix}")
-    return free
 
 
 def write_new_file(path: Path, text: str, option: str) -> None:

@@ -1,10 +1,11 @@
 """Statistics of few runs, with 95% intervals by the stratified bootstrap (Agarwal et al., "Deep Reinforcement Learning at the Edge of
-the Statistical Precipice", NeurIPS 2021, sections 4.1 to 4.3).
+the Statistical Precipice", NeurIPS 2021, sections 4.1 to 4.3), and the exact test of Mann and Whitney (1947), over several tasks.
 
 `scores[..., n, m]` is the score of run n on task m. Each statistic is a pure function over the last two axes.
 """
 
-from collections.abc import Callable
+import math
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -22,8 +23,11 @@ __all__ = [
     "bootstrap",
     "estimate",
     "interquartile_mean",
+    "mann_whitney",
+    "mann_whitney_u",
     "performance_profile",
     "probability_of_improvement",
+    "two_sided_p",
 ]
 
 REPETITIONS = 2000
@@ -111,17 +115,11 @@ def bootstrap(function: Callable[..., Float[np.ndarray, "*_"]], *scores: Float[n
     random = np.random.RandomState(0)  # NumPy keeps the stream of this generator unchanged
     samples = []
     for start in range(0, REPETITIONS, CHUNK):
-        indices = [_sample_indices(random, scores) for _ in range(min(CHUNK, REPETITIONS - start))]
+        n_samples = min(CHUNK, REPETITIONS - start)
+        indices = [[random.randint(x.shape[-2], size=x.shape[-2:]) for x in scores] for _ in range(n_samples)]
         samples.append(function(*map(_resample, scores, zip(*indices, strict=True))))
     low, high = np.percentile(np.concatenate(samples), PERCENTILES, axis=0)
     return Intervals(function(*(array[None] for array in scores))[0], low, high)
-
-
-def _sample_indices(
-    random: np.random.RandomState, scores: tuple[Float[np.ndarray, "*_"], ...]
-) -> list[Int[np.ndarray, "_ _"]]:
-    """Sample the indices of as many runs as each array has, on each task."""
-    return [random.randint(array.shape[-2], size=array.shape[-2:]) for array in scores]
 
 
 def _resample(
@@ -130,3 +128,44 @@ def _resample(
     index = np.stack(indices)
     index = index.reshape(len(indices), *(scores.ndim - 2) * [1], *scores.shape[-2:])
     return np.take_along_axis(scores[None], index, axis=-2)
+
+
+def mann_whitney_u(a: Float[np.ndarray, " a"], b: Float[np.ndarray, " b"]) -> float:
+    """Return the number of pairs in which a is larger than b. A tie counts half."""
+    return float(np.sum(wins(a[:, None], b)))
+
+
+def mann_whitney(tasks: Sequence[tuple[Float[np.ndarray, " _"], Float[np.ndarray, " _"]]]) -> tuple[float, float]:
+    """Return two probabilities: that U is at least as large by chance, and that it is at most as large.
+
+        U = sum over tasks and over all pairs of [a > b] + [a = b] / 2
+
+    `tasks` has the values a and b of each task. If they had the same distribution, all ways to split them into two groups would
+    be equally likely.
+    """
+    double_u, probabilities = 0, np.ones(1)
+    for a, b in tasks:
+        double_u += round(2 * mann_whitney_u(a, b))
+        probabilities = np.convolve(probabilities, _distribution(np.concatenate([a, b]), len(a)))
+    at_least, at_most = probabilities[double_u:].sum(), probabilities[: double_u + 1].sum()
+    return min(1.0, float(at_least)), min(1.0, float(at_most))
+
+
+def two_sided_p(tasks: Sequence[tuple[Float[np.ndarray, " _"], Float[np.ndarray, " _"]]]) -> float:
+    """Return the two-sided p-value: twice the smaller probability of `mann_whitney`, but at most 1."""
+    return min(1.0, 2 * min(mann_whitney(tasks)))
+
+
+def _distribution(values: Float[np.ndarray, " values"], n_a: int) -> Float[np.ndarray, " sums"]:
+    """Return the probabilities of 2 U = 0, 1, 2, ... over all choices of `n_a` of the values as a.
+
+    2 U is the sum of the doubled ranks of a, less n_a (n_a + 1). Ties share their mean rank, so that doubled ranks are whole numbers.
+    """
+    doubled_ranks = 1 + np.sum(2 * (values < values[:, None]) + (values == values[:, None]), axis=1)
+    # Choices by the number of values that they have, and by the sum of their doubled ranks.
+    counts = np.zeros((n_a + 1, int(doubled_ranks.sum()) + 1))
+    counts[0, 0] = 1
+    for rank in doubled_ranks:
+        counts[1:, rank:] += counts[:-1, :-rank].copy()
+    first, last = n_a * (n_a + 1), n_a * (n_a + 1) + 2 * n_a * (len(values) - n_a)
+    return counts[n_a, first : last + 1] / math.comb(len(values), n_a)

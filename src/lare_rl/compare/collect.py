@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from lare_rl.compare.labels import find_differences, find_origin_differences, label_runs
-from lare_rl.compare.results import LearningCurves, read_results_table, read_run_results
+from lare_rl.compare.results import LearningCurve, group_pairs, read_results_table, read_run_results
 from lare_rl.errors import LareError, did_you_mean
 from lare_rl.runs.directory import Run, find_run_directories, open_without_functions
 from lare_rl.runs.metric_names import RETURN, SUMMED_RETURN
@@ -14,13 +14,12 @@ from lare_rl.util.findings import Finding
 __all__ = ["collect_results", "select_runs"]
 
 
-def collect_results(paths: Sequence[Path], metric: str = RETURN) -> tuple[list[LearningCurves], list[Finding]]:
+def collect_results(paths: Sequence[Path], metric: str = RETURN) -> tuple[list[LearningCurve], list[Finding]]:
     """Read the results in run directories and tables (.csv), and find what the user should know about them.
 
     The first label is the baseline. Runs come before tables, unless the first path is a table: its first method is the baseline.
 
-    Raises:
-        LareError: there is nothing to compare, or a table cannot be read.
+    Raises `LareError` if there is nothing to compare, or a table cannot be read.
     """
     tables = [path for path in paths if path.suffix == ".csv"]
     directories = [path for path in paths if path not in tables]
@@ -46,8 +45,7 @@ def collect_results(paths: Sequence[Path], metric: str = RETURN) -> tuple[list[L
 def select_runs(runs: Sequence[Run], metric: str = RETURN) -> tuple[list[Run], list[Finding]]:
     """Select the runs that have a metric, and find runs that were not trained to their end.
 
-    Raises:
-        LareError: no run has an evaluation, or none has a value of the metric.
+    Raises `LareError` if no run has an evaluation, or none has a value of the metric.
     """
     selected, without_metric, findings, names = [], [], [], set()
     for run in runs:
@@ -76,7 +74,7 @@ def select_runs(runs: Sequence[Run], metric: str = RETURN) -> tuple[list[Run], l
     return selected, findings
 
 
-def _find_other_tasks(run_results: Sequence[LearningCurves], table_results: Sequence[LearningCurves]) -> list[Finding]:
+def _find_other_tasks(run_results: Sequence[LearningCurve], table_results: Sequence[LearningCurve]) -> list[Finding]:
     """Return the tasks of tables that no run has."""
     tasks = tuple(sorted({result.task for result in run_results}))
     unknown = dict.fromkeys((result.source, result.task) for result in table_results if result.task not in tasks)
@@ -84,17 +82,15 @@ def _find_other_tasks(run_results: Sequence[LearningCurves], table_results: Sequ
 
 
 def _find_other_steps(
-    run_results: Sequence[LearningCurves], table_results: Sequence[LearningCurves], metric: str
+    run_results: Sequence[LearningCurve], table_results: Sequence[LearningCurve], metric: str
 ) -> list[Finding]:
     """Return the methods of tables that lack the last step of the runs."""
-    last_steps: dict[str, int] = {}  # of the shortest run on each task
-    for result in run_results:
-        last_step = max(step for curve in result.curves.values() for step in curve)
-        last_steps[result.task] = min(last_step, last_steps.get(result.task, last_step))
-    findings = []
-    for result in table_results:
-        step = last_steps[result.task]
-        if any(step not in curve for curve in result.curves.values()):
-            values = {"source": result.source, "metric": metric, "label": result.label, "step": step}
-            findings.append(Finding("other_steps", values))
-    return findings
+    curves = group_pairs((result.task, result.values) for result in run_results if result.values)
+    last_steps = {task: min(map(max, values)) for task, values in curves.items()}  # of the shortest curve on each task
+    missing = dict.fromkeys(
+        (result.source, result.label, step)
+        for result in table_results
+        if (step := last_steps[result.task]) not in result.values
+    )
+    values = [{"source": source, "metric": metric, "label": label, "step": step} for source, label, step in missing]
+    return [Finding("other_steps", value) for value in values]

@@ -18,9 +18,9 @@ from lare_rl.compare.bootstrap import (
     interquartile_mean,
     performance_profile,
     probability_of_improvement,
+    two_sided_p,
 )
-from lare_rl.compare.rank_test import two_sided_p
-from lare_rl.compare.results import LearningCurves
+from lare_rl.compare.results import LearningCurve
 from lare_rl.compare.scores import LAST_RETURN, LabelScores, ScoreChoice, group_results
 from lare_rl.evaluation.reference_returns import REFERENCE_RETURNS
 from lare_rl.runs.metric_names import RETURN
@@ -91,11 +91,10 @@ class Comparison:
         return self.groups[self.rows[0].label].steps[-1]
 
 
-def compare(results: Sequence[LearningCurves], choice: ScoreChoice = LAST_RETURN) -> Comparison:
+def compare(results: Sequence[LearningCurve], choice: ScoreChoice = LAST_RETURN) -> Comparison:
     """Compare results by their labels. The first label is the baseline. All labels have the same tasks.
 
-    Raises:
-        LareError: some results are missing.
+    Raises `LareError` if some results are missing.
     """
     groups = group_results(results, choice)
     final = {group.label: group.run_scores for group in groups}
@@ -115,7 +114,7 @@ def compare(results: Sequence[LearningCurves], choice: ScoreChoice = LAST_RETURN
     )
 
 
-def compare_tasks(results: Sequence[LearningCurves], choice: ScoreChoice = LAST_RETURN) -> list[Comparison]:
+def compare_tasks(results: Sequence[LearningCurve], choice: ScoreChoice = LAST_RETURN) -> list[Comparison]:
     """Compare all tasks together, or each task alone if their scores have no common scale."""
     tasks = sorted({result.task for result in results})
     if len(tasks) == 1 or (choice.metric == RETURN and all(task in REFERENCE_RETURNS for task in tasks)):

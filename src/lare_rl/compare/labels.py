@@ -43,7 +43,7 @@ def label_runs(runs: Sequence[Run]) -> dict[str, list[Run]]:
     The label is the method, the algorithm if a task has several, and the settings in which runs of a method differ on a task.
     Runs with equal labels are distinguished by their functions and, if two of them have a seed in common, by their directories.
     """
-    settings = [_effective_settings(run) for run in runs]
+    settings = [effective_settings(run.config.settings) for run in runs]
     values_by_setting = group_pairs(
         ((run.config.task.name, name, values["method"], values["algorithm"]), str(values[name]))
         for run, values in zip(runs, settings, strict=True)
@@ -68,7 +68,7 @@ def find_differences(runs: Sequence[Run]) -> list[Difference]:
     """Return the settings, apart from the method, in which runs of one algorithm differ, and differences of latent functions."""
     by_setting = group_pairs(
         ((name, values["algorithm"]), (str(values[name]), values["method"]))
-        for values in map(_effective_settings, runs)
+        for values in (effective_settings(run.config.settings) for run in runs)
         for name in values.keys() - _ignored_settings(values) - {"method"}
     )
     differing = group_pairs(
@@ -85,10 +85,6 @@ def find_origin_differences(runs: Sequence[Run]) -> list[Difference]:
         for name, get_value in ORIGINS.items()
     )
     return [difference for difference in differences if len(difference.methods) > 1]
-
-
-def _effective_settings(run: Run) -> dict[str, Any]:
-    return effective_settings(run.config.settings)
 
 
 def _ignored_settings(settings: Mapping[str, Any]) -> set[str]:

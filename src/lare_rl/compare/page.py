@@ -7,7 +7,7 @@ from pathlib import Path
 from lare_rl.compare.bootstrap import REPETITIONS, Estimate
 from lare_rl.compare.comparison import Comparison, compare_over_tasks, compare_tasks
 from lare_rl.compare.messages import MESSAGES, find_min_p, find_score_meaning, find_small_samples, to_text
-from lare_rl.compare.results import LearningCurves
+from lare_rl.compare.results import LearningCurve
 from lare_rl.compare.scores import LAST_RETURN, ScoreChoice
 from lare_rl.report import figures
 from lare_rl.report.html import render_note, render_table, write_page
@@ -23,15 +23,14 @@ OVERALL_HEADER = ("all tasks", "seeds", "above baseline [95%]", "p")
 
 
 def write_comparisons(
-    results: Sequence[LearningCurves],
+    results: Sequence[LearningCurve],
     out: Path,
     choice: ScoreChoice = LAST_RETURN,
     findings: Iterable[Finding] = (),
 ) -> list[Comparison]:
     """Compare results (`compare_tasks`), and write the page, with the findings about the results at its end.
 
-    Raises:
-        LareError: the results cannot be compared, or the file cannot be written.
+    Raises `LareError` if the results cannot be compared, or the file cannot be written.
     """
     comparisons = compare_tasks(results, choice)
     tasks = ", ".join(task for comparison in comparisons for task in comparison.tasks)
@@ -83,7 +82,7 @@ def _format_cell(value: Estimate | float | None) -> str:
     return str(value) if isinstance(value, Estimate) else f"{value:.2g}"
 
 
-def _find_origin(results: Sequence[LearningCurves]) -> Finding | None:
+def _find_origin(results: Sequence[LearningCurve]) -> Finding | None:
     """Return the versions, machine and evaluations that all runs share."""
     configs = [result.config for result in results if result.config is not None]
     values = {

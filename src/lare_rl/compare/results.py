@@ -18,7 +18,7 @@ from lare_rl.runs.config_file import Config
 from lare_rl.runs.directory import Run
 from lare_rl.util.safe_io import read_text
 
-__all__ = ["LearningCurves", "group_pairs", "read_results_table", "read_run_results"]
+__all__ = ["LearningCurve", "group_pairs", "read_results_table", "read_run_results"]
 
 _Key = TypeVar("_Key", bound=Hashable)
 _Value = TypeVar("_Value")
@@ -29,8 +29,8 @@ COLUMNS = ("method", "task", "seed", "step")
 
 
 @dataclass(frozen=True)
-class LearningCurves:
-    """The values of a metric in one run, or of one method and task in a table."""
+class LearningCurve:
+    """The values of a metric for one seed of a run, or of a method and task in a table."""
 
     label: str
     """The row of the comparison: the method, and what distinguishes it from other rows."""
@@ -39,8 +39,9 @@ class LearningCurves:
     task: str
     draw: int
     """The draw of the language model; 0 for a table."""
-    curves: Mapping[int, Mapping[int, float]]
-    """The values, by seed and step."""
+    seed: int
+    values: Mapping[int, float]
+    """The values by step."""
     config: Config | None = None
     """The configuration of a run; None for a table."""
 
@@ -53,12 +54,8 @@ def group_pairs(pairs: Iterable[tuple[_Key, _Value]]) -> dict[_Key, list[_Value]
     return groups
 
 
-def read_run_results(runs: Mapping[str, Sequence[Run]], metric: str) -> list[LearningCurves]:
-    """Read the values of a metric in runs. `runs` maps each label to its runs.
-
-    Raises:
-        LareError: a file is damaged.
-    """
+def read_run_results(runs: Mapping[str, Sequence[Run]], metric: str) -> list[LearningCurve]:
+    """Read the values of a metric in runs. `runs` maps each label to its runs. Raises `LareError` if a file is damaged."""
     results = []
     for label, run in ((label, run) for label, group in runs.items() for run in group):
         curves: dict[int, dict[int, float]] = {seed: {} for seed in run.seeds}
@@ -67,18 +64,15 @@ def read_run_results(runs: Mapping[str, Sequence[Run]], metric: str) -> list[Lea
                 raise LareError(f"the metrics of {run.directory} have the seed {seed}, which the run does not have")
             if line.get(metric) is not None:
                 curves[seed][line["step"]] = float(line[metric])
-        task, draw = run.config.task.name, run.config.settings.draw
-        results.append(
-            LearningCurves(label=label, source=run.directory, task=task, draw=draw, curves=curves, config=run.config)
-        )
+        origin = label, run.directory, run.config.task.name, run.config.settings.draw
+        results += [LearningCurve(*origin, seed, values, run.config) for seed, values in curves.items()]
     return results
 
 
-def read_results_table(path: Path, metric: str) -> list[LearningCurves]:
-    """Read the curves of each method and task in a table.
+def read_results_table(path: Path, metric: str) -> list[LearningCurve]:
+    """Read the curves of each method, task and seed in a table.
 
-    Raises:
-        LareError: the file cannot be read, a column is missing, or a line is not valid.
+    Raises `LareError` if the file cannot be read, a column is missing, or a line is not valid.
     """
     rows = csv.DictReader(io.StringIO(read_text(path, MAX_TABLE_BYTES), newline=""), restkey="")
     try:
@@ -88,7 +82,7 @@ def read_results_table(path: Path, metric: str) -> list[LearningCurves]:
         raise LareError(f"{path} is not a CSV table: {error}") from error
     if not curves:
         raise LareError(f"{path} has no row with a value of {metric}")
-    return [LearningCurves(method, path, task, draw=0, curves=values) for (method, task), values in curves.items()]
+    return [LearningCurve(method, path, task, 0, seed, values) for (method, task, seed), values in curves.items()]
 
 
 def _check_columns(path: Path, header: Sequence[str], metric: str) -> None:
@@ -102,9 +96,9 @@ def _check_columns(path: Path, header: Sequence[str], metric: str) -> None:
         raise LareError(f"{path} has no column {name!r}{hint}: a table of results needs {', '.join(columns)}")
 
 
-def _read_curves(path: Path, rows: csv.DictReader, metric: str) -> dict[tuple[str, str], dict[int, dict[int, float]]]:
-    """Return the values by method and task, seed, and step."""
-    curves: dict[tuple[str, str], dict[int, dict[int, float]]] = {}
+def _read_curves(path: Path, rows: csv.DictReader, metric: str) -> dict[tuple[str, str, int], dict[int, float]]:
+    """Return the values by method, task and seed, and by step."""
+    curves: dict[tuple[str, str, int], dict[int, float]] = {}
     for row in rows:
         if not row[metric]:  # a row with other metrics
             continue
@@ -113,7 +107,7 @@ def _read_curves(path: Path, rows: csv.DictReader, metric: str) -> dict[tuple[st
         if not (method and task):
             raise LareError(f"{where} has no method or no task")
         seed, step = (_parse(f"{where}: {name}", row[name], _whole, "nonnegative whole") for name in ("seed", "step"))
-        curve = curves.setdefault((method, task), {}).setdefault(seed, {})
+        curve = curves.setdefault((method, task, seed), {})
         if step in curve:
             raise LareError(f"{where} is a second row of {method} on {task} with seed {seed} at step {step}")
         curve[step] = _parse(f"{where}: {metric}", row[metric], float, "finite")

@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from lare_rl.compare.results import LearningCurves, group_pairs
+from lare_rl.compare.results import LearningCurve, group_pairs
 from lare_rl.errors import LareError
 from lare_rl.evaluation.reference_returns import REFERENCE_RETURNS
 from lare_rl.runs.metric_names import RETURN
@@ -55,26 +55,14 @@ class LabelScores:
         return self.final_scores.mean(axis=0)
 
 
-class _Key(NamedTuple):
-    """The run and seed of a curve."""
-
-    label: str
-    task: str
-    draw: int
-    seed: int
+_Key = tuple[str, str, int, int]
+"""Label, task, draw and seed of a curve."""
 
 
-class _Curve(NamedTuple):
-    source: Path
-    values: Mapping[int, float]
-    """From step to value."""
-
-
-def group_results(results: Sequence[LearningCurves], choice: ScoreChoice = LAST_RETURN) -> list[LabelScores]:
+def group_results(results: Sequence[LearningCurve], choice: ScoreChoice = LAST_RETURN) -> list[LabelScores]:
     """Group the curves of runs by label: the name of the method in the comparison.
 
-    Raises:
-        LareError: a label lacks a task, draw or seed, or not all results have a value at the chosen step.
+    Raises `LareError` if a label lacks a task, draw or seed, or not all results have a value at the chosen step.
     """
     tasks = tuple(sorted({result.task for result in results}))
     _check_tasks(results, tasks, choice.metric)
@@ -83,8 +71,8 @@ def group_results(results: Sequence[LearningCurves], choice: ScoreChoice = LAST_
     n_final = len(last_quarter(steps)) if choice.average_last_quarter else 1
     groups = []
     for label in dict.fromkeys(result.label for result in results):
-        keys = [key for key in curves if key.label == label]
-        draws, seeds = (tuple(sorted(values)) for values in ({key.draw for key in keys}, {key.seed for key in keys}))
+        group = [curve for curve in curves.values() if curve.label == label]
+        draws, seeds = tuple(sorted({curve.draw for curve in group})), tuple(sorted({curve.seed for curve in group}))
         scores = _fill_scores(label, draws, seeds, tasks, steps, curves)
         groups.append(
             LabelScores(
@@ -106,12 +94,12 @@ def _fill_scores(
     seeds: Sequence[int],
     tasks: Sequence[str],
     steps: Sequence[int],
-    curves: Mapping[_Key, _Curve],
+    curves: Mapping[_Key, LearningCurve],
 ) -> Float[np.ndarray, "draws seeds tasks steps"]:
     """Return the scores of a label. Raises `LareError` if it lacks a task, draw or seed."""
     scores = np.empty((len(draws), len(seeds), len(tasks), len(steps)))
     for (i, draw), (j, seed), (k, task) in product(enumerate(draws), enumerate(seeds), enumerate(tasks)):
-        key = _Key(label, task, draw, seed)
+        key = label, task, draw, seed
         if key not in curves:
             hint = ", or compare each task alone" if len(tasks) > 1 else ""
             raise LareError(
@@ -130,7 +118,7 @@ def last_quarter(steps: Sequence[int]) -> list[int]:
     return [step for step in steps if 4 * step > 3 * steps[-1]]
 
 
-def _check_tasks(results: Sequence[LearningCurves], tasks: Sequence[str], metric: str) -> None:
+def _check_tasks(results: Sequence[LearningCurve], tasks: Sequence[str], metric: str) -> None:
     """Raise `LareError` if scores of several tasks have no common scale, or two tasks have the same name."""
     if len(tasks) > 1 and metric != RETURN:
         raise LareError(f"{metric} has no common scale over several tasks: compare each task alone")
@@ -146,39 +134,35 @@ def _check_tasks(results: Sequence[LearningCurves], tasks: Sequence[str], metric
                 )
 
 
-def _index_curves(results: Sequence[LearningCurves], metric: str) -> dict[_Key, _Curve]:
-    curves: dict[_Key, _Curve] = {}
+def _index_curves(results: Sequence[LearningCurve], metric: str) -> dict[_Key, LearningCurve]:
+    curves: dict[_Key, LearningCurve] = {}
     # A table counts as draw 0. Its method lacks the other draws, so it cannot share a label with runs that have them.
     run_sources = {result.label: result.source for result in reversed(results) if result.draw != 0}
     for result in results:
-        if result.config is None and result.label in run_sources:
+        source, label = result.source, result.label
+        if result.config is None and label in run_sources:
             raise LareError(
-                f"{result.source} and {run_sources[result.label]} both have {result.label}, and a table has no draws: rename the method in "
-                "the .csv file"
+                f"{source} and {run_sources[label]} both have {label}, and a table has no draws: rename the method in the .csv file"
             )
-        for seed, values in result.curves.items():
-            key = _Key(result.label, result.task, result.draw, seed)
-            if key in curves:
-                other = curves[key].source
-                from_table = result.config is None or other.suffix == ".csv"
-                hint = ", or rename the method in the .csv file" if from_table else ""
-                raise LareError(
-                    f"{result.source} and {other} both have {key.label} on {key.task} with seed {seed} and draw {key.draw}: leave "
-                    f"out one{hint}"
-                )
-            if not values:
-                raise LareError(f"{result.source} has no {metric} of seed {seed}: leave it out")
-            curves[key] = _Curve(result.source, values)
+        other = curves.setdefault((label, result.task, result.draw, result.seed), result)
+        if other is not result:
+            hint = "" if result.config and other.config else ", or rename the method in the .csv file"
+            raise LareError(
+                f"{source} and {other.source} both have {label} on {result.task} with seed {result.seed} and draw {result.draw}: leave "
+                f"out one{hint}"
+            )
+        if not result.values:
+            raise LareError(f"{source} has no {metric} of seed {result.seed}: leave it out")
     return curves
 
 
-def _shared_steps(curves: Mapping[_Key, _Curve], choice: ScoreChoice) -> list[int]:
+def _shared_steps(curves: Mapping[_Key, LearningCurve], choice: ScoreChoice) -> list[int]:
     """Return the steps at which all curves have a value, up to the chosen step."""
     metric, step, _ = choice
     steps = sorted(set.intersection(*(set(curve.values) for curve in curves.values())))
     if not steps:
         steps_of_seeds = group_pairs(
-            ((key.label, key.task, curve.source), curve.values) for key, curve in curves.items()
+            ((curve.label, curve.task, curve.source), curve.values) for curve in curves.values()
         )
         spans = [
             f"{label} on {task} in {source}: {min(map(min, values)):,} to {max(map(max, values)):,}"

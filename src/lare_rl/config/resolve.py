@@ -23,8 +23,7 @@ MIN_EVALUATIONS = 5
 def resolve(settings: Settings, task: TaskSpec) -> ResolvedSettings:
     """Fill in the settings that are None, by the task, and check all settings.
 
-    Raises:
-        LareError: method, algorithm and task do not go together.
+    Raises `LareError` if method, algorithm and task do not go together.
     """
     if task.team is not None:
         raise LareError(f"{task.name} is one team of {task.environment}: train the task that has both")

@@ -33,8 +33,7 @@ class Match(NamedTuple):
 def cross_play(runs: tuple[Run, Run], episodes: int = 200) -> list[Match]:
     """Let the first team of each run play against the second team of each: four matches, all from the same initial states.
 
-    Raises:
-        LareError: the runs are not of one task with two teams, or of different algorithms, or `episodes` is less than 1.
+    Raises `LareError` if the runs are not of one task with two teams, or of different algorithms, or `episodes` is less than 1.
     """
     episodes = check_count("episodes", episodes)
     task, other_task = (run.config.task for run in runs)

@@ -1,7 +1,6 @@
 """The credit that a run's decoders give to the steps of its last training episode."""
 
 from dataclasses import dataclass
-from functools import partial
 from typing import NamedTuple
 
 import jax
@@ -71,11 +70,21 @@ def load_episode_credit(run: Run) -> EpisodeCredit | None:
     index = _find_newest_episode(learner)
     if not config.method.has_proxy_rewards or index is None:
         return None
-    steps, training_reward = jax.jit(partial(_read_rewards, config=config))(learner, index)
+
+    @jax.jit
+    def read_rewards(learner: Learner, index: Index) -> tuple[StoredSteps, Float[Array, "steps agents"]]:
+        steps = replay.read(learner.replay, index)
+        return steps, rewards(steps, learner.reward_sources, config)
+
+    steps, training_reward = read_rewards(learner, index)
+
+    def posterior_std(decoder: DecoderState, steps: StoredSteps) -> Float[Array, " steps"]:
+        return reward_std(decoder, decoder_inputs(steps, config, 0)[:, 0], config.credit_specs[0])
+
     uncertainty = None
     if learner.decoders and config.method.fit in (Fit.EVIDENCE, Fit.PREFIX_EVIDENCE) and config.n_proxy_rewards == 1:
         with float64():
-            std = np.asarray(jax.jit(partial(_posterior_std, config=config))(learner.decoders[0], steps))
+            std = np.asarray(jax.jit(posterior_std)(learner.decoders[0], steps))
         uncertainty = 2 * std / np.where(learner.decoders[0].is_average, steps.length, 1)
     reward = np.asarray(steps.columns["reward"])
     return EpisodeCredit(
@@ -97,19 +106,6 @@ def _find_newest_episode(learner: Learner) -> Index | None:
     start = int(np.asarray(buffer.first)[0, episode % buffer.first.shape[-1]])
     number = jnp.arange(start, int(jax.jit(replay.end_of_episode)(buffer, env_index, episode)))
     return Index(jnp.zeros(len(number), int), number)
-
-
-def _read_rewards(
-    learner: Learner, index: Index, config: TrainConfig
-) -> tuple[StoredSteps, Float[Array, "steps agents"]]:
-    """Read steps of one seed's replay, and compute their training rewards."""
-    steps = replay.read(learner.replay, index)
-    return steps, rewards(steps, learner.reward_sources, config)
-
-
-def _posterior_std(decoder: DecoderState, steps: StoredSteps, config: TrainConfig) -> Float[Array, " steps"]:
-    """Compute the posterior standard deviation of a single agent's proxy rewards, in float64."""
-    return reward_std(decoder, decoder_inputs(steps, config, 0)[:, 0], config.credit_specs[0])
 
 
 def _factor_correlations(learners: Learner, config: TrainConfig) -> Float[np.ndarray, " factors"]:

@@ -23,7 +23,7 @@ from lare_rl.training.evaluation import Evaluation
 from lare_rl.training.saved_state import load_actor
 from lare_rl.training.streams import Stream, episode_seed
 from lare_rl.training.unroll_host import evaluate_policy_on_host
-from lare_rl.util.statistics import grouped_standard_error, standard_error
+from lare_rl.util.statistics import episode_error, grouped_standard_error, standard_error
 
 __all__ = [
     "MAX_RANDOM_EPISODES",
@@ -141,8 +141,8 @@ def mean_with_error(values: Float[np.ndarray, "seeds episodes"]) -> tuple[float,
     """Return the mean and its standard error, from seed to seed or from episode to episode. Return None for a single episode."""
     if values.shape[1] < 2:
         return None
-    episode_error = math.sqrt(np.mean(values.var(axis=1, ddof=1)) / values.size)
-    return float(values.mean()), grouped_standard_error(values.mean(axis=1), episode_error)
+    error = episode_error(values.var(axis=1, ddof=1), values.shape[1])
+    return float(values.mean()), grouped_standard_error(values.mean(axis=1), error)
 
 
 def measure_random_returns(task: TaskSpec, n_episodes: int = RANDOM_EPISODES) -> Float[np.ndarray, "teams episodes"]:

@@ -80,8 +80,7 @@ class RunPolicy:
     def select_env_action(self, observation: Any, available: Any = None) -> Float[np.ndarray, " action"]:
         """Return the action for one observation in the environment's units. A discrete action is one-hot, as in `JaxEnv.step`.
 
-        Raises:
-            LareError: the observation or the mask has another size, or there are several observations.
+        Raises `LareError` if the observation or the mask has another size, or there are several observations.
         """
         rows, is_single = self._check_observation(observation)
         if not is_single:

@@ -2,7 +2,7 @@
 
 import math
 import warnings
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from contextlib import closing
 from importlib.util import find_spec
 from io import BytesIO
@@ -26,7 +26,7 @@ from lare_rl.training.collect_device import make_jax_env
 from lare_rl.training.streams import Stream, episode_seed
 from lare_rl.util.files import check_new_path
 
-__all__ = ["check_video_path", "encode_film", "record_frames", "record_video", "render_played", "write_video"]
+__all__ = ["check_video_path", "encode_film", "record_frames", "record_video", "write_video"]
 
 FRAMES_PER_SECOND = 8
 """The frame rate of a film of many agents."""
@@ -47,8 +47,7 @@ def record_video(run: Run, path: str | Path, best: bool = False, deterministic: 
 
     A film of a particle task shows each agent's credit, as number and colour.
 
-    Raises:
-        LareError: the environment cannot be drawn on this machine, or the file cannot be written.
+    Raises `LareError` if the environment cannot be drawn on this machine, or the file cannot be written.
     """
     path = Path(path)
     check_video_path(path)
@@ -85,8 +84,8 @@ def record_frames(
             raise LareError(
                 f"{run.config.task.name} steps on the host, where only single agents are filmed: leave the video out"
             )
-        frames = render_played(run, played or play_run(run))
-        assert frames is not None
+        played = played or play_run(run)
+        frames = make_jax_env(run.config.task).frames(*played.select_episode((played.state, played.credit)))
         return frames[:max_frames], 1 / FRAMES_PER_SECOND
     policy = RunPolicy(run, best=best, deterministic=deterministic)
     if spec.is_jax:
@@ -96,14 +95,7 @@ def record_frames(
         metadata = env.environment.metadata if isinstance(env, GymnasiumEnv) else {}
         fps = metadata.get("render_fps", DEFAULT_FPS)
         interval = max(1, math.ceil(fps / max_rate))
-        return _play_and_render(run, env, policy, interval, max_frames), interval / fps
-
-
-def render_played(run: Run, played: PlayedEpisodes) -> list[Frame] | None:
-    """Render the first episode with each agent's credit. Return None for an environment that cannot be drawn."""
-    if not load_env_spec(run.config.task).is_jax:
-        return None
-    return make_jax_env(run.config.task).frames(*played.select_episode((played.state, played.credit)))
+        return _watch(run, env, policy, lambda: _render(env, run), interval, max_frames), interval / fps
 
 
 def encode_film(frames: Sequence[Frame], frame_seconds: float, max_bytes: int) -> bytes:
@@ -160,36 +152,34 @@ def write_video(path: Path, frames: Sequence[Frame], frame_seconds: float) -> No
 
 def _play_and_draw(run: Run, policy: RunPolicy, max_frames: int) -> list[Frame]:
     """Play an episode of an environment of pure functions, and draw the states in which the policy acts, or some of many."""
-    env, states = make_host_env(run.config.task), []
+    env = make_host_env(run.config.task)
     assert isinstance(env, JaxOnHost)
-
-    def act(*inputs: np.ndarray) -> np.ndarray:
-        states.append(env.state)
-        return policy.select_env_action(*inputs)
-
-    for _ in play_steps(env, act, np.random.default_rng(0), _film_seed(run)):
-        pass
+    states = _watch(run, env, policy, lambda: env.state)
     states = states[:: math.ceil(len(states) / max_frames)]
     return env.env.frames(jax.tree.map(lambda *leaves: np.stack(leaves), *states))
 
 
-def _film_seed(run: Run) -> int:
-    return episode_seed(run.seeds[0], Stream.EVALUATION_EPISODES, 0)
-
-
-def _play_and_render(run: Run, env: HostEnv, policy: RunPolicy, interval: int, max_frames: int | None) -> list[Frame]:
-    """Play an episode, and render every `interval`-th timestep at which the policy acts. It ends after `max_frames`."""
-    frames, steps = [], count()
+def _watch(
+    run: Run,
+    env: HostEnv,
+    policy: RunPolicy,
+    look: Callable[[], Any],
+    interval: int = 1,
+    max_frames: int | None = None,
+) -> list[Any]:
+    """Play an episode. Return what `look` returns at every `interval`-th timestep at which the policy acts, at most `max_frames`."""
+    seen, steps = [], count()
 
     def act(*inputs: np.ndarray) -> np.ndarray:
         if next(steps) % interval == 0:
-            frames.append(_render(env, run))
+            seen.append(look())
         return policy.select_env_action(*inputs)
 
-    for _ in play_steps(env, act, np.random.default_rng(0), _film_seed(run)):
-        if len(frames) == max_frames:
+    seed = episode_seed(run.seeds[0], Stream.EVALUATION_EPISODES, 0)
+    for _ in play_steps(env, act, np.random.default_rng(0), seed):
+        if len(seen) == max_frames:
             break
-    return frames
+    return seen
 
 
 def _render(env: HostEnv, run: Run) -> Frame:

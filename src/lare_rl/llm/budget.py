@@ -8,7 +8,7 @@ from typing import Any
 
 from lare_rl.errors import LareError
 from lare_rl.llm.prompts import Message
-from lare_rl.util.durations import format_seconds
+from lare_rl.util.findings import format_for_reader
 
 __all__ = ["Budget", "BudgetExceededError", "max_request_tokens"]
 
@@ -68,7 +68,8 @@ class Budget:
         if seconds >= self.seconds_left:
             pause = f", and a pause of {seconds:.0f} s comes next" if seconds else ""
             raise BudgetExceededError(
-                f"the {format_seconds(self.seconds)} of waiting for the model are over ({self.seconds_used:.0f} s are used{pause})"
+                f"the {format_for_reader(self.seconds, 'seconds')} of waiting for the model are over "
+                f"({self.seconds_used:.0f} s are used{pause})"
             )
         self.seconds_used += seconds
 
@@ -84,7 +85,7 @@ class Budget:
     def timeout_text(self) -> str:
         """Return the longest time for the next reply in words."""
         timeout_s = min(self.reply_timeout_s, self.seconds_left)
-        return f"{timeout_s:.0f} s at most ({format_seconds(self.seconds_left)} are left for all)"
+        return f"{timeout_s:.0f} s at most ({format_for_reader(self.seconds_left, 'seconds')} are left for all)"
 
     def count_reply(self, usage: Any, messages: Sequence[Message], reply_bytes: int) -> None:
         """Add the tokens of a request and its reply. `usage` is what the server reports. Without it, bytes count as tokens.

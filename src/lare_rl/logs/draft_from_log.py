@@ -4,7 +4,7 @@ import re
 from typing import Any
 
 from lare_rl.assigner.space_layout import SpaceLayout
-from lare_rl.logs.log import Log, open_log
+from lare_rl.logs.log import open_log
 from lare_rl.new_task.documentation import plain_lines, remove_rewards
 from lare_rl.new_task.draft import SCORE_LINE, Draft, count_entries, make_draft, warning_lines
 from lare_rl.tasks.spec import NO_ENVIRONMENT
@@ -17,7 +17,9 @@ LIMIT_LINE = "# max_episode_steps = 1000 # episodes that did not terminate, and 
 def draft_log_task(source: Any) -> Draft:
     """Draft a task from what a log contains. Raises `LareError` if the log cannot be read."""
     log = open_log(source)
-    description, removed = remove_rewards(plain_lines(_description(log)))
+    dataset = getattr(log, "dataset", None)  # only a Minari data set has a description
+    text = "" if dataset is None else str(dataset.storage.metadata.get("description") or "")
+    description, removed = remove_rewards(plain_lines(text))
     texts = {"description": description, "observation": "", "action": ""}
     layouts = {"observation": log.layout.observation, "action": log.layout.action}
     name = re.sub(r"[^\w.\-]+", "-", re.sub(r"\.parquet$", "", log.name.rstrip("/")).rpartition("/")[2]) or "logs"
@@ -34,11 +36,6 @@ def draft_log_task(source: Any) -> Draft:
     ]
     first_lines = {key: _first_line(layout, key) for key, layout in layouts.items()}
     return make_draft(name, lines, texts, first_lines, removed, logs_only=True)
-
-
-def _description(log: Log) -> str:
-    dataset = getattr(log, "dataset", None)  # only a Minari data set has a description
-    return "" if dataset is None else str(dataset.storage.metadata.get("description") or "")
 
 
 def _first_line(layout: SpaceLayout, key: str) -> str:

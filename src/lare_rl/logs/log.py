@@ -155,8 +155,7 @@ def check_output(out: Path, overwrite: bool, folders: Container[str] = ()) -> No
 def atomic_output(out: Path, overwrite: bool, folders: Container[str] = ()) -> Iterator[Path]:
     """Yield a temporary path for a file or a directory. At the end it replaces `out`; after an error it is removed.
 
-    Raises:
-        LareError: `out` exists, or cannot be written: see `check_output`.
+    Raises `LareError` if `out` exists, or cannot be written: see `check_output`.
     """
     check_output(out, overwrite, folders)
     new, old = (out.with_name(f".{out.name}.{uuid4().hex}.{kind}") for kind in ("new", "old"))

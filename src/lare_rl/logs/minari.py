@@ -109,7 +109,7 @@ def load_dataset(dataset_id: str) -> MinariDataset:
     try:
         return minari.load_dataset(dataset_id)
     except Exception as error:  # h5py and Minari may raise anything for untrusted files
-        if not (get_dataset_path(dataset_id) / "data").exists():
+        if not is_local_dataset(dataset_id):
             raise LareError(
                 f"{dataset_id} is neither a path nor a local Minari data set: see minari list local; minari download fetches one"
             ) from error
@@ -118,7 +118,7 @@ def load_dataset(dataset_id: str) -> MinariDataset:
 
 def is_local_dataset(dataset_id: str) -> bool:
     """Return whether a local Minari data set has that id."""
-    return (get_dataset_path(dataset_id) / "data").is_dir()
+    return (get_dataset_path(dataset_id) / FOLDERS[0]).is_dir()
 
 
 def _dataset_path(dataset_id: str | Path) -> Path:

@@ -154,7 +154,24 @@ def relabel(
     log = open_log(source, task)
     log.check_output(out, overwrite)
     name = method or ("bayes" if phi is None else "lare-bayes")
-    credit = _create_assigner(log, name, phi, task, settings, memory, seed)
+    if METHODS.find(name).reward is Reward.UNIFORM:
+        raise LareError(
+            f"{name} gives all steps of an episode the same reward, and needs no relabelling: compute it from the return"
+        )
+    create = partial(
+        CreditAssigner,
+        name,
+        phi,
+        task=task,
+        observation_space=log.layout.observation.size,  # `parse_episode` returns rows
+        action_space=log.layout.action.size,
+        settings=settings,
+        seed=seed,
+        fits_per_step=0.0,
+        forget=False,
+        groups=log.layout.has_groups,
+    )
+    credit = create(capacity=max(MIN_CAPACITY, int(memory * 2**30 / create(capacity=1).store.bytes_per_step)))
     size = _fit(credit, log, hold_out_flags(hold_out, seed), updates, listener)
     explanation, counts = tuple(credit.explanation()), _Counts()
     episodes = _compute_rewards(credit, log, hold_out_flags(hold_out, seed), size, counts, listener)
@@ -209,36 +226,6 @@ class _Counts:
     """Their predicted returns."""
 
 
-def _create_assigner(
-    log: Log,
-    method: str,
-    phi: LatentFunction | None,
-    task: TaskSpec | None,
-    settings: CreditSettings | None,
-    memory: float,
-    seed: int,
-) -> CreditAssigner:
-    """Create an assigner whose steps take about `memory` GiB."""
-    if METHODS.find(method).reward is Reward.UNIFORM:
-        raise LareError(
-            f"{method} gives all steps of an episode the same reward, and needs no relabelling: compute it from the return"
-        )
-    create = partial(
-        CreditAssigner,
-        method,
-        phi,
-        task=task,
-        observation_space=log.layout.observation.size,  # `parse_episode` returns rows
-        action_space=log.layout.action.size,
-        settings=settings,
-        seed=seed,
-        fits_per_step=0.0,
-        forget=False,
-        groups=log.layout.has_groups,
-    )
-    return create(capacity=max(MIN_CAPACITY, int(memory * 2**30 / create(capacity=1).store.bytes_per_step)))
-
-
 def _fit(
     credit: CreditAssigner, log: Log, is_held_out: Iterator[bool], updates: int, listener: Listener
 ) -> tuple[int, int]:
@@ -273,14 +260,13 @@ def _compute_rewards(
 ) -> Iterator[RelabelledEpisode]:
     """Yield every episode with its rewards, and add it to `counts`.
 
-    Raises:
-        LareError: the log has another `size` than in the first pass.
+    Raises `LareError` if the log has another `size` than in the first pass.
     """
     # `phi` takes about as long for many steps as for few.
     for batch in batch_by_steps(log.episodes(), len):
         lengths = [len(episode) for episode in batch]
-        begins = [_segment_begins(episode.reward, credit.config) for episode in batch]
-        payment_lengths = [_segment_lengths(first) for first in begins]
+        begins = [_payment_begins(episode.reward, credit.config) for episode in batch]
+        payment_lengths = [np.diff(np.append(np.flatnonzero(first), len(first))) for first in begins]
         r_hat = credit.rewards(
             np.concatenate([episode.observation for episode in batch]),
             np.concatenate([episode.action for episode in batch]),
@@ -289,7 +275,7 @@ def _compute_rewards(
             begins=np.concatenate(begins),
         )
         rewards = np.split(r_hat, np.cumsum(lengths)[:-1])
-        for episode, reward, payments in zip(batch, rewards, payment_lengths, strict=True):
+        for episode, reward, first, payments in zip(batch, rewards, begins, payment_lengths, strict=True):
             counts.episodes += 1
             counts.steps += len(episode)
             counts.cut += not episode.complete
@@ -299,33 +285,30 @@ def _compute_rewards(
                 unpaid = credit.step_rewards.unpaid_return(level, payments)
                 counts.predictions.append(float(reward.sum(dtype=np.float64)) + unpaid)
             if episode.complete and credit.config.spec.is_exact:
-                reward = _make_exact(reward, episode.reward, credit.config)
+                reward = _make_exact(reward, episode.reward, first, payments, credit.config)
             yield RelabelledEpisode(episode, reward)
             listener("write", counts.episodes, size[0])
     if (counts.episodes, counts.steps) != size:
         raise LareError(f"{log.name} changed while it was read: it had {size[0]} episodes, and now {counts.episodes}")
 
 
-def _segment_begins(reward: Float[np.ndarray, " steps"], config: AssignerConfig) -> Bool[np.ndarray, " steps"]:
+def _payment_begins(reward: Float[np.ndarray, " steps"], config: AssignerConfig) -> Bool[np.ndarray, " steps"]:
     """Return which steps of an episode are the first ones of a payment."""
     n_steps = len(reward)
     pays = is_paid(config.payments, np.arange(n_steps), reward[:, None], np.arange(n_steps) == n_steps - 1)
     return np.append(True, pays[:-1])
 
 
-def _segment_lengths(begins: Bool[np.ndarray, " steps"]) -> Int[np.ndarray, " payments"]:
-    """Return the number of steps of each payment of an episode."""
-    return np.diff(np.append(np.flatnonzero(begins), len(begins)))
-
-
 def _make_exact(
-    r_hat: Float[np.ndarray, " steps"], reward: Float[np.ndarray, " steps"], config: AssignerConfig
+    r_hat: Float[np.ndarray, " steps"],
+    reward: Float[np.ndarray, " steps"],
+    begins: Bool[np.ndarray, " steps"],
+    lengths: Int[np.ndarray, " payments"],
+    config: AssignerConfig,
 ) -> Float[np.ndarray, " steps"]:
-    """Return proxy rewards that add up to each payment."""
+    """Return proxy rewards that add up to each payment. Payments have `lengths` steps, and begin at the steps `begins`."""
     exact = config.settings.exact
     assert exact in ("last", "spread")
-    begins = _segment_begins(reward, config)
-    lengths = _segment_lengths(begins)
     residual = np.add.reduceat(reward - r_hat.astype(np.float64), np.flatnonzero(begins))
     residual, length = (np.repeat(values, lengths) for values in (residual, lengths))
     change = correction(residual, np.append(begins[1:], True), length, exact)

@@ -171,44 +171,38 @@ class Chart:
 
 @dataclass(frozen=True)
 class Bar:
-    """A bar of the length |amount|, to the right for a sign of 1 and to the left for -1. A sign of 0 has no side."""
+    """A bar of the length |amount|, to the left if it is negative. The style is a class of report.css: `minus` has another colour."""
 
     text: str
     name: str
     amount: float
-    sign: int
+    style: str
     hover: str
 
 
 def draw_legend(entries: Iterable[tuple[str, str]]) -> str:
     """Draw the meaning of the styles of lines, and of the styles `shade` and `band ...` of areas."""
-
-    def draw_key(style: str) -> str:
+    items = []
+    for style, text in entries:
         is_area = style.startswith(("shade", "band"))
-        return (
-            f'<rect class="{style}" width="26" height="12"/>' if is_area else f'<path class="key {style}" d="M0 6h26"/>'
-        )
-
-    keys = ((draw_key(style), text) for style, text in entries)
-    items = (f'<li><svg viewBox="0 0 26 12">{key}</svg>{escape(text)}</li>' for key, text in keys)
+        key = f'rect class="{style}" width="26" height="12"' if is_area else f'path class="key {style}" d="M0 6h26"'
+        items.append(f'<li><svg viewBox="0 0 26 12"><{key}/></svg>{escape(text)}</li>')
     return f'<ul class="legend">{"".join(items)}</ul>'
 
 
 def draw_bars(bars: Sequence[Bar]) -> str:
     """Draw bars below each other, with their amounts as percentages."""
-    longest = max([abs(bar.amount) for bar in bars] + [1e-9])
-    has_left = any(bar.sign < 0 and bar.amount for bar in bars)
+    low, high = min([0.0, *(bar.amount for bar in bars)]), max([0.0, *(bar.amount for bar in bars)])
+    extent = max(high - low, 1e-9)
     items = []
     for bar in bars:
-        width = abs(bar.amount) / longest * (50 if has_left else 100)
-        start = (50 - width if bar.sign < 0 else 50) if has_left else 0
-        side = "minus" if bar.sign < 0 else "plus"
+        start, width = (min(bar.amount, 0.0) - low) / extent, abs(bar.amount) / extent
         shape = (
-            f'<i class="{side}" style="left:{start:.1f}%;width:{width:.1f}%"></i>' if round(100 * bar.amount) else ""
+            f'<i class="{bar.style}" style="left:{start:.1%};width:{width:.1%}"></i>' if round(100 * bar.amount) else ""
         )
         items.append(
             f'<li title="{escape(bar.hover)}"><span class="meaning">{escape(bar.text)} <code>{escape(bar.name)}</code></span>'
-            f'<span class="track{" both" if has_left else ""}">{shape}</span><span class="amount">{bar.amount:z.0%}</span></li>'
+            f'<span class="track" style="--zero:{-low / extent:.1%}">{shape}</span><span class="amount">{bar.amount:z.0%}</span></li>'
         )
     return f'<ul class="bars">{"".join(items)}</ul>'
 
@@ -219,7 +213,8 @@ def draw_strips(rows: Mapping[str, Float[np.ndarray, "steps agents"]], shared_sc
     Args:
         shared_scale: whether a colour means the same in all strips.
     """
-    pooled = {name: _average_steps(values) for name, values in rows.items()}
+    chunks = {name: np.array_split(values, min(len(values), MAX_STRIP_COLUMNS)) for name, values in rows.items()}
+    pooled = {name: np.stack([chunk.mean(axis=0) for chunk in strip]) for name, strip in chunks.items()}
     scales = {name: (float(values.min()), float(values.max())) for name, values in pooled.items()}
     if shared_scale:
         scale = min(low for low, _ in scales.values()), max(high for _, high in scales.values())
@@ -273,11 +268,6 @@ def _encode_png(image: Image.Image) -> str:
     file = io.BytesIO()
     image.quantize(64, Image.Quantize.FASTOCTREE).save(file, "PNG", optimize=True)
     return f"data:image/png;base64,{base64.b64encode(file.getvalue()).decode()}"
-
-
-def _average_steps(values: Float[np.ndarray, "steps agents"]) -> Float[np.ndarray, "columns agents"]:
-    n_columns = min(len(values), MAX_STRIP_COLUMNS)
-    return np.stack([chunk.mean(axis=0) for chunk in np.array_split(values, n_columns)])
 
 
 def _points(x: np.ndarray, y: np.ndarray) -> str:

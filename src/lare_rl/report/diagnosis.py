@@ -11,9 +11,8 @@ import numpy as np
 from lare_rl.credit.basis import MAX_PAIRED_RAW_FEATURES
 from lare_rl.credit.prequential import LITTLE_R2
 from lare_rl.report.run_summary import MIN_EVALUATIONS, RunSummary
-from lare_rl.report.score_use import CLEAR_ERRORS
 from lare_rl.util.findings import Finding
-from lare_rl.util.statistics import sample_std
+from lare_rl.util.statistics import CLEAR_ERRORS, sample_std
 
 __all__ = ["CREDIT_CODES", "NEXT_CODES", "diagnose"]
 
@@ -177,8 +176,9 @@ def _one_seed_was_better(run: RunSummary) -> Finding | None:
     """Report the best evaluation of any seed, if it beats random actions and the final mean does not."""
     if not len(run.random_returns) or run.beats_random():
         return None
-    seed_index, best = np.unravel_index(np.nanargmax(run.trained_returns), run.returns.shape)
-    return_ = float(run.trained_returns[seed_index, best])
+    trained_returns = np.where(run.steps > run.warmup, run.returns, -np.inf)  # -inf before the first update
+    seed_index, best = np.unravel_index(np.nanargmax(trained_returns), run.returns.shape)
+    return_ = float(trained_returns[seed_index, best])
     if return_ <= run.random_mean + EVALUATION_STDS * run.random_std:
         return None
     values = {"step": int(run.steps[best]), "return_": return_, "directory": run.directory}

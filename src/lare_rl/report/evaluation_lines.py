@@ -19,12 +19,11 @@ from lare_rl.evaluation.evaluate import (
     mean_with_error,
     play_random,
 )
-from lare_rl.report.score_use import CLEAR_ERRORS
 from lare_rl.runs.directory import Run
 from lare_rl.training.evaluation import Evaluation
 from lare_rl.training.saved_state import load_actor
 from lare_rl.util.findings import format_for_reader
-from lare_rl.util.statistics import format_mean_std, format_plus_minus
+from lare_rl.util.statistics import CLEAR_ERRORS, format_mean_std, format_plus_minus
 
 __all__ = ["compare_actions", "describe_evaluation", "evaluation_lines"]
 

@@ -1,7 +1,6 @@
 """Figures of Matplotlib as SVG text, for comparisons and documents. The report has charts of its own (`charts.py`)."""
 
 import io
-import math
 import textwrap
 from collections.abc import Mapping
 from itertools import cycle, product
@@ -20,7 +19,7 @@ try:
 except ImportError as missing:
     raise missing_extra_error("a figure", "report") from missing
 
-__all__ = ["COLOURS", "add_white_background", "draw_band_panels", "draw_bands", "make_figure", "to_svg"]
+__all__ = ["COLOURS", "add_white_background", "draw_bands", "draw_bands_on", "make_figure", "to_svg"]
 
 COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#000000", "#8c6d31")
 """Okabe and Ito's colours, which colour-blind readers can distinguish."""
@@ -73,7 +72,7 @@ def draw_bands(
         x_is_steps: whether x counts environment steps. If not, y is a fraction of runs that changes at each x, drawn as stairs.
     """
     figure, (axes,) = make_figure()
-    _draw_bands_on(axes, bands, x_is_steps)
+    draw_bands_on(axes, bands, x_is_steps)
     axes.set(xlabel=x_label, ylabel=y_label)
     if log_scale:
         axes.set_yscale("log")
@@ -81,23 +80,8 @@ def draw_bands(
     return to_svg(figure)
 
 
-def draw_band_panels(panels: Mapping[str, Mapping[str, Band]], x_label: str, y_label: str) -> str:
-    """Draw panels of curves over steps, by title, two in a row. They share their axes and the meaning of the colours."""
-    n_rows = math.ceil(len(panels) / 2)
-    figure, all_axes = make_figure(n_rows, height=0.6 + 2.2 * n_rows, columns=2)
-    for axes in all_axes[len(panels) :]:
-        axes.set_visible(False)
-    for axes, (title, bands) in zip(all_axes, panels.items(), strict=False):
-        _draw_bands_on(axes, bands, x_is_steps=True)
-        axes.set_title(title, fontsize=11, loc="left")
-    figure.supxlabel(x_label, fontsize=11)
-    figure.supylabel(y_label, fontsize=11)
-    legend = all_axes[0].get_legend_handles_labels()
-    figure.legend(*legend, loc="outside upper left", ncols=4, fontsize=10, frameon=False)
-    return to_svg(figure)
-
-
-def _draw_bands_on(axes: Axes, bands: Mapping[str, Band], x_is_steps: bool) -> None:
+def draw_bands_on(axes: Axes, bands: Mapping[str, Band], x_is_steps: bool) -> None:
+    """Draw curves as `draw_bands` does, on axes of a figure."""
     for (line, colour), (name, (x, y, low, high)) in zip(cycle(_LINES), bands.items(), strict=False):
         axes.plot(x, y, color=colour, linestyle=line, label=name, drawstyle="default" if x_is_steps else "steps-post")
         axes.fill_between(x, low, high, color=colour, alpha=0.18, linewidth=0, step=None if x_is_steps else "post")

@@ -32,8 +32,7 @@ _PAGE = """<!doctype html>
 def write_page(path: Path, title: str, body: str, refresh: int | None = None) -> Path:
     """Write one self-contained HTML file. A browser reloads it after `refresh` seconds.
 
-    Raises:
-        LareError: the file cannot be written. An older file is left unchanged.
+    Raises `LareError` if the file cannot be written. An older file is left unchanged.
     """
     reload = "" if refresh is None else f'<meta http-equiv="refresh" content="{refresh}">\n'
     style = (files("lare_rl.report") / "report.css").read_text(encoding="utf-8")

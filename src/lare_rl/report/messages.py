@@ -61,14 +61,14 @@ MESSAGES = {
     # The proxy rewards
     "explained": (
         "Its proxy rewards, from {inputs}, explain {amount} of the score: R² of the last returns, before they were learned from, is "
-        "{r2:.2f}."
+        "{r2:r2}."
     ),
     "decoder_is_outdated": (
-        "Its proxy rewards, from {inputs}, usually explain {amount} of the score (median R² of returns: {r2:.2f}), but not the "
-        "last episodes (R² {last_r2:.2f}): the decoder may not have adapted to a new policy yet."
+        "Its proxy rewards, from {inputs}, usually explain {amount} of the score (median R² of returns: {r2:r2}), but not the "
+        "last episodes (R² {last_r2:r2}): the decoder may not have adapted to a new policy yet."
     ),
     "worse_than_mean": (
-        "Warning: the proxy rewards predict the last returns worse than their mean does (R² {r2:.2f}). That is no harm if "
+        "Warning: the proxy rewards predict the last returns worse than their mean does (R² {r2:r2}). That is no harm if "
         "these returns hardly differ, or if the policy has just changed and R² rises again. Otherwise, they mislead the "
         "policy: check `score` and `group` in the task file (docs/how-to/scores.md), and compare with `--method "
         "episodic`."

@@ -16,7 +16,6 @@ from lare_rl.report.reported_run import Curve, ReportedRun, finite, mean_over_se
 from lare_rl.report.run_summary import RunSummary, summarise_run
 from lare_rl.runs.metric_names import CREDIT_CORRELATION, CREDIT_ERROR, RETURN, RETURN_R2, RETURN_STD
 from lare_rl.tasks.spec import TaskSpec
-from lare_rl.util.durations import format_seconds
 from lare_rl.util.findings import Finding, format_for_reader, render
 from lare_rl.util.statistics import format_mean_std, wins
 
@@ -63,12 +62,8 @@ def summarise_runs(
     Each is compared with a run on the return of the episode alone, if there is one.
     """
     episodic = [run for run in runs if run.run.config.settings.method == "episodic" and np.isfinite(run.final_return)]
-    return [
-        summarise_run(
-            run, random_returns[0], next((other.final_return for other in episodic if other is not run), None)
-        )
-        for run in runs
-    ]
+    baselines = [next((other.final_return for other in episodic if other is not run), None) for run in runs]
+    return [summarise_run(run, random_returns[0], baseline) for run, baseline in zip(runs, baselines, strict=True)]
 
 
 def render_verdict(
@@ -101,7 +96,7 @@ def _tiles(reported: ReportedRun, summary: RunSummary) -> Iterable[tuple[str, st
     if summary.return_r2 is not None:
         yield "R² of returns", format_for_reader(summary.return_r2, "r2"), "of new episodes; 1 is perfect"
     if (seconds := reported.training_seconds()) is not None:
-        yield "Time trained", format_seconds(seconds), f"{int(summary.steps[-1]):,} steps for each seed"
+        yield "Time trained", format_for_reader(seconds, "seconds"), f"{int(summary.steps[-1]):,} steps for each seed"
 
 
 def render_headline(summary: RunSummary) -> str:
@@ -124,32 +119,19 @@ def compare_runs(runs: Sequence[ReportedRun]) -> list[Finding]:
         return []
     counts = {len(values) for values in finals.values()}
     n_seeds = Finding("seeds_each", {"n_seeds": counts.pop()}) if len(counts) == 1 else None
-    ranked = tuple(
-        Finding(
-            "ranked",
-            {
-                "name": name,
-                "return_": float(values.mean()),
-                "seeds": None if n_seeds else Finding("seeds", {"n_seeds": len(values)}),
-            },
-        )
-        for name, values in list(finals.items())[:MAX_RANKED]
-    )
-    n_more = len(finals) - len(ranked)
+    ranked = []
+    for name, values in list(finals.items())[:MAX_RANKED]:
+        seeds = None if n_seeds else Finding("seeds", {"n_seeds": len(values)})
+        ranked.append(Finding("ranked", {"name": name, "return_": float(values.mean()), "seeds": seeds}))
     (best, best_returns), (second, second_returns), *_ = finals.items()
     pairs = wins(best_returns[:, None], second_returns)
     probability, last = float(pairs.mean()), float(list(finals.values())[-1].mean())
+    n_more = len(finals) - len(ranked)
+    more = Finding("and_more", {"count": n_more, "last": last}) if n_more else None
     names = {"best": best, "second": second}
     findings = [
         Finding("is_best" if probability >= CLEAR_PROBABILITY and pairs.size > 1 else "none_is_best", names),
-        Finding(
-            "ranking",
-            {
-                "runs": ranked,
-                "more": Finding("and_more", {"count": n_more, "last": last}) if n_more else None,
-                "seeds": n_seeds,
-            },
-        ),
+        Finding("ranking", {"runs": tuple(ranked), "more": more, "seeds": n_seeds}),
         Finding("improvement", names | {"probability": probability, "n_pairs": pairs.size}),
     ]
     steps = {reported.last_step for reported in runs if reported.metrics}
@@ -204,11 +186,10 @@ def render_learning_curves(
         title = f"True return, team of {role.team}" if task.teams else "True return"
         if chart := _draw_metric(_Metric(name, title), runs, colours, reference, warmup):
             yield render_note(title) + chart
-    charts = {metric.title: _draw_metric(metric, runs, colours, {}, warmup) for metric in _other_metrics(task)}
     figures = [
-        f'<figure><figcaption class="title">{escape(title)}</figcaption>{chart}</figure>'
-        for title, chart in charts.items()
-        if chart
+        f'<figure><figcaption class="title">{escape(metric.title)}</figcaption>{chart}</figure>'
+        for metric in _other_metrics(task)
+        if (chart := _draw_metric(metric, runs, colours, {}, warmup))
     ]
     if task.name in REFERENCE_RETURNS:
         published = format_number(REFERENCE_RETURNS[task.name].trained)
@@ -238,33 +219,34 @@ def _draw_metric(
     metric: _Metric, runs: Sequence[ReportedRun], colours: dict[str, str], references: dict[str, float], warmup: int
 ) -> str:
     """Draw a metric of all runs: the mean over seeds and, of few runs, each seed. Return nothing if no run has it."""
-    curves = {reported.name: (reported, curve) for reported in runs if (curve := reported.curve(metric.name))}
+    curves = {reported.name: curve for reported in runs if (curve := reported.curve(metric.name))}
     if not curves:
         return ""
     lines, n_coloured = [], sum(colours[name] != "grey" for name in curves)
-    for name, (reported, (steps, values)) in sorted(
-        curves.items(), key=lambda item: colours[item[0]] != "grey", reverse=True
-    ):
-        colour = colours[name]
+    spreads = {reported.name: reported.curve(RETURN_STD) for reported in runs} if metric.name == RETURN else {}
+    for name in sorted(curves, key=lambda name: colours[name] == "grey"):
+        (steps, values), colour = curves[name], colours[name]
         if len(values) > 1 and len(runs) <= N_COLOURS:
             lines += [Line(steps, row, f"{colour} thin") for row in values]
-        spread = reported.curve(RETURN_STD) if len(values) == 1 and metric.name == RETURN and n_coloured == 1 else None
+        spread = spreads.get(name) if len(values) == 1 and n_coloured == 1 else None
         label = name if len(runs) > 1 and (colour != "grey" or len(runs) <= 2 * N_COLOURS) else ""
         style = "grey other" if colour == "grey" else colour
         lines.append(Line(steps, mean_over_seeds(values), style, label, None if spread is None else spread[1][0]))
-    first_step = min(curve[0][0] for _, curve in curves.values())
-    last_step = max(curve[0][-1] for _, curve in curves.values())
+    first_step, last_step = (
+        min(steps[0] for steps, _ in curves.values()),
+        max(steps[-1] for steps, _ in curves.values()),
+    )
     extent = np.array([first_step if first_step < last_step else 0.0, last_step])
     lines += [Line(extent, np.full(2, value), "grey dashed", name) for name, value in references.items()]
     has_negative = any((line.y[np.isfinite(line.y)] < 0).any() for line in lines)
     limits = (-1.0, 1.0) if metric.limits and has_negative else metric.limits
-    final = ", ".join(f"{name} {_format_spread(finite(curve[1][:, -1]))}" for name, (_, curve) in curves.items())
+    final = ", ".join(f"{name} {_format_spread(finite(values[:, -1]))}" for name, (_, values) in curves.items())
     return Chart(
         lines=lines,
         description=f"{metric.title} over environment steps. Last values: {final}",
         x_label="environment steps",
         limits=limits,
-        hovers=_hovers({name: curve for name, (_, curve) in curves.items()}),
+        hovers=_hovers(curves),
         shaded_until=float(warmup),
     ).render()
 

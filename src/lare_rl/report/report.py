@@ -112,7 +112,8 @@ def _render_task(runs: Sequence[ReportedRun], film: bool) -> Iterable[str]:
     n_random = max(n_random_episodes(reported.last_step, reported.run.config.longest_episode) for reported in runs)
     random_returns = measure_random_returns(task, n_random)
     summaries = summarise_runs(runs, random_returns)
-    all_played = [_play_run(reported.run) for reported in runs]
+    many_agents = any(_can_load(reported.run) for reported in runs) and load_env_spec(task).n_agents > 1
+    all_played = [play_run(reported.run) if many_agents and _can_load(reported.run) else None for reported in runs]
     filmed = [i for i, reported in enumerate(runs) if film and _can_load(reported.run)][:MAX_FILMS]
     films = {i: _load_film(runs[i].run, all_played[i], FILM_BYTES // len(filmed)) for i in filmed}
     figures = {i: render_film(data, f"An episode of {runs[i].name}") for i, data in films.items() if data}
@@ -153,11 +154,6 @@ def _note_missing(runs: Sequence[ReportedRun]) -> str:
 
 def _can_load(run: Run) -> bool:
     return run.has_checkpoint() and untrusted_module(run.config.task) is None
-
-
-def _play_run(run: Run) -> PlayedEpisodes | None:
-    """Play an episode of a run of many agents."""
-    return play_run(run) if _can_load(run) and load_env_spec(run.config.task).n_agents > 1 else None
 
 
 def _load_film(run: Run, played: PlayedEpisodes | None, max_bytes: int) -> bytes | None:

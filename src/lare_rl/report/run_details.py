@@ -14,7 +14,7 @@ from lare_rl.config.settings import Settings
 from lare_rl.credit import explanation_text
 from lare_rl.credit.methods import METHODS
 from lare_rl.envs.families import load_env_spec
-from lare_rl.errors import install_command
+from lare_rl.errors import LareError, install_command
 from lare_rl.evaluation.episode_credit import FactorLabel, label_factors, load_episode_credit
 from lare_rl.evaluation.played_episodes import PlayedEpisodes, TeamSample, sample_steps
 from lare_rl.latent.saved import read_source
@@ -53,8 +53,8 @@ _IN_BARS = ("factor", "unknown_factor", "about_factors", "about_shares", "about_
 """Findings that the bars show."""
 _SUMMARIES = ("factors_explain", "raw_features_explain")
 """Findings that stand above the bars."""
-_SIDES = ((1, "plus", "the reward of a step rises with the factor"), (-1, "minus", "it falls with the factor"))
-"""Signs of bars: their sides, and what they say."""
+_BAR_STYLES = {"plus": "the reward of a step rises with the factor", "minus": "it falls with the factor"}
+"""What the colours of bars say."""
 
 
 def render_details(run: Run, trust: Iterable[str] = (), played: PlayedEpisodes | None = None) -> Iterable[str]:
@@ -82,7 +82,8 @@ def _render_untrusted(run: Run, module: str) -> Iterable[str]:
         f"Its environment is of the module {module}, which is not imported for a report. Set {TRUST_VARIABLE}={module} to have it "
         "imported: random play, credit, factors and what the returns say of them then appear here."
     )
-    for role, path in function_paths(run.directory, run.config):
+    has_files = any(run.directory.glob("latent_function*.py"))  # the runs of published results have none
+    for role, path in function_paths(run.directory, run.config) if has_files else ():
         source = f"<pre>{escape(read_source(path).source)}</pre>"
         yield render_fold(f"The latent function{f' of {role.team}' if role.team else ''}", [source])
 
@@ -149,8 +150,10 @@ def _render_earnings(run: Run, correlations: Sequence[Float[np.ndarray, " factor
         bars += [bar for finding in findings for bar in _raw_feature_bars(finding)]
         sections += [f"<p>{_sentence(finding, 'html')}</p>" for finding in findings if finding.code in _SUMMARIES]
         if bars:
-            signs = {bar.sign for bar in bars}
-            texts = (f'<span><i class="{side}"></i>{text}</span>' for sign, side, text in _SIDES if sign in signs)
+            styles = {bar.style for bar in bars}
+            texts = (
+                f'<span><i class="{style}"></i>{text}</span>' for style, text in _BAR_STYLES.items() if style in styles
+            )
             sections += [draw_bars(bars), f'<div class="sides">{"".join(texts)}</div>']
         sections += [
             f'<p class="note">{_sentence(finding, "html")}</p>'
@@ -165,7 +168,10 @@ def _render_earnings(run: Run, correlations: Sequence[Float[np.ndarray, " factor
     if any(explanations):
         yield '<h2>What earned the score<a class="why" href="#share" title="What is a share?">?</a></h2>'
         source = explanation_source(run)
-        text = "A bar is the share of the differences between returns that a factor explains. A negative share offsets other factors."
+        text = (
+            "A bar is the share of the differences between returns that a factor explains. A bar to the left is a negative share: the "
+            "factor offsets others."
+        )
         yield render_note(f"{text} {source}." if source else text)
     yield from sections
 
@@ -175,23 +181,18 @@ def _sentence(finding: Finding, style: Literal["text", "html"] = "text") -> str:
 
 
 def _make_bar(finding: Finding, meanings: Mapping[str, str]) -> Bar:
-    """Return the bar of a factor: its share, on the side of its effect."""
-    name, effect = finding.values["name"], finding.values["effect"]
+    """Return the bar of a factor: its share, in the colour of its effect."""
+    name, share = finding.values["name"], float(finding.values.get("share", 0.0))
     meaning = meanings.get(name) or name.removeprefix("f_").replace("_", " ")
-    share, slope = float(finding.values.get("share", 0.0)), effect.values.get("slope", 0.0)
-    return Bar(
-        meaning[:1].upper() + meaning[1:],
-        name,
-        share,
-        int(np.sign(slope)) if round(100 * share) else 0,
-        _sentence(finding),
-    )
+    slope = finding.values["effect"].values.get("slope", 0.0) if round(100 * share) else 0.0
+    style = "plus" if slope > 0 else "minus" if slope < 0 else ""
+    return Bar(meaning[:1].upper() + meaning[1:], name, share, style, _sentence(finding))
 
 
 def _raw_feature_bars(finding: Finding) -> list[Bar]:
     largest = finding.values.get("largest") if finding.code == "raw_features_explain" else None
     features = () if largest is None else largest.values["features"]
-    return [Bar(feature.values["name"], "", feature.values["share"], 0, "") for feature in features]
+    return [Bar(feature.values["name"], "", feature.values["share"], "", "") for feature in features]
 
 
 def _render_factor_table(
@@ -304,11 +305,15 @@ def render_settings(runs: Sequence[ReportedRun]) -> Iterable[str]:
 
 
 def _default_settings(run: Run) -> dict[str, str] | None:
-    """Return the defaults for a run's task. None if its environment, which decides some of them, must not be imported."""
+    """Return the defaults for a run's task. None if its environment, which decides some, must not be imported, or is not installed."""
     settings, task = run.config.settings, run.config.task
     if untrusted_module(task) is not None:
         return None
-    defaults = fill_in(Settings(method=settings.method, algorithm=settings.algorithm), task, load_env_spec(task))
+    try:
+        env = load_env_spec(task)
+    except LareError:
+        return None
+    defaults = fill_in(Settings(method=settings.method, algorithm=settings.algorithm), task, env)
     return {key: _to_text(value) for key, value in effective_settings(defaults).items()}
 
 

@@ -12,7 +12,7 @@ from lare_rl.credit.methods import METHODS
 from lare_rl.credit.prequential import LITTLE_R2
 from lare_rl.envs.load import shipped_tasks
 from lare_rl.report.reported_run import ReportedRun, finite, mean_over_seeds
-from lare_rl.report.score_use import CLEAR_ERRORS, ScoreUse, summarise_score_use
+from lare_rl.report.score_use import ScoreUse, summarise_score_use
 from lare_rl.runs.metric_names import (
     ACTOR_SATURATION,
     CREDIT_CORRELATION,
@@ -25,7 +25,7 @@ from lare_rl.runs.metric_names import (
     SUMMED_RETURN,
 )
 from lare_rl.training.advice import describe_untrained
-from lare_rl.util.statistics import grouped_standard_error, sample_std, standard_error
+from lare_rl.util.statistics import CLEAR_ERRORS, episode_error, grouped_standard_error, sample_std, standard_error
 
 __all__ = [
     "MIN_EVALUATIONS",
@@ -111,14 +111,9 @@ class RunSummary:
         return finite(self.mean_returns)
 
     @cached_property
-    def trained_returns(self) -> Float[np.ndarray, "seeds evaluations"]:
-        """The returns, with -inf before the first update of a policy."""
-        return np.where(self.steps > self.warmup, self.returns, -np.inf)
-
-    @cached_property
     def final_returns(self) -> Float[np.ndarray, " finite_seeds"]:
         """The seeds' returns at the last evaluation, as far as they are finite."""
-        return self.returns[np.isfinite(self.returns[:, -1]), -1]
+        return finite(self.returns[:, -1])
 
     @property
     def final_return(self) -> float:
@@ -205,7 +200,7 @@ class RunSummary:
 
     @cached_property
     def trend(self) -> tuple[float, float, float] | None:
-        """The means of the last two quarters of `finite_means`, and the typical change from one evaluation to the next.
+        """The means of the last two quarters (n // 4) of the n `finite_means`, and the typical change from one evaluation to the next.
 
         None if there are too few evaluations with a return.
         """
@@ -236,9 +231,10 @@ def summarise_run(
         return None
     steps, returns = curve
     deterministic = reported.final_values(DETERMINISTIC_RETURN)
-    _, r2s = reported.curve(RETURN_R2) or (None, None)
+    _, r2s = reported.curve(RETURN_R2) or (None, np.zeros(0))
     run, task, settings = reported.run, reported.run.config.task, reported.run.config.settings
     method = METHODS.find(settings.method)
+    _, lengths = reported.curve(LENGTH) or (None, np.zeros(0))
     is_initial = steps <= settings.warmup
     initial_returns = returns[:, is_initial].mean(axis=1) if is_initial.any() else np.full(1, np.nan)
     return RunSummary(
@@ -250,12 +246,16 @@ def summarise_run(
         deterministic_returns=deterministic if len(deterministic) == len(returns) else None,
         episode_error=_episode_error(reported),
         episodic_return=episodic_return,
-        return_r2=None if r2s is None else _last_mean(r2s),
-        median_r2=None if r2s is None or not len(finite(r2s)) else float(np.median(finite(r2s))),
-        credit_error=_last_value(reported, CREDIT_ERROR),
-        credit_correlation=_last_value(reported, CREDIT_CORRELATION),
+        return_r2=_last_mean(reported, RETURN_R2),
+        median_r2=float(np.median(finite(r2s))) if len(finite(r2s)) else None,
+        credit_error=_last_mean(reported, CREDIT_ERROR),
+        credit_correlation=_last_mean(reported, CREDIT_CORRELATION),
         score_use=summarise_score_use(
-            method, settings, task, _score_metrics(reported), equal_lengths=_lengths_are_equal(reported)
+            method,
+            settings,
+            task,
+            _score_metrics(reported),
+            equal_lengths=lengths.size > 1 and bool(np.ptp(lengths) == 0),
         ),
         sees_factors=method.inputs is not None and method.inputs.has_factors,
         sees_raw_features=method.inputs is None or method.inputs.has_raw_features,
@@ -275,36 +275,24 @@ def _episode_error(reported: ReportedRun) -> float:
     stds = reported.final_values(RETURN_STD)
     if len(stds) < len(reported.run.seeds):
         return 0.0
-    n_free = max(1, reported.run.config.settings.evaluation_episodes - 1)  # the deviations have n in the denominator
-    return math.sqrt(np.mean(stds**2) / n_free / len(stds))
-
-
-def _lengths_are_equal(reported: ReportedRun) -> bool:
-    """Return whether there are several evaluations, and all have the same mean length of episodes."""
-    curve = reported.curve(LENGTH)
-    return curve is not None and curve[1].size > 1 and bool(np.ptp(curve[1]) == 0)
+    n = reported.run.config.settings.evaluation_episodes
+    return episode_error(stds**2 * n / max(1, n - 1), n)  # the deviations have n in the denominator
 
 
 def _score_metrics(reported: ReportedRun) -> dict[str, float | None]:
     """Return the last metrics about the score: means over the seeds, and the standard error of the mean gain."""
-    values = {key: _last_value(reported, f"credit/{key}") for key in ("average", "log_odds", "gain")}
-    _, errors = reported.curve("credit/gain_error") or (None, np.zeros((0, 0)))
-    errors = _last_finite(errors)
+    values = {key: _last_mean(reported, f"credit/{key}") for key in ("average", "log_odds", "gain")}
+    errors = _last_values(reported, "credit/gain_error")
     return values | {"gain_error": math.sqrt(np.sum(errors**2)) / len(errors) if len(errors) else None}
 
 
-def _last_value(reported: ReportedRun, key: str) -> float | None:
+def _last_mean(reported: ReportedRun, key: str) -> float | None:
     """Return the mean of the last values of a metric, or None if it was never measured."""
-    curve = reported.curve(key)
-    return None if curve is None else _last_mean(curve[1])
+    values = _last_values(reported, key)
+    return float(values.mean()) if len(values) else None
 
 
-def _last_mean(values: Float[np.ndarray, "seeds evaluations"]) -> float | None:
-    """Return the mean over the seeds at the last evaluation that has a finite value."""
-    numbers = _last_finite(values)
-    return float(numbers.mean()) if len(numbers) else None
-
-
-def _last_finite(values: Float[np.ndarray, "seeds evaluations"]) -> Float[np.ndarray, " finite_seeds"]:
-    """Return the finite values at the last evaluation that has any. Empty if none has."""
+def _last_values(reported: ReportedRun, key: str) -> Float[np.ndarray, " finite_seeds"]:
+    """Return the finite values of a metric at the last evaluation that has any. Empty if none has."""
+    _, values = reported.curve(key) or (None, np.zeros((0, 0)))
     return next((numbers for column in values.T[::-1] if len(numbers := finite(column))), np.zeros(0))

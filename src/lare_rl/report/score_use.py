@@ -9,7 +9,7 @@ from lare_rl.tasks.spec import TaskSpec
 from lare_rl.util.findings import Finding
 from lare_rl.util.statistics import CLEAR_ERRORS
 
-__all__ = ["CLEAR_ERRORS", "CLEAR_GAIN", "ScoreUse", "summarise_score_use"]
+__all__ = ["CLEAR_GAIN", "ScoreUse", "summarise_score_use"]
 
 CLEAR_GAIN = 0.8
 """Credit is trusted as a whole if predictions remove more than this share of the baseline's squared error."""
@@ -49,17 +49,13 @@ class ScoreUse:
         if self.equal_lengths and self.form in ("form_sum", "form_mean") and is_plain:
             return trust
         period_code = "period_nonzero" if self.period == "nonzero" else "period"
-        period = None if self.period is None else Finding(period_code, {"period": self.period})
-        return Finding(
-            "score_use",
-            {
-                "form": Finding(self.form),
-                "period": period,
-                "groups": Finding("with_groups") if self.has_groups else None,
-                "exact": None if self.exact == "no" else Finding(f"exact_{self.exact}"),
-                "trust": trust,
-            },
-        )
+        how = {
+            "form": Finding(self.form),
+            "period": Finding(period_code, {"period": self.period}) if self.period else None,
+            "groups": Finding("with_groups") if self.has_groups else None,
+            "exact": None if self.exact == "no" else Finding(f"exact_{self.exact}"),
+        }
+        return Finding("score_use", how | {"trust": trust})
 
 
 def summarise_score_use(

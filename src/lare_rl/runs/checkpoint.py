@@ -16,7 +16,7 @@ import zlib
 from collections.abc import Iterator, Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any, NamedTuple, Protocol, TypeVar, runtime_checkable
+from typing import Any, NamedTuple, TypeVar
 
 import jax
 import numpy as np
@@ -61,21 +61,11 @@ NEW_STATE = (
 MAX_COUNT = 2**53
 
 
-@runtime_checkable
-class WithReplay(Protocol):
-    """Any training state with a replay: `replay.columns` are arrays of [seeds envs rows ...], which are saved by row.
+State = TypeVar("State")
+"""A training state with a replay: `replay.columns` are arrays of [seeds envs rows ...], which are saved by row.
 
-    `replay.next_row` is the number of rows ever written. Each row is stored at its number modulo the capacity.
-    """
-
-    @property
-    def replay(self) -> Any: ...
-
-    def _replace(self, **changes: Any) -> Any: ...
-
-
-State = TypeVar("State", bound=WithReplay)
-Template = TypeVar("Template")
+`replay.next_row` is the number of rows ever written. Each row is stored at its number modulo the capacity.
+"""
 
 
 @dataclass(frozen=True)
@@ -89,6 +79,10 @@ class _RowFile:
     count: list[Any]
     """The number of rows, of each environment of each seed."""
 
+    @property
+    def filename(self) -> str:
+        return f"rows-{self.number}.npz"
+
 
 class Snapshot(NamedTuple):
     """What a checkpoint adds and replaces, as NumPy arrays that nothing else changes."""
@@ -101,7 +95,7 @@ class Snapshot(NamedTuple):
 
 
 def take_snapshot(
-    directory: Path, learner: WithReplay, metadata: Mapping[str, Any], arrays: Mapping[str, np.ndarray]
+    directory: Path, learner: Any, metadata: Mapping[str, Any], arrays: Mapping[str, np.ndarray]
 ) -> Snapshot:
     """Copy from the device what the next checkpoint will hold. The last one must have been written.
 
@@ -120,19 +114,19 @@ def take_snapshot(
     count = end - start + 1
     width = padded_size(int(count.max()))
     rows = _read_rows(learner.replay.columns, (start[..., None] + np.arange(width)) % capacity)
-    number = row_files[-1].number + 1 if row_files else 0
-    row_files.append(_RowFile(number, start.tolist(), count.tolist()))
+    newest = _RowFile(row_files[-1].number + 1 if row_files else 0, start.tolist(), count.tolist())
+    row_files.append(newest)
     in_use = [row_file for row_file in row_files if np.any(np.add(row_file.start, row_file.count) > end - capacity)]
     state = {name: np.array(leaf) for name, leaf in named_leaves(learner).items()}
     state |= {name: np.array(array) for name, array in arrays.items()}
     state["host"] = np.array(json.dumps(metadata))
     state["segments"] = np.array(json.dumps([asdict(row_file) for row_file in in_use]))
     return Snapshot(
-        rows_file=_rows_file(number),
+        rows_file=newest.filename,
         rows={name: np.array(values[:, :, : count.max()]) for name, values in jax.device_get(rows).items()},
         state=state,
         # Not always the oldest ones: a file from before a drop may reach further.
-        unused_files=[_rows_file(row_file.number) for row_file in row_files if row_file not in in_use],
+        unused_files=[row_file.filename for row_file in row_files if row_file not in in_use],
     )
 
 
@@ -145,10 +139,6 @@ def write(directory: Path, snapshot: Snapshot) -> None:
     replace_npz(directory / STATE_FILE, snapshot.state)
     for name in snapshot.unused_files:
         (directory / name).unlink(missing_ok=True)
-
-
-def _rows_file(number: int) -> str:
-    return f"rows-{number}.npz"
 
 
 def load(directory: Path, template: State) -> tuple[State, dict[str, Any], dict[str, np.ndarray]]:
@@ -205,7 +195,7 @@ def named_leaves(state: Any) -> dict[str, Any]:
     return {name: leaf for name, leaf in by_path.items() if not name.startswith(SAVED_BY_ROW)}
 
 
-def fill_template(template: Template, arrays: Mapping[str, np.ndarray]) -> Template:
+def fill_template(template: State, arrays: Mapping[str, np.ndarray]) -> State:
     """Replace the leaves of a template by saved arrays. A leaf that is a NumPy array stays one, and may have 64 bits.
 
     A name that the template does not have may be of an earlier version.
@@ -246,12 +236,12 @@ def _pad_rows(array: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
     return np.concatenate([array, padding], axis=2)
 
 
-def _load_rows(learner: State, directory: Path, row_files: list[_RowFile]) -> State:
+def _load_rows(learner: Any, directory: Path, row_files: list[_RowFile]) -> Any:
     capacity, columns = _capacity(learner), dict(learner.replay.columns)
     for name, column in columns.items():  # one after the other, so that only one is in memory twice
         buffer = np.zeros(column.shape, column.dtype)
         for row_file in row_files:
-            with open_npz(directory / _rows_file(row_file.number)) as saved:
+            with open_npz(directory / row_file.filename) as saved:
                 values = saved[name]
             counts = np.asarray(row_file.count)
             for env in np.ndindex(counts.shape):
@@ -275,7 +265,7 @@ def _read_rows(columns: dict[str, jax.Array], rows: jax.Array) -> dict[str, jax.
     return {name: read(column, rows) for name, column in columns.items()}
 
 
-def _capacity(learner: WithReplay) -> int:
+def _capacity(learner: Any) -> int:
     """Return the number of rows of each environment."""
     return next(iter(learner.replay.columns.values())).shape[2]
 

@@ -86,8 +86,7 @@ def write_config(directory: Path, config: Config) -> None:
 def read_config(directory: Path) -> Config:
     """Read config.json, of this or an earlier version.
 
-    Raises:
-        LareError: the directory is not a run, or its configuration is not valid.
+    Raises `LareError` if the directory is not a run, or its configuration is not valid.
     """
     path = directory / CONFIG
     if not path.is_file():

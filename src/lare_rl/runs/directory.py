@@ -25,7 +25,8 @@ from lare_rl.runs.config_file import CONFIG, Config, make_config, read_config, w
 from lare_rl.runs.metrics_file import read_metrics
 from lare_rl.tasks.spec import ScoredObservation, TaskSpec
 from lare_rl.tasks.trust import check_trusted, trust_environment
-from lare_rl.util.locks import try_lock
+from lare_rl.util.files import find_free_path
+from lare_rl.util.processes import try_lock
 
 __all__ = [
     "CHECKPOINT",
@@ -126,8 +127,7 @@ def create_run(directory: Path, task: TaskSpec, settings: ResolvedSettings, func
 def extend_run(run: Run, steps: int) -> Run:
     """Return the run with a larger number of steps, rounded up to whole iterations. It is written to config.json.
 
-    Raises:
-        LareError: the number is smaller than before.
+    Raises `LareError` if the number is smaller than before.
     """
     settings = run.config.settings
     steps = round_up(steps, settings.iteration_steps)
@@ -176,10 +176,7 @@ def as_run(run: Run | str | Path) -> Run:
 def default_directory(task: TaskSpec, settings: ResolvedSettings) -> Path:
     """Return runs/TASK-METHOD-ALGORITHM-sSEED, with a number appended if that exists."""
     name = f"{task.name}-{settings.method}-{settings.algorithm}-s{settings.seed}"
-    number = 1
-    while (directory := Path("runs") / (name if number == 1 else f"{name}-{number}")).exists():
-        number += 1
-    return directory
+    return find_free_path(Path("runs"), name)
 
 
 def function_filename(task: TaskSpec, role: TaskSpec) -> str:
@@ -190,8 +187,7 @@ def function_filename(task: TaskSpec, role: TaskSpec) -> str:
 def function_paths(directory: Path, config: Config) -> list[tuple[TaskSpec, Path]]:
     """Return each role with the file of its latent function. Nothing is executed.
 
-    Raises:
-        LareError: a file cannot be read, or was changed.
+    Raises `LareError` if a file cannot be read, or was changed.
     """
     digests, roles = config.function_sha256, config.task.roles
     if not digests:
@@ -230,8 +226,7 @@ def find_run_directories(paths: Sequence[Path]) -> list[Path]:
     A run that is found twice counts once, at its first path. The log that a sweep writes next to the directory of a run is
     skipped, so `DIRECTORY/*` may be passed.
 
-    Raises:
-        LareError: there is no path, or a path contains no run.
+    Raises `LareError` if there is no path, or a path contains no run.
     """
     directories: dict[Path, Path] = {}  # by resolved path
     for path in paths:

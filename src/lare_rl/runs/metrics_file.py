@@ -1,5 +1,6 @@
 """metrics.jsonl of a run: one JSON object in each line, for each seed and evaluation."""
 
+import functools
 import json
 import os
 from collections.abc import Sequence
@@ -19,29 +20,17 @@ MAX_METRICS_BYTES = 512 << 20
 MAX_INTEGER = 2**53
 """A larger whole number may change when it becomes a float."""
 
-MAX_PARSED_FILES = 32
-
-_parsed: dict[Path, tuple[tuple[int, ...], list[dict[str, Any]]]] = {}
-"""The state and the lines of the files that were read last. A report reads the metrics of a run twenty times."""
-
 
 def read_metrics(directory: Path) -> list[dict[str, Any]]:
     """Return every complete line of a run's metrics.jsonl, in order. The lines are shared: do not change them.
 
-    Raises:
-        LareError: the file cannot be read, or a line is not valid.
+    Raises `LareError` if the file cannot be read, or a line is not valid.
     """
-    path = (directory / METRICS_FILE).absolute()
+    path = directory / METRICS_FILE
     if not path.exists():
         return []
     stat = path.stat()
-    state = stat.st_dev, stat.st_ino, stat.st_size, stat.st_mtime_ns
-    cached = _parsed.pop(path, None)
-    lines = cached[1] if cached is not None and cached[0] == state else _parse(directory / METRICS_FILE)
-    _parsed[path] = state, lines
-    if len(_parsed) > MAX_PARSED_FILES:
-        del _parsed[next(iter(_parsed))]
-    return list(lines)
+    return list(_parse(path, (stat.st_dev, stat.st_ino, stat.st_size, stat.st_mtime_ns)))
 
 
 def append_metrics(directory: Path, lines: Sequence[dict[str, Any]]) -> int:
@@ -60,8 +49,7 @@ def append_metrics(directory: Path, lines: Sequence[dict[str, Any]]) -> int:
 def truncate_metrics(directory: Path, n_bytes: int) -> None:
     """Remove the lines that were written after a checkpoint. Resumed training writes them again.
 
-    Raises:
-        LareError: lines from before the checkpoint are missing.
+    Raises `LareError` if lines from before the checkpoint are missing.
     """
     path = directory / METRICS_FILE
     size = path.stat().st_size if path.exists() else 0
@@ -71,7 +59,9 @@ def truncate_metrics(directory: Path, n_bytes: int) -> None:
         os.truncate(path, n_bytes)
 
 
-def _parse(path: Path) -> list[dict[str, Any]]:
+@functools.lru_cache(maxsize=32)  # a report reads the metrics of a run twenty times
+def _parse(path: Path, state: tuple[int, ...]) -> list[dict[str, Any]]:
+    """Return the lines of a file, which has not changed while its `state` is the same."""
     lines = []
     for number, text in enumerate(read_text(path, MAX_METRICS_BYTES).split("\n")[:-1], start=1):
         try:

@@ -37,8 +37,7 @@ def train_in_processes(
 
     Closing the generator stops all jobs. Running jobs save a checkpoint first.
 
-    Raises:
-        LareError: there are not enough cores or accelerators.
+    Raises `LareError` if there are not enough cores or accelerators.
     """
     free_slots: queue.Queue[Slot] = queue.Queue()
     for slot in assign_slots(resources):
@@ -150,8 +149,7 @@ def train_on_ray(
 
     All machines must share the directory of the runs.
 
-    Raises:
-        LareError: Ray is not installed, or cannot be reached.
+    Raises `LareError` if Ray is not installed, or cannot be reached.
     """
     try:
         import ray

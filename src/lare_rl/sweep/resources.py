@@ -52,8 +52,7 @@ class Slot(NamedTuple):
 def assign_slots(resources: Resources) -> list[Slot]:
     """Divide this machine among processes.
 
-    Raises:
-        LareError: there are not enough cores or accelerators, or accelerators cannot be counted.
+    Raises `LareError` if there are not enough cores or accelerators, or accelerators cannot be counted.
     """
     cores = assign_cores(resources.processes, resources.cores)
     if resources.accelerators is None and resources.processes == 1:  # JAX uses all accelerators
@@ -65,8 +64,7 @@ def assign_slots(resources: Resources) -> list[Slot]:
 def assign_cores(processes: int, cores: int) -> list[list[int]]:
     """Return the cores of each process, or an empty list for each if the system cannot tell which cores are usable.
 
-    Raises:
-        LareError: there are not enough cores.
+    Raises `LareError` if there are not enough cores.
     """
     usable = usable_cores()
     if usable is None:
@@ -125,8 +123,7 @@ def _accelerator_variables(
 def _count_accelerators() -> int:
     """Return the number of accelerators that JAX sees. Another process asks JAX, which reserves their memory.
 
-    Raises:
-        LareError: JAX fails in that process.
+    Raises `LareError` if JAX fails in that process.
     """
     process = subprocess.run(
         [sys.executable, "-P", "-c", COUNT_ACCELERATORS], capture_output=True, encoding="utf-8", errors="replace"

@@ -67,8 +67,7 @@ class Sweep(Resources):
 def read_sweep(path: Path) -> tuple[Sweep, list[Job]]:
     """Read a file, and check all of its runs before any is trained.
 
-    Raises:
-        LareError: the file cannot be read, a run could not be trained, or a setting affects no run.
+    Raises `LareError` if the file cannot be read, a run could not be trained, or a setting affects no run.
     """
     table = read_table(path)
     try:
@@ -136,7 +135,7 @@ def _make_jobs(sweep: Sweep, path: Path) -> Iterator[Job]:
         functions = [path.parent / function for function in sweep.functions.get(task.name, ())]
         for draw in sweep.draws if METHODS.find(method).needs_phi and not functions else (0,):
             chosen = {"method": method, "algorithm": algorithm, "draw": draw}
-            settings = Settings(**rename_keys(sweep.settings) | chosen)
+            settings = Settings(**sweep.settings | chosen)
             try:
                 yield make_job(root, task, settings, functions)
             except LareError as error:

@@ -9,7 +9,7 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
 from lare_rl.errors import missing_extra_error
-from lare_rl.util.durations import format_seconds
+from lare_rl.util.findings import format_for_reader
 from lare_rl.util.sanitize import sanitize
 
 __all__ = ["Clock", "Listener", "MetricLines", "TensorBoard", "Terminal", "import_summary_writer", "known_numbers"]
@@ -125,7 +125,7 @@ class Terminal(Listener):
         """Return the time left at a rate (steps/s), after a comma. Empty if it is unknown, or at the end."""
         if not rate or step >= self._steps:
             return ""
-        return f", {format_seconds((self._steps - step) / rate)} left"
+        return f", {format_for_reader((self._steps - step) / rate, 'seconds')} left"
 
 
 _SUMMARY = {

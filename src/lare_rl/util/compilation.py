@@ -18,11 +18,11 @@ from platformdirs import user_cache_path
 
 __all__ = ["cache_variables", "enable_cache"]
 
-_MAX_CACHE_BYTES = 2**30
-"""JAX removes the programs that were not read for the longest time."""
-
-_MIN_COMPILE_TIME_S = 0.1
-"""Programs that compile faster are not saved."""
+_SETTINGS = {
+    "jax_compilation_cache_max_size": 2**30,  # bytes; JAX removes the programs that were not read for the longest time
+    "jax_persistent_cache_min_compile_time_secs": 0.1,  # programs that compile faster are not saved
+}
+"""JAX's settings of the cache. The environment variables have the same names in capitals."""
 
 _LOCK_TIMEOUT_S = 5
 
@@ -37,11 +37,8 @@ def cache_variables(environment: Mapping[str, str]) -> dict[str, str]:
     """
     if "JAX_COMPILATION_CACHE_DIR" in environment or (directory := _cache_directory(environment)) is None:
         return {}
-    return {
-        "JAX_COMPILATION_CACHE_DIR": str(directory),
-        "JAX_COMPILATION_CACHE_MAX_SIZE": str(_MAX_CACHE_BYTES),
-        "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": str(_MIN_COMPILE_TIME_S),
-    }
+    settings = {"jax_compilation_cache_dir": directory, **_SETTINGS}
+    return {name.upper(): str(value) for name, value in settings.items()}
 
 
 def enable_cache() -> None:
@@ -52,9 +49,8 @@ def enable_cache() -> None:
     chosen = jax.config.jax_compilation_cache_dir  # pyright: ignore[reportAttributeAccessIssue] - JAX makes it at run time
     if chosen is not None or (directory := _cache_directory(os.environ)) is None:
         return
-    jax.config.update("jax_compilation_cache_dir", str(directory))
-    jax.config.update("jax_compilation_cache_max_size", _MAX_CACHE_BYTES)
-    jax.config.update("jax_persistent_cache_min_compile_time_secs", _MIN_COMPILE_TIME_S)
+    for name, value in {"jax_compilation_cache_dir": str(directory), **_SETTINGS}.items():
+        jax.config.update(name, value)
     compilation_cache.reset_cache()  # JAX asks once whether there is a cache, at its first compilation
 
 

@@ -1,6 +1,7 @@
 """Check paths of new files, and replace files as a whole. If the process is killed, or the disk is full, the old file stays."""
 
 import contextlib
+import itertools
 import os
 import tempfile
 import time
@@ -12,7 +13,7 @@ from uuid import uuid4
 
 from lare_rl.errors import LareError
 
-__all__ = ["check_new_path", "replace_npz", "write_atomically", "write_npz"]
+__all__ = ["check_new_path", "find_free_path", "replace_npz", "write_atomically", "write_npz"]
 
 
 RETRY_S = 0.01, 0.03, 0.1, 0.3, 1.0
@@ -44,11 +45,16 @@ def _check_writable(directory: Path) -> None:
     tempfile.TemporaryFile(dir=directory).close()  # os.access says nothing to root about /proc
 
 
+def find_free_path(directory: Path, name: str, suffix: str = "") -> Path:
+    """Return DIRECTORY/NAME.SUFFIX, with a number appended to the name if that exists."""
+    paths = (directory / f"{name}{f'-{number}' if number > 1 else ''}{suffix}" for number in itertools.count(1))
+    return next(path for path in paths if not path.exists())
+
+
 def write_atomically(path: Path, write: Callable[[Any], object]) -> None:
     """Let `write` fill a new file, and move it to `path` when it is complete on the disk.
 
-    Raises:
-        LareError: the file cannot be written.
+    Raises `LareError` if the file cannot be written.
     """
     new = path.with_name(f"{path.name}.{uuid4().hex}.new")  # unique: another process may write the same file
     try:

@@ -64,6 +64,7 @@ def format_for_reader(value: Any, spec: str = "") -> str:
     * `std`: two digits, for a standard deviation.
     * `error`: one digit, or a whole number if it is large, for a standard error.
     * `steps`: a round number with k or M, such as `250k`.
+    * `seconds`: a duration, such as `20 s`, `4 min` or `2.2 h`.
     """
     match spec.split(" ", 1):
         case ["number"]:
@@ -80,6 +81,10 @@ def format_for_reader(value: Any, spec: str = "") -> str:
             return "less than 0.001" if value < 0.001 else f"{value:.1g}"
         case ["steps"]:
             return f"{value / 1e6:g}M" if value >= 1e6 else f"{value / 1e3:g}k" if value >= 1e3 else f"{value:g}"
+        case ["seconds"]:
+            if round(value) < 60:
+                return f"{value:.0f} s"
+            return f"{math.ceil(value / 60)} min" if value < 5400 else f"{value / 3600:.1f} h"
     return format(value, spec)
 
 

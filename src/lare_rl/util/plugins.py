@@ -57,8 +57,7 @@ class Registry(Mapping[str, T], Generic[T]):
     def register(self, name: str, value: T) -> None:
         """Add a value.
 
-        Raises:
-            LareError: another value has this name. Names cannot be reused, because compiled programs are cached by name.
+        Raises `LareError` if another value has this name. Names cannot be reused, because compiled programs are cached by name.
         """
         if self._values.setdefault(name, value) != value:
             raise LareError(
@@ -67,11 +66,7 @@ class Registry(Mapping[str, T], Generic[T]):
             )
 
     def find(self, name: str) -> T:
-        """Return the value of this name.
-
-        Raises:
-            LareError: no value has this name. The message lists all names.
-        """
+        """Return the value of this name. Raises `LareError` if no value has this name. The message lists all names."""
         if name in self:
             return self._values[name]
         hint = did_you_mean(name, self._values)

@@ -1,11 +1,11 @@
-"""The cores and the new processes of this program, on every system."""
+"""The cores and the new processes of this program, and locks between processes, on every system."""
 
 import os
 import subprocess
 import sys
-from typing import Any
+from typing import IO, Any
 
-__all__ = ["n_usable_cores", "own_session", "usable_cores"]
+__all__ = ["n_usable_cores", "own_session", "try_lock", "usable_cores"]
 
 
 def own_session() -> dict[str, Any]:
@@ -23,3 +23,21 @@ def usable_cores() -> list[int] | None:
 def n_usable_cores() -> int:
     """Return the number of cores that this process may use, as far as the system can tell."""
     return len(usable_cores() or range(os.cpu_count() or 1))
+
+
+def try_lock(file: IO[bytes]) -> bool:
+    """Lock a file until it is closed. Return False if it is locked already, and True if the file system has no locks."""
+    try:
+        if sys.platform == "win32":
+            import msvcrt
+
+            msvcrt.locking(file.fileno(), msvcrt.LK_NBLCK, 1)
+        else:
+            import fcntl
+
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except (BlockingIOError, PermissionError):
+        return False
+    except (ImportError, OSError):  # some network file systems have no locks
+        return True
+    return True

@@ -6,18 +6,16 @@ from typing import Any
 
 __all__ = ["rename_assigner", "rename_fields", "rename_keys", "rename_metrics", "rename_options"]
 
-_RENAMED_KEYS = {"cards": "accelerators", "judged_from": "credit_scope", "judges": "scored_observation"}
-"""From old to new keys of tasks, settings, sweeps and assigners."""
+_RENAMED_KEYS = {
+    "cards": "accelerators",
+    "drawn_steps": "sampled_steps",
+    "judged_from": "credit_scope",
+    "judges": "scored_observation",
+}
+"""From old to new keys of tasks, settings, sweeps and assigners, and options of the command line."""
 
 _RENAMED_METRICS = {"likeliest_return": "deterministic_return"}
 """From old to new metrics, after the slash."""
-
-_RENAMED_OPTIONS = {
-    "--cards": "--accelerators",
-    "--credit.drawn-steps": "--credit.sampled-steps",
-    "--judges": "--scored-observation",
-}
-"""From old to new options of the command line."""
 
 _RENAMED_ASSIGNER = {
     "features": "inputs",
@@ -85,9 +83,14 @@ _RENAMED_PATHS = {
 """From patterns of old names to new names, in the order in which they are applied."""
 
 
-def rename_keys(values: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the values of a table under the present names of its keys. A key beside its old name is not overwritten."""
-    return {name if (new := _RENAMED_KEYS.get(name, name)) in values else new: value for name, value in values.items()}
+def rename_keys(values: Any) -> Any:
+    """Return a table, with the tables in it, under the present names of keys. A key beside its old name is not overwritten."""
+    if isinstance(values, list):
+        return [rename_keys(value) for value in values]
+    if not isinstance(values, Mapping):
+        return values
+    names = {name: new for name, new in _RENAMED_KEYS.items() if new not in values}
+    return {names.get(name, name): rename_keys(value) for name, value in values.items()}
 
 
 def rename_assigner(values: Mapping[str, Any]) -> dict[str, Any]:
@@ -103,8 +106,14 @@ def rename_metrics(line: Mapping[str, Any]) -> dict[str, Any]:
 
 def rename_options(arguments: Sequence[str]) -> list[str]:
     """Return arguments of the command line under the present names of options."""
-    split = (argument.partition("=") for argument in arguments)
-    return [_RENAMED_OPTIONS.get(name, name) + equals + value for name, equals, value in split]
+
+    def rename(argument: str) -> str:
+        option, equals, value = argument.partition("=")
+        table, dot, name = option.removeprefix("--").rpartition(".")
+        new = _RENAMED_KEYS.get(name.replace("-", "_"))
+        return f"--{table}{dot}{new.replace('_', '-')}{equals}{value}" if new and option.startswith("--") else argument
+
+    return list(map(rename, arguments))
 
 
 def rename_fields(name: str) -> str:

@@ -42,8 +42,7 @@ _TOO_DEEP = f"it is nested more than {MAX_DEPTH} deep"
 def read_text(path: Path, max_bytes: int = MAX_TEXT_BYTES) -> str:
     r"""Read a text file in UTF-8. Lines of the result end with \n.
 
-    Raises:
-        LareError: the file cannot be read, or is too large.
+    Raises `LareError` if the file cannot be read, or is too large.
     """
     try:
         if path.exists() and not path.is_file():
@@ -89,8 +88,7 @@ def read_toml(text: str) -> dict[str, Any]:
 def read_table(path: Path) -> dict[str, Any]:
     """Read a file that is written by hand: JSON if its name ends with .json, else TOML.
 
-    Raises:
-        LareError: the file cannot be read, or is no table.
+    Raises `LareError` if the file cannot be read, or is no table.
     """
     text, is_json = read_text(path, MAX_SETTINGS_BYTES), path.suffix == ".json"
     try:

@@ -13,6 +13,7 @@ __all__ = [
     "Band",
     "column_correlations",
     "correlation",
+    "episode_error",
     "format_mean_std",
     "format_plus_minus",
     "format_rounded",
@@ -29,6 +30,8 @@ CLEAR_ERRORS = 2
 """A number is clear if it exceeds this many of its standard errors, or of its posterior standard deviations."""
 FLOAT32_NOISE = 1e-6
 """In float32, a constant may vary by this fraction of its size."""
+CLEAR_ERRORS = 2
+"""A number is clear if it exceeds this number of its standard errors."""
 CONSTANT = 1e-10
 """Values are taken as equal if the sum of their squared deviations is below this fraction of the sum of their squares."""
 
@@ -65,6 +68,11 @@ def grouped_standard_error(group_means: Float[np.ndarray, " groups"], error_with
         error_within: the standard error of the mean of all values, by their deviations from the means of their groups.
     """
     return max(error_within, standard_error(group_means))
+
+
+def episode_error(variances: Float[np.ndarray, " seeds"], n_episodes: int) -> float:
+    """Return the standard error of the mean over all episodes, from the unbiased variance of each seed's `n_episodes` episodes."""
+    return math.sqrt(np.mean(variances) / (len(variances) * n_episodes))
 
 
 def round_shares(shares: Sequence[float], total: float = 1.0) -> list[float]:

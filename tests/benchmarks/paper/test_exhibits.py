@@ -16,9 +16,10 @@ from lare_rl.sweep import processes
 from lare_rl.sweep.jobs import check_job, job_to_json, train_job
 from lare_rl.sweep.resources import Resources
 from lare_rl.training import train as training
+from lare_rl.util.statistics import Band
 from paper.exhibits import LARE_SOURCE, Exhibit, budgets, exhibit_jobs, exhibits
 from paper.reproduce import REAL, UNTRAINED, listed, reproduce
-from paper.trained import MEANING, TRAVELLED, WON, verdict
+from paper.trained import MEANING, TRAVELLED, WON, draw_panels, verdict
 
 EXHIBITS = exhibits()
 NAMES = [name for name, _, _ in listed()]
@@ -207,3 +208,11 @@ def test_reproduce_mistakes(command, monkeypatch, tmp_path):
     monkeypatch.setattr(studies, "_BENCHMARKS", tmp_path)
     status, _, err = command("reproduce")
     assert (status, "checkout" in err, "pip install" in err) == (2, True, True)
+
+
+def test_panels_share_legend_and_labels():
+    x = np.arange(3.0)
+    panels = {title: {"one": Band(x, x, x, x), "other": Band(x, 2 * x, x, 3 * x)} for title in ("td3", "sac", "ppo")}
+    svg = draw_panels(panels, "environment steps", "true return")
+    for text in (*panels, "one", "other", "environment steps", "true return"):
+        assert svg.count(f">{text}</text>") == 1, text

@@ -5,7 +5,7 @@ from types import SimpleNamespace
 
 import pytest
 
-from lare_rl.util.locks import try_lock
+from lare_rl.util.processes import try_lock
 
 
 def test_other_holder(tmp_path):
