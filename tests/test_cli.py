@@ -40,6 +40,7 @@ def first_column(table):
         ("train Task --steps 9 --td3.hidden 8 8,9", ["--td3.hidden: '8,9'", "whole number"]),
         ("train Task --step 9", ["--step, 9", "'--steps'"]),
         ("train Task --td3.gama 9", ["--td3.gama", "'--td3.gamma'"]),
+        ("train Task --ppo.no-aneal", ["'--ppo.no-anneal'"]),
         ("train Task --td3.gamma high", ["--td3.gamma: 'high'", "number"]),
         ("train Task --td3.gamma 3", ["td3.gamma = 3.0"]),
         ("train Task --scored-observation=left", ["--scored-observation: 'left'", "before, after, both"]),
@@ -246,6 +247,8 @@ def test_verify_with_returns(command, phi, spec_file):
     r2 = re.search(r"R² = (\d\.\d+) .*standard error of (less than )?0\.0", out)
     assert r2
     assert float(r2[1]) > 0.9
+    assert "pays at 20 of 20 steps" in out
+    assert "Play more episodes" not in out
     assert "\nFitted to all 30 episodes" in out
     assert "(before)" not in out
     _, both, _ = command("verify", phi, "--task", spec_file(), "--fit", "30", "--scored-observation", "both")

@@ -25,6 +25,9 @@ from lare_rl.cli.terminal import (
 from lare_rl.errors import LareError
 from lare_rl.tasks.spec import NO_ENVIRONMENT, ScoredObservation
 
+GOOD_R2 = 0.8
+"""From here on, the factors are worth training with."""
+
 if TYPE_CHECKING:
     from lare_rl.envs.play import Episode, Policy
     from lare_rl.latent.function import LatentFunction
@@ -202,6 +205,13 @@ def _print_assessment(function: "LatentFunction", role: "TaskSpec", episodes: Se
     from lare_rl.util.findings import format_for_reader
 
     assessment = assess_function(function, role, episodes)
+    n_steps = sum(len(episode.team_reward) for episode in episodes) / len(episodes)
+    n_paid = sum(int((episode.team_reward != 0).sum()) for episode in episodes) / len(episodes)
+    if n_paid > 1:
+        print_line(
+            f"An episode pays at {n_paid:.0f} of {n_steps:.0f} steps. Its return is the sum: if your reward is a running total, pay only "
+            "the last one."
+        )
     if len({episode.return_ for episode in episodes}) == 1:
         print_line(f"All {len(episodes)} episodes have the same return, which says nothing about the factors.")
         if role.environment != NO_ENVIRONMENT:
@@ -214,11 +224,13 @@ def _print_assessment(function: "LatentFunction", role: "TaskSpec", episodes: Se
         r2, r2_error = format_for_reader(assessment.r2, "r2"), format_for_reader(assessment.r2_error, "error")
         print_line(
             f"Returns of unseen episodes, predicted by the factors: R² = {r2} (1: exactly; 0: no better than their mean), "
-            f"with a standard error of {r2_error}. Each return was predicted from the episodes before it, so R² "
-            "usually rises with more episodes if the factors "
-            "are right. If it remains below about 0.8, phi lacks something that the score depends on, or the score is partly noise "
-            "or decided by the initial state."
+            f"with a standard error of {r2_error}."
         )
+        if assessment.r2 < GOOD_R2:
+            print_line(
+                f"Play more episodes: if the factors are right, R² rises. If it remains below about {GOOD_R2}, phi lacks something that "
+                "the score depends on, or the score is partly noise or decided by the initial state."
+            )
         if assessment.length_r2 is not None:
             length_r2 = format_for_reader(assessment.length_r2, "r2")
             print_line(f"Predicted by the lengths of these episodes alone, without a factor: R² = {length_r2}.")

@@ -158,7 +158,9 @@ def _option_names(command: Callable[..., None]) -> Iterator[str]:
     for name, parameter in inspect.signature(command).parameters.items():
         is_model = isinstance(parameter.default, CheckedModel)
         for key in model_keys(type(parameter.default)) if is_model else [name]:
-            yield f"--{key.replace('_', '-')}"
+            table, dot, last = key.replace("_", "-").rpartition(".")
+            yield f"--{table}{dot}{last}"
+            yield f"--{table}{dot}no-{last}"  # only switches have it, but a misspelt word is close to no other option
 
 
 def _read_model(info: StructTypeInfo, hidden: frozenset[str]) -> StructConstructorSpec | None:

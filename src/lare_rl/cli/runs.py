@@ -23,9 +23,8 @@ def evaluate(
     """Evaluate the policy of a run by its true return, from initial states that no evaluation of the run has used.
 
     Prints the mean return of the policy with its standard deviation, and the same of as many episodes of random actions, at
-    least ten (at least five if they take longer than the policy's), from other initial states, and the difference with its
-    standard error. If the task has groups, random actions play from the same initial states as the policy. A policy that samples
-    its actions also plays the most likely ones.
+    least ten (at least five if they take longer than the policy's), and the difference with its standard error. On the host,
+    random actions begin in the same initial states. A policy that samples its actions also plays the most likely ones.
 
     Args:
         run: a run directory.

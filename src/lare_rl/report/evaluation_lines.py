@@ -43,8 +43,8 @@ def evaluation_lines(
     samples = not (deterministic or ALGORITHMS[settings.algorithm].deterministic_evaluation(is_discrete))
     likeliest = evaluate_policy(run, episodes, best, True, make_listener(episodes)) if samples else None
     best_steps = load_actor(run, best=True)[2].tolist() if best else None
-    seeds = [] if task.group is None else evaluation_seeds(run, episodes)
-    if seeds:  # each equally often, because groups may differ in their returns
+    seeds = evaluation_seeds(run, episodes)
+    if task.group is not None:  # each equally often, because groups may differ in their returns
         n_random = len(seeds) * math.ceil(RANDOM_EPISODES / len(seeds))
     random_episodes = play_random(task, n_random, max(policy_s, RANDOM_PLAY_LIMIT_S), make_listener(n_random), seeds)
     yield from describe_evaluation(run, evaluation, random_episodes, best_steps)

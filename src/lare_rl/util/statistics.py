@@ -30,8 +30,6 @@ CLEAR_ERRORS = 2
 """A number is clear if it exceeds this many of its standard errors, or of its posterior standard deviations."""
 FLOAT32_NOISE = 1e-6
 """In float32, a constant may vary by this fraction of its size."""
-CLEAR_ERRORS = 2
-"""A number is clear if it exceeds this number of its standard errors."""
 CONSTANT = 1e-10
 """Values are taken as equal if the sum of their squared deviations is below this fraction of the sum of their squares."""
 
