@@ -24,8 +24,8 @@ import jax.numpy as jnp
 import numpy as np
 import tyro
 
-from lare_rl.envs.smax import SCENARIO_NAMES, battle, enemy, observation
-from lare_rl.envs.smax.scenarios import UNIT_TYPES, Scenario, find_scenario
+from lare_rl.envs.smax import battle, enemy, observation
+from lare_rl.envs.smax.scenarios import SCENARIOS, UNIT_TYPES, Scenario, find_scenario
 from lare_rl.envs.smax.smax_env import WIN_RETURN, reward
 from measure import write
 
@@ -280,7 +280,7 @@ def pinned(records: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
     return {"step": steps, "few": few} | {name.replace(" ", "_"): row for name, row in rows.items()}
 
 
-def main(battles: int = 12, tasks: tuple[str, ...] = SCENARIO_NAMES, pin: Path | None = None) -> None:
+def main(battles: int = 12, tasks: tuple[str, ...] = tuple(SCENARIOS), pin: Path | None = None) -> None:
     """Play and compare.
 
     Args:

@@ -99,11 +99,11 @@ def test_length_of_an_episode_is_checked(changes, words):
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"observation": np.zeros(2)}, "observation has the shape (2,), not (2, 2)"),
+        ({"observation": np.zeros(2)}, "observation of reset has the shape (2,), not (2, 2)"),
         ({"observation": np.float32([[0, 0], [0, np.nan]])}, "the observation of agent 1 contains nan in entry 1"),
         ({"reward": np.full(2, np.inf)}, "the reward of agent 0 contains inf"),
         ({"measures": {"goal": np.array(1)}}, "the measure 'goal' is not in EnvSpec.measures"),
-        ({"state": "left"}, "state has the shape (), not (1,)"),
+        ({"state": "left"}, "state of reset has the shape (), not (1,)"),
         (None, "reset must return a Timestep, not None"),
     ],
 )

@@ -29,10 +29,11 @@ MAX_ERROR = 300
 
 
 class EnvOutputError(LareError):
-    """An environment returned a value that cannot be used for training."""
+    """An environment returned a value that cannot be used for training. `env_index` is its index, if several run in lockstep."""
 
-    env_index: int | None = None
-    """The index of the environment, if several run in lockstep."""
+    def __init__(self, message: str, env_index: int | None = None):
+        super().__init__(message)
+        self.env_index = env_index
 
 
 def as_lare_error(message: str, error: BaseException, hint: str = "") -> LareError:

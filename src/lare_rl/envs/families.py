@@ -46,6 +46,17 @@ class Family(NamedTuple):
     single_agent: bool = False
     """Whether all environments of the family have one agent."""
 
+    @property
+    def module(self) -> str:
+        """The name of the module that defines the maker."""
+        return self.maker.partition(":")[0] if isinstance(self.maker, str) else self.maker.__module__
+
+    def load_maker(self) -> Maker:
+        """Return the maker. Its module is imported now if only its location is known."""
+        if isinstance(self.maker, str):
+            return getattr(importlib.import_module(self.module), self.maker.partition(":")[2])
+        return self.maker
+
 
 FAMILIES = Registry[Family]("family of environments", "families of environments")
 _GYMNASIUM = Family("lare_rl.envs.gymnasium_env:GymnasiumEnv", reads=("max_episode_steps",), single_agent=True)
@@ -75,8 +86,13 @@ register_family("particles", "lare_rl.envs.particles.particle_env:make")
 register_family("smax", "lare_rl.envs.smax.smax_env:make", score="sum")
 register_family("smac", "lare_rl.envs.starcraft:make", score="sum")
 register_family("pettingzoo", "lare_rl.envs.pettingzoo_env:make", reads=OPTIONAL_KEYS)
-for _name in ("gymnax", "brax", "playground", "jumanji"):
-    register_family(_name, f"lare_rl.envs.{_name}_env:make", reads=OPTIONAL_KEYS[:2], single_agent=True)
+for _name, _maker in {
+    "gymnax": "gymnax_env:make",
+    "brax": "robot_env:make_brax",
+    "playground": "robot_env:make_playground",
+    "jumanji": "jumanji_env:make",
+}.items():
+    register_family(_name, f"lare_rl.envs.{_maker}", reads=OPTIONAL_KEYS[:2], single_agent=True)
 register_family("jaxmarl", "lare_rl.envs.jaxmarl_env:make", reads=OPTIONAL_KEYS)
 
 
@@ -96,11 +112,7 @@ def make_env(task: TaskSpec, **kwargs: Any) -> JaxEnv | HostEnv:
     """
     family = _find_family(task)
     _check_keys(task, family)
-    maker = family.maker
-    if isinstance(maker, str):
-        module, _, attribute = maker.partition(":")
-        maker = getattr(importlib.import_module(module), attribute)
-    env = maker(task, **kwargs)
+    env = family.load_maker()(task, **kwargs)
     _check_functions(task, env)
     try:
         _check_spec(task, env.spec)
@@ -155,8 +167,7 @@ def _make_here(task: TaskSpec, **kwargs: Any) -> HostEnv:
 
 def picklable_maker(task: TaskSpec) -> Callable[[], HostEnv]:
     """Return a function that makes a task's environment in another process, which first imports the module of its family."""
-    maker = _find_family(task).maker
-    return partial(_import_and_make, maker.partition(":")[0] if isinstance(maker, str) else maker.__module__, task)
+    return partial(_import_and_make, _find_family(task).module, task)
 
 
 def _import_and_make(module: str, task: TaskSpec) -> HostEnv:

@@ -10,8 +10,7 @@ from jaxtyping import Array, Float, PRNGKeyArray
 
 from lare_rl.envs import jax_spaces
 from lare_rl.envs.env_errors import one_line_errors
-from lare_rl.envs.interface import Timestep
-from lare_rl.envs.jax_spaces import Bounds, Choices
+from lare_rl.envs.interface import Timestep, to_package_action
 from lare_rl.errors import LareError
 from lare_rl.tasks.spec import TaskSpec
 
@@ -45,21 +44,23 @@ class GymnaxEnv:
     """An environment of gymnax as a `JaxEnv`. An observation that is a number of a state becomes one-hot."""
 
     def __init__(self, env: Any, params: Any, task: TaskSpec):
-        self.env, self._name = env, task.environment
-        self.params = params
-        spaces = jax_spaces.import_package("gymnax.environments.spaces", task)
-        observation_space = env.observation_space(params)
-        self._n_states = int(observation_space.n) if isinstance(observation_space, spaces.Discrete) else 0
-        self._action = _read_action(env.action_space(params), spaces, task.environment)
-        key, action = jnp.zeros(2, jnp.uint32), self._action.decode(jnp.zeros(self._action.size))
+        self.env, self.params, self._name = env, params, task.environment
+        # The number of a state, if that is what the environment observes.
+        self._n_states = int(getattr(env.observation_space(params), "n", 0))
+        actions = env.action_space(params)
+
+        def play_step(key: PRNGKeyArray) -> tuple[Any, Any]:
+            observation, state = env.reset_env(key, params)
+            return observation, env.step_env(key, state, actions.sample(key), params)[-1]
+
+        fields = jax_spaces.action_fields(actions, task.environment)
         with one_line_errors(f"environment {self._name!r} cannot be used"):
-            observation, state = jax.eval_shape(env.reset_env, key, params)
-            info = jax.eval_shape(env.step_env, key, state, action, params)[-1]
+            observation, info = jax.eval_shape(play_step, jnp.zeros(2, jnp.uint32))
         self.spec = jax_spaces.agent_spec(
-            self._action,
             observation_size=self._n_states or jax_spaces.flat_size(observation),
             max_steps=int(getattr(params, LIMIT)),
             measures=jax_spaces.find_measures(task, info),
+            **fields,
         )
 
     def reset(self, key: PRNGKeyArray) -> tuple[Any, Timestep]:
@@ -67,7 +68,7 @@ class GymnaxEnv:
         return jax_spaces.strong_types(state), jax_spaces.agent_timestep(self.spec, self._flatten(observation))
 
     def step(self, state: Any, action: Float[Array, "1 action"], key: PRNGKeyArray) -> tuple[Any, Timestep]:
-        env_action = self._action.decode(action[0])
+        env_action = to_package_action(action[0], self.spec)
         observation, next_state, reward, terminated, info = self.env.step_env(
             jax_spaces.raw_key(key), state, env_action, self.params
         )
@@ -96,11 +97,3 @@ class GymnaxEnv:
 
     def _flatten(self, observation: Any) -> Float[Array, " observation"]:
         return jax.nn.one_hot(observation, self._n_states) if self._n_states else jax_spaces.flatten_tree(observation)
-
-
-def _read_action(space: Any, spaces: Any, environment: str) -> Choices | Bounds:
-    if isinstance(space, spaces.Discrete):
-        return jax_spaces.make_choices((space.n,), (), environment, space.dtype)
-    if isinstance(space, spaces.Box):
-        return jax_spaces.make_bounds(space.low, space.high, tuple(space.shape), environment)
-    raise jax_spaces.unusable_actions(environment, space)

@@ -182,9 +182,7 @@ def _make_agent(name: Any, space: Any, observation_size: int) -> Agent:
     if hasattr(space, "low"):
         low, high = (np.broadcast_to(np.asarray(bound, np.float32), space.shape) for bound in (space.low, space.high))
         return make_agent(name, observation_space, gymnasium.spaces.Box(low, high, dtype=np.float32))
-    raise LareError(
-        f"the actions of {name} are {short_repr(space)}: LaRe trains discrete actions and bounded continuous ones"
-    )
+    raise LareError(f"the actions of {name} are {short_repr(space)}: {jax_spaces.TRAINABLE_ACTIONS}")
 
 
 def _decode(agent: Agent, action: Float[Array, " action"]) -> Array:

@@ -7,12 +7,11 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
+from jaxtyping import Array, Float, Int, PRNGKeyArray
 
 from lare_rl.envs import jax_spaces
 from lare_rl.envs.env_errors import no_time_limit_error, one_line_errors
-from lare_rl.envs.interface import Timestep
-from lare_rl.envs.jax_spaces import Bounds, Choices
+from lare_rl.envs.interface import Timestep, to_package_action
 from lare_rl.tasks.spec import TaskSpec
 
 __all__ = ["JumanjiEnv", "make", "observed_arrays"]
@@ -59,19 +58,18 @@ class JumanjiEnv:
 
     def __init__(self, env: Any, task: TaskSpec, max_steps: int):
         self.env, self._name = env, task.environment
-        specs = jax_spaces.import_package("jumanji.specs", task)
-        self._action = _read_action(env.action_spec, specs, task.environment)
+        fields = jax_spaces.action_fields(env.action_spec, task.environment)
         with one_line_errors(f"environment {self._name!r} cannot be used"):
             _, timestep = jax.eval_shape(env.reset, jnp.zeros(2, jnp.uint32))
         if timestep.reward.shape:
             agents = f"each of its {len(timestep.reward)} agents has rewards"
             raise jax_spaces.unusable(self._name, f"{agents}, and LaRe's adapter of Jumanji has one agent")
         self.spec = jax_spaces.agent_spec(
-            self._action,
             observation_size=jax_spaces.flat_size(_observed(timestep.observation)),
             max_steps=max_steps,
-            masks_actions=_find_mask(timestep.observation) is not None and isinstance(self._action, Choices),
+            masks_actions=_find_mask(timestep.observation) is not None and fields["discrete"],
             measures=jax_spaces.find_measures(task, timestep.extras or {}),
+            **fields,
         )
 
     def reset(self, key: PRNGKeyArray) -> tuple[JumanjiState, Timestep]:
@@ -82,25 +80,23 @@ class JumanjiEnv:
         self, state: JumanjiState, action: Float[Array, "1 action"], key: PRNGKeyArray
     ) -> tuple[JumanjiState, Timestep]:
         """Make one step. The key is not used: Jumanji's state has its own."""
-        next_state, timestep = self.env.step(state.env, self._action.decode(action[0]))
+        next_state, timestep = self.env.step(state.env, to_package_action(action[0], self.spec))
         steps = state.steps + 1
         return JumanjiState(jax_spaces.cast_like(next_state, state.env), steps), self._make_timestep(timestep, steps)
 
     def _make_timestep(self, timestep: Any, steps: Any) -> Timestep:
-        is_terminal = timestep.last() & (timestep.discount == 0)
+        is_terminal, available = timestep.last() & (timestep.discount == 0), None
+        if self.spec.masks_actions:
+            available = jax_spaces.mask_combinations(_find_mask(timestep.observation), self.spec.choice_sizes)
         return jax_spaces.agent_timestep(
             self.spec,
             jax_spaces.flatten_tree(_observed(timestep.observation)),
             reward=timestep.reward,
             terminated=is_terminal,
             truncated=(timestep.last() & ~is_terminal) | (steps >= self.spec.max_steps),
-            available=self._read_mask(timestep.observation),
+            available=available,
             measures=timestep.extras,
         )
-
-    def _read_mask(self, observation: Any) -> Bool[Array, " action"] | None:
-        mask = _find_mask(observation)
-        return None if mask is None or isinstance(self._action, Bounds) else self._action.mask_combinations(mask)
 
     def frames(self, states: Any, credit: Any = None) -> list[np.ndarray]:
         """Return the package's pictures of states, which do not show credit. Raise `LareError` if it cannot draw them here."""
@@ -132,14 +128,3 @@ def _find_mask(observation: Any) -> Any:
 
 def _is_mask(path: tuple[Any, ...]) -> bool:
     return MASK in (getattr(path[-1], "name", None), getattr(path[-1], "key", None))
-
-
-def _read_action(spec: Any, specs: Any, environment: str) -> Choices | Bounds:
-    if isinstance(spec, specs.DiscreteArray):
-        return jax_spaces.make_choices((spec.num_values,), (), environment, spec.dtype)
-    if isinstance(spec, specs.MultiDiscreteArray):
-        sizes = np.asarray(spec.num_values)
-        return jax_spaces.make_choices(sizes.ravel().tolist(), sizes.shape, environment, spec.dtype)
-    if isinstance(spec, specs.BoundedArray) and np.issubdtype(spec.dtype, np.floating):
-        return jax_spaces.make_bounds(spec.minimum, spec.maximum, tuple(spec.shape), environment)
-    raise jax_spaces.unusable_actions(environment, spec)

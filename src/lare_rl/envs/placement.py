@@ -169,7 +169,6 @@ def _find_package(task: TaskSpec) -> str | None:
         if isinstance(entry_point, str):
             module = module or entry_point.partition(":")[0]
     elif not task.environment.startswith(PETTINGZOO_PREFIX):
-        maker = FAMILIES[task.family].maker
-        module = maker if isinstance(maker, str) else maker.__module__
-    package = module.partition(":")[0].partition(".")[0]
+        module = FAMILIES[task.family].module
+    package = module.partition(".")[0]
     return None if package in ("", "__main__") else package

@@ -1,6 +1,11 @@
-"""Environments of Brax and of MuJoCo Playground as `JaxEnv`s: both have the functions `reset(rng)` and `step(state, action)`."""
+"""Environments of Brax, `brax/halfcheetah`, and of MuJoCo Playground, `playground/CheetahRun`.
 
+Both packages have the functions `reset(rng)` and `step(state, action)`. Playground's simulator is MuJoCo's own, written for JAX (MJX).
+"""
+
+import math
 from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from typing import Any, NamedTuple
 
 import jax
@@ -10,13 +15,64 @@ from jaxtyping import Array, Float, Int, PRNGKeyArray
 
 from lare_rl.envs import jax_spaces
 from lare_rl.envs.env_errors import one_line_errors
-from lare_rl.envs.interface import Timestep
+from lare_rl.envs.interface import Timestep, to_package_action
 from lare_rl.tasks.spec import TaskSpec
 
-__all__ = ["RobotEnv", "RobotState"]
+__all__ = ["RobotEnv", "RobotState", "make_brax", "make_playground"]
+
+BRAX_MAX_STEPS = 1000
+"""The default of `brax.envs.create`."""
+PICTURE_SIZE = {"height": 240, "width": 320}
+"""Pixels of a picture of Playground."""
 
 OBSERVATION, PRIVILEGED = "state", "privileged_state"
 """Keys of an observation that is a dictionary: what the policy observes, and what only a critic may."""
+
+
+def make_brax(task: TaskSpec, **_: Any) -> "RobotEnv":
+    """Make the environment of a task with the name `brax/NAME`.
+
+    The task's arguments are arguments of the environment's class, such as `backend`. Raises `LareError` if Brax is not installed,
+    or the environment cannot be made.
+    """
+    envs = jax_spaces.import_package("brax.envs", task)
+    env = jax_spaces.construct(task, envs._envs, envs.get_environment)
+
+    def draw(states: list[Any]) -> Any:
+        from brax.io import image
+
+        return image.render_array(env.sys, [state.pipeline_state for state in states])
+
+    return RobotEnv(env, task, BRAX_MAX_STEPS, draw)
+
+
+def make_playground(task: TaskSpec, **_: Any) -> "RobotEnv":
+    """Make the environment of a task with the name `playground/NAME`.
+
+    The task's arguments replace values of the environment's configuration, such as `ctrl_dt` or `reward_config.scales.energy`.
+    Raises `LareError` if Playground is not installed, or the environment cannot be made.
+    """
+    playground = jax_spaces.import_package("mujoco_playground", task)
+
+    def load(name: str, **arguments: Any) -> tuple[Any, Any]:
+        config = playground.registry.get_default_config(name)
+        if "impl" in config:
+            config.impl = _choose_implementation(task)
+        env = playground.registry.load(name, config=config, config_overrides=arguments)
+        return env, config  # with the arguments, because the environment writes them into it
+
+    env, config = jax_spaces.construct(task, playground.registry.ALL_ENVS, load)
+    max_steps = math.ceil(config.episode_length / config.action_repeat)
+    return RobotEnv(env, task, max_steps, partial(env.render, **PICTURE_SIZE), config.action_repeat)
+
+
+def _choose_implementation(task: TaskSpec) -> str:
+    """Return the faster implementation where it runs: Warp on a card of NVIDIA if it is installed, else the one in JAX.
+
+    Playground's own default is Warp everywhere. `GraphMode` is a number where the version of Warp does not fit that of MuJoCo.
+    """
+    io = jax_spaces.import_package("mujoco.mjx._src.io", task)
+    return "warp" if io.has_cuda_gpu_device() and hasattr(io.mjxw.types.GraphMode, "WARP") else "jax"
 
 
 class RobotState(NamedTuple):
@@ -53,8 +109,6 @@ class RobotEnv:
             action_repeat: how often an action is repeated. The rewards of the repetitions are added up.
         """
         self.env, self._name = env, task.environment
-        # Playground's own algorithms act in [-1, 1] as well.
-        self._action = jax_spaces.make_bounds(-1.0, 1.0, (env.action_size,), self._name)
         self._draw, self._action_repeat = draw, action_repeat
         with one_line_errors(f"environment {self._name!r} cannot be used"):
             state = jax.eval_shape(env.reset, jnp.zeros(2, jnp.uint32))
@@ -63,11 +117,12 @@ class RobotEnv:
             raise jax_spaces.unusable(self._name, f"it observes {keys}, but not {OBSERVATION!r}")
         observation, privileged = _split_observation(state.obs)
         self.spec = jax_spaces.agent_spec(
-            self._action,
             observation_size=jax_spaces.flat_size(observation),
             max_steps=task.max_episode_steps or max_steps,
             state_size=jax_spaces.flat_size(privileged),
             measures=jax_spaces.find_measures(task, state.metrics),
+            # Playground's own algorithms act in [-1, 1] as well.
+            **jax_spaces.bounded_action(-1.0, 1.0, (env.action_size,), self._name),
         )
 
     def reset(self, key: PRNGKeyArray) -> tuple[RobotState, Timestep]:
@@ -82,7 +137,7 @@ class RobotEnv:
         """Make one step. The key is not used: the package's state has its own."""
         env_state, reward = state.env, jnp.zeros(())
         for _ in range(self._action_repeat):
-            env_state = self.env.step(_copy(env_state), self._action.decode(action[0]))
+            env_state = self.env.step(_copy(env_state), to_package_action(action[0], self.spec))
             reward += env_state.reward
         observation, privileged = map(jax_spaces.flatten_tree, _split_observation(env_state.obs))
         is_finite = jnp.isfinite(observation).all() & jnp.isfinite(privileged).all() & jnp.isfinite(reward)

@@ -13,20 +13,20 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from functools import partial
-from multiprocessing.connection import Connection
-from typing import Any, NamedTuple
+from multiprocessing.connection import Client, Connection, Listener
+from typing import Any
+from uuid import uuid4
 
 import numpy as np
 from jaxtyping import Int
 
 from lare_rl.envs.env_errors import EnvOutputError, one_line_errors
 from lare_rl.envs.interface import EnvSpec, HostEnv
-from lare_rl.envs.shared_arrays import SharedArrays, map_arrays, map_current
+from lare_rl.envs.shared_arrays import SharedArrays, map_arrays, map_current, open_directory
 from lare_rl.envs.trials import find_interference, time_steps
 from lare_rl.envs.vec_env import Maker, call_env, make_env_at
-from lare_rl.envs.worker_connection import connect, listen, open_address
 from lare_rl.errors import LareError
 from lare_rl.util.processes import own_session
 
@@ -34,22 +34,11 @@ __all__ = ["Worker", "end_workers", "pickle_maker"]
 
 PROGRAM = "import sys; from lare_rl.envs.worker_process import _serve; _serve(sys.argv[1])"
 
+CONNECT_TIMEOUT_S = 120.0
+"""A worker must listen within this time: it imports modules first."""
+POLL_S = 0.01
 CLOSE_TIMEOUT_S = 2.0
 """Workers must close their environments within this time."""
-
-
-class _Failure(NamedTuple):
-    """An error that a worker sends instead of a reply. Exceptions with attributes cannot be pickled reliably."""
-
-    message: str
-    env_index: int | None
-
-    def to_error(self) -> LareError:
-        if self.env_index is None:
-            return LareError(self.message)
-        error = EnvOutputError(self.message)
-        error.env_index = self.env_index
-        return error
 
 
 class Worker:
@@ -68,7 +57,7 @@ class Worker:
         self.connection: Connection
         """From `attach` on."""
         self._is_connected, self._stack = False, contextlib.ExitStack()
-        self._address = self._stack.enter_context(open_address())
+        self._address = self._stack.enter_context(_open_address())
         # The same import paths as in this process, and one thread, so that other workers can use the other cores.
         paths = os.pathsep.join(path or os.getcwd() for path in sys.path)
         variables = {"OMP_NUM_THREADS": "1"} | os.environ | {"PYTHONPATH": paths}
@@ -82,13 +71,24 @@ class Worker:
         self._current[0] = env_indices[0]
         if not self._is_connected:
             try:
-                self.connection = connect(self._address, self.process)
+                self.connection = self._connect()
             except OSError:
                 raise self._make_death_error() from None
             self._is_connected = True
             self._stack.close()
         self.send("attach", (worker_index, tuple(env_indices), memory))
         self.is_busy = False  # this command has no reply
+
+    def _connect(self) -> Connection:
+        """Connect to the process as soon as it listens. Raises `OSError` if it ends or takes too long."""
+        deadline = time.monotonic() + CONNECT_TIMEOUT_S
+        while True:
+            try:
+                return Client(self._address)
+            except (FileNotFoundError, ConnectionRefusedError):  # it does not listen yet
+                if self.process.poll() is not None or time.monotonic() > deadline:
+                    raise
+                time.sleep(POLL_S)
 
     @property
     def label(self) -> str:
@@ -114,8 +114,8 @@ class Worker:
         except (EOFError, OSError):
             raise self._make_death_error() from None
         self.is_busy = False
-        if isinstance(reply, _Failure):
-            raise reply.to_error()
+        if isinstance(reply, LareError):
+            raise reply
         return reply
 
     def _make_death_error(self) -> LareError:
@@ -141,6 +141,16 @@ class Worker:
         self.process.stdin.close()
 
 
+@contextlib.contextmanager
+def _open_address() -> Iterator[str]:
+    """Yield an address at which a worker can listen: a named pipe on Windows, else a socket that only this user may read."""
+    if sys.platform == "win32":
+        yield rf"\\.\pipe\lare-{uuid4().hex}"
+        return
+    with open_directory() as directory:
+        yield f"{directory}/socket"
+
+
 def end_workers(workers: Iterable[Worker]) -> None:
     """Let workers close their environments, and kill those that take too long."""
     workers = list(workers)
@@ -162,7 +172,10 @@ def pickle_maker(env_index: int, maker: Maker) -> bytes:
 def _serve(address: str) -> None:
     """Run a worker: make, reset and step environments, with a reply to each command, until the connection closes."""
     threading.Thread(target=_end_with_parent, daemon=True).start()
-    connection = listen(address)
+    listener = Listener(address)
+    connection = listener.accept()
+    with contextlib.suppress(FileNotFoundError):  # the parent may have removed the socket already
+        listener.close()
     envs: dict[int, HostEnv] = {}
     memory, current, shared = "", np.zeros(1, np.int64), None
     with contextlib.suppress(EOFError, BrokenPipeError, ConnectionResetError):
@@ -190,8 +203,10 @@ def _serve(address: str) -> None:
                 else:
                     assert shared is not None
                     _call_envs(envs, command, shared, current)
+            except EnvOutputError as error:
+                reply = EnvOutputError(str(error), error.env_index)
             except LareError as error:
-                reply = _Failure(str(error), error.env_index if isinstance(error, EnvOutputError) else None)
+                reply = LareError(str(error))  # another class may be defined where the parent cannot import it
             connection.send(reply)
     for env in envs.values():
         with contextlib.suppress(Exception):

@@ -2,13 +2,13 @@
 
 import inspect
 import re
-from importlib import import_module
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 from gymnasium.spaces import Box, Discrete
 
+from lare_rl.envs.families import FAMILIES
 from lare_rl.envs.interface import EnvSpec
 from lare_rl.envs.jaxmarl_env import JaxMARLEnv
 from lare_rl.envs.jumanji_env import JumanjiEnv, observed_arrays
@@ -28,8 +28,7 @@ FIELD = re.compile(r"^- (observation|action|reward|episode termination|state)s?:
 def draft_jax_task(environment_id: str) -> Draft:
     """Draft a task file from an environment's documentation and sizes. Raises `LareError` if it cannot be made."""
     family, _, name = environment_id.partition("/")
-    make = import_module(f"lare_rl.envs.{family}_env").make
-    stub = make_stub(name, environment_id)
+    make, stub = FAMILIES[family].load_maker(), make_stub(name, environment_id)
     limit: dict[str, int] = {}
     try:
         env = make(stub)

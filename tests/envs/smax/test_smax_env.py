@@ -9,8 +9,8 @@ import pytest
 
 from helpers.fake_smac import compiled_smax
 from lare_rl.envs.interface import Timestep
-from lare_rl.envs.smax import SCENARIO_NAMES
 from lare_rl.envs.smax.battle import ATTACK, STOP
+from lare_rl.envs.smax.scenarios import SCENARIOS
 from lare_rl.envs.smax.smax_env import SMAX, SmaxState
 
 BATTLES = 8
@@ -50,7 +50,7 @@ def play(name: str) -> tuple[SMAX, SmaxState, Timestep]:
 
 
 def test_sizes():
-    for name in SCENARIO_NAMES:
+    for name in SCENARIOS:
         spec = SMAX(name).spec
         sizes = (spec.n_agents, spec.observation_size, spec.state_size, spec.action_size, spec.max_steps)
         assert sizes == EXPECTED[name]
