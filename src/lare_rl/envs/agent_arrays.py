@@ -62,8 +62,7 @@ class Agent:
     def read_mask(self, observation: Any, info: Any) -> Bool[np.ndarray, " action"] | None:
         """Return which actions are available, from the observation or from `info`. Return None without a mask.
 
-        Raises:
-            ValueError: the mask is not valid. The message is the predicate of a sentence.
+        Raises `ValueError` with the predicate of a sentence if the mask is not valid.
         """
         mask = observation[MASK] if self.observes_mask else info.get(MASK) if isinstance(info, Mapping) else None
         if mask is None:
@@ -91,17 +90,10 @@ def make_agent(name: Any, observation: gymnasium.Space, action: gymnasium.Space)
 
 
 class AgentArrays:
-    """The layout of common arrays, with the agents in order.
-
-    If their spaces differ, each observation ends with the agent's index, one-hot encoded.
-    """
+    """The layout of common arrays. If the spaces of agents differ, each observation ends with the agent's index, one-hot encoded."""
 
     def __init__(self, agents: Sequence[Agent]):
-        """Make the layout.
-
-        Raises:
-            LareError: only some agents have discrete actions.
-        """
+        """Make the layout, with the agents in order. Raises `LareError` if only some of them have discrete actions."""
         first = agents[0]
         for agent in agents[1:]:
             if agent.discrete != first.discrete:

@@ -2,7 +2,7 @@
 
 import contextlib
 import logging
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -88,11 +88,7 @@ def no_time_limit_error(task: TaskSpec) -> LareError:
 
 
 def to_float(value: Any) -> float:
-    """Return a value as a float.
-
-    Raises:
-        ValueError: the value is not a number. The message is a predicate.
-    """
+    """Return a value as a float. Raises `ValueError`, whose message is a predicate, if it is not a number."""
     try:
         return float(value)
     except (TypeError, ValueError, OverflowError):
@@ -100,16 +96,13 @@ def to_float(value: Any) -> float:
 
 
 def read_measures(
-    infos: Iterable[Mapping[Any, Any]], task: TaskSpec, *, last: bool
+    infos: Sequence[Mapping[Any, Any]], task: TaskSpec, *, last: bool
 ) -> dict[str, Float[np.ndarray, ""]]:
     """Return the measures of the task from the `info` of a step: the means over the agents that report them.
 
-    They are 0 before the last step, except the group of the episode, if it is reported.
-
-    Raises:
-        LareError: a measure of the last step is missing, or is not a number.
+    They are 0 before the last step, except the group of the episode, if it is reported. Raises `LareError` if a measure of the last
+    step is missing, or is not a number.
     """
-    infos = list(infos)
     measures = {}
     for name in task.info_keys:
         is_read = last or (name == task.group and any(name in info for info in infos))
@@ -117,13 +110,7 @@ def read_measures(
     return measures
 
 
-def _read_measure(infos: Iterable[Mapping[Any, Any]], name: str) -> float:
-    """Return a measure of the task from the last step's `info`: the mean over the agents that report it.
-
-    Raises:
-        LareError: it is missing, or is not a number.
-    """
-    infos = list(infos)
+def _read_measure(infos: Sequence[Mapping[Any, Any]], name: str) -> float:
     try:
         values = [to_float(info[name]) for info in infos if name in info]
     except ValueError as error:

@@ -102,13 +102,9 @@ def find_score_type(task: TaskSpec) -> str | None:
 
 
 def make_env(task: TaskSpec, **kwargs: Any) -> JaxEnv | HostEnv:
-    """Make a task's environment.
+    """Make a task's environment. `kwargs` are arguments for the family's maker, such as `render_mode`.
 
-    Args:
-        kwargs: arguments for the family's maker, such as `render_mode`.
-
-    Raises:
-        LareError: the environment cannot be made, or does not match the task.
+    Raises `LareError` if the environment cannot be made, or does not match the task.
     """
     family = _find_family(task)
     _check_keys(task, family)

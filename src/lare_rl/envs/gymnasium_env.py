@@ -24,10 +24,9 @@ mujoco_rewards.register()
 
 
 def make_gymnasium(name: str, max_episode_steps: int | None = None, **kwargs: Any) -> gymnasium.Env:
-    """Make an environment whose spaces can be flattened. See `gymnasium.make` for the arguments.
+    """Make an environment. See `gymnasium.make` for the arguments.
 
-    Raises:
-        LareError: the environment cannot be made, or its spaces cannot be flattened.
+    Raises `LareError` if it cannot be made, or its spaces cannot be flattened.
     """
 
     def make_hint(error: BaseException) -> str:
@@ -68,8 +67,7 @@ class GymnasiumEnv:
     def __init__(self, task: TaskSpec, **kwargs: Any):
         """Make the environment of a task. See `gymnasium.make` for the keyword arguments.
 
-        Raises:
-            LareError: the environment cannot be made, or has no time limit.
+        Raises `LareError` if it cannot be made, or has no time limit.
         """
         self._name, self._task = task.environment, task
         self.environment = make_gymnasium(task.environment, task.max_episode_steps, **kwargs)

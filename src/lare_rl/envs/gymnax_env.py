@@ -23,10 +23,7 @@ LIMIT = "max_steps_in_episode"
 def make(task: TaskSpec, **_: Any) -> "GymnaxEnv":
     """Make the environment of a task with the name `gymnax/ID`.
 
-    The task's arguments are arguments of `gymnax.make` or parameters of the environment.
-
-    Raises:
-        LareError: gymnax is not installed, or the environment cannot be made.
+    The task's arguments are arguments of `gymnax.make` or parameters of the environment. Raises `LareError` if it cannot be made.
     """
     gymnax = jax_spaces.import_package("gymnax", task)
     names = gymnax.registered_envs

@@ -32,10 +32,8 @@ RESETS_ITSELF = ("coin_game",)
 def make(task: TaskSpec, **_: Any) -> "JaxMARLEnv":
     """Make the environment of a task with the name `jaxmarl/ID`.
 
-    The task's arguments are arguments of `jaxmarl.make`. If the environment has a time limit, `max_episode_steps` sets it.
-
-    Raises:
-        LareError: JaxMARL is not installed, or the environment cannot be made, or it has no time limit.
+    The task's arguments are arguments of `jaxmarl.make`. If the environment has a time limit, `max_episode_steps` sets it. Raises
+    `LareError` if it cannot be made, or has no time limit.
     """
     jaxmarl = jax_spaces.import_package("jaxmarl", task)
     names = jaxmarl.registered_envs

@@ -25,10 +25,8 @@ LIMIT = "time_limit"
 def make(task: TaskSpec, **_: Any) -> "JumanjiEnv":
     """Make the environment of a task with the name `jumanji/ID`.
 
-    The task's arguments are arguments of `jumanji.make`. If the environment has a time limit, `max_episode_steps` sets it.
-
-    Raises:
-        LareError: Jumanji is not installed, or the environment cannot be made, or it has several agents or no time limit.
+    The task's arguments are arguments of `jumanji.make`. If the environment has a time limit, `max_episode_steps` sets it. Raises
+    `LareError` if it cannot be made, or has several agents or no time limit.
     """
     jumanji = jax_spaces.import_package("jumanji", task)
     names = sorted(jumanji.registered_environments())

@@ -20,11 +20,7 @@ __all__ = ["import_mujoco", "mujoco_warnings"]
 
 
 def import_mujoco(name: str) -> None:
-    """Import MuJoCo if the environment is one of Gymnasium's that need it.
-
-    Raises:
-        LareError: MuJoCo is not installed.
-    """
+    """Import MuJoCo if the environment is one of Gymnasium's that need it. Raises `LareError` if it is not installed."""
     spec = gymnasium.registry.get(name)
     if spec is None or not str(spec.entry_point).startswith("gymnasium.envs.mujoco"):
         return
@@ -40,10 +36,7 @@ def import_mujoco(name: str) -> None:
 
 @contextlib.contextmanager
 def mujoco_warnings(name: str) -> Iterator[None]:
-    """Make an environment in this block. If MuJoCo is imported, its warnings become warnings of Python.
-
-    Warnings of deprecated attributes are dropped.
-    """
+    """Make an environment in this block. MuJoCo's warnings become warnings of Python, except those of deprecated attributes."""
     mujoco: Any = sys.modules.get("mujoco")  # its type stubs lack these functions
     if mujoco is None:
         yield

@@ -25,11 +25,7 @@ TIME_LIMITS = ("max_cycles", "max_episode_steps")
 
 
 def make_parallel_env(name: str, arguments: Mapping[str, Any]) -> Any:
-    """Return the ParallelEnv that `pettingzoo/MODULE:MAKER` makes from the arguments.
-
-    Raises:
-        LareError: it cannot be made, or is not a ParallelEnv.
-    """
+    """Return the ParallelEnv that `pettingzoo/MODULE:MAKER` makes from the arguments. Raises `LareError` if it makes none."""
     module_name, maker_name = split_environment(name)
     if not (module_name and maker_name):
         raise LareError(
@@ -89,8 +85,7 @@ def agent_kind(name: Any) -> str:
 def group_by_team(names: Sequence[Any], task: TaskSpec) -> tuple[list[Any], tuple[Team, ...]]:
     """Return the agents' names, team by team, and the teams.
 
-    Raises:
-        LareError: an agent is in no team or in several, or a team has no agents.
+    Raises `LareError` if an agent is in no team or in several, or if a team has no agents.
     """
     patterns = "; ".join(f"{role.team or role.name}: {', '.join(role.agents) or 'all'}" for role in task.roles)
     teams = {role.team or role.name: [name for name in names if _is_member(name, role)] for role in task.roles}

@@ -47,8 +47,7 @@ class ParallelHost:
     def __init__(self, environment: Any, task: TaskSpec):
         """Prepare the environment, and reset it once.
 
-        Raises:
-            LareError: the agents, spaces or first observations cannot be used, or there is no time limit.
+        Raises `LareError` if the agents, spaces or first observations cannot be used, or if there is no time limit.
         """
         self.environment, self._task, self._name = environment, task, task.environment
         names = list(environment.possible_agents or ())
@@ -227,10 +226,7 @@ class ParallelHost:
             )
 
     def _read_state(self, observation: Float[np.ndarray, "agents observation"]) -> Float[np.ndarray, " state"]:
-        """Return the environment's state.
-
-        Without one, return all observations if credit is assigned from the state, else an empty array.
-        """
+        """Return the environment's state. Without one: all observations if credit is assigned from the state, else nothing."""
         if self._initialising or self._state is not None:
             self._update_state()
         if self._state is not None:

@@ -32,8 +32,7 @@ OBSERVATION, PRIVILEGED = "state", "privileged_state"
 def make_brax(task: TaskSpec, **_: Any) -> "RobotEnv":
     """Make the environment of a task with the name `brax/NAME`.
 
-    The task's arguments are arguments of the environment's class, such as `backend`. Raises `LareError` if Brax is not installed,
-    or the environment cannot be made.
+    The task's arguments are arguments of the environment's class, such as `backend`. Raises `LareError` if it cannot be made.
     """
     envs = jax_spaces.import_package("brax.envs", task)
     env = jax_spaces.construct(task, envs._envs, envs.get_environment)
@@ -50,7 +49,7 @@ def make_playground(task: TaskSpec, **_: Any) -> "RobotEnv":
     """Make the environment of a task with the name `playground/NAME`.
 
     The task's arguments replace values of the environment's configuration, such as `ctrl_dt` or `reward_config.scales.energy`.
-    Raises `LareError` if Playground is not installed, or the environment cannot be made.
+    Raises `LareError` if it cannot be made.
     """
     playground = jax_spaces.import_package("mujoco_playground", task)
 
@@ -100,13 +99,10 @@ class RobotEnv:
         draw: Callable[[list[Any]], Sequence[Any]],
         action_repeat: int = 1,
     ):
-        """Wrap an environment.
+        """Wrap an environment of the package that has no wrappers.
 
-        Args:
-            env: the package's environment, without wrappers.
-            max_steps: the time limit of a task without one, in steps of this environment.
-            draw: makes pictures of the package's states.
-            action_repeat: how often an action is repeated. The rewards of the repetitions are added up.
+        `max_steps` is the time limit of a task without one, in steps of this environment. `draw` makes pictures of the package's states.
+        Each action is repeated `action_repeat` times, and the rewards are added up.
         """
         self.env, self._name = env, task.environment
         self._draw, self._action_repeat = draw, action_repeat

@@ -14,13 +14,9 @@ __all__ = ["check_spaces", "decode_box", "flatten_value", "float_array"]
 
 
 def check_spaces(owner: Any, observation: gymnasium.Space, action: gymnasium.Space) -> None:
-    """Check that observations can be flattened, and that actions are discrete or bounded.
+    """Raise `LareError` if observations cannot be flattened, or actions are neither discrete nor bounded.
 
-    Args:
-        owner: the name of the environment or agent, for the message.
-
-    Raises:
-        LareError: a space cannot be used.
+    `owner` is the name of the environment or agent, for the message.
     """
     if not observation.is_np_flattenable:
         raise LareError(f"the observation space of {owner} is {short_repr(observation)}, which cannot be flattened")
@@ -40,12 +36,9 @@ def decode_box(space: Box, vector: Float[np.ndarray, " size"]) -> np.ndarray:
 
 
 def flatten_value(space: gymnasium.Space, value: Any) -> Float[np.ndarray, " size"]:
-    """Return a value of a space as a new vector, in the order of `gymnasium.spaces.flatten`.
+    """Return a value of a space as a new vector, in the order of `gymnasium.spaces.flatten`, which does not check values.
 
-    Unlike Gymnasium's function, this one checks the value.
-
-    Raises:
-        ValueError: the value is not in the space. The message is the predicate of a sentence, such as "has the shape (3,), not (2,)".
+    Raises `ValueError` if the value is not in the space. The message is a predicate, such as "has the shape (3,), not (2,)".
     """
     if isinstance(space, Box):
         return float_array(value, space.shape).ravel()
@@ -77,8 +70,7 @@ def _flatten_all(pairs: Iterable[tuple[gymnasium.Space, Any]]) -> Float[np.ndarr
 def float_array(value: Any, shape: tuple[int, ...] | None = None) -> Float[np.ndarray, "..."]:
     """Return a value as a new float32 array.
 
-    Raises:
-        ValueError: the value is not an array of numbers, or has another shape. The message is a predicate.
+    Raises `ValueError`, whose message is a predicate, if it is not an array of numbers, or has another shape.
     """
     try:
         with np.errstate(over="ignore"):  # numbers beyond float32 become infinite, which `check_finite` refuses

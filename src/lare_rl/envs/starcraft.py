@@ -43,14 +43,9 @@ class StarCraft:
     spec: EnvSpec
 
     def __init__(self, name: str, make_game: Callable[..., Any] | None = None):
-        """Make the game.
+        """Make the game of a map, by default with SMAC's class.
 
-        Args:
-            name: the name of the map.
-            make_game: a function that makes the game. Default: SMAC's class.
-
-        Raises:
-            LareError: the package, StarCraft II or the map is missing.
+        Raises `LareError` if the package, StarCraft II or the map is missing.
         """
         self._name, self._make_game = name, make_game or _find_game()
         self._game: Any = None
@@ -89,8 +84,7 @@ class StarCraft:
     def step(self, action: Float[np.ndarray, "agents action"]) -> Timestep:
         """Make one step. If the game crashes, the episode is truncated, and the next `reset` starts the game again.
 
-        Raises:
-            LareError: an action is not available, or the game has crashed too often.
+        Raises `LareError` if an action is not available, or if the game has crashed too often.
         """
         choices = np.argmax(action, axis=1).tolist()
         for agent, choice in enumerate(choices):

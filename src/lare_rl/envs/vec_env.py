@@ -104,9 +104,7 @@ def make_env_at(env_index: int, maker: Maker) -> HostEnv:
 def check_lengths(spec: EnvSpec, length: Integer[np.ndarray, " n"], ended: Bool[np.ndarray, " n"]) -> None:
     """Raise `EnvOutputError` if an episode is longer or shorter than the specification says.
 
-    Args:
-        length: the number of steps of each episode.
-        ended: whether it has ended.
+    `length` is the number of steps that each episode has at present, and `ended` says whether it has ended.
     """
     at_limit = length >= spec.max_steps
     wrong = (at_limit != ended) if spec.fixed_length else (at_limit & ~ended)

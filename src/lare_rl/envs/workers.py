@@ -62,9 +62,8 @@ class SubprocVecEnv(VecEnv):
             reuse_key: keep the processes, one for each environment, open when the batch is closed, for the next batch with this
                 key. Empty: end them.
 
-        Raises:
-            LareError: an environment cannot be made, or `reuse_key` needs more processes. Later calls raise it if an environment
-                raises an error, dies or does not reply in time. All workers have then ended.
+        Raises `LareError` if an environment cannot be made, or `reuse_key` needs more processes. Later calls raise it if an environment
+        raises an error, dies or does not reply in time. All workers have then ended.
         """
         self.timeout = timeout
         self._timeout_hint, self._reuse_key = timeout_hint, reuse_key
@@ -129,10 +128,7 @@ class SubprocVecEnv(VecEnv):
     def find_interference(self, maker: Maker, timeout: float) -> str | None:
         """Make a second environment beside the only one, in its process. Return what goes wrong within `timeout` (s), or None.
 
-        The batch ends then, because the process may not be what it was.
-
-        Raises:
-            LareError: the process died or hangs.
+        The batch ends then, because the process may not be what it was. Raises `LareError` if the process died or hangs.
         """
         self.timeout = timeout
         with self._open_workers() as workers:

@@ -117,11 +117,7 @@ def make_draft(
 
 
 def text_lines(texts: Mapping[str, str], first_lines: Mapping[str, str]) -> list[str]:
-    """Return the texts of a task file in TOML. Missing texts are marked.
-
-    Args:
-        first_lines: lines to put before the texts. They are left out where a text begins in the same way.
-    """
+    """Return the texts of a task file in TOML. Missing texts are marked. `first_lines` precede texts that begin in another way."""
     lines = []
     for key, text in texts.items():
         text, first = text or f"{FILL_IN}: {CONTENTS[key]}", first_lines.get(key, "")

@@ -74,12 +74,9 @@ def write_team_drafts(
     removed: tuple[str, ...],
     more_lines: Sequence[str] = (),
 ) -> Draft:
-    """Write a task file and, if there are several teams, one for each of them.
+    """Write a task file, which has `more_lines`, and, if there are several teams, a file for each of them.
 
-    Args:
-        env: the environment, made for a task with these teams.
-        removed: the lines that were removed from the texts.
-        more_lines: further lines of the task file.
+    `env` is the environment, made for a task with these teams, and `removed` are the lines that were removed from the texts.
     """
     teams = env.spec.teams
     environment_lines = draft.environment_lines(environment_id, env.spec.observation_size, env.spec.action_size)

@@ -27,8 +27,7 @@ USED_TITLES = {
 def draft_task(environment_id: str) -> Draft:
     """Draft a task file from an environment's documentation and spaces.
 
-    Raises:
-        LareError: the environment cannot be made, its spaces cannot be flattened, or its family has no drafts.
+    Raises `LareError` if the environment cannot be made, its spaces cannot be flattened, or its family has no drafts.
     """
     if environment_id.startswith(PETTINGZOO_PREFIX):
         from lare_rl.new_task.many_agents import draft_multi_agent_task

@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-__all__ = ["concatenate_rows", "distances", "nearest_entities", "relative_positions", "slice_rows"]
+__all__ = ["concatenate_rows", "distances", "nearest_entities", "nearest_positions", "relative_positions", "slice_rows"]
 
 
 def distances(
@@ -29,6 +29,13 @@ def relative_positions(
     position: Float[Array, "entities 2"], observers: range, entities: Int[Array, "observers count"]
 ) -> Float[Array, "observers count 2"]:
     return position[entities] - slice_rows(position, observers)[:, None]
+
+
+def nearest_positions(
+    position: Float[Array, "entities 2"], observers: range, targets: range, count: int
+) -> Float[Array, "observers count 2"]:
+    """Return the relative positions of the `count` nearest targets."""
+    return relative_positions(position, observers, nearest_entities(position, observers, targets, count))
 
 
 def slice_rows(values: Float[Array, "entities 2"], entities: range) -> Float[Array, "range 2"]:
