@@ -139,7 +139,7 @@ def test_error_of_an_environment(make_vec_env, fault, message):
     [
         ("dies", 60, "died: signal SIGKILL"),
         ("leaves", 60, "died: exit status 3"),
-        ("hangs", 0.5, "did not reply for 0.5 s in step"),
+        ("hangs", 0.5, "did not reply for 0.5 s in step; if it needs longer, set timeout in the task file"),
     ],
 )
 def test_worker_that_fails(fault, timeout, message):

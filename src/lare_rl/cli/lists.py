@@ -11,7 +11,7 @@ if TYPE_CHECKING:
 
 def tasks() -> None:
     """List the tasks that come with the package. `lare-rl prompt TASK` describes one of them."""
-    from lare_rl.envs.families import has_single_agent
+    from lare_rl.envs.families import find_family
     from lare_rl.envs.load import read_task, shipped_tasks
 
     specs = [read_task(name) for name in shipped_tasks()]
@@ -23,7 +23,7 @@ def tasks() -> None:
                 str(spec.observation_size),
                 str(spec.action_size),
                 spec.scored_observation,
-                "of one team" if spec.team else "one" if has_single_agent(spec) else "many",
+                "of one team" if spec.team else "one" if find_family(spec).single_agent else "many",
             )
             for spec in specs
         ),

@@ -11,7 +11,7 @@ from gymnasium.spaces import Box, Dict, Discrete
 from jaxtyping import Bool, Float
 
 from lare_rl.envs.interface import EnvSpec, Team
-from lare_rl.envs.spaces import check_spaces, decode_box, flatten_value, float_array
+from lare_rl.envs.spaces import check_spaces, flatten_value, float_array
 from lare_rl.errors import LareError, short_repr
 
 __all__ = ["Agent", "AgentArrays", "make_agent"]
@@ -45,11 +45,12 @@ class Agent:
         return isinstance(self.action_space, Discrete)
 
     def decode_action(self, action: Float[np.ndarray, " action"]) -> Any:
-        """Return the action that a padded vector encodes, in the form that the environment expects."""
+        """Return the action that a padded vector encodes, in the form that the environment expects. Integers are rounded."""
         action, space = action[: self.action_size], self.action_space
         if isinstance(space, Discrete):
             return int(space.start) + int(np.argmax(action))
-        return decode_box(space, action)
+        clipped = np.clip(action.reshape(space.shape), space.low, space.high)
+        return (np.rint(clipped) if space.dtype.kind in "iu" else clipped).astype(space.dtype)
 
     def flatten_observation(self, observation: Any) -> Float[np.ndarray, " observation"]:
         """Return an observation as a new vector, without the mask. Raises `ValueError` like `flatten_value`."""

@@ -16,11 +16,11 @@ from lare_rl.util.plugins import Registry
 
 __all__ = [
     "FAMILIES",
+    "GYMNASIUM",
     "Family",
     "check_logs",
+    "find_family",
     "find_score_type",
-    "has_single_agent",
-    "is_gymnasium",
     "load_env_spec",
     "make_env",
     "make_host_env",
@@ -59,7 +59,7 @@ class Family(NamedTuple):
 
 
 FAMILIES = Registry[Family]("family of environments", "families of environments")
-_GYMNASIUM = Family("lare_rl.envs.gymnasium_env:GymnasiumEnv", reads=("max_episode_steps",), single_agent=True)
+GYMNASIUM = Family("lare_rl.envs.gymnasium_env:GymnasiumEnv", reads=("max_episode_steps",), single_agent=True)
 _LOGS_ONLY = Family("lare_rl.envs.families:_refuse_to_make", reads=("max_episode_steps",))
 
 
@@ -98,7 +98,7 @@ register_family("jaxmarl", "lare_rl.envs.jaxmarl_env:make", reads=OPTIONAL_KEYS)
 
 def find_score_type(task: TaskSpec) -> str | None:
     """Return "sum" or "average" (over the steps of an episode) if the task or its family says so."""
-    return task.score or _find_family(task).score
+    return task.score or find_family(task).score
 
 
 def make_env(task: TaskSpec, **kwargs: Any) -> JaxEnv | HostEnv:
@@ -106,7 +106,7 @@ def make_env(task: TaskSpec, **kwargs: Any) -> JaxEnv | HostEnv:
 
     Raises `LareError` if the environment cannot be made, or does not match the task.
     """
-    family = _find_family(task)
+    family = find_family(task)
     _check_keys(task, family)
     env = family.load_maker()(task, **kwargs)
     _check_functions(task, env)
@@ -125,18 +125,11 @@ def make_env(task: TaskSpec, **kwargs: Any) -> JaxEnv | HostEnv:
 
 def _check_functions(task: TaskSpec, env: Any) -> None:
     """Raise `LareError` if an environment lacks a function of its kind, which `is_jax` of its spec says."""
-    is_jax = env.spec.is_jax
-    names = ("reset", "step", "frames") if is_jax else ("reset", "step", "render", "close")
+    kind, names = "JaxEnv", ("reset", "step", "frames")
+    if not env.spec.is_jax:
+        kind, names = "HostEnv (without is_jax in its spec)", ("reset", "step", "render", "close")
     if missing := [name for name in names if not callable(getattr(env, name, None))]:
-        hint = (
-            ""
-            if is_jax or not hasattr(env, "frames")
-            else ". If it has pure functions of JAX, its spec needs is_jax=True"
-        )
-        raise LareError(
-            f"{task.environment}: a {'JaxEnv' if is_jax else 'HostEnv'} needs {', '.join(names)}, and this environment has no "
-            f"{' and no '.join(missing)}{hint}"
-        )
+        raise LareError(f"{task.environment}: a {kind} needs {', '.join(names)}, and has no {' and no '.join(missing)}")
 
 
 def make_host_env(task: TaskSpec, **kwargs: Any) -> HostEnv:
@@ -163,7 +156,7 @@ def _make_here(task: TaskSpec, **kwargs: Any) -> HostEnv:
 
 def picklable_maker(task: TaskSpec) -> Callable[[], HostEnv]:
     """Return a function that makes a task's environment in another process, which first imports the module of its family."""
-    return partial(_import_and_make, _find_family(task).module, task)
+    return partial(_import_and_make, find_family(task).module, task)
 
 
 def _import_and_make(module: str, task: TaskSpec) -> HostEnv:
@@ -175,16 +168,6 @@ def _import_and_make(module: str, task: TaskSpec) -> HostEnv:
             "Move the family into a module of its own."
         )
     return _make_here(task)
-
-
-def has_single_agent(task: TaskSpec) -> bool:
-    """Return whether all environments of the task's family have one agent."""
-    return _find_family(task).single_agent
-
-
-def is_gymnasium(task: TaskSpec) -> bool:
-    """Return whether Gymnasium makes the environment of a task."""
-    return _find_family(task) is _GYMNASIUM
 
 
 def load_env_spec(task: TaskSpec) -> EnvSpec:
@@ -210,10 +193,11 @@ def check_logs(task: TaskSpec) -> None:
             raise LareError(f"task {task.name!r}: {key} has no effect on logs. Remove it.")
 
 
-def _find_family(task: TaskSpec) -> Family:
+def find_family(task: TaskSpec) -> Family:
+    """Return the family of a task's environment."""
     if task.environment == NO_ENVIRONMENT:
         return _LOGS_ONLY
-    return FAMILIES.get(task.family, _GYMNASIUM) if task.family else _GYMNASIUM
+    return FAMILIES.get(task.family, GYMNASIUM) if task.family else GYMNASIUM
 
 
 def _refuse_to_make(task: TaskSpec, **_: Any) -> HostEnv:
@@ -228,7 +212,7 @@ def _check_keys(task: TaskSpec, family: Family) -> None:
         for key in OPTIONAL_KEYS:
             if getattr(role, key) and key not in family.reads:
                 advice = "Remove it."
-                if family is _GYMNASIUM and key == "arguments":
+                if family is GYMNASIUM and key == "arguments":
                     advice = "Remove it, and pass kwargs to gymnasium.register."
                 elif not str(family.maker).startswith("lare_rl."):
                     advice = f"Remove it, or pass reads=({key!r},) to register_family, if its maker reads it."

@@ -77,10 +77,9 @@ class GymnasiumEnv:
         action_space = self.environment.action_space
         assert isinstance(action_space, Discrete | Box)
         self._agent = Agent("agent", self.environment.observation_space, action_space, observes_mask=False)
-        fields: dict[str, Any]
         if isinstance(action_space, Box):
             dtype = np.result_type(action_space.dtype, np.float32)  # bounds stay as precise as they are
-            fields = {"low": action_space.low[None].astype(dtype), "high": action_space.high[None].astype(dtype)}
+            fields: dict[str, Any] = {key: getattr(action_space, key)[None].astype(dtype) for key in ("low", "high")}
         else:
             fields = {"first_choice": int(action_space.start)}
         self.spec = EnvSpec(

@@ -1,5 +1,6 @@
 """Environments of JaxMARL: `jaxmarl/MPE_simple_spread_v3`. The adapter calls `step_env`, which does not reset."""
 
+import contextlib
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple
 
@@ -193,12 +194,8 @@ def _decode(agent: Agent, action: Float[Array, " action"]) -> Array:
 
 def _find_masks(env: Any, state: Any) -> Callable[[Any], Mapping[Any, Any]] | None:
     """Return the function that returns the available actions by agent, if the environment has one."""
-    functions = [getattr(env, name, None) for name in ("get_avail_actions", "get_legal_moves")]
-    return next((function for function in functions if function and _is_implemented(function, state)), None)
-
-
-def _is_implemented(function: Callable[[Any], Any], state: Any) -> bool:
-    try:
-        return isinstance(jax.eval_shape(function, state), Mapping)
-    except NotImplementedError:  # of JaxMARL's base class
-        return False
+    for name in ("get_avail_actions", "get_legal_moves"):
+        with contextlib.suppress(NotImplementedError):  # of JaxMARL's base class
+            if hasattr(env, name) and isinstance(jax.eval_shape(getattr(env, name), state), Mapping):
+                return getattr(env, name)
+    return None

@@ -6,6 +6,7 @@ Agents and spaces are checked once. The values of each step are checked, but not
 import contextlib
 import logging
 from collections.abc import Callable, Mapping
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -172,11 +173,8 @@ class ParallelHost:
             if required:
                 raise self._error(f" returned no {name} for {agent.name}") from None
             return 0
-        return self._convert(name, agent, convert, value)
-
-    def _convert(self, name: str, agent: Agent, convert: Callable[..., Any], *values: Any) -> Any:
         try:
-            return convert(*values)
+            return convert(value)
         except ValueError as error:
             raise self._error(f": the {name} of {agent.name} {error}") from None
 
@@ -197,11 +195,15 @@ class ParallelHost:
             if observes[index]:
                 vectors[index] = self._read("observation", observations, agent, agent.flatten_observation, True)
                 if acts[index]:
-                    observation, info = observations[agent.name], infos.get(agent.name)
-                    mask = self._convert("action mask", agent, agent.read_mask, observation, info)
+                    read_mask = partial(agent.read_mask, info=infos.get(agent.name))
+                    mask = self._read("action mask", observations, agent, read_mask, True)
                     if mask is not None:
                         available[index, : agent.action_size] = mask
-                        self._check_masks_are_known(agent)
+                        self._masks_actions |= self._initialising
+                    if mask is not None and not self._masks_actions:
+                        raise self._error(
+                            f" returned an action mask for {agent.name}, but none at its first reset. Return masks at every step."
+                        )
             elif self.layout.discrete:
                 available[index] = np.arange(self.layout.action_size) == 0
         observation = self.layout.pad_observations(vectors)
@@ -216,14 +218,6 @@ class ParallelHost:
             truncated=np.array(truncated),
             measures=read_measures(reports, self._task, last=last),
         )
-
-    def _check_masks_are_known(self, agent: Agent) -> None:
-        if self._initialising:
-            self._masks_actions = True
-        elif not self._masks_actions:
-            raise self._error(
-                f" returned an action mask for {agent.name}, but none at its first reset. Return masks at every step."
-            )
 
     def _read_state(self, observation: Float[np.ndarray, "agents observation"]) -> Float[np.ndarray, " state"]:
         """Return the environment's state. Without one: all observations if credit is assigned from the state, else nothing."""

@@ -10,7 +10,7 @@ from jaxtyping import Float
 
 from lare_rl.errors import LareError, short_repr
 
-__all__ = ["check_spaces", "decode_box", "flatten_value", "float_array"]
+__all__ = ["check_spaces", "flatten_value", "float_array"]
 
 
 def check_spaces(owner: Any, observation: gymnasium.Space, action: gymnasium.Space) -> None:
@@ -27,12 +27,6 @@ def check_spaces(owner: Any, observation: gymnasium.Space, action: gymnasium.Spa
         )
     if isinstance(action, Box) and not action.is_bounded():
         raise LareError(f"the actions of {owner} have no bounds: {short_repr(action)}")
-
-
-def decode_box(space: Box, vector: Float[np.ndarray, " size"]) -> np.ndarray:
-    """Return the action of a space that a vector stands for. Integers are rounded."""
-    clipped = np.clip(vector.reshape(space.shape), space.low, space.high)
-    return (np.rint(clipped) if space.dtype.kind in "iu" else clipped).astype(space.dtype)
 
 
 def flatten_value(space: gymnasium.Space, value: Any) -> Float[np.ndarray, " size"]:

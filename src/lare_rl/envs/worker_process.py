@@ -55,7 +55,7 @@ class Worker:
         self.last_active, self._last_index = time.monotonic(), 0
         self._current = np.zeros(1, np.int64)
         self.connection: Connection
-        """From `attach` on."""
+        """From `start_making` on."""
         self._is_connected, self._stack = False, contextlib.ExitStack()
         self._address = self._stack.enter_context(_open_address())
         # The same import paths as in this process, and one thread, so that other workers can use the other cores.
@@ -65,10 +65,10 @@ class Worker:
             [sys.executable, "-P", "-c", PROGRAM, self._address], stdin=subprocess.PIPE, env=variables, **own_session()
         )
 
-    def attach(self, env_indices: Sequence[int], memory: str, worker_index: int) -> None:
-        """Number the environments anew, and use other memory."""
-        self.env_indices, self._current = env_indices, map_current(memory)[worker_index : worker_index + 1]
-        self._current[0] = env_indices[0]
+    def start_making(self, makers: Mapping[int, Maker], memory: str, worker_index: int) -> None:
+        """Number the environments anew, and use other memory. The makers of environments are ignored if they are made already."""
+        self.env_indices, self._current = list(makers), map_current(memory)[worker_index : worker_index + 1]
+        self._current[0] = self.env_indices[0]
         if not self._is_connected:
             try:
                 self.connection = self._connect()
@@ -76,8 +76,8 @@ class Worker:
                 raise self._make_death_error() from None
             self._is_connected = True
             self._stack.close()
-        self.send("attach", (worker_index, tuple(env_indices), memory))
-        self.is_busy = False  # this command has no reply
+        pickled = [] if self.specs else [pickle_maker(index, maker) for index, maker in makers.items()]
+        self.send("make", (worker_index, self.env_indices, memory, pickled))
 
     def _connect(self) -> Connection:
         """Connect to the process as soon as it listens. Raises `OSError` if it ends or takes too long."""
@@ -164,7 +164,7 @@ def end_workers(workers: Iterable[Worker]) -> None:
 
 
 def pickle_maker(env_index: int, maker: Maker) -> bytes:
-    """Return what the commands "make" and "second" need. Raises `LareError` if the maker cannot be pickled."""
+    """Return a maker for the commands "make" and "second". Raises `LareError` if it cannot be pickled."""
     with one_line_errors(f"environment {env_index} cannot be sent to a worker process"):
         return pickle.dumps(maker)
 
@@ -181,16 +181,14 @@ def _serve(address: str) -> None:
     with contextlib.suppress(EOFError, BrokenPipeError, ConnectionResetError):
         while True:
             command, argument = connection.recv()
-            if command == "attach":
-                worker_index, env_indices, memory = argument
-                current, shared = map_current(memory)[worker_index : worker_index + 1], None
-                envs = dict(zip(env_indices, envs.values(), strict=False))  # before "make", there are none
-                continue
             reply = None
             try:
                 if command == "make":
                     start = time.perf_counter()
-                    for index, pickled in argument.items():
+                    worker_index, env_indices, memory, makers = argument
+                    current = map_current(memory)[worker_index : worker_index + 1]
+                    envs = dict(zip(env_indices, envs.values(), strict=False))  # those that are made already
+                    for index, pickled in zip(env_indices, makers, strict=False):
                         current[0] = index
                         envs[index] = make_env_at(index, partial(_unpickle_and_make, pickled))
                     reply = tuple(env.spec for env in envs.values()), time.perf_counter() - start

@@ -16,7 +16,7 @@ import numpy as np
 from jaxtyping import Bool, Shaped
 
 from lare_rl.envs.interface import EnvSpec
-from lare_rl.envs.shared_arrays import MAX_WORKERS, SharedArrays, map_arrays, open_shared_memory
+from lare_rl.envs.shared_arrays import MAX_WORKERS, map_arrays, open_shared_memory
 from lare_rl.envs.vec_env import Maker, VecEnv, check_same_sizes
 from lare_rl.envs.worker_process import Worker, end_workers, pickle_maker
 from lare_rl.errors import LareError
@@ -49,7 +49,6 @@ class SubprocVecEnv(VecEnv):
         makers: Sequence[Maker],
         processes: int | None = None,
         timeout: float = 60.0,
-        timeout_hint: str = "",
         reuse_key: str = "",
     ):
         """Start the processes and make the environments.
@@ -58,15 +57,13 @@ class SubprocVecEnv(VecEnv):
             makers: one function for each environment. It must be possible to pickle them.
             processes: the number of processes. Default: the number of cores, but at most one for each environment.
             timeout: the time (s) within which an environment must reply.
-            timeout_hint: the end of the message about an environment that does not reply in time.
             reuse_key: keep the processes, one for each environment, open when the batch is closed, for the next batch with this
                 key. Empty: end them.
 
         Raises `LareError` if an environment cannot be made, or `reuse_key` needs more processes. Later calls raise it if an environment
         raises an error, dies or does not reply in time. All workers have then ended.
         """
-        self.timeout = timeout
-        self._timeout_hint, self._reuse_key = timeout_hint, reuse_key
+        self.timeout, self._reuse_key = timeout, reuse_key
         self._workers: list[Worker] = []
         n_envs, n_workers = len(makers), min(len(makers), processes or n_usable_cores(), MAX_WORKERS)
         if reuse_key and n_workers < n_envs:
@@ -76,10 +73,12 @@ class SubprocVecEnv(VecEnv):
             with open_shared_memory() as memory:
                 for _ in range(n_workers):
                     self._workers.append(_find_idle_worker(reuse_key) or Worker())
-                for worker_index, worker in enumerate(self._workers):
-                    worker.attach(range(worker_index, n_envs, n_workers), memory, worker_index)
-                specs = self._make_envs(makers)
-                self._shared = self._share_memory(memory, specs)
+                specs = self._make_envs(makers, memory)
+                self._shared = map_arrays(memory, specs[0], n_envs)
+                self._shared.batch.available[:] = True
+                for worker in self._workers:
+                    worker.send("share", (specs[0], n_envs))
+                self._receive("share")
                 super().__init__(specs[0], self._shared.batch)
         except BaseException as error:
             self._kill()
@@ -87,28 +86,17 @@ class SubprocVecEnv(VecEnv):
                 raise LareError(f"worker processes cannot be started: {error}") from error
             raise
 
-    def _make_envs(self, makers: Sequence[Maker]) -> list[EnvSpec]:
+    def _make_envs(self, makers: Sequence[Maker], memory: str) -> list[EnvSpec]:
         """Make the environments that the workers do not have yet. Return the specifications of all."""
-        for worker in self._workers:
-            if not worker.specs:
-                worker.send("make", {index: pickle_maker(index, makers[index]) for index in worker.env_indices})
-        for worker, reply in self._receive("make"):
-            worker.specs, worker.make_s = reply
-        by_index = {
-            i: spec for worker in self._workers for i, spec in zip(worker.env_indices, worker.specs, strict=True)
-        }
-        specs = [by_index[index] for index in range(len(makers))]
+        n_workers = len(self._workers)
+        for worker_index, worker in enumerate(self._workers):
+            indices = range(worker_index, len(makers), n_workers)
+            worker.start_making({index: makers[index] for index in indices}, memory, worker_index)
+        for worker, (specs, make_s) in self._receive("make"):
+            worker.specs, worker.make_s = specs, max(worker.make_s, make_s)
+        specs = [self._workers[index % n_workers].specs[index // n_workers] for index in range(len(makers))]
         check_same_sizes(specs)
         return specs
-
-    def _share_memory(self, memory: str, specs: Sequence[EnvSpec]) -> SharedArrays:
-        """Map the arrays of the environments in this process and in the workers."""
-        shared = map_arrays(memory, specs[0], len(specs))
-        shared.batch.available[:] = True
-        for worker in self._workers:
-            worker.send("share", (specs[0], len(specs)))
-        self._receive("share")
-        return shared
 
     @property
     def pids(self) -> list[int]:
@@ -169,7 +157,8 @@ class SubprocVecEnv(VecEnv):
                 if worker.connection in ready:
                     replies.append((worker, worker.receive()))
                 elif worker.measure_idle_s() > timeout:
-                    raise LareError(f"{worker.label} did not reply for {timeout:g} s in {command}{self._timeout_hint}")
+                    advice = "if it needs longer, set timeout in the task file"
+                    raise LareError(f"{worker.label} did not reply for {timeout:g} s in {command}; {advice}")
         return replies
 
     def close(self) -> None:

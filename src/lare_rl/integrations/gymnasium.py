@@ -42,12 +42,11 @@ class Credit(gymnasium.Wrapper, RecordConstructorArgs):
 
         Args:
             env: the environment, with the spaces that the assigner was made for.
-            credit: the assigner. Other environments may share it.
+            credit: the assigner, for one agent. Other environments may share it.
             pay: the reward that `step` returns. With "proxy" the decoder is fitted as steps come in.
             score: the key of the last step's `info` with the score of the episode. The default is the sum of the rewards.
 
-        Raises:
-            LareError: the assigner was made for other spaces, or for many agents.
+        Raises `LareError` if the assigner was made for other spaces, or for many agents.
         """
         # A copy of the assigner would learn from nothing but this environment.
         RecordConstructorArgs.__init__(self, _disable_deepcopy=True, credit=credit, pay=pay, score=score)
@@ -96,11 +95,7 @@ class VectorCredit(VectorWrapper, RecordConstructorArgs):
     """
 
     def __init__(self, env: VectorEnv, credit: CreditAssigner, pay: Pay = "proxy", score: str | None = None):
-        """Wrap a vector environment. The arguments are those of `Credit`.
-
-        Raises:
-            LareError: `metadata` has no autoreset mode, or the assigner was made for other spaces or for many agents.
-        """
+        """Wrap a vector environment. The arguments are those of `Credit`. Raises `LareError` if it has no autoreset mode, and as there."""
         RecordConstructorArgs.__init__(self, _disable_deepcopy=True, credit=credit, pay=pay, score=score)
         VectorWrapper.__init__(self, env)
         check_pay(pay)

@@ -12,12 +12,11 @@ from lare_rl.envs.families import FAMILIES
 from lare_rl.envs.interface import EnvSpec
 from lare_rl.envs.jaxmarl_env import JaxMARLEnv
 from lare_rl.envs.jumanji_env import JumanjiEnv, observed_arrays
-from lare_rl.envs.pettingzoo_construct import agent_kind
 from lare_rl.errors import LareError
 from lare_rl.new_task import draft
 from lare_rl.new_task.documentation import single_agent_lines, split_sections, write_texts
 from lare_rl.new_task.draft import Draft, count_entries, file_name, warning_lines
-from lare_rl.new_task.many_agents import make_stub, name_patterns, write_team_drafts
+from lare_rl.new_task.many_agents import make_stub, write_team_drafts
 
 __all__ = ["draft_jax_task"]
 
@@ -41,10 +40,7 @@ def draft_jax_task(environment_id: str) -> Draft:
     texts, removed = _read_texts(env)
     limit_lines = [draft.LIMIT_LINE] if limit else []
     if isinstance(env, JaxMARLEnv):
-        kinds = list(dict.fromkeys(agent_kind(agent.name) for agent in env.layout.agents))
-        if len(kinds) > 1:
-            stubs = tuple(make_stub(kind, environment_id, team=kind, agents=name_patterns(kind)) for kind in kinds)
-            env = make(make_stub(name, environment_id, teams=stubs, **limit))
+        env = make(make_stub(name, environment_id, env.layout.index, **limit))
         return write_team_drafts(file_name(name), environment_id, env, texts, removed, limit_lines)
     lines = [
         *warning_lines(removed),

@@ -100,9 +100,5 @@ def _find_package(module: str) -> Path | None:
 
 def _package_folders() -> set[Path]:
     """Return the folders in which packages are installed. No module of Python itself makes environments."""
-    paths = sysconfig.get_paths()
-    names = ("purelib", "platlib")
-    return {
-        Path(path).resolve()
-        for path in (*(paths[name] for name in names), *site.getsitepackages(), site.getusersitepackages())
-    }
+    folders = [sysconfig.get_path(name) for name in ("purelib", "platlib")]
+    return {Path(path).resolve() for path in (*folders, *site.getsitepackages(), site.getusersitepackages())}

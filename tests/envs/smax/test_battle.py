@@ -10,9 +10,8 @@ import pytest
 
 from lare_rl.envs.smax import battle
 from lare_rl.envs.smax.battle import STOP, TICKS, advance
-from lare_rl.envs.smax.observation import global_state, observe
 from lare_rl.envs.smax.scenarios import SCENARIOS, find_scenario
-from lare_rl.envs.smax.smax_env import reward
+from lare_rl.envs.smax.smax_env import global_state, observe, reward
 from lare_rl.errors import LareError
 
 PINNED = np.load(Path(__file__).parent / "pinned.npz")
