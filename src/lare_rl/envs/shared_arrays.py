@@ -80,7 +80,7 @@ def map_arrays(prefix: str, spec: EnvSpec, n: int) -> SharedArrays:
         np.ndarray(array.shape, array.dtype, memory, start)
         for array, start in zip(arrays, starts[:-1].tolist(), strict=True)
     )
-    n_measures = len(spec.measures)
-    fields, measures = columns[: len(columns) - n_measures], columns[len(columns) - n_measures :]
-    timestep = Timestep(*fields, measures=dict(zip(spec.measures, measures, strict=True)))  # pyright: ignore[reportCallIssue]
+    n_columns = len(batch) - 1
+    measures = dict(zip(spec.measures, columns[n_columns:], strict=True))
+    timestep = Timestep(*columns[:n_columns], measures=measures)  # pyright: ignore[reportCallIssue]
     return SharedArrays(where, seed, action, timestep)

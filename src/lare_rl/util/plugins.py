@@ -73,7 +73,9 @@ class Registry(Mapping[str, T], Generic[T]):
             LareError: no value has this name. The message lists all names.
         """
         plugins = "" if read_variable("LARE_PLUGINS") else " (for others, name their modules in LARE_PLUGINS)"
-        return find_named(self._kind, f"{self._kinds}{plugins}", name, self)
+        if name not in self._values:
+            load_plugins()
+        return find_named(self._kind, f"{self._kinds}{plugins}", name, self._values)
 
     def __getitem__(self, name: str) -> T:
         if name not in self._values:
