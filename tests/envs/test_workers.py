@@ -17,7 +17,7 @@ import lare_rl
 from helpers import host_envs
 from helpers.host_envs import ToyHostEnv
 from helpers.toy_envs import toy_spec
-from lare_rl.envs import families, worker_process, workers
+from lare_rl.envs import families, worker_process
 from lare_rl.envs.families import picklable_maker
 from lare_rl.envs.vec_env import LocalVecEnv
 from lare_rl.envs.workers import SubprocVecEnv
@@ -183,17 +183,6 @@ def test_close(tmp_path):
     for call in (SubprocVecEnv.measure_step_s, lambda envs: envs.find_interference(ToyHostEnv, 1.0), walk):
         with pytest.raises(LareError, match="the worker processes have ended"):
             call(envs)
-
-
-@pytest.mark.parametrize("processes", [1, None])
-def test_too_few_processes_for_reuse(monkeypatch, processes):
-    monkeypatch.setattr(workers, "n_usable_cores", lambda: 2)
-    with pytest.raises(LareError, match=r"3 environments.* processes = 3") as error:
-        SubprocVecEnv([ToyHostEnv] * 3, processes, reuse_key="toy")
-    assert str(workers.MAX_WORKERS) not in str(error.value)
-    monkeypatch.setattr(workers, "MAX_WORKERS", 2)
-    with pytest.raises(LareError, match=r"3 environments.* at most 2"):
-        SubprocVecEnv([ToyHostEnv] * 3, processes=3, reuse_key="toy")
 
 
 def test_makers_that_are_refused():

@@ -13,7 +13,7 @@ from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 from lare_rl.envs import jax_spaces
 from lare_rl.envs.agent_arrays import Agent, AgentArrays, make_agent
 from lare_rl.envs.env_errors import no_time_limit_error, one_line_errors
-from lare_rl.envs.interface import EnvSpec, Timestep, with_available_action
+from lare_rl.envs.interface import Timestep, with_available_action
 from lare_rl.envs.pettingzoo_construct import group_by_team
 from lare_rl.errors import LareError, short_repr
 from lare_rl.tasks.spec import TaskSpec
@@ -70,8 +70,6 @@ class JaxMARLEnv:
     another end: an episode that ends at `max_steps` is truncated, one that ends before is terminated. At the last step no agent
     leaves, because `phi` may read the observations of the agents that acted.
     """
-
-    spec: EnvSpec
 
     def __init__(self, env: Any, task: TaskSpec, max_steps: int):
         self.env, self._name = env, task.environment

@@ -15,7 +15,7 @@ from jaxtyping import Bool, Float
 from lare_rl.envs import env_errors
 from lare_rl.envs.agent_arrays import Agent, AgentArrays, make_agent
 from lare_rl.envs.env_errors import EnvOutputError, one_line_errors, read_measures, to_float
-from lare_rl.envs.interface import EnvSpec, Timestep
+from lare_rl.envs.interface import Timestep
 from lare_rl.envs.pettingzoo_construct import find_time_limit, group_by_team, make_parallel_env
 from lare_rl.envs.spaces import float_array
 from lare_rl.errors import LareError, short_repr
@@ -42,8 +42,6 @@ class ParallelHost:
     If an agent leaves while others stay, it observes zeros from then on. At an episode's last step no agent leaves: those that
     acted still observe the result, because `phi` may read it.
     """
-
-    spec: EnvSpec
 
     def __init__(self, environment: Any, task: TaskSpec):
         """Prepare the environment, and reset it once.

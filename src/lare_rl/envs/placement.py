@@ -148,7 +148,7 @@ def _measure_task(task_json: str) -> float:
 
 
 def _make_separate(task: TaskSpec, n: int) -> SubprocVecEnv:
-    return SubprocVecEnv([picklable_maker(task)] * n, n, task.timeout, reuse_key=task.model_dump_json())
+    return SubprocVecEnv([picklable_maker(task)] * n, timeout=task.timeout, reuse_key=task.model_dump_json())
 
 
 def _select_row(batch: Timestep) -> Timestep:

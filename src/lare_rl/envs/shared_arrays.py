@@ -15,10 +15,7 @@ from jaxtyping import Bool, Float, Int, Shaped
 from lare_rl.envs.interface import EnvSpec, Timestep
 from lare_rl.envs.vec_env import empty_batch
 
-__all__ = ["MAX_WORKERS", "SharedArrays", "map_arrays", "map_current", "open_directory", "open_shared_memory"]
-
-MAX_WORKERS = mmap.PAGESIZE // np.dtype(np.int64).itemsize
-"""A page of the shared memory has room for a number of each."""
+__all__ = ["SharedArrays", "map_arrays", "map_current", "open_directory", "open_shared_memory"]
 
 
 class SharedArrays(NamedTuple):
@@ -64,9 +61,9 @@ def _map(name: str, size: int) -> mmap.mmap:
         return mmap.mmap(file.fileno(), size)
 
 
-def map_current(prefix: str) -> Int[np.ndarray, " workers"]:
-    """Map a page of the memory with these names: the index of the environment that each worker calls now."""
-    return np.frombuffer(_map(prefix + "current", mmap.PAGESIZE), np.int64)
+def map_current(prefix: str, n_workers: int) -> Int[np.ndarray, " workers"]:
+    """Map a part of the memory with these names: the index of the environment that each worker calls now."""
+    return np.frombuffer(_map(prefix + "current", n_workers * np.dtype(np.int64).itemsize), np.int64)
 
 
 def map_arrays(prefix: str, spec: EnvSpec, n: int) -> SharedArrays:

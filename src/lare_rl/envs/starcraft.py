@@ -40,8 +40,6 @@ def make(task: TaskSpec, **_: Any) -> "StarCraft":
 class StarCraft:
     """A map of SMAC as a `HostEnv`. The actions are SMAC's: no-op, stop, north, south, east, west, and to attack each enemy."""
 
-    spec: EnvSpec
-
     def __init__(self, name: str, make_game: Callable[..., Any] | None = None):
         """Make the game of a map, by default with SMAC's class.
 

@@ -65,9 +65,9 @@ class Worker:
             [sys.executable, "-P", "-c", PROGRAM, self._address], stdin=subprocess.PIPE, env=variables, **own_session()
         )
 
-    def start_making(self, makers: Mapping[int, Maker], memory: str, worker_index: int) -> None:
+    def start_making(self, makers: Mapping[int, Maker], memory: str, worker_index: int, n_workers: int) -> None:
         """Number the environments anew, and use other memory. The makers of environments are ignored if they are made already."""
-        self.env_indices, self._current = list(makers), map_current(memory)[worker_index : worker_index + 1]
+        self.env_indices, self._current = list(makers), map_current(memory, n_workers)[worker_index : worker_index + 1]
         self._current[0] = self.env_indices[0]
         if not self._is_connected:
             try:
@@ -77,7 +77,7 @@ class Worker:
             self._is_connected = True
             self._stack.close()
         pickled = [] if self.specs else [pickle_maker(index, maker) for index, maker in makers.items()]
-        self.send("make", (worker_index, self.env_indices, memory, pickled))
+        self.send("make", (worker_index, n_workers, self.env_indices, memory, pickled))
 
     def _connect(self) -> Connection:
         """Connect to the process as soon as it listens. Raises `OSError` if it ends or takes too long."""
@@ -185,8 +185,8 @@ def _serve(address: str) -> None:
             try:
                 if command == "make":
                     start = time.perf_counter()
-                    worker_index, env_indices, memory, makers = argument
-                    current = map_current(memory)[worker_index : worker_index + 1]
+                    worker_index, n_workers, env_indices, memory, makers = argument
+                    current = map_current(memory, n_workers)[worker_index : worker_index + 1]
                     envs = dict(zip(env_indices, envs.values(), strict=False))  # those that are made already
                     for index, pickled in zip(env_indices, makers, strict=False):
                         current[0] = index

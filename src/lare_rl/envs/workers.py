@@ -16,7 +16,7 @@ import numpy as np
 from jaxtyping import Bool, Shaped
 
 from lare_rl.envs.interface import EnvSpec
-from lare_rl.envs.shared_arrays import MAX_WORKERS, map_arrays, open_shared_memory
+from lare_rl.envs.shared_arrays import map_arrays, open_shared_memory
 from lare_rl.envs.vec_env import Maker, VecEnv, check_same_sizes
 from lare_rl.envs.worker_process import Worker, end_workers, pickle_maker
 from lare_rl.errors import LareError
@@ -60,15 +60,13 @@ class SubprocVecEnv(VecEnv):
             reuse_key: keep the processes, one for each environment, open when the batch is closed, for the next batch with this
                 key. Empty: end them.
 
-        Raises `LareError` if an environment cannot be made, or `reuse_key` needs more processes. Later calls raise it if an environment
-        raises an error, dies or does not reply in time. All workers have then ended.
+        Raises `LareError` if an environment cannot be made. Later calls raise it if an environment raises an error, dies or does not
+        reply in time. All workers have then ended.
         """
         self.timeout, self._reuse_key = timeout, reuse_key
         self._workers: list[Worker] = []
-        n_envs, n_workers = len(makers), min(len(makers), processes or n_usable_cores(), MAX_WORKERS)
-        if reuse_key and n_workers < n_envs:
-            limit = f"at most {MAX_WORKERS}" if n_envs > MAX_WORKERS else f"{n_workers}: set processes = {n_envs}"
-            raise LareError(f"{n_envs} environments need a process each, and the batch has {limit}")
+        n_envs = len(makers)
+        n_workers = n_envs if reuse_key else min(n_envs, processes or n_usable_cores())
         try:
             with open_shared_memory() as memory:
                 for _ in range(n_workers):
@@ -91,7 +89,7 @@ class SubprocVecEnv(VecEnv):
         n_workers = len(self._workers)
         for worker_index, worker in enumerate(self._workers):
             indices = range(worker_index, len(makers), n_workers)
-            worker.start_making({index: makers[index] for index in indices}, memory, worker_index)
+            worker.start_making({index: makers[index] for index in indices}, memory, worker_index, n_workers)
         for worker, (specs, make_s) in self._receive("make"):
             worker.specs, worker.make_s = specs, max(worker.make_s, make_s)
         specs = [self._workers[index % n_workers].specs[index // n_workers] for index in range(len(makers))]

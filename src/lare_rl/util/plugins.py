@@ -72,10 +72,13 @@ class Registry(Mapping[str, T], Generic[T]):
         Raises:
             LareError: no value has this name. The message lists all names.
         """
-        plugins = "" if read_variable("LARE_PLUGINS") else " (for others, name their modules in LARE_PLUGINS)"
         if name not in self._values:
             load_plugins()
-        return find_named(self._kind, f"{self._kinds}{plugins}", name, self._values)
+        try:
+            return find_named(self._kind, self._kinds, name, self._values)
+        except LareError as error:
+            plugin = "" if read_variable("LARE_PLUGINS") else " (of a plugin: name its module in LARE_PLUGINS)"
+            raise LareError(f"{error}{plugin}") from None
 
     def __getitem__(self, name: str) -> T:
         if name not in self._values:

@@ -50,9 +50,6 @@ class SMAX:
     ((5, 127), (120,), 0.0)
     """
 
-    spec: EnvSpec
-    scenario: Scenario
-
     def __init__(self, name: str):
         self.scenario = scenario = find_scenario(name)
         self.spec = EnvSpec(
