@@ -11,7 +11,8 @@ from scipy.stats import mode
 from helpers.toy_envs import toy_spec
 from lare_rl.config.resolve import resolve
 from lare_rl.envs.families import register_family
-from lare_rl.envs.jax_spaces import agent_spec, agent_timestep
+from lare_rl.envs.interface import EnvSpec, Team
+from lare_rl.envs.jax_spaces import agent_timestep
 from lare_rl.envs.play import play_episodes
 from lare_rl.errors import LareError
 from lare_rl.evaluation.policy import load_policy
@@ -26,7 +27,8 @@ class DialsState(NamedTuple):
 class Dials:
     """Two dials with 2 and 3 positions. Of the 6 combinations, only number `step` and the one after it are available."""
 
-    spec = agent_spec(
+    spec = EnvSpec(
+        teams=(Team("agent", 0, 1),),
         observation_size=2,
         action_size=6,
         discrete=True,
@@ -34,6 +36,7 @@ class Dials:
         masks_actions=True,
         choice_sizes=(2, 3),
         package_shape=(2,),
+        is_jax=True,
     )
 
     def reset(self, key):

@@ -233,6 +233,10 @@ def _check_spec(task: TaskSpec, spec: EnvSpec) -> None:
     def fail(role: TaskSpec, mismatch: str) -> LareError:
         return LareError(f"task {role.name!r}: {mismatch}")
 
+    def expect(role: TaskSpec, key: str, value: Any, reason: str) -> None:
+        if getattr(role, key) != value:
+            raise fail(role, f"{key} = {getattr(role, key)!r}, but {reason}")
+
     env, names = task.environment, [team.name for team in spec.teams]
     if task.teams and [role.team for role in task.teams] != names:
         raise LareError(f"the teams of {env} must be {', '.join(names)}, in this order")
@@ -240,14 +244,12 @@ def _check_spec(task: TaskSpec, spec: EnvSpec) -> None:
         raise LareError(f"{env} has the teams {', '.join(names)}. Write a task file for each, and list them as teams.")
     for role in task.teams:
         for key in SHARED_KEYS:  # training reads only the task's keys, verification only the team's
-            team_value, task_value = getattr(role, key), getattr(task, key)
-            if team_value != task_value:
-                advice = "Use the same value in both."
-                raise fail(role, f"{key} = {team_value!r}, but {task_value!r} in {task.name!r}. {advice}")
+            value = getattr(task, key)
+            expect(role, key, value, f"{value!r} in {task.name!r}. Use the same value in both.")
     if not task.teams and task.team not in (None, *names):
         raise fail(task, f"team = {task.team!r}, but the teams of {env} are {', '.join(names)}")
-    if task.max_episode_steps not in (None, spec.max_steps):
-        raise fail(task, f"max_episode_steps = {task.max_episode_steps}, but {spec.max_steps} in {env}. Remove it.")
+    if task.max_episode_steps is not None:
+        expect(task, "max_episode_steps", spec.max_steps, f"{spec.max_steps} in {env}. Remove it.")
     for name in task.info_keys:
         if name not in spec.measures:
             raise fail(task, f"{env} has no measure {name!r}")
@@ -256,10 +258,8 @@ def _check_spec(task: TaskSpec, spec: EnvSpec) -> None:
         raise fail(task, f"credit_scope = 'state', but {env} has no global state")
     for role in task.roles:
         team = spec.teams[names.index(role.team)] if role.team in names else spec.teams[0]
+        sizes = ("observations", spec.observation_size), ("actions", spec.action_size)
         if from_state:
             sizes = ("states", spec.state_size), ("joint actions", spec.action_size * team.n_agents)
-        else:
-            sizes = ("observations", spec.observation_size), ("actions", spec.action_size)
         for key, (content, size) in zip(("observation_size", "action_size"), sizes, strict=True):
-            if getattr(role, key) != size:
-                raise fail(role, f"{key} = {getattr(role, key)}, but {env} has {content} of size {size}")
+            expect(role, key, size, f"{env} has {content} of size {size}")

@@ -16,15 +16,15 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
 from lare_rl.envs.env_errors import as_lare_error, one_line_errors
-from lare_rl.envs.interface import EnvSpec, Team, Timestep, with_available_action
+from lare_rl.envs.interface import EnvSpec, Team, Timestep, to_package_action, with_available_action
 from lare_rl.envs.mujoco_warnings import mujoco_warnings
 from lare_rl.errors import LareError, did_you_mean, install_command, missing_extra_error, short_repr
 from lare_rl.tasks.spec import TaskSpec
 
 __all__ = [
     "TRAINABLE_ACTIONS",
+    "AgentEnv",
     "action_fields",
-    "agent_spec",
     "agent_timestep",
     "bounded_action",
     "cast_like",
@@ -181,28 +181,76 @@ def mask_combinations(mask: Bool[Array, "..."], sizes: tuple[int, ...]) -> Bool[
 # A single agent
 
 
-def agent_spec(**fields: Any) -> EnvSpec:
-    """Return the sizes and bounds of an environment of one agent. `fields` are the further fields of `EnvSpec`."""
-    return EnvSpec(teams=(Team("agent", 0, 1),), is_jax=True, **fields)
+class AgentEnv:
+    """A package's environment of one agent as a `JaxEnv`."""
+
+    def __init__(
+        self,
+        task: TaskSpec,
+        env: Any,
+        reset: Callable[..., Any],
+        step: Callable[..., Any],
+        draw: Callable[[list[Any]], Sequence[Any]],
+        *,
+        max_steps: int,
+        **action: Any,
+    ):
+        """Make the adapter from functions that call the package's environment.
+
+        Args:
+            reset: from a raw key to a state, and the arguments of `agent_timestep` by name.
+            step: from a state, an action of the package and a raw key to the same.
+            draw: from a list of states to their pictures.
+            action: the fields of `EnvSpec` about actions.
+        """
+        self.env, self._name = env, task.environment
+        self._reset, self._step, self._draw = reset, step, draw
+        with one_line_errors(f"environment {self._name!r} cannot be used"):
+            _, outputs = jax.eval_shape(reset, jnp.zeros(2, jnp.uint32))
+        self.spec = EnvSpec(
+            teams=(Team("agent", 0, 1),),
+            observation_size=flat_size(outputs["observation"]),
+            max_steps=max_steps,
+            state_size=flat_size(outputs.get("state")),
+            masks_actions=outputs.get("available") is not None,
+            is_jax=True,
+            measures=find_measures(task, outputs.get("measures") or {}),
+            **action,
+        )
+
+    def reset(self, key: PRNGKeyArray) -> tuple[Any, Timestep]:
+        state, outputs = self._reset(raw_key(key))
+        return strong_types(state), agent_timestep(self.spec, **outputs)
+
+    def step(self, state: Any, action: Float[Array, "1 action"], key: PRNGKeyArray) -> tuple[Any, Timestep]:
+        next_state, outputs = self._step(state, to_package_action(action[0], self.spec), raw_key(key))
+        return cast_like(next_state, state), agent_timestep(self.spec, **outputs)
+
+    def frames(self, states: Any, credit: Any = None) -> list[np.ndarray]:
+        """Return the package's pictures of states, which do not show credit. Raise `LareError` if it cannot draw them here."""
+        return draw_states(self._name, self._draw, states)
 
 
 def agent_timestep(
     spec: EnvSpec,
-    observation: Float[Array, " observation"],
+    observation: Any,
     *,
     reward: Any = 0.0,
     terminated: Any = False,
     truncated: Any = False,
     available: Bool[Array, " action"] | None = None,
-    state: Float[Array, " state"] | None = None,
+    state: Any = None,
     measures: Mapping[str, Any] | None = None,
 ) -> Timestep:
-    """Return a timestep of one agent. By default all actions are available. If a mask has none, the first is."""
+    """Return a timestep of one agent. By default all actions are available. If a mask has none, the first is.
+
+    The observation and the state are trees of arrays.
+    """
     if available is None:
         available = jnp.ones(spec.action_size, bool)
     return Timestep(
-        observation=observation[None],
-        state=jnp.zeros(0) if state is None else state,
+        observation=flatten_tree(observation)[None],
+        state=flatten_tree(state),
         available=with_available_action(available.astype(bool))[None],
         alive=jnp.ones(1, bool),
         reward=jnp.asarray(reward, jnp.float32).reshape(1),

@@ -45,11 +45,7 @@ class SubprocVecEnv(VecEnv):
     """Environments in separate processes, several in each process if there are more environments than cores."""
 
     def __init__(
-        self,
-        makers: Sequence[Maker],
-        processes: int | None = None,
-        timeout: float = 60.0,
-        reuse_key: str = "",
+        self, makers: Sequence[Maker], processes: int | None = None, timeout: float = 60.0, reuse_key: str = ""
     ):
         """Start the processes and make the environments.
 

@@ -52,5 +52,5 @@ def _event_loop() -> asyncio.AbstractEventLoop:
 def _convert(message: Message) -> ModelRequest | ModelResponse:
     if message["role"] == "assistant":
         return ModelResponse([TextPart(content=message["content"])])
-    part = SystemPromptPart if message["role"] == "system" else UserPromptPart
-    return ModelRequest([part(content=message["content"])])
+    kind = SystemPromptPart if message["role"] == "system" else UserPromptPart
+    return ModelRequest([kind(content=message["content"])])

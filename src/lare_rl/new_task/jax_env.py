@@ -11,7 +11,7 @@ from gymnasium.spaces import Box, Discrete
 from lare_rl.envs.families import FAMILIES
 from lare_rl.envs.interface import EnvSpec
 from lare_rl.envs.jaxmarl_env import JaxMARLEnv
-from lare_rl.envs.jumanji_env import JumanjiEnv, observed_arrays
+from lare_rl.envs.jumanji_env import observed_arrays
 from lare_rl.errors import LareError
 from lare_rl.new_task import draft
 from lare_rl.new_task.documentation import single_agent_lines, split_sections, write_texts
@@ -49,7 +49,7 @@ def draft_jax_task(environment_id: str) -> Draft:
         draft.SCORE_LINE,
         *limit_lines,
     ]
-    first_lines = {"observation": _describe_observation(env), "action": _describe_action(env.spec)}
+    first_lines = {"observation": _describe_observation(env, family), "action": _describe_action(env.spec)}
     return draft.make_draft(file_name(name), lines, texts, first_lines, removed)
 
 
@@ -69,10 +69,10 @@ def _heading(match: re.Match[str]) -> str:
     return f"## {match[1]}\n{lead}"
 
 
-def _describe_observation(env: Any) -> str:
+def _describe_observation(env: Any, family: str) -> str:
     """Return the number of entries and, if the observation has several arrays, which entries come from which."""
     count = count_entries(env.spec.observation_size)
-    if not isinstance(env, JumanjiEnv):
+    if family != "jumanji":
         return f"{count}."
     _, timestep = jax.eval_shape(env.env.reset, jnp.zeros(2, jnp.uint32))
     start, ranges = 0, []

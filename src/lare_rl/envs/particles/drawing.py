@@ -17,14 +17,18 @@ MARGIN = 1.08
 
 
 def draw_state(
-    task: ParticleTask,
-    position: Float[np.ndarray, "entities 2"],
-    credit: Float[np.ndarray, " agents"] | None = None,
-    scale: float | None = None,
+    task: ParticleTask, position: Float[np.ndarray, "entities 2"], credit: Float[np.ndarray, " agents"] | None = None
 ) -> Figure:
-    """Draw a state, to scale. Each agent's credit is a number and a colour, which is darkest at `scale`."""
+    """Draw a state, to scale. Each agent's credit is a number and a colour."""
     figure, axes = blank_figure()
-    _paint(axes, task, position, _half_side(task, position), credit, scale)
+    _paint(
+        axes,
+        task,
+        position,
+        _half_side(task, position),
+        credit,
+        None if credit is None else float(np.abs(credit).max()),
+    )
     return figure
 
 
@@ -65,8 +69,7 @@ def _paint(
     ]
     edges = ["#333333"] * len(colours) if credit is None else list(colours)
     if credit is not None:
-        bound = scale or float(np.abs(credit).max()) or 1.0
-        shades = CREDIT_COLOURS(0.5 + 0.4 * np.clip(np.asarray(credit) / bound, -1, 1))
+        shades = CREDIT_COLOURS(0.5 + 0.4 * np.asarray(credit) / (scale or 1.0))
         colours[: task.n_agents] = [tuple(shade) for shade in shades]
     colours += [LANDMARK_COLOUR] * (len(position) - len(colours))
     landmarks_first = [*range(task.world.n_moving, len(position)), *range(task.world.n_moving)]
