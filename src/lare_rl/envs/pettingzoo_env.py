@@ -12,9 +12,8 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float
 
-from lare_rl.envs import env_errors
 from lare_rl.envs.agent_arrays import Agent, AgentArrays, make_agent
-from lare_rl.envs.env_errors import EnvOutputError, one_line_errors, read_measures, to_float
+from lare_rl.envs.env_errors import EnvOutputError, no_time_limit_error, one_line_errors, read_measures, to_float
 from lare_rl.envs.interface import Timestep
 from lare_rl.envs.pettingzoo_construct import find_time_limit, group_by_team, make_parallel_env
 from lare_rl.envs.spaces import float_array
@@ -62,7 +61,7 @@ class ParallelHost:
             raise LareError(f"environment {self._name!r}: {error}") from None
         max_steps = task.max_episode_steps or find_time_limit(environment, task.arguments)
         if max_steps is None:
-            raise env_errors.no_time_limit_error(task)
+            raise no_time_limit_error(task)
         self._available = self.layout.available
         self._masks_actions = any(agent.observes_mask for agent in agents) or not self._available.all()
         self._credit_from_state = any(role.credit_scope == "state" for role in (task, *task.teams))
@@ -229,13 +228,13 @@ class ParallelHost:
         if not callable(getattr(self.environment, "state", None)):
             return
         try:
-            value = self.environment.state()
-        except (Exception, SystemExit) as error:
-            if self._initialising and isinstance(error, NotImplementedError):
+            with one_line_errors(f"environment {self._name!r} failed in state"):
+                value = self.environment.state()
+        except LareError as error:
+            if self._initialising and isinstance(error.__cause__, NotImplementedError):
                 return  # from PettingZoo's base class: the environment has no state
-            error = env_errors.as_lare_error(f"environment {self._name!r} failed in state", error)
             if self._initialising or self._credit_from_state:
-                raise error from None
+                raise
             # Only a critic reads the state: keep the previous one. Multiwalker has no state once an agent has fallen.
             if not self._state_failed:
                 logging.getLogger(__name__).warning("%s; the previous state is used instead", error)
