@@ -15,7 +15,7 @@ from lare_rl.envs.jumanji_env import observed_arrays
 from lare_rl.errors import LareError
 from lare_rl.new_task import draft
 from lare_rl.new_task.documentation import single_agent_lines, split_sections, write_texts
-from lare_rl.new_task.draft import Draft, count_entries, file_name, warning_lines
+from lare_rl.new_task.draft import Draft, count_entries, file_name
 from lare_rl.new_task.many_agents import make_stub, write_team_drafts
 
 __all__ = ["draft_jax_task"]
@@ -42,15 +42,10 @@ def draft_jax_task(environment_id: str) -> Draft:
     if isinstance(env, JaxMARLEnv):
         env = make(make_stub(name, environment_id, env.layout.index, **limit))
         return write_team_drafts(file_name(name), environment_id, env, texts, removed, limit_lines)
-    lines = [
-        *warning_lines(removed),
-        f'name = "{file_name(name)}"',
-        *draft.environment_lines(environment_id, env.spec.observation_size, env.spec.action_size),
-        draft.SCORE_LINE,
-        *limit_lines,
-    ]
+    name, sizes = file_name(name), (env.spec.observation_size, env.spec.action_size)
+    lines = [*draft.head_lines(name, environment_id, sizes, removed), draft.SCORE_LINE, *limit_lines]
     first_lines = {"observation": _describe_observation(env, family), "action": _describe_action(env.spec)}
-    return draft.make_draft(file_name(name), lines, texts, first_lines, removed)
+    return draft.make_draft(name, lines, texts, first_lines, removed)
 
 
 def _read_texts(env: Any) -> tuple[dict[str, str], tuple[str, ...]]:

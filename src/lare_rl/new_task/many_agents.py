@@ -16,7 +16,7 @@ from lare_rl.envs.pettingzoo_construct import agent_kind, find_time_limit, make_
 from lare_rl.envs.pettingzoo_env import ParallelHost
 from lare_rl.new_task import draft
 from lare_rl.new_task.documentation import first_section, plain_lines, split_sections, write_texts
-from lare_rl.new_task.draft import Draft, count_entries, file_name, warning_lines
+from lare_rl.new_task.draft import Draft, count_entries, file_name
 from lare_rl.tasks.spec import TaskSpec, split_environment
 
 __all__ = ["draft_multi_agent_task", "make_stub", "write_team_drafts"]
@@ -75,20 +75,18 @@ def write_team_drafts(
 
     `env` is the environment, made for a task with these teams, and `removed` are the lines that were removed from the texts.
     """
-    teams = env.spec.teams
-    environment_lines = draft.environment_lines(environment_id, env.spec.observation_size, env.spec.action_size)
-    end = [*environment_lines, draft.SCORE_LINE, *more_lines]
-    head = [*warning_lines(removed), f'name = "{name}"']
+    teams, sizes = env.spec.teams, (env.spec.observation_size, env.spec.action_size)
+    task_lines = [*draft.head_lines(name, environment_id, sizes, removed), draft.SCORE_LINE, *more_lines]
     if len(teams) == 1:
-        return draft.make_draft(name, [*head, *end], texts, _first_lines(env, teams[0]), removed)
+        return draft.make_draft(name, task_lines, texts, _first_lines(env, teams[0]), removed)
     files = {}
     for team in teams:
-        lines = [*warning_lines(removed), *_team_lines(env, team), *environment_lines]
+        lines = [*draft.head_lines(team.name, environment_id, sizes, removed), *_team_lines(env, team)]
         team_draft = draft.make_draft(name, lines, _team_texts(env, team, texts), _first_lines(env, team), removed)
         files[f"{name}-{team.name}.toml"] = team_draft.toml
-    lines = [*head, *TEAMS_COMMENT, f"teams = {json.dumps(list(files))}", *end]
+    task_lines += [*TEAMS_COMMENT, f"teams = {json.dumps(list(files))}"]
     task_texts = texts | dict.fromkeys(TEAM_KEYS, "See the teams.")
-    task_draft = draft.make_draft(name, lines, task_texts, {}, removed, teams=files)
+    task_draft = draft.make_draft(name, task_lines, task_texts, {}, removed, teams=files)
     return replace(task_draft, missing_keys=tuple(key for key in texts if not texts[key]))
 
 
@@ -134,7 +132,7 @@ def _read_texts(env: Any) -> tuple[dict[str, str], tuple[str, ...]]:
 def _team_lines(host: Layouts, team: Team) -> list[str]:
     names = [str(agent.name) for agent in host.layout.agents[team.agents]]
     patterns = [pattern for pattern in _name_patterns(team.name) if any(fnmatchcase(name, pattern) for name in names)]
-    return [f'name = "{team.name}"', f'team = "{team.name}"', f"agents = {json.dumps(patterns)}"]
+    return [f'team = "{team.name}"', f"agents = {json.dumps(patterns)}"]
 
 
 def _team_texts(host: Layouts, team: Team, texts: Mapping[str, str]) -> dict[str, str]:
