@@ -82,13 +82,10 @@ class StarCraft:
     def step(self, action: Float[np.ndarray, "agents action"]) -> Timestep:
         """Make one step. If the game crashes, the episode is truncated, and the next `reset` starts the game again.
 
-        Raises `LareError` if an action is not available, or if the game has crashed too often.
+        Raises `LareError` if SMAC refuses an action, or if the game has crashed too often.
         """
-        choices = np.argmax(action, axis=1).tolist()
-        for agent, choice in enumerate(choices):
-            if not self._timestep.available[agent, choice]:
-                raise LareError(f"agent {agent} of {self._name} chose the action {choice}, which is not available")
-        reward, done, info = self._game.step(choices)
+        with one_line_errors(f"StarCraft II failed in a step of {self._name!r}"):
+            reward, done, info = self._game.step(np.argmax(action, axis=1).tolist())
         if done and not info:  # SMAC reports a crash only in this way
             return self._handle_crash()
         self._steps += 1
