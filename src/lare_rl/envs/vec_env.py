@@ -136,7 +136,8 @@ def _check_shapes(timestep: Any, batch: Timestep, owner: str, function: str) -> 
     """Raise `EnvOutputError` if the arrays of a timestep have other shapes than the rows of a batch."""
     if not isinstance(timestep, Timestep):
         raise EnvOutputError(f"{owner}: {function} must return a Timestep, not {short_repr(timestep)}")
-    for name, column, value in zip(Timestep._fields[:-1], batch, timestep, strict=False):
+    (*columns, _), (*values, _) = batch, timestep
+    for name, column, value in zip(Timestep._fields, columns, values, strict=False):
         if np.shape(value) != column.shape[1:]:
             shapes = f"{np.shape(value)}, not {column.shape[1:]}"
             raise EnvOutputError(f"{owner}: {name} of {function} has the shape {shapes}")

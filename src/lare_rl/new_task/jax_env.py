@@ -2,6 +2,7 @@
 
 import inspect
 import re
+from collections.abc import Callable
 from typing import Any
 
 import jax
@@ -27,7 +28,8 @@ FIELD = re.compile(r"^- (observation|action|reward|episode termination|state)s?:
 def draft_jax_task(environment_id: str) -> Draft:
     """Draft a task file from an environment's documentation and sizes. Raises `LareError` if it cannot be made."""
     family, _, name = environment_id.partition("/")
-    make, stub = FAMILIES[family].load_maker(), make_stub(name, environment_id)
+    make: Callable[..., Any] = FAMILIES[family].load_maker()
+    stub = make_stub(name, environment_id)
     limit: dict[str, int] = {}
     try:
         env = make(stub)
