@@ -9,20 +9,20 @@ import numpy as np
 from jaxtyping import Float
 
 from lare_rl.envs.interface import EnvSpec, Timestep
-from lare_rl.errors import LareError, short_repr
+from lare_rl.errors import LareError, install_command, short_repr
 from lare_rl.tasks.spec import TaskSpec
 
 __all__ = [
     "EnvOutputError",
     "as_lare_error",
     "check_finite",
+    "import_hint",
     "name_step",
     "no_time_limit_error",
     "one_line_errors",
     "read_measures",
     "to_float",
 ]
-
 
 MAX_ERROR = 300
 """Characters of an environment's error that a message quotes."""
@@ -56,6 +56,16 @@ def one_line_errors(message: str, make_hint: Callable[[BaseException], str] = la
         yield
     except (Exception, SystemExit) as error:
         raise as_lare_error(message, error, make_hint(error)) from error
+
+
+def import_hint(error: BaseException) -> str:
+    """Return how to make a missing module available, in brackets; an empty text for another error."""
+    if not isinstance(error, ModuleNotFoundError):
+        return ""
+    package = (error.name or "").partition(".")[0]
+    if package in ("mujoco", "pettingzoo"):
+        return f" (an extra: {install_command(package)})"
+    return " (a module in this folder is found with PYTHONPATH=.)"
 
 
 @contextlib.contextmanager

@@ -1,5 +1,6 @@
 """Gymnasium environments: one team of one agent, on the host."""
 
+import importlib
 import warnings
 from typing import Any
 
@@ -10,9 +11,16 @@ from jaxtyping import Float
 
 from lare_rl.envs import mujoco_rewards
 from lare_rl.envs.agent_arrays import Agent
-from lare_rl.envs.env_errors import EnvOutputError, no_time_limit_error, one_line_errors, read_measures, to_float
+from lare_rl.envs.env_errors import (
+    EnvOutputError,
+    import_hint,
+    no_time_limit_error,
+    one_line_errors,
+    read_measures,
+    to_float,
+)
 from lare_rl.envs.interface import EnvSpec, Team, Timestep
-from lare_rl.envs.mujoco_warnings import import_mujoco, mujoco_warnings
+from lare_rl.envs.mujoco_warnings import mujoco_warnings
 from lare_rl.envs.spaces import check_spaces, float_array
 from lare_rl.errors import LareError, short_repr
 from lare_rl.tasks.spec import TaskSpec, entry_meanings
@@ -36,11 +44,9 @@ def make_gymnasium(name: str, max_episode_steps: int | None = None, **kwargs: An
             return f" (for an environment of your own, write MODULE:{name}, where MODULE registers it)"
         if isinstance(error, gymnasium.error.NamespaceNotFound):
             return " (for a family of a plugin, import the plugin's module, or name it in LARE_PLUGINS)"
-        if isinstance(error, ModuleNotFoundError):
-            return " (a module in this folder is found with PYTHONPATH=.)"
         if "render_mode" in kwargs and "render_mode" in str(error):
             return ' (to be filmed, it must accept render_mode="rgb_array")'
-        return ""
+        return import_hint(error)
 
     with warnings.catch_warnings(), one_line_errors(f"environment {name!r} cannot be made", make_hint):
         # The user chooses the version: returns of v4 and v5 cannot be compared.
@@ -48,7 +54,8 @@ def make_gymnasium(name: str, max_episode_steps: int | None = None, **kwargs: An
         warnings.filterwarnings("ignore", message=".*Using the latest versioned environment.*")
         # A report asks for a film, and does without one if it gets none.
         warnings.filterwarnings("ignore", message=".*that is not in the possible render_modes.*")
-        import_mujoco(name)
+        if (spec := gymnasium.registry.get(name)) and str(spec.entry_point).startswith("gymnasium.envs.mujoco"):
+            importlib.import_module("mujoco")  # if parts of it are missing, only this says how to repair that
         with mujoco_warnings(name):
             env = gymnasium.make(name, max_episode_steps=max_episode_steps, **kwargs)
         try:

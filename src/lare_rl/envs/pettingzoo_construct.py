@@ -9,9 +9,9 @@ from typing import Any
 
 import numpy as np
 
-from lare_rl.envs.env_errors import one_line_errors
+from lare_rl.envs.env_errors import import_hint, one_line_errors
 from lare_rl.envs.interface import Team
-from lare_rl.errors import LareError, did_you_mean, install_command, short_repr
+from lare_rl.errors import LareError, did_you_mean, short_repr
 from lare_rl.tasks.spec import PETTINGZOO_PREFIX, TaskSpec, split_environment
 from lare_rl.tasks.trust import trusted_modules
 
@@ -33,7 +33,7 @@ def make_parallel_env(name: str, arguments: Mapping[str, Any]) -> Any:
             f"like {PETTINGZOO_PREFIX}mpe2.simple_spread_v3:parallel_env."
         )
     message = f"environment {name!r} cannot be made"
-    with warnings.catch_warnings(), one_line_errors(message, _make_hint):
+    with warnings.catch_warnings(), one_line_errors(message, import_hint):
         warnings.filterwarnings("ignore", message="The old environment creation API", category=DeprecationWarning)
         module = importlib.import_module(module_name)
         if not hasattr(module, maker_name):
@@ -58,14 +58,6 @@ def _check_maker(maker: Any, name: str) -> None:
         raise LareError(
             f"environment {name!r}: {maker_name} is defined in {package}. Name it there, or write a function in {module} that calls it."
         )
-
-
-def _make_hint(error: BaseException) -> str:
-    if not isinstance(error, ModuleNotFoundError):
-        return ""
-    if (error.name or "").partition(".")[0] == "pettingzoo":
-        return f" (PettingZoo is an extra: {install_command('pettingzoo')})"
-    return " (a module in this folder is found with PYTHONPATH=.)"
 
 
 def find_time_limit(env: Any, arguments: Mapping[str, Any]) -> int | None:
