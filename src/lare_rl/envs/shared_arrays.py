@@ -15,7 +15,7 @@ from jaxtyping import Bool, Float, Int, Shaped
 from lare_rl.envs.interface import EnvSpec, Timestep
 from lare_rl.envs.vec_env import empty_batch
 
-__all__ = ["SharedArrays", "map_arrays", "map_current", "open_directory", "open_shared_memory"]
+__all__ = ["SharedArrays", "map_arrays", "map_current", "open_shared_memory"]
 
 
 class SharedArrays(NamedTuple):
@@ -32,20 +32,16 @@ class SharedArrays(NamedTuple):
 
 
 @contextlib.contextmanager
-def open_directory() -> Iterator[str]:
-    """Yield a new directory, in memory if the system has such a file system."""
-    memory = "/dev/shm"
-    with tempfile.TemporaryDirectory(prefix="lare-", dir=memory if os.path.isdir(memory) else None) as directory:
-        yield directory
-
-
-@contextlib.contextmanager
 def open_shared_memory() -> Iterator[str]:
-    """Yield the beginning of names of memory. What is mapped until the end lasts as long as a process has mapped it."""
+    """Yield the beginning of names of memory. What is mapped until the end lasts as long as a process has mapped it.
+
+    It is a new directory, which only this user may read; on Windows, a name that nothing else has.
+    """
     if sys.platform == "win32":
         yield f"lare-{uuid4().hex}-"
         return
-    with open_directory() as directory:
+    in_memory = "/dev/shm" if os.path.isdir("/dev/shm") else None
+    with tempfile.TemporaryDirectory(prefix="lare-", dir=in_memory) as directory:
         yield f"{directory}/"
 
 

@@ -13,18 +13,17 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from functools import partial
 from multiprocessing.connection import Client, Connection, Listener
 from typing import Any
-from uuid import uuid4
 
 import numpy as np
 from jaxtyping import Int
 
 from lare_rl.envs.env_errors import EnvOutputError, one_line_errors
 from lare_rl.envs.interface import EnvSpec, HostEnv
-from lare_rl.envs.shared_arrays import SharedArrays, map_arrays, map_current, open_directory
+from lare_rl.envs.shared_arrays import SharedArrays, map_arrays, map_current
 from lare_rl.envs.trials import find_interference, time_steps
 from lare_rl.envs.vec_env import Maker, call_env, make_env_at
 from lare_rl.errors import LareError
@@ -44,7 +43,11 @@ CLOSE_TIMEOUT_S = 2.0
 class Worker:
     """A worker process and its environments, from the parent's side."""
 
-    def __init__(self):
+    def __init__(self, memory: str, worker_index: int):
+        """Start the process, which listens at a socket beside the shared memory; on Windows, at a named pipe."""
+        self._address = f"{memory}socket{worker_index}"
+        if sys.platform == "win32":
+            self._address = rf"\\.\pipe\{self._address}"
         self.env_indices: Sequence[int] = ()
         self.specs: tuple[EnvSpec, ...] = ()
         """The specifications of its environments, once they are made."""
@@ -56,8 +59,7 @@ class Worker:
         self._current = np.zeros(1, np.int64)
         self.connection: Connection
         """From `start_making` on."""
-        self._is_connected, self._stack = False, contextlib.ExitStack()
-        self._address = self._stack.enter_context(_open_address())
+        self._is_connected = False
         # The same import paths as in this process, and one thread, so that other workers can use the other cores.
         paths = os.pathsep.join(path or os.getcwd() for path in sys.path)
         variables = {"OMP_NUM_THREADS": "1"} | os.environ | {"PYTHONPATH": paths}
@@ -75,7 +77,6 @@ class Worker:
             except OSError:
                 raise self._make_death_error() from None
             self._is_connected = True
-            self._stack.close()
         pickled = [] if self.specs else [pickle_maker(index, maker) for index, maker in makers.items()]
         self.send("make", (worker_index, n_workers, self.env_indices, memory, pickled))
 
@@ -129,7 +130,6 @@ class Worker:
 
     def close_connection(self) -> None:
         """Ask the worker to end."""
-        self._stack.close()
         if self._is_connected:
             self.connection.close()
 
@@ -139,16 +139,6 @@ class Worker:
         self.process.wait()
         assert self.process.stdin is not None
         self.process.stdin.close()
-
-
-@contextlib.contextmanager
-def _open_address() -> Iterator[str]:
-    """Yield an address at which a worker can listen: a named pipe on Windows, else a socket that only this user may read."""
-    if sys.platform == "win32":
-        yield rf"\\.\pipe\lare-{uuid4().hex}"
-        return
-    with open_directory() as directory:
-        yield f"{directory}/socket"
 
 
 def end_workers(workers: Iterable[Worker]) -> None:

@@ -65,8 +65,8 @@ class SubprocVecEnv(VecEnv):
         n_workers = n_envs if reuse_key else min(n_envs, processes or n_usable_cores())
         try:
             with open_shared_memory() as memory:
-                for _ in range(n_workers):
-                    self._workers.append(_find_idle_worker(reuse_key) or Worker())
+                for worker_index in range(n_workers):
+                    self._workers.append(_find_idle_worker(reuse_key) or Worker(memory, worker_index))
                 specs = self._make_envs(makers, memory)
                 self._shared = map_arrays(memory, specs[0], n_envs)
                 self._shared.batch.available[:] = True
