@@ -71,24 +71,19 @@ class Worker:
         """Number the environments anew, and use other memory. The makers of environments are ignored if they are made already."""
         self.env_indices, self._current = list(makers), map_current(memory, n_workers)[worker_index : worker_index + 1]
         self._current[0] = self.env_indices[0]
-        if not self._is_connected:
-            try:
-                self.connection = self._connect()
-            except OSError:
-                raise self._make_death_error() from None
-            self._is_connected = True
+        self._connect()
         pickled = [] if self.specs else [pickle_maker(index, maker) for index, maker in makers.items()]
         self.send("make", (worker_index, n_workers, self.env_indices, memory, pickled))
 
-    def _connect(self) -> Connection:
-        """Connect to the process as soon as it listens. Raises `OSError` if it ends or takes too long."""
+    def _connect(self) -> None:
+        """Connect to the process as soon as it listens, if that has not been done. Raises `LareError` if it ends or takes too long."""
         deadline = time.monotonic() + CONNECT_TIMEOUT_S
-        while True:
+        while not self._is_connected:
             try:
-                return Client(self._address)
+                self.connection, self._is_connected = Client(self._address), True
             except (FileNotFoundError, ConnectionRefusedError):  # it does not listen yet
                 if self.process.poll() is not None or time.monotonic() > deadline:
-                    raise
+                    raise self._make_death_error() from None
                 time.sleep(POLL_S)
 
     @property
