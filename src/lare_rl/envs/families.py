@@ -86,13 +86,11 @@ register_family("particles", "lare_rl.envs.particles.particle_env:make")
 register_family("smax", "lare_rl.envs.smax.smax_env:make", score="sum")
 register_family("smac", "lare_rl.envs.starcraft:make", score="sum")
 register_family("pettingzoo", "lare_rl.envs.pettingzoo_env:make", reads=OPTIONAL_KEYS)
-for _name, _maker in {
-    "gymnax": "gymnax_env:make",
-    "brax": "robot_env:make_brax",
-    "playground": "robot_env:make_playground",
-    "jumanji": "jumanji_env:make",
-}.items():
-    register_family(_name, f"lare_rl.envs.{_maker}", reads=OPTIONAL_KEYS[:2], single_agent=True)
+_SINGLE_AGENT: dict[str, Any] = {"reads": OPTIONAL_KEYS[:2], "single_agent": True}
+register_family("gymnax", "lare_rl.envs.gymnax_env:make", **_SINGLE_AGENT)
+register_family("brax", "lare_rl.envs.robot_env:make_brax", **_SINGLE_AGENT)
+register_family("playground", "lare_rl.envs.robot_env:make_playground", **_SINGLE_AGENT)
+register_family("jumanji", "lare_rl.envs.jumanji_env:make", **_SINGLE_AGENT)
 register_family("jaxmarl", "lare_rl.envs.jaxmarl_env:make", reads=OPTIONAL_KEYS)
 
 
