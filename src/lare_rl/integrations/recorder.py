@@ -67,8 +67,10 @@ class StepRecorder:
 
         `results` are the rewards and the two flags of the steps, as in `CreditAssigner.add`. `infos` have the groups of episodes.
         """
-        values = [("observation", observation), ("action", action), ("observation", next_observation)]
-        steps = [value if self._same_space[kind] else self.layouts[kind].rows(value, kind) for kind, value in values]
+        steps = []
+        for name, value in (("observation", observation), ("action", action), ("next_observation", next_observation)):
+            kind = name.removeprefix("next_")
+            steps.append(value if self._same_space[kind] else self.layouts[kind].rows(value, name))
         group = None if infos is None else self.read_groups(infos)
         return self.credit.add(*steps, *results, env_ids=self.env_ids, valid=valid, group=group)
 
