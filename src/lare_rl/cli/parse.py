@@ -41,6 +41,8 @@ def parse(
     name, *options = rename_options(arguments) or [""]
     if name in ("-h", "--help"):
         deferred = {name: _defer(command) for name, command in commands.items()}
+        for command in deferred.values():
+            command.__doc__ = (command.__doc__ or "").partition("\n\n")[0]  # the help of each command has all of it
         with _RULES:
             tyro.extras.subcommand_cli_from_dict(deferred, prog="lare-rl", description=description, args=[name])
     if name not in commands:
