@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import tyro
 from jaxtyping import Array, Float, PRNGKeyArray
 
-from lare_rl.envs.smax import SCENARIO_NAMES
+from lare_rl.envs.smax.scenarios import SCENARIOS
 from lare_rl.envs.smax.smax_env import SMAX
 from measure import interleave, show, summary, write
 
@@ -49,7 +49,7 @@ def main(rounds: int = 7, batches: tuple[int, ...] = (1, 32, 256), calls: int = 
         calls: about how many battles in a turn.
     """
     figures, compiling = {}, {}
-    for name in SCENARIO_NAMES:
+    for name in SCENARIOS:
         env = SMAX(name)
 
         def turn(worlds: int, env: SMAX = env) -> None:

@@ -24,9 +24,9 @@ import jax.numpy as jnp
 import numpy as np
 import tyro
 
-from lare_rl.envs.smax import SCENARIO_NAMES, battle, enemy, observation
-from lare_rl.envs.smax.scenarios import UNIT_TYPES, Scenario, find_scenario
-from lare_rl.envs.smax.smax_env import WIN_RETURN, reward
+from lare_rl.envs.smax import battle, enemy
+from lare_rl.envs.smax.scenarios import SCENARIOS, UNIT_TYPES, Scenario, find_scenario
+from lare_rl.envs.smax.smax_env import WIN_RETURN, global_state, observe, reward
 from measure import write
 
 streams = sys.stdout, sys.stderr
@@ -184,7 +184,7 @@ class Match:
         after = battle.advance(scenario, state, action, longer)
         lost, won = battle.defeated(scenario, after)
         over = lost | won | (after.step >= scenario.max_steps)
-        seen, field = observation.observe(scenario, after), observation.global_state(scenario, after)
+        seen, field = observe(scenario, after), global_state(scenario, after)
         outputs = seen, field, reward(scenario, state, after), over, battle.available_actions(scenario, after)
         return after, memory, choice, sees, outputs
 
@@ -280,7 +280,7 @@ def pinned(records: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
     return {"step": steps, "few": few} | {name.replace(" ", "_"): row for name, row in rows.items()}
 
 
-def main(battles: int = 12, tasks: tuple[str, ...] = SCENARIO_NAMES, pin: Path | None = None) -> None:
+def main(battles: int = 12, tasks: tuple[str, ...] = tuple(SCENARIOS), pin: Path | None = None) -> None:
     """Play and compare.
 
     Args:

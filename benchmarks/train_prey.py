@@ -1,6 +1,6 @@
 """The scripted prey of the predator-prey tasks: its training by PPO, and its measurement.
 
-    python benchmarks/train_prey.py train        writes src/lare/tasks/particles/prey.npz
+    python benchmarks/train_prey.py train        writes src/lare_rl/envs/particles/prey.npz
     python benchmarks/train_prey.py measure      writes benchmarks/results/prey.json
 
 The published tasks ship the weights of a prey that was trained for a quarter of its time, which we may not redistribute. So our
@@ -22,18 +22,19 @@ import optax
 import tyro
 from jaxtyping import Array, Float, Int, PRNGKeyArray
 
-from lare_rl.envs.particles import prey, views
+from lare_rl.envs.particles import predator_prey, views
 from lare_rl.envs.particles.predator_prey import (
     SIZES,
+    Layers,
     Size,
-    flee,
     make_world,
     observe_preys,
     reset,
     reward_predators,
     reward_preys,
+    sample_actions,
+    shipped_prey,
 )
-from lare_rl.envs.particles.prey import Layers, shipped_prey
 from lare_rl.envs.particles.task import MAX_STEPS, N_ACTIONS
 from lare_rl.envs.particles.world import State, move, push
 from lare_rl.nn.networks import MLP, adam_step, init_adam
@@ -41,7 +42,7 @@ from measure import write
 
 TARGET = 29.5
 """The reward of greedy predators against the published prey, summed over predators and steps of a PP-6 episode."""
-SHIPPED = Path(prey.__file__).with_name("prey.npz")
+SHIPPED = Path(predator_prey.__file__).with_name("prey.npz")
 
 WORLDS = 256
 PASSES, MINIBATCHES = 4, 4
@@ -192,7 +193,7 @@ Policy = Callable[[Size, State, PRNGKeyArray], Int[Array, " preys"]]
 
 
 def shipped(size: Size, state: State, key: PRNGKeyArray) -> Int[Array, " preys"]:
-    return flee(size, shipped_prey(), state, key)
+    return sample_actions(shipped_prey(), observe_preys(size, state), key)
 
 
 def at_random(size: Size, state: State, key: PRNGKeyArray) -> Int[Array, " preys"]:

@@ -7,7 +7,7 @@ from contextvars import ContextVar
 from inspect import cleandoc, isclass
 from pathlib import Path
 from textwrap import fill
-from typing import TYPE_CHECKING, Annotated, Any, get_args
+from typing import TYPE_CHECKING, Annotated, Any, TypeVar, get_args
 
 from pydantic import BaseModel, ConfigDict, Field, GetCoreSchemaHandler, ValidationError
 from pydantic.fields import FieldInfo
@@ -19,6 +19,7 @@ __all__ = [
     "LareError",
     "check_count",
     "did_you_mean",
+    "find_named",
     "install_command",
     "missing_extra_error",
     "model_keys",
@@ -31,6 +32,8 @@ MAX_REPR = 100
 
 MAX_PROBLEMS = 3
 """Problems that a message lists."""
+
+T = TypeVar("T")
 
 Count = Annotated[int, Field(ge=1)]
 """The type of a field of a checked model: a whole number, 1 or more."""
@@ -78,6 +81,13 @@ def did_you_mean(name: str, known_names: Iterable[str]) -> str:
     containing = [other for other in names if len(name) > 2 and name.lower() in other.lower()]
     close = suffixed[:1] or difflib.get_close_matches(name, names, 1, CLOSE_RATIO) or containing[:1]
     return f" (did you mean {close[0]!r}?)" if close else ""
+
+
+def find_named(kind: str, kinds: str, name: str, values: Mapping[str, T]) -> T:
+    """Return the value of a name. Raise `LareError` if no value has it: the message lists all names of the `kinds`."""
+    if name in values:
+        return values[name]
+    raise LareError(f"no {kind} {name!r}{did_you_mean(name, values)}; the {kinds} are {', '.join(values)}")
 
 
 def check_count(name: str, value: Any) -> int:

@@ -75,7 +75,7 @@ class OtherActions(Chase):
 
     def step(self, action):
         assert self.action_space.contains(action)
-        return super().step(action[:1])
+        return super().step(np.ravel(action)[:1])
 
 
 class Undrawable(Chase):
@@ -215,10 +215,13 @@ def test_spaces_that_are_refused():
             make_env("OtherActions", action_space=Box(-1, 1, shape, np.float32))
 
 
-def test_integer_actions_are_rounded():
-    env = make_env("OtherActions", action_space=Box(0, 5, (2,), np.int64))
-    env.reset(0)
-    env.step(np.array([[3.25, 4.75]], np.float32))
+def test_actions_are_in_their_space():
+    """As the environment asserts: integers are rounded, and choices begin with any number."""
+    for space in (Box(0, 5, (2,), np.int64), Discrete(2, start=5)):
+        env = make_env("OtherActions", action_space=space)
+        env.reset(0)
+        env.step(np.array([[3.25, 4.75]], np.float32))
+    assert env.spec.first_choice == 5
 
 
 def test_gymnasium_can_make_it_again():

@@ -23,11 +23,11 @@ def test_last_observation_is_the_terminal_state():
         assert abs(position) > 2.4 or abs(angle) > 0.2095
         assert timesteps.reward[index, : last + 1].sum() == last + 1
     reset_key, keys = step_keys(4, 60)
-    observation, state = env.env.reset_env(reset_key, env.params)
+    observation, state = env.env.reset_env(reset_key, env.env.default_params)
     np.testing.assert_array_equal(first.observation[0, 0], observation)
     for number in range(ended[0] + 1):
         action = actions[0, number, 0].argmax()
-        observation, state, *_ = env.env.step_env(keys[number], state, action, env.params)
+        observation, state, *_ = env.env.step_env(keys[number], state, action, env.env.default_params)
         np.testing.assert_allclose(timesteps.observation[0, number, 0], observation, rtol=1e-4, atol=1e-6)
 
 

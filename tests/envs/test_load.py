@@ -29,7 +29,6 @@ class Broken(Chase):
         raise RuntimeError("the licence has run out\nsee the manual")
 
 
-gymnasium.register("misfits/Endless-v0", entry_point=Chase)
 gymnasium.register("misfits/Broken-v0", entry_point=Broken, max_episode_steps=20)
 
 
@@ -76,7 +75,7 @@ def test_like_over_two_generations(spec_file, tmp_path):
         ({"like": "Reacher"}, "did you mean 'Reacher-v5'"),
         ({"environment": "CartPole-v1", "observation_size": 4}, "action_size = 1, but .* actions of size 2"),
         ({"payments": True}, "payments"),
-        ({"environment": "misfits/Endless-v0"}, "no time limit.*max_episode_steps"),
+        ({"environment": "toys/Endless-v0"}, "no time limit.*max_episode_steps"),
         ({"teams": ["Reacher-v4"]}, "Reacher-v4 is not a team of toys/Chase-v0"),
         ({"environment": "particles/CN-6", "measures": ["info"]}, "no measure 'info'"),
         ({"environment": "misfits/Broken-v0"}, "the licence has run out see the manual$"),

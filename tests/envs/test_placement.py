@@ -58,7 +58,8 @@ def test_a_second_simulation_is_tried(name, separate, monkeypatch):
     assert needs_process(task) == separate
     assert not simulations
     if name in ("Shares", "Many"):
-        monkeypatch.setattr(placement, "n_usable_cores", lambda: 2)
+        for module in (placement, workers):
+            monkeypatch.setattr(module, "n_usable_cores", lambda: 2)
         monkeypatch.setattr(placement, "measure_step_s", lambda task: 1.0)  # so slow that two processes save time
         with make_vec_env(task, 2) as envs:
             assert len(set(envs.pids)) == 2

@@ -10,7 +10,7 @@ from helpers.toy_envs import toy_spec
 from lare_rl.envs.env_errors import EnvOutputError
 from lare_rl.envs.families import register_family
 from lare_rl.envs.interface import EnvSpec, Team, Timestep
-from lare_rl.envs.play import Episode, phi_inputs, play_episode, play_episodes, play_steps, sample_action
+from lare_rl.envs.play import Episode, phi_inputs, play_episodes, play_roles, play_steps, sample_action
 from lare_rl.errors import LareError
 from lare_rl.tasks.spec import TaskSpec
 
@@ -75,7 +75,7 @@ def test_error_names_the_step():
 
 
 def play_hunt(role: TaskSpec) -> Episode:
-    return play_episode(Hunt(), role, None, np.random.default_rng(0), 0)
+    return play_roles(Hunt(), (role,), None, np.random.default_rng(0), 0)[0]
 
 
 def test_episode_has_a_row_for_each_agent_of_the_team():

@@ -9,7 +9,7 @@ import pytest
 
 from helpers.jax_families import check_arrays, family_task, play, require_family, step_keys
 from lare_rl.envs.families import make_env
-from lare_rl.envs.robot_env import RobotEnv
+from lare_rl.envs.robot_env import adapt_robot
 from lare_rl.errors import LareError
 
 pytestmark = pytest.mark.filterwarnings("ignore:Accessing .* directly from:DeprecationWarning")
@@ -45,9 +45,9 @@ class ToyRobot:
         return self.make_state(state.time + 1, jnp.where(state.time + 1 >= self.nan, jnp.nan, state.time + 1))
 
 
-def make_toy(action_repeat=1, measures=(), **toy) -> RobotEnv:
+def make_toy(action_repeat=1, measures=(), **toy):
     task = family_task("brax/toy", measures=list(measures))
-    return RobotEnv(ToyRobot(**toy), task, 4, lambda states: [], action_repeat)
+    return adapt_robot(ToyRobot(**toy), task, 4, lambda states: [], action_repeat)
 
 
 def play_toy(**toy):

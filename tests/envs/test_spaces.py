@@ -8,39 +8,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as arrays
 
-from helpers.toy_envs import toy_spec
-from lare_rl.envs.gymnasium_env import GymnasiumEnv
 from lare_rl.envs.spaces import check_spaces, flatten_value
 from lare_rl.errors import LareError
 
 PLANE = Box(-1, 1, (2,), np.float32)
-
-
-class Three(gymnasium.Env):
-    """Remembers its last action, which is 5, 6 or 7."""
-
-    observation_space = Discrete(4)
-    action_space = Discrete(3, start=5)
-
-    def reset(self, *, seed=None, options=None):
-        super().reset(seed=seed)
-        return 0, {}
-
-    def step(self, action):
-        self.last_action = action
-        return int(action) - 4, 0.0, False, False, {}
-
-
-gymnasium.register("toys/Three-v0", entry_point=Three, max_episode_steps=10)
-
-
-def test_discrete_spaces_become_one_hot():
-    env = GymnasiumEnv(toy_spec(environment="toys/Three-v0"))
-    assert (env.spec.discrete, env.spec.action_size, env.spec.first_choice) == (True, 3, 5)
-    np.testing.assert_array_equal(env.reset(0).observation, [[1, 0, 0, 0]])
-    timestep = env.step(np.array([[0.2, 0.1, 0.9]], np.float32))
-    assert env.environment.unwrapped.last_action == 7
-    np.testing.assert_array_equal(timestep.observation, [[0, 0, 0, 1]])
 
 
 @pytest.mark.parametrize(

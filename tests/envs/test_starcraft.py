@@ -135,7 +135,7 @@ def test_launches():
 def test_errors():
     env = StarCraft("2s3z", make_game=FakeSmac)
     env.reset(0)
-    with pytest.raises(LareError, match=r"agent 0 .* action 0"):
+    with pytest.raises(LareError, match=r"in a step of '2s3z': .*not available"):
         env.step(np.eye(11, dtype=np.float32)[[0] * 5])
 
     def fail(**_):

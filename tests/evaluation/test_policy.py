@@ -11,14 +11,13 @@ from scipy.stats import mode
 from helpers.toy_envs import toy_spec
 from lare_rl.config.resolve import resolve
 from lare_rl.envs.families import register_family
-from lare_rl.envs.jax_spaces import agent_spec, agent_timestep, make_choices
+from lare_rl.envs.interface import EnvSpec, Team
+from lare_rl.envs.jax_spaces import agent_timestep
 from lare_rl.envs.play import play_episodes
 from lare_rl.errors import LareError
 from lare_rl.evaluation.policy import load_policy
 from lare_rl.runs.directory import create_run
 from lare_rl.training.start_session import start_session
-
-CHOICES = make_choices((2, 3), (2,), "dials/two")
 
 
 class DialsState(NamedTuple):
@@ -28,7 +27,17 @@ class DialsState(NamedTuple):
 class Dials:
     """Two dials with 2 and 3 positions. Of the 6 combinations, only number `step` and the one after it are available."""
 
-    spec = agent_spec(CHOICES, observation_size=2, max_steps=4, masks_actions=True)
+    spec = EnvSpec(
+        teams=(Team("agent", 0, 1),),
+        observation_size=2,
+        action_size=6,
+        discrete=True,
+        max_steps=4,
+        masks_actions=True,
+        choice_sizes=(2, 3),
+        package_shape=(2,),
+        is_jax=True,
+    )
 
     def reset(self, key):
         return DialsState(jnp.array(0)), self.timestep(jnp.array(0), 0.0)

@@ -26,11 +26,6 @@ def family_task(environment: str, observation_size: int = 1, action_size: int = 
     return toy_spec(name="Family", environment=environment, **sizes, **changes)
 
 
-def sample_actions(spec: EnvSpec, available, key):
-    action = jax.random.uniform(key, (spec.n_agents, spec.action_size), minval=-1, maxval=1)
-    return to_env_action(jnp.where(available, action, -jnp.inf) if spec.discrete else action, spec)
-
-
 def play(env: JaxEnv, n_envs: int, n_steps: int) -> tuple[Timestep, np.ndarray, Timestep]:
     """Play random actions in several environments in one compiled call.
 
@@ -39,7 +34,8 @@ def play(env: JaxEnv, n_envs: int, n_steps: int) -> tuple[Timestep, np.ndarray, 
 
     def step(carry, key):
         state, available = carry
-        action = sample_actions(env.spec, available, key)
+        action = jax.random.uniform(key, available.shape, minval=-1, maxval=1)
+        action = to_env_action(jnp.where(available, action, -jnp.inf) if env.spec.discrete else action, env.spec)
         state, timestep = env.step(state, action, key)
         return (state, timestep.available), (action, timestep)
 

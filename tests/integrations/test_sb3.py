@@ -4,7 +4,6 @@ import importlib
 import sys
 from types import SimpleNamespace
 
-import gymnasium
 import numpy as np
 import pytest
 import sb3_contrib
@@ -20,7 +19,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 from helpers.assigner_episodes import SMALL_CREDIT
 from helpers.logged_envs import LoggedEnv, RecordingAssigner, check_episodes
 from helpers.long_tests import long_case
-from helpers.toy_envs import Chase, Pick, toy_spec
+from helpers.toy_envs import Chase, Levels, Pick, levels_spec, toy_spec
 from lare_rl import CreditAssigner, EpisodicReward, LareError
 from lare_rl.integrations.sb3 import CreditCallback, CreditDictReplayBuffer, CreditNStepReplayBuffer, CreditReplayBuffer
 
@@ -129,29 +128,17 @@ def test_callback_steps(kind, env_class, policy):
     check_shown(credit, envs)
 
 
-class Grouped(gymnasium.Wrapper):
-    """Tells the group of an episode when it ends."""
-
-    n_episodes = 0
-
-    def step(self, action):
-        *results, info = self.env.step(action)
-        if results[2] or results[3]:
-            self.n_episodes += 1
-            info = info | {"level": self.n_episodes % 2}
-        return *results, info
-
-
 @pytest.mark.parametrize("kind", [SAC, PPO])
 def test_groups_are_read_from_info(kind):
-    env = Grouped(TimeLimit(Chase(), EPISODE_STEPS))
-    credit = CreditAssigner("bayes", task=toy_spec(group="level"), settings=SMALL_CREDIT)
+    env = TimeLimit(Levels(by_turns=True), EPISODE_STEPS)
+    credit = CreditAssigner("bayes", task=levels_spec(), settings=SMALL_CREDIT)
     if kind is PPO:
         on_policy(env, n_steps=64).learn(64, callback=CreditCallback(credit))
     else:
         off_policy(env, credit, SAC, learning_starts=100).learn(60)
-    assert set(credit.group_names) == {0, 1}
-    assert {episode.level for episode in credit.store.episodes.values()} == {0, 1}
+    names, episodes = list(credit.group_names), list(credit.store.episodes.values())
+    first = names[episodes[0].level]
+    assert [names[episode.level] for episode in episodes] == [(first + number) % 40 for number in range(3)]
 
 
 def test_normalised_buffer():

@@ -190,6 +190,12 @@ def test_collect_acts_at_random_during_the_warmup():
     )
 
 
+def test_episode_that_never_ends_is_refused():
+    config = small_config("dense", env=ONE_AGENT, hyperparameters=TD3Settings(hidden=(8,)))
+    with pytest.raises(LareError, match=f"has not ended, but max_steps is {ONE_AGENT.max_steps}"):
+        DeviceCollector(Still(), config, SEEDS).evaluate(make_actor(config=config)[1], 2)
+
+
 @pytest.mark.parametrize(("step", "epsilon"), [(0, 1.0), (SMALL_SETTINGS["qmix"].epsilon_steps, 0.05)])
 def test_get_actor_has_the_epsilon_of_the_step(step, epsilon, learner):
     config = replace(CONFIG, hyperparameters=SMALL_SETTINGS["qmix"])

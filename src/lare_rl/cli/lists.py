@@ -10,13 +10,13 @@ if TYPE_CHECKING:
 
 def tasks() -> None:
     """List the tasks that come with the package. `lare-rl prompt TASK` describes one of them."""
-    from lare_rl.envs.families import has_single_agent
+    from lare_rl.envs.families import find_family
     from lare_rl.envs.load import read_task, shipped_tasks
 
     head = ("task", "observation", "action", "scored_observation", "agents")
     rows = []
     for task in map(read_task, shipped_tasks()):
-        agents = "of one team" if task.team else "one" if has_single_agent(task) else "many"
+        agents = "of one team" if task.team else "one" if find_family(task).single_agent else "many"
         rows.append((task.name, str(task.observation_size), str(task.action_size), task.scored_observation, agents))
     print_table(head, rows)
 

@@ -11,7 +11,7 @@ from gymnasium.spaces import Box, Dict, Discrete
 from jaxtyping import Bool, Float
 
 from lare_rl.envs.interface import EnvSpec, Team
-from lare_rl.envs.spaces import check_spaces, decode_box, flatten_value, float_array
+from lare_rl.envs.spaces import check_spaces, flatten_value, float_array
 from lare_rl.errors import LareError, short_repr
 
 __all__ = ["Agent", "AgentArrays", "make_agent"]
@@ -45,11 +45,12 @@ class Agent:
         return isinstance(self.action_space, Discrete)
 
     def decode_action(self, action: Float[np.ndarray, " action"]) -> Any:
-        """Return the action that a padded vector encodes, in the form that the environment expects."""
+        """Return the action that a padded vector encodes, in the form that the environment expects. Integers are rounded."""
         action, space = action[: self.action_size], self.action_space
         if isinstance(space, Discrete):
             return int(space.start) + int(np.argmax(action))
-        return decode_box(space, action)
+        clipped = np.clip(action.reshape(space.shape), space.low, space.high)
+        return (np.rint(clipped) if space.dtype.kind in "iu" else clipped).astype(space.dtype)
 
     def flatten_observation(self, observation: Any) -> Float[np.ndarray, " observation"]:
         """Return an observation as a new vector, without the mask. Raises `ValueError` like `flatten_value`."""
@@ -62,8 +63,7 @@ class Agent:
     def read_mask(self, observation: Any, info: Any) -> Bool[np.ndarray, " action"] | None:
         """Return which actions are available, from the observation or from `info`. Return None without a mask.
 
-        Raises:
-            ValueError: the mask is not valid. The message is the predicate of a sentence.
+        Raises `ValueError` with the predicate of a sentence if the mask is not valid.
         """
         mask = observation[MASK] if self.observes_mask else info.get(MASK) if isinstance(info, Mapping) else None
         if mask is None:
@@ -91,17 +91,10 @@ def make_agent(name: Any, observation: gymnasium.Space, action: gymnasium.Space)
 
 
 class AgentArrays:
-    """The layout of common arrays, with the agents in order.
-
-    If their spaces differ, each observation ends with the agent's index, one-hot encoded.
-    """
+    """The layout of common arrays. If the spaces of agents differ, each observation ends with the agent's index, one-hot encoded."""
 
     def __init__(self, agents: Sequence[Agent]):
-        """Make the layout.
-
-        Raises:
-            LareError: only some agents have discrete actions.
-        """
+        """Make the layout, with the agents in order. Raises `LareError` if only some of them have discrete actions."""
         first = agents[0]
         for agent in agents[1:]:
             if agent.discrete != first.discrete:

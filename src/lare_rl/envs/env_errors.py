@@ -2,20 +2,21 @@
 
 import contextlib
 import logging
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any
 
 import numpy as np
 from jaxtyping import Float
 
 from lare_rl.envs.interface import EnvSpec, Timestep
-from lare_rl.errors import LareError, short_repr
+from lare_rl.errors import LareError, install_command, short_repr
 from lare_rl.tasks.spec import TaskSpec
 
 __all__ = [
     "EnvOutputError",
     "as_lare_error",
     "check_finite",
+    "import_hint",
     "name_step",
     "no_time_limit_error",
     "one_line_errors",
@@ -23,16 +24,16 @@ __all__ = [
     "to_float",
 ]
 
-
 MAX_ERROR = 300
 """Characters of an environment's error that a message quotes."""
 
 
 class EnvOutputError(LareError):
-    """An environment returned a value that cannot be used for training."""
+    """An environment returned a value that cannot be used for training. `env_index` is its index, if several run in lockstep."""
 
-    env_index: int | None = None
-    """The index of the environment, if several run in lockstep."""
+    def __init__(self, message: str, env_index: int | None = None):
+        super().__init__(message)
+        self.env_index = env_index
 
 
 def as_lare_error(message: str, error: BaseException, hint: str = "") -> LareError:
@@ -55,6 +56,16 @@ def one_line_errors(message: str, make_hint: Callable[[BaseException], str] = la
         yield
     except (Exception, SystemExit) as error:
         raise as_lare_error(message, error, make_hint(error)) from error
+
+
+def import_hint(error: BaseException) -> str:
+    """Return how to make a missing module available, in brackets; an empty text for another error."""
+    if not isinstance(error, ModuleNotFoundError):
+        return ""
+    package = (error.name or "").partition(".")[0]
+    if package in ("mujoco", "pettingzoo"):
+        return f" (an extra: {install_command(package)})"
+    return " (a module in this folder is found with PYTHONPATH=.)"
 
 
 @contextlib.contextmanager
@@ -87,11 +98,7 @@ def no_time_limit_error(task: TaskSpec) -> LareError:
 
 
 def to_float(value: Any) -> float:
-    """Return a value as a float.
-
-    Raises:
-        ValueError: the value is not a number. The message is a predicate.
-    """
+    """Return a value as a float. Raises `ValueError`, whose message is a predicate, if it is not a number."""
     try:
         return float(value)
     except (TypeError, ValueError, OverflowError):
@@ -99,16 +106,13 @@ def to_float(value: Any) -> float:
 
 
 def read_measures(
-    infos: Iterable[Mapping[Any, Any]], task: TaskSpec, *, last: bool
+    infos: Sequence[Mapping[Any, Any]], task: TaskSpec, *, last: bool
 ) -> dict[str, Float[np.ndarray, ""]]:
     """Return the measures of the task from the `info` of a step: the means over the agents that report them.
 
-    They are 0 before the last step, except the group of the episode, if it is reported.
-
-    Raises:
-        LareError: a measure of the last step is missing, or is not a number.
+    They are 0 before the last step, except the group of the episode, if it is reported. Raises `LareError` if a measure of the last
+    step is missing, or is not a number.
     """
-    infos = list(infos)
     measures = {}
     for name in task.info_keys:
         is_read = last or (name == task.group and any(name in info for info in infos))
@@ -116,13 +120,7 @@ def read_measures(
     return measures
 
 
-def _read_measure(infos: Iterable[Mapping[Any, Any]], name: str) -> float:
-    """Return a measure of the task from the last step's `info`: the mean over the agents that report it.
-
-    Raises:
-        LareError: it is missing, or is not a number.
-    """
-    infos = list(infos)
+def _read_measure(infos: Sequence[Mapping[Any, Any]], name: str) -> float:
     try:
         values = [to_float(info[name]) for info in infos if name in info]
     except ValueError as error:

@@ -56,11 +56,7 @@ class EpisodicReward(gymnasium.Wrapper, RecordConstructorArgs):
 
 
 def read_score(info: Mapping[str, Any], key: str) -> float:
-    """Return the score of an episode from the `info` of its last step.
-
-    Raises:
-        LareError: it is missing or is not a finite number.
-    """
+    """Return the score of an episode from the `info` of its last step. Raises `LareError` if it is no finite number."""
     if key not in info:
         raise LareError(f"the info of the last step has no {key!r}: it has {', '.join(map(repr, info)) or 'nothing'}")
     try:

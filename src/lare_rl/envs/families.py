@@ -16,11 +16,11 @@ from lare_rl.util.plugins import Registry
 
 __all__ = [
     "FAMILIES",
+    "GYMNASIUM",
     "Family",
     "check_logs",
+    "find_family",
     "find_score_type",
-    "has_single_agent",
-    "is_gymnasium",
     "load_env_spec",
     "make_env",
     "make_host_env",
@@ -46,9 +46,20 @@ class Family(NamedTuple):
     single_agent: bool = False
     """Whether all environments of the family have one agent."""
 
+    @property
+    def module(self) -> str:
+        """The name of the module that defines the maker."""
+        return self.maker.partition(":")[0] if isinstance(self.maker, str) else self.maker.__module__
+
+    def load_maker(self) -> Maker:
+        """Return the maker. Its module is imported now if only its location is known."""
+        if isinstance(self.maker, str):
+            return getattr(importlib.import_module(self.module), self.maker.partition(":")[2])
+        return self.maker
+
 
 FAMILIES = Registry[Family]("family of environments", "families of environments")
-_GYMNASIUM = Family("lare_rl.envs.gymnasium_env:GymnasiumEnv", reads=("max_episode_steps",), single_agent=True)
+GYMNASIUM = Family("lare_rl.envs.gymnasium_env:GymnasiumEnv", reads=("max_episode_steps",), single_agent=True)
 _LOGS_ONLY = Family("lare_rl.envs.families:_refuse_to_make", reads=("max_episode_steps",))
 
 
@@ -75,32 +86,27 @@ register_family("particles", "lare_rl.envs.particles.particle_env:make")
 register_family("smax", "lare_rl.envs.smax.smax_env:make", score="sum")
 register_family("smac", "lare_rl.envs.starcraft:make", score="sum")
 register_family("pettingzoo", "lare_rl.envs.pettingzoo_env:make", reads=OPTIONAL_KEYS)
-for _name in ("gymnax", "brax", "playground", "jumanji"):
-    register_family(_name, f"lare_rl.envs.{_name}_env:make", reads=OPTIONAL_KEYS[:2], single_agent=True)
+_SINGLE_AGENT: dict[str, Any] = {"reads": OPTIONAL_KEYS[:2], "single_agent": True}
+register_family("gymnax", "lare_rl.envs.gymnax_env:make", **_SINGLE_AGENT)
+register_family("brax", "lare_rl.envs.robot_env:make_brax", **_SINGLE_AGENT)
+register_family("playground", "lare_rl.envs.robot_env:make_playground", **_SINGLE_AGENT)
+register_family("jumanji", "lare_rl.envs.jumanji_env:make", **_SINGLE_AGENT)
 register_family("jaxmarl", "lare_rl.envs.jaxmarl_env:make", reads=OPTIONAL_KEYS)
 
 
 def find_score_type(task: TaskSpec) -> str | None:
     """Return "sum" or "average" (over the steps of an episode) if the task or its family says so."""
-    return task.score or _find_family(task).score
+    return task.score or find_family(task).score
 
 
 def make_env(task: TaskSpec, **kwargs: Any) -> JaxEnv | HostEnv:
-    """Make a task's environment.
+    """Make a task's environment. `kwargs` are arguments for the family's maker, such as `render_mode`.
 
-    Args:
-        kwargs: arguments for the family's maker, such as `render_mode`.
-
-    Raises:
-        LareError: the environment cannot be made, or does not match the task.
+    Raises `LareError` if the environment cannot be made, or does not match the task.
     """
-    family = _find_family(task)
+    family = find_family(task)
     _check_keys(task, family)
-    maker = family.maker
-    if isinstance(maker, str):
-        module, _, attribute = maker.partition(":")
-        maker = getattr(importlib.import_module(module), attribute)
-    env = maker(task, **kwargs)
+    env = family.load_maker()(task, **kwargs)
     _check_functions(task, env)
     try:
         _check_spec(task, env.spec)
@@ -117,18 +123,11 @@ def make_env(task: TaskSpec, **kwargs: Any) -> JaxEnv | HostEnv:
 
 def _check_functions(task: TaskSpec, env: Any) -> None:
     """Raise `LareError` if an environment lacks a function of its kind, which `is_jax` of its spec says."""
-    is_jax = env.spec.is_jax
-    names = ("reset", "step", "frames") if is_jax else ("reset", "step", "render", "close")
+    kind, names = "JaxEnv", ("reset", "step", "frames")
+    if not env.spec.is_jax:
+        kind, names = "HostEnv (without is_jax in its spec)", ("reset", "step", "render", "close")
     if missing := [name for name in names if not callable(getattr(env, name, None))]:
-        hint = (
-            ""
-            if is_jax or not hasattr(env, "frames")
-            else ". If it has pure functions of JAX, its spec needs is_jax=True"
-        )
-        raise LareError(
-            f"{task.environment}: a {'JaxEnv' if is_jax else 'HostEnv'} needs {', '.join(names)}, and this environment has no "
-            f"{' and no '.join(missing)}{hint}"
-        )
+        raise LareError(f"{task.environment}: a {kind} needs {', '.join(names)}, and has no {' and no '.join(missing)}")
 
 
 def make_host_env(task: TaskSpec, **kwargs: Any) -> HostEnv:
@@ -155,8 +154,7 @@ def _make_here(task: TaskSpec, **kwargs: Any) -> HostEnv:
 
 def picklable_maker(task: TaskSpec) -> Callable[[], HostEnv]:
     """Return a function that makes a task's environment in another process, which first imports the module of its family."""
-    maker = _find_family(task).maker
-    return partial(_import_and_make, maker.partition(":")[0] if isinstance(maker, str) else maker.__module__, task)
+    return partial(_import_and_make, find_family(task).module, task)
 
 
 def _import_and_make(module: str, task: TaskSpec) -> HostEnv:
@@ -168,16 +166,6 @@ def _import_and_make(module: str, task: TaskSpec) -> HostEnv:
             "Move the family into a module of its own."
         )
     return _make_here(task)
-
-
-def has_single_agent(task: TaskSpec) -> bool:
-    """Return whether all environments of the task's family have one agent."""
-    return _find_family(task).single_agent
-
-
-def is_gymnasium(task: TaskSpec) -> bool:
-    """Return whether Gymnasium makes the environment of a task."""
-    return _find_family(task) is _GYMNASIUM
 
 
 def load_env_spec(task: TaskSpec) -> EnvSpec:
@@ -203,10 +191,11 @@ def check_logs(task: TaskSpec) -> None:
             raise LareError(f"task {task.name!r}: {key} has no effect on logs. Remove it.")
 
 
-def _find_family(task: TaskSpec) -> Family:
+def find_family(task: TaskSpec) -> Family:
+    """Return the family of a task's environment."""
     if task.environment == NO_ENVIRONMENT:
         return _LOGS_ONLY
-    return FAMILIES.get(task.family, _GYMNASIUM) if task.family else _GYMNASIUM
+    return FAMILIES.get(task.family, GYMNASIUM) if task.family else GYMNASIUM
 
 
 def _refuse_to_make(task: TaskSpec, **_: Any) -> HostEnv:
@@ -221,7 +210,7 @@ def _check_keys(task: TaskSpec, family: Family) -> None:
         for key in OPTIONAL_KEYS:
             if getattr(role, key) and key not in family.reads:
                 advice = "Remove it."
-                if family is _GYMNASIUM and key == "arguments":
+                if family is GYMNASIUM and key == "arguments":
                     advice = "Remove it, and pass kwargs to gymnasium.register."
                 elif not str(family.maker).startswith("lare_rl."):
                     advice = f"Remove it, or pass reads=({key!r},) to register_family, if its maker reads it."
@@ -242,6 +231,10 @@ def _check_spec(task: TaskSpec, spec: EnvSpec) -> None:
     def fail(role: TaskSpec, mismatch: str) -> LareError:
         return LareError(f"task {role.name!r}: {mismatch}")
 
+    def expect(role: TaskSpec, key: str, value: Any, reason: str) -> None:
+        if getattr(role, key) != value:
+            raise fail(role, f"{key} = {getattr(role, key)!r}, but {reason}")
+
     env, names = task.environment, [team.name for team in spec.teams]
     if task.teams and [role.team for role in task.teams] != names:
         raise LareError(f"the teams of {env} must be {', '.join(names)}, in this order")
@@ -249,14 +242,12 @@ def _check_spec(task: TaskSpec, spec: EnvSpec) -> None:
         raise LareError(f"{env} has the teams {', '.join(names)}. Write a task file for each, and list them as teams.")
     for role in task.teams:
         for key in SHARED_KEYS:  # training reads only the task's keys, verification only the team's
-            team_value, task_value = getattr(role, key), getattr(task, key)
-            if team_value != task_value:
-                advice = "Use the same value in both."
-                raise fail(role, f"{key} = {team_value!r}, but {task_value!r} in {task.name!r}. {advice}")
+            value = getattr(task, key)
+            expect(role, key, value, f"{value!r} in {task.name!r}. Use the same value in both.")
     if not task.teams and task.team not in (None, *names):
         raise fail(task, f"team = {task.team!r}, but the teams of {env} are {', '.join(names)}")
-    if task.max_episode_steps not in (None, spec.max_steps):
-        raise fail(task, f"max_episode_steps = {task.max_episode_steps}, but {spec.max_steps} in {env}. Remove it.")
+    if task.max_episode_steps is not None:
+        expect(task, "max_episode_steps", spec.max_steps, f"{spec.max_steps} in {env}. Remove it.")
     for name in task.info_keys:
         if name not in spec.measures:
             raise fail(task, f"{env} has no measure {name!r}")
@@ -265,10 +256,8 @@ def _check_spec(task: TaskSpec, spec: EnvSpec) -> None:
         raise fail(task, f"credit_scope = 'state', but {env} has no global state")
     for role in task.roles:
         team = spec.teams[names.index(role.team)] if role.team in names else spec.teams[0]
+        sizes = ("observations", spec.observation_size), ("actions", spec.action_size)
         if from_state:
             sizes = ("states", spec.state_size), ("joint actions", spec.action_size * team.n_agents)
-        else:
-            sizes = ("observations", spec.observation_size), ("actions", spec.action_size)
         for key, (content, size) in zip(("observation_size", "action_size"), sizes, strict=True):
-            if getattr(role, key) != size:
-                raise fail(role, f"{key} = {getattr(role, key)}, but {env} has {content} of size {size}")
+            expect(role, key, size, f"{env} has {content} of size {size}")

@@ -1,5 +1,6 @@
 """Gymnasium environments: one team of one agent, on the host."""
 
+import importlib
 import warnings
 from typing import Any
 
@@ -10,9 +11,16 @@ from jaxtyping import Float
 
 from lare_rl.envs import mujoco_rewards
 from lare_rl.envs.agent_arrays import Agent
-from lare_rl.envs.env_errors import EnvOutputError, no_time_limit_error, one_line_errors, read_measures, to_float
+from lare_rl.envs.env_errors import (
+    EnvOutputError,
+    import_hint,
+    no_time_limit_error,
+    one_line_errors,
+    read_measures,
+    to_float,
+)
 from lare_rl.envs.interface import EnvSpec, Team, Timestep
-from lare_rl.envs.mujoco_warnings import import_mujoco, mujoco_warnings
+from lare_rl.envs.mujoco_warnings import mujoco_warnings
 from lare_rl.envs.spaces import check_spaces, float_array
 from lare_rl.errors import LareError, short_repr
 from lare_rl.tasks.spec import TaskSpec, entry_meanings
@@ -24,10 +32,9 @@ mujoco_rewards.register()
 
 
 def make_gymnasium(name: str, max_episode_steps: int | None = None, **kwargs: Any) -> gymnasium.Env:
-    """Make an environment whose spaces can be flattened. See `gymnasium.make` for the arguments.
+    """Make an environment. See `gymnasium.make` for the arguments.
 
-    Raises:
-        LareError: the environment cannot be made, or its spaces cannot be flattened.
+    Raises `LareError` if it cannot be made, or its spaces cannot be flattened.
     """
 
     def make_hint(error: BaseException) -> str:
@@ -37,11 +44,9 @@ def make_gymnasium(name: str, max_episode_steps: int | None = None, **kwargs: An
             return f" (for an environment of your own, write MODULE:{name}, where MODULE registers it)"
         if isinstance(error, gymnasium.error.NamespaceNotFound):
             return " (for a family of a plugin, import the plugin's module, or name it in LARE_PLUGINS)"
-        if isinstance(error, ModuleNotFoundError):
-            return " (a module in this folder is found with PYTHONPATH=.)"
         if "render_mode" in kwargs and "render_mode" in str(error):
             return ' (to be filmed, it must accept render_mode="rgb_array")'
-        return ""
+        return import_hint(error)
 
     with warnings.catch_warnings(), one_line_errors(f"environment {name!r} cannot be made", make_hint):
         # The user chooses the version: returns of v4 and v5 cannot be compared.
@@ -49,7 +54,8 @@ def make_gymnasium(name: str, max_episode_steps: int | None = None, **kwargs: An
         warnings.filterwarnings("ignore", message=".*Using the latest versioned environment.*")
         # A report asks for a film, and does without one if it gets none.
         warnings.filterwarnings("ignore", message=".*that is not in the possible render_modes.*")
-        import_mujoco(name)
+        if (spec := gymnasium.registry.get(name)) and str(spec.entry_point).startswith("gymnasium.envs.mujoco"):
+            importlib.import_module("mujoco")  # if parts of it are missing, only this says how to repair that
         with mujoco_warnings(name):
             env = gymnasium.make(name, max_episode_steps=max_episode_steps, **kwargs)
         try:
@@ -68,8 +74,7 @@ class GymnasiumEnv:
     def __init__(self, task: TaskSpec, **kwargs: Any):
         """Make the environment of a task. See `gymnasium.make` for the keyword arguments.
 
-        Raises:
-            LareError: the environment cannot be made, or has no time limit.
+        Raises `LareError` if it cannot be made, or has no time limit.
         """
         self._name, self._task = task.environment, task
         self.environment = make_gymnasium(task.environment, task.max_episode_steps, **kwargs)
@@ -79,10 +84,9 @@ class GymnasiumEnv:
         action_space = self.environment.action_space
         assert isinstance(action_space, Discrete | Box)
         self._agent = Agent("agent", self.environment.observation_space, action_space, observes_mask=False)
-        fields: dict[str, Any]
         if isinstance(action_space, Box):
             dtype = np.result_type(action_space.dtype, np.float32)  # bounds stay as precise as they are
-            fields = {"low": action_space.low[None].astype(dtype), "high": action_space.high[None].astype(dtype)}
+            fields: dict[str, Any] = {key: getattr(action_space, key)[None].astype(dtype) for key in ("low", "high")}
         else:
             fields = {"first_choice": int(action_space.start)}
         self.spec = EnvSpec(

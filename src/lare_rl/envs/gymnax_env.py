@@ -5,102 +5,61 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
-import numpy as np
-from jaxtyping import Array, Float, PRNGKeyArray
+from jaxtyping import Array
 
-from lare_rl.envs import jax_spaces
-from lare_rl.envs.env_errors import one_line_errors
-from lare_rl.envs.interface import Timestep
-from lare_rl.envs.jax_spaces import Bounds, Choices
+from lare_rl.envs.jax_spaces import AgentEnv, action_fields, construct, draw_updates, import_package
 from lare_rl.errors import LareError
 from lare_rl.tasks.spec import TaskSpec
 
-__all__ = ["GymnaxEnv", "make"]
+__all__ = ["make"]
 
 LIMIT = "max_steps_in_episode"
 """The time limit's name among the parameters of an environment."""
 
 
-def make(task: TaskSpec, **_: Any) -> "GymnaxEnv":
-    """Make the environment of a task with the name `gymnax/ID`.
+def make(task: TaskSpec, **_: Any) -> AgentEnv:
+    """Make the environment of a task with the name `gymnax/ID`. An observation that is a number of a state becomes one-hot.
 
-    The task's arguments are arguments of `gymnax.make` or parameters of the environment.
-
-    Raises:
-        LareError: gymnax is not installed, or the environment cannot be made.
+    The task's arguments are arguments of `gymnax.make` or parameters of the environment. Raises `LareError` if it cannot be made.
     """
-    gymnax = jax_spaces.import_package("gymnax", task)
+    gymnax = import_package("gymnax", task)
     names = gymnax.registered_envs
-    _, defaults = jax_spaces.construct(task, names, gymnax.make, {})
-    is_parameter = {key: hasattr(defaults, key) for key in task.arguments}
-    arguments = {key: value for key, value in task.arguments.items() if not is_parameter[key]}
-    env, params = jax_spaces.construct(task, names, gymnax.make, arguments)
-    changes = {key: value for key, value in task.arguments.items() if is_parameter[key]}
+    _, defaults = construct(task, names, gymnax.make, {})
+    changes = {key: value for key, value in task.arguments.items() if hasattr(defaults, key)}
+    arguments = {key: value for key, value in task.arguments.items() if key not in changes}
+    env, params = construct(task, names, gymnax.make, arguments)
     if task.max_episode_steps:
         changes[LIMIT] = task.max_episode_steps
-    return GymnaxEnv(env, params.replace(**changes), task)
+    params = params.replace(**changes)
+    actions, n_states = env.action_space(params), getattr(env.observation_space(params), "n", None)
 
+    def observe(observation: Any) -> Any:
+        return observation if n_states is None else jax.nn.one_hot(observation, n_states)
 
-class GymnaxEnv:
-    """An environment of gymnax as a `JaxEnv`. An observation that is a number of a state becomes one-hot."""
+    def reset(key: Array) -> tuple[Any, dict[str, Any]]:
+        observation, state = env.reset_env(key, params)
+        *_, info = jax.eval_shape(env.step_env, key, state, actions.sample(key), params)
+        measures = jax.tree.map(lambda value: jnp.zeros(value.shape), info)
+        return state, {"observation": observe(observation), "measures": measures}
 
-    def __init__(self, env: Any, params: Any, task: TaskSpec):
-        self.env, self._name = env, task.environment
-        self.params = params
-        spaces = jax_spaces.import_package("gymnax.environments.spaces", task)
-        observation_space = env.observation_space(params)
-        self._n_states = int(observation_space.n) if isinstance(observation_space, spaces.Discrete) else 0
-        self._action = _read_action(env.action_space(params), spaces, task.environment)
-        key, action = jnp.zeros(2, jnp.uint32), self._action.decode(jnp.zeros(self._action.size))
-        with one_line_errors(f"environment {self._name!r} cannot be used"):
-            observation, state = jax.eval_shape(env.reset_env, key, params)
-            info = jax.eval_shape(env.step_env, key, state, action, params)[-1]
-        self.spec = jax_spaces.agent_spec(
-            self._action,
-            observation_size=self._n_states or jax_spaces.flat_size(observation),
-            max_steps=int(getattr(params, LIMIT)),
-            measures=jax_spaces.find_measures(task, info),
-        )
+    def step(state: Any, action: Array, key: Array) -> tuple[Any, dict[str, Any]]:
+        observation, state, reward, terminated, info = env.step_env(key, state, action, params)
+        return state, {
+            "observation": observe(observation),
+            "reward": reward,
+            "terminated": terminated,
+            "truncated": env.is_truncated(state, params),
+            "measures": info,
+        }
 
-    def reset(self, key: PRNGKeyArray) -> tuple[Any, Timestep]:
-        observation, state = self.env.reset_env(jax_spaces.raw_key(key), self.params)
-        return jax_spaces.strong_types(state), jax_spaces.agent_timestep(self.spec, self._flatten(observation))
-
-    def step(self, state: Any, action: Float[Array, "1 action"], key: PRNGKeyArray) -> tuple[Any, Timestep]:
-        env_action = self._action.decode(action[0])
-        observation, next_state, reward, terminated, info = self.env.step_env(
-            jax_spaces.raw_key(key), state, env_action, self.params
-        )
-        timestep = jax_spaces.agent_timestep(
-            self.spec,
-            self._flatten(observation),
-            reward=reward,
-            terminated=terminated,
-            truncated=self.env.is_truncated(next_state, self.params),
-            measures=info,
-        )
-        return jax_spaces.cast_like(next_state, state), timestep
-
-    def frames(self, states: Any, credit: Any = None) -> list[np.ndarray]:
-        """Return the package's pictures of states, which do not show credit. Raise `LareError` if it cannot draw them here."""
-        return jax_spaces.draw_states(self._name, self._draw, states)
-
-    def _draw(self, states: Sequence[Any]) -> Sequence[Any]:
+    def draw(states: Sequence[Any]) -> Sequence[Any]:
         from gymnax.visualize import Visualizer
 
-        visualizer = Visualizer(self.env, self.params, states)
+        visualizer = Visualizer(env, params, states)
         visualizer.init()
         if not hasattr(visualizer, "im"):
-            raise LareError(f"environment {self._name!r} cannot be drawn: gymnax has no pictures of it")
-        return jax_spaces.draw_updates(visualizer, len(states))
+            raise LareError(f"environment {task.environment!r} cannot be drawn: gymnax has no pictures of it")
+        return draw_updates(visualizer, len(states))
 
-    def _flatten(self, observation: Any) -> Float[Array, " observation"]:
-        return jax.nn.one_hot(observation, self._n_states) if self._n_states else jax_spaces.flatten_tree(observation)
-
-
-def _read_action(space: Any, spaces: Any, environment: str) -> Choices | Bounds:
-    if isinstance(space, spaces.Discrete):
-        return jax_spaces.make_choices((space.n,), (), environment, space.dtype)
-    if isinstance(space, spaces.Box):
-        return jax_spaces.make_bounds(space.low, space.high, tuple(space.shape), environment)
-    raise jax_spaces.unusable_actions(environment, space)
+    fields = action_fields(actions, task.environment)
+    return AgentEnv(task, env, reset, step, draw, max_steps=int(getattr(params, LIMIT)), **fields)

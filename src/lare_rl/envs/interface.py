@@ -154,17 +154,18 @@ def to_env_action(
     return xp.minimum(xp.maximum(scaled, spec.low), spec.high)  # rounding may exceed the bounds
 
 
-def to_package_action(action: Float[np.ndarray, "*batch action"], spec: EnvSpec) -> Any:
+def to_package_action(action: Float[AnyArray, "*batch action"], spec: EnvSpec) -> Any:
     """Return actions of a single agent, in the environment's units, as the environment's package takes them in its own `step`.
 
     A one-hot row becomes the number of its choice, or an array of numbers where there are several choices at a time.
     """
     if not spec.discrete:
         return action if spec.package_shape is None else action.reshape(*action.shape[:-1], *spec.package_shape)
-    number = np.argmax(action, axis=-1)
+    xp = _array_module(action)
+    number = xp.argmax(action, axis=-1)
     if not spec.choice_sizes:
         return number + spec.first_choice
-    numbers = np.stack(np.unravel_index(number, spec.choice_sizes), axis=-1)
+    numbers = xp.stack(xp.unravel_index(number, spec.choice_sizes), axis=-1)
     return numbers.reshape(*number.shape, *(spec.package_shape or (-1,)))
 
 

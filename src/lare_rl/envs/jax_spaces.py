@@ -7,26 +7,26 @@ import math
 import sys
 import warnings
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
 from types import ModuleType
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
+from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
-from lare_rl.envs.env_errors import one_line_errors
-from lare_rl.envs.interface import EnvSpec, Team, Timestep, with_available_action
+from lare_rl.envs.env_errors import as_lare_error, one_line_errors
+from lare_rl.envs.interface import EnvSpec, Team, Timestep, to_package_action, with_available_action
 from lare_rl.envs.mujoco_warnings import mujoco_warnings
 from lare_rl.errors import LareError, did_you_mean, install_command, missing_extra_error, short_repr
 from lare_rl.tasks.spec import TaskSpec
 
 __all__ = [
-    "Bounds",
-    "Choices",
-    "agent_spec",
+    "TRAINABLE_ACTIONS",
+    "AgentEnv",
+    "action_fields",
     "agent_timestep",
+    "bounded_action",
     "cast_like",
     "construct",
     "draw_states",
@@ -35,40 +35,30 @@ __all__ = [
     "flat_size",
     "flatten_tree",
     "import_package",
-    "make_bounds",
-    "make_choices",
+    "mask_combinations",
     "raw_key",
     "read_measures",
     "strong_types",
-    "unstack",
     "unusable",
-    "unusable_actions",
 ]
 
 MAX_COMBINATIONS = 1024
 """The largest number of combinations of several choices that become a single choice."""
+TRAINABLE_ACTIONS = "LaRe trains discrete actions and bounded continuous ones"
 
 
 # Packages
 
 
 def import_package(name: str, task: TaskSpec) -> ModuleType:
-    """Import a package of an environment, without what it prints.
-
-    Raises:
-        LareError: it is not installed (the message names the extra), or cannot be imported.
-    """
+    """Import a package of an environment, without what it prints. Raises `LareError`, which names the extra, if that fails."""
     try:
         with _silence():
             return importlib.import_module(name)
-    except ModuleNotFoundError as error:
-        if error.name in (name, name.partition(".")[0]):
-            raise missing_extra_error(f"environment {task.environment!r}", task.family) from error
-        reason = error
     except Exception as error:  # an old package may raise anything if a newer JAX has removed a name
-        reason = error
-    summary = " ".join(str(reason).split())
-    raise LareError(f"{name} cannot be imported: {summary} (try {install_command(task.family)})") from reason
+        if isinstance(error, ModuleNotFoundError) and error.name in (name, name.partition(".")[0]):
+            raise missing_extra_error(f"environment {task.environment!r}", task.family) from error
+        raise as_lare_error(f"{name} cannot be imported", error, f" (try {install_command(task.family)})") from error
 
 
 @contextlib.contextmanager
@@ -87,10 +77,9 @@ def _silence() -> Iterator[None]:
 def construct(
     task: TaskSpec, names: Iterable[str], make: Callable[..., Any], arguments: Mapping[str, Any] | None = None
 ) -> Any:
-    """Call `make` with the environment's name and the task's arguments, or with `arguments`. Return its result.
+    """Return the result of `make` for the environment's name and the task's arguments, or `arguments`.
 
-    Raises:
-        LareError: the name is not among the package's names, or `make` raises an error.
+    Raises `LareError` if the name is not among the package's names, or if `make` raises an error.
     """
     name, names = task.environment_name, list(names)
     message = f"environment {task.environment!r} cannot be made"
@@ -103,11 +92,6 @@ def construct(
 
 def unusable(environment: str, reason: str) -> LareError:
     return LareError(f"environment {environment!r} cannot be used: {reason}")
-
-
-def unusable_actions(environment: str, space: Any) -> LareError:
-    actions = f"its actions are {short_repr(space)}"
-    return unusable(environment, f"{actions}: LaRe trains discrete actions and bounded continuous ones")
 
 
 # Values
@@ -152,109 +136,121 @@ def read_measures(spec: EnvSpec, values: Mapping[str, Any]) -> dict[str, Float[A
 # Actions
 
 
-class Choices(NamedTuple):
-    """A discrete action. Several choices at a time are one choice: of all their combinations, the last choice changing fastest."""
+def action_fields(space: Any, environment: str) -> dict[str, Any]:
+    """Return the fields of `EnvSpec` about actions, from a space of gymnax or a specification of Jumanji.
 
-    sizes: tuple[int, ...]
-    """The number of values of each choice."""
-    shape: tuple[int, ...] = ()
-    """The shape of the environment's action."""
-    dtype: Any = jnp.int32
-
-    @property
-    def size(self) -> int:
-        return math.prod(self.sizes)
-
-    def decode(self, action: Float[Array, " size"]) -> Int[Array, "*shape"]:
-        """Return the environment's action of a one-hot vector."""
-        index = jnp.argmax(action)
-        if self.shape:
-            index = jnp.stack(jnp.unravel_index(index, self.sizes)).reshape(self.shape)
-        return index.astype(self.dtype)
-
-    def mask_combinations(self, mask: Bool[Array, "..."]) -> Bool[Array, " size"]:
-        """Return which combinations are available, from a mask of all combinations or of each choice."""
-        if mask.shape == self.sizes:
-            return mask.ravel()
-        combinations = jnp.ones((), bool)
-        for row, size in zip(mask, self.sizes, strict=True):
-            combinations = combinations[..., None] & row[:size]
-        return combinations.ravel()
+    Several choices at a time are one choice: of all their combinations, the last choice changing fastest. Raises `LareError` if
+    these are too many, or if actions are neither discrete nor bounded.
+    """
+    n_values = getattr(space, "n", getattr(space, "num_values", None))
+    if n_values is not None:
+        shape, sizes = np.shape(n_values), tuple(map(int, np.ravel(n_values)))
+        if (size := math.prod(sizes)) > MAX_COMBINATIONS:
+            combinations = f"{size} combinations, more than {MAX_COMBINATIONS}"
+            raise unusable(environment, f"its {len(sizes)} choices at a time have {combinations}")
+        return {
+            "discrete": True,
+            "action_size": size,
+            "choice_sizes": sizes if shape else (),
+            "package_shape": shape,
+        }
+    for low, high in (("low", "high"), ("minimum", "maximum")):
+        if hasattr(space, low) and np.issubdtype(space.dtype, np.floating):
+            return bounded_action(getattr(space, low), getattr(space, high), space.shape, environment)
+    raise unusable(environment, f"its actions are {short_repr(space)}: {TRAINABLE_ACTIONS}")
 
 
-@dataclass(frozen=True, eq=False)
-class Bounds:
-    """A continuous action between bounds."""
-
-    low: Float[np.ndarray, " size"]
-    high: Float[np.ndarray, " size"]
-    shape: tuple[int, ...]
-    """The shape of the environment's action."""
-
-    @property
-    def size(self) -> int:
-        return len(self.low)
-
-    def decode(self, action: Float[Array, " size"]) -> Float[Array, "*shape"]:
-        """Return the environment's action of a vector."""
-        return action.reshape(self.shape)
-
-
-def make_choices(sizes: Sequence[int], shape: tuple[int, ...], environment: str, dtype: Any = jnp.int32) -> Choices:
-    """Make a discrete action. Raise `LareError` if its choices have too many combinations."""
-    choices = Choices(tuple(map(int, sizes)), shape, dtype)
-    if choices.size > MAX_COMBINATIONS:
-        combinations = f"{choices.size} combinations, more than {MAX_COMBINATIONS}"
-        raise unusable(environment, f"its {len(sizes)} choices at a time have {combinations}")
-    return choices
-
-
-def make_bounds(low: Any, high: Any, shape: tuple[int, ...], environment: str) -> Bounds:
-    """Make a continuous action. Raise `LareError` if it has no bounds."""
-    low, high = (np.broadcast_to(np.asarray(bound, np.float32), shape).ravel().copy() for bound in (low, high))
+def bounded_action(low: Any, high: Any, shape: Sequence[int], environment: str) -> dict[str, Any]:
+    """Return the fields of `EnvSpec` about a continuous action of a single agent. Raises `LareError` if it has no bounds."""
+    low, high = (np.broadcast_to(np.asarray(bound, np.float32), shape).reshape(1, -1).copy() for bound in (low, high))
     if not (np.isfinite(low).all() and np.isfinite(high).all()):
         raise unusable(environment, "its actions have no bounds")
-    return Bounds(low, high, shape)
+    return {"discrete": False, "action_size": low.size, "low": low, "high": high, "package_shape": tuple(shape)}
+
+
+def mask_combinations(mask: Bool[Array, "..."], sizes: tuple[int, ...]) -> Bool[Array, " combinations"]:
+    """Return which combinations of choices are available, from a mask of all combinations or of each choice."""
+    if mask.ndim == 1 or mask.shape == sizes:
+        return mask.ravel()
+    combinations = jnp.ones((), bool)
+    for row, size in zip(mask, sizes, strict=True):
+        combinations = combinations[..., None] & row[:size]
+    return combinations.ravel()
 
 
 # A single agent
 
 
-def agent_spec(action: Choices | Bounds, *, observation_size: int, max_steps: int, **fields: Any) -> EnvSpec:
-    """Return the sizes and bounds of an environment of one agent. `fields` are further fields of `EnvSpec`."""
-    if isinstance(action, Bounds):
-        fields |= {"low": action.low[None], "high": action.high[None]}
-    elif action.shape:
-        fields |= {"choice_sizes": action.sizes}
-    return EnvSpec(
-        teams=(Team("agent", 0, 1),),
-        observation_size=observation_size,
-        action_size=action.size,
-        discrete=isinstance(action, Choices),
-        max_steps=max_steps,
-        is_jax=True,
-        package_shape=action.shape,
-        **fields,
-    )
+class AgentEnv:
+    """A package's environment of one agent as a `JaxEnv`."""
+
+    def __init__(
+        self,
+        task: TaskSpec,
+        env: Any,
+        reset: Callable[..., Any],
+        step: Callable[..., Any],
+        draw: Callable[[list[Any]], Sequence[Any]],
+        *,
+        max_steps: int,
+        **action: Any,
+    ):
+        """Make the adapter from functions that call the package's environment.
+
+        Args:
+            reset: from a raw key to a state, and the arguments of `agent_timestep` by name.
+            step: from a state, an action of the package and a raw key to the same.
+            draw: from a list of states to their pictures.
+            action: the fields of `EnvSpec` about actions.
+        """
+        self.env, self._name = env, task.environment
+        self._reset, self._step, self._draw = reset, step, draw
+        with one_line_errors(f"environment {self._name!r} cannot be used"):
+            _, outputs = jax.eval_shape(reset, jnp.zeros(2, jnp.uint32))
+        self.spec = EnvSpec(
+            teams=(Team("agent", 0, 1),),
+            observation_size=flat_size(outputs["observation"]),
+            max_steps=max_steps,
+            state_size=flat_size(outputs.get("state")),
+            masks_actions=outputs.get("available") is not None,
+            is_jax=True,
+            measures=find_measures(task, outputs.get("measures") or {}),
+            **action,
+        )
+
+    def reset(self, key: PRNGKeyArray) -> tuple[Any, Timestep]:
+        state, outputs = self._reset(raw_key(key))
+        return strong_types(state), agent_timestep(self.spec, **outputs)
+
+    def step(self, state: Any, action: Float[Array, "1 action"], key: PRNGKeyArray) -> tuple[Any, Timestep]:
+        next_state, outputs = self._step(state, to_package_action(action[0], self.spec), raw_key(key))
+        return cast_like(next_state, state), agent_timestep(self.spec, **outputs)
+
+    def frames(self, states: Any, credit: Any = None) -> list[np.ndarray]:
+        """Return the package's pictures of states, which do not show credit. Raise `LareError` if it cannot draw them here."""
+        return draw_states(self._name, self._draw, states)
 
 
 def agent_timestep(
     spec: EnvSpec,
-    observation: Float[Array, " observation"],
+    observation: Any,
     *,
     reward: Any = 0.0,
     terminated: Any = False,
     truncated: Any = False,
     available: Bool[Array, " action"] | None = None,
-    state: Float[Array, " state"] | None = None,
+    state: Any = None,
     measures: Mapping[str, Any] | None = None,
 ) -> Timestep:
-    """Return a timestep of one agent. By default all actions are available. If a mask has none, the first is."""
+    """Return a timestep of one agent. By default all actions are available. If a mask has none, the first is.
+
+    The observation and the state are trees of arrays.
+    """
     if available is None:
         available = jnp.ones(spec.action_size, bool)
     return Timestep(
-        observation=observation[None],
-        state=jnp.zeros(0) if state is None else state,
+        observation=flatten_tree(observation)[None],
+        state=flatten_tree(state),
         available=with_available_action(available.astype(bool))[None],
         alive=jnp.ones(1, bool),
         reward=jnp.asarray(reward, jnp.float32).reshape(1),
@@ -270,13 +266,9 @@ def agent_timestep(
 def draw_states(environment: str, draw: Callable[[list[Any]], Sequence[Any]], states: Any) -> list[np.ndarray]:
     """Return the pictures that a package draws of an episode's states (leading axis: steps). Raise `LareError` if it cannot draw here."""
     with one_line_errors(f"environment {environment!r} cannot be drawn here", _render_hint), _silence():
-        return [np.asarray(picture)[..., :3].astype(np.uint8) for picture in draw(unstack(states))]
-
-
-def unstack(states: Any) -> list[Any]:
-    """Return the states of an episode (leading axis: steps) one by one, on the host."""
-    leaves, structure = jax.tree.flatten(jax.device_get(states))
-    return [jax.tree.unflatten(structure, step) for step in zip(*leaves, strict=True)]
+        leaves, structure = jax.tree.flatten(jax.device_get(states))
+        by_step = [jax.tree.unflatten(structure, step) for step in zip(*leaves, strict=True)]
+        return [np.asarray(picture)[..., :3].astype(np.uint8) for picture in draw(by_step)]
 
 
 def draw_updates(visualizer: Any, n_states: int) -> list[np.ndarray]:

@@ -1,5 +1,6 @@
 """Environments of JaxMARL: `jaxmarl/MPE_simple_spread_v3`. The adapter calls `step_env`, which does not reset."""
 
+import contextlib
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple
 
@@ -12,7 +13,7 @@ from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 from lare_rl.envs import jax_spaces
 from lare_rl.envs.agent_arrays import Agent, AgentArrays, make_agent
 from lare_rl.envs.env_errors import no_time_limit_error, one_line_errors
-from lare_rl.envs.interface import EnvSpec, Timestep, with_available_action
+from lare_rl.envs.interface import Timestep, with_available_action
 from lare_rl.envs.pettingzoo_construct import group_by_team
 from lare_rl.errors import LareError, short_repr
 from lare_rl.tasks.spec import TaskSpec
@@ -32,10 +33,8 @@ RESETS_ITSELF = ("coin_game",)
 def make(task: TaskSpec, **_: Any) -> "JaxMARLEnv":
     """Make the environment of a task with the name `jaxmarl/ID`.
 
-    The task's arguments are arguments of `jaxmarl.make`. If the environment has a time limit, `max_episode_steps` sets it.
-
-    Raises:
-        LareError: JaxMARL is not installed, or the environment cannot be made, or it has no time limit.
+    The task's arguments are arguments of `jaxmarl.make`. If the environment has a time limit, `max_episode_steps` sets it. Raises
+    `LareError` if it cannot be made, or has no time limit.
     """
     jaxmarl = jax_spaces.import_package("jaxmarl", task)
     names = jaxmarl.registered_envs
@@ -71,8 +70,6 @@ class JaxMARLEnv:
     another end: an episode that ends at `max_steps` is truncated, one that ends before is terminated. At the last step no agent
     leaves, because `phi` may read the observations of the agents that acted.
     """
-
-    spec: EnvSpec
 
     def __init__(self, env: Any, task: TaskSpec, max_steps: int):
         self.env, self._name = env, task.environment
@@ -182,9 +179,7 @@ def _make_agent(name: Any, space: Any, observation_size: int) -> Agent:
     if hasattr(space, "low"):
         low, high = (np.broadcast_to(np.asarray(bound, np.float32), space.shape) for bound in (space.low, space.high))
         return make_agent(name, observation_space, gymnasium.spaces.Box(low, high, dtype=np.float32))
-    raise LareError(
-        f"the actions of {name} are {short_repr(space)}: LaRe trains discrete actions and bounded continuous ones"
-    )
+    raise LareError(f"the actions of {name} are {short_repr(space)}: {jax_spaces.TRAINABLE_ACTIONS}")
 
 
 def _decode(agent: Agent, action: Float[Array, " action"]) -> Array:
@@ -197,12 +192,8 @@ def _decode(agent: Agent, action: Float[Array, " action"]) -> Array:
 
 def _find_masks(env: Any, state: Any) -> Callable[[Any], Mapping[Any, Any]] | None:
     """Return the function that returns the available actions by agent, if the environment has one."""
-    functions = [getattr(env, name, None) for name in ("get_avail_actions", "get_legal_moves")]
-    return next((function for function in functions if function and _is_implemented(function, state)), None)
-
-
-def _is_implemented(function: Callable[[Any], Any], state: Any) -> bool:
-    try:
-        return isinstance(jax.eval_shape(function, state), Mapping)
-    except NotImplementedError:  # of JaxMARL's base class
-        return False
+    for name in ("get_avail_actions", "get_legal_moves"):
+        with contextlib.suppress(NotImplementedError):  # of JaxMARL's base class
+            if hasattr(env, name) and isinstance(jax.eval_shape(getattr(env, name), state), Mapping):
+                return getattr(env, name)
+    return None

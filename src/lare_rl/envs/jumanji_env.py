@@ -7,39 +7,18 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
+from jaxtyping import Array, Int
 
-from lare_rl.envs import jax_spaces
-from lare_rl.envs.env_errors import no_time_limit_error, one_line_errors
-from lare_rl.envs.interface import Timestep
-from lare_rl.envs.jax_spaces import Bounds, Choices
+from lare_rl.envs.env_errors import no_time_limit_error
+from lare_rl.envs.jax_spaces import AgentEnv, action_fields, construct, import_package, mask_combinations, unusable
 from lare_rl.tasks.spec import TaskSpec
 
-__all__ = ["JumanjiEnv", "make", "observed_arrays"]
+__all__ = ["make", "observed_arrays"]
 
 MASK = "action_mask"
 """Jumanji's name of the mask of available actions in an observation."""
 LIMIT = "time_limit"
 """Jumanji's name of the time limit, as an argument and an attribute."""
-
-
-def make(task: TaskSpec, **_: Any) -> "JumanjiEnv":
-    """Make the environment of a task with the name `jumanji/ID`.
-
-    The task's arguments are arguments of `jumanji.make`. If the environment has a time limit, `max_episode_steps` sets it.
-
-    Raises:
-        LareError: Jumanji is not installed, or the environment cannot be made, or it has several agents or no time limit.
-    """
-    jumanji = jax_spaces.import_package("jumanji", task)
-    names = sorted(jumanji.registered_environments())
-    env = jax_spaces.construct(task, names, jumanji.make)
-    if task.max_episode_steps and LIMIT in inspect.signature(type(env).__init__).parameters:
-        env = jax_spaces.construct(task, names, jumanji.make, {LIMIT: task.max_episode_steps} | task.arguments)
-    limit = task.max_episode_steps or getattr(env, LIMIT, None)
-    if limit is None:
-        raise no_time_limit_error(task)
-    return JumanjiEnv(env, task, limit)
 
 
 class JumanjiState(NamedTuple):
@@ -49,80 +28,65 @@ class JumanjiState(NamedTuple):
     steps: Int[Array, ""]
 
 
-class JumanjiEnv:
-    """An environment of Jumanji as a `JaxEnv`.
+def make(task: TaskSpec, **_: Any) -> AgentEnv:
+    """Make the environment of a task with the name `jumanji/ID`.
+
+    The task's arguments are arguments of `jumanji.make`. If the environment has a time limit, `max_episode_steps` sets it. Raises
+    `LareError` if it cannot be made, or has several agents or no time limit.
 
     The observation is all arrays of Jumanji's observation but the mask, in the order of its fields, each row by row. Several choices
     at a time are one choice of all their combinations. An episode that ends with a discount of 0 is terminated, as Jumanji says;
     else it is truncated.
     """
+    jumanji = import_package("jumanji", task)
+    names = sorted(jumanji.registered_environments())
+    env = construct(task, names, jumanji.make)
+    if task.max_episode_steps and LIMIT in inspect.signature(type(env).__init__).parameters:
+        env = construct(task, names, jumanji.make, {LIMIT: task.max_episode_steps} | task.arguments)
+    max_steps = task.max_episode_steps or getattr(env, LIMIT, None)
+    if max_steps is None:
+        raise no_time_limit_error(task)
+    action = action_fields(env.action_spec, task.environment)
 
-    def __init__(self, env: Any, task: TaskSpec, max_steps: int):
-        self.env, self._name = env, task.environment
-        specs = jax_spaces.import_package("jumanji.specs", task)
-        self._action = _read_action(env.action_spec, specs, task.environment)
-        with one_line_errors(f"environment {self._name!r} cannot be used"):
-            _, timestep = jax.eval_shape(env.reset, jnp.zeros(2, jnp.uint32))
+    def read(timestep: Any, steps: Any) -> dict[str, Any]:
         if timestep.reward.shape:
             agents = f"each of its {len(timestep.reward)} agents has rewards"
-            raise jax_spaces.unusable(self._name, f"{agents}, and LaRe's adapter of Jumanji has one agent")
-        self.spec = jax_spaces.agent_spec(
-            self._action,
-            observation_size=jax_spaces.flat_size(_observed(timestep.observation)),
-            max_steps=max_steps,
-            masks_actions=_find_mask(timestep.observation) is not None and isinstance(self._action, Choices),
-            measures=jax_spaces.find_measures(task, timestep.extras or {}),
-        )
-
-    def reset(self, key: PRNGKeyArray) -> tuple[JumanjiState, Timestep]:
-        state, timestep = self.env.reset(jax_spaces.raw_key(key))
-        return JumanjiState(jax_spaces.strong_types(state), jnp.zeros((), jnp.int32)), self._make_timestep(timestep, 0)
-
-    def step(
-        self, state: JumanjiState, action: Float[Array, "1 action"], key: PRNGKeyArray
-    ) -> tuple[JumanjiState, Timestep]:
-        """Make one step. The key is not used: Jumanji's state has its own."""
-        next_state, timestep = self.env.step(state.env, self._action.decode(action[0]))
-        steps = state.steps + 1
-        return JumanjiState(jax_spaces.cast_like(next_state, state.env), steps), self._make_timestep(timestep, steps)
-
-    def _make_timestep(self, timestep: Any, steps: Any) -> Timestep:
+            raise unusable(task.environment, f"{agents}, and LaRe's adapter of Jumanji has one agent")
         is_terminal = timestep.last() & (timestep.discount == 0)
-        return jax_spaces.agent_timestep(
-            self.spec,
-            jax_spaces.flatten_tree(_observed(timestep.observation)),
-            reward=timestep.reward,
-            terminated=is_terminal,
-            truncated=(timestep.last() & ~is_terminal) | (steps >= self.spec.max_steps),
-            available=self._read_mask(timestep.observation),
-            measures=timestep.extras,
-        )
+        mask = _find_mask(timestep.observation) if action["discrete"] else None
+        return {
+            "observation": [array for _, array in observed_arrays(timestep.observation)],
+            "reward": timestep.reward,
+            "terminated": is_terminal,
+            "truncated": (timestep.last() & ~is_terminal) | (steps >= max_steps),
+            "available": None if mask is None else mask_combinations(mask, action["choice_sizes"]),
+            "measures": timestep.extras,
+        }
 
-    def _read_mask(self, observation: Any) -> Bool[Array, " action"] | None:
-        mask = _find_mask(observation)
-        return None if mask is None or isinstance(self._action, Bounds) else self._action.mask_combinations(mask)
+    def reset(key: Array) -> tuple[JumanjiState, dict[str, Any]]:
+        state, timestep = env.reset(key)
+        return JumanjiState(state, jnp.zeros((), jnp.int32)), read(timestep, 0)
 
-    def frames(self, states: Any, credit: Any = None) -> list[np.ndarray]:
-        """Return the package's pictures of states, which do not show credit. Raise `LareError` if it cannot draw them here."""
-        return jax_spaces.draw_states(self._name, self._draw, states)
+    def step(state: JumanjiState, action: Array, key: Array) -> tuple[JumanjiState, dict[str, Any]]:
+        next_state, timestep = env.step(state.env, action)  # the key is not used: Jumanji's state has its own
+        steps = state.steps + 1
+        return JumanjiState(next_state, steps), read(timestep, steps)
 
-    def _draw(self, states: Sequence[Any]) -> Sequence[Any]:
-        viewer = self.env.unwrapped._viewer
+    def draw(states: Sequence[JumanjiState]) -> list[np.ndarray]:
+        viewer = env.unwrapped._viewer
         viewer._display = viewer._display_rgb_array  # the viewer was made to open windows
         try:
             return [np.array(viewer.render(state.env)) for state in states]
         finally:
             viewer.close()
 
+    return AgentEnv(task, env, reset, step, draw, max_steps=max_steps, **action)
+
 
 def observed_arrays(observation: Any) -> list[tuple[str, Any]]:
     """Return the names and arrays of an observation, without the mask, in the order in which they are flattened."""
     leaves = jax.tree_util.tree_leaves_with_path(observation)
     return [(jax.tree_util.keystr(path, simple=True, separator="."), x) for path, x in leaves if not _is_mask(path)]
-
-
-def _observed(observation: Any) -> list[Any]:
-    return [leaf for _, leaf in observed_arrays(observation)]
 
 
 def _find_mask(observation: Any) -> Any:
@@ -132,14 +96,3 @@ def _find_mask(observation: Any) -> Any:
 
 def _is_mask(path: tuple[Any, ...]) -> bool:
     return MASK in (getattr(path[-1], "name", None), getattr(path[-1], "key", None))
-
-
-def _read_action(spec: Any, specs: Any, environment: str) -> Choices | Bounds:
-    if isinstance(spec, specs.DiscreteArray):
-        return jax_spaces.make_choices((spec.num_values,), (), environment, spec.dtype)
-    if isinstance(spec, specs.MultiDiscreteArray):
-        sizes = np.asarray(spec.num_values)
-        return jax_spaces.make_choices(sizes.ravel().tolist(), sizes.shape, environment, spec.dtype)
-    if isinstance(spec, specs.BoundedArray) and np.issubdtype(spec.dtype, np.floating):
-        return jax_spaces.make_bounds(spec.minimum, spec.maximum, tuple(spec.shape), environment)
-    raise jax_spaces.unusable_actions(environment, spec)

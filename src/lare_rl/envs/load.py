@@ -24,12 +24,8 @@ def shipped_tasks() -> list[str]:
 def resolve_task(task: TaskSpec | str | Path, playable: bool = True) -> TaskSpec:
     """Return the task of a spec, a shipped name, or the path of a file.
 
-    Args:
-        task: the spec, the name or the path.
-        playable: whether the environment of a name or path must exist and match the task. A spec is returned as it is.
-
-    Raises:
-        LareError: `task` is none of these; and as for `load_task`.
+    If `playable`, the environment of a name or path must exist and match the task. A spec is returned as it is. Raises `LareError`
+    like `load_task`, and for anything else.
     """
     if isinstance(task, TaskSpec):
         return task

@@ -6,44 +6,17 @@ change that.
 """
 
 import contextlib
-import importlib
 import sys
 import warnings
 from collections.abc import Iterator
 from typing import Any
 
-import gymnasium
-
-from lare_rl.errors import LareError, missing_extra_error
-
-__all__ = ["import_mujoco", "mujoco_warnings"]
-
-
-def import_mujoco(name: str) -> None:
-    """Import MuJoCo if the environment is one of Gymnasium's that need it.
-
-    Raises:
-        LareError: MuJoCo is not installed.
-    """
-    spec = gymnasium.registry.get(name)
-    if spec is None or not str(spec.entry_point).startswith("gymnasium.envs.mujoco"):
-        return
-    try:
-        importlib.import_module("mujoco")
-    except ModuleNotFoundError as missing:
-        if missing.name == "mujoco":
-            raise missing_extra_error(f"environment {name!r}", "mujoco") from missing
-        raise
-    except ImportError as error:  # parts of it are missing, after an upgrade say, and it says how to repair that
-        raise LareError(" ".join(str(error).split())) from error
+__all__ = ["mujoco_warnings"]
 
 
 @contextlib.contextmanager
 def mujoco_warnings(name: str) -> Iterator[None]:
-    """Make an environment in this block. If MuJoCo is imported, its warnings become warnings of Python.
-
-    Warnings of deprecated attributes are dropped.
-    """
+    """Make an environment in this block. MuJoCo's warnings become warnings of Python, except those of deprecated attributes."""
     mujoco: Any = sys.modules.get("mujoco")  # its type stubs lack these functions
     if mujoco is None:
         yield

@@ -9,9 +9,9 @@ from typing import Any
 
 import numpy as np
 
-from lare_rl.envs.env_errors import one_line_errors
+from lare_rl.envs.env_errors import import_hint, one_line_errors
 from lare_rl.envs.interface import Team
-from lare_rl.errors import LareError, did_you_mean, install_command, short_repr
+from lare_rl.errors import LareError, did_you_mean, short_repr
 from lare_rl.tasks.spec import PETTINGZOO_PREFIX, TaskSpec, split_environment
 from lare_rl.tasks.trust import trusted_modules
 
@@ -25,11 +25,7 @@ TIME_LIMITS = ("max_cycles", "max_episode_steps")
 
 
 def make_parallel_env(name: str, arguments: Mapping[str, Any]) -> Any:
-    """Return the ParallelEnv that `pettingzoo/MODULE:MAKER` makes from the arguments.
-
-    Raises:
-        LareError: it cannot be made, or is not a ParallelEnv.
-    """
+    """Return the ParallelEnv that `pettingzoo/MODULE:MAKER` makes from the arguments. Raises `LareError` if it makes none."""
     module_name, maker_name = split_environment(name)
     if not (module_name and maker_name):
         raise LareError(
@@ -37,7 +33,7 @@ def make_parallel_env(name: str, arguments: Mapping[str, Any]) -> Any:
             f"like {PETTINGZOO_PREFIX}mpe2.simple_spread_v3:parallel_env."
         )
     message = f"environment {name!r} cannot be made"
-    with warnings.catch_warnings(), one_line_errors(message, _make_hint):
+    with warnings.catch_warnings(), one_line_errors(message, import_hint):
         warnings.filterwarnings("ignore", message="The old environment creation API", category=DeprecationWarning)
         module = importlib.import_module(module_name)
         if not hasattr(module, maker_name):
@@ -64,14 +60,6 @@ def _check_maker(maker: Any, name: str) -> None:
         )
 
 
-def _make_hint(error: BaseException) -> str:
-    if not isinstance(error, ModuleNotFoundError):
-        return ""
-    if (error.name or "").partition(".")[0] == "pettingzoo":
-        return f" (PettingZoo is an extra: {install_command('pettingzoo')})"
-    return " (a module in this folder is found with PYTHONPATH=.)"
-
-
 def find_time_limit(env: Any, arguments: Mapping[str, Any]) -> int | None:
     """Return an environment's own time limit (steps), if the environment or its arguments contain one."""
     unwrapped = getattr(env, "unwrapped", env)
@@ -89,8 +77,7 @@ def agent_kind(name: Any) -> str:
 def group_by_team(names: Sequence[Any], task: TaskSpec) -> tuple[list[Any], tuple[Team, ...]]:
     """Return the agents' names, team by team, and the teams.
 
-    Raises:
-        LareError: an agent is in no team or in several, or a team has no agents.
+    Raises `LareError` if an agent is in no team or in several, or if a team has no agents.
     """
     patterns = "; ".join(f"{role.team or role.name}: {', '.join(role.agents) or 'all'}" for role in task.roles)
     teams = {role.team or role.name: [name for name in names if _is_member(name, role)] for role in task.roles}

@@ -6,15 +6,15 @@ Agents and spaces are checked once. The values of each step are checked, but not
 import contextlib
 import logging
 from collections.abc import Callable, Mapping
+from functools import partial
 from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float
 
-from lare_rl.envs import env_errors
 from lare_rl.envs.agent_arrays import Agent, AgentArrays, make_agent
-from lare_rl.envs.env_errors import EnvOutputError, one_line_errors, read_measures, to_float
-from lare_rl.envs.interface import EnvSpec, Timestep
+from lare_rl.envs.env_errors import EnvOutputError, no_time_limit_error, one_line_errors, read_measures, to_float
+from lare_rl.envs.interface import Timestep
 from lare_rl.envs.pettingzoo_construct import find_time_limit, group_by_team, make_parallel_env
 from lare_rl.envs.spaces import float_array
 from lare_rl.errors import LareError, short_repr
@@ -42,13 +42,10 @@ class ParallelHost:
     acted still observe the result, because `phi` may read it.
     """
 
-    spec: EnvSpec
-
     def __init__(self, environment: Any, task: TaskSpec):
         """Prepare the environment, and reset it once.
 
-        Raises:
-            LareError: the agents, spaces or first observations cannot be used, or there is no time limit.
+        Raises `LareError` if the agents, spaces or first observations cannot be used, or if there is no time limit.
         """
         self.environment, self._task, self._name = environment, task, task.environment
         names = list(environment.possible_agents or ())
@@ -64,7 +61,7 @@ class ParallelHost:
             raise LareError(f"environment {self._name!r}: {error}") from None
         max_steps = task.max_episode_steps or find_time_limit(environment, task.arguments)
         if max_steps is None:
-            raise env_errors.no_time_limit_error(task)
+            raise no_time_limit_error(task)
         self._available = self.layout.available
         self._masks_actions = any(agent.observes_mask for agent in agents) or not self._available.all()
         self._credit_from_state = any(role.credit_scope == "state" for role in (task, *task.teams))
@@ -173,11 +170,8 @@ class ParallelHost:
             if required:
                 raise self._error(f" returned no {name} for {agent.name}") from None
             return 0
-        return self._convert(name, agent, convert, value)
-
-    def _convert(self, name: str, agent: Agent, convert: Callable[..., Any], *values: Any) -> Any:
         try:
-            return convert(*values)
+            return convert(value)
         except ValueError as error:
             raise self._error(f": the {name} of {agent.name} {error}") from None
 
@@ -198,11 +192,15 @@ class ParallelHost:
             if observes[index]:
                 vectors[index] = self._read("observation", observations, agent, agent.flatten_observation, True)
                 if acts[index]:
-                    observation, info = observations[agent.name], infos.get(agent.name)
-                    mask = self._convert("action mask", agent, agent.read_mask, observation, info)
+                    read_mask = partial(agent.read_mask, info=infos.get(agent.name))
+                    mask = self._read("action mask", observations, agent, read_mask, True)
                     if mask is not None:
                         available[index, : agent.action_size] = mask
-                        self._check_masks_are_known(agent)
+                        self._masks_actions |= self._initialising
+                    if mask is not None and not self._masks_actions:
+                        raise self._error(
+                            f" returned an action mask for {agent.name}, but none at its first reset. Return masks at every step."
+                        )
             elif self.layout.discrete:
                 available[index] = np.arange(self.layout.action_size) == 0
         observation = self.layout.pad_observations(vectors)
@@ -218,19 +216,8 @@ class ParallelHost:
             measures=read_measures(reports, self._task, last=last),
         )
 
-    def _check_masks_are_known(self, agent: Agent) -> None:
-        if self._initialising:
-            self._masks_actions = True
-        elif not self._masks_actions:
-            raise self._error(
-                f" returned an action mask for {agent.name}, but none at its first reset. Return masks at every step."
-            )
-
     def _read_state(self, observation: Float[np.ndarray, "agents observation"]) -> Float[np.ndarray, " state"]:
-        """Return the environment's state.
-
-        Without one, return all observations if credit is assigned from the state, else an empty array.
-        """
+        """Return the environment's state. Without one: all observations if credit is assigned from the state, else nothing."""
         if self._initialising or self._state is not None:
             self._update_state()
         if self._state is not None:
@@ -241,13 +228,13 @@ class ParallelHost:
         if not callable(getattr(self.environment, "state", None)):
             return
         try:
-            value = self.environment.state()
-        except (Exception, SystemExit) as error:
-            if self._initialising and isinstance(error, NotImplementedError):
+            with one_line_errors(f"environment {self._name!r} failed in state"):
+                value = self.environment.state()
+        except LareError as error:
+            if self._initialising and isinstance(error.__cause__, NotImplementedError):
                 return  # from PettingZoo's base class: the environment has no state
-            error = env_errors.as_lare_error(f"environment {self._name!r} failed in state", error)
             if self._initialising or self._credit_from_state:
-                raise error from None
+                raise
             # Only a critic reads the state: keep the previous one. Multiwalker has no state once an agent has fallen.
             if not self._state_failed:
                 logging.getLogger(__name__).warning("%s; the previous state is used instead", error)

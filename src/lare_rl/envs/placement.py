@@ -9,13 +9,13 @@ import contextlib
 import logging
 import math
 from functools import lru_cache
-from typing import Any, NoReturn
+from typing import NoReturn
 
 import gymnasium
 import numpy as np
 from jaxtyping import Float
 
-from lare_rl.envs.families import FAMILIES, is_gymnasium, load_env_spec, make_host_env, picklable_maker
+from lare_rl.envs.families import GYMNASIUM, find_family, load_env_spec, make_host_env, picklable_maker
 from lare_rl.envs.interface import Timestep
 from lare_rl.envs.trials import time_steps
 from lare_rl.envs.vec_env import LocalVecEnv, VecEnv
@@ -44,8 +44,6 @@ SECOND_TIMEOUT_S = 30.0
 
 MIN_SAVED_S = 3e-4
 """Workers are used if they make a step of all environments at least this much faster. A call of all workers costs about as much."""
-
-_TIMEOUT_HINT = "; if it needs longer, set timeout in the task file"
 
 _log = logging.getLogger(__name__)
 
@@ -88,13 +86,12 @@ def make_vec_env(task: TaskSpec, n: int, parallel: bool = False) -> VecEnv:
     if needs_process(task):
         return _make_separate(task, n)
     makers = [picklable_maker(task)] * n
-    options: dict[str, Any] = {"timeout": task.timeout, "timeout_hint": _TIMEOUT_HINT}
     if parallel:
-        return SubprocVecEnv(makers, **options)
+        return SubprocVecEnv(makers, timeout=task.timeout)
     n_saved = n - math.ceil(n / n_usable_cores())
     if n_saved and n_saved * measure_step_s(task) > MIN_SAVED_S:
         with contextlib.suppress(LareError):
-            return SubprocVecEnv(makers, **options)
+            return SubprocVecEnv(makers, timeout=task.timeout)
     return LocalVecEnv(makers)
 
 
@@ -151,8 +148,7 @@ def _measure_task(task_json: str) -> float:
 
 
 def _make_separate(task: TaskSpec, n: int) -> SubprocVecEnv:
-    key = task.model_dump_json()
-    return SubprocVecEnv([picklable_maker(task)] * n, n, task.timeout, _TIMEOUT_HINT, key)
+    return SubprocVecEnv([picklable_maker(task)] * n, timeout=task.timeout, reuse_key=task.model_dump_json())
 
 
 def _select_row(batch: Timestep) -> Timestep:
@@ -164,12 +160,12 @@ def _select_row(batch: Timestep) -> Timestep:
 def _find_package(task: TaskSpec) -> str | None:
     """Return the package of a task's environment, or None if another process could not import it."""
     module, name = split_environment(task.environment)
-    if is_gymnasium(task):
+    family = find_family(task)
+    if family is GYMNASIUM:
         entry_point = gymnasium.registry[name].entry_point if name in gymnasium.registry else None
         if isinstance(entry_point, str):
             module = module or entry_point.partition(":")[0]
     elif not task.environment.startswith(PETTINGZOO_PREFIX):
-        maker = FAMILIES[task.family].maker
-        module = maker if isinstance(maker, str) else maker.__module__
-    package = module.partition(":")[0].partition(".")[0]
+        module = family.module
+    package = module.partition(".")[0]
     return None if package in ("", "__main__") else package

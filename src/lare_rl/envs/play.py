@@ -21,7 +21,6 @@ __all__ = [
     "find_team",
     "make_episode",
     "phi_inputs",
-    "play_episode",
     "play_episodes",
     "play_roles",
     "play_steps",
@@ -101,14 +100,9 @@ def play_episodes(
     with contextlib.closing(make_host_env(role)) as env:
         rng = np.random.default_rng(seed)
         for number in range(n_episodes):
-            episodes.append(play_episode(env, role, policy, rng, seed + number))
+            episodes += play_roles(env, (role,), policy, rng, seed + number)
             on_episode(len(episodes))
     return episodes
-
-
-def play_episode(env: HostEnv, role: TaskSpec, policy: Policy | None, rng: np.random.Generator, seed: int) -> Episode:
-    """Play one episode. See `play_episodes`."""
-    return play_roles(env, (role,), policy, rng, seed)[0]
 
 
 def play_roles(

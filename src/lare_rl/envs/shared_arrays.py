@@ -15,10 +15,7 @@ from jaxtyping import Bool, Float, Int, Shaped
 from lare_rl.envs.interface import EnvSpec, Timestep
 from lare_rl.envs.vec_env import empty_batch
 
-__all__ = ["MAX_WORKERS", "SharedArrays", "map_arrays", "map_current", "open_directory", "open_shared_memory"]
-
-MAX_WORKERS = mmap.PAGESIZE // np.dtype(np.int64).itemsize
-"""A page of the shared memory has room for a number of each."""
+__all__ = ["SharedArrays", "map_arrays", "map_current", "open_shared_memory"]
 
 
 class SharedArrays(NamedTuple):
@@ -35,20 +32,16 @@ class SharedArrays(NamedTuple):
 
 
 @contextlib.contextmanager
-def open_directory() -> Iterator[str]:
-    """Yield a new directory, in memory if the system has such a file system."""
-    memory = "/dev/shm"
-    with tempfile.TemporaryDirectory(prefix="lare-", dir=memory if os.path.isdir(memory) else None) as directory:
-        yield directory
-
-
-@contextlib.contextmanager
 def open_shared_memory() -> Iterator[str]:
-    """Yield the beginning of names of memory. What is mapped until the end lasts as long as a process has mapped it."""
+    """Yield the beginning of names of memory. What is mapped until the end lasts as long as a process has mapped it.
+
+    It is a new directory, which only this user may read; on Windows, a name that nothing else has.
+    """
     if sys.platform == "win32":
         yield f"lare-{uuid4().hex}-"
         return
-    with open_directory() as directory:
+    in_memory = "/dev/shm" if os.path.isdir("/dev/shm") else None
+    with tempfile.TemporaryDirectory(prefix="lare-", dir=in_memory) as directory:
         yield f"{directory}/"
 
 
@@ -64,9 +57,9 @@ def _map(name: str, size: int) -> mmap.mmap:
         return mmap.mmap(file.fileno(), size)
 
 
-def map_current(prefix: str) -> Int[np.ndarray, " workers"]:
-    """Map a page of the memory with these names: the index of the environment that each worker calls now."""
-    return np.frombuffer(_map(prefix + "current", mmap.PAGESIZE), np.int64)
+def map_current(prefix: str, n_workers: int) -> Int[np.ndarray, " workers"]:
+    """Map a part of the memory with these names: the index of the environment that each worker calls now."""
+    return np.frombuffer(_map(prefix + "current", n_workers * np.dtype(np.int64).itemsize), np.int64)
 
 
 def map_arrays(prefix: str, spec: EnvSpec, n: int) -> SharedArrays:
@@ -80,7 +73,7 @@ def map_arrays(prefix: str, spec: EnvSpec, n: int) -> SharedArrays:
         np.ndarray(array.shape, array.dtype, memory, start)
         for array, start in zip(arrays, starts[:-1].tolist(), strict=True)
     )
-    n_measures = len(spec.measures)
-    fields, measures = columns[: len(columns) - n_measures], columns[len(columns) - n_measures :]
-    timestep = Timestep(*fields, measures=dict(zip(spec.measures, measures, strict=True)))  # pyright: ignore[reportCallIssue]
+    n_columns = len(batch) - 1
+    measures = dict(zip(spec.measures, columns[n_columns:], strict=True))
+    timestep = Timestep(*columns[:n_columns], measures=measures)  # pyright: ignore[reportCallIssue]
     return SharedArrays(where, seed, action, timestep)

@@ -10,17 +10,13 @@ from jaxtyping import Float
 
 from lare_rl.errors import LareError, short_repr
 
-__all__ = ["check_spaces", "decode_box", "flatten_value", "float_array"]
+__all__ = ["check_spaces", "flatten_value", "float_array"]
 
 
 def check_spaces(owner: Any, observation: gymnasium.Space, action: gymnasium.Space) -> None:
-    """Check that observations can be flattened, and that actions are discrete or bounded.
+    """Raise `LareError` if observations cannot be flattened, or actions are neither discrete nor bounded.
 
-    Args:
-        owner: the name of the environment or agent, for the message.
-
-    Raises:
-        LareError: a space cannot be used.
+    `owner` is the name of the environment or agent, for the message.
     """
     if not observation.is_np_flattenable:
         raise LareError(f"the observation space of {owner} is {short_repr(observation)}, which cannot be flattened")
@@ -33,19 +29,10 @@ def check_spaces(owner: Any, observation: gymnasium.Space, action: gymnasium.Spa
         raise LareError(f"the actions of {owner} have no bounds: {short_repr(action)}")
 
 
-def decode_box(space: Box, vector: Float[np.ndarray, " size"]) -> np.ndarray:
-    """Return the action of a space that a vector stands for. Integers are rounded."""
-    clipped = np.clip(vector.reshape(space.shape), space.low, space.high)
-    return (np.rint(clipped) if space.dtype.kind in "iu" else clipped).astype(space.dtype)
-
-
 def flatten_value(space: gymnasium.Space, value: Any) -> Float[np.ndarray, " size"]:
-    """Return a value of a space as a new vector, in the order of `gymnasium.spaces.flatten`.
+    """Return a value of a space as a new vector, in the order of `gymnasium.spaces.flatten`, which does not check values.
 
-    Unlike Gymnasium's function, this one checks the value.
-
-    Raises:
-        ValueError: the value is not in the space. The message is the predicate of a sentence, such as "has the shape (3,), not (2,)".
+    Raises `ValueError` if the value is not in the space. The message is a predicate, such as "has the shape (3,), not (2,)".
     """
     if isinstance(space, Box):
         return float_array(value, space.shape).ravel()
@@ -77,8 +64,7 @@ def _flatten_all(pairs: Iterable[tuple[gymnasium.Space, Any]]) -> Float[np.ndarr
 def float_array(value: Any, shape: tuple[int, ...] | None = None) -> Float[np.ndarray, "..."]:
     """Return a value as a new float32 array.
 
-    Raises:
-        ValueError: the value is not an array of numbers, or has another shape. The message is a predicate.
+    Raises `ValueError`, whose message is a predicate, if it is not an array of numbers, or has another shape.
     """
     try:
         with np.errstate(over="ignore"):  # numbers beyond float32 become infinite, which `check_finite` refuses

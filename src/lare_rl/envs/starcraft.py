@@ -40,17 +40,10 @@ def make(task: TaskSpec, **_: Any) -> "StarCraft":
 class StarCraft:
     """A map of SMAC as a `HostEnv`. The actions are SMAC's: no-op, stop, north, south, east, west, and to attack each enemy."""
 
-    spec: EnvSpec
-
     def __init__(self, name: str, make_game: Callable[..., Any] | None = None):
-        """Make the game.
+        """Make the game of a map, by default with SMAC's class.
 
-        Args:
-            name: the name of the map.
-            make_game: a function that makes the game. Default: SMAC's class.
-
-        Raises:
-            LareError: the package, StarCraft II or the map is missing.
+        Raises `LareError` if the package, StarCraft II or the map is missing.
         """
         self._name, self._make_game = name, make_game or _find_game()
         self._game: Any = None
@@ -89,14 +82,10 @@ class StarCraft:
     def step(self, action: Float[np.ndarray, "agents action"]) -> Timestep:
         """Make one step. If the game crashes, the episode is truncated, and the next `reset` starts the game again.
 
-        Raises:
-            LareError: an action is not available, or the game has crashed too often.
+        Raises `LareError` if SMAC refuses an action, or if the game has crashed too often.
         """
-        choices = np.argmax(action, axis=1).tolist()
-        for agent, choice in enumerate(choices):
-            if not self._timestep.available[agent, choice]:
-                raise LareError(f"agent {agent} of {self._name} chose the action {choice}, which is not available")
-        reward, done, info = self._game.step(choices)
+        with one_line_errors(f"StarCraft II failed in a step of {self._name!r}"):
+            reward, done, info = self._game.step(np.argmax(action, axis=1).tolist())
         if done and not info:  # SMAC reports a crash only in this way
             return self._handle_crash()
         self._steps += 1

@@ -34,8 +34,7 @@ def time_steps(env: HostEnv) -> float:
 
 def find_interference(env: HostEnv, maker: Maker) -> str | None:
     """Make a second environment in this process, and step both by turns. Return what goes wrong, or None."""
-    alone = [observation.copy() for observation in _play(env)]
-    same_again = _are_equal(alone, list(_play(env)))
+    alone, again = (np.array([observation.copy() for observation in _play(env)]) for _ in range(2))
     observations = []
     try:
         with one_line_errors("a second environment fails in the same process"):
@@ -45,7 +44,7 @@ def find_interference(env: HostEnv, maker: Maker) -> str | None:
             list(_play(env))  # closing the second may end the first
     except LareError as error:
         return str(error)
-    if same_again and not _are_equal(alone[: len(observations)], observations):
+    if np.array_equal(alone, again) and not np.array_equal(alone[: len(observations)], observations):
         return "a second environment in the same process changes the observations of the first"
     return None
 
@@ -65,7 +64,3 @@ def _play(env: HostEnv, seed: int = 0) -> Iterator[np.ndarray]:
             return
         timestep = env.step(fixed_action(env.spec, timestep))
         yield timestep.observation
-
-
-def _are_equal(first: list[np.ndarray], second: list[np.ndarray]) -> bool:
-    return len(first) == len(second) and all(map(np.array_equal, first, second))

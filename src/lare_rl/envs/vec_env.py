@@ -8,10 +8,20 @@ import numpy as np
 from jaxtyping import Bool, Float, Integer, Shaped
 
 from lare_rl.envs.env_errors import EnvOutputError, check_finite, one_line_errors
-from lare_rl.envs.interface import EnvSpec, HostEnv, Timestep
+from lare_rl.envs.interface import EnvSpec, HostEnv, JaxEnv, Timestep
 from lare_rl.errors import LareError, short_repr
 
-__all__ = ["LocalVecEnv", "Maker", "VecEnv", "call_env", "check_same_sizes", "empty_batch", "make_env_at"]
+__all__ = [
+    "LocalVecEnv",
+    "Maker",
+    "VecEnv",
+    "call_env",
+    "check_jax_env",
+    "check_lengths",
+    "check_same_sizes",
+    "empty_batch",
+    "make_env_at",
+]
 
 Maker = Callable[[], HostEnv]
 
@@ -37,7 +47,7 @@ class VecEnv(ABC):
         """Start an episode in the selected environments."""
         self._call("reset", seeds, where)
         self._length[where] = 0
-        self._check(where)
+        self._check_lengths()
         return self.batch
 
     def step(
@@ -47,23 +57,11 @@ class VecEnv(ABC):
         where = np.ones(len(action), bool) if where is None else where
         self._call("step", action, where)
         self._length[where] += 1
-        self._check(where)
+        self._check_lengths()
         return self.batch
 
-    def _check(self, where: Bool[np.ndarray, " n"]) -> None:
-        """Raise `EnvOutputError` if an episode is longer or shorter than the specification says."""
-        max_steps, ended = self.spec.max_steps, np.logical_or(self.batch.terminated, self.batch.truncated)
-        at_limit = self._length >= max_steps
-        invalid = where & ((at_limit != ended) if self.spec.fixed_length else (at_limit & ~ended))
-        if invalid.any():
-            index = int(np.argmax(invalid))
-            length = int(self._length[index])
-            problem = f"the episode has {length} steps and has not ended, but max_steps is {max_steps}"
-            if ended[index]:
-                problem = f"the episode ended after {length} steps, but fixed_length says that all have {max_steps}"
-            error = EnvOutputError(f"environment {index}: {problem}")
-            error.env_index = index
-            raise error
+    def _check_lengths(self) -> None:
+        check_lengths(self.spec, self._length, np.logical_or(self.batch.terminated, self.batch.truncated))
 
     @abstractmethod
     def _call(self, command: str, arguments: Shaped[np.ndarray, "n *rest"], where: Bool[np.ndarray, " n"]) -> None:
@@ -103,27 +101,64 @@ def make_env_at(env_index: int, maker: Maker) -> HostEnv:
         return maker()
 
 
+def check_lengths(spec: EnvSpec, length: Integer[np.ndarray, " n"], ended: Bool[np.ndarray, " n"]) -> None:
+    """Raise `EnvOutputError` if an episode is longer or shorter than the specification says.
+
+    `length` is the number of steps that each episode has at present, and `ended` says whether it has ended.
+    """
+    at_limit = length >= spec.max_steps
+    wrong = (at_limit != ended) if spec.fixed_length else (at_limit & ~ended)
+    if wrong.any():
+        index = int(np.argmax(wrong))
+        problem = f"the episode has {length[index]} steps and has not ended, but max_steps is {spec.max_steps}"
+        if ended[index]:
+            problem = (
+                f"the episode ended after {length[index]} steps, but fixed_length says that all have {spec.max_steps}"
+            )
+        raise EnvOutputError(f"environment {index}: {problem}", index)
+
+
+def check_jax_env(env: JaxEnv, owner: str) -> None:
+    """Raise `EnvOutputError` if `reset` or `step` returns other arrays than the specification says, or lacks a measure."""
+    import jax  # not in worker processes
+
+    batch, key = empty_batch(env.spec, 1), jax.random.key(0)
+    state, first = jax.eval_shape(env.reset, key)
+    action = jax.ShapeDtypeStruct((env.spec.n_agents, env.spec.action_size), np.float32)
+    _, second = jax.eval_shape(env.step, state, action, key)
+    for function, timestep in (("reset", first), ("step", second)):
+        _check_shapes(timestep, batch, owner, function)
+        for name in batch.measures.keys() - timestep.measures.keys():
+            raise EnvOutputError(f"{owner}: {function} returns no measure {name!r}, which its spec names")
+
+
+def _check_shapes(timestep: Any, batch: Timestep, owner: str, function: str) -> None:
+    """Raise `EnvOutputError` if the arrays of a timestep have other shapes than the rows of a batch."""
+    if not isinstance(timestep, Timestep):
+        raise EnvOutputError(f"{owner}: {function} must return a Timestep, not {short_repr(timestep)}")
+    (*columns, _), (*values, _) = batch, timestep
+    for name, column, value in zip(Timestep._fields, columns, values, strict=False):
+        if np.shape(value) != column.shape[1:]:
+            shapes = f"{np.shape(value)}, not {column.shape[1:]}"
+            raise EnvOutputError(f"{owner}: {name} of {function} has the shape {shapes}")
+
+
 def call_env(env_index: int, env: HostEnv, command: str, argument: Any, batch: Timestep) -> None:
     """Call "reset" or "step" of an environment, check its timestep, and write it into a row of the batch."""
     *columns, measures = batch
+    owner = f"environment {env_index}"
     try:
-        with one_line_errors(f"environment {env_index} failed in {command}"):
+        with one_line_errors(f"{owner} failed in {command}"):
             timestep = env.reset(int(argument)) if command == "reset" else env.step(argument)
-            if not isinstance(timestep, Timestep):
-                raise EnvOutputError(
-                    f"environment {env_index}: {command} must return a Timestep, not {short_repr(timestep)}"
-                )
+            _check_shapes(timestep, batch, owner, command)
             *values, new_measures = timestep
-            for name, column, value in zip(Timestep._fields, columns, values, strict=False):
-                if np.shape(value) != column.shape[1:]:
-                    shapes = f"{np.shape(value)}, not {column.shape[1:]}"
-                    raise EnvOutputError(f"environment {env_index}: {name} has the shape {shapes}")
+            for column, value in zip(columns, values, strict=True):
                 column[env_index] = value
             row = Timestep(*(column[env_index] for column in columns), measures={})  # as float32, which may be infinite
-            check_finite(row, env.spec, f"environment {env_index}")
+            check_finite(row, env.spec, owner)
             for name, value in new_measures.items():
                 if name not in measures:
-                    raise EnvOutputError(f"environment {env_index}: the measure {name!r} is not in EnvSpec.measures")
+                    raise EnvOutputError(f"{owner}: the measure {name!r} is not in EnvSpec.measures")
                 measures[name][env_index] = value
     except EnvOutputError as error:
         error.env_index = env_index

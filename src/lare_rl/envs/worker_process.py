@@ -15,8 +15,8 @@ import threading
 import time
 from collections.abc import Iterable, Mapping, Sequence
 from functools import partial
-from multiprocessing.connection import Connection
-from typing import Any, NamedTuple
+from multiprocessing.connection import Client, Connection, Listener
+from typing import Any
 
 import numpy as np
 from jaxtyping import Int
@@ -26,7 +26,6 @@ from lare_rl.envs.interface import EnvSpec, HostEnv
 from lare_rl.envs.shared_arrays import SharedArrays, map_arrays, map_current
 from lare_rl.envs.trials import find_interference, time_steps
 from lare_rl.envs.vec_env import Maker, call_env, make_env_at
-from lare_rl.envs.worker_connection import connect, listen, open_address
 from lare_rl.errors import LareError
 from lare_rl.util.processes import own_session
 
@@ -34,28 +33,21 @@ __all__ = ["Worker", "end_workers", "pickle_maker"]
 
 PROGRAM = "import sys; from lare_rl.envs.worker_process import _serve; _serve(sys.argv[1])"
 
+CONNECT_TIMEOUT_S = 120.0
+"""A worker must listen within this time: it imports modules first."""
+POLL_S = 0.01
 CLOSE_TIMEOUT_S = 2.0
 """Workers must close their environments within this time."""
-
-
-class _Failure(NamedTuple):
-    """An error that a worker sends instead of a reply. Exceptions with attributes cannot be pickled reliably."""
-
-    message: str
-    env_index: int | None
-
-    def to_error(self) -> LareError:
-        if self.env_index is None:
-            return LareError(self.message)
-        error = EnvOutputError(self.message)
-        error.env_index = self.env_index
-        return error
 
 
 class Worker:
     """A worker process and its environments, from the parent's side."""
 
-    def __init__(self):
+    def __init__(self, memory: str, worker_index: int):
+        """Start the process, which listens at a socket beside the shared memory; on Windows, at a named pipe."""
+        self._address = f"{memory}socket{worker_index}"
+        if sys.platform == "win32":
+            self._address = rf"\\.\pipe\{self._address}"
         self.env_indices: Sequence[int] = ()
         self.specs: tuple[EnvSpec, ...] = ()
         """The specifications of its environments, once they are made."""
@@ -66,9 +58,8 @@ class Worker:
         self.last_active, self._last_index = time.monotonic(), 0
         self._current = np.zeros(1, np.int64)
         self.connection: Connection
-        """From `attach` on."""
-        self._is_connected, self._stack = False, contextlib.ExitStack()
-        self._address = self._stack.enter_context(open_address())
+        """From `start_making` on."""
+        self._is_connected = False
         # The same import paths as in this process, and one thread, so that other workers can use the other cores.
         paths = os.pathsep.join(path or os.getcwd() for path in sys.path)
         variables = {"OMP_NUM_THREADS": "1"} | os.environ | {"PYTHONPATH": paths}
@@ -76,19 +67,24 @@ class Worker:
             [sys.executable, "-P", "-c", PROGRAM, self._address], stdin=subprocess.PIPE, env=variables, **own_session()
         )
 
-    def attach(self, env_indices: Sequence[int], memory: str, worker_index: int) -> None:
-        """Number the environments anew, and use other memory."""
-        self.env_indices, self._current = env_indices, map_current(memory)[worker_index : worker_index + 1]
-        self._current[0] = env_indices[0]
-        if not self._is_connected:
+    def start_making(self, makers: Mapping[int, Maker], memory: str, worker_index: int, n_workers: int) -> None:
+        """Number the environments anew, and use other memory. The makers of environments are ignored if they are made already."""
+        self.env_indices, self._current = list(makers), map_current(memory, n_workers)[worker_index : worker_index + 1]
+        self._current[0] = self.env_indices[0]
+        self._connect()
+        pickled = [] if self.specs else [pickle_maker(index, maker) for index, maker in makers.items()]
+        self.send("make", (worker_index, n_workers, self.env_indices, memory, pickled))
+
+    def _connect(self) -> None:
+        """Connect to the process as soon as it listens, if that has not been done. Raises `LareError` if it ends or takes too long."""
+        deadline = time.monotonic() + CONNECT_TIMEOUT_S
+        while not self._is_connected:
             try:
-                self.connection = connect(self._address, self.process)
-            except OSError:
-                raise self._make_death_error() from None
-            self._is_connected = True
-            self._stack.close()
-        self.send("attach", (worker_index, tuple(env_indices), memory))
-        self.is_busy = False  # this command has no reply
+                self.connection, self._is_connected = Client(self._address), True
+            except (FileNotFoundError, ConnectionRefusedError):  # it does not listen yet
+                if self.process.poll() is not None or time.monotonic() > deadline:
+                    raise self._make_death_error() from None
+                time.sleep(POLL_S)
 
     @property
     def label(self) -> str:
@@ -114,8 +110,8 @@ class Worker:
         except (EOFError, OSError):
             raise self._make_death_error() from None
         self.is_busy = False
-        if isinstance(reply, _Failure):
-            raise reply.to_error()
+        if isinstance(reply, LareError):
+            raise reply
         return reply
 
     def _make_death_error(self) -> LareError:
@@ -129,7 +125,6 @@ class Worker:
 
     def close_connection(self) -> None:
         """Ask the worker to end."""
-        self._stack.close()
         if self._is_connected:
             self.connection.close()
 
@@ -154,7 +149,7 @@ def end_workers(workers: Iterable[Worker]) -> None:
 
 
 def pickle_maker(env_index: int, maker: Maker) -> bytes:
-    """Return what the commands "make" and "second" need. Raises `LareError` if the maker cannot be pickled."""
+    """Return a maker for the commands "make" and "second". Raises `LareError` if it cannot be pickled."""
     with one_line_errors(f"environment {env_index} cannot be sent to a worker process"):
         return pickle.dumps(maker)
 
@@ -162,22 +157,23 @@ def pickle_maker(env_index: int, maker: Maker) -> bytes:
 def _serve(address: str) -> None:
     """Run a worker: make, reset and step environments, with a reply to each command, until the connection closes."""
     threading.Thread(target=_end_with_parent, daemon=True).start()
-    connection = listen(address)
+    listener = Listener(address)
+    connection = listener.accept()
+    with contextlib.suppress(FileNotFoundError):  # the parent may have removed the socket already
+        listener.close()
     envs: dict[int, HostEnv] = {}
     memory, current, shared = "", np.zeros(1, np.int64), None
     with contextlib.suppress(EOFError, BrokenPipeError, ConnectionResetError):
         while True:
             command, argument = connection.recv()
-            if command == "attach":
-                worker_index, env_indices, memory = argument
-                current, shared = map_current(memory)[worker_index : worker_index + 1], None
-                envs = dict(zip(env_indices, envs.values(), strict=False))  # before "make", there are none
-                continue
             reply = None
             try:
                 if command == "make":
                     start = time.perf_counter()
-                    for index, pickled in argument.items():
+                    worker_index, n_workers, env_indices, memory, makers = argument
+                    current = map_current(memory, n_workers)[worker_index : worker_index + 1]
+                    envs = dict(zip(env_indices, envs.values(), strict=False))  # those that are made already
+                    for index, pickled in zip(env_indices, makers, strict=False):
                         current[0] = index
                         envs[index] = make_env_at(index, partial(_unpickle_and_make, pickled))
                     reply = tuple(env.spec for env in envs.values()), time.perf_counter() - start
@@ -190,8 +186,10 @@ def _serve(address: str) -> None:
                 else:
                     assert shared is not None
                     _call_envs(envs, command, shared, current)
+            except EnvOutputError as error:
+                reply = EnvOutputError(str(error), error.env_index)
             except LareError as error:
-                reply = _Failure(str(error), error.env_index if isinstance(error, EnvOutputError) else None)
+                reply = LareError(str(error))  # another class may be defined where the parent cannot import it
             connection.send(reply)
     for env in envs.values():
         with contextlib.suppress(Exception):

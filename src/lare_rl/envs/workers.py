@@ -16,7 +16,7 @@ import numpy as np
 from jaxtyping import Bool, Shaped
 
 from lare_rl.envs.interface import EnvSpec
-from lare_rl.envs.shared_arrays import MAX_WORKERS, SharedArrays, map_arrays, open_shared_memory
+from lare_rl.envs.shared_arrays import map_arrays, open_shared_memory
 from lare_rl.envs.vec_env import Maker, VecEnv, check_same_sizes
 from lare_rl.envs.worker_process import Worker, end_workers, pickle_maker
 from lare_rl.errors import LareError
@@ -45,12 +45,7 @@ class SubprocVecEnv(VecEnv):
     """Environments in separate processes, several in each process if there are more environments than cores."""
 
     def __init__(
-        self,
-        makers: Sequence[Maker],
-        processes: int | None = None,
-        timeout: float = 60.0,
-        timeout_hint: str = "",
-        reuse_key: str = "",
+        self, makers: Sequence[Maker], processes: int | None = None, timeout: float = 60.0, reuse_key: str = ""
     ):
         """Start the processes and make the environments.
 
@@ -58,29 +53,26 @@ class SubprocVecEnv(VecEnv):
             makers: one function for each environment. It must be possible to pickle them.
             processes: the number of processes. Default: the number of cores, but at most one for each environment.
             timeout: the time (s) within which an environment must reply.
-            timeout_hint: the end of the message about an environment that does not reply in time.
             reuse_key: keep the processes, one for each environment, open when the batch is closed, for the next batch with this
                 key. Empty: end them.
 
-        Raises:
-            LareError: an environment cannot be made, or `reuse_key` needs more processes. Later calls raise it if an environment
-                raises an error, dies or does not reply in time. All workers have then ended.
+        Raises `LareError` if an environment cannot be made. Later calls raise it if an environment raises an error, dies or does not
+        reply in time. All workers have then ended.
         """
-        self.timeout = timeout
-        self._timeout_hint, self._reuse_key = timeout_hint, reuse_key
+        self.timeout, self._reuse_key = timeout, reuse_key
         self._workers: list[Worker] = []
-        n_envs, n_workers = len(makers), min(len(makers), processes or n_usable_cores(), MAX_WORKERS)
-        if reuse_key and n_workers < n_envs:
-            limit = f"at most {MAX_WORKERS}" if n_envs > MAX_WORKERS else f"{n_workers}: set processes = {n_envs}"
-            raise LareError(f"{n_envs} environments need a process each, and the batch has {limit}")
+        n_envs = len(makers)
+        n_workers = n_envs if reuse_key else min(n_envs, processes or n_usable_cores())
         try:
             with open_shared_memory() as memory:
-                for _ in range(n_workers):
-                    self._workers.append(_find_idle_worker(reuse_key) or Worker())
-                for worker_index, worker in enumerate(self._workers):
-                    worker.attach(range(worker_index, n_envs, n_workers), memory, worker_index)
-                specs = self._make_envs(makers)
-                self._shared = self._share_memory(memory, specs)
+                for worker_index in range(n_workers):
+                    self._workers.append(_find_idle_worker(reuse_key) or Worker(memory, worker_index))
+                specs = self._make_envs(makers, memory)
+                self._shared = map_arrays(memory, specs[0], n_envs)
+                self._shared.batch.available[:] = True
+                for worker in self._workers:
+                    worker.send("share", (specs[0], n_envs))
+                self._receive("share")
                 super().__init__(specs[0], self._shared.batch)
         except BaseException as error:
             self._kill()
@@ -88,28 +80,17 @@ class SubprocVecEnv(VecEnv):
                 raise LareError(f"worker processes cannot be started: {error}") from error
             raise
 
-    def _make_envs(self, makers: Sequence[Maker]) -> list[EnvSpec]:
+    def _make_envs(self, makers: Sequence[Maker], memory: str) -> list[EnvSpec]:
         """Make the environments that the workers do not have yet. Return the specifications of all."""
-        for worker in self._workers:
-            if not worker.specs:
-                worker.send("make", {index: pickle_maker(index, makers[index]) for index in worker.env_indices})
-        for worker, reply in self._receive("make"):
-            worker.specs, worker.make_s = reply
-        by_index = {
-            i: spec for worker in self._workers for i, spec in zip(worker.env_indices, worker.specs, strict=True)
-        }
-        specs = [by_index[index] for index in range(len(makers))]
+        n_workers = len(self._workers)
+        for worker_index, worker in enumerate(self._workers):
+            indices = range(worker_index, len(makers), n_workers)
+            worker.start_making({index: makers[index] for index in indices}, memory, worker_index, n_workers)
+        for worker, (specs, make_s) in self._receive("make"):
+            worker.specs, worker.make_s = specs, max(worker.make_s, make_s)
+        specs = [self._workers[index % n_workers].specs[index // n_workers] for index in range(len(makers))]
         check_same_sizes(specs)
         return specs
-
-    def _share_memory(self, memory: str, specs: Sequence[EnvSpec]) -> SharedArrays:
-        """Map the arrays of the environments in this process and in the workers."""
-        shared = map_arrays(memory, specs[0], len(specs))
-        shared.batch.available[:] = True
-        for worker in self._workers:
-            worker.send("share", (specs[0], len(specs)))
-        self._receive("share")
-        return shared
 
     @property
     def pids(self) -> list[int]:
@@ -129,10 +110,7 @@ class SubprocVecEnv(VecEnv):
     def find_interference(self, maker: Maker, timeout: float) -> str | None:
         """Make a second environment beside the only one, in its process. Return what goes wrong within `timeout` (s), or None.
 
-        The batch ends then, because the process may not be what it was.
-
-        Raises:
-            LareError: the process died or hangs.
+        The batch ends then, because the process may not be what it was. Raises `LareError` if the process died or hangs.
         """
         self.timeout = timeout
         with self._open_workers() as workers:
@@ -173,7 +151,8 @@ class SubprocVecEnv(VecEnv):
                 if worker.connection in ready:
                     replies.append((worker, worker.receive()))
                 elif worker.measure_idle_s() > timeout:
-                    raise LareError(f"{worker.label} did not reply for {timeout:g} s in {command}{self._timeout_hint}")
+                    advice = "if it needs longer, set timeout in the task file"
+                    raise LareError(f"{worker.label} did not reply for {timeout:g} s in {command}; {advice}")
         return replies
 
     def close(self) -> None:

@@ -42,12 +42,11 @@ class Credit(gymnasium.Wrapper, RecordConstructorArgs):
 
         Args:
             env: the environment, with the spaces that the assigner was made for.
-            credit: the assigner. Other environments may share it.
+            credit: the assigner, for one agent. Other environments may share it.
             pay: the reward that `step` returns. With "proxy" the decoder is fitted as steps come in.
             score: the key of the last step's `info` with the score of the episode. The default is the sum of the rewards.
 
-        Raises:
-            LareError: the assigner was made for other spaces, or for many agents.
+        Raises `LareError` if the assigner was made for other spaces, or for many agents.
         """
         # A copy of the assigner would learn from nothing but this environment.
         RecordConstructorArgs.__init__(self, _disable_deepcopy=True, credit=credit, pay=pay, score=score)
@@ -96,11 +95,7 @@ class VectorCredit(VectorWrapper, RecordConstructorArgs):
     """
 
     def __init__(self, env: VectorEnv, credit: CreditAssigner, pay: Pay = "proxy", score: str | None = None):
-        """Wrap a vector environment. The arguments are those of `Credit`.
-
-        Raises:
-            LareError: `metadata` has no autoreset mode, or the assigner was made for other spaces or for many agents.
-        """
+        """Wrap a vector environment. The arguments are those of `Credit`. Raises `LareError` if it has no autoreset mode, and as there."""
         RecordConstructorArgs.__init__(self, _disable_deepcopy=True, credit=credit, pay=pay, score=score)
         VectorWrapper.__init__(self, env)
         check_pay(pay)
@@ -135,17 +130,23 @@ class VectorCredit(VectorWrapper, RecordConstructorArgs):
         observation, reward, terminated, truncated, infos = self.env.step(deepcopy(actions))
         done = np.asarray(terminated | truncated)
         valid = ~self._done if self.mode == AutoresetMode.NEXT_STEP else np.ones(self.num_envs, bool)
+        last_infos, credit_reward = None, np.asarray(reward, float)
+        if self.credit.config.groups or self.score is not None:
+            last_infos = [self._select_info(infos, done, env_index) for env_index in range(self.num_envs)]
+            if self.score is not None:
+                scores = [
+                    read_score(info, self.score) if end else 0 for info, end in zip(last_infos, done, strict=True)
+                ]
+                credit_reward = np.array(scores, float)
         steps = self._recorder.add(
             self._observation,
             actions,
             self._next_observation(observation, infos, done),
-            np.asarray(reward, float) if self.score is None else self._read_scores(infos, done),
+            credit_reward,
             terminated,
             truncated,
             valid=valid,
-            infos=[self._select_info(infos, done, env_index) for env_index in range(self.num_envs)]
-            if self.credit.config.groups
-            else None,
+            infos=last_infos,
         )
         self._observation, self._done = deepcopy(observation), done.copy()
         infos = {
@@ -171,14 +172,6 @@ class VectorCredit(VectorWrapper, RecordConstructorArgs):
         for env_index in np.flatnonzero(done):
             rows[env_index] = _select_env(infos["final_obs"], env_index)
         return concatenate(space, rows, create_empty_array(space, self.num_envs))
-
-    def _read_scores(self, infos: Mapping[str, Any], done: Bool[np.ndarray, " envs"]) -> Float[np.ndarray, " envs"]:
-        """Return the scores in `info` of the episodes that have ended, and 0 for the other environments."""
-        assert self.score is not None
-        scores = np.zeros(self.num_envs)
-        for env_index in np.flatnonzero(done):
-            scores[env_index] = read_score(self._select_info(infos, done, env_index), self.score)
-        return scores
 
     def _select_info(self, infos: Mapping[str, Any], done: Bool[np.ndarray, " envs"], env_index: Any) -> dict[str, Any]:
         """Return the `info` of the last step of one environment."""

@@ -42,8 +42,7 @@ class CreditParallel(BaseParallelWrapper):
             pay: the rewards that `step` returns: "proxy" (r_hat) or "environment" (its own). With "environment", call
                 `CreditAssigner.fit_pending` before `rewards_at`.
 
-        Raises:
-            LareError: the assigner was made for another number of agents, or for other spaces.
+        Raises `LareError` if the assigner was made for another number of agents, or for other spaces.
         """
         super().__init__(env)
         check_pay(pay)
@@ -60,8 +59,8 @@ class CreditParallel(BaseParallelWrapper):
         self._recorder = StepRecorder(
             credit, env.observation_space(first), env.action_space(first), env_ids=[object()], agents=n_agents
         )
-        self._no_observation = np.zeros((n_agents, self._recorder.observation_layout.size), np.float32)
-        self._no_action = np.zeros((n_agents, self._recorder.action_layout.size), np.float32)
+        self._no_observation = np.zeros((n_agents, self._recorder.layouts["observation"].size), np.float32)
+        self._no_action = np.zeros((n_agents, self._recorder.layouts["action"].size), np.float32)
         self._observation = self._no_observation
         """The last observation of each agent; zeros for an agent that has not appeared yet."""
 
@@ -105,7 +104,7 @@ class CreditParallel(BaseParallelWrapper):
         self, rows: Float[np.ndarray, "agents size"], kind: Literal["observation", "action"], values: dict
     ) -> Float[np.ndarray, "agents size"]:
         """Return a copy of the rows with the new observations or actions of some agents."""
-        rows, layout = rows.copy(), getattr(self._recorder, f"{kind}_layout")
+        rows, layout = rows.copy(), self._recorder.layouts[kind]
         for index, agent in enumerate(self.team):
             if agent in values:
                 space = getattr(self.env, f"{kind}_space")(agent)

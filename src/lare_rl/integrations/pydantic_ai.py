@@ -15,14 +15,7 @@ from lare_rl.llm.prompts import Message
 
 try:
     from pydantic_ai import Agent
-    from pydantic_ai.messages import (
-        ModelMessage,
-        ModelRequest,
-        ModelResponse,
-        SystemPromptPart,
-        TextPart,
-        UserPromptPart,
-    )
+    from pydantic_ai.messages import ModelRequest, ModelResponse, SystemPromptPart, TextPart, UserPromptPart
 except ImportError:
     raise missing_extra_error("lare_rl.integrations.pydantic_ai", "pydantic-ai") from None
 
@@ -32,11 +25,8 @@ __all__ = ["pydantic_ai_model"]
 def pydantic_ai_model(model: Any) -> FunctionModel:
     """Return a model that asks Pydantic AI, for `lare_rl.design(task, model=...)`.
 
-    Args:
-        model: the name of a model (`anthropic:claude-sonnet-4-5`), a model of Pydantic AI, or an `Agent` that returns texts.
-
-    Raises:
-        LareError: there is no such model, or its key is missing.
+    `model` is the name of a model (`anthropic:claude-sonnet-4-5`), a model of Pydantic AI, or an `Agent` that returns texts. Raises
+    `LareError` if there is no such model, or its key is missing.
     """
     try:
         agent = model if isinstance(model, Agent) else Agent(model)
@@ -48,29 +38,19 @@ def pydantic_ai_model(model: Any) -> FunctionModel:
         run = agent.run(messages[-1]["content"], message_history=history)
         return asyncio.run_coroutine_threadsafe(run, _event_loop()).result().output
 
-    return FunctionModel(ask, _model_name(agent))
+    return FunctionModel(ask, str(getattr(agent.model, "model_name", None) or agent.model or agent.name))
 
 
 @cache
 def _event_loop() -> asyncio.AbstractEventLoop:
-    """Return a loop that runs in a thread of its own, because in a notebook a loop runs in the main thread already.
-
-    It is one loop for all requests, because connections belong to a loop.
-    """
+    """Return the loop of all requests, because connections belong to a loop. In a notebook, the main thread runs another."""
     loop = asyncio.new_event_loop()
     threading.Thread(target=loop.run_forever, daemon=True).start()
     return loop
 
 
-def _model_name(agent: Agent[Any, Any]) -> str:
-    return str(getattr(agent.model, "model_name", None) or agent.model or agent.name)
-
-
-def _convert(message: Message) -> ModelMessage:
-    match message["role"]:
-        case "system":
-            return ModelRequest([SystemPromptPart(content=message["content"])])
-        case "assistant":
-            return ModelResponse([TextPart(content=message["content"])])
-        case _:
-            return ModelRequest([UserPromptPart(content=message["content"])])
+def _convert(message: Message) -> ModelRequest | ModelResponse:
+    if message["role"] == "assistant":
+        return ModelResponse([TextPart(content=message["content"])])
+    kind = SystemPromptPart if message["role"] == "system" else UserPromptPart
+    return ModelRequest([kind(content=message["content"])])

@@ -42,18 +42,17 @@ class StepRecorder:
         """
         check_assigner(credit, agents)
         self.credit, self.env_ids = credit, env_ids
-        self.observation_layout = make_layout(observation_space, "observation_space")
-        self.action_layout = make_layout(action_space, "action_space")
-        for name, layout, expected in (
-            ("observation", self.observation_layout, credit.config.observation),
-            ("action", self.action_layout, credit.config.action),
-        ):
-            if layout.size != expected.size:
+        self.layouts = {
+            "observation": make_layout(observation_space, "observation_space"),
+            "action": make_layout(action_space, "action_space"),
+        }
+        expected = {"observation": credit.config.observation, "action": credit.config.action}
+        for kind, layout in self.layouts.items():
+            if layout.size != expected[kind].size:
                 raise LareError(
-                    f"{name}s of the environment are rows of {layout.size} numbers, and the assigner was made for {expected.size}"
+                    f"{kind}s of the environment are rows of {layout.size} numbers, and the assigner was made for {expected[kind].size}"
                 )
-        self._same_observations = self.observation_layout == credit.config.observation
-        self._same_actions = self.action_layout == credit.config.action
+        self._same_space = {kind: layout == expected[kind] for kind, layout in self.layouts.items()}
 
     def add(
         self,
@@ -68,22 +67,17 @@ class StepRecorder:
 
         `results` are the rewards and the two flags of the steps, as in `CreditAssigner.add`. `infos` have the groups of episodes.
         """
+        steps = []
+        for name, value in (("observation", observation), ("action", action), ("next_observation", next_observation)):
+            kind = name.removeprefix("next_")
+            steps.append(value if self._same_space[kind] else self.layouts[kind].rows(value, name))
         group = None if infos is None else self.read_groups(infos)
-        if not self._same_observations:
-            observation = self.observation_layout.rows(observation, "observation")
-            next_observation = self.observation_layout.rows(next_observation, "next_observation")
-        if not self._same_actions:
-            action = self.action_layout.rows(action, "action")
-        return self.credit.add(
-            observation, action, next_observation, *results, env_ids=self.env_ids, valid=valid, group=group
-        )
+        return self.credit.add(*steps, *results, env_ids=self.env_ids, valid=valid, group=group)
 
     def read_groups(self, infos: Sequence[Mapping[str, Any]]) -> list[Any] | None:
         """Return the groups of episodes from the infos of their steps, None where a step has none. None without groups."""
         config = self.credit.config
-        if not config.groups:
-            return None
-        return [info.get(config.group_key) for info in infos]
+        return [info.get(config.group_key) for info in infos] if config.groups else None
 
     def drop(self, env_index: int) -> None:
         """Give up the running episode of an environment, which was reset."""

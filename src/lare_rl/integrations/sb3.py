@@ -58,14 +58,10 @@ class CreditReplayBuffer(ReplayBuffer):
     ):
         """Create an empty buffer. The algorithm does this; other arguments are those of Stable-Baselines3's buffer.
 
-        Args:
-            buffer_size: number of steps of all environments together.
-            observation_space: the space of one environment.
-            action_space: the space of one environment.
-            credit: the assigner, from `replay_buffer_kwargs`. Its capacity must be at least `buffer_size`.
+        `credit` is the assigner, from `replay_buffer_kwargs`. It must keep at least `buffer_size` steps, which counts those of all
+        environments. The spaces are those of one environment.
 
-        Raises:
-            LareError: there is no assigner, it is too small or was made for other spaces, or another class of buffer is needed.
+        Raises `LareError` if there is no assigner, if it is too small or was made for other spaces, or for the wrong class of buffer.
         """
         name = type(self).__name__
         if credit is None:

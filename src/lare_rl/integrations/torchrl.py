@@ -45,12 +45,9 @@ class CreditTransform(Transform):
         """Create a transform for one replay buffer.
 
         Args:
-            credit: the assigner. It must keep at least as many steps as the buffer (`capacity`).
+            credit: the assigner, for one agent. It must keep at least as many steps as the buffer (`capacity`).
             observation: the key of the observation. The default is "observation", or one key for each part of a Dict space.
             action: the key of the action.
-
-        Raises:
-            LareError: the assigner is one for many agents.
         """
         super().__init__()
         check_assigner(credit)

@@ -60,9 +60,7 @@ def write_texts(
 ) -> tuple[dict[str, str], tuple[str, ...]]:
     """Return the texts of a task file, and the lines that were removed because they mention rewards.
 
-    Args:
-        lines: the lines of each text, by its key. The description is extended by how an episode ends.
-        sections: the sections of the documentation.
+    `lines` are the lines of each text, by its key. The description is extended by how an episode ends, from the `sections`.
     """
     cleaned = {key: remove_rewards(text) for key, text in lines.items()}
     texts = {key: text for key, (text, _) in cleaned.items()}

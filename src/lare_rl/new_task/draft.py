@@ -20,8 +20,8 @@ __all__ = [
     "count_entries",
     "describe_action",
     "describe_flattening",
-    "environment_lines",
     "file_name",
+    "head_lines",
     "make_draft",
     "text_lines",
     "warning_lines",
@@ -93,12 +93,16 @@ def warning_lines(
     ]
 
 
-def environment_lines(environment: str, observation_size: int, action_size: int) -> list[str]:
-    """Return the lines about an environment that the drafts of a task and of its teams share."""
+def head_lines(
+    name: str, environment: str, sizes: tuple[int, int], removed: Sequence[str], unused: Sequence[str] = ()
+) -> list[str]:
+    """Return the first lines of a draft. `sizes` are those of an observation and of an action."""
     return [
+        *warning_lines(removed, unused=unused),
+        f'name = "{name}"',
         f'environment = "{environment}"',
-        f"observation_size = {observation_size}",
-        f"action_size = {action_size}",
+        f"observation_size = {sizes[0]}",
+        f"action_size = {sizes[1]}",
         SCORED_OBSERVATION_LINE,
     ]
 
@@ -117,11 +121,7 @@ def make_draft(
 
 
 def text_lines(texts: Mapping[str, str], first_lines: Mapping[str, str]) -> list[str]:
-    """Return the texts of a task file in TOML. Missing texts are marked.
-
-    Args:
-        first_lines: lines to put before the texts. They are left out where a text begins in the same way.
-    """
+    """Return the texts of a task file in TOML. Missing texts are marked. `first_lines` precede texts that begin in another way."""
     lines = []
     for key, text in texts.items():
         text, first = text or f"{FILL_IN}: {CONTENTS[key]}", first_lines.get(key, "")

@@ -2,22 +2,22 @@
 
 import inspect
 import re
-from importlib import import_module
+from collections.abc import Callable
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 from gymnasium.spaces import Box, Discrete
 
+from lare_rl.envs.families import FAMILIES
 from lare_rl.envs.interface import EnvSpec
 from lare_rl.envs.jaxmarl_env import JaxMARLEnv
-from lare_rl.envs.jumanji_env import JumanjiEnv, observed_arrays
-from lare_rl.envs.pettingzoo_construct import agent_kind
+from lare_rl.envs.jumanji_env import observed_arrays
 from lare_rl.errors import LareError
 from lare_rl.new_task import draft
 from lare_rl.new_task.documentation import single_agent_lines, split_sections, write_texts
-from lare_rl.new_task.draft import Draft, count_entries, file_name, warning_lines
-from lare_rl.new_task.many_agents import make_stub, name_patterns, write_team_drafts
+from lare_rl.new_task.draft import Draft, count_entries, file_name
+from lare_rl.new_task.many_agents import make_stub, write_team_drafts
 
 __all__ = ["draft_jax_task"]
 
@@ -28,7 +28,7 @@ FIELD = re.compile(r"^- (observation|action|reward|episode termination|state)s?:
 def draft_jax_task(environment_id: str) -> Draft:
     """Draft a task file from an environment's documentation and sizes. Raises `LareError` if it cannot be made."""
     family, _, name = environment_id.partition("/")
-    make = import_module(f"lare_rl.envs.{family}_env").make
+    make: Callable[..., Any] = FAMILIES[family].load_maker()
     stub = make_stub(name, environment_id)
     limit: dict[str, int] = {}
     try:
@@ -42,20 +42,12 @@ def draft_jax_task(environment_id: str) -> Draft:
     texts, removed = _read_texts(env)
     limit_lines = [draft.LIMIT_LINE] if limit else []
     if isinstance(env, JaxMARLEnv):
-        kinds = list(dict.fromkeys(agent_kind(agent.name) for agent in env.layout.agents))
-        if len(kinds) > 1:
-            stubs = tuple(make_stub(kind, environment_id, team=kind, agents=name_patterns(kind)) for kind in kinds)
-            env = make(make_stub(name, environment_id, teams=stubs, **limit))
+        env = make(make_stub(name, environment_id, env.layout.index, **limit))
         return write_team_drafts(file_name(name), environment_id, env, texts, removed, limit_lines)
-    lines = [
-        *warning_lines(removed),
-        f'name = "{file_name(name)}"',
-        *draft.environment_lines(environment_id, env.spec.observation_size, env.spec.action_size),
-        draft.SCORE_LINE,
-        *limit_lines,
-    ]
-    first_lines = {"observation": _describe_observation(env), "action": _describe_action(env.spec)}
-    return draft.make_draft(file_name(name), lines, texts, first_lines, removed)
+    name, sizes = file_name(name), (env.spec.observation_size, env.spec.action_size)
+    lines = [*draft.head_lines(name, environment_id, sizes, removed), draft.SCORE_LINE, *limit_lines]
+    first_lines = {"observation": _describe_observation(env, family), "action": _describe_action(env.spec)}
+    return draft.make_draft(name, lines, texts, first_lines, removed)
 
 
 def _read_texts(env: Any) -> tuple[dict[str, str], tuple[str, ...]]:
@@ -74,10 +66,10 @@ def _heading(match: re.Match[str]) -> str:
     return f"## {match[1]}\n{lead}"
 
 
-def _describe_observation(env: Any) -> str:
+def _describe_observation(env: Any, family: str) -> str:
     """Return the number of entries and, if the observation has several arrays, which entries come from which."""
     count = count_entries(env.spec.observation_size)
-    if not isinstance(env, JumanjiEnv):
+    if family != "jumanji":
         return f"{count}."
     _, timestep = jax.eval_shape(env.env.reset, jnp.zeros(2, jnp.uint32))
     start, ranges = 0, []

@@ -5,7 +5,7 @@ import inspect
 import json
 import re
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from fnmatch import fnmatchcase
 from typing import Any, Protocol, runtime_checkable
@@ -16,11 +16,10 @@ from lare_rl.envs.pettingzoo_construct import agent_kind, find_time_limit, make_
 from lare_rl.envs.pettingzoo_env import ParallelHost
 from lare_rl.new_task import draft
 from lare_rl.new_task.documentation import first_section, plain_lines, split_sections, write_texts
-from lare_rl.new_task.draft import Draft, count_entries, file_name, warning_lines
+from lare_rl.new_task.draft import Draft, count_entries, file_name
 from lare_rl.tasks.spec import TaskSpec, split_environment
 
-__all__ = ["draft_multi_agent_task", "make_stub", "name_patterns", "write_team_drafts"]
-
+__all__ = ["draft_multi_agent_task", "make_stub", "write_team_drafts"]
 
 GENERIC_MAKERS = ("parallel_env", "env", "raw_env")
 """Common names of functions that make environments. For these, the draft is named after the module."""
@@ -49,13 +48,11 @@ class Layouts(Protocol):
 def draft_multi_agent_task(environment_id: str) -> Draft:
     """Draft a task file from a PettingZoo environment's documentation and spaces. Raises `LareError` if it cannot be made."""
     env = make_parallel_env(environment_id, {})
-    limit, kinds = find_time_limit(env, {}), list(dict.fromkeys(map(agent_kind, env.possible_agents or ())))
+    limit, arguments = find_time_limit(env, {}), _default_arguments(env)
     module, maker = split_environment(environment_id)
     name = file_name(module.rpartition(".")[2] if maker in GENERIC_MAKERS else maker)
-    several = len(kinds) > 1
-    teams = [make_stub(kind, environment_id, team=kind, agents=name_patterns(kind)) for kind in kinds if several]
-    task = make_stub(name, environment_id, teams=teams, max_episode_steps=limit or draft.DEFAULT_LIMIT)
-    arguments = _default_arguments(env)
+    max_steps = limit or draft.DEFAULT_LIMIT
+    task = make_stub(name, environment_id, env.possible_agents or (), max_episode_steps=max_steps)
     lines = [
         draft.GROUP_LINE,
         *([] if limit else [draft.LIMIT_LINE]),
@@ -74,37 +71,43 @@ def write_team_drafts(
     removed: tuple[str, ...],
     more_lines: Sequence[str] = (),
 ) -> Draft:
-    """Write a task file and, if there are several teams, one for each of them.
+    """Write a task file, which has `more_lines`, and, if there are several teams, a file for each of them.
 
-    Args:
-        env: the environment, made for a task with these teams.
-        removed: the lines that were removed from the texts.
-        more_lines: further lines of the task file.
+    `env` is the environment, made for a task with these teams, and `removed` are the lines that were removed from the texts.
     """
-    teams = env.spec.teams
-    environment_lines = draft.environment_lines(environment_id, env.spec.observation_size, env.spec.action_size)
-    end = [*environment_lines, draft.SCORE_LINE, *more_lines]
-    head = [*warning_lines(removed), f'name = "{name}"']
+    teams, sizes = env.spec.teams, (env.spec.observation_size, env.spec.action_size)
+    task_lines = [*draft.head_lines(name, environment_id, sizes, removed), draft.SCORE_LINE, *more_lines]
     if len(teams) == 1:
-        return draft.make_draft(name, [*head, *end], texts, _first_lines(env, teams[0]), removed)
+        return draft.make_draft(name, task_lines, texts, _first_lines(env, teams[0]), removed)
     files = {}
     for team in teams:
-        lines = [*warning_lines(removed), *_team_lines(env, team), *environment_lines]
+        lines = [*draft.head_lines(team.name, environment_id, sizes, removed), *_team_lines(env, team)]
         team_draft = draft.make_draft(name, lines, _team_texts(env, team, texts), _first_lines(env, team), removed)
         files[f"{name}-{team.name}.toml"] = team_draft.toml
-    lines = [*head, *TEAMS_COMMENT, f"teams = {json.dumps(list(files))}", *end]
+    task_lines += [*TEAMS_COMMENT, f"teams = {json.dumps(list(files))}"]
     task_texts = texts | dict.fromkeys(TEAM_KEYS, "See the teams.")
-    task_draft = draft.make_draft(name, lines, task_texts, {}, removed, teams=files)
+    task_draft = draft.make_draft(name, task_lines, task_texts, {}, removed, teams=files)
     return replace(task_draft, missing_keys=tuple(key for key in texts if not texts[key]))
 
 
-def make_stub(name: str, environment: str, **keys: Any) -> TaskSpec:
-    """Return a task that only names the agents. Its sizes are placeholders, because the draft must determine them first."""
-    texts = dict.fromkeys(("description", "observation", "action"), "-")
-    return TaskSpec(name=file_name(name), environment=environment, observation_size=1, action_size=1, **texts, **keys)
+def make_stub(name: str, environment: str, agents: Iterable[Any] = (), **keys: Any) -> TaskSpec:
+    """Return a task that only has teams, of the kinds of agents with these names.
+
+    Its sizes are placeholders, because the draft must determine them first.
+    """
+
+    def stub(name: str, **keys: Any) -> TaskSpec:
+        texts = dict.fromkeys(("description", "observation", "action"), "-")
+        return TaskSpec(
+            name=file_name(name), environment=environment, observation_size=1, action_size=1, **texts, **keys
+        )
+
+    kinds = list(dict.fromkeys(map(agent_kind, agents)))
+    teams = [stub(kind, team=kind, agents=_name_patterns(kind)) for kind in kinds if len(kinds) > 1]
+    return stub(name, teams=teams, **keys)
 
 
-def name_patterns(kind: str) -> tuple[str, ...]:
+def _name_patterns(kind: str) -> tuple[str, ...]:
     """Return patterns that match the agents of a kind. An agent without a number has the name of its kind."""
     return (kind, f"{kind}_[0-9]*", f"{kind}[0-9]*")
 
@@ -128,8 +131,8 @@ def _read_texts(env: Any) -> tuple[dict[str, str], tuple[str, ...]]:
 
 def _team_lines(host: Layouts, team: Team) -> list[str]:
     names = [str(agent.name) for agent in host.layout.agents[team.agents]]
-    patterns = [pattern for pattern in name_patterns(team.name) if any(fnmatchcase(name, pattern) for name in names)]
-    return [f'name = "{team.name}"', f'team = "{team.name}"', f"agents = {json.dumps(patterns)}"]
+    patterns = [pattern for pattern in _name_patterns(team.name) if any(fnmatchcase(name, pattern) for name in names)]
+    return [f'team = "{team.name}"', f"agents = {json.dumps(patterns)}"]
 
 
 def _team_texts(host: Layouts, team: Team, texts: Mapping[str, str]) -> dict[str, str]:

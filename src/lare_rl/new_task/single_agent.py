@@ -10,7 +10,7 @@ from lare_rl.envs.gymnasium_env import make_gymnasium
 from lare_rl.errors import LareError
 from lare_rl.new_task import draft
 from lare_rl.new_task.documentation import single_agent_lines, split_sections, write_texts
-from lare_rl.new_task.draft import Draft, count_entries, file_name, warning_lines
+from lare_rl.new_task.draft import Draft, count_entries, file_name
 from lare_rl.tasks.spec import PETTINGZOO_PREFIX
 
 __all__ = ["draft_task"]
@@ -27,8 +27,7 @@ USED_TITLES = {
 def draft_task(environment_id: str) -> Draft:
     """Draft a task file from an environment's documentation and spaces.
 
-    Raises:
-        LareError: the environment cannot be made, its spaces cannot be flattened, or its family has no drafts.
+    Raises `LareError` if the environment cannot be made, its spaces cannot be flattened, or its family has no drafts.
     """
     if environment_id.startswith(PETTINGZOO_PREFIX):
         from lare_rl.new_task.many_agents import draft_multi_agent_task
@@ -59,9 +58,7 @@ def _write_draft(environment_id: str, env: gymnasium.Env) -> Draft:
     full_id = f"{module}{colon}{env.spec.id}" if env.spec else environment_id
     unused = tuple(title for title, body in sections.items() if title not in USED_TITLES and body.strip())
     lines = [
-        *warning_lines(removed, unused=unused),
-        f'name = "{file_name(name)}"',
-        *draft.environment_lines(full_id, observation_size, action_size),
+        *draft.head_lines(file_name(name), full_id, (observation_size, action_size), removed, unused),
         draft.SCORE_LINE,
         draft.MEASURES_LINE,
         draft.GROUP_LINE,

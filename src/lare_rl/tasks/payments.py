@@ -38,11 +38,8 @@ PAID_AT_END = PaymentRule()
 def is_paid(rule: PaymentRule, step: Any, team_reward: Any, ended: Any) -> Any:
     """Return at which steps an environment pays. The arrays are of NumPy or of JAX.
 
-    Args:
-        rule: when it pays.
-        step: [*batch] the index of the step in its episode, from 0.
-        team_reward: [*batch teams] the rewards.
-        ended: [*batch] whether the episode ended with this step.
+    `step` [*batch] is the index of the step in its episode, from 0; `team_reward` [*batch teams] are the rewards; `ended` [*batch]
+    says whether the episode ended with this step.
     """
     pays = ended
     if rule.period is not None:

@@ -67,10 +67,8 @@ def _makes_environment(name: str) -> bool:
 
 
 def check_trusted(task: TaskSpec, directory: Path) -> None:
-    """Check that a run's environment is of an installed package or a trusted module, and calls no function but those that make one.
-
-    Raises:
-        LareError: it would run another file, or call another function.
+    """Raise `LareError` if a run's environment would run a file of no installed package or trusted module, or call another function
+    than those that make environments.
     """
     module = untrusted_module(task)
     if module is None:
@@ -102,9 +100,5 @@ def _find_package(module: str) -> Path | None:
 
 def _package_folders() -> set[Path]:
     """Return the folders in which packages are installed. No module of Python itself makes environments."""
-    paths = sysconfig.get_paths()
-    names = ("purelib", "platlib")
-    return {
-        Path(path).resolve()
-        for path in (*(paths[name] for name in names), *site.getsitepackages(), site.getusersitepackages())
-    }
+    folders = [sysconfig.get_path(name) for name in ("purelib", "platlib")]
+    return {Path(path).resolve() for path in (*folders, *site.getsitepackages(), site.getusersitepackages())}

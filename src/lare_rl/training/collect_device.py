@@ -14,7 +14,7 @@ from lare_rl.algorithms.registry import Noise
 from lare_rl.data.trajectory import Trajectory
 from lare_rl.envs.families import make_env
 from lare_rl.envs.interface import JaxEnv, Timestep, team_mean, to_env_action
-from lare_rl.errors import LareError
+from lare_rl.envs.vec_env import check_jax_env, check_lengths
 from lare_rl.nn.masks import select
 from lare_rl.tasks.spec import TaskSpec
 from lare_rl.training.compile_cache import cache_by_value
@@ -61,9 +61,14 @@ class DeviceCollector:
         return steps
 
     def evaluate(self, actor: Any, n_episodes: int, number: int = 0) -> Evaluation:
-        """Evaluate whole episodes. The same number gives the same initial states; the run's own evaluations use 0."""
+        """Evaluate whole episodes. The same number gives the same initial states; the run's own evaluations use 0.
+
+        Raises `EnvOutputError` if an episode does not end within the time limit.
+        """
         keys = stream_keys(self._seeds, Stream.EVALUATION_EPISODES, number)
-        return jax.device_get(self._evaluate(actor, keys, n_episodes=n_episodes))
+        evaluation, ended = jax.device_get(self._evaluate(actor, keys, n_episodes=n_episodes))
+        check_lengths(self.env.spec, evaluation.lengths.ravel(), ended.ravel())
+        return evaluation
 
     def state_dict(self) -> dict[str, np.ndarray]:
         """Return the arrays that `restore` needs."""
@@ -225,32 +230,8 @@ def make_jax_env(task: TaskSpec) -> JaxEnv:
     """
     env = make_env(task)
     assert isinstance(env, JaxEnv)
-    _check_shapes(env, task)
+    check_jax_env(env, task.environment)
     return env
-
-
-def _check_shapes(env: JaxEnv, task: TaskSpec) -> None:
-    """Raise `LareError` if `reset` or `step` returns arrays of other shapes than the spec says, or lacks a measure."""
-    spec, key = env.spec, jax.random.key(0)
-    n_agents = spec.n_agents
-    state, first = jax.eval_shape(env.reset, key)
-    action = jax.ShapeDtypeStruct((n_agents, spec.action_size), np.float32)
-    _, second = jax.eval_shape(env.step, state, action, key)
-    shapes = {
-        "observation": (n_agents, spec.observation_size),
-        "alive": (n_agents,),
-        "reward": (n_agents,),
-        "terminated": (),
-        "truncated": (),
-    }
-    for function, timestep in (("reset", first), ("step", second)):
-        for name, shape in shapes.items():
-            if (actual := jnp.shape(getattr(timestep, name))) != shape:
-                raise LareError(f"{task.environment}: {name} of {function} has the shape {actual}, and not {shape}")
-        if missing := set(spec.measures) - timestep.measures.keys():
-            raise LareError(
-                f"{task.environment}: {function} returns no measure {sorted(missing)[0]!r}, which its spec names"
-            )
 
 
 def is_reset_cheap(env: JaxEnv, n_envs: int) -> bool:
@@ -262,7 +243,8 @@ def is_reset_cheap(env: JaxEnv, n_envs: int) -> bool:
 
 def _evaluate(
     env: JaxEnv, actor: Any, keys: Key[Array, " seeds"], *, n_episodes: int, config: TrainConfig
-) -> Evaluation:
+) -> tuple[Evaluation, Bool[Array, "seeds episodes"]]:
+    """Return the results of whole episodes, and whether each has ended."""
     steps, mask, _ = unroll_on_device(env, actor, keys, n_episodes, config, config.deterministic_evaluation)
     reward = steps.next_timestep.reward * mask[..., None]
     returns = [team_mean(reward, steps.timestep.alive, team).sum(axis=0) for team in config.env.teams]
@@ -270,7 +252,7 @@ def _evaluate(
     last = mask & steps.ended
     measures = {name: jnp.where(last, values, 0.0).sum(axis=0) for name, values in steps.next_timestep.measures.items()}
     returns, summed_returns = (jnp.stack(values, axis=-1) for values in (returns, summed_returns))
-    return Evaluation(returns, summed_returns, mask.sum(axis=0), measures)
+    return Evaluation(returns, summed_returns, mask.sum(axis=0), measures), last.any(axis=0)
 
 
 def _map_envs(function: Callable[..., Any]) -> Callable[..., Any]:

@@ -15,7 +15,7 @@ from importlib import import_module
 from importlib.metadata import entry_points
 from typing import Generic, TypeVar
 
-from lare_rl.errors import LareError, did_you_mean
+from lare_rl.errors import LareError, find_named
 from lare_rl.util.variables import read_variable
 
 __all__ = ["Registry", "load_plugins"]
@@ -67,11 +67,13 @@ class Registry(Mapping[str, T], Generic[T]):
 
     def find(self, name: str) -> T:
         """Return the value of this name. Raises `LareError` if no value has this name. The message lists all names."""
-        if name in self:
-            return self._values[name]
-        hint = did_you_mean(name, self._values)
-        plugin = "" if read_variable("LARE_PLUGINS") else " (of a plugin: name its module in LARE_PLUGINS)"
-        raise LareError(f"no {self._kind} {name!r}{hint}; the {self._kinds} are {', '.join(self._values)}{plugin}")
+        if name not in self._values:
+            load_plugins()
+        try:
+            return find_named(self._kind, self._kinds, name, self._values)
+        except LareError as error:
+            plugin = "" if read_variable("LARE_PLUGINS") else " (of a plugin: name its module in LARE_PLUGINS)"
+            raise LareError(f"{error}{plugin}") from None
 
     def __getitem__(self, name: str) -> T:
         if name not in self._values:

@@ -49,5 +49,5 @@ def test_frames_have_common_scales():
     pictures = ParticleEnv("TriangleArea").frames(states, credit)
     assert [picture.shape for picture in pictures] == [(400, 400, 3)] * 4
     assert len({picture.tobytes() for picture in pictures}) == 4
-    last = draw_state(TASKS["TriangleArea"], positions[-1], credit[-1], 11.0)
+    last = draw_state(TASKS["TriangleArea"], positions[-1], credit[-1])
     np.testing.assert_array_equal(pictures[-1], to_pixels(last))

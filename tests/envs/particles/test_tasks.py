@@ -11,8 +11,7 @@ from envs.particles import twin as slow
 from helpers.long_tests import long_case
 from lare_rl.envs.particles.catalogue import TASKS, find_particle_task
 from lare_rl.envs.particles.navigation import N_LAYOUTS, make_layouts
-from lare_rl.envs.particles.predator_prey import SIZES, observe_preys
-from lare_rl.envs.particles.prey import logits, sample_actions, shipped_prey
+from lare_rl.envs.particles.predator_prey import SIZES, logits, observe_preys, sample_actions, shipped_prey
 from lare_rl.envs.particles.task import MAX_STEPS
 from lare_rl.envs.particles.world import State, at_rest, move, push
 from lare_rl.errors import LareError

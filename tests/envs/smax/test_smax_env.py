@@ -8,14 +8,13 @@ import numpy as np
 import pytest
 
 from helpers.fake_smac import compiled_smax
+from helpers.long_tests import long_case
 from lare_rl.envs.interface import Timestep
-from lare_rl.envs.smax import SCENARIO_NAMES
 from lare_rl.envs.smax.battle import ATTACK, STOP
+from lare_rl.envs.smax.scenarios import SCENARIOS
 from lare_rl.envs.smax.smax_env import SMAX, SmaxState
 
 BATTLES = 8
-PLAYED = ("2s3z", "1c3s5z")
-"""They differ in the number of unit types. `test_battle.py` compares all scenarios with JaxMARL."""
 EXPECTED = {"2s3z": (5, 127, 120, 10, 120), "3s_vs_5z": (3, 101, 96, 10, 250), "1c3s5z": (9, 249, 234, 14, 180)}
 """Numbers of agents, sizes of observations, states and actions, and time limits."""
 
@@ -50,7 +49,7 @@ def play(name: str) -> tuple[SMAX, SmaxState, Timestep]:
 
 
 def test_sizes():
-    for name in SCENARIO_NAMES:
+    for name in SCENARIOS:
         spec = SMAX(name).spec
         sizes = (spec.n_agents, spec.observation_size, spec.state_size, spec.action_size, spec.max_steps)
         assert sizes == EXPECTED[name]
@@ -58,7 +57,7 @@ def test_sizes():
         assert (spec.discrete, spec.masks_actions, spec.agents_leave, spec.fixed_length) == (True, True, True, False)
 
 
-@pytest.mark.parametrize("name", PLAYED)
+@pytest.mark.parametrize("name", ["2s3z", long_case("1c3s5z")])  # they differ in the number of unit types
 def test_random_battles(name):
     env, (battle, _), timestep = play(name)
     assert timestep.state.shape == (BATTLES, env.spec.max_steps + 1, env.spec.state_size)

@@ -3,7 +3,7 @@
 from lare_rl.envs.particles import navigation, predator_prey
 from lare_rl.envs.particles.task import ParticleTask
 from lare_rl.envs.particles.triangle_area import triangle_area
-from lare_rl.errors import LareError, did_you_mean
+from lare_rl.errors import find_named
 
 __all__ = ["TASKS", "find_particle_task"]
 
@@ -19,11 +19,5 @@ TASKS: dict[str, ParticleTask] = {
 
 
 def find_particle_task(name: str) -> ParticleTask:
-    """Return the task of a name.
-
-    Raises:
-        LareError: no task has this name; the message lists all names.
-    """
-    if name in TASKS:
-        return TASKS[name]
-    raise LareError(f"no particle task {name!r}{did_you_mean(name, TASKS)}; the particle tasks are {', '.join(TASKS)}")
+    """Return the task of a name. Raises `LareError` if no task has it."""
+    return find_named("particle task", "particle tasks", name, TASKS)

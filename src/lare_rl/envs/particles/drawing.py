@@ -17,14 +17,18 @@ MARGIN = 1.08
 
 
 def draw_state(
-    task: ParticleTask,
-    position: Float[np.ndarray, "entities 2"],
-    credit: Float[np.ndarray, " agents"] | None = None,
-    scale: float | None = None,
+    task: ParticleTask, position: Float[np.ndarray, "entities 2"], credit: Float[np.ndarray, " agents"] | None = None
 ) -> Figure:
-    """Draw a state, to scale. Each agent's credit is a number and a colour, which is darkest at `scale`."""
+    """Draw a state, to scale. Each agent's credit is a number and a colour."""
     figure, axes = blank_figure()
-    _paint(axes, task, position, _half_side(task, position), credit, scale)
+    _paint(
+        axes,
+        task,
+        position,
+        _half_side(task, position),
+        credit,
+        None if credit is None else float(np.abs(credit).max()),
+    )
     return figure
 
 
@@ -60,19 +64,13 @@ def _paint(
     axes.axis("off")
     square = (-task.half_side, -task.half_side)
     axes.add_patch(patches.Rectangle(square, 2 * task.half_side, 2 * task.half_side, fill=False, edgecolor="#dddddd"))
-    colours: list = [
-        TEAM_COLOUR if entity < task.teams[0].stop else OTHER_COLOUR for entity in range(task.world.n_moving)
-    ]
-    edges = ["#333333"] * len(colours) if credit is None else list(colours)
+    n_team, n_moving, n_landmarks = task.teams[0].stop, task.world.n_moving, len(position) - task.world.n_moving
+    colours: list = [TEAM_COLOUR] * n_team + [OTHER_COLOUR] * (n_moving - n_team) + [LANDMARK_COLOUR] * n_landmarks
+    edges = (["#333333"] * n_moving if credit is None else colours[:n_moving]) + ["none"] * n_landmarks
     if credit is not None:
-        bound = scale or float(np.abs(credit).max()) or 1.0
-        shades = CREDIT_COLOURS(0.5 + 0.4 * np.clip(np.asarray(credit) / bound, -1, 1))
-        colours[: task.n_agents] = [tuple(shade) for shade in shades]
-    colours += [LANDMARK_COLOUR] * (len(position) - len(colours))
-    landmarks_first = [*range(task.world.n_moving, len(position)), *range(task.world.n_moving)]
-    for entity in landmarks_first:
-        edge = edges[entity] if entity < task.world.n_moving else "none"
-        radius = max(float(task.world.radius[entity]), 0.008 * side)
+        colours[: task.n_agents] = map(tuple, CREDIT_COLOURS(0.5 + 0.4 * np.asarray(credit) / (scale or 1.0)))
+    for entity in (*range(n_moving, len(position)), *range(n_moving)):  # landmarks first
+        radius, edge = max(float(task.world.radius[entity]), 0.008 * side), edges[entity]
         circle = patches.Circle(tuple(position[entity]), radius, facecolor=colours[entity], edgecolor=edge, linewidth=1)
         axes.add_patch(circle)
     if credit is not None:

@@ -95,13 +95,11 @@ def _reset(size: Size, key: PRNGKeyArray) -> State:
 
 def _observe(size: Size, state: State) -> Float[Array, "agents observation"]:
     """Return each agent's velocity and position, the nearest landmarks, and the nearest other agents."""
-    landmarks = views.nearest_entities(state.position, size.agents, size.landmarks, N_VISIBLE_LANDMARKS)
-    other_agents = views.nearest_entities(state.position, size.agents, size.agents, N_VISIBLE_AGENTS)
     return views.concatenate_rows(
         views.slice_rows(state.velocity, size.agents),
         views.slice_rows(state.position, size.agents),
-        views.relative_positions(state.position, size.agents, landmarks),
-        views.relative_positions(state.position, size.agents, other_agents),
+        views.nearest_positions(state.position, size.agents, size.landmarks, N_VISIBLE_LANDMARKS),
+        views.nearest_positions(state.position, size.agents, size.agents, N_VISIBLE_AGENTS),
     )
 
 

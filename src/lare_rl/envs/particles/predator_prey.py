@@ -5,11 +5,14 @@
 
 after `simple_tag` of the multi-agent particle environments (Lowe et al., 2017), in the form of STAS and LaRe
 (`simple_tag_n6_noshare` and so on, where the predators learn and the preys follow a script, and `hetero_tag_n6_noshare`,
-where both learn).
+where both learn). The script of preys is a small policy network that ships with the package, trained by `benchmarks/train_prey.py`:
+
+    logits = W_3 relu(W_2 relu(W_1 observation)), and an action is drawn from their softmax
 """
 
 from dataclasses import dataclass
-from functools import partial
+from functools import cache, partial
+from importlib.resources import files
 
 import jax
 import jax.numpy as jnp
@@ -18,16 +21,16 @@ from jaxtyping import Array, Float, Int, PRNGKeyArray
 
 from lare_rl.envs.interface import Team
 from lare_rl.envs.particles import views
-from lare_rl.envs.particles.prey import Layers, sample_actions, shipped_prey
 from lare_rl.envs.particles.task import ParticleTask
 from lare_rl.envs.particles.world import State, World, at_rest
 
 __all__ = [
     "SIZES",
+    "Layers",
     "Size",
     "View",
     "competitive",
-    "flee",
+    "logits",
     "make_world",
     "observe_predators",
     "observe_preys",
@@ -35,6 +38,8 @@ __all__ = [
     "reset",
     "reward_predators",
     "reward_preys",
+    "sample_actions",
+    "shipped_prey",
     "touches",
 ]
 
@@ -45,6 +50,10 @@ CATCH = 10.0
 DISTANCE_WEIGHT = 0.1
 MARGIN = 0.1
 """Obstacles keep this distance from the border of the square in which all other entities start."""
+
+
+Layers = tuple[tuple[Float[np.ndarray | Array, "_in _out"], Float[np.ndarray | Array, " _out"]], ...]
+"""Weight and bias of each layer of the scripted preys' network."""
 
 
 @dataclass(frozen=True)
@@ -107,7 +116,7 @@ def predator_prey(name: str) -> ParticleTask:
         reset=partial(reset, size),
         observe=partial(observe_predators, size),
         reward=partial(reward_predators, size),
-        script=lambda state, key: flee(size, shipped_prey(), state, key),
+        script=lambda state, key: sample_actions(shipped_prey(), observe_preys(size, state), key),
     )
 
 
@@ -166,12 +175,8 @@ def _observe(size: Size, state: State, observers: range, view: View) -> Float[Ar
     return views.concatenate_rows(
         views.slice_rows(state.velocity, observers),
         views.slice_rows(position, observers),
-        views.relative_positions(
-            position, observers, views.nearest_entities(position, observers, size.obstacles, view.landmarks)
-        ),
-        views.relative_positions(
-            position, observers, views.nearest_entities(position, observers, size.predators, view.predators)
-        ),
+        views.nearest_positions(position, observers, size.obstacles, view.landmarks),
+        views.nearest_positions(position, observers, size.predators, view.predators),
         views.relative_positions(position, observers, preys),
         state.velocity[preys],
     )
@@ -193,5 +198,25 @@ def reward_preys(size: Size, state: State) -> Float[Array, " preys"]:
     return -CATCH * jnp.sum(touches(size, state), axis=0)
 
 
-def flee(size: Size, layers: Layers, state: State, key: PRNGKeyArray) -> Int[Array, " preys"]:
-    return sample_actions(layers, observe_preys(size, state), key)
+# Scripted preys
+
+
+@cache
+def shipped_prey() -> Layers:
+    """Load the prey's network, which is the same for PP-6, PP-15 and PP-30."""
+    with files("lare_rl.envs.particles").joinpath("prey.npz").open("rb") as file, np.load(file) as arrays:
+        return tuple((arrays[f"weight_{i}"], arrays[f"bias_{i}"]) for i in range(len(arrays) // 2))
+
+
+def logits(layers: Layers, observation: Float[Array, "preys observation"]) -> Float[Array, "preys actions"]:
+    *hidden, (weight, bias) = layers
+    for hidden_weight, hidden_bias in hidden:
+        observation = jax.nn.relu(observation @ hidden_weight + hidden_bias)
+    return observation @ weight + bias
+
+
+def sample_actions(
+    layers: Layers, observation: Float[Array, "preys observation"], key: PRNGKeyArray
+) -> Int[Array, " preys"]:
+    """Sample an action of each prey from the softmax of its logits."""
+    return jax.random.categorical(key, logits(layers, observation))

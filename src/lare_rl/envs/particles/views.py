@@ -5,12 +5,12 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-__all__ = ["concatenate_rows", "distances", "nearest_entities", "relative_positions", "slice_rows"]
+__all__ = ["concatenate_rows", "distances", "nearest_entities", "nearest_positions", "relative_positions", "slice_rows"]
+
+Positions = Float[Array, "entities 2"]
 
 
-def distances(
-    position: Float[Array, "entities 2"], observers: range, targets: range
-) -> Float[Array, "observers targets"]:
+def distances(position: Positions, observers: range, targets: range) -> Float[Array, "observers targets"]:
     """Return the distances between the centres of observers and targets; infinite from an entity to itself."""
     offset = slice_rows(position, targets) - slice_rows(position, observers)[:, None]
     is_same = np.asarray(observers)[:, None] == np.asarray(targets)
@@ -18,7 +18,7 @@ def distances(
 
 
 def nearest_entities(
-    position: Float[Array, "entities 2"], observers: range, targets: range, count: int
+    position: Positions, observers: range, targets: range, count: int
 ) -> Int[Array, "observers count"]:
     """Return the indices of the `count` targets that are nearest to each observer, nearest first."""
     _, index = jax.lax.top_k(-distances(position, observers, targets), count)
@@ -26,9 +26,16 @@ def nearest_entities(
 
 
 def relative_positions(
-    position: Float[Array, "entities 2"], observers: range, entities: Int[Array, "observers count"]
+    position: Positions, observers: range, entities: Int[Array, "observers count"]
 ) -> Float[Array, "observers count 2"]:
     return position[entities] - slice_rows(position, observers)[:, None]
+
+
+def nearest_positions(
+    position: Positions, observers: range, targets: range, count: int
+) -> Float[Array, "observers count 2"]:
+    """Return the relative positions of the `count` nearest targets."""
+    return relative_positions(position, observers, nearest_entities(position, observers, targets, count))
 
 
 def slice_rows(values: Float[Array, "entities 2"], entities: range) -> Float[Array, "range 2"]:

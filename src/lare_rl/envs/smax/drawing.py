@@ -20,10 +20,7 @@ ALLY_COLOUR, ENEMY_COLOUR, DEAD_COLOUR = "#0072b2", "#d55e00", "#bbbbbb"
 def draw_frames(scenario: Scenario, battles: Battle, credit: Float[np.ndarray, " steps"] | None = None) -> list[Frame]:
     """Draw an episode as pictures. Each unit is a disc, filled in proportion to its health. Lines show the hits of a step.
 
-    Args:
-        scenario: the units.
-        battles: one state for each picture, along a leading axis.
-        credit: for each state, the credit of the step before it, which is shown as a number.
+    `battles` are the states, along a leading axis. The credit of the step before a state is shown as a number.
     """
     battles = jax.tree.map(np.asarray, battles)
     states = [jax.tree.map(itemgetter(step), battles) for step in range(len(battles.step))]

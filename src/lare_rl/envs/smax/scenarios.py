@@ -12,8 +12,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float, Int
 
-from lare_rl.envs.smax import SCENARIO_NAMES
-from lare_rl.errors import LareError, did_you_mean
+from lare_rl.errors import find_named
 
 __all__ = ["SCENARIOS", "UNIT_TYPES", "Scenario", "UnitType", "find_scenario"]
 
@@ -100,11 +99,5 @@ SCENARIOS = {
 
 
 def find_scenario(name: str) -> Scenario:
-    """Return the scenario of a name.
-
-    Raises:
-        LareError: no scenario has this name; the message lists all names.
-    """
-    if name in SCENARIOS:
-        return SCENARIOS[name]
-    raise LareError(f"no scenario {name!r}{did_you_mean(name, SCENARIOS)}. SMAX has {', '.join(SCENARIO_NAMES)}.")
+    """Return the scenario of a name. Raises `LareError` if no scenario has it."""
+    return find_named("scenario", "scenarios of SMAX", name, SCENARIOS)
