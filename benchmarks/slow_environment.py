@@ -23,8 +23,7 @@ from gymnasium.spaces import Box, Discrete
 
 import lare_rl
 from lare_rl.config.settings import Settings
-from lare_rl.envs.families import make_host_env
-from lare_rl.envs.placement import needs_process
+from lare_rl.envs.placement import make_host_env, needs_process
 from lare_rl.envs.trials import fixed_action
 from lare_rl.tasks.spec import TaskSpec
 from lare_rl.training import loop

@@ -15,8 +15,8 @@ from pydantic import Field, field_validator
 from lare_rl.config.resolve import choose_algorithm
 from lare_rl.config.settings import Settings
 from lare_rl.credit.methods import METHODS
-from lare_rl.envs.families import load_env_spec
 from lare_rl.envs.load import load_task
+from lare_rl.envs.placement import load_env_spec
 from lare_rl.errors import CheckedModel, LareError
 from lare_rl.runs.metric_names import RETURN
 from lare_rl.sweep.jobs import Job, make_job

@@ -11,7 +11,7 @@ from lare_rl.compare.comparison import Comparison, compare
 from lare_rl.compare.messages import find_small_samples, to_text
 from lare_rl.compare.results import read_run_results
 from lare_rl.compare.scores import LabelScores, ScoreChoice
-from lare_rl.envs.families import load_env_spec
+from lare_rl.envs.placement import load_env_spec
 from lare_rl.report import figures
 from lare_rl.runs.directory import Run, open_without_functions
 from lare_rl.runs.metric_names import CREDIT_CORRELATION, CREDIT_ERROR, RETURN, SUMMED_RETURN

@@ -8,10 +8,11 @@ import pytest
 from helpers.host_envs import ToyHostEnv
 from helpers.jax_toy_envs import Echo
 from helpers.toy_envs import toy_spec
-from lare_rl.envs.families import find_score_type, load_env_spec, make_env, make_host_env, register_family
+from lare_rl.envs.families import find_score_type, make_env, register_family
 from lare_rl.envs.interface import EnvSpec, Team
 from lare_rl.envs.jax_on_host import JaxOnHost
 from lare_rl.envs.load import read_task
+from lare_rl.envs.placement import load_env_spec, make_host_env
 from lare_rl.errors import LareError
 from lare_rl.tasks.spec import TaskSpec
 

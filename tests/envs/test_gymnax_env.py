@@ -3,8 +3,8 @@
 import numpy as np
 
 from helpers.jax_families import check_arrays, family_task, play, require_family, step_keys
-from lare_rl.envs.families import load_env_spec
 from lare_rl.envs.gymnax_env import make
+from lare_rl.envs.placement import load_env_spec
 
 require_family("gymnax")
 

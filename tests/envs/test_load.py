@@ -7,8 +7,8 @@ import pytest
 
 from helpers.long_tests import long_case
 from helpers.toy_envs import Chase, toy_spec
-from lare_rl.envs.families import load_env_spec
 from lare_rl.envs.load import check_environment, load_task, read_task, shipped_tasks
+from lare_rl.envs.placement import load_env_spec
 from lare_rl.errors import LareError
 
 NAMES = (

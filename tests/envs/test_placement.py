@@ -10,8 +10,14 @@ import pytest
 from helpers.single_instance import N_STEPS, simulations, single_spec
 from helpers.toy_envs import toy_spec
 from lare_rl.envs import placement, workers
-from lare_rl.envs.families import load_env_spec, make_host_env
-from lare_rl.envs.placement import make_vec_env, measure_step_s, n_open_envs, needs_process
+from lare_rl.envs.placement import (
+    load_env_spec,
+    make_host_env,
+    make_vec_env,
+    measure_step_s,
+    n_open_envs,
+    needs_process,
+)
 from lare_rl.envs.play import play_episodes
 from lare_rl.envs.vec_env import LocalVecEnv
 from lare_rl.envs.workers import close_idle_workers

@@ -12,9 +12,10 @@ from PIL import Image
 
 import lare_rl
 from helpers.toy_envs import Chase, levels_spec, pick_spec, toy_spec
-from lare_rl.envs.families import make_host_env, register_family
+from lare_rl.envs.families import register_family
 from lare_rl.envs.gymnasium_env import GymnasiumEnv
 from lare_rl.envs.load import load_task
+from lare_rl.envs.placement import make_host_env
 from lare_rl.envs.vec_env import LocalVecEnv
 from lare_rl.errors import LareError, check_count, install_command
 from lare_rl.evaluation import evaluate as module

@@ -17,8 +17,9 @@ from lare_rl.credit.history import next_history_columns
 from lare_rl.credit.input_names import input_arrays
 from lare_rl.credit.methods import METHODS, Method
 from lare_rl.credit.spec import CreditSpec
-from lare_rl.envs.families import find_score_type, load_env_spec
+from lare_rl.envs.families import find_score_type
 from lare_rl.envs.load import resolve_task
+from lare_rl.envs.placement import load_env_spec
 from lare_rl.errors import CheckedModel, Count, LareError, short_repr
 from lare_rl.latent.function import LatentFunction, check_task
 from lare_rl.tasks.payments import PAID_AT_END, PaymentRule

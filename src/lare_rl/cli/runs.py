@@ -36,7 +36,7 @@ def evaluate(
         video: a .gif to write of one episode of the first seed (.mp4 with the extra lare-rl[video]).
     """
     _refuse_untrusted(run)
-    from lare_rl.envs.families import load_env_spec
+    from lare_rl.envs.placement import load_env_spec
     from lare_rl.evaluation.evaluate import move_evaluations
     from lare_rl.evaluation.video import check_video_path, record_video
     from lare_rl.report.evaluation_lines import evaluation_lines

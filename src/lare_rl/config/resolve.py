@@ -9,8 +9,9 @@ from lare_rl.config.validity import CreditContext, check_credit
 from lare_rl.credit.decoder_settings import MULTI_AGENT_CREDIT, RECENT_STEPS, CreditSettings
 from lare_rl.credit.methods import METHODS
 from lare_rl.data.replay import required_capacity
-from lare_rl.envs.families import find_score_type, load_env_spec
+from lare_rl.envs.families import find_score_type
 from lare_rl.envs.interface import EnvSpec
+from lare_rl.envs.placement import load_env_spec
 from lare_rl.errors import LareError
 from lare_rl.tasks.spec import TaskSpec
 

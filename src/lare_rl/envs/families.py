@@ -3,7 +3,6 @@
 The part of the name before the first slash is the family. All names without a registered family belong to Gymnasium.
 """
 
-import functools
 import importlib
 from collections.abc import Callable
 from functools import partial
@@ -21,9 +20,8 @@ __all__ = [
     "check_logs",
     "find_family",
     "find_score_type",
-    "load_env_spec",
     "make_env",
-    "make_host_env",
+    "make_local_env",
     "picklable_maker",
     "register_family",
 ]
@@ -130,20 +128,8 @@ def _check_functions(task: TaskSpec, env: Any) -> None:
         raise LareError(f"{task.environment}: a {kind} needs {', '.join(names)}, and has no {' and no '.join(missing)}")
 
 
-def make_host_env(task: TaskSpec, **kwargs: Any) -> HostEnv:
-    """Make a task's environment as a `HostEnv`, even if it is a `JaxEnv`. See `make_env`.
-
-    If it needs a process of its own, it gets one, except with `kwargs`, because a worker draws no films.
-    """
-    from lare_rl.envs import placement  # it imports this module
-
-    if not kwargs and placement.runs_separately(task):
-        return placement.SeparateEnv(task)
-    return _make_here(task, **kwargs)
-
-
-def _make_here(task: TaskSpec, **kwargs: Any) -> HostEnv:
-    """Make a task's environment as a `HostEnv` in this process."""
+def make_local_env(task: TaskSpec, **kwargs: Any) -> HostEnv:
+    """Make a task's environment as a `HostEnv` in this process, even if it is a `JaxEnv`. See `make_env`."""
     env = make_env(task, **kwargs)
     if isinstance(env, HostEnv):
         return env
@@ -165,21 +151,7 @@ def _import_and_make(module: str, task: TaskSpec) -> HostEnv:
             f"{task.environment}: a worker process cannot import the script that registers {task.family!r}. "
             "Move the family into a module of its own."
         )
-    return _make_here(task)
-
-
-def load_env_spec(task: TaskSpec) -> EnvSpec:
-    """Return the sizes and bounds of a task's environment. It is made once to read them. Raises `LareError` like `make_env`."""
-    return _load_env_spec(task.model_dump_json())
-
-
-@functools.lru_cache(maxsize=64)
-def _load_env_spec(task_json: str) -> EnvSpec:
-    task = TaskSpec.model_validate_json(task_json)
-    env = make_host_env(task) if task.processes == "separate" else make_env(task)
-    if isinstance(env, HostEnv):
-        env.close()
-    return env.spec
+    return make_local_env(task)
 
 
 def check_logs(task: TaskSpec) -> None:

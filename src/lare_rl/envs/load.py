@@ -64,7 +64,8 @@ def read_task(task: str | Path) -> TaskSpec:
 
 def check_environment(spec: TaskSpec) -> None:
     """Make the environment and compare it with the task. Raises `LareError` at the first mismatch."""
-    from lare_rl.envs.families import check_logs, load_env_spec  # imports NumPy, which listing tasks does not need
+    from lare_rl.envs.families import check_logs  # imports NumPy, which listing tasks does not need
+    from lare_rl.envs.placement import load_env_spec
 
     if spec.environment == NO_ENVIRONMENT:
         check_logs(spec)

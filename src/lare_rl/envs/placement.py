@@ -9,14 +9,14 @@ import contextlib
 import logging
 import math
 from functools import lru_cache
-from typing import NoReturn
+from typing import Any, NoReturn
 
 import gymnasium
 import numpy as np
 from jaxtyping import Float
 
-from lare_rl.envs.families import GYMNASIUM, find_family, load_env_spec, make_host_env, picklable_maker
-from lare_rl.envs.interface import Timestep
+from lare_rl.envs.families import GYMNASIUM, find_family, make_env, make_local_env, picklable_maker
+from lare_rl.envs.interface import EnvSpec, HostEnv, Timestep
 from lare_rl.envs.trials import time_steps
 from lare_rl.envs.vec_env import LocalVecEnv, VecEnv
 from lare_rl.envs.workers import SubprocVecEnv
@@ -27,6 +27,8 @@ from lare_rl.util.processes import n_usable_cores
 __all__ = [
     "SLOW_STEP_S",
     "SeparateEnv",
+    "load_env_spec",
+    "make_host_env",
     "make_vec_env",
     "measure_step_s",
     "n_open_envs",
@@ -75,6 +77,28 @@ class SeparateEnv:
 
     def close(self) -> None:
         self.envs.close()
+
+
+def make_host_env(task: TaskSpec, **kwargs: Any) -> HostEnv:
+    """Make a task's environment as a `HostEnv`, even if it is a `JaxEnv`. See `make_env`.
+
+    If it needs a process of its own, as far as this is known, it gets one, except with `kwargs`, because a worker draws no films.
+    """
+    return SeparateEnv(task) if runs_separately(task) and not kwargs else make_local_env(task, **kwargs)
+
+
+def load_env_spec(task: TaskSpec) -> EnvSpec:
+    """Return the sizes and bounds of a task's environment. It is made once to read them. Raises `LareError` like `make_env`."""
+    return _load_env_spec(task.model_dump_json())
+
+
+@lru_cache(maxsize=64)
+def _load_env_spec(task_json: str) -> EnvSpec:
+    task = TaskSpec.model_validate_json(task_json)
+    env = make_host_env(task) if task.processes == "separate" else make_env(task)
+    if isinstance(env, HostEnv):
+        env.close()
+    return env.spec
 
 
 def make_vec_env(task: TaskSpec, n: int, parallel: bool = False) -> VecEnv:

@@ -10,8 +10,8 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from lare_rl.envs.env_errors import check_finite, name_step
-from lare_rl.envs.families import make_host_env
 from lare_rl.envs.interface import EnvSpec, HostEnv, Team, Timestep, team_mean, to_env_action
+from lare_rl.envs.placement import make_host_env
 from lare_rl.tasks.spec import CreditScope, TaskSpec
 
 __all__ = [

@@ -9,8 +9,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 
-from lare_rl.envs.families import load_env_spec
 from lare_rl.envs.interface import JaxEnv, Team, team_mean
+from lare_rl.envs.placement import load_env_spec
 from lare_rl.errors import LareError, check_count
 from lare_rl.runs.directory import Run
 from lare_rl.training.collect_device import make_jax_env, unroll_on_device

@@ -10,9 +10,8 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
-from lare_rl.envs.families import load_env_spec, make_host_env
 from lare_rl.envs.load import check_environment
-from lare_rl.envs.placement import make_vec_env, n_open_envs
+from lare_rl.envs.placement import load_env_spec, make_host_env, make_vec_env, n_open_envs
 from lare_rl.envs.play import Episode, EpisodeListener, play_roles
 from lare_rl.errors import LareError, check_count
 from lare_rl.runs.directory import Run, as_run

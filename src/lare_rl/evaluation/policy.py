@@ -8,8 +8,8 @@ import jax
 import numpy as np
 from jaxtyping import Bool, Float
 
-from lare_rl.envs.families import load_env_spec
 from lare_rl.envs.interface import to_env_action, to_package_action, with_available_action
+from lare_rl.envs.placement import load_env_spec
 from lare_rl.errors import LareError
 from lare_rl.runs.directory import Run, as_run
 from lare_rl.training.host_policy import HostPolicy, draw_noise, init_host_memory, make_policy

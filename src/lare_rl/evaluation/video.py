@@ -13,10 +13,10 @@ from typing import Any
 import jax
 import numpy as np
 
-from lare_rl.envs.families import load_env_spec, make_host_env
 from lare_rl.envs.gymnasium_env import GymnasiumEnv
 from lare_rl.envs.interface import Frame, HostEnv
 from lare_rl.envs.jax_on_host import JaxOnHost
+from lare_rl.envs.placement import load_env_spec, make_host_env
 from lare_rl.envs.play import play_steps
 from lare_rl.errors import LareError, missing_extra_error
 from lare_rl.evaluation.played_episodes import PlayedEpisodes, play_run

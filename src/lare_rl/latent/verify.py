@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float
 
-from lare_rl.envs.families import make_host_env
+from lare_rl.envs.placement import make_host_env
 from lare_rl.envs.play import find_team, phi_inputs, play_steps
 from lare_rl.errors import LareError
 from lare_rl.latent.factors import compute_batch, find_infinity

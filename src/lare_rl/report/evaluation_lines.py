@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterator, Sequence
 import numpy as np
 
 from lare_rl.algorithms.registry import ALGORITHMS
-from lare_rl.envs.families import load_env_spec
+from lare_rl.envs.placement import load_env_spec
 from lare_rl.envs.play import Episode, EpisodeListener
 from lare_rl.evaluation.evaluate import (
     RANDOM_EPISODES,

@@ -6,7 +6,7 @@ from contextlib import suppress
 from html import escape
 from pathlib import Path
 
-from lare_rl.envs.families import load_env_spec
+from lare_rl.envs.placement import load_env_spec
 from lare_rl.errors import LareError
 from lare_rl.evaluation.evaluate import measure_random_returns, n_random_episodes
 from lare_rl.evaluation.played_episodes import PlayedEpisodes, play_run

@@ -13,7 +13,7 @@ from lare_rl.config.resolve import fill_in
 from lare_rl.config.settings import Settings
 from lare_rl.credit import explanation_text
 from lare_rl.credit.methods import METHODS
-from lare_rl.envs.families import load_env_spec
+from lare_rl.envs.placement import load_env_spec
 from lare_rl.errors import LareError, install_command
 from lare_rl.evaluation.episode_credit import FactorLabel, label_factors, load_episode_credit
 from lare_rl.evaluation.played_episodes import PlayedEpisodes, TeamSample, sample_steps

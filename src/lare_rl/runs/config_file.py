@@ -11,7 +11,7 @@ import jax
 
 from lare_rl.config.migrate import CONFIG, FORMAT, migrate
 from lare_rl.config.settings import ResolvedSettings
-from lare_rl.envs.families import load_env_spec
+from lare_rl.envs.placement import load_env_spec
 from lare_rl.errors import CheckedModel, LareError
 from lare_rl.latent.function import LatentFunction
 from lare_rl.tasks.spec import TaskSpec

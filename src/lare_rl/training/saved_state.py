@@ -10,7 +10,7 @@ from jaxtyping import Int
 from lare_rl.algorithms.registry import ALGORITHMS
 from lare_rl.config.resolve import replay_rows
 from lare_rl.credit.methods import METHODS
-from lare_rl.envs.families import load_env_spec
+from lare_rl.envs.placement import load_env_spec
 from lare_rl.errors import LareError
 from lare_rl.runs import checkpoint
 from lare_rl.runs.best_policy import load_best
