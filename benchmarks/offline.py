@@ -17,7 +17,7 @@ import torch
 
 import lare_rl
 from lare_rl.data import replay
-from lare_rl.logs.log import open_log
+from lare_rl.logs.open_log import open_log
 from lare_rl.training.saved_state import load_learner
 from lare_rl.training.seed_axis import select_seed
 from measure import write

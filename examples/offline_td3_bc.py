@@ -17,7 +17,7 @@ import torch
 from torch import nn
 from torch.nn import functional
 
-from lare_rl.logs.log import open_log
+from lare_rl.logs.open_log import open_log
 
 BATCH, GAMMA, TAU, ALPHA, NOISE, CLIP, DELAY = 256, 0.99, 0.005, 2.5, 0.2, 0.5, 2
 

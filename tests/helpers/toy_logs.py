@@ -3,7 +3,7 @@
 import numpy as np
 
 from lare_rl.logs.episode import RelabelledEpisode
-from lare_rl.logs.log import open_log
+from lare_rl.logs.open_log import open_log
 
 PHI = """import numpy as np
 

@@ -12,7 +12,8 @@ from helpers.toy_logs import check_log, logged_episodes, read_directory, write_r
 from lare_rl import LareError
 from lare_rl.errors import install_command
 from lare_rl.logs.arrays import NpzLog, read_npz
-from lare_rl.logs.log import atomic_output, open_log
+from lare_rl.logs.log import atomic_output
+from lare_rl.logs.open_log import open_log
 
 
 def test_round_trip_keeps_other_arrays(folder, tmp_path):

@@ -10,7 +10,7 @@ from minari.data_collector import EpisodeBuffer
 import lare_rl
 from helpers.toy_logs import check_log, logged_episodes, write_rewards_plus_one
 from lare_rl import LareError
-from lare_rl.logs.log import open_log
+from lare_rl.logs.open_log import open_log
 
 # Minari warns about missing authors and permalinks.
 pytestmark = pytest.mark.filterwarnings("ignore::UserWarning")

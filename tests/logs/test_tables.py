@@ -11,7 +11,7 @@ from lare_rl import LareError
 from lare_rl.logs import log as log_module
 from lare_rl.logs import tables as tables_module
 from lare_rl.logs.episode import RelabelledEpisode
-from lare_rl.logs.log import open_log
+from lare_rl.logs.open_log import open_log
 
 
 @pytest.fixture(autouse=True)

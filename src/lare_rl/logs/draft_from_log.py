@@ -4,7 +4,7 @@ import re
 from typing import Any
 
 from lare_rl.assigner.space_layout import SpaceLayout
-from lare_rl.logs.log import open_log
+from lare_rl.logs.open_log import open_log
 from lare_rl.new_task.documentation import plain_lines, remove_rewards
 from lare_rl.new_task.draft import SCORE_LINE, Draft, count_entries, make_draft, warning_lines
 from lare_rl.tasks.spec import NO_ENVIRONMENT

@@ -1,4 +1,4 @@
-"""Logs: Minari and Hugging Face data sets, directories of .npz files, Parquet files, and arrays."""
+"""What a log is in any format, and how one is written completely or not at all."""
 
 import contextlib
 import shutil
@@ -8,11 +8,11 @@ from pathlib import Path
 from typing import Any, TypeVar
 from uuid import uuid4
 
-from lare_rl.errors import LareError, short_repr
+from lare_rl.errors import LareError
 from lare_rl.logs.episode import LoggedEpisode, LogLayout, RelabelledEpisode, infer_layout, parse_episode
-from lare_rl.tasks.spec import TaskSpec, require_role
+from lare_rl.tasks.spec import TaskSpec
 
-__all__ = ["Log", "atomic_output", "batch_by_steps", "check_output", "open_log"]
+__all__ = ["Log", "atomic_output", "batch_by_steps", "check_output"]
 
 _Item = TypeVar("_Item")
 
@@ -77,59 +77,6 @@ def batch_by_steps(items: Iterable[_Item], count_steps: Callable[[_Item], int]) 
             batch, n_steps = [], 0
     if batch:
         yield batch
-
-
-def open_log(source: Any, task: TaskSpec | None = None) -> Log:
-    """Open a log by its path, its Minari id, or as an object.
-
-    Args:
-        source: a directory of .npz or Parquet files, a Parquet file, a Hugging Face data set on the disk, a Minari id or data set,
-            flat arrays by name (as in D4RL), or a list of episodes, each a mapping of arrays.
-        task: has the time limit, and the number of choices if observations or actions are whole numbers.
-
-    Raises:
-        LareError: the log does not exist, is not a log, or its first episode is damaged.
-    """
-    role = None if task is None else require_role(task)
-    if isinstance(source, str | Path):
-        return _open_path(source, role)
-    # Each format is imported when it is needed, because the libraries of most formats are optional.
-    if hasattr(source, "iterate_episodes"):
-        from lare_rl.logs.minari import MinariLog
-
-        return MinariLog(source, role)
-    if isinstance(source, Iterable) and not isinstance(source, bytes):
-        from lare_rl.logs.arrays import FlatLog, ListLog
-
-        return FlatLog(source, role) if isinstance(source, Mapping) else ListLog(source, role)
-    raise LareError(f"{short_repr(source)} is not a log: a path, a Minari id, arrays by name, or a list of episodes")
-
-
-def _open_path(source: str | Path, role: TaskSpec | None) -> Log:
-    path = Path(source)
-    if path.is_file() and path.suffix.lower() in (".csv", ".tsv", ".txt", ".json", ".jsonl"):
-        raise LareError(
-            f"{path} is text, which cannot be read: write the log as .npz or Parquet (docs/reference/logs.md)"
-        )
-    if path.is_file() or any(path.glob("*.parquet")):
-        from lare_rl.logs.tables import ParquetLog
-
-        return ParquetLog(path, role)
-    if any((path / name).exists() for name in ("state.json", "dataset_dict.json")):
-        from lare_rl.logs.huggingface import HuggingFaceLog
-
-        return HuggingFaceLog(path, role)
-    if path.is_dir():
-        from lare_rl.logs.arrays import NpzLog
-
-        return NpzLog(path, role)
-    if isinstance(source, Path) or source.endswith((".parquet", "/")):
-        raise LareError(f"{source} does not exist")
-    try:
-        from lare_rl.logs.minari import MinariLog, load_dataset
-    except LareError as error:
-        raise LareError(f"no file or directory {source} exists. If it is the id of a data set: {error}") from error
-    return MinariLog(load_dataset(source), role)
 
 
 def check_output(out: Path, overwrite: bool, folders: Container[str] = ()) -> None:

@@ -24,7 +24,8 @@ from lare_rl.envs.load import resolve_task
 from lare_rl.errors import LareError
 from lare_rl.latent.function import LatentFunction
 from lare_rl.logs.episode import RelabelledEpisode
-from lare_rl.logs.log import Log, batch_by_steps, open_log
+from lare_rl.logs.log import Log, batch_by_steps
+from lare_rl.logs.open_log import open_log
 from lare_rl.tasks.payments import is_paid
 from lare_rl.tasks.spec import TaskSpec
 from lare_rl.util.findings import Finding, render

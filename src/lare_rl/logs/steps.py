@@ -9,7 +9,7 @@ import numpy as np
 from lare_rl.envs.load import resolve_task
 from lare_rl.envs.play import Episode
 from lare_rl.latent.verify import N_SAMPLE_STEPS, Steps, evenly_spaced
-from lare_rl.logs.log import open_log
+from lare_rl.logs.open_log import open_log
 from lare_rl.tasks.spec import TaskSpec, select_states
 
 __all__ = ["logged_episodes", "logged_steps"]

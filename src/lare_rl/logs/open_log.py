@@ -1,0 +1,66 @@
+"""Logs by format: Minari and Hugging Face data sets, directories of .npz files, Parquet files, and arrays.
+
+Each format is imported when it is needed, because the libraries of most formats are optional.
+"""
+
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from typing import Any
+
+from lare_rl.errors import LareError, short_repr
+from lare_rl.logs.log import Log
+from lare_rl.tasks.spec import TaskSpec, require_role
+
+__all__ = ["open_log"]
+
+
+def open_log(source: Any, task: TaskSpec | None = None) -> Log:
+    """Open a log by its path, its Minari id, or as an object.
+
+    Args:
+        source: a directory of .npz or Parquet files, a Parquet file, a Hugging Face data set on the disk, a Minari id or data set,
+            flat arrays by name (as in D4RL), or a list of episodes, each a mapping of arrays.
+        task: has the time limit, and the number of choices if observations or actions are whole numbers.
+
+    Raises:
+        LareError: the log does not exist, is not a log, or its first episode is damaged.
+    """
+    role = None if task is None else require_role(task)
+    if isinstance(source, str | Path):
+        return _open_path(source, role)
+    if hasattr(source, "iterate_episodes"):
+        from lare_rl.logs.minari import MinariLog
+
+        return MinariLog(source, role)
+    if isinstance(source, Iterable) and not isinstance(source, bytes):
+        from lare_rl.logs.arrays import FlatLog, ListLog
+
+        return FlatLog(source, role) if isinstance(source, Mapping) else ListLog(source, role)
+    raise LareError(f"{short_repr(source)} is not a log: a path, a Minari id, arrays by name, or a list of episodes")
+
+
+def _open_path(source: str | Path, role: TaskSpec | None) -> Log:
+    path = Path(source)
+    if path.is_file() and path.suffix.lower() in (".csv", ".tsv", ".txt", ".json", ".jsonl"):
+        raise LareError(
+            f"{path} is text, which cannot be read: write the log as .npz or Parquet (docs/reference/logs.md)"
+        )
+    if path.is_file() or any(path.glob("*.parquet")):
+        from lare_rl.logs.tables import ParquetLog
+
+        return ParquetLog(path, role)
+    if any((path / name).exists() for name in ("state.json", "dataset_dict.json")):
+        from lare_rl.logs.huggingface import HuggingFaceLog
+
+        return HuggingFaceLog(path, role)
+    if path.is_dir():
+        from lare_rl.logs.arrays import NpzLog
+
+        return NpzLog(path, role)
+    if isinstance(source, Path) or source.endswith((".parquet", "/")):
+        raise LareError(f"{source} does not exist")
+    try:
+        from lare_rl.logs.minari import MinariLog, load_dataset
+    except LareError as error:
+        raise LareError(f"no file or directory {source} exists. If it is the id of a data set: {error}") from error
+    return MinariLog(load_dataset(source), role)
