@@ -20,6 +20,7 @@ from lare_rl.envs.vec_env import LocalVecEnv
 from lare_rl.training import collect_host
 from lare_rl.training.collect_host import HostCollector, HostVecEnv
 from lare_rl.training.compiled import compile_functions, init_seeds
+from lare_rl.training.policy import get_actor
 from lare_rl.training.streams import Stream, episode_seed, seed_keys, stream_keys
 from lare_rl.training.unroll_host import DivergedError, evaluate_on_host, evaluate_policy_on_host, record_on_host
 
@@ -216,8 +217,8 @@ def test_evaluate_initial_states_and_returns():
 def test_evaluated_episode_does_not_depend_on_the_number_of_environments():
     """Neither its initial state nor the choices that a policy samples."""
     config = small_config("dense", "ppo", local_envs(1, pick_spec()).spec)
-    functions = compile_functions(config)
-    actor = functions.get_actor(init_seeds(functions, seed_keys(jnp.array([0, 3]), 0)), 0)
+    learner = init_seeds(compile_functions(config), seed_keys(jnp.array([0, 3]), 0))
+    actor = get_actor(learner.algorithm, 0, config)
     results, steps, episodes = [], [], []
     for width in (5, 2):
         envs, listeners = local_envs(2 * width, pick_spec()), (lambda: steps.append(len(episodes)), episodes.append)
@@ -248,7 +249,7 @@ def test_actions_are_random_until_the_end_of_the_warmup(monkeypatch):
     config = small_config("dense", env=envs.spec, hyperparameters=settings)
     monkeypatch.setattr(
         collect_host,
-        "make_policy",
+        "make_host_policy",
         lambda *arguments, **options: lambda memory, *inputs: (np.full((2, 1, 1, 1), 0.5, np.float32), memory),
     )
     collector = HostCollector(envs, local_envs(2), config, (0, 1))

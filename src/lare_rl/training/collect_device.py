@@ -18,17 +18,13 @@ from lare_rl.errors import LareError
 from lare_rl.nn.masks import select
 from lare_rl.tasks.spec import TaskSpec
 from lare_rl.training.compile_cache import cache_by_value
-from lare_rl.training.compiled import init_memory, policy_function
 from lare_rl.training.evaluation import EpisodeBatch, Evaluation
+from lare_rl.training.policy import Policy, init_memory, make_policy
 from lare_rl.training.seed_axis import jit_over_seeds, seed_sharding
 from lare_rl.training.static_config import TrainConfig
 from lare_rl.training.streams import Stream, device_noise, stream_keys
 
 __all__ = ["DeviceCollector", "VecEnvState", "collect", "is_reset_cheap", "make_jax_env", "reset", "unroll_on_device"]
-
-Act = Callable[..., tuple[Array, Any]]
-"""From actor, memory, observation, available actions, noise and episode starts to the action and the new memory."""
-
 
 MAX_RESET_FLOPS = 2e7
 """A card resets all environments with each step, and uses the result where an episode has ended, if that takes fewer operations than
@@ -83,12 +79,6 @@ class DeviceCollector:
         self.envs = jax.device_put(envs, seed_sharding(self._n_devices))
         return np.zeros(self.envs.episode_start.shape, bool), []
 
-    def watch(self, on_step: Callable[[int], None], stop_requested: Callable[[], bool]) -> None:
-        """Do nothing: one compiled call makes all steps of an iteration."""
-
-    def close(self) -> None:
-        """Do nothing: there is nothing to close."""
-
 
 def _is_key(leaf: Array) -> bool:
     """Return whether an array holds random keys, as the state of an environment may."""
@@ -102,10 +92,10 @@ def unroll_on_device(
     n_episodes: int,
     config: TrainConfig,
     deterministic: bool,
-    act: Act | None = None,
+    act: Policy | None = None,
 ) -> EpisodeBatch:
     """Play whole episodes of a policy, each from a different initial state. `act` replaces the policy of training."""
-    act = act or policy_function(config, deterministic)
+    act = act or make_policy(config, deterministic)
     reset_keys, step_keys = jnp.unstack(_split_keys(keys, 2), axis=1)
     envs = reset(env, reset_keys, n_episodes, config)
 
@@ -156,7 +146,7 @@ def _draw(keys: Key[Array, " seeds"], n_envs: int, config: TrainConfig, determin
 
 
 def _step(
-    env: JaxEnv, envs: VecEnvState, actor: Any, randomness: _Randomness, config: TrainConfig, act: Act
+    env: JaxEnv, envs: VecEnvState, actor: Any, randomness: _Randomness, config: TrainConfig, act: Policy
 ) -> tuple[VecEnvState, Trajectory]:
     """Step all environments. Episodes that have ended are not reset."""
     timestep, noise = envs.timestep, randomness.noise
@@ -201,9 +191,9 @@ def collect(
     return envs, jax.tree.map(lambda rows: jnp.swapaxes(rows, 0, 1), steps)
 
 
-def _exploration_policy(env_steps: int | Int[Array, ""], config: TrainConfig) -> Act:
+def _exploration_policy(env_steps: int | Int[Array, ""], config: TrainConfig) -> Policy:
     """Return the policy that collects. During the warmup, its actions are random: evenly distributed between the bounds."""
-    policy = policy_function(config, deterministic=False)
+    policy = make_policy(config, deterministic=False)
     if not config.warmup:
         return policy
     assert config.noise is Noise.NORMAL

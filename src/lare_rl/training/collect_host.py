@@ -22,7 +22,7 @@ from lare_rl.envs.vec_env import VecEnv
 from lare_rl.errors import LareError
 from lare_rl.tasks.spec import TaskSpec
 from lare_rl.training.evaluation import Evaluation
-from lare_rl.training.host_policy import draw_noise, init_host_memory, make_policy
+from lare_rl.training.policy import draw_noise, init_host_memory, make_host_policy
 from lare_rl.training.static_config import TrainConfig
 from lare_rl.training.streams import Stream, episode_seed, numpy_generator
 from lare_rl.training.unroll_host import add_seed_axis, check_actions, evaluate_policy_on_host
@@ -198,7 +198,7 @@ class HostCollector:
             uniform = [rng.uniform(-1, 1, (*shape, config.env.action_size)) for rng in rngs]
             action = np.stack(uniform, axis=1).astype(np.float32)
             return self._envs.collect(lambda timestep, action_t, episode_start: action_t, action, report)
-        policy = make_policy(config, actor, config.n_envs, deterministic=False)
+        policy = make_host_policy(config, actor, config.n_envs, deterministic=False)
         noise = np.moveaxis(draw_noise(config, rngs, config.rollout_steps, config.n_envs), 1, 0)
 
         def explore(timestep: Timestep, noise_t: np.ndarray, episode_start: np.ndarray) -> np.ndarray:

@@ -1,4 +1,4 @@
-"""Whole episodes of a policy, and what an evaluation measures of them."""
+"""Whole episodes of a policy, and what an evaluation measures of them and of the policy's actions."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -6,13 +6,29 @@ from typing import Any, NamedTuple
 
 import jax
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Array, Bool, Float, Int, Shaped
 
+from lare_rl.data.replay import Replay, capacity
 from lare_rl.data.trajectory import Trajectory
 from lare_rl.envs.interface import AnyArray, EnvSpec
 from lare_rl.tasks.spec import TaskSpec
+from lare_rl.training.policy import compile_policy
+from lare_rl.training.static_config import TrainConfig
 
-__all__ = ["EpisodeBatch", "Evaluation", "concatenate", "metrics_lines"]
+__all__ = [
+    "EpisodeBatch",
+    "Evaluation",
+    "concatenate",
+    "greedy_actions",
+    "measure_saturation",
+    "metrics_lines",
+    "saturation",
+]
+
+N_STATES = 1000
+"""The number of stored observations in which the saturation of a policy is measured."""
+ACTION_BOUND = 0.99
+"""A component of a normalised action is at a bound if its size is larger."""
 
 
 class EpisodeBatch(NamedTuple):
@@ -75,3 +91,40 @@ def metrics_lines(seeds: Sequence[int], step: int, metrics: Mapping[str, Any], r
         valid = {name: value if math.isfinite(value) else None for name, value in numbers.items()}
         lines.append({"step": step, "seed": seed, **valid, "time/steps_per_second": round(rate, 1)})
     return lines
+
+
+def measure_saturation(actor: Any, replay: Replay, config: TrainConfig) -> Float[np.ndarray, " seeds"]:
+    """Return the saturation of each seed's policy, by an off-policy algorithm, in the newest states of its first environment."""
+    return saturation(greedy_actions(actor, replay, config, N_STATES))
+
+
+def greedy_actions(
+    actor: Any, replay: Replay, config: TrainConfig, n_states: int
+) -> Float[np.ndarray, "seeds states action"]:
+    """Return actions without noise in the newest states of the first environment.
+
+    If fewer are stored, they are repeated: the shape, and so the compiled program, is always the same.
+    """
+    rows = np.asarray(replay.next_row)[:, :1] - 1 - np.arange(n_states) % int(np.min(replay.next_row))
+    observation = _read_first_env(replay.columns["observation"], rows % capacity(replay))
+    available = np.ones((*rows.shape, 1, config.env.action_size), bool)
+    act = compile_policy(config, deterministic=True)
+    action, _ = act(actor, (), observation, available, None, np.zeros(rows.shape, bool))
+    return np.asarray(action)[:, :, 0]
+
+
+def saturation(action: Float[np.ndarray, "seeds steps action"]) -> Float[np.ndarray, " seeds"]:
+    """Return the fraction of an action's components that are at the same bound in all states.
+
+    Each seed's policy has chosen the actions in the same states, without noise, between -1 and 1.
+    """
+    bound = np.where(np.abs(action) > ACTION_BOUND, np.sign(action), 0)
+    return np.mean((bound[:, 0] != 0) & np.all(bound == bound[:, :1], axis=1), axis=-1)
+
+
+@jax.jit
+def _read_first_env(
+    column: Shaped[Array, "seeds envs rows *rest"], rows: Int[Array, "seeds steps"]
+) -> Shaped[Array, "seeds steps *rest"]:
+    """Return rows of a column of the replay, of each seed's first environment."""
+    return jax.vmap(lambda seed_column, seed_rows: seed_column[0, seed_rows])(column, rows)

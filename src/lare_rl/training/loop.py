@@ -14,8 +14,8 @@ from lare_rl.runs.directory import Run
 from lare_rl.runs.metric_names import ACTOR_SATURATION, RETURN
 from lare_rl.runs.metrics_file import append_metrics
 from lare_rl.training import advice
+from lare_rl.training.decoder_fits import FirstFitStoppedError
 from lare_rl.training.explain import describe_returns
-from lare_rl.training.first_fit import FirstFitStoppedError
 from lare_rl.training.progress import Clock, Listener
 from lare_rl.training.seed_axis import first_shard
 from lare_rl.training.session import Session
@@ -47,7 +47,7 @@ def run_session(session: Session, listeners: Sequence[Listener], stop: threading
     clock, explained, saved_at = Clock(session.step), False, time.monotonic()
     returns: list[np.ndarray] = []
     evaluated_at: list[float] = []
-    session.collector.watch(_limit_rate(lambda step: [listener.on_step(step) for listener in listeners]), stop.is_set)
+    session.watch(_limit_rate(lambda step: [listener.on_step(step) for listener in listeners]), stop.is_set)
 
     def say(lines: Iterable[str]) -> None:
         for line in lines:
@@ -112,7 +112,7 @@ def _advance(session: Session, until: int, stop: threading.Event) -> None:
         session.finish_saving()
         raise RunInterruptedError(f"stopped at step {session.step} of {session.settings.steps} and saved; {hint}")
     try:
-        session.advance(until, stop.is_set)
+        session.advance(until)
     except FirstFitStoppedError:
         raise RunInterruptedError(f"stopped during the decoder's first fit; {hint}") from None
 

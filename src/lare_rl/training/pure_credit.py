@@ -32,7 +32,7 @@ from lare_rl.phi.graph import Graph
 from lare_rl.tasks.spec import ScoredObservation
 from lare_rl.training import episodes
 from lare_rl.training.decoder_fits import fit_repeatedly
-from lare_rl.training.factors import compute_factors
+from lare_rl.training.decoder_inputs import compute_factors
 from lare_rl.training.learner import Learner, init_learner, replay_columns, store_with_factors
 from lare_rl.training.rewards import rewards
 from lare_rl.training.static_config import TrainConfig
@@ -198,7 +198,17 @@ def _make_functions(config: TrainConfig, phi: tuple[Graph, ...]) -> PureCredit:
         return PureCreditState(learner, state.n_invalid + jnp.sum(~is_valid))
 
     def refit(state: PureCreditState, key: PRNGKeyArray) -> PureCreditState:
-        return state._replace(learner=_refit(state.learner, key, learn_returns, config))
+        learner = state.learner
+        if not learner.decoders:
+            return state
+        seeds = jax.tree.map(lambda leaf: leaf[None], learner)
+        decoders, n_learned = jax.tree.map(lambda leaf: leaf[0], learn_returns(seeds))
+        learner = learner._replace(reward_sources=decoders, n_learned=n_learned)
+        if config.method.uses_gradient:
+            has_episode = jnp.any(segments_as_episodes(learner.replay).current_episode > 0)
+            fitted = jax.lax.cond(has_episode, lambda: fit_repeatedly(learner, key, config)[0], lambda: decoders)
+            learner = learner._replace(reward_sources=fitted)
+        return state._replace(learner=learner)
 
     def reward(state: PureCreditState, steps: CreditSteps) -> Float[Array, "time envs *agents"]:
         trajectory = _trajectory(steps, config)
@@ -267,40 +277,27 @@ def _stored_steps(learner: Learner, columns: dict[str, Any], next_columns: dict[
     )
 
 
-def _make_learn_returns(config: TrainConfig) -> Callable[..., Any]:
-    """Return `learn_returns` as a function that `vmap` can map at any time.
+def _make_learn_returns(config: TrainConfig) -> Callable[[Learner], tuple[Any, Any]]:
+    """Return a function from learners to their decoders after `learn_returns`, and `n_learned`, that `vmap` can map at any time.
 
     `learn_returns` must be traced with float64 enabled, but a user's `vmap` may trace it later, when it is not. So a mapped axis is
     merged into the axis of seeds.
     """
 
     @jax.custom_batching.custom_vmap
-    def learn_returns(*inputs: Any) -> tuple[Any, ...]:
+    def learn_returns(learner: Learner) -> tuple[Any, Any]:
         with float64():
-            decoders, buffer, n_learned = inputs
-            return episodes.learn_returns(decoders, buffer, n_learned, config)
+            learned = episodes.learn_returns(learner, config)
+        return learned.decoders, learned.n_learned
 
     @learn_returns.def_vmap
-    def _map_learn_returns(axis_size: int, is_mapped: Any, *inputs: Any) -> tuple[Any, Any]:
+    def _map_learn_returns(axis_size: int, is_mapped: Any, learner: Learner) -> tuple[Any, Any]:
         def merge(leaf: Array, mapped: bool) -> Array:
             leaf = leaf if mapped else jnp.broadcast_to(leaf, (axis_size, *leaf.shape))
             return leaf.reshape(leaf.shape[0] * leaf.shape[1], *leaf.shape[2:])  # -1 fails for an array without entries
 
-        learned = learn_returns(*jax.tree.map(merge, list(inputs), is_mapped))
+        learned = learn_returns(jax.tree.map(merge, learner, *is_mapped))
         learned = jax.tree.map(lambda leaf: leaf.reshape(axis_size, len(leaf) // axis_size, *leaf.shape[1:]), learned)
         return learned, jax.tree.map(lambda _: True, learned)
 
     return learn_returns
-
-
-def _refit(learner: Learner, key: PRNGKeyArray, learn_returns: Callable[..., Any], config: TrainConfig) -> Learner:
-    if not learner.decoders:
-        return learner
-    inputs = jax.tree.map(lambda leaf: leaf[None], (learner.decoders, learner.replay, learner.n_learned))
-    decoders, n_learned, _ = jax.tree.map(lambda leaf: leaf[0], learn_returns(*inputs))
-    learner = learner._replace(reward_sources=decoders, n_learned=n_learned)
-    if not config.method.uses_gradient:
-        return learner
-    has_episode = jnp.any(segments_as_episodes(learner.replay).current_episode > 0)
-    fitted = jax.lax.cond(has_episode, lambda: fit_repeatedly(learner, key, config)[0], lambda: learner.decoders)
-    return learner._replace(reward_sources=fitted)
