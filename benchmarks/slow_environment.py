@@ -107,7 +107,7 @@ MEASURED = {
     "storing": (Session, "_store"),
     "updating": (Session, "_update"),
     "evaluating": (Session, "evaluate"),
-    "explaining": (loop, "_explain"),
+    "explaining": (loop, "describe_returns"),
     "checkpoints": (Session, "save"),
 }
 

@@ -14,6 +14,7 @@ from lare_rl.algorithms.registry import Noise
 from lare_rl.data.trajectory import Trajectory
 from lare_rl.envs.families import make_env
 from lare_rl.envs.interface import JaxEnv, Timestep, team_mean, to_env_action
+from lare_rl.envs.vec_env import empty_batch
 from lare_rl.errors import LareError
 from lare_rl.nn.masks import select
 from lare_rl.tasks.spec import TaskSpec
@@ -63,20 +64,19 @@ class DeviceCollector:
 
     def state_dict(self) -> dict[str, np.ndarray]:
         """Return the arrays that `restore` needs."""
-        leaves = jax.tree.leaves(self.envs)
-        return {
-            str(i): np.asarray(jax.random.key_data(leaf) if _is_key(leaf) else leaf) for i, leaf in enumerate(leaves)
-        }
+        leaves = enumerate(jax.tree.leaves(self.envs))
+        return {str(i): np.asarray(jax.random.key_data(leaf) if _is_key(leaf) else leaf) for i, leaf in leaves}
 
     def restore(self, arrays: dict[str, np.ndarray]) -> tuple[Bool[np.ndarray, "seeds envs"], list[str]]:
         """Restore the environments. Return which episodes were dropped, and messages: never any, as on the host."""
         leaves, structure = jax.tree.flatten(self.envs)
-        saved: list[Any] = [arrays[str(i)] for i in range(len(leaves))]
-        for i, leaf in enumerate(leaves):
-            if _is_key(leaf):
-                saved[i] = jax.random.wrap_key_data(saved[i], impl=jax.random.key_impl(leaf))
-        envs = jax.tree.unflatten(structure, saved)
-        self.envs = jax.device_put(envs, seed_sharding(self._n_devices))
+        saved = [
+            jax.random.wrap_key_data(arrays[str(i)], impl=jax.random.key_impl(leaf))
+            if _is_key(leaf)
+            else arrays[str(i)]
+            for i, leaf in enumerate(leaves)
+        ]
+        self.envs = jax.device_put(jax.tree.unflatten(structure, saved), seed_sharding(self._n_devices))
         return np.zeros(self.envs.episode_start.shape, bool), []
 
 
@@ -107,7 +107,7 @@ def unroll_on_device(
         return (envs, running & ~steps.ended), EpisodeBatch(steps, running, envs.state)
 
     keys = jnp.swapaxes(_split_keys(step_keys, config.env.max_steps), 0, 1)
-    randomness = jax.vmap(lambda keys_t: _draw(keys_t, n_episodes, config, deterministic))(keys)
+    randomness = _draw(keys, n_episodes, config, deterministic)
     return jax.lax.scan(body, (envs, jnp.ones_like(envs.episode_start)), randomness)[1]
 
 
@@ -130,19 +130,22 @@ def reset(env: JaxEnv, keys: Key[Array, " seeds"], n_envs: int, config: TrainCon
 class _Randomness(NamedTuple):
     """The random numbers of a step. Those of many steps are drawn at once, which takes a card as long as those of one step."""
 
-    noise: Float[Array, "seeds envs agents noise"] | None
+    noise: Float[Array, "*time seeds envs agents noise"] | None
     """The noise of the policy; None without noise."""
-    keys: Key[Array, "seeds envs"]
+    keys: Key[Array, "*time seeds envs"]
     """The keys of the environments."""
 
 
-def _draw(keys: Key[Array, " seeds"], n_envs: int, config: TrainConfig, deterministic: bool) -> _Randomness:
-    """Draw the random numbers of a step."""
-    noise_keys, env_keys = jnp.unstack(_split_keys(keys, 2), axis=1)
-    noise, shape = None, (n_envs, config.env.n_agents, config.noise_size)
-    if not deterministic:
-        noise = jax.vmap(lambda key: device_noise(key, config.noise, shape))(noise_keys)
-    return _Randomness(noise, _split_keys(env_keys, n_envs))
+def _draw(keys: Key[Array, "time seeds"], n_envs: int, config: TrainConfig, deterministic: bool) -> _Randomness:
+    """Draw the random numbers of steps."""
+
+    def draw_step(keys: Key[Array, " seeds"]) -> _Randomness:
+        noise_keys, env_keys = jnp.unstack(_split_keys(keys, 2), axis=1)
+        shape = n_envs, config.env.n_agents, config.noise_size
+        noise = None if deterministic else jax.vmap(lambda key: device_noise(key, config.noise, shape))(noise_keys)
+        return _Randomness(noise, _split_keys(env_keys, n_envs))
+
+    return jax.vmap(draw_step)(keys)
 
 
 def _step(
@@ -186,7 +189,7 @@ def collect(
 
     keys = jnp.swapaxes(_split_keys(keys, config.rollout_steps), 0, 1)
     step_keys, reset_keys = jnp.unstack(jax.vmap(partial(_split_keys, n_envs=2))(keys), axis=2)
-    randomness = jax.vmap(lambda keys_t: _draw(keys_t, n_envs, config, deterministic=False))(step_keys)
+    randomness = _draw(step_keys, n_envs, config, deterministic=False)
     envs, steps = jax.lax.scan(body, envs, (randomness, reset_keys))
     return envs, jax.tree.map(lambda rows: jnp.swapaxes(rows, 0, 1), steps)
 
@@ -222,20 +225,14 @@ def make_jax_env(task: TaskSpec) -> JaxEnv:
 def _check_shapes(env: JaxEnv, task: TaskSpec) -> None:
     """Raise `LareError` if `reset` or `step` returns arrays of other shapes than the spec says, or lacks a measure."""
     spec, key = env.spec, jax.random.key(0)
-    n_agents = spec.n_agents
+    expected = empty_batch(spec)
     state, first = jax.eval_shape(env.reset, key)
-    action = jax.ShapeDtypeStruct((n_agents, spec.action_size), np.float32)
+    action = jax.ShapeDtypeStruct((spec.n_agents, spec.action_size), np.float32)
     _, second = jax.eval_shape(env.step, state, action, key)
-    shapes = {
-        "observation": (n_agents, spec.observation_size),
-        "alive": (n_agents,),
-        "reward": (n_agents,),
-        "terminated": (),
-        "truncated": (),
-    }
     for function, timestep in (("reset", first), ("step", second)):
-        for name, shape in shapes.items():
-            if (actual := jnp.shape(getattr(timestep, name))) != shape:
+        for name in ("observation", "alive", "reward", "terminated", "truncated"):
+            actual, shape = np.shape(getattr(timestep, name)), np.shape(getattr(expected, name))
+            if actual != shape:
                 raise LareError(f"{task.environment}: {name} of {function} has the shape {actual}, and not {shape}")
         if missing := set(spec.measures) - timestep.measures.keys():
             raise LareError(

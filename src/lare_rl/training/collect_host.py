@@ -14,9 +14,9 @@ import jax
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from lare_rl.data.trajectory import Trajectory
+from lare_rl.data.trajectory import Trajectory, empty_trajectory
 from lare_rl.envs.env_errors import EnvOutputError
-from lare_rl.envs.interface import EnvSpec, Timestep, to_env_action
+from lare_rl.envs.interface import Timestep, to_env_action
 from lare_rl.envs.placement import make_vec_env, n_open_envs
 from lare_rl.envs.vec_env import VecEnv
 from lare_rl.errors import LareError
@@ -42,11 +42,11 @@ class HostVecEnv:
     def __init__(self, envs: VecEnv, seeds: Sequence[int], n_envs: int):
         self.shape = len(seeds), n_envs
         self.envs, self._seeds, self._n_envs = envs, list(seeds), n_envs
-        self._spec = envs.spec
         self._episode = np.full(len(seeds) * n_envs, -1)
         """The number of each environment's running episode."""
         self._actions: list[list[np.ndarray]] = [[] for _ in self._episode]
         """The actions of that episode, in the environment's units."""
+        self._action_shape = envs.spec.n_agents, envs.spec.action_size
         self._timestep = add_seed_axis(envs.batch, self.shape)
         """The current time step of each environment. The next step overwrites it."""
         self._episode_start = np.ones(self.shape, bool)
@@ -71,7 +71,7 @@ class HostVecEnv:
         The policy is a function from a timestep, noise, and which episodes have just begun, to the action. `on_step` is called with the
         number of steps of each seed.
         """
-        steps = _empty_trajectory(self._spec, self._timestep, len(noise))
+        steps = empty_trajectory(self.envs.spec, len(self._seeds), len(noise), self._n_envs)
         try:
             for t, noise_t in enumerate(noise):
                 self._collect_step(policy, noise_t, steps, t)
@@ -87,7 +87,7 @@ class HostVecEnv:
     ) -> None:
         """Make a step, and write it into row `t` of the steps."""
         action = policy(self._timestep, noise, self._episode_start)
-        env_action = to_env_action(action, self._spec)
+        env_action = to_env_action(action, self.envs.spec)
         _write_timestep(steps.timestep, t, self._timestep)
         steps.action[:, t], steps.env_action[:, t] = action, env_action
         rows = env_action.reshape(-1, *env_action.shape[2:])
@@ -104,7 +104,7 @@ class HostVecEnv:
         """Return the arrays that `restore` needs to continue the running episodes."""
         arrays = {"episode": self._episode.copy(), "new": self._episode_start}
         for index, actions in enumerate(self._actions):
-            arrays[f"actions{index}"] = np.reshape(actions, (-1, self._spec.n_agents, self._spec.action_size))
+            arrays[f"actions{index}"] = np.reshape(actions, (-1, *self._action_shape))
             arrays[f"observation{index}"] = self.envs.batch.observation[index].copy()
         return arrays
 
@@ -120,7 +120,7 @@ class HostVecEnv:
         self._episode = arrays["episode"].copy()
         indices = range(len(self._episode))
         actions = [arrays[f"actions{index}"] for index in indices]
-        idle = np.zeros((self._spec.n_agents, self._spec.action_size), np.float32)  # of environments that do not step
+        idle = np.zeros(self._action_shape, np.float32)  # of environments that do not step
         self._call(lambda: self.envs.reset(np.ones(len(indices), bool), self._episode_seeds()))
         ended_early = np.zeros(len(indices), bool)
         for t in range(max(map(len, actions))):
@@ -129,8 +129,8 @@ class HostVecEnv:
             timestep = self._call(lambda action=action_t, where=where: self.envs.step(action, where))
             ended_early |= where & (timestep.terminated | timestep.truncated)
         self._actions, self._episode_start = [list(rows) for rows in actions], arrays["new"].copy()
-        same = [np.array_equal(self.envs.batch.observation[index], arrays[f"observation{index}"]) for index in indices]
-        dropped = ended_early | ~np.array(same)
+        expected = np.stack([arrays[f"observation{index}"] for index in indices])
+        dropped = ended_early | (self.envs.batch.observation != expected).any(axis=(1, 2))
         messages = [
             f"episode {self._episode[index]} of seed {self._seed(index)} was dropped after {len(actions[index])} steps: "
             "the same actions did not lead to the same observation again"
@@ -149,11 +149,11 @@ class HostVecEnv:
 
     def _episode_seeds(self) -> Int[np.ndarray, " all"]:
         """Return the random seed of each environment's running episode."""
-        seeds = []
-        for index, episode in enumerate(self._episode):
-            number = int(episode) * self._n_envs + index % self._n_envs  # among all episodes of the seed
-            seeds.append(episode_seed(self._seed(index), Stream.TRAINING_EPISODES, number))
-        return np.array(seeds)
+        # The number of an episode, among all episodes of the seed.
+        numbers = [int(episode) * self._n_envs + i % self._n_envs for i, episode in enumerate(self._episode)]
+        return np.array(
+            [episode_seed(self._seed(i), Stream.TRAINING_EPISODES, number) for i, number in enumerate(numbers)]
+        )
 
     def _call(self, function: Callable[[], Timestep]) -> Timestep:
         """Call the environments. An error names the step, episode and seed of the environment that raised it."""
@@ -165,6 +165,9 @@ class HostVecEnv:
             env = f" in environment {index % self._n_envs}" if self._n_envs > 1 else ""
             where = f"at step {len(self._actions[index])} of episode {self._episode[index]} of seed {self._seed(index)}{env}"
             raise EnvOutputError(f"{error}, {where}") from None
+
+
+def _ignore_step(step: int) -> None: ...
 
 
 class HostCollector:
@@ -211,13 +214,10 @@ class HostCollector:
 
     def evaluate(self, actor: Any, n_episodes: int, deterministic: bool = False) -> Evaluation:
         """Evaluate whole episodes of the policy, always from the same initial states. If `deterministic`, by its likeliest actions."""
-
-        def report() -> None:
-            self._on_step(self._step)
-
-        envs, config = self._evaluation_envs, self._config
-        config = replace(config, deterministic=True) if deterministic else config
-        return evaluate_policy_on_host(envs, config, actor, self._seeds, n_episodes, on_step=report)
+        config = replace(self._config, deterministic=True) if deterministic else self._config
+        return evaluate_policy_on_host(
+            self._evaluation_envs, config, actor, self._seeds, n_episodes, on_step=lambda: self._on_step(self._step)
+        )
 
     def state_dict(self) -> dict[str, np.ndarray]:
         """Return the arrays that `restore` needs: seeds and actions of the running episodes, and the actors' memory."""
@@ -238,9 +238,6 @@ class HostCollector:
             self._evaluation_envs.close()
 
 
-def _ignore_step(step: int) -> None: ...
-
-
 def make_host_collector(
     task: TaskSpec, config: TrainConfig, seeds: Sequence[int], n_evaluation_episodes: int
 ) -> HostCollector:
@@ -249,17 +246,6 @@ def make_host_collector(
     envs = make_vec_env(task, n_seeds * config.n_envs, parallel=config.n_envs > 1)
     evaluation_envs = make_vec_env(task.evaluation_task, n_seeds * n_open_envs(task, n_seeds, n_evaluation_episodes))
     return HostCollector(envs, evaluation_envs, config, seeds)
-
-
-def _empty_trajectory(spec: EnvSpec, timestep: Timestep, n_steps: int) -> Trajectory:
-    n_seeds, n_envs = timestep.terminated.shape
-
-    def empty_timestep() -> Timestep:
-        return jax.tree.map(lambda leaf: np.zeros((n_seeds, n_steps, *leaf.shape[1:]), leaf.dtype), timestep)
-
-    action = np.zeros((n_seeds, n_steps, n_envs, spec.n_agents, spec.action_size), np.float32)
-    env_action = action.astype(spec.action_dtype)
-    return Trajectory(empty_timestep(), action, env_action, empty_timestep())
 
 
 def _write_timestep(columns: Timestep, t: int, timestep: Timestep) -> None:

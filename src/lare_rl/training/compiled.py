@@ -14,8 +14,7 @@ from jaxtyping import Array, Bool, Float, Key
 from lare_rl.algorithms.batches import Metrics
 from lare_rl.algorithms.registry import Consumes
 from lare_rl.credit.score_type import ScoreType
-from lare_rl.data.trajectory import Trajectory
-from lare_rl.envs.interface import Timestep
+from lare_rl.data.trajectory import Trajectory, empty_trajectory
 from lare_rl.nn.leading_axis import map_leading_axis
 from lare_rl.phi.graph import Graph
 from lare_rl.training import off_policy, on_policy, sequences
@@ -37,7 +36,6 @@ __all__ = [
     "init_seeds",
     "is_batching_faster",
     "learner_shape",
-    "steps_shape",
     "train_step_function",
 ]
 
@@ -117,7 +115,8 @@ def compile_ahead(
     """
     functions = compile_functions(config, phi)
     learner = learner_shape(config, n_seeds)
-    steps, keys = shape_over_seeds((steps_shape(config, n_seeds), keys_shape(n_seeds)), config.n_devices)
+    steps = empty_trajectory(config.env, n_seeds, config.rollout_steps, config.n_envs)
+    steps, keys = shape_over_seeds((steps, keys_shape(n_seeds)), config.n_devices)
     functions = functions._replace(assess=_compile(functions.assess, learner))
     if iterates_on_host:
         functions = functions._replace(
@@ -139,31 +138,6 @@ def init_seeds(functions: CompiledFunctions, keys: Key[Array, " seeds"]) -> Lear
 def learner_shape(config: TrainConfig, n_seeds: int) -> Learner:
     """Return a learner with shapes instead of arrays."""
     return shape_over_seeds(jax.eval_shape(compile_functions(config).init, keys_shape(n_seeds)), config.n_devices)
-
-
-def steps_shape(config: TrainConfig, n_seeds: int) -> Trajectory:
-    """Return the steps of an iteration with shapes instead of arrays."""
-    env = config.env
-
-    def shape(*sizes: int, dtype: Any = np.float32) -> Any:
-        return jax.ShapeDtypeStruct((n_seeds, config.rollout_steps, config.n_envs, *sizes), dtype)
-
-    timestep = Timestep(
-        observation=shape(env.n_agents, env.observation_size),
-        state=shape(env.state_size),
-        available=shape(env.n_agents, env.action_size, dtype=np.bool_),
-        alive=shape(env.n_agents, dtype=np.bool_),
-        reward=shape(env.n_agents),
-        terminated=shape(dtype=np.bool_),
-        truncated=shape(dtype=np.bool_),
-        measures={name: shape() for name in env.measures},
-    )
-    return Trajectory(
-        timestep=timestep,
-        action=shape(env.n_agents, env.action_size),
-        env_action=shape(env.n_agents, env.action_size, dtype=env.action_dtype),
-        next_timestep=timestep,
-    )
 
 
 @cache_by_value

@@ -100,8 +100,8 @@ def _update_decoder(
     n_chunks = 1
     if not config.batched and config.has_fixed_segments and n_rows > CHUNK_ROWS:
         chunk_episodes = max(1, CHUNK_ROWS * n_episodes // n_rows)
-        divisors = (n for n in range(1, n_episodes + 1) if n_episodes % n == 0)
-        n_chunks = min(n for n in divisors if n_episodes // n <= chunk_episodes)
+        chunk_counts = range(-(-n_episodes // chunk_episodes), n_episodes + 1)
+        n_chunks = next(n for n in chunk_counts if n_episodes % n == 0)
     if n_chunks == 1:
         return descent.update(decoder, batch, key, config.method.fit, config.credit)
     # Every chunk counts its episodes from 0.

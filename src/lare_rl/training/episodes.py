@@ -49,16 +49,12 @@ def learn_returns(learner: Learner, config: TrainConfig) -> Learner:
     learned = learner._replace(reward_sources=decoders, n_learned=n_now)
     if not config.predicts_ahead:
         return learned
-    # A new fit changes the proxy rewards of all episodes.
-    is_new = jax.vmap(_is_refitted)(learner.decoders[0], decoders[0])[:, None]
+    old, new = learner.decoders[0].closed_form, decoders[0].closed_form
+    assert old is not None
+    assert new is not None
+    is_new = (old.n_fitted != new.n_fitted)[:, None]  # a new fit changes the proxy rewards of all episodes
     since = jnp.where(is_new, buffer.oldest, jnp.where(is_due[:, None], n_learned, buffer.current_episode))
     return jax.vmap(partial(predict_returns, config=config))(learned, since)
-
-
-def _is_refitted(before: DecoderState, after: DecoderState) -> Bool[Array, ""]:
-    assert before.closed_form is not None
-    assert after.closed_form is not None
-    return before.closed_form.n_fitted != after.closed_form.n_fitted
 
 
 def predict_returns(learner: Learner, since: Int[Array, " envs"], config: TrainConfig) -> Learner:

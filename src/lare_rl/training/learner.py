@@ -98,7 +98,8 @@ def store_with_factors(
     The decoders do not read the steps of agents where `scored` is false. The rewards of these steps count.
     """
     columns, next_columns = replay_columns(steps, factors, config, scored)
-    team_reward, level = _team_rewards(steps, config), _levels(steps, config)
+    rewards = [team_mean(steps.next_timestep.reward, steps.timestep.alive, team) for team in config.env.teams]
+    team_reward, level = jnp.stack(rewards, axis=-1), _levels(steps, config)
     buffer = extend(learner.replay, columns, next_columns, team_reward, steps.ended, config.payments, level)
     if config.n_tracked:
         buffer = _with_history(learner.replay, buffer, len(steps.ended), config)
@@ -139,12 +140,6 @@ def replay_columns(
         {name: columns[name] for name in config.columns if name in columns},
         {name: getattr(steps.next_timestep, name) for name in STEP_COLUMNS if name in config.columns},
     )
-
-
-def _team_rewards(steps: Trajectory, config: TrainConfig) -> Float[Array, "time envs teams"]:
-    """Return the true reward of each team for each step."""
-    rewards = [team_mean(steps.next_timestep.reward, steps.timestep.alive, team) for team in config.env.teams]
-    return jnp.stack(rewards, axis=-1)
 
 
 def _levels(steps: Trajectory, config: TrainConfig) -> Int[Array, "time envs"] | None:

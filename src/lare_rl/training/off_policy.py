@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int, Key, PRNGKeyArray, Scalar
 
-from lare_rl.algorithms.batches import Transitions
+from lare_rl.algorithms.batches import Metrics, Transitions
 from lare_rl.algorithms.off_policy import OffPolicySettings
 from lare_rl.credit.engine import RewardSource, select_decoders
 from lare_rl.data import replay
@@ -27,20 +27,20 @@ __all__ = ["train_step"]
 
 def train_step(
     learner: Learner, steps: Trajectory, keys: Key[Array, " seeds"], env_steps: Int[Scalar, ""], config: TrainConfig
-) -> tuple[Learner, dict[str, Float[Array, " seeds"]]]:
+) -> tuple[Learner, Metrics]:
     """Update decoder and algorithm once for each new step of an environment. Of `steps`, only the number matters."""
     return jax.vmap(partial(_train_seed, config=config), in_axes=(0, 0, None))(learner, keys, env_steps)
 
 
 def _train_seed(
     learner: Learner, key: PRNGKeyArray, env_steps: Int[Scalar, ""], config: TrainConfig
-) -> tuple[Learner, dict[str, Float[Array, ""]]]:
+) -> tuple[Learner, Metrics]:
     sample_key, _, noise_key = jax.random.split(key, 3)
     algorithm, settings, buffer = config.algorithm.load(), config.hyperparameters, learner.replay
     assert isinstance(settings, OffPolicySettings)
     n_updates = config.rollout_steps * config.n_envs
 
-    def update(carry: tuple[Any, tuple[RewardSource, ...]], inputs: Any) -> tuple[Any, dict[str, Array]]:
+    def update(carry: tuple[Any, tuple[RewardSource, ...]], inputs: Any) -> tuple[Any, Metrics]:
         state, sources = carry
         update_index, index, credit_sample, key = inputs
         fit_key, key = jax.random.split(key)

@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int, Key, PRNGKeyArray, Scalar, Shaped
 
-from lare_rl.algorithms.batches import Rollout
+from lare_rl.algorithms.batches import Metrics, Rollout
 from lare_rl.data import replay
 from lare_rl.data.trajectory import Trajectory
 from lare_rl.training.episodes import predict_returns
@@ -23,26 +23,30 @@ __all__ = ["train_step"]
 
 def train_step(
     learner: Learner, steps: Trajectory, keys: Key[Array, " seeds"], env_steps: Int[Scalar, ""], config: TrainConfig
-) -> tuple[Learner, dict[str, Float[Array, " seeds"]]]:
+) -> tuple[Learner, Metrics]:
     """Update the policy on `steps`, which have just been stored."""
     return jax.vmap(partial(_train_seed, config=config), in_axes=(0, 0, 0, None))(learner, steps, keys, env_steps)
 
 
 def _train_seed(
     learner: Learner, steps: Trajectory, key: PRNGKeyArray, env_steps: Int[Scalar, ""], config: TrainConfig
-) -> tuple[Learner, dict[str, Float[Array, ""]]]:
+) -> tuple[Learner, Metrics]:
     remaining = 1 - env_steps / config.steps
     rollout = _rollout(learner, jax.tree.map(jnp.asarray, steps), config)
     state, metrics = config.algorithm.load().update(learner.algorithm, rollout, key, remaining, config.hyperparameters)
     return learner._replace(algorithm=state), metrics
 
 
+def _predict_newest_returns(learner: Learner, config: TrainConfig) -> Learner:
+    """Predict the returns of all episodes that end in the newest steps."""
+    buffer = replay.segments_as_episodes(learner.replay)
+    since = replay.look_up(buffer.episode, jnp.arange(config.n_envs), buffer.next_transition - config.rollout_steps)
+    return predict_returns(learner, since, config)
+
+
 def _rollout(learner: Learner, steps: Trajectory, config: TrainConfig) -> Rollout:
     """Return the newest steps with the method's rewards. Each agent of each environment is one actor of the rollout."""
-    if config.is_exact:
-        buffer = replay.segments_as_episodes(learner.replay)
-        since = replay.look_up(buffer.episode, jnp.arange(config.n_envs), buffer.next_transition - config.rollout_steps)
-        learner = predict_returns(learner, since, config)
+    learner = _predict_newest_returns(learner, config) if config.is_exact else learner
     stored = replay.read(learner.replay, replay.newest_steps(learner.replay, config.rollout_steps))
     reward = rewards(stored, learner.reward_sources, config)  # [envs time agents]
     n_agents, agents_leave = config.env.n_agents, config.env.agents_leave

@@ -25,7 +25,8 @@ from lare_rl.credit.decoder_settings import CreditSettings, default_credit
 from lare_rl.credit.methods import METHODS, Method
 from lare_rl.data.replay import StoredSteps, mean_length, required_capacity, segments_as_episodes
 from lare_rl.data.trajectory import Trajectory
-from lare_rl.envs.interface import EnvSpec, Team, Timestep, to_env_action
+from lare_rl.envs.interface import EnvSpec, Team, to_env_action
+from lare_rl.envs.vec_env import empty_batch
 from lare_rl.errors import LareError
 from lare_rl.latent.function import LatentFunction
 from lare_rl.phi.graph import Graph
@@ -150,7 +151,16 @@ def pure_credit(
         steps=0,
         fit_updates=fit_updates,
     )
-    _check_method(config)
+    context = CreditContext(
+        n_agents=agents,
+        n_raw_features=observation_size + action_size,
+        scored_observation=scored_observation,
+        scale_rewards=scale_rewards,
+        discrete_actions=discrete,
+        max_steps=max_steps,
+        step_at_a_time=True,  # the reward of a step is computed from this step alone
+    )
+    check_credit(chosen, credit, context)
     return _make_functions(config, () if phi is None else (phi.graph,))
 
 
@@ -163,21 +173,6 @@ def _check_phi(method: Method, phi: LatentFunction | None, sizes: tuple[int, int
     if method.needs_phi and phi is None:
         raise LareError(f"{method.name} needs a latent function: phi=...")
     return phi if method.needs_phi else None
-
-
-def _check_method(config: TrainConfig) -> None:
-    """Raise `LareError` if the method cannot compute the reward of a step from this step alone, or does not fit the environment."""
-    env = config.env
-    context = CreditContext(
-        n_agents=env.n_agents,
-        n_raw_features=env.observation_size + env.action_size,
-        scored_observation=config.scored_observation,
-        scale_rewards=config.scale_rewards,
-        discrete_actions=env.discrete,
-        max_steps=env.max_steps,
-        step_at_a_time=True,
-    )
-    check_credit(config.method, config.credit, context)
 
 
 def _make_functions(config: TrainConfig, phi: tuple[Graph, ...]) -> PureCredit:
@@ -231,33 +226,24 @@ def _valid_factors(
 
 def _trajectory(steps: CreditSteps, config: TrainConfig) -> Trajectory:
     """Return the steps with an axis of agents."""
-    env, ended = config.env, jnp.asarray(steps.terminated)
-    lead = ended.shape
+    env, lead = config.env, jnp.shape(steps.terminated)
 
     def with_agents(values: Array, *rest: int) -> Float[Array, "time envs agents *rest"]:
         return jnp.asarray(values, jnp.float32).reshape(*lead, env.n_agents, *rest)
 
     action = with_agents(steps.action, env.action_size)
-
-    def timestep(observation: Array, reward: Array, terminated: Array, truncated: Array) -> Timestep:
-        return Timestep(
-            observation=with_agents(observation, env.observation_size),
-            state=jnp.zeros((*lead, 0)),
-            available=jnp.ones((*lead, env.n_agents, env.action_size), bool),
-            alive=jnp.ones((*lead, env.n_agents), bool),
-            reward=with_agents(reward),
-            terminated=jnp.asarray(terminated, bool),
-            truncated=jnp.asarray(truncated, bool),
-            measures={},
-        )
-
-    nothing = jnp.zeros(lead, bool)
-    return Trajectory(
-        timestep=timestep(steps.observation, jnp.zeros((*lead, env.n_agents)), nothing, nothing),
-        action=action,
-        env_action=action if env.discrete else to_env_action(action, env),
-        next_timestep=timestep(steps.next_observation, steps.reward, steps.terminated, steps.truncated),
+    empty = jax.tree.map(jnp.asarray, empty_batch(env, *lead))
+    timestep = empty._replace(
+        observation=with_agents(steps.observation, env.observation_size), alive=jnp.ones_like(empty.alive)
     )
+    next_timestep = timestep._replace(
+        observation=with_agents(steps.next_observation, env.observation_size),
+        reward=with_agents(steps.reward),
+        terminated=jnp.asarray(steps.terminated, bool),
+        truncated=jnp.asarray(steps.truncated, bool),
+    )
+    env_action = action if env.discrete else to_env_action(action, env)
+    return Trajectory(timestep, action, env_action, next_timestep)
 
 
 def _stored_steps(learner: Learner, columns: dict[str, Any], next_columns: dict[str, Any]) -> StoredSteps:

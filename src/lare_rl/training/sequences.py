@@ -14,7 +14,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int, Key, PRNGKeyArray, Scalar
 
 from lare_rl.algorithms.batches import Metrics, Sequences
-from lare_rl.algorithms.sequences import SequenceSettings
+from lare_rl.algorithms.registry import SequenceSettings
 from lare_rl.credit.engine import RewardSource
 from lare_rl.data import replay
 from lare_rl.data.layouts import lay_out_padded
@@ -88,7 +88,7 @@ def get_actor(state: SequenceState, env_steps: int | Int[Array, ""], config: Tra
 
 def train_step(
     learner: Learner, steps: Trajectory, keys: Key[Array, " seeds"], env_steps: Int[Scalar, ""], config: TrainConfig
-) -> tuple[Learner, dict[str, Float[Array, " seeds"]]]:
+) -> tuple[Learner, Metrics]:
     """Make the updates that are due, once there are enough episodes for a batch.
 
     The function is written for all seeds, so that all of them use the same length of a batch: the smallest that fits

@@ -14,7 +14,7 @@ from jaxtyping import Array, Float, Key
 from lare_rl.algorithms.batches import Metrics
 from lare_rl.algorithms.off_policy import OffPolicySettings
 from lare_rl.config.settings import ResolvedSettings
-from lare_rl.data.trajectory import Trajectory
+from lare_rl.data.trajectory import Trajectory, empty_trajectory
 from lare_rl.errors import LareError
 from lare_rl.runs import checkpoint
 from lare_rl.runs.best_policy import BEST_FILE, BestPolicy, empty_best, load_best, save_best, update_best
@@ -23,7 +23,7 @@ from lare_rl.runs.metric_names import ACTOR_SATURATION, DETERMINISTIC_RETURN
 from lare_rl.training import decoder_fits, iteration
 from lare_rl.training.collect_device import DeviceCollector
 from lare_rl.training.collect_host import HostCollector
-from lare_rl.training.compiled import CompiledFunctions, compile_functions, learner_shape, steps_shape
+from lare_rl.training.compiled import CompiledFunctions, compile_functions, learner_shape
 from lare_rl.training.decoder_inputs import compute_host_factors
 from lare_rl.training.evaluation import measure_saturation, metrics_lines
 from lare_rl.training.explain import compile_explanation
@@ -134,8 +134,8 @@ class Session:
         if self.settings.overlap_collection:
             actor = jax.tree.map(jnp.copy, self.actor)  # the update reuses the memory of its learner
             # In a thread, because the call of an update returns when the device has nearly finished it. It reads only stored steps.
-            shapes = steps_shape(self.config, len(self.run.seeds))
-            no_steps = jax.tree.map(lambda leaf: np.zeros(leaf.shape, leaf.dtype), shapes)
+            config = self.config
+            no_steps = empty_trajectory(config.env, len(self.run.seeds), config.rollout_steps, config.n_envs)
             updating = self._threads.submit(self._update, no_steps)
             steps = self.collector.collect(actor, self.step)
             updating.result()

@@ -65,7 +65,12 @@ def train(
     """
     if tensorboard:
         import_summary_writer()  # before anything is made
-    task, settings, listeners = resolve_task(task), _check_settings(settings), _check_listeners(listeners)
+    if not isinstance(settings, Settings | None):
+        raise LareError(
+            "settings must be a lare_rl.Settings, such as lare_rl.Settings(method='rrdu', steps=100_000), and are "
+            f"{short_repr(settings)}"
+        )
+    task, settings, listeners = resolve_task(task), settings or Settings(), _check_listeners(listeners)
     resolved = resolve(settings, task)
     functions = choose_functions(task, resolved, function)
     run = create_run(Path(out) if out is not None else default_directory(task, resolved), task, resolved, functions)
@@ -73,7 +78,10 @@ def train(
     messages = unused[:1] if len(unused) < 2 else [f"{unused[0]} (and {len(unused) - 1} more)"]
     messages += _describe_rounding(resolved, steps=settings.steps, evaluate_every=settings.evaluate_every)
     with lock_run(run), report_full_memory(run), catch_stop_signals() as stop:
-        return _train_from_start(run, tensorboard, listeners, stop, messages)
+        _prepare(run, listeners)
+        session = start_session(run)
+        session.save()  # so that there is always a checkpoint
+        return _finish(session, tensorboard, listeners, stop, messages)
 
 
 def resume(
@@ -104,15 +112,17 @@ def resume(
     with lock_run(run), report_full_memory(run), catch_stop_signals() as stop:
         earlier_steps = run.config.settings.steps
         run = run if steps is None else extend_run(run, steps)
-        rounding = _describe_rounding(run.config.settings, steps=steps)
-        if not run.has_checkpoint():
-            if run.metrics():  # metrics are never removed
-                raise LareError(f"{run.directory} has no checkpoint any more: it cannot be resumed")
-            return _train_from_start(run, tensorboard, listeners, stop, rounding)
+        messages = _describe_rounding(run.config.settings, steps=steps)
+        if not run.has_checkpoint() and run.metrics():  # metrics are never removed
+            raise LareError(f"{run.directory} has no checkpoint any more: it cannot be resumed")
         _prepare(run, listeners)
-        session, messages = restore_session(run)
-        truncate_metrics(run.directory, session.metrics_bytes)
-        messages = [*rounding, *messages, *_describe_annealing(session, earlier_steps)]
+        if run.has_checkpoint():
+            session, restored = restore_session(run)
+            truncate_metrics(run.directory, session.metrics_bytes)
+            messages += [*restored, *_describe_annealing(session, earlier_steps)]
+        else:
+            session = start_session(run)
+            session.save()
         return _finish(session, tensorboard, listeners, stop, messages)
 
 
@@ -148,26 +158,6 @@ def _check_listeners(listeners: Sequence[Listener] | None) -> list[Listener]:
                 f"(lare_rl.training.progress.Listener): {short_repr(listener)} does not"
             )
     return checked
-
-
-def _check_settings(settings: Settings | None) -> Settings:
-    """Return the settings, or the default ones. Raise `LareError` if they are something else."""
-    if settings is None or isinstance(settings, Settings):
-        return settings or Settings()
-    raise LareError(
-        "settings must be a lare_rl.Settings, such as lare_rl.Settings(method='rrdu', steps=100_000), and are "
-        f"{short_repr(settings)}"
-    )
-
-
-def _train_from_start(
-    run: Run, tensorboard: bool, listeners: list[Listener], stop: threading.Event, messages: Sequence[str]
-) -> Run:
-    """Train from the first step on. The untrained learner is saved, so that there is always a checkpoint."""
-    _prepare(run, listeners)
-    session = start_session(run)
-    session.save()
-    return _finish(session, tensorboard, listeners, stop, messages)
 
 
 def _prepare(run: Run, listeners: Sequence[Listener]) -> None:
@@ -248,13 +238,10 @@ def _finish(
 
 def _introduction(session: Session) -> list[str]:
     """Return messages about a session before its next step."""
-    settings, messages = session.settings, []
-    if (warning := warmup_warning(settings)) is not None:
-        messages.append(warning)
-    elif session.step < settings.warmup:
-        messages.append(
-            f"the first {settings.warmup:,} steps are random ({settings.algorithm}.warmup): the policy is not trained yet"
-        )
+    settings, warning = session.settings, warmup_warning(session.settings)
+    if warning is None and session.step < settings.warmup:
+        warning = f"the first {settings.warmup:,} steps are random ({settings.algorithm}.warmup): the policy is not trained yet"
+    messages = [] if warning is None else [warning]
     if session.step >= settings.steps:
         messages.append(
             f"the run is complete ({settings.steps:,} steps): to continue it, give a larger --steps (steps=... in Python)"
