@@ -18,7 +18,7 @@ from lare_rl.envs.gymnasium_env import GymnasiumEnv
 from lare_rl.envs.interface import EnvSpec, Team, to_env_action
 from lare_rl.envs.vec_env import LocalVecEnv
 from lare_rl.training import collect_host
-from lare_rl.training.collect_host import HostCollector, HostVecEnv
+from lare_rl.training.collect_host import HostCollector
 from lare_rl.training.compiled import compile_functions, init_seeds
 from lare_rl.training.policy import get_actor
 from lare_rl.training.streams import Stream, episode_seed, seed_keys, stream_keys
@@ -67,9 +67,8 @@ def local_envs(count, task=None):
 
 
 def make_envs(seeds=(0, 1), n_envs=1, task=None):
-    envs = HostVecEnv(local_envs(len(seeds) * n_envs, task), seeds, n_envs)
-    envs.reset()
-    return envs
+    envs = local_envs(len(seeds) * n_envs, task)
+    return HostCollector(envs, envs, small_config("dense", env=envs.spec, n_envs=n_envs), seeds)
 
 
 def best_policy(timestep, noise, episode_start):
@@ -78,7 +77,7 @@ def best_policy(timestep, noise, episode_start):
 
 
 def collect(envs, n_steps, noise=0.0):
-    return envs.collect(best_policy, np.full((n_steps, *envs.shape, 1, 1), noise, np.float32))
+    return envs.collect_by(best_policy, np.full((n_steps, *envs.shape, 1, 1), noise, np.float32))
 
 
 # Actions.
@@ -143,7 +142,7 @@ def test_collect_tells_policy_episode_starts():
         return noise
 
     for n_steps in (21, 20):
-        envs.collect(policy, np.zeros((n_steps, *envs.shape, 1, 1), np.float32))
+        envs.collect_by(policy, np.zeros((n_steps, *envs.shape, 1, 1), np.float32))
     assert np.flatnonzero(np.array(starts) == 3).tolist() == [0, 20, 40]
     assert starts.count(0) == 38
 
@@ -264,7 +263,7 @@ def test_actions_are_random_until_the_end_of_the_warmup(monkeypatch):
 def test_policy_that_is_nan_is_reported():
     action, envs = np.float32([[[[0]]], [[[np.nan]]]]), make_envs()
     with pytest.raises(DivergedError, match="policy of seed 1"):
-        envs.collect(lambda timestep, noise, episode_start: action, np.zeros((1, 2, 1, 1, 1)))
+        envs.collect_by(lambda timestep, noise, episode_start: action, np.zeros((1, 2, 1, 1, 1)))
     with pytest.raises(DivergedError, match="policy of seed 1"):
         evaluate_on_host(local_envs(2), lambda timestep, episode_start: action, (0, 1), 1)
 

@@ -30,7 +30,7 @@ task, settings = TaskSpec(**json.loads(sys.argv[1])), lare_rl.Settings(**json.lo
 train_and_stop(task, settings, "run", settings.evaluate_every)
 opened, _ = restore_session(open_run("run"))
 functions = opened.functions
-compiled = [functions.store, functions.train_step] if opened.loop is None else [opened.loop.run]
+compiled = [functions.store, functions.train_step] if opened.loop is None else [opened.loop.args[0]]
 collective = re.compile("all-gather|all-reduce|all-to-all|collective-permute|reduce-scatter")
 opened.close()
 print(json.dumps({

@@ -100,15 +100,15 @@ def unroll_on_device(
     envs = reset(env, reset_keys, n_episodes, config)
 
     def body(
-        carry: tuple[VecEnvState, Bool[Array, "seeds episodes"]], randomness: _Randomness
+        carry: tuple[VecEnvState, Bool[Array, "seeds episodes"]], randomness: tuple[Any, Any]
     ) -> tuple[tuple[VecEnvState, Bool[Array, "seeds episodes"]], EpisodeBatch]:
         envs, running = carry
-        envs, steps = _step(env, envs, actor, randomness, config, act)
+        envs, steps = _step(env, envs, actor, *randomness, config, act)
         return (envs, running & ~steps.ended), EpisodeBatch(steps, running, envs.state)
 
     keys = jnp.swapaxes(_split_keys(step_keys, config.env.max_steps), 0, 1)
-    randomness = _draw(keys, n_episodes, config, deterministic)
-    return jax.lax.scan(body, (envs, jnp.ones_like(envs.episode_start)), randomness)[1]
+    start = envs, jnp.ones_like(envs.episode_start)
+    return jax.lax.scan(body, start, _draw(keys, n_episodes, config, deterministic))[1]
 
 
 @cache_by_value
@@ -127,35 +127,31 @@ def reset(env: JaxEnv, keys: Key[Array, " seeds"], n_envs: int, config: TrainCon
     return VecEnvState(state, timestep, init_memory(config, *episode_start.shape), episode_start)
 
 
-class _Randomness(NamedTuple):
-    """The random numbers of a step. Those of many steps are drawn at once, which takes a card as long as those of one step."""
+def _draw(
+    keys: Key[Array, "time seeds"], n_envs: int, config: TrainConfig, deterministic: bool
+) -> tuple[Float[Array, "time seeds envs agents noise"] | None, Key[Array, "time seeds envs"]]:
+    """Draw the noise of the policy (None without noise), and the keys of the environments.
 
-    noise: Float[Array, "*time seeds envs agents noise"] | None
-    """The noise of the policy; None without noise."""
-    keys: Key[Array, "*time seeds envs"]
-    """The keys of the environments."""
+    Those of many steps are drawn at once, which takes a card as long as those of one step.
+    """
 
-
-def _draw(keys: Key[Array, "time seeds"], n_envs: int, config: TrainConfig, deterministic: bool) -> _Randomness:
-    """Draw the random numbers of steps."""
-
-    def draw_step(keys: Key[Array, " seeds"]) -> _Randomness:
+    def draw_step(keys: Key[Array, " seeds"]) -> tuple[Any, Any]:
         noise_keys, env_keys = jnp.unstack(_split_keys(keys, 2), axis=1)
         shape = n_envs, config.env.n_agents, config.noise_size
         noise = None if deterministic else jax.vmap(lambda key: device_noise(key, config.noise, shape))(noise_keys)
-        return _Randomness(noise, _split_keys(env_keys, n_envs))
+        return noise, _split_keys(env_keys, n_envs)
 
     return jax.vmap(draw_step)(keys)
 
 
 def _step(
-    env: JaxEnv, envs: VecEnvState, actor: Any, randomness: _Randomness, config: TrainConfig, act: Policy
+    env: JaxEnv, envs: VecEnvState, actor: Any, noise: Array | None, keys: Array, config: TrainConfig, act: Policy
 ) -> tuple[VecEnvState, Trajectory]:
     """Step all environments. Episodes that have ended are not reset."""
-    timestep, noise = envs.timestep, randomness.noise
+    timestep = envs.timestep
     action, memory = act(actor, envs.memory, timestep.observation, timestep.available, noise, envs.episode_start)
     env_action = action if config.env.discrete else to_env_action(action, config.env)
-    state, next_timestep = _map_envs(env.step)(envs.state, env_action, randomness.keys)
+    state, next_timestep = _map_envs(env.step)(envs.state, env_action, keys)
     steps = Trajectory(timestep=timestep, action=action, env_action=env_action, next_timestep=next_timestep)
     return VecEnvState(state, next_timestep, memory, jnp.zeros_like(envs.episode_start)), steps
 
@@ -174,9 +170,9 @@ def collect(
     """
     act, n_envs = _exploration_policy(env_steps, config), config.n_envs
 
-    def body(envs: VecEnvState, randomness: tuple[_Randomness, Key[Array, " seeds"]]) -> tuple[VecEnvState, Trajectory]:
-        step_randomness, reset_keys = randomness
-        envs, steps = _step(env, envs, actor, step_randomness, config, act)
+    def body(envs: VecEnvState, randomness: tuple[Any, ...]) -> tuple[VecEnvState, Trajectory]:
+        noise, env_keys, reset_keys = randomness
+        envs, steps = _step(env, envs, actor, noise, env_keys, config, act)
 
         def reset_ended(envs: VecEnvState) -> VecEnvState:
             fresh = reset(env, reset_keys, n_envs, config)
@@ -189,8 +185,8 @@ def collect(
 
     keys = jnp.swapaxes(_split_keys(keys, config.rollout_steps), 0, 1)
     step_keys, reset_keys = jnp.unstack(jax.vmap(partial(_split_keys, n_envs=2))(keys), axis=2)
-    randomness = _draw(step_keys, n_envs, config, deterministic=False)
-    envs, steps = jax.lax.scan(body, envs, (randomness, reset_keys))
+    randomness = (*_draw(step_keys, n_envs, config, deterministic=False), reset_keys)
+    envs, steps = jax.lax.scan(body, envs, randomness)
     return envs, jax.tree.map(lambda rows: jnp.swapaxes(rows, 0, 1), steps)
 
 

@@ -6,7 +6,7 @@ from typing import Any, NamedTuple
 
 import jax
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int, Shaped
+from jaxtyping import Bool, Float, Int
 
 from lare_rl.data.replay import Replay, capacity
 from lare_rl.data.trajectory import Trajectory
@@ -20,7 +20,6 @@ __all__ = [
     "Evaluation",
     "concatenate",
     "greedy_actions",
-    "measure_saturation",
     "metrics_lines",
     "saturation",
 ]
@@ -93,24 +92,20 @@ def metrics_lines(seeds: Sequence[int], step: int, metrics: Mapping[str, Any], r
     return lines
 
 
-def measure_saturation(actor: Any, replay: Replay, config: TrainConfig) -> Float[np.ndarray, " seeds"]:
-    """Return the saturation of each seed's policy, by an off-policy algorithm, in the newest states of its first environment."""
-    return saturation(greedy_actions(actor, replay, config, N_STATES))
-
-
 def greedy_actions(
-    actor: Any, replay: Replay, config: TrainConfig, n_states: int
+    actor: Any, replay: Replay, config: TrainConfig, n_states: int = N_STATES
 ) -> Float[np.ndarray, "seeds states action"]:
-    """Return actions without noise in the newest states of the first environment.
+    """Return actions of an off-policy algorithm without noise, in the newest states of the first environment.
 
     If fewer are stored, they are repeated: the shape, and so the compiled program, is always the same.
     """
     rows = np.asarray(replay.next_row)[:, :1] - 1 - np.arange(n_states) % int(np.min(replay.next_row))
-    observation = _read_first_env(replay.columns["observation"], rows % capacity(replay))
+    observation = jax.vmap(lambda column, seed_rows: column[0, seed_rows])(
+        replay.columns["observation"], rows % capacity(replay)
+    )
     available = np.ones((*rows.shape, 1, config.env.action_size), bool)
     act = compile_policy(config, deterministic=True)
-    action, _ = act(actor, (), observation, available, None, np.zeros(rows.shape, bool))
-    return np.asarray(action)[:, :, 0]
+    return np.asarray(act(actor, (), observation, available, None, np.zeros(rows.shape, bool))[0])[:, :, 0]
 
 
 def saturation(action: Float[np.ndarray, "seeds steps action"]) -> Float[np.ndarray, " seeds"]:
@@ -120,11 +115,3 @@ def saturation(action: Float[np.ndarray, "seeds steps action"]) -> Float[np.ndar
     """
     bound = np.where(np.abs(action) > ACTION_BOUND, np.sign(action), 0)
     return np.mean((bound[:, 0] != 0) & np.all(bound == bound[:, :1], axis=1), axis=-1)
-
-
-@jax.jit
-def _read_first_env(
-    column: Shaped[Array, "seeds envs rows *rest"], rows: Int[Array, "seeds steps"]
-) -> Shaped[Array, "seeds steps *rest"]:
-    """Return rows of a column of the replay, of each seed's first environment."""
-    return jax.vmap(lambda seed_column, seed_rows: seed_column[0, seed_rows])(column, rows)

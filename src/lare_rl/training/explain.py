@@ -86,27 +86,26 @@ def explain_stored_returns(learner: Learner, config: TrainConfig) -> list[Explan
 
     The list is empty for a method that fits nothing to returns, and for fewer than `MIN_EXPLAINED_EPISODES` episodes.
     """
-    replay = segments_as_episodes(learner.replay)
+    config, replay = _explanation_config(config), segments_as_episodes(learner.replay)
     n_stored = np.sum(np.asarray(replay.current_episode)[0] - np.asarray(replay.oldest)[0])
-    explain = _compile(config)
-    if not learner.decoders or explain is None or n_stored < MIN_EXPLAINED_EPISODES:
+    has_features = all(spec.basis.n_features for spec in config.credit_specs)
+    if not learner.decoders or not has_features or n_stored < MIN_EXPLAINED_EPISODES:
         return []
     with float64():
-        return jax.tree.map(np.asarray, explain(*first_shard(_inputs(learner))))
+        is_average = tuple(decoder.is_average for decoder in learner.decoders)
+        explanations = _compile(config)(*first_shard((replay, is_average)))
+        return jax.tree.map(np.asarray, explanations)
 
 
 def compile_explanation(learner: Learner, config: TrainConfig) -> None:
     """Compile `explain_stored_returns` for a learner of these shapes, on one device, also in another thread."""
-    explain = _compile(config)
-    if learner.decoders and explain is not None:
-        shapes = jax.tree.map(lambda leaf: jax.ShapeDtypeStruct(leaf.shape, leaf.dtype), _inputs(learner))
-        with jax.enable_x64(True):
-            explain.lower(*shapes).compile()
-
-
-def _inputs(learner: Learner) -> tuple[Replay, tuple[Bool[Array, " seeds"], ...]]:
-    """Return the inputs of the compiled function."""
-    return segments_as_episodes(learner.replay), tuple(decoder.is_average for decoder in learner.decoders)
+    config, replay = _explanation_config(config), segments_as_episodes(learner.replay)
+    if not learner.decoders or not all(spec.basis.n_features for spec in config.credit_specs):
+        return
+    inputs = replay, tuple(decoder.is_average for decoder in learner.decoders)
+    shapes = jax.tree.map(lambda leaf: jax.ShapeDtypeStruct(leaf.shape, leaf.dtype), inputs)
+    with jax.enable_x64(True):
+        _compile(config).lower(*shapes).compile()
 
 
 def _explanation_config(config: TrainConfig) -> TrainConfig:
@@ -124,10 +123,7 @@ def _explanation_config(config: TrainConfig) -> TrainConfig:
 
 @cache_by_value
 def _compile(config: TrainConfig) -> Any:
-    """Return the compiled `_explain_first_seed`, or None if there are no features."""
-    config = _explanation_config(config)
-    if not all(spec.basis.n_features for spec in config.credit_specs):
-        return None
+    """Return the compiled `_explain_first_seed`."""
     return jax.jit(partial(_explain_first_seed, config=config))
 
 

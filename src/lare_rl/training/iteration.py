@@ -1,16 +1,17 @@
 """An iteration of Algorithm 1 of the LaRe paper: after its steps have been collected on the host, or many in one compiled call.
 
-The two differ in how a condition is evaluated (`When`) and in how metrics are recorded (`Record`). In an environment of pure functions,
-collection, factors, replay, fits, relabelling and updates are one program, so nothing is transferred between two iterations.
+In an environment of pure functions, collection, factors, replay, fits, relabelling and updates are one program, so nothing is transferred
+between two iterations.
 """
 
 from collections.abc import Callable, Sequence
 from functools import partial
-from typing import Any, NamedTuple, TypeVar
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, Int, Key
+import numpy as np
+from jaxtyping import Array, Bool, Int, Key
 
 from lare_rl.algorithms.batches import Metrics
 from lare_rl.data.trajectory import Trajectory
@@ -29,22 +30,15 @@ from lare_rl.training.streams import Stream, keys_shape, seed_keys, stream_keys
 from lare_rl.util.float64 import float64
 
 __all__ = [
-    "CompiledLoop",
     "IterationFunctions",
     "LoopState",
     "compile_loop",
-    "init_loop",
     "store_steps",
     "update",
-    "when_compiled",
-    "when_on_host",
 ]
 
-Measured = TypeVar("Measured")
-When = Callable[..., tuple[Any, ...]]
-"""Called with a condition, a function and its arguments. Returns the function's results, or the arguments if the condition is false."""
-Record = Callable[[Measured, Metrics, Float[Array, " seeds"] | None], Measured]
-"""From the metrics so far, new ones, and the number of updates that they are of (None: any) to both together."""
+Measured = tuple[Metrics, dict[str, Bool[Array | np.ndarray, " seeds"]]]
+"""The newest metrics, and for which seeds they have been measured."""
 
 
 class IterationFunctions(NamedTuple):
@@ -56,24 +50,14 @@ class IterationFunctions(NamedTuple):
     train_step: Callable[..., tuple[Learner, Metrics]]
 
 
-def when_on_host(condition: Any, function: Callable[..., tuple[Any, ...]], *state: Any) -> tuple[Any, ...]:
-    """Call a function if a condition is true."""
-    return function(*state) if condition else state
-
-
-def when_compiled(condition: Any, function: Callable[..., tuple[Any, ...]], *state: Any) -> tuple[Any, ...]:
-    """Call a function if a condition is true, which is computed inside a compiled program."""
-    return jax.lax.cond(condition, function, lambda *unchanged: unchanged, *state)
-
-
 def store_steps(
-    learner: Learner, steps: Trajectory, functions: IterationFunctions, when: When, config: TrainConfig
+    learner: Learner, steps: Trajectory, functions: IterationFunctions, config: TrainConfig
 ) -> tuple[Learner, Bool[Array, " seeds"]]:
     """Store new steps, and let the decoders learn from episodes that have finished. Return whether all factors are finite."""
     learner, is_finite = functions.store(learner, steps)
     if learner.decoders:
         is_paid = steps.ended.any() | (not config.payments.only_at_end)
-        (learner,) = when(is_paid, lambda learner: (functions.learn_returns(learner),), learner)
+        (learner,) = _when(is_paid, lambda learner: (functions.learn_returns(learner),), learner)
     return learner, is_finite
 
 
@@ -84,8 +68,6 @@ def update(
     seeds: Int[Array, " seeds"],
     env_steps: int | Int[Array, ""],
     functions: IterationFunctions,
-    when: When,
-    record: Record[Measured],
     config: TrainConfig,
 ) -> tuple[Learner, Measured]:
     """Fit the decoders if they have updates of their own that are due, and update the algorithm. Do nothing during the warmup.
@@ -94,23 +76,41 @@ def update(
         measured: the metrics of earlier updates.
         steps: the newest steps, which have been stored.
         env_steps: the number of environment steps before these.
-        when: how conditions are evaluated.
-        record: adds metrics to `measured`.
     """
 
     def fit(learner: Learner, measured: Measured) -> tuple[Learner, Measured]:
         learner, metrics = functions.fit(learner, stream_keys(seeds, Stream.FIT, env_steps))
-        return learner, record(measured, metrics, None)
+        return learner, _record(measured, metrics)
 
     def fit_and_update(learner: Learner, measured: Measured) -> tuple[Learner, Measured]:
         if config.fits_separately:
             iteration = env_steps // (config.rollout_steps * config.n_envs)
-            learner, measured = when(iteration % config.fit_every == 0, fit, learner, measured)
+            learner, measured = _when(iteration % config.fit_every == 0, fit, learner, measured)
         keys = seed_keys(jnp.asarray(seeds), env_steps + 1)
         learner, metrics = functions.train_step(learner, steps, keys, env_steps)
-        return learner, record(measured, metrics, metrics.get("algorithm/updates"))
+        return learner, _record(measured, metrics)
 
-    return when(env_steps >= config.warmup, fit_and_update, learner, measured)
+    return _when(env_steps >= config.warmup, fit_and_update, learner, measured)
+
+
+def _when(condition: Any, function: Callable[..., tuple[Any, ...]], *state: Any) -> tuple[Any, ...]:
+    """Call a function if a condition is true. Without it, return the arguments. A compiled program may compute the condition."""
+    if isinstance(condition, jax.core.Tracer):
+        return jax.lax.cond(condition, function, lambda *unchanged: unchanged, *state)
+    return function(*state) if condition else state
+
+
+def _record(measured: Measured, metrics: Metrics) -> Measured:
+    """Replace the metrics of the seeds that have new ones: of those with updates, if they are counted."""
+    old, is_measured = measured
+    if "algorithm/updates" not in metrics:
+        return old | metrics, is_measured | {name: np.ones(len(values), bool) for name, values in metrics.items()}
+    is_new = metrics["algorithm/updates"] > 0
+    was_measured = {name: is_measured.get(name, jnp.zeros_like(is_new)) for name in metrics}
+    new = {
+        name: jnp.where(is_new | ~was_measured[name], values, old.get(name, values)) for name, values in metrics.items()
+    }
+    return old | new, is_measured | {name: was_measured[name] | is_new for name in metrics}
 
 
 class LoopState(NamedTuple):
@@ -121,26 +121,22 @@ class LoopState(NamedTuple):
     metrics: Metrics
     """The metrics of the newest updates."""
     is_measured: dict[str, Bool[Array, " seeds"]]
-    """Which metrics have been measured."""
+    """For which seeds they have been measured."""
     steps: Trajectory
     """The newest steps, for the message about a factor that is not finite."""
     is_finite: Bool[Array, " seeds"]
     """Whether all factors of the newest steps are finite."""
 
 
-class CompiledLoop(NamedTuple):
-    """The compiled iterations of a run."""
-
-    run: Callable[[LoopState, Int[Array, " seeds"], Int[Array, ""], Int[Array, ""]], LoopState]
-    """From the state, the seeds, the number of iterations before, and the number of iterations to make, to the new state. It
-    consumes its state. A device stops after an iteration with a factor that is not finite."""
-    shape: LoopState
-    """The state with shapes instead of arrays."""
-
-
 @cache_by_value
-def compile_loop(env: JaxEnv, config: TrainConfig, phi: Sequence[Graph], n_seeds: int) -> CompiledLoop:
-    """Compile the iterations of a run. `phi` holds the graph of each team's phi."""
+def compile_loop(env: JaxEnv, config: TrainConfig, phi: Sequence[Graph], n_seeds: int) -> Callable[..., LoopState]:
+    """Compile the iterations of a run. `phi` holds the graph of each team's phi.
+
+    Returns:
+        A function from the learner and the environments, which it consumes, the metrics of the newest updates (empty before the first), the
+        seeds, the number of iterations before, and the number of iterations to make. A device stops after an iteration with a factor that
+        is not finite.
+    """
 
     def loop(
         state: LoopState, seeds: Int[Array, " seeds"], n_done: Int[Array, ""], n_iterations: Int[Array, ""]
@@ -157,17 +153,23 @@ def compile_loop(env: JaxEnv, config: TrainConfig, phi: Sequence[Graph], n_seeds
     seeds = jax.ShapeDtypeStruct((n_seeds,), number.dtype)
     shape, seeds = shape_over_seeds((_loop_shape(env, config, n_seeds), seeds), config.n_devices)
     jitted = jit_over_seeds(loop, config.n_devices, shared=(2, 3), donate=(0,))
-    return CompiledLoop(jitted.lower(shape, seeds, number, number).compile(), shape)
+    return partial(_run_loop, jitted.lower(shape, seeds, number, number).compile(), shape)
 
 
-def init_loop(loop: CompiledLoop, learner: Learner, envs: VecEnvState, metrics: Metrics) -> LoopState:
-    """Return the state before an iteration. `metrics` are those of the newest updates, or empty before the first."""
-    shape = loop.shape
-
+def _run_loop(
+    program: Callable[..., LoopState],
+    shape: LoopState,
+    learner: Learner,
+    envs: VecEnvState,
+    metrics: Metrics,
+    seeds: Int[Array, " seeds"],
+    n_done: int,
+    n_iterations: int,
+) -> LoopState:
     def fill(leaf: Any, value: int) -> Array:
         return jnp.full(leaf.shape, value, leaf.dtype, device=leaf.sharding)
 
-    return LoopState(
+    state = LoopState(
         learner=learner,
         envs=envs,
         metrics={name: jnp.array(metrics.get(name, fill(leaf, 0))) for name, leaf in shape.metrics.items()},
@@ -175,6 +177,7 @@ def init_loop(loop: CompiledLoop, learner: Learner, envs: VecEnvState, metrics: 
         steps=jax.tree.map(lambda leaf: fill(leaf, 0), shape.steps),
         is_finite=fill(shape.is_finite, True),
     )
+    return program(state, seeds, jnp.int32(n_done), jnp.int32(n_iterations))
 
 
 def _loop_shape(env: JaxEnv, config: TrainConfig, n_seeds: int) -> LoopState:
@@ -218,21 +221,7 @@ def _iterate(
     actor = get_actor(state.learner.algorithm, env_steps, config)
     keys = stream_keys(seeds, Stream.EXPLORATION, env_steps)
     envs, steps = collect_device.collect(env, state.envs, actor, keys, env_steps, config)
-    learner, is_finite = store_steps(state.learner, steps, functions, when_compiled, config)
+    learner, is_finite = store_steps(state.learner, steps, functions, config)
     measured = state.metrics, state.is_measured
-    learner, (metrics, is_measured) = update(
-        learner, measured, steps, seeds, env_steps, functions, when_compiled, _record, config
-    )
+    learner, (metrics, is_measured) = update(learner, measured, steps, seeds, env_steps, functions, config)
     return LoopState(learner, envs, metrics, is_measured, steps, is_finite)
-
-
-def _record(
-    measured: tuple[Metrics, dict[str, Bool[Array, " seeds"]]],
-    metrics: Metrics,
-    n_updates: Float[Array, " seeds"] | None,
-) -> tuple[Metrics, dict[str, Bool[Array, " seeds"]]]:
-    """Replace the metrics of the seeds that have new ones. `measured` is the metrics, and which of them have been measured."""
-    old, is_measured = measured
-    is_new = jnp.ones_like(next(iter(is_measured.values()))) if n_updates is None else n_updates > 0
-    new = {name: jnp.where(is_new | ~is_measured[name], values, old[name]) for name, values in metrics.items()}
-    return old | new, is_measured | {name: is_measured[name] | is_new for name in metrics}

@@ -25,9 +25,9 @@ from lare_rl.training.collect_device import DeviceCollector
 from lare_rl.training.collect_host import HostCollector
 from lare_rl.training.compiled import CompiledFunctions, compile_functions, learner_shape
 from lare_rl.training.decoder_inputs import compute_host_factors
-from lare_rl.training.evaluation import measure_saturation, metrics_lines
+from lare_rl.training.evaluation import greedy_actions, metrics_lines, saturation
 from lare_rl.training.explain import compile_explanation
-from lare_rl.training.iteration import CompiledLoop, IterationFunctions, init_loop, when_on_host
+from lare_rl.training.iteration import IterationFunctions, LoopState
 from lare_rl.training.learner import Learner, abandon_episodes
 from lare_rl.training.policy import actor_shape, get_actor
 from lare_rl.training.static_config import TrainConfig
@@ -48,7 +48,7 @@ class Session:
     functions: CompiledFunctions
     learner: Learner
     collector: DeviceCollector | HostCollector
-    loop: CompiledLoop | None = None
+    loop: Callable[..., LoopState] | None = None
     """Iterations as one compiled call, for an environment of pure functions."""
     step: int = 0
     """Environment steps done, of each seed."""
@@ -109,21 +109,20 @@ class Session:
         """Whether the decoders' first fit is still to be made. The host decides when it ends."""
         return self.config.has_first_fit and not self.first_fit_done
 
-    def _iterate_compiled(self, loop: CompiledLoop, max_iterations: int) -> None:
+    def _iterate_compiled(self, loop: Callable[..., LoopState], max_iterations: int) -> None:
         """Make iterations in one compiled call, for about `MAX_CALL_S`."""
         assert isinstance(self.collector, DeviceCollector)
         n_iterations = max(1, min(max_iterations, int(MAX_CALL_S / self._iteration_s)))
         start = time.perf_counter()
-        state = init_loop(loop, self.learner, self.collector.envs, self.latest_metrics)
+        seeds, n_done = jnp.asarray(self.run.seeds), self.step // self.settings.iteration_steps
         with one_blas_thread():
-            n_done = self.step // self.settings.iteration_steps
-            state = loop.run(state, jnp.asarray(self.run.seeds), jnp.int32(n_done), jnp.int32(n_iterations))
+            state = loop(self.learner, self.collector.envs, self.latest_metrics, seeds, n_done, n_iterations)
             is_measured, is_finite = jax.device_get((state.is_measured, state.is_finite))
         self._iteration_s = max(1e-6, (time.perf_counter() - start) / n_iterations)
         self.learner, self.collector.envs = state.learner, state.envs
         self._unchecked = is_finite, state.steps
         self._check_factors()
-        self.latest_metrics |= {name: values for name, values in state.metrics.items() if is_measured[name].any()}
+        self._keep_metrics(state.metrics, is_measured)
         self.step += n_iterations * self.settings.iteration_steps
 
     def _iterate(self) -> None:
@@ -148,9 +147,7 @@ class Session:
 
     def _store(self, steps: Trajectory) -> None:
         self._check_factors()
-        self.learner, is_finite = iteration.store_steps(
-            self.learner, steps, self._iteration_functions, when_on_host, self.config
-        )
+        self.learner, is_finite = iteration.store_steps(self.learner, steps, self._iteration_functions, self.config)
         self._unchecked = is_finite, steps
 
     def _check_factors(self) -> None:
@@ -169,10 +166,15 @@ class Session:
             )
 
     def _update(self, steps: Trajectory) -> None:
-        functions, seeds, measured = self._iteration_functions, jnp.asarray(self.run.seeds), self.latest_metrics
-        self.learner, self.latest_metrics = iteration.update(
-            self.learner, measured, steps, seeds, self.step, functions, when_on_host, _record, self.config
+        seeds, functions = jnp.asarray(self.run.seeds), self._iteration_functions
+        measured = self.latest_metrics, dict.fromkeys(self.latest_metrics, np.ones(len(seeds), bool))
+        self.learner, measured = iteration.update(
+            self.learner, measured, steps, seeds, self.step, functions, self.config
         )
+        self._keep_metrics(*measured)
+
+    def _keep_metrics(self, metrics: Metrics, is_measured: dict[str, Any]) -> None:
+        self.latest_metrics |= {name: values for name, values in metrics.items() if np.any(is_measured[name])}
 
     @property
     def _iteration_functions(self) -> IterationFunctions:
@@ -222,7 +224,7 @@ class Session:
             deterministic = self.collector.evaluate(actor, n_episodes, deterministic=True)
             metrics[DETERMINISTIC_RETURN] = deterministic.returns[..., 0].mean(axis=1)
         if self.step > self.config.warmup and isinstance(self.settings.hyperparameters, OffPolicySettings):
-            metrics[ACTOR_SATURATION] = measure_saturation(actor, self.learner.replay, self.config)
+            metrics[ACTOR_SATURATION] = saturation(greedy_actions(actor, self.learner.replay, self.config))
         return metrics_lines(self.run.seeds, self.step, metrics, rate)
 
     def _keep_best(self, score: Float[np.ndarray, " seeds"], actor: Any) -> None:
@@ -281,16 +283,6 @@ class Session:
         finally:
             self._threads.shutdown()
             self.finish_saving()
-
-
-def _record(old: Metrics, metrics: Metrics, n_updates: Float[Array, " seeds"] | None) -> Metrics:
-    """Replace the metrics of the seeds that have new ones."""
-    if n_updates is None:
-        return old | metrics
-    is_new = n_updates > 0
-    if not np.any(is_new):
-        return old
-    return old | {name: jnp.where(is_new, values, old.get(name, values)) for name, values in metrics.items()}
 
 
 def _select_prefix(arrays: dict[str, np.ndarray], prefix: str) -> dict[str, np.ndarray]:

@@ -76,11 +76,9 @@ def record_on_host(
     envs: VecEnv, policy: BatchPolicy, seeds: Sequence[int], episode_seeds: Sequence[int]
 ) -> EpisodeBatch:
     """Play one episode in each environment, and return all steps. The arguments are as in `unroll_on_host`."""
-    steps, masks = [], []
-    for step, running in unroll_on_host(envs, policy, seeds, episode_seeds):
-        steps.append(jax.tree.map(np.copy, step))
-        masks.append(running)
-    return EpisodeBatch(jax.tree.map(lambda *rows: np.stack(rows), *steps), np.stack(masks), None)
+    played = [jax.tree.map(np.copy, rows) for rows in unroll_on_host(envs, policy, seeds, episode_seeds)]
+    steps, mask = jax.tree.map(lambda *rows: np.stack(rows), *played)
+    return EpisodeBatch(steps, mask, None)
 
 
 def evaluate_on_host(

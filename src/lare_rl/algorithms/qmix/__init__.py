@@ -11,7 +11,7 @@ from lare_rl.errors import Count
 if TYPE_CHECKING:
     from lare_rl.envs.interface import EnvSpec
 
-__all__ = ["QMIX", "QMIXSettings"]
+__all__ = ["QMIXSettings"]
 
 
 class QMIXSettings(SequenceSettings):
@@ -54,7 +54,7 @@ def _run_defaults(env: "EnvSpec", environments: int) -> dict[str, Any]:
     }
 
 
-QMIX = Algorithm(
+_QMIX = Algorithm(
     name="qmix",
     consumes=Consumes.SEQUENCES,
     settings=QMIXSettings(),
@@ -65,10 +65,10 @@ QMIX = Algorithm(
     continuous=False,
     multi_agent=True,
 )
-register_algorithm(QMIX)
+register_algorithm(_QMIX)
 register_algorithm(
     replace(
-        QMIX,
+        _QMIX,
         name="vdn",
         settings=QMIXSettings(monotonic=False),
         summary="as qmix, with the sum of the agents' values",

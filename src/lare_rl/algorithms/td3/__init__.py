@@ -9,7 +9,7 @@ from lare_rl.algorithms.off_policy import OffPolicySettings, run_defaults
 from lare_rl.algorithms.registry import Algorithm, Consumes, register_algorithm
 from lare_rl.errors import Count
 
-__all__ = ["TD3", "TD3Settings"]
+__all__ = ["TD3Settings"]
 
 
 class TD3Settings(OffPolicySettings):
@@ -25,7 +25,7 @@ class TD3Settings(OffPolicySettings):
     """Standard deviation of the noise on actions, in action bounds."""
 
 
-TD3 = Algorithm(
+_TD3 = Algorithm(
     name="td3",
     consumes=Consumes.TRANSITIONS,
     settings=TD3Settings(),
@@ -35,10 +35,10 @@ TD3 = Algorithm(
     source="Fujimoto et al., ICML 2018",
     discrete=False,
 )
-register_algorithm(TD3)
+register_algorithm(_TD3)
 register_algorithm(
     replace(
-        TD3,
+        _TD3,
         name="ddpg",
         settings=TD3Settings(critics=1, policy_noise=0.0, policy_delay=1),
         summary="one critic and a deterministic policy",
