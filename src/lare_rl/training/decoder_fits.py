@@ -88,7 +88,7 @@ def fit_decoders(
         _update_decoder(decoder, episode_batch(steps, sample, config, i), keys[i], config)
         for i, decoder in enumerate(decoders)
     ]
-    return tuple(decoder for decoder, _ in updates), team_metrics([metrics for _, metrics in updates], config)
+    return tuple(decoder for decoder, _ in updates), team_metrics([metrics for _, metrics in updates], config.env.teams)
 
 
 def _update_decoder(

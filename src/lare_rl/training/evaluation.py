@@ -13,6 +13,7 @@ from lare_rl.data.trajectory import Trajectory
 from lare_rl.envs.interface import AnyArray, EnvSpec
 from lare_rl.tasks.spec import TaskSpec
 from lare_rl.training.policy import compile_policy
+from lare_rl.training.rewards import team_metrics
 from lare_rl.training.static_config import TrainConfig
 
 __all__ = [
@@ -59,21 +60,17 @@ class Evaluation(NamedTuple):
         return self._replace(measures={name: self.measures[name] for name in names})
 
     def metrics(self, spec: EnvSpec) -> dict[str, Float[np.ndarray, " seeds"]]:
-        """Return the means over the episodes, and the standard deviation of returns, by the keys of metrics.jsonl.
-
-        With several teams, each has its own keys. The keys without a suffix belong to the first team.
-        """
+        """Return the means over the episodes, and the standard deviation of returns, by the keys of metrics.jsonl."""
         metrics = {"evaluation/length": self.lengths.mean(axis=1)}
         metrics |= {f"evaluation/{name}": values.mean(axis=1) for name, values in self.measures.items()}
-        suffixes = [("", 0)]
-        if len(spec.teams) > 1:
-            suffixes += [(f"_{team.name}", team_index) for team_index, team in enumerate(spec.teams)]
-        for suffix, team_index in suffixes:
-            metrics[f"evaluation/return{suffix}"] = self.returns[..., team_index].mean(axis=1)
-            metrics[f"evaluation/return_std{suffix}"] = self.returns[..., team_index].std(axis=1)
-            if spec.n_agents > 1:
-                metrics[f"evaluation/summed_return{suffix}"] = self.summed_returns[..., team_index].mean(axis=1)
-        return metrics
+        of_teams = []
+        for i in range(len(spec.teams)):
+            returns, summed_returns = self.returns[..., i], self.summed_returns[..., i]
+            of_teams.append(
+                {"evaluation/return": returns.mean(axis=1), "evaluation/return_std": returns.std(axis=1)}
+                | ({"evaluation/summed_return": summed_returns.mean(axis=1)} if spec.n_agents > 1 else {})
+            )
+        return metrics | team_metrics(of_teams, spec.teams)
 
 
 def concatenate(evaluations: Sequence[Evaluation]) -> Evaluation:

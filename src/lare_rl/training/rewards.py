@@ -1,5 +1,8 @@
 """The rewards that the algorithm is trained on, and how close they are to the true ones."""
 
+from collections.abc import Sequence
+from typing import Any
+
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
@@ -10,7 +13,7 @@ from lare_rl.credit.engine import RewardSource
 from lare_rl.credit.methods import Reward
 from lare_rl.data import replay
 from lare_rl.data.replay import StoredSteps
-from lare_rl.envs.interface import team_mean
+from lare_rl.envs.interface import Team, team_mean
 from lare_rl.training.decoder_inputs import alive_agents, step_batch
 from lare_rl.training.learner import Learner
 from lare_rl.training.static_config import TrainConfig
@@ -70,12 +73,12 @@ def assess(learner: Learner, config: TrainConfig) -> Metrics:
             if decoder.score_type_predictions is not None:
                 metrics[-1]["credit/average"] = decoder.is_average.astype(jnp.float32)
                 metrics[-1]["credit/log_odds"] = decoder.is_log_odds.astype(jnp.float32)
-    return team_metrics(metrics, config)
+    return team_metrics(metrics, config.env.teams)
 
 
-def team_metrics(metrics: list[Metrics], config: TrainConfig) -> Metrics:
+def team_metrics(metrics: list[dict[str, Any]], teams: Sequence[Team]) -> dict[str, Any]:
     """Return the metrics of the first team; with several teams also the metrics of each team, with the suffix `_<team>`."""
     if len(metrics) == 1:
         return metrics[0]
-    named = zip(config.env.teams, metrics, strict=True)
+    named = zip(teams, metrics, strict=True)
     return metrics[0] | {f"{name}_{team.name}": value for team, values in named for name, value in values.items()}
