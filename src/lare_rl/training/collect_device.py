@@ -70,12 +70,10 @@ class DeviceCollector:
     def restore(self, arrays: dict[str, np.ndarray]) -> tuple[Bool[np.ndarray, "seeds envs"], list[str]]:
         """Restore the environments. Return which episodes were dropped, and messages: never any, as on the host."""
         leaves, structure = jax.tree.flatten(self.envs)
-        saved = [
-            jax.random.wrap_key_data(arrays[str(i)], impl=jax.random.key_impl(leaf))
-            if _is_key(leaf)
-            else arrays[str(i)]
-            for i, leaf in enumerate(leaves)
-        ]
+        saved: list[Any] = [arrays[str(i)] for i in range(len(leaves))]
+        for i, leaf in enumerate(leaves):
+            if _is_key(leaf):
+                saved[i] = jax.random.wrap_key_data(saved[i], impl=jax.random.key_impl(leaf))
         self.envs = jax.device_put(jax.tree.unflatten(structure, saved), seed_sharding(self._n_devices))
         return np.zeros(self.envs.episode_start.shape, bool), []
 

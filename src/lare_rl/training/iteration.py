@@ -11,6 +11,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.core import Tracer
 from jaxtyping import Array, Bool, Int, Key
 
 from lare_rl.algorithms.batches import Metrics
@@ -37,7 +38,7 @@ __all__ = [
     "update",
 ]
 
-Measured = tuple[Metrics, dict[str, Bool[Array | np.ndarray, " seeds"]]]
+Measured = tuple[Metrics, dict[str, Any]]
 """The newest metrics, and for which seeds they have been measured."""
 
 
@@ -95,7 +96,7 @@ def update(
 
 def _when(condition: Any, function: Callable[..., tuple[Any, ...]], *state: Any) -> tuple[Any, ...]:
     """Call a function if a condition is true. Without it, return the arguments. A compiled program may compute the condition."""
-    if isinstance(condition, jax.core.Tracer):
+    if isinstance(condition, Tracer):
         return jax.lax.cond(condition, function, lambda *unchanged: unchanged, *state)
     return function(*state) if condition else state
 

@@ -113,9 +113,11 @@ def act(
 def make_policy(config: TrainConfig, deterministic: bool) -> Policy:
     """Return the policy of all seeds. If `deterministic`, its noise must be None. Its memory is reset where an episode is new."""
 
-    def act_in_envs(actor: Any, memory: Any, *inputs: Any) -> tuple[Array, Any]:
-        *inputs, is_new = inputs
-        return act(actor, select(is_new, init_memory(config), memory), *inputs, config)
+    def act_in_envs(
+        actor: Any, memory: Any, observation: Array, available: Array, noise: Array | None, is_new: Bool[Array, " envs"]
+    ) -> tuple[Array, Any]:
+        memory = select(is_new, init_memory(config), memory)
+        return act(actor, memory, observation, available, noise, config)
 
     return jax.vmap(act_in_envs, in_axes=(0, 0, 0, 0, None if deterministic else 0, 0))
 
