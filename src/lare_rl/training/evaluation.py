@@ -63,14 +63,14 @@ class Evaluation(NamedTuple):
         """Return the means over the episodes, and the standard deviation of returns, by the keys of metrics.jsonl."""
         metrics = {"evaluation/length": self.lengths.mean(axis=1)}
         metrics |= {f"evaluation/{name}": values.mean(axis=1) for name, values in self.measures.items()}
-        of_teams = []
+        per_team = []
         for i in range(len(spec.teams)):
             returns, summed_returns = self.returns[..., i], self.summed_returns[..., i]
-            of_teams.append(
+            per_team.append(
                 {"evaluation/return": returns.mean(axis=1), "evaluation/return_std": returns.std(axis=1)}
                 | ({"evaluation/summed_return": summed_returns.mean(axis=1)} if spec.n_agents > 1 else {})
             )
-        return metrics | team_metrics(of_teams, spec.teams)
+        return metrics | team_metrics(per_team, spec.teams)
 
 
 def concatenate(evaluations: Sequence[Evaluation]) -> Evaluation:
