@@ -193,9 +193,8 @@ def policy_case(config, actor):
     if memory:
         expected["next_hidden"] = memory.hidden[0]
     if env.discrete and not config.deterministic_evaluation:
-        inputs = policy_input(jnp.asarray(observation)[None], config)
-
-        expected["logits"] = np.asarray(jax.vmap(ppo.logits)(actor, inputs, available[None]))[0]
+        rows = policy_input(jnp.asarray(observation)[None], config)
+        expected["logits"] = np.asarray(jax.vmap(ppo.logits)(actor, rows, available[None]))[0]
     action = np.asarray(action)[0]
     expected["action"] = np.argmax(action, axis=-1) if env.discrete else to_env_action(action, env)
     if env.n_agents == 1:
