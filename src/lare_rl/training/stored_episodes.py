@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from lare_rl.data.replay import Index, Replay, StoredSteps, end_of_episode, look_up, read
+from lare_rl.data.replay import Index, Replay, end_of_episode, look_up, read
 from lare_rl.envs.interface import EnvSpec, Timestep, to_env_action
 from lare_rl.envs.play import Episode, make_episode
 from lare_rl.errors import LareError
@@ -53,9 +53,9 @@ def stored_episodes(run: Run | str | Path, seed: int | None = None) -> list[Log]
     replay = select_seed(learner.replay, seed_index)
     _check_columns(run, replay, "observation", "action", "reward")
     return [
-        _make_log(steps, config.env) | ({} if level is None else {"group": np.array(level)})
+        _make_log(columns, next_columns, config.env) | ({} if level is None else {"group": np.array(level)})
         for env_index in range(len(replay.row))
-        for steps, level in _finished_episodes(replay, env_index)
+        for columns, next_columns, level in _finished_episodes(replay, env_index)
     ]
 
 
@@ -79,8 +79,8 @@ def stored_role_episodes(run: Run, role: TaskSpec) -> list[Episode]:
             newest = list(_finished_episodes(replay, env_index, n_newest))
             # The last episodes of each environment were played at about the same time.
             episodes += [
-                (i - len(newest), replace(_make_episode(steps, config.env, role), group=level))
-                for i, (steps, level) in enumerate(newest)
+                (i - len(newest), replace(_make_episode(columns, next_columns, config.env, role), group=level))
+                for i, (columns, next_columns, level) in enumerate(newest)
             ]
     return [episode for _, episode in sorted(episodes, key=lambda pair: pair[0])]
 
@@ -94,8 +94,8 @@ def _check_columns(run: Run, replay: Replay, *names: str) -> None:
 
 def _finished_episodes(
     replay: Replay, env_index: int, n_newest: int | None = None
-) -> Iterator[tuple[StoredSteps, int | None]]:
-    """Yield the steps of finished episodes of an environment, as NumPy arrays, and the level of each, if there are levels."""
+) -> Iterator[tuple[Log, Log, int | None]]:
+    """Yield the columns of finished episodes of an environment, before and after each step, and the level of each episode, if any."""
     oldest, current = int(replay.oldest[env_index]), int(replay.current_episode[env_index])
     episode = jnp.arange(oldest if n_newest is None else max(oldest, current - n_newest), current)
     if not len(episode):
@@ -103,16 +103,18 @@ def _finished_episodes(
     env = jnp.full_like(episode, env_index)
     begins, ends = np.asarray(look_up(replay.first, env, episode)), np.asarray(end_of_episode(replay, env, episode))
     number = jnp.arange(begins[0], ends[-1])
-    steps = jax.tree.map(np.asarray, read(replay, Index(jnp.full_like(number, env_index), number)))
+    steps = read(replay, Index(jnp.full_like(number, env_index), number))
+    levels = None if steps.level is None else np.asarray(steps.level)
+    arrays = jax.tree.map(np.asarray, (steps.columns, steps.next_columns))
     for begin, end in zip(begins - begins[0], ends - begins[0], strict=True):
-        rows = jax.tree.map(lambda leaf, begin=begin, end=end: leaf[begin:end], steps)
-        yield rows, None if rows.level is None else int(rows.level[-1])
+        columns, next_columns = jax.tree.map(lambda leaf, begin=begin, end=end: leaf[begin:end], arrays)
+        yield columns, next_columns, None if levels is None else int(levels[end - 1])
 
 
-def _make_log(steps: StoredSteps, env: EnvSpec) -> Log:
-    columns, env_action = steps.columns, to_env_action(steps.columns["action"], env)
+def _make_log(columns: Log, next_columns: Log, env: EnvSpec) -> Log:
+    env_action = to_env_action(columns["action"], env)
     log = {
-        "observations": np.append(columns["observation"], steps.next_columns["observation"][-1:], axis=0),
+        "observations": np.append(columns["observation"], next_columns["observation"][-1:], axis=0),
         "actions": np.argmax(env_action, axis=-1) if env.discrete else env_action,
         "rewards": columns["reward"],
     }
@@ -125,15 +127,12 @@ def _make_log(steps: StoredSteps, env: EnvSpec) -> Log:
     return log | {"terminations": terminated, "truncations": is_last & ~terminated}
 
 
-def _make_episode(steps: StoredSteps, env: EnvSpec, role: TaskSpec) -> Episode:
+def _make_episode(columns: Log, next_columns: Log, env: EnvSpec, role: TaskSpec) -> Episode:
     def make_timestep(columns: Log, **changes: np.ndarray) -> Timestep:
         arrays = {name: columns.get(name, np.zeros(0, np.float32)) for name in Timestep._fields if name != "measures"}
         return Timestep(**(arrays | changes), measures={})
 
-    columns = steps.columns
-    alive = columns.get("alive", np.ones((len(steps.last), env.n_agents), bool))
-    timestep, next_timestep = (
-        make_timestep(columns, alive=alive),
-        make_timestep(steps.next_columns, reward=columns["reward"]),
-    )
+    reward = columns["reward"]
+    alive = columns.get("alive", np.ones((len(reward), env.n_agents), bool))
+    timestep, next_timestep = make_timestep(columns, alive=alive), make_timestep(next_columns, reward=reward)
     return make_episode(role, env, timestep, to_env_action(columns["action"], env), next_timestep)
