@@ -22,9 +22,10 @@ from lare_rl.envs.particles.particle_env import ParticleEnv
 from lare_rl.envs.particles.task import MAX_STEPS
 from lare_rl.evaluation.played_episodes import compute_training_rewards, unroll_policy
 from lare_rl.training import learner as learner_module
-from lare_rl.training.compiled import compile_functions, training_module
+from lare_rl.training.compiled import compile_functions
 from lare_rl.training.decoder_fits import fit_repeatedly
 from lare_rl.training.learner import Learner
+from lare_rl.training.policy import get_actor
 from lare_rl.training.seed_axis import select_seed
 from lare_rl.training.static_config import TrainConfig
 from measure import apart, correlation, write
@@ -61,7 +62,7 @@ def no_factors(episodes: int) -> np.ndarray:
 
 def random_episodes(key: int, count: int, config: TrainConfig) -> Trajectory:
     """Episodes of random actions, by networks of zeros, which have no preference."""
-    actor = training_module(config).get_actor(compile_functions(config).init(jax.random.key(0)[None]), 0, config)
+    actor = get_actor(compile_functions(config).init(jax.random.key(0)[None]).algorithm, 0, config)
     return unroll_policy(ENV, config, jax.tree.map(jnp.zeros_like, actor), count, key).steps
 
 

@@ -18,9 +18,9 @@ import numpy as np
 import lare_rl
 from lare_rl.config.resolve import resolve
 from lare_rl.runs.directory import create_run
-from lare_rl.training import first_fit
-from lare_rl.training.start_session import start_session
+from lare_rl.training import decoder_fits
 from lare_rl.training.streams import Stream, stream_keys
+from lare_rl.training.train import start_session
 from measure import write
 
 LARGE = "held-out, updates as large as later ones"
@@ -46,7 +46,7 @@ def measured(name: str, way: str) -> dict[str, Any]:
             begun.learner, _ = begun.functions.store(begun.learner, steps)
             jax.block_until_ready(begun.learner)
             start = time.process_time()
-            with mock.patch.object(first_fit, "BATCH_DIVISOR", 1 if way == LARGE else first_fit.BATCH_DIVISOR):
+            with mock.patch.object(decoder_fits, "BATCH_DIVISOR", 1 if way == LARGE else decoder_fits.BATCH_DIVISOR):
                 keys = stream_keys(run.seeds, Stream.FIT, 0)
                 begun.learner, _ = begun._fit(begun.learner, keys)
                 jax.block_until_ready(begun.learner)

@@ -31,7 +31,7 @@ from lare_rl.phi.graph import Graph
 from lare_rl.phi.limits import RefusedError
 from lare_rl.phi.read import read
 from lare_rl.training.compiled import compile_functions
-from lare_rl.training.factors import is_compilable
+from lare_rl.training.decoder_inputs import is_compilable
 from measure import interleave, new_session, write
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))

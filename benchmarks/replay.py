@@ -29,16 +29,18 @@ from lare_rl.algorithms.td3 import TD3Settings
 from lare_rl.credit.decoder_settings import CreditSettings
 from lare_rl.credit.methods import METHODS
 from lare_rl.data import replay
-from lare_rl.data.replay import Replay
+from lare_rl.data.replay import Index, Replay
+from lare_rl.data.sampling import CreditSample, sample_transitions
 from lare_rl.data.trajectory import Trajectory
 from lare_rl.envs.interface import EnvSpec, Team, Timestep
-from lare_rl.training import off_policy
+from lare_rl.training.decoder_fits import sample_credit
 from lare_rl.training.decoder_inputs import decoder_inputs
 from lare_rl.training.session import Session
 from lare_rl.training.static_config import TrainConfig
 from measure import advance, interleave, new_session, show, summary, write
 
 SEED, EPISODE, UPDATES = 0, 1000, 50
+SETTINGS = TD3Settings()
 STORED = (10_000, 100_000, 1_000_000)
 CONFIG = TrainConfig(
     env=EnvSpec((Team("agent", 0, 1),), observation_size=17, action_size=6, discrete=False, max_steps=EPISODE),
@@ -46,7 +48,7 @@ CONFIG = TrainConfig(
     scored_observation="after",
     method=METHODS.find("lare-rrdu"),
     algorithm=ALGORITHMS["td3"],
-    hyperparameters=TD3Settings(),
+    hyperparameters=SETTINGS,
     credit=CreditSettings(),
     scale_rewards=False,
     n_factors=(6,),
@@ -82,12 +84,15 @@ def filled(transitions: int) -> Replay:
 
 def reads(stored_replay: Replay, key: jax.Array) -> Any:
     """Read the data of 50 updates, one after the other; returns the data of the last one."""
-    draws = off_policy._sample(stored_replay, key, UPDATES, CONFIG)
+    batch_key, credit_key = jax.random.split(key)
+    draws = (
+        sample_transitions(stored_replay, batch_key, (UPDATES, SETTINGS.batch_size)),
+        sample_credit(stored_replay, credit_key, UPDATES, CONFIG),
+    )
 
-    def use(draw: off_policy.UpdateSample) -> Any:
-        assert draw.credit is not None
-        credit_steps, batch = replay.read(stored_replay, draw.credit.steps), replay.read(stored_replay, draw.batch)
-        credit = decoder_inputs(credit_steps, CONFIG, 0), draw.credit.episodes
+    def use(draw: tuple[Index, CreditSample]) -> Any:
+        credit_steps, batch = replay.read(stored_replay, draw[1].steps), replay.read(stored_replay, draw[0])
+        credit = decoder_inputs(credit_steps, CONFIG, 0), draw[1].episodes
         before, after = batch.columns, batch.next_columns
         read = before["observation"], before["action"], after["observation"], before["terminated"]
         return credit, decoder_inputs(batch, CONFIG, 0), read

@@ -106,7 +106,7 @@ MEASURED = {
     "storing": (Session, "_store"),
     "updating": (Session, "_update"),
     "evaluating": (Session, "evaluate"),
-    "explaining": (loop, "_explain"),
+    "explaining": (loop, "describe_returns"),
     "checkpoints": (Session, "save"),
 }
 

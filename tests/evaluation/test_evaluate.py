@@ -35,10 +35,9 @@ from lare_rl.evaluation.policy import load_policy
 from lare_rl.evaluation.video import check_video_path, record_video, write_video
 from lare_rl.report.evaluation_lines import compare_actions, describe_evaluation
 from lare_rl.runs.metric_names import DETERMINISTIC_RETURN
-from lare_rl.training.compiled import compile_functions
-from lare_rl.training.host_policy import EvaluationPolicy
+from lare_rl.training.policy import get_actor
 from lare_rl.training.saved_state import load_learner
-from lare_rl.training.unroll_host import evaluate_on_host
+from lare_rl.training.unroll_host import evaluate_on_host, evaluation_policy
 from lare_rl.util.statistics import format_mean_std
 
 
@@ -259,8 +258,8 @@ def test_evaluate_in_several_batches(run, returns):
 
 def test_evaluate_continues_after_initial_states_of_run(run, returns):
     state = load_learner(run)
-    functions = compile_functions(state.config)
-    policy = EvaluationPolicy(state.config, functions.get_actor(state.learner, 60), run.seeds, np.arange(4), 4)
+    actor = get_actor(state.learner.algorithm, 60, state.config)
+    policy = evaluation_policy(state.config, actor, run.seeds, np.arange(4), 4)
     with LocalVecEnv([partial(make_host_env, TASK)] * 8) as envs:
         first_returns = evaluate_on_host(envs, policy, run.seeds, 4).returns[..., 0]
     last_evaluation = [line["evaluation/return"] for line in run.metrics()[-2:]]

@@ -22,7 +22,7 @@ from lare_rl.report import run_details
 from lare_rl.report.overview import render_learning_curves
 from lare_rl.report.reported_run import ReportedRun
 from lare_rl.training.collect_device import unroll_on_device
-from lare_rl.training.compiled import training_module
+from lare_rl.training.policy import get_actor
 from lare_rl.training.saved_state import load_actor, load_learner
 
 pytestmark = pytest.mark.long
@@ -84,7 +84,7 @@ def test_cross_play(runs, command):
     play = jax.jit(partial(unroll_on_device, env, n_episodes=N_EPISODES, config=state.config, deterministic=False))
     for seed in range(2):
         learner = jax.tree.map(lambda leaf, seed=seed: leaf[seed : seed + 1], state.learner)
-        batch = play(training_module(state.config).get_actor(learner, 200, state.config), jax.random.key(0)[None])
+        batch = play(get_actor(learner.algorithm, 200, state.config), jax.random.key(0)[None])
         team, steps = state.config.env.teams[0], batch.steps
         reward = team_mean(steps.next_timestep.reward, steps.timestep.alive, team)
         np.testing.assert_allclose(matches[0].returns[seed, seed], reward.sum(axis=0).mean(), rtol=1e-4)

@@ -17,7 +17,7 @@ from lare_rl.envs.play import play_episodes
 from lare_rl.errors import LareError
 from lare_rl.evaluation.policy import load_policy
 from lare_rl.runs.directory import create_run
-from lare_rl.training.start_session import start_session
+from lare_rl.training.train import start_session
 
 
 class DialsState(NamedTuple):

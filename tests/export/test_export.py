@@ -30,8 +30,7 @@ from lare_rl.export.policy_graph import policy_graph
 from lare_rl.latent.function import verify_function
 from lare_rl.phi.evaluate import evaluate
 from lare_rl.training import learner as learners
-from lare_rl.training import on_policy
-from lare_rl.training.compiled import compile_functions, init_memory
+from lare_rl.training.policy import compile_policy, get_actor, init_memory, policy_input
 from lare_rl.training.rewards import rewards
 from lare_rl.training.saved_state import load_learner
 from lare_rl.training.seed_axis import select_seed
@@ -130,7 +129,7 @@ def test_export_agrees_with_jax(kind, method, export_run):
     run, result, exported = export_run(kind, method)
     config, learner, host, _ = load_learner(run)
     seed_learner = select_seed(learner, 1)
-    actors = compile_functions(config).get_actor(learner, host["step"])
+    actors = get_actor(learner.algorithm, host["step"], config)
     check_function(exported, "policy", *policy_case(config, jax.tree.map(lambda leaf: leaf[1:], actors)))
     names = [name for name in result.functions if name != "policy"]
     if result.no_reward_reason:
@@ -154,7 +153,7 @@ def test_policy_graph_of_teams(algorithm, env):
     """The policies of teams, untrained: recurrent networks, and networks that read the index of the agent."""
     config = small_config("ircr", algorithm, env)
     learner = jax.tree.map(lambda leaf: leaf[None], untrained_learner(config))
-    actor = compile_functions(config).get_actor(learner, 0)
+    actor = get_actor(learner.algorithm, 0, config)
     if algorithm == "ippo":
         statistics = jax.tree.map(
             lambda leaf: leaf + jnp.linspace(1, 2, leaf.size).reshape(leaf.shape), actor.observation_rms
@@ -188,13 +187,14 @@ def policy_case(config, actor):
         )
         inputs |= {"hidden": hidden[0], "last_action": last}
     is_new = jnp.zeros((1, 3), bool)
-    action, memory = compile_functions(config).act(actor, memory, observation[None], available[None], None, is_new)
+    action, memory = compile_policy(config, deterministic=True)(
+        actor, memory, observation[None], available[None], None, is_new
+    )
     if memory:
         expected["next_hidden"] = memory.hidden[0]
     if env.discrete and not config.deterministic_evaluation:
-        policy_input = on_policy.policy_input(jnp.asarray(observation)[None], config)
-
-        expected["logits"] = np.asarray(jax.vmap(ppo.logits)(actor, policy_input, available[None]))[0]
+        rows = policy_input(jnp.asarray(observation)[None], config)
+        expected["logits"] = np.asarray(jax.vmap(ppo.logits)(actor, rows, available[None]))[0]
     action = np.asarray(action)[0]
     expected["action"] = np.argmax(action, axis=-1) if env.discrete else to_env_action(action, env)
     if env.n_agents == 1:

@@ -19,8 +19,8 @@ from lare_rl.data.replay import STEP_COLUMNS
 from lare_rl.data.trajectory import Trajectory
 from lare_rl.envs.interface import EnvSpec, Team, Timestep, to_env_action
 from lare_rl.training import learner as learners
-from lare_rl.training.compiled import training_module
 from lare_rl.training.episodes import learn_returns
+from lare_rl.training.policy import init_algorithm
 from lare_rl.training.static_config import TrainConfig
 
 LENGTHS = (5, 12, 3, 9, 12)
@@ -152,8 +152,7 @@ def random_factors(config, steps, seed=1):
 
 def untrained_learner(config, seed=0):
     """Return an untrained learner. It is not compiled: single operations are shared by all configurations."""
-    init_algorithm = partial(training_module(config).init, config=config)
-    return learners.init_learner(jax.random.key(seed), config, init_algorithm)
+    return learners.init_learner(jax.random.key(seed), config, partial(init_algorithm, config=config))
 
 
 def steps_as_stored(config, steps=None, factors=None):
@@ -225,10 +224,10 @@ def jitted(function, config):
 
 def learn_stored_returns(learner, config):
     """Return a learner whose decoders have learned from all finished episodes."""
-    arrays = jax.tree.map(lambda leaf: np.asarray(leaf)[None], (learner.decoders, learner.replay, learner.n_learned))
+    untrained = learner._replace(algorithm=())
     with jax.enable_x64(True):
-        learned = jitted(learn_returns, config)(*arrays)
-    return learners.with_learned_returns(learner, *jax.tree.map(lambda leaf: leaf[0], learned))
+        learned = jitted(learn_returns, config)(jax.tree.map(lambda leaf: np.asarray(leaf)[None], untrained))
+    return jax.tree.map(lambda leaf: leaf[0], learned)._replace(algorithm=learner.algorithm)
 
 
 def with_factor_decoders(learner, weights):

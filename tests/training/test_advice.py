@@ -20,9 +20,9 @@ from lare_rl.training.advice import (
     find_slow_evaluations,
     find_untrained,
 )
-from lare_rl.training.compiled import compile_functions
+from lare_rl.training.evaluation import greedy_actions, saturation
 from lare_rl.training.loop import _final_findings
-from lare_rl.training.saturation import greedy_actions, saturation
+from lare_rl.training.policy import get_actor
 from lare_rl.training.saved_state import load_learner
 from lare_rl.util.findings import render
 
@@ -113,9 +113,8 @@ def test_saturated_policies(action, saturations, start):
 
 def test_greedy_actions_of_newest_states(dense_run):
     config, learner, host, _ = load_learner(dense_run)
-    functions, replay = compile_functions(config), learner.replay
-    actor = functions.get_actor(learner, host["step"])
-    actions = greedy_actions(functions.act, actor, replay, config, 5)
+    replay, actor = learner.replay, get_actor(learner.algorithm, host["step"], config)
+    actions = greedy_actions(actor, replay, config, 5)
     assert actions.shape == (2, 5, 1)
     rows = (int(replay.next_row[1, 0]) - np.arange(1, 6)) % 64
     observation = np.asarray(replay.columns["observation"][1, 0, rows, 0])

@@ -18,6 +18,7 @@ from lare_rl.errors import LareError
 from lare_rl.training import collect_device
 from lare_rl.training.collect_device import DeviceCollector, make_jax_env, unroll_on_device
 from lare_rl.training.compiled import compile_functions
+from lare_rl.training.policy import get_actor
 from lare_rl.training.streams import Stream, stream_keys
 
 SEEDS, ENVS, TIME = (0, 3), 4, 9
@@ -28,7 +29,7 @@ CONFIG = small_config("dense", "qmix", ENV.spec, n_envs=ENVS, rollout_steps=TIME
 
 def make_actor(seeds=SEEDS, config=CONFIG):
     learner = compile_functions(config).init(jax.vmap(jax.random.key)(jnp.asarray(seeds)))
-    return learner, compile_functions(config).get_actor(learner, 0)
+    return learner, get_actor(learner.algorithm, 0, config)
 
 
 @pytest.fixture(scope="module")
@@ -199,7 +200,7 @@ def test_episode_that_never_ends_is_refused():
 @pytest.mark.parametrize(("step", "epsilon"), [(0, 1.0), (SMALL_SETTINGS["qmix"].epsilon_steps, 0.05)])
 def test_get_actor_has_the_epsilon_of_the_step(step, epsilon, learner):
     config = replace(CONFIG, hyperparameters=SMALL_SETTINGS["qmix"])
-    actor = compile_functions(config).get_actor(learner[0], step)
+    actor = get_actor(learner[0].algorithm, step, config)
     np.testing.assert_allclose(actor.epsilon, [epsilon] * len(SEEDS), rtol=1e-6)
 
 

@@ -18,8 +18,9 @@ from lare_rl.envs.gymnasium_env import GymnasiumEnv
 from lare_rl.envs.interface import EnvSpec, Team, to_env_action
 from lare_rl.envs.vec_env import LocalVecEnv
 from lare_rl.training import collect_host
-from lare_rl.training.collect_host import HostCollector, HostVecEnv
+from lare_rl.training.collect_host import HostCollector
 from lare_rl.training.compiled import compile_functions, init_seeds
+from lare_rl.training.policy import get_actor
 from lare_rl.training.streams import Stream, episode_seed, seed_keys, stream_keys
 from lare_rl.training.unroll_host import DivergedError, evaluate_on_host, evaluate_policy_on_host, record_on_host
 
@@ -66,9 +67,8 @@ def local_envs(count, task=None):
 
 
 def make_envs(seeds=(0, 1), n_envs=1, task=None):
-    envs = HostVecEnv(local_envs(len(seeds) * n_envs, task), seeds, n_envs)
-    envs.reset()
-    return envs
+    envs = local_envs(len(seeds) * n_envs, task)
+    return HostCollector(envs, envs, small_config("dense", env=envs.spec, n_envs=n_envs), seeds)
 
 
 def best_policy(timestep, noise, episode_start):
@@ -77,7 +77,7 @@ def best_policy(timestep, noise, episode_start):
 
 
 def collect(envs, n_steps, noise=0.0):
-    return envs.collect(best_policy, np.full((n_steps, *envs.shape, 1, 1), noise, np.float32))
+    return envs.collect_by(best_policy, np.full((n_steps, *envs.shape, 1, 1), noise, np.float32))
 
 
 # Actions.
@@ -142,7 +142,7 @@ def test_collect_tells_policy_episode_starts():
         return noise
 
     for n_steps in (21, 20):
-        envs.collect(policy, np.zeros((n_steps, *envs.shape, 1, 1), np.float32))
+        envs.collect_by(policy, np.zeros((n_steps, *envs.shape, 1, 1), np.float32))
     assert np.flatnonzero(np.array(starts) == 3).tolist() == [0, 20, 40]
     assert starts.count(0) == 38
 
@@ -216,8 +216,8 @@ def test_evaluate_initial_states_and_returns():
 def test_evaluated_episode_does_not_depend_on_the_number_of_environments():
     """Neither its initial state nor the choices that a policy samples."""
     config = small_config("dense", "ppo", local_envs(1, pick_spec()).spec)
-    functions = compile_functions(config)
-    actor = functions.get_actor(init_seeds(functions, seed_keys(jnp.array([0, 3]), 0)), 0)
+    learner = init_seeds(compile_functions(config), seed_keys(jnp.array([0, 3]), 0))
+    actor = get_actor(learner.algorithm, 0, config)
     results, steps, episodes = [], [], []
     for width in (5, 2):
         envs, listeners = local_envs(2 * width, pick_spec()), (lambda: steps.append(len(episodes)), episodes.append)
@@ -248,7 +248,7 @@ def test_actions_are_random_until_the_end_of_the_warmup(monkeypatch):
     config = small_config("dense", env=envs.spec, hyperparameters=settings)
     monkeypatch.setattr(
         collect_host,
-        "make_policy",
+        "make_host_policy",
         lambda *arguments, **options: lambda memory, *inputs: (np.full((2, 1, 1, 1), 0.5, np.float32), memory),
     )
     collector = HostCollector(envs, local_envs(2), config, (0, 1))
@@ -263,7 +263,7 @@ def test_actions_are_random_until_the_end_of_the_warmup(monkeypatch):
 def test_policy_that_is_nan_is_reported():
     action, envs = np.float32([[[[0]]], [[[np.nan]]]]), make_envs()
     with pytest.raises(DivergedError, match="policy of seed 1"):
-        envs.collect(lambda timestep, noise, episode_start: action, np.zeros((1, 2, 1, 1, 1)))
+        envs.collect_by(lambda timestep, noise, episode_start: action, np.zeros((1, 2, 1, 1, 1)))
     with pytest.raises(DivergedError, match="policy of seed 1"):
         evaluate_on_host(local_envs(2), lambda timestep, episode_start: action, (0, 1), 1)
 

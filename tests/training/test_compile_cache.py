@@ -56,7 +56,7 @@ def test_run_shares_functions_but_not_phi():
     functions = compile_functions(small_config("lare-rrdu"), (graph,))
     assert compile_functions(small_config("lare-rrdu"), (same_graph,)) is functions
     other_phi = compile_functions(small_config("lare-rrdu"), (other,))
-    assert (other_phi.act, other_phi.train_step) == (functions.act, functions.train_step)
+    assert (other_phi.fit, other_phi.train_step) == (functions.fit, functions.train_step)
     assert other_phi.store is not functions.store
 
 

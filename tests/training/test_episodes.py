@@ -121,8 +121,7 @@ def test_a_seed_without_new_episodes_does_not_change():
     new = learned._replace(n_learned=jnp.zeros_like(learned.n_learned))
     seeds = jax.tree.map(lambda *leaves: jnp.stack(leaves), new, learned)
     with jax.enable_x64(True):
-        learn_returns = jax.jit(partial(episodes.learn_returns, config=config))
-        decoders = learn_returns(seeds.decoders, seeds.replay, seeds.n_learned)[0]
+        decoders = jax.jit(partial(episodes.learn_returns, config=config))(seeds).decoders
     assert decoders[0].closed_form.n_steps.tolist() == [10 * TOTAL, TOTAL]
     for leaf, before in zip(*map(jax.tree.leaves, (decoders, seeds.decoders)), strict=True):
         np.testing.assert_array_equal(leaf[1], before[1])

@@ -8,36 +8,15 @@ import pytest
 import lare_rl
 from helpers.jax_toy_envs import Echo
 from helpers.long_tests import long_case
-from helpers.small_configs import random_steps, small_config, untrained_learner
+from helpers.small_configs import random_steps, small_config
 from helpers.training_runs import ECHO_PHI, train_quietly
 from lare_rl.config.resolve import resolve
 from lare_rl.envs.particles.catalogue import TASKS
 from lare_rl.errors import LareError
 from lare_rl.latent.function import verify_function
 from lare_rl.runs.directory import create_run, open_run
-from lare_rl.training import factors
-from lare_rl.training.iteration import IterationFunctions, update, when_on_host
+from lare_rl.training import decoder_inputs
 from lare_rl.training.latent_functions import choose_functions
-
-
-def test_update_fits_decoders_before_the_algorithm():
-    """Iterations have 20 steps, and the decoders are fitted in every second of them."""
-    config, steps, measured, calls = small_config("lare-rd", "ippo", rollout_steps=20), random_steps(), {}, []
-
-    def fit(learner, keys):
-        calls.append("fit")
-        return learner, {"credit/loss": 1.0}
-
-    def train_step(learner, steps, keys, step):
-        calls.append(("train", step))
-        return learner, {}
-
-    functions = IterationFunctions(lambda *_: None, lambda *_: None, fit, train_step)
-    for step in (80, 100, 120):
-        arguments = jnp.arange(2), step, functions, when_on_host, lambda old, new, _: old | new, config, 2
-        _, measured = update(untrained_learner(config), measured, steps, *arguments)
-    assert calls == ["fit", ("train", 80), ("train", 100), "fit", ("train", 120)]
-    assert measured == {"credit/loss": 1.0}
 
 
 @pytest.mark.long
@@ -75,10 +54,10 @@ def test_create_run_with_one_function_per_team(tmp_path):
         open_run(run.directory)
 
 
-@pytest.mark.parametrize("max_operations", [factors.MAX_COMPILED_OPERATIONS, 0])
+@pytest.mark.parametrize("max_operations", [decoder_inputs.MAX_COMPILED_OPERATIONS, 0])
 def test_compute_factors_of_state(max_operations, echo, monkeypatch):
     """One row in each step: the global state, and all actions concatenated. Large graphs are computed by NumPy."""
-    monkeypatch.setattr(factors, "MAX_COMPILED_OPERATIONS", max_operations)
+    monkeypatch.setattr(decoder_inputs, "MAX_COMPILED_OPERATIONS", max_operations)
     task = echo.model_copy(update={"credit_scope": "state", "observation_size": 9, "action_size": 9})
     source = "def evaluation_func(s, a):\n    return [np.sum(s * a, axis=1, keepdims=True), s[:, 0:1]]\n"
     graph, steps = verify_function(source, task).graph, random_steps(Echo.spec)
@@ -86,7 +65,7 @@ def test_compute_factors_of_state(max_operations, echo, monkeypatch):
         config = small_config("lare-rd", "qmix", Echo.spec, credit_scope="state", scored_observation=scored_observation)
         state = (steps.timestep if scored_observation == "before" else steps.next_timestep).state
         expected = np.stack([(state * steps.action.reshape(state.shape)).sum(axis=-1), state[..., 0]], axis=-1)
-        z = factors.compute_factors([graph], jax.tree.map(jnp.asarray, steps), config)
+        z = decoder_inputs.compute_factors([graph], jax.tree.map(jnp.asarray, steps), config)
         np.testing.assert_allclose(z[..., 0, :], expected, rtol=1e-5, atol=1e-6)
 
 

@@ -7,9 +7,8 @@ import pytest
 
 from helpers.small_configs import small_config
 from lare_rl.algorithms.registry import ALGORITHMS
-from lare_rl.training import host_policy
+from lare_rl.training import policy
 from lare_rl.training.compiled import compile_functions, init_seeds
-from lare_rl.training.host_policy import make_policy
 from lare_rl.training.numpy_program import UnsupportedOperationError, to_numpy
 from lare_rl.training.streams import seed_keys
 
@@ -54,16 +53,16 @@ def test_other_operations_are_refused(function):
 def test_policy_on_host_equals_compiled_policy(algorithm, monkeypatch):
     hyperparameters = ALGORITHMS[algorithm].settings.model_copy(update={"hidden": (8,)})
     config = small_config("dense", algorithm, hyperparameters=hyperparameters)
-    functions = compile_functions(config)
-    actor = functions.get_actor(init_seeds(functions, seed_keys(jnp.arange(2), 0)), 0)
+    learner = init_seeds(compile_functions(config), seed_keys(jnp.arange(2), 0))
+    actor = policy.get_actor(learner.algorithm, 0, config)
     inputs = (), draw(2, 3, 1, 3), np.ones((2, 3, 1, 2), bool)
     for deterministic in (True, False):
         noise = None if deterministic else draw(2, 3, 1, config.noise_size)
-        assert host_policy._translate_policy(config, 2, 3, deterministic) is not None
+        assert policy._translate_policy(config, 2, 3, deterministic) is not None
         results = []
         for _ in range(2):
-            policy = make_policy(config, actor, 3, deterministic=deterministic)
-            results.append(policy(*inputs, noise, np.zeros((2, 3), bool))[0])
-            monkeypatch.setattr(host_policy, "_translate_policy", lambda *_: None)
+            act = policy.make_host_policy(config, actor, 3, deterministic=deterministic)
+            results.append(act(*inputs, noise, np.zeros((2, 3), bool))[0])
+            monkeypatch.setattr(policy, "_translate_policy", lambda *_: None)
         np.testing.assert_allclose(*results, atol=1e-6)
         monkeypatch.undo()

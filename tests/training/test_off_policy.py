@@ -20,6 +20,7 @@ from helpers.small_configs import (
 )
 from lare_rl.algorithms.td3 import td3
 from lare_rl.credit.decoder_settings import CreditSettings
+from lare_rl.data.sampling import sample_transitions
 from lare_rl.training import off_policy
 from lare_rl.training.rewards import rewards
 
@@ -30,8 +31,8 @@ def test_train_step_relabels_by_the_newest_decoder():
     learner = learner_with_episodes(config)
     updated, metrics = jitted(off_policy._train_seed, config)(learner, jax.random.key(0), jnp.array(0))
     sample_key, _, noise_key = jax.random.split(jax.random.key(0), 3)
-    sample = off_policy._sample(learner.replay, sample_key, 1, config)
-    steps, losses = read(learner.replay, jax.tree.map(lambda leaf: leaf[0], sample.batch)), []
+    index = sample_transitions(learner.replay, jax.random.split(sample_key)[0], (8,))
+    steps, losses = read(learner.replay, index), []
     update = jax.jit(partial(td3.update, settings=config.hyperparameters))
     for decoders in (learner.decoders, updated.decoders):
         reward = jitted(rewards, config)(steps, decoders)

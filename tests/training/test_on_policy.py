@@ -25,7 +25,7 @@ from helpers.small_configs import (
 )
 from lare_rl.algorithms.ppo import ppo
 from lare_rl.nn.normalise import standardise
-from lare_rl.training import on_policy
+from lare_rl.training import on_policy, policy
 from lare_rl.training.rewards import rewards
 
 ppo_config = partial(small_config, algorithm="ppo", rollout_steps=20)
@@ -96,8 +96,8 @@ def test_act_normalises_by_the_statistics_of_earlier_rollouts():
     statistics = learner.algorithm.observation_rms
     expected = steps.timestep.observation[-20:, 0, 0].mean(axis=0)
     np.testing.assert_allclose(statistics.mean, expected, rtol=1e-3, atol=1e-5)
-    actor, observation = on_policy.get_actor(learner, 0, config), jnp.asarray(steps.timestep.observation[0])
-    action, _ = on_policy.act(actor, (), observation, jnp.ones((1, 1, 2), bool), None, config)
+    actor, observation = policy.get_actor(learner.algorithm, 0, config), jnp.asarray(steps.timestep.observation[0])
+    action, _ = policy.act(actor, (), observation, jnp.ones((1, 1, 2), bool), None, config)
     np.testing.assert_allclose(action, actor.policy.mode(standardise(statistics, observation)), rtol=1e-4, atol=1e-5)
     prepared = ppo.prepare_batch(learner.algorithm, rollout, config.hyperparameters)[0]
     expected = standardise(statistics, rollout.observation[:, 0])
@@ -107,12 +107,12 @@ def test_act_normalises_by_the_statistics_of_earlier_rollouts():
 @pytest.mark.parametrize("discrete", [False, True])
 def test_act_with_and_without_noise(discrete):
     config = ppo_config("dense", env=replace(ONE_AGENT, discrete=discrete))
-    actor, random = on_policy.get_actor(untrained_learner(config), 0, config), np.random.default_rng(0)
+    actor, random = policy.get_actor(untrained_learner(config).algorithm, 0, config), np.random.default_rng(0)
     noise = random.gumbel(size=(20, 1, 2)) if discrete else random.normal(size=(20, 1, 2))
     noise, observation, available = jnp.asarray(noise, jnp.float32), jnp.ones((20, 1, 3)), jnp.ones((20, 1, 2), bool)
-    explored, memory = on_policy.act(actor, (), observation, available, noise, config)
+    explored, memory = policy.act(actor, (), observation, available, noise, config)
     assert memory == ()
-    greedy = on_policy.act(actor, (), observation, available, None, config)[0]
+    greedy = policy.act(actor, (), observation, available, None, config)[0]
     if discrete:
         np.testing.assert_array_equal(np.sort(explored, axis=-1), np.broadcast_to([0, 1], explored.shape))
         assert 0 < explored[..., 0].sum() < len(explored)

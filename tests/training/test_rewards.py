@@ -52,7 +52,7 @@ def test_exact_rewards_add_up_to_payments(method, algorithm, env, exact, payment
     for seed in range(3):
         learner = add_steps(learner, config, random_steps(env, seed=seed))
     if algorithm != "td3":  # the sums are computed with each update
-        learner = learner._replace(replay=jitted(on_policy._with_predicted_returns, config)(learner))
+        learner = jitted(on_policy._predict_newest_returns, config)(learner)
         index = replay.newest_steps(learner.replay, config.rollout_steps)
         steps = jax.tree.map(lambda rows: rows[0], replay.read(learner.replay, index))
     else:

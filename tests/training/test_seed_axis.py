@@ -24,13 +24,13 @@ import lare_rl
 from helpers.training_runs import train_and_stop
 from lare_rl.runs.directory import open_run
 from lare_rl.tasks.spec import TaskSpec
-from lare_rl.training.start_session import restore_session
+from lare_rl.training.train import restore_session
 
 task, settings = TaskSpec(**json.loads(sys.argv[1])), lare_rl.Settings(**json.loads(sys.argv[2]))
 train_and_stop(task, settings, "run", settings.evaluate_every)
 opened, _ = restore_session(open_run("run"))
 functions = opened.functions
-compiled = [functions.store, functions.train_step] if opened.loop is None else [opened.loop.run]
+compiled = [functions.store, functions.train_step] if opened.loop is None else [opened.loop.args[0]]
 collective = re.compile("all-gather|all-reduce|all-to-all|collective-permute|reduce-scatter")
 opened.close()
 print(json.dumps({

@@ -3,7 +3,6 @@
 import json
 import re
 from concurrent.futures import Future, ThreadPoolExecutor
-from types import SimpleNamespace
 
 import gymnasium
 import jax
@@ -166,8 +165,8 @@ def test_env_fault_is_located(dense, tmp_path, monkeypatch):
 def test_diverged_loss_is_not_saved(dense, tmp_path, monkeypatch):
     advance = Session.advance
 
-    def spoil_loss(session, until, stop_requested):
-        advance(session, until, stop_requested)
+    def spoil_loss(session, until):
+        advance(session, until)
         if session.step == 84:
             session.latest_metrics["critic/loss"] = np.array([1.0, np.nan])
 
@@ -178,19 +177,20 @@ def test_diverged_loss_is_not_saved(dense, tmp_path, monkeypatch):
     assert read_metadata(run.checkpoint)["step"] == run.metrics()[-1]["step"] < 84
 
 
-def test_close_reports_a_failed_checkpoint_after_an_error_of_the_environments():
-    def fail():
+def test_close_reports_a_failed_checkpoint_after_an_error_of_the_environments(monkeypatch):
+    def fail(collector):
         raise RuntimeError("a worker does not answer")
 
     saving, threads = Future(), ThreadPoolExecutor(1)
     saving.set_exception(LareError("No space left"))
     session = Session.__new__(Session)  # without the run and the learner that a session needs
-    vars(session).update(collector=SimpleNamespace(close=fail), _threads=threads, _saving=saving)
+    monkeypatch.setattr(HostCollector, "close", fail)
+    vars(session).update(collector=HostCollector.__new__(HostCollector), _threads=threads, _saving=saving)
     with pytest.raises(LareError, match="No space left") as error:
         session.close()
     assert isinstance(error.value.__context__, RuntimeError)
     with pytest.raises(RuntimeError, match="shutdown"):
-        threads.submit(fail)
+        threads.submit(print)
 
 
 @pytest.mark.parametrize("error", [MemoryError(), jax.errors.JaxRuntimeError("RESOURCE_EXHAUSTED: Out of memory")])

@@ -18,17 +18,36 @@ from importlib import import_module
 from pkgutil import resolve_name
 from typing import TYPE_CHECKING, Any
 
-from lare_rl.errors import CheckedModel, LareError
+from lare_rl.errors import CheckedModel, Count, LareError
 from lare_rl.util.plugins import Registry
 
 if TYPE_CHECKING:  # importing NumPy takes longer than all else that the command line does before it shows a message
     from lare_rl.envs.interface import EnvSpec
 
-__all__ = ["ALGORITHMS", "Algorithm", "AlgorithmSettings", "Consumes", "Noise", "register_algorithm"]
+__all__ = [
+    "ALGORITHMS",
+    "Algorithm",
+    "AlgorithmSettings",
+    "Consumes",
+    "Noise",
+    "SequenceSettings",
+    "register_algorithm",
+]
 
 
 class AlgorithmSettings(CheckedModel):
     """The base class of an algorithm's hyperparameters."""
+
+
+class SequenceSettings(AlgorithmSettings):
+    """The base class for algorithms that consume whole episodes: how many an update reads, and how often there is one."""
+
+    batch_size: Count = 128
+    """Episodes in one update."""
+    update_every: Count = 8
+    """New episodes for each update."""
+    target_every: Count = 200
+    """Episodes between two copies to the target networks, each after an update."""
 
 
 class Consumes(StrEnum):
@@ -106,7 +125,7 @@ ALGORITHMS = Registry[Algorithm]("algorithm")
 _SETTINGS = {
     Consumes.TRANSITIONS: "lare_rl.algorithms.off_policy:OffPolicySettings",
     Consumes.ROLLOUTS: "lare_rl.algorithms.registry:AlgorithmSettings",
-    Consumes.SEQUENCES: "lare_rl.algorithms.sequences:SequenceSettings",
+    Consumes.SEQUENCES: "lare_rl.algorithms.registry:SequenceSettings",
 }
 """The classes that the settings of algorithms derive from. Their modules import this one."""
 

@@ -2,9 +2,13 @@
 
 from typing import NamedTuple
 
+import numpy as np
 from jaxtyping import Bool, Float
 
-from lare_rl.envs.interface import AnyArray, Timestep
+from lare_rl.envs.interface import AnyArray, EnvSpec, Timestep
+from lare_rl.envs.vec_env import empty_batch
+
+__all__ = ["Trajectory", "empty_trajectory"]
 
 
 class Trajectory(NamedTuple):
@@ -26,3 +30,14 @@ class Trajectory(NamedTuple):
     def ended(self) -> Bool[AnyArray, "*lead time envs"]:
         """Whether the step was the last of its episode: terminated or truncated."""
         return self.next_timestep.terminated | self.next_timestep.truncated
+
+
+def empty_trajectory(spec: EnvSpec, *lead: int) -> Trajectory:
+    """Return steps of zeros, as NumPy arrays. `lead` ends in the numbers of steps and environments."""
+    action = np.zeros((*lead, spec.n_agents, spec.action_size), np.float32)
+    return Trajectory(
+        timestep=empty_batch(spec, *lead),
+        action=action,
+        env_action=action.astype(spec.action_dtype),
+        next_timestep=empty_batch(spec, *lead),
+    )

@@ -177,15 +177,15 @@ def _sizes(spec: EnvSpec) -> tuple[Any, ...]:
     return spec.teams, spec.observation_size, spec.action_size, spec.discrete, spec.state_size, spec.measures
 
 
-def empty_batch(spec: EnvSpec, n: int) -> Timestep:
-    """Return the timesteps of `n` environments before their first reset."""
+def empty_batch(spec: EnvSpec, *lead: int) -> Timestep:
+    """Return the timesteps of environments before their first reset, as arrays of shape `lead`."""
     return Timestep(
-        observation=np.zeros((n, spec.n_agents, spec.observation_size), np.float32),
-        state=np.zeros((n, spec.state_size), np.float32),
-        available=np.ones((n, spec.n_agents, spec.action_size), bool),
-        alive=np.zeros((n, spec.n_agents), bool),
-        reward=np.zeros((n, spec.n_agents), np.float32),
-        terminated=np.zeros(n, bool),
-        truncated=np.zeros(n, bool),
-        measures={name: np.zeros(n, np.float32) for name in spec.measures},
+        observation=np.zeros((*lead, spec.n_agents, spec.observation_size), np.float32),
+        state=np.zeros((*lead, spec.state_size), np.float32),
+        available=np.ones((*lead, spec.n_agents, spec.action_size), bool),
+        alive=np.zeros((*lead, spec.n_agents), bool),
+        reward=np.zeros((*lead, spec.n_agents), np.float32),
+        terminated=np.zeros(lead, bool),
+        truncated=np.zeros(lead, bool),
+        measures={name: np.zeros(lead, np.float32) for name in spec.measures},
     )

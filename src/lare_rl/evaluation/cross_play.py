@@ -14,7 +14,7 @@ from lare_rl.envs.placement import load_env_spec
 from lare_rl.errors import LareError, check_count
 from lare_rl.runs.directory import Run
 from lare_rl.training.collect_device import make_jax_env, unroll_on_device
-from lare_rl.training.compiled import policy_function, training_module
+from lare_rl.training.policy import get_actor, make_policy
 from lare_rl.training.saved_state import load_learner
 from lare_rl.training.static_config import TrainConfig
 
@@ -60,7 +60,7 @@ def cross_play(runs: tuple[Run, Run], episodes: int = 200) -> list[Match]:
 def _load_actors(run: Run) -> tuple[TrainConfig, list[Any]]:
     """Load the actor of each seed, with an axis of one seed."""
     state = load_learner(run)
-    actors = training_module(state.config).get_actor(state.learner, run.config.settings.steps, state.config)
+    actors = get_actor(state.learner.algorithm, run.config.settings.steps, state.config)
     return state.config, [jax.tree.map(lambda leaf, i=i: leaf[i : i + 1], actors) for i in range(len(run.seeds))]
 
 
@@ -69,7 +69,7 @@ def _play_match(
 ) -> Float[Array, ""]:
     """Return the mean over episodes of the first team's return R."""
     team = config.env.teams[0]
-    policy = partial(combine_policies, policy=policy_function(config, deterministic=False), team=team)
+    policy = partial(combine_policies, policy=make_policy(config, deterministic=False), team=team)
     batch = unroll_on_device(env, (first, second), key[None], n_episodes, config, deterministic=False, act=policy)
     reward = team_mean(batch.steps.next_timestep.reward, batch.steps.timestep.alive, team)
     return jnp.mean(jnp.sum(reward * batch.mask, axis=0))

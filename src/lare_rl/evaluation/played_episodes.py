@@ -18,11 +18,11 @@ from lare_rl.envs.placement import make_vec_env, n_open_envs
 from lare_rl.envs.play import make_episode
 from lare_rl.runs.directory import Run
 from lare_rl.training.collect_device import make_jax_env, unroll_on_device
-from lare_rl.training.compiled import training_module
+from lare_rl.training.decoder_inputs import compute_host_factors
 from lare_rl.training.episodes import predict_returns
 from lare_rl.training.evaluation import EpisodeBatch
-from lare_rl.training.factors import compute_host_factors
 from lare_rl.training.learner import Learner, empty_replay, store_with_factors
+from lare_rl.training.policy import get_actor
 from lare_rl.training.rewards import rewards
 from lare_rl.training.saved_state import load_learner
 from lare_rl.training.seed_axis import select_seed
@@ -86,8 +86,8 @@ def play_run(run: Run, n_episodes: int = 1, *, actor: Any = None, key: int = 0) 
     state = load_learner(run)
     config, learner = state.config, state.learner
     if actor is None:
-        first = jax.tree.map(lambda leaf: leaf[:1], learner)
-        actor = training_module(config).get_actor(first, run.config.settings.steps, config)
+        first = jax.tree.map(lambda leaf: leaf[:1], learner.algorithm)
+        actor = get_actor(first, run.config.settings.steps, config)
     if config.env.is_jax:
         batch = unroll_policy(make_jax_env(run.config.task), config, actor, n_episodes, key)
     else:
@@ -148,11 +148,11 @@ def compute_training_rewards(
 
     @jax.jit
     def compute(steps: Trajectory, factors: Array) -> Array:
-        filled = store_with_factors(learner._replace(replay=buffer), steps, factors, config).replay
+        filled = store_with_factors(learner._replace(replay=buffer), steps, factors, config)
         if config.is_exact:
-            predicted = predict_returns(learner.decoders, filled, replay.segments_as_episodes(filled).oldest, config)
-            filled = replay.replace_payment_fields(filled, predicted_return=predicted)
-        stored = replay.read(filled, replay.newest_steps(filled, n_steps))
+            since = replay.segments_as_episodes(filled.replay).oldest
+            filled = predict_returns(filled._replace(reward_sources=learner.reward_sources), since, config)
+        stored = replay.read(filled.replay, replay.newest_steps(filled.replay, n_steps))
         return jnp.swapaxes(rewards(stored, learner.reward_sources, config), 0, 1)
 
     return np.asarray(compute(jax.tree.map(jnp.asarray, steps), jnp.asarray(factors)))

@@ -12,7 +12,7 @@ from lare_rl.envs.interface import to_env_action, to_package_action, with_availa
 from lare_rl.envs.placement import load_env_spec
 from lare_rl.errors import LareError
 from lare_rl.runs.directory import Run, as_run
-from lare_rl.training.host_policy import HostPolicy, draw_noise, init_host_memory, make_policy
+from lare_rl.training.policy import HostPolicy, draw_noise, init_host_memory, make_host_policy
 from lare_rl.training.saved_state import load_actor
 from lare_rl.training.streams import Stream, numpy_generator
 from lare_rl.util.shapes import padded_size
@@ -105,7 +105,9 @@ class RunPolicy:
         n_padded = padded_size(n_rows)
         padded = np.minimum(np.arange(n_padded), n_rows - 1)  # the last row is repeated
         if n_padded not in self._policies:
-            self._policies[n_padded] = make_policy(self._config, self._actor, n_padded, deterministic=deterministic)
+            self._policies[n_padded] = make_host_policy(
+                self._config, self._actor, n_padded, deterministic=deterministic
+            )
         action, self._memory = self._policies[n_padded](
             self._memory,
             observations[None, padded, None],

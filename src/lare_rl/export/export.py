@@ -22,7 +22,7 @@ from lare_rl.phi import evaluate
 from lare_rl.phi.graph import Gather, Graph, Node
 from lare_rl.phi.onnx import BATCH, is_installed, onnx_model
 from lare_rl.runs.directory import Run, as_run, function_filename
-from lare_rl.training.compiled import compile_functions
+from lare_rl.training.policy import get_actor
 from lare_rl.training.saved_state import load_actor, load_learner
 from lare_rl.training.seed_axis import select_seed
 from lare_rl.util.files import replace_npz, write_atomically
@@ -69,7 +69,7 @@ def export_run(run: Run | str | Path, out: str | Path, seed: int | None = None, 
         _, actors, best_steps = load_actor(run, best=True)
         step = int(best_steps[seed_index])
     else:
-        actors = compile_functions(config).get_actor(learner, step)
+        actors = get_actor(learner.algorithm, step, config)
     first_choice = config.env.first_choice
     graphs = {"policy": policy_graph(select_seed(actors, seed_index), config, first_choice)}
     credit = select_seed(learner.decoders, seed_index)

@@ -19,8 +19,7 @@ from lare_rl.export.translate import compute, finish, graph_input
 from lare_rl.phi.builder import Builder, building
 from lare_rl.phi.graph import Graph
 from lare_rl.phi.limits import UNLIMITED
-from lare_rl.training.compiled import training_module
-from lare_rl.training.on_policy import policy_input
+from lare_rl.training import policy
 from lare_rl.training.static_config import TrainConfig
 
 __all__ = ["policy_graph"]
@@ -42,7 +41,7 @@ def policy_graph(actor: Any, config: TrainConfig, first_choice: int) -> Graph:
         inputs = {"observation": graph_input("observation", (*agents, env.observation_size))}
         if env.masks_actions:
             inputs["available"] = graph_input("available", (*agents, env.action_size), "bool")
-        if memory := training_module(config).init_memory(config):
+        if memory := policy.init_memory(config):
             inputs["hidden"] = graph_input("hidden", (*agents, memory.hidden.shape[-1]))
             inputs["last_action"] = graph_input("last_action", agents, "int")
         return finish(**compute(partial(_act, actor=actor, config=config, first_choice=first_choice), inputs))
@@ -50,15 +49,15 @@ def policy_graph(actor: Any, config: TrainConfig, first_choice: int) -> Graph:
 
 def _act(inputs: dict[str, Array], actor: Any, config: TrainConfig, first_choice: int) -> dict[str, Array]:
     """Return the outputs of the policy for one row of inputs."""
-    env, module, algorithm = config.env, training_module(config), config.algorithm.load()
+    env, algorithm = config.env, config.algorithm.load()
     inputs = inputs if env.n_agents > 1 else {name: values[None] for name, values in inputs.items()}
     observation = inputs["observation"]
     available = inputs.get("available", jnp.ones((env.n_agents, env.action_size), bool))
-    memory = module.init_memory(config)
+    memory = policy.init_memory(config)
     if memory:
         last_action = jax.nn.one_hot(inputs["last_action"], env.action_size)
         memory = memory._replace(hidden=inputs["hidden"], last_action=last_action)
-    action, next_memory = module.act(actor, memory, observation, available, None, config)
+    action, next_memory = policy.act(actor, memory, observation, available, None, config)
     outputs = {"next_hidden": next_memory.hidden} if memory else {}
     if not env.discrete:
         outputs["action"] = to_env_action(action, env)
@@ -66,5 +65,5 @@ def _act(inputs: dict[str, Array], actor: Any, config: TrainConfig, first_choice
         outputs["action"] = jnp.argmax(action, axis=-1) + first_choice
         if not config.deterministic_evaluation and hasattr(algorithm, "logits"):
             choices = available if env.masks_actions else None
-            outputs["logits"] = algorithm.logits(actor, policy_input(observation, config), choices)
+            outputs["logits"] = algorithm.logits(actor, policy.policy_input(observation, config), choices)
     return outputs if env.n_agents > 1 else {name: values[0] for name, values in outputs.items()}

@@ -18,17 +18,13 @@ from lare_rl.envs.vec_env import check_jax_env, check_lengths
 from lare_rl.nn.masks import select
 from lare_rl.tasks.spec import TaskSpec
 from lare_rl.training.compile_cache import cache_by_value
-from lare_rl.training.compiled import init_memory, policy_function
 from lare_rl.training.evaluation import EpisodeBatch, Evaluation
+from lare_rl.training.policy import Policy, init_memory, make_policy
 from lare_rl.training.seed_axis import jit_over_seeds, seed_sharding
 from lare_rl.training.static_config import TrainConfig
 from lare_rl.training.streams import Stream, device_noise, stream_keys
 
 __all__ = ["DeviceCollector", "VecEnvState", "collect", "is_reset_cheap", "make_jax_env", "reset", "unroll_on_device"]
-
-Act = Callable[..., tuple[Array, Any]]
-"""From actor, memory, observation, available actions, noise and episode starts to the action and the new memory."""
-
 
 MAX_RESET_FLOPS = 2e7
 """A card resets all environments with each step, and uses the result where an episode has ended, if that takes fewer operations than
@@ -72,10 +68,8 @@ class DeviceCollector:
 
     def state_dict(self) -> dict[str, np.ndarray]:
         """Return the arrays that `restore` needs."""
-        leaves = jax.tree.leaves(self.envs)
-        return {
-            str(i): np.asarray(jax.random.key_data(leaf) if _is_key(leaf) else leaf) for i, leaf in enumerate(leaves)
-        }
+        leaves = enumerate(jax.tree.leaves(self.envs))
+        return {str(i): np.asarray(jax.random.key_data(leaf) if _is_key(leaf) else leaf) for i, leaf in leaves}
 
     def restore(self, arrays: dict[str, np.ndarray]) -> tuple[Bool[np.ndarray, "seeds envs"], list[str]]:
         """Restore the environments. Return which episodes were dropped, and messages: never any, as on the host."""
@@ -84,15 +78,8 @@ class DeviceCollector:
         for i, leaf in enumerate(leaves):
             if _is_key(leaf):
                 saved[i] = jax.random.wrap_key_data(saved[i], impl=jax.random.key_impl(leaf))
-        envs = jax.tree.unflatten(structure, saved)
-        self.envs = jax.device_put(envs, seed_sharding(self._n_devices))
+        self.envs = jax.device_put(jax.tree.unflatten(structure, saved), seed_sharding(self._n_devices))
         return np.zeros(self.envs.episode_start.shape, bool), []
-
-    def watch(self, on_step: Callable[[int], None], stop_requested: Callable[[], bool]) -> None:
-        """Do nothing: one compiled call makes all steps of an iteration."""
-
-    def close(self) -> None:
-        """Do nothing: there is nothing to close."""
 
 
 def _is_key(leaf: Array) -> bool:
@@ -107,23 +94,23 @@ def unroll_on_device(
     n_episodes: int,
     config: TrainConfig,
     deterministic: bool,
-    act: Act | None = None,
+    act: Policy | None = None,
 ) -> EpisodeBatch:
     """Play whole episodes of a policy, each from a different initial state. `act` replaces the policy of training."""
-    act = act or policy_function(config, deterministic)
+    act = act or make_policy(config, deterministic)
     reset_keys, step_keys = jnp.unstack(_split_keys(keys, 2), axis=1)
     envs = reset(env, reset_keys, n_episodes, config)
 
     def body(
-        carry: tuple[VecEnvState, Bool[Array, "seeds episodes"]], randomness: _Randomness
+        carry: tuple[VecEnvState, Bool[Array, "seeds episodes"]], randomness: tuple[Any, Any]
     ) -> tuple[tuple[VecEnvState, Bool[Array, "seeds episodes"]], EpisodeBatch]:
         envs, running = carry
-        envs, steps = _step(env, envs, actor, randomness, config, act)
+        envs, steps = _step(env, envs, actor, *randomness, config, act)
         return (envs, running & ~steps.ended), EpisodeBatch(steps, running, envs.state)
 
     keys = jnp.swapaxes(_split_keys(step_keys, config.env.max_steps), 0, 1)
-    randomness = jax.vmap(lambda keys_t: _draw(keys_t, n_episodes, config, deterministic))(keys)
-    return jax.lax.scan(body, (envs, jnp.ones_like(envs.episode_start)), randomness)[1]
+    start = envs, jnp.ones_like(envs.episode_start)
+    return jax.lax.scan(body, start, _draw(keys, n_episodes, config, deterministic))[1]
 
 
 @cache_by_value
@@ -142,32 +129,31 @@ def reset(env: JaxEnv, keys: Key[Array, " seeds"], n_envs: int, config: TrainCon
     return VecEnvState(state, timestep, init_memory(config, *episode_start.shape), episode_start)
 
 
-class _Randomness(NamedTuple):
-    """The random numbers of a step. Those of many steps are drawn at once, which takes a card as long as those of one step."""
+def _draw(
+    keys: Key[Array, "time seeds"], n_envs: int, config: TrainConfig, deterministic: bool
+) -> tuple[Float[Array, "time seeds envs agents noise"] | None, Key[Array, "time seeds envs"]]:
+    """Draw the noise of the policy (None without noise), and the keys of the environments.
 
-    noise: Float[Array, "seeds envs agents noise"] | None
-    """The noise of the policy; None without noise."""
-    keys: Key[Array, "seeds envs"]
-    """The keys of the environments."""
+    Those of many steps are drawn at once, which takes a card as long as those of one step.
+    """
 
+    def draw_step(keys: Key[Array, " seeds"]) -> tuple[Any, Any]:
+        noise_keys, env_keys = jnp.unstack(_split_keys(keys, 2), axis=1)
+        shape = n_envs, config.env.n_agents, config.noise_size
+        noise = None if deterministic else jax.vmap(lambda key: device_noise(key, config.noise, shape))(noise_keys)
+        return noise, _split_keys(env_keys, n_envs)
 
-def _draw(keys: Key[Array, " seeds"], n_envs: int, config: TrainConfig, deterministic: bool) -> _Randomness:
-    """Draw the random numbers of a step."""
-    noise_keys, env_keys = jnp.unstack(_split_keys(keys, 2), axis=1)
-    noise, shape = None, (n_envs, config.env.n_agents, config.noise_size)
-    if not deterministic:
-        noise = jax.vmap(lambda key: device_noise(key, config.noise, shape))(noise_keys)
-    return _Randomness(noise, _split_keys(env_keys, n_envs))
+    return jax.vmap(draw_step)(keys)
 
 
 def _step(
-    env: JaxEnv, envs: VecEnvState, actor: Any, randomness: _Randomness, config: TrainConfig, act: Act
+    env: JaxEnv, envs: VecEnvState, actor: Any, noise: Array | None, keys: Array, config: TrainConfig, act: Policy
 ) -> tuple[VecEnvState, Trajectory]:
     """Step all environments. Episodes that have ended are not reset."""
-    timestep, noise = envs.timestep, randomness.noise
+    timestep = envs.timestep
     action, memory = act(actor, envs.memory, timestep.observation, timestep.available, noise, envs.episode_start)
     env_action = action if config.env.discrete else to_env_action(action, config.env)
-    state, next_timestep = _map_envs(env.step)(envs.state, env_action, randomness.keys)
+    state, next_timestep = _map_envs(env.step)(envs.state, env_action, keys)
     steps = Trajectory(timestep=timestep, action=action, env_action=env_action, next_timestep=next_timestep)
     return VecEnvState(state, next_timestep, memory, jnp.zeros_like(envs.episode_start)), steps
 
@@ -186,9 +172,9 @@ def collect(
     """
     act, n_envs = _exploration_policy(env_steps, config), config.n_envs
 
-    def body(envs: VecEnvState, randomness: tuple[_Randomness, Key[Array, " seeds"]]) -> tuple[VecEnvState, Trajectory]:
-        step_randomness, reset_keys = randomness
-        envs, steps = _step(env, envs, actor, step_randomness, config, act)
+    def body(envs: VecEnvState, randomness: tuple[Any, ...]) -> tuple[VecEnvState, Trajectory]:
+        noise, env_keys, reset_keys = randomness
+        envs, steps = _step(env, envs, actor, noise, env_keys, config, act)
 
         def reset_ended(envs: VecEnvState) -> VecEnvState:
             fresh = reset(env, reset_keys, n_envs, config)
@@ -201,14 +187,14 @@ def collect(
 
     keys = jnp.swapaxes(_split_keys(keys, config.rollout_steps), 0, 1)
     step_keys, reset_keys = jnp.unstack(jax.vmap(partial(_split_keys, n_envs=2))(keys), axis=2)
-    randomness = jax.vmap(lambda keys_t: _draw(keys_t, n_envs, config, deterministic=False))(step_keys)
-    envs, steps = jax.lax.scan(body, envs, (randomness, reset_keys))
+    randomness = (*_draw(step_keys, n_envs, config, deterministic=False), reset_keys)
+    envs, steps = jax.lax.scan(body, envs, randomness)
     return envs, jax.tree.map(lambda rows: jnp.swapaxes(rows, 0, 1), steps)
 
 
-def _exploration_policy(env_steps: int | Int[Array, ""], config: TrainConfig) -> Act:
+def _exploration_policy(env_steps: int | Int[Array, ""], config: TrainConfig) -> Policy:
     """Return the policy that collects. During the warmup, its actions are random: evenly distributed between the bounds."""
-    policy = policy_function(config, deterministic=False)
+    policy = make_policy(config, deterministic=False)
     if not config.warmup:
         return policy
     assert config.noise is Noise.NORMAL

@@ -14,72 +14,88 @@ import jax
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from lare_rl.data.trajectory import Trajectory
+from lare_rl.data.trajectory import Trajectory, empty_trajectory
 from lare_rl.envs.env_errors import EnvOutputError
-from lare_rl.envs.interface import EnvSpec, Timestep, to_env_action
+from lare_rl.envs.interface import Timestep, to_env_action
 from lare_rl.envs.placement import make_vec_env, n_open_envs
 from lare_rl.envs.vec_env import VecEnv
-from lare_rl.errors import LareError
 from lare_rl.tasks.spec import TaskSpec
 from lare_rl.training.evaluation import Evaluation
-from lare_rl.training.host_policy import draw_noise, init_host_memory, make_policy
+from lare_rl.training.policy import draw_noise, init_host_memory, make_host_policy
 from lare_rl.training.static_config import TrainConfig
 from lare_rl.training.streams import Stream, episode_seed, numpy_generator
 from lare_rl.training.unroll_host import add_seed_axis, check_actions, evaluate_policy_on_host
 
-__all__ = ["HostCollector", "HostVecEnv", "make_host_collector"]
+__all__ = ["HostCollector", "make_host_collector"]
 
 
-class HostVecEnv:
-    """The training environments of a run, and the running episode of each.
+class HostCollector:
+    """The training environments of a run and the running episode of each, the policy that acts, and environments to evaluate it in.
 
     Args:
         envs: `n_envs` environments of the first seed, then of the second, and so on.
+        evaluation_envs: environments of the first seed, then of the second, and so on.
         seeds: the seeds of the run.
-        n_envs: the number of environments of each seed.
     """
 
-    def __init__(self, envs: VecEnv, seeds: Sequence[int], n_envs: int):
-        self.shape = len(seeds), n_envs
-        self.envs, self._seeds, self._n_envs = envs, list(seeds), n_envs
-        self._spec = envs.spec
-        self._episode = np.full(len(seeds) * n_envs, -1)
+    def __init__(self, envs: VecEnv, evaluation_envs: VecEnv, config: TrainConfig, seeds: Sequence[int]):
+        self.shape = len(seeds), config.n_envs
+        self._config, self._seeds, self._n_envs = config, list(seeds), config.n_envs
+        self._envs, self._evaluation_envs = envs, evaluation_envs
+        self._action_shape = envs.spec.n_agents, envs.spec.action_size
+        self._memory = init_host_memory(config, *self.shape)
+        self._step, self._on_step = 0, _ignore_step
+        self._episode = np.full(len(seeds) * config.n_envs, -1)
         """The number of each environment's running episode."""
         self._actions: list[list[np.ndarray]] = [[] for _ in self._episode]
         """The actions of that episode, in the environment's units."""
         self._timestep = add_seed_axis(envs.batch, self.shape)
         """The current time step of each environment. The next step overwrites it."""
         self._episode_start = np.ones(self.shape, bool)
+        self._reset(np.ones(len(self._episode), bool))
 
-    def reset(self, where: Bool[np.ndarray, " all"] | None = None) -> None:
-        """Start the next episode in the environments that `where` selects; in all by default."""
-        where = np.ones(len(self._episode), bool) if where is None else where
-        self._episode[where] += 1
-        for index in np.flatnonzero(where):
-            self._actions[index] = []
-        self._call(lambda: self.envs.reset(where, self._episode_seeds()))
-        self._episode_start = self._episode_start | where.reshape(self.shape)
+    def watch(self, on_step: Callable[[int], None], stop_requested: Callable[[], bool]) -> None:
+        """Call `on_step` with the number of steps of each seed while environments step, also during evaluations.
 
-    def collect(
-        self,
-        policy: Callable[..., Any],
-        noise: Float[np.ndarray, "time seeds envs agents noise"],
-        on_step: Callable[[int], None] = lambda n_steps: None,
+        Once the user has asked the run to stop, environments in other processes must reply soon.
+        """
+        self._on_step = on_step
+        self._envs.stop_requested = self._evaluation_envs.stop_requested = stop_requested
+
+    def collect(self, actor: Any, step: int) -> Trajectory:
+        """Return the steps of the iteration that begins at `step`. During the warmup, actions are random."""
+        config, rngs = self._config, [numpy_generator(seed, Stream.EXPLORATION, step) for seed in self._seeds]
+        self._step = step
+        if step < config.warmup:
+            shape = config.rollout_steps, config.n_envs, *self._action_shape
+            uniform = [rng.uniform(-1, 1, shape) for rng in rngs]
+            action = np.stack(uniform, axis=1).astype(np.float32)
+            return self.collect_by(lambda timestep, action_t, episode_start: action_t, action)
+        policy = make_host_policy(config, actor, config.n_envs, deterministic=False)
+        noise = np.moveaxis(draw_noise(config, rngs, config.rollout_steps, config.n_envs), 1, 0)
+
+        def explore(timestep: Timestep, noise_t: np.ndarray, episode_start: np.ndarray) -> np.ndarray:
+            inputs = timestep.observation, timestep.available, noise_t, episode_start
+            action, self._memory = policy(self._memory, *inputs)
+            return action
+
+        return self.collect_by(explore, noise)
+
+    def collect_by(
+        self, policy: Callable[..., Any], noise: Float[np.ndarray, "time seeds envs agents noise"]
     ) -> Trajectory:
         """Let a policy act for as many steps as there is noise. When an episode ends, the next one begins.
 
-        The policy is a function from a timestep, noise, and which episodes have just begun, to the action. `on_step` is called with the
-        number of steps of each seed.
+        The policy is a function from a timestep, noise, and which episodes have just begun, to the action.
         """
-        steps = _empty_trajectory(self._spec, self._timestep, len(noise))
+        steps = empty_trajectory(self._envs.spec, len(self._seeds), len(noise), self._n_envs)
         try:
             for t, noise_t in enumerate(noise):
                 self._collect_step(policy, noise_t, steps, t)
-                on_step((t + 1) * self._n_envs)
-        except LareError:
-            check_actions(steps.action, self._seeds)  # such actions may be the reason
-            raise
-        check_actions(steps.action, self._seeds)
+                self._step += self._n_envs
+                self._on_step(self._step)
+        finally:
+            check_actions(steps.action, self._seeds)  # such actions may be the reason of an error
         return steps
 
     def _collect_step(
@@ -87,25 +103,41 @@ class HostVecEnv:
     ) -> None:
         """Make a step, and write it into row `t` of the steps."""
         action = policy(self._timestep, noise, self._episode_start)
-        env_action = to_env_action(action, self._spec)
+        env_action = to_env_action(action, self._envs.spec)
         _write_timestep(steps.timestep, t, self._timestep)
         steps.action[:, t], steps.env_action[:, t] = action, env_action
         rows = env_action.reshape(-1, *env_action.shape[2:])
         for actions, row in zip(self._actions, rows, strict=True):
             actions.append(row)
-        self._call(lambda: self.envs.step(rows))
+        self._call(lambda: self._envs.step(rows))
         _write_timestep(steps.next_timestep, t, self._timestep)
         self._episode_start = np.zeros(self.shape, bool)
         ended = np.logical_or(self._timestep.terminated, self._timestep.truncated)
         if ended.any():
-            self.reset(ended.ravel())
+            self._reset(ended.ravel())
+
+    def _reset(self, where: Bool[np.ndarray, " all"]) -> None:
+        """Start the next episode in the environments that `where` selects."""
+        self._episode[where] += 1
+        for index in np.flatnonzero(where):
+            self._actions[index] = []
+        self._call(lambda: self._envs.reset(where, self._episode_seeds()))
+        self._episode_start = self._episode_start | where.reshape(self.shape)
+
+    def evaluate(self, actor: Any, n_episodes: int, deterministic: bool = False) -> Evaluation:
+        """Evaluate whole episodes of the policy, always from the same initial states. If `deterministic`, by its likeliest actions."""
+        config = replace(self._config, deterministic=True) if deterministic else self._config
+        return evaluate_policy_on_host(
+            self._evaluation_envs, config, actor, self._seeds, n_episodes, on_step=lambda: self._on_step(self._step)
+        )
 
     def state_dict(self) -> dict[str, np.ndarray]:
-        """Return the arrays that `restore` needs to continue the running episodes."""
-        arrays = {"episode": self._episode.copy(), "new": self._episode_start}
+        """Return the arrays that `restore` needs: seeds and actions of the running episodes, and the actors' memory."""
+        arrays = {f"memory{i}": np.asarray(leaf) for i, leaf in enumerate(jax.tree.leaves(self._memory))}
+        arrays |= {"episode": self._episode.copy(), "new": self._episode_start}
         for index, actions in enumerate(self._actions):
-            arrays[f"actions{index}"] = np.reshape(actions, (-1, self._spec.n_agents, self._spec.action_size))
-            arrays[f"observation{index}"] = self.envs.batch.observation[index].copy()
+            arrays[f"actions{index}"] = np.reshape(actions, (-1, *self._action_shape))
+            arrays[f"observation{index}"] = self._envs.batch.observation[index].copy()
         return arrays
 
     def restore(self, arrays: dict[str, np.ndarray]) -> tuple[Bool[np.ndarray, "seeds envs"], list[str]]:
@@ -117,19 +149,21 @@ class HostVecEnv:
         Returns:
             Which episodes were dropped, and a message about each of them.
         """
+        leaves, structure = jax.tree.flatten(self._memory)
+        self._memory = jax.tree.unflatten(structure, [arrays[f"memory{i}"] for i in range(len(leaves))])
         self._episode = arrays["episode"].copy()
         indices = range(len(self._episode))
         actions = [arrays[f"actions{index}"] for index in indices]
-        idle = np.zeros((self._spec.n_agents, self._spec.action_size), np.float32)  # of environments that do not step
-        self._call(lambda: self.envs.reset(np.ones(len(indices), bool), self._episode_seeds()))
+        idle = np.zeros(self._action_shape, np.float32)  # of environments that do not step
+        self._call(lambda: self._envs.reset(np.ones(len(indices), bool), self._episode_seeds()))
         ended_early = np.zeros(len(indices), bool)
         for t in range(max(map(len, actions))):
             where = np.array([t < len(rows) for rows in actions]) & ~ended_early
             action_t = np.stack([rows[min(t, len(rows) - 1)] if len(rows) else idle for rows in actions])
-            timestep = self._call(lambda action=action_t, where=where: self.envs.step(action, where))
+            timestep = self._call(lambda action=action_t, where=where: self._envs.step(action, where))
             ended_early |= where & (timestep.terminated | timestep.truncated)
         self._actions, self._episode_start = [list(rows) for rows in actions], arrays["new"].copy()
-        same = [np.array_equal(self.envs.batch.observation[index], arrays[f"observation{index}"]) for index in indices]
+        same = [np.array_equal(self._envs.batch.observation[i], arrays[f"observation{i}"]) for i in indices]
         dropped = ended_early | ~np.array(same)
         messages = [
             f"episode {self._episode[index]} of seed {self._seed(index)} was dropped after {len(actions[index])} steps: "
@@ -137,23 +171,26 @@ class HostVecEnv:
             for index in np.flatnonzero(dropped).tolist()
         ]
         if dropped.any():
-            self.reset(dropped)
+            self._reset(dropped)
         return dropped.reshape(self.shape), messages
 
     def close(self) -> None:
         """Close the environments."""
-        self.envs.close()
+        try:
+            self._envs.close()
+        finally:
+            self._evaluation_envs.close()
 
     def _seed(self, env_index: int) -> int:
         return self._seeds[env_index // self._n_envs]
 
     def _episode_seeds(self) -> Int[np.ndarray, " all"]:
         """Return the random seed of each environment's running episode."""
-        seeds = []
-        for index, episode in enumerate(self._episode):
-            number = int(episode) * self._n_envs + index % self._n_envs  # among all episodes of the seed
-            seeds.append(episode_seed(self._seed(index), Stream.TRAINING_EPISODES, number))
-        return np.array(seeds)
+        # The number of an episode, among all episodes of the seed.
+        numbers = [int(episode) * self._n_envs + i % self._n_envs for i, episode in enumerate(self._episode)]
+        return np.array(
+            [episode_seed(self._seed(i), Stream.TRAINING_EPISODES, number) for i, number in enumerate(numbers)]
+        )
 
     def _call(self, function: Callable[[], Timestep]) -> Timestep:
         """Call the environments. An error names the step, episode and seed of the environment that raised it."""
@@ -167,77 +204,6 @@ class HostVecEnv:
             raise EnvOutputError(f"{error}, {where}") from None
 
 
-class HostCollector:
-    """The training environments, the policy that acts in them, and environments to evaluate it in."""
-
-    def __init__(self, envs: VecEnv, evaluation_envs: VecEnv, config: TrainConfig, seeds: Sequence[int]):
-        self._config, self._seeds = config, list(seeds)
-        self._envs, self._evaluation_envs = HostVecEnv(envs, seeds, config.n_envs), evaluation_envs
-        self._memory = init_host_memory(config, *self._envs.shape)
-        self._step, self._on_step = 0, _ignore_step
-        self._envs.reset()
-
-    def watch(self, on_step: Callable[[int], None], stop_requested: Callable[[], bool]) -> None:
-        """Call `on_step` with the number of steps of each seed while environments step, also during evaluations.
-
-        Once the user has asked the run to stop, environments in other processes must reply soon.
-        """
-        self._on_step = on_step
-        self._envs.envs.stop_requested = self._evaluation_envs.stop_requested = stop_requested
-
-    def collect(self, actor: Any, step: int) -> Trajectory:
-        """Return the steps of the iteration that begins at `step`. During the warmup, actions are random."""
-        config, rngs = self._config, [numpy_generator(seed, Stream.EXPLORATION, step) for seed in self._seeds]
-
-        def report(n_steps: int) -> None:
-            self._step = step + n_steps
-            self._on_step(self._step)
-
-        shape = config.rollout_steps, config.n_envs, config.env.n_agents
-        if step < config.warmup:
-            uniform = [rng.uniform(-1, 1, (*shape, config.env.action_size)) for rng in rngs]
-            action = np.stack(uniform, axis=1).astype(np.float32)
-            return self._envs.collect(lambda timestep, action_t, episode_start: action_t, action, report)
-        policy = make_policy(config, actor, config.n_envs, deterministic=False)
-        noise = np.moveaxis(draw_noise(config, rngs, config.rollout_steps, config.n_envs), 1, 0)
-
-        def explore(timestep: Timestep, noise_t: np.ndarray, episode_start: np.ndarray) -> np.ndarray:
-            action, self._memory = policy(
-                self._memory, timestep.observation, timestep.available, noise_t, episode_start
-            )
-            return action
-
-        return self._envs.collect(explore, noise, report)
-
-    def evaluate(self, actor: Any, n_episodes: int, deterministic: bool = False) -> Evaluation:
-        """Evaluate whole episodes of the policy, always from the same initial states. If `deterministic`, by its likeliest actions."""
-
-        def report() -> None:
-            self._on_step(self._step)
-
-        envs, config = self._evaluation_envs, self._config
-        config = replace(config, deterministic=True) if deterministic else config
-        return evaluate_policy_on_host(envs, config, actor, self._seeds, n_episodes, on_step=report)
-
-    def state_dict(self) -> dict[str, np.ndarray]:
-        """Return the arrays that `restore` needs: seeds and actions of the running episodes, and the actors' memory."""
-        memory = {f"memory{i}": np.asarray(leaf) for i, leaf in enumerate(jax.tree.leaves(self._memory))}
-        return self._envs.state_dict() | memory
-
-    def restore(self, arrays: dict[str, np.ndarray]) -> tuple[Bool[np.ndarray, "seeds envs"], list[str]]:
-        """Restore the running episodes. Return which of them were dropped, and messages about these."""
-        leaves, structure = jax.tree.flatten(self._memory)
-        self._memory = jax.tree.unflatten(structure, [arrays[f"memory{i}"] for i in range(len(leaves))])
-        return self._envs.restore(arrays)
-
-    def close(self) -> None:
-        """Close the environments."""
-        try:
-            self._envs.close()
-        finally:
-            self._evaluation_envs.close()
-
-
 def _ignore_step(step: int) -> None: ...
 
 
@@ -249,17 +215,6 @@ def make_host_collector(
     envs = make_vec_env(task, n_seeds * config.n_envs, parallel=config.n_envs > 1)
     evaluation_envs = make_vec_env(task.evaluation_task, n_seeds * n_open_envs(task, n_seeds, n_evaluation_episodes))
     return HostCollector(envs, evaluation_envs, config, seeds)
-
-
-def _empty_trajectory(spec: EnvSpec, timestep: Timestep, n_steps: int) -> Trajectory:
-    n_seeds, n_envs = timestep.terminated.shape
-
-    def empty_timestep() -> Timestep:
-        return jax.tree.map(lambda leaf: np.zeros((n_seeds, n_steps, *leaf.shape[1:]), leaf.dtype), timestep)
-
-    action = np.zeros((n_seeds, n_steps, n_envs, spec.n_agents, spec.action_size), np.float32)
-    env_action = action.astype(spec.action_dtype)
-    return Trajectory(empty_timestep(), action, env_action, empty_timestep())
 
 
 def _write_timestep(columns: Timestep, t: int, timestep: Timestep) -> None:

@@ -1,9 +1,9 @@
 """The functions of a run, compiled, with a leading seed axis on every array but the number of steps done."""
 
 import contextlib
+import timeit
 from collections.abc import Callable, Sequence
 from functools import partial
-from types import ModuleType
 from typing import Any, NamedTuple
 
 import jax
@@ -13,36 +13,41 @@ from jaxtyping import Array, Bool, Float, Key
 
 from lare_rl.algorithms.batches import Metrics
 from lare_rl.algorithms.registry import Consumes
-from lare_rl.data.trajectory import Trajectory
-from lare_rl.envs.interface import Timestep
-from lare_rl.nn.masks import select
+from lare_rl.credit.score_type import ScoreType
+from lare_rl.data.trajectory import Trajectory, empty_trajectory
+from lare_rl.nn.leading_axis import map_leading_axis
 from lare_rl.phi.graph import Graph
-from lare_rl.training import episodes, off_policy, on_policy, sequences
+from lare_rl.training import off_policy, on_policy, sequences
 from lare_rl.training.compile_cache import cache_by_value
 from lare_rl.training.decoder_fits import fit_seeds
-from lare_rl.training.learner import Learner, init_learner, store, with_learned_returns
+from lare_rl.training.episodes import learn_returns
+from lare_rl.training.learner import Learner, init_learner, store
+from lare_rl.training.policy import init_algorithm
 from lare_rl.training.rewards import assess
 from lare_rl.training.seed_axis import jit_over_seeds, shape_over_seeds
 from lare_rl.training.static_config import TrainConfig
-from lare_rl.training.streams import seed_keys
+from lare_rl.training.streams import keys_shape
 from lare_rl.util.float64 import float64
 
 __all__ = [
     "CompiledFunctions",
     "compile_ahead",
     "compile_functions",
-    "init_memory",
     "init_seeds",
-    "keys_shape",
+    "is_batching_faster",
     "learner_shape",
-    "policy_function",
-    "steps_shape",
-    "training_module",
+    "train_step_function",
 ]
+
+MIN_SPEED_UP = 2.0
+"""Less may be noise, and then a run would not always choose the same."""
+N_REPETITIONS, N_STARTS = 5, 3
+MIN_FEATURES = 32
+"""The size of the matrix if no fit is in closed form."""
 
 
 class CompiledFunctions(NamedTuple):
-    """The functions of a run. `store`, `fit` and `train_step` consume their learner: its buffers are reused for the new one."""
+    """The functions of a run. All but `init` and `assess` consume their learner: its buffers are reused for the new one."""
 
     init: Callable[[Key[Array, " seeds"]], Learner]
     """Return untrained learners."""
@@ -59,79 +64,45 @@ class CompiledFunctions(NamedTuple):
     before. Return the mean of each metric."""
     assess: Callable[[Learner], Metrics]
     """Compare proxy rewards with true rewards."""
-    get_actor: Callable[[Learner, int], Any]
-    """Return the parts of the learner that are needed to act."""
-    explore: Callable[..., tuple[Float[Array, "seeds envs agents action"], Any]]
-    """Return actions of the policy that collects, and its new memory, from actor, memory, observation, available
-    actions, noise, and which episodes are new."""
-    act: Callable[..., tuple[Float[Array, "seeds envs agents action"], Any]]
-    """Return actions of the policy without noise, from the same arguments with None as the noise."""
 
 
-def training_module(config: TrainConfig) -> ModuleType:
-    """Return the module for the data that the run's algorithm consumes."""
+def train_step_function(config: TrainConfig) -> Callable[..., tuple[Learner, Metrics]]:
+    """Return the function for the data that the run's algorithm consumes: `CompiledFunctions.train_step`, not compiled."""
     modules = {Consumes.TRANSITIONS: off_policy, Consumes.ROLLOUTS: on_policy, Consumes.SEQUENCES: sequences}
-    return modules[config.algorithm.consumes]
-
-
-def init_memory(config: TrainConfig, *lead: int) -> Any:
-    """Return the memory of actors before the first step of an episode, for seeds and environments of shape `lead`."""
-    memory = training_module(config).init_memory(config)
-    return jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (*lead, *leaf.shape)), memory)
-
-
-def policy_function(config: TrainConfig, deterministic: bool) -> Callable[..., tuple[Array, Any]]:
-    """Return the policy of all seeds. Its memory is reset where an episode is new."""
-    module = training_module(config)
-
-    def act(
-        actor: Any, memory: Any, observation: Array, available: Array, noise: Array | None, is_new: Bool[Array, " envs"]
-    ) -> tuple[Array, Any]:
-        memory = select(is_new, module.init_memory(config), memory)
-        return module.act(actor, memory, observation, available, noise, config)
-
-    return jax.vmap(act, in_axes=(0, 0, 0, 0, None if deterministic else 0, 0))
+    return partial(modules[config.algorithm.consumes].train_step, config=config)
 
 
 @cache_by_value
 def compile_functions(config: TrainConfig, phi: Sequence[Graph] = ()) -> CompiledFunctions:
     """Return the compiled functions of a run. `phi` holds the graph of each team's phi; only `store` needs it."""
     jit = partial(jit_over_seeds, n_devices=config.n_devices)
-
-    def jit_store() -> Callable[..., Any]:
-        return jit(jax.vmap(partial(store, config=config, phi=phi)), donate=(0,))
-
+    compiled_store = jit(jax.vmap(partial(store, config=config, phi=phi)), donate=(0,))
     if phi:
-        return compile_functions(config)._replace(store=jit_store())
-    module = training_module(config)
+        return compile_functions(config)._replace(store=compiled_store)
 
     def init(keys: Key[Array, " seeds"]) -> Learner:
         # One seed after the other: batched QR decompositions of several layers may wait for each other for ever on two cores
         # (jaxlib 0.10, `ParallelBatchMap`).
-        return jax.lax.map(lambda key: init_learner(key, config, partial(module.init, config=config)), keys)
+        return jax.lax.map(lambda key: init_learner(key, config, partial(init_algorithm, config=config)), keys)
 
-    learn = jit(partial(episodes.learn_returns, config=config))
+    learn = jit(partial(learn_returns, config=config), donate=(0,))
 
-    def learn_returns(learner: Learner) -> Learner:
+    def learn_in_float64(learner: Learner) -> Learner:
         with float64():
-            learned = jax.block_until_ready(learn(learner.decoders, learner.replay, learner.n_learned))
-        return with_learned_returns(learner, *learned)
+            return jax.block_until_ready(learn(learner))
 
     def compile_learning(learner: Learner) -> None:
-        with jax.enable_x64(True):  # as in `learn_returns`, whose limit of threads would be that of all threads
-            learn.lower(learner.decoders, learner.replay, learner.n_learned).compile()
+        with jax.enable_x64(True):  # as above, but without its limit of threads, which would be that of all threads
+            learn.lower(learner).compile()
 
     return CompiledFunctions(
         init=jit(init),
-        learn_returns=learn_returns,
+        store=compiled_store,
+        learn_returns=learn_in_float64,
         compile_learning=compile_learning,
-        store=jit_store(),
         fit=jit(partial(fit_seeds, config=config), donate=(0,)),
-        train_step=jit(partial(module.train_step, config=config), shared=(3,), donate=(0,)),
+        train_step=jit(train_step_function(config), shared=(3,), donate=(0,)),
         assess=jit(jax.vmap(partial(assess, config=config))),
-        get_actor=partial(module.get_actor, config=config),
-        explore=jit(policy_function(config, deterministic=False)),
-        act=jit(policy_function(config, deterministic=True)),
     )
 
 
@@ -144,7 +115,8 @@ def compile_ahead(
     """
     functions = compile_functions(config, phi)
     learner = learner_shape(config, n_seeds)
-    steps, keys = shape_over_seeds((steps_shape(config, n_seeds), keys_shape(n_seeds)), config.n_devices)
+    steps = empty_trajectory(config.env, n_seeds, config.rollout_steps, config.n_envs)
+    steps, keys = shape_over_seeds((steps, keys_shape(n_seeds)), config.n_devices)
     functions = functions._replace(assess=_compile(functions.assess, learner))
     if iterates_on_host:
         functions = functions._replace(
@@ -168,36 +140,6 @@ def learner_shape(config: TrainConfig, n_seeds: int) -> Learner:
     return shape_over_seeds(jax.eval_shape(compile_functions(config).init, keys_shape(n_seeds)), config.n_devices)
 
 
-def keys_shape(n_seeds: int) -> Any:
-    """Return keys with a shape instead of an array."""
-    return jax.eval_shape(seed_keys, jnp.zeros(n_seeds, int), 0)
-
-
-def steps_shape(config: TrainConfig, n_seeds: int) -> Trajectory:
-    """Return the steps of an iteration with shapes instead of arrays."""
-    env = config.env
-
-    def shape(*sizes: int, dtype: Any = np.float32) -> Any:
-        return jax.ShapeDtypeStruct((n_seeds, config.rollout_steps, config.n_envs, *sizes), dtype)
-
-    timestep = Timestep(
-        observation=shape(env.n_agents, env.observation_size),
-        state=shape(env.state_size),
-        available=shape(env.n_agents, env.action_size, dtype=np.bool_),
-        alive=shape(env.n_agents, dtype=np.bool_),
-        reward=shape(env.n_agents),
-        terminated=shape(dtype=np.bool_),
-        truncated=shape(dtype=np.bool_),
-        measures={name: shape() for name in env.measures},
-    )
-    return Trajectory(
-        timestep=timestep,
-        action=shape(env.n_agents, env.action_size),
-        env_action=shape(env.n_agents, env.action_size, dtype=env.action_dtype),
-        next_timestep=timestep,
-    )
-
-
 @cache_by_value
 def _compile(function: Any, *shapes: Any) -> Any:
     """Return a jitted function compiled for arguments of these shapes."""
@@ -210,3 +152,25 @@ def _free_memory() -> None:
         import ctypes
 
         ctypes.CDLL(None).malloc_trim(0)
+
+
+def is_batching_faster(config: TrainConfig, n_seeds: int) -> bool:
+    """Measure whether this device factorises the matrices of all fits faster at once than one after the other.
+
+    On a CPU, it is never faster by much, and a choice by time would make runs differ. Besides, batched calls of LAPACK that run at
+    the same time may wait for each other for ever (jaxlib 0.10, `ParallelBatchMap`).
+    """
+    if config.method.fit is None or jax.default_backend() == "cpu":
+        return False
+    n_features = max(MIN_FEATURES, *(spec.basis.n_features for spec in config.credit_specs))
+    n_fits = n_seeds // config.n_devices * N_STARTS * len(ScoreType)
+    with float64():
+        matrices = jnp.asarray(np.eye(n_features) + np.full((n_fits, n_features, n_features), 0.5))
+        return _factorise_s(matrices, batched=False) > MIN_SPEED_UP * _factorise_s(matrices, batched=True)
+
+
+def _factorise_s(matrices: Float[Array, "fits features features"], *, batched: bool) -> float:
+    """Return the shortest time of a factorisation of all matrices (s), after one that compiles."""
+    factorise = jax.jit(lambda matrices: map_leading_axis(jnp.linalg.cholesky, matrices, batched=batched))
+    jax.block_until_ready(factorise(matrices))
+    return min(timeit.repeat(lambda: jax.block_until_ready(factorise(matrices)), number=1, repeat=N_REPETITIONS))

@@ -13,7 +13,7 @@ from typing import TypeVar
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Bool, Int
 
 from lare_rl.credit import returns
 from lare_rl.credit.decomposition import CreditBatch, DecoderState
@@ -25,53 +25,41 @@ from lare_rl.data.sampling import count_episodes_since, episodes_in_order
 from lare_rl.nn.leading_axis import map_leading_axis
 from lare_rl.nn.masks import select
 from lare_rl.training.decoder_inputs import episode_batch
+from lare_rl.training.learner import Learner
 from lare_rl.training.static_config import TrainConfig
 
-__all__ = ["Decoders", "PredictedReturns", "fold_episodes", "learn_returns", "predict_returns"]
+__all__ = ["Decoders", "fold_episodes", "learn_returns", "predict_returns"]
 
 MAX_ROWS = 8000
 """The most rows of decoder inputs that are read at a time, unless a single episode has more."""
 
 Decoders = tuple[DecoderState, ...]
-PredictedReturns = Float[Array, "*seeds envs episodes teams"] | None
 State = TypeVar("State")
 
 
-def learn_returns(
-    decoders: Decoders, buffer: Replay, n_learned: Int[Array, "seeds envs"], config: TrainConfig
-) -> tuple[Decoders, Int[Array, "seeds envs"], PredictedReturns]:
-    """Let the decoders learn from episodes that have finished. Every array has a leading seed axis.
-
-    Returns:
-        The decoders of each team, how many episodes they have learned from, and the predicted returns of the replay.
-    """
-    buffer = replay.segments_as_episodes(buffer)
+def learn_returns(learner: Learner, config: TrainConfig) -> Learner:
+    """Let the decoders learn from episodes that have finished, and predict returns anew. Every array has a leading seed axis."""
+    buffer, n_learned = replay.segments_as_episodes(learner.replay), learner.n_learned
     n_before = jnp.sum(n_learned, axis=1)
     n_new = jnp.sum(buffer.current_episode, axis=1) - n_before
     is_due = n_new >= jnp.maximum(returns.MIN_GROWTH * n_before, 1)
     learn = partial(_learn_if_due, buffer=buffer, n_learned=n_learned, is_due=is_due, config=config)
-    learned = jax.lax.cond(jnp.any(is_due), learn, lambda unchanged: unchanged, decoders)
+    decoders = jax.lax.cond(jnp.any(is_due), learn, lambda unchanged: unchanged, learner.decoders)
     n_now = jnp.where(is_due[:, None], buffer.current_episode, n_learned).astype(n_learned.dtype)
-    predicted = buffer.predicted_return
-    if predicted is not None and config.predicts_ahead:
-        # A new fit changes the proxy rewards of all episodes.
-        is_new = jax.vmap(_is_refitted)(decoders[0], learned[0])[:, None]
-        since = jnp.where(is_new, buffer.oldest, jnp.where(is_due[:, None], n_learned, buffer.current_episode))
-        predicted = jax.vmap(partial(predict_returns, config=config))(learned, buffer, since)
-    return learned, n_now, predicted
+    learned = learner._replace(reward_sources=decoders, n_learned=n_now)
+    if not config.predicts_ahead:
+        return learned
+    old, new = learner.decoders[0].closed_form, decoders[0].closed_form
+    assert old is not None
+    assert new is not None
+    is_new = (old.n_fitted != new.n_fitted)[:, None]  # a new fit changes the proxy rewards of all episodes
+    since = jnp.where(is_new, buffer.oldest, jnp.where(is_due[:, None], n_learned, buffer.current_episode))
+    return jax.vmap(partial(predict_returns, config=config))(learned, since)
 
 
-def _is_refitted(before: DecoderState, after: DecoderState) -> Bool[Array, ""]:
-    assert before.closed_form is not None
-    assert after.closed_form is not None
-    return before.closed_form.n_fitted != after.closed_form.n_fitted
-
-
-def predict_returns(
-    decoders: Decoders, buffer: Replay, since: Int[Array, " envs"], config: TrainConfig
-) -> Float[Array, "envs episodes teams"]:
-    """Return the predicted returns of the replay of one seed, with those of the episodes from `since` on computed anew."""
-    buffer = replay.segments_as_episodes(buffer)
+def predict_returns(learner: Learner, since: Int[Array, " envs"], config: TrainConfig) -> Learner:
+    """Return the learner of one seed with the predicted returns of the episodes from `since` on, computed anew."""
+    buffer = replay.segments_as_episodes(learner.replay)
     slots = buffer.first.shape[-1]
 
     def body(state: tuple[DecoderState, Array], episodes: CreditBatch, first: Index) -> tuple[DecoderState, Array]:
@@ -84,9 +72,10 @@ def predict_returns(
         return decoder, predicted.at[first.env, slot].set(values.astype(predicted.dtype), mode="drop")
 
     assert buffer.predicted_return is not None
-    states = tuple((decoder, buffer.predicted_return[..., i]) for i, decoder in enumerate(decoders))
+    states = tuple((decoder, buffer.predicted_return[..., i]) for i, decoder in enumerate(learner.decoders))
     states = fold_episodes(states, buffer, since, body, config)
-    return jnp.stack([predicted for _, predicted in states], axis=-1)
+    predicted = jnp.stack([predicted for _, predicted in states], axis=-1)
+    return learner._replace(replay=replay.replace_payment_fields(learner.replay, predicted_return=predicted))
 
 
 def _learn_if_due(
@@ -123,11 +112,8 @@ def fold_episodes(
         body: the function from a state, a batch of whole episodes, and the first step of each, to the next state.
         expected: about how many episodes there are; None if they may be many.
     """
-    buffer, longest, n_episodes = (
-        replay.segments_as_episodes(buffer),
-        config.longest_segment,
-        config.credit_specs[0].window,
-    )
+    buffer = replay.segments_as_episodes(buffer)
+    longest, n_episodes = config.longest_segment, config.credit_specs[0].window
     expected = n_episodes if expected is None else max(1, expected)
     rows = max(1, min(expected, n_episodes, MAX_ROWS // (config.n_proxy_rewards * longest))) * longest
     total = jnp.sum(count_episodes_since(buffer, since))

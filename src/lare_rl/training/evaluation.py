@@ -1,4 +1,4 @@
-"""Whole episodes of a policy, and what an evaluation measures of them."""
+"""Whole episodes of a policy, and what an evaluation measures of them and of the policy's actions."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -8,11 +8,27 @@ import jax
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from lare_rl.data.replay import Replay, capacity
 from lare_rl.data.trajectory import Trajectory
 from lare_rl.envs.interface import AnyArray, EnvSpec
 from lare_rl.tasks.spec import TaskSpec
+from lare_rl.training.policy import compile_policy
+from lare_rl.training.rewards import team_metrics
+from lare_rl.training.static_config import TrainConfig
 
-__all__ = ["EpisodeBatch", "Evaluation", "concatenate", "metrics_lines"]
+__all__ = [
+    "EpisodeBatch",
+    "Evaluation",
+    "concatenate",
+    "greedy_actions",
+    "metrics_lines",
+    "saturation",
+]
+
+N_STATES = 1000
+"""The number of stored observations in which the saturation of a policy is measured."""
+ACTION_BOUND = 0.99
+"""A component of a normalised action is at a bound if its size is larger."""
 
 
 class EpisodeBatch(NamedTuple):
@@ -44,21 +60,17 @@ class Evaluation(NamedTuple):
         return self._replace(measures={name: self.measures[name] for name in names})
 
     def metrics(self, spec: EnvSpec) -> dict[str, Float[np.ndarray, " seeds"]]:
-        """Return the means over the episodes, and the standard deviation of returns, by the keys of metrics.jsonl.
-
-        With several teams, each has its own keys. The keys without a suffix belong to the first team.
-        """
+        """Return the means over the episodes, and the standard deviation of returns, by the keys of metrics.jsonl."""
         metrics = {"evaluation/length": self.lengths.mean(axis=1)}
         metrics |= {f"evaluation/{name}": values.mean(axis=1) for name, values in self.measures.items()}
-        suffixes = [("", 0)]
-        if len(spec.teams) > 1:
-            suffixes += [(f"_{team.name}", team_index) for team_index, team in enumerate(spec.teams)]
-        for suffix, team_index in suffixes:
-            metrics[f"evaluation/return{suffix}"] = self.returns[..., team_index].mean(axis=1)
-            metrics[f"evaluation/return_std{suffix}"] = self.returns[..., team_index].std(axis=1)
-            if spec.n_agents > 1:
-                metrics[f"evaluation/summed_return{suffix}"] = self.summed_returns[..., team_index].mean(axis=1)
-        return metrics
+        per_team = []
+        for i in range(len(spec.teams)):
+            returns, summed_returns = self.returns[..., i], self.summed_returns[..., i]
+            per_team.append(
+                {"evaluation/return": returns.mean(axis=1), "evaluation/return_std": returns.std(axis=1)}
+                | ({"evaluation/summed_return": summed_returns.mean(axis=1)} if spec.n_agents > 1 else {})
+            )
+        return metrics | team_metrics(per_team, spec.teams)
 
 
 def concatenate(evaluations: Sequence[Evaluation]) -> Evaluation:
@@ -75,3 +87,28 @@ def metrics_lines(seeds: Sequence[int], step: int, metrics: Mapping[str, Any], r
         valid = {name: value if math.isfinite(value) else None for name, value in numbers.items()}
         lines.append({"step": step, "seed": seed, **valid, "time/steps_per_second": round(rate, 1)})
     return lines
+
+
+def greedy_actions(
+    actor: Any, replay: Replay, config: TrainConfig, n_states: int = N_STATES
+) -> Float[np.ndarray, "seeds states action"]:
+    """Return actions of an off-policy algorithm without noise, in the newest states of the first environment.
+
+    If fewer are stored, they are repeated: the shape, and so the compiled program, is always the same.
+    """
+    rows = np.asarray(replay.next_row)[:, :1] - 1 - np.arange(n_states) % int(np.min(replay.next_row))
+    observation = jax.vmap(lambda column, seed_rows: column[0, seed_rows])(
+        replay.columns["observation"], rows % capacity(replay)
+    )
+    available = np.ones((*rows.shape, 1, config.env.action_size), bool)
+    act = compile_policy(config, deterministic=True)
+    return np.asarray(act(actor, (), observation, available, None, np.zeros(rows.shape, bool))[0])[:, :, 0]
+
+
+def saturation(action: Float[np.ndarray, "seeds steps action"]) -> Float[np.ndarray, " seeds"]:
+    """Return the fraction of an action's components that are at the same bound in all states.
+
+    Each seed's policy has chosen the actions in the same states, without noise, between -1 and 1.
+    """
+    bound = np.where(np.abs(action) > ACTION_BOUND, np.sign(action), 0)
+    return np.mean((bound[:, 0] != 0) & np.all(bound == bound[:, :1], axis=1), axis=-1)

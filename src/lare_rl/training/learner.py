@@ -25,8 +25,7 @@ from lare_rl.envs.interface import team_mean
 from lare_rl.nn.normalise import update_scale
 from lare_rl.phi.graph import Graph
 from lare_rl.tasks.spec import MAX_LEVELS
-from lare_rl.training.decoder_inputs import decoder_inputs, row_mask, tracked_inputs
-from lare_rl.training.factors import compute_factors
+from lare_rl.training.decoder_inputs import compute_factors, decoder_inputs, row_mask, tracked_inputs
 from lare_rl.training.static_config import TrainConfig
 
 __all__ = [
@@ -37,7 +36,6 @@ __all__ = [
     "replay_columns",
     "store",
     "store_with_factors",
-    "with_learned_returns",
 ]
 
 
@@ -100,7 +98,8 @@ def store_with_factors(
     The decoders do not read the steps of agents where `scored` is false. The rewards of these steps count.
     """
     columns, next_columns = replay_columns(steps, factors, config, scored)
-    team_reward, level = _team_rewards(steps, config), _levels(steps, config)
+    rewards = [team_mean(steps.next_timestep.reward, steps.timestep.alive, team) for team in config.env.teams]
+    team_reward, level = jnp.stack(rewards, axis=-1), _levels(steps, config)
     buffer = extend(learner.replay, columns, next_columns, team_reward, steps.ended, config.payments, level)
     if config.n_tracked:
         buffer = _with_history(learner.replay, buffer, len(steps.ended), config)
@@ -143,12 +142,6 @@ def replay_columns(
     )
 
 
-def _team_rewards(steps: Trajectory, config: TrainConfig) -> Float[Array, "time envs teams"]:
-    """Return the true reward of each team for each step."""
-    rewards = [team_mean(steps.next_timestep.reward, steps.timestep.alive, team) for team in config.env.teams]
-    return jnp.stack(rewards, axis=-1)
-
-
 def _levels(steps: Trajectory, config: TrainConfig) -> Int[Array, "time envs"] | None:
     """Return the level of each step's episode, which is valid at the steps that are paid."""
     if config.group is None:
@@ -165,17 +158,6 @@ def _observe(source: RewardSource, steps: StoredSteps, config: TrainConfig, team
     decoder = decomposition.observe_steps(source, rows, mask)
     level = None if steps.level is None else steps.level.ravel()
     return decomposition.observe_returns(decoder, mean_reward, steps.length.ravel(), steps.last.ravel(), level)
-
-
-def with_learned_returns(
-    learner: Learner,
-    decoders: tuple[DecoderState, ...],
-    n_learned: Int[Array, "*seeds envs"],
-    predicted: Float[Array, "*seeds envs episodes teams"] | None,
-) -> Learner:
-    """Return the learner with the results of `learn_returns`."""
-    buffer = replay.replace_payment_fields(learner.replay, predicted_return=predicted)
-    return learner._replace(reward_sources=decoders, n_learned=n_learned, replay=buffer)
 
 
 def abandon_episodes(learner: Learner, abandoned: Bool[Array, " envs"]) -> Learner:

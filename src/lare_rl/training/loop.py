@@ -14,9 +14,9 @@ from lare_rl.runs.directory import Run
 from lare_rl.runs.metric_names import ACTOR_SATURATION, RETURN
 from lare_rl.runs.metrics_file import append_metrics
 from lare_rl.training import advice
+from lare_rl.training.decoder_fits import FirstFitStoppedError
 from lare_rl.training.explain import describe_returns
-from lare_rl.training.first_fit import FirstFitStoppedError
-from lare_rl.training.progress import Clock, Listener
+from lare_rl.training.progress import Listener
 from lare_rl.training.seed_axis import first_shard
 from lare_rl.training.session import Session
 from lare_rl.training.unroll_host import DivergedError
@@ -44,10 +44,11 @@ def run_session(session: Session, listeners: Sequence[Listener], stop: threading
         DivergedError: a policy or a loss is not finite any more.
     """
     run, settings = session.run, session.settings
-    clock, explained, saved_at = Clock(session.step), False, time.monotonic()
+    explained, saved_at = False, time.monotonic()
+    rated_step, rated_at = session.step, saved_at
     returns: list[np.ndarray] = []
     evaluated_at: list[float] = []
-    session.collector.watch(_limit_rate(lambda step: [listener.on_step(step) for listener in listeners]), stop.is_set)
+    session.watch(_limit_rate(lambda step: [listener.on_step(step) for listener in listeners]), stop.is_set)
 
     def say(lines: Iterable[str]) -> None:
         for line in lines:
@@ -67,12 +68,16 @@ def run_session(session: Session, listeners: Sequence[Listener], stop: threading
         is_last = session.step == settings.steps
         if not is_last and session.step % settings.evaluate_every:
             if time.monotonic() - saved_at > CHECKPOINT_S:
-                _check_losses(session)
-                session.save()
+                _save(session)
                 saved_at = time.monotonic()
             continue
         began_at = time.monotonic()
-        lines = _evaluate(session, clock.measure_rate(session.step))
+        rate = (session.step - rated_step) / max(began_at - rated_at, 1e-9)
+        rated_step, rated_at = session.step, began_at
+        lines = session.evaluate(rate)
+        _check_losses(session)
+        session.metrics_bytes = append_metrics(run.directory, lines)
+        session.save()
         saved_at = time.monotonic()
         evaluated_at.append(saved_at)
         for listener in listeners:
@@ -82,8 +87,8 @@ def run_session(session: Session, listeners: Sequence[Listener], stop: threading
             report(advice.find_constant_returns(returns))
         if len(evaluated_at) == 2:  # the first one compiles the policy
             report(advice.find_slow_evaluations(settings, saved_at - began_at, saved_at - evaluated_at[0]))
-        if is_last or not explained:
-            sentences = _explain(session, legend=not explained)
+        if session.step >= settings.warmup and (is_last or not explained):
+            sentences = describe_returns(run, session.learner, session.config, legend=not explained)
             say(sentences)
             explained = bool(sentences)
         if is_last:
@@ -107,38 +112,24 @@ def _advance(session: Session, until: int, stop: threading.Event) -> None:
     """Make iterations, none beyond step `until`, unless the user has asked the run to stop."""
     hint = f"to continue: lare-rl train --resume {shlex.quote(str(session.run.directory))}"
     if stop.is_set():
-        _check_losses(session)
-        session.save()
+        _save(session)
         session.finish_saving()
         raise RunInterruptedError(f"stopped at step {session.step} of {session.settings.steps} and saved; {hint}")
     try:
-        session.advance(until, stop.is_set)
+        session.advance(until)
     except FirstFitStoppedError:
         raise RunInterruptedError(f"stopped during the decoder's first fit; {hint}") from None
 
 
-def _evaluate(session: Session, rate: float) -> list[dict[str, Any]]:
-    """Evaluate, and write the metrics and a checkpoint. Return the lines of metrics.jsonl."""
-    lines = session.evaluate(rate)
+def _save(session: Session) -> None:
     _check_losses(session)
-    session.metrics_bytes = append_metrics(session.run.directory, lines)
     session.save()
-    return lines
-
-
-def _explain(session: Session, legend: bool) -> list[str]:
-    """Describe how well factors explain the returns. It is empty before the first updates and for too few episodes."""
-    if session.step < session.settings.warmup:
-        return []
-    return describe_returns(session.run, session.learner, session.config, legend)
 
 
 def _final_findings(run: Run, lines: Sequence[dict[str, Any]]) -> list[Finding]:
-    findings = []
+    findings = advice.find_equal_returns(run)
     if ACTOR_SATURATION in lines[0]:
-        saturations = [line[ACTOR_SATURATION] for line in lines]
-        findings += advice.find_saturated_policies(saturations, run.seeds)
-    findings += advice.find_equal_returns(run)
+        findings = advice.find_saturated_policies([line[ACTOR_SATURATION] for line in lines], run.seeds) + findings
     untrained = advice.find_untrained(run)
     if untrained is not None and warmup_warning(run.config.settings) is None:  # that warning was the first message
         findings.append(untrained)

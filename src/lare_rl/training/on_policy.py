@@ -4,88 +4,50 @@ Algorithm 1 of the LaRe paper, lines 6 to 8, for PPO and IPPO. The decoder was f
 """
 
 from functools import partial
-from typing import Any
 
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int, Key, PRNGKeyArray, Scalar, Shaped
 
-from lare_rl.algorithms.batches import Rollout
+from lare_rl.algorithms.batches import Metrics, Rollout
 from lare_rl.data import replay
-from lare_rl.data.replay import Replay
 from lare_rl.data.trajectory import Trajectory
 from lare_rl.training.episodes import predict_returns
 from lare_rl.training.learner import Learner
-from lare_rl.training.memoryless import get_actor, init_memory
+from lare_rl.training.policy import policy_input
 from lare_rl.training.rewards import rewards
 from lare_rl.training.static_config import TrainConfig
 
-__all__ = ["act", "get_actor", "init", "init_memory", "policy_input", "train_step"]
-
-
-def init(key: PRNGKeyArray, config: TrainConfig) -> Any:
-    """Return the untrained algorithm."""
-    env = config.env
-    # Several teams have different policies, in one network that sees the agent's number.
-    input_size = env.observation_size + (env.n_agents if len(env.teams) > 1 else 0)
-    return config.algorithm.load().init(key, input_size, env.action_size, env.discrete, config.hyperparameters)
-
-
-def policy_input(
-    observation: Float[Array, "*batch agents observation"], config: TrainConfig
-) -> Float[Array, "*batch agents policy_input"]:
-    """Return the input of actor and critic: the observation and, with several teams, the agent's one-hot number."""
-    if len(config.env.teams) == 1:
-        return observation
-    n_agents = config.env.n_agents
-    one_hot = jnp.broadcast_to(jnp.eye(n_agents), (*observation.shape[:-1], n_agents))
-    return jnp.concatenate([observation, one_hot], axis=-1)
-
-
-def act(
-    actor: Any,
-    memory: tuple[()],
-    observation: Float[Array, "*batch agents observation"],
-    available: Array,
-    noise: Float[Array, "*batch agents action"] | None,
-    config: TrainConfig,
-) -> tuple[Float[Array, "*batch agents action"], tuple[()]]:
-    """Return the likeliest actions or, with noise, actions that the policy draws."""
-    algorithm = config.algorithm.load()
-    inputs, choices = policy_input(observation, config), available if config.env.masks_actions else None
-    if noise is None:
-        return algorithm.act(actor, inputs, choices), memory
-    return algorithm.explore(actor, inputs, choices, noise), memory
+__all__ = ["train_step"]
 
 
 def train_step(
     learner: Learner, steps: Trajectory, keys: Key[Array, " seeds"], env_steps: Int[Scalar, ""], config: TrainConfig
-) -> tuple[Learner, dict[str, Float[Array, " seeds"]]]:
+) -> tuple[Learner, Metrics]:
     """Update the policy on `steps`, which have just been stored."""
     return jax.vmap(partial(_train_seed, config=config), in_axes=(0, 0, 0, None))(learner, steps, keys, env_steps)
 
 
 def _train_seed(
     learner: Learner, steps: Trajectory, key: PRNGKeyArray, env_steps: Int[Scalar, ""], config: TrainConfig
-) -> tuple[Learner, dict[str, Float[Array, ""]]]:
+) -> tuple[Learner, Metrics]:
     remaining = 1 - env_steps / config.steps
     rollout = _rollout(learner, jax.tree.map(jnp.asarray, steps), config)
     state, metrics = config.algorithm.load().update(learner.algorithm, rollout, key, remaining, config.hyperparameters)
     return learner._replace(algorithm=state), metrics
 
 
-def _with_predicted_returns(learner: Learner, config: TrainConfig) -> Replay:
-    """Return the replay with the sums of proxy rewards of all episodes that end in the newest steps."""
+def _predict_newest_returns(learner: Learner, config: TrainConfig) -> Learner:
+    """Predict the returns of all episodes that end in the newest steps."""
     buffer = replay.segments_as_episodes(learner.replay)
     since = replay.look_up(buffer.episode, jnp.arange(config.n_envs), buffer.next_transition - config.rollout_steps)
-    predicted = predict_returns(learner.decoders, buffer, since, config)
-    return replay.replace_payment_fields(learner.replay, predicted_return=predicted)
+    return predict_returns(learner, since, config)
 
 
 def _rollout(learner: Learner, steps: Trajectory, config: TrainConfig) -> Rollout:
     """Return the newest steps with the method's rewards. Each agent of each environment is one actor of the rollout."""
-    buffer = _with_predicted_returns(learner, config) if config.is_exact else learner.replay
-    stored = replay.read(buffer, replay.newest_steps(buffer, config.rollout_steps))
+    learner = _predict_newest_returns(learner, config) if config.is_exact else learner
+    stored = replay.read(learner.replay, replay.newest_steps(learner.replay, config.rollout_steps))
     reward = rewards(stored, learner.reward_sources, config)  # [envs time agents]
     n_agents, agents_leave = config.env.n_agents, config.env.agents_leave
 

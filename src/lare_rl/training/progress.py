@@ -12,7 +12,7 @@ from lare_rl.errors import missing_extra_error
 from lare_rl.util.findings import format_for_reader
 from lare_rl.util.sanitize import sanitize
 
-__all__ = ["Clock", "Listener", "MetricLines", "TensorBoard", "Terminal", "import_summary_writer", "known_numbers"]
+__all__ = ["Listener", "MetricLines", "TensorBoard", "Terminal", "import_summary_writer", "known_numbers"]
 
 LINE_S = 60.0
 """Where there is no terminal, a line is printed at least this often (s) while environments step."""
@@ -178,16 +178,3 @@ class TensorBoard(Listener):
     def on_stop(self) -> None:
         for writer in self._writers.values():
             writer.close()
-
-
-class Clock:
-    """Measures steps per second since the last call of `measure_rate`."""
-
-    def __init__(self, step: int):
-        self._step, self._time = step, time.perf_counter()
-
-    def measure_rate(self, step: int) -> float:
-        now = time.perf_counter()
-        rate = (step - self._step) / max(now - self._time, 1e-9)
-        self._step, self._time = step, now
-        return rate

@@ -25,14 +25,15 @@ from lare_rl.credit.decoder_settings import CreditSettings, default_credit
 from lare_rl.credit.methods import METHODS, Method
 from lare_rl.data.replay import StoredSteps, mean_length, required_capacity, segments_as_episodes
 from lare_rl.data.trajectory import Trajectory
-from lare_rl.envs.interface import EnvSpec, Team, Timestep, to_env_action
+from lare_rl.envs.interface import EnvSpec, Team, to_env_action
+from lare_rl.envs.vec_env import empty_batch
 from lare_rl.errors import LareError
 from lare_rl.latent.function import LatentFunction
 from lare_rl.phi.graph import Graph
 from lare_rl.tasks.spec import ScoredObservation
 from lare_rl.training import episodes
 from lare_rl.training.decoder_fits import fit_repeatedly
-from lare_rl.training.factors import compute_factors
+from lare_rl.training.decoder_inputs import compute_factors
 from lare_rl.training.learner import Learner, init_learner, replay_columns, store_with_factors
 from lare_rl.training.rewards import rewards
 from lare_rl.training.static_config import TrainConfig
@@ -150,7 +151,16 @@ def pure_credit(
         steps=0,
         fit_updates=fit_updates,
     )
-    _check_method(config)
+    context = CreditContext(
+        n_agents=agents,
+        n_raw_features=observation_size + action_size,
+        scored_observation=scored_observation,
+        scale_rewards=scale_rewards,
+        discrete_actions=discrete,
+        max_steps=max_steps,
+        step_at_a_time=True,  # the reward of a step is computed from this step alone
+    )
+    check_credit(chosen, credit, context)
     return _make_functions(config, () if phi is None else (phi.graph,))
 
 
@@ -163,21 +173,6 @@ def _check_phi(method: Method, phi: LatentFunction | None, sizes: tuple[int, int
     if method.needs_phi and phi is None:
         raise LareError(f"{method.name} needs a latent function: phi=...")
     return phi if method.needs_phi else None
-
-
-def _check_method(config: TrainConfig) -> None:
-    """Raise `LareError` if the method cannot compute the reward of a step from this step alone, or does not fit the environment."""
-    env = config.env
-    context = CreditContext(
-        n_agents=env.n_agents,
-        n_raw_features=env.observation_size + env.action_size,
-        scored_observation=config.scored_observation,
-        scale_rewards=config.scale_rewards,
-        discrete_actions=env.discrete,
-        max_steps=env.max_steps,
-        step_at_a_time=True,
-    )
-    check_credit(config.method, config.credit, context)
 
 
 def _make_functions(config: TrainConfig, phi: tuple[Graph, ...]) -> PureCredit:
@@ -198,7 +193,17 @@ def _make_functions(config: TrainConfig, phi: tuple[Graph, ...]) -> PureCredit:
         return PureCreditState(learner, state.n_invalid + jnp.sum(~is_valid))
 
     def refit(state: PureCreditState, key: PRNGKeyArray) -> PureCreditState:
-        return state._replace(learner=_refit(state.learner, key, learn_returns, config))
+        learner = state.learner
+        if not learner.decoders:
+            return state
+        seeds = jax.tree.map(lambda leaf: leaf[None], learner)
+        decoders, n_learned = jax.tree.map(lambda leaf: leaf[0], learn_returns(seeds))
+        learner = learner._replace(reward_sources=decoders, n_learned=n_learned)
+        if config.method.uses_gradient:
+            has_episode = jnp.any(segments_as_episodes(learner.replay).current_episode > 0)
+            fitted = jax.lax.cond(has_episode, lambda: fit_repeatedly(learner, key, config)[0], lambda: decoders)
+            learner = learner._replace(reward_sources=fitted)
+        return state._replace(learner=learner)
 
     def reward(state: PureCreditState, steps: CreditSteps) -> Float[Array, "time envs *agents"]:
         trajectory = _trajectory(steps, config)
@@ -221,33 +226,24 @@ def _valid_factors(
 
 def _trajectory(steps: CreditSteps, config: TrainConfig) -> Trajectory:
     """Return the steps with an axis of agents."""
-    env, ended = config.env, jnp.asarray(steps.terminated)
-    lead = ended.shape
+    env, lead = config.env, jnp.shape(steps.terminated)
 
     def with_agents(values: Array, *rest: int) -> Float[Array, "time envs agents *rest"]:
         return jnp.asarray(values, jnp.float32).reshape(*lead, env.n_agents, *rest)
 
     action = with_agents(steps.action, env.action_size)
-
-    def timestep(observation: Array, reward: Array, terminated: Array, truncated: Array) -> Timestep:
-        return Timestep(
-            observation=with_agents(observation, env.observation_size),
-            state=jnp.zeros((*lead, 0)),
-            available=jnp.ones((*lead, env.n_agents, env.action_size), bool),
-            alive=jnp.ones((*lead, env.n_agents), bool),
-            reward=with_agents(reward),
-            terminated=jnp.asarray(terminated, bool),
-            truncated=jnp.asarray(truncated, bool),
-            measures={},
-        )
-
-    nothing = jnp.zeros(lead, bool)
-    return Trajectory(
-        timestep=timestep(steps.observation, jnp.zeros((*lead, env.n_agents)), nothing, nothing),
-        action=action,
-        env_action=action if env.discrete else to_env_action(action, env),
-        next_timestep=timestep(steps.next_observation, steps.reward, steps.terminated, steps.truncated),
+    empty = jax.tree.map(jnp.asarray, empty_batch(env, *lead))
+    timestep = empty._replace(
+        observation=with_agents(steps.observation, env.observation_size), alive=jnp.ones_like(empty.alive)
     )
+    next_timestep = timestep._replace(
+        observation=with_agents(steps.next_observation, env.observation_size),
+        reward=with_agents(steps.reward),
+        terminated=jnp.asarray(steps.terminated, bool),
+        truncated=jnp.asarray(steps.truncated, bool),
+    )
+    env_action = action if env.discrete else to_env_action(action, env)
+    return Trajectory(timestep, action, env_action, next_timestep)
 
 
 def _stored_steps(learner: Learner, columns: dict[str, Any], next_columns: dict[str, Any]) -> StoredSteps:
@@ -267,40 +263,27 @@ def _stored_steps(learner: Learner, columns: dict[str, Any], next_columns: dict[
     )
 
 
-def _make_learn_returns(config: TrainConfig) -> Callable[..., Any]:
-    """Return `learn_returns` as a function that `vmap` can map at any time.
+def _make_learn_returns(config: TrainConfig) -> Callable[[Learner], tuple[Any, Any]]:
+    """Return a function from learners to their decoders after `learn_returns`, and `n_learned`, that `vmap` can map at any time.
 
     `learn_returns` must be traced with float64 enabled, but a user's `vmap` may trace it later, when it is not. So a mapped axis is
     merged into the axis of seeds.
     """
 
     @jax.custom_batching.custom_vmap
-    def learn_returns(*inputs: Any) -> tuple[Any, ...]:
+    def learn_returns(learner: Learner) -> tuple[Any, Any]:
         with float64():
-            decoders, buffer, n_learned = inputs
-            return episodes.learn_returns(decoders, buffer, n_learned, config)
+            learned = episodes.learn_returns(learner, config)
+        return learned.decoders, learned.n_learned
 
     @learn_returns.def_vmap
-    def _map_learn_returns(axis_size: int, is_mapped: Any, *inputs: Any) -> tuple[Any, Any]:
+    def _map_learn_returns(axis_size: int, is_mapped: Any, learner: Learner) -> tuple[Any, Any]:
         def merge(leaf: Array, mapped: bool) -> Array:
             leaf = leaf if mapped else jnp.broadcast_to(leaf, (axis_size, *leaf.shape))
             return leaf.reshape(leaf.shape[0] * leaf.shape[1], *leaf.shape[2:])  # -1 fails for an array without entries
 
-        learned = learn_returns(*jax.tree.map(merge, list(inputs), is_mapped))
+        learned = learn_returns(jax.tree.map(merge, learner, *is_mapped))
         learned = jax.tree.map(lambda leaf: leaf.reshape(axis_size, len(leaf) // axis_size, *leaf.shape[1:]), learned)
         return learned, jax.tree.map(lambda _: True, learned)
 
     return learn_returns
-
-
-def _refit(learner: Learner, key: PRNGKeyArray, learn_returns: Callable[..., Any], config: TrainConfig) -> Learner:
-    if not learner.decoders:
-        return learner
-    inputs = jax.tree.map(lambda leaf: leaf[None], (learner.decoders, learner.replay, learner.n_learned))
-    decoders, n_learned, _ = jax.tree.map(lambda leaf: leaf[0], learn_returns(*inputs))
-    learner = learner._replace(reward_sources=decoders, n_learned=n_learned)
-    if not config.method.uses_gradient:
-        return learner
-    has_episode = jnp.any(segments_as_episodes(learner.replay).current_episode > 0)
-    fitted = jax.lax.cond(has_episode, lambda: fit_repeatedly(learner, key, config)[0], lambda: learner.decoders)
-    return learner._replace(reward_sources=fitted)

@@ -105,20 +105,19 @@ def assess_function(function: LatentFunction, role: TaskSpec, episodes: Sequence
     """
     if len(episodes) < MIN_EXPLAINED_EPISODES:
         raise LareError(f"{len(episodes)} episodes say too little of a function: {MIN_EXPLAINED_EPISODES} are needed")
-    factors = [_compute_factors(function, role, episode) for episode in episodes]
     inputs = []
-    for z, episode in zip(factors, episodes, strict=True):
+    for episode in episodes:
         observed = select_states(role.scored_observation, episode.observation, episode.next_observation)
-        inputs.append(np.concatenate([z, *observed, episode.env_action], axis=-1))
-    n_factors = factors[0].shape[-1]
-    basis = Basis(n_factors, inputs[0].shape[-1] - n_factors, extended=True)
+        factors = _compute_factors(function, role, episode)
+        inputs.append(np.concatenate([factors, *observed, episode.env_action], axis=-1))
+    names = function.factor_columns(role.scored_observation)
+    basis = Basis(len(names), inputs[0].shape[-1] - len(names), extended=True)
     alive, returns = [episode.alive for episode in episodes], np.array([episode.return_ for episode in episodes])
     fit = assess_factors(inputs, alive, returns, basis, role.score, _levels(episodes))
-    names = function.factor_columns(role.scored_observation)
     observed = select_states(role.scored_observation, "observation", "next_observation")
     sizes = dict.fromkeys(observed, role.observation_size) | {"action": role.action_size}
     raw_names = raw_feature_names(role.observation, role.action, sizes) if basis.n_raw_used else []
-    valid_factors = np.concatenate([z[mask] for z, mask in zip(factors, alive, strict=True)])
+    valid_factors = np.concatenate([rows[mask] for rows, mask in zip(inputs, alive, strict=True)])[:, : len(names)]
     findings = explanation_findings(fit.explanation, fit.score_type, names, raw_names)
     return FunctionAssessment(
         r2=fit.r2,

@@ -1,15 +1,19 @@
 """The rewards that the algorithm is trained on, and how close they are to the true ones."""
 
+from collections.abc import Sequence
+from typing import Any
+
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from lare_rl.algorithms.batches import Metrics
 from lare_rl.credit import accuracy, engine, prequential
 from lare_rl.credit.decoder_settings import RECENT_STEPS
 from lare_rl.credit.engine import RewardSource
 from lare_rl.credit.methods import Reward
 from lare_rl.data import replay
 from lare_rl.data.replay import StoredSteps
-from lare_rl.envs.interface import team_mean
+from lare_rl.envs.interface import Team, team_mean
 from lare_rl.training.decoder_inputs import alive_agents, step_batch
 from lare_rl.training.learner import Learner
 from lare_rl.training.static_config import TrainConfig
@@ -23,16 +27,13 @@ def rewards(
     """Return the rewards that the algorithm is trained on, for each agent, by `Learner.reward_sources`."""
     alive = alive_agents(steps, config)
     team_rewards = []
-    for i, team in enumerate(config.env.teams):
-        team_alive = alive[..., team.agents]
+    for i, (team, source) in enumerate(zip(config.env.teams, reward_sources, strict=True)):
         if config.method.has_proxy_rewards:
-            batch, spec = step_batch(steps, config, i), config.credit_specs[i]
-            team_rewards.append(engine.training_rewards(reward_sources[i], batch, spec))
+            team_rewards.append(engine.training_rewards(source, step_batch(steps, config, i), config.credit_specs[i]))
             continue
-        is_dense = config.method.reward is Reward.TRUE
+        is_dense, team_alive = config.method.reward is Reward.TRUE, alive[..., team.agents]
         reward = steps.columns["reward"][..., team.agents] if is_dense else steps.episodic_reward[..., i, None]
-        reward = jnp.broadcast_to(reward, team_alive.shape)
-        scale = engine.return_scale(reward_sources[i])
+        reward, scale = jnp.broadcast_to(reward, team_alive.shape), engine.return_scale(source)
         team_rewards.append(engine.scale_and_mask(reward, scale, team_alive, scale_rewards=config.scale_rewards))
     return jnp.concatenate(team_rewards, axis=-1)
 
@@ -45,7 +46,7 @@ def team_proxy_rewards(
     return engine.proxy_rewards(reward_sources[team_index], batch, spec)
 
 
-def assess(learner: Learner, config: TrainConfig) -> dict[str, Float[Array, ""]]:
+def assess(learner: Learner, config: TrainConfig) -> Metrics:
     """Compare the newest proxy rewards with the true rewards, over the last steps of every environment."""
     if not config.method.has_proxy_rewards:
         return {}
@@ -57,30 +58,27 @@ def assess(learner: Learner, config: TrainConfig) -> dict[str, Float[Array, ""]]
     is_stored = (index.number >= oldest)[..., None]
     steps = replay.read(buffer, index._replace(number=jnp.maximum(index.number, oldest)))
     alive = alive_agents(steps, config)
-    metrics = []
+    metrics: list[Metrics] = []
     for i, team in enumerate(config.env.teams):
         reward, mask = steps.columns["reward"][..., team.agents], is_stored & alive[..., team.agents]
         if config.team_level:
             reward, mask = team_mean(steps.columns["reward"], alive, team)[..., None], is_stored
         r_hat = jnp.broadcast_to(team_proxy_rewards(steps, learner.reward_sources, config, i), reward.shape)
         last = jnp.broadcast_to(steps.last[..., None], reward.shape)
-        metrics.append(
-            accuracy.metrics(
-                r_hat.ravel(), reward.ravel(), last.ravel(), mask.ravel(), calibrated=config.method.calibrated
-            )
-        )
+        rows = (values.ravel() for values in (r_hat, reward, last, mask))
+        metrics.append(accuracy.metrics(*rows, calibrated=config.method.calibrated))
         if learner.decoders:
             decoder = learner.decoders[i]
             metrics[-1] |= prequential.metrics(decoder.predictions)
             if decoder.score_type_predictions is not None:
                 metrics[-1]["credit/average"] = decoder.is_average.astype(jnp.float32)
                 metrics[-1]["credit/log_odds"] = decoder.is_log_odds.astype(jnp.float32)
-    return team_metrics(metrics, config)
+    return team_metrics(metrics, config.env.teams)
 
 
-def team_metrics(metrics: list[dict[str, Array]], config: TrainConfig) -> dict[str, Array]:
+def team_metrics(metrics: list[dict[str, Any]], teams: Sequence[Team]) -> dict[str, Any]:
     """Return the metrics of the first team; with several teams also the metrics of each team, with the suffix `_<team>`."""
     if len(metrics) == 1:
         return metrics[0]
-    named = zip(config.env.teams, metrics, strict=True)
+    named = zip(teams, metrics, strict=True)
     return metrics[0] | {f"{name}_{team.name}": value for team, values in named for name, value in values.items()}

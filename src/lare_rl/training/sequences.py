@@ -11,10 +11,10 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, Int, Key, PRNGKeyArray, Scalar
+from jaxtyping import Array, Float, Int, Key, PRNGKeyArray, Scalar
 
 from lare_rl.algorithms.batches import Metrics, Sequences
-from lare_rl.algorithms.sequences import SequenceSettings
+from lare_rl.algorithms.registry import SequenceSettings
 from lare_rl.credit.engine import RewardSource
 from lare_rl.data import replay
 from lare_rl.data.layouts import lay_out_padded
@@ -30,7 +30,7 @@ from lare_rl.training.learner import Learner
 from lare_rl.training.rewards import rewards
 from lare_rl.training.static_config import TrainConfig
 
-__all__ = ["SequenceState", "act", "get_actor", "init", "init_memory", "train_step"]
+__all__ = ["Actor", "SequenceState", "get_actor", "init", "train_step"]
 
 Updated = tuple[Any, tuple[RewardSource, ...]]
 """The state of the algorithm, and what rewards are computed from."""
@@ -79,34 +79,16 @@ def init(key: PRNGKeyArray, config: TrainConfig) -> SequenceState:
     return SequenceState(state, empty_mean_std(input_size), jnp.zeros((), jnp.int32))
 
 
-def get_actor(learner: Learner, env_steps: int | Int[Array, ""], config: TrainConfig) -> Actor:
-    """Return the parts of the learner that are needed to act, for all seeds."""
-    state, algorithm = learner.algorithm, config.algorithm.load()
+def get_actor(state: SequenceState, env_steps: int | Int[Array, ""], config: TrainConfig) -> Actor:
+    """Return the parts of the state that are needed to act, of one seed or of all."""
+    algorithm = config.algorithm.load()
     epsilon = algorithm.epsilon(env_steps, _settings(config))
     return Actor(algorithm.get_actor(state.networks), jnp.full(state.n_due.shape, epsilon))
 
 
-def init_memory(config: TrainConfig) -> Any:
-    """Return the memory of the agents before the first step of an episode."""
-    env = config.env
-    return config.algorithm.load().init_memory((env.n_agents,), env.action_size, _settings(config))
-
-
-def act(
-    actor: Actor,
-    memory: Any,
-    observation: Float[Array, "*batch agents observation"],
-    available: Bool[Array, "*batch agents action"],
-    noise: Float[Array, "*batch agents 1+action"] | None,
-    config: TrainConfig,
-) -> tuple[Float[Array, "*batch agents action"], Any]:
-    """Return the available actions of largest value; with noise, sometimes random available ones."""
-    return config.algorithm.load().act(actor.agent, memory, observation, available, noise, actor.epsilon)
-
-
 def train_step(
     learner: Learner, steps: Trajectory, keys: Key[Array, " seeds"], env_steps: Int[Scalar, ""], config: TrainConfig
-) -> tuple[Learner, dict[str, Float[Array, " seeds"]]]:
+) -> tuple[Learner, Metrics]:
     """Make the updates that are due, once there are enough episodes for a batch.
 
     The function is written for all seeds, so that all of them use the same length of a batch: the smallest that fits
@@ -174,9 +156,8 @@ def _update_seed(
     """Update the decoder and then the algorithm of one seed. Return only what changes: the learner holds much more."""
     sample_key, fit_key = jax.random.split(key)
     sources, metrics = learner.reward_sources, {}
-    samples = sample_credit(learner.replay, sample_key, 1, config)
-    if samples is not None:
-        sample = jax.tree.map(lambda leaf: leaf[0], samples)
+    if config.joint_fit:
+        sample = jax.tree.map(lambda leaf: leaf[0], sample_credit(learner.replay, sample_key, 1, config))
         sources, metrics = fit_decoders(learner.decoders, learner.replay, sample, fit_key, config)
     state, settings = learner.algorithm, _settings(config)
     batch = _sequences(learner.replay, episodes, n_steps, sources, state.mixer_statistics, config)

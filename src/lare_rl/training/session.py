@@ -14,29 +14,22 @@ from jaxtyping import Array, Float, Key
 from lare_rl.algorithms.batches import Metrics
 from lare_rl.algorithms.off_policy import OffPolicySettings
 from lare_rl.config.settings import ResolvedSettings
-from lare_rl.data.trajectory import Trajectory
+from lare_rl.data.trajectory import Trajectory, empty_trajectory
 from lare_rl.errors import LareError
 from lare_rl.runs import checkpoint
 from lare_rl.runs.best_policy import BEST_FILE, BestPolicy, empty_best, load_best, save_best, update_best
 from lare_rl.runs.directory import Run
 from lare_rl.runs.metric_names import ACTOR_SATURATION, DETERMINISTIC_RETURN
-from lare_rl.training import first_fit, iteration, saturation
+from lare_rl.training import decoder_fits, iteration
 from lare_rl.training.collect_device import DeviceCollector
 from lare_rl.training.collect_host import HostCollector
-from lare_rl.training.compile_cache import cache_by_value
-from lare_rl.training.compiled import (
-    CompiledFunctions,
-    compile_functions,
-    learner_shape,
-    steps_shape,
-)
-from lare_rl.training.compiled_loop import CompiledLoop, init_loop
-from lare_rl.training.evaluation import metrics_lines
+from lare_rl.training.compiled import CompiledFunctions, compile_functions, learner_shape
+from lare_rl.training.decoder_inputs import compute_host_factors
+from lare_rl.training.evaluation import greedy_actions, metrics_lines, saturation
 from lare_rl.training.explain import compile_explanation
-from lare_rl.training.factors import compute_host_factors
-from lare_rl.training.iteration import IterationFunctions, when_on_host
+from lare_rl.training.iteration import IterationFunctions, LoopState
 from lare_rl.training.learner import Learner, abandon_episodes
-from lare_rl.training.saved_state import actor_shape
+from lare_rl.training.policy import actor_shape, get_actor
 from lare_rl.training.static_config import TrainConfig
 from lare_rl.util.float64 import load_linear_algebra, one_blas_thread
 
@@ -55,7 +48,7 @@ class Session:
     functions: CompiledFunctions
     learner: Learner
     collector: DeviceCollector | HostCollector
-    loop: CompiledLoop | None = None
+    loop: Callable[..., LoopState] | None = None
     """Iterations as one compiled call, for an environment of pure functions."""
     step: int = 0
     """Environment steps done, of each seed."""
@@ -87,45 +80,49 @@ class Session:
     @property
     def actor(self) -> Any:
         """The parts of the learner that are needed to act now."""
-        return self.functions.get_actor(self.learner, self.step)
+        return get_actor(self.learner.algorithm, self.step, self.config)
 
-    def advance(self, until: int, stop_requested: Callable[[], bool] = lambda: False) -> None:
-        """Make iterations: one on the host, or several in one compiled call, but none beyond step `until`.
+    def watch(self, on_step: Callable[[int], None], stop_requested: Callable[[], bool]) -> None:
+        """Call `on_step` with the number of steps of each seed while environments step on the host.
 
         Args:
             stop_requested: whether the user has asked the run to stop.
+        """
+        self._stop_requested = stop_requested
+        if isinstance(self.collector, HostCollector):
+            self.collector.watch(on_step, stop_requested)
+
+    def advance(self, until: int) -> None:
+        """Make iterations: one on the host, or several in one compiled call, but none beyond step `until`.
 
         Raises:
             FirstFitStoppedError: the user has asked the run to stop, during the decoder's first fit. The session cannot
                 continue.
         """
-        self._stop_requested = stop_requested
         if self.loop is None or self._is_before_first_fit:
             self._iterate()
         else:
-            self._iterate_compiled((until - self.step) // self.settings.iteration_steps)
+            self._iterate_compiled(self.loop, (until - self.step) // self.settings.iteration_steps)
 
     @property
     def _is_before_first_fit(self) -> bool:
         """Whether the decoders' first fit is still to be made. The host decides when it ends."""
-        return first_fit.has_first_fit(self.settings, self.config) and not self.first_fit_done
+        return self.config.has_first_fit and not self.first_fit_done
 
-    def _iterate_compiled(self, max_iterations: int) -> None:
+    def _iterate_compiled(self, loop: Callable[..., LoopState], max_iterations: int) -> None:
         """Make iterations in one compiled call, for about `MAX_CALL_S`."""
-        assert self.loop is not None
         assert isinstance(self.collector, DeviceCollector)
         n_iterations = max(1, min(max_iterations, int(MAX_CALL_S / self._iteration_s)))
         start = time.perf_counter()
-        state = init_loop(self.loop, self.learner, self.collector.envs, self.latest_metrics)
+        seeds, n_done = jnp.asarray(self.run.seeds), self.step // self.settings.iteration_steps
         with one_blas_thread():
-            n_done = self.step // self.settings.iteration_steps
-            state = self.loop.run(state, jnp.asarray(self.run.seeds), jnp.int32(n_done), jnp.int32(n_iterations))
+            state = loop(self.learner, self.collector.envs, self.latest_metrics, seeds, n_done, n_iterations)
             is_measured, is_finite = jax.device_get((state.is_measured, state.is_finite))
         self._iteration_s = max(1e-6, (time.perf_counter() - start) / n_iterations)
         self.learner, self.collector.envs = state.learner, state.envs
         self._unchecked = is_finite, state.steps
         self._check_factors()
-        self.latest_metrics |= {name: values for name, values in state.metrics.items() if is_measured[name].any()}
+        self._keep_metrics(state.metrics, is_measured)
         self.step += n_iterations * self.settings.iteration_steps
 
     def _iterate(self) -> None:
@@ -135,9 +132,10 @@ class Session:
         """
         if self.settings.overlap_collection:
             actor = jax.tree.map(jnp.copy, self.actor)  # the update reuses the memory of its learner
-            # In a thread, because the call of an update returns when the device has nearly finished it.
-            stored_only = _empty_steps(self.config, len(self.run.seeds))
-            updating = self._threads.submit(self._update, stored_only)
+            # In a thread, because the call of an update returns when the device has nearly finished it. It reads only stored steps.
+            config = self.config
+            no_steps = empty_trajectory(config.env, len(self.run.seeds), config.rollout_steps, config.n_envs)
+            updating = self._threads.submit(self._update, no_steps)
             steps = self.collector.collect(actor, self.step)
             updating.result()
             self._store(steps)
@@ -149,9 +147,7 @@ class Session:
 
     def _store(self, steps: Trajectory) -> None:
         self._check_factors()
-        self.learner, is_finite = iteration.store_steps(
-            self.learner, steps, self._iteration_functions, when_on_host, self.config
-        )
+        self.learner, is_finite = iteration.store_steps(self.learner, steps, self._iteration_functions, self.config)
         self._unchecked = is_finite, steps
 
     def _check_factors(self) -> None:
@@ -170,18 +166,29 @@ class Session:
             )
 
     def _update(self, steps: Trajectory) -> None:
-        self.learner, self.latest_metrics = iteration.update(
-            learner=self.learner,
-            measured=self.latest_metrics,
-            steps=steps,
-            seeds=jnp.asarray(self.run.seeds),
-            env_steps=self.step,
-            functions=self._iteration_functions,
-            when=when_on_host,
-            record=_record,
-            config=self.config,
-            fit_every=self.settings.fit_every,
+        seeds, functions = jnp.asarray(self.run.seeds), self._iteration_functions
+        measured = self.latest_metrics, dict.fromkeys(self.latest_metrics, np.ones(len(seeds), bool))
+        self.learner, measured = iteration.update(
+            self.learner, measured, steps, seeds, self.step, functions, self.config
         )
+        self._keep_metrics(*measured)
+
+    def _keep_metrics(self, metrics: Metrics, is_measured: dict[str, Any]) -> None:
+        self.latest_metrics |= {name: values for name, values in metrics.items() if np.any(is_measured[name])}
+
+    @property
+    def _iteration_functions(self) -> IterationFunctions:
+        functions = self.functions
+        return IterationFunctions(functions.store, functions.learn_returns, self._fit, functions.train_step)
+
+    def _fit(self, learner: Learner, keys: Key[Array, " seeds"]) -> tuple[Learner, Metrics]:
+        """Fit the decoders. The first fit lasts until it brings no improvement."""
+        if not (self._is_before_first_fit and decoder_fits.has_enough_episodes(learner)):
+            return self.functions.fit(learner, keys)
+        fit = compile_functions(decoder_fits.config_of_first_fit(self.config)).fit
+        fitted = decoder_fits.fit_until_converged(learner, fit, keys, self.config, self._stop_requested)
+        self.first_fit_done = True
+        return fitted
 
     def compile_while_collecting(self) -> None:
         """Compile in threads what the first finished episodes need. Until then, the processor often waits for a simulator.
@@ -194,20 +201,6 @@ class Session:
         if self.config.n_devices == 1:
             self._threads.submit(compile_explanation, shape, self.config)
 
-    @property
-    def _iteration_functions(self) -> IterationFunctions:
-        functions = self.functions
-        return IterationFunctions(functions.store, functions.learn_returns, self._fit, functions.train_step)
-
-    def _fit(self, learner: Learner, keys: Key[Array, " seeds"]) -> tuple[Learner, Metrics]:
-        """Fit the decoders. The first fit lasts until it brings no improvement."""
-        if not (self._is_before_first_fit and first_fit.has_enough_episodes(learner)):
-            return self.functions.fit(learner, keys)
-        fit = compile_functions(first_fit.config_of_first_fit(self.config)).fit
-        fitted = first_fit.fit_until_converged(learner, fit, keys, self.config, self._stop_requested)
-        self.first_fit_done = True
-        return fitted
-
     def evaluate(self, rate: float) -> list[dict[str, Any]]:
         """Evaluate, always from the same initial states, and keep the best policies. `rate` is in steps per second.
 
@@ -218,27 +211,26 @@ class Session:
             LareError: a factor is not finite, an environment fails, or the best policies cannot be written.
         """
         self._check_factors()
-        evaluation = self.collector.evaluate(self.actor, self.settings.evaluation_episodes)
+        actor, n_episodes = self.actor, self.settings.evaluation_episodes
+        evaluation = self.collector.evaluate(actor, n_episodes)
         if len(self.config.env.teams) == 1:
-            self._keep_best(evaluation.returns[..., 0].mean(axis=1))
+            self._keep_best(evaluation.returns[..., 0].mean(axis=1), actor)
         metrics = evaluation.drop_group(self.run.config.task).metrics(self.config.env)
         metrics |= self.functions.assess(self.learner) | self.latest_metrics
         is_last, is_sampled = self.step == self.settings.steps, not self.config.deterministic_evaluation
         # Only at the end, because it takes as long as the evaluation of sampled actions. Not in JAX, where it would be a program of its own
         # to compile.
         if is_last and is_sampled and isinstance(self.collector, HostCollector):
-            deterministic = self.collector.evaluate(self.actor, self.settings.evaluation_episodes, deterministic=True)
+            deterministic = self.collector.evaluate(actor, n_episodes, deterministic=True)
             metrics[DETERMINISTIC_RETURN] = deterministic.returns[..., 0].mean(axis=1)
         if self.step > self.config.warmup and isinstance(self.settings.hyperparameters, OffPolicySettings):
-            metrics[ACTOR_SATURATION] = saturation.measure(
-                self.functions.act, self.actor, self.learner.replay, self.config
-            )
+            metrics[ACTOR_SATURATION] = saturation(greedy_actions(actor, self.learner.replay, self.config))
         return metrics_lines(self.run.seeds, self.step, metrics, rate)
 
-    def _keep_best(self, score: Float[np.ndarray, " seeds"]) -> None:
+    def _keep_best(self, score: Float[np.ndarray, " seeds"], actor: Any) -> None:
         """Save the policies of the seeds whose evaluation is their best so far."""
         old = self.best or empty_best(len(self.run.seeds))
-        self.best = update_best(old, score, self.step, self.actor)
+        self.best = update_best(old, score, self.step, actor)
         if np.any(self.best.return_ > old.return_):
             save_best(self.run.checkpoint, self.best)
 
@@ -250,9 +242,13 @@ class Session:
         """
         self._check_factors()
         self.finish_saving()
-        digests = [function.digest for function in self.run.functions]
-        metadata = {"step": self.step, "metrics_length": self.metrics_bytes, "fitted": self.first_fit_done}
-        metadata |= {"function_sha256": digests, "batched": self.config.batched}
+        metadata = {
+            "step": self.step,
+            "metrics_length": self.metrics_bytes,
+            "fitted": self.first_fit_done,
+            "function_sha256": [function.digest for function in self.run.functions],
+            "batched": self.config.batched,
+        }
         arrays = {f"latest/{name}": np.asarray(values) for name, values in self.latest_metrics.items()}
         arrays |= {f"collector/{name}": values for name, values in self.collector.state_dict().items()}
         snapshot = checkpoint.take_snapshot(self.run.checkpoint, self.learner, metadata, arrays)
@@ -274,7 +270,7 @@ class Session:
             self.best = load_best(self.run.checkpoint, actor_shape(self.config, n_seeds), n_seeds)
         dropped, messages = self.collector.restore(_select_prefix(arrays, "collector/"))
         if dropped.any():
-            self.learner = _abandon_episodes(self.learner, jnp.asarray(dropped))
+            self.learner = jax.jit(jax.vmap(abandon_episodes))(self.learner, jnp.asarray(dropped))
             self.save()  # now, because a new episode will overwrite rows that the checkpoint counts as saved
             self.finish_saving()
         return messages
@@ -282,29 +278,11 @@ class Session:
     def close(self) -> None:
         """Close the environments, and finish the last checkpoint. Raises `LareError` if it cannot be written."""
         try:
-            self.collector.close()
+            if isinstance(self.collector, HostCollector):
+                self.collector.close()
         finally:
             self._threads.shutdown()
             self.finish_saving()
-
-
-@cache_by_value
-def _empty_steps(config: TrainConfig, n_seeds: int) -> Trajectory:
-    """Return steps for an update that reads only stored ones."""
-    return jax.tree.map(lambda shape: np.zeros(shape.shape, shape.dtype), steps_shape(config, n_seeds))
-
-
-_abandon_episodes = jax.jit(jax.vmap(abandon_episodes))
-
-
-def _record(old: Metrics, metrics: Metrics, n_updates: Float[Array, " seeds"] | None) -> Metrics:
-    """Replace the metrics of the seeds that have new ones."""
-    if n_updates is None:
-        return old | metrics
-    is_new = n_updates > 0
-    if not np.any(is_new):
-        return old
-    return old | {name: jnp.where(is_new, values, old.get(name, values)) for name, values in metrics.items()}
 
 
 def _select_prefix(arrays: dict[str, np.ndarray], prefix: str) -> dict[str, np.ndarray]:

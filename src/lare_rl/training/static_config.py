@@ -6,11 +6,14 @@ from functools import cached_property
 import jax
 import numpy as np
 
-from lare_rl.algorithms.registry import Algorithm, AlgorithmSettings, Consumes, Noise
+from lare_rl.algorithms.registry import ALGORITHMS, Algorithm, AlgorithmSettings, Consumes, Noise
+from lare_rl.config.resolve import replay_rows
 from lare_rl.credit.decoder_settings import CreditSettings
-from lare_rl.credit.methods import Method
+from lare_rl.credit.methods import METHODS, Method
 from lare_rl.credit.spec import CreditSpec
+from lare_rl.envs.families import load_env_spec
 from lare_rl.envs.interface import EnvSpec
+from lare_rl.runs.directory import Run
 from lare_rl.tasks.payments import PAID_AT_END, PaymentRule
 from lare_rl.tasks.spec import CreditScope, ScoredObservation
 
@@ -41,8 +44,12 @@ class TrainConfig:
     fit_updates: int
     """Updates of the decoder in an iteration that fits it. Unused if the decoder is updated with every update of the
     algorithm."""
+    fit_every: int = 1
+    """The decoder makes updates of its own in each iteration whose number is a multiple of this."""
+    held_out_first_fit: bool = False
+    """Whether the first of these fits lasts until it brings no improvement on held-out episodes."""
     batched: bool = False
-    """Whether the device is faster with much work at once (`batching.py`). It changes the last bits of a fit."""
+    """Whether the device is faster with much work at once (`compiled.is_batching_faster`). It changes the last bits of a fit."""
     resets_with_steps: bool = False
     """Reset all environments with each step, and use the result where an episode has ended."""
     n_devices: int = 1
@@ -104,6 +111,11 @@ class TrainConfig:
     def fits_separately(self) -> bool:
         """Whether the decoder makes gradient updates of its own, between iterations."""
         return self.method.uses_gradient and not self.joint_fit
+
+    @property
+    def has_first_fit(self) -> bool:
+        """Whether the decoder has a first fit that lasts until it brings no improvement."""
+        return self.fits_separately and self.held_out_first_fit
 
     @property
     def longest_segment(self) -> int:
@@ -176,3 +188,28 @@ class TrainConfig:
             "terminated": (consumes is Consumes.TRANSITIONS, (), np.bool_),
         }
         return {name: jax.ShapeDtypeStruct(shape, dtype) for name, (stored, shape, dtype) in columns.items() if stored}
+
+
+def make_train_config(run: Run) -> TrainConfig:
+    """Return the static configuration of a run's compiled functions."""
+    task, settings, env = run.config.task, run.config.settings, load_env_spec(run.config.task)
+    return TrainConfig(
+        env=env,
+        credit_scope=task.credit_scope,
+        scored_observation=run.scored_observation,
+        method=METHODS.find(settings.method),
+        algorithm=ALGORITHMS[settings.algorithm],
+        hyperparameters=settings.hyperparameters,
+        credit=settings.credit,
+        scale_rewards=settings.scale_rewards,
+        n_factors=tuple(function.n_factors(run.scored_observation) for function in run.functions),
+        n_envs=settings.environments,
+        rollout_steps=settings.rollout_steps,
+        capacity=replay_rows(settings, env.max_steps),
+        steps=settings.steps,
+        fit_updates=settings.fit_updates,
+        fit_every=settings.fit_every,
+        held_out_first_fit=settings.first_fit == "held-out",
+        payments=task.payment_rule,
+        group=task.group,
+    )

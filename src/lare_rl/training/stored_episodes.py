@@ -4,11 +4,11 @@ from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 
+import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Int
 
-from lare_rl.data.replay import Replay, end_of_episode, look_up, segments_as_episodes
+from lare_rl.data.replay import Index, Replay, end_of_episode, look_up, read
 from lare_rl.envs.interface import EnvSpec, Timestep, to_env_action
 from lare_rl.envs.play import Episode, make_episode
 from lare_rl.errors import LareError
@@ -53,10 +53,9 @@ def stored_episodes(run: Run | str | Path, seed: int | None = None) -> list[Log]
     replay = select_seed(learner.replay, seed_index)
     _check_columns(run, replay, "observation", "action", "reward")
     return [
-        _make_log(_env_columns(replay, env_index), rows, config.env)
-        | ({} if level is None else {"group": np.array(level)})
+        _make_log(columns, next_columns, config.env) | ({} if level is None else {"group": np.array(level)})
         for env_index in range(len(replay.row))
-        for rows, level in _finished_episodes(replay, env_index)
+        for columns, next_columns, level in _finished_episodes(replay, env_index)
     ]
 
 
@@ -77,12 +76,11 @@ def stored_role_episodes(run: Run, role: TaskSpec) -> list[Episode]:
         replay = select_seed(learner.replay, seed_index)
         _check_columns(run, replay, "state" if role.credit_scope == "state" else "observation", "action", "reward")
         for env_index in range(config.n_envs):
-            columns = _env_columns(replay, env_index)
-            newest = list(_finished_episodes(replay, env_index))[-n_newest:]
+            newest = list(_finished_episodes(replay, env_index, n_newest))
             # The last episodes of each environment were played at about the same time.
             episodes += [
-                (i - len(newest), replace(_make_episode(columns, rows, config.env, role), group=level))
-                for i, (rows, level) in enumerate(newest)
+                (i - len(newest), replace(_make_episode(columns, next_columns, config.env, role), group=level))
+                for i, (columns, next_columns, level) in enumerate(newest)
             ]
     return [episode for _, episode in sorted(episodes, key=lambda pair: pair[0])]
 
@@ -94,55 +92,47 @@ def _check_columns(run: Run, replay: Replay, *names: str) -> None:
         )
 
 
-def _env_columns(replay: Replay, env_index: int) -> dict[str, np.ndarray]:
-    return {name: np.asarray(column[env_index]) for name, column in replay.columns.items()}
+def _finished_episodes(
+    replay: Replay, env_index: int, n_newest: int | None = None
+) -> Iterator[tuple[Log, Log, int | None]]:
+    """Yield the columns of finished episodes of an environment, before and after each step, and the level of each episode, if any."""
+    oldest, current = int(replay.oldest[env_index]), int(replay.current_episode[env_index])
+    episode = jnp.arange(oldest if n_newest is None else max(oldest, current - n_newest), current)
+    if not len(episode):
+        return
+    env = jnp.full_like(episode, env_index)
+    begins, ends = np.asarray(look_up(replay.first, env, episode)), np.asarray(end_of_episode(replay, env, episode))
+    number = jnp.arange(begins[0], ends[-1])
+    steps = read(replay, Index(jnp.full_like(number, env_index), number))
+    levels = None if steps.level is None else np.asarray(steps.level)
+    arrays = jax.tree.map(np.asarray, (steps.columns, steps.next_columns))
+    for begin, end in zip(begins - begins[0], ends - begins[0], strict=True):
+        columns, next_columns = jax.tree.map(lambda leaf, begin=begin, end=end: leaf[begin:end], arrays)
+        yield columns, next_columns, None if levels is None else int(levels[end - 1])
 
 
-def _finished_episodes(replay: Replay, env_index: int) -> Iterator[tuple[Int[np.ndarray, " steps"], int | None]]:
-    """Yield the rows of the steps of each finished episode, and its level, if there are levels.
-
-    The row after the last one has the final observation.
-    """
-    row, first = np.asarray(replay.row[env_index]), np.asarray(replay.first[env_index])
-    episode = jnp.arange(int(replay.oldest[env_index]), int(replay.current_episode[env_index]))
-    env, payments = jnp.full_like(episode, env_index), segments_as_episodes(replay)
-    ends = end_of_episode(replay, env, episode)
-    levels: list[int | None] = [None] * len(episode)
-    if payments.level is not None:
-        levels = look_up(payments.level, env, look_up(payments.episode, env, ends - 1)).tolist()
-    for begin, end, level in zip(first[episode % len(first)], np.asarray(ends), levels, strict=True):
-        yield row[np.arange(begin, end) % len(row)], level
-
-
-def _make_log(columns: Log, rows: Int[np.ndarray, " steps"], env: EnvSpec) -> Log:
-    size = len(columns["observation"])
-    env_action = to_env_action(columns["action"][rows % size], env)
+def _make_log(columns: Log, next_columns: Log, env: EnvSpec) -> Log:
+    env_action = to_env_action(columns["action"], env)
     log = {
-        "observations": columns["observation"][np.append(rows, rows[-1] + 1) % size],
+        "observations": np.append(columns["observation"], next_columns["observation"][-1:], axis=0),
         "actions": np.argmax(env_action, axis=-1) if env.discrete else env_action,
-        "rewards": columns["reward"][rows % size],
+        "rewards": columns["reward"],
     }
     if env.n_agents == 1:
         log = {name: values[:, 0] for name, values in log.items()}
     if "terminated" not in columns:
         return log
-    terminated = columns["terminated"][rows % size]
-    is_last = np.arange(len(rows)) == len(rows) - 1
+    terminated = columns["terminated"]
+    is_last = np.arange(len(terminated)) == len(terminated) - 1
     return log | {"terminations": terminated, "truncations": is_last & ~terminated}
 
 
-def _make_episode(columns: Log, rows: Int[np.ndarray, " steps"], env: EnvSpec, role: TaskSpec) -> Episode:
-    size = len(columns["reward"])
+def _make_episode(columns: Log, next_columns: Log, env: EnvSpec, role: TaskSpec) -> Episode:
+    def make_timestep(columns: Log, **changes: np.ndarray) -> Timestep:
+        arrays = {name: columns.get(name, np.zeros(0, np.float32)) for name in Timestep._fields if name != "measures"}
+        return Timestep(**(arrays | changes), measures={})
 
-    def read(name: str, rows: np.ndarray) -> np.ndarray:
-        return columns[name][rows % size] if name in columns else np.zeros(0, np.float32)
-
-    def read_timestep(rows: np.ndarray) -> Timestep:
-        arrays = {name: read(name, rows) for name in Timestep._fields if name != "measures"}
-        return Timestep(**arrays, measures={})
-
-    alive = read("alive", rows) if "alive" in columns else np.ones((len(rows), env.n_agents), bool)
-    timestep = read_timestep(rows)._replace(alive=alive)
-    # The reward of a step is in its own row of the replay, and what it leads to in the next one.
-    next_timestep = read_timestep(rows + 1)._replace(reward=read("reward", rows))
-    return make_episode(role, env, timestep, to_env_action(read("action", rows), env), next_timestep)
+    reward = columns["reward"]
+    alive = columns.get("alive", np.ones((len(reward), env.n_agents), bool))
+    timestep, next_timestep = make_timestep(columns, alive=alive), make_timestep(next_columns, reward=reward)
+    return make_episode(role, env, timestep, to_env_action(columns["action"], env), next_timestep)

@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from enum import IntEnum
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -10,7 +11,16 @@ from jaxtyping import Array, Float, Int, Key
 
 from lare_rl.algorithms.registry import Noise
 
-__all__ = ["Stream", "device_noise", "episode_seed", "host_noise", "numpy_generator", "seed_keys", "stream_keys"]
+__all__ = [
+    "Stream",
+    "device_noise",
+    "episode_seed",
+    "host_noise",
+    "keys_shape",
+    "numpy_generator",
+    "seed_keys",
+    "stream_keys",
+]
 
 
 class Stream(IntEnum):
@@ -37,6 +47,11 @@ def episode_seed(seed: int, stream: Stream, episode: int) -> int:
 def seed_keys(seeds: Int[Array, " seeds"], number: int | Array) -> Key[Array, " seeds"]:
     """Return a key for each seed."""
     return jax.vmap(lambda seed: jax.random.fold_in(jax.random.key(seed), number))(seeds)
+
+
+def keys_shape(n_seeds: int) -> Any:
+    """Return the keys of all seeds with a shape instead of an array."""
+    return jax.eval_shape(seed_keys, jnp.zeros(n_seeds, int), 0)
 
 
 def stream_keys(

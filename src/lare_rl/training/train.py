@@ -2,7 +2,10 @@
 
 import threading
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
+
+import jax.numpy as jnp
 
 from lare_rl.config.effective import unused_settings, warmup_warning
 from lare_rl.config.resolve import resolve
@@ -10,18 +13,27 @@ from lare_rl.config.settings import ResolvedSettings, Settings
 from lare_rl.envs.load import resolve_task
 from lare_rl.envs.workers import close_idle_workers
 from lare_rl.errors import LareError, short_repr
+from lare_rl.runs import checkpoint
 from lare_rl.runs.directory import Run, as_run, create_run, default_directory, extend_run, lock_run
 from lare_rl.runs.metrics_file import truncate_metrics
 from lare_rl.tasks.spec import TaskSpec
+from lare_rl.training.collect_device import DeviceCollector, is_reset_cheap, make_jax_env
+from lare_rl.training.collect_host import make_host_collector
+from lare_rl.training.compiled import compile_ahead, init_seeds, is_batching_faster
+from lare_rl.training.iteration import compile_loop
 from lare_rl.training.latent_functions import FunctionOrPath, choose_functions
+from lare_rl.training.learner import Learner
 from lare_rl.training.loop import run_session
 from lare_rl.training.process import catch_stop_signals, report_full_memory
 from lare_rl.training.progress import Listener, TensorBoard, Terminal, import_summary_writer
+from lare_rl.training.saved_state import load_learner
+from lare_rl.training.seed_axis import count_seed_devices
 from lare_rl.training.session import Session
-from lare_rl.training.start_session import restore_session, start_session
+from lare_rl.training.static_config import TrainConfig, make_train_config
+from lare_rl.training.streams import seed_keys
 from lare_rl.util import compilation
 
-__all__ = ["resume", "train"]
+__all__ = ["restore_session", "resume", "start_session", "train"]
 
 EVENTS_DIRECTORY = "tensorboard"
 """Within the run directory."""
@@ -53,7 +65,12 @@ def train(
     """
     if tensorboard:
         import_summary_writer()  # before anything is made
-    task, settings, listeners = resolve_task(task), _check_settings(settings), _check_listeners(listeners)
+    if not isinstance(settings, Settings | None):
+        raise LareError(
+            "settings must be a lare_rl.Settings, such as lare_rl.Settings(method='rrdu', steps=100_000), and are "
+            f"{short_repr(settings)}"
+        )
+    task, settings, listeners = resolve_task(task), settings or Settings(), _check_listeners(listeners)
     resolved = resolve(settings, task)
     functions = choose_functions(task, resolved, function)
     run = create_run(Path(out) if out is not None else default_directory(task, resolved), task, resolved, functions)
@@ -61,7 +78,10 @@ def train(
     messages = unused[:1] if len(unused) < 2 else [f"{unused[0]} (and {len(unused) - 1} more)"]
     messages += _describe_rounding(resolved, steps=settings.steps, evaluate_every=settings.evaluate_every)
     with lock_run(run), report_full_memory(run), catch_stop_signals() as stop:
-        return _train_from_start(run, tensorboard, listeners, stop, messages)
+        _prepare(run, listeners)
+        session = start_session(run)
+        session.save()  # so that there is always a checkpoint
+        return _finish(session, tensorboard, listeners, stop, messages)
 
 
 def resume(
@@ -92,15 +112,17 @@ def resume(
     with lock_run(run), report_full_memory(run), catch_stop_signals() as stop:
         earlier_steps = run.config.settings.steps
         run = run if steps is None else extend_run(run, steps)
-        rounding = _describe_rounding(run.config.settings, steps=steps)
-        if not run.has_checkpoint():
-            if run.metrics():  # metrics are never removed
-                raise LareError(f"{run.directory} has no checkpoint any more: it cannot be resumed")
-            return _train_from_start(run, tensorboard, listeners, stop, rounding)
+        messages = _describe_rounding(run.config.settings, steps=steps)
+        if not run.has_checkpoint() and run.metrics():  # metrics are never removed
+            raise LareError(f"{run.directory} has no checkpoint any more: it cannot be resumed")
         _prepare(run, listeners)
-        session, messages = restore_session(run)
-        truncate_metrics(run.directory, session.metrics_bytes)
-        messages = [*rounding, *messages, *_describe_annealing(session, earlier_steps)]
+        if run.has_checkpoint():
+            session, restored = restore_session(run)
+            truncate_metrics(run.directory, session.metrics_bytes)
+            messages += [*restored, *_describe_annealing(session, earlier_steps)]
+        else:
+            session = start_session(run)
+            session.save()
         return _finish(session, tensorboard, listeners, stop, messages)
 
 
@@ -138,26 +160,6 @@ def _check_listeners(listeners: Sequence[Listener] | None) -> list[Listener]:
     return checked
 
 
-def _check_settings(settings: Settings | None) -> Settings:
-    """Return the settings, or the default ones. Raise `LareError` if they are something else."""
-    if settings is None or isinstance(settings, Settings):
-        return settings or Settings()
-    raise LareError(
-        "settings must be a lare_rl.Settings, such as lare_rl.Settings(method='rrdu', steps=100_000), and are "
-        f"{short_repr(settings)}"
-    )
-
-
-def _train_from_start(
-    run: Run, tensorboard: bool, listeners: list[Listener], stop: threading.Event, messages: Sequence[str] = ()
-) -> Run:
-    """Train from the first step on. The untrained learner is saved, so that there is always a checkpoint."""
-    _prepare(run, listeners)
-    session = start_session(run)
-    session.save()
-    return _finish(session, tensorboard, listeners, stop, messages)
-
-
 def _prepare(run: Run, listeners: Sequence[Listener]) -> None:
     """Turn on the compilation cache, and tell the listeners how long compiling takes."""
     for listener in listeners:
@@ -165,6 +167,51 @@ def _prepare(run: Run, listeners: Sequence[Listener]) -> None:
             f"preparing {run.directory}: compiling takes about half a minute, or about ten seconds if it was done before"
         )
     compilation.enable_cache()
+
+
+def start_session(run: Run) -> Session:
+    """Return a session before its first step."""
+    config = replace(make_train_config(run), n_devices=count_seed_devices(len(run.seeds)))
+    config = replace(config, batched=is_batching_faster(config, len(run.seeds)))
+    return _make_session(run, config, None)
+
+
+def restore_session(run: Run) -> tuple[Session, list[str]]:
+    """Return a session at the last checkpoint, and messages for the user.
+
+    Raises:
+        LareError: there is no checkpoint, or it cannot be used.
+    """
+    config, learner, metadata, arrays = load_learner(run, count_seed_devices(len(run.seeds)))
+    session = _make_session(run, config, learner)
+    try:
+        return session, session.restore(metadata, arrays)
+    except checkpoint.DAMAGED_FILE_ERRORS as error:
+        session.close()
+        raise LareError(
+            f"the checkpoint in {run.checkpoint} does not fit its environments ({type(error).__name__}: {error}): start a new run, or "
+            "install the version that the run names"
+        ) from error
+
+
+def _make_session(run: Run, config: TrainConfig, learner: Learner | None) -> Session:
+    """Compile the functions of a session and make its environments. Without a learner, start with an untrained one."""
+    task, n_seeds = run.config.task, len(run.seeds)
+    env = make_jax_env(task) if config.env.is_jax else None
+    if env is not None and config.batched:
+        n_envs = config.n_envs * n_seeds // config.n_devices
+        config = replace(config, resets_with_steps=is_reset_cheap(env, n_envs))
+    iterates_on_host = env is None or config.has_first_fit
+    functions = compile_ahead(config, run.graphs, n_seeds, iterates_on_host=iterates_on_host)
+    loop = None if env is None else compile_loop(env, config, run.graphs, n_seeds)
+    learner = learner or init_seeds(functions, seed_keys(jnp.asarray(run.seeds), 0))
+    if env is not None:
+        return Session(run, config, functions, learner, DeviceCollector(env, config, run.seeds), loop)
+    collector = make_host_collector(task, config, run.seeds, run.config.settings.evaluation_episodes)
+    session = Session(run, config, functions, learner, collector)
+    if learner.decoders:
+        session.compile_while_collecting()
+    return session
 
 
 def _finish(
@@ -191,13 +238,10 @@ def _finish(
 
 def _introduction(session: Session) -> list[str]:
     """Return messages about a session before its next step."""
-    settings, messages = session.settings, []
-    if (warning := warmup_warning(settings)) is not None:
-        messages.append(warning)
-    elif session.step < settings.warmup:
-        messages.append(
-            f"the first {settings.warmup:,} steps are random ({settings.algorithm}.warmup): the policy is not trained yet"
-        )
+    settings, warning = session.settings, warmup_warning(session.settings)
+    if warning is None and session.step < settings.warmup:
+        warning = f"the first {settings.warmup:,} steps are random ({settings.algorithm}.warmup): the policy is not trained yet"
+    messages = [] if warning is None else [warning]
     if session.step >= settings.steps:
         messages.append(
             f"the run is complete ({settings.steps:,} steps): to continue it, give a larger --steps (steps=... in Python)"

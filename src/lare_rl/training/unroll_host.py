@@ -5,7 +5,7 @@ from typing import Any
 
 import jax
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 
 from lare_rl.data.trajectory import Trajectory
 from lare_rl.envs.env_errors import EnvOutputError, name_step
@@ -14,9 +14,9 @@ from lare_rl.envs.play import EpisodeListener
 from lare_rl.envs.vec_env import VecEnv
 from lare_rl.errors import LareError
 from lare_rl.training.evaluation import EpisodeBatch, Evaluation, concatenate
-from lare_rl.training.host_policy import EvaluationPolicy
+from lare_rl.training.policy import draw_noise, init_host_memory, make_host_policy
 from lare_rl.training.static_config import TrainConfig
-from lare_rl.training.streams import Stream, episode_seed
+from lare_rl.training.streams import Stream, episode_seed, numpy_generator
 
 __all__ = [
     "DivergedError",
@@ -24,6 +24,8 @@ __all__ = [
     "check_actions",
     "evaluate_on_host",
     "evaluate_policy_on_host",
+    "evaluation_policy",
+    "policy_turns",
     "record_on_host",
     "unroll_on_host",
 ]
@@ -74,20 +76,23 @@ def record_on_host(
     envs: VecEnv, policy: BatchPolicy, seeds: Sequence[int], episode_seeds: Sequence[int]
 ) -> EpisodeBatch:
     """Play one episode in each environment, and return all steps. The arguments are as in `unroll_on_host`."""
-    steps, masks = [], []
-    for step, running in unroll_on_host(envs, policy, seeds, episode_seeds):
-        steps.append(jax.tree.map(np.copy, step))
-        masks.append(running)
-    return EpisodeBatch(jax.tree.map(lambda *rows: np.stack(rows), *steps), np.stack(masks), None)
+    played = [jax.tree.map(np.copy, rows) for rows in unroll_on_host(envs, policy, seeds, episode_seeds)]
+    steps, mask = jax.tree.map(lambda *rows: np.stack(rows), *played)
+    return EpisodeBatch(steps, mask, None)
 
 
 def evaluate_on_host(
-    envs: VecEnv, policy: BatchPolicy, seeds: Sequence[int], n_episodes: int, first: int = 0
+    envs: VecEnv,
+    policy: BatchPolicy,
+    seeds: Sequence[int],
+    n_episodes: int,
+    first: int = 0,
+    on_step: Callable[[], None] = lambda: None,
 ) -> Evaluation:
     """Evaluate one episode in each of the first `n_episodes` environments of each seed, each from a different initial state.
 
     The initial states depend only on the seed and on the episode's number, which counts from `first`. So every evaluation of a
-    run begins from the same ones, and no training episode does.
+    run begins from the same ones, and no training episode does. `on_step` is called after each step of the environments.
     """
     numbers = range(first, first + n_episodes)
     episode_seeds = [episode_seed(seed, Stream.EVALUATION_EPISODES, number) for seed in seeds for number in numbers]
@@ -98,6 +103,7 @@ def evaluate_on_host(
     measures = {name: np.full(shape, np.nan) for name in spec.measures}
     try:
         for step, running in unroll_on_host(envs, policy, seeds, episode_seeds):
+            on_step()
             timestep, next_timestep = step.timestep, step.next_timestep
             reward = next_timestep.reward.astype(np.float64) * running[..., None]
             returns += np.stack([team_mean(reward, timestep.alive, team) for team in spec.teams], axis=-1)
@@ -113,9 +119,30 @@ def evaluate_on_host(
     return jax.tree.map(lambda values: values[:, :n_episodes], results)
 
 
+def evaluation_policy(
+    config: TrainConfig, actor: Any, seeds: Sequence[int], noise_rows: Int[np.ndarray, " episodes"], n_noise_rows: int
+) -> BatchPolicy:
+    """Return the policy of all seeds for whole episodes, which all begin with its first call. It holds the memory of the actors.
+
+    The noise of these episodes is `noise_rows` of that of `n_noise_rows` episodes.
+    """
+    deterministic, n_episodes = config.deterministic_evaluation, len(noise_rows)
+    policy = make_host_policy(config, actor, n_episodes, deterministic=deterministic)
+    memory = init_host_memory(config, len(seeds), n_episodes)
+    rngs = [numpy_generator(seed, Stream.EVALUATION_NOISE, 0) for seed in seeds]
+
+    def act(timestep: Timestep, episode_start: Bool[np.ndarray, "seeds envs"]) -> np.ndarray:
+        nonlocal memory
+        noise = None if deterministic else draw_noise(config, rngs, n_noise_rows)[:, noise_rows]
+        action, memory = policy(memory, timestep.observation, timestep.available, noise, episode_start)
+        return action
+
+    return act
+
+
 def policy_turns(
     envs: VecEnv, config: TrainConfig, actor: Any, seeds: Sequence[int], n_episodes: int
-) -> Iterator[tuple[range, EvaluationPolicy]]:
+) -> Iterator[tuple[range, BatchPolicy]]:
     """Yield the numbers of the episodes that begin together, and their policy, until each seed has `n_episodes`.
 
     If there are fewer environments, some episodes begin after others. The noise of an episode does not depend on that.
@@ -123,7 +150,7 @@ def policy_turns(
     width = len(envs.batch.terminated) // len(seeds)
     for start in range(0, n_episodes, width):
         rows = np.minimum(np.arange(start, start + width), n_episodes - 1)
-        yield range(start, min(start + width, n_episodes)), EvaluationPolicy(config, actor, seeds, rows, n_episodes)
+        yield range(start, min(start + width, n_episodes)), evaluation_policy(config, actor, seeds, rows, n_episodes)
 
 
 def evaluate_policy_on_host(
@@ -140,22 +167,14 @@ def evaluate_policy_on_host(
 
     Args:
         envs: as many environments for each seed.
-        config: the configuration of training.
         actor: what acts, of all seeds.
-        seeds: the seeds of the run.
-        n_episodes: the number of episodes of each seed.
         first: the number of the first episode, which determines its initial state.
-        on_step: called before each step of the environments.
+        on_step: called after each step of the environments.
         on_episode: called with the number of episodes of each seed, when some have ended.
     """
     evaluations = []
     for numbers, policy in policy_turns(envs, config, actor, seeds, n_episodes):
-
-        def act(*inputs: Any, policy: EvaluationPolicy = policy) -> np.ndarray:
-            on_step()
-            return policy(*inputs)
-
-        evaluations.append(evaluate_on_host(envs, act, seeds, len(numbers), first + numbers.start))
+        evaluations.append(evaluate_on_host(envs, policy, seeds, len(numbers), first + numbers.start, on_step))
         on_episode(numbers.stop)
     return concatenate(evaluations)
 

@@ -27,25 +27,7 @@ from lare_rl.nn.masks import masked_mean
 from lare_rl.nn.networks import MLP, adam_step, clip_gradient, init_adam, init_orthogonal
 from lare_rl.nn.normalise import RunningMeanStd, empty_mean_std, running_std, standardise_if_observed, update_mean_std
 
-__all__ = [
-    "PPO",
-    "Actor",
-    "Batch",
-    "Networks",
-    "act",
-    "advantages",
-    "explore",
-    "get_actor",
-    "init",
-    "logits",
-    "minibatch_indices",
-    "normalise",
-    "policy_objective",
-    "prepare_batch",
-    "update",
-    "value_loss",
-    "values",
-]
+__all__ = ["PPO", "Actor", "act", "explore", "get_actor", "init", "logits", "update"]
 
 
 class Networks(NamedTuple):

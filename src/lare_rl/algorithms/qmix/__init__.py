@@ -1,11 +1,11 @@
 """QMIX and VDN: hyperparameters, default run settings and registration. The update is in `qmix.py`."""
 
+from dataclasses import replace
 from typing import TYPE_CHECKING, Annotated, Any
 
 from pydantic import Field
 
-from lare_rl.algorithms.registry import Algorithm, Consumes, register_algorithm
-from lare_rl.algorithms.sequences import SequenceSettings
+from lare_rl.algorithms.registry import Algorithm, Consumes, SequenceSettings, register_algorithm
 from lare_rl.errors import Count
 
 if TYPE_CHECKING:
@@ -54,29 +54,24 @@ def _run_defaults(env: "EnvSpec", environments: int) -> dict[str, Any]:
     }
 
 
-register_algorithm(
-    Algorithm(
-        name="qmix",
-        consumes=Consumes.SEQUENCES,
-        settings=QMIXSettings(),
-        module="lare_rl.algorithms.qmix.qmix",
-        run_defaults=_run_defaults,
-        summary="a team's value as a monotonic mixture of its agents' values; recurrent agents",
-        source="Rashid et al., ICML 2018; hyperparameters of PyMARL2 (Hu et al., 2021)",
-        continuous=False,
-        multi_agent=True,
-    )
+_QMIX = Algorithm(
+    name="qmix",
+    consumes=Consumes.SEQUENCES,
+    settings=QMIXSettings(),
+    module="lare_rl.algorithms.qmix.qmix",
+    run_defaults=_run_defaults,
+    summary="a team's value as a monotonic mixture of its agents' values; recurrent agents",
+    source="Rashid et al., ICML 2018; hyperparameters of PyMARL2 (Hu et al., 2021)",
+    continuous=False,
+    multi_agent=True,
 )
+register_algorithm(_QMIX)
 register_algorithm(
-    Algorithm(
+    replace(
+        _QMIX,
         name="vdn",
-        consumes=Consumes.SEQUENCES,
         settings=QMIXSettings(monotonic=False),
-        module="lare_rl.algorithms.qmix.qmix",
-        run_defaults=_run_defaults,
         summary="as qmix, with the sum of the agents' values",
         source="Sunehag et al., AAMAS 2018; hyperparameters of PyMARL2",
-        continuous=False,
-        multi_agent=True,
     )
 )

@@ -23,23 +23,7 @@ from lare_rl.algorithms.qmix.networks import Mixer, RecurrentNetwork, mix
 from lare_rl.nn.masks import masked_mean
 from lare_rl.nn.networks import adam_step, clip_gradient, copy_networks, init_adam
 
-__all__ = [
-    "QMIX",
-    "Memory",
-    "Networks",
-    "act",
-    "action_values",
-    "agent_input",
-    "epsilon",
-    "get_actor",
-    "greedy_action",
-    "init",
-    "init_memory",
-    "lambda_returns",
-    "loss",
-    "td_targets",
-    "update",
-]
+__all__ = ["QMIX", "Memory", "act", "epsilon", "get_actor", "init", "init_memory", "update"]
 
 Observations = Float[Array, "*batch agents observation"]
 Actions = Float[Array, "*batch agents action"]

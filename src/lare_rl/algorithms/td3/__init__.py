@@ -1,5 +1,6 @@
 """TD3 and DDPG: hyperparameters and registration. The update is in `td3.py`."""
 
+from dataclasses import replace
 from typing import Annotated
 
 from pydantic import Field
@@ -24,27 +25,23 @@ class TD3Settings(OffPolicySettings):
     """Standard deviation of the noise on actions, in action bounds."""
 
 
-register_algorithm(
-    Algorithm(
-        name="td3",
-        consumes=Consumes.TRANSITIONS,
-        settings=TD3Settings(),
-        module="lare_rl.algorithms.td3.td3",
-        run_defaults=run_defaults,
-        summary="two critics against overestimation, a delayed deterministic policy",
-        source="Fujimoto et al., ICML 2018",
-        discrete=False,
-    )
+_TD3 = Algorithm(
+    name="td3",
+    consumes=Consumes.TRANSITIONS,
+    settings=TD3Settings(),
+    module="lare_rl.algorithms.td3.td3",
+    run_defaults=run_defaults,
+    summary="two critics against overestimation, a delayed deterministic policy",
+    source="Fujimoto et al., ICML 2018",
+    discrete=False,
 )
+register_algorithm(_TD3)
 register_algorithm(
-    Algorithm(
+    replace(
+        _TD3,
         name="ddpg",
-        consumes=Consumes.TRANSITIONS,
         settings=TD3Settings(critics=1, policy_noise=0.0, policy_delay=1),
-        module="lare_rl.algorithms.td3.td3",
-        run_defaults=run_defaults,
         summary="one critic and a deterministic policy",
         source="Lillicrap et al., ICLR 2016",
-        discrete=False,
     )
 )

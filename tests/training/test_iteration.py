@@ -1,18 +1,43 @@
-"""Iterations in one compiled call make the same training state as iterations on the host."""
+"""The order of an iteration. Iterations in one compiled call make the same training state as iterations on the host."""
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
 from helpers.jax_toy_envs import echo_spec
 from helpers.long_tests import long_case
+from helpers.small_configs import random_steps, small_config, untrained_learner
 from helpers.training_runs import ECHO_PHI, QUICK_CREDIT
 from lare_rl.config.resolve import resolve
 from lare_rl.errors import LareError
 from lare_rl.latent.function import verify_function
 from lare_rl.runs.directory import create_run
 from lare_rl.training import session
-from lare_rl.training.start_session import start_session
+from lare_rl.training.iteration import IterationFunctions, update
+from lare_rl.training.train import start_session
+
+
+def test_update_fits_decoders_before_the_algorithm():
+    """Iterations have 20 steps, and the decoders are fitted in every second of them."""
+    config, calls = small_config("lare-rd", "ippo", rollout_steps=20, fit_every=2), []
+    steps, measured = random_steps(), ({}, {})
+
+    def fit(learner, keys):
+        calls.append("fit")
+        return learner, {"credit/loss": jnp.ones(2)}
+
+    def train_step(learner, steps, keys, step):
+        calls.append(("train", step))
+        return learner, {}
+
+    functions = IterationFunctions(lambda *_: None, lambda *_: None, fit, train_step)
+    for step in (80, 100, 120):
+        arguments = jnp.arange(2), step, functions, config
+        _, measured = update(untrained_learner(config), measured, steps, *arguments)
+    assert calls == ["fit", ("train", 80), ("train", 100), "fit", ("train", 120)]
+    for values in measured:
+        assert {name: array.tolist() for name, array in values.items()} == {"credit/loss": [1, 1]}
 
 
 @pytest.fixture(scope="module")
