@@ -21,14 +21,15 @@ from typing import Any
 import numpy as np
 
 from lare_rl.phi.builder import current_builder
-from lare_rl.phi.graph import NumberKind, all_positions
-from lare_rl.phi.indices import ALL, computed_positions, fixed_index, index_entries, is_mask, masked_index, overwrite
+from lare_rl.phi.graph import NumberKind, all_positions, widest
+from lare_rl.phi.indices import ALL, check_rows, computed_positions, index_entries, is_mask, masked_index, overwrite
 from lare_rl.phi.limits import RefusedError
-from lare_rl.phi.operand import BATCH, BatchSize, Operand, common_batch_axis
+from lare_rl.phi.operand import BATCH, BatchSize, Operand, common_batch_axis, program_shape
+from lare_rl.phi.rearrange import Source, leaves, map_leaves, move
 from lare_rl.phi.values import describe
 
 __all__ = [
-    "Array", "Complex", "Masked", "as_array", "broadcast", "concatenate", "elementwise", "invert", "power", "stack",
+    "Array", "Complex", "Masked", "as_array", "broadcast", "concatenate", "elementwise", "invert", "power", "rearrange", "stack",
 ]  # fmt: skip
 
 
@@ -65,7 +66,7 @@ class Array(_Value):
     @property
     def shape(self) -> tuple[Any, ...]:
         """Shape that the program sees."""
-        return tuple(BatchSize(n) if axis == self.batch_axis else n for axis, n in enumerate(self.row_shape))
+        return program_shape(self.row_shape, self.batch_axis)
 
     @property
     def ndim(self) -> int:
@@ -142,26 +143,18 @@ class Array(_Value):
             )
         return axes
 
-    # --- moving numbers -------------------------------------------------------------------------------------------------
-
-    def rearranged(self, function: Callable[[np.ndarray], np.ndarray], batch_axis: int | None) -> Array:
-        """Move numbers as a function of NumPy moves the positions of a row. The result is a view if NumPy returns a view."""
-        builder = current_builder()
-        positions = all_positions(self.row_shape) if self.positions is None else self.positions
-        builder.spend(positions.size)
-        moved = np.asarray(function(positions))
-        builder.check_size(moved.shape)
-        if np.may_share_memory(moved, positions):
-            return Array(self.base._node, batch_axis, self.base, moved)
-        return Array(builder.gather(self.base.node, moved), batch_axis)
+    @property
+    def source(self) -> Source:
+        """The positions of its numbers in the base."""
+        return Source(all_positions(self.row_shape) if self.positions is None else self.positions, self.batch_axis)
 
     def reshaped(self, row_shape: Sequence[int], batch_axis: int | None) -> Array:
-        return self.rearranged(lambda positions: positions.reshape(row_shape), batch_axis)
-
-    def transposed(self, axes: Sequence[int]) -> Array:
-        """Return the array with its axes in another order."""
-        batch_axis = None if self.batch_axis is None else list(axes).index(self.batch_axis)
-        return self.rearranged(lambda positions: positions.transpose(axes), batch_axis)
+        """Return a view of another shape, whose batch axis is known."""
+        positions = self.source.positions
+        moved = positions.reshape(row_shape)
+        if np.may_share_memory(moved, positions):
+            return Array(self.base._node, batch_axis, self.base, moved)
+        return Array(current_builder().gather(self.base.node, moved), batch_axis)
 
     def copy(self) -> Array:
         return Array(self.node, self.batch_axis)
@@ -178,7 +171,8 @@ class Array(_Value):
         if self.batch_axis is not None and isinstance([e for e in entries if e is not None][self.batch_axis], int):
             shape = np.empty(self.row_shape)[tuple(0 if isinstance(entry, int) else entry for entry in entries)].shape
             return Array(current_builder().add("first_row", (), shape, self.kind), None)
-        return self.rearranged(*fixed_index(self, entries))
+        check_rows(self, entries)
+        return rearrange(lambda positions: positions[tuple(entries)], self)
 
     def select(self, axis: int, index: Any) -> Any:
         """Return x[index] along an axis that is counted from the front."""
@@ -199,26 +193,27 @@ class Array(_Value):
         elif any(isinstance(entry, Array) for entry in entries):
             positions = computed_positions(self, entries, as_array)
             current_builder().check_size((math.prod(positions.row_shape), math.prod(self.row_shape)))
-            values = broadcast(as_array(value), positions.row_shape, positions.batch_axis)
+            values = broadcast(as_array(value), positions.shape)
             self[...] = Array(overwrite(self.node, positions.node, values.node), self.batch_axis)
         else:
-            select, batch_axis = fixed_index(self, entries)
-            positions = all_positions(self.row_shape) if self.positions is None else self.positions
-            self._write(value, select(positions), batch_axis)
+            check_rows(self, entries)
+            region = move(lambda positions: positions[tuple(entries)], self.source, (), math.prod(self.base.row_shape))
+            assert isinstance(region, Source)
+            self._write(value, region)
 
     def _entries(self, index: Any) -> list[Any]:
         items = index if isinstance(index, tuple) else (index,)
         return index_entries(self, [as_array(x) if isinstance(x, (list, tuple, range)) else x for x in items])
 
-    def _write(self, value: Any, positions: np.ndarray, batch_axis: int | None) -> None:
-        """Write into these positions of the base."""
-        base, builder = self.base, current_builder()
+    def _write(self, value: Any, region: Source) -> None:
+        """Write into positions of the base."""
+        base, builder, positions = self.base, current_builder(), region.positions
         if base.read_only:
             raise ValueError("the inputs cannot be written into: copy them first, x = observation.copy()")
-        node = builder.cast(broadcast(as_array(value), positions.shape, batch_axis).node, base.kind)
+        values = broadcast(as_array(value), program_shape(positions.shape, region.batch_axis))
         sources = all_positions(base.row_shape)
         sources.reshape(-1)[positions.reshape(-1)] = sources.size + np.arange(positions.size)
-        base._node = builder.gather(builder.concat([base._node, node]), sources)
+        base._node = builder.gather(builder.concat([base._node, builder.cast(values.node, base.kind)]), sources)
 
 
 class Masked(_Value):
@@ -313,37 +308,53 @@ def invert(x: Any) -> Any:
     return elementwise("logical_not", x) if kind == "bool" else elementwise("subtract", -1, x)
 
 
-def broadcast(array: Array, row_shape: Sequence[int], batch_axis: int | None) -> Array:
-    """Repeat an array to a shape."""
-    current_builder().check_size(row_shape)
-    target = Array(current_builder().constant(np.broadcast_to(np.zeros(()), row_shape)), batch_axis)
-    shape = np.broadcast_shapes(array.row_shape, tuple(row_shape))
-    if common_batch_axis([array, target]) != batch_axis or shape != tuple(row_shape):
-        raise ValueError(f"an array of the shape {array.shape} cannot be broadcast to the shape {target.shape}")
-    return array.rearranged(lambda positions: np.broadcast_to(positions, row_shape), batch_axis)
+def rearrange(function: Callable[..., Any], arrays: Any, *args: Any) -> Any:
+    """Return what a function of NumPy makes of arrays if it only moves, repeats and leaves out their numbers.
+
+    Args:
+        function: takes an array or nested lists of arrays, and `args`. The result is a view if NumPy returns a view.
+        args: may have lengths of batch axes, and arrays whose numbers are constant.
+
+    Raises:
+        RefusedError: rows would be mixed, added or left out.
+    """
+    builder, inputs = current_builder(), leaves(arrays)
+    sizes = [math.prod(array.row_shape) for array in inputs]
+    builder.spend(builder.check_size([sum(sizes)]))
+    if len(inputs) == 1:
+        base = inputs[0].base
+        nodes, sources, size = [base.node], [inputs[0].source], math.prod(base.row_shape)
+    else:
+        starts, size = itertools.accumulate(sizes, initial=0), sum(sizes)
+        nodes = [array.node for array in inputs]
+        sources = [
+            Source(all_positions(x.row_shape) + start, x.batch_axis) for x, start in zip(inputs, starts, strict=False)
+        ]
+    remaining = iter(sources)
+    moved = move(function, map_leaves(lambda _: next(remaining), arrays), args, size + 1)
+
+    def to_array(source: Source) -> Array:
+        positions, batch_axis = source
+        if len(inputs) == 1 and np.may_share_memory(positions, sources[0].positions):
+            return Array(base._node, batch_axis, base, positions)
+        if positions.min() >= 0:
+            return Array(builder.gather(builder.concat(nodes), positions), batch_axis)
+        zero = builder.cast(builder.constant(0), widest([builder.nodes[node].kind for node in nodes]))
+        return Array(builder.gather(builder.concat([*nodes, zero]), positions % (size + 1)), batch_axis)
+
+    return [to_array(source) for source in moved] if isinstance(moved, list) else to_array(moved)
 
 
-def stack(arrays: Sequence[Array], axis: Any) -> Array:
+def broadcast(array: Array, shape: Sequence[Any]) -> Array:
+    """Repeat an array to a shape that the program sees."""
+    return rearrange(np.broadcast_to, array, tuple(shape))
+
+
+def stack(arrays: Sequence[Array], axis: int) -> Array:
     """Join arrays along a new axis."""
-    at = arrays[0].axis(axis, extra=1)
-    if len({array.row_shape for array in arrays}) > 1 or len({array.batch_axis for array in arrays}) > 1:
-        raise ValueError(f"arrays that are stacked must have the same shape: {_shapes_text(arrays)}")
-    return concatenate([array.select(at, None) for array in arrays], at)
+    return rearrange(np.stack, list(arrays), axis)
 
 
-def concatenate(arrays: Sequence[Array], axis: Any) -> Array:
+def concatenate(arrays: Sequence[Array], axis: int | None) -> Array:
     """Join arrays along an axis."""
-    (at,) = arrays[0].row_axes(axis)
-    if len({(array.batch_axis, array.row_shape[:at], array.row_shape[at + 1 :]) for array in arrays}) > 1:
-        raise ValueError(f"the shapes {_shapes_text(arrays)} cannot be joined along axis {at}")
-    builder = current_builder()
-    sizes = [math.prod(array.row_shape) for array in arrays]
-    builder.check_size((sum(sizes),))
-    starts = itertools.accumulate(sizes, initial=0)
-    positions = [all_positions(array.row_shape) + start for array, start in zip(arrays, starts, strict=False)]
-    node = builder.concat([array.node for array in arrays])
-    return Array(builder.gather(node, np.concatenate(positions, at)), arrays[0].batch_axis)
-
-
-def _shapes_text(arrays: Sequence[Array]) -> str:
-    return " and ".join(dict.fromkeys(str(array.shape) for array in arrays))
+    return rearrange(np.concatenate, list(arrays), axis)

@@ -8,7 +8,7 @@ from typing import Any, Never, Protocol, runtime_checkable
 
 from lare_rl.phi.limits import RefusedError
 
-__all__ = ["BATCH", "BatchSize", "Operand", "Shaped", "common_batch_axis"]
+__all__ = ["BATCH", "BatchSize", "Operand", "Shaped", "common_batch_axis", "program_shape"]
 
 
 def _operators(op: str) -> tuple[Callable[[Any, Any], Any], Callable[[Any, Any], Any]]:
@@ -110,6 +110,11 @@ class BatchSize:
 
 
 BATCH = BatchSize()
+
+
+def program_shape(row_shape: Sequence[int], batch_axis: int | None) -> tuple[Any, ...]:
+    """Return the shape that the program sees of an array."""
+    return tuple(BatchSize(n) if axis == batch_axis else n for axis, n in enumerate(row_shape))
 
 
 @runtime_checkable

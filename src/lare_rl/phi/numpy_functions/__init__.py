@@ -3,7 +3,6 @@
 from lare_rl.phi.numpy_functions import (
     creation,
     elementwise,
-    positions,
     products,
     reductions,
     sequences,
@@ -23,7 +22,6 @@ __all__ = [
     "creation",
     "elementwise",
     "find_hint",
-    "positions",
     "products",
     "reductions",
     "sequences",

@@ -9,14 +9,14 @@ from typing import Any
 
 import numpy as np
 
-from lare_rl.phi.arrays import Array, as_array, broadcast, elementwise, stack
+from lare_rl.phi.arrays import Array, as_array, broadcast, rearrange, stack
 from lare_rl.phi.builder import current_builder
-from lare_rl.phi.indices import ALL
 from lare_rl.phi.limits import RefusedError
 from lare_rl.phi.numpy_functions.registry import (
     FUNCTIONS,
     array_functions,
     as_float,
+    as_list,
     as_sizes,
     astype,
     dtype_kind,
@@ -24,7 +24,7 @@ from lare_rl.phi.numpy_functions.registry import (
     numpy_functions,
     numpy_variants,
 )
-from lare_rl.phi.numpy_functions.shapes import column_stack, concatenate_, ravel, split_shape
+from lare_rl.phi.numpy_functions.shapes import meshgrid
 from lare_rl.phi.operand import BatchSize
 
 
@@ -43,7 +43,7 @@ def asarray(a: Array, dtype: Any = None, count: Any = -1) -> Array:
 
 @numpy_function()
 def full(shape: Any, fill_value: Any, dtype: Any = None) -> Array:
-    filled = broadcast(as_array(fill_value), *split_shape(shape)).copy()
+    filled = broadcast(as_array(fill_value), as_list(shape)).copy()
     return filled if dtype is None else astype(filled, dtype)
 
 
@@ -93,33 +93,6 @@ def unit_matrix(function: Any, N: int, M: int | None = None, k: int = 0, dtype: 
     return astype(function(*shape, k), dtype)
 
 
-def _last_axes(m: Array) -> tuple[int, ...]:
-    m.row_axes((-1, -2))
-    return m.row_shape[-2:]
-
-
-@numpy_function()
-def diag(v: Array, k: int = 0) -> Any:
-    if v.ndim == 2:
-        return FUNCTIONS["diagonal"](v, k)
-    v.row_axes(0)
-    current_builder().check_size([v.row_shape[0] + abs(k)] * 2)
-    positions = np.diag(np.arange(1, v.row_shape[0] + 1), k)
-    padded = concatenate_([v, astype(np.zeros(1), v.kind)])
-    return padded[as_array(positions - 1)]  # position -1 is the 0 behind
-
-
-@numpy_function()
-def meshgrid(*xi: Array, indexing: Any = "xy", sparse: Any = False, copy: Any = True) -> list[Any]:
-    for x in xi:
-        x.row_axes(None)
-    current_builder().check_size([math.prod(x.row_shape) for x in xi])
-    flat = [ravel(x) for x in xi]
-    order = [1, 0, *range(2, len(xi))] if indexing == "xy" and len(xi) > 1 else list(range(len(xi)))
-    grids = [x[tuple(ALL if j == i else None for j in order)] for i, x in enumerate(flat)]
-    return grids if sparse else FUNCTIONS["broadcast_arrays"](*grids)
-
-
 @numpy_function()
 def fromfunction(function: Callable[..., Any], shape: Any, *, dtype: Any = "float") -> Any:
     sizes = as_sizes(shape)
@@ -152,8 +125,8 @@ class Concatenator:
     def __getitem__(self, index: Any) -> Any:
         items = [self.item(item) for item in (index if isinstance(index, tuple) else (index,))]
         if self.columns:
-            return column_stack(items)
-        return concatenate_([x if x.ndim else x[None] for x in items])
+            return FUNCTIONS["column_stack"](items)
+        return rearrange(lambda arrays: np.concatenate(list(map(np.atleast_1d, arrays))), items)
 
     def item(self, item: Any) -> Array:
         if isinstance(item, slice) and isinstance(item.step, complex):  # 5j: five numbers
@@ -191,16 +164,7 @@ array_functions(
         "copy": lambda a: a.copy(),
         "zeros_like": lambda a, dtype=None, shape=None: full_like(a, 0, dtype, shape),
         "ones_like": lambda a, dtype=None, shape=None: full_like(a, 1, dtype, shape),
-        "tril": lambda m, k=0: elementwise(
-            "where", unit_matrix(np.tri, *_last_axes(m), operator.index(k), "bool"), m, 0
-        ),
-        "triu": lambda m, k=0: elementwise(
-            "where", unit_matrix(np.tri, *_last_axes(m), operator.index(k) - 1, "bool"), 0, m
-        ),
-        "diagflat": lambda v, k=0: diag(ravel(v), operator.index(k)),
-        "ix_": lambda *args: tuple(
-            x[tuple(ALL if j == i else None for j in range(len(args)))] for i, x in enumerate(args)
-        ),
+        "ix_": lambda *args: rearrange(lambda arrays: np.ix_(*arrays), list(args)),
     }
 )
 numpy_functions(

@@ -10,11 +10,10 @@ from typing import Any
 
 import numpy as np
 
-from lare_rl.phi.arrays import Array, as_array, elementwise, power, stack
+from lare_rl.phi.arrays import Array, as_array, elementwise, power, rearrange, stack
 from lare_rl.phi.builder import current_builder
 from lare_rl.phi.indices import ALL
 from lare_rl.phi.limits import MAX_EINSUM_ARRAYS, MAX_INVERSE_SIZE, MAX_MATRIX_POWER, RefusedError
-from lare_rl.phi.numpy_functions.positions import diagonal
 from lare_rl.phi.numpy_functions.reductions import along
 from lare_rl.phi.numpy_functions.registry import (
     FUNCTIONS,
@@ -26,7 +25,6 @@ from lare_rl.phi.numpy_functions.registry import (
     numpy_functions,
     require_constant,
 )
-from lare_rl.phi.numpy_functions.shapes import ravel
 
 _TERM = r"[a-zA-Z]*+(\.\.\.)?[a-zA-Z]*+"
 PATTERN = re.compile(rf"{_TERM}(,{_TERM})*+(->{_TERM})?")
@@ -135,12 +133,6 @@ def cross(a: Array, b: Array, axisa: int = -1, axisb: int = -1, axisc: int = -1,
     return stack([a1 * b2 - a2 * b1, a2 * b0 - a0 * b2, a0 * b1 - a1 * b0], axisc)
 
 
-@numpy_function("trace", "linalg.trace")
-def trace(a: Array, offset: int = 0, axis1: Any = None, axis2: Any = None) -> Any:
-    axes = (0, 1) if axis1 is None or axis2 is None else (axis1, axis2)
-    return along("sum", diagonal(a, offset, *axes), -1)
-
-
 def _correlate(a: Array, v: Array, mode: str, reverse: bool) -> Any:
     if a.ndim != 1 or v.ndim != 1 or a.batch_axis is not None or v.batch_axis is not None:
         raise RefusedError("E-ROWS", "np.convolve takes one series, not a batch: use sliding_window_view along axis 1")
@@ -157,9 +149,13 @@ def _correlate(a: Array, v: Array, mode: str, reverse: bool) -> Any:
 
 array_functions(
     {
-        "outer linalg.outer": lambda a, b: einsum("i,j->ij", ravel(a), ravel(b)),
-        "vdot": lambda a, b: einsum("i,i->", ravel(a), ravel(b)),
+        "outer linalg.outer": lambda a, b: einsum("i,j->ij", rearrange(np.ravel, a), rearrange(np.ravel, b)),
+        "vdot": lambda a, b: einsum("i,i->", rearrange(np.ravel, a), rearrange(np.ravel, b)),
         "vecdot linalg.vecdot": lambda x1, x2, axis=-1: along("sum", elementwise("multiply", x1, x2), axis),
+        "trace": lambda a, offset=0, axis1=0, axis2=1: along(
+            "sum", rearrange(np.diagonal, a, offset, axis1, axis2), -1
+        ),
+        "linalg.trace": lambda x, *, offset=0: along("sum", rearrange(np.diagonal, x, offset, -2, -1), -1),
         "matvec": lambda x1, x2: einsum("...ij,...j->...i", x1, x2),
         "vecmat": lambda x1, x2: einsum("...j,...jk->...k", x1, x2),
         "convolve": lambda a, v, mode="full": _correlate(a, v, mode, reverse=True),
@@ -269,7 +265,7 @@ def eigvalsh(a: Array, UPLO: Any = "L") -> Any:  # noqa: N803
 
 def _eigenvalues_3x3(a: Array, uplo: Any) -> Any:
     rows, columns = ([1, 2, 2], [0, 0, 1]) if uplo == "L" else ([0, 0, 1], [1, 2, 2])
-    diagonals = diagonal(a, 0, a.ndim - 2, a.ndim - 1)
+    diagonals = rearrange(np.diagonal, a, 0, -2, -1)
     off = a[..., rows, columns]
     middle = FUNCTIONS["mean"](diagonals, -1, keepdims=True)
     centered = elementwise("subtract", diagonals, middle)

@@ -61,7 +61,7 @@ def _count(x: Array, axis: Any, keepdims: Any, where: Any = True) -> Any:
     """Return how many numbers a reduction reads."""
     if where is True:
         return math.prod(x.row_shape[i] for i in x.row_axes(axis))
-    return along("sum", broadcast(as_array(where), x.row_shape, x.batch_axis), axis, keepdims)
+    return along("sum", broadcast(as_array(where), x.shape), axis, keepdims)
 
 
 def _sum(x: Any, axis: Any, keepdims: Any, where: Any = True) -> Any:
@@ -80,7 +80,7 @@ def average(a: Array, axis: Any = None, weights: Any = None, *, keepdims: Any = 
     weights = as_numbers(weights)
     if weights.ndim == 1 and a.ndim > 1 and axis is not None and weights.batch_axis is None:
         weights = weights[(..., *(None,) * (a.ndim - 1 - a.axis(axis)))]
-    weights = broadcast(weights, a.row_shape, a.batch_axis) if a.batch_axis is not None else weights
+    weights = broadcast(weights, a.shape) if a.batch_axis is not None else weights
     return _sum(a * weights, axis, keepdims) / _sum(weights, axis, keepdims)
 
 

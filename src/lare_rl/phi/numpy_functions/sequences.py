@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from typing import Any
 
-from lare_rl.phi.arrays import Array, as_array, broadcast, concatenate, elementwise, stack
+from lare_rl.phi.arrays import Array, as_array, broadcast, concatenate, elementwise, rearrange, stack
 from lare_rl.phi.builder import current_builder
 from lare_rl.phi.limits import RefusedError
 from lare_rl.phi.numpy_functions.reductions import along, flatten_constant
@@ -53,10 +53,9 @@ def accumulate(ufunc: str, array: Array, axis: Any = 0) -> Any:
 @numpy_function()
 def diff(a: Array, n: int = 1, axis: int = -1, prepend: Any = None, append: Any = None) -> Any:
     (at,) = a.row_axes(axis)
-    edge = (*a.row_shape[:at], 1, *a.row_shape[at + 1 :])
     if prepend is not None or append is not None:
         arrays = [as_array(x) for x in (prepend, a, append) if x is not None]
-        a = concatenate([x if x.ndim else broadcast(x, edge, a.batch_axis) for x in arrays], at)
+        a = concatenate([x if x.ndim else broadcast(x, (*a.shape[:at], 1, *a.shape[at + 1 :])) for x in arrays], at)
     op = "not_equal" if a.kind == "bool" else "subtract"
     for _ in range(n):
         a = elementwise(op, a.select(at, slice(1, None)), a.select(at, slice(None, -1)))
@@ -164,10 +163,8 @@ def quantile(a: Array, q: Any, axis: Any = None, *, method: Any = "linear", keep
     x = as_numbers(a)
     if len(axes) != 1:
         rest = [i for i in range(a.ndim) if i not in axes]
-        shape = [a.row_shape[i] for i in rest]
-        batch_axis = None if a.batch_axis is None else rest.index(a.batch_axis)
-        moved = x.rearranged(lambda p: p.transpose([*rest, *axes]).reshape([*shape, -1]), batch_axis)
-        at, x = moved.ndim - 1, moved
+        x = rearrange(lambda p: p.transpose([*rest, *axes]).reshape([*(p.shape[i] for i in rest), -1]), x)
+        at = len(rest)
     else:
         at = axes[0]
     ordered, is_nan = scan("sort", x, at), along("any", elementwise("isnan", x), at)
