@@ -34,6 +34,7 @@ array_functions(
         "nancumsum": lambda a, axis=None: scan("cumsum", elementwise("where", elementwise("isnan", a), 0, a), axis),
         "add.accumulate": lambda array, axis=0: scan("cumsum", array, axis),
         "multiply.accumulate": lambda array, axis=0: scan("cumprod", array, axis),
+        "ediff1d": lambda ary: diff(flatten_constant(ary)),
     }
 )
 
@@ -115,11 +116,7 @@ def trapezoid(y: Array, x: Any = None, dx: Any = 1.0, axis: int = -1) -> Any:
         x = as_array(x)
         width = diff(x, 1, 0 if x.ndim == 1 else at)
         width = width[(..., *(None,) * (y.ndim - 1 - at))] if x.ndim == 1 and y.ndim > 1 else width
-    both = elementwise("add", y.select(at, slice(1, None)), y.select(at, slice(None, -1)))
-    return along("sum", elementwise("multiply", width, elementwise("divide", both, 2.0)), at)
-
-
-array_functions({"ediff1d": lambda ary: diff(flatten_constant(ary))})
+    return along("sum", width * ((y.select(at, slice(1, None)) + y.select(at, slice(None, -1))) / 2.0), at)
 
 
 # --- the order of numbers --------------------------------------------------------------------------------------------
@@ -136,7 +133,7 @@ array_functions(
             a, 0.5, axis, keepdims=keepdims
         ),
         "percentile": lambda a, q, axis=None, *, method="linear", keepdims=False: quantile(
-            a, elementwise("divide", q, 100.0), axis, method=method, keepdims=keepdims
+            a, q / 100.0, axis, method=method, keepdims=keepdims
         ),
     }
 )
@@ -160,13 +157,9 @@ def quantile(a: Array, q: Any, axis: Any = None, *, method: Any = "linear", keep
     """Between the two entries of the sorted numbers at (n - 1) q; NaN if one of the numbers is NaN."""
     fractions = require_constant(q, "q of np.quantile")
     axes = a.row_axes(axis)
-    x = as_numbers(a)
-    if len(axes) != 1:
-        rest = [i for i in range(a.ndim) if i not in axes]
-        x = rearrange(lambda p: p.transpose([*rest, *axes]).reshape([*(p.shape[i] for i in rest), -1]), x)
-        at = len(rest)
-    else:
-        at = axes[0]
+    rest = [i for i in range(a.ndim) if i not in axes]
+    x, at = as_numbers(a), len(rest)
+    x = rearrange(lambda p: p.transpose([*rest, *axes]).reshape([*(p.shape[i] for i in rest), -1]), x)
     ordered, is_nan = scan("sort", x, at), along("any", elementwise("isnan", x), at)
     if ((fractions < 0) | (fractions > 1)).any():
         raise ValueError("quantiles are between 0 and 1, percentiles between 0 and 100")
@@ -175,8 +168,7 @@ def quantile(a: Array, q: Any, axis: Any = None, *, method: Any = "linear", keep
         for fraction in fractions.ravel()
     ]
     if keepdims:
-        full_shape = tuple(1 if i in axes else size for i, size in enumerate(a.row_shape))
-        results = [result.reshaped(full_shape, a.batch_axis) for result in results]
+        results = [FUNCTIONS["expand_dims"](result, axes) for result in results]
     return results[0] if not fractions.ndim else stack(results, 0)
 
 
@@ -190,4 +182,4 @@ def _at_fraction(ordered: Array, at: int, fraction: float, method: str) -> Any:
     if method not in weights:
         raise RefusedError("E-NUMPY", f"method={method[:40]!r}: use one of {', '.join(weights)}")
     weight = weights[method]
-    return {0.0: low, 1.0: high}.get(weight, elementwise("add", low, (high - low) * weight))
+    return {0.0: low, 1.0: high}.get(weight, low + (high - low) * weight)

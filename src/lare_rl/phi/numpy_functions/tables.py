@@ -14,6 +14,7 @@ from lare_rl.phi.builder import current_builder
 from lare_rl.phi.limits import MAX_CONSTANT_SIZE, MAX_SYSTEM_SIZE, RefusedError
 from lare_rl.phi.numpy_functions.reductions import along
 from lare_rl.phi.numpy_functions.registry import (
+    FUNCTIONS,
     array_functions,
     as_float,
     as_numbers,
@@ -86,8 +87,8 @@ for _name in (
 
 def _steps_above(x: Array, edges: Array, op: str) -> Array:
     """Return how many edges lie below each number (op "greater") or not above it ("greater_equal"). NaN lies above all."""
-    beyond = elementwise({"greater": "less_equal", "greater_equal": "less"}[op], x[..., None], edges)
-    return along("sum", elementwise("logical_not", beyond), -1)
+    column = x[..., None]
+    return along("sum", ~(column <= edges if op == "greater" else column < edges), -1)
 
 
 @numpy_function()
@@ -102,7 +103,7 @@ def digitize(x: Array, bins: Array, right: Any = False) -> Any:
     edges = require_constant(bins, "the bins of np.digitize")
     if len(edges) > 1 and edges[0] > edges[-1]:  # falling: bins[i - 1] > x >= bins[i]
         count = _steps_above(x, as_array(edges), "greater_equal" if not right else "greater")
-        return elementwise("subtract", len(edges), count)
+        return len(edges) - count
     return _steps_above(x, as_array(edges), "greater" if right else "greater_equal")
 
 
@@ -112,7 +113,7 @@ def interp(x: Array, xp: Array, fp: Array, left: Any = None, right: Any = None, 
     knots = require_constant(xp, "xp of np.interp").astype(float)
     x = as_numbers(x)
     if period is not None:
-        x = elementwise("remainder", x, as_float(period))
+        x %= as_float(period)
         order = np.argsort(knots % as_float(period), kind="stable")
         fp, knots = fp[as_array(order)], (knots % as_float(period))[order]
         knots = np.concatenate([[knots[-1] - period], knots, [knots[0] + period]])
@@ -120,13 +121,13 @@ def interp(x: Array, xp: Array, fp: Array, left: Any = None, right: Any = None, 
     if len(knots) != fp.row_shape[0] or not (np.diff(knots) >= 0).all():
         raise ValueError("np.interp needs rising xp, and as many fp")
     start = _interval(x, knots)
-    low, high = fp[start], fp[elementwise("add", start, 1)]
+    low, high = fp[start], fp[start + 1]
     left_edge, width = as_array(knots[:-1])[start], as_array(np.diff(knots))[start]
-    share = (x - left_edge) / elementwise("where", elementwise("equal", width, 0), 1.0, width)
-    result = low + (high - low) * elementwise("minimum", elementwise("maximum", share, 0.0), 1.0)
+    share = (x - left_edge) / elementwise("where", width == 0, 1.0, width)
+    result = low + (high - low) * FUNCTIONS["clip"](share, 0.0, 1.0)
     result = elementwise("where", elementwise("isnan", x), math.nan, result)
-    result = result if left is None else elementwise("where", elementwise("less", x, knots[0]), left, result)
-    return result if right is None else elementwise("where", elementwise("greater", x, knots[-1]), right, result)
+    result = result if left is None else elementwise("where", x < float(knots[0]), left, result)
+    return result if right is None else elementwise("where", x > float(knots[-1]), right, result)
 
 
 def _interval(x: Array, knots: np.ndarray) -> Any:
@@ -135,7 +136,7 @@ def _interval(x: Array, knots: np.ndarray) -> Any:
         raise ValueError("np.interp needs at least two points")
     current_builder().check_size((math.prod(x.row_shape), len(knots)))
     if len(knots) == 2:
-        return elementwise("multiply", 0, elementwise("isnan", x))
+        return elementwise("isnan", x) * 0
     return _steps_above(x, as_array(knots[1:-1]), "greater_equal")
 
 
@@ -148,8 +149,7 @@ def unravel_index(indices: Array, shape: Any, order: Any = "C") -> tuple[Any, ..
 @numpy_function()
 def ravel_multi_index(multi_index: Any, dims: Any, *, order: Any = "C") -> Any:
     strides = _strides(as_sizes(dims), order)
-    terms = [elementwise("multiply", index, stride) for index, stride in zip(multi_index, strides, strict=True)]
-    return functools.reduce(lambda x, y: elementwise("add", x, y), terms)
+    return sum(as_array(index) * stride for index, stride in zip(multi_index, strides, strict=True))
 
 
 def _strides(sizes: Sequence[int], order: Any) -> list[int]:
@@ -178,7 +178,7 @@ def polyval(p: Any, x: Array) -> Any:
     coefficients = p.falling if isinstance(p, Polynomial) else as_array(p)
     result: Any = as_array(0.0)
     for i in range(coefficients.row_shape[0]):
-        result = elementwise("add", elementwise("multiply", result, x), coefficients[i])
+        result = result * x + coefficients[i]
     return result
 
 
@@ -222,5 +222,5 @@ for _name in "polyder polyint polymul polyadd".split():
 def isin(element: Array, test_elements: Any, invert: Any = False, assume_unique: Any = False) -> Any:
     values = as_array(list(test_elements) if isinstance(test_elements, (dict, range)) else test_elements)
     values.row_axes(None)
-    hit = along("any", elementwise("equal", element[..., None], values.reshaped((-1,), None)), -1)
-    return elementwise("logical_not", hit) if invert else hit
+    hit = along("any", element[..., None] == values.reshaped((-1,), None), -1)
+    return ~hit if invert else hit
