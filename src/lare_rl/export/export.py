@@ -75,7 +75,7 @@ def export_run(run: Run | str | Path, out: str | Path, seed: int | None = None, 
     credit = select_seed(learner.decoders, seed_index)
     no_reward_reason = missing_reward_reason(config.method)
     for team_index, role in enumerate(task.roles if no_reward_reason is None else ()):
-        phi = run.functions[team_index].graph if run.functions else None
+        phi = run.functions[team_index] if run.functions else None
         graph = reward_graph(credit[team_index] if credit else None, config, team_index, phi)
         graphs["reward" if role is task else f"reward_{role.team}"] = graph
     functions = {name: _describe_graph(graph) for name, graph in graphs.items()}

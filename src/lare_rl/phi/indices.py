@@ -86,9 +86,10 @@ def computed_positions(array: Shaped, entries: Sequence[Any], as_array: Callable
         axis = None if entry is None else next(axes)
         size, stride = (1, 0) if axis is None else (array.row_shape[axis], math.prod(array.row_shape[axis + 1 :]))
         if axis is not None and axis == array.batch_axis:
-            if entry is None or not getattr(entry, "is_row_number", False) or size > 1:
+            if not getattr(entry, "is_row_number", False) or math.prod(entry.row_shape) != size:
                 raise RefusedError("E-ROWS", "an index that differs from row to row is x[np.arange(len(x)), i]")
-            computed = as_array(np.zeros(entry.row_shape, int)).reshaped(entry.row_shape, entry.batch_axis) + computed
+            rows = as_array(np.arange(size) * stride).reshaped(entry.row_shape, entry.batch_axis)
+            computed = rows + computed
         elif not isinstance(entry, slice) and entry is not None:
             computed = _clamp(as_array(entry), size) * stride + computed
     arrays = [i for i, entry in enumerate(entries) if not isinstance(entry, slice) and entry is not None]

@@ -9,7 +9,7 @@ import threading
 import warnings
 from concurrent.futures import ThreadPoolExecutor
 
-from lare_rl.phi.arrays import Array
+from lare_rl.phi.arrays import Array, concatenate
 from lare_rl.phi.attributes import module_attribute
 from lare_rl.phi.builder import Builder, building, current_builder
 from lare_rl.phi.graph import Graph
@@ -37,7 +37,7 @@ from lare_rl.phi.values import (
 )
 from lare_rl.util.sanitize import first_invisible
 
-__all__ = ["FUNCTION_NAME", "describe_failure", "parse", "read"]
+__all__ = ["FUNCTION_NAME", "apply_program", "describe_failure", "parse", "read"]
 
 _PARSING = threading.Lock()
 """`threading.stack_size` is for the whole process. Before Python 3.11.8 and 3.12.2, parsers in two threads may also miscount
@@ -104,6 +104,21 @@ def read(source: str, observation_size: int, action_size: int, max_factors: int 
     first = f"{code} line {line}: {' '.join(message[:MAX_MESSAGE_LENGTH].split())}"
     further = [] if tree is None else _unavailable_names(tree, interpreter.module)
     raise RefusedError(code, "\n".join(dict.fromkeys([first, *further])), line) from None
+
+
+def apply_program(source: str, observation: Array, action: Array) -> Array:
+    """Carry out a program that could be read in the graph that is being built.
+
+    Args:
+        observation, action: (rows, size), with the batch axis 0: several rows for each row of the graph.
+
+    Returns:
+        The factors (rows, n_factors), with the batch axis 0.
+    """
+    interpreter = Interpreter(current_builder())
+    interpreter.run(parse(source).body, interpreter.module)
+    factors = interpreter.call(interpreter.module[FUNCTION_NAME], [observation, action], {})
+    return concatenate(factors, 1)
 
 
 def describe_failure(error: Exception, interpreter: Interpreter) -> tuple[str, str, int | None]:

@@ -66,9 +66,8 @@ def empty_like(prototype: Array, dtype: Any = None, shape: Any = None) -> Array:
 @numpy_function()
 def arange(start: Any, stop: Any = None, step: Any = 1, dtype: Any = None) -> Array:
     start, stop = (0, start) if stop is None else (start, stop)
-    if isinstance(stop, BatchSize) and (start, step) == (0, 1) and stop.factor == 1:
-        builder = current_builder()
-        return Array(builder.add("row_number", (), (1,), "int"), 0)
+    if isinstance(stop, BatchSize) and (start, step) == (0, 1):
+        return Array(current_builder().add("row_number", (), (stop.factor,), "int"), 0)
     first, last, width = (x if isinstance(x, (int, float)) else as_array(x).number() for x in (start, stop, step))
     if not width or not math.isfinite((last - first) / width):
         raise ValueError("np.arange needs finite numbers, and a step that is not 0")
@@ -102,18 +101,13 @@ def fromfunction(function: Callable[..., Any], shape: Any, *, dtype: Any = "floa
 
 @numpy_function()
 def apply_along_axis(func1d: Callable[..., Any], axis: int, arr: Array, *args: Any, **kwargs: Any) -> Any:
-    """Apply a function to each series along an axis. It is called once for all rows, for each entry of the other axes."""
+    """Apply a function to each series along the last axis. It is called once for all rows, for each entry of the other axes."""
     (at,) = arr.row_axes(axis)
-    lead = [i for i in range(arr.ndim) if i not in (at, arr.batch_axis)]
-    if at != arr.ndim - 1 or (arr.batch_axis is not None and (arr.batch_axis or arr.row_shape[0] != 1)):
+    if at != arr.ndim - 1:
         raise RefusedError("E-NUMPY", "np.apply_along_axis works along the last axis: use axis=-1")
     in_row = Array(arr.node, None).reshaped((-1, arr.row_shape[at]), None)  # arrays of one row, without a batch axis
-    series = [as_array(func1d(in_row[i], *args, **kwargs)) for i in range(in_row.row_shape[0])]
-    results = stack(series, 0)
-    shape = (*(arr.row_shape[i] for i in lead), *results.row_shape[1:])
-    return Array(
-        current_builder().reshape(results.node, shape if arr.batch_axis is None else (1, *shape)), arr.batch_axis
-    )
+    results = stack([as_array(func1d(series, *args, **kwargs)) for series in in_row], 0)
+    return results.reshaped((*arr.row_shape[:-1], *results.row_shape[1:]), arr.batch_axis)
 
 
 class Concatenator:
