@@ -92,7 +92,7 @@ def read(source: str, observation_size: int, action_size: int, max_factors: int 
             and often what to write instead: first what stopped the reader, then further names that are not available.
     """
     builder, tree = Builder(), None
-    interpreter = Interpreter(builder, has_yield="yield" in source)
+    interpreter = Interpreter(builder)
     try:
         with building(builder), warnings.catch_warnings():
             warnings.simplefilter("ignore")

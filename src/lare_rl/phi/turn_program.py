@@ -61,8 +61,7 @@ class TurnProgram:
             RefusedError: the program fails, costs too much, or returns something else. The message has a line for its author.
         """
         with building(builder := Builder()):
-            interpreter = Interpreter(builder, has_yield="yield" in self.source)
-            interpreter.meter = Meter(MAX_STEPS)
+            interpreter = Interpreter(builder, MAX_STEPS)
             interpreter.module["find_numbers"] = Bound(lambda value: _find_numbers(interpreter.meter, value))
             inputs = [shorten(tool), _copy_argument(dict(arguments)), shorten(result), shorten(text)]
             try:
