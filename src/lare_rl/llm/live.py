@@ -80,7 +80,7 @@ class LiveModel:
     on_message: Callable[[str], None] = lambda _: None
     """Called with messages about waiting and retries."""
     sleep: Callable[[float], None] = time.sleep
-    forms: RequestForms = RequestForms()
+    forms: RequestForms = field(default_factory=RequestForms)
     """The requests that the server may support. They become fewer when it refuses one."""
 
     def __post_init__(self) -> None:

@@ -261,7 +261,7 @@ def as_array(value: Any) -> Array:
 
 
 COMPLEX_OPERATIONS: dict[str, Callable[..., Any]] = {}
-"""What `elementwise` does if an operand is complex. `complex_numbers.py` fills it."""
+"""Functions of complex arrays. `complex_numbers.py` fills this table."""
 
 
 def elementwise(op: str, *operands: Any) -> Any:

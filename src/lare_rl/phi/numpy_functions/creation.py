@@ -47,10 +47,10 @@ def full(shape: Any, fill_value: Any, dtype: Any = None) -> Array:
     return filled if dtype is None else astype(filled, dtype)
 
 
-@numpy_function()
-def empty(shape: Any, dtype: Any = "float") -> Array:
-    """Not a number, until the program has written numbers into it."""
-    return full(shape, math.nan if dtype_kind(dtype) == "float" else 0, dtype)
+@numpy_variants({"zeros": 0, "ones": 1, "empty": math.nan})
+def fill(value: float, shape: Any, dtype: Any = "float") -> Array:
+    """Fill with a number. `empty` is NaN until the program has written numbers into it."""
+    return full(shape, 0 if value != value and dtype_kind(dtype) != "float" else value, dtype)
 
 
 @numpy_function()
@@ -58,9 +58,9 @@ def full_like(a: Array, fill_value: Any, dtype: Any = None, shape: Any = None) -
     return full(a.shape if shape is None else shape, fill_value, a.kind if dtype is None else dtype)
 
 
-@numpy_function()
-def empty_like(prototype: Array, dtype: Any = None, shape: Any = None) -> Array:
-    return empty(prototype.shape if shape is None else shape, prototype.kind if dtype is None else dtype)
+@numpy_variants({"zeros_like": 0, "ones_like": 1, "empty_like": math.nan})
+def fill_like(value: float, a: Array, dtype: Any = None, shape: Any = None) -> Array:
+    return fill(value, a.shape if shape is None else shape, a.kind if dtype is None else dtype)
 
 
 @numpy_function()
@@ -110,39 +110,30 @@ def apply_along_axis(func1d: Callable[..., Any], axis: int, arr: Array, *args: A
     return results.reshaped((*arr.row_shape[:-1], *results.row_shape[1:]), arr.batch_axis)
 
 
-class Concatenator:
-    """np.r_ and np.c_: arrays joined by an index. Slices stand for ranges."""
+class Indexed:
+    """An object of NumPy that makes an array of an index. Slices stand for ranges."""
 
-    def __init__(self, columns: bool):
-        self.columns = columns
+    def __init__(self, join: Callable[[list[Array]], Any]):
+        self.join = join
 
     def __getitem__(self, index: Any) -> Any:
-        items = [self.item(item) for item in (index if isinstance(index, tuple) else (index,))]
-        if self.columns:
-            return FUNCTIONS["column_stack"](items)
-        return rearrange(lambda arrays: np.concatenate(list(map(np.atleast_1d, arrays))), items)
+        return self.join(list(map(_read_range, index if isinstance(index, tuple) else (index,))))
 
-    def item(self, item: Any) -> Array:
-        if isinstance(item, slice) and isinstance(item.step, complex):  # 5j: five numbers
-            return FUNCTIONS["linspace"](as_float(item.start or 0), as_float(item.stop), int(item.step.imag))
-        if isinstance(item, slice):
-            return arange(item.start or 0, item.stop, 1 if item.step is None else item.step)
+
+def _read_range(item: Any) -> Array:
+    if not isinstance(item, slice):
         return as_array(item)
+    if isinstance(item.step, complex):  # 5j: five numbers
+        return FUNCTIONS["linspace"](as_float(item.start or 0), as_float(item.stop), int(item.step.imag))
+    return arange(item.start or 0, item.stop, 1 if item.step is None else item.step)
 
 
-class Grid:
-    """np.mgrid and np.ogrid: grids of ranges."""
-
-    def __init__(self, sparse: bool):
-        self.sparse = sparse
-
-    def __getitem__(self, index: Any) -> Any:
-        ranges = [Concatenator(False).item(item) for item in (index if isinstance(index, tuple) else (index,))]
-        grids = meshgrid(*ranges, indexing="ij", sparse=self.sparse)
-        return grids if self.sparse else FUNCTIONS["stack"](grids)
-
-
-INDEXED = {"r_": Concatenator(False), "c_": Concatenator(True), "mgrid": Grid(False), "ogrid": Grid(True)}
+INDEXED = {
+    "r_": Indexed(lambda items: rearrange(lambda arrays: np.concatenate(list(map(np.atleast_1d, arrays))), items)),
+    "c_": Indexed(lambda items: rearrange(np.column_stack, items)),
+    "mgrid": Indexed(lambda ranges: stack(meshgrid(*ranges, indexing="ij"), 0)),
+    "ogrid": Indexed(lambda ranges: meshgrid(*ranges, indexing="ij", sparse=True)),
+}
 """Objects of NumPy that are used with an index."""
 
 
@@ -156,8 +147,6 @@ def indices(dimensions: Any, dtype: Any = "int") -> Array:
 array_functions(
     {
         "copy": lambda a: a.copy(),
-        "zeros_like": lambda a, dtype=None, shape=None: full_like(a, 0, dtype, shape),
-        "ones_like": lambda a, dtype=None, shape=None: full_like(a, 1, dtype, shape),
         "ix_": lambda *args: rearrange(lambda arrays: np.ix_(*arrays), list(args)),
     }
 )
@@ -165,7 +154,5 @@ numpy_functions(
     {
         "astype": astype,
         "identity": lambda n, dtype="float": unit_matrix(np.eye, operator.index(n), dtype=dtype),
-        "zeros": lambda shape, dtype="float": full(shape, 0, dtype),
-        "ones": lambda shape, dtype="float": full(shape, 1, dtype),
     }
 )

@@ -65,24 +65,26 @@ def plain_constant(x: Any, name: str, largest: int) -> Any:
     return values.item() if values.ndim == 0 else values
 
 
-for _name, _options in {
-    "nonzero": "", "flatnonzero": "", "argwhere": "", "union1d": "", "intersect1d": "", "setdiff1d": "", "setxor1d": "",
-    "unique": "return_index return_inverse return_counts", "array_equal": "", "trim_zeros": "", "i0": "", "hanning": "",
-    "hamming": "", "blackman": "", "bartlett": "", "kaiser": "", "histogram": "bins", "bincount": "minlength",
-    "vander": "N increasing", "triu_indices_from": "k", "tril_indices_from": "k",
+for _largest, _options_by_name in {
+    MAX_CONSTANT_SIZE: {
+        **dict.fromkeys(
+            "nonzero flatnonzero argwhere union1d intersect1d setdiff1d setxor1d array_equal trim_zeros i0 hanning hamming blackman "
+            "bartlett kaiser".split(), "",
+        ),
+        "unique": "return_index return_inverse return_counts", "histogram": "bins", "bincount": "minlength",
+        "vander": "N increasing", "triu_indices_from": "k", "tril_indices_from": "k",
+    },
+    MAX_SYSTEM_SIZE: {
+        **dict.fromkeys("roots poly diag_indices gcd lcm".split(), ""), "polyfit": "deg", "tril_indices": "k m",
+        "triu_indices": "k m", "cov": "ddof rowvar", "corrcoef": "rowvar", "allclose": "rtol atol",
+        **dict.fromkeys("polyadd polysub polymul polyder polyint polydiv".split(), "m"),
+        **{f"polynomial.polynomial.{name}": "m" for name in "polyder polyint polymul polyadd".split()},
+    },
 }.items():  # fmt: skip
-    register_constant_function(_name, _options)
-for _name, _options in {
-    "roots": "", "poly": "", "polyfit": "deg", "tril_indices": "k m", "triu_indices": "k m", "diag_indices": "",
-    "cov": "ddof rowvar", "corrcoef": "rowvar", "gcd": "", "lcm": "", "allclose": "rtol atol",
-}.items():  # fmt: skip
-    register_constant_function(_name, _options, MAX_SYSTEM_SIZE)
-
-
-for _name in (
-    "linalg.pinv linalg.cholesky linalg.matrix_rank linalg.cond linalg.eigh linalg.svd linalg.svdvals linalg.qr".split()
-):
-    register_constant_function(_name, work=lambda x: np.size(x) * max(np.shape(x), default=1))
+    for _name, _options in _options_by_name.items():
+        register_constant_function(_name, _options, _largest)
+for _name in "pinv cholesky matrix_rank cond eigh svd svdvals qr".split():
+    register_constant_function(f"linalg.{_name}", work=lambda x: np.size(x) * max(np.shape(x), default=1))
 
 
 def _steps_above(x: Array, edges: Array, op: str) -> Array:
@@ -209,11 +211,6 @@ array_functions(
         "poly1d": lambda c_or_r: Polynomial(c_or_r),
     }
 )
-for _name in "polyadd polysub polymul polyder polyint polydiv".split():
-    register_constant_function(_name, "m", MAX_SYSTEM_SIZE)
-for _name in "polyder polyint polymul polyadd".split():
-    register_constant_function(f"polynomial.polynomial.{_name}", "m", MAX_SYSTEM_SIZE)
-
 
 # --- sets ---------------------------------------------------------------------------------------------------------------
 
