@@ -70,7 +70,6 @@ def reward_graph(
 
 
 def _reward(arrays: dict[str, Any], credit: DecoderState | None, config: TrainConfig) -> Any:
-    """Return the proxy rewards of one step."""
     inputs, length = arrays["inputs"], arrays.get("length")
     rows = inputs if inputs.ndim > 1 else inputs[None]
     if credit is None:

@@ -114,7 +114,6 @@ def _read_header(file: Path) -> tuple[dict[str, str], str]:
 
 
 def _was_changed(header: dict[str, str], source: str) -> bool:
-    """Return whether the header has the hash of another source."""
     return header.get("sha256") not in (None, source_hash(source))
 
 

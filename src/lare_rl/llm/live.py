@@ -144,7 +144,6 @@ class LiveModel:
                 raise BudgetExceededError(f"{error}{cause}") from None
 
     def _request(self, messages: Sequence[Message]) -> str | _Failure:
-        """Send one request. Return the reply, or why there is none."""
         max_tokens = min(self.forms.reply_tokens, self.budget.max_reply_tokens(messages, MIN_REPLY_TOKENS))
         request = self.forms.request(self.name, messages, max_tokens, self.temperature)
         self.budget.requests_used += 1

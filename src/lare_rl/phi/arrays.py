@@ -65,7 +65,6 @@ class Array(_Value):
 
     @property
     def shape(self) -> tuple[Any, ...]:
-        """Shape that the program sees."""
         return program_shape(self.row_shape, self.batch_axis)
 
     @property
@@ -351,10 +350,8 @@ def broadcast(array: Array, shape: Sequence[Any]) -> Array:
 
 
 def stack(arrays: Sequence[Array], axis: int) -> Array:
-    """Join arrays along a new axis."""
     return rearrange(np.stack, list(arrays), axis)
 
 
 def concatenate(arrays: Sequence[Array], axis: int | None) -> Array:
-    """Join arrays along an axis."""
     return rearrange(np.concatenate, list(arrays), axis)

@@ -141,7 +141,6 @@ def get_attribute(runtime: Runtime, owner: Any, name: str) -> Any:
 
 
 def module_attribute(module: str, name: str) -> Any:
-    """Return module.name."""
     full = f"{module}.{name}"
     if full in CONSTANTS:
         return CONSTANTS[full]

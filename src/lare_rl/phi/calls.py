@@ -161,7 +161,6 @@ IGNORED_DECORATORS = frozenset(
 
 
 def make_class(runtime: Runtime, statement: ast.ClassDef, scope: Scope) -> Class:
-    """Carry out the definition of a class."""
     bases = [runtime.evaluate(base, scope) for base in statement.bases]
     program_bases = [base for base in bases if isinstance(base, Class)]
     names = {x.name if isinstance(x, Symbol) else "that is no class" for x in bases if not isinstance(x, Class)}
@@ -180,7 +179,6 @@ def make_class(runtime: Runtime, statement: ast.ClassDef, scope: Scope) -> Class
 
 
 def decorate(runtime: Runtime, value: Any, decorators: Sequence[ast.expr], scope: Scope) -> Any:
-    """Apply the decorators of a function or of a class."""
     for node in reversed(decorators):
         decorator = runtime.evaluate(node.func if isinstance(node, ast.Call) else node, scope)
         name = decorator.name if isinstance(decorator, Symbol) else ""
@@ -196,7 +194,6 @@ def decorate(runtime: Runtime, value: Any, decorators: Sequence[ast.expr], scope
 
 
 def new_instance(runtime: Runtime, cls: Class, args: Sequence[Any], kwargs: Mapping[str, Any]) -> Instance:
-    """Create an object of a class."""
     instance = Instance(cls)
     if cls.has("__init__"):
         runtime.call(class_attribute(runtime, instance, "__init__"), args, kwargs)

@@ -32,7 +32,6 @@ def as_complex(value: Any) -> Complex:
 
 
 def is_complex(value: Any) -> bool:
-    """Return whether a value, or an entry of a list, is complex."""
     if isinstance(value, (list, tuple)):
         return any(isinstance(item, (Complex, complex)) for item in value)
     return isinstance(value, (Complex, complex))

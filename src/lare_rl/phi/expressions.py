@@ -82,7 +82,6 @@ def _compare(runtime: Runtime, op: ast.cmpop, x: Any, y: Any) -> Any:
 
 
 def get_item(runtime: Runtime, container: Any, index: Any) -> Any:
-    """Return container[index]."""
     runtime.meter.pay_for_all_within([index])
     match container:
         case Array() | Complex():
@@ -138,7 +137,6 @@ def list_items(runtime: Runtime, value: Any) -> Sequence[Any]:
 
 
 def evaluate(runtime: Runtime, node: ast.expr, scope: Scope) -> Any:
-    """Return the value of an expression."""
     runtime.meter.pay()
     match node:
         case ast.Constant(value=value):

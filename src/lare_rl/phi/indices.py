@@ -8,14 +8,17 @@ from __future__ import annotations
 import math
 import operator
 from collections.abc import Callable, Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from lare_rl.phi.builder import current_builder
 from lare_rl.phi.graph import all_positions
 from lare_rl.phi.limits import RefusedError
-from lare_rl.phi.operand import BatchSize, Shaped
+from lare_rl.phi.operand import BatchSize
+
+if TYPE_CHECKING:
+    from lare_rl.phi.arrays import Array
 
 __all__ = ["ALL", "check_rows", "computed_positions", "index_entries", "is_mask", "masked_index", "overwrite"]
 
@@ -27,7 +30,7 @@ def is_mask(entry: Any) -> bool:
     return getattr(entry, "kind", None) == "bool"
 
 
-def index_entries(array: Shaped, items: Sequence[Any]) -> list[Any]:
+def index_entries(array: Array, items: Sequence[Any]) -> list[Any]:
     """Return an index as an entry for each axis, and None for each new one: slices, integers, arrays of integers."""
     entries: list[Any] = []
     for item in items:
@@ -57,14 +60,14 @@ def _read_slice(entry: slice) -> slice:
     return slice(*(None if end is None else operator.index(end) for end in (entry.start, stop, entry.step)))
 
 
-def check_rows(array: Shaped, entries: Sequence[Any]) -> None:
+def check_rows(array: Array, entries: Sequence[Any]) -> None:
     """Raise `RefusedError` if an index selects rows of the batch."""
     axes = [entry for entry in entries if entry is not None]
     if array.batch_axis is not None and axes[array.batch_axis] not in (ALL, slice(0, None), slice(0, None, 1)):
         raise RefusedError("E-ROWS", f"an index into the rows of {array.shape} takes one row for all: write x[:, i]")
 
 
-def masked_index(array: Shaped, entries: Sequence[Any]) -> tuple[Any, ...]:
+def masked_index(array: Array, entries: Sequence[Any]) -> tuple[Any, ...]:
     """Return the index of all numbers that the mask in front of an index may select."""
     mask = entries[0]
     if mask.batch_axis != array.batch_axis or mask.row_shape != array.row_shape[: mask.ndim]:
@@ -74,7 +77,7 @@ def masked_index(array: Shaped, entries: Sequence[Any]) -> tuple[Any, ...]:
     return (ALL,) * mask.ndim + tuple(entries[1:])
 
 
-def computed_positions(array: Shaped, entries: Sequence[Any], as_array: Callable[[Any], Any]) -> Any:
+def computed_positions(array: Array, entries: Sequence[Any], as_array: Callable[[Any], Any]) -> Any:
     """Return the array of the positions of x[np.arange(batch), i, 2:4] in a row.
 
     Each row reads its own numbers, or those of a constant. A computed index beyond the end of an axis stands for the last

@@ -43,7 +43,6 @@ class Interpreter(Runtime):
     truth = expressions.test_truth
 
     def attribute(self, owner: Any, name: str) -> Any:
-        """Return owner.name."""
         if isinstance(owner, (Instance, Class)):
             return class_attribute(self, owner, name)
         return get_attribute(self, owner, name)

@@ -4,11 +4,14 @@ from __future__ import annotations
 
 import operator
 from collections.abc import Callable, Sequence
-from typing import Any, Never, Protocol, runtime_checkable
+from typing import TYPE_CHECKING, Any, Never
 
 from lare_rl.phi.limits import RefusedError
 
-__all__ = ["BATCH", "BatchSize", "Operand", "Shaped", "common_batch_axis", "program_shape"]
+if TYPE_CHECKING:
+    from lare_rl.phi.arrays import Array
+
+__all__ = ["BATCH", "BatchSize", "Operand", "common_batch_axis", "program_shape"]
 
 
 def _operators(op: str) -> tuple[Callable[[Any, Any], Any], Callable[[Any, Any], Any]]:
@@ -117,21 +120,7 @@ def program_shape(row_shape: Sequence[int], batch_axis: int | None) -> tuple[Any
     return tuple(BatchSize(n) if axis == batch_axis else n for axis, n in enumerate(row_shape))
 
 
-@runtime_checkable
-class Shaped(Protocol):
-    """An array, as far as its axes go."""
-
-    batch_axis: int | None
-
-    @property
-    def row_shape(self) -> tuple[int, ...]: ...
-    @property
-    def shape(self) -> tuple[Any, ...]: ...
-    @property
-    def ndim(self) -> int: ...
-
-
-def common_batch_axis(arrays: Sequence[Shaped]) -> int | None:
+def common_batch_axis(arrays: Sequence[Array]) -> int | None:
     """Return the batch axis of the result, if arrays are broadcast to each other.
 
     Raises:

@@ -138,7 +138,6 @@ def describe_failure(error: Exception, interpreter: Interpreter) -> tuple[str, s
 
 
 def error_text(error: Exception) -> str:
-    """Return the message of an error that a program raised."""
     if isinstance(error, NameError):
         return f"{error} is not defined, or not available"
     return str(error) if isinstance(error, ProgramError) else f"{type(error).__name__}: {error}"

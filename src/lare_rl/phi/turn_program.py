@@ -43,8 +43,6 @@ NUMBER = re.compile(r"(?<![\w.])[-+]?\d{1,300}(?:\.\d{1,300})?(?!\d)")
 
 @dataclass(frozen=True)
 class TurnProgram:
-    """A program that was read."""
-
     source: str
     tree: ast.Module
 
@@ -126,7 +124,6 @@ def _find_numbers(meter: Meter, text: Any) -> list[float]:
 
 
 def _check_events(events: Any) -> dict[str, float]:
-    """Return the events of a program as numbers."""
     if type(events) is not dict:
         raise RefusedError("E-FORM", f"{TURN_FUNCTION_NAME} must return a dictionary of events, not {describe(events)}")
     if not 1 <= len(events) <= MAX_FACTORS:

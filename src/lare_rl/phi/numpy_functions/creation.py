@@ -48,7 +48,7 @@ def full(shape: Any, fill_value: Any, dtype: Any = None) -> Array:
 
 
 @numpy_variants({"zeros": 0, "ones": 1, "empty": math.nan})
-def fill(value: float, shape: Any, dtype: Any = "float") -> Array:
+def fill(value: Any, shape: Any, dtype: Any = "float") -> Array:
     """Fill with a number. `empty` is NaN until the program has written numbers into it."""
     return full(shape, 0 if value != value and dtype_kind(dtype) != "float" else value, dtype)
 
@@ -59,7 +59,7 @@ def full_like(a: Array, fill_value: Any, dtype: Any = None, shape: Any = None) -
 
 
 @numpy_variants({"zeros_like": 0, "ones_like": 1, "empty_like": math.nan})
-def fill_like(value: float, a: Array, dtype: Any = None, shape: Any = None) -> Array:
+def fill_like(value: Any, a: Array, dtype: Any = None, shape: Any = None) -> Array:
     return fill(value, a.shape if shape is None else shape, a.kind if dtype is None else dtype)
 
 
