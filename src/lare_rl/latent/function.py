@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Float
 
 from lare_rl.errors import LareError, short_repr
-from lare_rl.latent.factors import check_finite, compute_batch
+from lare_rl.latent.factors import NonFiniteFactorError, compute_batch
 from lare_rl.latent.verify import Check, Steps, Verdict, verify
 from lare_rl.llm.key import redact_key
 from lare_rl.llm.prompts import FunctionKind
@@ -112,7 +112,12 @@ class LatentFunction:
         if len(observations) != len(actions):
             raise LareError(f"there are {len(observations)} observations and {len(actions)} actions")
         factors = compute_batch(self.graph, observations, actions)
-        check_finite(factors, self.names, observations, actions)
+        if not np.isfinite(factors).all():
+            row, column = np.argwhere(~np.isfinite(factors))[0]
+            factor = f"factor {self.names[column]!r} is {factors[row, column]}"
+            text = np.array2string(observations[row], precision=3, threshold=6)
+            message = f"the latent function failed: {factor} for the observation {text}"
+            raise NonFiniteFactorError(message, observations, actions)
         return factors[0] if single else factors
 
     def step_factors(

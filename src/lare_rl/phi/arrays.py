@@ -15,7 +15,7 @@ import itertools
 import math
 import operator
 from collections.abc import Callable, Iterator, Sequence
-from functools import partial
+from functools import cached_property, partial
 from typing import Any
 
 import numpy as np
@@ -92,9 +92,8 @@ class Array(_Value):
         """Return the only number of a constant, as a number of Python."""
         values = self.constant
         if values is None:
-            raise RefusedError(
-                "E-FLOW", "a number or condition that differs from row to row: use np.where instead of if"
-            )
+            text = "a number or condition that differs from row to row: use np.where instead of if"
+            raise RefusedError("E-FLOW", text)
         if values.size != 1:
             raise ValueError("the truth value of an array with more than one element is ambiguous")
         return values.item()
@@ -120,12 +119,12 @@ class Array(_Value):
 
     # --- axes -----------------------------------------------------------------------------------------------------------
 
-    def axis(self, axis: Any, extra: int = 0) -> int:
-        """Return an axis counted from the front. `extra` axes are about to be added."""
-        number, ndim = operator.index(axis), self.ndim + extra
-        if not -ndim <= number < ndim:
+    def axis(self, axis: Any) -> int:
+        """Return an axis counted from the front."""
+        number = operator.index(axis)
+        if not -self.ndim <= number < self.ndim:
             raise IndexError(f"axis {number} is out of bounds for an array of the shape {self.shape}")
-        return number % ndim
+        return number % self.ndim
 
     def row_axes(self, axis: Any) -> tuple[int, ...]:
         """Return the axes of an operation along `axis`, which is an int, a tuple, or None for all axes.
@@ -137,23 +136,24 @@ class Array(_Value):
         axes = tuple(sorted(set(map(self.axis, numbers))))
         if self.batch_axis in axes:
             how = "without axis=" if axis is None else f"along axis {self.batch_axis}"
-            raise RefusedError(
-                "E-ROWS", f"{how}, the shape {self.shape} is computed over the batch: use axis=1 or axis=-1"
-            )
+            text = f"{how}, the shape {self.shape} is computed over the batch: use axis=1 or axis=-1"
+            raise RefusedError("E-ROWS", text)
         return axes
 
-    @property
+    @cached_property
     def source(self) -> Source:
         """The positions of its numbers in the base."""
         return Source(all_positions(self.row_shape) if self.positions is None else self.positions, self.batch_axis)
 
     def reshaped(self, row_shape: Sequence[int], batch_axis: int | None) -> Array:
-        """Return a view of another shape, whose batch axis is known."""
-        positions = self.source.positions
-        moved = positions.reshape(row_shape)
-        if np.may_share_memory(moved, positions):
-            return Array(self.base._node, batch_axis, self.base, moved)
-        return Array(current_builder().gather(self.base.node, moved), batch_axis)
+        """Return the array in another shape, whose batch axis is known."""
+        return self.moved(self.source.positions.reshape(row_shape), batch_axis)
+
+    def moved(self, positions: np.ndarray, batch_axis: int | None) -> Array:
+        """Return numbers of the base: a view, if NumPy made these positions a view of those of this array."""
+        if np.may_share_memory(positions, self.source.positions):
+            return Array(self.base._node, batch_axis, self.base, positions)
+        return Array(current_builder().gather(self.base.node, positions), batch_axis)
 
     def copy(self) -> Array:
         return Array(self.node, self.batch_axis)
@@ -184,9 +184,8 @@ class Array(_Value):
             if isinstance(value, Masked) and value.mask.node == region.mask.node:
                 value = value.values
             elif isinstance(value, Array) and value.batch_axis is not None:
-                raise ValueError(
-                    "x[mask] = y differs from row to row: write x[mask] = y[mask], or np.where(mask, y, x)"
-                )
+                text = "x[mask] = y differs from row to row: write x[mask] = y[mask], or np.where(mask, y, x)"
+                raise ValueError(text)
             value = elementwise("where", region.mask_for(region.values), value, region.values)
             self[masked_index(self, entries)] = value
         elif any(isinstance(entry, Array) for entry in entries):
@@ -334,9 +333,9 @@ def rearrange(function: Callable[..., Any], arrays: Any, *args: Any) -> Any:
 
     def to_array(source: Source) -> Array:
         positions, batch_axis = source
-        if len(inputs) == 1 and np.may_share_memory(positions, sources[0].positions):
-            return Array(base._node, batch_axis, base, positions)
         if positions.min() >= 0:
+            if len(inputs) == 1:
+                return inputs[0].moved(positions, batch_axis)
             return Array(builder.gather(builder.concat(nodes), positions), batch_axis)
         zero = builder.cast(builder.constant(0), widest([builder.nodes[node].kind for node in nodes]))
         return Array(builder.gather(builder.concat([*nodes, zero]), positions % (size + 1)), batch_axis)

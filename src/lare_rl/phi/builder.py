@@ -13,7 +13,17 @@ from typing import Any
 import numpy as np
 
 from lare_rl.phi.evaluate import compute
-from lare_rl.phi.graph import Gather, Graph, Node, NumberKind, all_positions, elementwise_kinds, letter_sizes, widest
+from lare_rl.phi.graph import (
+    KIND_OF_CODE,
+    Gather,
+    Graph,
+    Node,
+    NumberKind,
+    all_positions,
+    elementwise_kinds,
+    letter_sizes,
+    widest,
+)
 from lare_rl.phi.limits import DEFAULT_LIMITS, MAX_EINSUM_LETTERS, OPERATION_COST, GraphLimits, RefusedError
 
 __all__ = ["Builder", "building", "current_builder"]
@@ -23,8 +33,6 @@ ROW_OPS = {
     "first_row": "x[0] of the batch takes one row for all: write x[:, i] for entry i of every row",
 }
 """Values that a program may have, but not compute with: `np.arange(batch)` may be an index, and x[0] has a shape."""
-_KIND_OF_CODE: dict[str, NumberKind] = {"b": "bool", "i": "int", "u": "int", "f": "float"}
-"""Kinds by the codes of NumPy's types (`dtype.kind`)."""
 _DTYPES: dict[NumberKind, type] = {"bool": bool, "int": np.int64, "float": np.float64}
 
 
@@ -97,7 +105,7 @@ class Builder:
     def constant(self, value: Any) -> int:
         """Add numbers that never change."""
         array = np.asarray(value)
-        kind = _KIND_OF_CODE.get(array.dtype.kind)
+        kind = KIND_OF_CODE.get(array.dtype.kind)
         if kind is None:
             raise RefusedError("E-PYTHON", f"an array of {array.dtype}: only real numbers are available")
         return self.add("constant", (), array.shape, kind, np.array(array, _DTYPES[kind], order="C"))

@@ -89,7 +89,7 @@ def computed_positions(array: Array, entries: Sequence[Any], as_array: Callable[
         axis = None if entry is None else next(axes)
         size, stride = (1, 0) if axis is None else (array.row_shape[axis], math.prod(array.row_shape[axis + 1 :]))
         if axis is not None and axis == array.batch_axis:
-            if not getattr(entry, "is_row_number", False) or math.prod(entry.row_shape) != size:
+            if entry is None or not getattr(entry, "is_row_number", False) or math.prod(entry.row_shape) != size:
                 raise RefusedError("E-ROWS", "an index that differs from row to row is x[np.arange(len(x)), i]")
             rows = as_array(np.arange(size) * stride).reshaped(entry.row_shape, entry.batch_axis)
             computed = rows + computed

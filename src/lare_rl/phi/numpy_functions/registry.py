@@ -234,8 +234,6 @@ _CONVERSIONS: dict[str, Callable[[Any], Any]] = {
     "list[Array]": as_arrays,
     "int": operator.index,
     "float": as_float,
-    "Array | None": _optional(as_array),
     "Operand | None": _optional(as_operand),
     "int | None": _optional(operator.index),
-    "float | None": _optional(as_float),
 }

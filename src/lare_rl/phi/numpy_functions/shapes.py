@@ -63,7 +63,7 @@ numpy_functions(
     {
         "concatenate concat": lambda arrays, axis=0: rearrange(np.concatenate, as_arrays(arrays), axis),
         "append": lambda arr, values, axis=None: rearrange(
-            lambda both: np.append(*both, axis), [as_array(arr), as_array(values)]
+            lambda both: np.append(both[0], both[1], axis), [as_array(arr), as_array(values)]
         ),
         "block": lambda arrays: rearrange(np.block, _to_arrays(arrays)),
         "broadcast_shapes": lambda *args: broadcast_arrays(*map(FUNCTIONS["zeros"], args))[0].shape,
