@@ -5,6 +5,8 @@ from __future__ import annotations
 import math
 from typing import Any
 
+import numpy as np
+
 from lare_rl.phi.arrays import Array, as_array, broadcast, concatenate, elementwise, rearrange, stack
 from lare_rl.phi.builder import current_builder
 from lare_rl.phi.limits import RefusedError
@@ -68,44 +70,32 @@ def gradient(f: Array, *varargs: Any, axis: Any = None, edge_order: int = 1) -> 
     """Central differences inside, and one-sided differences at the ends."""
     axes = f.row_axes(axis)
     spacings = [as_array(x) for x in (varargs if len(varargs) == len(axes) else (varargs or (1.0,)) * len(axes))]
-    slopes = [_gradient_along(as_numbers(f), at, gap, edge_order) for at, gap in zip(axes, spacings, strict=True)]
+    slopes = []
+    for at, spacing in zip(axes, spacings, strict=True):
+        slope = _gradient_along_last_axis(rearrange(np.moveaxis, as_numbers(f), at, -1), spacing, edge_order)
+        slopes.append(rearrange(np.moveaxis, slope, -1, at))
     return slopes[0] if isinstance(axis, int) or len(slopes) == 1 else slopes
 
 
-def _gradient_along(f: Array, at: int, spacing: Array, edge_order: int) -> Any:
-    size = f.row_shape[at]
+def _gradient_along_last_axis(f: Array, spacing: Array, edge_order: int) -> Any:
+    size = f.row_shape[-1]
     if size < edge_order + 1:
         raise ValueError(f"np.gradient needs at least {edge_order + 1} numbers along its axis")
-
-    def entries(index: Any) -> Any:
-        return f.select(at, index)
-
-    x = [float(v) for v in require_constant(spacing, "the spacing of np.gradient").ravel()]
-    x = [i * x[0] for i in range(size)] if len(x) == 1 else x
-    shape = [-1 if i == at else 1 for i in range(f.ndim)]
-
-    def column(values: list[float]) -> Array:
-        return as_array(values).reshaped(shape, None)
-
-    pieces = [(entries(slice(1, 2)) - entries(slice(0, 1))) / (x[1] - x[0])]
+    x = require_constant(spacing, "the spacing of np.gradient").ravel().astype(float)
+    x = np.arange(size) * x[0] if len(x) == 1 else x
+    pieces = [(f[..., 1:2] - f[..., :1]) / (x[1] - x[0])]
     if size > 2:
-        steps = [(x[i] - x[i - 1], x[i + 1] - x[i]) for i in range(1, size - 1)]
-        w_before = column([-d1 / (d0 * (d0 + d1)) for d0, d1 in steps])
-        w_middle = column([(d1 - d0) / (d0 * d1) for d0, d1 in steps])
-        w_behind = column([d0 / (d1 * (d0 + d1)) for d0, d1 in steps])
-        pieces.append(
-            entries(slice(None, -2)) * w_before + entries(slice(1, -1)) * w_middle + entries(slice(2, None)) * w_behind
-        )
-    pieces.append((entries(slice(-1, None)) - entries(slice(-2, -1))) / (x[-1] - x[-2]))
+        d0, d1 = x[1:-1] - x[:-2], x[2:] - x[1:-1]
+        w_before, w_middle, w_behind = -d1 / (d0 * (d0 + d1)), (d1 - d0) / (d0 * d1), d0 / (d1 * (d0 + d1))
+        pieces.append(f[..., :-2] * w_before + f[..., 1:-1] * w_middle + f[..., 2:] * w_behind)
+    pieces.append((f[..., -1:] - f[..., -2:-1]) / (x[-1] - x[-2]))
     if edge_order == 2:
-        for piece, edge, middle, inner in ((0, 0, 1, 2), (-1, size - 1, size - 2, size - 3)):
-            d0, d1 = x[middle] - x[edge], x[inner] - x[middle]
-            pieces[piece] = (
-                entries(slice(edge, edge + 1)) * (-(2 * d0 + d1) / (d0 * (d0 + d1)))
-                + entries(slice(middle, middle + 1)) * ((d0 + d1) / (d0 * d1))
-                - entries(slice(inner, inner + 1)) * (d0 / (d1 * (d0 + d1)))
-            )
-    return concatenate(pieces, at)
+        for piece, (i, j, k) in ((0, (0, 1, 2)), (-1, (size - 1, size - 2, size - 3))):
+            d0, d1 = x[j] - x[i], x[k] - x[j]
+            edge, middle, inner = (f[..., [n]] for n in (i, j, k))
+            first = edge * (-(2 * d0 + d1) / (d0 * (d0 + d1)))
+            pieces[piece] = first + middle * ((d0 + d1) / (d0 * d1)) - inner * (d0 / (d1 * (d0 + d1)))
+    return concatenate(pieces, -1)
 
 
 @numpy_function("trapezoid", "trapz")
