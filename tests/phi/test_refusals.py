@@ -37,7 +37,7 @@ BODIES = {
     "return [action.reshape(3, -1)]": "E-ROWS line 3: (batch, 6)",
     "return [np.concatenate([observation, action])]": "E-RUN line 3: (batch, 17) and (batch, 6)",
     "return [np.concatenate([action, action])]": "E-ROWS line 3: (batch, 6)",
-    "return [np.array_split(action, 10 ** 9)]": "E-COST line 3: too large",
+    "return [np.array_split(action, np.array(10 ** 9))]": "E-COST line 3: too large",
     "return [np.unravel_index(7, (3, 4), order='F')[0] * observation]": "E-NUMPY line 3: np.transpose",
     "return [np.choose([0, 3], [1, 2], mode='wrap')[0] * observation]": "E-NUMPY line 3: mode",
     "return [np.polynomial.Polynomial([1, 2], domain=[0, 1])(observation)]": "E-NUMPY line 3: domain",

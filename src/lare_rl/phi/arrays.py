@@ -22,7 +22,7 @@ import numpy as np
 
 from lare_rl.phi.builder import current_builder
 from lare_rl.phi.graph import NumberKind, all_positions, widest
-from lare_rl.phi.indices import ALL, check_rows, computed_positions, index_entries, is_mask, masked_index, overwrite
+from lare_rl.phi.indices import ALL, check_index, computed_positions, index_entries, is_mask, masked_index, overwrite
 from lare_rl.phi.limits import RefusedError
 from lare_rl.phi.operand import BATCH, BatchSize, Operand, common_batch_axis, program_shape
 from lare_rl.phi.rearrange import Source, leaves, map_leaves, move
@@ -170,7 +170,7 @@ class Array(_Value):
         if self.batch_axis is not None and isinstance([e for e in entries if e is not None][self.batch_axis], int):
             shape = np.empty(self.row_shape)[tuple(0 if isinstance(entry, int) else entry for entry in entries)].shape
             return Array(current_builder().add("first_row", (), shape, self.kind), None)
-        check_rows(self, entries)
+        check_index(self, entries)
         return rearrange(lambda positions: positions[tuple(entries)], self)
 
     def select(self, axis: int, index: Any) -> Any:
@@ -194,7 +194,7 @@ class Array(_Value):
             values = broadcast(as_array(value), positions.shape)
             self[...] = Array(overwrite(self.node, positions.node, values.node), self.batch_axis)
         else:
-            check_rows(self, entries)
+            check_index(self, entries)
             region = move(lambda positions: positions[tuple(entries)], self.source, (), math.prod(self.base.row_shape))
             assert isinstance(region, Source)
             self._write(value, region)

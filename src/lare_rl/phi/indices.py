@@ -20,7 +20,7 @@ from lare_rl.phi.operand import BatchSize
 if TYPE_CHECKING:
     from lare_rl.phi.arrays import Array
 
-__all__ = ["ALL", "check_rows", "computed_positions", "index_entries", "is_mask", "masked_index", "overwrite"]
+__all__ = ["ALL", "check_index", "computed_positions", "index_entries", "is_mask", "masked_index", "overwrite"]
 
 ALL = slice(None)
 
@@ -60,11 +60,13 @@ def _read_slice(entry: slice) -> slice:
     return slice(*(None if end is None else operator.index(end) for end in (entry.start, stop, entry.step)))
 
 
-def check_rows(array: Array, entries: Sequence[Any]) -> None:
-    """Raise `RefusedError` if an index selects rows of the batch."""
+def check_index(array: Array, entries: Sequence[Any]) -> None:
+    """Raise `RefusedError` if an index selects rows of the batch, or too many numbers."""
     axes = [entry for entry in entries if entry is not None]
     if array.batch_axis is not None and axes[array.batch_axis] not in (ALL, slice(0, None), slice(0, None, 1)):
         raise RefusedError("E-ROWS", f"an index into the rows of {array.shape} takes one row for all: write x[:, i]")
+    # NumPy finds the shape of the result on an array without numbers.
+    current_builder().check_size(np.empty((*array.row_shape, 0))[(*entries, ALL)].shape[:-1])
 
 
 def masked_index(array: Array, entries: Sequence[Any]) -> tuple[Any, ...]:

@@ -109,8 +109,7 @@ def size(a: Array, axis: Any = None) -> Any:
 
 @numpy_variants({"split": np.split, "array_split": np.array_split})
 def split(function: Callable[..., Any], ary: Array, indices_or_sections: Any, axis: int = 0) -> list[Array]:
-    if isinstance(indices_or_sections, int):
-        current_builder().check_size([indices_or_sections])
+    current_builder().check_size([max(1, *as_sizes(indices_or_sections))])
     return rearrange(function, ary, indices_or_sections, axis)
 
 
