@@ -132,9 +132,8 @@ def get_attribute(runtime: Runtime, owner: Any, name: str) -> Any:
         case Masked() if name in ("clip", "astype", "round", "copy"):
             return Bound(lambda *args, **kwargs: call_numpy(name, [owner, *args], kwargs) if name != "copy" else owner)
     if isinstance(owner, Masked):
-        raise RefusedError(
-            "E-ROWS", f"x[mask].{name[:60]}: rows differ in what a mask selects: use np.where(mask, x, 0)"
-        )
+        text = f"x[mask].{name[:60]}: rows differ in what a mask selects: use np.where(mask, x, 0)"
+        raise RefusedError("E-ROWS", text)
     raise RefusedError("E-ATTRIBUTE", f".{name[:60]} of a {value_type(owner)} is not available")
 
 

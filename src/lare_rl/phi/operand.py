@@ -99,9 +99,8 @@ class BatchSize:
         return BatchSize(factor) if factor > 0 and not rest else self.refuse()
 
     def refuse(self, *_: Any) -> Never:
-        raise RefusedError(
-            "E-ROWS", "no factor can depend on the number of rows, and no loop can go over them: use columns, x[:, i]"
-        )
+        text = "no factor can depend on the number of rows, and no loop can go over them: use columns, x[:, i]"
+        raise RefusedError("E-ROWS", text)
 
     def __hash__(self) -> int:
         return hash(self.factor)
@@ -133,9 +132,8 @@ def common_batch_axis(arrays: Sequence[Array]) -> int | None:
         return None
     shapes = " and ".join(str(array.shape) for array in arrays)
     if len(axes_from_end) > 1:
-        raise RefusedError(
-            "E-ROWS", f"the shapes {shapes} combine each row with all others: use keepdims=True or [:, None]"
-        )
+        text = f"the shapes {shapes} combine each row with all others: use keepdims=True or [:, None]"
+        raise RefusedError("E-ROWS", text)
     (from_end,) = axes_from_end
     lengths = {array.row_shape[-from_end] for array in arrays if array.batch_axis is not None}
     fixed = {array.row_shape[-from_end] for array in arrays if array.batch_axis is None and array.ndim >= from_end}

@@ -177,9 +177,8 @@ def _build_graph(interpreter: Interpreter, observation_size: int, action_size: i
         outputs.append(_check_factors(interpreter.call(function, arrays, {}), max_factors))
         interpreter.meter, builder.work = Meter(), 0
     if outputs[0] != outputs[1]:
-        raise RefusedError(
-            "E-STATE", "a second call gives other factors: keep nothing in module variables, defaults or closures"
-        )
+        text = "a second call gives other factors: keep nothing in module variables, defaults or closures"
+        raise RefusedError("E-STATE", text)
     return builder.finish({"factors": builder.concat(outputs[0])})
 
 
@@ -193,14 +192,10 @@ def _check_factors(factors: object, max_factors: int) -> list[int]:
         raise RefusedError("E-FORM", f"{FUNCTION_NAME} must return {most}, not {len(factors)}")
     for number, factor in enumerate(factors, start=1):
         if not isinstance(factor, Array) or factor.batch_axis != 0 or factor.row_shape != (1, 1):
-            hint = (
-                ": write x[:, None], or keepdims=True in a sum"
-                if isinstance(factor, Array) and factor.row_shape == (1,)
-                else ""
-            )
-            raise RefusedError(
-                "E-FORM", f"factor {number} must be an array of the shape (batch, 1), not {_describe(factor)}{hint}"
-            )
+            is_flat = isinstance(factor, Array) and factor.row_shape == (1,)
+            hint = ": write x[:, None], or keepdims=True in a sum" if is_flat else ""
+            text = f"factor {number} must be an array of the shape (batch, 1), not {_describe(factor)}{hint}"
+            raise RefusedError("E-FORM", text)
     return [builder.reshape(builder.cast(factor.node, "float"), (1,)) for factor in factors]
 
 

@@ -87,9 +87,9 @@ def _to_source(positions: np.ndarray, two_rows: np.ndarray, three_rows: np.ndarr
     source = Source(positions, growing[0] if growing else None)
     for n_rows, labels in ((2, two_rows), (3, three_rows)):
         expected = Source(positions % size, source.batch_axis).labels(n_rows, size)
-        of_all_rows = (labels < 0) | (labels >= n_rows * size)
+        shared = (labels < 0) | (labels >= n_rows * size)
         if labels.shape != expected.shape or not np.all(
-            (labels == expected) | (of_all_rows & (labels % size == expected % size))
+            (labels == expected) | (shared & (labels % size == expected % size))
         ):
             raise ValueError("rows differ")
     return source

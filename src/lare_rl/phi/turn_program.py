@@ -131,9 +131,8 @@ def _check_events(events: Any) -> dict[str, float]:
     result = {}
     for name, value in events.items():
         if not isinstance(name, str) or not 0 < len(name) <= MAX_NAME or name != one_line(name):
-            raise RefusedError(
-                "E-FORM", f"the name of an event must be a text of 1 to {MAX_NAME} characters, in one line"
-            )
+            text = f"the name of an event must be a text of 1 to {MAX_NAME} characters, in one line"
+            raise RefusedError("E-FORM", text)
         if not isinstance(value, bool | int | float):
             raise RefusedError("E-FORM", f"the event {name!r} must be a number or a truth value, not {describe(value)}")
         if not abs(value) <= MAX_EVENT:

@@ -39,9 +39,8 @@ def einsum(subscripts: Any, *operands: Array, optimize: Any = False) -> Array:
     compact = "".join(subscripts.split())
     output = [letter for letter in compact.partition("->")[2] if letter != "."]
     if not PATTERN.fullmatch(compact) or len(set(output)) < len(output) or len(operands) > MAX_EINSUM_ARRAYS:
-        raise RefusedError(
-            "E-NUMPY", f"np.einsum({subscripts[:40]!r}): use at most 8 arrays and 20 letters: 'bij,bj->bi'"
-        )
+        text = f"np.einsum({subscripts[:40]!r}): use at most 8 arrays and 20 letters: 'bij,bj->bi'"
+        raise RefusedError("E-NUMPY", text)
     inputs, arrow, result = compact.partition("->")
     terms = inputs.split(",")
     unused = [letter for letter in string.ascii_letters if letter not in inputs]
