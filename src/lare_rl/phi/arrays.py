@@ -22,7 +22,7 @@ import numpy as np
 
 from lare_rl.phi.builder import current_builder
 from lare_rl.phi.graph import NumberKind, all_positions, widest
-from lare_rl.phi.indices import ALL, check_index, computed_positions, index_entries, is_mask, masked_index, overwrite
+from lare_rl.phi.indices import ALL, computed_positions, fixed_index, index_entries, is_mask, masked_index, overwrite
 from lare_rl.phi.limits import RefusedError
 from lare_rl.phi.operand import BATCH, BatchSize, Operand, common_batch_axis, program_shape
 from lare_rl.phi.rearrange import Source, leaves, map_leaves, move
@@ -170,8 +170,7 @@ class Array(_Value):
         if self.batch_axis is not None and isinstance([e for e in entries if e is not None][self.batch_axis], int):
             shape = np.empty(self.row_shape)[tuple(0 if isinstance(entry, int) else entry for entry in entries)].shape
             return Array(current_builder().add("first_row", (), shape, self.kind), None)
-        check_index(self, entries)
-        return rearrange(lambda positions: positions[tuple(entries)], self)
+        return self.moved(*fixed_index(self, entries))
 
     def select(self, axis: int, index: Any) -> Any:
         """Return x[index] along an axis that is counted from the front."""
@@ -194,21 +193,18 @@ class Array(_Value):
             values = broadcast(as_array(value), positions.shape)
             self[...] = Array(overwrite(self.node, positions.node, values.node), self.batch_axis)
         else:
-            check_index(self, entries)
-            region = move(lambda positions: positions[tuple(entries)], self.source, (), math.prod(self.base.row_shape))
-            assert isinstance(region, Source)
-            self._write(value, region)
+            self._write(value, *fixed_index(self, entries))
 
     def _entries(self, index: Any) -> list[Any]:
         items = index if isinstance(index, tuple) else (index,)
         return index_entries(self, [as_array(x) if isinstance(x, (list, tuple, range)) else x for x in items])
 
-    def _write(self, value: Any, region: Source) -> None:
+    def _write(self, value: Any, positions: np.ndarray, batch_axis: int | None) -> None:
         """Write into positions of the base."""
-        base, builder, positions = self.base, current_builder(), region.positions
+        base, builder = self.base, current_builder()
         if base.read_only:
             raise ValueError("the inputs cannot be written into: copy them first, x = observation.copy()")
-        values = broadcast(as_array(value), program_shape(positions.shape, region.batch_axis))
+        values = broadcast(as_array(value), program_shape(positions.shape, batch_axis))
         sources = all_positions(base.row_shape)
         sources.reshape(-1)[positions.reshape(-1)] = sources.size + np.arange(positions.size)
         base._node = builder.gather(builder.concat([base._node, builder.cast(values.node, base.kind)]), sources)

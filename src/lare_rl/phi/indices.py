@@ -20,7 +20,7 @@ from lare_rl.phi.operand import BatchSize
 if TYPE_CHECKING:
     from lare_rl.phi.arrays import Array
 
-__all__ = ["ALL", "check_index", "computed_positions", "index_entries", "is_mask", "masked_index", "overwrite"]
+__all__ = ["ALL", "computed_positions", "fixed_index", "index_entries", "is_mask", "masked_index", "overwrite"]
 
 ALL = slice(None)
 
@@ -60,13 +60,22 @@ def _read_slice(entry: slice) -> slice:
     return slice(*(None if end is None else operator.index(end) for end in (entry.start, stop, entry.step)))
 
 
-def check_index(array: Array, entries: Sequence[Any]) -> None:
-    """Raise `RefusedError` if an index selects rows of the batch, or too many numbers."""
+def fixed_index(array: Array, entries: Sequence[Any]) -> tuple[np.ndarray, int | None]:
+    """Return the positions that an index selects, and where the batch axis then is.
+
+    Raises:
+        RefusedError: it selects rows of the batch, or too many numbers.
+    """
     axes = [entry for entry in entries if entry is not None]
     if array.batch_axis is not None and axes[array.batch_axis] not in (ALL, slice(0, None), slice(0, None, 1)):
         raise RefusedError("E-ROWS", f"an index into the rows of {array.shape} takes one row for all: write x[:, i]")
-    # NumPy finds the shape of the result on an array without numbers.
-    current_builder().check_size(np.empty((*array.row_shape, 0))[(*entries, ALL)].shape[:-1])
+    # NumPy finds the shape on an array without numbers: the batch axis, or else a last axis, has the length 0.
+    at = array.ndim if array.batch_axis is None else array.batch_axis
+    index = (*entries, ALL) if array.batch_axis is None else tuple(entries)
+    shape = np.empty((*array.row_shape[:at], 0, *array.row_shape[at + 1 :]))[index].shape
+    is_empty = shape.count(0) > 1
+    current_builder().spend(current_builder().check_size([0 if is_empty else max(size, 1) for size in shape]))
+    return np.asarray(array.source.positions[tuple(entries)]), None if array.batch_axis is None else shape.index(0)
 
 
 def masked_index(array: Array, entries: Sequence[Any]) -> tuple[Any, ...]:
