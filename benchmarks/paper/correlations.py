@@ -116,7 +116,7 @@ def replies_cell(task: TaskSpec, draws: int) -> str:
     recordings = [entry for draw in range(draws) for entry in shipped_recordings("factors", draw)]
     exchanges = [exchange for entry in recordings if entry.task == task.name for exchange in entry.exchanges]
     replies = [reply for exchange in exchanges if exchange.stage == "candidate" for reply in exchange.replies]
-    passed = [not examine_reply(reply, task, "factors").errors for reply in replies]
+    passed = [examine_reply(reply, task, "factors").verdict.passed for reply in replies]
     return f"{sum(passed)} of {len(passed)}"
 
 

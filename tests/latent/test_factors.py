@@ -5,7 +5,7 @@ import pytest
 
 from helpers.toy_envs import PHI, phi_source
 from lare_rl.latent import factors as factors_module
-from lare_rl.latent.factors import NonFiniteFactorError, check_finite, compute_batch, find_infinity
+from lare_rl.latent.factors import compute_batch, find_infinity
 from lare_rl.phi.read import read
 
 
@@ -25,19 +25,6 @@ def test_compute_factors_in_chunks(rows, monkeypatch):
     np.testing.assert_array_equal(
         factors, np.concatenate([-np.square(action - observation[:, 0:1]), -np.square(action)], axis=1)
     )
-
-
-@pytest.mark.parametrize(
-    ("factors", "words"),
-    [([[1, 2], [np.nan, 3]], "factor 'a' is nan"), ([[1, np.inf], [np.nan, 3]], "factor 'b' is inf")],
-)
-def test_check_finite(factors, words):
-    observation, action = random_steps(2)
-    check_finite(np.ones((2, 2), np.float32), ["a", "b"], observation, action)
-    with pytest.raises(NonFiniteFactorError, match=words) as error:
-        check_finite(np.array(factors, np.float32), ["a", "b"], observation, action)
-    assert error.value.observation is observation
-    assert error.value.action is action
 
 
 @pytest.mark.parametrize(

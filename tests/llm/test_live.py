@@ -24,10 +24,9 @@ from helpers.chat_servers import (
     text_response,
 )
 from lare_rl.errors import LareError
-from lare_rl.llm import request_forms
 from lare_rl.llm.budget import Budget, BudgetExceededError, max_request_tokens
 from lare_rl.llm.live import LiveModel, ModelError
-from lare_rl.llm.request_forms import RequestForms, store_forms
+from lare_rl.llm.request_forms import RequestForms
 
 KEY = "sk-secret-key-0123456789"
 REQUEST = [{"role": "user", "content": "Write some."}]
@@ -39,15 +38,12 @@ def serve(monkeypatch):
     """Start a server with its answers. Return it, a model that asks it, and the list of the model's pauses."""
     monkeypatch.setenv("OPENAI_API_KEY", KEY)
     monkeypatch.delenv("OPENAI_BASE_URL", raising=False)
-    monkeypatch.setattr(request_forms, "_VERIFIED", {})
     servers = []
 
-    def serve(*answers, first_forms=None, **settings):
+    def serve(*answers, **settings):
         servers.append(Server(*answers))
-        if first_forms is None:
+        if "forms" not in settings:
             pytest.importorskip("openai.resources.responses")  # the client may be older
-        else:
-            store_forms(f"{servers[-1].url}/", "m", first_forms)
         pauses = []
         return servers[-1], LiveModel("m", servers[-1].url, sleep=pauses.append, **settings), pauses
 
@@ -59,13 +55,13 @@ def serve(monkeypatch):
 @pytest.fixture
 def start(serve):
     """Start a server that is asked for chat completions."""
-    return partial(serve, first_forms=RequestForms().without_responses())
+    return partial(serve, forms=RequestForms().without_responses())
 
 
 @pytest.fixture(params=["responses", "chat"])
 def start_either(request, serve):
     """Start a server of either API."""
-    return serve if request.param == "responses" else partial(serve, first_forms=RequestForms().without_responses())
+    return serve if request.param == "responses" else partial(serve, forms=RequestForms().without_responses())
 
 
 def test_request(start_either):
@@ -224,10 +220,8 @@ def test_server_without_the_responses_api(serve, answer):
     assert server.apis == ["responses", "completions", "completions"]
     assert server.requests[1]["response_format"]["type"] == "json_schema"
     assert (pauses, model.budget.requests_used) == ([], 3)
-    assert LiveModel("m", server.url).reply(REQUEST, 0) == "hello"  # the process stores what the server supports
+    assert model.reply(REQUEST, 0) == "hello"  # the model keeps what the server supports
     assert server.apis[3:] == ["completions"]
-    LiveModel("other", server.url).reply(REQUEST, 0)
-    assert server.apis[4:] == ["responses", "completions"]
 
 
 def test_refused_options_of_a_response(serve):
@@ -263,7 +257,7 @@ def test_error_of_both_apis(serve, status):
 
 
 def test_client_without_the_responses_api(serve, monkeypatch):
-    server, _, _ = serve(reply_with("hello"), first_forms=RequestForms())
+    server, _, _ = serve(reply_with("hello"), forms=RequestForms())
     connect = LiveModel._connect
     monkeypatch.setattr(LiveModel, "_connect", lambda self: OldClient(connect(self)))
     assert LiveModel("m", server.url).reply(REQUEST, 0) == "hello"

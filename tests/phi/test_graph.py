@@ -3,13 +3,14 @@
 import numpy as np
 import pytest
 
-from helpers.phi_programs import benign_programs, random_inputs, read_program, varied_programs
+from helpers.phi_programs import Program, benign_programs, random_inputs, read_program, varied_programs
 from helpers.toy_envs import phi_source
 from lare_rl.latent.function import features_text
-from lare_rl.phi.builder import Builder, inline
+from lare_rl.phi.arrays import Array
+from lare_rl.phi.builder import Builder, building
 from lare_rl.phi.evaluate import evaluate
 from lare_rl.phi.limits import UNLIMITED, GraphLimits, RefusedError
-from lare_rl.phi.read import read
+from lare_rl.phi.read import apply_program, read
 
 PROGRAMS = {p.name: p for p in (*benign_programs()[:6], *varied_programs()[5::20])}
 
@@ -127,16 +128,20 @@ def test_entries_read_are_those_whose_change_matters(expression):
     assert entries == [np.flatnonzero(column).tolist() for column in matters.T]
 
 
-@pytest.mark.parametrize("name", PROGRAMS)
-def test_inlined_graph_computes_each_of_several_rows(name):
-    program = PROGRAMS[name]
+ROWS = "import numpy as np\n" + phi_source(
+    "x = observation\ny = x[np.arange(len(x)), np.argmax(x[:, :3], axis=1)]\nz = np.apply_along_axis(np.sort, 1, x[:, :3])\n"
+    "t = np.tile(np.arange(3.0), (len(x), 1))[np.arange(x.shape[0])[:, None], [[0, 2]]]\nreturn [y[:, None], z[:, :1], t[:, 1:]]"
+)
+
+
+@pytest.mark.parametrize("name", [*PROGRAMS, "rows"])
+def test_program_applied_to_several_rows(name):
+    program = PROGRAMS.get(name, Program(name, (7, 2), ROWS))
     graph = read_program(program)
     observation, action = (array.reshape(4, 3, -1) for array in random_inputs(program.sizes, rows=12))
-    builder = Builder(UNLIMITED)
-    inputs = {
-        key: builder.input(key, (3, size)) for key, size in zip(("observation", "action"), program.sizes, strict=True)
-    }
-    outer = builder.finish(inline(builder, graph, inputs, rows=3))
     arrays = {"observation": observation, "action": action}
+    with building(Builder(UNLIMITED)) as builder:
+        inputs = [Array(builder.input(key, array.shape[1:]), 0) for key, array in arrays.items()]
+        outer = builder.finish({"factors": apply_program(program.source, *inputs).node})
     for_rows = evaluate(outer, arrays, dtype=np.float64)["factors"]
     np.testing.assert_allclose(for_rows, evaluate(graph, arrays, dtype=np.float64)["factors"], rtol=1e-12, atol=1e-12)

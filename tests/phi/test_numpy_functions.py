@@ -122,7 +122,9 @@ EXPRESSIONS = {
         x.reshape(len(x) * 3, 2).sum(axis=1).reshape(len(x), 3) | x.reshape(-1, 2)[:, 0].reshape(-1, 3)
         np.repeat(x, 2, axis=0).reshape(len(x), -1)
         np.apply_along_axis(lambda v: np.convolve(v, [1, 2, 1], "valid"), 1, x) | np.apply_along_axis(np.sum, 1, x)
-        x.flatten().reshape(x.shape)
+        x.flatten().reshape(x.shape) | y.reshape(-1, 6, order="F") | np.reshape(t, (2, 2), order="F")[0, 1] * x
+        np.linalg.diagonal(np.arange(12).reshape(3, 2, 2))[2] * x[:, :2] | np.linalg.trace(np.arange(8).reshape(2, 2, 2))[1] * x
+        np.block([[x, a]]) | np.repeat(x, 2).reshape(x.shape[0], 12) | np.insert(x, 2, a[:, 0], axis=1)
     """,
     "products": """
         x @ np.ones(6) | x @ np.arange(12).reshape(6, 2) | y @ y.transpose(0, 2, 1) | np.matmul(y, np.ones((2, 4)))

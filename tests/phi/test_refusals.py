@@ -29,7 +29,15 @@ BODIES = {
     "return [np.sum(observation, axes=1)]": "E-NUMPY line 3: axis",
     "return [np.partition(observation)]": "E-NUMPY line 3: kth",
     "return [observation.sum(axis=1, dtype=int)]": "E-NUMPY line 3: astype",
-    "return [np.eye(2).flatten('F')[:1] * observation]": "E-NUMPY line 3: np.transpose",
+    "return [observation.flatten('F')]": "E-ROWS line 3: mixed",
+    "return [np.flip(observation)]": "E-ROWS line 3: (batch, 17)",
+    "return [np.roll(observation, 6, axis=0)]": "E-ROWS line 3: axis=1",
+    "return [np.delete(observation, slice(5, None), axis=0)]": "E-ROWS line 3: axis=1",
+    "return [np.insert(observation, 2, action[:, :1], axis=1)]": "E-ROWS line 3: mixed",
+    "return [action.reshape(3, -1)]": "E-ROWS line 3: (batch, 6)",
+    "return [np.concatenate([observation, action])]": "E-RUN line 3: (batch, 17) and (batch, 6)",
+    "return [np.concatenate([action, action])]": "E-ROWS line 3: (batch, 6)",
+    "return [np.array_split(action, np.array(10 ** 9))]": "E-COST line 3: too large",
     "return [np.unravel_index(7, (3, 4), order='F')[0] * observation]": "E-NUMPY line 3: np.transpose",
     "return [np.choose([0, 3], [1, 2], mode='wrap')[0] * observation]": "E-NUMPY line 3: mode",
     "return [np.polynomial.Polynomial([1, 2], domain=[0, 1])(observation)]": "E-NUMPY line 3: domain",
@@ -59,7 +67,7 @@ BODIES = {
     "return [np.nonzero(observation)]": "E-NUMPY line 3: same for all rows",
     "return [observation[:, 40]]": "E-RUN line 3: IndexError",
     "return list(np.insert(observation, -40, 0.0, axis=1).T)": "E-RUN line 3: IndexError",
-    "return [observation[:, 40:41]]": "E-RUN line 3: beyond the end",
+    "return [observation[:, 40:41]]": "E-INDEX line 3: beyond the end",
     "return [observation + action]": "E-RUN line 3: ValueError",
     "return [observation[:, :1] + np.ones((5, 1))]": "E-RUN line 3: for any number of rows",
     "return [np.zeros((len(action), 0))]": "E-INDEX line 3: empty",
@@ -111,7 +119,7 @@ def test_refusal_lists_further_names():
 
 
 ACCEPTED = set(
-    "star_import type_call yield_function try_swallow annotation_exec walrus_rebind_np np_frompyfunc np_apply_along_axis "
+    "star_import type_call yield_function annotation_exec walrus_rebind_np np_frompyfunc np_apply_along_axis "
     "np_errstate_callback two_definitions lambda_called_at_once lambda_in_a_list module_as_value function_as_value method_as_value "
     "builtin_as_value inner_function_returned dunder_parameter dunder_loop_target comprehension_rebinds_np loop_rebinds_range "
     "with_two_contexts errstate_raise dtype_by_variable dtype_by_condition starred_subscript string_default_of_get "

@@ -20,7 +20,7 @@ from lare_rl.export.policy_graph import policy_graph
 from lare_rl.export.reward_graph import missing_reward_reason, reward_graph
 from lare_rl.phi import evaluate
 from lare_rl.phi.graph import Gather, Graph, Node
-from lare_rl.phi.onnx import BATCH, is_installed, onnx_model
+from lare_rl.phi.onnx import BATCH, DTYPES, is_installed, onnx_model
 from lare_rl.runs.directory import Run, as_run, function_filename
 from lare_rl.training.policy import get_actor
 from lare_rl.training.saved_state import load_actor, load_learner
@@ -29,9 +29,6 @@ from lare_rl.util.files import replace_npz, write_atomically
 from lare_rl.util.provenance import code_version
 
 __all__ = ["ExportResult", "export_run"]
-
-_DTYPES = {"float": "float32", "int": "int64", "bool": "bool"}
-"""The type of inputs and outputs of each kind."""
 
 
 class ExportResult(NamedTuple):
@@ -75,7 +72,7 @@ def export_run(run: Run | str | Path, out: str | Path, seed: int | None = None, 
     credit = select_seed(learner.decoders, seed_index)
     no_reward_reason = missing_reward_reason(config.method)
     for team_index, role in enumerate(task.roles if no_reward_reason is None else ()):
-        phi = run.functions[team_index].graph if run.functions else None
+        phi = run.functions[team_index] if run.functions else None
         graph = reward_graph(credit[team_index] if credit else None, config, team_index, phi)
         graphs["reward" if role is task else f"reward_{role.team}"] = graph
     functions = {name: _describe_graph(graph) for name, graph in graphs.items()}
@@ -109,7 +106,10 @@ def _describe_graph(graph: Graph) -> dict[str, Any]:
     """Return a graph as JSON, without its constants and positions."""
 
     def describe_arrays(nodes: dict[str, Node]) -> dict[str, Any]:
-        return {name: {"shape": [BATCH, *node.shape], "type": _DTYPES[node.kind]} for name, node in nodes.items()}
+        return {
+            name: {"shape": [BATCH, *node.shape], "type": np.dtype(DTYPES[node.kind]).name}
+            for name, node in nodes.items()
+        }
 
     return {
         "inputs": describe_arrays(graph.inputs),

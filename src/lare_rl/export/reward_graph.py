@@ -5,7 +5,7 @@
     length [batch *one]                             T of the step's episode, if the score is a mean over its steps
     ->  r_hat [batch *agents]
 
-The graph has only the inputs that the method uses, and the graph of phi is a part of it. If credit is assigned by the global state,
+The graph has only the inputs that the method uses, and phi is a part of it: its rows are agents. If credit is assigned by the global state,
 `before` and `after` are states, `action` holds the actions of all agents side by side, and there is one r_hat for the team.
 """
 
@@ -20,10 +20,12 @@ from lare_rl.credit.input_names import input_arrays
 from lare_rl.credit.methods import Method, Reward
 from lare_rl.envs.interface import alive_mean
 from lare_rl.export.translate import compute, finish, graph_input
-from lare_rl.phi.arrays import Array, concatenate
-from lare_rl.phi.builder import Builder, building, current_builder, inline
+from lare_rl.latent.function import LatentFunction
+from lare_rl.phi.arrays import concatenate
+from lare_rl.phi.builder import Builder, building
 from lare_rl.phi.graph import Graph
 from lare_rl.phi.limits import UNLIMITED
+from lare_rl.phi.read import apply_program
 from lare_rl.tasks.spec import select_states
 from lare_rl.training.static_config import TrainConfig
 
@@ -43,12 +45,14 @@ def missing_reward_reason(method: Method) -> str | None:
     return None
 
 
-def reward_graph(credit: DecoderState | None, config: TrainConfig, team_index: int, phi: Graph | None = None) -> Graph:
+def reward_graph(
+    credit: DecoderState | None, config: TrainConfig, team_index: int, phi: LatentFunction | None = None
+) -> Graph:
     """Return the graph of a team's proxy rewards.
 
     Args:
         credit: the decoder of one seed, or None if phi itself is the reward.
-        phi: the graph of the team's phi, if the method has one.
+        phi: the team's phi, if the method has one.
 
     Raises:
         LareError: the decoder has an operation that a graph cannot have.
@@ -66,7 +70,6 @@ def reward_graph(credit: DecoderState | None, config: TrainConfig, team_index: i
 
 
 def _reward(arrays: dict[str, Any], credit: DecoderState | None, config: TrainConfig) -> Any:
-    """Return the proxy rewards of one step."""
     inputs, length = arrays["inputs"], arrays.get("length")
     rows = inputs if inputs.ndim > 1 else inputs[None]
     if credit is None:
@@ -85,7 +88,7 @@ class _StepInputs(dict[str, Any]):
     An input is added to the graph when it is first read.
     """
 
-    def __init__(self, config: TrainConfig, rows: tuple[int, ...], team_index: int, phi: Graph | None):
+    def __init__(self, config: TrainConfig, rows: tuple[int, ...], team_index: int, phi: LatentFunction | None):
         super().__init__()
         self.config, self.rows, self.team_index, self.phi = config, rows, team_index, phi
 
@@ -116,11 +119,11 @@ class _StepInputs(dict[str, Any]):
     def _factors(self) -> Any:
         """Return the factors of a step, for each agent by itself."""
         assert self.phi is not None
-        factors = []
+        rows, factors = self.rows or (1,), []
         for side in select_states(self.config.scored_observation, "before", "after"):
-            nodes = {"observation": self[side].node, "action": self["env_action"].node}
-            node = inline(current_builder(), self.phi, nodes, self.rows[0] if self.rows else None)["factors"]
-            factors.append(Array(node, None))
+            inputs = (self[name].reshaped((*rows, -1), 0) for name in (side, "env_action"))
+            scores = apply_program(self.phi.source, *inputs)
+            factors.append(scores.reshaped((*self.rows, -1), None))
         return concatenate(factors, -1)
 
 

@@ -3,6 +3,7 @@
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import NamedTuple
 
 from lare_rl.envs.load import resolve_task
 from lare_rl.errors import LareError
@@ -15,10 +16,7 @@ from lare_rl.llm.recording import Recorder
 from lare_rl.llm.reply import MalformedReplyError, parse_reply
 from lare_rl.tasks.spec import TaskSpec, require_role
 
-__all__ = [
-    "Conversation", "DesignError", "DesignInterruptedError", "DesignModelError", "check_recorded", "design",
-    "examine_reply",
-]  # fmt: skip
+__all__ = ["Conversation", "DesignError", "check_recorded", "design", "examine_reply"]
 
 _MAX_ATTEMPTS = 5
 """Attempts at a function that passes verification, the first included."""
@@ -28,42 +26,30 @@ _MAX_QUOTE = 20_000
 
 
 class DesignError(LareError):
-    """No attempt passed. `recorder` holds all exchanges with the model."""
+    """No attempt passed.
 
-    status = 1
+    Attributes:
+        recorder: holds all exchanges with the model.
+        status: 1; 2 if the model became unavailable before an attempt passed, and 130 if the user stopped the design.
+    """
 
-    def __init__(self, message: str, recorder: Recorder, model: str):
+    def __init__(self, message: str, recorder: Recorder, model: str, status: int = 1):
         super().__init__(message)
-        self.recorder, self.model = recorder, model
+        self.recorder, self.model, self.status = recorder, model, status
 
 
-class DesignModelError(DesignError):
-    """The model became unavailable before an attempt passed."""
-
-    status = 2
-
-
-class DesignInterruptedError(DesignError):
-    """The user stopped the design before an attempt passed."""
-
-    status = 130
-
-
-@dataclass(frozen=True)
-class Attempt:
+class Attempt(NamedTuple):
     """A reply, and the result of its verification."""
 
     reply: str
     source: str
     """It is empty if the reply could not be read."""
     verdict: Verdict
-    errors: str
-    """All errors of the reply, for the model. It is empty if the reply passed."""
 
     @property
     def first_error(self) -> str:
         """The first error, in one line, or "passes"."""
-        lines = self.errors.splitlines() or ["passes"]
+        lines = self.verdict.errors.splitlines() or ["passes"]
         return lines[0] + (f" (and {len(lines) - 1} more)" if len(lines) > 1 else "")
 
 
@@ -72,9 +58,8 @@ def examine_reply(reply: str, task: TaskSpec, kind: FunctionKind, steps: Steps |
     try:
         source = normalise_source(parse_reply(reply).functions)
     except MalformedReplyError as error:
-        return Attempt(reply=reply, source="", verdict=Verdict(()), errors=str(error))
-    verdict = verify(source, task, kind, steps)
-    return Attempt(reply=reply, source=source, verdict=verdict, errors=verdict.errors)
+        return Attempt(reply, "", Verdict((Check("reply", False, str(error)),)))
+    return Attempt(reply, source, verify(source, task, kind, steps))
 
 
 @dataclass(frozen=True)
@@ -109,7 +94,7 @@ class Conversation:
             attempts = [self._examine(reply) for reply in replies]
             for number, attempt in enumerate(attempts, start=1):
                 self.on_message(f"candidate {number}: {attempt.first_error}")
-            passing = [attempt.reply for attempt in attempts if not attempt.errors]
+            passing = [attempt.reply for attempt in attempts if attempt.verdict.passed]
         request = prompts.combine(self.task, passing or list(map(_quote, replies)), self.kind)
         return request, self.ask("combine", request)
 
@@ -118,10 +103,10 @@ class Conversation:
         attempt = self._examine(reply)
         for number in range(1, _MAX_ATTEMPTS + 1):
             self.on_message(f"attempt {number}: {attempt.first_error}")
-            if not attempt.errors:
+            if attempt.verdict.passed:
                 return attempt
             if number < _MAX_ATTEMPTS:
-                request = prompts.correct(request, _quote(attempt.reply), attempt.errors)
+                request = prompts.correct(request, _quote(attempt.reply), attempt.verdict.errors)
                 attempt = self._examine(self.ask("correct", request))
         raise self._error(f"none of {_MAX_ATTEMPTS} attempts passed; the last one failed: {attempt.first_error}")
 
@@ -134,7 +119,7 @@ class Conversation:
         attempt = self._examine(reply)
         if attempt.verdict.graph is None:
             raise self._error(f"the reply cannot be read: {attempt.first_error}")
-        return replace(attempt, verdict=Verdict((Check("read", True),), attempt.verdict.graph), errors="")
+        return attempt._replace(verdict=Verdict((Check("read", True),), attempt.verdict.graph))
 
     def to_function(self, attempt: Attempt) -> LatentFunction:
         """Return the latent function of an attempt."""
@@ -201,8 +186,7 @@ def design(
             environment, as `lare_rl.logged_steps` reads them from a data set.
 
     Raises:
-        DesignError: no attempt passed. It is a `DesignModelError` if the model became unavailable, and a `DesignInterruptedError`
-            after Ctrl-C.
+        DesignError: no attempt passed, the model became unavailable, or the user stopped the design.
         LareError: the model cannot answer, the environment does not run, or each team of the task needs its own function.
     """
     task = require_role(resolve_task(task))
@@ -215,14 +199,9 @@ def design(
     try:
         request, reply = conversation.start(candidates, pre_verification)
         attempt = conversation.correct(request, reply) if pre_verification else conversation.accept(reply)
-    except DesignError:
-        raise
-    except LareError as error:
-        if not recorder.exchanges:
+    except (LareError, KeyboardInterrupt) as error:
+        if isinstance(error, DesignError) or not recorder.exchanges:
             raise
-        raise DesignModelError(str(error), recorder, model.name) from error
-    except KeyboardInterrupt:
-        if not recorder.exchanges:
-            raise
-        raise DesignInterruptedError("stopped", recorder, model.name) from None
+        status = 2 if isinstance(error, LareError) else 130
+        raise DesignError(str(error) or "stopped", recorder, model.name, status) from error
     return conversation.to_function(attempt)

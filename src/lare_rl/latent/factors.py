@@ -1,7 +1,5 @@
 """Compute the factors of steps with NumPy. Factors that are not finite are an error."""
 
-from collections.abc import Sequence
-
 import numpy as np
 from jaxtyping import Float
 
@@ -9,7 +7,7 @@ from lare_rl.errors import LareError
 from lare_rl.phi.evaluate import compute_nodes, evaluate
 from lare_rl.phi.graph import Graph
 
-__all__ = ["NonFiniteFactorError", "check_finite", "compute_batch", "find_infinity"]
+__all__ = ["NonFiniteFactorError", "compute_batch", "find_infinity"]
 
 _CHUNK_NUMBERS = 1 << 22
 """About how many numbers are computed at a time."""
@@ -33,22 +31,6 @@ def compute_batch(
         for i in range(0, max(len(observation), 1), rows)
     ]
     return chunks[0] if len(chunks) == 1 else np.concatenate(chunks)
-
-
-def check_finite(
-    factors: Float[np.ndarray, "batch factors"],
-    names: Sequence[str],
-    observation: Float[np.ndarray, "batch observation"],
-    action: Float[np.ndarray, "batch action"],
-) -> None:
-    """Check that all factors are finite. Raises `NonFiniteFactorError` if a factor is infinite or NaN."""
-    if not np.isfinite(factors).all():
-        row, column = np.argwhere(~np.isfinite(factors))[0]
-        text = np.array2string(observation[row], precision=3, threshold=6)
-        message = (
-            f"the latent function failed: factor {names[column]!r} is {factors[row, column]} for the observation {text}"
-        )
-        raise NonFiniteFactorError(message, observation, action)
 
 
 def find_infinity(

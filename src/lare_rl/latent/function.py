@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Float
 
 from lare_rl.errors import LareError, short_repr
-from lare_rl.latent.factors import check_finite, compute_batch
+from lare_rl.latent.factors import NonFiniteFactorError, compute_batch
 from lare_rl.latent.verify import Check, Steps, Verdict, verify
 from lare_rl.llm.key import redact_key
 from lare_rl.llm.prompts import FunctionKind
@@ -112,7 +112,12 @@ class LatentFunction:
         if len(observations) != len(actions):
             raise LareError(f"there are {len(observations)} observations and {len(actions)} actions")
         factors = compute_batch(self.graph, observations, actions)
-        check_finite(factors, self.names, observations, actions)
+        if not np.isfinite(factors).all():
+            row, column = np.argwhere(~np.isfinite(factors))[0]
+            factor = f"factor {self.names[column]!r} is {factors[row, column]}"
+            text = np.array2string(observations[row], precision=3, threshold=6)
+            message = f"the latent function failed: {factor} for the observation {text}"
+            raise NonFiniteFactorError(message, observations, actions)
         return factors[0] if single else factors
 
     def step_factors(
@@ -128,8 +133,9 @@ class LatentFunction:
         if scored_observation not in ("before", "after", "both"):
             raise LareError(f"scored_observation = {short_repr(scored_observation)}: it is before, after or both")
         observations = select_states(scored_observation, observation, next_observation)
-        lead, actions = np.shape(action)[:-1], _to_rows(action)
-        factors = [self(_to_rows(array), actions) for array in observations]
+        lead = np.shape(action)[:-1]
+        rows = [np.reshape(array, (-1, np.shape(array)[-1])) for array in (*observations, action)]
+        factors = [self(array, rows[-1]) for array in rows[:-1]]
         return np.concatenate(factors, axis=-1).reshape(*lead, self.n_factors(scored_observation))
 
     def n_factors(self, scored_observation: ScoredObservation) -> int:
@@ -169,12 +175,6 @@ class LatentFunction:
                 path.with_suffix(suffix).write_text(redact_key(text) + "\n", encoding="utf-8")
         except OSError as error:
             raise LareError(f"{path} cannot be written: {error.strerror}") from error
-
-
-def _to_rows(values: Any) -> np.ndarray:
-    """Merge all axes but the last."""
-    array = np.asarray(values)
-    return array.reshape(-1, array.shape[-1])
 
 
 def _as_array(name: str, values: Any, size: int) -> np.ndarray:

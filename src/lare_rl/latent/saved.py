@@ -2,7 +2,6 @@
 
 import itertools
 import json
-from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple
@@ -48,8 +47,8 @@ class SavedSource(NamedTuple):
 
 def read_source(path: str | Path) -> SavedSource:
     """Read the source of a function file, or of a model's reply (.json). Raises `LareError` if the file cannot be read."""
-    header, source = _split_header(_read_source_text(_find_file(path)))
-    return SavedSource(source=source, changed=_was_changed(header, source), task=_header_value(header, "task"))
+    header, source = _read_header(_find_file(path))
+    return SavedSource(source=source, changed=_was_changed(header, source), task=header.get("task"))
 
 
 def load_function(path: str | Path, task: TaskSpec | str | Path, steps: Steps | None = None) -> LatentFunction:
@@ -67,18 +66,18 @@ def load_function(path: str | Path, task: TaskSpec | str | Path, steps: Steps | 
         LareError: the file cannot be read, or the function does not pass for this task.
     """
     file, task = _find_file(path), resolve_task(task, playable=steps is None)
-    header, source = _split_header(_read_source_text(file))
-    saved_task = _header_value(header, "task")
+    header, source = _read_header(file)
+    saved_task = header.get("task")
     if saved_task not in (None, task.name):
         raise LareError(
             f"{file} was written for the task {saved_task!r}, not for {task.name!r}. If the function is "
             f'right for both tasks, remove the line "{HEADER_PREFIX}task: {saved_task}"'
         )
-    kind: FunctionKind = "reward" if _header_value(header, "kind") == "reward" else "factors"
+    kind: FunctionKind = "reward" if header.get("kind") == "reward" else "factors"
     function = verify_function(source, task, kind, steps, file)
     if file.suffix == ".json":
         return replace(function, model=_UNNAMED_LLM)
-    function = replace(function, model=_header_value(header, "model") or function.model)
+    function = replace(function, model=header.get("model") or function.model)
     function = _add_provenance(function, file.with_suffix(".json"))
     if _was_changed(header, source) and not function.changed:
         function = replace(function, model=function.model + CHANGED_SUFFIX)
@@ -100,33 +99,22 @@ def _find_file(path: str | Path) -> Path:
     return file
 
 
-def _read_source_text(file: Path) -> str:
-    """Return the text of a Python file, or the function within a model's reply."""
+def _read_header(file: Path) -> tuple[dict[str, str], str]:
+    """Return what `save` wrote above a source, and the source: of a Python file, or of a model's reply."""
     text = read_text(file)
-    if file.suffix != ".json":
-        return text
-    try:
-        return parse_reply(text).functions
-    except MalformedReplyError as error:
-        python = file.with_suffix(".py")
-        raise LareError(f"{file} is not a model's reply ({error}), and {python} does not exist") from error
+    if file.suffix == ".json":
+        try:
+            text = parse_reply(text).functions
+        except MalformedReplyError as error:
+            python = file.with_suffix(".py")
+            raise LareError(f"{file} is not a model's reply ({error}), and {python} does not exist") from error
+    lines = list(itertools.takewhile(lambda line: line.startswith(HEADER_PREFIX), text.split("\n")))
+    pairs = (line.removeprefix(HEADER_PREFIX).partition(": ") for line in reversed(lines))
+    return {key: value.strip() for key, _, value in pairs}, normalise_source(text)
 
 
-def _split_header(text: str) -> tuple[list[str], str]:
-    """Return the header lines that `save` wrote, and the source."""
-    header = list(itertools.takewhile(lambda line: line.startswith(HEADER_PREFIX), text.split("\n")))
-    return header, normalise_source(text)
-
-
-def _header_value(header: Sequence[str], key: str) -> str | None:
-    """Return the value of a key in the header."""
-    start = f"{HEADER_PREFIX}{key}: "
-    return next((line.removeprefix(start).strip() for line in header if line.startswith(start)), None)
-
-
-def _was_changed(header: Sequence[str], source: str) -> bool:
-    """Return whether the header has the hash of another source."""
-    return _header_value(header, "sha256") not in (None, source_hash(source))
+def _was_changed(header: dict[str, str], source: str) -> bool:
+    return header.get("sha256") not in (None, source_hash(source))
 
 
 def _add_provenance(function: LatentFunction, record: Path) -> LatentFunction:

@@ -98,35 +98,32 @@ def _finite_error(
     """Return a message about the first factor that is not finite on a batch of steps."""
     # Random numbers that are reproducible for a source, but that its author cannot know.
     rng = np.random.default_rng(list(hashlib.sha256(source.encode(errors="replace")).digest()))
-    for batch_name, observations, actions in _test_batches(observation, action, rng):
-        factors = compute_batch(graph, observations, actions)
+    size, total = observation.shape[1], observation.shape[1] + action.shape[1]
+    noise = [rng.standard_normal((N_SAMPLE_STEPS, n)).astype(np.float32) for n in (size, total - size)]
+    recorded = np.concatenate([observation, action], axis=1)
+    batches = {  # training may or may not contain them
+        "recorded steps": recorded,
+        "random steps": np.concatenate(noise, axis=1),
+        "steps of nothing but zeros": np.zeros((1, total), np.float32),
+        "steps of nothing but ones": np.ones((1, total), np.float32),
+        "steps with a single one": np.eye(total, dtype=np.float32),
+        "recorded steps times 1000": np.concatenate([1000 * observation, action], axis=1),
+        "recorded steps times 1e-9": np.float32(1e-9) * recorded,
+    }
+    for batch_name, steps in batches.items():
+        factors = compute_batch(graph, steps[:, :size], steps[:, size:])
         bad = ~np.isfinite(factors)
         if bad.any():
             factor = int(bad.any(axis=0).argmax())
             rows = bad[:, factor]
-            origin = find_infinity(graph, factor, observations[rows][:1], actions[rows][:1])
+            step = steps[rows][:1]
+            origin = find_infinity(graph, factor, step[:, :size], step[:, size:])
             line, operation = (f" line {origin[1]}", f" ({origin[0]})") if origin else ("", "")
             return (
                 f"E-FINITE{line}: factor {factor + 1}, {names[factor]!r}, is {factors[rows, factor][0]}{operation} for "
                 f"{rows.sum()} of {len(rows)} {batch_name}"
             )
     return None
-
-
-def _test_batches(
-    observation: np.ndarray, action: np.ndarray, rng: np.random.Generator
-) -> Iterator[tuple[str, np.ndarray, np.ndarray]]:
-    """Yield steps of many kinds, which training may or may not contain. Factors must be finite on all of them."""
-    sizes = observation.shape[1], action.shape[1]
-    yield "recorded steps", observation, action
-    noise = [rng.standard_normal((N_SAMPLE_STEPS, size)).astype(np.float32) for size in sizes]
-    yield "random steps", noise[0], noise[1]
-    yield "steps of nothing but zeros", np.zeros((1, sizes[0]), np.float32), np.zeros((1, sizes[1]), np.float32)
-    yield "steps of nothing but ones", np.ones((1, sizes[0]), np.float32), np.ones((1, sizes[1]), np.float32)
-    unit = np.eye(sum(sizes), dtype=np.float32)
-    yield "steps with a single one", unit[:, : sizes[0]], unit[:, sizes[0] :]
-    yield "recorded steps times 1000", 1000 * observation, action
-    yield "recorded steps times 1e-9", np.float32(1e-9) * observation, np.float32(1e-9) * action
 
 
 def _advice(graph: Graph, names: Sequence[str], factors: Float[np.ndarray, "steps factors"]) -> Iterator[str]:
@@ -208,8 +205,8 @@ def _random_steps(task_json: str, n_steps: int, seed: int) -> Steps:
                 break
     if not n_rows:
         raise LareError(f"no agent of {role.name} acted in {n_played} steps of random actions")
-    columns = zip(*itertools.chain(*rows_by_side.values()), strict=True)
     selected = evenly_spaced(n_rows, n_steps)
+    columns = zip(*itertools.chain(*rows_by_side.values()), strict=True)
     observation, action = (np.concatenate(arrays).astype(np.float32)[selected] for arrays in columns)
     observation.setflags(write=False)
     action.setflags(write=False)

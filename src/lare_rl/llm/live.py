@@ -28,7 +28,7 @@ from lare_rl.llm.http_limits import (
 )
 from lare_rl.llm.key import KEY_VARIABLE, api_key, redact_key
 from lare_rl.llm.prompts import Message
-from lare_rl.llm.request_forms import MIN_REPLY_TOKENS, FailedResponseError, find_forms, store_forms
+from lare_rl.llm.request_forms import MIN_REPLY_TOKENS, FailedResponseError, RequestForms
 from lare_rl.util.safe_io import read_json
 from lare_rl.util.sanitize import one_line
 from lare_rl.util.variables import read_variable
@@ -80,6 +80,8 @@ class LiveModel:
     on_message: Callable[[str], None] = lambda _: None
     """Called with messages about waiting and retries."""
     sleep: Callable[[float], None] = time.sleep
+    forms: RequestForms = field(default_factory=RequestForms)
+    """The requests that the server may support. They become fewer when it refuses one."""
 
     def __post_init__(self) -> None:
         if not self.name.strip() or not self.name.isprintable():
@@ -99,9 +101,8 @@ class LiveModel:
         except Exception as error:  # the client raises errors of several kinds for a bad address
             url = _without_password(str(self.base_url))
             raise ModelError(f"the endpoint {url!r} cannot be used: {_safe_text(error)}") from None
-        self._forms = find_forms(str(self._client.base_url), self.name)
         if not hasattr(self._client, "responses"):  # in versions of the client before 1.66
-            self._forms = self._forms.without_responses()
+            self.forms = self.forms.without_responses()
 
     def _connect(self) -> Any:
         """Return a client that limits the time and the size of answers."""
@@ -143,12 +144,11 @@ class LiveModel:
                 raise BudgetExceededError(f"{error}{cause}") from None
 
     def _request(self, messages: Sequence[Message]) -> str | _Failure:
-        """Send one request. Return the reply, or why there is none."""
-        max_tokens = min(self._forms.reply_tokens, self.budget.max_reply_tokens(messages, MIN_REPLY_TOKENS))
-        request = self._forms.request(self.name, messages, max_tokens, self.temperature)
+        max_tokens = min(self.forms.reply_tokens, self.budget.max_reply_tokens(messages, MIN_REPLY_TOKENS))
+        request = self.forms.request(self.name, messages, max_tokens, self.temperature)
         self.budget.requests_used += 1
         timeout_s = min(self.budget.reply_timeout_s, self.budget.seconds_left)
-        api = self._client.responses if self._forms.api == "responses" else self._client.chat.completions
+        api = self._client.responses if self.forms.api == "responses" else self._client.chat.completions
         create = api.with_streaming_response.create
 
         def fetch() -> bytes:
@@ -165,22 +165,20 @@ class LiveModel:
     def _read_answer(self, body: bytes, messages: Sequence[Message], max_tokens: int) -> str | _Failure:
         """Return the text of an answer. A body that is no answer is a failure."""
         try:
-            answer = self._forms.read_answer(body)
+            answer = self.forms.read_answer(body)
         except FailedResponseError as error:
             self.budget.count_reply(None, messages, len(body))
             return _Failure(_safe_text(f"the model failed: {error}"), retry=True)
         except (ValueError, TypeError, KeyError, IndexError, AttributeError) as error:
             self.budget.count_reply(None, messages, len(body))
-            kind = "response" if self._forms.api == "responses" else "chat completion"
+            kind = "response" if self.forms.api == "responses" else "chat completion"
             reason = f"the answer is not a {kind} ({type(error).__name__}: {error})"
-            is_missing = self._forms.api == "responses" and not self._forms.is_verified
+            is_missing = self.forms.api == "responses" and not self.forms.is_verified
             if is_missing:  # some servers answer any request for an unknown address
-                self._forms = self._forms.without_responses()
+                self.forms = self.forms.without_responses()
             page = _excerpt(body.decode(errors="replace"))
             return _Failure(_safe_text(f"{reason}: {page}"), retry=True, request_changed=is_missing)
-        if not self._forms.is_verified:
-            self._forms = replace(self._forms, is_verified=True)
-        store_forms(str(self._client.base_url), self.name, self._forms)
+        self.forms = replace(self.forms, is_verified=True)
         text = answer.text.encode(errors="replace").decode()  # replaces lone surrogates
         self.budget.count_reply(answer.usage, messages, len(text.encode()))
         if answer.is_cut_off:
@@ -209,9 +207,9 @@ class LiveModel:
     def _refusal(self, error: StatusError) -> _Failure:
         """Handle an HTTP error: change the request, wait, or give up."""
         message = _safe_text(f"HTTP {error.status}: {_error_text(error.body)}")
-        forms = self._forms.after_refusal(error.status, error.body.lower(), self.temperature is not None)
+        forms = self.forms.after_refusal(error.status, error.body.lower(), self.temperature is not None)
         if forms is not None:
-            self._forms = forms
+            self.forms = forms
             return _Failure(message, retry=True, request_changed=True)
         may_recover = error.status in _RETRIED_STATUSES or error.status >= 500
         retry = may_recover and "insufficient_quota" not in error.body

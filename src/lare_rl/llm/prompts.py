@@ -12,16 +12,8 @@ from lare_rl.errors import LareError
 from lare_rl.tasks.spec import FILL_IN, TaskSpec
 
 __all__ = [
-    "MAX_CANDIDATES",
-    "N_CANDIDATES",
-    "FunctionKind",
-    "Message",
-    "Stage",
-    "candidate",
-    "combine",
-    "correct",
-    "reflect",
-]
+    "MAX_CANDIDATES", "N_CANDIDATES", "FunctionKind", "Message", "Stage", "candidate", "combine", "correct", "reflect",
+]  # fmt: skip
 
 N_CANDIDATES = 5
 """The default number of candidates for a function: n in line 2 of the paper's Algorithm 1."""

@@ -15,14 +15,8 @@ from lare_rl.util.files import check_new_path, write_atomically
 from lare_rl.util.safe_io import read_json
 
 __all__ = [
-    "RECORDED",
-    "SHIPPED_RECORDINGS",
-    "Exchange",
-    "RecordedModel",
-    "Recorder",
-    "read_recording",
-    "shipped_recordings",
-]
+    "RECORDED", "SHIPPED_RECORDINGS", "Exchange", "RecordedModel", "Recorder", "read_recording", "shipped_recordings",
+]  # fmt: skip
 
 RecordingKind = Literal["factors", "reward", "events"]
 """What a recorded function returns: factors or a reward of a step, or the events of a turn (`lare_rl.turns`)."""

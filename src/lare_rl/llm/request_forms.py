@@ -3,7 +3,7 @@
     responses   OpenAI's Responses API, with a JSON schema
     chat        chat completions: with a JSON schema, with a JSON object, or with the structure only in words
 
-The form that a server answered is stored for the process, by endpoint and model.
+A model keeps the form that its server has answered.
 """
 
 import re
@@ -15,7 +15,7 @@ from lare_rl.llm.prompts import Message
 from lare_rl.llm.reply import REPLY_KEYS
 from lare_rl.util.safe_io import read_json
 
-__all__ = ["MIN_REPLY_TOKENS", "Answer", "FailedResponseError", "RequestForms", "find_forms", "store_forms"]
+__all__ = ["MIN_REPLY_TOKENS", "Answer", "FailedResponseError", "RequestForms"]
 
 MAX_REPLY_TOKENS, MIN_REPLY_TOKENS = 16_384, 1024
 """The limit on a reply's tokens. It is halved while the model allows less, down to the second number."""
@@ -154,17 +154,3 @@ def _read_response(answer: Any) -> Answer:
     # Under the names of chat completions.
     names = {"prompt_tokens": "input_tokens", "completion_tokens": "output_tokens"}
     return Answer(text, {name: usage.get(source) for name, source in names.items()}, is_cut_off)
-
-
-_VERIFIED: dict[tuple[str, str], RequestForms] = {}
-"""The forms of servers that have answered, by endpoint and model."""
-
-
-def find_forms(endpoint: str, name: str) -> RequestForms:
-    """Return the forms for an endpoint and a model that have answered in this process, or all forms."""
-    return _VERIFIED.get((endpoint, name), RequestForms())
-
-
-def store_forms(endpoint: str, name: str, forms: RequestForms) -> None:
-    """Store the forms for an endpoint and a model that have answered."""
-    _VERIFIED[endpoint, name] = forms

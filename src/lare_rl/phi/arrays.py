@@ -15,20 +15,21 @@ import itertools
 import math
 import operator
 from collections.abc import Callable, Iterator, Sequence
-from functools import partial
+from functools import cached_property, partial
 from typing import Any
 
 import numpy as np
 
 from lare_rl.phi.builder import current_builder
-from lare_rl.phi.graph import NumberKind, all_positions
+from lare_rl.phi.graph import NumberKind, all_positions, widest
 from lare_rl.phi.indices import ALL, computed_positions, fixed_index, index_entries, is_mask, masked_index, overwrite
 from lare_rl.phi.limits import RefusedError
-from lare_rl.phi.operand import BATCH, BatchSize, Operand, common_batch_axis
+from lare_rl.phi.operand import BATCH, BatchSize, Operand, common_batch_axis, program_shape
+from lare_rl.phi.rearrange import Source, leaves, map_leaves, move
 from lare_rl.phi.values import describe
 
 __all__ = [
-    "Array", "Complex", "Masked", "as_array", "broadcast", "concatenate", "elementwise", "invert", "power", "stack",
+    "Array", "Complex", "Masked", "as_array", "broadcast", "concatenate", "elementwise", "invert", "power", "rearrange", "stack",
 ]  # fmt: skip
 
 
@@ -64,8 +65,7 @@ class Array(_Value):
 
     @property
     def shape(self) -> tuple[Any, ...]:
-        """Shape that the program sees."""
-        return tuple(BatchSize(n) if axis == self.batch_axis else n for axis, n in enumerate(self.row_shape))
+        return program_shape(self.row_shape, self.batch_axis)
 
     @property
     def ndim(self) -> int:
@@ -92,9 +92,8 @@ class Array(_Value):
         """Return the only number of a constant, as a number of Python."""
         values = self.constant
         if values is None:
-            raise RefusedError(
-                "E-FLOW", "a number or condition that differs from row to row: use np.where instead of if"
-            )
+            text = "a number or condition that differs from row to row: use np.where instead of if"
+            raise RefusedError("E-FLOW", text)
         if values.size != 1:
             raise ValueError("the truth value of an array with more than one element is ambiguous")
         return values.item()
@@ -120,12 +119,12 @@ class Array(_Value):
 
     # --- axes -----------------------------------------------------------------------------------------------------------
 
-    def axis(self, axis: Any, extra: int = 0) -> int:
-        """Return an axis counted from the front. `extra` axes are about to be added."""
-        number, ndim = operator.index(axis), self.ndim + extra
-        if not -ndim <= number < ndim:
+    def axis(self, axis: Any) -> int:
+        """Return an axis counted from the front."""
+        number = operator.index(axis)
+        if not -self.ndim <= number < self.ndim:
             raise IndexError(f"axis {number} is out of bounds for an array of the shape {self.shape}")
-        return number % ndim
+        return number % self.ndim
 
     def row_axes(self, axis: Any) -> tuple[int, ...]:
         """Return the axes of an operation along `axis`, which is an int, a tuple, or None for all axes.
@@ -137,31 +136,24 @@ class Array(_Value):
         axes = tuple(sorted(set(map(self.axis, numbers))))
         if self.batch_axis in axes:
             how = "without axis=" if axis is None else f"along axis {self.batch_axis}"
-            raise RefusedError(
-                "E-ROWS", f"{how}, the shape {self.shape} is computed over the batch: use axis=1 or axis=-1"
-            )
+            text = f"{how}, the shape {self.shape} is computed over the batch: use axis=1 or axis=-1"
+            raise RefusedError("E-ROWS", text)
         return axes
 
-    # --- moving numbers -------------------------------------------------------------------------------------------------
-
-    def rearranged(self, function: Callable[[np.ndarray], np.ndarray], batch_axis: int | None) -> Array:
-        """Move numbers as a function of NumPy moves the positions of a row. The result is a view if NumPy returns a view."""
-        builder = current_builder()
-        positions = all_positions(self.row_shape) if self.positions is None else self.positions
-        builder.spend(positions.size)
-        moved = np.asarray(function(positions))
-        builder.check_size(moved.shape)
-        if np.may_share_memory(moved, positions):
-            return Array(self.base._node, batch_axis, self.base, moved)
-        return Array(builder.gather(self.base.node, moved), batch_axis)
+    @cached_property
+    def source(self) -> Source:
+        """The positions of its numbers in the base."""
+        return Source(all_positions(self.row_shape) if self.positions is None else self.positions, self.batch_axis)
 
     def reshaped(self, row_shape: Sequence[int], batch_axis: int | None) -> Array:
-        return self.rearranged(lambda positions: positions.reshape(row_shape), batch_axis)
+        """Return the array in another shape, whose batch axis is known."""
+        return self.moved(self.source.positions.reshape(row_shape), batch_axis)
 
-    def transposed(self, axes: Sequence[int]) -> Array:
-        """Return the array with its axes in another order."""
-        batch_axis = None if self.batch_axis is None else list(axes).index(self.batch_axis)
-        return self.rearranged(lambda positions: positions.transpose(axes), batch_axis)
+    def moved(self, positions: np.ndarray, batch_axis: int | None) -> Array:
+        """Return numbers of the base: a view, if NumPy made these positions a view of those of this array."""
+        if np.may_share_memory(positions, self.source.positions):
+            return Array(self.base._node, batch_axis, self.base, positions)
+        return Array(current_builder().gather(self.base.node, positions), batch_axis)
 
     def copy(self) -> Array:
         return Array(self.node, self.batch_axis)
@@ -178,7 +170,7 @@ class Array(_Value):
         if self.batch_axis is not None and isinstance([e for e in entries if e is not None][self.batch_axis], int):
             shape = np.empty(self.row_shape)[tuple(0 if isinstance(entry, int) else entry for entry in entries)].shape
             return Array(current_builder().add("first_row", (), shape, self.kind), None)
-        return self.rearranged(*fixed_index(self, entries))
+        return self.moved(*fixed_index(self, entries))
 
     def select(self, axis: int, index: Any) -> Any:
         """Return x[index] along an axis that is counted from the front."""
@@ -191,34 +183,31 @@ class Array(_Value):
             if isinstance(value, Masked) and value.mask.node == region.mask.node:
                 value = value.values
             elif isinstance(value, Array) and value.batch_axis is not None:
-                raise ValueError(
-                    "x[mask] = y differs from row to row: write x[mask] = y[mask], or np.where(mask, y, x)"
-                )
+                text = "x[mask] = y differs from row to row: write x[mask] = y[mask], or np.where(mask, y, x)"
+                raise ValueError(text)
             value = elementwise("where", region.mask_for(region.values), value, region.values)
             self[masked_index(self, entries)] = value
         elif any(isinstance(entry, Array) for entry in entries):
             positions = computed_positions(self, entries, as_array)
             current_builder().check_size((math.prod(positions.row_shape), math.prod(self.row_shape)))
-            values = broadcast(as_array(value), positions.row_shape, positions.batch_axis)
+            values = broadcast(as_array(value), positions.shape)
             self[...] = Array(overwrite(self.node, positions.node, values.node), self.batch_axis)
         else:
-            select, batch_axis = fixed_index(self, entries)
-            positions = all_positions(self.row_shape) if self.positions is None else self.positions
-            self._write(value, select(positions), batch_axis)
+            self._write(value, *fixed_index(self, entries))
 
     def _entries(self, index: Any) -> list[Any]:
         items = index if isinstance(index, tuple) else (index,)
         return index_entries(self, [as_array(x) if isinstance(x, (list, tuple, range)) else x for x in items])
 
     def _write(self, value: Any, positions: np.ndarray, batch_axis: int | None) -> None:
-        """Write into these positions of the base."""
+        """Write into positions of the base."""
         base, builder = self.base, current_builder()
         if base.read_only:
             raise ValueError("the inputs cannot be written into: copy them first, x = observation.copy()")
-        node = builder.cast(broadcast(as_array(value), positions.shape, batch_axis).node, base.kind)
+        values = broadcast(as_array(value), program_shape(positions.shape, batch_axis))
         sources = all_positions(base.row_shape)
         sources.reshape(-1)[positions.reshape(-1)] = sources.size + np.arange(positions.size)
-        base._node = builder.gather(builder.concat([base._node, node]), sources)
+        base._node = builder.gather(builder.concat([base._node, builder.cast(values.node, base.kind)]), sources)
 
 
 class Masked(_Value):
@@ -266,7 +255,7 @@ def as_array(value: Any) -> Array:
 
 
 COMPLEX_OPERATIONS: dict[str, Callable[..., Any]] = {}
-"""What `elementwise` does if an operand is complex. `complex_numbers.py` fills it."""
+"""Functions of complex arrays. `complex_numbers.py` fills this table."""
 
 
 def elementwise(op: str, *operands: Any) -> Any:
@@ -313,37 +302,51 @@ def invert(x: Any) -> Any:
     return elementwise("logical_not", x) if kind == "bool" else elementwise("subtract", -1, x)
 
 
-def broadcast(array: Array, row_shape: Sequence[int], batch_axis: int | None) -> Array:
-    """Repeat an array to a shape."""
-    current_builder().check_size(row_shape)
-    target = Array(current_builder().constant(np.broadcast_to(np.zeros(()), row_shape)), batch_axis)
-    shape = np.broadcast_shapes(array.row_shape, tuple(row_shape))
-    if common_batch_axis([array, target]) != batch_axis or shape != tuple(row_shape):
-        raise ValueError(f"an array of the shape {array.shape} cannot be broadcast to the shape {target.shape}")
-    return array.rearranged(lambda positions: np.broadcast_to(positions, row_shape), batch_axis)
+def rearrange(function: Callable[..., Any], arrays: Any, *args: Any) -> Any:
+    """Return what a function of NumPy makes of arrays if it only moves, repeats and leaves out their numbers.
+
+    Args:
+        function: takes an array or nested lists of arrays, and `args`. The result is a view if NumPy returns a view.
+        args: may have lengths of batch axes, and arrays whose numbers are constant.
+
+    Raises:
+        RefusedError: rows would be mixed, added or left out.
+    """
+    builder, inputs = current_builder(), leaves(arrays)
+    sizes = [math.prod(array.row_shape) for array in inputs]
+    builder.spend(builder.check_size([sum(sizes)]))
+    if len(inputs) == 1:
+        base = inputs[0].base
+        nodes, sources, size = [base.node], [inputs[0].source], math.prod(base.row_shape)
+    else:
+        starts, size = itertools.accumulate(sizes, initial=0), sum(sizes)
+        nodes = [array.node for array in inputs]
+        sources = [
+            Source(all_positions(x.row_shape) + start, x.batch_axis) for x, start in zip(inputs, starts, strict=False)
+        ]
+    remaining = iter(sources)
+    moved = move(function, map_leaves(lambda _: next(remaining), arrays), args, size + 1)
+
+    def to_array(source: Source) -> Array:
+        positions, batch_axis = source
+        if positions.min() >= 0:
+            if len(inputs) == 1:
+                return inputs[0].moved(positions, batch_axis)
+            return Array(builder.gather(builder.concat(nodes), positions), batch_axis)
+        zero = builder.cast(builder.constant(0), widest([builder.nodes[node].kind for node in nodes]))
+        return Array(builder.gather(builder.concat([*nodes, zero]), positions % (size + 1)), batch_axis)
+
+    return [to_array(source) for source in moved] if isinstance(moved, list) else to_array(moved)
 
 
-def stack(arrays: Sequence[Array], axis: Any) -> Array:
-    """Join arrays along a new axis."""
-    at = arrays[0].axis(axis, extra=1)
-    if len({array.row_shape for array in arrays}) > 1 or len({array.batch_axis for array in arrays}) > 1:
-        raise ValueError(f"arrays that are stacked must have the same shape: {_shapes_text(arrays)}")
-    return concatenate([array.select(at, None) for array in arrays], at)
+def broadcast(array: Array, shape: Sequence[Any]) -> Array:
+    """Repeat an array to a shape that the program sees."""
+    return rearrange(np.broadcast_to, array, tuple(shape))
 
 
-def concatenate(arrays: Sequence[Array], axis: Any) -> Array:
-    """Join arrays along an axis."""
-    (at,) = arrays[0].row_axes(axis)
-    if len({(array.batch_axis, array.row_shape[:at], array.row_shape[at + 1 :]) for array in arrays}) > 1:
-        raise ValueError(f"the shapes {_shapes_text(arrays)} cannot be joined along axis {at}")
-    builder = current_builder()
-    sizes = [math.prod(array.row_shape) for array in arrays]
-    builder.check_size((sum(sizes),))
-    starts = itertools.accumulate(sizes, initial=0)
-    positions = [all_positions(array.row_shape) + start for array, start in zip(arrays, starts, strict=False)]
-    node = builder.concat([array.node for array in arrays])
-    return Array(builder.gather(node, np.concatenate(positions, at)), arrays[0].batch_axis)
+def stack(arrays: Sequence[Array], axis: int) -> Array:
+    return rearrange(np.stack, list(arrays), axis)
 
 
-def _shapes_text(arrays: Sequence[Array]) -> str:
-    return " and ".join(dict.fromkeys(str(array.shape) for array in arrays))
+def concatenate(arrays: Sequence[Array], axis: int | None) -> Array:
+    return rearrange(np.concatenate, list(arrays), axis)

@@ -104,26 +104,24 @@ def get_attribute(runtime: Runtime, owner: Any, name: str) -> Any:
             return module_attribute(module, name)
         case Array():
             return _array_attribute(runtime, owner, name)
-        case Complex() if name in ("real", "imag"):
+        case Complex() | complex() if name in ("real", "imag"):
             return getattr(owner, name)
         case Complex() if name in ("shape", "ndim", "size"):
             return _array_attribute(runtime, owner.real, name)
         case Complex():
             return Bound(lambda *args, **kwargs: call_with_complex(name, [owner, *args], kwargs))
-        case complex() if name in ("real", "imag"):
-            return owner.real if name == "real" else owner.imag
         case Polynomial() if name in ("coef", "coeffs", "c"):
             return owner.falling if name != "coef" else owner.falling[::-1]
         case Polynomial() if name == "deriv":
             return Bound(lambda: Polynomial(call_numpy("polyder", [owner.falling], {})))
         case np.finfo() | np.iinfo() if name in ("eps", "tiny", "max", "min", "resolution", "smallest_normal"):
-            return getattr(owner, name).item() if hasattr(getattr(owner, name), "item") else getattr(owner, name)
+            return np.asarray(getattr(owner, name)).item()
         case str() | list() | dict() if name in METHODS.get(type(owner), METHODS[list]):
             return Bound(lambda *args, **kwargs: call_method(runtime, owner, name, args, kwargs))
         case tuple() if name in ("index", "count"):
             return Bound(lambda value: call_method(runtime, list(owner), name, [value], {}))
         case slice() if name in ("start", "stop", "step"):
-            return {"start": owner.start, "stop": owner.stop, "step": owner.step}[name]
+            return getattr(owner, name)
         case bool() | int() | float():
             if name in ("value", "real"):  # of an entry of an Enum
                 return owner
@@ -134,14 +132,12 @@ def get_attribute(runtime: Runtime, owner: Any, name: str) -> Any:
         case Masked() if name in ("clip", "astype", "round", "copy"):
             return Bound(lambda *args, **kwargs: call_numpy(name, [owner, *args], kwargs) if name != "copy" else owner)
     if isinstance(owner, Masked):
-        raise RefusedError(
-            "E-ROWS", f"x[mask].{name[:60]}: rows differ in what a mask selects: use np.where(mask, x, 0)"
-        )
+        text = f"x[mask].{name[:60]}: rows differ in what a mask selects: use np.where(mask, x, 0)"
+        raise RefusedError("E-ROWS", text)
     raise RefusedError("E-ATTRIBUTE", f".{name[:60]} of a {value_type(owner)} is not available")
 
 
 def module_attribute(module: str, name: str) -> Any:
-    """Return module.name."""
     full = f"{module}.{name}"
     if full in CONSTANTS:
         return CONSTANTS[full]

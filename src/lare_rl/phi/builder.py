@@ -13,18 +13,26 @@ from typing import Any
 import numpy as np
 
 from lare_rl.phi.evaluate import compute
-from lare_rl.phi.graph import Gather, Graph, Node, NumberKind, all_positions, elementwise_kinds, letter_sizes, widest
+from lare_rl.phi.graph import (
+    KIND_OF_CODE,
+    Gather,
+    Graph,
+    Node,
+    NumberKind,
+    all_positions,
+    elementwise_kinds,
+    letter_sizes,
+    widest,
+)
 from lare_rl.phi.limits import DEFAULT_LIMITS, MAX_EINSUM_LETTERS, OPERATION_COST, GraphLimits, RefusedError
 
-__all__ = ["Builder", "building", "current_builder", "inline"]
+__all__ = ["Builder", "building", "current_builder"]
 
 ROW_OPS = {
     "row_number": "a factor cannot depend on the number of its row in the batch",
     "first_row": "x[0] of the batch takes one row for all: write x[:, i] for entry i of every row",
 }
 """Values that a program may have, but not compute with: `np.arange(batch)` may be an index, and x[0] has a shape."""
-_KIND_OF_CODE: dict[str, NumberKind] = {"b": "bool", "i": "int", "u": "int", "f": "float"}
-"""Kinds by the codes of NumPy's types (`dtype.kind`)."""
 _DTYPES: dict[NumberKind, type] = {"bool": bool, "int": np.int64, "float": np.float64}
 
 
@@ -97,7 +105,7 @@ class Builder:
     def constant(self, value: Any) -> int:
         """Add numbers that never change."""
         array = np.asarray(value)
-        kind = _KIND_OF_CODE.get(array.dtype.kind)
+        kind = KIND_OF_CODE.get(array.dtype.kind)
         if kind is None:
             raise RefusedError("E-PYTHON", f"an array of {array.dtype}: only real numbers are available")
         return self.add("constant", (), array.shape, kind, np.array(array, _DTYPES[kind], order="C"))
@@ -273,63 +281,3 @@ def building(builder: Builder) -> Iterator[Builder]:
 
 current_builder: Callable[[], Builder] = _BUILDING.get
 """Returns the builder of the graph that is being read."""
-
-
-# --- a graph within another one: the graph of phi in the graph of a reward -------------------------------------------
-
-
-def inline(builder: Builder, graph: Graph, inputs: Mapping[str, int], rows: int | None = None) -> dict[str, int]:
-    """Add all operations of a graph to a builder, and return the nodes of its outputs.
-
-    Args:
-        inputs: for each input of the inner graph, a node of the outer graph.
-        rows: if set, the nodes in `inputs` have an axis of this length in front, the inner graph is computed for each of these
-            rows, and the outputs have this axis too.
-    """
-    new: list[int] = []
-    for node in graph.nodes:
-        x = [new[i] for i in node.inputs]
-        if node.op == "input":
-            new.append(inputs[node.option])
-        elif node.op == "constant":
-            new.append(builder.constant(node.option))
-        elif rows is None:
-            option = node.option.positions if node.op == "gather" else node.option
-            new.append(builder.add(node.op, x, node.shape, node.kind, option))
-        else:
-            new.append(_add_for_rows(builder, node, x, [graph.nodes[i] for i in node.inputs], rows))
-    return {name: _repeat_constant(builder, new[i], graph.nodes[i].shape, rows) for name, i in graph.outputs.items()}
-
-
-def _add_for_rows(builder: Builder, node: Node, x: list[int], inputs: Sequence[Node], rows: int) -> int:
-    """Add an operation on arrays that have one more axis in front."""
-    if all(map(builder.is_constant, x)):
-        return builder.add(node.op, x, node.shape, node.kind, node.option)
-    sizes = [math.prod(operand.shape) for operand in inputs]
-    starts = np.arange(rows).reshape(-1, *[1] * len(node.shape))
-    match node.op:
-        case "gather":
-            return builder.gather(x[0], starts * sizes[0] + node.option.positions)
-        case "concat":
-            ends = np.cumsum(sizes) - sizes
-            x = [_repeat_constant(builder, i, operand.shape, rows) for i, operand in zip(x, inputs, strict=True)]
-            columns = [
-                rows * end + np.arange(rows)[:, None] * size + np.arange(size)
-                for end, size in zip(ends, sizes, strict=True)
-            ]
-            return builder.gather(builder.concat(x), np.concatenate(columns, 1))
-        case "take" if not builder.is_constant(x[0]):
-            return builder.take(x[0], builder.elementwise("add", x[1], builder.constant(starts * sizes[0])))
-        case "einsum":
-            terms, result = node.option.replace("...", "").split("->")
-            letter = next(c for c in string.ascii_letters if c not in terms)
-            terms = [("" if builder.is_constant(i) else letter) + t for t, i in zip(terms.split(","), x, strict=True)]
-            return builder.einsum(terms, letter + result, x)
-    return builder.add(node.op, x, (rows, *node.shape), node.kind, node.option)
-
-
-def _repeat_constant(builder: Builder, x: int, shape: tuple[int, ...], rows: int | None) -> int:
-    """Repeat a constant for each row. Anything else has been computed for each row."""
-    if rows is None or not builder.is_constant(x):
-        return x
-    return builder.gather(x, np.broadcast_to(all_positions(shape), (rows, *shape)))

@@ -25,26 +25,8 @@ from lare_rl.phi.values import (
 )
 
 __all__ = [
-    "call", "class_attribute", "decorate", "define_function", "evaluate_call", "make_class", "new_instance",
-    "super_object",
+    "call", "class_attribute", "decorate", "define_function", "make_class", "new_instance", "super_object",
 ]  # fmt: skip
-
-
-def evaluate_call(runtime: Runtime, node: ast.Call, scope: Scope) -> Any:
-    if isinstance(node.func, ast.Name) and node.func.id == "super" and not node.args:
-        return super_object(scope)
-    function = runtime.evaluate(node.func, scope)
-    args = runtime.entries(node.args, scope)
-    kwargs: dict[str, Any] = {}
-    for keyword in node.keywords:
-        value = runtime.evaluate(keyword.value, scope)
-        more = {keyword.arg: value} if keyword.arg is not None else value
-        if not isinstance(more, dict) or not all(isinstance(key, str) for key in more):
-            raise TypeError("** needs a dictionary whose keys are texts")
-        kwargs |= more
-        runtime.meter.pay(len(more))
-    runtime.line = runtime.builder.line = node.lineno
-    return runtime.call(function, args, kwargs)
 
 
 def call(runtime: Runtime, function: Any, args: Sequence[Any], kwargs: Mapping[str, Any]) -> Any:
@@ -106,14 +88,14 @@ def define_function(runtime: Runtime, node: ast.FunctionDef | ast.Lambda, scope:
     defaults = [runtime.evaluate(default, scope) for default in node.args.defaults]
     more = [None if default is None else runtime.evaluate(default, scope) for default in node.args.kw_defaults]
     name = node.name if isinstance(node, ast.FunctionDef) else "<lambda>"
-    yields = runtime.has_yield and _has_yield(node.body)
-    return Function(name, node.args, node.body, scope.closure, defaults, more, yields)
+    return Function(name, node.args, node.body, scope.closure, defaults, more, _has_yield(runtime, node.body))
 
 
-def _has_yield(body: Sequence[ast.stmt] | ast.expr) -> bool:
+def _has_yield(runtime: Runtime, body: Sequence[ast.stmt] | ast.expr) -> bool:
     """Return whether the body of a function yields, apart from functions within it."""
     stack: list[ast.AST] = list(body) if isinstance(body, list) else []
     while stack:
+        runtime.meter.pay()
         node = stack.pop()
         if isinstance(node, (ast.Yield, ast.YieldFrom)):
             return True
@@ -179,7 +161,6 @@ IGNORED_DECORATORS = frozenset(
 
 
 def make_class(runtime: Runtime, statement: ast.ClassDef, scope: Scope) -> Class:
-    """Carry out the definition of a class."""
     bases = [runtime.evaluate(base, scope) for base in statement.bases]
     program_bases = [base for base in bases if isinstance(base, Class)]
     names = {x.name if isinstance(x, Symbol) else "that is no class" for x in bases if not isinstance(x, Class)}
@@ -198,7 +179,6 @@ def make_class(runtime: Runtime, statement: ast.ClassDef, scope: Scope) -> Class
 
 
 def decorate(runtime: Runtime, value: Any, decorators: Sequence[ast.expr], scope: Scope) -> Any:
-    """Apply the decorators of a function or of a class."""
     for node in reversed(decorators):
         decorator = runtime.evaluate(node.func if isinstance(node, ast.Call) else node, scope)
         name = decorator.name if isinstance(decorator, Symbol) else ""
@@ -214,7 +194,6 @@ def decorate(runtime: Runtime, value: Any, decorators: Sequence[ast.expr], scope
 
 
 def new_instance(runtime: Runtime, cls: Class, args: Sequence[Any], kwargs: Mapping[str, Any]) -> Instance:
-    """Create an object of a class."""
     instance = Instance(cls)
     if cls.has("__init__"):
         runtime.call(class_attribute(runtime, instance, "__init__"), args, kwargs)

@@ -32,7 +32,6 @@ def as_complex(value: Any) -> Complex:
 
 
 def is_complex(value: Any) -> bool:
-    """Return whether a value, or an entry of a list, is complex."""
     if isinstance(value, (list, tuple)):
         return any(isinstance(item, (Complex, complex)) for item in value)
     return isinstance(value, (Complex, complex))
@@ -40,8 +39,8 @@ def is_complex(value: Any) -> bool:
 
 def call_with_complex(name: str, args: Sequence[Any], kwargs: Mapping[str, Any]) -> Any:
     """Call a function of NumPy with at least one complex argument."""
-    if name in COMPLEX_FUNCTIONS:
-        return COMPLEX_FUNCTIONS[name](*args, **kwargs)
+    if name in COMPLEX_OPERATIONS:
+        return COMPLEX_OPERATIONS[name](*args, **kwargs)
     if name not in BY_COMPONENT:
         raise RefusedError("E-NUMPY", f"np.{name} of complex numbers: use np.abs, np.angle, .real or .imag")
 
@@ -91,6 +90,11 @@ _OPERATIONS: dict[str, Callable[..., Any]] = {
     "negative": lambda x: Complex(-x.real, -x.imag),
     "abs": lambda x: elementwise("hypot", x.real, x.imag),
     "exp": _exp,
+    "square": lambda x: _multiply(x, x),
+    "real": lambda x: x.real,
+    "imag": lambda x: x.imag,
+    "conj": lambda x: Complex(x.real, -x.imag),
+    "angle": lambda x: elementwise("arctan2", x.imag, x.real),
     "where": lambda c, x, y: Complex(
         elementwise("where", c.real, x.real, y.real), elementwise("where", c.real, x.imag, y.imag)
     ),
@@ -98,17 +102,7 @@ _OPERATIONS: dict[str, Callable[..., Any]] = {
 for _name, _function in _OPERATIONS.items():
     COMPLEX_OPERATIONS[_name] = lambda *x, f=_function: f(*map(as_complex, x))
 COMPLEX_OPERATIONS["power"] = _power
-
-COMPLEX_FUNCTIONS: dict[str, Callable[..., Any]] = {
-    **COMPLEX_OPERATIONS,
-    "absolute": lambda x: COMPLEX_OPERATIONS["abs"](x),
-    "square": lambda x: _multiply(as_complex(x), as_complex(x)),
-    "real": lambda x: as_complex(x).real,
-    "imag": lambda x: as_complex(x).imag,
-    "conj": lambda x: Complex(as_complex(x).real, -as_complex(x).imag),
-    "conjugate": lambda x: Complex(as_complex(x).real, -as_complex(x).imag),
-    "angle": lambda x: elementwise("arctan2", as_complex(x).imag, as_complex(x).real),
-}
+COMPLEX_OPERATIONS |= {"absolute": COMPLEX_OPERATIONS["abs"], "conjugate": COMPLEX_OPERATIONS["conj"]}
 
 
 array_functions(
@@ -141,7 +135,7 @@ def transform(variant: tuple[float, bool], a: Any, n: Any = None, axis: int = -1
     return Complex(real, imag) if sign < 0 else Complex(real / n, imag / n)
 
 
-COMPLEX_FUNCTIONS |= {name: FUNCTIONS[name] for name in ("fft.fft", "fft.ifft", "fft.rfft")}
+COMPLEX_OPERATIONS |= {name: FUNCTIONS[name] for name in ("fft.fft", "fft.ifft", "fft.rfft")}
 
 
 @numpy_variants({"fft.rfftfreq": np.fft.rfftfreq, "fft.fftfreq": np.fft.fftfreq})

@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterable, Sequence
 from typing import Any
 
 from lare_rl.phi.arrays import Array, Complex, as_array
-from lare_rl.phi.calls import evaluate_call
+from lare_rl.phi.calls import define_function, super_object
 from lare_rl.phi.limits import MAX_INT_BITS, RefusedError
 from lare_rl.phi.numpy_functions import INDEXED, call_numpy
 from lare_rl.phi.operand import BatchSize, Operand
@@ -14,10 +14,7 @@ from lare_rl.phi.runtime import Runtime, check_key, check_number, check_text
 from lare_rl.phi.text import combine_values, format_value
 from lare_rl.phi.values import Class, Function, Instance, Iterator, Scope, Set, Symbol, describe
 
-__all__ = [
-    "apply_binary", "apply_unary", "compare", "evaluate", "evaluate_entries", "get_item", "list_items",
-    "test_truth",
-]  # fmt: skip
+__all__ = ["apply_binary", "evaluate", "get_item", "list_items", "test_truth"]
 
 NUMBERS = (bool, int, float, complex)
 BINARY: dict[type[ast.operator], tuple[str, Callable[[Any, Any], Any]]] = {
@@ -38,7 +35,7 @@ GENERIC_TYPES = ("list", "tuple", "dict", "set", "type")
 """Types that annotations index: list[float]."""
 
 
-def apply_unary(runtime: Runtime, op: ast.unaryop, value: Any) -> Any:
+def _apply_unary(runtime: Runtime, op: ast.unaryop, value: Any) -> Any:
     if isinstance(op, ast.Not):
         return not runtime.truth(value)
     function = UNARY[type(op)]
@@ -72,7 +69,7 @@ def apply_binary(runtime: Runtime, op: ast.operator, x: Any, y: Any) -> Any:
     return combine_values(runtime.meter, name, x, y)
 
 
-def compare(runtime: Runtime, op: ast.cmpop, x: Any, y: Any) -> Any:
+def _compare(runtime: Runtime, op: ast.cmpop, x: Any, y: Any) -> Any:
     runtime.meter.pay_for_all_within([x, y])
     if isinstance(op, (ast.In, ast.NotIn)):
         if isinstance(x, Operand) and isinstance(y, (list, tuple)):
@@ -85,7 +82,6 @@ def compare(runtime: Runtime, op: ast.cmpop, x: Any, y: Any) -> Any:
 
 
 def get_item(runtime: Runtime, container: Any, index: Any) -> Any:
-    """Return container[index]."""
     runtime.meter.pay_for_all_within([index])
     match container:
         case Array() | Complex():
@@ -141,7 +137,6 @@ def list_items(runtime: Runtime, value: Any) -> Sequence[Any]:
 
 
 def evaluate(runtime: Runtime, node: ast.expr, scope: Scope) -> Any:
-    """Return the value of an expression."""
     runtime.meter.pay()
     match node:
         case ast.Constant(value=value):
@@ -153,21 +148,21 @@ def evaluate(runtime: Runtime, node: ast.expr, scope: Scope) -> Any:
         case ast.Attribute(value=owner, attr=name):
             return runtime.attribute(runtime.evaluate(owner, scope), name)
         case ast.Call():
-            return evaluate_call(runtime, node, scope)
+            return _evaluate_call(runtime, node, scope)
         case ast.BinOp(x, op, y):
             return runtime.binary(op, runtime.evaluate(x, scope), runtime.evaluate(y, scope))
         case ast.UnaryOp(op=op, operand=operand):
-            return apply_unary(runtime, op, runtime.evaluate(operand, scope))
+            return _apply_unary(runtime, op, runtime.evaluate(operand, scope))
         case ast.Subscript(value=container, slice=index):
             return runtime.item(runtime.evaluate(container, scope), runtime.evaluate(index, scope))
         case ast.Slice(lower=lower, upper=upper, step=step):
             return slice(*(None if end is None else runtime.evaluate(end, scope) for end in (lower, upper, step)))
         case ast.Tuple(elts=items):
-            return tuple(runtime.entries(items, scope))
+            return tuple(_evaluate_entries(runtime, items, scope))
         case ast.List(elts=items):
-            return runtime.entries(items, scope)
+            return _evaluate_entries(runtime, items, scope)
         case ast.Set(elts=items):
-            return Set(dict.fromkeys(map(check_key, runtime.entries(items, scope))))
+            return Set(dict.fromkeys(map(check_key, _evaluate_entries(runtime, items, scope))))
         case ast.Dict(keys=keys, values=values):
             return _evaluate_dict(runtime, keys, values, scope)
         case ast.Compare(first, ops, comparators):
@@ -181,7 +176,7 @@ def evaluate(runtime: Runtime, node: ast.expr, scope: Scope) -> Any:
             scope.function.assign(name, result)
             return result
         case ast.Lambda():
-            return runtime.define(node, scope)
+            return define_function(runtime, node, scope)
         case ast.ListComp() | ast.GeneratorExp() | ast.SetComp() | ast.DictComp():
             return _evaluate_comprehension(runtime, node, scope)
         case ast.JoinedStr(values=values):
@@ -197,7 +192,24 @@ def evaluate(runtime: Runtime, node: ast.expr, scope: Scope) -> Any:
     raise RefusedError("E-PYTHON", f"{type(node).__name__.lower()} is not available")
 
 
-def evaluate_entries(runtime: Runtime, nodes: Sequence[ast.expr], scope: Scope) -> list[Any]:
+def _evaluate_call(runtime: Runtime, node: ast.Call, scope: Scope) -> Any:
+    if isinstance(node.func, ast.Name) and node.func.id == "super" and not node.args:
+        return super_object(scope)
+    function = runtime.evaluate(node.func, scope)
+    args = _evaluate_entries(runtime, node.args, scope)
+    kwargs: dict[str, Any] = {}
+    for keyword in node.keywords:
+        value = runtime.evaluate(keyword.value, scope)
+        more = {keyword.arg: value} if keyword.arg is not None else value
+        if not isinstance(more, dict) or not all(isinstance(key, str) for key in more):
+            raise TypeError("** needs a dictionary whose keys are texts")
+        kwargs |= more
+        runtime.meter.pay(len(more))
+    runtime.line = runtime.builder.line = node.lineno
+    return runtime.call(function, args, kwargs)
+
+
+def _evaluate_entries(runtime: Runtime, nodes: Sequence[ast.expr], scope: Scope) -> list[Any]:
     """Return the values of a list. Some of them may be unpacked: [a, *b]."""
     values: list[Any] = []
     for node in nodes:
@@ -254,7 +266,7 @@ def _evaluate_comparison(
         if i and not runtime.truth(result):
             break
         y = runtime.evaluate(comparator, scope)
-        result, x = compare(runtime, op, x, y), y
+        result, x = _compare(runtime, op, x, y), y
     return result
 
 

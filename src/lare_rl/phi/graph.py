@@ -23,7 +23,7 @@ from typing import Any, Literal, NamedTuple, get_args
 
 import numpy as np
 
-__all__ = ["ELEMENTWISE", "Gather", "Graph", "Node", "NumberKind", "elementwise_kinds", "widest"]
+__all__ = ["ELEMENTWISE", "KIND_OF_CODE", "Gather", "Graph", "Node", "NumberKind", "elementwise_kinds", "widest"]
 
 NumberKind = Literal["bool", "int", "float"]
 
@@ -182,6 +182,9 @@ def all_positions(shape: tuple[int, ...]) -> np.ndarray:
 
 KINDS: tuple[NumberKind, ...] = get_args(NumberKind)
 """From the narrowest to the widest."""
+
+KIND_OF_CODE: dict[str, NumberKind] = {"b": "bool", "i": "int", "u": "int", "f": "float"}
+"""Kinds by the codes of NumPy's types (`dtype.kind`)."""
 
 ELEMENTWISE: dict[str, str] = {
     **dict.fromkeys(

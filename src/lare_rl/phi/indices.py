@@ -8,14 +8,17 @@ from __future__ import annotations
 import math
 import operator
 from collections.abc import Callable, Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from lare_rl.phi.builder import current_builder
 from lare_rl.phi.graph import all_positions
 from lare_rl.phi.limits import RefusedError
-from lare_rl.phi.operand import BatchSize, Shaped
+from lare_rl.phi.operand import BatchSize
+
+if TYPE_CHECKING:
+    from lare_rl.phi.arrays import Array
 
 __all__ = ["ALL", "computed_positions", "fixed_index", "index_entries", "is_mask", "masked_index", "overwrite"]
 
@@ -27,7 +30,7 @@ def is_mask(entry: Any) -> bool:
     return getattr(entry, "kind", None) == "bool"
 
 
-def index_entries(array: Shaped, items: Sequence[Any]) -> list[Any]:
+def index_entries(array: Array, items: Sequence[Any]) -> list[Any]:
     """Return an index as an entry for each axis, and None for each new one: slices, integers, arrays of integers."""
     entries: list[Any] = []
     for item in items:
@@ -57,23 +60,25 @@ def _read_slice(entry: slice) -> slice:
     return slice(*(None if end is None else operator.index(end) for end in (entry.start, stop, entry.step)))
 
 
-def fixed_index(array: Shaped, entries: Sequence[Any]) -> tuple[Callable[[np.ndarray], np.ndarray], int | None]:
-    """Return what an index does to positions, and where the batch axis then is. NumPy finds it on an array without numbers."""
+def fixed_index(array: Array, entries: Sequence[Any]) -> tuple[np.ndarray, int | None]:
+    """Return the positions that an index selects, and where the batch axis then is.
+
+    Raises:
+        RefusedError: it selects rows of the batch, or too many numbers.
+    """
     axes = [entry for entry in entries if entry is not None]
     if array.batch_axis is not None and axes[array.batch_axis] not in (ALL, slice(0, None), slice(0, None, 1)):
         raise RefusedError("E-ROWS", f"an index into the rows of {array.shape} takes one row for all: write x[:, i]")
-    # An axis of length 0 marks the batch axis; without one, it is behind all others.
+    # NumPy finds the shape on an array without numbers: the batch axis, or else a last axis, has the length 0.
     at = array.ndim if array.batch_axis is None else array.batch_axis
-    shape, index = [*array.row_shape[:at], 0, *array.row_shape[at + 1 :]], tuple(entries)
-    result = np.empty(shape)[index if array.batch_axis is not None else (*index, ALL)].shape
-    if result.count(0) > 1:
-        raise IndexError(f"a slice is empty: it lies beyond the end of an axis of the shape {array.shape}")
-    current_builder().check_size([size or 1 for size in result])
-    batch_axis = None if array.batch_axis is None else result.index(0)
-    return lambda positions: np.asarray(positions[index]), batch_axis
+    index = (*entries, ALL) if array.batch_axis is None else tuple(entries)
+    shape = np.empty((*array.row_shape[:at], 0, *array.row_shape[at + 1 :]))[index].shape
+    is_empty = shape.count(0) > 1
+    current_builder().spend(current_builder().check_size([0 if is_empty else max(size, 1) for size in shape]))
+    return np.asarray(array.source.positions[tuple(entries)]), None if array.batch_axis is None else shape.index(0)
 
 
-def masked_index(array: Shaped, entries: Sequence[Any]) -> tuple[Any, ...]:
+def masked_index(array: Array, entries: Sequence[Any]) -> tuple[Any, ...]:
     """Return the index of all numbers that the mask in front of an index may select."""
     mask = entries[0]
     if mask.batch_axis != array.batch_axis or mask.row_shape != array.row_shape[: mask.ndim]:
@@ -83,38 +88,33 @@ def masked_index(array: Shaped, entries: Sequence[Any]) -> tuple[Any, ...]:
     return (ALL,) * mask.ndim + tuple(entries[1:])
 
 
-def computed_positions(array: Shaped, entries: Sequence[Any], as_array: Callable[[Any], Any]) -> Any:
+def computed_positions(array: Array, entries: Sequence[Any], as_array: Callable[[Any], Any]) -> Any:
     """Return the array of the positions of x[np.arange(batch), i, 2:4] in a row.
 
     Each row reads its own numbers, or those of a constant. A computed index beyond the end of an axis stands for the last
     entry.
     """
-    at_arrays = [i for i, entry in enumerate(entries) if not isinstance(entry, slice) and entry is not None]
-    # If slices are between arrays, the axes of the arrays come first in the result.
-    apart = at_arrays != list(range(at_arrays[0], at_arrays[-1] + 1))
-    first = -1 if apart else at_arrays[0]
     computed = as_array(0)
-    before: list[np.ndarray] = []
-    behind: list[np.ndarray] = []
     axes = iter(range(array.ndim))
-    for i, entry in enumerate(entries):
+    for entry in entries:
         axis = None if entry is None else next(axes)
         size, stride = (1, 0) if axis is None else (array.row_shape[axis], math.prod(array.row_shape[axis + 1 :]))
         if axis is not None and axis == array.batch_axis:
-            if entry is None or not getattr(entry, "is_row_number", False) or size > 1:
+            if entry is None or not getattr(entry, "is_row_number", False) or math.prod(entry.row_shape) != size:
                 raise RefusedError("E-ROWS", "an index that differs from row to row is x[np.arange(len(x)), i]")
-            computed = as_array(np.zeros(entry.row_shape, int)).reshaped(entry.row_shape, entry.batch_axis) + computed
-        elif isinstance(entry, slice) or entry is None:
-            (behind if i > first else before).append(np.arange(size)[entry or ALL] * stride)
-        else:
+            rows = as_array(np.arange(size) * stride).reshaped(entry.row_shape, entry.batch_axis)
+            computed = rows + computed
+        elif not isinstance(entry, slice) and entry is not None:
             computed = _clamp(as_array(entry), size) * stride + computed
-    sizes = [len(steps) for steps in before], [len(steps) for steps in behind]
-    current_builder().check_size((*sizes[0], *computed.row_shape, *sizes[1]))
-    offsets = sum(np.meshgrid(*before, *behind, indexing="ij"), np.zeros((), int))
-    offsets = np.reshape(offsets, (*sizes[0], *[1] * computed.ndim, *sizes[1]))
-    shape = *[1] * len(before), *computed.row_shape, *[1] * len(behind)
-    batch_axis = None if computed.batch_axis is None else len(before) + computed.batch_axis
-    return computed.reshaped(shape, batch_axis).copy() + offsets
+    arrays = [i for i, entry in enumerate(entries) if not isinstance(entry, slice) and entry is not None]
+    starts = all_positions(array.row_shape)[tuple(0 if i in arrays else entry for i, entry in enumerate(entries))]
+    current_builder().check_size((*starts.shape, *computed.row_shape))
+    # If slices are between arrays, the axes of the arrays come first in the result.
+    before = arrays[0] if arrays == list(range(arrays[0], arrays[-1] + 1)) else 0
+    behind = starts.ndim - before
+    starts = starts.reshape((*starts.shape[:before], *[1] * computed.ndim, *starts.shape[before:]))
+    batch_axis = None if computed.batch_axis is None else before + computed.batch_axis
+    return computed.reshaped((*[1] * before, *computed.row_shape, *[1] * behind), batch_axis).copy() + starts
 
 
 def overwrite(old: int, positions: int, values: int) -> int:

@@ -15,6 +15,7 @@ from lare_rl.phi import calls, expressions, statements
 from lare_rl.phi.attributes import get_attribute
 from lare_rl.phi.builder import Builder
 from lare_rl.phi.calls import class_attribute
+from lare_rl.phi.limits import MAX_STEPS
 from lare_rl.phi.python_functions import BUILTINS
 from lare_rl.phi.runtime import Meter, Runtime
 from lare_rl.phi.values import Class, Instance, Scope, Symbol
@@ -25,11 +26,9 @@ __all__ = ["Interpreter"]
 class Interpreter(Runtime):
     """The state of a program that is carried out. Its methods are the functions of the modules that describe them."""
 
-    def __init__(self, builder: Builder, has_yield: bool = True):
-        self.builder, self.has_yield = builder, has_yield
-        self.meter = Meter()
-        self.line = 1
-        self.call_depth = 0
+    def __init__(self, builder: Builder, max_steps: int = MAX_STEPS):
+        self.builder, self.meter = builder, Meter(max_steps)
+        self.line, self.call_depth = 1, 0
         self.module = Scope()
         self.module |= {"__name__": "phi", "np": Symbol("np"), "numpy": Symbol("np"), "math": Symbol("math")}
         self.module |= {name: Symbol(name) for name in (*BUILTINS, "staticmethod", "classmethod", "property")}
@@ -37,8 +36,6 @@ class Interpreter(Runtime):
     run = statements.run_statements
     assign = statements.assign
     evaluate = expressions.evaluate
-    entries = expressions.evaluate_entries
-    define = calls.define_function
     call = calls.call
     binary = expressions.apply_binary
     item = expressions.get_item
@@ -46,7 +43,6 @@ class Interpreter(Runtime):
     truth = expressions.test_truth
 
     def attribute(self, owner: Any, name: str) -> Any:
-        """Return owner.name."""
         if isinstance(owner, (Instance, Class)):
             return class_attribute(self, owner, name)
         return get_attribute(self, owner, name)

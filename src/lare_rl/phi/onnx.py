@@ -10,9 +10,9 @@ from typing import Any
 
 import numpy as np
 
-from lare_rl.phi.graph import Graph, Node
+from lare_rl.phi.graph import KIND_OF_CODE, Graph, Node
 
-__all__ = ["BATCH", "is_installed", "onnx_model"]
+__all__ = ["BATCH", "DTYPES", "is_installed", "onnx_model"]
 
 OPSET = 18
 """Version of ONNX's operations. Runtimes of 2023 and later support it."""
@@ -48,6 +48,7 @@ COMPOSED: dict[str, Callable[..., str]] = {
 }
 """Operations that are some operations of ONNX. `op` adds one of them."""
 DTYPES = {"float": np.float32, "int": np.int64, "bool": np.bool_}
+"""The types of inputs and outputs."""
 
 
 def is_installed() -> bool:
@@ -100,9 +101,8 @@ class _Writer:
     def constant(self, value: Any) -> str:
         from onnx import numpy_helper
 
-        array = np.asarray(value)
-        kinds, name = {"f": np.float32, "i": np.int64, "b": np.bool_}, f"constant_{len(self.constants)}"
-        self.constants.append(numpy_helper.from_array(array.astype(kinds[array.dtype.kind]), name))
+        array, name = np.asarray(value), f"constant_{len(self.constants)}"
+        self.constants.append(numpy_helper.from_array(array.astype(DTYPES[KIND_OF_CODE[array.dtype.kind]]), name))
         return name
 
     def repeat_for_rows(self, constant: str, shape: tuple[int, ...]) -> str:

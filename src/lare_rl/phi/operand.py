@@ -4,11 +4,14 @@ from __future__ import annotations
 
 import operator
 from collections.abc import Callable, Sequence
-from typing import Any, Never, Protocol, runtime_checkable
+from typing import TYPE_CHECKING, Any, Never
 
 from lare_rl.phi.limits import RefusedError
 
-__all__ = ["BATCH", "BatchSize", "Operand", "Shaped", "common_batch_axis"]
+if TYPE_CHECKING:
+    from lare_rl.phi.arrays import Array
+
+__all__ = ["BATCH", "BatchSize", "Operand", "common_batch_axis", "program_shape"]
 
 
 def _operators(op: str) -> tuple[Callable[[Any, Any], Any], Callable[[Any, Any], Any]]:
@@ -96,9 +99,8 @@ class BatchSize:
         return BatchSize(factor) if factor > 0 and not rest else self.refuse()
 
     def refuse(self, *_: Any) -> Never:
-        raise RefusedError(
-            "E-ROWS", "no factor can depend on the number of rows, and no loop can go over them: use columns, x[:, i]"
-        )
+        text = "no factor can depend on the number of rows, and no loop can go over them: use columns, x[:, i]"
+        raise RefusedError("E-ROWS", text)
 
     def __hash__(self) -> int:
         return hash(self.factor)
@@ -112,21 +114,12 @@ class BatchSize:
 BATCH = BatchSize()
 
 
-@runtime_checkable
-class Shaped(Protocol):
-    """An array, as far as its axes go."""
-
-    batch_axis: int | None
-
-    @property
-    def row_shape(self) -> tuple[int, ...]: ...
-    @property
-    def shape(self) -> tuple[Any, ...]: ...
-    @property
-    def ndim(self) -> int: ...
+def program_shape(row_shape: Sequence[int], batch_axis: int | None) -> tuple[Any, ...]:
+    """Return the shape that the program sees of an array."""
+    return tuple(BatchSize(n) if axis == batch_axis else n for axis, n in enumerate(row_shape))
 
 
-def common_batch_axis(arrays: Sequence[Shaped]) -> int | None:
+def common_batch_axis(arrays: Sequence[Array]) -> int | None:
     """Return the batch axis of the result, if arrays are broadcast to each other.
 
     Raises:
@@ -139,9 +132,8 @@ def common_batch_axis(arrays: Sequence[Shaped]) -> int | None:
         return None
     shapes = " and ".join(str(array.shape) for array in arrays)
     if len(axes_from_end) > 1:
-        raise RefusedError(
-            "E-ROWS", f"the shapes {shapes} combine each row with all others: use keepdims=True or [:, None]"
-        )
+        text = f"the shapes {shapes} combine each row with all others: use keepdims=True or [:, None]"
+        raise RefusedError("E-ROWS", text)
     (from_end,) = axes_from_end
     lengths = {array.row_shape[-from_end] for array in arrays if array.batch_axis is not None}
     fixed = {array.row_shape[-from_end] for array in arrays if array.batch_axis is None and array.ndim >= from_end}

@@ -9,7 +9,7 @@ import threading
 import warnings
 from concurrent.futures import ThreadPoolExecutor
 
-from lare_rl.phi.arrays import Array
+from lare_rl.phi.arrays import Array, concatenate
 from lare_rl.phi.attributes import module_attribute
 from lare_rl.phi.builder import Builder, building, current_builder
 from lare_rl.phi.graph import Graph
@@ -37,7 +37,7 @@ from lare_rl.phi.values import (
 )
 from lare_rl.util.sanitize import first_invisible
 
-__all__ = ["FUNCTION_NAME", "describe_failure", "parse", "read"]
+__all__ = ["FUNCTION_NAME", "apply_program", "describe_failure", "parse", "read"]
 
 _PARSING = threading.Lock()
 """`threading.stack_size` is for the whole process. Before Python 3.11.8 and 3.12.2, parsers in two threads may also miscount
@@ -92,7 +92,7 @@ def read(source: str, observation_size: int, action_size: int, max_factors: int 
             and often what to write instead: first what stopped the reader, then further names that are not available.
     """
     builder, tree = Builder(), None
-    interpreter = Interpreter(builder, has_yield="yield" in source)
+    interpreter = Interpreter(builder)
     try:
         with building(builder), warnings.catch_warnings():
             warnings.simplefilter("ignore")
@@ -104,6 +104,21 @@ def read(source: str, observation_size: int, action_size: int, max_factors: int 
     first = f"{code} line {line}: {' '.join(message[:MAX_MESSAGE_LENGTH].split())}"
     further = [] if tree is None else _unavailable_names(tree, interpreter.module)
     raise RefusedError(code, "\n".join(dict.fromkeys([first, *further])), line) from None
+
+
+def apply_program(source: str, observation: Array, action: Array) -> Array:
+    """Carry out a program that could be read in the graph that is being built.
+
+    Args:
+        observation, action: (rows, size), with the batch axis 0: several rows for each row of the graph.
+
+    Returns:
+        The factors (rows, n_factors), with the batch axis 0.
+    """
+    interpreter = Interpreter(current_builder())
+    interpreter.run(parse(source).body, interpreter.module)
+    factors = interpreter.call(interpreter.module[FUNCTION_NAME], [observation, action], {})
+    return concatenate(factors, 1)
 
 
 def describe_failure(error: Exception, interpreter: Interpreter) -> tuple[str, str, int | None]:
@@ -123,7 +138,6 @@ def describe_failure(error: Exception, interpreter: Interpreter) -> tuple[str, s
 
 
 def error_text(error: Exception) -> str:
-    """Return the message of an error that a program raised."""
     if isinstance(error, NameError):
         return f"{error} is not defined, or not available"
     return str(error) if isinstance(error, ProgramError) else f"{type(error).__name__}: {error}"
@@ -163,9 +177,8 @@ def _build_graph(interpreter: Interpreter, observation_size: int, action_size: i
         outputs.append(_check_factors(interpreter.call(function, arrays, {}), max_factors))
         interpreter.meter, builder.work = Meter(), 0
     if outputs[0] != outputs[1]:
-        raise RefusedError(
-            "E-STATE", "a second call gives other factors: keep nothing in module variables, defaults or closures"
-        )
+        text = "a second call gives other factors: keep nothing in module variables, defaults or closures"
+        raise RefusedError("E-STATE", text)
     return builder.finish({"factors": builder.concat(outputs[0])})
 
 
@@ -179,14 +192,10 @@ def _check_factors(factors: object, max_factors: int) -> list[int]:
         raise RefusedError("E-FORM", f"{FUNCTION_NAME} must return {most}, not {len(factors)}")
     for number, factor in enumerate(factors, start=1):
         if not isinstance(factor, Array) or factor.batch_axis != 0 or factor.row_shape != (1, 1):
-            hint = (
-                ": write x[:, None], or keepdims=True in a sum"
-                if isinstance(factor, Array) and factor.row_shape == (1,)
-                else ""
-            )
-            raise RefusedError(
-                "E-FORM", f"factor {number} must be an array of the shape (batch, 1), not {_describe(factor)}{hint}"
-            )
+            is_flat = isinstance(factor, Array) and factor.row_shape == (1,)
+            hint = ": write x[:, None], or keepdims=True in a sum" if is_flat else ""
+            text = f"factor {number} must be an array of the shape (batch, 1), not {_describe(factor)}{hint}"
+            raise RefusedError("E-FORM", text)
     return [builder.reshape(builder.cast(factor.node, "float"), (1,)) for factor in factors]
 
 

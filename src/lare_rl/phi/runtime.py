@@ -12,7 +12,7 @@ from typing import Any
 from lare_rl.phi.arrays import Array
 from lare_rl.phi.builder import Builder
 from lare_rl.phi.limits import MAX_INT_BITS, MAX_KEY_LENGTH, MAX_LIST_LENGTH, MAX_STEPS, MAX_TEXT_LENGTH, RefusedError
-from lare_rl.phi.values import Function, Instance, Scope, Symbol
+from lare_rl.phi.values import Instance, Scope, Symbol
 
 __all__ = ["Meter", "Runtime", "builtin", "check_key", "check_number", "check_text", "check_text_length", "varies"]
 
@@ -92,8 +92,6 @@ class Runtime(ABC):
     line: int
     """Line that is being carried out."""
     call_depth: int
-    has_yield: bool
-    """Whether the source has the word `yield` somewhere."""
 
     @abstractmethod
     def run(self, statements: Iterable[ast.stmt], scope: Scope, /) -> None: ...
@@ -101,10 +99,6 @@ class Runtime(ABC):
     def assign(self, target: ast.expr, value: Any, scope: Scope, /) -> None: ...
     @abstractmethod
     def evaluate(self, node: ast.expr, scope: Scope, /) -> Any: ...
-    @abstractmethod
-    def entries(self, nodes: Sequence[ast.expr], scope: Scope, /) -> list[Any]: ...
-    @abstractmethod
-    def define(self, node: ast.FunctionDef | ast.Lambda, scope: Scope, /) -> Function: ...
     @abstractmethod
     def binary(self, op: ast.operator, x: Any, y: Any, /) -> Any: ...
     @abstractmethod

@@ -9,7 +9,7 @@ from typing import Any
 
 from lare_rl.phi.arrays import Array
 from lare_rl.phi.attributes import resolve_import
-from lare_rl.phi.calls import decorate, make_class
+from lare_rl.phi.calls import decorate, define_function, make_class
 from lare_rl.phi.limits import RefusedError
 from lare_rl.phi.python_functions import ERRORS
 from lare_rl.phi.runtime import Runtime, check_key
@@ -68,7 +68,7 @@ def _execute(runtime: Runtime, statement: ast.stmt, scope: Scope) -> None:
             _loop(runtime, turns, body, orelse, scope)
         case ast.FunctionDef() | ast.ClassDef():
             is_function = isinstance(statement, ast.FunctionDef)
-            value = runtime.define(statement, scope) if is_function else make_class(runtime, statement, scope)
+            value = define_function(runtime, statement, scope) if is_function else make_class(runtime, statement, scope)
             scope.assign(statement.name, decorate(runtime, value, statement.decorator_list, scope))
         case ast.Try():
             _try(runtime, statement, scope)

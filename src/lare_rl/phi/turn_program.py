@@ -43,8 +43,6 @@ NUMBER = re.compile(r"(?<![\w.])[-+]?\d{1,300}(?:\.\d{1,300})?(?!\d)")
 
 @dataclass(frozen=True)
 class TurnProgram:
-    """A program that was read."""
-
     source: str
     tree: ast.Module
 
@@ -61,8 +59,7 @@ class TurnProgram:
             RefusedError: the program fails, costs too much, or returns something else. The message has a line for its author.
         """
         with building(builder := Builder()):
-            interpreter = Interpreter(builder, has_yield="yield" in self.source)
-            interpreter.meter = Meter(MAX_STEPS)
+            interpreter = Interpreter(builder, MAX_STEPS)
             interpreter.module["find_numbers"] = Bound(lambda value: _find_numbers(interpreter.meter, value))
             inputs = [shorten(tool), _copy_argument(dict(arguments)), shorten(result), shorten(text)]
             try:
@@ -127,7 +124,6 @@ def _find_numbers(meter: Meter, text: Any) -> list[float]:
 
 
 def _check_events(events: Any) -> dict[str, float]:
-    """Return the events of a program as numbers."""
     if type(events) is not dict:
         raise RefusedError("E-FORM", f"{TURN_FUNCTION_NAME} must return a dictionary of events, not {describe(events)}")
     if not 1 <= len(events) <= MAX_FACTORS:
@@ -135,9 +131,8 @@ def _check_events(events: Any) -> dict[str, float]:
     result = {}
     for name, value in events.items():
         if not isinstance(name, str) or not 0 < len(name) <= MAX_NAME or name != one_line(name):
-            raise RefusedError(
-                "E-FORM", f"the name of an event must be a text of 1 to {MAX_NAME} characters, in one line"
-            )
+            text = f"the name of an event must be a text of 1 to {MAX_NAME} characters, in one line"
+            raise RefusedError("E-FORM", text)
         if not isinstance(value, bool | int | float):
             raise RefusedError("E-FORM", f"the event {name!r} must be a number or a truth value, not {describe(value)}")
         if not abs(value) <= MAX_EVENT:

@@ -3,7 +3,6 @@
 from lare_rl.phi.numpy_functions import (
     creation,
     elementwise,
-    positions,
     products,
     reductions,
     sequences,
@@ -15,18 +14,6 @@ from lare_rl.phi.numpy_functions.registry import FUNCTIONS, KIND_OF_DTYPE, call_
 from lare_rl.phi.numpy_functions.tables import Polynomial
 
 __all__ = [
-    "FUNCTIONS",
-    "INDEXED",
-    "KIND_OF_DTYPE",
-    "Polynomial",
-    "call_numpy",
-    "creation",
-    "elementwise",
-    "find_hint",
-    "positions",
-    "products",
-    "reductions",
-    "sequences",
-    "shapes",
-    "tables",
+    "FUNCTIONS", "INDEXED", "KIND_OF_DTYPE", "Polynomial", "call_numpy", "creation", "elementwise", "find_hint", "products",
+    "reductions", "sequences", "shapes", "tables",
 ]  # fmt: skip

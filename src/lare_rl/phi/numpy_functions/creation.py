@@ -9,14 +9,14 @@ from typing import Any
 
 import numpy as np
 
-from lare_rl.phi.arrays import Array, as_array, broadcast, elementwise, stack
+from lare_rl.phi.arrays import Array, as_array, broadcast, rearrange, stack
 from lare_rl.phi.builder import current_builder
-from lare_rl.phi.indices import ALL
 from lare_rl.phi.limits import RefusedError
 from lare_rl.phi.numpy_functions.registry import (
     FUNCTIONS,
     array_functions,
     as_float,
+    as_list,
     as_sizes,
     astype,
     dtype_kind,
@@ -24,7 +24,7 @@ from lare_rl.phi.numpy_functions.registry import (
     numpy_functions,
     numpy_variants,
 )
-from lare_rl.phi.numpy_functions.shapes import column_stack, concatenate_, ravel, split_shape
+from lare_rl.phi.numpy_functions.shapes import meshgrid
 from lare_rl.phi.operand import BatchSize
 
 
@@ -43,14 +43,14 @@ def asarray(a: Array, dtype: Any = None, count: Any = -1) -> Array:
 
 @numpy_function()
 def full(shape: Any, fill_value: Any, dtype: Any = None) -> Array:
-    filled = broadcast(as_array(fill_value), *split_shape(shape)).copy()
+    filled = broadcast(as_array(fill_value), as_list(shape)).copy()
     return filled if dtype is None else astype(filled, dtype)
 
 
-@numpy_function()
-def empty(shape: Any, dtype: Any = "float") -> Array:
-    """Not a number, until the program has written numbers into it."""
-    return full(shape, math.nan if dtype_kind(dtype) == "float" else 0, dtype)
+@numpy_variants({"zeros": 0, "ones": 1, "empty": math.nan})
+def fill(value: Any, shape: Any, dtype: Any = "float") -> Array:
+    """Fill with a number. `empty` is NaN until the program has written numbers into it."""
+    return full(shape, 0 if value != value and dtype_kind(dtype) != "float" else value, dtype)
 
 
 @numpy_function()
@@ -58,17 +58,16 @@ def full_like(a: Array, fill_value: Any, dtype: Any = None, shape: Any = None) -
     return full(a.shape if shape is None else shape, fill_value, a.kind if dtype is None else dtype)
 
 
-@numpy_function()
-def empty_like(prototype: Array, dtype: Any = None, shape: Any = None) -> Array:
-    return empty(prototype.shape if shape is None else shape, prototype.kind if dtype is None else dtype)
+@numpy_variants({"zeros_like": 0, "ones_like": 1, "empty_like": math.nan})
+def fill_like(value: Any, a: Array, dtype: Any = None, shape: Any = None) -> Array:
+    return fill(value, a.shape if shape is None else shape, a.kind if dtype is None else dtype)
 
 
 @numpy_function()
 def arange(start: Any, stop: Any = None, step: Any = 1, dtype: Any = None) -> Array:
     start, stop = (0, start) if stop is None else (start, stop)
-    if isinstance(stop, BatchSize) and (start, step) == (0, 1) and stop.factor == 1:
-        builder = current_builder()
-        return Array(builder.add("row_number", (), (1,), "int"), 0)
+    if isinstance(stop, BatchSize) and (start, step) == (0, 1):
+        return Array(current_builder().add("row_number", (), (stop.factor,), "int"), 0)
     first, last, width = (x if isinstance(x, (int, float)) else as_array(x).number() for x in (start, stop, step))
     if not width or not math.isfinite((last - first) / width):
         raise ValueError("np.arange needs finite numbers, and a step that is not 0")
@@ -93,33 +92,6 @@ def unit_matrix(function: Any, N: int, M: int | None = None, k: int = 0, dtype: 
     return astype(function(*shape, k), dtype)
 
 
-def _last_axes(m: Array) -> tuple[int, ...]:
-    m.row_axes((-1, -2))
-    return m.row_shape[-2:]
-
-
-@numpy_function()
-def diag(v: Array, k: int = 0) -> Any:
-    if v.ndim == 2:
-        return FUNCTIONS["diagonal"](v, k)
-    v.row_axes(0)
-    current_builder().check_size([v.row_shape[0] + abs(k)] * 2)
-    positions = np.diag(np.arange(1, v.row_shape[0] + 1), k)
-    padded = concatenate_([v, astype(np.zeros(1), v.kind)])
-    return padded[as_array(positions - 1)]  # position -1 is the 0 behind
-
-
-@numpy_function()
-def meshgrid(*xi: Array, indexing: Any = "xy", sparse: Any = False, copy: Any = True) -> list[Any]:
-    for x in xi:
-        x.row_axes(None)
-    current_builder().check_size([math.prod(x.row_shape) for x in xi])
-    flat = [ravel(x) for x in xi]
-    order = [1, 0, *range(2, len(xi))] if indexing == "xy" and len(xi) > 1 else list(range(len(xi)))
-    grids = [x[tuple(ALL if j == i else None for j in order)] for i, x in enumerate(flat)]
-    return grids if sparse else FUNCTIONS["broadcast_arrays"](*grids)
-
-
 @numpy_function()
 def fromfunction(function: Callable[..., Any], shape: Any, *, dtype: Any = "float") -> Any:
     sizes = as_sizes(shape)
@@ -129,53 +101,39 @@ def fromfunction(function: Callable[..., Any], shape: Any, *, dtype: Any = "floa
 
 @numpy_function()
 def apply_along_axis(func1d: Callable[..., Any], axis: int, arr: Array, *args: Any, **kwargs: Any) -> Any:
-    """Apply a function to each series along an axis. It is called once for all rows, for each entry of the other axes."""
+    """Apply a function to each series along the last axis. It is called once for all rows, for each entry of the other axes."""
     (at,) = arr.row_axes(axis)
-    lead = [i for i in range(arr.ndim) if i not in (at, arr.batch_axis)]
-    if at != arr.ndim - 1 or (arr.batch_axis is not None and (arr.batch_axis or arr.row_shape[0] != 1)):
+    if at != arr.ndim - 1:
         raise RefusedError("E-NUMPY", "np.apply_along_axis works along the last axis: use axis=-1")
     in_row = Array(arr.node, None).reshaped((-1, arr.row_shape[at]), None)  # arrays of one row, without a batch axis
-    series = [as_array(func1d(in_row[i], *args, **kwargs)) for i in range(in_row.row_shape[0])]
-    results = stack(series, 0)
-    shape = (*(arr.row_shape[i] for i in lead), *results.row_shape[1:])
-    return Array(
-        current_builder().reshape(results.node, shape if arr.batch_axis is None else (1, *shape)), arr.batch_axis
-    )
+    results = stack([as_array(func1d(series, *args, **kwargs)) for series in in_row], 0)
+    return results.reshaped((*arr.row_shape[:-1], *results.row_shape[1:]), arr.batch_axis)
 
 
-class Concatenator:
-    """np.r_ and np.c_: arrays joined by an index. Slices stand for ranges."""
+class Indexed:
+    """An object of NumPy that makes an array of an index. Slices stand for ranges."""
 
-    def __init__(self, columns: bool):
-        self.columns = columns
+    def __init__(self, join: Callable[[list[Array]], Any]):
+        self.join = join
 
     def __getitem__(self, index: Any) -> Any:
-        items = [self.item(item) for item in (index if isinstance(index, tuple) else (index,))]
-        if self.columns:
-            return column_stack(items)
-        return concatenate_([x if x.ndim else x[None] for x in items])
+        return self.join(list(map(_read_range, index if isinstance(index, tuple) else (index,))))
 
-    def item(self, item: Any) -> Array:
-        if isinstance(item, slice) and isinstance(item.step, complex):  # 5j: five numbers
-            return FUNCTIONS["linspace"](as_float(item.start or 0), as_float(item.stop), int(item.step.imag))
-        if isinstance(item, slice):
-            return arange(item.start or 0, item.stop, 1 if item.step is None else item.step)
+
+def _read_range(item: Any) -> Array:
+    if not isinstance(item, slice):
         return as_array(item)
+    if isinstance(item.step, complex):  # 5j: five numbers
+        return FUNCTIONS["linspace"](as_float(item.start or 0), as_float(item.stop), int(item.step.imag))
+    return arange(item.start or 0, item.stop, 1 if item.step is None else item.step)
 
 
-class Grid:
-    """np.mgrid and np.ogrid: grids of ranges."""
-
-    def __init__(self, sparse: bool):
-        self.sparse = sparse
-
-    def __getitem__(self, index: Any) -> Any:
-        ranges = [Concatenator(False).item(item) for item in (index if isinstance(index, tuple) else (index,))]
-        grids = meshgrid(*ranges, indexing="ij", sparse=self.sparse)
-        return grids if self.sparse else FUNCTIONS["stack"](grids)
-
-
-INDEXED = {"r_": Concatenator(False), "c_": Concatenator(True), "mgrid": Grid(False), "ogrid": Grid(True)}
+INDEXED = {
+    "r_": Indexed(lambda items: rearrange(lambda arrays: np.concatenate(list(map(np.atleast_1d, arrays))), items)),
+    "c_": Indexed(lambda items: rearrange(np.column_stack, items)),
+    "mgrid": Indexed(lambda ranges: stack(meshgrid(*ranges, indexing="ij"), 0)),
+    "ogrid": Indexed(lambda ranges: meshgrid(*ranges, indexing="ij", sparse=True)),
+}
 """Objects of NumPy that are used with an index."""
 
 
@@ -189,25 +147,12 @@ def indices(dimensions: Any, dtype: Any = "int") -> Array:
 array_functions(
     {
         "copy": lambda a: a.copy(),
-        "zeros_like": lambda a, dtype=None, shape=None: full_like(a, 0, dtype, shape),
-        "ones_like": lambda a, dtype=None, shape=None: full_like(a, 1, dtype, shape),
-        "tril": lambda m, k=0: elementwise(
-            "where", unit_matrix(np.tri, *_last_axes(m), operator.index(k), "bool"), m, 0
-        ),
-        "triu": lambda m, k=0: elementwise(
-            "where", unit_matrix(np.tri, *_last_axes(m), operator.index(k) - 1, "bool"), 0, m
-        ),
-        "diagflat": lambda v, k=0: diag(ravel(v), operator.index(k)),
-        "ix_": lambda *args: tuple(
-            x[tuple(ALL if j == i else None for j in range(len(args)))] for i, x in enumerate(args)
-        ),
+        "ix_": lambda *args: rearrange(lambda arrays: np.ix_(*arrays), list(args)),
     }
 )
 numpy_functions(
     {
         "astype": astype,
         "identity": lambda n, dtype="float": unit_matrix(np.eye, operator.index(n), dtype=dtype),
-        "zeros": lambda shape, dtype="float": full(shape, 0, dtype),
-        "ones": lambda shape, dtype="float": full(shape, 1, dtype),
     }
 )

@@ -40,20 +40,34 @@ def _register_ufunc(op: str, function: Callable[..., Any]) -> None:
 
 for _op in ELEMENTWISE:
     _register_ufunc(_op, lambda *x, op=_op: elementwise(op, *x))
+
+
+def _nonzero(x: Operand) -> Any:
+    """Replace 0 by 1."""
+    return elementwise("where", x == 0, 1.0, x)
+
+
 UNARY |= {"square", "reciprocal", "positive", "degrees", "radians", "rad2deg", "deg2rad", "bitwise_not", "invert", "isneginf",
-          "isposinf", "conj", "conjugate", "real", "bitwise_invert"}  # fmt: skip
+          "isposinf", "conj", "conjugate", "real", "bitwise_invert", "modf", "sinc"}  # fmt: skip
 for _names, _function in {
     "power pow": power,
-    "float_power": lambda x, y: power(elementwise("multiply", x, 1.0), y),
-    "square": lambda x: elementwise("multiply", x, x),
-    "reciprocal": lambda x: elementwise("divide", 1.0, x),
+    "float_power": lambda x, y: power(x * 1.0, y),
+    "square": lambda x: x * x,
+    "reciprocal": lambda x: 1.0 / x,
     "positive conj conjugate real": lambda x: x,
-    "degrees rad2deg": lambda x: elementwise("multiply", x, 180 / math.pi),
-    "radians deg2rad": lambda x: elementwise("multiply", x, math.pi / 180),
+    "degrees rad2deg": lambda x: x * (180 / math.pi),
+    "radians deg2rad": lambda x: x * (math.pi / 180),
     "bitwise_not invert bitwise_invert": invert,
-    "isposinf": lambda x: elementwise("equal", x, math.inf),
-    "isneginf": lambda x: elementwise("equal", x, -math.inf),
-    "ldexp": lambda x, n: elementwise("multiply", x, elementwise("exp2", n)),
+    "isposinf": lambda x: x == math.inf,
+    "isneginf": lambda x: x == -math.inf,
+    "ldexp": lambda x, n: x * elementwise("exp2", n),
+    "divmod": lambda x, y: (x // y, x % y),
+    "modf": lambda x: (x - elementwise("trunc", x), elementwise("trunc", x)),
+    # NaN stays NaN.
+    "heaviside": lambda x, at_zero: elementwise(
+        "where", x == 0, at_zero, elementwise("where", x != x, x, (x > 0) * 1.0)
+    ),
+    "sinc": lambda x: elementwise("where", x == 0, 1.0, elementwise("sin", x * math.pi) / _nonzero(x * math.pi)),
 }.items():
     for _name in _names.split():
         _register_ufunc(_name, _function)
@@ -77,34 +91,10 @@ def clip(a: Operand, a_min: Any = None, a_max: Any = None, *, min: Any = None, m
 
 
 @numpy_function()
-def divmod_(x1: Operand, x2: Operand) -> tuple[Any, Any]:
-    return x1 // x2, x1 % x2
-
-
-@numpy_function()
-def modf(x: Operand) -> tuple[Any, Any]:
-    integral = elementwise("trunc", x)
-    return elementwise("subtract", x, integral), integral
-
-
-@numpy_function()
-def heaviside(x1: Operand, x2: Operand) -> Any:
-    at_zero = elementwise("where", elementwise("equal", x1, 0), x2, x1)  # NaN stays NaN
-    return elementwise("where", x1 > 0, 1.0, elementwise("where", x1 < 0, 0.0, at_zero))
-
-
-@numpy_function()
-def sinc(x: Operand) -> Any:
-    angle = elementwise("multiply", x, math.pi)
-    divisor = elementwise("where", elementwise("equal", angle, 0), 1.0, angle)
-    return elementwise("where", elementwise("equal", angle, 0), 1.0, elementwise("sin", angle) / divisor)
-
-
-@numpy_function()
 def nan_to_num(x: Operand, copy: Any = True, nan: Any = 0.0, posinf: Any = None, neginf: Any = None) -> Any:
-    x = elementwise("where", elementwise("isnan", x), nan, x)
-    x = elementwise("where", elementwise("equal", x, math.inf), MAX_FLOAT32 if posinf is None else posinf, x)
-    return elementwise("where", elementwise("equal", x, -math.inf), -MAX_FLOAT32 if neginf is None else neginf, x)
+    x = elementwise("where", x != x, nan, x)
+    x = elementwise("where", x == math.inf, MAX_FLOAT32 if posinf is None else posinf, x)
+    return elementwise("where", x == -math.inf, -MAX_FLOAT32 if neginf is None else neginf, x)
 
 
 @numpy_function("round", "around", "round_")
@@ -112,16 +102,13 @@ def round_(a: Operand, decimals: int = 0) -> Any:
     if decimals == 0:
         return elementwise("rint", a)
     scale = 10.0 ** max(-30, min(decimals, 30))
-    return elementwise("divide", elementwise("rint", elementwise("multiply", a, scale)), scale)
+    return elementwise("rint", a * scale) / scale
 
 
 @numpy_function()
 def isclose(a: Operand, b: Operand, rtol: Any = 1e-5, atol: Any = 1e-8, equal_nan: Any = False) -> Any:
-    near = abs(a - b) <= atol + rtol * abs(b)
-    both_nan = elementwise("logical_and", elementwise("isnan", a), elementwise("isnan", b))
-    near = elementwise("logical_and", near, elementwise("isfinite", b))
-    close = elementwise("logical_or", near, elementwise("equal", a, b))
-    return elementwise("logical_or", close, both_nan) if equal_nan else close
+    close = (abs(a - b) <= atol + rtol * abs(b)) & elementwise("isfinite", b) | (a == b)
+    return close | ((a != a) & (b != b)) if equal_nan else close
 
 
 @numpy_function()
@@ -135,7 +122,7 @@ def select(condlist: Sequence[Any], choicelist: Sequence[Any], default: Any = 0)
 @numpy_function()
 def choose(a: Array, choices: Any) -> Any:
     choices = list(choices)
-    return select([elementwise("equal", a, i) for i in range(len(choices) - 1)], choices[:-1], choices[-1])
+    return select([a == i for i in range(len(choices) - 1)], choices[:-1], choices[-1])
 
 
 @numpy_function()
@@ -146,8 +133,7 @@ def unwrap(p: Array, discont: Any = None, axis: int = -1, *, period: Any = 2 * m
         return p
     step = call_numpy("diff", [p], {"axis": axis})
     wrapped = (step + period / 2) % period - period / 2
-    at_half = elementwise("logical_and", wrapped == -period / 2, step > 0)
-    correction = elementwise("where", at_half, period / 2, wrapped) - step
+    correction = elementwise("where", (wrapped == -period / 2) & (step > 0), period / 2, wrapped) - step
     correction = elementwise("where", abs(step) < (period / 2 if discont is None else discont), 0.0, correction)
     shift = call_numpy("cumsum", [correction], {"axis": axis})
     first = call_numpy("zeros_like", [p.select(p.axis(axis), slice(0, 1))], {})
@@ -163,4 +149,4 @@ def piecewise(x: Array, condlist: Any, funclist: Sequence[Any], *args: Any, **kw
     result = as_operand(default)
     for condition, choice in zip(conditions, choices, strict=False):  # the last condition that holds decides
         result = elementwise("where", condition, as_operand(choice), result)
-    return elementwise("multiply", as_array(result), 1.0) if x.kind == "float" else result
+    return as_array(result) * 1.0 if x.kind == "float" else result

@@ -10,11 +10,10 @@ from typing import Any
 
 import numpy as np
 
-from lare_rl.phi.arrays import Array, as_array, elementwise, power, stack
+from lare_rl.phi.arrays import Array, as_array, elementwise, power, rearrange, stack
 from lare_rl.phi.builder import current_builder
 from lare_rl.phi.indices import ALL
 from lare_rl.phi.limits import MAX_EINSUM_ARRAYS, MAX_INVERSE_SIZE, MAX_MATRIX_POWER, RefusedError
-from lare_rl.phi.numpy_functions.positions import diagonal
 from lare_rl.phi.numpy_functions.reductions import along
 from lare_rl.phi.numpy_functions.registry import (
     FUNCTIONS,
@@ -26,7 +25,6 @@ from lare_rl.phi.numpy_functions.registry import (
     numpy_functions,
     require_constant,
 )
-from lare_rl.phi.numpy_functions.shapes import ravel
 
 _TERM = r"[a-zA-Z]*+(\.\.\.)?[a-zA-Z]*+"
 PATTERN = re.compile(rf"{_TERM}(,{_TERM})*+(->{_TERM})?")
@@ -41,9 +39,8 @@ def einsum(subscripts: Any, *operands: Array, optimize: Any = False) -> Array:
     compact = "".join(subscripts.split())
     output = [letter for letter in compact.partition("->")[2] if letter != "."]
     if not PATTERN.fullmatch(compact) or len(set(output)) < len(output) or len(operands) > MAX_EINSUM_ARRAYS:
-        raise RefusedError(
-            "E-NUMPY", f"np.einsum({subscripts[:40]!r}): use at most 8 arrays and 20 letters: 'bij,bj->bi'"
-        )
+        text = f"np.einsum({subscripts[:40]!r}): use at most 8 arrays and 20 letters: 'bij,bj->bi'"
+        raise RefusedError("E-NUMPY", text)
     inputs, arrow, result = compact.partition("->")
     terms = inputs.split(",")
     unused = [letter for letter in string.ascii_letters if letter not in inputs]
@@ -89,7 +86,7 @@ def matmul(x1: Array, x2: Array) -> Any:
 @numpy_function()
 def dot(a: Array, b: Array) -> Any:
     if not a.ndim or not b.ndim:
-        return elementwise("multiply", a, b)
+        return a * b
     if b.ndim > 2:
         raise RefusedError("E-NUMPY", "np.dot with an array of more than two axes: use np.einsum or @")
     return matmul(a, b)
@@ -98,7 +95,7 @@ def dot(a: Array, b: Array) -> Any:
 @numpy_function()
 def inner(a: Array, b: Array) -> Any:
     if not a.ndim or not b.ndim:
-        return elementwise("multiply", a, b)
+        return a * b
     first, second = string.ascii_lowercase[: a.ndim - 1], string.ascii_uppercase[: b.ndim - 1]
     return einsum(f"{first}z,{second}z->{first}{second}", a, b)
 
@@ -117,49 +114,42 @@ def tensordot(a: Array, b: Array, axes: Any = 2) -> Any:
 @numpy_function()
 def kron(a: Array, b: Array) -> Any:
     current_builder().check_size([math.prod(a.row_shape), math.prod(b.row_shape)])
-    return as_array(np.kron(require_constant(a, "the arrays of np.kron"), require_constant(b, "the arrays of np.kron")))
+    return as_array(np.kron(*(require_constant(x, "the arrays of np.kron") for x in (a, b))))
 
 
 @numpy_function("cross", "linalg.cross")
 def cross(a: Array, b: Array, axisa: int = -1, axisb: int = -1, axisc: int = -1, axis: Any = None) -> Any:
     axisa, axisb, axisc = (axisa, axisb, axisc) if axis is None else (axis, axis, axis)
-    at_a, at_b = a.row_axes(axisa)[0], b.row_axes(axisb)[0]
-
-    sizes = a.row_shape[at_a], b.row_shape[at_b]
-    if not set(sizes) <= {2, 3}:
-        raise ValueError(f"np.cross of vectors of {sizes[0]} and {sizes[1]} numbers")
-    a0, a1, b0, b1 = (x.select(at, i) for x, at in ((a, at_a), (b, at_b)) for i in (0, 1))
-    if sizes == (2, 2):
+    (a0, a1, *a2), (b0, b1, *b2) = FUNCTIONS["unstack"](a, axis=axisa), FUNCTIONS["unstack"](b, axis=axisb)
+    if len(a2) > 1 or len(b2) > 1:
+        raise ValueError("np.cross takes vectors of 2 or 3 numbers")
+    if not a2 and not b2:
         return a0 * b1 - a1 * b0
-    a2, b2 = (x.select(at, 2) if n == 3 else as_array(0.0) for x, at, n in ((a, at_a, sizes[0]), (b, at_b, sizes[1])))
+    a2, b2 = (rest[0] if rest else as_array(0.0) for rest in (a2, b2))
     return stack([a1 * b2 - a2 * b1, a2 * b0 - a0 * b2, a0 * b1 - a1 * b0], axisc)
-
-
-@numpy_function("trace", "linalg.trace")
-def trace(a: Array, offset: int = 0, axis1: Any = None, axis2: Any = None) -> Any:
-    axes = (0, 1) if axis1 is None or axis2 is None else (axis1, axis2)
-    return along("sum", diagonal(a, offset, *axes), -1)
 
 
 def _correlate(a: Array, v: Array, mode: str, reverse: bool) -> Any:
     if a.ndim != 1 or v.ndim != 1 or a.batch_axis is not None or v.batch_axis is not None:
         raise RefusedError("E-ROWS", "np.convolve takes one series, not a batch: use sliding_window_view along axis 1")
-    if len(v.row_shape) and v.row_shape[0] > a.row_shape[0] and reverse:
+    if v.row_shape[0] > a.row_shape[0] and reverse:
         a, v = v, a
     n, m = a.row_shape[0], v.row_shape[0]
-    kernel = v[::-1] if reverse else v
-    padded = FUNCTIONS["pad"](a, m - 1)
-    windows = FUNCTIONS["sliding_window_view"](padded, m)
-    full = einsum("ij,j->i", windows, kernel)
+    windows = FUNCTIONS["sliding_window_view"](FUNCTIONS["pad"](a, m - 1), m)
+    full = matmul(windows, v[::-1] if reverse else v)
     start, length = {"full": (0, n + m - 1), "same": ((m - 1) // 2, max(n, m)), "valid": (m - 1, n - m + 1)}[str(mode)]
     return full[start : start + length]
 
 
 array_functions(
     {
-        "outer linalg.outer": lambda a, b: einsum("i,j->ij", ravel(a), ravel(b)),
-        "vdot": lambda a, b: einsum("i,i->", ravel(a), ravel(b)),
-        "vecdot linalg.vecdot": lambda x1, x2, axis=-1: along("sum", elementwise("multiply", x1, x2), axis),
+        "outer linalg.outer": lambda a, b: einsum("i,j->ij", rearrange(np.ravel, a), rearrange(np.ravel, b)),
+        "vdot": lambda a, b: einsum("i,i->", rearrange(np.ravel, a), rearrange(np.ravel, b)),
+        "vecdot linalg.vecdot": lambda x1, x2, axis=-1: along("sum", x1 * x2, axis),
+        "trace": lambda a, offset=0, axis1=0, axis2=1: along(
+            "sum", rearrange(np.diagonal, a, offset, axis1, axis2), -1
+        ),
+        "linalg.trace": lambda x, *, offset=0: along("sum", rearrange(np.diagonal, x, offset, -2, -1), -1),
         "matvec": lambda x1, x2: einsum("...ij,...j->...i", x1, x2),
         "vecmat": lambda x1, x2: einsum("...j,...jk->...k", x1, x2),
         "convolve": lambda a, v, mode="full": _correlate(a, v, mode, reverse=True),
@@ -177,25 +167,24 @@ def norm(x: Array, ord: Any = None, axis: Any = None, keepdims: Any = False) -> 
     axes = x.row_axes(axis)
     if len(axes) > 1 and ord is not None:
         return _matrix_norm(x, ord, axes, keepdims)
-    magnitude = elementwise("abs", x)
+    magnitude = abs(x)
     if ord in (None, 2):
-        return elementwise("sqrt", along("sum", elementwise("multiply", x, x), axis, keepdims))
+        return elementwise("sqrt", along("sum", x * x, axis, keepdims))
     if ord in (math.inf, -math.inf):
         return along("max" if ord > 0 else "min", magnitude, axis, keepdims)
     if ord == 0:
-        return elementwise("multiply", FUNCTIONS["count_nonzero"](x, axis, keepdims=keepdims), 1.0)
+        return FUNCTIONS["count_nonzero"](x, axis, keepdims=keepdims) * 1.0
     return power(along("sum", power(magnitude, ord), axis, keepdims), 1 / float(ord))
 
 
 def _matrix_norm(x: Array, order: Any, axes: tuple[int, ...], keepdims: Any) -> Any:
     """Frobenius' norm, or the largest sum of magnitudes of a column or of a row."""
     if order == "fro":
-        return elementwise("sqrt", along("sum", elementwise("multiply", x, x), axes, keepdims))
+        return elementwise("sqrt", along("sum", x * x, axes, keepdims))
     if order in (1, -1, math.inf, -math.inf):
         summed, other = axes if abs(order) == 1 else axes[::-1]
-        sums = along("sum", elementwise("abs", x), summed, True)
-        result = along("max" if order > 0 else "min", sums, other, True)
-        return result if keepdims else result[tuple(0 if i in axes else ALL for i in range(x.ndim))]
+        result = along("max" if order > 0 else "min", along("sum", abs(x), summed, True), other, True)
+        return result if keepdims else rearrange(np.squeeze, result, axes)
     raise RefusedError("E-NUMPY", f"np.linalg.norm of matrices, ord={order!r}: use 'fro', 1 or np.inf")
 
 
@@ -221,14 +210,14 @@ def inv(a: Array) -> Any:
     if n > MAX_INVERSE_SIZE:
         raise RefusedError("E-NUMPY", f"np.linalg.inv: at most {MAX_INVERSE_SIZE} x {MAX_INVERSE_SIZE} numbers")
     if n == 1:
-        return elementwise("divide", 1.0, a)
+        return 1.0 / a
 
     def cofactor(i: int, j: int) -> Any:
-        rest = a[..., [k for k in range(n) if k != i], :][..., [k for k in range(n) if k != j]]
-        return elementwise("multiply", det(rest), (-1.0) ** (i + j))
+        rest = rearrange(lambda positions: np.delete(np.delete(positions, i, -2), j, -1), a)
+        return det(rest) * (-1.0) ** (i + j)
 
     adjugate = stack([stack([cofactor(i, j) for i in range(n)], -1) for j in range(n)], -2)
-    return elementwise("divide", adjugate, det(a)[..., None, None])
+    return adjugate / det(a)[..., None, None]
 
 
 @numpy_function("linalg.matrix_power")
@@ -239,10 +228,7 @@ def matrix_power(a: Array, n: int) -> Any:
         raise RefusedError("E-COST", f"np.linalg.matrix_power: at most {MAX_MATRIX_POWER}")
     if n == 0:
         return FUNCTIONS["broadcast_to"](as_array(np.eye(size)), a.shape)
-    result = base
-    for _ in range(abs(n) - 1):
-        result = matmul(result, base)
-    return result
+    return functools.reduce(matmul, [base] * abs(n))
 
 
 @numpy_function("linalg.eigvalsh")
@@ -269,31 +255,27 @@ def eigvalsh(a: Array, UPLO: Any = "L") -> Any:  # noqa: N803
 
 def _eigenvalues_3x3(a: Array, uplo: Any) -> Any:
     rows, columns = ([1, 2, 2], [0, 0, 1]) if uplo == "L" else ([0, 0, 1], [1, 2, 2])
-    diagonals = diagonal(a, 0, a.ndim - 2, a.ndim - 1)
+    diagonals = rearrange(np.diagonal, a, 0, -2, -1)
     off = a[..., rows, columns]
     middle = FUNCTIONS["mean"](diagonals, -1, keepdims=True)
-    centered = elementwise("subtract", diagonals, middle)
-    square = along("sum", elementwise("multiply", centered, centered), -1, True)
-    radius = elementwise("sqrt", (square + 2 * along("sum", elementwise("multiply", off, off), -1, True)) / 6)
-    scale = elementwise("where", elementwise("equal", radius, 0), 1.0, radius)
-    d, e = centered / scale, elementwise("divide", off, scale)
+    centered = diagonals - middle
+    square = along("sum", centered * centered, -1, True) + 2 * along("sum", off * off, -1, True)
+    radius = elementwise("sqrt", square / 6)
+    scale = elementwise("where", radius == 0, 1.0, radius)
+    d, e = centered / scale, off / scale
     determinant = (
         d[..., 0:1] * d[..., 1:2] * d[..., 2:3] + 2 * e[..., 0:1] * e[..., 1:2] * e[..., 2:3]
         - d[..., 0:1] * e[..., 2:3] ** 2 - d[..., 1:2] * e[..., 1:2] ** 2 - d[..., 2:3] * e[..., 0:1] ** 2
     )  # fmt: skip
     angle = elementwise("arccos", FUNCTIONS["clip"](determinant / 2, -1.0, 1.0)) / 3
     turns = as_array(np.array([2, -2, 0]) * math.pi / 3)  # from the smallest to the largest
-    return middle + 2 * radius * elementwise("cos", elementwise("add", angle, turns))
-
-
-def _sign_and_log(value: Array) -> tuple[Any, Any]:
-    return elementwise("sign", value), elementwise("log", elementwise("abs", value))
+    return middle + 2 * radius * elementwise("cos", angle + turns)
 
 
 array_functions(
     {
         "linalg.vector_norm": lambda x, *, axis=None, keepdims=False, ord=2: norm(x, ord, axis, keepdims),  # noqa: A006
-        "linalg.slogdet": lambda a: _sign_and_log(det(a)),
+        "linalg.slogdet": lambda a: (elementwise("sign", det(a)), elementwise("log", abs(det(a)))),
         "linalg.solve": lambda a, b: matmul(inv(a), b),
     }
 )

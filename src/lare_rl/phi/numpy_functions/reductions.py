@@ -11,7 +11,7 @@ from lare_rl.phi.builder import current_builder
 from lare_rl.phi.graph import ELEMENTWISE
 from lare_rl.phi.limits import RefusedError
 from lare_rl.phi.numpy_functions.elementwise import UNARY
-from lare_rl.phi.numpy_functions.registry import FUNCTIONS, array_functions, as_numbers, numpy_function, numpy_variants
+from lare_rl.phi.numpy_functions.registry import FUNCTIONS, as_numbers, numpy_function, numpy_variants
 
 UFUNC_REDUCTIONS = {
     "add": "sum", "multiply": "prod", "maximum": "max", "minimum": "min", "logical_and": "all", "logical_or": "any",
@@ -61,7 +61,7 @@ def _count(x: Array, axis: Any, keepdims: Any, where: Any = True) -> Any:
     """Return how many numbers a reduction reads."""
     if where is True:
         return math.prod(x.row_shape[i] for i in x.row_axes(axis))
-    return along("sum", broadcast(as_array(where), x.row_shape, x.batch_axis), axis, keepdims)
+    return along("sum", broadcast(as_array(where), x.shape), axis, keepdims)
 
 
 def _sum(x: Any, axis: Any, keepdims: Any, where: Any = True) -> Any:
@@ -80,7 +80,7 @@ def average(a: Array, axis: Any = None, weights: Any = None, *, keepdims: Any = 
     weights = as_numbers(weights)
     if weights.ndim == 1 and a.ndim > 1 and axis is not None and weights.batch_axis is None:
         weights = weights[(..., *(None,) * (a.ndim - 1 - a.axis(axis)))]
-    weights = broadcast(weights, a.row_shape, a.batch_axis) if a.batch_axis is not None else weights
+    weights = broadcast(weights, a.shape) if a.batch_axis is not None else weights
     return _sum(a * weights, axis, keepdims) / _sum(weights, axis, keepdims)
 
 
@@ -97,8 +97,8 @@ def spread(
     correction: Any = None,
 ) -> Any:
     center = FUNCTIONS["mean"](a, axis, keepdims=True, where=where) if mean is None else mean
-    deviation = elementwise("subtract", as_numbers(a), center)
-    total = _sum(elementwise("multiply", deviation, deviation), axis, keepdims, where)
+    deviation = as_numbers(a) - center
+    total = _sum(deviation * deviation, axis, keepdims, where)
     variance = total / (_count(a, axis, keepdims, where) - (correction or ddof))
     return elementwise("sqrt", variance) if has_root else variance
 
@@ -115,34 +115,25 @@ def reduce_without_nan(op: str, a: Array, axis: Any = None, *, keepdims: Any = F
     return result
 
 
+@numpy_variants({f"nan{name}": name for name in ("mean", "var", "std")})
+def moment_without_nan(name: str, a: Array, axis: Any = None, *, keepdims: Any = False, **more: Any) -> Any:
+    is_nan = elementwise("isnan", a)
+    return FUNCTIONS[name](elementwise("where", is_nan, 0, a), axis, keepdims=keepdims, where=~is_nan, **more)
+
+
+@numpy_variants({"argmax": "argmax", "argmin": "argmin"})
+def reduce_to_index(op: str, a: Array, axis: Any = None, *, keepdims: Any = False) -> Any:
+    return along(op, a, axis, keepdims)
+
+
 @numpy_function()
-def nanvar(a: Array, axis: Any = None, *, ddof: Any = 0, keepdims: Any = False) -> Any:
-    a, where = elementwise("where", elementwise("isnan", a), 0, a), _not_nan(a)
-    return FUNCTIONS["var"](a, axis, ddof=ddof, keepdims=keepdims, where=where)
+def ptp(a: Array, axis: Any = None, *, keepdims: Any = False) -> Any:
+    return elementwise("subtract", along("max", a, axis, keepdims), along("min", a, axis, keepdims))
 
 
-def _not_nan(a: Array) -> Any:
-    return elementwise("logical_not", elementwise("isnan", a))
-
-
-array_functions(
-    {
-        "argmax": lambda a, axis=None, *, keepdims=False: along("argmax", a, axis, keepdims),
-        "argmin": lambda a, axis=None, *, keepdims=False: along("argmin", a, axis, keepdims),
-        "ptp": lambda a, axis=None, *, keepdims=False: (
-            along("max", a, axis, keepdims) - along("min", a, axis, keepdims)  # pyright: ignore[reportOperatorIssue]
-        ),
-        "count_nonzero": lambda a, axis=None, *, keepdims=False: along(
-            "sum", elementwise("not_equal", a, 0), axis, keepdims
-        ),
-        "nanmean": lambda a, axis=None, *, keepdims=False: mean(
-            elementwise("where", elementwise("isnan", a), 0, a), axis, keepdims=keepdims, where=_not_nan(a)
-        ),
-        "nanstd": lambda a, axis=None, *, ddof=0, keepdims=False: elementwise(
-            "sqrt", nanvar(a, axis, ddof=ddof, keepdims=keepdims)
-        ),
-    }
-)
+@numpy_function()
+def count_nonzero(a: Array, axis: Any = None, *, keepdims: Any = False) -> Any:
+    return along("sum", elementwise("not_equal", a, 0), axis, keepdims)
 
 
 BINARY = ELEMENTWISE.keys() - UNARY

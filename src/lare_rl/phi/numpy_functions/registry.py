@@ -147,7 +147,6 @@ def call_numpy(name: str, args: Sequence[Any], kwargs: Mapping[str, Any]) -> Any
 
 
 def _signature_text(name: str) -> str:
-    """Return the parameters of a function, for a message."""
     parameters = _SIGNATURES[name].parameters.values()
     return ", ".join("*" * (p.kind is p.VAR_POSITIONAL) + p.name for p in parameters) or "no arguments"
 
@@ -195,7 +194,6 @@ def astype(x: Any, dtype: Any) -> Array:
 
 
 def as_numbers(x: Any) -> Array:
-    """Return an array of fractional numbers."""
     return astype(x, "float")
 
 
@@ -236,8 +234,6 @@ _CONVERSIONS: dict[str, Callable[[Any], Any]] = {
     "list[Array]": as_arrays,
     "int": operator.index,
     "float": as_float,
-    "Array | None": _optional(as_array),
     "Operand | None": _optional(as_operand),
     "int | None": _optional(operator.index),
-    "float | None": _optional(as_float),
 }

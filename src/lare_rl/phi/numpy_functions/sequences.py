@@ -5,7 +5,9 @@ from __future__ import annotations
 import math
 from typing import Any
 
-from lare_rl.phi.arrays import Array, as_array, broadcast, concatenate, elementwise, stack
+import numpy as np
+
+from lare_rl.phi.arrays import Array, as_array, broadcast, concatenate, elementwise, rearrange, stack
 from lare_rl.phi.builder import current_builder
 from lare_rl.phi.limits import RefusedError
 from lare_rl.phi.numpy_functions.reductions import along, flatten_constant
@@ -34,6 +36,7 @@ array_functions(
         "nancumsum": lambda a, axis=None: scan("cumsum", elementwise("where", elementwise("isnan", a), 0, a), axis),
         "add.accumulate": lambda array, axis=0: scan("cumsum", array, axis),
         "multiply.accumulate": lambda array, axis=0: scan("cumprod", array, axis),
+        "ediff1d": lambda ary: diff(flatten_constant(ary)),
     }
 )
 
@@ -53,10 +56,9 @@ def accumulate(ufunc: str, array: Array, axis: Any = 0) -> Any:
 @numpy_function()
 def diff(a: Array, n: int = 1, axis: int = -1, prepend: Any = None, append: Any = None) -> Any:
     (at,) = a.row_axes(axis)
-    edge = (*a.row_shape[:at], 1, *a.row_shape[at + 1 :])
     if prepend is not None or append is not None:
         arrays = [as_array(x) for x in (prepend, a, append) if x is not None]
-        a = concatenate([x if x.ndim else broadcast(x, edge, a.batch_axis) for x in arrays], at)
+        a = concatenate([x if x.ndim else broadcast(x, (*a.shape[:at], 1, *a.shape[at + 1 :])) for x in arrays], at)
     op = "not_equal" if a.kind == "bool" else "subtract"
     for _ in range(n):
         a = elementwise(op, a.select(at, slice(1, None)), a.select(at, slice(None, -1)))
@@ -68,44 +70,32 @@ def gradient(f: Array, *varargs: Any, axis: Any = None, edge_order: int = 1) -> 
     """Central differences inside, and one-sided differences at the ends."""
     axes = f.row_axes(axis)
     spacings = [as_array(x) for x in (varargs if len(varargs) == len(axes) else (varargs or (1.0,)) * len(axes))]
-    slopes = [_gradient_along(as_numbers(f), at, gap, edge_order) for at, gap in zip(axes, spacings, strict=True)]
+    slopes = []
+    for at, spacing in zip(axes, spacings, strict=True):
+        slope = _gradient_along_last_axis(rearrange(np.moveaxis, as_numbers(f), at, -1), spacing, edge_order)
+        slopes.append(rearrange(np.moveaxis, slope, -1, at))
     return slopes[0] if isinstance(axis, int) or len(slopes) == 1 else slopes
 
 
-def _gradient_along(f: Array, at: int, spacing: Array, edge_order: int) -> Any:
-    size = f.row_shape[at]
+def _gradient_along_last_axis(f: Array, spacing: Array, edge_order: int) -> Any:
+    size = f.row_shape[-1]
     if size < edge_order + 1:
         raise ValueError(f"np.gradient needs at least {edge_order + 1} numbers along its axis")
-
-    def entries(index: Any) -> Any:
-        return f.select(at, index)
-
-    x = [float(v) for v in require_constant(spacing, "the spacing of np.gradient").ravel()]
-    x = [i * x[0] for i in range(size)] if len(x) == 1 else x
-    shape = [-1 if i == at else 1 for i in range(f.ndim)]
-
-    def column(values: list[float]) -> Array:
-        return as_array(values).reshaped(shape, None)
-
-    pieces = [(entries(slice(1, 2)) - entries(slice(0, 1))) / (x[1] - x[0])]
+    x = require_constant(spacing, "the spacing of np.gradient").ravel().astype(float)
+    x = np.arange(size) * x[0] if len(x) == 1 else x
+    pieces = [(f[..., 1:2] - f[..., :1]) / (x[1] - x[0])]
     if size > 2:
-        steps = [(x[i] - x[i - 1], x[i + 1] - x[i]) for i in range(1, size - 1)]
-        w_before = column([-d1 / (d0 * (d0 + d1)) for d0, d1 in steps])
-        w_middle = column([(d1 - d0) / (d0 * d1) for d0, d1 in steps])
-        w_behind = column([d0 / (d1 * (d0 + d1)) for d0, d1 in steps])
-        pieces.append(
-            entries(slice(None, -2)) * w_before + entries(slice(1, -1)) * w_middle + entries(slice(2, None)) * w_behind
-        )
-    pieces.append((entries(slice(-1, None)) - entries(slice(-2, -1))) / (x[-1] - x[-2]))
+        d0, d1 = x[1:-1] - x[:-2], x[2:] - x[1:-1]
+        w_before, w_middle, w_behind = -d1 / (d0 * (d0 + d1)), (d1 - d0) / (d0 * d1), d0 / (d1 * (d0 + d1))
+        pieces.append(f[..., :-2] * w_before + f[..., 1:-1] * w_middle + f[..., 2:] * w_behind)
+    pieces.append((f[..., -1:] - f[..., -2:-1]) / (x[-1] - x[-2]))
     if edge_order == 2:
-        for piece, edge, middle, inner in ((0, 0, 1, 2), (-1, size - 1, size - 2, size - 3)):
-            d0, d1 = x[middle] - x[edge], x[inner] - x[middle]
-            pieces[piece] = (
-                entries(slice(edge, edge + 1)) * (-(2 * d0 + d1) / (d0 * (d0 + d1)))
-                + entries(slice(middle, middle + 1)) * ((d0 + d1) / (d0 * d1))
-                - entries(slice(inner, inner + 1)) * (d0 / (d1 * (d0 + d1)))
-            )
-    return concatenate(pieces, at)
+        for piece, (i, j, k) in ((0, (0, 1, 2)), (-1, (size - 1, size - 2, size - 3))):
+            d0, d1 = x[j] - x[i], x[k] - x[j]
+            edge, middle, inner = (f[..., [n]] for n in (i, j, k))
+            first = edge * (-(2 * d0 + d1) / (d0 * (d0 + d1)))
+            pieces[piece] = first + middle * ((d0 + d1) / (d0 * d1)) - inner * (d0 / (d1 * (d0 + d1)))
+    return concatenate(pieces, -1)
 
 
 @numpy_function("trapezoid", "trapz")
@@ -116,11 +106,7 @@ def trapezoid(y: Array, x: Any = None, dx: Any = 1.0, axis: int = -1) -> Any:
         x = as_array(x)
         width = diff(x, 1, 0 if x.ndim == 1 else at)
         width = width[(..., *(None,) * (y.ndim - 1 - at))] if x.ndim == 1 and y.ndim > 1 else width
-    both = elementwise("add", y.select(at, slice(1, None)), y.select(at, slice(None, -1)))
-    return along("sum", elementwise("multiply", width, elementwise("divide", both, 2.0)), at)
-
-
-array_functions({"ediff1d": lambda ary: diff(flatten_constant(ary))})
+    return along("sum", width * ((y.select(at, slice(1, None)) + y.select(at, slice(None, -1))) / 2.0), at)
 
 
 # --- the order of numbers --------------------------------------------------------------------------------------------
@@ -137,7 +123,7 @@ array_functions(
             a, 0.5, axis, keepdims=keepdims
         ),
         "percentile": lambda a, q, axis=None, *, method="linear", keepdims=False: quantile(
-            a, elementwise("divide", q, 100.0), axis, method=method, keepdims=keepdims
+            a, q / 100.0, axis, method=method, keepdims=keepdims
         ),
     }
 )
@@ -161,15 +147,9 @@ def quantile(a: Array, q: Any, axis: Any = None, *, method: Any = "linear", keep
     """Between the two entries of the sorted numbers at (n - 1) q; NaN if one of the numbers is NaN."""
     fractions = require_constant(q, "q of np.quantile")
     axes = a.row_axes(axis)
-    x = as_numbers(a)
-    if len(axes) != 1:
-        rest = [i for i in range(a.ndim) if i not in axes]
-        shape = [a.row_shape[i] for i in rest]
-        batch_axis = None if a.batch_axis is None else rest.index(a.batch_axis)
-        moved = x.rearranged(lambda p: p.transpose([*rest, *axes]).reshape([*shape, -1]), batch_axis)
-        at, x = moved.ndim - 1, moved
-    else:
-        at = axes[0]
+    rest = [i for i in range(a.ndim) if i not in axes]
+    x, at = as_numbers(a), len(rest)
+    x = rearrange(lambda p: p.transpose([*rest, *axes]).reshape([*(p.shape[i] for i in rest), -1]), x)
     ordered, is_nan = scan("sort", x, at), along("any", elementwise("isnan", x), at)
     if ((fractions < 0) | (fractions > 1)).any():
         raise ValueError("quantiles are between 0 and 1, percentiles between 0 and 100")
@@ -178,8 +158,7 @@ def quantile(a: Array, q: Any, axis: Any = None, *, method: Any = "linear", keep
         for fraction in fractions.ravel()
     ]
     if keepdims:
-        full_shape = tuple(1 if i in axes else size for i, size in enumerate(a.row_shape))
-        results = [result.reshaped(full_shape, a.batch_axis) for result in results]
+        results = [FUNCTIONS["expand_dims"](result, axes) for result in results]
     return results[0] if not fractions.ndim else stack(results, 0)
 
 
@@ -193,4 +172,4 @@ def _at_fraction(ordered: Array, at: int, fraction: float, method: str) -> Any:
     if method not in weights:
         raise RefusedError("E-NUMPY", f"method={method[:40]!r}: use one of {', '.join(weights)}")
     weight = weights[method]
-    return {0.0: low, 1.0: high}.get(weight, elementwise("add", low, (high - low) * weight))
+    return {0.0: low, 1.0: high}.get(weight, low + (high - low) * weight)

@@ -1,16 +1,20 @@
-"""Functions of the shape of an array: reshape, transpose, broadcast, join, split, insert, delete."""
+"""Functions that move, repeat, join and split numbers: NumPy itself applies them to positions (`arrays.rearrange`).
+
+A function whose result may be larger than its arguments checks its size first.
+"""
 
 from __future__ import annotations
 
-import itertools
+import functools
+import inspect
 import math
 import operator
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 
-from lare_rl.phi.arrays import Array, as_array, broadcast, concatenate, stack
+from lare_rl.phi.arrays import Array, as_array, rearrange
 from lare_rl.phi.builder import current_builder
 from lare_rl.phi.indices import ALL
 from lare_rl.phi.limits import RefusedError
@@ -19,136 +23,80 @@ from lare_rl.phi.numpy_functions.registry import (
     array_functions,
     as_arrays,
     as_list,
+    as_sizes,
     numpy_function,
     numpy_functions,
     numpy_variants,
     require_constant,
 )
-from lare_rl.phi.operand import BATCH, BatchSize, common_batch_axis
+from lare_rl.phi.operand import BatchSize
 
 
-def split_shape(shape: Any) -> tuple[tuple[int, ...], int | None]:
-    """Return a shape that a program names as the shape in the graph and the batch axis."""
-    sizes = as_list(shape)
-    batch_axes = [axis for axis, size in enumerate(sizes) if isinstance(size, BatchSize)]
-    if len(batch_axes) > 1:
-        BATCH.refuse()
-    row_shape = tuple(size.factor if isinstance(size, BatchSize) else operator.index(size) for size in sizes)
-    return row_shape, batch_axes[0] if batch_axes else None
+def _register(names: str, convert: Callable[[Any], Any]) -> None:
+    """Register a function with NumPy's own parameters, apart from those that change no position. The first is what it moves."""
+    function: Any = functools.reduce(getattr, names.split()[0].split("."), np)
+
+    def apply(moved: Any, *args: Any, **kwargs: Any) -> Any:
+        return rearrange(functools.partial(function, **kwargs), convert(moved), *args)
+
+    ignored = ("out", "dtype", "casting", "subok")
+    parameters = [p for p in inspect.signature(function).parameters.values() if p.name not in ignored]
+    vars(apply)["__signature__"] = inspect.Signature(parameters)
+    numpy_function(*names.split())(apply)
 
 
-def check_order(order: Any) -> None:
-    """Raise `RefusedError` if numbers are not to be counted row by row."""
-    if order != "C":
-        raise RefusedError("E-NUMPY", "the order of an array is 'C' alone: use np.transpose")
+for _names in (
+    "transpose permute_dims,matrix_transpose linalg.matrix_transpose,swapaxes,moveaxis,rollaxis,expand_dims,ravel,broadcast_to,"
+    "flip,fliplr,flipud,rot90,diagonal,linalg.diagonal,hsplit,vsplit,dsplit"
+).split(","):
+    _register(_names, as_array)
+for _names in ("stack", "hstack", "vstack row_stack", "dstack", "column_stack"):
+    _register(_names, as_arrays)
+
+
+def _to_arrays(values: Any) -> Any:
+    """Return nested lists with arrays in them."""
+    return list(map(_to_arrays, values)) if isinstance(values, list) else as_array(values)
+
+
+numpy_functions(
+    {
+        "concatenate concat": lambda arrays, axis=0: rearrange(np.concatenate, as_arrays(arrays), axis),
+        "append": lambda arr, values, axis=None: rearrange(
+            lambda both: np.append(both[0], both[1], axis), [as_array(arr), as_array(values)]
+        ),
+        "block": lambda arrays: rearrange(np.block, _to_arrays(arrays)),
+        "broadcast_shapes": lambda *args: broadcast_arrays(*map(FUNCTIONS["zeros"], args))[0].shape,
+    }
+)
+array_functions(
+    {
+        "atleast_1d": lambda *arys: rearrange(lambda arrays: np.atleast_1d(*arrays), list(arys)),
+        "atleast_2d": lambda *arys: rearrange(lambda arrays: np.atleast_2d(*arrays), list(arys)),
+        "atleast_3d": lambda *arys: rearrange(lambda arrays: np.atleast_3d(*arrays), list(arys)),
+        "shape": lambda a: a.shape,
+        "ndim": lambda a: a.ndim,
+        "tril": lambda m, k=0: _with_zeros(np.tril, m, (-1, -2), k),
+        "triu": lambda m, k=0: _with_zeros(np.triu, m, (-1, -2), k),
+        "diagflat": lambda v, k=0: _diagonal_matrix(rearrange(np.ravel, v), k),
+    }
+)
 
 
 @numpy_function()
 def reshape(a: Array, shape: Any, order: Any = "C") -> Array:
-    """Reshape. The batch axis may be merged with axes behind it, or divided again."""
-    sizes = as_list(shape)
-    check_order(order)
-    row_shape, batch_axis = split_shape(sizes)
-    free = [axis for axis, size in enumerate(row_shape) if size == -1]
-    if batch_axis is None and a.batch_axis is not None:  # -1 stands for the batch
-        batch_axis, free = (free[0], []) if free else (None, [])
-    if len(free) > 1 or (a.batch_axis is None) != (batch_axis is None):
-        raise RefusedError("E-ROWS", f"a reshape of {a.shape} to {tuple(sizes)} does not keep the rows apart")
-    if batch_axis is None or a.batch_axis is None:
-        current_builder().check_size([abs(size) for size in row_shape])
-        return a.reshaped(row_shape, None)
-    # As many numbers of a row lie before the batch axis as before; the batch axis and those behind it share the others.
-    before, behind = math.prod(a.row_shape[: a.batch_axis]), math.prod(a.row_shape[a.batch_axis :])
-    new = list(row_shape)
-    if free:
-        side = slice(0, batch_axis) if free[0] < batch_axis else slice(batch_axis, None)
-        size = math.prod(size for size in new[side] if size != -1)
-        new[free[0]] = (before if free[0] < batch_axis else behind) // max(size, 1)
-    elif not isinstance(sizes[batch_axis], BatchSize):
-        new[batch_axis] = behind // max(math.prod(new[batch_axis + 1 :]), 1)
-    if math.prod(new[:batch_axis]) != before or math.prod(new[batch_axis:]) != behind or min(new) < 1:
-        raise RefusedError("E-ROWS", f"a reshape of {a.shape} to {tuple(sizes)} does not keep the rows apart")
-    return a.reshaped(new, batch_axis)
-
-
-@numpy_function()
-def transpose(a: Array, axes: Any = None) -> Array:
-    order = list(range(a.ndim))[::-1] if axes is None else [a.axis(axis) for axis in axes]
-    if sorted(order) != list(range(a.ndim)):
-        raise ValueError(f"axes {axes} do not match an array of the shape {a.shape}")
-    return a.transposed(order)
-
-
-@numpy_function()
-def swapaxes(a: Array, axis1: int, axis2: int) -> Array:
-    order, first, second = list(range(a.ndim)), a.axis(axis1), a.axis(axis2)
-    order[first], order[second] = order[second], order[first]
-    return a.transposed(order)
-
-
-@numpy_function()
-def moveaxis(a: Array, source: Any, destination: Any) -> Array:
-    moved = [a.axis(axis) for axis in as_list(source)]
-    order = [axis for axis in range(a.ndim) if axis not in moved]
-    for target, axis in sorted(zip(map(a.axis, as_list(destination)), moved, strict=True)):
-        order.insert(target, axis)
-    return a.transposed(order)
-
-
-@numpy_function()
-def rollaxis(a: Array, axis: int, start: int = 0) -> Array:
-    order = [i for i in range(a.ndim) if i != a.axis(axis)]
-    order.insert(start - (a.axis(axis) < start), a.axis(axis))
-    return a.transposed(order)
-
-
-@numpy_function()
-def expand_dims(a: Array, axis: Any) -> Any:
-    axes = as_list(axis)
-    for at in sorted(a.axis(i, extra=len(axes)) for i in axes):
-        a = a.select(at, None)
-    return a
+    return rearrange(np.reshape, a, shape, order)
 
 
 @numpy_function()
 def squeeze(a: Array, axis: Any = None) -> Any:
     single = [i for i, size in enumerate(a.row_shape) if size == 1 and i != a.batch_axis]
-    removed = single if axis is None else list(map(a.axis, as_list(axis)))
-    if not set(removed) <= set(single):
-        raise ValueError(f"an axis of {a.shape} whose length is not 1 cannot be removed")
-    return a[tuple(0 if i in removed else ALL for i in range(a.ndim))]
-
-
-def atleast_1d(a: Array) -> Any:
-    return a if a.ndim else a[None]
-
-
-def atleast_2d(a: Array) -> Any:
-    return a if a.ndim > 1 else a[(None,) * (2 - a.ndim)]
-
-
-def atleast_3d(a: Array) -> Any:
-    return a if a.ndim > 2 else atleast_2d(a)[:, :, None]
-
-
-def _map(function: Callable[[Array], Any], arrays: Sequence[Array]) -> Any:
-    """Return the result of a function for one array, or a list of its results for several."""
-    results = [function(a) for a in arrays]
-    return results[0] if len(results) == 1 else results
+    return rearrange(np.squeeze, a, tuple(single) if axis is None else axis)
 
 
 @numpy_function()
 def broadcast_arrays(*args: Array) -> list[Array]:
-    shape, batch_axis = np.broadcast_shapes(*(a.row_shape for a in args)), common_batch_axis(args)
-    return [broadcast(a, shape, batch_axis) for a in args]
-
-
-@numpy_function()
-def resize(a: Array, new_shape: Any) -> Array:
-    row_shape, _ = split_shape(new_shape)
-    current_builder().check_size(row_shape)
-    a.row_axes(None)
-    return a.rearranged(lambda positions: np.resize(positions, row_shape), None)
+    return rearrange(lambda arrays: np.broadcast_arrays(*arrays), list(args))
 
 
 @numpy_function()
@@ -159,124 +107,148 @@ def size(a: Array, axis: Any = None) -> Any:
     return numbers if a.batch_axis is None else BatchSize(numbers)
 
 
-def ravel(a: Array, order: Any = "C") -> Array:
-    return reshape(a, -1, order)
-
-
-numpy_functions(
-    {
-        "broadcast_to": lambda array, shape: broadcast(as_array(array), *split_shape(shape)),
-        "broadcast_shapes": lambda *args: broadcast_arrays(*(FUNCTIONS["zeros"](shape) for shape in args))[0].shape,
-    }
-)
-array_functions(
-    {
-        "atleast_1d": lambda *arys: _map(atleast_1d, arys),
-        "atleast_2d": lambda *arys: _map(atleast_2d, arys),
-        "atleast_3d": lambda *arys: _map(atleast_3d, arys),
-        "ravel": ravel,
-        "permute_dims": lambda a, axes=None: transpose(a, axes),
-        "matrix_transpose linalg.matrix_transpose": lambda x: swapaxes(x, -1, -2),
-        "shape": lambda a: a.shape,
-        "ndim": lambda a: a.ndim,
-    }
-)
-
-
-# --- joining and splitting -------------------------------------------------------------------------------------------
-
-
-@numpy_function("concatenate", "concat")
-def concatenate_(arrays: list[Array], axis: Any = 0) -> Array:
-    return concatenate(arrays, axis) if axis is not None else concatenate([ravel(a) for a in arrays], 0)
+@numpy_variants({"split": np.split, "array_split": np.array_split})
+def split(function: Callable[..., Any], ary: Array, indices_or_sections: Any, axis: int = 0) -> list[Array]:
+    current_builder().check_size([max(1, *as_sizes(indices_or_sections))])
+    return rearrange(function, ary, indices_or_sections, axis)
 
 
 @numpy_function()
-def hstack(tup: list[Array]) -> Array:
-    arrays = [atleast_1d(a) for a in tup]
-    return concatenate(arrays, 0 if arrays[0].ndim == 1 else 1)
+def unstack(x: Array, *, axis: int = 0) -> list[Array]:
+    return rearrange(lambda positions: list(np.moveaxis(positions, axis, 0)), x)
+
+
+# --- repetitions, and numbers that are added or left out -----------------------------------------------------------------
+
+
+def _with_zeros(function: Callable[..., Any], a: Array, axes: tuple[int, ...], *args: Any) -> Array:
+    """Apply a function that fills with zeros."""
+    a.row_axes(axes)
+    return rearrange(lambda positions, *args: function(positions + 1, *args) - 1, a, *args)
+
+
+def _diagonal_matrix(v: Array, k: Any) -> Array:
+    v.row_axes(0)
+    current_builder().check_size([v.row_shape[0] + abs(operator.index(k))] * 2)
+    return _with_zeros(np.diag, v, (0,), k)
 
 
 @numpy_function()
-def column_stack(tup: list[Array]) -> Array:
-    return concatenate([a if a.ndim > 1 else a[:, None] for a in tup], 1)
+def diag(v: Array, k: int = 0) -> Any:
+    return FUNCTIONS["diagonal"](v, k) if v.ndim == 2 else _diagonal_matrix(v, k)
 
 
 @numpy_function()
-def block(arrays: Any) -> Array:
-    """Nested lists of arrays, joined along the last axes."""
-
-    def depth(x: Any) -> int:
-        return 1 + max(map(depth, x)) if isinstance(x, list) else 0
-
-    def join(x: Any, axis: int) -> Array:
-        return concatenate([join(item, axis + 1) for item in x], axis) if isinstance(x, list) else as_array(x)
-
-    return join(arrays, -depth(arrays))
+def roll(a: Array, shift: Any, axis: Any = None) -> Array:
+    a.row_axes(axis)
+    if len(as_list(shift)) > 4:
+        raise RefusedError("E-COST", "np.roll along more than 4 axes")
+    return rearrange(np.roll, a, shift, axis)
 
 
 @numpy_function()
-def array_split(ary: Array, indices_or_sections: Any, axis: int = 0) -> list[Any]:
-    (at,) = ary.row_axes(axis)
-    size = ary.row_shape[at]
-    if isinstance(indices_or_sections, (list, tuple, Array)):
-        ends = [0, *(operator.index(end) for end in indices_or_sections), size]
-    else:
-        count = operator.index(indices_or_sections)
-        if not 1 <= count <= size:
-            raise ValueError(f"{size} numbers cannot be split into {count} parts")
-        lengths = [size // count + (i < size % count) for i in range(count)]
-        ends = [0, *itertools.accumulate(lengths)]
-    return [ary.select(at, slice(start, end)) for start, end in itertools.pairwise(ends)]
-
-
-@numpy_variants(
-    {
-        "split": lambda a, axis: axis,
-        "hsplit": lambda a, _: min(a.ndim - 1, 1),
-        "vsplit": lambda a, _: 0,
-        "dsplit": lambda a, _: 2,
-    }
-)
-def split(axis_for: Callable[[Array, int], int], ary: Array, indices_or_sections: Any, axis: int = 0) -> list[Any]:
-    at = axis_for(ary, axis)
-    size = ary.row_shape[ary.axis(at)]
-    if isinstance(indices_or_sections, int) and size % max(indices_or_sections, 1):
-        raise ValueError(f"{size} numbers cannot be split into {indices_or_sections} equal parts")
-    return array_split(ary, indices_or_sections, at)
+def resize(a: Array, new_shape: Any) -> Array:
+    current_builder().check_size(as_sizes(new_shape))
+    return rearrange(np.resize, a, new_shape)
 
 
 @numpy_function()
-def unstack(x: Array, *, axis: int = 0) -> tuple[Any, ...]:
-    (at,) = x.row_axes(axis)
-    return tuple(x.select(at, i) for i in range(x.row_shape[at]))
+def repeat(a: Array, repeats: Any, axis: Any = None) -> Array:
+    """Repeat each number. Along the batch axis, the repetitions of a row stay together."""
+    if not isinstance(repeats, BatchSize):
+        current_builder().check_size([math.prod(a.row_shape), max(1, *as_sizes(repeats))])
+    return rearrange(np.repeat, a, repeats, axis)
 
 
-numpy_functions(
-    {
-        "stack": lambda arrays, axis=0: stack(as_arrays(arrays), operator.index(axis)),
-        "vstack row_stack": lambda tup: concatenate([atleast_2d(a) for a in as_arrays(tup)], 0),
-        "dstack": lambda tup: concatenate([atleast_3d(a) for a in as_arrays(tup)], 2),
-        "append": lambda arr, values, axis=None: concatenate_([as_array(arr), as_array(values)], axis),
-    }
-)
+@numpy_function()
+def tile(A: Array, reps: Any) -> Array:  # noqa: N803
+    counts = [count.factor if isinstance(count, BatchSize) else operator.index(count) for count in as_list(reps)]
+    current_builder().check_size([math.prod(A.row_shape), *counts])
+    return rearrange(np.tile, A, reps)
+
+
+@numpy_function()
+def pad(array: Array, pad_width: Any, mode: Any = "constant", *, constant_values: Any = 0) -> Array:
+    widths = np.broadcast_to(require_constant(pad_width, "the widths of np.pad"), (array.ndim, 2)).tolist()
+    current_builder().check_size([n + sum(map(abs, pair)) for n, pair in zip(array.row_shape, widths, strict=True)])
+    if mode in ("edge", "reflect", "symmetric", "wrap"):
+        return rearrange(np.pad, array, widths, mode)
+    if mode != "constant":
+        text = f"np.pad, mode={str(mode)[:40]!r}: use constant, edge, reflect, symmetric or wrap"
+        raise RefusedError("E-NUMPY", text)
+    fill = as_array(as_array(constant_values).number())
+    return rearrange(lambda both: np.pad(both[0], widths, constant_values=both[1]), [array, fill])
 
 
 @numpy_function()
 def delete(arr: Array, obj: Any, axis: Any = None) -> Any:
     at = arr.row_axes(0 if axis is None and arr.ndim == 1 else axis)[0]
-    removed = np.arange(arr.row_shape[at])[
-        obj if isinstance(obj, (slice, int)) else require_constant(obj, "the index of np.delete")
-    ]
-    rest = np.setdiff1d(np.arange(arr.row_shape[at]), removed)
-    return arr.select(at, as_array(rest) if len(rest) else slice(0, 0))
+    return rearrange(np.delete, arr, obj, at)
 
 
 @numpy_function()
-def insert(arr: Array, obj: int, values: Any, axis: Any = None) -> Any:
+def insert(arr: Array, obj: int, values: Array, axis: Any = None) -> Any:
     at = arr.row_axes(0 if axis is None and arr.ndim == 1 else axis)[0]
-    size = arr.row_shape[at]
-    i = range(size)[obj] if obj < 0 else range(size + 1)[obj]
-    values = broadcast(as_array(values), (*arr.row_shape[:at], 1, *arr.row_shape[at + 1 :]), arr.batch_axis)
-    ends = [arr.select(at, end) for end in (slice(None, i), slice(i, None)) if len(range(arr.row_shape[at])[end])]
-    return concatenate([*ends[: i > 0], values, *ends[i > 0 :]], at)
+    length = arr.row_shape[at]
+    current_builder().check_size([math.prod(arr.row_shape) // length, length + math.prod(values.row_shape)])
+    return rearrange(lambda both: np.insert(both[0], obj, both[1], at), [arr, values])
+
+
+@numpy_function("sliding_window_view", "lib.stride_tricks.sliding_window_view")
+def sliding_window_view(x: Array, window_shape: Any, axis: Any = None) -> Array:
+    sizes = as_sizes(window_shape)
+    current_builder().check_size([*x.row_shape, *(max(n, 1) for n in sizes)])
+    return rearrange(lambda positions: np.lib.stride_tricks.sliding_window_view(positions, sizes, axis).copy(), x)
+
+
+@numpy_function()
+def meshgrid(*xi: Array, indexing: Any = "xy", sparse: Any = False, copy: Any = True) -> list[Any]:
+    current_builder().check_size([math.prod(x.row_shape) for x in xi])
+    return rearrange(lambda arrays: np.meshgrid(*arrays, indexing=indexing, sparse=bool(sparse)), list(xi))
+
+
+# --- reading and writing at positions -------------------------------------------------------------------------------------
+
+
+@numpy_function()
+def take(a: Array, indices: Any, axis: Any = None, mode: Any = "raise") -> Any:
+    a, at = (rearrange(np.ravel, a), 0) if axis is None else (a, a.axis(axis))
+    index = indices if isinstance(indices, int) else as_array(indices)
+    if mode in ("clip", "wrap"):
+        size = a.row_shape[at]
+        index = FUNCTIONS["clip"](as_array(index), 0, size - 1) if mode == "clip" else as_array(index) % size
+    return a.select(at, index)
+
+
+def _along_axis(arr: Array, indices: Array, axis: Any) -> tuple[Any, ...]:
+    """Return the index of take_along_axis: `indices` along the axis, and all positions along the others."""
+    (at,) = arr.row_axes(axis)
+    if indices.ndim != arr.ndim:
+        raise ValueError(f"the indices {indices.shape} must have as many axes as the array {arr.shape}")
+    return tuple(
+        indices if i == at else FUNCTIONS["arange"](size)[(*(None,) * i, ALL, *(None,) * (arr.ndim - i - 1))]
+        for i, size in enumerate(arr.shape)
+    )
+
+
+@numpy_function()
+def copyto(dst: Array, src: Any, casting: Any = "same_kind", where: Any = True) -> None:
+    dst[...] = src if where is True else FUNCTIONS["where"](where, src, dst)
+
+
+@numpy_function()
+def fill_diagonal(a: Array, val: Any) -> None:
+    a.row_axes(None)
+    step = sum(math.prod(a.row_shape[i + 1 :]) for i in range(a.ndim))
+    a.reshaped((-1,), None)[: a.row_shape[1] ** 2 : step] = val
+
+
+array_functions({"take_along_axis": lambda arr, indices, axis=-1: arr[_along_axis(arr, indices, axis)]})
+numpy_functions(
+    {
+        "put_along_axis": lambda arr, indices, values, axis: as_array(arr).__setitem__(
+            _along_axis(as_array(arr), as_array(indices), axis), values
+        ),
+        "putmask place": lambda a, mask, values: copyto(as_array(a), values, where=as_array(mask)),
+    }
+)

@@ -14,6 +14,7 @@ from lare_rl.phi.builder import current_builder
 from lare_rl.phi.limits import MAX_CONSTANT_SIZE, MAX_SYSTEM_SIZE, RefusedError
 from lare_rl.phi.numpy_functions.reductions import along
 from lare_rl.phi.numpy_functions.registry import (
+    FUNCTIONS,
     array_functions,
     as_float,
     as_numbers,
@@ -23,7 +24,6 @@ from lare_rl.phi.numpy_functions.registry import (
     numpy_variants,
     require_constant,
 )
-from lare_rl.phi.numpy_functions.shapes import check_order
 
 
 def register_constant_function(
@@ -65,30 +65,32 @@ def plain_constant(x: Any, name: str, largest: int) -> Any:
     return values.item() if values.ndim == 0 else values
 
 
-for _name, _options in {
-    "nonzero": "", "flatnonzero": "", "argwhere": "", "union1d": "", "intersect1d": "", "setdiff1d": "", "setxor1d": "",
-    "unique": "return_index return_inverse return_counts", "array_equal": "", "trim_zeros": "", "i0": "", "hanning": "",
-    "hamming": "", "blackman": "", "bartlett": "", "kaiser": "", "histogram": "bins", "bincount": "minlength",
-    "vander": "N increasing", "triu_indices_from": "k", "tril_indices_from": "k",
+for _largest, _options_by_name in {
+    MAX_CONSTANT_SIZE: {
+        **dict.fromkeys(
+            "nonzero flatnonzero argwhere union1d intersect1d setdiff1d setxor1d array_equal trim_zeros i0 hanning hamming blackman "
+            "bartlett kaiser".split(), "",
+        ),
+        "unique": "return_index return_inverse return_counts", "histogram": "bins", "bincount": "minlength",
+        "vander": "N increasing", "triu_indices_from": "k", "tril_indices_from": "k",
+    },
+    MAX_SYSTEM_SIZE: {
+        **dict.fromkeys("roots poly diag_indices gcd lcm".split(), ""), "polyfit": "deg", "tril_indices": "k m",
+        "triu_indices": "k m", "cov": "ddof rowvar", "corrcoef": "rowvar", "allclose": "rtol atol",
+        **dict.fromkeys("polyadd polysub polymul polyder polyint polydiv".split(), "m"),
+        **{f"polynomial.polynomial.{name}": "m" for name in "polyder polyint polymul polyadd".split()},
+    },
 }.items():  # fmt: skip
-    register_constant_function(_name, _options)
-for _name, _options in {
-    "roots": "", "poly": "", "polyfit": "deg", "tril_indices": "k m", "triu_indices": "k m", "diag_indices": "",
-    "cov": "ddof rowvar", "corrcoef": "rowvar", "gcd": "", "lcm": "", "allclose": "rtol atol",
-}.items():  # fmt: skip
-    register_constant_function(_name, _options, MAX_SYSTEM_SIZE)
-
-
-for _name in (
-    "linalg.pinv linalg.cholesky linalg.matrix_rank linalg.cond linalg.eigh linalg.svd linalg.svdvals linalg.qr".split()
-):
-    register_constant_function(_name, work=lambda x: np.size(x) * max(np.shape(x), default=1))
+    for _name, _options in _options_by_name.items():
+        register_constant_function(_name, _options, _largest)
+for _name in "pinv cholesky matrix_rank cond eigh svd svdvals qr".split():
+    register_constant_function(f"linalg.{_name}", work=lambda x: np.size(x) * max(np.shape(x), default=1))
 
 
 def _steps_above(x: Array, edges: Array, op: str) -> Array:
     """Return how many edges lie below each number (op "greater") or not above it ("greater_equal"). NaN lies above all."""
-    beyond = elementwise({"greater": "less_equal", "greater_equal": "less"}[op], x[..., None], edges)
-    return along("sum", elementwise("logical_not", beyond), -1)
+    column = x[..., None]
+    return along("sum", ~(column <= edges if op == "greater" else column < edges), -1)
 
 
 @numpy_function()
@@ -103,7 +105,7 @@ def digitize(x: Array, bins: Array, right: Any = False) -> Any:
     edges = require_constant(bins, "the bins of np.digitize")
     if len(edges) > 1 and edges[0] > edges[-1]:  # falling: bins[i - 1] > x >= bins[i]
         count = _steps_above(x, as_array(edges), "greater_equal" if not right else "greater")
-        return elementwise("subtract", len(edges), count)
+        return len(edges) - count
     return _steps_above(x, as_array(edges), "greater" if right else "greater_equal")
 
 
@@ -113,7 +115,7 @@ def interp(x: Array, xp: Array, fp: Array, left: Any = None, right: Any = None, 
     knots = require_constant(xp, "xp of np.interp").astype(float)
     x = as_numbers(x)
     if period is not None:
-        x = elementwise("remainder", x, as_float(period))
+        x %= as_float(period)
         order = np.argsort(knots % as_float(period), kind="stable")
         fp, knots = fp[as_array(order)], (knots % as_float(period))[order]
         knots = np.concatenate([[knots[-1] - period], knots, [knots[0] + period]])
@@ -121,13 +123,13 @@ def interp(x: Array, xp: Array, fp: Array, left: Any = None, right: Any = None, 
     if len(knots) != fp.row_shape[0] or not (np.diff(knots) >= 0).all():
         raise ValueError("np.interp needs rising xp, and as many fp")
     start = _interval(x, knots)
-    low, high = fp[start], fp[elementwise("add", start, 1)]
+    low, high = fp[start], fp[start + 1]
     left_edge, width = as_array(knots[:-1])[start], as_array(np.diff(knots))[start]
-    share = (x - left_edge) / elementwise("where", elementwise("equal", width, 0), 1.0, width)
-    result = low + (high - low) * elementwise("minimum", elementwise("maximum", share, 0.0), 1.0)
+    share = (x - left_edge) / elementwise("where", width == 0, 1.0, width)
+    result = low + (high - low) * FUNCTIONS["clip"](share, 0.0, 1.0)
     result = elementwise("where", elementwise("isnan", x), math.nan, result)
-    result = result if left is None else elementwise("where", elementwise("less", x, knots[0]), left, result)
-    return result if right is None else elementwise("where", elementwise("greater", x, knots[-1]), right, result)
+    result = result if left is None else elementwise("where", x < float(knots[0]), left, result)
+    return result if right is None else elementwise("where", x > float(knots[-1]), right, result)
 
 
 def _interval(x: Array, knots: np.ndarray) -> Any:
@@ -136,7 +138,7 @@ def _interval(x: Array, knots: np.ndarray) -> Any:
         raise ValueError("np.interp needs at least two points")
     current_builder().check_size((math.prod(x.row_shape), len(knots)))
     if len(knots) == 2:
-        return elementwise("multiply", 0, elementwise("isnan", x))
+        return elementwise("isnan", x) * 0
     return _steps_above(x, as_array(knots[1:-1]), "greater_equal")
 
 
@@ -149,12 +151,12 @@ def unravel_index(indices: Array, shape: Any, order: Any = "C") -> tuple[Any, ..
 @numpy_function()
 def ravel_multi_index(multi_index: Any, dims: Any, *, order: Any = "C") -> Any:
     strides = _strides(as_sizes(dims), order)
-    terms = [elementwise("multiply", index, stride) for index, stride in zip(multi_index, strides, strict=True)]
-    return functools.reduce(lambda x, y: elementwise("add", x, y), terms)
+    return sum(as_array(index) * stride for index, stride in zip(multi_index, strides, strict=True))
 
 
 def _strides(sizes: Sequence[int], order: Any) -> list[int]:
-    check_order(order)
+    if order != "C":
+        raise RefusedError("E-NUMPY", "numbers are counted in the order 'C' alone: use np.transpose")
     current_builder().check_size(sizes)
     return [math.prod(sizes[i + 1 :]) for i in range(len(sizes))]
 
@@ -178,7 +180,7 @@ def polyval(p: Any, x: Array) -> Any:
     coefficients = p.falling if isinstance(p, Polynomial) else as_array(p)
     result: Any = as_array(0.0)
     for i in range(coefficients.row_shape[0]):
-        result = elementwise("add", elementwise("multiply", result, x), coefficients[i])
+        result = result * x + coefficients[i]
     return result
 
 
@@ -209,11 +211,6 @@ array_functions(
         "poly1d": lambda c_or_r: Polynomial(c_or_r),
     }
 )
-for _name in "polyadd polysub polymul polyder polyint polydiv".split():
-    register_constant_function(_name, "m", MAX_SYSTEM_SIZE)
-for _name in "polyder polyint polymul polyadd".split():
-    register_constant_function(f"polynomial.polynomial.{_name}", "m", MAX_SYSTEM_SIZE)
-
 
 # --- sets ---------------------------------------------------------------------------------------------------------------
 
@@ -222,5 +219,5 @@ for _name in "polyder polyint polymul polyadd".split():
 def isin(element: Array, test_elements: Any, invert: Any = False, assume_unique: Any = False) -> Any:
     values = as_array(list(test_elements) if isinstance(test_elements, (dict, range)) else test_elements)
     values.row_axes(None)
-    hit = along("any", elementwise("equal", element[..., None], values.reshaped((-1,), None)), -1)
-    return elementwise("logical_not", hit) if invert else hit
+    hit = along("any", element[..., None] == values.reshaped((-1,), None), -1)
+    return ~hit if invert else hit

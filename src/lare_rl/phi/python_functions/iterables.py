@@ -94,7 +94,6 @@ def _map(runtime: Runtime, function: Any, argument_lists: Iterable[Sequence[Any]
 
 
 def _make(convert: Callable[[Sequence[Any]], Any]) -> Callable[..., Any]:
-    """Return the function that makes a list or the like of the entries of its argument."""
     return lambda runtime, values=(): convert(runtime.meter.pay_for_list(runtime.items(values)))
 
 
