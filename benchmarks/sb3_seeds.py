@@ -118,7 +118,9 @@ def train(setting: Setting, rewards: str, seed: int) -> list[Line]:
         scores = [play(model, env, reset, setting.deterministic) for reset in resets]
         lines.append({"step": step, "seed": seed, "evaluation/return": float(np.mean(scores))})
 
-    model.learn(setting.steps, log_interval=None, callback=[*callbacks, Evaluations(setting.evaluate_every, report)])
+    model.learn(
+        setting.steps, log_interval=1_000_000, callback=[*callbacks, Evaluations(setting.evaluate_every, report)]
+    )
     return lines
 
 

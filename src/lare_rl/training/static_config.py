@@ -11,8 +11,8 @@ from lare_rl.config.resolve import replay_rows
 from lare_rl.credit.decoder_settings import CreditSettings
 from lare_rl.credit.methods import METHODS, Method
 from lare_rl.credit.spec import CreditSpec
-from lare_rl.envs.placement import load_env_spec
 from lare_rl.envs.interface import EnvSpec
+from lare_rl.envs.placement import load_env_spec
 from lare_rl.runs.directory import Run
 from lare_rl.tasks.payments import PAID_AT_END, PaymentRule
 from lare_rl.tasks.spec import CreditScope, ScoredObservation
