@@ -51,7 +51,7 @@ def test_line_per_minute(monkeypatch):
     for _ in range(4):
         terminal.on_step(400)
     assert [line.partition(",")[0] for line in text.getvalue().splitlines()[1:]] == [
-        "step   300 of 20000: 2.5 steps/s",
+        "step   300 of 20000: 2.5 steps/s with compiling",
         "step   400 of 20000: evaluating",
     ]
 

@@ -9,6 +9,7 @@ The environment's rewards are unchanged, so that the returns that are logged and
 """
 
 import re
+import warnings
 from copy import deepcopy
 from typing import Any
 
@@ -223,7 +224,13 @@ class CreditCallback(BaseCallback):
             )
         self.credit.fit(self.updates)
         buffer.rewards += self.credit.rewards_at(np.stack(steps))
-        for name, value in self.credit.metrics().items():
+        metrics = self.credit.metrics()
+        if not metrics["credit/episodes"]:
+            warnings.warn(
+                f"no episode has ended in {buffer.buffer_size} steps, so all rewards are 0: n_steps should hold several episodes",
+                stacklevel=2,
+            )
+        for name, value in metrics.items():
             self.logger.record(name, value)
         type(buffer).compute_returns_and_advantage(buffer, last_values=last_values, dones=dones)
 

@@ -92,7 +92,9 @@ class Terminal(Listener):
             return
         n_steps, text = step - self._line_step, f"step {step:>{len(str(self._steps))}} of {self._steps}"
         if step > self._due_step:
-            self.on_message(f"{text}: {n_steps / seconds:.3g} steps/s{self._time_left(step, n_steps / seconds)}")
+            rate = n_steps / seconds
+            left = self._time_left(step, rate) if self._has_compiled else " with compiling"
+            self.on_message(f"{text}: {rate:.3g} steps/s{left}")
         elif seconds > 2 * LINE_S:
             self.on_message(f"{text}: evaluating")
         else:
