@@ -213,6 +213,22 @@ def test_new_task_without_documentation(command):
     assert re.findall(r"fill in: (\w+) ", out)[-1] == "max_episode_steps"
 
 
+def test_new_task_with_poor_documentation(command, tmp_path, monkeypatch):
+    env = "\n".join(
+        [
+            "import gymnasium",
+            "class Poor(gymnasium.Env):",
+            "    'A room.\\n\\n## Observation Space\\n\\n4 numbers.'",
+            "    observation_space, action_space = gymnasium.spaces.Box(-1, 1, (4,)), gymnasium.spaces.Discrete(2)",
+            "gymnasium.register('Poor-v0', Poor, max_episode_steps=9)",
+        ]
+    )
+    (tmp_path / "poor.py").write_text(env)
+    monkeypatch.syspath_prepend(tmp_path)
+    assert "check: observation" in command("new-task", "poor:Poor-v0")[1]
+    assert "check: observation" not in command("new-task", "Pendulum-v1")[1]
+
+
 def test_design(command, tmp_path):
     status, out, err = command("design", "Reacher-v4", "--kind", "reward")
     assert (status, err) == (0, "".join(f"candidate {n}: passes\n" for n in range(1, 6)) + "attempt 1: passes\n")

@@ -84,6 +84,8 @@ def new_task(
         print_line(
             f"  fill in: {key}{where} ({'the log' if draft.logs_only else 'the environment'} does not document it)"
         )
+    if not draft.lists_entries:
+        print_line("  check: observation (its entries are not described one by one)")
     if draft.guesses_limit:
         print_line("  fill in: max_episode_steps (a guess: the environment has no limit of its own)")
     data = f" --data {environment}" if draft.logs_only else ""

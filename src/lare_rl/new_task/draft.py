@@ -1,6 +1,7 @@
 """A draft of a task file, and the lines that all drafts have."""
 
 import re
+import tomllib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
@@ -8,7 +9,7 @@ from typing import Any
 import gymnasium
 from gymnasium.spaces import Box, Discrete
 
-from lare_rl.tasks.spec import FILL_IN
+from lare_rl.tasks.spec import FILL_IN, entry_meanings
 
 __all__ = [
     "DEFAULT_LIMIT",
@@ -71,6 +72,12 @@ class Draft:
     """The titles of sections of the documentation that were not used."""
     logs_only: bool = False
     """Whether the task has logs but no environment."""
+
+    @property
+    def lists_entries(self) -> bool:
+        """Whether the text of the observation has lines for single entries, or is missing, or that of each team."""
+        text = tomllib.loads(self.toml).get("observation", FILL_IN)
+        return FILL_IN in text or bool(entry_meanings(text))
 
     @property
     def guesses_limit(self) -> bool:

@@ -193,7 +193,9 @@ def _check_factors(factors: object, max_factors: int) -> list[int]:
     for number, factor in enumerate(factors, start=1):
         if not isinstance(factor, Array) or factor.batch_axis != 0 or factor.row_shape != (1, 1):
             is_flat = isinstance(factor, Array) and factor.row_shape == (1,)
-            hint = ": write observation[:, 8:9] instead of observation[:, 8], or keepdims=True in a sum" if is_flat else ""
+            hint = (
+                ": write observation[:, 8:9] instead of observation[:, 8], or keepdims=True in a sum" if is_flat else ""
+            )
             text = f"factor {number} must be an array of the shape (batch, 1), not {_describe(factor)}{hint}"
             raise RefusedError("E-FORM", text)
     return [builder.reshape(builder.cast(factor.node, "float"), (1,)) for factor in factors]
