@@ -61,6 +61,7 @@ CUTS = {
     r"--resume runs/lare --steps 200000": "--resume runs/lare --steps 600",
     r"--steps 20000 --td3.warmup [12]000": "--steps 400 --td3.warmup 100 --evaluation-episodes 1",
     r"--steps 40000": "--steps 600",
+    r"--steps 50000": "--steps 400 --rollout-steps 200 --evaluation-episodes 1",
     r"--resume runs/first --steps 205000": "--resume runs/first --steps 400",
     r"steps=(100|20)_000": "steps=400, evaluation_episodes=1",
     r"learn\(10_000": "learn(1100",
@@ -191,8 +192,10 @@ def write_pendulum(page):
 
 
 def design_pendulum(page):
-    """Write the function, which the reader saves, and start the model that the page asks."""
+    """Write the function, which the reader saves, start the model that the page asks, and link the examples."""
     page.write("phi.py", PENDULUM)
+    (page.directory / "examples").symlink_to(ROOT / "examples")
+    page.patch.syspath_prepend(ROOT / "examples")
     page.serve(PENDULUM)
 
 
