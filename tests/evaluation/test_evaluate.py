@@ -207,7 +207,9 @@ def test_most_likely_actions_beside_sampled_ones(small, tmp_path, command):
 def test_measures_of_random_play(run, command):
     status, out, err = command("evaluate", run.directory, "--episodes", 4)
     assert (status, err) == (0, "")
-    distances = np.array([episode.measures["distance"] for episode in play_random(TASK, seeds=evaluation_seeds(run, 4))[0]])
+    distances = np.array(
+        [episode.measures["distance"] for episode in play_random(TASK, seeds=evaluation_seeds(run, 4))[0]]
+    )
     assert f"random actions: distance {format_mean_std(distances)}" in out.splitlines()
     assert distances.std() > 0
 
