@@ -154,19 +154,22 @@ class HostCollector:
         self._episode = arrays["episode"].copy()
         indices = range(len(self._episode))
         actions = [arrays[f"actions{index}"] for index in indices]
+        self._actions = [[] for _ in indices]
         idle = np.zeros(self._action_shape, np.float32)  # of environments that do not step
         self._call(lambda: self._envs.reset(np.ones(len(indices), bool), self._episode_seeds()))
         ended_early = np.zeros(len(indices), bool)
         for t in range(max(map(len, actions))):
             where = np.array([t < len(rows) for rows in actions]) & ~ended_early
-            action_t = np.stack([rows[min(t, len(rows) - 1)] if len(rows) else idle for rows in actions])
+            for index in np.flatnonzero(where):
+                self._actions[index].append(actions[index][t])
+            action_t = np.stack([rows[-1] if rows else idle for rows in self._actions])
             timestep = self._call(lambda action=action_t, where=where: self._envs.step(action, where))
             ended_early |= where & (timestep.terminated | timestep.truncated)
-        self._actions, self._episode_start = [list(rows) for rows in actions], arrays["new"].copy()
+        self._episode_start = arrays["new"].copy()
         same = [np.array_equal(self._envs.batch.observation[i], arrays[f"observation{i}"]) for i in indices]
         dropped = ended_early | ~np.array(same)
         messages = [
-            f"episode {self._episode[index]} of seed {self._seed(index)} was dropped after {len(actions[index])} steps: "
+            f"{self._episode_name(index)} was dropped after {len(actions[index])} steps: "
             "the same actions did not lead to the same observation again"
             for index in np.flatnonzero(dropped).tolist()
         ]
@@ -181,8 +184,13 @@ class HostCollector:
         finally:
             self._evaluation_envs.close()
 
-    def _seed(self, env_index: int) -> int:
-        return self._seeds[env_index // self._n_envs]
+    def _seed(self, index: int) -> int:
+        return self._seeds[index // self._n_envs]
+
+    def _episode_name(self, index: int) -> str:
+        """Return the name of an environment's running episode, for messages."""
+        env = f" in environment {index % self._n_envs}" if self._n_envs > 1 else ""
+        return f"episode {self._episode[index]} of seed {self._seed(index)}{env}"
 
     def _episode_seeds(self) -> Int[np.ndarray, " all"]:
         """Return the random seed of each environment's running episode."""
@@ -199,8 +207,7 @@ class HostCollector:
         except EnvOutputError as error:
             if (index := error.env_index) is None:
                 raise
-            env = f" in environment {index % self._n_envs}" if self._n_envs > 1 else ""
-            where = f"at step {len(self._actions[index])} of episode {self._episode[index]} of seed {self._seed(index)}{env}"
+            where = f"at step {len(self._actions[index])} of {self._episode_name(index)}"
             raise EnvOutputError(f"{error}, {where}") from None
 
 
