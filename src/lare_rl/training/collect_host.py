@@ -30,11 +30,11 @@ __all__ = ["HostCollector", "make_host_collector"]
 
 
 class HostCollector:
-    """The training environments of a run and the running episode of each, the policy that acts, and environments to evaluate it in.
+    """The training environments of a run, with the running episode of each, and the environments of its evaluations.
 
     Args:
         envs: `n_envs` environments of the first seed, then of the second, and so on.
-        evaluation_envs: environments of the first seed, then of the second, and so on.
+        evaluation_envs: the same for evaluations, in any number for each seed.
         seeds: the seeds of the run.
     """
 
@@ -44,9 +44,10 @@ class HostCollector:
         self._envs, self._evaluation_envs = envs, evaluation_envs
         self._action_shape = envs.spec.n_agents, envs.spec.action_size
         self._memory = init_host_memory(config, *self.shape)
+        """The memory of the actors."""
         self._step, self._on_step = 0, _ignore_step
         self._episode = np.full(len(seeds) * config.n_envs, -1)
-        """The number of each environment's running episode."""
+        """The number of each environment's running episode, among the episodes of this environment."""
         self._actions: list[list[np.ndarray]] = [[] for _ in self._episode]
         """The actions of that episode, in the environment's units."""
         self._timestep = add_seed_axis(envs.batch, self.shape)
@@ -57,7 +58,7 @@ class HostCollector:
     def watch(self, on_step: Callable[[int], None], stop_requested: Callable[[], bool]) -> None:
         """Call `on_step` with the number of steps of each seed while environments step, also during evaluations.
 
-        Once the user has asked the run to stop, environments in other processes must reply soon.
+        `stop_requested` says whether the user wants to stop. Environments in other processes must then reply soon.
         """
         self._on_step = on_step
         self._envs.stop_requested = self._evaluation_envs.stop_requested = stop_requested
@@ -95,7 +96,7 @@ class HostCollector:
                 self._step += self._n_envs
                 self._on_step(self._step)
         finally:
-            check_actions(steps.action, self._seeds)  # such actions may be the reason of an error
+            check_actions(steps.action, self._seeds)  # an action that is not finite may be the cause of an environment's error
         return steps
 
     def _collect_step(
@@ -125,14 +126,14 @@ class HostCollector:
         self._episode_start = self._episode_start | where.reshape(self.shape)
 
     def evaluate(self, actor: Any, n_episodes: int, deterministic: bool = False) -> Evaluation:
-        """Evaluate whole episodes of the policy, always from the same initial states. If `deterministic`, by its likeliest actions."""
+        """Evaluate whole episodes of the policy, always from the same initial states. If `deterministic`, it acts without noise."""
         config = replace(self._config, deterministic=True) if deterministic else self._config
         return evaluate_policy_on_host(
             self._evaluation_envs, config, actor, self._seeds, n_episodes, on_step=lambda: self._on_step(self._step)
         )
 
     def state_dict(self) -> dict[str, np.ndarray]:
-        """Return the arrays that `restore` needs: seeds and actions of the running episodes, and the actors' memory."""
+        """Return the arrays that `restore` needs: numbers and actions of the running episodes, and the actors' memory."""
         arrays = {f"memory{i}": np.asarray(leaf) for i, leaf in enumerate(jax.tree.leaves(self._memory))}
         arrays |= {"episode": self._episode.copy(), "new": self._episode_start}
         for index, actions in enumerate(self._actions):
@@ -194,7 +195,7 @@ class HostCollector:
 
     def _episode_seeds(self) -> Int[np.ndarray, " all"]:
         """Return the random seed of each environment's running episode."""
-        # The number of an episode, among all episodes of the seed.
+        # The number of an episode among those of all environments of the seed.
         numbers = [int(episode) * self._n_envs + i % self._n_envs for i, episode in enumerate(self._episode)]
         return np.array(
             [episode_seed(self._seed(i), Stream.TRAINING_EPISODES, number) for i, number in enumerate(numbers)]
