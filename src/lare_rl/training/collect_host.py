@@ -6,7 +6,8 @@ An episode is determined by its seed and its actions. So a run can be resumed in
 simulator: reset with the seed, play the actions, and compare the observation bit for bit.
 """
 
-from collections.abc import Callable, Sequence
+import contextlib
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -96,7 +97,7 @@ class HostCollector:
                 self._step += self._n_envs
                 self._on_step(self._step)
         finally:
-            check_actions(steps.action, self._seeds)  # an action that is not finite may be the cause of an environment's error
+            check_actions(steps.action, self._seeds)  # NaN as an action may have caused the error
         return steps
 
     def _collect_step(
@@ -110,7 +111,8 @@ class HostCollector:
         rows = env_action.reshape(-1, *env_action.shape[2:])
         for actions, row in zip(self._actions, rows, strict=True):
             actions.append(row)
-        self._call(lambda: self._envs.step(rows))
+        with self._locate_errors():
+            self._envs.step(rows)
         _write_timestep(steps.next_timestep, t, self._timestep)
         self._episode_start = np.zeros(self.shape, bool)
         ended = np.logical_or(self._timestep.terminated, self._timestep.truncated)
@@ -122,7 +124,8 @@ class HostCollector:
         self._episode[where] += 1
         for index in np.flatnonzero(where):
             self._actions[index] = []
-        self._call(lambda: self._envs.reset(where, self._episode_seeds()))
+        with self._locate_errors():
+            self._envs.reset(where, self._episode_seeds())
         self._episode_start = self._episode_start | where.reshape(self.shape)
 
     def evaluate(self, actor: Any, n_episodes: int, deterministic: bool = False) -> Evaluation:
@@ -157,14 +160,16 @@ class HostCollector:
         actions = [arrays[f"actions{index}"] for index in indices]
         self._actions = [[] for _ in indices]
         idle = np.zeros(self._action_shape, np.float32)  # of environments that do not step
-        self._call(lambda: self._envs.reset(np.ones(len(indices), bool), self._episode_seeds()))
+        with self._locate_errors():
+            self._envs.reset(np.ones(len(indices), bool), self._episode_seeds())
         ended_early = np.zeros(len(indices), bool)
         for t in range(max(map(len, actions))):
             where = np.array([t < len(rows) for rows in actions]) & ~ended_early
             for index in np.flatnonzero(where):
                 self._actions[index].append(actions[index][t])
             action_t = np.stack([rows[-1] if rows else idle for rows in self._actions])
-            timestep = self._call(lambda action=action_t, where=where: self._envs.step(action, where))
+            with self._locate_errors():
+                timestep = self._envs.step(action_t, where)
             ended_early |= where & (timestep.terminated | timestep.truncated)
         self._episode_start = arrays["new"].copy()
         same = [np.array_equal(self._envs.batch.observation[i], arrays[f"observation{i}"]) for i in indices]
@@ -201,10 +206,11 @@ class HostCollector:
             [episode_seed(self._seed(i), Stream.TRAINING_EPISODES, number) for i, number in enumerate(numbers)]
         )
 
-    def _call(self, function: Callable[[], Timestep]) -> Timestep:
-        """Call the environments. An error names the step, episode and seed of the environment that raised it."""
+    @contextlib.contextmanager
+    def _locate_errors(self) -> Iterator[None]:
+        """Add the step, episode and seed of an environment to an `EnvOutputError` of a block."""
         try:
-            return function()
+            yield
         except EnvOutputError as error:
             if (index := error.env_index) is None:
                 raise
