@@ -161,7 +161,8 @@ def test_predicted_return_statistics():
     ("changes", "expected"),
     [
         ({"held_out": 7}, ["too_few"]),
-        ({"return_correlation": math.nan}, ["constant"]),
+        ({"return_correlation": math.nan, "return_r2": math.nan}, ["constant"]),
+        ({"return_correlation": math.nan, "return_r2": -0.01}, ["r2", "worthless"]),  # equal predictions
         ({"return_r2": math.nan}, ["correlation"]),
         ({"return_r2": 0.09}, ["r2", "worthless"]),
         ({"cut": 3}, ["cut", "r2"]),

@@ -97,14 +97,14 @@ class Relabelled:
         episodes = {"episodes": self.held_out}
         if self.held_out < MIN_R2_EPISODES:
             yield Finding("too_few", {**episodes, "needed": MIN_R2_EPISODES})
-        elif math.isnan(self.return_correlation):
-            yield Finding("constant", episodes)
-        elif math.isnan(self.return_r2):
-            yield Finding("correlation", {**episodes, "correlation": self.return_correlation})
-        else:
+        elif not math.isnan(self.return_r2):
             yield Finding("r2", {**episodes, "r2": self.return_r2, "error": self.return_r2_error})
             if self.return_r2 < LITTLE_R2:
                 yield Finding("worthless")
+        elif math.isnan(self.return_correlation):
+            yield Finding("constant", episodes)
+        else:
+            yield Finding("correlation", {**episodes, "correlation": self.return_correlation})
 
 
 def predicted_return_statistics(returns: Sequence[float], predictions: Sequence[float]) -> tuple[float, float, float]:
