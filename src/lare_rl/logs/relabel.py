@@ -289,8 +289,10 @@ def _compute_rewards(
                 reward = _make_exact(reward, episode.reward, first, payments, credit.config)
             yield RelabelledEpisode(episode, reward)
             listener("write", counts.episodes, size[0])
-    if (counts.episodes, counts.steps) != size:
-        raise LareError(f"{log.name} changed while it was read: it had {size[0]} episodes, and now {counts.episodes}")
+    new_size = counts.episodes, counts.steps
+    if new_size != size:
+        before, after = (f"{n_episodes} episodes of {n_steps} steps" for n_episodes, n_steps in (size, new_size))
+        raise LareError(f"{log.name} changed while it was read: it had {before}, and now {after}")
 
 
 def _payment_begins(reward: Float[np.ndarray, " steps"], config: AssignerConfig) -> Bool[np.ndarray, " steps"]:
