@@ -34,10 +34,11 @@ from lare_rl.util.statistics import FLOAT32_NOISE, correlation, r_squared
 __all__ = ["MESSAGES", "Relabelled", "hold_out_flags", "predicted_return_statistics", "relabel"]
 
 BLOCK_EPISODES = 10
-"""The held-out share is the same in every block of episodes, so that it is even in a sorted log."""
+"""Held-out episodes are drawn from each block of this many complete episodes, so that they are spread evenly over a sorted log."""
 MIN_CAPACITY = 100_000
+"""The least number of steps whose inputs are stored, even if they take more than `memory`."""
 UPDATES = 10_000
-"""Gradient updates of a decoder."""
+"""The default number of gradient updates of a decoder."""
 MESSAGES = {
     "relabelled": "{method} gave rewards to {steps:count step} of {episodes:count episode}.",
     "cut": "Cut before their end, and not learned from: {episodes:count episode}.",
@@ -56,7 +57,7 @@ MESSAGES = {
 """The sentences of `Relabelled.findings`."""
 
 Listener = Callable[[str, int, int | None], None]
-"""Called with the name of the pass, the number of episodes so far, and the number of all episodes, if it is known."""
+"""Called with the pass ("fit" or "write"), the number of its episodes so far, and the number of all episodes; None if it is unknown."""
 
 
 @dataclass(frozen=True)
@@ -112,8 +113,9 @@ def predicted_return_statistics(returns: Sequence[float], predictions: Sequence[
     if len(returns) < MIN_R2_EPISODES:
         return math.nan, math.nan, math.nan
     y, predicted = np.array(returns), np.array(predictions)
+    r2, error = r_squared(y, predicted)
     varies = all(np.ptp(values) > FLOAT32_NOISE * np.abs(values).max() for values in (y, predicted))
-    return *r_squared(y, predicted), correlation(y, predicted) if varies else math.nan
+    return r2, error, correlation(y, predicted) if varies else math.nan
 
 
 def relabel(
@@ -131,7 +133,7 @@ def relabel(
     overwrite: bool = False,
     listener: Listener = lambda stage, n_done, n_episodes: None,
 ) -> Relabelled:
-    """Give the steps of logged episodes rewards that are fitted to the episodes' returns. With `exact`, they add up to them.
+    """Give the steps of logged episodes rewards that are fitted to the episodes' returns.
 
     Args:
         source: a directory of .npz or Parquet files, a Parquet file, a Hugging Face data set on the disk, a Minari id or data set,
@@ -142,10 +144,13 @@ def relabel(
         task: a name, a path, or a spec: the task that `phi` was designed for. It has the time limit and the number of discrete
             actions.
         hold_out: share of the complete episodes that are held out of the fit, to measure how well returns are predicted.
+        settings: the settings of the decoder. With `exact`, the rewards of a complete episode add up to its return.
         updates: number of gradient updates of the decoder. A closed-form decoder has none.
-        memory: approximate limit of the memory for the decoder's inputs, in GiB. A closed-form fit uses all episodes, other fits
-            use the last episodes that fit into it.
+        memory: approximate limit of the memory for the decoder's inputs, in GiB; at least 100,000 steps are stored. A closed-form fit
+            uses all episodes, other fits use the last episodes that fit into it.
         seed: seed of the choice of held-out episodes and of the decoder's initial weights.
+        overwrite: whether `out` is replaced if it exists.
+        listener: is told of each episode that is read, in both passes.
 
     Raises:
         LareError: the log is damaged or empty, `out` cannot be written or exists, or method, function and task do not fit together.
@@ -205,11 +210,14 @@ def _check_numbers(hold_out: float, memory: float, updates: int) -> None:
 
 
 def hold_out_flags(share: float, seed: int) -> Iterator[bool]:
-    """Yield without end whether the next complete episode is held out: a random `share` of each `BLOCK_EPISODES` episodes."""
+    """Yield without end whether the next complete episode is held out.
+
+    After each block of `BLOCK_EPISODES` episodes, `share` of all so far are held out, rounded down. Which ones of a block is random.
+    """
     block = 0
     while True:
-        first, last = (math.floor(n_blocks * BLOCK_EPISODES * share + 1e-9) for n_blocks in (block, block + 1))
-        held_out = np.random.default_rng([seed, block]).permutation(BLOCK_EPISODES)[: last - first]
+        before, after = (math.floor(n_blocks * BLOCK_EPISODES * share + 1e-9) for n_blocks in (block, block + 1))
+        held_out = np.random.default_rng([seed, block]).permutation(BLOCK_EPISODES)[: after - before]
         yield from (episode in held_out for episode in range(BLOCK_EPISODES))
         block += 1
 
