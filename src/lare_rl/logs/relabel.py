@@ -159,14 +159,14 @@ def relabel(
     task = None if task is None else resolve_task(task, playable=False)
     log = open_log(source, task)
     log.check_output(out, overwrite)
-    name = method or ("bayes" if phi is None else "lare-bayes")
-    if METHODS.find(name).reward is Reward.UNIFORM:
+    method = method or ("bayes" if phi is None else "lare-bayes")
+    if METHODS.find(method).reward is Reward.UNIFORM:
         raise LareError(
-            f"{name} gives all steps of an episode the same reward, and needs no relabelling: compute it from the return"
+            f"{method} gives all steps of an episode the same reward, and needs no relabelling: compute it from the return"
         )
     create = partial(
         CreditAssigner,
-        name,
+        method,
         phi,
         task=task,
         observation_space=log.layout.observation.size,  # `parse_episode` returns rows
@@ -181,14 +181,16 @@ def relabel(
     size = _fit(credit, log, hold_out_flags(hold_out, seed), updates, listener)
     explanation, counts = tuple(credit.explanation()), _Counts()
     episodes = _compute_rewards(credit, log, hold_out_flags(hold_out, seed), size, counts, listener)
-    comment = f"Rewards by lare-rl relabel, {name}; the old rewards are in infos['paid'], after an entry for the reset."
+    comment = (
+        f"Rewards by lare-rl relabel, {method}; the old rewards are in infos['paid'], after an entry for the reset."
+    )
     path = log.write(out, episodes, overwrite, comment)
     r2, r2_error, return_correlation = predicted_return_statistics(counts.returns, counts.predictions)
     if not credit.config.method.calibrated:
         r2 = r2_error = math.nan
     return Relabelled(
         out=path,
-        method=name,
+        method=method,
         episodes=counts.episodes,
         steps=counts.steps,
         cut=counts.cut,
@@ -273,29 +275,28 @@ def _compute_rewards(
     """
     # `phi` takes about as long for many steps as for few.
     for batch in batch_by_steps(log.episodes(), len):
-        lengths = [len(episode) for episode in batch]
-        begins = [_payment_begins(episode.reward, credit.config) for episode in batch]
-        payment_lengths = [np.diff(np.append(np.flatnonzero(first), len(first))) for first in begins]
-        r_hat = credit.rewards(
+        begins = [_segment_begins(episode.reward, credit.config) for episode in batch]
+        segment_lengths = [np.diff(np.append(np.flatnonzero(begin), len(begin))) for begin in begins]
+        r_hats = credit.rewards(
             np.concatenate([episode.observation for episode in batch]),
             np.concatenate([episode.action for episode in batch]),
             np.concatenate([episode.next_observation for episode in batch]),
-            length=np.concatenate([np.repeat(payments, payments) for payments in payment_lengths]),
+            length=np.concatenate([np.repeat(length, length) for length in segment_lengths]),
             begins=np.concatenate(begins),
         )
-        rewards = np.split(r_hat, np.cumsum(lengths)[:-1])
-        for episode, reward, first, payments in zip(batch, rewards, begins, payment_lengths, strict=True):
+        r_hats = np.split(r_hats, np.cumsum([len(episode) for episode in batch])[:-1])
+        for episode, r_hat, begin, length in zip(batch, r_hats, begins, segment_lengths, strict=True):
             counts.episodes += 1
             counts.steps += len(episode)
             counts.cut += not episode.complete
             if episode.complete and next(is_held_out):
                 counts.returns.append(float(episode.reward.sum()))
                 level = None if episode.group is None else credit.group_names.get(episode.group)
-                unpaid = credit.step_rewards.unpaid_return(level, payments)
-                counts.predictions.append(float(reward.sum(dtype=np.float64)) + unpaid)
+                unpaid = credit.step_rewards.unpaid_return(level, length)
+                counts.predictions.append(float(r_hat.sum(dtype=np.float64)) + unpaid)
             if episode.complete and credit.config.spec.is_exact:
-                reward = _make_exact(reward, episode.reward, first, payments, credit.config)
-            yield RelabelledEpisode(episode, reward)
+                r_hat = _make_exact(r_hat, episode.reward, begin, length, credit.config)
+            yield RelabelledEpisode(episode, r_hat)
             listener("write", counts.episodes, size[0])
     new_size = counts.episodes, counts.steps
     if new_size != size:
@@ -303,8 +304,8 @@ def _compute_rewards(
         raise LareError(f"{log.name} changed while it was read: it had {before}, and now {after}")
 
 
-def _payment_begins(reward: Float[np.ndarray, " steps"], config: AssignerConfig) -> Bool[np.ndarray, " steps"]:
-    """Return which steps of an episode are the first ones of a payment."""
+def _segment_begins(reward: Float[np.ndarray, " steps"], config: AssignerConfig) -> Bool[np.ndarray, " steps"]:
+    """Return which steps of an episode are the first ones of a segment."""
     n_steps = len(reward)
     pays = is_paid(config.payments, np.arange(n_steps), reward[:, None], np.arange(n_steps) == n_steps - 1)
     return np.append(True, pays[:-1])
@@ -314,13 +315,12 @@ def _make_exact(
     r_hat: Float[np.ndarray, " steps"],
     reward: Float[np.ndarray, " steps"],
     begins: Bool[np.ndarray, " steps"],
-    lengths: Int[np.ndarray, " payments"],
+    length: Int[np.ndarray, " segments"],
     config: AssignerConfig,
 ) -> Float[np.ndarray, " steps"]:
-    """Return proxy rewards that add up to each payment. Payments have `lengths` steps, and begin at the steps `begins`."""
+    """Return proxy rewards that add up to each payment. `begins` says where its segment begins, and `length` how long it is."""
     exact = config.settings.exact
     assert exact in ("last", "spread")
     residual = np.add.reduceat(reward - r_hat.astype(np.float64), np.flatnonzero(begins))
-    residual, length = (np.repeat(values, lengths) for values in (residual, lengths))
-    change = correction(residual, np.append(begins[1:], True), length, exact)
+    change = correction(np.repeat(residual, length), np.append(begins[1:], True), np.repeat(length, length), exact)
     return (r_hat + change).astype(r_hat.dtype)
