@@ -33,7 +33,7 @@ switched off could not be switched on again."""
 JITTER = 1e-10
 """This fraction of the diagonal of S is added to S, so that S can be factorised if features are collinear."""
 TOLERANCE = 1e-3
-"""The iteration to the fixed point ends when a round changes the log evidence by less than this (in `logistic.py`: xi)."""
+"""The iteration to the fixed point ends when a round changes the log evidence by less than this."""
 MIN_VARIATION = 1e-5
 """A feature is taken to be constant if its standard deviation between cases is a smaller fraction of its size. The rounding errors of a
 constant in float32 are smaller. An episode's mean of the time is constant, for example, if all episodes are equally long. A weight for it
