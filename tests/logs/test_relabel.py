@@ -161,7 +161,8 @@ def test_predicted_return_statistics():
     ("changes", "expected"),
     [
         ({"held_out": 7}, ["too_few"]),
-        ({"return_correlation": math.nan}, ["constant"]),
+        ({"return_correlation": math.nan, "return_r2": math.nan}, ["constant"]),
+        ({"return_correlation": math.nan, "return_r2": -0.01}, ["r2", "worthless"]),  # equal predictions
         ({"return_r2": math.nan}, ["correlation"]),
         ({"return_r2": 0.09}, ["r2", "worthless"]),
         ({"cut": 3}, ["cut", "r2"]),
@@ -177,17 +178,24 @@ def test_findings(changes, expected):
     assert "1 episode." in result.summary[0]
 
 
-def test_failure_in_second_pass_keeps_old_output(tmp_path):
+@pytest.mark.parametrize(
+    ("new", "message"),
+    [
+        ({"count": 19}, "it had 20 episodes of 483 steps, and now 19 episodes of 457 steps"),
+        ({"seed": 1}, "it had 20 episodes of 483 steps, and now 20 episodes of"),
+    ],
+)
+def test_failure_in_second_pass_keeps_old_output(tmp_path, new, message):
     class ChangingLog:
         passes = 0
 
         def __iter__(self):
             self.passes += 1
-            return iter(logged_episodes(20 if self.passes < 4 else 19))
+            return logged_episodes(**({"count": 20} | (new if self.passes >= 4 else {})))
 
     (tmp_path / "new").mkdir()
     (tmp_path / "new" / "mine.npz").write_text("old")
-    with pytest.raises(LareError, match="changed while it was read: it had 20 episodes, and now 19"):
+    with pytest.raises(LareError, match=f"changed while it was read: {message}"):
         relabel(ChangingLog(), tmp_path / "new", method="rd-linear", settings=SUM, overwrite=True)
     assert [path.name for path in tmp_path.rglob("*")] == ["new", "mine.npz"]
     assert (tmp_path / "new" / "mine.npz").read_text() == "old"

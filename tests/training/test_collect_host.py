@@ -171,7 +171,7 @@ def test_restore_drops_only_other_observations():
     collect(envs, 27)
     state = envs.state_dict()
     dropped, (message,) = restored.restore(state | {"observation3": state["observation3"] + 1})
-    assert message.startswith("episode 1 of seed 4 was dropped after 7 steps")
+    assert message.startswith("episode 1 of seed 4 in environment 1 was dropped after 7 steps")
     assert dropped.tolist() == [[False, False], [False, True]]
     state = restored.state_dict()
     assert state["episode"].tolist() == [1, 1, 1, 2]
@@ -296,6 +296,15 @@ def test_collect_locates_bad_outputs(wrap):
     wrap(BadOutput, value=float("nan"), seeds={seed}, reward=True)
     with pytest.raises(EnvOutputError, match=r"reward.*nan.*, at step 3 of episode 1 of seed 9 in environment 1$"):
         collect(make_envs((4, 9), 2, task=WRAPPED), 40)
+
+
+def test_restore_locates_bad_outputs(wrap):
+    """The step is that of the repeated episode."""
+    envs = make_envs((4,), task=WRAPPED)
+    collect(envs, 27)
+    wrap(BadOutput, value=float("nan"), reward=True)
+    with pytest.raises(EnvOutputError, match=r"reward.*nan.*, at step 3 of episode 1 of seed 4$"):
+        make_envs((4,), task=WRAPPED).restore(envs.state_dict())
 
 
 def test_evaluate_locates_bad_output(wrap):

@@ -1,7 +1,8 @@
 """One round of the evidence's fixed point (`evidence.py`), for arrays of NumPy and of JAX.
 
-The equations are those of `evidence.py`. Here they have no loop: they are methods of a `Backend`, an array library. The caller gives the
-`Moments` of the posterior, which a special structure of the features may allow to compute faster than `dense_moments` does.
+The equations are those of `evidence.py`. They are methods of `Backend`, which holds the array library. The loops over rounds are in
+`evidence.py` and `turns/regression.py`. The caller computes the `Moments` of the posterior: by `dense_moments`, or faster if S has a
+structure, as in `turns/regression.py`.
 """
 
 from collections.abc import Callable
@@ -34,8 +35,9 @@ JITTER = 1e-10
 TOLERANCE = 1e-3
 """The iteration to the fixed point ends when a round changes the log evidence by less than this."""
 MIN_VARIATION = 1e-5
-"""A feature that varies less than this between cases is taken to be constant: what float32 leaves of a constant is less. An episode's mean
-of the time is constant, for example, if all episodes are equally long. A weight for it would be the quotient of two rounding errors."""
+"""A feature is taken to be constant if its standard deviation between cases is a smaller fraction of its size. The rounding errors of a
+constant in float32 are smaller. An episode's mean of the time is constant, for example, if all episodes are equally long. A weight for it
+would be the quotient of two rounding errors."""
 MIN_NOISE = 1e-10
 """The smallest variance of the noise, relative to that of the returns. Float32 features and returns cannot resolve less."""
 
@@ -44,22 +46,25 @@ Array = Any
 Features = Float[Array, " features"]
 Groups = Float[Array, " groups"]
 FeatureIndex = Int[np.ndarray, " features"]
-"""The index of each feature's group, or of its strength (`relevance.py`)."""
+"""For each feature, the index of its precision in alpha: that of its group, or of its strength (`relevance.py`)."""
 
 
 class Posterior(NamedTuple):
-    """The posterior of the weights, without their covariance, which `evidence.posterior_covariance` computes."""
+    """The posterior of the weights, without their covariance, which `evidence.posterior_covariance` computes.
+
+    During the iteration, y is in units of its standard deviation and the bias is 0. `evidence.unscale` returns to the unit of y.
+    """
 
     weight: Float[Array, "*batch features"]
     bias: Float[Array, "*batch"]
     alpha: Float[Array, "*batch groups"]
-    """The precision of the weights of each group, in units of the standard deviation of y."""
+    """The precision of the weights of each group in the next round, always with y in units of its standard deviation."""
     beta: Float[Array, "*batch"]
-    """The precision of a step's noise, in the same unit."""
+    """The precision of a step's noise in the next round, with y in the same units."""
     n_effective: Float[Array, "*batch groups"]
     """gamma: how many features of each group the data determine."""
     log_evidence: Float[Array, "*batch"]
-    """The log evidence, up to a constant that does not depend on groups and precisions."""
+    """The log evidence of the precisions of this round, up to a constant that does not depend on groups and precisions."""
 
 
 class Regression(NamedTuple):
@@ -90,9 +95,9 @@ class Moments(NamedTuple):
     """q - 2 mu . p + mu . S mu."""
 
 
-def varies(variance: Features, mean_square: Any) -> Any:
-    """Return which features vary between cases by more than rounding errors, which grow with `mean_square`."""
-    return variance > MIN_VARIATION**2 * (1 + mean_square)
+def varies(variance: Features, squared_size: Any) -> Any:
+    """Return which features vary between cases by more than rounding errors, which grow with their size."""
+    return variance > MIN_VARIATION**2 * (1 + squared_size)
 
 
 class Backend(NamedTuple):
@@ -112,14 +117,14 @@ class Backend(NamedTuple):
         return self.xp.where(trace > 0, 2 * n_groups * trace / q, 1)
 
     def clip_precisions(self, problem: Regression, alpha: Groups, beta: Any) -> tuple[Groups, Any]:
-        """Clip precisions to a range that float32 can represent."""
+        """Clip alpha to `PRIOR_RANGE` around equal shares, and beta to noise from `MIN_NOISE` of the variation to twice all of it."""
         xp = self.xp
         noise_only = xp.maximum(problem.dof, 1) / problem.q  # beta if all variation is noise
         alpha = xp.clip(alpha, problem.equal_alpha / PRIOR_RANGE, problem.equal_alpha * PRIOR_RANGE)
         return alpha, xp.clip(beta, noise_only / 2, noise_only / MIN_NOISE)
 
     def inverse_root(self, precision: Float[Array, "n n"]) -> tuple[Float[Array, "n n"], Any]:
-        """Return L with L^T L the inverse of a precision matrix, and the log of the matrix's determinant."""
+        """Return a root, where root^T root is the inverse of a precision matrix, and the log of the matrix's determinant."""
         xp = self.xp
         scale = xp.sqrt(xp.diagonal(precision))  # a diagonal of ones makes the factorisation accurate
         factor = xp.linalg.cholesky(precision / xp.outer(scale, scale))
@@ -146,7 +151,7 @@ class Backend(NamedTuple):
     def next_posterior(
         self, problem: Regression, alpha: Groups, beta: Any, moments: Callable[[Groups, Any], Moments]
     ) -> Posterior:
-        """Compute the posterior under some precisions, and the precisions that follow from it."""
+        """Return the posterior under some precisions, with the precisions that follow from it, those of the next round."""
         xp = self.xp
         alpha, beta = self.clip_precisions(problem, alpha, beta)
         weight, variance, log_det, residual = moments(alpha, beta)
@@ -166,7 +171,10 @@ NUMPY = Backend(np, lambda values, group_index, n_groups: np.bincount(group_inde
 
 
 def expand_groups(groups: Posterior, group_index: FeatureIndex, strength_index: FeatureIndex) -> Posterior:
-    """Return a fit by groups in the form of a fit by strengths (`relevance.py`): each strength has the precision of its group."""
+    """Return a fit by groups as if it were by strengths (`relevance.py`).
+
+    Each strength has the precision of its group, and an equal part of the group's `n_effective`.
+    """
     group = np.zeros(int(strength_index.max(initial=-1)) + 1, int)
     group[strength_index] = group_index
     n_strengths = np.bincount(group, minlength=groups.alpha.shape[-1])

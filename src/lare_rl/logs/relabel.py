@@ -34,10 +34,11 @@ from lare_rl.util.statistics import FLOAT32_NOISE, correlation, r_squared
 __all__ = ["MESSAGES", "Relabelled", "hold_out_flags", "predicted_return_statistics", "relabel"]
 
 BLOCK_EPISODES = 10
-"""The held-out share is the same in every block of episodes, so that it is even in a sorted log."""
+"""Held-out episodes are drawn from each block of this many complete episodes, so that they are spread evenly over a sorted log."""
 MIN_CAPACITY = 100_000
+"""The least number of steps whose inputs are stored, even if they take more than `memory`."""
 UPDATES = 10_000
-"""Gradient updates of a decoder."""
+"""The default number of gradient updates of a decoder."""
 MESSAGES = {
     "relabelled": "{method} gave rewards to {steps:count step} of {episodes:count episode}.",
     "cut": "Cut before their end, and not learned from: {episodes:count episode}.",
@@ -56,7 +57,7 @@ MESSAGES = {
 """The sentences of `Relabelled.findings`."""
 
 Listener = Callable[[str, int, int | None], None]
-"""Called with the name of the pass, the number of episodes so far, and the number of all episodes, if it is known."""
+"""Called with the pass ("fit" or "write"), the number of its episodes so far, and the number of all episodes; None if it is unknown."""
 
 
 @dataclass(frozen=True)
@@ -97,14 +98,14 @@ class Relabelled:
         episodes = {"episodes": self.held_out}
         if self.held_out < MIN_R2_EPISODES:
             yield Finding("too_few", {**episodes, "needed": MIN_R2_EPISODES})
-        elif math.isnan(self.return_correlation):
-            yield Finding("constant", episodes)
-        elif math.isnan(self.return_r2):
-            yield Finding("correlation", {**episodes, "correlation": self.return_correlation})
-        else:
+        elif not math.isnan(self.return_r2):
             yield Finding("r2", {**episodes, "r2": self.return_r2, "error": self.return_r2_error})
             if self.return_r2 < LITTLE_R2:
                 yield Finding("worthless")
+        elif math.isnan(self.return_correlation):
+            yield Finding("constant", episodes)
+        else:
+            yield Finding("correlation", {**episodes, "correlation": self.return_correlation})
 
 
 def predicted_return_statistics(returns: Sequence[float], predictions: Sequence[float]) -> tuple[float, float, float]:
@@ -112,8 +113,9 @@ def predicted_return_statistics(returns: Sequence[float], predictions: Sequence[
     if len(returns) < MIN_R2_EPISODES:
         return math.nan, math.nan, math.nan
     y, predicted = np.array(returns), np.array(predictions)
+    r2, error = r_squared(y, predicted)
     varies = all(np.ptp(values) > FLOAT32_NOISE * np.abs(values).max() for values in (y, predicted))
-    return *r_squared(y, predicted), correlation(y, predicted) if varies else math.nan
+    return r2, error, correlation(y, predicted) if varies else math.nan
 
 
 def relabel(
@@ -131,7 +133,7 @@ def relabel(
     overwrite: bool = False,
     listener: Listener = lambda stage, n_done, n_episodes: None,
 ) -> Relabelled:
-    """Give the steps of logged episodes rewards that are fitted to the episodes' returns. With `exact`, they add up to them.
+    """Give the steps of logged episodes rewards that are fitted to the episodes' returns.
 
     Args:
         source: a directory of .npz or Parquet files, a Parquet file, a Hugging Face data set on the disk, a Minari id or data set,
@@ -142,10 +144,13 @@ def relabel(
         task: a name, a path, or a spec: the task that `phi` was designed for. It has the time limit and the number of discrete
             actions.
         hold_out: share of the complete episodes that are held out of the fit, to measure how well returns are predicted.
+        settings: the settings of the decoder. With `exact`, the rewards of a complete episode add up to its return.
         updates: number of gradient updates of the decoder. A closed-form decoder has none.
-        memory: approximate limit of the memory for the decoder's inputs, in GiB. A closed-form fit uses all episodes, other fits
-            use the last episodes that fit into it.
+        memory: approximate limit of the memory for the decoder's inputs, in GiB; at least 100,000 steps are stored. A closed-form fit
+            uses all episodes, other fits use the last episodes that fit into it.
         seed: seed of the choice of held-out episodes and of the decoder's initial weights.
+        overwrite: whether `out` is replaced if it exists.
+        listener: is told of each episode that is read, in both passes.
 
     Raises:
         LareError: the log is damaged or empty, `out` cannot be written or exists, or method, function and task do not fit together.
@@ -154,14 +159,14 @@ def relabel(
     task = None if task is None else resolve_task(task, playable=False)
     log = open_log(source, task)
     log.check_output(out, overwrite)
-    name = method or ("bayes" if phi is None else "lare-bayes")
-    if METHODS.find(name).reward is Reward.UNIFORM:
+    method = method or ("bayes" if phi is None else "lare-bayes")
+    if METHODS.find(method).reward is Reward.UNIFORM:
         raise LareError(
-            f"{name} gives all steps of an episode the same reward, and needs no relabelling: compute it from the return"
+            f"{method} gives all steps of an episode the same reward, and needs no relabelling: compute it from the return"
         )
     create = partial(
         CreditAssigner,
-        name,
+        method,
         phi,
         task=task,
         observation_space=log.layout.observation.size,  # `parse_episode` returns rows
@@ -176,14 +181,16 @@ def relabel(
     size = _fit(credit, log, hold_out_flags(hold_out, seed), updates, listener)
     explanation, counts = tuple(credit.explanation()), _Counts()
     episodes = _compute_rewards(credit, log, hold_out_flags(hold_out, seed), size, counts, listener)
-    comment = f"Rewards by lare-rl relabel, {name}; the old rewards are in infos['paid'], after an entry for the reset."
+    comment = (
+        f"Rewards by lare-rl relabel, {method}; the old rewards are in infos['paid'], after an entry for the reset."
+    )
     path = log.write(out, episodes, overwrite, comment)
     r2, r2_error, return_correlation = predicted_return_statistics(counts.returns, counts.predictions)
     if not credit.config.method.calibrated:
         r2 = r2_error = math.nan
     return Relabelled(
         out=path,
-        method=name,
+        method=method,
         episodes=counts.episodes,
         steps=counts.steps,
         cut=counts.cut,
@@ -205,11 +212,14 @@ def _check_numbers(hold_out: float, memory: float, updates: int) -> None:
 
 
 def hold_out_flags(share: float, seed: int) -> Iterator[bool]:
-    """Yield without end whether the next complete episode is held out: a random `share` of each `BLOCK_EPISODES` episodes."""
+    """Yield without end whether the next complete episode is held out.
+
+    After each block of `BLOCK_EPISODES` episodes, `share` of all so far are held out, rounded down. Which ones of a block is random.
+    """
     block = 0
     while True:
-        first, last = (math.floor(n_blocks * BLOCK_EPISODES * share + 1e-9) for n_blocks in (block, block + 1))
-        held_out = np.random.default_rng([seed, block]).permutation(BLOCK_EPISODES)[: last - first]
+        before, after = (math.floor(n_blocks * BLOCK_EPISODES * share + 1e-9) for n_blocks in (block, block + 1))
+        held_out = np.random.default_rng([seed, block]).permutation(BLOCK_EPISODES)[: after - before]
         yield from (episode in held_out for episode in range(BLOCK_EPISODES))
         block += 1
 
@@ -265,36 +275,37 @@ def _compute_rewards(
     """
     # `phi` takes about as long for many steps as for few.
     for batch in batch_by_steps(log.episodes(), len):
-        lengths = [len(episode) for episode in batch]
-        begins = [_payment_begins(episode.reward, credit.config) for episode in batch]
-        payment_lengths = [np.diff(np.append(np.flatnonzero(first), len(first))) for first in begins]
-        r_hat = credit.rewards(
+        begins = [_segment_begins(episode.reward, credit.config) for episode in batch]
+        segment_lengths = [np.diff(np.append(np.flatnonzero(begin), len(begin))) for begin in begins]
+        r_hats = credit.rewards(
             np.concatenate([episode.observation for episode in batch]),
             np.concatenate([episode.action for episode in batch]),
             np.concatenate([episode.next_observation for episode in batch]),
-            length=np.concatenate([np.repeat(payments, payments) for payments in payment_lengths]),
+            length=np.concatenate([np.repeat(length, length) for length in segment_lengths]),
             begins=np.concatenate(begins),
         )
-        rewards = np.split(r_hat, np.cumsum(lengths)[:-1])
-        for episode, reward, first, payments in zip(batch, rewards, begins, payment_lengths, strict=True):
+        r_hats = np.split(r_hats, np.cumsum([len(episode) for episode in batch])[:-1])
+        for episode, r_hat, begin, length in zip(batch, r_hats, begins, segment_lengths, strict=True):
             counts.episodes += 1
             counts.steps += len(episode)
             counts.cut += not episode.complete
             if episode.complete and next(is_held_out):
                 counts.returns.append(float(episode.reward.sum()))
                 level = None if episode.group is None else credit.group_names.get(episode.group)
-                unpaid = credit.step_rewards.unpaid_return(level, payments)
-                counts.predictions.append(float(reward.sum(dtype=np.float64)) + unpaid)
+                unpaid = credit.step_rewards.unpaid_return(level, length)
+                counts.predictions.append(float(r_hat.sum(dtype=np.float64)) + unpaid)
             if episode.complete and credit.config.spec.is_exact:
-                reward = _make_exact(reward, episode.reward, first, payments, credit.config)
-            yield RelabelledEpisode(episode, reward)
+                r_hat = _make_exact(r_hat, episode.reward, begin, length, credit.config)
+            yield RelabelledEpisode(episode, r_hat)
             listener("write", counts.episodes, size[0])
-    if (counts.episodes, counts.steps) != size:
-        raise LareError(f"{log.name} changed while it was read: it had {size[0]} episodes, and now {counts.episodes}")
+    new_size = counts.episodes, counts.steps
+    if new_size != size:
+        before, after = (f"{n_episodes} episodes of {n_steps} steps" for n_episodes, n_steps in (size, new_size))
+        raise LareError(f"{log.name} changed while it was read: it had {before}, and now {after}")
 
 
-def _payment_begins(reward: Float[np.ndarray, " steps"], config: AssignerConfig) -> Bool[np.ndarray, " steps"]:
-    """Return which steps of an episode are the first ones of a payment."""
+def _segment_begins(reward: Float[np.ndarray, " steps"], config: AssignerConfig) -> Bool[np.ndarray, " steps"]:
+    """Return which steps of an episode are the first ones of a segment."""
     n_steps = len(reward)
     pays = is_paid(config.payments, np.arange(n_steps), reward[:, None], np.arange(n_steps) == n_steps - 1)
     return np.append(True, pays[:-1])
@@ -304,13 +315,12 @@ def _make_exact(
     r_hat: Float[np.ndarray, " steps"],
     reward: Float[np.ndarray, " steps"],
     begins: Bool[np.ndarray, " steps"],
-    lengths: Int[np.ndarray, " payments"],
+    length: Int[np.ndarray, " segments"],
     config: AssignerConfig,
 ) -> Float[np.ndarray, " steps"]:
-    """Return proxy rewards that add up to each payment. Payments have `lengths` steps, and begin at the steps `begins`."""
+    """Return proxy rewards that add up to each payment. `begins` says where its segment begins, and `length` how long it is."""
     exact = config.settings.exact
     assert exact in ("last", "spread")
     residual = np.add.reduceat(reward - r_hat.astype(np.float64), np.flatnonzero(begins))
-    residual, length = (np.repeat(values, lengths) for values in (residual, lengths))
-    change = correction(residual, np.append(begins[1:], True), length, exact)
+    change = correction(np.repeat(residual, length), np.append(begins[1:], True), np.repeat(length, length), exact)
     return (r_hat + change).astype(r_hat.dtype)

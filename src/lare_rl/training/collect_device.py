@@ -199,8 +199,8 @@ def _exploration_policy(env_steps: int | Int[Array, ""], config: TrainConfig) ->
         return policy
     assert config.noise is Noise.NORMAL
 
-    def act(actor: Any, memory: Any, observation: Array, available: Array, noise: Array, is_new: Array) -> Any:
-        action, memory = policy(actor, memory, observation, available, noise, is_new)
+    def act(actor: Any, memory: Any, observation: Array, available: Array, noise: Array, episode_start: Array) -> Any:
+        action, memory = policy(actor, memory, observation, available, noise, episode_start)
         uniform = jax.lax.erf(noise / math.sqrt(2))  # the distribution function of the noise, scaled to -1 to 1
         return jnp.where(env_steps < config.warmup, uniform, action), memory
 

@@ -6,7 +6,8 @@ An episode is determined by its seed and its actions. So a run can be resumed in
 simulator: reset with the seed, play the actions, and compare the observation bit for bit.
 """
 
-from collections.abc import Callable, Sequence
+import contextlib
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -30,11 +31,11 @@ __all__ = ["HostCollector", "make_host_collector"]
 
 
 class HostCollector:
-    """The training environments of a run and the running episode of each, the policy that acts, and environments to evaluate it in.
+    """The training environments of a run, with the running episode of each, and the environments of its evaluations.
 
     Args:
         envs: `n_envs` environments of the first seed, then of the second, and so on.
-        evaluation_envs: environments of the first seed, then of the second, and so on.
+        evaluation_envs: the same for evaluations, in any number for each seed.
         seeds: the seeds of the run.
     """
 
@@ -44,9 +45,10 @@ class HostCollector:
         self._envs, self._evaluation_envs = envs, evaluation_envs
         self._action_shape = envs.spec.n_agents, envs.spec.action_size
         self._memory = init_host_memory(config, *self.shape)
+        """The memory of the actors."""
         self._step, self._on_step = 0, _ignore_step
         self._episode = np.full(len(seeds) * config.n_envs, -1)
-        """The number of each environment's running episode."""
+        """The number of each environment's running episode, among the episodes of this environment."""
         self._actions: list[list[np.ndarray]] = [[] for _ in self._episode]
         """The actions of that episode, in the environment's units."""
         self._timestep = add_seed_axis(envs.batch, self.shape)
@@ -57,7 +59,7 @@ class HostCollector:
     def watch(self, on_step: Callable[[int], None], stop_requested: Callable[[], bool]) -> None:
         """Call `on_step` with the number of steps of each seed while environments step, also during evaluations.
 
-        Once the user has asked the run to stop, environments in other processes must reply soon.
+        `stop_requested` says whether the user wants to stop. Environments in other processes must then reply soon.
         """
         self._on_step = on_step
         self._envs.stop_requested = self._evaluation_envs.stop_requested = stop_requested
@@ -95,7 +97,7 @@ class HostCollector:
                 self._step += self._n_envs
                 self._on_step(self._step)
         finally:
-            check_actions(steps.action, self._seeds)  # such actions may be the reason of an error
+            check_actions(steps.action, self._seeds)  # NaN as an action may have caused the error
         return steps
 
     def _collect_step(
@@ -109,7 +111,8 @@ class HostCollector:
         rows = env_action.reshape(-1, *env_action.shape[2:])
         for actions, row in zip(self._actions, rows, strict=True):
             actions.append(row)
-        self._call(lambda: self._envs.step(rows))
+        with self._locate_errors():
+            self._envs.step(rows)
         _write_timestep(steps.next_timestep, t, self._timestep)
         self._episode_start = np.zeros(self.shape, bool)
         ended = np.logical_or(self._timestep.terminated, self._timestep.truncated)
@@ -121,18 +124,19 @@ class HostCollector:
         self._episode[where] += 1
         for index in np.flatnonzero(where):
             self._actions[index] = []
-        self._call(lambda: self._envs.reset(where, self._episode_seeds()))
+        with self._locate_errors():
+            self._envs.reset(where, self._episode_seeds())
         self._episode_start = self._episode_start | where.reshape(self.shape)
 
     def evaluate(self, actor: Any, n_episodes: int, deterministic: bool = False) -> Evaluation:
-        """Evaluate whole episodes of the policy, always from the same initial states. If `deterministic`, by its likeliest actions."""
+        """Evaluate whole episodes of the policy, always from the same initial states. If `deterministic`, it acts without noise."""
         config = replace(self._config, deterministic=True) if deterministic else self._config
         return evaluate_policy_on_host(
             self._evaluation_envs, config, actor, self._seeds, n_episodes, on_step=lambda: self._on_step(self._step)
         )
 
     def state_dict(self) -> dict[str, np.ndarray]:
-        """Return the arrays that `restore` needs: seeds and actions of the running episodes, and the actors' memory."""
+        """Return the arrays that `restore` needs: numbers and actions of the running episodes, and the actors' memory."""
         arrays = {f"memory{i}": np.asarray(leaf) for i, leaf in enumerate(jax.tree.leaves(self._memory))}
         arrays |= {"episode": self._episode.copy(), "new": self._episode_start}
         for index, actions in enumerate(self._actions):
@@ -154,19 +158,24 @@ class HostCollector:
         self._episode = arrays["episode"].copy()
         indices = range(len(self._episode))
         actions = [arrays[f"actions{index}"] for index in indices]
+        self._actions = [[] for _ in indices]
         idle = np.zeros(self._action_shape, np.float32)  # of environments that do not step
-        self._call(lambda: self._envs.reset(np.ones(len(indices), bool), self._episode_seeds()))
+        with self._locate_errors():
+            self._envs.reset(np.ones(len(indices), bool), self._episode_seeds())
         ended_early = np.zeros(len(indices), bool)
         for t in range(max(map(len, actions))):
             where = np.array([t < len(rows) for rows in actions]) & ~ended_early
-            action_t = np.stack([rows[min(t, len(rows) - 1)] if len(rows) else idle for rows in actions])
-            timestep = self._call(lambda action=action_t, where=where: self._envs.step(action, where))
+            for index in np.flatnonzero(where):
+                self._actions[index].append(actions[index][t])
+            action_t = np.stack([rows[-1] if rows else idle for rows in self._actions])
+            with self._locate_errors():
+                timestep = self._envs.step(action_t, where)
             ended_early |= where & (timestep.terminated | timestep.truncated)
-        self._actions, self._episode_start = [list(rows) for rows in actions], arrays["new"].copy()
+        self._episode_start = arrays["new"].copy()
         same = [np.array_equal(self._envs.batch.observation[i], arrays[f"observation{i}"]) for i in indices]
         dropped = ended_early | ~np.array(same)
         messages = [
-            f"episode {self._episode[index]} of seed {self._seed(index)} was dropped after {len(actions[index])} steps: "
+            f"{self._episode_name(index)} was dropped after {len(actions[index])} steps: "
             "the same actions did not lead to the same observation again"
             for index in np.flatnonzero(dropped).tolist()
         ]
@@ -181,26 +190,31 @@ class HostCollector:
         finally:
             self._evaluation_envs.close()
 
-    def _seed(self, env_index: int) -> int:
-        return self._seeds[env_index // self._n_envs]
+    def _seed(self, index: int) -> int:
+        return self._seeds[index // self._n_envs]
+
+    def _episode_name(self, index: int) -> str:
+        """Return the name of an environment's running episode, for messages."""
+        env = f" in environment {index % self._n_envs}" if self._n_envs > 1 else ""
+        return f"episode {self._episode[index]} of seed {self._seed(index)}{env}"
 
     def _episode_seeds(self) -> Int[np.ndarray, " all"]:
         """Return the random seed of each environment's running episode."""
-        # The number of an episode, among all episodes of the seed.
+        # The number of an episode among those of all environments of the seed.
         numbers = [int(episode) * self._n_envs + i % self._n_envs for i, episode in enumerate(self._episode)]
         return np.array(
             [episode_seed(self._seed(i), Stream.TRAINING_EPISODES, number) for i, number in enumerate(numbers)]
         )
 
-    def _call(self, function: Callable[[], Timestep]) -> Timestep:
-        """Call the environments. An error names the step, episode and seed of the environment that raised it."""
+    @contextlib.contextmanager
+    def _locate_errors(self) -> Iterator[None]:
+        """Add the step, episode and seed of an environment to an `EnvOutputError` of a block."""
         try:
-            return function()
+            yield
         except EnvOutputError as error:
             if (index := error.env_index) is None:
                 raise
-            env = f" in environment {index % self._n_envs}" if self._n_envs > 1 else ""
-            where = f"at step {len(self._actions[index])} of episode {self._episode[index]} of seed {self._seed(index)}{env}"
+            where = f"at step {len(self._actions[index])} of {self._episode_name(index)}"
             raise EnvOutputError(f"{error}, {where}") from None
 
 

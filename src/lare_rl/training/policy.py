@@ -1,7 +1,7 @@
 """The policy of a run, whatever data its algorithm consumes: untrained, compiled, and on the host with NumPy.
 
 A policy is a function of the actor, its memory, the observation, the available actions, the noise (None: it acts without noise) and which
-episodes are new. It returns the action and the new memory. Only QMIX and VDN have a memory.
+episodes have just begun. It returns the action and the new memory. Only QMIX and VDN have a memory.
 
 A small network acts faster on the CPU with NumPy than on a card, which needs two transfers and a launch for each step. The weights are
 copied once for many steps.
@@ -111,12 +111,17 @@ def act(
 
 
 def make_policy(config: TrainConfig, deterministic: bool) -> Policy:
-    """Return the policy of all seeds. If `deterministic`, its noise must be None. Its memory is reset where an episode is new."""
+    """Return the policy of all seeds. If `deterministic`, its noise must be None. Its memory is reset where an episode has just begun."""
 
     def act_in_envs(
-        actor: Any, memory: Any, observation: Array, available: Array, noise: Array | None, is_new: Bool[Array, " envs"]
+        actor: Any,
+        memory: Any,
+        observation: Array,
+        available: Array,
+        noise: Array | None,
+        episode_start: Bool[Array, " envs"],
     ) -> tuple[Array, Any]:
-        memory = select(is_new, init_memory(config), memory)
+        memory = select(episode_start, init_memory(config), memory)
         return act(actor, memory, observation, available, noise, config)
 
     return jax.vmap(act_in_envs, in_axes=(0, 0, 0, 0, None if deterministic else 0, 0))
