@@ -49,7 +49,7 @@ class StepRewards:
     def rewards(
         self, inputs: Float[np.ndarray, "n *agents inputs"], length: Int[np.ndarray, " n"]
     ) -> Float[np.ndarray, "n *agents"]:
-        """Return the rewards of any steps, whose episodes have these lengths. The method must not need their returns."""
+        """Return the rewards of any steps, by the lengths of their episodes. The method must not need returns."""
         ended, alive = np.ones(len(length), bool), np.ones((len(length), self.config.agents), bool)
         arrays: Any = inputs, length, np.zeros(len(length), np.float32), ended, ended, alive
         return self._compute(StepBatch(*arrays))
@@ -85,7 +85,7 @@ class StepRewards:
     def _residuals(
         self, step_ids: Int[np.ndarray, " n"], rows: Int[np.ndarray, " n"]
     ) -> tuple[Bool[np.ndarray, " n"], Float[np.ndarray, " n"]]:
-        """Return which steps are the last ones of their episodes, and the residual of each step's episode; 0 if it is not paid."""
+        """Return which steps end a stored episode, and the residual of each step's episode; 0 where none is known or added."""
         number = self.store.episode[rows]
         stored = [self.store.episodes.get(k) for k in number.tolist()]
         last = np.array([e is not None and e.step_ids[-1] == k for e, k in zip(stored, step_ids, strict=True)], bool)
@@ -96,7 +96,7 @@ class StepRewards:
         return last, residual
 
     def _episode_residuals(self, numbers: Sequence[int]) -> Float[np.ndarray, " episodes"]:
-        """Return the returns of episodes, less the sums of their proxy rewards by the newest decoder."""
+        """Return the residuals R - sum_t r_hat_t of episodes, by their numbers and the newest decoder."""
         decoder = self.learner.decoder
         if self._residual_cache[0] is not decoder:
             self._residual_cache = decoder, {}
@@ -113,9 +113,9 @@ class StepRewards:
         return np.array([residuals[number] for number in numbers], np.float32)
 
     def unpaid_return(self, level: int | None, length: Int[np.ndarray, " payments"]) -> float:
-        """Return the part of the return of an episode that no step is paid for.
+        """Return the part of an episode's return that no proxy reward contains: that of its level, or of all episodes.
 
-        `level` is None for an unknown group. `length` is the number of steps of each payment.
+        `level` is None if it is unknown. `length` has the number of steps of each segment.
         """
         decoder = self.learner.decoder
         if decoder is None or not self.learner.is_fitted:

@@ -30,7 +30,7 @@ __all__ = [
 
 ScoredObservation = Literal["before", "after", "both"]
 """The observations of a step that `phi` reads: before the action, after it, or both. For both, `phi` is called on each, and the
-factors are concatenated. So are the raw features of closed-form decoders."""
+factors are concatenated. A decoder's input `scored_observation` is then both observations."""
 
 State = TypeVar("State")
 
@@ -59,7 +59,7 @@ def entry_meanings(text: str) -> dict[int, str]:
 
 
 CreditScope = Literal["observation", "state"]
-"""The inputs of `phi`: each agent's observation and action, or the global state and the concatenated actions of the team."""
+"""What `phi` reads: each agent's observation and action, or the global state and the concatenated actions of the team."""
 
 PETTINGZOO_PREFIX = "pettingzoo/"
 """The prefix of the names of PettingZoo environments. The rest is MODULE:NAME."""
@@ -139,8 +139,8 @@ class TaskSpec(CheckedModel):
     measures: tuple[str, ...] = ()
     """Keys of the last step's `info` whose values are averaged and reported beside the return."""
     processes: Literal["auto", "separate"] = "auto"
-    """`separate`: every environment has a process of its own, for a simulator that allows one in a process. `auto`: only if an
-    unknown package's environment starts or steps slowly, or if a second one in its process fails, hangs or changes it."""
+    """`separate`: every environment has its own process, for a simulator that allows one in a process. `auto`: only if an
+    unknown package's environment starts or steps slowly, or if a second one in its process fails, hangs or changes the first."""
     timeout: Annotated[float, Field(gt=0, allow_inf_nan=False)] = 120.0
     """Time (s) within which an environment in another process must reply; else the run stops with a message."""
     arguments: dict[str, Any] = Field(default_factory=dict)
@@ -175,7 +175,7 @@ class TaskSpec(CheckedModel):
 
     @model_validator(mode="after")
     def _check_evaluation_environment(self) -> "TaskSpec":
-        # A run's files may name any module, and only that of `environment` is checked before it is imported.
+        # A run's file may name any module, but only the module of `environment` is checked for trust before its import.
         other = self.evaluation_environment
         if other is not None and _module(other) != _module(self.environment):
             raise ValueError(
@@ -227,7 +227,7 @@ class TaskSpec(CheckedModel):
 
 
 def split_environment(name: str) -> tuple[str, str]:
-    """Return the module that an environment's name imports, or "", and the rest: MODULE:NAME without the prefix of PettingZoo."""
+    """Split MODULE:NAME or NAME, which may follow the prefix of PettingZoo, into the module, or "", and the name."""
     module, colon, rest = name.removeprefix(PETTINGZOO_PREFIX).partition(":")
     return (module, rest) if colon else ("", module)
 

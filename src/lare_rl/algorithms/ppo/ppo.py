@@ -5,6 +5,8 @@
     rho     = pi(a | s) / pi_old(a | s)
     theta  <- ascend  mean min(rho A, clip(rho, 1 - c, 1 + c) A)  -  v * value loss  +  e * entropy
 
+Here c, v and e are the settings `clip`, `value_coef` and `entropy_coef`.
+
 In independent PPO (de Witt et al., 2020) all agents share one actor and one critic, which see one agent's own observation
 at a time. In a rollout each agent of each environment is therefore one entry of the axis `actors`. After an agent has left, its
 `mask` is 0 and its steps are ignored.
@@ -44,7 +46,7 @@ class PPO(NamedTuple):
     """Running statistics of the returns that the critic was fitted to."""
     observation_rms: RunningMeanStd | None
     """Running statistics that normalise the networks' observations; None if these are not normalised. A rollout is added only
-    after the update on it, so that the policy that is updated is the policy that acted."""
+    after the update on it: until then, the policy must see observations as it did when it acted."""
 
 
 class Actor(NamedTuple):
@@ -63,7 +65,7 @@ class Batch(NamedTuple):
     """The log probability of the action under the policy that chose it."""
     advantage: Float[Array, " batch"]
     value: Float[Array, " batch"]
-    """The critic's output before the update, in the critic's units. The update clips changes of it to `value_clip`."""
+    """The critic's output before the update, in the critic's units. The value loss clips new outputs to within `value_clip` of it."""
     target: Float[Array, " batch"]
     """The returns, standardised by statistics that include them."""
     available: Bool[Array, "batch action"] | None
