@@ -62,14 +62,18 @@ def test_split_double_keeps_float64():
         assert "reduce_precision" in str(jax.make_jaxpr(closed_form.split_double)(statistics))
 
 
+def fit_signs_in_float64(state):
+    with jax.enable_x64(True):
+        return closed_form.fit_signs(state)
+
+
 @pytest.mark.parametrize("seed", range(4))
 def test_fit_signs_against_trying_all(seed):
     rows, length, returns = sample_episodes(seed=seed, noise=30.0)
     returns += 8 * length  # no signs give this level: the fit must weigh it against the differences between episodes
     with jax.enable_x64(True):
-        state = closed_form.fit_signs(
-            add_episodes(init(PLAIN, (ScoreType.SUM,)), np.concatenate(rows), length, returns)
-        )
+        state = add_episodes(init(PLAIN, (ScoreType.SUM,)), np.concatenate(rows), length, returns)
+    state = jax.jit(fit_signs_in_float64)(state)  # compiled without float64, as in training
     means = np.stack([episode.mean(axis=0) for episode in rows])
     errors = {
         signs: (length * (means @ signs - returns / length) ** 2).sum()

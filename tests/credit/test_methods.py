@@ -114,9 +114,25 @@ def test_output_of_a_decoder_is_checked(call, agents, registered, monkeypatch):
         CreditAssigner("mine", observation_space=2, action_space=1, agents=agents, max_steps=5)
 
 
+@pytest.mark.parametrize(
+    ("fit", "decoder", "message"),
+    [
+        (None, "step", "a fit"),
+        (Fit.EVIDENCE, "step", "'linear' or 'additive', not 'step'"),
+        (Fit.ALL_STEPS, "linear", "with gradients, not 'linear'"),
+        (Fit.SIGNS, "additive", "'linear'"),
+        (Fit.LIKELIHOOD, "step", "standard deviation"),
+        (Fit.DECODER_LOSS, "step", "loss"),
+    ],
+)
+def test_register_refuses_a_fit_without_its_decoder(fit, decoder, message, registered):
+    with pytest.raises(LareError, match=f"method mine: .*{message}"):
+        register_method(Method("mine", "mine", "this test", methods.RAW, fit, decoder))
+
+
 def test_register_refuses(registered):
     with pytest.raises(LareError, match="another method 'rd'"):
-        register_method(Method("rd", "mine", "this test"))
+        register_method(Method("rd", "mine", "this test", methods.RAW, Fit.ALL_STEPS))
     with pytest.raises(LareError, match="no decoder 'nothing'"):
         register_method(Method("new", "mine", "this test", decoder="nothing"))
     with pytest.raises(LareError, match="whole_episodes"):

@@ -74,6 +74,12 @@ def test_family_names_are_unique():
         register_family("logged", ToyHostEnv)
 
 
+@pytest.mark.parametrize(("argument", "value"), [("reads", "arguments"), ("reads", ("seed",)), ("score", "sums")])
+def test_arguments_of_families_are_checked(argument, value):
+    with pytest.raises(LareError, match=rf"family new: {argument} = .*{value[0]}"):
+        register_family("new", ToyHostEnv, **{argument: value})
+
+
 @pytest.mark.parametrize(
     ("environment", "key"),
     [

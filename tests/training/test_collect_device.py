@@ -232,6 +232,7 @@ class BadEcho(Echo):
     CHANGES = {  # noqa: RUF012
         "scalar": lambda timestep: timestep._replace(reward=timestep.reward[0]),
         "short": lambda timestep: timestep._replace(observation=timestep.observation[:, 1:]),
+        "whole": lambda timestep: timestep._replace(reward=timestep.reward.astype(int)),
         "unmeasured": lambda timestep: timestep._replace(measures={}),
     }
 
@@ -251,9 +252,10 @@ register_family("bad-echo", BadEcho)
     [
         ("scalar", r"bad-echo/scalar: reward of reset .*\(\).*\(3,\)"),
         ("short", r"observation .*\(3, 3\).*\(3, 4\)"),
+        ("whole", "reward of reset has the type int32, not float32"),
         ("unmeasured", "measure 'right'"),
     ],
 )
-def test_arrays_have_the_shapes_of_the_spec(name, message):
+def test_arrays_are_those_of_the_spec(name, message):
     with pytest.raises(LareError, match=message):
         make_jax_env(echo_spec(environment=f"bad-echo/{name}"))

@@ -240,7 +240,9 @@ def fit_signs(state: ClosedForm) -> ClosedForm:
     v = jnp.concatenate([signs, -jnp.ones((len(signs), 1))], axis=1)
     error = jnp.sum((v @ statistics.products[:-1, :-1]) * v, axis=1)
     error = error + statistics.n_steps * (v @ statistics.mean[:-1]) ** 2
-    return _set_weights(state, signs[jax.lax.argmin(error, 0, jnp.int32)][None], jnp.zeros(1))
+    # The first index where it is true, as int32: the program around this one may be compiled without float64.
+    best = jax.lax.argmax(error == jnp.min(error), 0, jnp.int32)
+    return _set_weights(state, signs[best][None], jnp.zeros(1))
 
 
 def _set_weights(

@@ -177,10 +177,30 @@ def register_method(method: Method) -> None:
     """Add a method, by whose name `lare-rl train --method` and `CreditAssigner` then find it.
 
     Raises:
-        LareError: another method has this name, or its decoder is not registered.
+        LareError: another method has this name, its decoder is not registered, or its inputs, fit and decoder do not go together.
     """
     DECODERS.find(method.decoder)
+    if problem := _find_conflict(method):
+        raise LareError(f"method {method.name}: {problem}")
     METHODS.register(method.name, method)
+
+
+def _find_conflict(method: Method) -> str | None:
+    """Return why a method's inputs, fit and decoder do not go together, or None."""
+    fit, decoder = method.fit, method.decoder
+    if method.reward is not Reward.PROXY:
+        return None
+    if method.inputs is None or fit is None:
+        return "proxy rewards need inputs and a fit"
+    if fit is Fit.SIGNS and decoder != "linear":
+        return "Fit.SIGNS needs the decoder 'linear'"
+    if fit.closed_form != (decoder in ("linear", "additive")):
+        needed = "decoder 'linear' or 'additive'" if fit.closed_form else "decoder with gradients"
+        return f"Fit.{fit.name} needs a {needed}, not {decoder!r}"
+    if fit in (Fit.LIKELIHOOD, Fit.DECODER_LOSS) and decoder in ("step", "bottleneck"):
+        needed = "a standard deviation" if fit is Fit.LIKELIHOOD else "a loss of its own"
+        return f"Fit.{fit.name} needs a decoder with {needed}, not {decoder!r}"
+    return None
 
 
 RAW = InputNames(("observation", "action", "observation_change"), ("next_observation",))

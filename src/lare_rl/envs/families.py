@@ -4,7 +4,7 @@ The part of the name before the first slash is the family. All names without a r
 """
 
 import importlib
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -62,7 +62,7 @@ _LOGS_ONLY = Family("lare_rl.envs.families:_refuse_to_make", reads=("max_episode
 
 
 def register_family(
-    name: str, maker: Maker | str, *, reads: tuple[str, ...] = (), score: str | None = None, single_agent: bool = False
+    name: str, maker: Maker | str, *, reads: Sequence[str] = (), score: str | None = None, single_agent: bool = False
 ) -> None:
     """Add a family of environments: a task with `environment = "NAME/..."` then uses its maker.
 
@@ -75,8 +75,12 @@ def register_family(
         single_agent: whether all environments of the family have one agent.
 
     Raises:
-        LareError: another family has this name.
+        LareError: another family has this name, or an argument has no such value.
     """
+    if isinstance(reads, str) or not set(reads) <= set(OPTIONAL_KEYS):
+        raise LareError(f"family {name}: reads = {reads!r}: give a tuple of some of {', '.join(OPTIONAL_KEYS)}")
+    if score not in (None, "sum", "average"):
+        raise LareError(f'family {name}: score = {score!r}: give "sum", "average" or None')
     FAMILIES.register(name, Family(maker, tuple(reads), score, single_agent))
 
 

@@ -128,6 +128,9 @@ def check_jax_env(env: JaxEnv, owner: str) -> None:
     _, second = jax.eval_shape(env.step, state, action, key)
     for function, timestep in (("reset", first), ("step", second)):
         _check_shapes(timestep, batch, owner, function)
+        for name, column, value in zip(Timestep._fields[:-1], batch[:-1], timestep[:-1], strict=True):
+            if value.dtype != column.dtype:
+                raise EnvOutputError(f"{owner}: {name} of {function} has the type {value.dtype}, not {column.dtype}")
         for name in batch.measures.keys() - timestep.measures.keys():
             raise EnvOutputError(f"{owner}: {function} returns no measure {name!r}, which its spec names")
 

@@ -147,5 +147,5 @@ def _check_losses(session: Session) -> None:
             if n_updates and not np.isfinite(loss):
                 raise DivergedError(
                     f"training diverged: {name} of seed {seed} is not finite at step {session.step}; the last checkpoint is "
-                    "whole: train again with a smaller learning rate"
+                    "whole: train again with a smaller learning rate (a JaxEnv may also have returned NaN)"
                 )

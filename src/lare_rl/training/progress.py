@@ -93,8 +93,8 @@ class Terminal(Listener):
         n_steps, text = step - self._line_step, f"step {step:>{len(str(self._steps))}} of {self._steps}"
         if step > self._due_step:
             rate = n_steps / seconds
-            left = self._time_left(step, rate) if self._has_compiled else " with compiling"
-            self.on_message(f"{text}: {rate:.3g} steps/s{left}")
+            remark = self._time_left(step, rate) if self._has_compiled else " with compiling"
+            self.on_message(f"{text}: {rate:.3g} steps/s{remark}")
         elif seconds > 2 * LINE_S:
             self.on_message(f"{text}: evaluating")
         else:

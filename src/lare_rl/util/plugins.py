@@ -32,7 +32,7 @@ def load_plugins() -> None:
         source = f" of the package {package} (entry point {entry.name} = {entry.value})"
         plugins[entry.name] = entry.value.partition(":")[0].strip(), source, f"Update or uninstall {package}."
     for name in filter(None, map(str.strip, read_variable("LARE_PLUGINS").split(","))):
-        plugins[name] = name, "", "Correct the variable LARE_PLUGINS, or unset it."
+        plugins[name] = name, "", "Correct LARE_PLUGINS, or PYTHONPATH, where Python looks for it."
     for plugin, (module, source, advice) in plugins.items():
         try:
             import_module(module)
