@@ -114,7 +114,7 @@ def test_timestep_is_checked(changes, message):
 
     with LocalVecEnv([ToyHostEnv, Broken]) as envs, pytest.raises(LareError) as error:
         walk(envs)
-    assert (str(error.value), error.value.env_index) == (f"environment 1: {message}", 1)
+    assert (str(error.value), error.value.env_index) == (f"the environment: {message}", 1)
 
 
 @pytest.mark.parametrize("make_vec_env", [LocalVecEnv, partial(SubprocVecEnv, processes=1)])

@@ -19,6 +19,7 @@ from lare_rl import LareError
 from lare_rl.credit.decoder_settings import CreditSettings
 from lare_rl.logs import log as log_module
 from lare_rl.logs.relabel import MESSAGES, Relabelled, hold_out_flags, predicted_return_statistics
+from lare_rl.tasks.spec import PaidSteps
 from lare_rl.util.findings import render
 
 SUM = CreditSettings(score="sum")
@@ -90,6 +91,78 @@ def test_mean_scores_that_are_paid_several_times(task, tmp_path):
         episode["rewards"][starts + lengths - 1] = payments
     task = task.model_copy(update={"payments": 4, "score": "average"})
     assert relabel(episodes, tmp_path / "new", method="rd-linear", task=task, hold_out=0.2).return_r2 > 0.95
+
+
+def paid_every_4(episodes, window, mean=False):
+    """Return episodes that pay for the last `window` steps every 4 steps and at the end, and their rewards in the unit of payments."""
+    rewards = []
+    for episode in episodes:
+        n_steps, payments = len(episode["rewards"]), np.zeros_like(episode["rewards"])
+        rewards.append(episode["rewards"].copy())
+        for end in payment_ends(n_steps):
+            steps = slice(max(0, end - window), end)
+            payments[end - 1] = episode["rewards"][steps].mean() if mean else episode["rewards"][steps].sum()
+            if mean:
+                rewards[-1][max(0, (end - 1) // 4 * 4) : end] /= min(end, window)
+        episode["rewards"] = payments
+    return episodes, rewards
+
+
+def payment_ends(n_steps):
+    return [*range(4, n_steps, 4), n_steps]
+
+
+def new_rewards(path):
+    return [episode["rewards"] for episode in read_directory(path)]
+
+
+@pytest.mark.parametrize("exact", ["no", "last", "spread"])
+@pytest.mark.parametrize(("window", "score"), [(2, "sum"), (8, "sum"), (8, "average")])
+def test_payments_for_a_fixed_number_of_steps(window, score, exact, task, tmp_path):
+    """Steps are in no payment, or in two. What each payment lacks is 0, so that `exact` changes nothing."""
+    episodes, rewards = paid_every_4(list(logged_episodes(80)), window, mean=score == "average")
+    task = task.model_copy(update={"payments": 4, "paid_for": PaidSteps(steps=window), "score": score})
+    result = relabel(episodes, tmp_path / "new", task=task, hold_out=0.2, settings=CreditSettings(exact=exact))
+    assert result.return_r2 > 0.999
+    for new, expected in zip(new_rewards(tmp_path / "new"), rewards, strict=True):
+        np.testing.assert_allclose(new, expected, atol=0.01)
+
+
+@pytest.mark.parametrize("window", [2, 8])
+@pytest.mark.parametrize("exact", ["last", "spread"])
+def test_exact_pays_what_each_payment_lacks(exact, window, task, tmp_path):
+    """Over the steps that the payment is for: these add up to it if no other payment is for them."""
+    episodes, _ = paid_every_4([e for e in logged_episodes(60, noise=True) if len(e["actions"]) % 4 != 1], window)
+    task = task.model_copy(update={"payments": 4, "paid_for": PaidSteps(steps=window), "score": "sum"})
+    for name in (exact, "no"):
+        relabel(episodes, tmp_path / name, task=task, settings=CreditSettings(exact=name))
+    files = new_rewards(tmp_path / exact), new_rewards(tmp_path / "no")
+    for episode, new, fitted in zip(episodes, *files, strict=True):
+        expected = fitted.astype(np.float64)
+        for end in payment_ends(len(new)):
+            steps = slice(max(0, end - window), end)
+            lacks = episode["rewards"][end - 1] - fitted[steps].sum()
+            expected[end - 1 if exact == "last" else steps] += lacks / (1 if exact == "last" else min(window, end))
+            if window == 2:
+                assert new[steps].sum() == pytest.approx(episode["rewards"][end - 1], abs=1e-4)
+        np.testing.assert_allclose(new, expected, atol=1e-4)
+        assert np.abs(new - fitted).max() > 0.1
+
+
+@pytest.mark.parametrize("window", [None, 8])
+def test_score_is_paid_at_the_end(window, task, tmp_path):
+    """Whatever the payments of the task are, also when the log is relabelled again."""
+    episodes = list(logged_episodes(80))
+    rewards = [episode.pop("rewards") for episode in episodes]
+    for episode, values in zip(episodes, rewards, strict=True):
+        episode["score"] = values.sum()
+    update = {"payments": 4} if window is None else {"payments": 4, "paid_for": PaidSteps(steps=window)}
+    task = task.model_copy(update=update)
+    for source in (episodes, tmp_path / "new"):
+        result = relabel(source, tmp_path / "new", task=task, settings=SUM, hold_out=0.2, overwrite=True)
+        assert result.return_r2 > 0.999
+        for new, expected in zip(new_rewards(tmp_path / "new"), rewards, strict=True):
+            np.testing.assert_allclose(new, expected, atol=0.05)
 
 
 def test_score_of_noise(tmp_path):

@@ -288,13 +288,18 @@ class BadOutput(gymnasium.Wrapper):
 
 
 def test_collect_locates_bad_outputs(wrap):
-    """The reward in the second episode of the second environment of seed 9, which is the seed's episode number 3."""
+    """The reward in the second episode of the second environment of seed 9, which is the seed's episode number 3.
+
+    The fourth environment of the run has a single number in the message.
+    """
     wrap(BadOutput, value=np.zeros(3))
     with pytest.raises(EnvOutputError, match=r"observation.*\(3,\).*, at step 3 of episode 0 of seed 4$"):
         collect(make_envs((4,), task=WRAPPED), 20)
     seed = episode_seed(9, Stream.TRAINING_EPISODES, 3)
     wrap(BadOutput, value=float("nan"), seeds={seed}, reward=True)
-    with pytest.raises(EnvOutputError, match=r"reward.*nan.*, at step 3 of episode 1 of seed 9 in environment 1$"):
+    with pytest.raises(
+        EnvOutputError, match=r"^the environment: .*reward.*nan.*, at step 3 of episode 1 of seed 9 in environment 1$"
+    ):
         collect(make_envs((4, 9), 2, task=WRAPPED), 40)
 
 

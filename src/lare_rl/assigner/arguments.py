@@ -9,7 +9,7 @@ from jaxtyping import Bool, Float, Int
 from lare_rl.assigner.assigner_config import AssignerConfig
 from lare_rl.envs.interface import alive_mean
 from lare_rl.errors import LareError, short_repr
-from lare_rl.tasks.payments import PAID_AT_END, PaymentRule
+from lare_rl.tasks.payments import PaymentRule
 from lare_rl.tasks.spec import MAX_LEVELS
 
 __all__ = [
@@ -95,7 +95,7 @@ def read_episode(
         raise LareError(f"the score is {score}: give a finite number")
     if is_score:
         new.reward[-1] = score
-    return new, PAID_AT_END if is_score else config.payments
+    return new, config.payments.for_scores if is_score else config.payments
 
 
 def to_rows(

@@ -182,7 +182,7 @@ class Store:
         episode.step_ids.append(step_id)
         episode.return_ += reward
         is_payment = is_paid(payments, len(episode.step_ids) - 1, np.array([reward]), ended)
-        return self._pay(episode, episode.return_) if is_payment else None
+        return self._pay(episode, episode.return_, payments.window) if is_payment else None
 
     def end(self, env_id: Hashable, score: float | None = None) -> StoredEpisode:
         """End the running episode of an environment, with `score` as its return, or as its last payment.
@@ -208,12 +208,11 @@ class Store:
             raise LareError(
                 f"the last step of the environment {env_id!r} was paid already: end the episode with this step"
             )
-        return self._pay(episode, episode.return_ if score is None else float(score))
+        return self._pay(episode, episode.return_ if score is None else float(score), self.payments.window)
 
-    def _pay(self, episode: RunningEpisode, return_: float) -> StoredEpisode:
-        """Store the steps that a payment is for. Raises `LareError` like `end`."""
+    def _pay(self, episode: RunningEpisode, return_: float, window: int | None) -> StoredEpisode:
+        """Store the steps that a payment is for: the last `window` ones, or all since the last payment. Raises `LareError` like `end`."""
         since_last = np.array(episode.step_ids[episode.n_paid :], np.int64)
-        window = self.payments.window
         step_ids = since_last if window is None else np.array(episode.step_ids[-window:], np.int64)
         episode.n_paid, episode.return_ = len(episode.step_ids), 0.0
         if self.longest is not None and len(step_ids) > self.longest:

@@ -115,7 +115,7 @@ def check_lengths(spec: EnvSpec, length: Integer[np.ndarray, " n"], ended: Bool[
             problem = (
                 f"the episode ended after {length[index]} steps, but fixed_length says that all have {spec.max_steps}"
             )
-        raise EnvOutputError(f"environment {index}: {problem}", index)
+        raise EnvOutputError(f"the environment: {problem}", index)
 
 
 def check_jax_env(env: JaxEnv, owner: str) -> None:
@@ -147,11 +147,14 @@ def _check_shapes(timestep: Any, batch: Timestep, owner: str, function: str) -> 
 
 
 def call_env(env_index: int, env: HostEnv, command: str, argument: Any, batch: Timestep) -> None:
-    """Call "reset" or "step" of an environment, check its timestep, and write it into a row of the batch."""
+    """Call "reset" or "step" of an environment, check its timestep, and write it into a row of the batch.
+
+    An `EnvOutputError` has the index as `env_index` alone: the caller's message names the environment.
+    """
     *columns, measures = batch
-    owner = f"environment {env_index}"
+    owner = "the environment"
     try:
-        with one_line_errors(f"{owner} failed in {command}"):
+        with one_line_errors(f"environment {env_index} failed in {command}"):
             timestep = env.reset(int(argument)) if command == "reset" else env.step(argument)
             _check_shapes(timestep, batch, owner, command)
             *values, new_measures = timestep

@@ -34,6 +34,8 @@ class LoggedEpisode:
     next_observation: Float[np.ndarray, "steps observation"]
     reward: Float[np.ndarray, " steps"]
     """The original reward of each step. A score is the reward of the last step."""
+    is_score: bool
+    """Whether the log has the episode's score, and not its rewards."""
     complete: bool
     """Whether the episode was played to its end. Only then is its return known."""
     group: str | int | float | None
@@ -132,6 +134,7 @@ def parse_episode(name: str, values: Mapping[str, Any], layout: LogLayout, conte
         action=action,
         next_observation=next_observation,
         reward=_original_reward(name, values, n_steps),
+        is_score="score" in values,
         complete=_is_complete(name, values, n_steps, layout.max_episode_steps),
         group=_group(name, values, n_steps),
         contents=contents,

@@ -9,13 +9,12 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from lare_rl.assigner.assigner import CreditAssigner
-from lare_rl.assigner.assigner_config import AssignerConfig
 from lare_rl.credit.decoder_settings import CreditSettings
 from lare_rl.credit.engine import correction
 from lare_rl.credit.methods import METHODS, Reward
@@ -23,10 +22,10 @@ from lare_rl.credit.prequential import LITTLE_R2, MIN_R2_EPISODES
 from lare_rl.envs.load import resolve_task
 from lare_rl.errors import LareError
 from lare_rl.latent.function import LatentFunction
-from lare_rl.logs.episode import RelabelledEpisode
+from lare_rl.logs.episode import LoggedEpisode, RelabelledEpisode
 from lare_rl.logs.log import Log, batch_by_steps
 from lare_rl.logs.open_log import open_log
-from lare_rl.tasks.payments import is_paid
+from lare_rl.tasks.payments import PaymentRule, is_paid
 from lare_rl.tasks.spec import TaskSpec
 from lare_rl.util.findings import Finding, render
 from lare_rl.util.statistics import FLOAT32_NOISE, correlation, r_squared
@@ -144,7 +143,9 @@ def relabel(
         task: a name, a path, or a spec: the task that `phi` was designed for. It has the time limit and the number of discrete
             actions.
         hold_out: share of the complete episodes that are held out of the fit, to measure how well returns are predicted.
-        settings: the settings of the decoder. With `exact`, the rewards of a complete episode add up to its return.
+        settings: the settings of the decoder. With `exact`, the rewards of a complete episode add up to its return. With the task's
+            `paid_for`, those of the steps of a payment add up to it, unless payments share steps: what each payment then lacks is
+            spread over its own steps, or added to the last of them.
         updates: number of gradient updates of the decoder. A closed-form decoder has none.
         memory: approximate limit of the memory for the decoder's inputs, in GiB; at least 100,000 steps are stored. A closed-form fit
             uses all episodes, other fits use the last episodes that fit into it.
@@ -224,6 +225,27 @@ def hold_out_flags(share: float, seed: int) -> Iterator[bool]:
         block += 1
 
 
+class _Payments(NamedTuple):
+    """The payments of an episode."""
+
+    end: Int[np.ndarray, " payments"]
+    """The number of steps up to each payment."""
+    n_since_last: Int[np.ndarray, " payments"]
+    """The number of steps since the payment before."""
+    length: Int[np.ndarray, " payments"]
+    """The number of last steps that each payment is for."""
+
+    @property
+    def step_length(self) -> Int[np.ndarray, " steps"]:
+        """The number of steps that the next payment after each step is for."""
+        return np.repeat(self.length, self.n_since_last)
+
+    @property
+    def begins(self) -> Bool[np.ndarray, " steps"]:
+        """Whether each step is the first one since a payment, or of the episode."""
+        return np.isin(np.arange(self.end[-1]), self.end - self.n_since_last)
+
+
 @dataclass
 class _Counts:
     """Running counts of the second pass."""
@@ -246,7 +268,8 @@ def _fit(
         if episode.complete and not next(is_held_out):
             n_fitted += 1
             try:
-                steps = episode.observation, episode.action, episode.next_observation, episode.reward
+                reward = episode.reward[-1] if episode.is_score else episode.reward
+                steps = episode.observation, episode.action, episode.next_observation, reward
                 credit.add_episode(*steps, group=episode.group)
                 credit.fit_pending()
             except LareError as error:
@@ -273,29 +296,31 @@ def _compute_rewards(
 
     Raises `LareError` if the log has another `size` than in the first pass.
     """
+    is_average = credit.score_type == "average"
     # `phi` takes about as long for many steps as for few.
     for batch in batch_by_steps(log.episodes(), len):
-        begins = [_segment_begins(episode.reward, credit.config) for episode in batch]
-        segment_lengths = [np.diff(np.append(np.flatnonzero(begin), len(begin))) for begin in begins]
+        batch_payments = [_find_payments(episode, credit.config.payments) for episode in batch]
         r_hats = credit.rewards(
             np.concatenate([episode.observation for episode in batch]),
             np.concatenate([episode.action for episode in batch]),
             np.concatenate([episode.next_observation for episode in batch]),
-            length=np.concatenate([np.repeat(length, length) for length in segment_lengths]),
-            begins=np.concatenate(begins),
+            length=np.concatenate([payments.step_length for payments in batch_payments]),
+            begins=np.concatenate([payments.begins for payments in batch_payments]),
         )
         r_hats = np.split(r_hats, np.cumsum([len(episode) for episode in batch])[:-1])
-        for episode, r_hat, begin, length in zip(batch, r_hats, begins, segment_lengths, strict=True):
+        for episode, r_hat, payments in zip(batch, r_hats, batch_payments, strict=True):
             counts.episodes += 1
             counts.steps += len(episode)
             counts.cut += not episode.complete
+            predicted = _predict_payments(r_hat, payments, is_average=is_average)
             if episode.complete and next(is_held_out):
                 counts.returns.append(float(episode.reward.sum()))
                 level = None if episode.group is None else credit.group_names.get(episode.group)
-                unpaid = credit.step_rewards.unpaid_return(level, length)
-                counts.predictions.append(float(r_hat.sum(dtype=np.float64)) + unpaid)
+                unpaid = credit.step_rewards.unpaid_return(level, payments.length)
+                counts.predictions.append(float(predicted.sum()) + unpaid)
             if episode.complete and credit.config.spec.is_exact:
-                r_hat = _make_exact(r_hat, episode.reward, begin, length, credit.config)
+                residual = np.add.reduceat(episode.reward, payments.end - payments.n_since_last) - predicted
+                r_hat = _make_exact(r_hat, residual, payments, credit.config.settings)
             yield RelabelledEpisode(episode, r_hat)
             listener("write", counts.episodes, size[0])
     new_size = counts.episodes, counts.steps
@@ -304,23 +329,39 @@ def _compute_rewards(
         raise LareError(f"{log.name} changed while it was read: it had {before}, and now {after}")
 
 
-def _segment_begins(reward: Float[np.ndarray, " steps"], config: AssignerConfig) -> Bool[np.ndarray, " steps"]:
-    """Return which steps of an episode are the first ones of a segment."""
-    n_steps = len(reward)
-    pays = is_paid(config.payments, np.arange(n_steps), reward[:, None], np.arange(n_steps) == n_steps - 1)
-    return np.append(True, pays[:-1])
+def _find_payments(episode: LoggedEpisode, rule: PaymentRule) -> _Payments:
+    """Return when an episode is paid, and for how many steps."""
+    rule = rule.for_scores if episode.is_score else rule
+    step = np.arange(len(episode))
+    end = np.flatnonzero(is_paid(rule, step, episode.reward[:, None], step == len(episode) - 1)) + 1
+    n_since_last = np.diff(end, prepend=0)
+    return _Payments(end, n_since_last, n_since_last if rule.window is None else np.minimum(rule.window, end))
+
+
+def _predict_payments(
+    r_hat: Float[np.ndarray, " steps"], payments: _Payments, *, is_average: bool
+) -> Float[np.ndarray, " payments"]:
+    """Return the sum of r_hat over the steps of each payment.
+
+    A step that is in several payments has the r_hat of the first. If the score is an average, r_hat is inversely proportional to the
+    number of steps of a payment.
+    """
+    weight, divisor = (payments.step_length, payments.length) if is_average else (1, 1)
+    total = np.append(0, np.cumsum(r_hat.astype(np.float64) * weight))
+    return (total[payments.end] - total[payments.end - payments.length]) / divisor
 
 
 def _make_exact(
     r_hat: Float[np.ndarray, " steps"],
-    reward: Float[np.ndarray, " steps"],
-    begins: Bool[np.ndarray, " steps"],
-    length: Int[np.ndarray, " segments"],
-    config: AssignerConfig,
+    residual: Float[np.ndarray, " payments"],
+    payments: _Payments,
+    settings: CreditSettings,
 ) -> Float[np.ndarray, " steps"]:
-    """Return proxy rewards that add up to each payment. `begins` says where its segment begins, and `length` how long it is."""
-    exact = config.settings.exact
+    """Return proxy rewards to which the residual of each payment is added, at its last step, or spread over its steps."""
+    exact = settings.exact
     assert exact in ("last", "spread")
-    residual = np.add.reduceat(reward - r_hat.astype(np.float64), np.flatnonzero(begins))
-    change = correction(np.repeat(residual, length), np.append(begins[1:], True), np.repeat(length, length), exact)
-    return (r_hat + change).astype(r_hat.dtype)
+    reward = r_hat.astype(np.float64)
+    for value, end, length in zip(residual, payments.end.tolist(), payments.length.tolist(), strict=True):
+        steps = np.arange(end - length, end)
+        reward[steps] += correction(np.full(length, value), steps == end - 1, np.full(length, length), exact)
+    return reward.astype(r_hat.dtype)

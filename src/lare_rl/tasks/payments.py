@@ -22,6 +22,11 @@ class PaymentRule:
         """Whether an episode is paid once, for all of its steps."""
         return self == PAID_AT_END
 
+    @property
+    def for_scores(self) -> "PaymentRule":
+        """When an episode is paid whose score alone is known: once, at its end. `window` stands only if there is no other payment."""
+        return PAID_AT_END if self.nonzero or self.period is not None else self
+
     def longest_segment(self, max_steps: int) -> int:
         """Return the largest number of steps that a payment is for, in episodes of at most `max_steps` steps."""
         longest = min(max_steps, self.period or max_steps) if self.window is None else self.window
