@@ -1,9 +1,11 @@
 """What the credit of prefixes is compared with. Each function returns one number for each turn, to be used as its advantage."""
 
+from functools import partial
+
 import numpy as np
 from jaxtyping import Float, Int
 
-from lare_rl.credit.precisions import JITTER, NUMPY, Regression
+from lare_rl.credit.precisions import JITTER, NUMPY_BACKEND, Regression
 from turns.finite_task import Rollouts, Task
 
 __all__ = ["gigpo", "grpo", "summed_credit"]
@@ -44,7 +46,7 @@ def _fit(
     x: Float[np.ndarray, "rollouts features"], y: Float[np.ndarray, " rollouts"], weight: Float[np.ndarray, " rollouts"]
 ) -> Float[np.ndarray, " features"]:
     """Return the weights of the evidence's regression of y on x."""
-    total, group_index = weight.sum(), np.zeros(x.shape[1], int)
+    total, alpha_index = weight.sum(), np.zeros(x.shape[1], int)
     x, y = x - weight @ x / total, y - weight @ y / total
     y_std = np.sqrt(weight @ y**2 / total)
     if y_std == 0:
@@ -52,12 +54,12 @@ def _fit(
     s = (weight[:, None] * x).T @ x
     s += JITTER * np.diag(np.diagonal(s))
     p = (weight[:, None] * x).T @ y / y_std
-    shares = NUMPY.equal_shares(np.diagonal(s), total, group_index)
-    problem = Regression(s, p, total, np.asarray(len(y) - 1.0), np.zeros(()), y_std, group_index, shares)
-    alpha, beta = shares, 2 * problem.dof / total
-    weight = np.zeros(x.shape[1])
+    equal_alpha = NUMPY_BACKEND.equal_alpha(np.diagonal(s), total, alpha_index)
+    problem = Regression(s, p, total, np.asarray(len(y) - 1.0), np.zeros(()), y_std, alpha_index, equal_alpha)
+    alpha, beta, weight = equal_alpha, 2 * problem.dof / total, np.zeros(x.shape[1])
+    moments = partial(NUMPY_BACKEND.dense_moments, problem)
     for _ in range(ROUNDS):
-        posterior = NUMPY.next_posterior(problem, alpha, beta, lambda a, b: NUMPY.dense_moments(problem, a, b))
+        posterior = NUMPY_BACKEND.next_posterior(problem, alpha, beta, moments)
         weight, alpha, beta = posterior.weight, posterior.alpha, posterior.beta
     return y_std * weight
 

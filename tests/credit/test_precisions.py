@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from lare_rl.credit import evidence
-from lare_rl.credit.precisions import NUMPY, Posterior, Regression, expand_groups
+from lare_rl.credit.precisions import NUMPY_BACKEND, Posterior, Regression, expand_groups
 
 GROUP_INDEX = np.array([0, 0, 1, 2, 2])
 
@@ -16,8 +16,8 @@ def problem():
     y = x @ random.normal(size=5) + random.normal(size=40)
     x, y = x - x.mean(axis=0), (y - y.mean()) / y.std()
     s = x.T @ x
-    shares = NUMPY.equal_shares(np.diagonal(s), 40.0, GROUP_INDEX)
-    return Regression(s, x.T @ y, np.array(40.0), np.array(39.0), np.array(0.0), np.array(1.0), GROUP_INDEX, shares)
+    equal = NUMPY_BACKEND.equal_alpha(np.diagonal(s), 40.0, GROUP_INDEX)
+    return Regression(s, x.T @ y, np.array(40.0), np.array(39.0), np.array(0.0), np.array(1.0), GROUP_INDEX, equal)
 
 
 def run_rounds(backend, problem, n_rounds):
@@ -29,9 +29,9 @@ def run_rounds(backend, problem, n_rounds):
 
 
 def test_rounds_of_numpy_and_jax_are_the_same(problem):
-    numpy_posterior = run_rounds(NUMPY, problem, 20)
+    numpy_posterior = run_rounds(NUMPY_BACKEND, problem, 20)
     with jax.enable_x64(True):
-        in_jax = jax.tree.map(jnp.asarray, problem._replace(group_index=None))._replace(group_index=GROUP_INDEX)
+        in_jax = jax.tree.map(jnp.asarray, problem._replace(alpha_index=None))._replace(alpha_index=GROUP_INDEX)
         jax_posterior = run_rounds(evidence.JAX_BACKEND, in_jax, 20)
         for name in Posterior._fields:
             np.testing.assert_allclose(
@@ -41,7 +41,7 @@ def test_rounds_of_numpy_and_jax_are_the_same(problem):
 
 def test_moments_are_those_of_the_inverse(problem):
     alpha, beta = np.array([1.0, 2.0, 3.0]), 5.0
-    moments = NUMPY.dense_moments(problem, alpha, beta)
+    moments = NUMPY_BACKEND.dense_moments(problem, alpha, beta)
     precision = beta * problem.s + np.diag(alpha[GROUP_INDEX])
     mean = beta * np.linalg.solve(precision, problem.p)
     np.testing.assert_allclose(moments.weight, mean)
@@ -57,14 +57,14 @@ def test_equal_shares_explain_half_of_the_returns(problem):
 
 
 def test_precisions_are_clipped(problem):
-    alpha, beta = NUMPY.clip_precisions(problem, np.array([0.0, np.inf, 1.0]), 0.0)
+    alpha, beta = NUMPY_BACKEND.clip_precisions(problem, np.array([0.0, np.inf, 1.0]), 0.0)
     assert alpha[0] == problem.equal_alpha[0] / 1e6
     assert alpha[1] == problem.equal_alpha[1] * 1e6
     assert beta == problem.dof / problem.q / 2
 
 
 def test_strengths_start_from_their_groups(problem):
-    groups = run_rounds(NUMPY, problem, 3)
+    groups = run_rounds(NUMPY_BACKEND, problem, 3)
     strengths = expand_groups(groups, GROUP_INDEX, np.arange(5))
     np.testing.assert_array_equal(strengths.alpha, groups.alpha[GROUP_INDEX])
     assert strengths.n_effective.sum() == pytest.approx(groups.n_effective.sum())

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from helpers.turn_toys import dense_posterior, sample_table
-from lare_rl.credit.precisions import NUMPY, Regression
+from lare_rl.credit.precisions import NUMPY_BACKEND, Regression
 from lare_rl.turns.features import build_prefixes
 from lare_rl.turns.regression import eliminate_groups, fit_linear, fixed_point, group_moments, sum_up
 
@@ -34,7 +34,7 @@ def dense_problem(x, y, weight, group, sums):
         dof=sums.problem.dof,
         y_mean=sums.problem.y_mean,
         y_std=sums.problem.y_std,
-        group_index=sums.problem.group_index,
+        alpha_index=sums.problem.alpha_index,
         equal_alpha=sums.problem.equal_alpha,
     )
 
@@ -42,9 +42,9 @@ def dense_problem(x, y, weight, group, sums):
 @pytest.mark.parametrize("beta", [0.5, 20.0])
 def test_moments_are_those_of_the_engine(prefixes, beta):
     x, y, weight, group, n = prefixes
-    sums = sum_up(x, y, weight, group, int(group.max()) + 1, n)
+    sums = sum_up(x, y, weight, group, n)
     alpha = np.random.default_rng(0).lognormal(size=x.shape[1] + 1)
-    dense = NUMPY.dense_moments(dense_problem(x, y, weight, group, sums), alpha, beta)
+    dense = NUMPY_BACKEND.dense_moments(dense_problem(x, y, weight, group, sums), alpha, beta)
     for name, expected in dense._asdict().items():
         np.testing.assert_allclose(getattr(group_moments(sums, alpha, beta), name), expected, rtol=1e-6, atol=1e-7)
 
@@ -53,7 +53,7 @@ def test_posterior_is_that_of_one_large_matrix(prefixes):
     x, y, weight, group, n = prefixes
     fit = fit_linear(x, y, weight, group, n)
     n_features = x.shape[1]
-    sums = sum_up(x, y, weight, group, int(group.max()) + 1, n)
+    sums = sum_up(x, y, weight, group, n)
     best = max(
         (fixed_point(sums, sums.problem.equal_alpha * factor, 2 * (n - 1) / n) for factor in (1.0, 1e3)),
         key=lambda posterior: posterior.log_evidence,
@@ -69,13 +69,13 @@ def test_posterior_is_that_of_one_large_matrix(prefixes):
 
 def test_precisions_maximise_the_evidence(prefixes):
     x, y, weight, group, n = prefixes
-    sums = sum_up(x, y, weight, group, int(group.max()) + 1, n)
+    sums = sum_up(x, y, weight, group, n)
     best = fixed_point(sums, sums.problem.equal_alpha, 2.0, max_rounds=2000)
 
     def log_evidence(alpha, beta):
         moments = group_moments(sums, alpha, beta)
-        size = np.bincount(sums.problem.group_index)
-        squares = np.bincount(sums.problem.group_index, moments.weight**2)
+        size = np.bincount(sums.problem.alpha_index)
+        squares = np.bincount(sums.problem.alpha_index, moments.weight**2)
         terms = sums.problem.dof * np.log(beta) + size @ np.log(alpha) - moments.log_det
         return 0.5 * (terms - beta * moments.residual - alpha @ squares)
 
@@ -103,6 +103,6 @@ def test_no_features_leaves_the_means_of_groups(prefixes):
 
 def test_groups_without_prefixes_have_no_intercept(prefixes):
     x, y, weight, group, n = prefixes
-    sums = sum_up(x, y, weight, 2 * group, 2 * int(group.max()) + 2, n)
+    sums = sum_up(x, y, weight, 2 * group, n)
     posterior = eliminate_groups(sums, sums.problem.equal_alpha, 2.0)
     assert not posterior.intercept[1::2].any()

@@ -282,7 +282,7 @@ class CreditAssigner:
         """Return metrics of the decoder, which need no true rewards.
 
         `credit/return_r2` is R^2 of the last 32 returns, or of the last 256 if there are several in an episode or if `score` is
-        `binary`. Each was predicted before it was learned from. It is NaN while they are fewer than 8, or all the same.
+        `binary`. Each was predicted before it was learned from. It is NaN for fewer than `MIN_R2_EPISODES`, or if all are equal.
         `credit/loss` is the mean loss of the last gradient updates.
         """
         with self.lock:

@@ -36,7 +36,7 @@ import jax.numpy as jnp
 from jax.scipy.linalg import solve_triangular
 from jaxtyping import Array, Bool, Float, Int
 
-from lare_rl.credit.precisions import JITTER, TOLERANCE, Backend, FeatureIndex, Posterior, Regression, varies
+from lare_rl.credit.precisions import JITTER, TOLERANCE, AlphaIndex, Backend, Posterior, Regression, n_alphas, varies
 from lare_rl.nn.leading_axis import map_leading_axis
 from lare_rl.nn.masks import select
 from lare_rl.nn.normalise import merge_means
@@ -67,11 +67,11 @@ MANY_EPISODES_PER_FEATURE = 2
 """With more episodes than this for each feature, and an earlier fit, starts 2 and 3 of `fit` have one round each."""
 
 
-def _add_groups(values: Float[Array, " features"], group_index: FeatureIndex, n_groups: int) -> Float[Array, " groups"]:
-    return jnp.zeros(n_groups).at[group_index].add(values)
+def _sum_by_alpha(values: Float[Array, " features"], alpha_index: AlphaIndex) -> Float[Array, " alphas"]:
+    return jnp.zeros(n_alphas(alpha_index)).at[alpha_index].add(values)
 
 
-JAX_BACKEND = Backend(jnp, _add_groups, partial(solve_triangular, lower=True))
+JAX_BACKEND = Backend(jnp, _sum_by_alpha, partial(solve_triangular, lower=True))
 
 
 class SufficientStatistics(NamedTuple):
@@ -141,20 +141,17 @@ def _add_cases(
     )
 
 
-def init_posterior(group_index: FeatureIndex) -> Posterior:
+def init_posterior(alpha_index: AlphaIndex) -> Posterior:
     """Return the posterior before the first episode. Its precisions are 0, which means that they have no value yet."""
-    zero = jnp.zeros(())
-    groups = jnp.zeros(int(group_index.max(initial=-1)) + 1)
-    return Posterior(
-        jnp.zeros(len(group_index)), bias=zero, alpha=groups, beta=zero, n_effective=groups, log_evidence=zero
-    )
+    zero, zeros, weight = (jnp.zeros(shape) for shape in ((), n_alphas(alpha_index), len(alpha_index)))
+    return Posterior(weight, bias=zero, alpha=zeros, beta=zero, n_effective=zeros, log_evidence=zero)
 
 
 def regression(
-    statistics: SufficientStatistics, score_type: Int[Array, ""] | int, group_index: FeatureIndex
+    statistics: SufficientStatistics, score_type: Int[Array, ""] | int, alpha_index: AlphaIndex
 ) -> Regression:
     """Return the regression of R/T for a score that is a sum, or of R for a score that is an average."""
-    n_features = len(group_index)
+    n_features = len(alpha_index)
     assert len(statistics.mean) == n_features + 2
     column = n_features + score_type
     n_steps = jnp.maximum(statistics.n_steps, 1)
@@ -171,15 +168,15 @@ def regression(
         dof=statistics.n_episodes - 1,
         y_mean=y_mean,
         y_std=y_std,
-        group_index=group_index,
-        equal_alpha=JAX_BACKEND.equal_shares(jnp.diagonal(s), n_steps, group_index),
+        alpha_index=alpha_index,
+        equal_alpha=JAX_BACKEND.equal_alpha(jnp.diagonal(s), n_steps, alpha_index),
     )
 
 
 def fit(
     statistics: SufficientStatistics,
     score_type: Int[Array, ""] | int,
-    group_index: FeatureIndex,
+    alpha_index: AlphaIndex,
     start: Posterior,
     max_rounds: int | Int[Array, ""],
     *,
@@ -199,20 +196,20 @@ def fit(
     `MANY_EPISODES_PER_FEATURE` episodes for each feature, starts 2 and 3 have one round each.
 
     Args:
-        group_index: the index of each feature's group.
+        alpha_index: for each feature, the index of its precision in alpha: that of its group, for example.
         start: an earlier fit, whose precisions start the iteration, or `init_posterior`.
         max_rounds: the maximum number of rounds of each iteration.
         batched: whether the three iterations run at once.
     """
-    problem = regression(statistics, score_type, group_index)
-    has_start, few = start.beta > 0, problem.dof < MANY_EPISODES_PER_FEATURE * len(group_index)
+    problem = regression(statistics, score_type, alpha_index)
+    has_start, few = start.beta > 0, problem.dof < MANY_EPISODES_PER_FEATURE * len(alpha_index)
     limits = jnp.where(jnp.stack([jnp.array(True), has_start & few, ~has_start | few]), max_rounds, 1)
     starts = starting_precisions(problem, start)
     candidates = map_leading_axis(lambda args: fixed_point(problem, *args), (*starts, limits), batched=batched)
     return unscale(statistics, problem, most_likely(candidates), fallback=start)
 
 
-def starting_precisions(problem: Regression, start: Posterior) -> tuple[Float[Array, "3 groups"], Float[Array, "3"]]:
+def starting_precisions(problem: Regression, start: Posterior) -> tuple[Float[Array, "3 alphas"], Float[Array, "3"]]:
     """Return alpha and beta of the three starts of `fit`."""
     has_start = start.beta > 0
     equal = problem.equal_alpha, 2 * problem.dof / problem.q
@@ -240,7 +237,7 @@ def unscale(
     is_determined = (problem.dof > 0) & (problem.y_std > 0)
     posterior = select(is_determined, posterior, fallback)
     weight = jnp.where(is_determined, problem.y_std * posterior.weight, 0)
-    bias = problem.y_mean - weight @ statistics.mean[: len(problem.group_index)]
+    bias = problem.y_mean - weight @ statistics.mean[: len(problem.alpha_index)]
     return posterior._replace(weight=weight, bias=bias)
 
 
@@ -249,7 +246,7 @@ _State = tuple[Int[Array, ""], Float[Array, ""], Posterior]
 
 
 def fixed_point(
-    problem: Regression, alpha: Float[Array, " groups"], beta: Float[Array, ""], max_rounds: int | Int[Array, ""]
+    problem: Regression, alpha: Float[Array, " alphas"], beta: Float[Array, ""], max_rounds: int | Int[Array, ""]
 ) -> Posterior:
     """Iterate from some precisions until the evidence stops changing, at most `max_rounds` rounds."""
 
@@ -266,7 +263,7 @@ def fixed_point(
     return jax.lax.while_loop(is_unsettled, body, state)[2]
 
 
-def _round(problem: Regression, alpha: Float[Array, " groups"], beta: Float[Array, ""]) -> Posterior:
+def _round(problem: Regression, alpha: Float[Array, " alphas"], beta: Float[Array, ""]) -> Posterior:
     return JAX_BACKEND.next_posterior(problem, alpha, beta, partial(JAX_BACKEND.dense_moments, problem))
 
 
@@ -282,18 +279,18 @@ class PosteriorCovariance(NamedTuple):
 
 
 def posterior_covariance(
-    statistics: SufficientStatistics, score_type: Int[Array, ""] | int, group_index: FeatureIndex, posterior: Posterior
+    statistics: SufficientStatistics, score_type: Int[Array, ""] | int, alpha_index: AlphaIndex, posterior: Posterior
 ) -> PosteriorCovariance:
     """Return the covariance of a posterior. It is 0 as long as all returns are equal.
 
     The weight of a feature without data has its prior standard deviation.
     """
-    problem = regression(statistics, score_type, group_index)
+    problem = regression(statistics, score_type, alpha_index)
     alpha, beta = JAX_BACKEND.clip_precisions(problem, posterior.alpha, posterior.beta)
-    root, _ = JAX_BACKEND.inverse_root(beta * problem.s + jnp.diag(alpha[group_index]))
+    root, _ = JAX_BACKEND.inverse_root(beta * problem.s + jnp.diag(alpha[alpha_index]))
     covariance = PosteriorCovariance(
         root=problem.y_std * root,
-        centre=statistics.mean[: len(group_index)],
+        centre=statistics.mean[: len(alpha_index)],
         centre_variance=problem.y_std**2 / (beta * jnp.maximum(statistics.n_steps, 1)),
     )
     return jax.tree.map(lambda leaf: jnp.where(problem.y_std > 0, leaf, 0), covariance)

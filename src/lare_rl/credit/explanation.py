@@ -36,7 +36,7 @@ from lare_rl.credit.basis import N_FREQUENCIES, Basis
 from lare_rl.credit.closed_form import ClosedForm
 from lare_rl.credit.decomposition import CreditBatch, valid_rows
 from lare_rl.credit.evidence import SufficientStatistics
-from lare_rl.credit.precisions import FeatureIndex, Posterior, Regression
+from lare_rl.credit.precisions import AlphaIndex, Posterior, Regression
 from lare_rl.credit.returns import add_to_sums
 from lare_rl.credit.score_type import ScoreType
 from lare_rl.nn.normalise import RunningMeanStd
@@ -181,8 +181,8 @@ class _Fit(NamedTuple):
 def _fit(
     statistics: SufficientStatistics,
     score_type: Int[Array, ""] | int,
-    group_index: FeatureIndex,
-    strength_index: FeatureIndex,
+    group_index: AlphaIndex,
+    strength_index: AlphaIndex,
 ) -> _Fit:
     problem, indices = evidence.regression(statistics, score_type, group_index), (group_index, strength_index)
     start, earlier = map(evidence.init_posterior, indices)

@@ -24,12 +24,11 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from lare_rl.credit import evidence
 from lare_rl.credit.evidence import JAX_BACKEND, PosteriorCovariance
-from lare_rl.credit.precisions import JITTER, PRIOR_RANGE, Posterior, varies
+from lare_rl.credit.precisions import JITTER, PRIOR_RANGE, AlphaIndex, Posterior, varies
 from lare_rl.credit.prequential import ring_slots
 
 __all__ = [
@@ -64,11 +63,11 @@ class LogOddsFit(NamedTuple):
     """root^T root = Sigma, the covariance of the weights."""
 
 
-def init(group_index: Int[np.ndarray, " columns"]) -> LogOddsFit:
+def init(alpha_index: AlphaIndex) -> LogOddsFit:
     """Return the state without episodes."""
-    n_columns = len(group_index)
+    n_columns = len(alpha_index)
     empty = jnp.zeros((WINDOW, n_columns)), jnp.zeros(WINDOW), jnp.zeros(())
-    return LogOddsFit(*empty, evidence.init_posterior(group_index), root=jnp.zeros((n_columns, n_columns)))
+    return LogOddsFit(*empty, evidence.init_posterior(alpha_index), root=jnp.zeros((n_columns, n_columns)))
 
 
 def remove_episodes(state: LogOddsFit) -> LogOddsFit:
@@ -102,21 +101,20 @@ _State = tuple[Int[Array, ""], Float[Array, ""], Float[Array, " window"], Poster
 """The number of rounds so far, the largest change of xi in the last of them, xi, and the fit."""
 
 
-def fit(state: LogOddsFit, group_index: Int[np.ndarray, " columns"], max_rounds: int | Int[Array, ""]) -> LogOddsFit:
+def fit(state: LogOddsFit, alpha_index: AlphaIndex, max_rounds: int | Int[Array, ""]) -> LogOddsFit:
     """Fit to the episodes, from the precisions of the last fit. Call this with float64 enabled.
 
     Returns are divided into won and lost halfway between the lowest and the highest. While all are equal, nothing changes.
     """
     valid, low, high = _values(state)
-    n_episodes, n_groups = jnp.maximum(jnp.sum(valid), 1), int(group_index.max()) + 1
+    n_episodes = jnp.maximum(jnp.sum(valid), 1)
     x = jnp.where(valid[:, None], state.columns, 0).astype(float)
     won = (state.returns > (low + high) / 2).astype(float)
     squares = jnp.sum(jnp.where(valid[:, None], x - jnp.sum(x, axis=0) / n_episodes, 0) ** 2, axis=0)
     is_used = varies(squares / n_episodes, jnp.sum(x**2) / (n_episodes * x.shape[1]))
     x = jnp.where(is_used, x, 0)
-    trace = JAX_BACKEND.group_sums(jnp.where(is_used, squares, 0), group_index, n_groups)
-    # By this alpha, each group changes the log odds of an episode by about 1.
-    equal_alpha = jnp.where(trace > 0, n_groups * trace / n_episodes, 1)
+    # By this alpha, all groups together change the log odds of an episode by about 1.
+    equal_alpha = JAX_BACKEND.equal_alpha(jnp.where(is_used, squares, 0), 2 * n_episodes, alpha_index)
     limits = equal_alpha / PRIOR_RANGE, equal_alpha * PRIOR_RANGE
 
     def body(carry: _State) -> _State:
@@ -130,19 +128,20 @@ def fit(state: LogOddsFit, group_index: Int[np.ndarray, " columns"], max_rounds:
         weighted = precision[:, None] * difference
         s = weighted.T @ difference
         alpha = posterior.alpha
-        root, log_det = JAX_BACKEND.inverse_root(s + jnp.diag(JITTER * jnp.diagonal(s) + alpha[group_index]))
+        root, log_det = JAX_BACKEND.inverse_root(s + jnp.diag(JITTER * jnp.diagonal(s) + alpha[alpha_index]))
         weight = (root @ (weighted.T @ (target - target_mean))) @ root
         eta = target_mean + difference @ weight
         variance = jnp.sum((difference @ root.T) ** 2, axis=1) + 1 / total
-        size, n_effective, squares = JAX_BACKEND.count_effective(group_index, alpha, weight, jnp.sum(root**2, axis=0))
+        moments = weight, jnp.sum(root**2, axis=0), log_det
+        n_effective, alpha, log_occam = JAX_BACKEND.update_alpha(alpha_index, alpha, *moments)
         likelihood = jnp.sum(jnp.where(valid, jax.nn.log_sigmoid((2 * won - 1) * eta), 0))
         posterior = Posterior(
             weight=weight,
             bias=target_mean - x_mean @ weight,
-            alpha=jnp.clip(n_effective / jnp.maximum(squares, 1e-30), *limits),
+            alpha=jnp.clip(alpha, *limits),
             beta=jnp.ones(()),
             n_effective=n_effective,
-            log_evidence=likelihood + 0.5 * (size @ jnp.log(alpha) - log_det - alpha @ squares),
+            log_evidence=likelihood + log_occam,
         )
         new_xi = jnp.sqrt(eta**2 + variance)
         change = jnp.max(jnp.where(valid, jnp.abs(new_xi - xi), 0))

@@ -13,17 +13,18 @@ from jaxtyping import Float, Int
 
 __all__ = [
     "JITTER",
-    "NUMPY",
+    "NUMPY_BACKEND",
     "PRIOR_RANGE",
     "TOLERANCE",
+    "AlphaIndex",
+    "Alphas",
     "Backend",
-    "FeatureIndex",
     "Features",
-    "Groups",
     "Moments",
     "Posterior",
     "Regression",
     "expand_groups",
+    "n_alphas",
     "varies",
 ]
 
@@ -44,8 +45,8 @@ MIN_NOISE = 1e-10
 Array = Any
 """An array of NumPy or of JAX. (jaxtyping's `Array` would import JAX.)"""
 Features = Float[Array, " features"]
-Groups = Float[Array, " groups"]
-FeatureIndex = Int[np.ndarray, " features"]
+Alphas = Float[Array, " alphas"]
+AlphaIndex = Int[np.ndarray, " features"]
 """For each feature, the index of its precision in alpha: that of its group, or of its strength (`relevance.py`)."""
 
 
@@ -57,12 +58,12 @@ class Posterior(NamedTuple):
 
     weight: Float[Array, "*batch features"]
     bias: Float[Array, "*batch"]
-    alpha: Float[Array, "*batch groups"]
-    """The precision of the weights of each group in the next round, always with y in units of its standard deviation."""
+    alpha: Float[Array, "*batch alphas"]
+    """The precisions of the weights in the next round, one for each group or strength, always with y in units of its standard deviation."""
     beta: Float[Array, "*batch"]
     """The precision of a step's noise in the next round, with y in the same units."""
-    n_effective: Float[Array, "*batch groups"]
-    """gamma: how many features of each group the data determine."""
+    n_effective: Float[Array, "*batch alphas"]
+    """gamma: for each alpha, how many of its features the data determine."""
     log_evidence: Float[Array, "*batch"]
     """The log evidence of the precisions of this round, up to a constant that does not depend on groups and precisions."""
 
@@ -77,9 +78,8 @@ class Regression(NamedTuple):
     """N - 1 degrees of freedom, for N episodes."""
     y_mean: Float[Array, ""]
     y_std: Float[Array, ""]
-    group_index: FeatureIndex
-    """The index of each feature's group."""
-    equal_alpha: Groups
+    alpha_index: AlphaIndex
+    equal_alpha: Alphas
     """The alpha of each group by which all groups explain equal parts of the returns, and together half of them."""
 
 
@@ -105,18 +105,17 @@ class Backend(NamedTuple):
 
     xp: Any
     """`numpy` or `jax.numpy`."""
-    group_sums: Callable[[Array, Array, int], Array]
-    """(values, group_index, n_groups) -> the sum of the values of each group."""
+    sum_by_alpha: Callable[[Array, AlphaIndex], Alphas]
+    """(values, alpha_index) -> for each alpha, the sum of the values of its features."""
     solve_lower: Callable[[Array, Array], Array]
     """(L, B) -> L^-1 B for a lower triangle L."""
 
-    def equal_shares(self, diagonal: Features, q: Any, group_index: FeatureIndex) -> Groups:
+    def equal_alpha(self, diagonal: Features, q: Any, alpha_index: AlphaIndex) -> Alphas:
         """Return `Regression.equal_alpha` from the diagonal of S."""
-        n_groups = int(group_index.max()) + 1
-        trace = self.group_sums(diagonal, group_index, n_groups)
-        return self.xp.where(trace > 0, 2 * n_groups * trace / q, 1)
+        trace = self.sum_by_alpha(diagonal, alpha_index)
+        return self.xp.where(trace > 0, 2 * len(trace) * trace / q, 1)
 
-    def clip_precisions(self, problem: Regression, alpha: Groups, beta: Any) -> tuple[Groups, Any]:
+    def clip_precisions(self, problem: Regression, alpha: Alphas, beta: Any) -> tuple[Alphas, Any]:
         """Clip alpha to `PRIOR_RANGE` around equal shares, and beta to noise from `MIN_NOISE` of the variation to twice all of it."""
         xp = self.xp
         noise_only = xp.maximum(problem.dof, 1) / problem.q  # beta if all variation is noise
@@ -131,51 +130,56 @@ class Backend(NamedTuple):
         root = self.solve_lower(factor, xp.diag(1 / scale))
         return root, 2 * xp.sum(xp.log(xp.diagonal(factor)) + xp.log(scale))
 
-    def dense_moments(self, problem: Regression, alpha: Groups, beta: Any) -> Moments:
+    def dense_moments(self, problem: Regression, alpha: Alphas, beta: Any) -> Moments:
         """Return the moments of the posterior under some precisions, from the whole matrix S."""
         xp = self.xp
-        root, log_det = self.inverse_root(beta * problem.s + xp.diag(alpha[problem.group_index]))
+        root, log_det = self.inverse_root(beta * problem.s + xp.diag(alpha[problem.alpha_index]))
         weight = beta * ((root @ problem.p) @ root)
         residual = problem.q - 2 * weight @ problem.p + weight @ problem.s @ weight
         return Moments(weight, xp.sum(root**2, axis=0), log_det, residual)
 
-    def count_effective(
-        self, group_index: FeatureIndex, alpha: Groups, weight: Features, variance: Features
-    ) -> tuple[Groups, Groups, Groups]:
-        """Return n_g, gamma_g and |mu_g|^2 of each group."""
-        xp, n_groups = self.xp, len(alpha)
-        size = self.group_sums(xp.ones_like(weight), group_index, n_groups)
-        n_effective = xp.clip(size - alpha * self.group_sums(variance, group_index, n_groups), 0, size)
-        return size, n_effective, self.group_sums(weight**2, group_index, n_groups)
+    def update_alpha(
+        self, alpha_index: AlphaIndex, alpha: Alphas, weight: Features, variance: Features, log_det: Any
+    ) -> tuple[Alphas, Alphas, Any]:
+        """Return gamma, the next alpha without limits, and the log Occam factor: log evidence - log likelihood at mu (MacKay, 1992)."""
+        xp = self.xp
+        size = self.sum_by_alpha(xp.ones_like(weight), alpha_index)
+        n_effective = xp.clip(size - alpha * self.sum_by_alpha(variance, alpha_index), 0, size)
+        squares = self.sum_by_alpha(weight**2, alpha_index)
+        log_occam = 0.5 * (size @ xp.log(alpha) - log_det - alpha @ squares)
+        return n_effective, n_effective / xp.maximum(squares, 1e-30), log_occam
 
     def next_posterior(
-        self, problem: Regression, alpha: Groups, beta: Any, moments: Callable[[Groups, Any], Moments]
+        self, problem: Regression, alpha: Alphas, beta: Any, moments: Callable[[Alphas, Any], Moments]
     ) -> Posterior:
         """Return the posterior under some precisions, with the precisions that follow from it, those of the next round."""
         xp = self.xp
         alpha, beta = self.clip_precisions(problem, alpha, beta)
         weight, variance, log_det, residual = moments(alpha, beta)
         residual = xp.maximum(residual, MIN_NOISE * problem.q)
-        size, n_effective, squares = self.count_effective(problem.group_index, alpha, weight, variance)
-        log_evidence = 0.5 * (
-            problem.dof * xp.log(beta) + size @ xp.log(alpha) - log_det - beta * residual - alpha @ squares
-        )
+        n_effective, next_alpha, log_occam = self.update_alpha(problem.alpha_index, alpha, weight, variance, log_det)
+        log_evidence = 0.5 * (problem.dof * xp.log(beta) - beta * residual) + log_occam
         noise_dof = xp.maximum(problem.dof - xp.sum(n_effective), 0.5)
-        alpha, beta = self.clip_precisions(problem, n_effective / xp.maximum(squares, 1e-30), noise_dof / residual)
+        alpha, beta = self.clip_precisions(problem, next_alpha, noise_dof / residual)
         return Posterior(
             weight=weight, bias=xp.zeros(()), alpha=alpha, beta=beta, n_effective=n_effective, log_evidence=log_evidence
         )
 
 
-NUMPY = Backend(np, lambda values, group_index, n_groups: np.bincount(group_index, values, n_groups), np.linalg.solve)
+NUMPY_BACKEND = Backend(np, lambda values, alpha_index: np.bincount(alpha_index, values), np.linalg.solve)
 
 
-def expand_groups(groups: Posterior, group_index: FeatureIndex, strength_index: FeatureIndex) -> Posterior:
+def n_alphas(alpha_index: AlphaIndex) -> int:
+    """Return the size of alpha."""
+    return int(alpha_index.max(initial=-1)) + 1
+
+
+def expand_groups(posterior: Posterior, group_index: AlphaIndex, strength_index: AlphaIndex) -> Posterior:
     """Return a fit by groups as if it were by strengths (`relevance.py`).
 
     Each strength has the precision of its group, and an equal part of the group's `n_effective`.
     """
-    group = np.zeros(int(strength_index.max(initial=-1)) + 1, int)
+    group = np.zeros(n_alphas(strength_index), int)  # of each strength
     group[strength_index] = group_index
-    n_strengths = np.bincount(group, minlength=groups.alpha.shape[-1])
-    return groups._replace(alpha=groups.alpha[..., group], n_effective=(groups.n_effective / n_strengths)[..., group])
+    share = posterior.n_effective / np.bincount(group, minlength=posterior.alpha.shape[-1])
+    return posterior._replace(alpha=posterior.alpha[..., group], n_effective=share[..., group])

@@ -17,7 +17,7 @@ from jaxtyping import Array, Bool, Int
 
 from lare_rl.credit import evidence
 from lare_rl.credit.evidence import SufficientStatistics
-from lare_rl.credit.precisions import FeatureIndex, Posterior, expand_groups
+from lare_rl.credit.precisions import AlphaIndex, Posterior, expand_groups
 from lare_rl.nn import masks
 
 __all__ = ["fit", "is_better", "select"]
@@ -30,8 +30,8 @@ later episodes best on eight scores (`benchmarks/relevance.py`)."""
 def fit(
     statistics: SufficientStatistics,
     score_type: Int[Array, ""] | int,
-    group_index: FeatureIndex,
-    strength_index: FeatureIndex,
+    group_index: AlphaIndex,
+    strength_index: AlphaIndex,
     earlier_groups: Posterior,
     earlier: Posterior,
     max_rounds: int,
@@ -65,9 +65,7 @@ def is_better(strengths: Posterior, groups: Posterior) -> Bool[Array, "*score_ty
     return has_fit & (strengths.log_evidence > groups.log_evidence + MIN_GAIN * n_more)
 
 
-def select(
-    strengths: Posterior, groups: Posterior, group_index: FeatureIndex, strength_index: FeatureIndex
-) -> Posterior:
+def select(strengths: Posterior, groups: Posterior, group_index: AlphaIndex, strength_index: AlphaIndex) -> Posterior:
     """Return the fit that is used, with a precision for each strength. The posteriors may have a leading axis of score types."""
     shared = expand_groups(groups, group_index, strength_index)
     return masks.select(is_better(strengths, groups), strengths, shared)

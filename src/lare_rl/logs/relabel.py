@@ -72,12 +72,11 @@ class Relabelled:
     held_out: int
     """Complete episodes that were held out of the fit."""
     return_r2: float
-    """R^2 of the returns of the held-out episodes. NaN if they are fewer than 8 or have equal returns, or if r_hat is not in the
-    unit of returns."""
+    """R^2 of their returns. NaN for fewer than `MIN_R2_EPISODES`, for equal returns, or if r_hat is not in the unit of returns."""
     return_r2_error: float
     """The standard error of `return_r2` over these episodes."""
     return_correlation: float
-    """Pearson's correlation of these returns with their predictions. NaN if they are fewer than 8, or one side never varies."""
+    """Pearson's correlation of these returns with their predictions. NaN for fewer than `MIN_R2_EPISODES`, or if one never varies."""
     explanation: tuple[str, ...]
     """What the returns say about the factors: `CreditAssigner.explanation`."""
 
@@ -108,7 +107,7 @@ class Relabelled:
 
 
 def predicted_return_statistics(returns: Sequence[float], predictions: Sequence[float]) -> tuple[float, float, float]:
-    """Return R^2 of predicted returns, its standard error, and the correlation. NaN for fewer than 8 episodes."""
+    """Return R^2 of predicted returns, its standard error, and the correlation. NaN for fewer than `MIN_R2_EPISODES`."""
     if len(returns) < MIN_R2_EPISODES:
         return math.nan, math.nan, math.nan
     y, predicted = np.array(returns), np.array(predictions)

@@ -11,7 +11,7 @@ by a step of Newton's method, which needs the curvature of the likelihood, not o
 import numpy as np
 from jaxtyping import Float, Int
 
-from lare_rl.credit.precisions import NUMPY, TOLERANCE
+from lare_rl.credit.precisions import NUMPY_BACKEND, TOLERANCE
 from lare_rl.turns.regression import GroupSums, PrefixFit, eliminate_groups, sum_up, to_fit
 
 __all__ = ["fit_logistic", "logistic"]
@@ -40,17 +40,16 @@ def fit_logistic(
     n_rollouts: int,
 ) -> PrefixFit:
     """Return the posterior of the log odds. The arguments are those of `fit_linear`; y is between 0 and 1."""
-    n_groups = int(group.max()) + 1
     rate = np.clip(weight @ y / weight.sum(), 0.02, 0.98)
     eta = np.full(len(y), np.log(rate / (1 - rate)))
 
     def regress() -> GroupSums:
         p = logistic(eta)
         curvature = np.maximum(p * (1 - p), MIN_CURVATURE)
-        return sum_up(x, eta + (y - p) / curvature, weight * curvature, group, n_groups, n_rollouts, unit=1.0)
+        return sum_up(x, eta + (y - p) / curvature, weight * curvature, group, n_rollouts, unit=1.0)
 
     sums = regress()
-    index = sums.problem.group_index
+    alpha_index = sums.problem.alpha_index
     first = np.append(np.diagonal(sums.problem.s) / sums.problem.q * x.shape[1], 1.0) + 1e-12
     alpha, previous, n_rounds, n_steps = first, -np.inf, 1, FIRST_STEPS
     while True:
@@ -62,12 +61,12 @@ def fit_logistic(
         n_steps -= 1
         if largest < 1e-3 or not n_steps:
             solution = np.concatenate([posterior.weight[:-1], posterior.intercept])
-            size, n_effective, squares = NUMPY.count_effective(index, alpha, solution, posterior.variance)
+            moments = solution, posterior.variance, posterior.log_det
+            _, next_alpha, log_occam = NUMPY_BACKEND.update_alpha(alpha_index, alpha, *moments)
             p = np.clip(logistic(eta), 1e-12, 1 - 1e-12)
-            log_likelihood = weight @ (y * np.log(p) + (1 - y) * np.log(1 - p))
-            log_evidence = log_likelihood + 0.5 * (size @ np.log(alpha) - alpha @ squares - posterior.log_det)
+            log_evidence = weight @ (y * np.log(p) + (1 - y) * np.log(1 - p)) + log_occam
             if abs(log_evidence - previous) <= 10 * TOLERANCE or n_rounds == MAX_ROUNDS:
                 return to_fit(sums, posterior, 1.0, is_logistic=True)
             previous, n_rounds, n_steps = log_evidence, n_rounds + 1, NEXT_STEPS
-            alpha = np.clip(n_effective / np.maximum(squares, 1e-30), first * WEAKEST, first * STRONGEST)
+            alpha = np.clip(next_alpha, first * WEAKEST, first * STRONGEST)
         sums = regress()

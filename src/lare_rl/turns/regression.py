@@ -23,7 +23,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float, Int
 
-from lare_rl.credit.precisions import JITTER, NUMPY, TOLERANCE, Moments, Posterior, Regression, varies
+from lare_rl.credit.precisions import JITTER, NUMPY_BACKEND, TOLERANCE, Moments, Posterior, Regression, varies
 
 __all__ = [
     "GroupSums",
@@ -83,7 +83,6 @@ def sum_up(
     y: Float[np.ndarray, " prefixes"],
     weight: Float[np.ndarray, " prefixes"],
     group: Int[np.ndarray, " prefixes"],
-    n_groups: int,
     n_rollouts: int,
     unit: float | None = None,
 ) -> GroupSums:
@@ -92,7 +91,7 @@ def sum_up(
     Each prefix has the outcome y of its rollout, in `unit`, or else in its standard deviations. The degrees of freedom are the rollouts,
     because all prefixes of a rollout have the same outcome.
     """
-    total = weight.sum()
+    n_groups, total = int(group.max()) + 1, weight.sum()
     x_mean, y_mean = weight @ x / total, weight @ y / total
     x_centred, y_centred = x - x_mean, y - y_mean
     x_centred = np.where(varies(weight @ x_centred**2 / total, x_mean**2), x_centred, 0)
@@ -108,7 +107,7 @@ def sum_up(
     group_x = np.zeros((n_groups, x.shape[1]))
     group_x[group[order][starts]] = np.add.reduceat(weighted[order], starts, axis=0)
     group_y, group_weight = (np.bincount(group, values, n_groups) for values in (scaled, weight))
-    strengths = np.concatenate([np.arange(x.shape[1]), np.full(n_groups, x.shape[1])])
+    alpha_index = np.concatenate([np.arange(x.shape[1]), np.full(n_groups, x.shape[1])])
     diagonal = np.concatenate([np.diagonal(s), group_weight - group_weight**2 / total])  # of S for v and b
     problem = Regression(
         s=s,
@@ -117,8 +116,8 @@ def sum_up(
         dof=np.asarray(n_rollouts - 1.0),
         y_mean=y_mean,
         y_std=np.asarray(y_std),
-        group_index=strengths,
-        equal_alpha=NUMPY.equal_shares(diagonal, total, strengths),
+        alpha_index=alpha_index,
+        equal_alpha=NUMPY_BACKEND.equal_alpha(diagonal, total, alpha_index),
     )
     return GroupSums(x_mean, group_x, group_y, group_weight, problem)
 
@@ -142,7 +141,7 @@ class Elimination(NamedTuple):
         return np.concatenate([np.sum(self.root[:, :-1] ** 2, axis=0), group_variance])
 
 
-def eliminate_groups(sums: GroupSums, alpha: Float[np.ndarray, " strengths"], beta: float) -> Elimination:
+def eliminate_groups(sums: GroupSums, alpha: Float[np.ndarray, " alphas"], beta: float) -> Elimination:
     """Return the posterior of (v, m) under some precisions, with the intercepts eliminated, and then that of b."""
     problem, n = sums.problem, len(sums.x_mean)
     d = beta * sums.group_weight + alpha[-1]
@@ -150,7 +149,7 @@ def eliminate_groups(sums: GroupSums, alpha: Float[np.ndarray, " strengths"], be
     precision = np.diag(np.append(alpha[:-1], beta * problem.q))
     precision[:n, :n] += beta * problem.s
     group_row = rows / d[:, None]
-    root, log_det = NUMPY.inverse_root(precision - rows.T @ group_row)
+    root, log_det = NUMPY_BACKEND.inverse_root(precision - rows.T @ group_row)
     right = beta * (np.append(problem.p[:n], 0) - group_row.T @ sums.group_y)
     weight = root.T @ (root @ right)
     intercept = beta * sums.group_y / d - group_row @ weight
@@ -159,7 +158,7 @@ def eliminate_groups(sums: GroupSums, alpha: Float[np.ndarray, " strengths"], be
     return Elimination(root, log_det, weight, intercept, group_row, d)
 
 
-def group_moments(sums: GroupSums, alpha: Float[np.ndarray, " strengths"], beta: float) -> Moments:
+def group_moments(sums: GroupSums, alpha: Float[np.ndarray, " alphas"], beta: float) -> Moments:
     """Return the moments of (v, b), as `precisions.dense_moments` of the whole matrix S would."""
     problem, posterior = sums.problem, eliminate_groups(sums, alpha, beta)
     v, b = posterior.weight[:-1], posterior.intercept
@@ -182,12 +181,12 @@ def fit_linear(
     The evidence may have a maximum where all is noise. So there are two iterations, from equal shares and from much smaller ones. The
     larger evidence wins.
     """
-    sums = sum_up(x, y, weight, group, int(group.max()) + 1, n_rollouts)
+    sums = sum_up(x, y, weight, group, n_rollouts)
     problem = sums.problem
     beta = 2 * problem.dof / problem.q  # the features explain half of the variance
     candidates = [fixed_point(sums, problem.equal_alpha * factor, beta) for factor in (1.0, NOISE_ONLY)]
     best = max(candidates, key=lambda posterior: posterior.log_evidence)
-    alpha, beta = NUMPY.clip_precisions(problem, best.alpha, best.beta)
+    alpha, beta = NUMPY_BACKEND.clip_precisions(problem, best.alpha, best.beta)
     return to_fit(sums, eliminate_groups(sums, alpha, beta), float(beta), is_logistic=False)
 
 
@@ -208,13 +207,13 @@ def to_fit(sums: GroupSums, posterior: Elimination, beta: float, *, is_logistic:
 
 
 def fixed_point(
-    sums: GroupSums, alpha: Float[np.ndarray, " strengths"], beta: float, max_rounds: int = MAX_ROUNDS
+    sums: GroupSums, alpha: Float[np.ndarray, " alphas"], beta: float, max_rounds: int = MAX_ROUNDS
 ) -> Posterior:
     """Iterate from some precisions until the evidence stops changing: `evidence.fixed_point`, in NumPy."""
-    moments = partial(group_moments, sums)
-    posterior = NUMPY.next_posterior(sums.problem, alpha, beta, moments)
+    next_posterior = partial(NUMPY_BACKEND.next_posterior, sums.problem, moments=partial(group_moments, sums))
+    posterior = next_posterior(alpha, beta)
     for _ in range(max_rounds - 1):
-        previous, posterior = posterior, NUMPY.next_posterior(sums.problem, posterior.alpha, posterior.beta, moments)
+        previous, posterior = posterior, next_posterior(posterior.alpha, posterior.beta)
         if abs(posterior.log_evidence - previous.log_evidence) <= TOLERANCE:
             break
     return posterior
