@@ -75,7 +75,7 @@ BODIES = {
     "raise ValueError('no')": "E-RUN line 3: no",
     "assert observation.shape[1] == 18, 'size'\nreturn [1]": "E-RUN line 3: size",
     "return observation[:, :1]": "E-FORM line 3: list",
-    "return [observation[:, 0]]": "E-FORM line 3: [:, None]",
+    "return [observation[:, 0]]": "E-FORM line 3: [:, 8:9]",
     "return [observation[:, :2]]": "E-FORM line 3: (batch, 2)",
     "return [np.zeros((5, 1))]": "E-FORM line 3: (5, 1)",
     "return []": "E-FORM line 3: 1 to 32",

@@ -74,7 +74,7 @@ class _RunSettings(CheckedModel, Generic[Open]):
     scale_rewards: bool = False
     """Divide rewards by the running root mean square of R/T. No effect with ppo and ippo."""
     overlap_collection: bool = False
-    """Collect the next steps while the device updates: faster on a card, with a policy one update older. For algorithms that
+    """Collect the next steps while the device updates: faster on an accelerator, with a policy one update older. For algorithms that
     consume transitions, in an environment on the host."""
     credit: CreditSettings | Open = OPEN
     """How the decoder is fitted. The algorithm decides each of these settings that is not given."""

@@ -3,7 +3,7 @@
 A policy is a function of the actor, its memory, the observation, the available actions, the noise (None: it acts without noise) and which
 episodes have just begun. It returns the action and the new memory. Only QMIX and VDN have a memory.
 
-A small network acts faster on the CPU with NumPy than on a card, which needs two transfers and a launch for each step. The weights are
+A small network acts faster on the CPU with NumPy than on a GPU, which needs two transfers and a launch for each step. The weights are
 copied once for many steps.
 """
 
