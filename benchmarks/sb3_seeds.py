@@ -3,7 +3,7 @@
     pip install -e '.[sb3]' -e 'benchmarks/real[wheat]'
     PYTHONPATH=examples python benchmarks/sb3_seeds.py wheat             results/plugs/wheat-REWARDS.jsonl
     PYTHONPATH=examples python benchmarks/sb3_seeds.py pickers           results/plugs/pickers-REWARDS.jsonl
-    PYTHONPATH=examples python benchmarks/sb3_seeds.py wheat --table     results/plugs/wheat.json
+    PYTHONPATH=examples python benchmarks/sb3_seeds.py wheat --table     results/plugs/wheat.json: tables
 
 The algorithms have the defaults of Stable-Baselines3, except those of `TASKS`. Evaluations play the deterministic policy (wheat: each
 of the seven held-out years once) or the sampled one (pickers: 50 new shifts). A seed that is in a file is not trained again.
@@ -145,15 +145,22 @@ def read_seeds(path: Path) -> dict[int, list[Line]]:
 
 
 def tabulate(name: str, rewards: tuple[str, ...], steps: int) -> None:
-    """Write the mean returns of the last quarter of the evaluations, and each method beside `episodic`."""
-    late = {}
-    for method in rewards:
-        seeds = read_seeds(RESULTS / f"{name}-{method}.jsonl").values()
-        late[method] = [float(np.mean([x["evaluation/return"] for x in y if x["step"] > 0.75 * steps])) for y in seeds]
-    table = {method: describe(values, late["episodic"]) for method, values in late.items()}
-    for method, row in table.items():
-        print(f"{method:12s}", {key: np.round(value, 3).tolist() for key, value in row.items()})
-    write(f"plugs/{name}", {"table": table})
+    """Write the mean returns of the last quarter of the evaluations and of all, and each method beside `episodic`."""
+    tables = {}
+    for measure, after in (("late", 0.75), ("area", 0.0)):
+        returns = {}
+        for method in rewards:
+            seeds = read_seeds(RESULTS / f"{name}-{method}.jsonl").values()
+            returns[method] = [mean_return(lines, after * steps) for lines in seeds]
+        tables[measure] = {method: describe(values, returns["episodic"]) for method, values in returns.items()}
+        for method, row in tables[measure].items():
+            print(f"{measure} {method:12s}", {key: np.round(value, 3).tolist() for key, value in row.items()})
+    write(f"plugs/{name}", {"tables": tables})
+
+
+def mean_return(lines: list[Line], after: float) -> float:
+    """Return the mean return of the evaluations after a step."""
+    return float(np.mean([line["evaluation/return"] for line in lines if line["step"] > after]))
 
 
 def main(
