@@ -11,7 +11,7 @@ from jaxtyping import Array, Bool
 from lare_rl.credit.decomposition import CreditBatch, valid_rows
 from lare_rl.credit.explanation import Explanation, add_to_explanation, explain, init_explanation
 from lare_rl.credit.explanation_text import LEGEND_CODES, MESSAGES, MIN_EXPLAINED_EPISODES, returns_findings
-from lare_rl.credit.methods import METHODS
+from lare_rl.credit.methods import METHODS, Method
 from lare_rl.data.replay import Index, Replay, segments_as_episodes
 from lare_rl.nn.normalise import RunningMeanStd, empty_mean_std, update_mean_std
 from lare_rl.runs.directory import Run
@@ -50,7 +50,7 @@ def explanation_source(run: Run) -> str:
     """Return which seed and which fit an explanation is of. It is empty where that goes without saying."""
     method = METHODS.find(run.config.settings.method)
     remarks = [f"of seed {run.seeds[0]} alone"] if len(run.seeds) > 1 else []
-    if method.uses_gradient:
+    if method is not METHODS[_explaining_method(method)]:
         remarks.append(f"by a closed-form fit to the stored returns, which is not the decoder of {method.name}")
     text = ", ".join(remarks)
     return text[:1].upper() + text[1:]
@@ -107,12 +107,16 @@ def compile_explanation(learner: Learner, config: TrainConfig) -> None:
         _compile(config).lower(*shapes).compile()
 
 
+def _explaining_method(method: Method) -> str:
+    return "lare-bayes" if method.needs_phi else "bayes"
+
+
 def _explanation_config(config: TrainConfig) -> TrainConfig:
     """Return the run's configuration with a closed-form method, whose inputs are in the columns of the run's replay."""
     observed = "state" if config.team_level else "observation"
     has_raw_features = {observed, "action"} <= set(config.columns)
     if has_raw_features:
-        method = METHODS["lare-bayes" if config.method.needs_phi else "bayes"]
+        method = METHODS[_explaining_method(config.method)]
     elif config.method.needs_phi:
         method = replace(METHODS["lare-linear"], decoder="additive")
     else:
