@@ -27,7 +27,7 @@ from lare_rl.training.streams import Stream, device_noise, stream_keys
 __all__ = ["DeviceCollector", "VecEnvState", "collect", "is_reset_cheap", "make_jax_env", "reset", "unroll_on_device"]
 
 MAX_RESET_FLOPS = 2e7
-"""A GPU resets all environments with each step, and uses the result where an episode has ended, if that takes fewer operations than
+"""An accelerator resets all environments with each step. It uses the result where an episode has ended, if that takes fewer operations than
 this. The host would need longer to ask whether one has ended."""
 
 
@@ -134,7 +134,7 @@ def _draw(
 ) -> tuple[Float[Array, "time seeds envs agents noise"] | None, Key[Array, "time seeds envs"]]:
     """Draw the noise of the policy (None without noise), and the keys of the environments.
 
-    Those of many steps are drawn at once, which takes a GPU as long as those of one step.
+    Those of many steps are drawn at once, which takes an accelerator as long as those of one step.
     """
 
     def draw_step(keys: Key[Array, " seeds"]) -> tuple[Any, Any]:
@@ -221,7 +221,7 @@ def make_jax_env(task: TaskSpec) -> JaxEnv:
 
 
 def is_reset_cheap(env: JaxEnv, n_envs: int) -> bool:
-    """Whether a GPU should reset all environments with each step, by XLA's estimate of the operations."""
+    """Whether an accelerator should reset all environments with each step, by XLA's estimate of the operations."""
     keys = jax.eval_shape(lambda: jax.random.split(jax.random.key(0), n_envs))
     cost = jax.jit(jax.vmap(env.reset)).lower(keys).cost_analysis()
     return float((cost or {}).get("flops", math.inf)) < MAX_RESET_FLOPS

@@ -3,8 +3,8 @@
 A policy is a function of the actor, its memory, the observation, the available actions, the noise (None: it acts without noise) and which
 episodes have just begun. It returns the action and the new memory. Only QMIX and VDN have a memory.
 
-A small network acts faster on the CPU with NumPy than on a GPU, which needs two transfers and a launch for each step. The weights are
-copied once for many steps.
+A small network acts faster on the CPU with NumPy than on an accelerator, which needs two transfers and a launch for each step. The
+weights are copied once for many steps.
 """
 
 from collections.abc import Callable, Sequence
