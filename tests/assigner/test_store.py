@@ -94,7 +94,7 @@ def test_lengths_of_a_long_running_episode_is_its_steps_since_the_last_payment()
 
 
 def test_lengths_with_a_window_are_the_steps_that_payments_are_for():
-    """Not the steps since the last payment: a step that is not paid yet has the same T as those that are."""
+    """T is the number of steps that a payment is for, also at steps that no payment has followed yet."""
     store, row = Store(20, (1,), payments=PaymentRule(period=2, window=5)), np.zeros((11, 1), np.float32)
     payments = list(store.extend(["a"] * 11, store.add(11), [row] * 3, np.ones(11), np.zeros(11, bool)))
     assert [len(payment.step_ids) for payment in payments] == [2, 4, 5, 5, 5]

@@ -172,7 +172,7 @@ def _serve(address: str) -> None:
                     start = time.perf_counter()
                     worker_index, n_workers, env_indices, memory, makers = argument
                     current = map_current(memory, n_workers)[worker_index : worker_index + 1]
-                    envs = dict(zip(env_indices, envs.values(), strict=False))  # those that are made already
+                    envs = dict(zip(env_indices, envs.values(), strict=False))  # the environments that exist
                     for index, pickled in zip(env_indices, makers, strict=False):
                         current[0] = index
                         envs[index] = make_env_at(index, partial(_unpickle_and_make, pickled))

@@ -150,7 +150,7 @@ class Array(_Value):
         return self.moved(self.source.positions.reshape(row_shape), batch_axis)
 
     def moved(self, positions: np.ndarray, batch_axis: int | None) -> Array:
-        """Return numbers of the base: a view, if NumPy made these positions a view of those of this array."""
+        """Return the numbers at these positions of the base. They are a view if NumPy made the positions as a view of `source`."""
         if np.may_share_memory(positions, self.source.positions):
             return Array(self.base._node, batch_axis, self.base, positions)
         return Array(current_builder().gather(self.base.node, positions), batch_axis)

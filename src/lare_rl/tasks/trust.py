@@ -67,8 +67,8 @@ def _makes_environment(name: str) -> bool:
 
 
 def check_trusted(task: TaskSpec, directory: Path) -> None:
-    """Raise `LareError` if a run's environment would run a file of no installed package or trusted module, or call another function
-    than those that make environments.
+    """Raise `LareError` if a run's environment would run a file of no installed package or trusted module, or call a function
+    that does not make environments.
     """
     module = untrusted_module(task)
     if module is None:

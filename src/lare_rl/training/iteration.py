@@ -102,7 +102,7 @@ def _when(condition: Any, function: Callable[..., tuple[Any, ...]], *state: Any)
 
 
 def _record(measured: Measured, metrics: Metrics) -> Measured:
-    """Replace the metrics of the seeds that have new ones: of those with updates, if they are counted."""
+    """Replace the metrics of the seeds that made updates or, if updates are not counted, of all seeds."""
     old, is_measured = measured
     if "algorithm/updates" not in metrics:
         return old | metrics, is_measured | {name: np.ones(len(values), bool) for name, values in metrics.items()}

@@ -33,7 +33,7 @@ from lare_rl.phi.operand import BatchSize
 
 
 def _register(names: str, convert: Callable[[Any], Any]) -> None:
-    """Register a function with NumPy's own parameters, apart from those that change no position. The first is what it moves."""
+    """Register a function that moves the numbers of its first argument. It has NumPy's parameters, except those that move nothing."""
     function: Any = functools.reduce(getattr, names.split()[0].split("."), np)
 
     def apply(moved: Any, *args: Any, **kwargs: Any) -> Any:
