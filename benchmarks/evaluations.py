@@ -12,18 +12,21 @@ from stable_baselines3.common.callbacks import BaseCallback
 
 def evaluate(model: Any, environment: gymnasium.Env, seed: int, episodes: int) -> float:
     """Mean return of the deterministic policy, from the same initial states at every evaluation."""
+    resets = ({"seed": 1_000_000 + 1000 * seed + episode} for episode in range(episodes))
+    return float(np.mean([play(model, environment, reset) for reset in resets]))
+
+
+def play(model: Any, environment: gymnasium.Env, reset: dict[str, Any], deterministic: bool = True) -> float:
+    """Return of an episode that begins with these arguments of `reset`."""
     normal = model.get_vec_normalize_env()
-    returns = np.zeros(episodes)
-    for episode in range(episodes):
-        observation, _ = environment.reset(seed=1_000_000 + 1000 * seed + episode)
-        ended = False
-        while not ended:
-            normalised = observation if normal is None else normal.normalize_obs(observation)
-            action, _ = model.predict(normalised, deterministic=True)
-            observation, reward, terminated, truncated, _ = environment.step(action)
-            returns[episode] += float(reward)
-            ended = terminated or truncated
-    return float(returns.mean())
+    observation, _ = environment.reset(**reset)
+    return_, ended = 0.0, False
+    while not ended:
+        normalised = observation if normal is None else normal.normalize_obs(observation)
+        action, _ = model.predict(normalised, deterministic=deterministic)
+        observation, reward, terminated, truncated, _ = environment.step(action)
+        return_, ended = return_ + float(reward), terminated or truncated
+    return return_
 
 
 def append_evaluation(out: Path, model: Any, environment: gymnasium.Env, seed: int, episodes: int, step: int) -> None:

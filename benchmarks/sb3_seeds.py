@@ -23,7 +23,7 @@ import tyro
 from stable_baselines3 import PPO, SAC
 
 import lare_rl
-from evaluations import Evaluations
+from evaluations import Evaluations, play
 from lare_rl.integrations.sb3 import CreditCallback, CreditReplayBuffer
 from measure import provenance, write
 from scores.training import describe
@@ -122,17 +122,6 @@ def train(setting: Setting, rewards: str, seed: int) -> list[Line]:
         setting.steps, log_interval=1_000_000, callback=[*callbacks, Evaluations(setting.evaluate_every, report)]
     )
     return lines
-
-
-def play(model: Any, env: gymnasium.Env, reset: dict[str, Any], deterministic: bool) -> float:
-    """Return the score of an episode."""
-    observation, _ = env.reset(**reset)
-    score, ended = 0.0, False
-    while not ended:
-        action, _ = model.predict(observation, deterministic=deterministic)
-        observation, reward, terminated, truncated, _ = env.step(action)
-        score, ended = score + float(reward), terminated or truncated
-    return score
 
 
 def read_seeds(path: Path) -> dict[int, list[Line]]:

@@ -48,7 +48,7 @@ class NewSteps(NamedTuple):
 
 def read_steps(
     config: AssignerConfig,
-    steps: tuple[Any, Any, Any],
+    arrays: tuple[np.ndarray, np.ndarray, np.ndarray],
     reward: Any,
     terminated: Any,
     truncated: Any,
@@ -56,8 +56,10 @@ def read_steps(
     valid: Any,
     alive: Any,
 ) -> NewSteps:
-    """Return the valid rows of the arguments of `CreditAssigner.add`. Raises `LareError` if they do not fit together."""
-    arrays = to_rows(config, *steps)
+    """Return the valid rows of the arguments of `CreditAssigner.add`. Raises `LareError` if they do not fit together.
+
+    `arrays` are the steps as `to_rows` returns them.
+    """
     n_rows = len(arrays[0])
     team_reward, alive = _to_team_reward(config, reward, alive, n_rows)
     ended = to_flags(terminated, "terminated", n_rows) | to_flags(truncated, "truncated", n_rows)
@@ -84,12 +86,13 @@ def read_episode(
     config: AssignerConfig, steps: tuple[Any, Any, Any], reward: Any, alive: Any
 ) -> tuple[NewSteps, PaymentRule]:
     """Return the arguments of `CreditAssigner.add_episode`, and when the episode was paid. Raises `LareError` if they do not fit."""
-    n_steps = len(to_rows(config, *steps)[0])
+    arrays = to_rows(config, *steps)
+    n_steps = len(arrays[0])
     if not n_steps:
         raise LareError("the episode has no step")
     is_score, is_last = np.ndim(reward) == 0, np.arange(n_steps) == n_steps - 1
     rewards = np.zeros(n_steps) if is_score else reward
-    new = read_steps(config, steps, rewards, is_last, np.zeros(n_steps, bool), None, None, alive)
+    new = read_steps(config, arrays, rewards, is_last, np.zeros(n_steps, bool), None, None, alive)
     score = float(reward) if is_score else float(new.reward.sum())
     if not np.isfinite(score):
         raise LareError(f"the score is {score}: give a finite number")

@@ -168,7 +168,8 @@ class CreditAssigner:
                 raise LareError("both env_ids and lanes, its earlier name, were given: leave lanes out")
             steps = observation, action, next_observation
             ids = lanes if env_ids is None else env_ids
-            new = arguments.read_steps(self.config, steps, reward, terminated, truncated, ids, valid, alive)
+            arrays = arguments.to_rows(self.config, *steps)
+            new = arguments.read_steps(self.config, arrays, reward, terminated, truncated, ids, valid, alive)
             step_ids = np.full(new.n_rows, -1)
             if len(new.rows):
                 level = arguments.to_levels(self.config, group, new, self.group_names)
@@ -282,7 +283,7 @@ class CreditAssigner:
         """Return metrics of the decoder, which need no true rewards.
 
         `credit/return_r2` is R^2 of the last 32 returns, or of the last 256 if there are several in an episode or if `score` is
-        `binary`. Each was predicted before it was learned from. It is NaN for fewer than `MIN_R2_EPISODES`, or if all are equal.
+        `binary`. Each was predicted before it was learned from. It is NaN for fewer than 8, or if all are equal.
         `credit/loss` is the mean loss of the last gradient updates.
         """
         with self.lock:

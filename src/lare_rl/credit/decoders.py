@@ -35,6 +35,8 @@ class Decoder:
     whole_episodes: bool = False
     """Whether its rows must be whole episodes of the same length, one after another. Such a decoder is for several agents."""
     single_agent_only: bool = False
+    closed_form: bool = False
+    """Whether it is linear in features, and its weights are solved for, not trained."""
     extended_basis: bool = False
     """Whether a closed-form decoder has shapes and pairs of its inputs as features (`basis.py`)."""
     pays_shares: bool = False
@@ -87,7 +89,7 @@ for _decoder in (
     Decoder("rudder", "lare_rl.credit.rudder:RUDDER", frozenset({"hidden"}), single_agent_only=True),
     Decoder("grd", "lare_rl.credit.grd:GRD", frozenset({"hidden", "sparsity"}), single_agent_only=True),
     Decoder("rbt", "lare_rl.credit.rbt:RBT", frozenset({"hidden"}), single_agent_only=True, longest_segment=RBT_STEPS),
-    Decoder("linear", "lare_rl.credit.closed_form:init_linear_decoder"),
-    Decoder("additive", "lare_rl.credit.closed_form:init_linear_decoder", extended_basis=True),
+    Decoder("linear", "lare_rl.credit.closed_form:init_linear_decoder", closed_form=True),
+    Decoder("additive", "lare_rl.credit.closed_form:init_linear_decoder", closed_form=True, extended_basis=True),
 ):
     register_decoder(_decoder)

@@ -187,14 +187,14 @@ def register_method(method: Method) -> None:
 
 def _find_conflict(method: Method) -> str | None:
     """Return why a method's inputs, fit and decoder do not go together, or None."""
-    fit, decoder = method.fit, method.decoder
+    fit, decoder, kind = method.fit, method.decoder, method.decoder_kind
     if method.reward is not Reward.PROXY:
         return None
     if method.inputs is None or fit is None:
         return "proxy rewards need inputs and a fit"
-    if fit is Fit.SIGNS and decoder != "linear":
+    if fit is Fit.SIGNS and (kind.extended_basis or not kind.closed_form):
         return "Fit.SIGNS needs the decoder 'linear'"
-    if fit.closed_form != (decoder in ("linear", "additive")):
+    if fit.closed_form != kind.closed_form:
         needed = "decoder 'linear' or 'additive'" if fit.closed_form else "decoder with gradients"
         return f"Fit.{fit.name} needs a {needed}, not {decoder!r}"
     if fit in (Fit.LIKELIHOOD, Fit.DECODER_LOSS) and decoder in ("step", "bottleneck"):

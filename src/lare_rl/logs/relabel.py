@@ -9,23 +9,21 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
 
 from lare_rl.assigner.assigner import CreditAssigner
 from lare_rl.credit.decoder_settings import CreditSettings
-from lare_rl.credit.engine import correction
 from lare_rl.credit.methods import METHODS, Reward
 from lare_rl.credit.prequential import LITTLE_R2, MIN_R2_EPISODES
 from lare_rl.envs.load import resolve_task
 from lare_rl.errors import LareError
 from lare_rl.latent.function import LatentFunction
-from lare_rl.logs.episode import LoggedEpisode, RelabelledEpisode
+from lare_rl.logs.episode import RelabelledEpisode
 from lare_rl.logs.log import Log, batch_by_steps
 from lare_rl.logs.open_log import open_log
-from lare_rl.tasks.payments import PaymentRule, is_paid
+from lare_rl.logs.payments import find_payments, make_exact, predict_payments
 from lare_rl.tasks.spec import TaskSpec
 from lare_rl.util.findings import Finding, render
 from lare_rl.util.statistics import FLOAT32_NOISE, correlation, r_squared
@@ -224,27 +222,6 @@ def hold_out_flags(share: float, seed: int) -> Iterator[bool]:
         block += 1
 
 
-class _Payments(NamedTuple):
-    """The payments of an episode."""
-
-    end: Int[np.ndarray, " payments"]
-    """The number of steps up to each payment."""
-    n_since_last: Int[np.ndarray, " payments"]
-    """The number of steps since the payment before."""
-    length: Int[np.ndarray, " payments"]
-    """The number of last steps that each payment is for."""
-
-    @property
-    def step_length(self) -> Int[np.ndarray, " steps"]:
-        """The number of steps that the next payment after each step is for."""
-        return np.repeat(self.length, self.n_since_last)
-
-    @property
-    def begins(self) -> Bool[np.ndarray, " steps"]:
-        """Whether each step is the first one since a payment, or of the episode."""
-        return np.isin(np.arange(self.end[-1]), self.end - self.n_since_last)
-
-
 @dataclass
 class _Counts:
     """Running counts of the second pass."""
@@ -298,7 +275,7 @@ def _compute_rewards(
     is_average = credit.score_type == "average"
     # `phi` takes about as long for many steps as for few.
     for batch in batch_by_steps(log.episodes(), len):
-        batch_payments = [_find_payments(episode, credit.config.payments) for episode in batch]
+        batch_payments = [find_payments(episode, credit.config.payments) for episode in batch]
         r_hats = credit.rewards(
             np.concatenate([episode.observation for episode in batch]),
             np.concatenate([episode.action for episode in batch]),
@@ -311,7 +288,7 @@ def _compute_rewards(
             counts.episodes += 1
             counts.steps += len(episode)
             counts.cut += not episode.complete
-            predicted = _predict_payments(r_hat, payments, is_average=is_average)
+            predicted = predict_payments(r_hat, payments, is_average=is_average)
             if episode.complete and next(is_held_out):
                 counts.returns.append(float(episode.reward.sum()))
                 level = None if episode.group is None else credit.group_names.get(episode.group)
@@ -319,48 +296,10 @@ def _compute_rewards(
                 counts.predictions.append(float(predicted.sum()) + unpaid)
             if episode.complete and credit.config.spec.is_exact:
                 residual = np.add.reduceat(episode.reward, payments.end - payments.n_since_last) - predicted
-                r_hat = _make_exact(r_hat, residual, payments, credit.config.settings)
+                r_hat = make_exact(r_hat, residual, payments, credit.config.settings)
             yield RelabelledEpisode(episode, r_hat)
             listener("write", counts.episodes, size[0])
     new_size = counts.episodes, counts.steps
     if new_size != size:
         before, after = (f"{n_episodes} episodes of {n_steps} steps" for n_episodes, n_steps in (size, new_size))
         raise LareError(f"{log.name} changed while it was read: it had {before}, and now {after}")
-
-
-def _find_payments(episode: LoggedEpisode, rule: PaymentRule) -> _Payments:
-    """Return when an episode is paid, and for how many steps."""
-    rule = rule.for_scores if episode.is_score else rule
-    step = np.arange(len(episode))
-    end = np.flatnonzero(is_paid(rule, step, episode.reward[:, None], step == len(episode) - 1)) + 1
-    n_since_last = np.diff(end, prepend=0)
-    return _Payments(end, n_since_last, n_since_last if rule.window is None else np.minimum(rule.window, end))
-
-
-def _predict_payments(
-    r_hat: Float[np.ndarray, " steps"], payments: _Payments, *, is_average: bool
-) -> Float[np.ndarray, " payments"]:
-    """Return the sum of r_hat over the steps of each payment.
-
-    A step that is in several payments has the r_hat of the first. If the score is an average, r_hat is inversely proportional to the
-    number of steps of a payment.
-    """
-    weight, divisor = (payments.step_length, payments.length) if is_average else (1, 1)
-    total = np.append(0, np.cumsum(r_hat.astype(np.float64) * weight))
-    return (total[payments.end] - total[payments.end - payments.length]) / divisor
-
-
-def _make_exact(
-    r_hat: Float[np.ndarray, " steps"],
-    residual: Float[np.ndarray, " payments"],
-    payments: _Payments,
-    settings: CreditSettings,
-) -> Float[np.ndarray, " steps"]:
-    """Return proxy rewards to which the residual of each payment is added, at its last step, or spread over its steps."""
-    exact = settings.exact
-    assert exact in ("last", "spread")
-    reward = r_hat.astype(np.float64)
-    for value, end, length in zip(residual, payments.end.tolist(), payments.length.tolist(), strict=True):
-        steps = np.arange(end - length, end)
-        reward[steps] += correction(np.full(length, value), steps == end - 1, np.full(length, length), exact)
-    return reward.astype(r_hat.dtype)
