@@ -116,7 +116,7 @@ def new_rewards(path):
     return [episode["rewards"] for episode in read_directory(path)]
 
 
-@pytest.mark.parametrize("exact", ["no", "last", "spread"])
+@pytest.mark.parametrize("exact", ["no", "last"])
 @pytest.mark.parametrize(("window", "score"), [(2, "sum"), (8, "sum"), (8, "average")])
 def test_payments_for_a_fixed_number_of_steps(window, score, exact, task, tmp_path):
     """Steps are in no payment, or in two. What each payment lacks is 0, so that `exact` changes nothing."""
@@ -128,25 +128,32 @@ def test_payments_for_a_fixed_number_of_steps(window, score, exact, task, tmp_pa
         np.testing.assert_allclose(new, expected, atol=0.01)
 
 
-@pytest.mark.parametrize("window", [2, 8])
-@pytest.mark.parametrize("exact", ["last", "spread"])
+@pytest.mark.parametrize(("exact", "window"), [("last", 2), ("last", 8), ("last", None), ("spread", None)])
 def test_exact_pays_what_each_payment_lacks(exact, window, task, tmp_path):
-    """Over the steps that the payment is for: these add up to it if no other payment is for them."""
-    episodes, _ = paid_every_4([e for e in logged_episodes(60, noise=True) if len(e["actions"]) % 4 != 1], window)
-    task = task.model_copy(update={"payments": 4, "paid_for": PaidSteps(steps=window), "score": "sum"})
+    """The steps that a payment is for then add up to it, if no other payment is for them."""
+    episodes, _ = paid_every_4([e for e in logged_episodes(60, noise=True) if len(e["actions"]) % 4 != 1], window or 4)
+    update = {"payments": 4, "score": "sum"} | ({"paid_for": PaidSteps(steps=window)} if window else {})
+    task = task.model_copy(update=update)
     for name in (exact, "no"):
         relabel(episodes, tmp_path / name, task=task, settings=CreditSettings(exact=name))
     files = new_rewards(tmp_path / exact), new_rewards(tmp_path / "no")
     for episode, new, fitted in zip(episodes, *files, strict=True):
         expected = fitted.astype(np.float64)
-        for end in payment_ends(len(new)):
-            steps = slice(max(0, end - window), end)
+        ends = payment_ends(len(new))
+        for begin, end in zip([0, *ends], ends, strict=False):
+            steps = slice(max(0, end - window) if window else begin, end)
             lacks = episode["rewards"][end - 1] - fitted[steps].sum()
-            expected[end - 1 if exact == "last" else steps] += lacks / (1 if exact == "last" else min(window, end))
-            if window == 2:
+            expected[end - 1 if exact == "last" else steps] += lacks / (1 if exact == "last" else end - begin)
+            if window != 8:
                 assert new[steps].sum() == pytest.approx(episode["rewards"][end - 1], abs=1e-4)
         np.testing.assert_allclose(new, expected, atol=1e-4)
         assert np.abs(new - fitted).max() > 0.1
+
+
+def test_windows_cannot_be_spread(task, tmp_path):
+    task = task.model_copy(update={"payments": 4, "paid_for": PaidSteps(steps=8)})
+    with pytest.raises(LareError, match="several: use exact = 'last'"):
+        relabel(list(logged_episodes(20)), tmp_path / "new", task=task, settings=CreditSettings(exact="spread"))
 
 
 @pytest.mark.parametrize("window", [None, 8])

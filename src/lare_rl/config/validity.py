@@ -65,6 +65,8 @@ def _reward_problems(method: Method, credit: CreditSettings, context: CreditCont
         yield f"{name} is one reward for each step: set scored_observation to 'before' or 'after', not to 'both'"
     if context.scale_rewards and method.has_proxy_rewards and not method.calibrated:
         yield f"scale_rewards divides by the size of returns, and rewards of {name} are not in their unit"
+    if credit.exact == "spread" and context.payments.window is not None:
+        yield "exact = 'spread' needs steps that belong to one payment each, and paid_for gives a step to several: use exact = 'last'"
     if context.off_policy and method.uses_gradient and credit.exact != "no":
         yield (
             f"exact needs proxy rewards that stay the same during an iteration, and the updates of an off-policy algorithm change "

@@ -65,8 +65,6 @@ def make_exact(
     """Return proxy rewards to which the residual of each payment is added, at its last step, or spread over its steps."""
     exact = settings.exact
     assert exact in ("last", "spread")
-    reward = r_hat.astype(np.float64)
-    for value, end, length in zip(residual, payments.end.tolist(), payments.length.tolist(), strict=True):
-        steps = np.arange(end - length, end)
-        reward[steps] += correction(np.full(length, value), steps == end - 1, np.full(length, length), exact)
-    return reward.astype(r_hat.dtype)
+    last = np.isin(np.arange(len(r_hat)), payments.end - 1)
+    added = correction(np.repeat(residual, payments.n_since_last), last, payments.step_length, exact)
+    return (r_hat + added).astype(r_hat.dtype)
