@@ -70,9 +70,11 @@ def registered(monkeypatch):
 @pytest.mark.parametrize("fit", [Fit.ALL_STEPS, Fit.DECODER_LOSS, long_case(Fit.SAMPLED_STEPS_UNBIASED)])
 def test_registered_method_is_trained(fit, registered):
     register_decoder(Decoder("squares", lambda key, spec: Squares(spec.output_scale * jnp.ones(spec.n_inputs))))
-    register_method(Method(f"squares {fit}", "squares", "this test", inputs=methods.RAW, fit=fit, decoder="squares"))
-    assert Settings(method=f"squares {fit}").method == f"squares {fit}"
-    credit = CreditAssigner(f"squares {fit}", observation_space=2, action_space=1, settings=SMALL_CREDIT)
+    register_method(
+        Method(f"squares-{fit.name}", "squares", "this test", inputs=methods.RAW, fit=fit, decoder="squares")
+    )
+    assert Settings(method=f"squares-{fit.name}").method == f"squares-{fit.name}"
+    credit = CreditAssigner(f"squares-{fit.name}", observation_space=2, action_space=1, settings=SMALL_CREDIT)
     random = np.random.default_rng(0)
     for _ in range(4):
         s, a, reward = random.normal(size=(10, 2)), random.normal(size=(10, 1)), random.normal(size=10)

@@ -4,15 +4,19 @@ import numpy as np
 import pytest
 
 from lare_rl.credit import evidence
-from lare_rl.credit.precisions import NUMPY_BACKEND, Posterior, Regression, expand_groups
+from lare_rl.credit.precisions import MIN_NOISE, NUMPY_BACKEND, Posterior, Regression, expand_groups
 
 GROUP_INDEX = np.array([0, 0, 1, 2, 2])
 
 
 @pytest.fixture
 def problem():
+    return make_problem()
+
+
+def make_problem(constant=()):
     random = np.random.default_rng(0)
-    x = random.normal(size=(40, 5))
+    x = random.normal(size=(40, 5)) * ~np.isin(np.arange(5), constant)
     y = x @ random.normal(size=5) + random.normal(size=40)
     x, y = x - x.mean(axis=0), (y - y.mean()) / y.std()
     s = x.T @ x
@@ -28,7 +32,9 @@ def run_rounds(backend, problem, n_rounds):
     return posterior
 
 
-def test_rounds_of_numpy_and_jax_are_the_same(problem):
+@pytest.mark.parametrize("constant", [(), (3, 4)])
+def test_rounds_of_numpy_and_jax_are_the_same(constant):
+    problem = make_problem(constant)
     numpy_posterior = run_rounds(NUMPY_BACKEND, problem, 20)
     with jax.enable_x64(True):
         in_jax = jax.tree.map(jnp.asarray, problem._replace(alpha_index=None))._replace(alpha_index=GROUP_INDEX)
@@ -37,6 +43,11 @@ def test_rounds_of_numpy_and_jax_are_the_same(problem):
             np.testing.assert_allclose(
                 getattr(numpy_posterior, name), getattr(jax_posterior, name), rtol=1e-9, atol=1e-12
             )
+
+
+def test_precision_of_constant_features_stays():
+    problem = make_problem(constant=(3, 4))
+    assert run_rounds(NUMPY_BACKEND, problem, 20).alpha[2] == problem.equal_alpha[2]
 
 
 def test_moments_are_those_of_the_inverse(problem):
@@ -61,6 +72,7 @@ def test_precisions_are_clipped(problem):
     assert alpha[0] == problem.equal_alpha[0] / 1e6
     assert alpha[1] == problem.equal_alpha[1] * 1e6
     assert beta == problem.dof / problem.q / 2
+    assert NUMPY_BACKEND.clip_precisions(problem, alpha, np.inf)[1] == problem.dof / problem.q / MIN_NOISE
 
 
 def test_strengths_start_from_their_groups(problem):

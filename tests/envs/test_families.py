@@ -216,6 +216,25 @@ def test_sizes_are_read_once(log):
     assert load_env_spec(make_toy_task(name="sizes", description="Run.")) is not first
 
 
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"low": np.zeros((0, 0))}, r"low and high in EnvSpec, of the shape \(2, 2\)"),
+        (None, "an EnvSpec, and has None"),
+    ],
+)
+def test_spec_is_checked(changes, message):
+    class Unbounded(ToyHostEnv):
+        def __init__(self, task):
+            super().__init__(changes=changes)
+            self.spec = self.spec if changes else None
+
+    name = f"unbounded-{changes is None}"
+    register_family(name, Unbounded)
+    with pytest.raises(LareError, match=message):
+        make_env(toy_spec(environment=f"{name}/two", observation_size=2, action_size=2))
+
+
 def test_make_host_env(echo, log):
     assert isinstance(make_host_env(make_toy_task(), render_mode="rgb_array"), Logged)
     assert log == [("made", {"render_mode": "rgb_array"})]

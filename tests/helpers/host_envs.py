@@ -21,7 +21,8 @@ class ToyHostEnv:
         if fault == "make":
             raise OSError("no asset\ntrack.bin")
         self.fault, self.seconds, self.note = fault, seconds, note
-        spec = EnvSpec((Team("agent", 0, 2),), size, 2, False, 5, 1, measures=("distance",))
+        bounds = np.ones((2, 2), np.float32)
+        spec = EnvSpec((Team("agent", 0, 2),), size, 2, False, 5, 1, -bounds, bounds, measures=("distance",))
         self.spec = replace(spec, **(changes or {}))
 
     def reset(self, seed):

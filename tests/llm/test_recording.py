@@ -55,9 +55,9 @@ def test_unknown_draw(kind, draw, draws):
 @pytest.mark.parametrize(
     ("text", "words"),
     [
-        ("", "not JSON"),
-        ('{"task": ', "not JSON"),
-        ("[" * 100_000, "not JSON"),
+        ("", "not valid JSON"),
+        ('{"task": ', "not valid JSON"),
+        ("[" * 100_000, "not valid JSON"),
         ("[]", "not an object"),
         ('{"task": "\\ud800"}', "surrogate"),
         ("{}", "'exchanges'"),

@@ -95,7 +95,7 @@ def test_learner_comes_back(method, payments, tmp_path):
     jax.tree.map(np.testing.assert_array_equal, checkpoint.named_leaves(checkpoint.load(tmp_path, shape)[0]), expected)
 
 
-def test_segment_before_dropped_episode_is_kept(tmp_path):
+def test_row_file_before_dropped_episode_is_kept(tmp_path):
     """At row 40 of 100, the episode since row 10 is dropped: rows 0 to 40 are used for longer than row 10 alone."""
     rows = np.arange(100.0)
     for end in (0, 40, 10, 60, 125):
@@ -107,12 +107,30 @@ def test_segment_before_dropped_episode_is_kept(tmp_path):
 def test_files_of_killed_process_are_removed(tmp_path):
     directory = tmp_path / "checkpoint"
     save(directory, np.zeros(CAPACITY), 3)
-    (directory / "rows-1.npz.0123.new").write_bytes(b"half")
+    for name in ("rows-1.npz.0123.new", "rows-7.npz", "best.npz.0123.new"):
+        (directory / name).write_bytes(b"half")
     save(directory, np.zeros(CAPACITY), 5)
-    assert {path.name for path in directory.iterdir()} == {"rows-0.npz", "rows-1.npz", "state.npz"}
+    # The last name may be a file that is being written just now.
+    expected = {"rows-0.npz", "rows-1.npz", "state.npz", "best.npz.0123.new"}
+    assert {path.name for path in directory.iterdir()} == expected
 
 
-@pytest.mark.parametrize("n_bytes", [0, 1, 100, 200])
+def test_rows_that_are_dropped_at_once_are_not_written(tmp_path):
+    save(tmp_path / "checkpoint", np.arange(16.0), 3)
+    save(tmp_path / "checkpoint", np.arange(16.0), 5000)
+    with np.load(tmp_path / "checkpoint" / "rows-1.npz") as rows:
+        assert rows["reward"].shape == (1, 1, CAPACITY)
+    learner, _, _ = checkpoint.load(tmp_path / "checkpoint", template(1, 1, CAPACITY))
+    np.testing.assert_array_equal(learner.replay.columns["reward"][0, 0], np.arange(16))
+
+
+def test_parent_that_is_a_file_is_reported(tmp_path):
+    (tmp_path / "file").touch()
+    with pytest.raises(LareError, match="file/checkpoint cannot be written"):
+        save(tmp_path / "file" / "checkpoint", np.zeros(CAPACITY), 3)
+
+
+@pytest.mark.parametrize("n_bytes", [1, 100, 200])
 @pytest.mark.parametrize("name", ["state.npz", "rows-0.npz"])
 def test_truncated_file_is_refused(name, n_bytes, tmp_path):
     directory = tmp_path / "checkpoint"
@@ -145,5 +163,5 @@ def test_arrays_that_earlier_checkpoints_lack_are_zero():
     filled = checkpoint.fill_template(state, {".closed_form.weight": np.full(2, 5.0, np.float32)})
     assert filled.closed_form.weight.tolist() == [5, 5]
     assert filled.closed_form.strengths.weight.tolist() == [0, 0, 0]
-    with pytest.raises(KeyError):
+    with pytest.raises(ValueError, match="weight is missing"):
         checkpoint.fill_template(state, {})

@@ -2,6 +2,7 @@
 
 import io
 import json
+import re
 import zipfile
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -90,8 +91,8 @@ def test_html_is_escaped(tmp_path):
     ("line", "message"),
     [
         (DEEP, TOO_DEEP),
-        ("{", "line 1 column 2 (char 1) in line 2"),
-        ("9" * 5000, "in line 2"),
+        ("{", "line 2 is not valid JSON: Expecting"),
+        ("9" * 5000, "5,000 digits"),
         ("[]", "line 2 is no evaluation"),
         *((json.dumps(LINE | {"step": step}), "line 2 is no evaluation") for step in (True, -1, 1.5, 10**400)),
         *((json.dumps(LINE | {name: "0"}), "line 2 is no evaluation") for name in ("seed", "evaluation/return")),
@@ -162,7 +163,7 @@ def segments(**values) -> np.ndarray:
     ("changes", "message"),
     [
         ({"host": np.array(DEEP)}, TOO_DEEP),
-        ({"host": np.array("[]")}, "metadata is no object"),
+        ({"host": np.array("[]")}, "not an object"),
         ({"host": np.zeros(3)}, "line 1 column 3"),
         ({"host": host(step="3")}, "'3' is not a count"),
         ({"host": host(step=-1)}, "-1 is not a count"),
@@ -172,9 +173,10 @@ def segments(**values) -> np.ndarray:
         ({"segments": np.array("[{}]")}, "'number'"),
         ({"segments": segments(number="../../../etc/passwd")}, "'../../../etc/passwd' is not a count"),
         ({"segments": segments(start=[[-5]])}, "-5 is not a count"),
-        ({"segments": segments(count=[[10**15]])}, ""),
-        ({"segments": segments(count=[[[[4]]]])}, ""),
-        ({"segments": segments(number=7)}, ""),
+        ({"segments": segments(count=[[10**15]])}, "rows-0.npz does not fit"),
+        ({"segments": segments(count=[[5]])}, "rows-0.npz does not fit"),
+        ({"segments": segments(count=[[[[4]]]])}, "indices"),
+        ({"segments": segments(number=7)}, "rows-7.npz"),
         ({".replay.next_row": np.zeros((1, 1), "U5")}, ".replay.next_row holds <U5, not int32"),
         ({".replay.next_row": np.zeros((1, 1), float)}, ".replay.next_row holds float64, not int32"),
         ({".replay.next_row": np.zeros((2, 9), int)}, ".replay.next_row has shape (2, 9), not (1, 1)"),
@@ -195,24 +197,38 @@ def header(shape: tuple) -> bytes:
     return file.getvalue()
 
 
-@pytest.mark.parametrize("shape", [(10**15,), (10**11,), (2**62, 4), (-1,)])
-def test_state_with_false_shape(directory, shape):
+@pytest.mark.parametrize(
+    "content",
+    [
+        *map(header, [(10**15,), (10**11,), (2**62, 4), (-1,)]),
+        header((3,)).replace(b"(3,), }" + b" " * 20, b"1" + b"+1" * 13),
+        header((3,))[:-1],
+    ],
+)
+def test_state_with_false_header(directory, content):
     with zipfile.ZipFile(directory / "state.npz", "a") as archive:
-        archive.writestr("latest/more.npy", header(shape))
+        archive.writestr("latest/more.npy", content)
     check_refused(directory)
 
 
 def test_state_zip_bomb(directory):
     with zipfile.ZipFile(directory / "state.npz", "a", zipfile.ZIP_DEFLATED) as archive:
         archive.writestr("latest/more.npy", header((1 << 24,)) + b"\0" * (8 << 24))
-    check_refused(directory, "latest/more.npy is packed")
+    check_refused(directory, "latest/more.npy is compressed")
     assert checkpoint.read_metadata(directory) is None
 
 
-@pytest.mark.parametrize("content", [b"", b"PK", b"\x93NUMPY\x01\x00" + b"\xff" * 99, header((3,)), b"\x80\x04."])
+def test_encrypted_state(directory):
+    content = bytearray((directory / "state.npz").read_bytes())
+    content[content.index(b"PK\x01\x02") + 8] |= 1
+    (directory / "state.npz").write_bytes(content)
+    check_refused(directory, "encrypted")
+
+
+@pytest.mark.parametrize("content", [b"", b"PK", b"PK\x03\x04" + b"\xff" * 99, header((0,)), b"\x80\x04."])
 def test_state_that_is_no_archive(directory, content):
     (directory / "state.npz").write_bytes(content)
-    check_refused(directory)
+    check_refused(directory, "no .npz file")
 
 
 # Sweeps and task files
@@ -223,16 +239,15 @@ def test_state_that_is_no_archive(directory, content):
     ("content", "message"),
     [
         (f"x = {DEEP}", TOO_DEEP),
-        ("a." * 200_000 + "a = 1", TOO_DEEP),
         ("x = {" * 100 + "}" * 100, TOO_DEEP),
         ("x", "Expected '='"),
-        (f"x = {'9' * 5000}", ""),
-        ("", ""),
-        ("name = 3\ntasks = {}", ""),
+        (f"x = {'9' * 5000}", "digits"),
+        ("", "missing|required"),
+        ("name = 3\ntasks = {}", "name|tasks"),
         ("#" * (2 << 20), "is larger than 1 MB"),
     ],
 )
 def test_task_or_sweep(tmp_path, read, content, message):
     path = tmp_path / "file.toml"
     path.write_text(content)
-    assert message in refusal(read, path)
+    assert re.search(message, refusal(read, path))

@@ -107,7 +107,7 @@ def test_mistakes(write, monkeypatch, tmp_path, text, words):
     ("name", "text", "words"),
     [
         ("none.toml", None, "plans/none.toml cannot be read: No such file"),
-        ("list.json", "[1]", "plans/list.json: it is JSON, but not an object"),
+        ("list.json", "[1]", "plans/list.json: it is not valid JSON: it is not an object"),
         ("bad.json", "{", "plans/bad.json: it is not valid JSON"),
         ("copy.json", '{"task_sha256": "0"}', "name the run directory"),
         (".", None, "plans is not a run"),

@@ -41,6 +41,20 @@ def test_registry(numbers):
         numbers["ones"]
 
 
+@pytest.mark.parametrize("name", ["a/b", "", "has space"])
+def test_name_is_checked(name, numbers):
+    with pytest.raises(LareError, match="the name of a number has letters"):
+        numbers.register(name, 3)
+
+
+def test_file_in_place_of_a_module(numbers, monkeypatch):
+    monkeypatch.setenv("LARE_PLUGINS", "my_plugin.py")
+    load_plugins.cache_clear()
+    with pytest.raises(LareError, match="and write my_plugin"):
+        numbers.find("two")
+    load_plugins.cache_clear()
+
+
 def test_plugin_of_the_environment_variable(plugin, numbers, monkeypatch):
     plugin.write_text(PLUGIN)
     monkeypatch.setenv("LARE_PLUGINS", " my_plugin, ")

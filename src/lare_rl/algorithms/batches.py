@@ -1,4 +1,7 @@
-"""The data that the training loop hands to an update, by what the algorithm consumes, and the shapes that algorithms share."""
+"""The data that the training loop hands to an update, by what the algorithm consumes, and the shapes that algorithms share.
+
+Shapes are those of jaxtyping: each word is an axis, and `*batch` stands for any number of axes.
+"""
 
 from typing import NamedTuple
 
@@ -12,6 +15,7 @@ Action = Float[Array, "*batch action"]
 Available = Bool[Array, "*batch action"] | None
 """Which choices are available. None: all of them, or the actions are continuous."""
 Value = Float[Array, "*batch"]
+"""Q(s, a) or V(s)."""
 Metrics = dict[str, Float[Array, "*seeds"]]
 
 
@@ -34,7 +38,7 @@ class Rollout(NamedTuple):
     reward: Float[Array, "time actors"]
     next_observation: Float[Array, "time actors observation"]
     terminated: Float[Array, "time actors"]
-    """1 where the episode terminated, else 0, where the target bootstraps."""
+    """1 where the target must not bootstrap: the episode terminated, or the agent left. With gamma = 1 also at a time limit."""
     done: Float[Array, "time actors"]
     """1 at the last step of an episode, terminated or truncated, and at the last step of an agent that leaves."""
     available: Bool[Array, "time actors action"] | None = None

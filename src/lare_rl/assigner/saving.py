@@ -21,9 +21,10 @@ from lare_rl.assigner.store import Store, StoredEpisode
 from lare_rl.credit.methods import METHODS
 from lare_rl.errors import LareError, short_repr
 from lare_rl.latent.saved import load_function
-from lare_rl.runs.checkpoint import DAMAGED_FILE_ERRORS, fill_template, named_leaves, open_npz
+from lare_rl.runs.checkpoint import fill_template, named_leaves
 from lare_rl.tasks.spec import TaskSpec
-from lare_rl.util.files import replace_npz, write_atomically
+from lare_rl.util.files import make_directory, replace_npz, write_atomically
+from lare_rl.util.npz import DAMAGED_FILE_ERRORS, open_npz
 from lare_rl.util.renamed_fields import rename_assigner, rename_keys
 from lare_rl.util.safe_io import read_json, read_text
 
@@ -81,10 +82,7 @@ def restore(learner: DecoderLearner, state: AssignerState) -> None:
 
 def write_state(state: AssignerState, directory: Path) -> None:
     """Write a directory. Files of an earlier save are replaced, each as a whole."""
-    try:
-        directory.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise LareError(f"{directory} cannot be written: {error.strerror}") from error
+    make_directory(directory)
     if state.config.phi is not None:
         state.config.phi.save(directory / FUNCTION_FILE)
     replace_npz(directory / ARRAYS_FILE, state.arrays)
@@ -130,7 +128,7 @@ def report_damage(directory: Path) -> Iterator[None]:
     """Raise a `LareError` that names the directory, in place of the errors that damaged files cause."""
     try:
         yield
-    except (*DAMAGED_FILE_ERRORS, TypeError, RecursionError) as error:
+    except DAMAGED_FILE_ERRORS as error:
         raise LareError(
             f"{directory} holds no credit assigner, or one that is damaged or of another version: {short_repr(error)}"
         ) from error

@@ -22,9 +22,9 @@ def evaluate(
 ) -> None:
     """Evaluate the policy of a run by its true return, from initial states that no evaluation of the run has used.
 
-    Prints the mean return of the policy with its standard deviation, and the same of as many episodes of random actions, at
-    least ten (at least five if they take longer than the policy's), and the difference with its standard error. On the host,
-    random actions begin in the same initial states. A policy that samples its actions also plays the most likely ones.
+    Prints the mean return of the policy with its standard deviation. Then plays random actions for as many episodes, but at least
+    ten, or five where they are slow. Prints the same of them, and the difference with its standard error. In an environment in
+    Python, random actions begin in the same initial states. A policy that samples its actions also plays the most likely ones.
 
     Args:
         run: a run directory.
@@ -60,7 +60,7 @@ def evaluate(
 
 
 def _refuse_untrusted(directory: Path) -> None:
-    """Refuse a run of an untrusted module before the slow imports. `open_run` refuses all that this cannot read."""
+    """Refuse a run of an untrusted module before the slow imports. If the file cannot be read, `open_run` reports that later."""
     from lare_rl.config.migrate import CONFIG, migrate
     from lare_rl.tasks.spec import TaskSpec
     from lare_rl.tasks.trust import check_trusted
@@ -101,7 +101,7 @@ def report(runs: RunDirectories, out: Path | None = None, film: bool = True) -> 
     default_path = directories[0] / "report.html"
     if untrusted and out is None and default_path.exists():
         raise LareError(
-            f"{default_path} would lose random play, credit and factors, because {untrusted} is not imported: set "
+            f"the new {default_path} would have no random play, credit and factors, because {untrusted} is not imported: set "
             f"{TRUST_VARIABLE}={untrusted} to allow the import, or write another file with --out"
         )
     print_progress("drawing, which takes up to a minute for each run")
@@ -139,9 +139,9 @@ def export(
 
 
 def cross_play(first: RunDirectory, second: RunDirectory, episodes: int = 200) -> None:
-    """Let the first team of each of two runs play against the second team of each, every seed against every seed.
+    """Let the teams of two runs play against each other: the first team of each run against the second team of each.
 
-    Prints the first team's return, mean and standard deviation over the pairs of seeds.
+    Each match is played for every pair of seeds. Prints the first team's return, mean and standard deviation over the pairs.
 
     Args:
         first: a run of a task in which two teams learn, such as CompetitivePP-6.
@@ -155,7 +155,7 @@ def cross_play(first: RunDirectory, second: RunDirectory, episodes: int = 200) -
     runs = open_run(first), open_run(second)
     cells = [format_mean_std(match.returns.ravel()) for match in play(runs, episodes)]
     first_team, second_team = (role.team for role in runs[0].config.task.teams)
-    head = (f"{first_team} of, against {second_team} of", str(first), str(second))
+    head = (f"{first_team} (rows) against {second_team}", str(first), str(second))
     print_table(head, [(str(first), *cells[:2]), (str(second), *cells[2:])])
     print_line(
         f"Returns of the {first_team} team: mean ± standard deviation over all pairs of a seed of one run and a seed of the other, "

@@ -21,19 +21,19 @@ MAX_SEED = 2**31 - 1
 MAX_SEEDS = 1000
 """In one process."""
 
-Open = TypeVar("Open")
-"""The type of an open value: None in `Settings`, and Never in `ResolvedSettings`."""
+Undecided = TypeVar("Undecided")
+"""The type of a value that is not decided yet: None in `Settings`, and Never in `ResolvedSettings`."""
 
-OPEN: Any = None
+UNDECIDED: Any = None
 
 
-class _RunSettings(CheckedModel, Generic[Open]):
-    method: str | Open = OPEN
+class _RunSettings(CheckedModel, Generic[Undecided]):
+    method: str | Undecided = UNDECIDED
     """How credit is assigned (`lare-rl methods`). By default lare-bayes; with qmix and vdn lare-rd."""
-    algorithm: str | Open = OPEN
+    algorithm: str | Undecided = UNDECIDED
     """What trains the policy (`lare-rl algorithms`). By default, for one agent, ppo with discrete actions, else td3; for many,
     qmix with a global state and action masks, else ippo."""
-    steps: Annotated[int, Field(ge=1, le=MAX_STEPS)] | Open = OPEN
+    steps: Annotated[int, Field(ge=1, le=MAX_STEPS)] | Undecided = UNDECIDED
     """Environment steps of each seed; all agents act in one step. By default 1,000,000 for one agent, about 2,000,000 for
     many."""
     seeds: Count = 1
@@ -46,29 +46,29 @@ class _RunSettings(CheckedModel, Generic[Open]):
     """The recorded reply that phi comes from (0 to 4); independent of the seed."""
     candidates: Count = N_CANDIDATES
     """Candidates that phi is combined from; with 1, no self-prompting. The shipped recordings have 1 and 5."""
-    environments: Count | Open = OPEN
+    environments: Count | Undecided = UNDECIDED
     """Copies of the environment for each seed; several on the host run in worker processes. By default 1 on the host; in JAX 82
     for ippo and 8 for qmix."""
-    rollout_steps: Count | Open = OPEN
-    """Steps of each copy in an iteration (collect, store, fit, update). By default 50; ppo: 2000 over all copies, rounded to
-    episodes of the maximum length; ippo: an episode on particle tasks, else over all copies 2050 in JAX and 2000 on the host.
-    For ppo and ippo at least 16."""
-    fit_every: Count | Open = OPEN
-    """For ppo and ippo, and for diaster, rudder, grd and rbt: iterations between two fits of the decoder. By default 10 for
-    ippo, else 1."""
-    fit_updates: Count | Open = OPEN
-    """For the same: gradient steps in each fit. By default 500 for ppo and 50 for ippo; for diaster, rudder, grd and rbt, one
-    for every 50 environment steps."""
+    rollout_steps: Count | Undecided = UNDECIDED
+    """Steps of each copy in an iteration (collect, store, fit, update). By default 50. For ppo, all copies together have 2000,
+    rounded to episodes of the maximum length. For ippo, a copy has one episode if all episodes are equally long; else all copies
+    together have 2050 in JAX, and 2000 on the host. For ppo and ippo at least 16."""
+    fit_every: Count | Undecided = UNDECIDED
+    """Iterations between two fits of the decoder, for ppo and ippo, and for methods with a loss of their own (diaster, rudder, grd,
+    rbt). By default 10 for ippo, else 1."""
+    fit_updates: Count | Undecided = UNDECIDED
+    """Gradient steps in each of these fits. By default 500 for ppo and 50 for ippo. For methods with a loss of their own, one for
+    every 50 environment steps."""
     first_fit: Literal["held-out", "published"] | None = None
     """For ippo: the first fit lasts until the held-out error stops falling (held-out, the default), or for fit_updates
     (published)."""
-    evaluate_every: Count | Open = OPEN
+    evaluate_every: Count | Undecided = UNDECIDED
     """Environment steps between two evaluations; one also follows the last step. By default 5000 for td3, ddpg and sac, about
-    10,000 for qmix, 10 iterations for ippo, and 5 for ppo. If ippo or ppo would then have fewer than 5 evaluations, they are
-    more frequent; in a short run, every iteration."""
-    evaluation_episodes: Count | Open = OPEN
+    10,000 for qmix, 10 iterations for ippo, and 5 iterations for ppo. A short run of ippo or ppo is evaluated more often, so that
+    it has 5 evaluations."""
+    evaluation_episodes: Count | Undecided = UNDECIDED
     """Episodes in one evaluation. By default 10; in JAX 50 for ippo and 32 for qmix."""
-    capacity: Annotated[int, Field(ge=4)] | Open = OPEN
+    capacity: Annotated[int, Field(ge=4)] | Undecided = UNDECIDED
     """Rows in a seed's replay; an episode of T steps takes T + 1. By default 1,000,000; 15,000 of the longest episodes for
     ippo, and 5000 for qmix."""
     scale_rewards: bool = False
@@ -76,7 +76,7 @@ class _RunSettings(CheckedModel, Generic[Open]):
     overlap_collection: bool = False
     """Collect the next steps while the device updates: faster on an accelerator, with a policy one update older. For algorithms that
     consume transitions, in an environment on the host."""
-    credit: CreditSettings | Open = OPEN
+    credit: CreditSettings | Undecided = UNDECIDED
     """How the decoder is fitted. The algorithm decides each of these settings that is not given."""
 
     @field_validator("method", "algorithm")
@@ -131,9 +131,12 @@ def round_up(steps: int, iteration_steps: int) -> int:
 
 
 class ResolvedSettings(_RunSettings[Never]):
-    """The settings that a run uses. No value is open, except for `scored_observation`, which the task then decides."""
+    """The settings that a run uses.
 
-    model_config = ConfigDict(validate_default=True)  # an open value that is missing is an error
+    Two values may be None: `scored_observation` (the task decides) and `first_fit` (the run does not use it).
+    """
+
+    model_config = ConfigDict(validate_default=True)  # a value that is missing is an error
 
     hyperparameters: SerializeAsAny[AlgorithmSettings]
     """The hyperparameters of the algorithm."""
@@ -157,7 +160,7 @@ class ResolvedSettings(_RunSettings[Never]):
 
     @property
     def all_seeds(self) -> list[int]:
-        return [self.seed + i for i in range(self.seeds)]
+        return list(range(self.seed, self.seed + self.seeds))
 
     @property
     def iteration_steps(self) -> int:

@@ -99,8 +99,14 @@ class Method:
     """Whether all agents get the mean of their proxy rewards: credit over time, but not among agents."""
 
     def __post_init__(self) -> None:
-        examples = {InputNames: 'InputNames(("observation", "action"))', Fit: "Fit.ALL_STEPS", Reward: "Reward.PROXY"}
-        for value, (kind, example) in zip((self.inputs, self.fit, self.reward), examples.items(), strict=True):
+        examples = {
+            InputNames: 'InputNames(("observation", "action"))',
+            Fit: "Fit.ALL_STEPS",
+            Reward: "Reward.PROXY",
+            str: '"step", a registered decoder',
+        }
+        values = self.inputs, self.fit, self.reward, self.decoder
+        for value, (kind, example) in zip(values, examples.items(), strict=True):
             if not isinstance(value, kind | None):
                 raise LareError(
                     f"method {self.name}: {short_repr(value)} is no {kind.__name__}: write {example}, for example"

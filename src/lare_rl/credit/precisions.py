@@ -29,16 +29,16 @@ __all__ = [
 ]
 
 PRIOR_RANGE = 1e6
-"""A group may explain at most this many times more, or less, of the returns than its equal share. Without a limit, a group that was
-switched off could not be switched on again."""
+"""alpha stays within this factor of `Regression.equal_alpha`. Without a limit, a group that was switched off could not be switched on
+again."""
 JITTER = 1e-10
 """This fraction of the diagonal of S is added to S, so that S can be factorised if features are collinear."""
 TOLERANCE = 1e-3
 """The iteration to the fixed point ends when a round changes the log evidence by less than this."""
 MIN_VARIATION = 1e-5
-"""A feature is taken to be constant if its standard deviation between cases is a smaller fraction of its size. The rounding errors of a
-constant in float32 are smaller. An episode's mean of the time is constant, for example, if all episodes are equally long. A weight for it
-would be the quotient of two rounding errors."""
+"""A feature is taken to be constant if its standard deviation between cases is below this fraction of sqrt(1 + mean^2). So features must
+have a size of about 1, or more. The rounding errors of a constant in float32 are smaller. An episode's mean of the time is constant, for
+example, if all episodes are equally long. A weight for it would be the quotient of two rounding errors."""
 MIN_NOISE = 1e-10
 """The smallest variance of the noise, relative to that of the returns. Float32 features and returns cannot resolve less."""
 
@@ -80,7 +80,7 @@ class Regression(NamedTuple):
     y_std: Float[Array, ""]
     alpha_index: AlphaIndex
     equal_alpha: Alphas
-    """The alpha of each group by which all groups explain equal parts of the returns, and together half of them."""
+    """The alpha of each group by which all groups explain equal parts of the returns, and together half of them if all of them vary."""
 
 
 class Moments(NamedTuple):
@@ -147,19 +147,21 @@ class Backend(NamedTuple):
         n_effective = xp.clip(size - alpha * self.sum_by_alpha(variance, alpha_index), 0, size)
         squares = self.sum_by_alpha(weight**2, alpha_index)
         log_occam = 0.5 * (size @ xp.log(alpha) - log_det - alpha @ squares)
-        return n_effective, n_effective / xp.maximum(squares, 1e-30), log_occam
+        # Without variation, weights are 0, and there is nothing to learn about their precision.
+        next_alpha = xp.where(squares > 0, n_effective / xp.where(squares > 0, squares, 1), alpha)
+        return n_effective, next_alpha, log_occam
 
     def next_posterior(
         self, problem: Regression, alpha: Alphas, beta: Any, moments: Callable[[Alphas, Any], Moments]
     ) -> Posterior:
-        """Return the posterior under some precisions, with the precisions that follow from it, those of the next round."""
+        """Return the posterior under the clipped alpha and beta. Its own alpha and beta are those of the next round."""
         xp = self.xp
         alpha, beta = self.clip_precisions(problem, alpha, beta)
         weight, variance, log_det, residual = moments(alpha, beta)
         residual = xp.maximum(residual, MIN_NOISE * problem.q)
         n_effective, next_alpha, log_occam = self.update_alpha(problem.alpha_index, alpha, weight, variance, log_det)
         log_evidence = 0.5 * (problem.dof * xp.log(beta) - beta * residual) + log_occam
-        noise_dof = xp.maximum(problem.dof - xp.sum(n_effective), 0.5)
+        noise_dof = xp.maximum(problem.dof - xp.sum(n_effective), 0.5)  # also if the weights use all degrees of freedom
         alpha, beta = self.clip_precisions(problem, next_alpha, noise_dof / residual)
         return Posterior(
             weight=weight, bias=xp.zeros(()), alpha=alpha, beta=beta, n_effective=n_effective, log_evidence=log_evidence
@@ -179,7 +181,6 @@ def expand_groups(posterior: Posterior, group_index: AlphaIndex, strength_index:
 
     Each strength has the precision of its group, and an equal part of the group's `n_effective`.
     """
-    group = np.zeros(n_alphas(strength_index), int)  # of each strength
-    group[strength_index] = group_index
+    group = group_index[np.unique(strength_index, return_index=True)[1]]  # of each strength
     share = posterior.n_effective / np.bincount(group, minlength=posterior.alpha.shape[-1])
     return posterior._replace(alpha=posterior.alpha[..., group], n_effective=share[..., group])

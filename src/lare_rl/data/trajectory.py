@@ -32,12 +32,12 @@ class Trajectory(NamedTuple):
         return self.next_timestep.terminated | self.next_timestep.truncated
 
 
-def empty_trajectory(spec: EnvSpec, *lead: int) -> Trajectory:
-    """Return steps of zeros, as NumPy arrays. `lead` ends in the numbers of steps and environments."""
-    action = np.zeros((*lead, spec.n_agents, spec.action_size), np.float32)
+def empty_trajectory(spec: EnvSpec, *shape: int) -> Trajectory:
+    """Return steps of zeros, as NumPy arrays. `shape` ends in the numbers of steps and environments."""
+    action = np.zeros((*shape, spec.n_agents, spec.action_size), np.float32)
     return Trajectory(
-        timestep=empty_batch(spec, *lead),
+        timestep=empty_batch(spec, *shape),
         action=action,
         env_action=action.astype(spec.action_dtype),
-        next_timestep=empty_batch(spec, *lead),
+        next_timestep=empty_batch(spec, *shape),
     )

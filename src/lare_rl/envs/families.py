@@ -8,8 +8,10 @@ from collections.abc import Callable, Sequence
 from functools import partial
 from typing import Any, NamedTuple
 
+import numpy as np
+
 from lare_rl.envs.interface import EnvSpec, HostEnv, JaxEnv
-from lare_rl.errors import LareError
+from lare_rl.errors import LareError, short_repr
 from lare_rl.tasks.spec import NO_ENVIRONMENT, SHARED_KEYS, TaskSpec
 from lare_rl.util.plugins import Registry
 
@@ -109,7 +111,7 @@ def make_env(task: TaskSpec, **kwargs: Any) -> JaxEnv | HostEnv:
     family = find_family(task)
     _check_keys(task, family)
     env = family.load_maker()(task, **kwargs)
-    _check_functions(task, env)
+    _check_env(task, env)
     try:
         _check_spec(task, env.spec)
         if task.evaluation_environment is not None and not isinstance(env, HostEnv):
@@ -123,10 +125,13 @@ def make_env(task: TaskSpec, **kwargs: Any) -> JaxEnv | HostEnv:
     return env
 
 
-def _check_functions(task: TaskSpec, env: Any) -> None:
-    """Raise `LareError` if an environment lacks a function of its kind, which `is_jax` of its spec says."""
+def _check_env(task: TaskSpec, env: Any) -> None:
+    """Raise `LareError` if an environment lacks its spec or a function of its kind."""
+    spec = getattr(env, "spec", None)
+    if not isinstance(spec, EnvSpec):
+        raise LareError(f"{task.environment}: an environment needs spec, an EnvSpec, and has {short_repr(spec)}")
     kind, names = "JaxEnv", ("reset", "step", "frames")
-    if not env.spec.is_jax:
+    if not spec.is_jax:
         kind, names = "HostEnv (without is_jax in its spec)", ("reset", "step", "render", "close")
     if missing := [name for name in names if not callable(getattr(env, name, None))]:
         raise LareError(f"{task.environment}: a {kind} needs {', '.join(names)}, and has no {' and no '.join(missing)}")
@@ -202,7 +207,10 @@ def _check_keys(task: TaskSpec, family: Family) -> None:
 
 
 def _check_spec(task: TaskSpec, spec: EnvSpec) -> None:
-    """Raise `LareError` at the first mismatch between a task and its environment."""
+    """Raise `LareError` if the bounds of actions are missing, or at the first mismatch between a task and its environment."""
+    shape = spec.n_agents, spec.action_size
+    if not spec.discrete and (np.shape(spec.low), np.shape(spec.high)) != (shape, shape):
+        raise LareError(f"{task.environment}: continuous actions need low and high in EnvSpec, of the shape {shape}")
 
     def fail(role: TaskSpec, mismatch: str) -> LareError:
         return LareError(f"task {role.name!r}: {mismatch}")

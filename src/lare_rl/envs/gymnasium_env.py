@@ -19,10 +19,11 @@ from lare_rl.envs.env_errors import (
     read_measures,
     to_float,
 )
+from lare_rl.envs.families import FAMILIES
 from lare_rl.envs.interface import EnvSpec, Team, Timestep
 from lare_rl.envs.mujoco_warnings import mujoco_warnings
 from lare_rl.envs.spaces import check_spaces, float_array
-from lare_rl.errors import LareError, short_repr
+from lare_rl.errors import LareError, did_you_mean, short_repr
 from lare_rl.tasks.spec import TaskSpec, entry_meanings
 from lare_rl.util.variables import read_variable
 
@@ -43,7 +44,8 @@ def make_gymnasium(name: str, max_episode_steps: int | None = None, **kwargs: An
         if isinstance(error, gymnasium.error.NameNotFound) and ":" not in name:
             return f" (for an environment of your own, write MODULE:{name}, where MODULE registers it)"
         if isinstance(error, gymnasium.error.NamespaceNotFound):
-            return " (for a family of a plugin, import the plugin's module, or name it in LARE_PLUGINS)"
+            hint = did_you_mean(name.partition("/")[0], FAMILIES)
+            return hint or " (for a family of a plugin, import the plugin's module, or name it in LARE_PLUGINS)"
         if "render_mode" in kwargs and "render_mode" in str(error):
             return ' (to be filmed, it must accept render_mode="rgb_array")'
         return import_hint(error)

@@ -1,7 +1,7 @@
 """Many copies of a `HostEnv`, stepped in lockstep. `LocalVecEnv` has them in this process, `workers.SubprocVecEnv` in others."""
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -139,6 +139,10 @@ def _check_shapes(timestep: Any, batch: Timestep, owner: str, function: str) -> 
     """Raise `EnvOutputError` if the arrays of a timestep have other shapes than the rows of a batch."""
     if not isinstance(timestep, Timestep):
         raise EnvOutputError(f"{owner}: {function} must return a Timestep, not {short_repr(timestep)}")
+    if not isinstance(timestep.measures, Mapping):
+        raise EnvOutputError(
+            f"{owner}: measures of {function} must be a dictionary, not {short_repr(timestep.measures)}"
+        )
     (*columns, _), (*values, _) = batch, timestep
     for name, column, value in zip(Timestep._fields, columns, values, strict=False):
         if np.shape(value) != column.shape[1:]:

@@ -15,7 +15,7 @@ import jax.numpy as jnp
 from jaxtyping import Array
 
 from lare_rl.envs.interface import to_env_action
-from lare_rl.export.translate import compute, finish, graph_input
+from lare_rl.export.translate import add_function, finish, graph_input
 from lare_rl.phi.builder import Builder, building
 from lare_rl.phi.graph import Graph
 from lare_rl.phi.limits import UNLIMITED
@@ -44,7 +44,7 @@ def policy_graph(actor: Any, config: TrainConfig, first_choice: int) -> Graph:
         if memory := policy.init_memory(config):
             inputs["hidden"] = graph_input("hidden", (*agents, memory.hidden.shape[-1]))
             inputs["last_action"] = graph_input("last_action", agents, "int")
-        return finish(**compute(partial(_act, actor=actor, config=config, first_choice=first_choice), inputs))
+        return finish(**add_function(partial(_act, actor=actor, config=config, first_choice=first_choice), inputs))
 
 
 def _act(inputs: dict[str, Array], actor: Any, config: TrainConfig, first_choice: int) -> dict[str, Array]:

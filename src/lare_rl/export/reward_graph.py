@@ -19,7 +19,7 @@ from lare_rl.credit.decomposition import DecoderState, decoder_rewards
 from lare_rl.credit.input_names import input_arrays
 from lare_rl.credit.methods import Method, Reward
 from lare_rl.envs.interface import alive_mean
-from lare_rl.export.translate import compute, finish, graph_input
+from lare_rl.export.translate import add_function, finish, graph_input
 from lare_rl.latent.function import LatentFunction
 from lare_rl.phi.arrays import concatenate
 from lare_rl.phi.builder import Builder, building
@@ -66,7 +66,7 @@ def reward_graph(
             inputs["length"] = graph_input("length", (1,) if rows else ())
         if config.method.shared and rows and config.env.agents_leave:
             inputs["alive"] = graph_input("alive", rows)
-        return finish(r_hat=compute(partial(_reward, credit=credit, config=config), inputs))
+        return finish(r_hat=add_function(partial(_reward, credit=credit, config=config), inputs))
 
 
 def _reward(arrays: dict[str, Any], credit: DecoderState | None, config: TrainConfig) -> Any:
@@ -114,7 +114,7 @@ class _StepInputs(dict[str, Any]):
             return action
         agents = slice(None) if self.config.team_level else env.teams[self.team_index].agents
         low, high = (bound[agents].reshape((*self.rows, -1)) for bound in (env.low, env.high))
-        return compute(partial(_to_network_action, low=low, high=high), {"action": action})
+        return add_function(partial(_to_network_action, low=low, high=high), {"action": action})
 
     def _factors(self) -> Any:
         """Return the factors of a step, for each agent by itself."""

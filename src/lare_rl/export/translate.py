@@ -1,7 +1,6 @@
-"""Functions of JAX as operations of a graph: that of the `building` block around the calls. An array has the axes of one row."""
+"""Translation of JAX functions to operations of a graph: that of the present `building` block. Shapes are those of one row."""
 
 from collections.abc import Callable
-from functools import partial
 from typing import Any
 
 import jax
@@ -15,9 +14,9 @@ from lare_rl.phi.graph import Graph, NumberKind
 from lare_rl.phi.numpy_functions import FUNCTIONS, call_numpy
 from lare_rl.training.numpy_program import Operation, UnsupportedOperationError, apply
 
-__all__ = ["compute", "finish", "graph_input"]
+__all__ = ["add_function", "finish", "graph_input"]
 
-DTYPES = {"float": np.float32, "int": np.int32, "bool": np.bool_}
+JAX_DTYPES = {"float": np.float32, "int": np.int32, "bool": np.bool_}
 """The types of JAX for kinds of numbers."""
 
 
@@ -31,19 +30,19 @@ def finish(**outputs: Any) -> Graph:
     return current_builder().finish({name: as_array(array).node for name, array in outputs.items()})
 
 
-def compute(function: Callable[[dict[str, Any]], Any], arrays: dict[str, Array]) -> Any:
+def add_function(function: Callable[[dict[str, Any]], Any], arrays: dict[str, Array]) -> Any:
     """Add the operations of a function of JAX, from arrays by name to a pytree of arrays. Return its results.
 
     Raises:
-        LareError: a graph cannot have one of its operations.
+        LareError: one of its operations cannot be translated.
     """
-    shapes = {name: jax.ShapeDtypeStruct(array.row_shape, DTYPES[array.kind]) for name, array in arrays.items()}
+    shapes = {name: jax.ShapeDtypeStruct(array.row_shape, JAX_DTYPES[array.kind]) for name, array in arrays.items()}
     try:
         return apply(function, shapes, arrays, _find_function)
     except UnsupportedOperationError as error:
         raise LareError(
-            f"a function of this run cannot be exported, because a graph has no operation {str(error)!r}: load the policy in Python "
-            "with lare_rl.load_policy"
+            f"a function of this run cannot be exported, because its operation {str(error)!r} is not translated: load the policy in "
+            "Python with lare_rl.load_policy"
         ) from error
 
 
@@ -52,18 +51,17 @@ def _find_function(name: str) -> Operation:
         return _gather
     if name not in FUNCTIONS:
         raise UnsupportedOperationError(name)
-    return partial(_call, name)
-
-
-def _call(name: str, *args: Any, **kwargs: Any) -> Any:
-    return call_numpy(name, args, kwargs)
+    return lambda *args, **kwargs: call_numpy(name, args, kwargs)
 
 
 def _gather(equation: Any, x: Any, indices: Any) -> Array:
     """Take numbers at fixed positions. JAX itself moves the positions as it would move the numbers."""
     array, index = as_array(x), as_array(indices).constant
     if index is None:
-        raise UnsupportedOperationError("gather")
+        raise UnsupportedOperationError("gather at computed positions")
     positions = jnp.arange(np.prod(array.row_shape)).reshape(array.row_shape)
-    moved = equation.primitive.bind(positions, jnp.asarray(index, jnp.int32), **equation.params)
-    return Array(current_builder().gather(array.node, np.asarray(moved)), None)
+    params = equation.params | {"fill_value": -1}
+    moved = np.asarray(equation.primitive.bind(positions, jnp.asarray(index, jnp.int32), **params))
+    if (moved < 0).any():
+        raise UnsupportedOperationError("gather outside of an array")
+    return Array(current_builder().gather(array.node, moved), None)

@@ -12,7 +12,7 @@ from lare_rl.errors import CheckedModel, LareError
 from lare_rl.llm.key import redact_key
 from lare_rl.llm.prompts import N_CANDIDATES, Message, Stage
 from lare_rl.util.files import check_new_path, write_atomically
-from lare_rl.util.safe_io import read_json
+from lare_rl.util.safe_io import read_json_object
 
 __all__ = [
     "RECORDED", "SHIPPED_RECORDINGS", "Exchange", "RecordedModel", "Recorder", "read_recording", "shipped_recordings",
@@ -72,14 +72,12 @@ def read_recording(text: str, name: str) -> Recording:
         LareError: the text is not a recording.
     """
     try:
-        values = read_json(text)
+        values = read_json_object(text)
         json.dumps(values, ensure_ascii=False).encode()
     except UnicodeEncodeError as error:
         raise LareError(f"recording {name} holds half a character (a surrogate), which no file can store") from error
     except ValueError as error:
-        raise LareError(f"recording {name} is not JSON: {error}") from error
-    if not isinstance(values, dict):
-        raise LareError(f"recording {name} is JSON, but not an object")
+        raise LareError(f"recording {name} is not valid JSON: {error}") from error
     if "Functions" in values:
         raise LareError(f"{name} is a single reply, not a recording: check it by lare-rl verify {name} --task TASK")
     try:

@@ -19,8 +19,14 @@ JAX_FAMILIES = ("gymnax", "brax", "playground", "jumanji", "jaxmarl")
 """Families whose environments are functions of JAX. Their drafts are written by a module that imports JAX."""
 
 USED_TITLES = {
-    *("", "description", "observation space", "observation", "action space", "action"),
-    *("episode end", "episode termination"),
+    "",
+    "description",
+    "observation space",
+    "observation",
+    "action space",
+    "action",
+    "episode end",
+    "episode termination",
 }
 
 
@@ -33,11 +39,12 @@ def draft_task(environment_id: str) -> Draft:
         from lare_rl.new_task.many_agents import draft_multi_agent_task
 
         return draft_multi_agent_task(environment_id)
-    if environment_id.partition("/")[0] in JAX_FAMILIES:
+    family, slash, _ = environment_id.partition("/")
+    if slash and family in JAX_FAMILIES:
         from lare_rl.new_task.jax_env import draft_jax_task
 
         return draft_jax_task(environment_id)
-    if (family := environment_id.partition("/")[0]) in FAMILIES:
+    if slash and family in FAMILIES:
         raise LareError(f"new-task cannot draft a task of {family}: write its file by hand (docs/reference/tasks.md)")
     with contextlib.closing(make_gymnasium(environment_id)) as env:
         return _write_draft(environment_id, env)
@@ -62,6 +69,7 @@ def _write_draft(environment_id: str, env: gymnasium.Env) -> Draft:
         draft.SCORE_LINE,
         draft.MEASURES_LINE,
         draft.GROUP_LINE,
-        *([] if env.spec and env.spec.max_episode_steps else [draft.LIMIT_LINE]),
     ]
+    if not (env.spec and env.spec.max_episode_steps):
+        lines.append(draft.LIMIT_LINE)
     return draft.make_draft(file_name(name), lines, texts, first_lines, removed, unused_sections=unused)

@@ -14,7 +14,10 @@ Tree = TypeVar("Tree")
 def masked_mean(
     x: Float[Array, "*shape"], mask: Num[Array, "*shape"] | Bool[Array, "*shape"] | None
 ) -> Float[Array, ""]:
-    """Return the mean of x where `mask` is 1, or 0 if it is 1 nowhere. Without a mask, return the mean of all."""
+    """Return the mean of x where `mask` is 1, or 0 if it is 1 nowhere. Without a mask, return the mean of all.
+
+    `mask` is 0 or 1. Where it is 0, x must be finite.
+    """
     return jnp.mean(x) if mask is None else jnp.sum(x * mask) / jnp.maximum(jnp.sum(mask), 1)
 
 

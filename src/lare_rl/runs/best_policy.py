@@ -14,8 +14,9 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from lare_rl.errors import LareError
-from lare_rl.runs.checkpoint import DAMAGED_FILE_ERRORS, fill_template, named_leaves, open_npz
-from lare_rl.util.files import replace_npz
+from lare_rl.runs.checkpoint import fill_template, named_leaves
+from lare_rl.util.files import make_directory, replace_npz
+from lare_rl.util.npz import open_npz, report_damage
 
 __all__ = ["BEST_FILE", "BestPolicy", "empty_best", "load_best", "save_best", "update_best"]
 
@@ -56,7 +57,7 @@ def update_best(best: BestPolicy, return_: Float[np.ndarray, " seeds"], step: in
 def save_best(directory: Path, best: BestPolicy) -> None:
     """Write the best policies into a checkpoint's directory. Raises `LareError` if they cannot be written."""
     arrays = {name: np.asarray(leaf) for name, leaf in named_leaves(best).items()}
-    directory.mkdir(exist_ok=True)
+    make_directory(directory)
     replace_npz(directory / BEST_FILE, arrays)
 
 
@@ -74,8 +75,5 @@ def load_best(directory: Path, actor_shape: Any, n_seeds: int) -> BestPolicy:
         raise LareError(
             f"there is no {path}: the run has not been evaluated yet, trains several teams, or is of an older version"
         )
-    try:
-        with open_npz(path) as arrays:
-            return fill_template(empty_best(n_seeds)._replace(actor=actor_shape), arrays)
-    except DAMAGED_FILE_ERRORS as error:
-        raise LareError(f"{path} cannot be read: {error or type(error).__name__}") from error
+    with report_damage(str(path)), open_npz(path) as arrays:
+        return fill_template(empty_best(n_seeds)._replace(actor=actor_shape), arrays)

@@ -1,19 +1,15 @@
-"""Checkpoints that stay valid if the process is killed at any moment, at a cost that does not grow with the replay.
+"""Checkpoints that stay valid if the process is killed at any moment. Each row of the replay is written once.
 
     checkpoint/
-      rows-0.npz, rows-1.npz, ...   the replay's rows, in the order in which they came; each is written once
+      rows-0.npz, rows-1.npz, ...   the replay's rows, in the order in which they came
       state.npz                     everything else, and the list of the row files in use
 
-Row files are only added. A new `state.npz` is written next to the old one, and then replaces it. So `state.npz` always lists
-complete row files. No pickle anywhere.
+A row file never changes. It is deleted when no row of it is in the replay any more. A new `state.npz` is written next to the old one,
+and then replaces it. So `state.npz` always lists complete row files. No pickle anywhere.
 """
 
-import contextlib
 import json
-import tokenize
-import zipfile
-import zlib
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, NamedTuple, TypeVar
@@ -22,18 +18,17 @@ import jax
 import numpy as np
 
 from lare_rl.errors import LareError, short_repr
-from lare_rl.util.files import replace_npz
+from lare_rl.util.files import make_directory, replace_npz
+from lare_rl.util.npz import DAMAGED_FILE_ERRORS, open_npz, report_damage
 from lare_rl.util.renamed_fields import rename_fields
-from lare_rl.util.safe_io import read_json
+from lare_rl.util.safe_io import read_json, read_json_object
 from lare_rl.util.shapes import padded_size
 
 __all__ = [
-    "DAMAGED_FILE_ERRORS",
     "STATE_FILE",
     "fill_template",
     "load",
     "named_leaves",
-    "open_npz",
     "read_metadata",
     "take_snapshot",
     "write",
@@ -41,11 +36,8 @@ __all__ = [
 
 STATE_FILE = "state.npz"
 
-DAMAGED_FILE_ERRORS = (
-    *(OSError, ValueError, KeyError, EOFError, NotImplementedError, zipfile.BadZipFile, zlib.error),
-    *(tokenize.TokenError, TypeError, IndexError, AttributeError, OverflowError, MemoryError, SyntaxError),
-)
-"""Errors that may be raised by reading a file that is damaged, or holds something else."""
+METADATA, ROW_FILES = "host", "segments"
+"""The names in `state.npz` of the metadata and of the list of row files, both as JSON. The names of a state's arrays begin with a dot."""
 
 REPLAY = ".replay."
 """The path of the replay within the state."""
@@ -59,7 +51,7 @@ NEW_STATE = (
 """Paths of arrays that earlier checkpoints do not have. Zeros mean that they have not been computed yet, or make no difference."""
 
 MAX_COUNT = 2**53
-
+"""The largest whole number that JSON readers agree on."""
 
 State = TypeVar("State")
 """A training state with a replay: `replay.columns` are arrays of [seeds envs rows ...], which are saved by row.
@@ -90,8 +82,8 @@ class Snapshot(NamedTuple):
     rows_file: str
     rows: dict[str, np.ndarray]
     state: dict[str, np.ndarray]
-    unused_files: list[str]
-    """Earlier files of rows that are not in use any more."""
+    used_files: set[str]
+    """The files of rows that are in use."""
 
 
 def take_snapshot(
@@ -101,44 +93,46 @@ def take_snapshot(
 
     Args:
         metadata: other data to save, as JSON.
-        arrays: other data to save, as arrays.
+        arrays: other data to save, as arrays. Their names must not begin with a dot, or be `METADATA` or `ROW_FILES`.
     """
     capacity, end = _capacity(learner), np.asarray(learner.replay.next_row)
     start, row_files = np.zeros_like(end), []
     if (directory / STATE_FILE).exists():
         with open_npz(directory / STATE_FILE) as saved:
-            start, row_files = saved[".replay.next_row"], _read_row_files(saved["segments"])
+            start, row_files = saved[".replay.next_row"], _parse_row_files(saved[ROW_FILES])
     # The last saved row is saved again, because it held only the newest observation then. And if an episode has just
-    # been dropped, `end` is smaller than before.
-    start = np.minimum(start, end)
+    # been dropped, `end` is smaller than before. Of more new rows than the capacity, only the last ones exist.
+    start = np.minimum(np.maximum(start, end - capacity + 1), end)
     count = end - start + 1
     width = padded_size(int(count.max()))
-    rows = _read_rows(learner.replay.columns, (start[..., None] + np.arange(width)) % capacity)
+    rows = _gather_rows(learner.replay.columns, (start[..., None] + np.arange(width)) % capacity)
     newest = _RowFile(row_files[-1].number + 1 if row_files else 0, start.tolist(), count.tolist())
     row_files.append(newest)
     in_use = [row_file for row_file in row_files if np.any(np.add(row_file.start, row_file.count) > end - capacity)]
     state = {name: np.array(leaf) for name, leaf in named_leaves(learner).items()}
     state |= {name: np.array(array) for name, array in arrays.items()}
-    state["host"] = np.array(json.dumps(metadata))
-    state["segments"] = np.array(json.dumps([asdict(row_file) for row_file in in_use]))
+    state[METADATA] = np.array(json.dumps(metadata))
+    state[ROW_FILES] = np.array(json.dumps([asdict(row_file) for row_file in in_use]))
     return Snapshot(
         rows_file=newest.filename,
         rows={name: np.array(values[:, :, : count.max()]) for name, values in jax.device_get(rows).items()},
         state=state,
-        # Not always the oldest ones: a file from before a drop may reach further.
-        unused_files=[row_file.filename for row_file in row_files if row_file not in in_use],
+        # Not always the newest ones: a file from before a drop may reach further.
+        used_files={row_file.filename for row_file in in_use},
     )
 
 
 def write(directory: Path, snapshot: Snapshot) -> None:
     """Write a checkpoint. Raises `LareError` if it cannot be written."""
-    directory.mkdir(exist_ok=True)
-    for partial_file in directory.glob("*.new"):  # of a process that was killed while it wrote
-        partial_file.unlink(missing_ok=True)
+    make_directory(directory)
+    for pattern in ("rows-*.new", f"{STATE_FILE}.*.new"):  # of a process that was killed while it wrote
+        for partial_file in directory.glob(pattern):
+            partial_file.unlink(missing_ok=True)
     replace_npz(directory / snapshot.rows_file, snapshot.rows)
     replace_npz(directory / STATE_FILE, snapshot.state)
-    for name in snapshot.unused_files:
-        (directory / name).unlink(missing_ok=True)
+    for path in directory.glob("rows-*.npz"):
+        if path.name not in snapshot.used_files:
+            path.unlink(missing_ok=True)
 
 
 def load(directory: Path, template: State) -> tuple[State, dict[str, Any], dict[str, np.ndarray]]:
@@ -156,13 +150,11 @@ def load(directory: Path, template: State) -> tuple[State, dict[str, Any], dict[
     path = directory / STATE_FILE
     if not path.is_file():
         raise LareError(f"there is no checkpoint in {directory}")
-    try:
+    with report_damage(f"the checkpoint {path}"):
         with open_npz(path) as saved:
             state = {name: saved[name] for name in saved.files}
-        metadata, row_files = _read_metadata(state.pop("host")), _read_row_files(state.pop("segments"))
+        metadata, row_files = _parse_metadata(state.pop(METADATA)), _parse_row_files(state.pop(ROW_FILES))
         learner = _load_rows(fill_template(template, state), directory, row_files)
-    except DAMAGED_FILE_ERRORS as error:
-        raise LareError(f"the checkpoint {path} cannot be read: {error or type(error).__name__}") from error
     return learner, metadata, {name: array for name, array in state.items() if not name.startswith(".")}
 
 
@@ -170,22 +162,9 @@ def read_metadata(directory: Path) -> dict[str, Any] | None:
     """Read the `metadata` of the last checkpoint. Return None if there is no checkpoint that can be read."""
     try:
         with open_npz(directory / STATE_FILE) as saved:
-            return _read_metadata(saved["host"])
+            return _parse_metadata(saved[METADATA])
     except DAMAGED_FILE_ERRORS:
         return None
-
-
-@contextlib.contextmanager
-def open_npz(path: Path) -> Iterator[Any]:
-    """Open the arrays of a file, which must not be compressed. A damaged file is closed too, unlike by `numpy.load` alone."""
-    with path.open("rb") as file, np.load(file, allow_pickle=False) as arrays:
-        if not isinstance(arrays, np.lib.npyio.NpzFile):
-            raise ValueError("it holds a single array")
-        with zipfile.ZipFile(file) as archive:
-            for entry in archive.infolist():
-                if entry.compress_type != zipfile.ZIP_STORED:  # a few bytes can unpack to gigabytes
-                    raise ValueError(f"{entry.filename} is packed, which no checkpoint is")
-        yield arrays
 
 
 def named_leaves(state: Any) -> dict[str, Any]:
@@ -201,8 +180,7 @@ def fill_template(template: State, arrays: Mapping[str, np.ndarray]) -> State:
     A name that the template does not have may be of an earlier version.
 
     Raises:
-        ValueError: a shape or a type differs.
-        KeyError: an array is missing.
+        ValueError: an array is missing, or a shape or a type differs.
     """
     leaves, structure = jax.tree_util.tree_flatten_with_path(template)
     names = [jax.tree_util.keystr(path) for path, _ in leaves]
@@ -214,6 +192,8 @@ def fill_template(template: State, arrays: Mapping[str, np.ndarray]) -> State:
             continue
         if name not in arrays and any(path in name for path in NEW_STATE):
             array = np.zeros(leaf.shape, leaf.dtype)
+        elif name not in arrays:
+            raise ValueError(f"{name} is missing")
         else:
             array = _pad_rows(arrays[name], leaf.shape) if name.startswith(REPLAY) else arrays[name]
         if array.shape != leaf.shape:
@@ -243,12 +223,13 @@ def _load_rows(learner: Any, directory: Path, row_files: list[_RowFile]) -> Any:
         for row_file in row_files:
             with open_npz(directory / row_file.filename) as saved:
                 values = saved[name]
-            counts = np.asarray(row_file.count)
+            starts, counts = np.asarray(row_file.start), np.asarray(row_file.count)
+            if values.dtype != column.dtype or values.shape[2] < counts.max():
+                raise ValueError(f"{row_file.filename} does not fit")
             for env in np.ndindex(counts.shape):
-                # Of a file longer than the replay, only the end is in use, as in the replay itself.
-                start, count = int(np.asarray(row_file.start)[env]), int(counts[env])
-                rows = np.arange(start, start + count)[-capacity:]
-                buffer[(*env, rows % capacity)] = values[env][:count][-capacity:]
+                # Earlier versions wrote files that are longer than the replay. Only their ends are in use.
+                rows = np.arange(starts[env], starts[env] + counts[env])[-capacity:]
+                buffer[(*env, rows % capacity)] = values[env][: counts[env]][-capacity:]
         columns[name] = _put_like(column, buffer)
     return learner._replace(replay=learner.replay._replace(columns=columns))
 
@@ -259,7 +240,7 @@ def _put_like(template: Any, array: np.ndarray) -> jax.Array:
 
 
 @jax.jit
-def _read_rows(columns: dict[str, jax.Array], rows: jax.Array) -> dict[str, jax.Array]:
+def _gather_rows(columns: dict[str, jax.Array], rows: jax.Array) -> dict[str, jax.Array]:
     """Return rows of every environment of every seed."""
     read = jax.vmap(jax.vmap(lambda column, env_rows: column[env_rows]))
     return {name: read(column, rows) for name, column in columns.items()}
@@ -270,11 +251,9 @@ def _capacity(learner: Any) -> int:
     return next(iter(learner.replay.columns.values())).shape[2]
 
 
-def _read_metadata(text: Any) -> dict[str, Any]:
+def _parse_metadata(text: Any) -> dict[str, Any]:
     """Read the data that are saved as JSON. Raise `ValueError` if they are not valid."""
-    metadata = read_json(str(text))
-    if not isinstance(metadata, dict):
-        raise ValueError("metadata is no object")
+    metadata = read_json_object(str(text))
     _check_counts([metadata[name] for name in ("step", "metrics_length") if name in metadata])
     digests = metadata.get("function_sha256", [])
     if not (isinstance(digests, list) and all(isinstance(digest, str) for digest in digests)):
@@ -282,7 +261,7 @@ def _read_metadata(text: Any) -> dict[str, Any]:
     return metadata
 
 
-def _read_row_files(text: Any) -> list[_RowFile]:
+def _parse_row_files(text: Any) -> list[_RowFile]:
     """Read the list of the row files in use. Raise `ValueError` if it is not valid."""
     names = ("number", "start", "count")
     return [_RowFile(**{name: _check_counts(values[name]) for name in names}) for values in read_json(str(text))]

@@ -18,7 +18,7 @@ from lare_rl.tasks.spec import TaskSpec
 from lare_rl.util.files import write_atomically
 from lare_rl.util.processes import n_usable_cores
 from lare_rl.util.provenance import code_version
-from lare_rl.util.safe_io import read_json, read_text
+from lare_rl.util.safe_io import read_table
 
 __all__ = ["CONFIG", "Config", "make_config", "read_config", "write_config"]
 
@@ -91,10 +91,8 @@ def read_config(directory: Path) -> Config:
     path = directory / CONFIG
     if not path.is_file():
         raise LareError(f"{directory} is not a run: there is no {CONFIG} in it")
+    values = read_table(path, MAX_CONFIG_BYTES)
     try:
-        values = read_json(read_text(path, MAX_CONFIG_BYTES))
-        if not isinstance(values, dict):
-            raise LareError("it is JSON, but not an object")
         return Config(**migrate(values))
-    except (LareError, OSError, ValueError, TypeError) as error:
+    except (LareError, ValueError, TypeError) as error:
         raise LareError(f"{path}: {error}") from error

@@ -67,7 +67,7 @@ def _parse(path: Path, state: tuple[int, ...]) -> list[dict[str, Any]]:
         try:
             line = read_json(text)
         except ValueError as error:
-            raise LareError(f"{path} is damaged: {error} in line {number}") from error
+            raise LareError(f"{path} is damaged: line {number} is not valid JSON: {error}") from error
         if not _is_evaluation(line):
             raise LareError(f"{path} is damaged: line {number} is no evaluation")
         lines.append(rename_metrics(line))

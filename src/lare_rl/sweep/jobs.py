@@ -34,23 +34,27 @@ class Job:
     directory: Path
     task: TaskSpec
     settings: Settings
-    """Before defaults are filled in."""
+    """As the user gives them."""
     resolved: ResolvedSettings
+    """With all defaults."""
     functions: tuple[Path, ...] = ()
     """Files of latent functions instead of the recorded ones, one for each team."""
 
     @property
     def name(self) -> str:
-        """TASK/METHOD-ALGORITHM."""
+        """The last two parts of the directory: TASK/RUN."""
         return f"{self.directory.parent.name}/{self.directory.name}"
 
     @property
     def started(self) -> bool:
-        """Whether the directory of the run exists."""
+        """Whether the directory holds a run."""
         return (self.directory / CONFIG).is_file()
 
     def step(self) -> int:
-        """Return the step of the checkpoint or, without one, of the last evaluation. Raises `LareError` for a damaged run."""
+        """Return the step of the checkpoint or, without one that can be read, of the last evaluation.
+
+        Raises `LareError` if the metrics are damaged.
+        """
         if (checkpoint := read_metadata(self.directory / CHECKPOINT)) is not None:
             return checkpoint["step"]
         lines = read_metrics(self.directory)
@@ -75,14 +79,15 @@ class Job:
 def make_job(root: Path, task: TaskSpec, settings: Settings, functions: Sequence[Path] = ()) -> Job:
     """Plan a run in ROOT/TASK/METHOD-ALGORITHM[-drawK][-candidatesN]. Raises `LareError` if settings and task do not fit together.
 
-    The endings in brackets name a recorded `phi`. A run with `functions` has none.
+    The name of a run with a recorded `phi` has its draw, and the number of candidates if it is not 5.
     """
     resolved = resolve(settings, task)
     name = f"{resolved.method}-{resolved.algorithm}"
     needs_phi = METHODS.find(resolved.method).needs_phi
     if needs_phi and not functions:
         name += f"-draw{resolved.draw}"
-        name += f"-candidates{resolved.candidates}" if resolved.candidates != N_CANDIDATES else ""
+        if resolved.candidates != N_CANDIDATES:
+            name += f"-candidates{resolved.candidates}"
     return Job(
         directory=root / task.name / name,
         task=task,
@@ -99,8 +104,9 @@ def check_job(job: Job) -> None:
     if not job.started:
         if job.directory.exists():
             raise LareError(f"{job.directory} exists, and is not a run: {ANOTHER_OUT}")
-        for role in job.task.roles if method.needs_phi and not functions else ():
-            check_recorded(role, method.phi_kind, job.resolved.draw, job.resolved.candidates)
+        if method.needs_phi and not functions:
+            for role in job.task.roles:
+                check_recorded(role, method.phi_kind, job.resolved.draw, job.resolved.candidates)
         return
     config = read_config(job.directory)
     if config.task.digest != job.task.digest:
@@ -108,7 +114,10 @@ def check_job(job: Job) -> None:
     old = effective_settings(config.settings)
     for name, value in effective_settings(job.resolved).items():
         if (old_value := old.get(name)) != value:
-            raise LareError(f"{job.directory} holds a run with {name} = {old_value}, not {value}: {ANOTHER_OUT}")
+            more = (
+                f"extend it with lare-rl train --resume {job.directory} --steps {value}, or " if name == "steps" else ""
+            )
+            raise LareError(f"{job.directory} holds a run with {name} = {old_value}, not {value}: {more}{ANOTHER_OUT}")
     if functions and config.function_sha256 != tuple(function.digest for function in functions):
         raise LareError(f"{job.directory} holds a run with another latent function: {ANOTHER_OUT}")
 

@@ -26,17 +26,21 @@ _PETTINGZOO_PACKAGES = ("mpe2", "pettingzoo")
 """Packages whose functions `parallel_env` make environments, and do nothing else."""
 
 _own_environments = set[str]()
-"""The names of the environments of this process's own runs."""
+"""The names of environments that the user, not only a file, has given to this process."""
 
 
 def trust_environment(task: TaskSpec) -> None:
     """Trust the environment of a task that the user has given to this process, in all files that it reads later."""
-    _own_environments.update({task.environment, task.evaluation_task.environment})
+    _own_environments.update(_names(task))
+
+
+def _names(task: TaskSpec) -> set[str]:
+    return {task.environment, task.evaluation_task.environment}
 
 
 def trusted_modules() -> list[str]:
     """Return the modules that the user trusts."""
-    return [name.strip() for name in read_variable(TRUST_VARIABLE).split(",")]
+    return [name for name in map(str.strip, read_variable(TRUST_VARIABLE).split(",")) if name]
 
 
 def module_to_trust(task: TaskSpec) -> str | None:
@@ -46,13 +50,13 @@ def module_to_trust(task: TaskSpec) -> str | None:
 
 
 def untrusted_module(task: TaskSpec) -> str | None:
-    """Return the module that a task's environment would import, or whose function it would call.
+    """Return the module of a task's environment, if a report must not import it, else None.
 
-    Return None without such a module, and for one that the user trusts. PettingZoo's environments are made by a function that the
-    task names, so this function must be known too. For Gymnasium, it is enough that this process has imported the module.
+    That is a module that the user does not trust, of a task that the user has not given to this process. A module that the process
+    has imported already may be used. PettingZoo's environments are made by a function that the task names: it must be known too.
     """
     module = module_to_trust(task)
-    names = {task.environment, task.evaluation_task.environment}
+    names = _names(task)
     if module is None or names <= _own_environments:
         return None
     return None if module in sys.modules and all(map(_makes_environment, names)) else module
@@ -67,16 +71,18 @@ def _makes_environment(name: str) -> bool:
 
 
 def check_trusted(task: TaskSpec, directory: Path) -> None:
-    """Raise `LareError` if a run's environment would run a file of no installed package or trusted module, or call a function
-    that does not make environments.
+    """Raise `LareError` unless the module of a run's environment is installed, or trusted by the user.
+
+    Of PettingZoo's, the function must also be known to make environments.
     """
     module = untrusted_module(task)
     if module is None:
         return
-    path = _find_package(module)
-    if path is not None and not any(path.is_relative_to(folder) for folder in _package_folders()):
-        reason = f"run {path}, which belongs to no installed package"
-    elif not all(map(_makes_environment, (task.environment, task.evaluation_task.environment))):
+    folders = _package_folders()
+    foreign = [path for path in _package_paths(module) if not any(map(path.is_relative_to, folders))]
+    if foreign:
+        reason = f"run {foreign[0]}, which is in no folder of installed packages"
+    elif not all(map(_makes_environment, _names(task))):
         reason = f"call a function of {module}"
     else:
         return
@@ -86,16 +92,18 @@ def check_trusted(task: TaskSpec, directory: Path) -> None:
     )
 
 
-def _find_package(module: str) -> Path | None:
-    """Return the file of a module's outermost package, without running it. Return None for built-in and missing modules."""
+def _package_paths(module: str) -> list[Path]:
+    """Return the file of a module's outermost package, or its folders, without running it. Built-in and missing modules have none."""
     try:
         spec = find_spec(module.partition(".")[0])
     except (ImportError, ValueError):
-        return None
+        return []
     if spec is None or spec.origin in ("built-in", "frozen"):
-        return None
-    paths = [spec.origin] if spec.origin else list(spec.submodule_search_locations or ())
-    return Path(paths[0]).resolve() if paths else None
+        return []
+    paths = (
+        [spec.origin] if spec.origin else list(spec.submodule_search_locations or ())
+    )  # a namespace may have several
+    return [Path(path).resolve() for path in paths]
 
 
 def _package_folders() -> set[Path]:

@@ -13,7 +13,6 @@ from lare_rl.config.settings import ResolvedSettings, Settings
 from lare_rl.envs.load import resolve_task
 from lare_rl.envs.workers import close_idle_workers
 from lare_rl.errors import LareError, short_repr
-from lare_rl.runs import checkpoint
 from lare_rl.runs.directory import Run, as_run, create_run, default_directory, extend_run, lock_run
 from lare_rl.runs.metrics_file import truncate_metrics
 from lare_rl.tasks.spec import TaskSpec
@@ -186,7 +185,7 @@ def restore_session(run: Run) -> tuple[Session, list[str]]:
     session = _make_session(run, config, learner)
     try:
         return session, session.restore(metadata, arrays)
-    except checkpoint.DAMAGED_FILE_ERRORS as error:
+    except DAMAGED_FILE_ERRORS as error:
         session.close()
         raise LareError(
             f"the checkpoint in {run.checkpoint} does not fit its environments ({type(error).__name__}: {error}): start a new run, or "

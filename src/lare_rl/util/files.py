@@ -13,7 +13,7 @@ from uuid import uuid4
 
 from lare_rl.errors import LareError
 
-__all__ = ["check_new_path", "find_free_path", "replace_npz", "write_atomically", "write_npz"]
+__all__ = ["check_new_path", "find_free_path", "make_directory", "replace_npz", "write_atomically", "write_npz"]
 
 
 RETRY_S = 0.01, 0.03, 0.1, 0.3, 1.0
@@ -49,6 +49,14 @@ def find_free_path(directory: Path, name: str, suffix: str = "") -> Path:
     """Return DIRECTORY/NAME.SUFFIX, with a number appended to the name if that exists."""
     paths = (directory / f"{name}{f'-{number}' if number > 1 else ''}{suffix}" for number in itertools.count(1))
     return next(path for path in paths if not path.exists())
+
+
+def make_directory(directory: Path) -> None:
+    """Make a directory and its parents, if they do not exist. Raises `LareError` if that is not possible."""
+    try:
+        directory.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise LareError(f"{directory} cannot be written: {error.strerror or error}") from error
 
 
 def write_atomically(path: Path, write: Callable[[Any], object]) -> None:

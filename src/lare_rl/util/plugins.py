@@ -9,6 +9,7 @@ The environment variable `LARE_PLUGINS` names further modules, separated by comm
 imported when a name is not registered, or when all registered names are listed.
 """
 
+import re
 from collections.abc import Iterator, Mapping
 from functools import cache
 from importlib import import_module
@@ -22,6 +23,8 @@ __all__ = ["Registry", "load_plugins"]
 
 T = TypeVar("T")
 
+_NAME = re.compile(r"[\w.-]+")
+
 
 @cache
 def load_plugins() -> None:
@@ -32,12 +35,15 @@ def load_plugins() -> None:
         source = f" of the package {package} (entry point {entry.name} = {entry.value})"
         plugins[entry.name] = entry.value.partition(":")[0].strip(), source, f"Update or uninstall {package}."
     for name in filter(None, map(str.strip, read_variable("LARE_PLUGINS").split(","))):
-        plugins[name] = name, "", "Correct LARE_PLUGINS, or PYTHONPATH, where Python looks for it."
+        without = f", and write {name[:-3]}" if name.endswith(".py") else ""
+        plugins[name] = name, "", f"Correct LARE_PLUGINS, or PYTHONPATH, where Python looks for it{without}."
     for plugin, (module, source, advice) in plugins.items():
         try:
             import_module(module)
         except Exception as error:  # a plugin's code can raise anything
             reason = " ".join(f"{type(error).__name__}: {error}".split())
+            if not isinstance(error, ImportError):
+                advice = "lare-rl --debug shows the line."
             raise LareError(f"the plugin {plugin!r}{source} cannot be imported: {reason}. {advice}") from error
 
 
@@ -57,8 +63,11 @@ class Registry(Mapping[str, T], Generic[T]):
     def register(self, name: str, value: T) -> None:
         """Add a value.
 
-        Raises `LareError` if another value has this name. Names cannot be reused, because compiled programs are cached by name.
+        Raises `LareError` if the name has other characters than letters, digits, `-`, `_` and `.`, or if another value has it. Names
+        cannot be reused, because compiled programs are cached by name.
         """
+        if not _NAME.fullmatch(str(name)):
+            raise LareError(f"the name of a {self._kind} has letters, digits, - and _ only, unlike {name!r}")
         if self._values.setdefault(name, value) != value:
             raise LareError(
                 f"there is another {self._kind} {name!r}: choose another name; if you ran the same file or cell twice, restart Python, "

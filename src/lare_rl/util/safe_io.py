@@ -17,6 +17,7 @@ __all__ = [
     "check_depth",
     "parse_integer",
     "read_json",
+    "read_json_object",
     "read_table",
     "read_text",
     "read_toml",
@@ -32,10 +33,14 @@ MAX_SETTINGS_BYTES = 1 << 20
 """The largest size of a file that is written by hand."""
 
 _MAX_DIGITS = 1000
-"""The most digits of a whole number. Python's own limit is 4300, and its message is for programmers."""
+"""The most digits of a whole number of JSON. Python's own limit is 4300, and its message is for programmers."""
 
-# A name of deeply nested tables, for which the parser takes quadratic time.
-_DEEP_NAME = re.compile(rf"""(?<![\w-])(?:(?:[\w-]++|"[^"\n]*+"|'[^'\n]*+')[ \t]*+\.[ \t]*+){{{MAX_DEPTH}}}""")
+_TOML_TEXT = re.compile(r'''"""(?:[^\\]|\\[\s\S])*?"""|\'\'\'[\s\S]*?\'\'\'|"(?:[^"\\\n]|\\.)*+"|'[^'\n]*+'|#[^\n]*+''')
+"""A string or a comment of TOML."""
+
+_DEEP_NAME = re.compile(rf"(?<![\w-])(?:[\w-]++[ \t]*+\.[ \t]*+){{{MAX_DEPTH}}}")
+"""A name of deeply nested tables, for which the parser takes quadratic time. Its strings must have been replaced by words."""
+
 _TOO_DEEP = f"it is nested more than {MAX_DEPTH} deep"
 
 
@@ -53,7 +58,7 @@ def read_text(path: Path, max_bytes: int = MAX_TEXT_BYTES) -> str:
             raise LareError(f"{path} is larger than {max_bytes >> 20} MB")
         return content.decode("utf-8-sig").replace("\r\n", "\n").replace("\r", "\n")
     except (OSError, UnicodeDecodeError) as error:
-        reason = error.strerror if isinstance(error, OSError) else error
+        reason = (isinstance(error, OSError) and error.strerror) or error
         raise LareError(f"{path} cannot be read: {reason}") from error
 
 
@@ -72,9 +77,17 @@ def read_json(text: str | bytes, strict: bool = True) -> Any:
         raise ValueError(_TOO_DEEP) from None
 
 
+def read_json_object(text: str | bytes) -> dict[str, Any]:
+    """Parse a JSON object. Raises `ValueError` like `read_json`, and for another value."""
+    value = read_json(text)
+    if not isinstance(value, dict):
+        raise ValueError("it is not an object")
+    return value
+
+
 def read_toml(text: str) -> dict[str, Any]:
     """Parse a TOML text. Raises `ValueError` if the text is not TOML, or is nested too deep."""
-    if _DEEP_NAME.search(text):
+    if _DEEP_NAME.search(_TOML_TEXT.sub("text", text)):
         raise ValueError(_TOO_DEEP)
     try:
         return check_depth(tomllib.loads(text))
@@ -85,34 +98,32 @@ def read_toml(text: str) -> dict[str, Any]:
         raise ValueError(f"{error}{hint}") from error
 
 
-def read_table(path: Path) -> dict[str, Any]:
-    """Read a file that is written by hand: JSON if its name ends with .json, else TOML.
+def read_table(path: Path, max_bytes: int = MAX_SETTINGS_BYTES) -> dict[str, Any]:
+    """Read a file of settings: JSON if its name ends with .json, else TOML.
 
     Raises `LareError` if the file cannot be read, or is no table.
     """
-    text, is_json = read_text(path, MAX_SETTINGS_BYTES), path.suffix == ".json"
+    text, is_json = read_text(path, max_bytes), path.suffix == ".json"
     try:
-        table = read_json(text) if is_json else read_toml(text)
+        return read_json_object(text) if is_json else read_toml(text)
     except ValueError as error:
         raise LareError(f"{path}: it is not valid {'JSON' if is_json else 'TOML'}: {error}") from error
-    if not isinstance(table, dict):
-        raise LareError(f"{path}: it is JSON, but not an object")
-    return table
 
 
 def check_depth(value: Any) -> Any:
     """Return a value that is not nested too deep for recursive functions. Raises `ValueError` if it is nested too deep."""
     level = [value]
-    for _ in range(MAX_DEPTH):
+    for _ in range(MAX_DEPTH + 1):
         containers = [x.values() if isinstance(x, dict) else x for x in level if isinstance(x, dict | list)]
-        level = [item for container in containers for item in container]
-        if not level:
+        if not containers:
             return value
+        level = [item for container in containers for item in container]
     raise ValueError(_TOO_DEEP)
 
 
 def parse_integer(digits: str) -> int:
     """Parse a whole number. Raises `ValueError` if it has too many digits."""
-    if len(digits) > _MAX_DIGITS:
-        raise ValueError(f"a number has {len(digits):,} digits (at most {_MAX_DIGITS:,} are read)")
+    n_digits = len(digits.lstrip("-"))
+    if n_digits > _MAX_DIGITS:
+        raise ValueError(f"a number has {n_digits:,} digits (at most {_MAX_DIGITS:,} are read)")
     return int(digits)

@@ -147,6 +147,23 @@ def test_foreign_module_is_refused_at_once(write_run, foreign_file, command, mon
     assert "LARE_TRUST=foreign_file" in message
 
 
+def test_trusted_modules(monkeypatch):
+    for value, names in (("", []), (" ", []), ("a, b,", ["a", "b"])):
+        monkeypatch.setenv("LARE_TRUST", value)
+        assert trust.trusted_modules() == names
+
+
+def test_every_folder_of_a_namespace_is_checked(write_run, tmp_path, monkeypatch):
+    (tmp_path / "other" / "spread_package").mkdir(parents=True)
+    folders = [*sys.path, str(tmp_path / "other")]
+    installed = tmp_path / "installed"
+    (installed / "spread_package").mkdir(parents=True)
+    monkeypatch.setattr(sys, "path", [str(installed), *folders])
+    monkeypatch.setattr(trust, "_package_folders", lambda: {installed.resolve()})
+    with pytest.raises(LareError, match=r"other/spread_package, which is in no folder"):
+        open_run(write_run("spread_package.evil:X-v0"))
+
+
 def test_module_that_a_new_process_would_not_trust(monkeypatch):
     task = toy_spec(environment="helpers.toy_envs:toys/Chase-v0")
     trust.trust_environment(task)

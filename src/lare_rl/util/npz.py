@@ -1,0 +1,49 @@
+"""Reading of .npz files that may be damaged, or come from another person. `files.py` writes them."""
+
+import contextlib
+import tokenize
+import zipfile
+import zlib
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+
+from lare_rl.errors import LareError
+
+__all__ = ["DAMAGED_FILE_ERRORS", "open_npz", "report_damage"]
+
+DAMAGED_FILE_ERRORS = (
+    *(OSError, ValueError, KeyError, EOFError, NotImplementedError, RecursionError, zipfile.BadZipFile, zlib.error),
+    *(tokenize.TokenError, TypeError, IndexError, AttributeError, OverflowError, MemoryError, SyntaxError),
+)
+"""Errors that may be raised by reading a file that is damaged, or holds something else."""
+
+_ENCRYPTED = 1  # a flag of an entry
+
+
+@contextlib.contextmanager
+def open_npz(path: Path) -> Iterator[np.lib.npyio.NpzFile]:
+    """Open the arrays of a file. A damaged file is closed too, unlike by `numpy.load` alone.
+
+    Raises `ValueError` if they are compressed, or one of the other `DAMAGED_FILE_ERRORS`.
+    """
+    with path.open("rb") as file:
+        if not zipfile.is_zipfile(file):
+            raise ValueError("it is no .npz file, or not whole")
+        file.seek(0)
+        with np.load(file, allow_pickle=False) as arrays:
+            for entry in arrays.zip.infolist():
+                # A few compressed bytes can unpack to gigabytes.
+                if entry.compress_type != zipfile.ZIP_STORED or entry.flag_bits & _ENCRYPTED:
+                    raise ValueError(f"{entry.filename} is compressed or encrypted, and LaRe writes no such arrays")
+            yield arrays
+
+
+@contextlib.contextmanager
+def report_damage(name: str) -> Iterator[None]:
+    """Raise a `LareError` that names the file, in place of the errors that a damaged file causes."""
+    try:
+        yield
+    except DAMAGED_FILE_ERRORS as error:
+        raise LareError(f"{name} cannot be read: {error or type(error).__name__}") from error
