@@ -122,7 +122,7 @@ def main(out: str) -> None:
             steps=STEPS,
             seeds=SEEDS,
             evaluate_every=STEPS // 10,
-            sac=SACSettings(warmup=WARMUP),
+            sac=SACSettings(warmup=WARMUP, target_every=2),
         )
         seed_index = Path(out) / name.replace(" ", "-")
         run = (

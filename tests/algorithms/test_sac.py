@@ -8,7 +8,7 @@ from helpers.numpy_twins import equal, mlp_forward, q_values, random_transitions
 from lare_rl.algorithms.sac import SACSettings, sac
 from lare_rl.nn.networks import MLP
 
-SETTINGS = SACSettings(hidden=(8, 8), temperature=0.5, learning_rate=1e-3)
+SETTINGS = SACSettings(hidden=(8, 8), temperature=0.5, learning_rate=1e-3, target_every=2)
 KEY, BATCH = jax.random.key(1), random_transitions()
 init, update = jax.jit(sac.init, static_argnums=(1, 2, 3)), jax.jit(sac.update, static_argnums=4)
 sample = jax.jit(sac.sample)

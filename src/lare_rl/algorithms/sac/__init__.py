@@ -12,9 +12,9 @@ __all__ = ["SACSettings"]
 
 
 class SACSettings(OffPolicySettings):
-    """Hyperparameters, as the LaRe paper sets them."""
+    """Hyperparameters, as the LaRe paper sets them. Its code has `target_every` = 2."""
 
-    target_every: Count = 2
+    target_every: Count = 1
     """Updates between two moves of the target critics."""
     temperature: Annotated[float, Field(gt=0)] = 1.0
     """Temperature alpha at the start."""
