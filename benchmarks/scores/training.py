@@ -12,7 +12,7 @@ Kinds:
 * `published`: published methods in the corridor, on CN-6 and on PP-6.
 * `cheetah`: HalfCheetah-v4 paid once, every 50 and every 200 steps.
 * `true-rewards`: HalfCheetah-v4, true rewards as they are, 0.3 of them, and the mean of the last 10.
-* `threshold`: HalfCheetah, paid for steps faster than 2 m/s.
+* `threshold`: HalfCheetah, paid for steps faster than 2 m/s; in one row, a factor of phi says which steps these are.
 
 Finished runs in RUNS are not trained again, and stopped ones continue. Kept runs are in `results/scores`: copy them to RUNS first. `late`
 is the mean return of the evaluations after three quarters of the steps, and `area` that of all evaluations, which also says how fast a
@@ -35,6 +35,7 @@ from lare_rl.sweep.jobs import Job
 from lare_rl.tasks.spec import TaskSpec
 from measure import write
 from scores.environments import corridor_task, level_task
+from threshold import load_terms
 
 PARTICLE_STEPS = 205_000
 CORRIDOR: dict[str, Any] = {"algorithm": "ppo", "steps": 64_000, "environments": 20, "evaluation_episodes": 100}
@@ -52,6 +53,8 @@ class Row(NamedTuple):
     task: TaskSpec
     settings: dict[str, Any]
     is_baseline: bool = False
+    function: lare_rl.LatentFunction | None = None
+    """A phi instead of the recorded one."""
 
 
 def corridor(score: str, methods: tuple[str, ...], baseline: str) -> Iterator[Row]:
@@ -132,10 +135,12 @@ def true_rewards() -> Iterator[Row]:
 
 
 def threshold() -> Iterator[Row]:
+    task = read_task("HalfCheetahThreshold-v4")
+    settings = {**CHEETAH, "steps": 60_000, "evaluate_every": 5_000}
     for method in ("lare-bayes", "lare-bayes-history", "dense", "rrdu", "episodic", "lare-rrdu"):
-        settings = {"method": method, **CHEETAH, "steps": 60_000, "evaluate_every": 5_000}
-        task = read_task("HalfCheetahThreshold-v4")
-        yield Row(task.name, method, task, settings, is_baseline=method == "lare-bayes")
+        yield Row(task.name, method, task, {"method": method, **settings}, is_baseline=method == "lare-bayes")
+    named = {"method": "lare-bayes", **settings}
+    yield Row(task.name, "lare-bayes, the event is a factor", task, named, function=load_terms())
 
 
 KINDS: dict[str, Callable[[], Iterator[Row]]] = {
@@ -185,7 +190,7 @@ def main(
         settings = lare_rl.Settings(**row.settings, seeds=seeds)
         job = Job(directory, row.task, settings, resolve(settings, row.task))
         if not job.started:
-            lare_rl.train(row.task, settings, out=directory)
+            lare_rl.train(row.task, settings, function=row.function, out=directory)
         elif not job.done:
             lare_rl.resume(directory)
         for measure, after in (("late", 0.75), ("area", 0.0)):
