@@ -98,7 +98,7 @@ class _RunSettings(CheckedModel, Generic[Undecided]):
 _HYPERPARAMETERS: dict[str, Any] = {name: (type(row.settings), row.settings) for name, row in ALGORITHMS.items()}
 
 
-class Settings(create_model("Settings", __base__=_RunSettings[None], __module__=__name__, **_HYPERPARAMETERS)):
+class Settings(create_model("_AlgorithmFields", __base__=_RunSettings[None], __module__=__name__, **_HYPERPARAMETERS)):
     """The settings of `lare-rl train` and `lare_rl.train`. If a setting is None, the task and the algorithm decide it.
 
     The hyperparameters of an algorithm have its name: `Settings(td3={"gamma": 0.98})` changes one, and keeps the others as published.

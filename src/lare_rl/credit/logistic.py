@@ -45,7 +45,7 @@ __all__ = [
 
 WINDOW = 512
 """The number of last episodes that are fitted."""
-TOLERANCE = 1e-3
+XI_TOLERANCE = 1e-3
 """The iteration ends when no log odds change by more than this."""
 
 
@@ -148,7 +148,7 @@ def fit(state: LogOddsFit, alpha_index: AlphaIndex, max_rounds: int | Int[Array,
         return n_rounds + 1, change, new_xi, posterior, root
 
     def is_unsettled(carry: _State) -> Bool[Array, ""]:
-        return (carry[0] < max_rounds) & (carry[1] > TOLERANCE)
+        return (carry[0] < max_rounds) & (carry[1] > XI_TOLERANCE)
 
     has_start = state.posterior.beta > 0
     start = state.posterior._replace(alpha=jnp.where(has_start, jnp.clip(state.posterior.alpha, *limits), equal_alpha))
