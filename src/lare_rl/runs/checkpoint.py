@@ -228,8 +228,9 @@ def _load_rows(learner: Any, directory: Path, row_files: list[_RowFile]) -> Any:
                 raise ValueError(f"{row_file.filename} does not fit")
             for env in np.ndindex(counts.shape):
                 # Earlier versions wrote files that are longer than the replay. Only their ends are in use.
-                rows = np.arange(starts[env], starts[env] + counts[env])[-capacity:]
-                buffer[(*env, rows % capacity)] = values[env][: counts[env]][-capacity:]
+                start, count = int(starts[env]), int(counts[env])
+                rows = np.arange(start, start + count)[-capacity:]
+                buffer[(*env, rows % capacity)] = values[env][:count][-capacity:]
         columns[name] = _put_like(column, buffer)
     return learner._replace(replay=learner.replay._replace(columns=columns))
 

@@ -31,6 +31,7 @@ from lare_rl.training.session import Session
 from lare_rl.training.static_config import TrainConfig, make_train_config
 from lare_rl.training.streams import seed_keys
 from lare_rl.util import compilation
+from lare_rl.util.npz import DAMAGED_FILE_ERRORS
 
 __all__ = ["restore_session", "resume", "start_session", "train"]
 
