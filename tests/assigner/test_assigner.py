@@ -388,12 +388,21 @@ STEPS = {name: ROWS[name] for name in ("observation", "action", "next_observatio
         (ROWS | {"valid": [True]}, r"valid .*\(1,\).* 2 steps"),
         (ROWS | {"env_ids": [0]}, "env_ids has 1 .* 2 steps"),
         (ROWS | {"env_ids": [0, 1], "lanes": [0, 1]}, "env_ids and lanes"),
-        (ROWS | {"alive": np.ones((2, 1))}, r"alive .*\(2, 1\)"),
+        (ROWS | {"env_ids": 3}, "env_ids is 3"),
+        (ROWS | {"env_ids": np.zeros((2, 1))}, "env_ids .*hashable"),
+        (ROWS | {"alive": np.ones((2, 1))}, "single agent.* alive"),
+        (ROWS | {"terminated": ["False", "False"]}, "terminated .*'False'.* numbers"),
+        (ROWS | {"truncated": [np.nan, 0.5]}, "truncated .*true or false"),
+        (ROWS | {"reward": [[1], [1, 2]]}, "reward .*numbers"),
+        (ROWS | {"reward": [0, 1e19]}, "reward of row 1 .*1e\\+19"),
         (ROWS | {"observation": [[0, 0], [0, np.nan]]}, "observation of row 1 .*nan in entry 1"),
         (ROWS | {"action": [[np.inf], [0]]}, "action of row 0 .*inf"),
         (ROWS | {"next_observation": [[0, 0], [0, 1e300]]}, "next_observation of row 1 .*inf"),
         (ROWS | {"reward": [0, -np.inf], "valid": [False, True]}, "reward of row 1 .*-inf"),
+        (STEPS | {"reward": None}, "reward is None"),
         (STEPS | {"reward": np.nan}, "score is nan"),
+        (STEPS | {"reward": 1e300}, "score is 1e\\+300"),
+        (STEPS | {"reward": [1e18, 1e18]}, "score is 2e\\+18"),
         (STEPS | {"reward": [0.0, np.inf]}, "reward of row 1 .*inf"),
         (STEPS | {"reward": 1.0, "next_observation": np.full((2, 2), np.nan)}, "next_observation of row 0 .*nan"),
         (STEPS | {"reward": [1.0]}, r"reward .*\(1,\).* 2 steps"),
@@ -647,7 +656,8 @@ def test_groups_that_do_not_fit_are_refused():
     with pytest.raises(LareError, match="None when it is paid"):
         credit.add(*episode, is_valid, ~is_valid, valid=is_valid, group=[None, "a", "b", "c", "d"])
     for group, message in (
-        ("abcde", "is one text"),
+        ("abcde", "give a list"),
+        (5, "give a list"),
         ([("a", 1)] * 5, "a text or a number"),
         (["a", None, None, None, None], "None when it is paid"),
     ):

@@ -1,12 +1,13 @@
 """The arrays that a `CreditAssigner` is given: they are checked, and become rows of numbers."""
 
-from collections.abc import Hashable, Sequence
+from collections.abc import Hashable, Iterable, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from lare_rl.assigner.assigner_config import AssignerConfig
+from lare_rl.assigner.space_layout import MAX_MAGNITUDE, to_array
 from lare_rl.envs.interface import alive_mean
 from lare_rl.errors import LareError, short_repr
 from lare_rl.tasks.payments import PaymentRule
@@ -21,12 +22,13 @@ __all__ = [
     "to_lengths",
     "to_levels",
     "to_rows",
+    "to_score",
     "to_step_ids",
 ]
 
 
 GroupName = str | int | float
-"""The name of a group."""
+"""What a group may be. It is the same again when it is read from a file."""
 
 
 class NewSteps(NamedTuple):
@@ -61,12 +63,11 @@ def read_steps(
     `arrays` are the steps as `to_rows` returns them.
     """
     n_rows = len(arrays[0])
-    team_reward, alive = _to_team_reward(config, reward, alive, n_rows)
+    alive = _to_alive(config, alive, n_rows)
+    team_reward = _to_team_reward(config, reward, alive, n_rows)
     ended = to_flags(terminated, "terminated", n_rows) | to_flags(truncated, "truncated", n_rows)
     rows = np.flatnonzero(np.ones(n_rows, bool) if valid is None else to_flags(valid, "valid", n_rows))
-    ids = range(n_rows) if env_ids is None else env_ids
-    if len(ids) != n_rows:
-        raise LareError(f"env_ids has {len(ids)} entries, but there are {n_rows} steps")
+    ids = range(n_rows) if env_ids is None else _to_env_ids(env_ids, n_rows)
     # Copies, because an environment may write its next step into the same memory.
     observation, action, next_observation = (array[rows] for array in arrays)
     new = NewSteps(
@@ -78,7 +79,7 @@ def read_steps(
         ended=ended[rows],
         alive=None if alive is None else alive[rows],
     )
-    _check_finite(rows, new.steps, new.reward)
+    _check_finite(new)
     return new
 
 
@@ -90,12 +91,12 @@ def read_episode(
     n_steps = len(arrays[0])
     if not n_steps:
         raise LareError("the episode has no step")
-    is_score, is_last = np.ndim(reward) == 0, np.arange(n_steps) == n_steps - 1
+    reward = to_array(reward, "reward")
+    is_score = reward.ndim == 0
     rewards = np.zeros(n_steps) if is_score else reward
-    new = read_steps(config, arrays, rewards, is_last, np.zeros(n_steps, bool), None, None, alive)
-    score = float(reward) if is_score else float(new.reward.sum())
-    if not np.isfinite(score):
-        raise LareError(f"the score is {score}: give a finite number")
+    ended = np.arange(n_steps) == n_steps - 1
+    new = read_steps(config, arrays, rewards, ended, np.zeros(n_steps, bool), None, None, alive)
+    score = to_score(reward if is_score else new.reward.sum(), "the score")
     if is_score:
         new.reward[-1] = score
     return new, config.payments.for_scores if is_score else config.payments
@@ -114,7 +115,8 @@ def to_rows(
     for name, values in rows.items():
         if values.shape[:-1] != (n_steps, *config.agent_axis):
             shape = ", ".join(["steps", *map(str, config.agent_axis), str(values.shape[-1])])
-            raise LareError(f"{name} has the shape {values.shape}: give it rows ({shape}), as many as the observations")
+            hint = "" if name == "observation" else ", with as many steps as observation"
+            raise LareError(f"{name} has the shape {values.shape}: give it the axes ({shape}){hint}")
     return rows["observation"], rows["action"], rows["next_observation"]
 
 
@@ -126,19 +128,14 @@ def to_levels(
     Raises `LareError` if there are too many groups, if they do not fit, or if a step that is paid has none. `group_names` is then
     unchanged.
     """
-    if (group is not None) != config.groups:
-        needs, has_none = (
-            "needs group: give group=, one for each row; or set groups=False, if your adapter has none",
-            "has no groups: leave group out, or set groups=True",
-        )
-        raise LareError(f"this assigner {needs if config.groups else has_none}")
+    if config.groups and group is None:
+        raise LareError("this assigner needs groups: give group=, or set groups=False, if your adapter has none")
+    if group is not None and not config.groups:
+        raise LareError("this assigner has no groups: leave group out, or set groups=True")
     if group is None:
         return np.zeros(len(new.rows), np.int32)
-    if isinstance(group, str):
-        raise LareError(f"group is one text, {short_repr(group)}: give a list with the group of each row")
-    if len(group) != new.n_rows:
-        raise LareError(f"group has {len(group)} entries, but there are {new.n_rows} steps")
-    names = [_to_group_name(group[row]) for row in new.rows.tolist()]
+    groups = _to_list(group, "group", new.n_rows)
+    names = [_to_group_name(groups[row]) for row in new.rows.tolist()]
     numbers = dict(group_names)
     for name in names:
         if name is not None:
@@ -160,33 +157,64 @@ def _to_group_name(value: Any) -> GroupName | None:
     return name
 
 
+def _to_list(values: Any, name: str, n_rows: int) -> list[Any]:
+    """Return one value for each row. Raise `LareError` if there are more or fewer, or no list."""
+    if isinstance(values, str) or not isinstance(values, Iterable):
+        raise LareError(f"{name} is {short_repr(values)}: give a list, with an entry for each row")
+    entries = list(values)
+    if len(entries) != n_rows:
+        raise LareError(f"{name} has {len(entries)} entries, but there are {n_rows} steps")
+    return entries
+
+
+def _to_env_ids(values: Any, n_rows: int) -> list[Hashable]:
+    """Return the environment of each row. Raise `LareError` for values that cannot be keys of a dictionary."""
+    # The hash of a tensor is its identity, and not its value.
+    ids = [entry.tolist() if hasattr(entry, "tolist") else entry for entry in _to_list(values, "env_ids", n_rows)]
+    if not all(isinstance(env_id, Hashable) for env_id in ids):
+        raise LareError(f"env_ids is {short_repr(values)}: give a hashable value for each row")
+    return ids
+
+
+def _to_alive(config: AssignerConfig, alive: Any, n_steps: int) -> Bool[np.ndarray, "n agents"] | None:
+    """Return which agents were alive, if that is given."""
+    if alive is None:
+        return None
+    if config.agents == 1:
+        raise LareError("this assigner has a single agent: leave alive out")
+    return to_flags(alive, "alive", n_steps, config.agents)
+
+
 def _to_team_reward(
-    config: AssignerConfig, reward: Any, alive: Any, n_steps: int
-) -> tuple[Float[np.ndarray, " n"], Bool[np.ndarray, "n agents"] | None]:
-    """Return the team's reward of each step, and which agents were alive, if that is given."""
-    reward = np.asarray(reward, np.float64)
-    mask = None if alive is None else np.asarray(alive, bool)
-    if mask is not None and (mask.shape != (n_steps, config.agents) or config.agents == 1):
-        raise LareError(f"alive has the shape {mask.shape}: give it ({n_steps}, agents), of more than one agent")
-    if config.agents > 1 and reward.shape == (n_steps, config.agents):
-        return alive_mean(reward, np.ones(reward.shape, bool) if mask is None else mask), mask
-    return _check_shape(reward, "reward", "number", n_steps), mask
+    config: AssignerConfig, reward: Any, alive: Bool[np.ndarray, "n agents"] | None, n_steps: int
+) -> Float[np.ndarray, " n"]:
+    """Return the team's reward of each step."""
+    rewards = to_array(reward, "reward").astype(np.float64)
+    if config.agents == 1:
+        return _check_shape(rewards, "reward", "number", n_steps)
+    if rewards.shape == (n_steps, config.agents):
+        return alive_mean(rewards, np.ones(rewards.shape, bool) if alive is None else alive)
+    return _check_shape(rewards, "reward", "number, or one for each agent,", n_steps)
 
 
-def _check_shape(values: np.ndarray, name: str, noun: str, n_rows: int) -> np.ndarray:
-    if values.shape != (n_rows,):
-        raise LareError(f"{name} has the shape {values.shape}: give one {noun} for each of {n_rows} steps")
+def _check_shape(values: np.ndarray, name: str, noun: str, *shape: int) -> np.ndarray:
+    if values.shape != shape:
+        counts = " and ".join(f"{n} {axis}" for n, axis in zip(shape, ("steps", "agents"), strict=False))
+        raise LareError(f"{name} has the shape {values.shape}: give one {noun} for each of {counts}")
     return values
 
 
-def to_flags(values: Any, name: str, n_rows: int) -> Bool[np.ndarray, " steps"]:
-    """Return one flag for each row. Raises `LareError` if there are more or fewer."""
-    return _check_shape(np.asarray(values, bool), name, "flag", n_rows)
+def to_flags(values: Any, name: str, *shape: int) -> Bool[np.ndarray, "*shape"]:
+    """Return flags, of a shape (steps,) or (steps, agents). Raises `LareError` if they do not fit, or are not true or false."""
+    flags = _check_shape(to_array(values, name), name, "flag", *shape)
+    if not np.isin(flags, (0, 1)).all():
+        raise LareError(f"{name} must be true or false, and is {short_repr(values)}")
+    return flags.astype(bool)
 
 
 def to_lengths(values: Any, n_rows: int) -> Int[np.ndarray, " steps"]:
     """Return the length of each row's episode. Raises `LareError` if there are more or fewer, or for one that is no length."""
-    lengths = _check_shape(np.asarray(values, np.float64), "length", "number", n_rows)
+    lengths = _check_shape(to_array(values, "length").astype(np.float64), "length", "number", n_rows)
     wrong = np.flatnonzero(~((lengths >= 1) & (lengths < 2**31)) | (lengths != np.floor(lengths)))
     if len(wrong):
         raise LareError(f"length of row {wrong[0]} is {lengths[wrong[0]]:g}: give the number of steps of its episode")
@@ -195,20 +223,27 @@ def to_lengths(values: Any, n_rows: int) -> Int[np.ndarray, " steps"]:
 
 def to_step_ids(steps: Any) -> Int[np.ndarray, "*shape"]:
     """Return numbers of steps as an array. Raises `LareError` for anything else."""
-    try:
-        step_ids = np.asarray(steps)
-    except ValueError:  # lists of different lengths
-        step_ids = np.array("")
+    step_ids = to_array(steps, "steps")
     if step_ids.size and (step_ids.dtype.kind not in "iu" or step_ids.min() < -1):
         raise LareError(f"steps are {short_repr(steps)}: give numbers that `add` has returned, or -1")
     return step_ids.astype(np.int64)
 
 
-def _check_finite(rows: np.ndarray, steps: Sequence[np.ndarray], reward: np.ndarray) -> None:
-    """Raise `LareError` for the first number that is not finite. `rows` are the indices of the rows in the user's arrays."""
+def to_score(score: Any, name: str) -> float:
+    """Return a score as a number. Raises `LareError` if it is none, or not finite, or too large."""
+    number = to_array(score, name)
+    if number.size != 1 or not abs(number.item()) <= MAX_MAGNITUDE:  # true for NaN
+        raise LareError(f"{name} is {short_repr(number.tolist())}: give a finite number, at most {MAX_MAGNITUDE:g}")
+    return float(number.item())
+
+
+def _check_finite(new: NewSteps) -> None:
+    """Raise `LareError` for the first number that is not finite, or too large."""
     names = ("observation", "action", "next_observation", "reward")
-    for name, values in zip(names, (*steps, reward), strict=True):
-        if not np.isfinite(values).all():
-            index = np.argwhere(~np.isfinite(values))[0]
+    for name, values in zip(names, (*new.steps, new.reward), strict=True):
+        is_wrong = ~(np.abs(values) <= MAX_MAGNITUDE)  # true for NaN
+        if is_wrong.any():
+            index = np.argwhere(is_wrong)[0]
             entry = f" in entry {', '.join(map(str, index[1:]))}" if len(index) > 1 else ""
-            raise LareError(f"{name} of row {rows[index[0]]} has {values[tuple(index)]}{entry}: give finite numbers")
+            number = f"{name} of row {new.rows[index[0]]} has {values[tuple(index)]}{entry}"
+            raise LareError(f"{number}: give finite numbers, at most {MAX_MAGNITUDE:g}")

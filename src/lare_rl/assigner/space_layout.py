@@ -10,7 +10,10 @@ from pydantic import AliasChoices, Field
 
 from lare_rl.errors import CheckedModel, LareError, short_repr
 
-__all__ = ["SpaceLayout", "make_layout"]
+__all__ = ["MAX_MAGNITUDE", "SpaceLayout", "make_layout", "to_array"]
+
+MAX_MAGNITUDE = 1e18
+"""The largest absolute value of a number. Squares of numbers are summed in float32."""
 
 Kind = Literal["numbers", "choices", "named", "in a row"]
 
@@ -53,7 +56,7 @@ class SpaceLayout(CheckedModel):
             return self._concatenate([values[key] for key in self.names], name)
         if self.kind == "in a row" and isinstance(values, tuple | list) and len(values) == len(self.inner):
             return self._concatenate(values, name)
-        array = _to_array(values, name)
+        array = to_array(values, name)
         if self.kind == "choices":
             return self._one_hot(array, name)
         lead = array.shape[: array.ndim - len(self.shape)]
@@ -99,8 +102,8 @@ class SpaceLayout(CheckedModel):
         return _to_float32(array)
 
 
-def _to_array(values: Any, name: str) -> Shaped[np.ndarray, "*shape"]:
-    """Return numbers as an array. Raise `LareError` if the values are not numbers."""
+def to_array(values: Any, name: str) -> Shaped[np.ndarray, "*shape"]:
+    """Return numbers as an array. Raises `LareError` if the values are not numbers."""
     try:
         array = np.asarray(values)
     except (TypeError, ValueError, RuntimeError):  # unequal lengths; objects that do not convert

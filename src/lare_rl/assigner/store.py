@@ -14,6 +14,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from lare_rl.assigner.arguments import to_score
 from lare_rl.errors import LareError
 from lare_rl.tasks.payments import PAID_AT_END, PaymentRule, is_paid
 
@@ -198,8 +199,7 @@ class Store:
                 f"no episode is running in the environment {env_id!r}: it has ended, or is older than "
                 f"{self.capacity} steps (capacity)"
             )
-        if score is not None and not np.isfinite(score):
-            raise LareError(f"the score of the environment {env_id!r} is {score}: give a finite number")
+        score = None if score is None else to_score(score, f"the score of the environment {env_id!r}")
         if self.has_levels and self.running[env_id].level < 0:
             raise LareError(f"the episode of the environment {env_id!r} has no group: give group= at a step of it")
         episode = self.running.pop(env_id)
@@ -208,7 +208,7 @@ class Store:
             raise LareError(
                 f"the last step of the environment {env_id!r} was paid already: end the episode with this step"
             )
-        return self._pay(episode, episode.return_ if score is None else float(score), self.payments.window)
+        return self._pay(episode, episode.return_ if score is None else score, self.payments.window)
 
     def _pay(self, episode: RunningEpisode, return_: float, window: int | None) -> StoredEpisode:
         """Store the steps that a payment is for: the last `window` ones, or all since the last payment. Raises `LareError` like `end`."""

@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from lare_rl.assigner.space_layout import SpaceLayout
+from lare_rl.assigner.space_layout import MAX_MAGNITUDE, SpaceLayout
 from lare_rl.errors import LareError, short_repr
 from lare_rl.tasks.spec import TaskSpec
 
@@ -19,8 +19,6 @@ KEYS = (
     *("terminations", "truncations", "cut", "paid", "group"),
 )
 """The arrays of an episode that are read. The key `paid` has the rewards before the log was relabelled."""
-MAX_MAGNITUDE = 1e18
-"""The largest absolute value of a number in a log. Squares of numbers are summed in float32."""
 
 
 @dataclass(frozen=True)

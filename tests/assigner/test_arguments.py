@@ -1,0 +1,42 @@
+"""The arguments of `CreditAssigner.add`: what they become, and messages for teams."""
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from helpers.assigner_episodes import small_assigner
+from lare_rl.assigner.arguments import read_steps
+from lare_rl.errors import LareError
+
+
+def read(reward, *, agents=None, env_ids=None, alive=None):
+    axes = (2,) if agents is None else (2, agents)
+    config = small_assigner(agents=agents or 1, max_steps=5).config
+    arrays = np.zeros((*axes, 2)), np.zeros((*axes, 1)), np.zeros((*axes, 2))
+    return read_steps(config, arrays, reward, [False, True], [0, 0], env_ids, None, alive)
+
+
+@pytest.mark.parametrize("env_ids", [jnp.arange(2), [np.array(0), np.array(1)], iter([0, 1])])
+def test_environments_are_read_by_value(env_ids):
+    assert read([1, 2], env_ids=env_ids).env_ids == [0, 1]
+
+
+def test_team_reward_is_the_mean_over_the_agents_alive():
+    rewards = [[1.0, 3.0], [5.0, 7.0]]
+    assert read(rewards, agents=2).reward.tolist() == [2.0, 6.0]
+    assert read(rewards, agents=2, alive=[[1, 0], [0, 1]]).reward.tolist() == [1.0, 7.0]
+    assert read([2.0, 6.0], agents=2).reward.tolist() == [2.0, 6.0]
+
+
+@pytest.mark.parametrize(
+    ("reward", "alive", "message"),
+    [
+        (np.zeros((2, 3)), None, r"reward .*\(2, 3\).* each agent.* 2 steps"),
+        (np.zeros(2), np.ones(2), r"alive .*\(2,\).* 2 steps and 2 agents"),
+        (np.zeros(2), [[1], [1, 0]], "alive .*numbers"),
+        (np.zeros(2), [[1, 2], [1, 0]], "alive .*true or false"),
+    ],
+)
+def test_team_arguments_are_refused(reward, alive, message):
+    with pytest.raises(LareError, match=message):
+        read(reward, agents=2, alive=alive)
