@@ -17,7 +17,7 @@ from lare_rl.logs.open_log import open_log
 
 
 def test_round_trip_keeps_other_arrays(folder, tmp_path):
-    """`file` and `name` are arguments of NumPy's functions."""
+    """`name` is an argument of a function of NumPy (`util/files.py`)."""
     extra = {"infos/qpos": np.ones((2, 2)), "name": np.array("a walk")}
     path = folder(episode | extra for episode in logged_episodes(3))
     write_rewards_plus_one(path, tmp_path / "new")
@@ -71,6 +71,11 @@ def test_flat_arrays_of_d4rl(tmp_path):
         ({"next_observations": None}, "next_observations is missing"),
         ({"terminations": None}, "terminations or truncations"),
         ({"rewards": np.zeros(3)}, r"rewards must have 4 rows.*\(3,\)"),
+        ({"rewards": [[1], [1, 2], [3], [4]]}, "rewards .*one shape"),
+        ({"infos": [[1], [1, 2], [3], [4]]}, "infos .*one shape"),
+        ({"terminals": np.zeros(4)}, "terminals and terminations"),
+        ({"terminations": ["a"] * 4}, "terminations .*numbers"),
+        ({"actions": np.zeros((0, 1))}, "no step"),
     ],
 )
 def test_bad_flat_arrays(changes, message):
@@ -78,6 +83,29 @@ def test_bad_flat_arrays(changes, message):
     arrays |= {"rewards": np.zeros(4), "terminations": np.zeros(4, bool)} | changes
     with pytest.raises(LareError, match=message):
         open_log({key: value for key, value in arrays.items() if value is not None})
+
+
+def test_flags_may_have_an_axis():
+    arrays = {key: np.zeros((4, 1)) for key in ("observations", "next_observations", "actions")}
+    log = open_log(arrays | {"rewards": np.zeros(4), "terminals": np.array([[0], [1], [0], [0]])})
+    assert [(len(episode), episode.complete) for episode in log.episodes()] == [(2, True), (2, False)]
+
+
+@pytest.mark.parametrize("infos", [[{}, {}], None, [[1], [1, 2]]])
+def test_objects_are_refused_before_the_fit(infos, tmp_path):
+    log = open_log([episode | {"infos": infos} for episode in logged_episodes(2)])
+    assert len(list(log.episodes())) == 2
+    with pytest.raises(LareError, match=r"episode 0: infos .*leave it out"):
+        log.check_output(tmp_path / "new", False)
+
+
+def test_compressed_episodes_have_a_largest_size(folder, tmp_path, monkeypatch):
+    path = folder([])
+    np.savez_compressed(path / "0.npz", **next(iter(logged_episodes(1))))
+    assert len(list(open_log(path).episodes())) == 1
+    monkeypatch.setattr("lare_rl.logs.arrays.MAX_EPISODE_BYTES", 100)
+    with pytest.raises(LareError, match=r"0\.npz .*GiB"):
+        open_log(path)
 
 
 def test_failed_output_is_undone(tmp_path):

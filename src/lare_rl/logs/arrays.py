@@ -6,16 +6,20 @@ from typing import Any
 
 import numpy as np
 
+from lare_rl.assigner.space_layout import to_array
 from lare_rl.errors import LareError, short_repr
 from lare_rl.logs.episode import KEYS, RelabelledEpisode
 from lare_rl.logs.log import Log, atomic_output
 from lare_rl.tasks.spec import TaskSpec
 from lare_rl.util.files import write_npz
+from lare_rl.util.npz import open_npz
 
 __all__ = ["FlatLog", "ListLog", "NpzLog", "read_npz"]
 
 D4RL_NAMES = {"terminals": "terminations", "timeouts": "truncations"}
 """Names of flags in D4RL's data sets, and the names here."""
+MAX_EPISODE_BYTES = 8 << 30
+"""The largest size of an episode in memory. A few compressed bytes can unpack to gigabytes."""
 
 
 class ArrayLog(Log):
@@ -57,8 +61,8 @@ class NpzLog(ArrayLog):
 def read_npz(file: Path) -> dict[str, np.ndarray]:
     """Read the arrays of a file, without unpickling anything. Raises `LareError` if the file is damaged."""
     try:
-        with file.open("rb") as stream, np.load(stream, allow_pickle=False) as archive:
-            return {key: archive[key] for key in archive.files}
+        with open_npz(file, MAX_EPISODE_BYTES) as arrays:
+            return {key: arrays[key] for key in arrays.files}
     except Exception as error:  # NumPy and zipfile may raise anything for an untrusted file
         raise LareError(f"{file} is not an .npz file, or damaged: {short_repr(error)}") from error
 
@@ -71,39 +75,71 @@ class ListLog(ArrayLog):
     def __init__(self, episodes: Iterable[Any], role: TaskSpec | None):
         if iter(episodes) is episodes:
             raise LareError("a log is read twice: give a list, or an object whose __iter__ starts again")
-        self.list = episodes
+        self.mappings = episodes
         self.n_episodes = len(episodes) if hasattr(episodes, "__len__") else None  # pyright: ignore[reportArgumentType]
         self.layout = self.infer_layout(role)
 
     def read(self) -> Iterator[tuple[str, Mapping[str, Any], Mapping[str, Any]]]:
-        for number, arrays in enumerate(self.list):
+        for number, arrays in enumerate(self.mappings):
             if not isinstance(arrays, Mapping):
                 raise LareError(f"episode {number} must be a mapping of arrays, and is {short_repr(arrays)}")
             yield f"episode {number}", arrays, arrays
+
+    def check_output(self, out: str | Path, overwrite: bool) -> None:
+        """Raise `LareError` if `out` cannot be written, or if an array cannot be saved."""
+        super().check_output(out, overwrite)
+        for name, arrays, _ in self.read():
+            for key, value in arrays.items():
+                if _has_objects(value):
+                    raise LareError(
+                        f"{name}: {key} is no array of numbers or texts, but {short_repr(value)}: leave it out"
+                    )
+
+
+def _has_objects(value: Any) -> bool:
+    try:
+        return np.asarray(value).dtype.hasobject
+    except (TypeError, ValueError, RuntimeError):  # unequal lengths; objects that do not convert
+        return True
 
 
 class FlatLog(ListLog):
     """Arrays of all steps. A flag marks the end of an episode. Steps after the last flag are an episode that was cut."""
 
+    name = "the flat arrays"
+
     def __init__(self, arrays: Mapping[str, Any], role: TaskSpec | None):
-        flat = {D4RL_NAMES.get(key, key): np.asarray(value) for key, value in arrays.items()}
+        both = [key for key, name in D4RL_NAMES.items() if key in arrays and name in arrays]
+        if both:
+            raise LareError(f"flat arrays have {both[0]} and {D4RL_NAMES[both[0]]}: leave one of them out")
+        flat = {D4RL_NAMES.get(key, key): _read_flat(key, value) for key, value in arrays.items()}
         missing = [key for key in ("observations", "next_observations", "actions", "rewards") if key not in flat]
         if missing:
             raise LareError(
                 f"flat arrays need observations, next_observations, actions and rewards: {missing[0]} is missing"
             )
-        flags = [flat[key] for key in D4RL_NAMES.values() if key in flat]
+        flags = {key: to_array(flat[key], key).ravel() for key in D4RL_NAMES.values() if key in flat}  # (n, 1) too
         if not flags:
             raise LareError("flat arrays need terminations or truncations, which mark the ends of episodes")
+        flat |= flags
         n_steps = len(np.atleast_1d(flat["actions"]))
+        if not n_steps:
+            raise LareError("flat arrays have no step")
         # Arrays without a row for each step (D4RL's metadata) belong to no episode.
         flat = {key: value for key, value in flat.items() if key in KEYS or np.shape(value)[:1] == (n_steps,)}
         for key, value in flat.items():
             if np.shape(value)[:1] != (n_steps,):
                 raise LareError(f"{key} must have {n_steps} rows, as many as actions: its shape is {np.shape(value)}")
-        is_end = np.any([array.astype(bool).reshape(n_steps, -1).any(axis=1) for array in flags], axis=0)
-        is_end[-1:] = True
+        is_end = np.any([array.astype(bool) for array in flags.values()], axis=0)
+        is_end[-1] = True
         super().__init__(_FlatEpisodes(flat, np.flatnonzero(is_end) + 1), role)
+
+
+def _read_flat(key: str, value: Any) -> np.ndarray:
+    try:
+        return np.asarray(value)
+    except ValueError:
+        raise LareError(f"{key} is {short_repr(value)}: its rows must have one shape") from None
 
 
 class _FlatEpisodes:

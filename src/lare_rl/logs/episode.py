@@ -1,6 +1,5 @@
 """One episode of a log. No log is trusted: a value that does not fit raises a `LareError` that names the file and the key."""
 
-import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple
@@ -8,7 +7,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from lare_rl.assigner.space_layout import MAX_MAGNITUDE, SpaceLayout
+from lare_rl.assigner.space_layout import MAX_MAGNITUDE, SpaceLayout, to_array
 from lare_rl.errors import LareError, short_repr
 from lare_rl.tasks.spec import TaskSpec
 
@@ -76,7 +75,7 @@ def infer_layout(name: str, values: Mapping[str, Any], role: TaskSpec | None) ->
     sizes = {} if role is None else {"observation": role.observation_size, "action": role.action_size}
     layouts = {}
     for kind in ("observation", "action"):
-        array = np.asarray(values.get(f"{kind}s", np.zeros((0, 0))))
+        array = to_array(values.get(f"{kind}s", np.zeros((0, 0))), f"{name}: {kind}s")
         is_discrete = array.dtype.kind in "iu" and array.ndim == 1
         if is_discrete and kind not in sizes:
             raise LareError(
@@ -141,28 +140,28 @@ def parse_episode(name: str, values: Mapping[str, Any], layout: LogLayout, conte
 
 def _rows(where: str, values: Any, layout: SpaceLayout) -> Float[np.ndarray, "steps size"]:
     for leaf in _leaves(values):
-        _check_numbers(where, leaf)
+        _to_numbers(where, leaf)
     rows = layout.rows(values, where)
     if rows.ndim != 2:
         raise LareError(f"{where} must have rows of {layout.size} numbers, and its shape is {rows.shape}")
     return rows
 
 
-def _leaves(values: Any) -> list[np.ndarray]:
+def _leaves(values: Any) -> list[Any]:
     """Return the arrays of a nested observation."""
     if isinstance(values, dict | tuple):
         children = values.values() if isinstance(values, dict) else values
         return [leaf for child in children for leaf in _leaves(child)]
-    return [np.asarray(values)]
+    return [values]
 
 
-def _check_numbers(where: str, array: np.ndarray) -> None:
-    if array.dtype.kind not in "biuf":
-        raise LareError(f"{where} must be numbers, and has the type {array.dtype}")
+def _to_numbers(where: str, values: Any) -> np.ndarray:
+    array = to_array(values, where)
     with np.errstate(all="ignore"):
         in_range = not array.size or np.abs(array.astype(np.float64)).max() <= MAX_MAGNITUDE  # false for NaN
     if not in_range:
         raise LareError(f"{where} has a number that is not finite, or larger than {MAX_MAGNITUDE:g}")
+    return array
 
 
 def _original_reward(name: str, values: Mapping[str, Any], n_steps: int) -> Float[np.ndarray, " steps"]:
@@ -170,14 +169,14 @@ def _original_reward(name: str, values: Mapping[str, Any], n_steps: int) -> Floa
     key = next((key for key in ("paid", "score", "rewards") if key in values), None)
     if key is None:
         raise LareError(f"{name} has no rewards and no score: an episode needs observations, actions, and one of these")
-    where, reward = f"{name}: {key}", np.asarray(values[key])
-    _check_numbers(where, reward)
+    where = f"{name}: {key}"
+    reward = _to_numbers(where, values[key])
     shape = () if key == "score" else (n_steps,)
     if reward.shape != shape:
         expected = f"have one number for each of {n_steps} steps" if shape else "be a single number"
         raise LareError(f"{where} must {expected}, and its shape is {reward.shape}")
     reward = reward.astype(np.float64)
-    _check_numbers(where, np.asarray(np.abs(reward).sum()))
+    _to_numbers(where, np.abs(reward).sum())
     return reward if shape else np.append(np.zeros(n_steps - 1), reward)
 
 
@@ -185,13 +184,11 @@ def _group(name: str, values: Mapping[str, Any], n_steps: int) -> str | int | fl
     """Return the group of an episode. If there is one for each step, it is that of the last step."""
     if "group" not in values:
         return None
-    groups = np.asarray(values["group"])
-    if groups.shape not in ((), (1,), (n_steps,)) or groups.dtype.kind not in "biufUO":
-        raise LareError(f"{name}: group must be a text or a number, and is {short_repr(values['group'])}")
-    group = np.atleast_1d(groups)[-1]
+    groups = np.asarray(values["group"], object)
+    group = groups.ravel()[-1] if groups.shape in ((), (1,), (n_steps,)) else None
     group = group.item() if isinstance(group, np.generic) else group
-    if not isinstance(group, str | int | float) or math.isnan(group if not isinstance(group, str) else 0):
-        raise LareError(f"{name}: group must be a text or a number, and is {short_repr(group)}")
+    if not isinstance(group, str | int | float) or group != group:  # NaN
+        raise LareError(f"{name}: group must be a text or a number, and is {short_repr(values['group'])}")
     return group
 
 
@@ -212,8 +209,8 @@ def _last_flag(name: str, key: str, values: Mapping[str, Any], n_steps: int) -> 
     """Return the flag of the last step, or None without flags. `cut` is true if any of its flags is."""
     if key not in values:
         return None
-    flags = np.asarray(values[key])
-    if flags.dtype.kind not in "biuf" or not np.isin(flags, (0, 1)).all():
+    flags = to_array(values[key], f"{name}: {key}")
+    if not np.isin(flags, (0, 1)).all():
         raise LareError(f"{name}: {key} must be true or false, and is {short_repr(flags)}")
     if flags.shape not in ((), (1,), (n_steps,)):
         raise LareError(f"{name}: {key} must have one flag for each of {n_steps} steps, and its shape is {flags.shape}")

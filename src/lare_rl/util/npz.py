@@ -23,20 +23,26 @@ _ENCRYPTED = 1  # a flag of an entry
 
 
 @contextlib.contextmanager
-def open_npz(path: Path) -> Iterator[np.lib.npyio.NpzFile]:
+def open_npz(path: Path, max_bytes: int | None = None) -> Iterator[np.lib.npyio.NpzFile]:
     """Open the arrays of a file. A damaged file is closed too, unlike by `numpy.load` alone.
 
-    Raises `ValueError` if they are compressed, or one of the other `DAMAGED_FILE_ERRORS`.
+    Compressed arrays are only read with `max_bytes`, the largest size of all arrays in memory.
+
+    Raises `ValueError` if they are compressed or too large, or one of the other `DAMAGED_FILE_ERRORS`.
     """
     with path.open("rb") as file:
         if not zipfile.is_zipfile(file):
             raise ValueError("it is no .npz file, or not whole")
         file.seek(0)
         with np.load(file, allow_pickle=False) as arrays:
-            for entry in arrays.zip.infolist():
+            entries = arrays.zip.infolist()
+            for entry in entries:
                 # A few compressed bytes can unpack to gigabytes.
-                if entry.compress_type != zipfile.ZIP_STORED or entry.flag_bits & _ENCRYPTED:
+                is_compressed = max_bytes is None and entry.compress_type != zipfile.ZIP_STORED
+                if is_compressed or entry.flag_bits & _ENCRYPTED:
                     raise ValueError(f"{entry.filename} is compressed or encrypted, and LaRe writes no such arrays")
+            if max_bytes is not None and sum(entry.file_size for entry in entries) > max_bytes:
+                raise ValueError(f"its arrays have more than {max_bytes / 2**30:.3g} GiB")
             yield arrays
 
 
