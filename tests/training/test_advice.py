@@ -15,13 +15,13 @@ from lare_rl.runs.metric_names import RETURN, RETURN_STD
 from lare_rl.training.advice import (
     MESSAGES,
     find_constant_returns,
+    find_equal_returns,
     find_large_observations,
     find_saturated_policies,
     find_slow_evaluations,
     find_untrained,
 )
 from lare_rl.training.evaluation import greedy_actions, saturation
-from lare_rl.training.loop import _final_findings
 from lare_rl.training.policy import get_actor
 from lare_rl.training.saved_state import load_learner
 from lare_rl.util.findings import render
@@ -86,8 +86,7 @@ def test_equal_returns(values, is_found, tmp_path):
     run = Run(tmp_path, make_config(toy_spec(), settings, ()), ())
     lines = [{"step": k, "seed": 0, RETURN: return_, RETURN_STD: std} for k, (return_, std) in enumerate(values)]
     (tmp_path / "metrics.jsonl").write_text("".join(json.dumps(line) + "\n" for line in lines))
-    codes = [finding.code for finding in _final_findings(run, lines)]
-    assert ("equal returns" in codes) == is_found
+    assert [finding.code for finding in find_equal_returns(run)] == ["equal returns"] * is_found
 
 
 STUCK = np.full((1, 4, 2), [[1.0, -0.995]])

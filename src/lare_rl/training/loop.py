@@ -8,7 +8,6 @@ from typing import Any
 
 import numpy as np
 
-from lare_rl.config.effective import warmup_warning
 from lare_rl.errors import LareError
 from lare_rl.runs.directory import Run
 from lare_rl.runs.metric_names import ACTOR_SATURATION, RETURN
@@ -31,7 +30,7 @@ PROGRESS_S = 1.0
 
 
 class RunInterruptedError(LareError):
-    """The user stopped a run. It was saved."""
+    """The user stopped a run, which can be continued from its last checkpoint."""
 
     status = 130
 
@@ -75,6 +74,7 @@ def run_session(session: Session, listeners: Sequence[Listener], stop: threading
         rate = (session.step - rated_step) / max(began_at - rated_at, 1e-9)
         rated_step, rated_at = session.step, began_at
         lines = session.evaluate(rate)
+        evaluation_s = time.monotonic() - began_at
         _check_losses(session)
         session.metrics_bytes = append_metrics(run.directory, lines)
         session.save()
@@ -86,7 +86,7 @@ def run_session(session: Session, listeners: Sequence[Listener], stop: threading
             returns.append(np.array([line[RETURN] for line in lines]))
             report(advice.find_constant_returns(returns))
         if len(evaluated_at) == 2:  # the first one compiles the policy
-            report(advice.find_slow_evaluations(settings, saved_at - began_at, saved_at - evaluated_at[0]))
+            report(advice.find_slow_evaluations(settings, evaluation_s, saved_at - evaluated_at[0]))
         if session.step >= settings.warmup and (is_last or not explained):
             sentences = describe_returns(run, session.learner, session.config, legend=not explained)
             say(sentences)
@@ -118,7 +118,7 @@ def _advance(session: Session, until: int, stop: threading.Event) -> None:
     try:
         session.advance(until)
     except FirstFitStoppedError:
-        raise RunInterruptedError(f"stopped during the decoder's first fit; {hint}") from None
+        raise RunInterruptedError(f"stopped during the decoder's first fit, of which nothing is kept; {hint}") from None
 
 
 def _save(session: Session) -> None:
@@ -131,7 +131,7 @@ def _final_findings(run: Run, lines: Sequence[dict[str, Any]]) -> list[Finding]:
     if ACTOR_SATURATION in lines[0]:
         findings = advice.find_saturated_policies([line[ACTOR_SATURATION] for line in lines], run.seeds) + findings
     untrained = advice.find_untrained(run)
-    if untrained is not None and warmup_warning(run.config.settings) is None:  # that warning was the first message
+    if untrained is not None and untrained.code != "all steps random":  # that was the first message
         findings.append(untrained)
     return findings
 

@@ -1,7 +1,8 @@
 """Trains a run from its start, or from its last checkpoint, to its end."""
 
+import contextlib
 import threading
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -79,9 +80,9 @@ def train(
     messages += _describe_rounding(resolved, steps=settings.steps, evaluate_every=settings.evaluate_every)
     with lock_run(run), report_full_memory(run), catch_stop_signals() as stop:
         _prepare(run, listeners)
-        session = start_session(run)
-        session.save()  # so that there is always a checkpoint
-        return _finish(session, tensorboard, listeners, stop, messages)
+        with _closing(start_session(run)) as session:
+            session.save()  # so that there is always a checkpoint
+            return _finish(session, tensorboard, listeners, stop, messages)
 
 
 def resume(
@@ -116,14 +117,15 @@ def resume(
         if not run.has_checkpoint() and run.metrics():  # metrics are never removed
             raise LareError(f"{run.directory} has no checkpoint any more: it cannot be resumed")
         _prepare(run, listeners)
-        if run.has_checkpoint():
-            session, restored = restore_session(run)
-            truncate_metrics(run.directory, session.metrics_bytes)
+        is_new = not run.has_checkpoint()
+        session, restored = (start_session(run), []) if is_new else restore_session(run)
+        with _closing(session):
+            if is_new:
+                session.save()
+            else:
+                truncate_metrics(run.directory, session.metrics_bytes)
             messages += [*restored, *_describe_annealing(session, earlier_steps)]
-        else:
-            session = start_session(run)
-            session.save()
-        return _finish(session, tensorboard, listeners, stop, messages)
+            return _finish(session, tensorboard, listeners, stop, messages)
 
 
 def _describe_rounding(resolved: ResolvedSettings, **requested: int | None) -> list[str]:
@@ -186,8 +188,10 @@ def restore_session(run: Run) -> tuple[Session, list[str]]:
     session = _make_session(run, config, learner)
     try:
         return session, session.restore(metadata, arrays)
-    except DAMAGED_FILE_ERRORS as error:
+    except BaseException as error:
         session.close()
+        if not isinstance(error, DAMAGED_FILE_ERRORS):
+            raise
         raise LareError(
             f"the checkpoint in {run.checkpoint} does not fit its environments ({type(error).__name__}: {error}): start a new run, or "
             "install the version that the run names"
@@ -214,25 +218,33 @@ def _make_session(run: Run, config: TrainConfig, learner: Learner | None) -> Ses
     return session
 
 
+@contextlib.contextmanager
+def _closing(session: Session) -> Iterator[Session]:
+    """Close a session at the end, also after an error."""
+    try:
+        yield session
+    finally:
+        try:
+            session.close()
+        finally:
+            close_idle_workers()
+
+
 def _finish(
     session: Session, tensorboard: bool, listeners: list[Listener], stop: threading.Event, messages: Sequence[str]
 ) -> Run:
-    """Run a session to its end, and close it."""
+    """Run a session to its end. Every listener that was started is stopped, also after an error."""
     run = session.run
-    try:
-        if tensorboard:
-            listeners.append(TensorBoard(run.directory / EVENTS_DIRECTORY, session.step, run.seeds))
+    if tensorboard:
+        listeners.append(TensorBoard(run.directory / EVENTS_DIRECTORY, session.step, run.seeds))
+    with contextlib.ExitStack() as started:
         for listener in listeners:
+            started.callback(listener.on_stop)
             for message in (*messages, *_introduction(session)):
                 listener.on_message(message)
             name = f"{run.config.task.name} {session.settings.method}"
             listener.on_start(name, session.step, session.settings.steps)
         run_session(session, listeners, stop)
-    finally:
-        for listener in listeners:
-            listener.on_stop()
-        session.close()
-        close_idle_workers()
     return run
 
 

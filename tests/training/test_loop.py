@@ -1,0 +1,121 @@
+"""The outer loop, with a session that does nothing: what it reports, and what is closed after an error."""
+
+import threading
+import time
+import types
+
+import numpy as np
+import pytest
+
+from lare_rl.errors import LareError
+from lare_rl.training import advice, loop
+from lare_rl.training import train as training
+from lare_rl.training.decoder_fits import FirstFitStoppedError
+from lare_rl.training.progress import Listener
+
+SETTINGS = types.SimpleNamespace(
+    method="dense", algorithm="td3", steps=30, evaluate_every=10, warmup=0, evaluation_episodes=3
+)
+RUN = types.SimpleNamespace(
+    seeds=[0],
+    directory="run",
+    checkpoint="run/checkpoint",
+    config=types.SimpleNamespace(task=types.SimpleNamespace(name="task")),
+)
+
+
+class EmptySession:
+    run, settings, config, learner = RUN, SETTINGS, None, types.SimpleNamespace(replay=None)
+    step = metrics_bytes = 0
+    evaluation_s = save_s = 0.0
+    is_closed = False
+
+    def __init__(self, **attributes):
+        self.latest_metrics = {}
+        vars(self).update(attributes)
+
+    def watch(self, on_step, stop_requested):
+        pass
+
+    def advance(self, until):
+        self.step = until
+
+    def evaluate(self, rate):
+        time.sleep(self.evaluation_s)
+        return [{"step": self.step, "seed": 0, "evaluation/return": 1.0}]
+
+    def save(self):
+        time.sleep(self.save_s)
+
+    def close(self):
+        self.is_closed = True
+
+
+class Recorder(Listener):
+    def __init__(self, fails=False):
+        self.messages, self.fails, self.n_stops = [], fails, 0
+
+    def on_message(self, message):
+        self.messages.append(message)
+
+    def on_stop(self):
+        self.n_stops += 1
+        if self.fails:
+            raise OSError("disk full")
+
+
+@pytest.fixture(autouse=True)
+def no_files(monkeypatch):
+    for name in ("append_metrics", "first_shard", "describe_returns", "_final_findings"):
+        monkeypatch.setattr(loop, name, lambda *args, **options: [])
+    monkeypatch.setattr(advice, "find_large_observations", lambda *args: [])
+    monkeypatch.setattr(training, "_introduction", lambda session: [])
+
+
+@pytest.mark.parametrize(("seconds", "is_slow"), [({"save_s": 0.05}, False), ({"evaluation_s": 0.05}, True)])
+def test_time_of_an_evaluation_has_no_checkpoint_in_it(seconds, is_slow, monkeypatch):
+    monkeypatch.setattr(advice, "MIN_EVALUATION_S", 0.02)
+    listener = Recorder()
+    loop.run_session(EmptySession(**seconds), [listener], threading.Event())
+    assert any("--evaluation-episodes" in message for message in listener.messages) == is_slow
+
+
+def test_first_fit_that_is_stopped_is_not_kept():
+    def stop(until):
+        raise FirstFitStoppedError
+
+    with pytest.raises(loop.RunInterruptedError, match=r"nothing is kept.*--resume run"):
+        loop.run_session(EmptySession(advance=stop), [], threading.Event())
+
+
+def test_steps_are_passed_on_at_most_once_a_second(monkeypatch):
+    now, steps = iter(np.arange(0.0, 5, 0.3)), []
+    monkeypatch.setattr(loop.time, "monotonic", lambda: float(next(now)))
+    call = loop._limit_rate(steps.append)
+    for step in range(6):
+        call(step)
+    assert steps == [3]
+
+
+def test_every_listener_is_stopped_and_the_session_is_closed():
+    listeners, session = [Recorder(fails=True), Recorder(), Recorder(fails=True)], EmptySession()
+    with pytest.raises(OSError, match="disk full"), training._closing(session):
+        training._finish(session, False, listeners, threading.Event(), [])
+    assert [listener.n_stops for listener in listeners] == [1, 1, 1]
+    assert session.is_closed
+
+
+@pytest.mark.parametrize(
+    ("error", "message"),
+    [(LareError("best.npz is damaged"), "best.npz"), (KeyError("state"), "does not fit"), (KeyboardInterrupt(), "")],
+)
+def test_session_that_cannot_be_restored_is_closed(error, message, monkeypatch):
+    def restore(metadata, arrays):
+        raise error
+
+    session = EmptySession(restore=restore)
+    monkeypatch.setattr(training, "load_learner", lambda run, n_devices: (None, None, {}, {}))
+    monkeypatch.setattr(training, "_make_session", lambda run, config, learner: session)
+    with pytest.raises(KeyboardInterrupt if message == "" else LareError, match=message):
+        training.restore_session(RUN)
+    assert session.is_closed
