@@ -2,35 +2,32 @@
 
 import threading
 import time
-import types
 
 import numpy as np
 import pytest
 
+from helpers.toy_envs import toy_spec
+from lare_rl.config.resolve import resolve
+from lare_rl.config.settings import Settings
 from lare_rl.errors import LareError
+from lare_rl.runs.config_file import make_config
+from lare_rl.runs.directory import Run
 from lare_rl.training import advice, loop
 from lare_rl.training import train as training
 from lare_rl.training.decoder_fits import FirstFitStoppedError
 from lare_rl.training.progress import Listener
-
-SETTINGS = types.SimpleNamespace(
-    method="dense", algorithm="td3", steps=30, evaluate_every=10, warmup=0, evaluation_episodes=3
-)
-RUN = types.SimpleNamespace(
-    seeds=[0],
-    directory="run",
-    checkpoint="run/checkpoint",
-    config=types.SimpleNamespace(task=types.SimpleNamespace(name="task")),
-)
+from lare_rl.training.session import Session
 
 
-class EmptySession:
-    run, settings, config, learner = RUN, SETTINGS, None, types.SimpleNamespace(replay=None)
-    step = metrics_bytes = 0
+class EmptySession(Session):
     evaluation_s = save_s = 0.0
     is_closed = False
 
-    def __init__(self, **attributes):
+    def __init__(self, directory, **attributes):
+        settings = resolve(
+            Settings(method="dense", steps=36, rollout_steps=12, evaluate_every=12, evaluation_episodes=1), toy_spec()
+        )
+        self.run = Run(directory, make_config(toy_spec(), settings, ()), ())
         self.latest_metrics = {}
         vars(self).update(attributes)
 
@@ -66,26 +63,24 @@ class Recorder(Listener):
 
 @pytest.fixture(autouse=True)
 def no_files(monkeypatch):
-    for name in ("append_metrics", "first_shard", "describe_returns", "_final_findings"):
-        monkeypatch.setattr(loop, name, lambda *args, **options: [])
-    monkeypatch.setattr(advice, "find_large_observations", lambda *args: [])
-    monkeypatch.setattr(training, "_introduction", lambda session: [])
+    monkeypatch.setattr(loop, "append_metrics", lambda directory, lines: 0)
+    monkeypatch.setattr(loop, "_final_findings", lambda run, lines: [])
 
 
 @pytest.mark.parametrize(("seconds", "is_slow"), [({"save_s": 0.05}, False), ({"evaluation_s": 0.05}, True)])
-def test_time_of_an_evaluation_has_no_checkpoint_in_it(seconds, is_slow, monkeypatch):
+def test_time_of_an_evaluation_has_no_checkpoint_in_it(seconds, is_slow, tmp_path, monkeypatch):
     monkeypatch.setattr(advice, "MIN_EVALUATION_S", 0.02)
     listener = Recorder()
-    loop.run_session(EmptySession(**seconds), [listener], threading.Event())
+    loop.run_session(EmptySession(tmp_path, **seconds), [listener], threading.Event())
     assert any("--evaluation-episodes" in message for message in listener.messages) == is_slow
 
 
-def test_first_fit_that_is_stopped_is_not_kept():
+def test_first_fit_that_is_stopped_is_not_kept(tmp_path):
     def stop(until):
         raise FirstFitStoppedError
 
-    with pytest.raises(loop.RunInterruptedError, match=r"nothing is kept.*--resume run"):
-        loop.run_session(EmptySession(advance=stop), [], threading.Event())
+    with pytest.raises(loop.RunInterruptedError, match=r"nothing is kept.*--resume"):
+        loop.run_session(EmptySession(tmp_path, advance=stop), [], threading.Event())
 
 
 def test_steps_are_passed_on_at_most_once_a_second(monkeypatch):
@@ -97,8 +92,8 @@ def test_steps_are_passed_on_at_most_once_a_second(monkeypatch):
     assert steps == [3]
 
 
-def test_every_listener_is_stopped_and_the_session_is_closed():
-    listeners, session = [Recorder(fails=True), Recorder(), Recorder(fails=True)], EmptySession()
+def test_every_listener_is_stopped_and_the_session_is_closed(tmp_path):
+    listeners, session = [Recorder(fails=True), Recorder(), Recorder(fails=True)], EmptySession(tmp_path)
     with pytest.raises(OSError, match="disk full"), training._closing(session):
         training._finish(session, False, listeners, threading.Event(), [])
     assert [listener.n_stops for listener in listeners] == [1, 1, 1]
@@ -109,13 +104,13 @@ def test_every_listener_is_stopped_and_the_session_is_closed():
     ("error", "message"),
     [(LareError("best.npz is damaged"), "best.npz"), (KeyError("state"), "does not fit"), (KeyboardInterrupt(), "")],
 )
-def test_session_that_cannot_be_restored_is_closed(error, message, monkeypatch):
+def test_session_that_cannot_be_restored_is_closed(error, message, tmp_path, monkeypatch):
     def restore(metadata, arrays):
         raise error
 
-    session = EmptySession(restore=restore)
+    session = EmptySession(tmp_path, restore=restore)
     monkeypatch.setattr(training, "load_learner", lambda run, n_devices: (None, None, {}, {}))
     monkeypatch.setattr(training, "_make_session", lambda run, config, learner: session)
     with pytest.raises(KeyboardInterrupt if message == "" else LareError, match=message):
-        training.restore_session(RUN)
+        training.restore_session(session.run)
     assert session.is_closed
