@@ -19,7 +19,7 @@ CATALOGUES = {"`Relabelled.findings`": LOGS, "`CreditedTurns.findings`": TURNS}
 COUNTS = ("count", "needed")
 """Placeholders of numbers, beside those that begin with `n_`."""
 
-PLACEHOLDER = re.compile(r"(?P<before>.?)\{(?P<name>\w+)(?P<format>:[^}]*)?\}(?=(?P<after>.?))")
+PLACEHOLDER = re.compile(r"(?P<before>.?)\{(?P<name>\w+)(?P<format>:(?:\{\w+\}|[^}])*)?\}(?=(?P<after>.?))")
 
 
 def metrics_page() -> str:

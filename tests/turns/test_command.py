@@ -7,10 +7,7 @@ import pytest
 from helpers.turn_toys import sample_table, table_rollouts
 from lare_rl.errors import LareError
 from lare_rl.turns.credit import TurnCredit
-from lare_rl.turns.features import tabulate
 from lare_rl.turns.files import read_rollout_file, write_credit_file
-from lare_rl.turns.page import choose_rollouts, write_turn_report
-from lare_rl.turns.rollouts import read_rollouts
 
 PHI = "def turn_events(tool, arguments, result, text):\n    return {'works': 'ok' in result}\n"
 
@@ -117,14 +114,3 @@ def test_half_characters_are_written(tmp_path):
     result = TurnCredit()(rollouts)
     write_credit_file(tmp_path / "out.jsonl", rollouts, result)
     assert json.loads((tmp_path / "out.jsonl").read_text())["note"] == "\ud800"
-
-
-def test_page_escapes_texts(tmp_path):
-    rollouts = [{"turns": [{"<script>": k % 2}], "outcome": k % 2, "group": "<i>"} for k in range(20)]
-    checked = read_rollouts(rollouts)
-    result = TurnCredit().assign(tabulate(checked))
-    html = write_turn_report(tmp_path / "page.html", rollouts, checked, result).read_text()
-    assert "<script>" not in html
-    assert "<i>" not in html
-    outcomes = [checked[k].outcome for k in choose_rollouts(checked, result)]
-    assert outcomes == [1, 0, 1, 0, 1, 0]

@@ -16,7 +16,7 @@ from lare_rl.turns.regression import PrefixFit
 from lare_rl.turns.rollouts import Phi, read_rollouts
 from lare_rl.turns.trust import UNTRUSTED, Errors, Trust
 from lare_rl.turns.value import advantages, changes, fit_prefixes, held_out_values, posterior_stds, values
-from lare_rl.turns.words import MESSAGES
+from lare_rl.turns.words import MESSAGES, count_decimals
 from lare_rl.util.findings import Finding, render
 from lare_rl.util.statistics import CLEAR_ERRORS
 
@@ -47,6 +47,11 @@ class FeatureEffect(NamedTuple):
     """What each further turn with the feature adds."""
     further_std: float
 
+    @property
+    def importance(self) -> float:
+        """The mean size of its first effect over all turns."""
+        return abs(self.first * self.frequency)
+
 
 @dataclass(frozen=True)
 class CreditedTurns:
@@ -66,6 +71,8 @@ class CreditedTurns:
     """The gain, its standard error, and the surprise at the end, over the latest calls."""
     effects: tuple[FeatureEffect, ...]
     """Of each feature of a turn."""
+    is_logistic: bool
+    """Whether the effects are changes of log odds."""
     reason: Finding
     """Why this lambda was used."""
 
@@ -93,10 +100,14 @@ class CreditedTurns:
     def findings(self) -> list[Finding]:
         """The same as findings, whose sentences are in `turns/words.py`."""
         clear = [effect for effect in self.effects if abs(effect.first) > CLEAR_ERRORS * effect.first_std]
-        clear.sort(key=lambda effect: -abs(effect.first * effect.frequency))
+        clear.sort(key=lambda effect: -effect.importance)
+        form = {
+            "target": "log odds" if self.is_logistic else "value",
+            "decimals": count_decimals(self.trust.outcome_std),
+        }
         return [
             Finding("grpo" if self.is_grpo else "lambda", {"lambda_": self.lambda_, "reason": self.reason}),
-            *(Finding("effect", effect._asdict()) for effect in clear[:MAX_SENTENCES]),
+            *(Finding("effect", effect._asdict() | form) for effect in clear[:MAX_SENTENCES]),
         ]
 
 
@@ -176,6 +187,7 @@ class TurnCredit:
             lambda_=float(lambda_),
             trust=trust,
             effects=_describe_effects(table, prefixes, fit),
+            is_logistic=self.logistic,
             reason=reason,
         )
 

@@ -1,5 +1,6 @@
 """The report of credited rollouts: a few of them as strips of turns, what features are worth, and how far to trust it."""
 
+import itertools
 from collections.abc import Mapping, Sequence
 from html import escape
 from pathlib import Path
@@ -12,8 +13,8 @@ from lare_rl.report.html import render_note, render_table, write_page
 from lare_rl.turns.credit import CreditedTurns
 from lare_rl.turns.messages import Turn, split_turns
 from lare_rl.turns.rollouts import Rollout
-from lare_rl.turns.words import MESSAGES
-from lare_rl.util.findings import render
+from lare_rl.turns.words import MESSAGES, count_decimals
+from lare_rl.util.findings import format_for_reader, render
 from lare_rl.util.provenance import code_version
 from lare_rl.util.sanitize import one_line
 
@@ -25,28 +26,34 @@ MAX_TURNS = 60
 """The largest number of turns of a strip."""
 MAX_CHARACTERS = 90
 """Characters of a turn's text, and of its features."""
-SMALL = 0.0005
-"""Smaller effects are shown as 0: the evidence has switched the feature off."""
 
 NOTE_SUMS = (
-    "Progress is the change of the expected outcome that a turn made. It is not a score whose sum predicts the outcome, as the proxy "
-    "rewards of lare-rl relabel are: such scores are for rewards, and must not be used as advantages of turns."
+    "Progress is the change of the expected outcome that a turn made. The proxy rewards of lare-rl relabel are something else: their "
+    "sum predicts the outcome, and they must not be used as advantages of turns."
 )
 NOTE_DEVIATIONS = (
-    "Bars of two posterior standard deviations contain the exact change of value in about half of the turns only, because they do not "
-    "know of what the features miss. A bar that does not touch 0 usually has the right sign."
+    "The error bars are two posterior standard deviations. They contain the exact change of value in only about half of the turns, "
+    "because they leave out what the features miss. If an error bar does not reach 0, the sign of the progress is usually right."
 )
+NOTE_LOGISTIC = "Effects are changes of the log odds of the outcome."
 
 
 def write_turn_report(
     path: Path, rollouts: Sequence[Mapping[str, Any]], checked: Sequence[Rollout], credit: CreditedTurns
 ) -> Path:
-    """Write one self-contained HTML file about rollouts as they were read, and checked (`read_rollouts`), and their credit.
+    """Write the page as one self-contained HTML file.
+
+    Args:
+        path: the file.
+        rollouts: the mappings of the rollouts' file.
+        checked: the same rollouts from `read_rollouts`.
+        credit: their credit.
 
     Raises:
         LareError: the file cannot be written. An older file is left unchanged.
     """
-    title = f"Credit for {sum(len(rollout.turns) for rollout in checked):,} turns of {len(checked):,} rollouts"
+    n_turns = format_for_reader(sum(len(rollout.turns) for rollout in checked), "count turn")
+    title = f"Credit for {n_turns} of {format_for_reader(len(checked), 'count rollout')}"
     outcome = np.array([rollout.outcome for rollout in checked])
     trust, *effects = (render(finding, MESSAGES, "html") for finding in credit.findings)
     body = [
@@ -57,6 +64,7 @@ def write_turn_report(
         "<ul>" + "".join(f"<li>{line}</li>" for line in effects) + "</ul>"
         if effects
         else render_note("No feature of a turn changes the value clearly."),
+        render_note(NOTE_LOGISTIC) if credit.is_logistic else "",
         _render_effects(credit),
         "<h2>Some rollouts</h2>",
         render_note(NOTE_DEVIATIONS),
@@ -68,32 +76,37 @@ def write_turn_report(
 
 
 def choose_rollouts(checked: Sequence[Rollout], credit: CreditedTurns) -> list[int]:
-    """Return rollouts to draw: alternately above and below the median outcome, those with the clearest turns first."""
+    """Return rollouts to draw: alternately above and below the mean outcome, those with the clearest turns first.
+
+    The last turn does not count: its progress is the rest of the outcome, and is always large.
+    """
     clarity = [
         float(np.max(np.abs(progress[:-1]) - 2 * std[:-1], initial=-np.inf))
         for progress, std in zip(credit.progress, credit.deviation, strict=True)
     ]
-    middle = np.median([rollout.outcome for rollout in checked])
+    middle = np.mean([rollout.outcome for rollout in checked])
     order = sorted(range(len(checked)), key=lambda k: -clarity[k])
-    high = [k for k in order if checked[k].outcome > middle][: N_STRIPS // 2]
-    low = [k for k in order if k not in high][: N_STRIPS - len(high)]
-    mixed = [k for pair in zip(high, low, strict=False) for k in pair]
-    return mixed + [k for k in high + low if k not in mixed]
+    high = [k for k in order if checked[k].outcome > middle]
+    low = [k for k in order if checked[k].outcome <= middle]
+    mixed = [k for pair in itertools.zip_longest(high[:N_STRIPS], low[:N_STRIPS]) for k in pair if k is not None]
+    return mixed[:N_STRIPS]
 
 
 def _render_rollout(k: int, rollout: Mapping[str, Any], checked: Rollout, credit: CreditedTurns) -> list[str]:
-    group = f", group {one_line(checked.group)[:MAX_CHARACTERS]}" if checked.group else ""
+    group = f", group {_shorten(checked.group)}" if checked.group else ""
+    value, n_turns, decimals = credit.value[k], len(checked.turns), count_decimals(credit.trust.outcome_std)
     ending = ", cut off" if checked.truncated else ""
-    value = credit.value[k]
+    if n_turns > MAX_TURNS:
+        ending += f" (the first {MAX_TURNS} of {n_turns} turns)"
     rows = []
     messages = rollout.get("messages")
-    turns = [None] * len(value) if messages is None else split_turns(messages, f"rollout {k}")
-    for t, (features, turn) in enumerate(zip(checked.turns, turns, strict=True)):
-        progress, std = credit.progress[k][t], credit.deviation[k][t]
-        numbers = f"{value[t]:.2f}", f"{progress:+.3f} ± {std:.3f}", f"{credit.advantage[k][t]:+.3f}"
+    turns = [None] * n_turns if messages is None else split_turns(messages, f"rollout {k}")
+    for t, (features, turn) in enumerate(zip(checked.turns[:MAX_TURNS], turns[:MAX_TURNS], strict=True)):
+        progress = _format_change(credit.progress[k][t], credit.deviation[k][t], decimals)
+        numbers = f"{value[t]:.{max(0, decimals - 1)}f}", progress, f"{credit.advantage[k][t]:+.{decimals}f}"
         rows.append((str(t + 1), _describe_turn(turn), _describe_features(features), *numbers))
     header = ("turn", "the assistant", "features", "value before", "progress", "advantage")
-    table = render_table(header, rows[:MAX_TURNS], numbers=(0, 3, 4, 5))
+    table = render_table(header, rows, numbers=(0, 3, 4, 5))
     return [
         f"<h3>Rollout {k}{escape(group)}: outcome {checked.outcome:g}{ending}</h3>",
         _draw_strip(credit.progress[k][:MAX_TURNS], credit.deviation[k][:MAX_TURNS]),
@@ -117,20 +130,30 @@ def _describe_turn(turn: Turn | None) -> str:
     if turn is None:
         return "-"
     calls = ", ".join(f"{call.tool}({call.arguments})" for call in turn.calls)
-    return one_line(calls or turn.text)[:MAX_CHARACTERS] or "-"
+    return _shorten(calls or turn.text) or "-"
 
 
 def _describe_features(features: Mapping[str, float]) -> str:
     texts = (name if value == 1 else f"{name} {value:.3g}" for name, value in features.items() if value)
-    return ", ".join(texts)[:MAX_CHARACTERS] or "-"
+    return _shorten(", ".join(texts)) or "-"
+
+
+def _shorten(text: str) -> str:
+    line = one_line(text)
+    return line if len(line) <= MAX_CHARACTERS else f"{line[:MAX_CHARACTERS]}..."
+
+
+def _format_change(number: float, std: float, decimals: int) -> str:
+    return f"{number:+.{decimals}f} ± {std:.{decimals}f}"
 
 
 def _render_effects(credit: CreditedTurns) -> str:
-    rows = []
-    for effect in sorted(credit.effects, key=lambda effect: -abs(effect.first * effect.frequency)):
+    """Return the table of effects. A 0 without a deviation means that the evidence has switched the feature off."""
+    rows, decimals = [], count_decimals(credit.trust.outcome_std)
+    for effect in sorted(credit.effects, key=lambda effect: -effect.importance):
         pairs = ((getattr(effect, x), getattr(effect, f"{x}_std")) for x in ("first", "lasting", "further"))
-        numbers = ("0" if max(abs(number), std) < SMALL else f"{number:+.3f} ± {std:.3f}" for number, std in pairs)
+        numbers = (_format_change(*pair, decimals) if round(max(map(abs, pair)), decimals) else "0" for pair in pairs)
         name = effect.name if effect.unit == 1 else f"{effect.name} ({effect.unit:.3g})"
         rows.append((name, f"{effect.frequency:.0%}", *numbers))
-    header = ("feature of a turn", "turns with it", "the first one", "what lasts of it", "each further one")
+    header = ("feature of a turn", "turns with it", "the first one", "what lasts", "each further one")
     return render_table(header, rows, numbers=(1, 2, 3, 4))

@@ -21,6 +21,7 @@ from jaxtyping import Float
 
 from lare_rl.turns.features import TurnTable
 from lare_rl.turns.regression import fit_linear
+from lare_rl.turns.words import count_decimals
 from lare_rl.util.findings import Finding
 from lare_rl.util.statistics import CLEAR_ERRORS, ratio_of_sums
 
@@ -100,7 +101,7 @@ def summarise(errors: Sequence[Errors]) -> Trust:
 
 def choose_lambda(trust: Trust) -> tuple[float, Finding]:
     """Return lambda, and why."""
-    values = trust._asdict()
+    values = trust._asdict() | {"decimals": max(0, count_decimals(trust.outcome_std) - 1)}
     if math.isnan(trust.gain):
         return GRPO, Finding("unknown", values)
     if trust.gain <= CLEAR_ERRORS * trust.gain_error:

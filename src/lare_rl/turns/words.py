@@ -1,6 +1,8 @@
 """The sentences of `CreditedTurns.findings`, by the codes of its findings (`util/findings.py`)."""
 
-__all__ = ["MESSAGES"]
+import math
+
+__all__ = ["MESSAGES", "count_decimals"]
 
 MESSAGES = {
     "lambda": "Lambda {lambda_:g} was used: {reason}.",
@@ -20,14 +22,20 @@ MESSAGES = {
     ),
     "surprised": (
         "values of prefixes remove {gain:.1%} ± {gain_error:.1%} of the squared error of the group's mean, but outcomes are "
-        "{surprise:+.2f} above the values when agents stop: the features miss an event before the end"
+        "{surprise:+.{decimals}f} above the values when agents stop: the features miss an event before the end"
     ),
     "trusted": (
         "values of prefixes remove {gain:.1%} ± {gain_error:.1%} of the squared error of the group's mean, and outcomes differ from them "
-        "by {surprise:+.2f} when agents stop"
+        "by {surprise:+.{decimals}f} when agents stop"
     ),
     "effect": (
-        "The first `{name}` changes the value by {first:+.3f} ± {first_std:.3f}; {lasting:+.3f} ± {lasting_std:.3f} of it "
-        "lasts. Each further one adds {further:+.3f} ± {further_std:.3f}."
+        "The first `{name}` changes the {target} by {first:+.{decimals}f} ± {first_std:.{decimals}f}, and by "
+        "{lasting:+.{decimals}f} ± {lasting_std:.{decimals}f} after further turns without it. Each further one adds "
+        "{further:+.{decimals}f} ± {further_std:.{decimals}f}."
     ),
 }
+
+
+def count_decimals(outcome_std: float) -> int:
+    """Return the decimal places of changes of the value: three if outcomes are 0 and 1, and fewer if they are larger."""
+    return max(0, 2 - math.floor(math.log10(outcome_std))) if outcome_std > 0 else 3
