@@ -1,7 +1,9 @@
 """Models of Pydantic AI as language models of a design."""
 
 import asyncio
+import concurrent.futures
 import json
+import threading
 
 import pytest
 
@@ -13,7 +15,6 @@ pydantic_ai = pytest.importorskip("pydantic_ai")
 
 from pydantic_ai.messages import ModelMessagesTypeAdapter, ModelResponse, TextPart  # noqa: E402
 from pydantic_ai.models.function import FunctionModel  # noqa: E402
-from pydantic_ai.models.test import TestModel  # noqa: E402
 
 from lare_rl.integrations.pydantic_ai import pydantic_ai_model  # noqa: E402
 
@@ -45,9 +46,38 @@ def test_messages_are_converted():
     assert phi.exchanges[1]["messages"][-1]["content"] == correction[1]
 
 
-def test_agent():
-    agent = pydantic_ai.Agent(TestModel(custom_output_text=REPLY))
-    assert lare_rl.design(toy_spec(), model=pydantic_ai_model(agent), candidates=2).source == PHI.strip("\n")
+def test_instructions_of_an_agent_are_sent():
+    seen = []
+
+    def answer(messages, info):
+        seen.append((info.instructions, [part.content for message in messages for part in message.parts]))
+        return ModelResponse([TextPart("reply")])
+
+    agent = pydantic_ai.Agent(FunctionModel(answer, model_name="m"), instructions="Be short.", system_prompt="Be long.")
+    messages = [{"role": "system", "content": "Design."}, {"role": "user", "content": "Write."}]
+    assert pydantic_ai_model(agent).reply(messages, 0) == "reply"
+    assert seen == [("Be short.", ["Design.", "Write."])]
+
+
+def test_interruption_cancels_the_request(monkeypatch):
+    started, ended = threading.Event(), threading.Event()
+
+    async def answer(messages, info):
+        started.set()
+        try:
+            await asyncio.sleep(60)
+        finally:
+            ended.set()
+
+    def interrupt(future):
+        started.wait(30)
+        raise KeyboardInterrupt
+
+    model = pydantic_ai_model(FunctionModel(answer, model_name="m"))
+    monkeypatch.setattr(concurrent.futures.Future, "result", interrupt)
+    with pytest.raises(KeyboardInterrupt):
+        model.reply([{"role": "user", "content": "Write."}], 0)
+    assert ended.wait(30)
 
 
 def test_model_in_a_running_loop():
@@ -61,9 +91,14 @@ def test_model_in_a_running_loop():
     assert requests == [[("user-prompt", "Write some.")]] * 2
 
 
-def test_errors():
-    with pytest.raises(LareError, match="Pydantic AI cannot use 'nobody:m'"):
-        pydantic_ai_model("nobody:m")
+def test_errors(monkeypatch):
+    monkeypatch.delenv("OPENAI_API_KEY", raising=False)
+    for model in ("nobody:m", "openai:gpt-5"):
+        with pytest.raises(LareError, match=f"Pydantic AI cannot use '{model}'"):
+            pydantic_ai_model(model)
+    for model in (None, pydantic_ai.Agent()):
+        with pytest.raises(LareError, match="has no model"):
+            pydantic_ai_model(model)
 
     def fail(messages, info):
         raise ConnectionError("no network")

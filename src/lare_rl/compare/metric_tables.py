@@ -43,13 +43,14 @@ def write_table(rows: Sequence[dict[str, Any]], path: Path) -> list[Path]:
     writer = csv.DictWriter(text, names)
     writer.writeheader()
     writer.writerows(rows)
-    csv_path, parquet_path = path.with_suffix(".csv"), path.with_suffix(".parquet")
+    csv_path, parquet_path = (path.with_name(path.name + suffix) for suffix in (".csv", ".parquet"))
     write_atomically(csv_path, lambda file: file.write(text.getvalue().encode()))
     try:
         import pyarrow
         from pyarrow import parquet
     except ImportError:
+        parquet_path.unlink(missing_ok=True)  # it would have other rows
         return [csv_path]
-    table = pyarrow.Table.from_pylist([{name: row.get(name) for name in names} for row in rows])
+    table = pyarrow.table({name: [row.get(name) for row in rows] for name in names})
     write_atomically(parquet_path, lambda file: parquet.write_table(table, file))
     return [csv_path, parquet_path]

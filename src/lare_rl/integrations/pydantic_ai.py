@@ -21,29 +21,46 @@ except ImportError:
 
 __all__ = ["pydantic_ai_model"]
 
+_LOCK = threading.Lock()
+"""Held while the loop is started, because `cache` may call a function several times at once."""
+
 
 def pydantic_ai_model(model: Any) -> FunctionModel:
     """Return a model that asks Pydantic AI, for `lare_rl.design(task, model=...)`.
 
-    `model` is the name of a model (`anthropic:claude-sonnet-4-5`), a model of Pydantic AI, or an `Agent` that returns texts. Raises
-    `LareError` if there is no such model, or its key is missing.
+    `model` is the name of a model (`anthropic:claude-sonnet-4-5`), a model of Pydantic AI, or an `Agent` that returns texts. The
+    `instructions` of an agent are sent; its `system_prompt` is not, because each request has one.
+
+    Raises:
+        LareError: there is no such model, or its key is missing.
     """
     try:
         agent = model if isinstance(model, Agent) else Agent(model)
     except Exception as error:  # Pydantic AI, and the client of each provider, raise their own
         raise LareError(f"Pydantic AI cannot use {short_repr(model)}: {error}") from error
+    if agent.model is None:
+        raise LareError("the agent has no model: give one, such as Agent('anthropic:claude-sonnet-4-5')")
 
     def ask(messages: list[Message]) -> str:
         history = [_convert(message) for message in messages[:-1]]
         run = agent.run(messages[-1]["content"], message_history=history)
-        return asyncio.run_coroutine_threadsafe(run, _event_loop()).result().output
+        future = asyncio.run_coroutine_threadsafe(run, _event_loop())
+        try:
+            return future.result().output
+        finally:
+            future.cancel()  # after an interruption; it does nothing to a request that has ended
 
-    return FunctionModel(ask, str(getattr(agent.model, "model_name", None) or agent.model or agent.name))
+    return FunctionModel(ask, str(getattr(agent.model, "model_name", agent.model)))
+
+
+def _event_loop() -> asyncio.AbstractEventLoop:
+    """Return the loop of all requests, because connections belong to a loop. In a notebook, the main thread runs another."""
+    with _LOCK:
+        return _start_loop()
 
 
 @cache
-def _event_loop() -> asyncio.AbstractEventLoop:
-    """Return the loop of all requests, because connections belong to a loop. In a notebook, the main thread runs another."""
+def _start_loop() -> asyncio.AbstractEventLoop:
     loop = asyncio.new_event_loop()
     threading.Thread(target=loop.run_forever, daemon=True).start()
     return loop
