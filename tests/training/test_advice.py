@@ -128,7 +128,7 @@ def test_greedy_actions_of_newest_states(dense_run):
         ({"td3": {"warmup": 60}}, 50, {"critic/loss": None}, ("steps so far random", {})),
         ({"td3": {"warmup": 60}}, 90, {"critic/loss": 0.0}, None),
         ({"algorithm": "qmix"}, 90, {}, ("too few episodes", {"step": 90, "algorithm": "qmix", "batch_size": 128})),
-        ({"algorithm": "qmix"}, 90, {"critic/loss/prey": 2.0}, None),
+        ({"algorithm": "qmix"}, 90, {"critic/loss": 2.0, "critic/loss_prey": None}, None),
     ],
 )
 def test_untrained_policy(settings, step, loss, expected, tmp_path):

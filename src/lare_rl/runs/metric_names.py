@@ -3,6 +3,9 @@
 With several teams, each has its own, which ends in `_` and the team's name.
 """
 
+from collections.abc import Mapping
+from typing import Any
+
 __all__ = [
     "ACTOR_SATURATION",
     "CREDIT_CORRELATION",
@@ -14,6 +17,7 @@ __all__ = [
     "RETURN_R2",
     "RETURN_STD",
     "SUMMED_RETURN",
+    "was_updated",
 ]
 
 RETURN = "evaluation/return"
@@ -76,3 +80,8 @@ METRIC_GROUPS: dict[str, dict[str, str]] = {
     },
 }
 """What each metric means, by who writes it. Names have no teams; a task's own measures are not listed."""
+
+
+def was_updated(line: Mapping[str, Any]) -> bool:
+    """Return whether the policy had been updated before the evaluation of a line of metrics.jsonl."""
+    return line.get("critic/loss") is not None

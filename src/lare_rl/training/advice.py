@@ -11,7 +11,7 @@ from lare_rl.config.settings import ResolvedSettings
 from lare_rl.credit.input_names import raw_feature_names
 from lare_rl.data.replay import Replay
 from lare_rl.runs.directory import Run
-from lare_rl.runs.metric_names import RETURN, RETURN_STD
+from lare_rl.runs.metric_names import RETURN, RETURN_STD, was_updated
 from lare_rl.training.static_config import TrainConfig
 from lare_rl.util.findings import Finding, render
 from lare_rl.util.statistics import FLOAT32_NOISE
@@ -75,7 +75,7 @@ def find_untrained(run: Run) -> Finding | None:
     settings, lines = run.config.settings, run.metrics()
     if (reason := warmup_warning(settings)) is not None:
         return Finding("all steps random", {"reason": reason})
-    if not lines or any(key.startswith("critic/loss") and line[key] is not None for line in lines for key in line):
+    if not lines or any(map(was_updated, lines)):
         return None
     step, algorithm = lines[-1]["step"], settings.algorithm
     if step <= settings.warmup:

@@ -10,7 +10,7 @@ import numpy as np
 
 from lare_rl.errors import LareError
 from lare_rl.runs.directory import Run
-from lare_rl.runs.metric_names import ACTOR_SATURATION, RETURN
+from lare_rl.runs.metric_names import ACTOR_SATURATION, RETURN, was_updated
 from lare_rl.runs.metrics_file import append_metrics
 from lare_rl.training import advice
 from lare_rl.training.decoder_fits import FirstFitStoppedError
@@ -82,7 +82,7 @@ def run_session(session: Session, listeners: Sequence[Listener], stop: threading
         evaluated_at.append(saved_at)
         for listener in listeners:
             listener.on_evaluation(lines)
-        if "critic/loss" in lines[0]:
+        if any(map(was_updated, lines)):
             returns.append(np.array([line[RETURN] for line in lines]))
             report(advice.find_constant_returns(returns))
         if len(evaluated_at) == 2:  # the first one compiles the policy

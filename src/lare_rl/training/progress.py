@@ -9,6 +9,7 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
 from lare_rl.errors import missing_extra_error
+from lare_rl.runs.metric_names import was_updated
 from lare_rl.util.findings import format_for_reader
 from lare_rl.util.sanitize import sanitize
 
@@ -108,7 +109,7 @@ class Terminal(Listener):
             self._progress.update(self._progress.task_ids[0], figures=_summarise(metrics))
         else:
             step, steps = metrics[0]["step"], self._steps
-            is_trained = _mean(metrics, "critic/loss") is not None
+            is_trained = any(map(was_updated, metrics))
             rate = _mean(metrics, "time/steps_per_second") or 0.0 if self._has_compiled else 0.0
             compiling = " with compiling" if is_trained and not self._has_compiled else ""
             self._has_compiled |= is_trained
