@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from helpers.assigner_episodes import small_assigner
-from lare_rl.assigner.arguments import read_steps
+from lare_rl.assigner.arguments import read_steps, to_levels
 from lare_rl.errors import LareError
 
 
@@ -19,6 +19,15 @@ def read(reward, *, agents=None, env_ids=None, alive=None):
 @pytest.mark.parametrize("env_ids", [jnp.arange(2), [np.array(0), np.array(1)], iter([0, 1])])
 def test_environments_are_read_by_value(env_ids):
     assert read([1, 2], env_ids=env_ids).env_ids == [0, 1]
+
+
+def test_lists_are_needed():
+    with pytest.raises(LareError, match="env_ids is 3: give a list"):
+        read([1, 2], env_ids=3)
+    with pytest.raises(LareError, match=r"env_ids .*hashable"):
+        read([1, 2], env_ids=np.zeros((2, 1)))
+    with pytest.raises(LareError, match="group is 5: give a list"):
+        to_levels(small_assigner(groups=True).config, 5, read([1, 2]), {})
 
 
 def test_team_reward_is_the_mean_over_the_agents_alive():

@@ -1,6 +1,6 @@
 """The arrays that a `CreditAssigner` is given: they are checked, and become rows of numbers."""
 
-from collections.abc import Hashable, Iterable, Sequence
+from collections.abc import Hashable, Iterable
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -54,7 +54,7 @@ def read_steps(
     reward: Any,
     terminated: Any,
     truncated: Any,
-    env_ids: Sequence[Hashable] | None,
+    env_ids: Any,
     valid: Any,
     alive: Any,
 ) -> NewSteps:
@@ -121,7 +121,7 @@ def to_rows(
 
 
 def to_levels(
-    config: AssignerConfig, group: Sequence[Hashable] | None, new: NewSteps, group_names: dict[GroupName, int]
+    config: AssignerConfig, group: Any, new: NewSteps, group_names: dict[GroupName, int]
 ) -> Int[np.ndarray, " steps"]:
     """Return the number of the group of each new step, and add new groups to `group_names`. It is -1 for None.
 

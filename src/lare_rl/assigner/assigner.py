@@ -11,7 +11,7 @@ samples steps, because stored proxy rewards would be those of an older decoder.
 """
 
 import threading
-from collections.abc import Hashable, Sequence
+from collections.abc import Hashable, Iterable
 from pathlib import Path
 from typing import Any
 
@@ -131,11 +131,11 @@ class CreditAssigner:
         terminated: Any,
         truncated: Any,
         *,
-        env_ids: Sequence[Hashable] | None = None,
+        env_ids: Iterable[Hashable] | None = None,
         valid: Any = None,
         alive: Any = None,
-        group: Sequence[Hashable] | None = None,
-        lanes: Sequence[Hashable] | None = None,
+        group: Iterable[Hashable] | None = None,
+        lanes: Iterable[Hashable] | None = None,
     ) -> Int[np.ndarray, " steps"]:
         """Add one step of each of several environments.
 
