@@ -1,7 +1,5 @@
 """Directories of .npz files, and logs in memory."""
 
-import sys
-
 import hypothesis
 import numpy as np
 import pytest
@@ -10,9 +8,7 @@ from hypothesis import strategies as st
 
 from helpers.toy_logs import check_log, logged_episodes, read_directory, write_rewards_plus_one
 from lare_rl import LareError
-from lare_rl.errors import install_command
 from lare_rl.logs.arrays import NpzLog, read_npz
-from lare_rl.logs.log import atomic_output
 from lare_rl.logs.open_log import open_log
 
 
@@ -108,35 +104,11 @@ def test_compressed_episodes_have_a_largest_size(folder, tmp_path, monkeypatch):
         open_log(path)
 
 
-def test_failed_output_is_undone(tmp_path):
-    (tmp_path / "log").write_text("old")
-    with pytest.raises(LareError, match="log cannot be written"), atomic_output(tmp_path / "log", True):
-        pass  # nothing is written
-    assert [file.read_text() for file in tmp_path.iterdir()] == ["old"]
-
-
 def test_nothing_is_unpickled(folder, tmp_path):
     path = folder(logged_episodes(1))
     np.savez(path / "0000.npz", allow_pickle=True, observations=np.array([{}], object))
     with pytest.raises(LareError, match=r"0000\.npz is not an \.npz file, or damaged: .*allow_pickle=False"):
         open_log(path)
-
-
-def test_path_is_not_a_log(tmp_path, monkeypatch):
-    (tmp_path / "log.csv").write_text("observation,action\n")
-    (tmp_path / "empty").mkdir()
-    monkeypatch.setitem(sys.modules, "minari", None)
-    monkeypatch.delitem(sys.modules, "lare_rl.logs.minari", raising=False)
-    for source, message in (
-        (tmp_path / "log.csv", "log.csv is text"),
-        (tmp_path / "empty", "empty holds no .npz"),
-        (tmp_path / "gone", "gone does not exist"),
-        ("nologs", install_command("minari")),
-        (7, "7 is not a log"),
-    ):
-        with pytest.raises(LareError) as error:
-            open_log(source)
-        assert message in str(error.value)
 
 
 @hypothesis.settings(

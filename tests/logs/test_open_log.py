@@ -1,0 +1,26 @@
+"""What is no log is refused."""
+
+import sys
+
+import pytest
+
+from lare_rl import LareError
+from lare_rl.errors import install_command
+from lare_rl.logs.open_log import open_log
+
+
+def test_path_is_not_a_log(tmp_path, monkeypatch):
+    (tmp_path / "log.csv").write_text("observation,action\n")
+    (tmp_path / "empty").mkdir()
+    monkeypatch.setitem(sys.modules, "minari", None)
+    monkeypatch.delitem(sys.modules, "lare_rl.logs.minari", raising=False)
+    for source, message in (
+        (tmp_path / "log.csv", "log.csv is text"),
+        (tmp_path / "empty", "empty holds no .npz"),
+        (tmp_path / "gone", "gone does not exist"),
+        ("nologs", install_command("minari")),
+        (7, "7 is not a log"),
+    ):
+        with pytest.raises(LareError) as error:
+            open_log(source)
+        assert message in str(error.value)
