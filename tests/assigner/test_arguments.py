@@ -24,6 +24,8 @@ def test_environments_are_read_by_value(env_ids):
 def test_lists_are_needed():
     with pytest.raises(LareError, match="env_ids is 3: give a list"):
         read([1, 2], env_ids=3)
+    with pytest.raises(LareError, match=r"env_ids is array\(3\): give a list"):
+        read([1, 2], env_ids=np.array(3))
     with pytest.raises(LareError, match=r"env_ids .*hashable"):
         read([1, 2], env_ids=np.zeros((2, 1)))
     with pytest.raises(LareError, match="group is 5: give a list"):

@@ -1,6 +1,6 @@
 """The arrays that a `CreditAssigner` is given: they are checked, and become rows of numbers."""
 
-from collections.abc import Hashable, Iterable
+from collections.abc import Hashable
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -159,7 +159,7 @@ def _to_group_name(value: Any) -> GroupName | None:
 
 def _to_list(values: Any, name: str, n_rows: int) -> list[Any]:
     """Return one value for each row. Raise `LareError` if there are more or fewer, or no list."""
-    if isinstance(values, str) or not isinstance(values, Iterable):
+    if isinstance(values, str) or not np.iterable(values):
         raise LareError(f"{name} is {short_repr(values)}: give a list, with an entry for each row")
     entries = list(values)
     if len(entries) != n_rows:
