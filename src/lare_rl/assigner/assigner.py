@@ -161,7 +161,7 @@ class CreditAssigner:
             A number for each step, for `rewards_at`; -1 for a row that is not valid.
 
         Raises:
-            LareError: shapes do not fit, a number is not finite, or the steps or an episode are more than `capacity`.
+            LareError: shapes do not fit, a number is not finite or too large, or the steps or an episode are more than `capacity`.
         """
         with self.lock:
             if env_ids is not None and lanes is not None:
