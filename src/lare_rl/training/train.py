@@ -2,7 +2,7 @@
 
 import contextlib
 import threading
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -80,9 +80,12 @@ def train(
     messages += _describe_rounding(resolved, steps=settings.steps, evaluate_every=settings.evaluate_every)
     with lock_run(run), report_full_memory(run), catch_stop_signals() as stop:
         _prepare(run, listeners)
-        with _closing(start_session(run)) as session:
+        session = start_session(run)
+        try:
             session.save()  # so that there is always a checkpoint
             return _finish(session, tensorboard, listeners, stop, messages)
+        finally:
+            _close(session)
 
 
 def resume(
@@ -119,13 +122,15 @@ def resume(
         _prepare(run, listeners)
         is_new = not run.has_checkpoint()
         session, restored = (start_session(run), []) if is_new else restore_session(run)
-        with _closing(session):
+        try:
             if is_new:
                 session.save()
             else:
                 truncate_metrics(run.directory, session.metrics_bytes)
             messages += [*restored, *_describe_annealing(session, earlier_steps)]
             return _finish(session, tensorboard, listeners, stop, messages)
+        finally:
+            _close(session)
 
 
 def _describe_rounding(resolved: ResolvedSettings, **requested: int | None) -> list[str]:
@@ -189,7 +194,7 @@ def restore_session(run: Run) -> tuple[Session, list[str]]:
     try:
         return session, session.restore(metadata, arrays)
     except BaseException as error:
-        session.close()
+        _close(session)
         if not isinstance(error, DAMAGED_FILE_ERRORS):
             raise
         raise LareError(
@@ -218,16 +223,12 @@ def _make_session(run: Run, config: TrainConfig, learner: Learner | None) -> Ses
     return session
 
 
-@contextlib.contextmanager
-def _closing(session: Session) -> Iterator[Session]:
-    """Close a session at the end, also after an error."""
+def _close(session: Session) -> None:
+    """Close a session, and its worker processes."""
     try:
-        yield session
+        session.close()
     finally:
-        try:
-            session.close()
-        finally:
-            close_idle_workers()
+        close_idle_workers()
 
 
 def _finish(
