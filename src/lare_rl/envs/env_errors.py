@@ -10,12 +10,13 @@ from jaxtyping import Float
 
 from lare_rl.envs.interface import EnvSpec, Timestep
 from lare_rl.errors import LareError, install_command, short_repr
-from lare_rl.tasks.spec import TaskSpec
+from lare_rl.tasks.spec import MAX_LEVELS, TaskSpec
 
 __all__ = [
     "EnvOutputError",
     "as_lare_error",
     "check_finite",
+    "close_env",
     "import_hint",
     "name_step",
     "no_time_limit_error",
@@ -56,6 +57,14 @@ def one_line_errors(message: str, make_hint: Callable[[BaseException], str] = la
         yield
     except (Exception, SystemExit) as error:
         raise as_lare_error(message, error, make_hint(error)) from error
+
+
+def close_env(env: Any, label: str) -> None:
+    """Close an environment. An error becomes a warning: no step depends on it, and it must not hide an earlier error."""
+    try:
+        env.close()
+    except (Exception, SystemExit) as error:
+        logging.getLogger(__name__).warning("%s", as_lare_error(f"{label} failed in close", error))
 
 
 def import_hint(error: BaseException) -> str:
@@ -111,12 +120,15 @@ def read_measures(
     """Return the measures of the task from the `info` of a step: the means over the agents that report them.
 
     They are 0 before the last step, except the group of the episode, if it is reported. Raises `LareError` if a measure of the last
-    step is missing, or is not a number.
+    step is missing, or is not a number, or if the group is not valid.
     """
     measures = {}
     for name in task.info_keys:
         is_read = last or (name == task.group and any(name in info for info in infos))
-        measures[name] = np.array(_read_measure(infos, name) if is_read else 0, np.float32)
+        value = _read_measure(infos, name) if is_read else 0
+        if name == task.group and value not in range(MAX_LEVELS):
+            raise LareError(f"the group {name!r} in info is {value:g}, not a whole number from 0 to {MAX_LEVELS - 1}")
+        measures[name] = np.array(value, np.float32)
     return measures
 
 

@@ -10,6 +10,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from lare_rl.envs.env_errors import close_env, import_hint, one_line_errors
 from lare_rl.envs.interface import EnvSpec, HostEnv, JaxEnv
 from lare_rl.errors import LareError, short_repr
 from lare_rl.tasks.spec import NO_ENVIRONMENT, SHARED_KEYS, TaskSpec
@@ -110,7 +111,8 @@ def make_env(task: TaskSpec, **kwargs: Any) -> JaxEnv | HostEnv:
     """
     family = find_family(task)
     _check_keys(task, family)
-    env = family.load_maker()(task, **kwargs)
+    with one_line_errors(f"environment {task.environment!r} cannot be made", import_hint):
+        env = family.load_maker()(task, **kwargs)
     _check_env(task, env)
     try:
         _check_spec(task, env.spec)
@@ -120,7 +122,7 @@ def make_env(task: TaskSpec, **kwargs: Any) -> JaxEnv | HostEnv:
             )
     except LareError:
         if isinstance(env, HostEnv):
-            env.close()
+            close_env(env, f"environment {task.environment!r}")
         raise
     return env
 
@@ -206,11 +208,20 @@ def _check_keys(task: TaskSpec, family: Family) -> None:
             raise LareError(f"task {role.name!r} is a team of {task.name!r} and cannot have teams. Remove them.")
 
 
-def _check_spec(task: TaskSpec, spec: EnvSpec) -> None:
-    """Raise `LareError` if the bounds of actions are missing, or at the first mismatch between a task and its environment."""
+def _check_bounds(environment: str, spec: EnvSpec) -> None:
     shape = spec.n_agents, spec.action_size
-    if not spec.discrete and (np.shape(spec.low), np.shape(spec.high)) != (shape, shape):
-        raise LareError(f"{task.environment}: continuous actions need low and high in EnvSpec, of the shape {shape}")
+    if (np.shape(spec.low), np.shape(spec.high)) != (shape, shape):
+        raise LareError(f"{environment}: continuous actions need low and high in EnvSpec, of the shape {shape}")
+    with np.errstate(over="ignore", invalid="ignore"):
+        width = spec.high - spec.low
+    if not ((width >= 0) & (width < np.inf)).all():  # actions in between would be NaN
+        raise LareError(f"{environment}: actions need finite bounds, with low <= high and a finite high - low")
+
+
+def _check_spec(task: TaskSpec, spec: EnvSpec) -> None:
+    """Raise `LareError` if the bounds of actions cannot be used, or at the first mismatch between a task and its environment."""
+    if not spec.discrete:
+        _check_bounds(task.environment, spec)
 
     def fail(role: TaskSpec, mismatch: str) -> LareError:
         return LareError(f"task {role.name!r}: {mismatch}")

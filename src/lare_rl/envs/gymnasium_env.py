@@ -13,6 +13,7 @@ from lare_rl.envs import mujoco_rewards
 from lare_rl.envs.agent_arrays import Agent
 from lare_rl.envs.env_errors import (
     EnvOutputError,
+    close_env,
     import_hint,
     no_time_limit_error,
     one_line_errors,
@@ -66,7 +67,7 @@ def make_gymnasium(name: str, max_episode_steps: int | None = None, **kwargs: An
                 raise LareError(f"the action space of {name} is {env.action_space}, not a Box with one axis")
             return env
         except Exception:
-            env.close()
+            close_env(env, f"environment {name!r}")
             raise
 
 
@@ -101,7 +102,7 @@ class GymnasiumEnv:
             entry_meanings=entry_meanings(task.observation),
             **fields,
         )
-        self._decodes = action_space.dtype.kind in "iu"  # other actions are passed on as they are
+        self._decodes = action_space.dtype not in (np.float32, np.float64)  # such actions are passed on as they are
         self._state, self._alive = np.zeros(0, np.float32), np.ones(1, bool)
         self._available = np.ones((1, self.spec.action_size), bool)
 
@@ -144,5 +145,4 @@ class GymnasiumEnv:
             return self.environment.render()
 
     def close(self) -> None:
-        with one_line_errors(f"environment {self._name!r} failed in close"):
-            self.environment.close()
+        close_env(self.environment, f"environment {self._name!r}")

@@ -148,7 +148,7 @@ def to_env_action(
     """Clip a continuous action to [-1, 1] and scale it to the environment's units. Encode a discrete action by its argmax."""
     xp = _array_module(action)
     if spec.discrete:
-        return xp.eye(spec.action_size, dtype=np.float32)[xp.argmax(action, axis=-1)]
+        return (np.arange(spec.action_size) == xp.argmax(action, axis=-1)[..., None]).astype(np.float32)
     clipped = xp.minimum(xp.maximum(action, -1), 1)  # np.clip takes ten times as long for small arrays
     scaled = spec.low + (clipped + 1) / 2 * (spec.high - spec.low)
     return xp.minimum(xp.maximum(scaled, spec.low), spec.high)  # rounding may exceed the bounds

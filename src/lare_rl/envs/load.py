@@ -83,8 +83,10 @@ def _read_values(task: str, ancestors: tuple[str, ...] = ()) -> dict[str, Any]:
         raise LareError(f"task {task!r} is not valid TOML: {error}") from error
     like, teams = values.get("like"), values.get("teams")
 
+    paths = *ancestors, os.path.realpath(task)
+
     def is_valid(name: Any) -> bool:
-        return isinstance(name, str) and resolve_path(task, name) not in (*ancestors, task)
+        return isinstance(name, str) and os.path.realpath(resolve_path(task, name)) not in paths
 
     if not (like is None or is_valid(like)):
         raise LareError(f"task {task!r}: like = {like!r} must be another task, without a cycle")
@@ -92,9 +94,9 @@ def _read_values(task: str, ancestors: tuple[str, ...] = ()) -> dict[str, Any]:
         raise LareError(f"task {task!r}: teams = {teams!r} must be a list of other tasks, without a cycle")
     if teams is not None:
         shared = {key: values[key] for key in SHARED_KEYS if key in values}
-        values["teams"] = [shared | _read_values(resolve_path(task, team), (*ancestors, task)) for team in teams]
+        values["teams"] = [shared | _read_values(resolve_path(task, team), paths) for team in teams]
     values.pop("like", None)
-    return values if like is None else _read_values(resolve_path(task, like), (*ancestors, task)) | values
+    return values if like is None else _read_values(resolve_path(task, like), paths) | values
 
 
 def _read_file(task: str) -> str:

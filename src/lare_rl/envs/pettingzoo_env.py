@@ -3,7 +3,6 @@
 Agents and spaces are checked once. The values of each step are checked, but not that they are finite (`check_finite`).
 """
 
-import contextlib
 import logging
 from collections.abc import Callable, Mapping
 from functools import partial
@@ -13,7 +12,14 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from lare_rl.envs.agent_arrays import Agent, AgentArrays, make_agent
-from lare_rl.envs.env_errors import EnvOutputError, no_time_limit_error, one_line_errors, read_measures, to_float
+from lare_rl.envs.env_errors import (
+    EnvOutputError,
+    close_env,
+    no_time_limit_error,
+    one_line_errors,
+    read_measures,
+    to_float,
+)
 from lare_rl.envs.interface import Timestep
 from lare_rl.envs.pettingzoo_construct import find_time_limit, group_by_team, make_parallel_env
 from lare_rl.envs.spaces import float_array
@@ -30,8 +36,7 @@ def make(task: TaskSpec, render_mode: str | None = None) -> "ParallelHost":
     try:
         return ParallelHost(environment, task)
     except BaseException:
-        with contextlib.suppress(Exception):
-            environment.close()
+        close_env(environment, f"environment {task.environment!r}")
         raise
 
 
@@ -138,8 +143,7 @@ class ParallelHost:
         return pixels
 
     def close(self) -> None:
-        with one_line_errors(f"environment {self._name!r} failed in close"):
-            self.environment.close()
+        close_env(self.environment, f"environment {self._name!r}")
 
     def _error(self, predicate: str) -> EnvOutputError:
         return EnvOutputError(f"environment {self._name!r}{predicate}")
@@ -153,7 +157,9 @@ class ParallelHost:
         return values
 
     def _read_present(self) -> Bool[np.ndarray, " agents"]:
-        names, index = self.environment.agents, self.layout.index
+        index = self.layout.index
+        with one_line_errors(f"environment {self._name!r}: its agents cannot be read"):
+            names = list(self.environment.agents)
         for name in names:
             if name not in index:
                 possible = ", ".join(map(str, index))

@@ -15,10 +15,11 @@ import gymnasium
 import numpy as np
 from jaxtyping import Float
 
+from lare_rl.envs.env_errors import close_env
 from lare_rl.envs.families import GYMNASIUM, find_family, make_env, make_local_env, picklable_maker
 from lare_rl.envs.interface import EnvSpec, HostEnv, Timestep
 from lare_rl.envs.trials import time_steps
-from lare_rl.envs.vec_env import LocalVecEnv, VecEnv
+from lare_rl.envs.vec_env import LocalVecEnv, VecEnv, select_row
 from lare_rl.envs.workers import SubprocVecEnv
 from lare_rl.errors import LareError
 from lare_rl.tasks.spec import PETTINGZOO_PREFIX, TaskSpec, split_environment
@@ -67,10 +68,10 @@ class SeparateEnv:
         self.spec = self.envs.spec
 
     def reset(self, seed: int) -> Timestep:
-        return _select_row(self.envs.reset(np.ones(1, bool), np.array([seed])))
+        return select_row(self.envs.reset(np.ones(1, bool), np.array([seed])))
 
     def step(self, action: Float[np.ndarray, "agents action"]) -> Timestep:
-        return _select_row(self.envs.step(action[None]))
+        return select_row(self.envs.step(action[None]))
 
     def render(self) -> NoReturn:
         raise LareError("an environment in a process of its own cannot be drawn")
@@ -97,7 +98,7 @@ def _load_env_spec(task_json: str) -> EnvSpec:
     task = TaskSpec.model_validate_json(task_json)
     env = make_host_env(task) if task.processes == "separate" else make_env(task)
     if isinstance(env, HostEnv):
-        env.close()
+        close_env(env, f"environment {task.environment!r}")
     return env.spec
 
 
@@ -173,12 +174,6 @@ def _measure_task(task_json: str) -> float:
 
 def _make_separate(task: TaskSpec, n: int) -> SubprocVecEnv:
     return SubprocVecEnv([picklable_maker(task)] * n, timeout=task.timeout, reuse_key=task.model_dump_json())
-
-
-def _select_row(batch: Timestep) -> Timestep:
-    measures = {name: value[0] for name, value in batch.measures.items()}
-    columns = {name: value[0].copy() for name, value in batch._asdict().items() if name != "measures"}
-    return Timestep(**columns, measures=measures)
 
 
 def _find_package(task: TaskSpec) -> str | None:

@@ -9,9 +9,11 @@ from typing import Any, Protocol, runtime_checkable
 import numpy as np
 from jaxtyping import Bool, Float
 
-from lare_rl.envs.env_errors import check_finite, name_step
+from lare_rl.envs.env_errors import name_step
 from lare_rl.envs.interface import EnvSpec, HostEnv, Team, Timestep, team_mean, to_env_action
 from lare_rl.envs.placement import make_host_env
+from lare_rl.envs.vec_env import LocalVecEnv, select_row
+from lare_rl.errors import LareError, short_repr
 from lare_rl.tasks.spec import CreditScope, TaskSpec
 
 __all__ = [
@@ -148,15 +150,14 @@ def play_steps(
     if isinstance(policy, StatefulPolicy):
         policy.reset()
         policy = policy.select_env_action
+    envs = LocalVecEnv([lambda: env])  # it checks every timestep
     with name_step(0):
-        next_timestep = env.reset(seed)
-        check_finite(next_timestep, env.spec, "the environment")
+        next_timestep = select_row(envs.reset(np.ones(1, bool), np.array([seed])))
     for number in itertools.count(1):
         timestep = next_timestep
         action = sample_action(env.spec, timestep, rng) if policy is None else _act(policy, env.spec, timestep)
         with name_step(number):
-            next_timestep = env.step(action)
-            check_finite(next_timestep, env.spec, "the environment")
+            next_timestep = select_row(envs.step(action[None]))
         yield timestep, action, next_timestep
         if next_timestep.terminated or next_timestep.truncated:
             return
@@ -164,7 +165,10 @@ def play_steps(
 
 def _act(policy: Callable[..., np.ndarray], spec: EnvSpec, timestep: Timestep) -> Float[np.ndarray, "1 action"]:
     mask = [timestep.available[0]] if spec.masks_actions else []
-    return policy(timestep.observation[0], *mask)[None]
+    action = np.asarray(policy(timestep.observation[0], *mask))
+    if action.shape != (spec.action_size,):
+        raise LareError(f"the policy returned {short_repr(action)}, not an array of the shape ({spec.action_size},)")
+    return action[None]
 
 
 def sample_action(spec: EnvSpec, timestep: Timestep, rng: np.random.Generator) -> Float[np.ndarray, "agents action"]:

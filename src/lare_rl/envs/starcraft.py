@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from lare_rl.envs.env_errors import one_line_errors
+from lare_rl.envs.env_errors import close_env, one_line_errors
 from lare_rl.envs.interface import EnvSpec, Team, Timestep
 from lare_rl.errors import LareError
 from lare_rl.tasks.spec import TaskSpec
@@ -125,7 +125,7 @@ class StarCraft:
 
     def close(self) -> None:
         if self._game is not None:
-            self._game.close()
+            close_env(self._game, f"StarCraft II on {self._name!r}")
             self._game = None
         self._can_continue = False
 

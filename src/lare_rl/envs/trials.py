@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Float
 
 from lare_rl.envs.env_errors import one_line_errors
-from lare_rl.envs.interface import EnvSpec, HostEnv, Timestep
+from lare_rl.envs.interface import EnvSpec, HostEnv, Timestep, to_env_action
 from lare_rl.envs.vec_env import Maker
 from lare_rl.errors import LareError
 
@@ -21,6 +21,7 @@ N_TIMED_STEPS = 10
 N_COMPARED_STEPS = 3
 
 
+@one_line_errors("the first steps of an episode failed")
 def time_steps(env: HostEnv) -> float:
     """Return the time of the fastest of the first steps (s). The others may have been interrupted."""
     timestep, times = env.reset(0), []
@@ -51,8 +52,7 @@ def find_interference(env: HostEnv, maker: Maker) -> str | None:
 
 def fixed_action(spec: EnvSpec, timestep: Timestep) -> Float[np.ndarray, "agents action"]:
     """Return the first available discrete action, or the middle of continuous actions."""
-    first_available = np.eye(spec.action_size, dtype=np.float32)[np.argmax(timestep.available, axis=-1)]
-    return first_available if spec.discrete else (spec.low + spec.high) / 2
+    return to_env_action(timestep.available, spec) if spec.discrete else (spec.low + spec.high) / 2
 
 
 def _play(env: HostEnv, seed: int = 0) -> Iterator[np.ndarray]:

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float, Integer, Shaped
 
-from lare_rl.envs.env_errors import EnvOutputError, check_finite, one_line_errors
+from lare_rl.envs.env_errors import EnvOutputError, check_finite, close_env, one_line_errors
 from lare_rl.envs.interface import EnvSpec, HostEnv, JaxEnv, Timestep
 from lare_rl.errors import LareError, short_repr
 
@@ -21,6 +21,7 @@ __all__ = [
     "check_same_sizes",
     "empty_batch",
     "make_env_at",
+    "select_row",
 ]
 
 Maker = Callable[[], HostEnv]
@@ -81,9 +82,15 @@ class LocalVecEnv(VecEnv):
     """Environments in this process, stepped one after the other."""
 
     def __init__(self, makers: Sequence[Maker]):
-        self._envs = [make_env_at(index, maker) for index, maker in enumerate(makers)]
-        specs = [env.spec for env in self._envs]
-        check_same_sizes(specs)
+        self._envs: list[HostEnv] = []
+        try:
+            for index, maker in enumerate(makers):
+                self._envs.append(make_env_at(index, maker))
+            specs = [env.spec for env in self._envs]
+            check_same_sizes(specs)
+        except BaseException:
+            self.close()
+            raise
         super().__init__(specs[0], empty_batch(specs[0], len(specs)))
 
     def _call(self, command: str, arguments: Shaped[np.ndarray, "n *rest"], where: Bool[np.ndarray, " n"]) -> None:
@@ -91,8 +98,8 @@ class LocalVecEnv(VecEnv):
             call_env(index, self._envs[index], command, arguments[index], self.batch)
 
     def close(self) -> None:
-        for env in self._envs:
-            env.close()
+        for index, env in enumerate(self._envs):
+            close_env(env, f"environment {index}")
 
 
 def make_env_at(env_index: int, maker: Maker) -> HostEnv:
@@ -199,3 +206,9 @@ def empty_batch(spec: EnvSpec, *lead: int) -> Timestep:
         truncated=np.zeros(lead, bool),
         measures={name: np.zeros(lead, np.float32) for name in spec.measures},
     )
+
+
+def select_row(batch: Timestep) -> Timestep:
+    """Return a copy of the timestep of the first environment of a batch."""
+    *columns, measures = batch
+    return Timestep(*(column[0].copy() for column in columns), {name: value[0] for name, value in measures.items()})

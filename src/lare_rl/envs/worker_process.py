@@ -21,7 +21,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Int
 
-from lare_rl.envs.env_errors import EnvOutputError, one_line_errors
+from lare_rl.envs.env_errors import EnvOutputError, close_env, one_line_errors
 from lare_rl.envs.interface import EnvSpec, HostEnv
 from lare_rl.envs.shared_arrays import SharedArrays, map_arrays, map_current
 from lare_rl.envs.trials import find_interference, time_steps
@@ -82,8 +82,10 @@ class Worker:
             try:
                 self.connection, self._is_connected = Client(self._address), True
             except (FileNotFoundError, ConnectionRefusedError):  # it does not listen yet
-                if self.process.poll() is not None or time.monotonic() > deadline:
+                if self.process.poll() is not None:
                     raise self._make_death_error() from None
+                if time.monotonic() > deadline:
+                    raise LareError(f"{self.label} did not start within {CONNECT_TIMEOUT_S:g} s") from None
                 time.sleep(POLL_S)
 
     @property
@@ -191,9 +193,8 @@ def _serve(address: str) -> None:
             except LareError as error:
                 reply = LareError(str(error))  # another class may be defined where the parent cannot import it
             connection.send(reply)
-    for env in envs.values():
-        with contextlib.suppress(Exception):
-            env.close()
+    for index, env in envs.items():
+        close_env(env, f"environment {index}")
 
 
 def _call_envs(envs: Mapping[int, HostEnv], command: str, shared: SharedArrays, current: Int[np.ndarray, "1"]) -> None:
