@@ -4,8 +4,6 @@ import re
 from functools import partial
 
 import gymnasium
-import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
 from PIL import Image
@@ -32,7 +30,6 @@ from lare_rl.evaluation.evaluate import (
     n_random_episodes,
     play_random,
 )
-from lare_rl.evaluation.policy import load_policy
 from lare_rl.evaluation.video import check_video_path, record_video, write_video
 from lare_rl.report.evaluation_lines import compare_actions, describe_evaluation
 from lare_rl.runs.metric_names import DETERMINISTIC_RETURN
@@ -268,34 +265,6 @@ def test_evaluate_continues_after_initial_states_of_run(run, returns):
     last_evaluation = [line["evaluation/return"] for line in run.metrics()[-2:]]
     np.testing.assert_allclose(first_returns[:, :2].mean(axis=1), last_evaluation, rtol=1e-5)
     np.testing.assert_allclose(returns[:, :2], first_returns[:, 2:], rtol=1e-5)
-
-
-def test_load_policy(run):
-    observation = np.ones(TASK.observation_size, np.float32)
-    actors = load_learner(run).learner.algorithm.online.actor
-    env_actions = 2 * jnp.tanh(jax.vmap(lambda actor: actor(jnp.ones((1, 2))))(actors))
-    for seed_index, seed in enumerate(run.seeds):
-        np.testing.assert_allclose(load_policy(run, seed)(observation), env_actions[seed_index, 0], rtol=1e-5)
-    np.testing.assert_array_equal(load_policy(run)(observation), load_policy(run, 0)(observation))
-    with pytest.raises(LareError, match="no seed 7"):
-        load_policy(run, 7)
-
-
-def test_policy_has_few_programs_for_all_sizes_of_a_batch(run):
-    policy, rows = load_policy(run), np.linspace(-1, 1, 18).reshape(9, 2)
-    single = [policy(row) for row in rows]
-    for n_rows in range(1, 10):
-        np.testing.assert_allclose(policy(rows[:n_rows]), single[:n_rows], rtol=1e-5)
-    assert sorted(policy._policies) == [1, 2, 4, 8, 16]
-
-
-@pytest.mark.parametrize(
-    ("observation", "words"),
-    [("x", "no array"), (np.ones(3), "the shape is"), (np.full(2, np.nan), "not finite"), (np.ones((0, 2)), "shape")],
-)
-def test_policy_checks_observations(run, observation, words):
-    with pytest.raises(LareError, match=words):
-        load_policy(run)(observation)
 
 
 def test_policies_and_random_actions_are_evaluated_in_the_evaluation_environment(small, tmp_path):

@@ -1,4 +1,4 @@
-"""The policy of a run whose environment has masks and several choices at a time."""
+"""The policy of a run, also in an environment with masks and several choices at a time."""
 
 from typing import NamedTuple
 
@@ -17,6 +17,7 @@ from lare_rl.envs.play import play_episodes
 from lare_rl.errors import LareError
 from lare_rl.evaluation.policy import load_policy
 from lare_rl.runs.directory import create_run
+from lare_rl.training.saved_state import load_learner
 from lare_rl.training.train import start_session
 
 
@@ -57,17 +58,32 @@ class Dials:
 
 register_family("dials", lambda task, **_: Dials())
 TASK = toy_spec(environment="dials/two", observation_size=2, action_size=6)
+CHASE = toy_spec()
 
 
 @pytest.fixture(scope="module")
-def run(small, tmp_path_factory):
-    """A run with a checkpoint before its first step."""
-    settings = resolve(small(method="dense", algorithm="ppo"), TASK)
-    run = create_run(tmp_path_factory.mktemp("dials") / "run", TASK, settings, ())
-    session = start_session(run)
-    session.save()
-    session.close()
-    return run
+def untrained(small, tmp_path_factory):
+    """Return a function that makes a run with a checkpoint before its first step."""
+
+    def make(task, algorithm):
+        settings = resolve(small(method="dense", algorithm=algorithm), task)
+        run = create_run(tmp_path_factory.mktemp("runs") / "run", task, settings, ())
+        session = start_session(run)
+        session.save()
+        session.close()
+        return run
+
+    return make
+
+
+@pytest.fixture(scope="module")
+def run(untrained):
+    return untrained(TASK, "ppo")
+
+
+@pytest.fixture(scope="module")
+def chase_run(untrained):
+    return untrained(CHASE, "td3")
 
 
 def test_actions_are_available_and_those_of_the_package(run):
@@ -91,6 +107,7 @@ def test_actions_are_available_and_those_of_the_package(run):
         (1, (np.ones(6),), "float64"),
         (2, (np.ones((6, 2), bool),), r"the shape \(2, 6\), not \(6, 2\)"),
         (2, (np.ones(12, bool),), r"not \(12,\)"),
+        (2, ([[True] * 6, [True]],), "6 booleans"),
     ],
 )
 def test_mask_is_checked(run, rows, mask, words):
@@ -108,3 +125,48 @@ def test_played_episodes_have_available_actions(run):
     (episode,) = play_episodes(TASK, 1, load_policy(run))
     choices = episode.env_action[:, 0].argmax(axis=-1)
     assert np.isin(choices - np.arange(4), (0, 1)).all()
+
+
+def test_load_policy(chase_run):
+    observation = np.ones(CHASE.observation_size, np.float32)
+    actors = load_learner(chase_run).learner.algorithm.online.actor
+    env_actions = 2 * jnp.tanh(jax.vmap(lambda actor: actor(jnp.ones((1, 2))))(actors))
+    for seed_index, seed in enumerate(chase_run.seeds):
+        np.testing.assert_allclose(load_policy(chase_run, seed)(observation), env_actions[seed_index, 0], rtol=1e-5)
+    np.testing.assert_array_equal(load_policy(chase_run)(observation), load_policy(chase_run, 0)(observation))
+    with pytest.raises(LareError, match="no seed 7"):
+        load_policy(chase_run, 7)
+
+
+def test_policy_has_few_programs_for_all_sizes_of_a_batch(chase_run):
+    policy, rows = load_policy(chase_run), np.linspace(-1, 1, 18).reshape(9, 2)
+    single = [policy(row) for row in rows]
+    for n_rows in range(1, 10):
+        np.testing.assert_allclose(policy(rows[:n_rows]), single[:n_rows], rtol=1e-5)
+    assert sorted(policy._policies) == [1, 2, 4, 8, 16]
+
+
+@pytest.mark.parametrize(
+    ("observation", "words"),
+    [
+        ("x", "arrays of numbers"),
+        (np.ones(3), "the shape is"),
+        (np.full(2, np.nan), "not finite"),
+        (np.ones((0, 2)), "shape"),
+    ],
+)
+def test_policy_checks_observations(chase_run, observation, words):
+    with pytest.raises(LareError, match=words):
+        load_policy(chase_run)(observation)
+
+
+def test_policy_with_a_memory(untrained):
+    """Each observation changes it, and `reset` empties it."""
+    policy = load_policy(untrained(TASK, "qmix"))
+    empty = jax.tree.leaves(policy._memory)
+    policy(np.ones(2), np.ones(6, bool))
+    assert any((old != new).any() for old, new in zip(empty, jax.tree.leaves(policy._memory), strict=True))
+    policy.reset()
+    jax.tree.map(np.testing.assert_array_equal, empty, jax.tree.leaves(policy._memory))
+    with pytest.raises(LareError, match="has a memory"):
+        policy(np.ones((2, 2)), np.ones((2, 6), bool))

@@ -49,12 +49,37 @@ def test_step_factors(function, scored_observation, columns, expected):
     assert empty.shape == (0, len(columns))
 
 
+@pytest.mark.parametrize("scored_observation", ["before", "both"])
+def test_step_factors_of_any_batch_axes(function, scored_observation):
+    observation, action = np.arange(12.0).reshape(2, 3, 2), np.arange(6.0).reshape(2, 3, 1)
+    factors = function.step_factors(observation, action, -observation, scored_observation)
+    assert factors.shape == (2, 3, function.n_factors(scored_observation))
+    row = function.step_factors(observation[1, 0], action[1, 0], -observation[1, 0], scored_observation)
+    np.testing.assert_array_equal(factors[1, 0], row)
+
+
+@pytest.mark.parametrize(
+    ("observation", "action", "next_observation", "words"),
+    [
+        (np.zeros((2, 3, 2)), np.zeros((3, 2, 1)), np.zeros((2, 3, 2)), r"same batch axes.*\(2, 3, 2\)"),
+        (np.zeros((6, 2)), np.zeros((3, 2, 1)), np.zeros((6, 2)), "same batch axes"),
+        (np.zeros((6, 2)), 3, np.zeros((6, 2)), "same batch axes"),
+        (np.zeros((6, 2)), np.zeros((6, 1)), None, "same batch axes"),
+        ([[1, 2], [1]], np.zeros((2, 1)), np.zeros((2, 2)), "arrays of numbers"),
+        (np.zeros((6, 3)), np.zeros((6, 1)), np.zeros((6, 2)), r"\(batch, 2\)"),
+    ],
+)
+def test_step_factors_refuse_other_shapes(function, observation, action, next_observation, words):
+    with pytest.raises(LareError, match=words):
+        function.step_factors(observation, action, next_observation, "both")
+
+
 @pytest.mark.parametrize(
     ("observation", "action", "words"),
     [
         (np.zeros((3, 3)), np.zeros((3, 1)), r"observations .*\(batch, 2\).*\(3, 3\)"),
         (np.zeros((3, 2)), np.zeros(3), r"actions .*\(batch, 1\).*\(3,\)"),
-        (np.zeros((3, 2)), np.zeros((4, 1)), "3 observations and 4 actions"),
+        (np.zeros((3, 2)), np.zeros((4, 1)), "differ: 3 and 4"),
         (np.zeros((3, 2)), [["a"]] * 3, "actions must be arrays of numbers"),
     ],
 )
@@ -101,6 +126,7 @@ def test_pickle(function):
     function(observation, action)
     other = pickle.loads(pickle.dumps(function))
     assert other == function
+    assert hash(other) == hash(function)
     assert "graph" not in other.__dict__
     np.testing.assert_array_equal(other(observation, action), function(observation, action))
 

@@ -112,6 +112,19 @@ def test_model_name_is_no_code(function, chase, path):
     assert path.read_text().splitlines()[2] == "# lare: model: x import os import sys #"
 
 
+def test_model_name_that_no_file_can_have(function, chase, path):
+    replace(function, model="m\udcff").save(path)
+    assert load_function(path, chase) == replace(function, model="m\\udcff")
+
+
+@pytest.mark.parametrize(
+    ("name", "file"), [("phi", "phi.py"), ("phi.json", "phi.py"), ("phi.v2", "phi.v2.py"), ("phi-0.5.py", "phi-0.5.py")]
+)
+def test_names_of_files(function, tmp_path, name, file):
+    function.save(tmp_path / name)
+    assert sorted(path.name for path in tmp_path.iterdir()) == sorted([file, file.replace(".py", ".json")])
+
+
 def test_load_function_verifies(chase, path):
     path.write_text(path.read_text().replace("[f_near, f_effort]", "[f_near, effort]"))
     with pytest.raises(LareError, match=r"phi\.py: .*'Chase': E-RUN line 8: effort"):
@@ -153,7 +166,9 @@ def test_broken_record(chase, path, record):
         load_function(path, chase)
 
 
-@pytest.mark.parametrize(("path", "words"), [("none/phi.py", "cannot be written"), ("", "not the name of a file")])
+@pytest.mark.parametrize(
+    ("path", "words"), [("none/phi.py", "cannot be written"), ("", "not the name"), ("..", "not the name")]
+)
 def test_unwritable_file(verified, tmp_path, monkeypatch, path, words):
     monkeypatch.chdir(tmp_path)
     with pytest.raises(LareError, match=words):

@@ -64,6 +64,5 @@ def test_files_of_a_design(tmp_path, spelling):
     for name in ("phi.py", "phi.json", "record.json"):
         content = (tmp_path / name).read_text()
         assert redact_key(content) == content
-        assert KEY not in content
     for name in ("phi.json", "record.json"):
         assert KEY not in repr(json.loads((tmp_path / name).read_text()))

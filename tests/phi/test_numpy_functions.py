@@ -1,4 +1,4 @@
-"""Each function of NumPy, with its arguments, beside NumPy itself. x is (batch, 6), y (batch, 3, 2), b a condition, i integers.
+"""Each function of NumPy, with its arguments, beside NumPy itself. x is (batch, 6), y (batch, 3, 2), b a condition, i integers, z complex.
 
 Expressions are separated by | or the end of a line, and ¦ stands for the operator |. Each is a factor of a program.
 """
@@ -38,6 +38,7 @@ def evaluation_func(observation, action):
     b, i = x > 0.2, np.floor(np.abs(x) * 3).astype(int)
     n = np.where(x > 1, np.nan, x)
     t = np.array([0.5, 1.5, -2.0, 4.0])
+    z = x + 1j * x[:, ::-1]
     return [{}]
 """
 EXPRESSIONS = {
@@ -163,6 +164,27 @@ EXPRESSIONS = {
         np.polynomial.polynomial.polyadd([1, 2], [3])[0] * x | np.copyto(x.copy(), 1.0) or x
         np.fft.ifft(x, axis=1).real | np.fft.ifft(np.fft.fft(x, axis=1), axis=1).real
         np.abs(np.fft.rfft(x, n=4, axis=1)) | np.fft.ifft(np.fft.fft(x, n=5, axis=1), n=8, axis=1).real
+    """,
+    "complex": """
+        (x / z).imag | (1 / z).imag | (z - 1j).imag | (-z * z).imag | np.square(z).imag | np.exp(z).imag | np.conj(z).imag
+        (z ** 8).imag | (z ** 2.0).imag | np.power(z, 5.0).imag | (z / (1e-200 + 1e-200j)).real * 1e-200
+        np.where(b, z, 1).imag | np.where(b, 1j * x, np.inf).imag | np.imag(z) | np.real(z) | np.imag(x)
+        np.angle(z) | np.angle(x) | np.angle(np.conj(x)) | np.angle(x * (1 + 0j)) | np.angle(np.array([x[:, :1], 1j * x[:, :1]])[0])
+        np.angle(np.fft.rfft(x, axis=1)) | np.angle(np.fft.rfft(x, n=5, axis=1)) | np.angle(np.fft.rfft(y, axis=1))
+        np.angle(np.fft.rfft(-np.abs(x), axis=1)) | np.fft.fft(z, n=4, axis=1).imag | np.fft.ifft(z, axis=1).imag
+        z.sum(axis=1).imag | np.sum(z, axis=1, where=b).imag | np.sum(z, axis=1, initial=5.0).imag
+        np.sum(z, axis=1, initial=5j).imag | np.mean(z, axis=1, where=b ¦ (x < 9)).imag | np.cumsum(z, axis=1).imag
+        np.diff(z, axis=1, prepend=1).imag | np.diff(z, axis=1, append=z[:, :1]).imag | z.reshape(-1, 3, 2).imag
+        np.reshape(z, (len(x), 3, 2)).imag | np.ravel(z).reshape(z.shape).imag | z.flatten().imag.reshape(-1, 6) | z.T.T.imag
+        np.transpose(z).T.imag | np.swapaxes(z[:, :, None], 2, 1).imag | np.moveaxis(z[:, :, None], 2, 1).imag
+        np.take(z, indices=np.array([0, 2]), axis=1).imag | np.concatenate([x, z], axis=1).imag | np.stack([x, z], axis=1).imag
+        np.roll(z, 1, axis=1).imag | np.flip(z, axis=1).imag | np.expand_dims(z, 1).imag | np.squeeze(z[:, :1]).imag
+        np.copy(z).imag | np.broadcast_to(z[:, :1], (len(x), 6)).imag | np.repeat(z, repeats=np.array([1, 2, 1, 1, 1, 1]), axis=1).imag
+        np.tile(z, (1, 2)).imag | np.split(z, indices_or_sections=np.array([2, 4]), axis=1)[1].imag | np.hsplit(z, 2)[1].imag
+        np.array_split(z, 4, axis=1)[1].imag | np.asarray(z).imag | np.hstack([x, z]).imag | np.column_stack([x, z]).imag
+        np.vstack([1j * t, [1, 2, 3, 4]]).imag.sum() * x | np.atleast_1d(z).imag | np.atleast_2d(z).imag
+        np.array([1j, 2.5, True]).imag.sum() * x | np.array([[1j, 2], [3, 4j]]).imag.sum() * x | np.mean([1j, 2, 3]).imag * x
+        np.concatenate([[1j], [2.0]]).imag.sum() * x | np.exp([1j, 2j]).imag.sum() * x | np.abs([1j, 2]).sum() * x
     """,
     "tables": """
         np.interp(x, [-1, 0, 2], [0.0, 1.0, -1.0]) | np.interp(x, [0, 1], [3, 4.0], left=-1, right=9)

@@ -83,6 +83,10 @@ BODIES = {
     "while True:\n    pass": "E-COST line 4: steps",
     "return [np.zeros((1000, 1000))]": "E-COST line 3: 1000000",
     "return [np.linalg.eigvalsh(observation[:, :16].reshape(-1, 4, 4))]": "E-NUMPY line 3: 3 x 3",
+    "return [np.sqrt(1j * observation)]": "E-NUMPY line 3: np.abs",
+    "return [(1j * action) @ np.ones(6)]": "E-NUMPY line 3: np.abs",
+    "return [(1j * action).frobnicate()]": "E-NUMPY line 3: np.abs",
+    "return [np.power(1j * action, 2.5)]": "E-NUMPY line 3: 1 to 8",
     # What a message says of a value is its type in Python.
     "return [np.sum(np.sin)]": "E-RUN line 3: no array can be made of np.sin",
     "return [np.sum(observation.sum)]": "E-RUN line 3: no array can be made of a function",

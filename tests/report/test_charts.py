@@ -1,7 +1,10 @@
+import base64
+import io
 import re
 
 import numpy as np
 import pytest
+from PIL import Image
 
 from helpers.markup import check_markup
 from lare_rl.report.charts import Bar, Chart, Line, draw_bars, draw_points, draw_strips, visible_steps
@@ -36,9 +39,27 @@ def test_lines_fill_the_chart():
     assert heights(chart(Line(X, X / 2, "c0"), limits=(0.0, 1.0))) == [[1000, 500, 0]]
 
 
-def test_gaps_and_equal_values():
-    values = (np.array([np.nan, 1, 2]), np.zeros(3), np.full(3, np.nan))
-    assert [len(line) for line in heights(chart(*(Line(X, y, "c0") for y in values)))] == [2, 3, 0]
+def test_missing_and_equal_values():
+    values = (np.array([np.nan, 1, 2]), np.array([1, np.nan, np.inf]), np.zeros(3), np.full(3, np.nan))
+    lines = heights(chart(*(Line(X, y, "c0") for y in values)))
+    assert [len(line) for line in lines] == [2, 2, 3, 0]
+    assert lines[0][1] < lines[0][0] == lines[1][0] < lines[2][0] < 1000
+
+
+@pytest.mark.parametrize(
+    ("low", "high", "labels"),
+    [
+        (10.01, 10.03, ["10.01", "10.015", "10.02", "10.025", "10.03"]),
+        (-151.2, -149.4, ["-151", "-150.5", "-150", "-149.5"]),
+        (100.0, 111.0, ["100", "102.5", "105", "107.5", "110"]),
+        (1000.0, 1001.0, ["1,000", "1,000.2", "1,000.4", "1,000.6", "1,000.8", "1,001"]),
+        (-1.0, 1.0, ["-1", "-0.5", "0", "0.5", "1"]),
+    ],
+)
+def test_ticks_have_the_digits_that_they_need(low, high, labels):
+    html = chart(Line(X, X, "c0"), limits=(low, high))
+    assert re.findall(r'<span class="y"[^>]*>([^<]*)<', html) == labels
+    assert f"--digits:{max(map(len, labels))};" in html
 
 
 def test_missing_values_move_no_label_and_no_band():
@@ -50,9 +71,10 @@ def test_missing_values_move_no_label_and_no_band():
     assert 'class="label' not in chart(Line(X, np.full(3, np.nan), "c0", "line", band=np.full(3, np.nan)))
 
 
-def test_wide_band_does_not_flatten_a_line():
-    (line,) = heights(chart(Line(X, X, "c0", band=np.full(3, 1000.0))))
-    assert max(line) - min(line) > 300
+@pytest.mark.parametrize("n_lines", [1, 4])
+def test_wide_bands_do_not_flatten_a_line(n_lines):
+    lines = heights(chart(*[Line(X, X, "c0", band=np.full(3, 1000.0))] * n_lines))
+    assert max(lines[0]) - min(lines[0]) > 450
 
 
 def test_single_point_is_visible():
@@ -67,14 +89,17 @@ def test_hovers_are_limited():
         Line(np.arange(500.0), np.arange(500.0), "c0"), hovers={float(step): f"<{step}>" for step in range(500)}
     )
     assert 30 <= html.count("<title>&lt;") <= 60
+    assert "&lt;499&gt;" in html
 
 
-def test_labels_do_not_overlap():
-    html = chart(*(Line(X, X + i / 100, "c0", f"line {i}") for i in range(6)), Line(X, X - 9, "c0", "low"))
+@pytest.mark.parametrize("gap", [5.5, 9.0])
+def test_labels_do_not_overlap(gap):
+    lines = [*(Line(X, X + i / 100, "c0", f"line {i}") for i in range(6)), Line(X, X - 9, "c0", "low")]
+    html = chart(*lines, label_gap=gap)
     tops = [float(top) for top in re.findall(r'class="label[^>]*top:([\d.]+)%', html)]
-    assert min(np.diff(sorted(tops))) > 4
-    assert (min(tops), max(tops)) >= (0, 50)
-    assert max(tops) <= 100
+    assert min(np.diff(sorted(tops))) > gap - 0.1
+    assert min(tops) >= 0
+    assert 50 <= max(tops) <= 100
 
 
 def test_bars_point_to_the_side_of_their_amounts():
@@ -103,5 +128,12 @@ def test_strips_share_a_scale_if_they_are_comparable():
 
 
 def test_points():
-    points = np.random.default_rng(0).normal(size=(50, 2))
-    check_markup(draw_points(points, points[:, 0], "points"))
+    """The largest value is yellow, the smallest one dark, and between the points there is nothing."""
+    points = np.array([(0.0, 0.0), (1.0, 0.0), (0.0, 1.0), (1.0, 1.0)])
+    html = draw_points(points, np.array([0.0, 1.0, 2.0, 3.0]), "points")
+    check_markup(html)
+    (data,) = re.findall(r"base64,([^\"]+)", html)
+    pixels = np.asarray(Image.open(io.BytesIO(base64.b64decode(data))).convert("RGBA")).astype(int)
+    assert abs(pixels[4, 4, :3] - (68, 1, 84)).max() < 20
+    assert abs(pixels[-5, -5, :3] - (253, 231, 37)).max() < 20
+    assert pixels[pixels.shape[0] // 2, pixels.shape[1] // 2, 3] == 0

@@ -35,6 +35,7 @@ def test_render_incomplete():
         (12345.6, "number", "12,346"),
         (-12.345, "number", "-12.3"),
         (float("nan"), "number", "nan"),
+        (-0.0, "number", "0"),
         (1, "count episode", "1 episode"),
         (1000, "count episode", "1,000 episodes"),
         (0.991, "r2", "0.991"),

@@ -76,7 +76,7 @@ def design(
     model_name = RECORDED if model_name is None else model_name
     is_live = model_name != RECORDED and not model_name.endswith(".json")
     _check_options(is_live, live, draw, reflect, policy, data)
-    _check_files(out, record)
+    out = _check_files(out, record)
     spec = lare_rl.load_task(task) if data is None else read_task(task)
     play, steps = load_playing_policy(policy, spec), load_steps(data, spec)
     path = None if model_name == RECORDED else Path(model_name)
@@ -90,7 +90,7 @@ def design(
     if out is None:
         _print_function(function, find_free_path(Path(), spec.name, ".py"))
     else:
-        _save_function(function, out, _next_command(task, spec, out.with_suffix(".py"), kind, data))
+        _save_function(function, out, _next_command(task, spec, out, kind, data))
 
 
 @contextmanager
@@ -138,18 +138,22 @@ def _check_options(
             raise LareError(message)
 
 
-def _check_files(out: Path | None, record: Path | None) -> None:
-    """Raise `LareError` if a file could not be written, before a model is asked and paid."""
+def _check_files(out: Path | None, record: Path | None) -> Path | None:
+    """Return the .py file. Raise `LareError` if a file could not be written, before a model is asked and paid."""
+    from lare_rl.latent.function import python_file
+
     files = []
     if out is not None:
-        check_new_path(out, "--out", overwrite=True)  # a directory has no suffix to replace
-        files = [out.with_suffix(suffix) for suffix in (".py", ".json")]
+        check_new_path(out, "--out", overwrite=True)  # it may be a directory
+        out = python_file(out)
+        files = [out, out.with_suffix(".json")]
     for path in files:
         check_new_path(path, "--out")
     if record is not None:
         check_new_path(record, "--record")
         if record.resolve() in [path.resolve() for path in files]:
             raise LareError(f"--out writes {record} too: choose another --record")
+    return out
 
 
 def _save_attempts(error: "DesignError", other: Path) -> None:
@@ -185,5 +189,5 @@ def _save_function(function: "LatentFunction", out: Path, next_command: str) -> 
     except LareError:
         print_line(function.source)
         raise
-    print_line(f"wrote {out.with_suffix('.py')}: {function.size} factors ({', '.join(function.names)})")
+    print_line(f"wrote {out}: {function.size} factors ({', '.join(function.names)})")
     print_line(next_command)

@@ -1,4 +1,4 @@
-"""A square figure without a window, on which all environments draw, and what they need of Matplotlib for it."""
+"""Pictures by Matplotlib without a window: a square figure to draw on, and the pixels of any figure."""
 
 from collections.abc import Callable
 
@@ -16,13 +16,17 @@ except ImportError as missing:
 
 from lare_rl.envs.interface import Frame
 
-__all__ = ["Axes", "Figure", "blank_figure", "colormaps", "paint_frames", "patches", "to_pixels"]
+__all__ = [
+    "OTHER_COLOUR", "TEAM_COLOUR", "Axes", "Figure", "blank_figure", "colormaps", "paint_frames", "patches", "to_pixels",
+]  # fmt: skip
+
+TEAM_COLOUR, OTHER_COLOUR = "#0072b2", "#d55e00"
+"""The colours of the first team, and of the others that move."""
 
 
 def blank_figure() -> tuple[Figure, Axes]:
     """Make an empty picture of 400 by 400 pixels."""
-    figure = Figure(figsize=(4, 4))
-    FigureCanvasAgg(figure)
+    figure = Figure(figsize=(4, 4), dpi=100)
     return figure, figure.add_axes((0, 0, 1, 1))
 
 

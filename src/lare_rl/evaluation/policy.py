@@ -15,6 +15,7 @@ from lare_rl.runs.directory import Run, as_run
 from lare_rl.training.policy import HostPolicy, draw_noise, init_host_memory, make_host_policy
 from lare_rl.training.saved_state import load_actor
 from lare_rl.training.streams import Stream, numpy_generator
+from lare_rl.util.rows import as_rows
 from lare_rl.util.shapes import padded_size
 
 __all__ = ["RunPolicy", "load_policy"]
@@ -68,10 +69,12 @@ class RunPolicy:
 
         Args:
             observation: the observation, or a batch.
-            available: which actions are available, (actions,) or (batch, actions). Needed if the environment has such masks.
+            available: which actions are available, (actions,) or (batch, actions). Needed if the environment has such masks, and refused
+                otherwise.
 
         Raises:
-            LareError: observations or masks have another size, or a policy with a memory is called with a batch.
+            LareError: observations or masks have another size, the environment has no masks, or a policy with a memory is called
+                with a batch.
         """
         rows, is_single = self._check_observation(observation)
         actions = to_package_action(self._select_actions(rows, available), self._env)
@@ -120,15 +123,20 @@ class RunPolicy:
     def _check_mask(self, available: Any, n_rows: int) -> Bool[np.ndarray, "batch action"]:
         """Return the masks of all rows. As in training, the first action counts as available if a mask has none."""
         size = self._env.action_size
-        if available is None:
-            if self._env.masks_actions:
-                raise LareError(
-                    f"some of the {size} actions may be unavailable: pass the mask too, as in policy(observation, available)"
-                )
+        if not self._env.masks_actions:
+            if available is not None:
+                raise LareError("the environment has no masks: leave the mask out, as in policy(observation)")
             return np.ones((n_rows, size), bool)
-        mask = np.asarray(available)
-        shapes = [(size,), self._env.choice_sizes or (size,)]  # flat, or with an axis for each choice
-        shapes = shapes * (n_rows == 1) + [(n_rows, *shape) for shape in shapes]
+        if available is None:
+            raise LareError(
+                f"some of the {size} actions may be unavailable: pass the mask too, as in policy(observation, available)"
+            )
+        try:
+            mask = np.asarray(available)
+        except ValueError:
+            raise LareError(f"a mask has {size} booleans for each observation: its rows differ in length") from None
+        row_shapes = [(size,), self._env.choice_sizes or (size,)]  # flat, or with an axis for each choice
+        shapes = [*(row_shapes if n_rows == 1 else ()), *((n_rows, *shape) for shape in row_shapes)]
         if mask.shape not in shapes or mask.dtype.kind not in "biu":
             raise LareError(
                 f"a mask has {size} booleans for each observation: pass the shape {shapes[0]}, not {mask.shape} of type {mask.dtype}"
@@ -137,16 +145,9 @@ class RunPolicy:
 
     def _check_observation(self, observation: Any) -> tuple[Float[np.ndarray, "batch observation"], bool]:
         """Return observations as rows, and whether there is a single one."""
-        size = self._env.observation_size
-        try:
-            rows = np.asarray(observation, np.float32)
-        except (TypeError, ValueError):
-            kind = type(observation).__name__
-            raise LareError(f"an observation is {size} numbers: no array can be made of {kind}") from None
-        if rows.ndim == 2 and not len(rows):
+        rows = as_rows("observation", observation, self._env.observation_size)
+        if not len(rows):
             raise LareError(f"the batch is empty: its shape is {rows.shape}")
-        if rows.ndim not in (1, 2) or rows.shape[-1] != size:
-            raise LareError(f"an observation is {size} numbers, a batch has rows of them: the shape is {rows.shape}")
         if not np.isfinite(rows).all():
             raise LareError("an observation holds a number that is not finite")
         return np.atleast_2d(rows), rows.ndim == 1

@@ -4,8 +4,9 @@ import functools
 import hashlib
 import itertools
 import json
+import math
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -21,10 +22,12 @@ from lare_rl.phi.graph import Graph
 from lare_rl.phi.names import factor_meanings, factor_names
 from lare_rl.phi.read import read
 from lare_rl.tasks.spec import ScoredObservation, TaskSpec, require_role, select_states, step_names
+from lare_rl.util.files import write_atomically
+from lare_rl.util.rows import as_numbers, as_rows
 
 __all__ = [
     "CHANGED_SUFFIX", "HEADER_PREFIX", "LatentFunction", "check_task", "features_text", "function_from_verdict",
-    "normalise_source", "pair_with_roles", "source_hash", "verify_function",
+    "normalise_source", "pair_with_roles", "python_file", "source_hash", "verify_function",
 ]  # fmt: skip
 
 CHANGED_SUFFIX = "; changed by hand since"
@@ -52,7 +55,7 @@ class LatentFunction:
     sizes: tuple[int, int]
     """The sizes of an observation and of an action."""
     model: str = "none: written by hand"
-    exchanges: tuple[dict[str, Any], ...] = ()
+    exchanges: tuple[dict[str, Any], ...] = field(default=(), hash=False)
     """Every request and its replies: `stage`, `messages`, `replies`."""
 
     @property
@@ -105,12 +108,12 @@ class LatentFunction:
             LareError: the arrays do not have the task's sizes, or the numbers of observations and actions differ.
             NonFiniteFactorError: a factor is not finite.
         """
-        observations = _as_array("observation", observation, self.sizes[0])
-        actions = _as_array("action", action, self.sizes[1])
+        observations = as_rows("observation", observation, self.sizes[0])
+        actions = as_rows("action", action, self.sizes[1])
         single = observations.ndim == actions.ndim == 1
         observations, actions = np.atleast_2d(observations), np.atleast_2d(actions)
         if len(observations) != len(actions):
-            raise LareError(f"there are {len(observations)} observations and {len(actions)} actions")
+            raise LareError(f"the numbers of observations and actions differ: {len(observations)} and {len(actions)}")
         factors = compute_batch(self.graph, observations, actions)
         if not np.isfinite(factors).all():
             row, column = np.argwhere(~np.isfinite(factors))[0]
@@ -128,14 +131,18 @@ class LatentFunction:
         For "both", the factors of both observations are concatenated.
 
         Raises:
-            LareError: as for `__call__`, or `scored_observation` is not before, after or both.
+            LareError: as for `__call__`, the batch axes differ, or `scored_observation` is not before, after or both.
         """
         if scored_observation not in ("before", "after", "both"):
             raise LareError(f"scored_observation = {short_repr(scored_observation)}: it is before, after or both")
-        observations = select_states(scored_observation, observation, next_observation)
-        lead = np.shape(action)[:-1]
-        rows = [np.reshape(array, (-1, np.shape(array)[-1])) for array in (*observations, action)]
-        factors = [self(array, rows[-1]) for array in rows[:-1]]
+        states = select_states(scored_observation, observation, next_observation)
+        arrays = [as_numbers("observation", state) for state in states] + [as_numbers("action", action)]
+        lead = arrays[-1].shape[:-1]
+        if any(not array.ndim or array.shape[:-1] != lead for array in arrays):
+            shapes = " and ".join(str(array.shape) for array in arrays)
+            raise LareError(f"observations and actions need the same batch axes: their shapes are {shapes}")
+        *observations, actions = (array.reshape(math.prod(lead), array.shape[-1]) for array in arrays)
+        factors = [self(array, actions) for array in observations]
         return np.concatenate(factors, axis=-1).reshape(*lead, self.n_factors(scored_observation))
 
     def n_factors(self, scored_observation: ScoredObservation) -> int:
@@ -151,41 +158,34 @@ class LatentFunction:
         return {name: value for name, value in self.__dict__.items() if name != "graph"}
 
     def save(self, path: str | Path) -> None:
-        """Write the source to `path` (.py), and the replies and checks to a .json file beside it.
+        """Write a header and the source to `path` (.py), and all fields to a .json file beside it. Existing files are replaced.
 
         Raises:
             LareError: a file cannot be written.
         """
-        path = Path(path)
-        if not path.name:
-            raise LareError(f"{path} is not the name of a file")
-        path = path.with_suffix(".py")
+        path = python_file(Path(path))
+        # An argument of the command line that is not UTF-8 has characters that no file can have.
+        fields = asdict(self) | {"model": self.model.encode(errors="backslashreplace").decode()}
         header = (
             f"task: {self.task}",
             f"kind: {self.kind}",
-            f"model: {self.model}",
+            f"model: {fields['model']}",
             f"sha256: {self.digest}",
             f"passed: {', '.join(check.name for check in self.checks)}",
         )
         # Names are untrusted. Without line breaks, they cannot become lines of code.
         lines = [HEADER_PREFIX + " ".join(line.split()) for line in header]
-        texts = {".py": "\n".join([*lines, self.source]), ".json": json.dumps(asdict(self), indent=1)}
-        try:
-            for suffix, text in texts.items():
-                path.with_suffix(suffix).write_text(redact_key(text) + "\n", encoding="utf-8")
-        except OSError as error:
-            raise LareError(f"{path} cannot be written: {error.strerror}") from error
+        texts = {".json": json.dumps(fields, indent=1), ".py": "\n".join([*lines, self.source])}
+        for suffix, text in texts.items():
+            data = (redact_key(text) + "\n").encode()
+            write_atomically(path.with_suffix(suffix), lambda file, data=data: file.write(data))
 
 
-def _as_array(name: str, values: Any, size: int) -> np.ndarray:
-    """Return observations or actions as an array of rows, or of a single row."""
-    try:
-        array = np.asarray(values, np.float32)
-    except (TypeError, ValueError):
-        raise LareError(f"{name}s must be arrays of numbers, not {short_repr(values)}") from None
-    if array.ndim not in (1, 2) or array.shape[-1] != size:
-        raise LareError(f"{name}s must have the shape (batch, {size}) or ({size},): the shape is {array.shape}")
-    return array
+def python_file(path: Path) -> Path:
+    """Return the .py file that `save` writes. Raises `LareError` if `path` is not the name of a file."""
+    if path.name in ("", ".."):
+        raise LareError(f"{path} is not the name of a file")
+    return path.with_suffix(".py") if path.suffix in (".py", ".json") else path.with_name(f"{path.name}.py")
 
 
 def verify_function(
@@ -226,7 +226,7 @@ def function_from_verdict(source: str, task: TaskSpec, kind: FunctionKind, verdi
 
 
 def normalise_source(source: str) -> str:
-    r"""Return a source as it is saved: lines end with \n, no surrounding blank lines, and no header.
+    r"""Return a source as it is saved: lines end with \n, no empty lines around it, and no header.
 
     A line ends where Python's parser ends it, and nowhere else. Variation selectors, which make an emoji of a sign, are
     removed: models write warning signs into comments, and a variation selector is invisible.

@@ -16,7 +16,7 @@ import math
 import operator
 from collections.abc import Callable, Iterator, Sequence
 from functools import cached_property, partial
-from typing import Any
+from typing import Any, NoReturn
 
 import numpy as np
 
@@ -29,7 +29,8 @@ from lare_rl.phi.rearrange import Source, leaves, map_leaves, move
 from lare_rl.phi.values import describe
 
 __all__ = [
-    "Array", "Complex", "Masked", "as_array", "broadcast", "concatenate", "elementwise", "invert", "power", "rearrange", "stack",
+    "Array", "Complex", "Masked", "as_array", "broadcast", "concatenate", "elementwise", "invert", "power", "rearrange",
+    "refuse_complex", "stack",
 ]  # fmt: skip
 
 
@@ -251,7 +252,13 @@ def as_array(value: Any) -> Array:
         value.refuse()
     if isinstance(value, Masked):
         raise RefusedError("E-ROWS", "what x[mask] selects differs from row to row: use np.where(mask, x, 0)")
+    if isinstance(value, (complex, Complex)):
+        refuse_complex("a real array")
     raise TypeError(f"no array can be made of {describe(value)}")
+
+
+def refuse_complex(what: str) -> NoReturn:
+    raise RefusedError("E-NUMPY", f"{what} of complex numbers: use np.abs, np.angle, .real or .imag")
 
 
 COMPLEX_OPERATIONS: dict[str, Callable[..., Any]] = {}
@@ -262,7 +269,7 @@ def elementwise(op: str, *operands: Any) -> Any:
     """Apply an operation on each number to arrays, which are broadcast to each other."""
     if any(isinstance(operand, (complex, Complex)) for operand in operands):
         if op not in COMPLEX_OPERATIONS:
-            raise RefusedError("E-NUMPY", f"{op} of complex numbers: use np.abs, np.angle, .real or .imag")
+            refuse_complex(op)
         return COMPLEX_OPERATIONS[op](*operands)
     masks = {operand.mask.node: operand.mask for operand in operands if isinstance(operand, Masked)}
     if masks:

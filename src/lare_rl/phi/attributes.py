@@ -108,8 +108,10 @@ def get_attribute(runtime: Runtime, owner: Any, name: str) -> Any:
             return getattr(owner, name)
         case Complex() if name in ("shape", "ndim", "size"):
             return _array_attribute(runtime, owner.real, name)
+        case Complex() if name == "T":
+            return call_with_complex("transpose", [owner], {})
         case Complex():
-            return Bound(lambda *args, **kwargs: call_with_complex(name, [owner, *args], kwargs))
+            return Bound(lambda *args, **kwargs: _call_array_method(owner, name, args, kwargs))
         case Polynomial() if name in ("coef", "coeffs", "c"):
             return owner.falling if name != "coef" else owner.falling[::-1]
         case Polynomial() if name == "deriv":
@@ -209,12 +211,13 @@ def _to_list(runtime: Runtime, array: Array) -> Any:
     return values.tolist()
 
 
-def _call_array_method(array: Array, name: str, args: tuple[Any, ...], kwargs: dict[str, Any]) -> Any:
+def _call_array_method(array: Array | Complex, name: str, args: tuple[Any, ...], kwargs: dict[str, Any]) -> Any:
     """Call a method of an array: the function of NumPy of this name."""
+    call = call_with_complex if isinstance(array, Complex) else call_numpy
     if name == "flatten":
-        return call_numpy("ravel", [array, *args], kwargs).copy()
+        return call("copy", [call("ravel", [array, *args], kwargs)], {})
     if name in ("reshape", "transpose") and (len(args) > 1 or (args and isinstance(args[0], BatchSize))):
         args = (args,)
     if name == "reshape" and "shape" not in kwargs and not args:
         args = (kwargs.pop("newshape", ()),)
-    return call_numpy(name, [array, *args], kwargs)
+    return call(name, [array, *args], kwargs)

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from lare_rl.phi.arrays import COMPLEX_OPERATIONS, Array, Complex, as_array, elementwise
+from lare_rl.phi.arrays import COMPLEX_OPERATIONS, Array, Complex, as_array, elementwise, refuse_complex
 from lare_rl.phi.builder import current_builder
 from lare_rl.phi.limits import MAX_TRANSFORM_LENGTH, RefusedError
 from lare_rl.phi.numpy_functions import call_numpy
@@ -27,13 +27,15 @@ def as_complex(value: Any) -> Complex:
         return value
     if isinstance(value, complex):
         return Complex(as_array(value.real), as_array(value.imag))
+    if is_complex(value):  # a list with complex numbers
+        return call_with_complex("array", [value], {})
     array = as_array(value)
-    return Complex(array, elementwise("multiply", array, 0.0))
+    return Complex(array, call_numpy("zeros_like", [array], {"dtype": "float"}))
 
 
 def is_complex(value: Any) -> bool:
     if isinstance(value, (list, tuple)):
-        return any(isinstance(item, (Complex, complex)) for item in value)
+        return any(map(is_complex, value))
     return isinstance(value, (Complex, complex))
 
 
@@ -42,16 +44,21 @@ def call_with_complex(name: str, args: Sequence[Any], kwargs: Mapping[str, Any])
     if name in COMPLEX_OPERATIONS:
         return COMPLEX_OPERATIONS[name](*args, **kwargs)
     if name not in BY_COMPONENT:
-        raise RefusedError("E-NUMPY", f"np.{name} of complex numbers: use np.abs, np.angle, .real or .imag")
+        refuse_complex(f"np.{name}")
 
     def component(value: Any, key: str) -> Any:
-        if isinstance(value, (list, tuple)) and is_complex(value):
+        if isinstance(value, (list, tuple)):
             return [component(item, key) for item in value]
-        return getattr(as_complex(value), key) if is_complex(value) or isinstance(value, Array) else value
+        return getattr(as_complex(value), key)
 
     real, imag = (
         call_numpy(
-            name, [component(args[0], key), *args[1:]], {name_: component(x, key) for name_, x in kwargs.items()}
+            name,
+            [component(args[0], key), *args[1:]],
+            {
+                name_: component(x, key) if name_ in ("initial", "prepend", "append") else x
+                for name_, x in kwargs.items()
+            },
         )
         for key in ("real", "imag")
     )
@@ -63,16 +70,16 @@ def _multiply(x: Complex, y: Complex) -> Complex:
 
 
 def _divide(x: Complex, y: Complex) -> Complex:
-    size = y.real * y.real + y.imag * y.imag
-    product = _multiply(x, Complex(y.real, -y.imag))
+    size = elementwise("hypot", y.real, y.imag)  # its square may be too large or too small for float32
+    product = _multiply(x, Complex(y.real / size, -y.imag / size))
     return Complex(product.real / size, product.imag / size)
 
 
 def _power(x: Any, y: Any) -> Any:
-    if not isinstance(y, int) or not 0 < y <= 8:
+    if not isinstance(y, (int, float)) or y not in range(1, 9):
         raise RefusedError("E-NUMPY", "complex numbers have whole powers from 1 to 8 only")
     result = as_complex(x)
-    for _ in range(y - 1):
+    for _ in range(int(y) - 1):
         result = _multiply(result, as_complex(x))
     return result
 
@@ -107,8 +114,8 @@ COMPLEX_OPERATIONS |= {"absolute": COMPLEX_OPERATIONS["abs"], "conjugate": COMPL
 
 array_functions(
     {
-        "angle": lambda z: elementwise("arctan2", elementwise("multiply", z, 0.0), z),
-        "imag": lambda val: elementwise("multiply", val, 0.0),
+        "angle": lambda z: elementwise("arctan2", 0.0, z),
+        "imag": lambda val: call_numpy("zeros_like", [val], {}),
     }
 )
 
@@ -124,14 +131,19 @@ def transform(variant: tuple[float, bool], a: Any, n: Any = None, axis: int = -1
         raise RefusedError("E-COST", f"np.fft of {max(n, size)} numbers: at most {MAX_TRANSFORM_LENGTH}")
     if n < 1:
         raise ValueError(f"np.fft with n = {n}")
-    phase = sign * 2 * math.pi * np.outer(np.arange(size), np.arange(n // 2 + 1 if half else n)) / n
-    cos, sin = (function(phase) * (np.arange(size) < n)[:, None] for function in (np.cos, np.sin))
+    turns = np.outer(np.arange(size), np.arange(n // 2 + 1 if half else n)) % n
+    phase, is_used = sign * 2 * math.pi * turns / n, (np.arange(size) < n)[:, None]
+    cos, sin = np.cos(phase) * is_used, np.where(2 * turns % n == 0, 0.0, np.sin(phase)) * is_used
 
     def product(array: Array, matrix: np.ndarray) -> Any:
         return call_numpy("moveaxis", [call_numpy("tensordot", [array, matrix], {"axes": [[at], [0]]}), -1, at], {})
 
-    real = product(x.real, cos) - product(x.imag, sin)
-    imag = product(x.real, sin) + product(x.imag, cos)
+    real, imag = product(x.real, cos), product(x.real, sin)
+    if is_complex(a):
+        real, imag = real - product(x.imag, sin), imag + product(x.imag, cos)
+    else:  # exactly +0, as NumPy's: np.angle tells -0 from it
+        has_imag = sin.any(axis=0).reshape(-1, *[1] * (x.real.ndim - 1 - at))
+        imag = elementwise("where", has_imag, imag, 0.0)
     return Complex(real, imag) if sign < 0 else Complex(real / n, imag / n)
 
 

@@ -14,9 +14,11 @@ from itertools import pairwise
 
 import numpy as np
 from jaxtyping import Float, UInt8
+from numpy.typing import ArrayLike
 
 from lare_rl.errors import missing_extra_error
-from lare_rl.util.findings import format_for_reader
+from lare_rl.report.reported_run import finite
+from lare_rl.util.findings import format_for_reader, format_number
 
 try:
     from PIL import Image, ImageDraw
@@ -32,12 +34,11 @@ __all__ = [
     "draw_legend",
     "draw_points",
     "draw_strips",
-    "format_number",
     "visible_steps",
 ]
 
 N_COLOURS = 4
-"""The number of colours that are told apart; other lines are grey."""
+"""The number of colours that are told apart, `c0` to `c3` of report.css; other lines are grey."""
 MAX_VISIBLE_STEPS = 100
 """The largest number of steps that a reader can distinguish in a line."""
 MAX_STRIP_COLUMNS = 200
@@ -48,19 +49,18 @@ MAX_LABEL = 24
 """Characters of the text at the end of a line that a chart has room for."""
 _UNITS = 1000
 """The width and the height of a chart in its own units."""
-_LABEL_GAP = 5.5
-"""Percent of a chart's height between two labels."""
+_Scale = Callable[[ArrayLike], np.ndarray]
 _VIRIDIS = np.array([(68, 1, 84), (59, 82, 139), (33, 145, 140), (94, 201, 98), (253, 231, 37)], float)
 
 
 @dataclass(frozen=True)
 class Line:
-    """A line of a chart. NaN are gaps."""
+    """A line of a chart. Points whose y is not finite are left out."""
 
     x: Float[np.ndarray, " points"]
     y: Float[np.ndarray, " points"]
     style: str
-    """Classes of report.css: a colour, and `thin` or `dashed`."""
+    """Classes of report.css: a colour (`c0` to `c3`, `grey`), and perhaps `thin`, `dashed` or `other`."""
     label: str = ""
     """The text at its end."""
     band: Float[np.ndarray, " points"] | None = None
@@ -81,6 +81,8 @@ class Chart:
     """Texts that appear at values of x."""
     shaded_until: float = 0.0
     is_low: bool = False
+    label_gap: float = 5.5
+    """Percent of the height between two labels: 9 for a chart among `figures`, which is lower."""
 
     def render(self) -> str:
         """Return the chart as HTML."""
@@ -89,80 +91,75 @@ class Chart:
         if start == end:  # a single point stands out inside
             start, end = 0.0, 1.05 * end or 1.0
         bottom, top = self.limits or self._find_limits()
-
-        def to_units(values: np.ndarray, low: float, high: float) -> np.ndarray:
-            return np.clip(
-                np.nan_to_num((values - low) / max(high - low, 1e-12) * _UNITS, posinf=9e9), -_UNITS, 2 * _UNITS
-            )
-
-        def across(values: np.ndarray) -> np.ndarray:
-            return to_units(np.asarray(values, float), start, end)
-
-        def down(values: np.ndarray) -> np.ndarray:
-            return _UNITS - to_units(np.asarray(values, float), bottom, top)
-
         y_ticks, x_ticks = _choose_ticks(bottom, top, 3 if self.is_low else 5), _choose_ticks(start, end, 5)
-        shapes = [f'<path class="grid" d="{"".join(f"M0 {y:.0f}h{_UNITS}" for y in down(np.array(y_ticks)))}"/>']
+
+        def across(values: ArrayLike) -> np.ndarray:
+            return _to_units(values, start, end)
+
+        def down(values: ArrayLike) -> np.ndarray:
+            return _UNITS - _to_units(values, bottom, top)
+
+        shapes = [f'<path class="grid" d="{"".join(f"M0 {y:.0f}h{_UNITS}" for y in down(y_ticks))}"/>']
         if self.shaded_until > start:
-            shapes.append(
-                f'<rect class="shade" width="{across(np.array([self.shaded_until]))[0]:.0f}" height="{_UNITS}"/>'
-            )
-        for line in self.lines:
-            if line.band is not None:
-                is_finite = np.isfinite(line.y + line.band)
-                x, y, band = line.x[is_finite], line.y[is_finite], line.band[is_finite]
-                edges = zip((x, x[::-1]), (y + band, (y - band)[::-1]), strict=True)
-                outline = " ".join(_points(across(x), down(y)) for x, y in edges)
-                shapes.append(f'<polygon class="band {line.style}" points="{outline}"/>')
-        for line in self.lines:
-            is_known = np.isfinite(line.y)
-            points = _points(across(line.x[is_known]), down(line.y[is_known]))
-            style = line.style if is_known.sum() > 1 else f"{line.style} dot"
-            shapes.append(f'<polyline class="{style}" points="{points}{f" {points}" if is_known.sum() == 1 else ""}"/>')
-        shapes += self._render_hovers(across)
-        labels = [
-            (float(down(y[-1:])[0]) / 10, line)
-            for line in self.lines
-            if line.label and len(y := line.y[np.isfinite(line.y)])
-        ]
-        texts = [
-            f'<span class="label {line.style}" style="top:{y:.1f}%">{escape(line.label)}</span>'
-            for (_, line), y in zip(labels, _spread([y for y, _ in labels]), strict=True)
-        ]
+            shapes.append(f'<rect class="shade" width="{across([self.shaded_until])[0]:.0f}" height="{_UNITS}"/>')
+        shapes += [*self._render_lines(across, down), *self._render_hovers(across)]
+        tick_labels = _label_ticks(y_ticks)
+        texts = self._render_labels(down)
+        classes = f"chart{' low' if self.is_low else ''}{' labelled' if texts else ''}"
         texts += [
-            f'<span class="y" style="top:{y / 10:.1f}%">{format_number(tick)}</span>'
-            for tick, y in zip(y_ticks, down(np.array(y_ticks)), strict=True)
+            f'<span class="y" style="top:{y / 10:.1f}%">{label}</span>'
+            for label, y in zip(tick_labels, down(y_ticks), strict=True)
         ]
         texts += [
             f'<span class="x" style="left:{x / 10:.1f}%">{format_for_reader(tick, "steps")}</span>'
-            for tick, x in zip(x_ticks, across(np.array(x_ticks)), strict=True)
+            for tick, x in zip(x_ticks, across(x_ticks), strict=True)
         ]
-        n_characters = max(len(format_number(tick)) for tick in y_ticks)
-        classes = f"chart{' low' if self.is_low else ''}{' labelled' if labels else ''}"
-        n_label = min(MAX_LABEL, max([len(line.label) for line in self.lines]))
+        n_label = min(MAX_LABEL, max(len(line.label) for line in self.lines))
         return (
-            f'<div class="{classes}" style="--digits:{n_characters};--label:{n_label}"><div class="plot">'
+            f'<div class="{classes}" style="--digits:{max(map(len, tick_labels))};--label:{n_label}"><div class="plot">'
             f'<svg viewBox="0 0 {_UNITS} {_UNITS}" preserveAspectRatio="none" role="img" aria-label="{escape(self.description)}">'
             f'{"".join(shapes)}</svg>{"".join(texts)}<span class="axis">{escape(self.x_label)}</span></div></div>'
         )
 
     def _find_limits(self) -> tuple[float, float]:
-        values = np.concatenate([line.y for line in self.lines])
-        if not np.isfinite(values).any():
+        values = finite(np.concatenate([line.y for line in self.lines]))
+        if not len(values):
             return 0.0, 1.0
-        low, high = float(np.nanmin(values)), float(np.nanmax(values))
+        low, high = float(values.min()), float(values.max())
         size = high - low or abs(high) or 1.0
-        for line in self.lines:
-            # A wide band must not flatten the lines.
-            if line.band is not None and np.isfinite(line.y + line.band).any():
-                low = max(min(low, float(np.nanmin(line.y - line.band))), low - size / 2)
-                high = min(max(high, float(np.nanmax(line.y + line.band))), high + size / 2)
+        edges = [line.y + sign * line.band for line in self.lines if line.band is not None for sign in (-1, 1)]
+        values = finite(np.concatenate([values, *edges]))
+        # A wide band must not flatten the lines.
+        low, high = max(float(values.min()), low - size / 2), min(float(values.max()), high + size / 2)
         return low - 0.05 * size, high + 0.05 * size
 
-    def _render_hovers(self, across: Callable[[np.ndarray], np.ndarray]) -> list[str]:
-        chosen = list(self.hovers.items())[:: math.ceil(len(self.hovers) / MAX_HOVERS) or 1]
-        centres = across(np.array([x for x, _ in chosen]))
-        edges = np.concatenate([[0], (centres[1:] + centres[:-1]) / 2, [_UNITS]]) if chosen else np.zeros(0)
+    def _render_lines(self, across: _Scale, down: _Scale) -> Iterable[str]:
+        for line in self.lines:
+            if line.band is not None:
+                is_finite = np.isfinite(line.y + line.band)
+                x, y, band = line.x[is_finite], line.y[is_finite], line.band[is_finite]
+                outline = _points(across([*x, *x[::-1]]), down([*(y + band), *(y - band)[::-1]]))
+                yield f'<polygon class="band {line.style}" points="{outline}"/>'
+        for line in self.lines:
+            is_finite = np.isfinite(line.y)
+            points, style = _points(across(line.x[is_finite]), down(line.y[is_finite])), line.style
+            if is_finite.sum() == 1:  # a line without length, with round ends
+                points, style = f"{points} {points}", f"{style} dot"
+            yield f'<polyline class="{style}" points="{points}"/>'
+
+    def _render_labels(self, down: _Scale) -> list[str]:
+        labelled = [line for line in self.lines if line.label and np.isfinite(line.y).any()]
+        tops = _spread(down([finite(line.y)[-1] for line in labelled]) / 10, self.label_gap)
+        return [
+            f'<span class="label {line.style}" style="top:{y:.1f}%">{escape(line.label)}</span>'
+            for line, y in zip(labelled, tops, strict=True)
+        ]
+
+    def _render_hovers(self, across: _Scale) -> list[str]:
+        step = math.ceil(len(self.hovers) / MAX_HOVERS) or 1
+        chosen = list(self.hovers.items())[::-step][::-1]  # with the last
+        centres = across([x for x, _ in chosen])
+        edges = np.concatenate([[0], (centres[1:] + centres[:-1]) / 2, [_UNITS]])
         return [
             f'<rect class="hover" x="{x:.0f}" width="{end - x:.0f}" height="{_UNITS}"><title>{escape(text)}</title></rect>'
             for (_, text), x, end in zip(chosen, edges, edges[1:], strict=False)
@@ -222,7 +219,7 @@ def draw_strips(rows: Mapping[str, Float[np.ndarray, "steps agents"]], shared_sc
     strips = []
     for name, values in pooled.items():
         low, high = scales[name]
-        pixels = _colour((values.T - low) / max(high - low, 1e-12))
+        pixels = _colour(values.T, low, high)
         height = 28 if len(pixels) == 1 else 12 * len(pixels)
         text = f"{name}, from {format_number(low)} (dark) to {format_number(high)} (bright)"
         strips.append(
@@ -239,7 +236,7 @@ def draw_points(points: Float[np.ndarray, "points 2"], values: Float[np.ndarray,
     positions = radius + (points - points.min(axis=0)) / np.ptp(points, axis=0) * (size - 2 * radius)
     image = Image.new("RGBA", (size, size))
     draw = ImageDraw.Draw(image)
-    for (x, y), colour in zip(positions, _colour((values - low) / max(high - low, 1e-12)), strict=True):
+    for (x, y), colour in zip(positions, _colour(values, low, high), strict=True):
         draw.ellipse((x - radius, y - radius, x + radius, y + radius), fill=tuple(map(int, colour)))
     return (
         f'<figure><figcaption>{escape(text)}</figcaption><img alt="{escape(text)}" src="{_encode_png(image)}"></figure>'
@@ -252,14 +249,9 @@ def visible_steps(length: int) -> slice:
     return slice(first, min(length, first + MAX_VISIBLE_STEPS))
 
 
-def format_number(value: float | np.number) -> str:
-    """Write a number as all pages do."""
-    return format_for_reader(float(value) + 0.0, "number")
-
-
-def _colour(position: Float[np.ndarray, "*shape"]) -> UInt8[np.ndarray, "*shape 3"]:
-    """Return the colours of numbers between 0 and 1."""
-    position = np.clip(position, 0, 1) * (len(_VIRIDIS) - 1)
+def _colour(values: Float[np.ndarray, "*shape"], low: float, high: float) -> UInt8[np.ndarray, "*shape 3"]:
+    """Return the colours of numbers, from dark at `low` to bright at `high`."""
+    position = np.clip((values - low) / max(high - low, 1e-12), 0, 1) * (len(_VIRIDIS) - 1)
     return np.stack([np.interp(position, range(len(_VIRIDIS)), channel) for channel in _VIRIDIS.T], -1).astype(np.uint8)
 
 
@@ -268,6 +260,10 @@ def _encode_png(image: Image.Image) -> str:
     file = io.BytesIO()
     image.quantize(64, Image.Quantize.FASTOCTREE).save(file, "PNG", optimize=True)
     return f"data:image/png;base64,{base64.b64encode(file.getvalue()).decode()}"
+
+
+def _to_units(values: ArrayLike, low: float, high: float) -> np.ndarray:
+    return np.clip((np.asarray(values, float) - low) / max(high - low, 1e-12) * _UNITS, -_UNITS, 2 * _UNITS)
 
 
 def _points(x: np.ndarray, y: np.ndarray) -> str:
@@ -282,12 +278,23 @@ def _choose_ticks(low: float, high: float, n_ticks: int) -> list[float]:
     return [float(step * i) for i in range(math.ceil(low / step - 1e-9), math.floor(high / step + 1e-9) + 1)] or [low]
 
 
-def _spread(positions: Sequence[float]) -> list[float]:
+def _label_ticks(ticks: Sequence[float]) -> list[str]:
+    """Write ticks with as many digits as they need, up to 8."""
+    texts = [list(map(format_number, ticks)), *([f"{tick:,.{n}g}" for tick in ticks] for n in range(4, 9))]
+    tolerance = 0.001 * (ticks[-1] - ticks[0])
+    return next((row for row in texts if _max_error(row, ticks) <= tolerance), texts[0])
+
+
+def _max_error(texts: Sequence[str], numbers: Sequence[float]) -> float:
+    return max(abs(float(text.replace(",", "")) - number) for text, number in zip(texts, numbers, strict=True))
+
+
+def _spread(positions: Float[np.ndarray, " labels"], gap: float) -> list[float]:
     """Return positions of labels, moved apart where they would overlap."""
-    moved, order = np.array(positions, float), sorted(range(len(positions)), key=lambda i: positions[i])
+    moved, order = positions.copy(), positions.argsort(kind="stable")
     for _ in range(50):
         for i, j in pairwise(order):
-            overlap = max(0.0, _LABEL_GAP - (moved[j] - moved[i])) / 2
+            overlap = max(0.0, gap - (moved[j] - moved[i])) / 2
             moved[[i, j]] += -overlap, overlap
         moved += max(0.0, -moved.min(initial=0)) - max(0.0, moved.max(initial=0) - 100)
     return moved.tolist()

@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Float
 
 from lare_rl.evaluation.reference_returns import REFERENCE_RETURNS
-from lare_rl.report.charts import N_COLOURS, Chart, Line, draw_legend, format_number
+from lare_rl.report.charts import N_COLOURS, Chart, Line, draw_legend
 from lare_rl.report.diagnosis import CREDIT_CODES, NEXT_CODES, diagnose
 from lare_rl.report.html import render_fold, render_note, render_table, render_tiles
 from lare_rl.report.messages import MESSAGES, WORDS
@@ -16,7 +16,7 @@ from lare_rl.report.reported_run import Curve, ReportedRun, finite, mean_over_se
 from lare_rl.report.run_summary import RunSummary, summarise_run
 from lare_rl.runs.metric_names import CREDIT_CORRELATION, CREDIT_ERROR, RETURN, RETURN_R2, RETURN_STD
 from lare_rl.tasks.spec import TaskSpec
-from lare_rl.util.findings import Finding, format_for_reader, render
+from lare_rl.util.findings import Finding, format_for_reader, format_number, render
 from lare_rl.util.statistics import format_mean_std, wins
 
 __all__ = [
@@ -189,7 +189,7 @@ def render_learning_curves(
     figures = [
         f'<figure><figcaption class="title">{escape(metric.title)}</figcaption>{chart}</figure>'
         for metric in _other_metrics(task)
-        if (chart := _draw_metric(metric, runs, colours, {}, warmup))
+        if (chart := _draw_metric(metric, runs, colours, {}, warmup, label_gap=9.0))
     ]
     if task.name in REFERENCE_RETURNS:
         published = format_number(REFERENCE_RETURNS[task.name].trained)
@@ -216,7 +216,12 @@ def _other_metrics(task: TaskSpec) -> Iterable[_Metric]:
 
 
 def _draw_metric(
-    metric: _Metric, runs: Sequence[ReportedRun], colours: dict[str, str], references: dict[str, float], warmup: int
+    metric: _Metric,
+    runs: Sequence[ReportedRun],
+    colours: dict[str, str],
+    references: dict[str, float],
+    warmup: int,
+    label_gap: float = 5.5,
 ) -> str:
     """Draw a metric of all runs: the mean over seeds and, of few runs, each seed. Return nothing if no run has it."""
     curves = {reported.name: curve for reported in runs if (curve := reported.curve(metric.name))}
@@ -238,7 +243,7 @@ def _draw_metric(
     )
     extent = np.array([first_step if first_step < last_step else 0.0, last_step])
     lines += [Line(extent, np.full(2, value), "grey dashed", name) for name, value in references.items()]
-    has_negative = any((line.y[np.isfinite(line.y)] < 0).any() for line in lines)
+    has_negative = any((finite(line.y) < 0).any() for line in lines)
     limits = (-1.0, 1.0) if metric.limits and has_negative else metric.limits
     final = ", ".join(f"{name} {_format_spread(finite(values[:, -1]))}" for name, (_, values) in curves.items())
     return Chart(
@@ -248,6 +253,7 @@ def _draw_metric(
         limits=limits,
         hovers=_hovers(curves),
         shaded_until=float(warmup),
+        label_gap=label_gap,
     ).render()
 
 

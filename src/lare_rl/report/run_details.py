@@ -26,7 +26,6 @@ from lare_rl.report.charts import (
     draw_legend,
     draw_points,
     draw_strips,
-    format_number,
     visible_steps,
 )
 from lare_rl.report.html import render_fold, render_function, render_note, render_table
@@ -35,7 +34,7 @@ from lare_rl.runs.directory import Run, function_paths
 from lare_rl.tasks.spec import base_name
 from lare_rl.tasks.trust import TRUST_VARIABLE, untrusted_module
 from lare_rl.training.explain import explanation_source, find_explanations
-from lare_rl.util.findings import Finding, render
+from lare_rl.util.findings import Finding, format_number, render
 from lare_rl.util.statistics import column_correlations
 
 __all__ = ["describe_method", "render_details", "render_settings"]

@@ -15,9 +15,9 @@ import string
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from html import escape
-from typing import Any, Literal
+from typing import Any, Literal, SupportsFloat
 
-__all__ = ["Finding", "format_for_reader", "render"]
+__all__ = ["Finding", "format_for_reader", "format_number", "render"]
 
 Catalogue = Mapping[str, str]
 """The message templates of a package, by code."""
@@ -68,7 +68,7 @@ def format_for_reader(value: Any, spec: str = "") -> str:
     """
     match spec.split(" ", 1):
         case ["number"]:
-            return f"{value:,.0f}" if math.isfinite(value) and abs(value) >= 100 else f"{value:.3g}"
+            return f"{value:,.0f}" if math.isfinite(value) and abs(value) >= 100 else f"{value + 0.0:.3g}"  # not -0
         case ["count", noun]:
             return f"{value:,} {noun}" if value == 1 else f"{value:,} {noun}s"
         case ["r2"]:
@@ -86,6 +86,11 @@ def format_for_reader(value: Any, spec: str = "") -> str:
                 return f"{value:.0f} s"
             return f"{math.ceil(value / 60)} min" if value < 5400 else f"{value / 3600:.1f} h"
     return format(value, spec)
+
+
+def format_number(value: SupportsFloat) -> str:
+    """Write a number as all pages do."""
+    return format_for_reader(float(value), "number")
 
 
 @dataclass

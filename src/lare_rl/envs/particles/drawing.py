@@ -3,14 +3,23 @@
 import numpy as np
 from jaxtyping import Float
 
-from lare_rl.envs.canvas import Axes, Figure, blank_figure, colormaps, paint_frames, patches
+from lare_rl.envs.canvas import (
+    OTHER_COLOUR,
+    TEAM_COLOUR,
+    Axes,
+    Figure,
+    blank_figure,
+    colormaps,
+    paint_frames,
+    patches,
+)
 from lare_rl.envs.interface import Frame
 from lare_rl.envs.particles.task import ParticleTask
 
 __all__ = ["draw_frames", "draw_state"]
 
-TEAM_COLOUR, OTHER_COLOUR, LANDMARK_COLOUR = "#0072b2", "#d55e00", "#9a9a9a"
-"""The colours of the first team, of other moving entities, and of entities that do not move."""
+LANDMARK_COLOUR = "#9a9a9a"
+"""The colour of entities that do not move."""
 CREDIT_COLOURS = colormaps["RdBu"]
 MARGIN = 1.08
 """The size of the picture relative to the square that it must contain."""

@@ -7,14 +7,14 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from lare_rl.envs.canvas import Axes, paint_frames, patches
+from lare_rl.envs.canvas import OTHER_COLOUR, TEAM_COLOUR, Axes, paint_frames, patches
 from lare_rl.envs.interface import Frame
 from lare_rl.envs.smax.battle import FIELD, Battle, attack_target
 from lare_rl.envs.smax.scenarios import Scenario
 
 __all__ = ["draw_frames", "find_hits", "paint_state"]
 
-ALLY_COLOUR, ENEMY_COLOUR, DEAD_COLOUR = "#0072b2", "#d55e00", "#bbbbbb"
+DEAD_COLOUR = "#bbbbbb"
 
 
 def draw_frames(scenario: Scenario, battles: Battle, credit: Float[np.ndarray, " steps"] | None = None) -> list[Frame]:
@@ -56,7 +56,7 @@ def paint_state(axes: Axes, scenario: Scenario, battle: Battle, previous: Battle
 
 
 def _side_colour(scenario: Scenario, unit: int) -> str:
-    return ENEMY_COLOUR if scenario.is_enemy[unit] else ALLY_COLOUR
+    return OTHER_COLOUR if scenario.is_enemy[unit] else TEAM_COLOUR
 
 
 def find_hits(scenario: Scenario, battle: Battle, previous: Battle) -> list[tuple[int, int]]:

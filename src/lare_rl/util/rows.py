@@ -1,0 +1,26 @@
+"""Arguments that are rows of numbers."""
+
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+
+from lare_rl.errors import LareError, short_repr
+
+__all__ = ["as_numbers", "as_rows"]
+
+
+def as_numbers(name: str, values: Any) -> Float[np.ndarray, "*shape"]:
+    """Return an argument as an array of float32. Raises `LareError`, which names it, if it is no array of numbers."""
+    try:
+        return np.asarray(values, np.float32)
+    except (TypeError, ValueError, OverflowError):
+        raise LareError(f"{name}s must be arrays of numbers, not {short_repr(values)}") from None
+
+
+def as_rows(name: str, values: Any, size: int) -> Float[np.ndarray, "*batch size"]:
+    """Return a row of `size` numbers, or a batch of rows, as `as_numbers` does. Raises `LareError` for other shapes too."""
+    array = as_numbers(name, values)
+    if array.ndim not in (1, 2) or array.shape[-1] != size:
+        raise LareError(f"{name}s must have the shape (batch, {size}) or ({size},): the shape is {array.shape}")
+    return array
