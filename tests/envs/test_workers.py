@@ -161,6 +161,13 @@ def test_worker_that_does_not_start(monkeypatch):
         SubprocVecEnv([ToyHostEnv])
 
 
+def test_worker_that_starts_too_late(monkeypatch):
+    monkeypatch.setattr(worker_process, "PROGRAM", "import time; time.sleep(60)")
+    monkeypatch.setattr(worker_process, "CONNECT_TIMEOUT_S", 0.2)
+    with pytest.raises(LareError, match=r"did not start within 0\.2 s"):
+        SubprocVecEnv([ToyHostEnv])
+
+
 def test_worker_that_is_killed_between_steps():
     envs = SubprocVecEnv([ToyHostEnv])
     pid = envs.pids[0]
@@ -183,6 +190,23 @@ def test_close(tmp_path):
     for call in (SubprocVecEnv.measure_step_s, lambda envs: envs.find_interference(ToyHostEnv, 1.0), walk):
         with pytest.raises(LareError, match="the worker processes have ended"):
             call(envs)
+
+
+@pytest.mark.parametrize("makers", [[partial(ToyHostEnv, "make")], [partial(ToyHostEnv, size=3)]])
+def test_environments_are_closed_if_another_is_refused(makers, tmp_path):
+    notes = [tmp_path / name for name in ("first", "second")]
+    with pytest.raises(LareError, match="environment 2"):
+        LocalVecEnv([*(partial(ToyHostEnv, note=str(note)) for note in notes), *makers])
+    assert [note.read_text() for note in notes] == ["closed", "closed"]
+
+
+@pytest.mark.parametrize("make_vec_env", [LocalVecEnv, partial(SubprocVecEnv, processes=1)])
+def test_error_in_close_is_a_warning(make_vec_env, tmp_path, capfd, caplog):
+    """The other environments are closed too."""
+    note = tmp_path / "second"
+    make_vec_env([partial(ToyHostEnv, note=str(tmp_path)), partial(ToyHostEnv, note=str(note))]).close()
+    assert note.read_text() == "closed"
+    assert (caplog.text + capfd.readouterr().err).count("environment 0 failed in close: ") == 1
 
 
 def test_makers_that_are_refused():
