@@ -1,5 +1,6 @@
 """Environments in worker processes equal those in this process, and their failures are errors of one line."""
 
+import contextlib
 import os
 import signal
 import subprocess
@@ -17,8 +18,9 @@ import lare_rl
 from helpers import host_envs
 from helpers.host_envs import ToyHostEnv
 from helpers.toy_envs import toy_spec
-from lare_rl.envs import families, worker_process
+from lare_rl.envs import families, worker_process, workers
 from lare_rl.envs.families import picklable_maker
+from lare_rl.envs.shared_arrays import open_shared_memory
 from lare_rl.envs.vec_env import LocalVecEnv
 from lare_rl.envs.workers import SubprocVecEnv
 from lare_rl.errors import LareError
@@ -159,6 +161,27 @@ def test_worker_that_does_not_start(monkeypatch):
     monkeypatch.setattr(worker_process, "PROGRAM", "raise SystemExit(7)")
     with pytest.raises(LareError, match=r"^environment 0 \(in worker process \d+\) died: exit status 7$"):
         SubprocVecEnv([ToyHostEnv])
+
+
+def test_workers_end_before_their_directory(monkeypatch):
+    """One that is just starting would make its socket there, or fail to."""
+    processes, ended, start = [], [], subprocess.Popen
+
+    @contextlib.contextmanager
+    def watch():
+        with open_shared_memory() as memory:
+            try:
+                yield memory
+            finally:
+                ended.extend(process.poll() is not None for process in processes)
+
+    monkeypatch.setattr(
+        subprocess, "Popen", lambda *args, **kwargs: processes.append(start(*args, **kwargs)) or processes[-1]
+    )
+    monkeypatch.setattr(workers, "open_shared_memory", watch)
+    with pytest.raises(LareError, match="cannot be sent"):
+        SubprocVecEnv([lambda: ToyHostEnv()] * 2, processes=2)
+    assert ended == [True, True]
 
 
 def test_worker_that_starts_too_late(monkeypatch):
