@@ -20,6 +20,7 @@ TOY = "pettingzoo/helpers.parallel_toy_envs:Toy"
 KEYS = {"max_episode_steps": 25, "arguments": {"N": 3}, "agents": ("a_*",)}
 
 TEAMS = Team("cat", 0, 2), Team("mouse", 2, 5)
+WIDEST = np.full((2, 2), np.finfo(np.float32).max)
 HUNT = EnvSpec(TEAMS, 4, 3, discrete=True, max_steps=9, state_size=7, measures=("caught",))
 
 
@@ -66,6 +67,15 @@ def test_maker_may_be_a_location(tmp_path, monkeypatch):
     monkeypatch.syspath_prepend(tmp_path)
     register_family("located", "my_envs:make")
     assert isinstance(make_env(toy_spec(environment="located/two", action_size=2)), ToyHostEnv)
+
+
+def test_foreign_errors_are_one_line():
+    def make(task, **_):
+        raise OSError("no asset\ntrack.bin")
+
+    register_family("raising", make)
+    with pytest.raises(LareError, match=r"'raising/x' cannot be made: no asset track.bin$"):
+        make_env(toy_spec(environment="raising/x"))
 
 
 def test_family_names_are_unique():
@@ -219,7 +229,10 @@ def test_sizes_are_read_once(log):
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"low": np.zeros((0, 0))}, r"low and high in EnvSpec, of the shape \(2, 2\)"),
+        (dict.fromkeys(("low", "high"), np.zeros((0, 0))), r"low and high in EnvSpec, of the shape \(2, 2\)"),
+        ({"low": np.full((2, 2), -np.inf, np.float32)}, "finite bounds"),
+        ({"low": np.full((2, 2), 2, np.float32)}, "low <= high"),
+        ({"low": -WIDEST, "high": WIDEST}, "finite high - low"),
         (None, "an EnvSpec, and has None"),
     ],
 )
@@ -229,7 +242,7 @@ def test_spec_is_checked(changes, message):
             super().__init__(changes=changes)
             self.spec = self.spec if changes else None
 
-    name = f"unbounded-{changes is None}"
+    name = f"unbounded-{len(message)}"
     register_family(name, Unbounded)
     with pytest.raises(LareError, match=message):
         make_env(toy_spec(environment=f"{name}/two", observation_size=2, action_size=2))

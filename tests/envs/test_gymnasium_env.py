@@ -185,10 +185,12 @@ def test_measures_are_those_of_the_last_step():
         ({"fail_in": "step", "error": SystemExit(0)}, "step: 0$"),
         ({"fail_in": "step", "error": LareError("no battery")}, "^no battery$"),
         ({"fail_in": "render", "error": IndexError("range")}, "render: range$"),
-        ({"fail_in": "close", "error": TypeError("float")}, "close: float$"),
         ({"info": {}, "terminated": True}, "'won'.*is empty"),
         ({"info": {"lost": 1, 3: 4}, "terminated": True}, "'won'.*only 3, lost"),
         ({"info": {"won": 10**400}, "terminated": True}, "'won'.*not a number"),
+        ({"info": {"level": 64}}, "group 'level'.*64.*from 0 to 63"),
+        ({"info": {"level": 0.5}}, "group 'level'.*0.5"),
+        ({"info": {"level": np.nan}}, "group 'level'.*nan"),
     ],
 )
 def test_invalid_value_or_failure(kwargs, content):
@@ -196,15 +198,22 @@ def test_invalid_value_or_failure(kwargs, content):
         for timestep in (env.reset(0), env.step(STILL), env.step(STILL)):
             check_finite(timestep, env.spec, "the environment")
         env.render()
-        env.close()
 
     measures = ("won",) if kwargs.get("terminated") is True else ()
-    task = toy_spec(environment="foreign/Invalid-v0", observation="0: the target\n1: noise", measures=measures)
+    group = "level" if "level" in (kwargs.get("info") or {}) else None
+    texts = {"observation": "0: the target\n1: noise"}
+    task = toy_spec(environment="foreign/Invalid-v0", measures=measures, group=group, **texts)
     env = GymnasiumEnv(task, **kwargs)
     with pytest.raises(LareError, match=content) as error:
         use(env)
     assert "\n" not in str(error.value)
     assert isinstance(error.value, EnvOutputError) == content.startswith(("observation", "reward"))
+
+
+def test_error_in_close_is_a_warning(caplog):
+    """It would hide the error for which the environment is closed."""
+    make_env("Invalid", fail_in="close", error=OSError("no\nlink")).close()
+    assert caplog.messages == ["environment 'foreign/Invalid-v0' failed in close: no link"]
 
 
 def test_spaces_that_are_refused():
@@ -217,7 +226,7 @@ def test_spaces_that_are_refused():
 
 def test_actions_are_in_their_space():
     """As the environment asserts: integers are rounded, and choices begin with any number."""
-    for space in (Box(0, 5, (2,), np.int64), Discrete(2, start=5)):
+    for space in (Box(0, 5, (2,), np.int64), Box(0, 5, (2,), np.float16), Discrete(2, start=5)):
         env = make_env("OtherActions", action_space=space)
         env.reset(0)
         env.step(np.array([[3.25, 4.75]], np.float32))

@@ -1,5 +1,7 @@
 """The interface of environments: team means, actions in the environment's units, and `JaxEnv`s on the host."""
 
+from dataclasses import replace
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -46,6 +48,8 @@ def test_discrete_action_is_the_first_largest():
     env_action = to_env_action(action, DISCRETE)
     np.testing.assert_array_equal(env_action, np.eye(3)[[2, 1, 0, 2]])
     assert env_action.dtype == np.float32
+    many = replace(DISCRETE, action_size=10**6)  # a matrix of all one-hot rows would need 4 TB
+    assert to_env_action(np.eye(1, 10**6, 7), many).argmax() == 7
 
 
 @pytest.mark.parametrize(

@@ -160,6 +160,13 @@ def test_like_keeps_teams(tmp_path):
     assert read_task("CN-6").roles == (read_task("CN-6"),)
 
 
+def test_like_cycle_by_relative_paths(tmp_path):
+    file = tmp_path / "a.toml"
+    file.write_text(f'like = "../{tmp_path.name}/a.toml"')
+    with pytest.raises(LareError, match="without a cycle"):
+        read_task(file)
+
+
 @pytest.mark.parametrize("circle", [["a"], ["a", "b", "c"]])
 def test_like_cycle(tmp_path, circle):
     files = [tmp_path / name for name in circle]

@@ -353,6 +353,7 @@ def test_arguments():
         ({"actions": dict.fromkeys(("a_0", "a_1"), MultiDiscrete([2, 2]))}, f"{TOY}.*action space of a_0"),
         ({"possible_agents": ["a", "a"]}, "possible agents"),
         ({"possible_agents": ["a_0", "b_0"]}, "spaces cannot be read: 'b_0'"),
+        ({"spoil_reset": lambda toy, *results: vars(toy).pop("agents") and results}, "its agents cannot be read"),
     ],
 )
 def test_toy_that_is_refused(changes, content):

@@ -63,15 +63,33 @@ def make_role(team, **changes) -> TaskSpec:
 
 
 class SpoiltHunt(Hunt):
+    """`fault` is an error of the second step, or what the timesteps have from then on."""
+
+    def __init__(self, fault):
+        super().__init__()
+        self.fault = fault
+
     def step(self, action):
+        timestep = super().step(action)
         if self.time == 1:
-            raise EnvOutputError("the reward contains nan")
-        return super().step(action)
+            return timestep
+        if isinstance(self.fault, Exception):
+            raise self.fault
+        return timestep._replace(**self.fault)
 
 
-def test_error_names_the_step():
-    with pytest.raises(EnvOutputError, match=r"nan, at step 2 of the episode$"):
-        list(play_steps(SpoiltHunt(), None, np.random.default_rng(0), 0))
+@pytest.mark.parametrize(
+    ("fault", "content"),
+    [
+        (EnvOutputError("the reward contains nan"), r"nan, at step 2 of the episode$"),
+        (OSError("no\nasset"), "failed in step: no asset$"),
+        ({"reward": np.zeros(2, np.float32)}, r"reward of step has the shape \(2,\), .*at step 2 of the episode$"),
+        ({"terminated": np.array(False)}, r"3 steps .*max_steps is 3, at step 3 of the episode$"),
+    ],
+)
+def test_faults_of_steps(fault, content):
+    with pytest.raises(LareError, match=content):
+        list(play_steps(SpoiltHunt(fault), None, np.random.default_rng(0), 0))
 
 
 def play_hunt(role: TaskSpec) -> Episode:
@@ -158,6 +176,11 @@ def test_policy_with_a_memory_forgets_the_episode_before():
 
     for episode in play_episodes(toy_spec(max_episode_steps=3), 2, Counter()):
         assert episode.env_action[:, 0, 0].tolist() == [0.125, 0.25, 0.375]
+
+
+def test_action_of_a_policy_is_checked():
+    with pytest.raises(LareError, match=r"policy returned array\(0.5\), not .*shape \(1,\)"):
+        play_episodes(toy_spec(), 1, lambda observation: 0.5)
 
 
 def test_policy_receives_the_observation_before_the_step():

@@ -1,5 +1,6 @@
 """Environments in worker processes equal those in this process, and their failures are errors of one line."""
 
+import contextlib
 import os
 import signal
 import subprocess
@@ -17,8 +18,9 @@ import lare_rl
 from helpers import host_envs
 from helpers.host_envs import ToyHostEnv
 from helpers.toy_envs import toy_spec
-from lare_rl.envs import families, worker_process
+from lare_rl.envs import families, worker_process, workers
 from lare_rl.envs.families import picklable_maker
+from lare_rl.envs.shared_arrays import open_shared_memory
 from lare_rl.envs.vec_env import LocalVecEnv
 from lare_rl.envs.workers import SubprocVecEnv
 from lare_rl.errors import LareError
@@ -161,6 +163,34 @@ def test_worker_that_does_not_start(monkeypatch):
         SubprocVecEnv([ToyHostEnv])
 
 
+def test_workers_end_before_their_directory(monkeypatch):
+    """One that is just starting would make its socket there, or fail to."""
+    processes, ended, start = [], [], subprocess.Popen
+
+    @contextlib.contextmanager
+    def watch():
+        with open_shared_memory() as memory:
+            try:
+                yield memory
+            finally:
+                ended.extend(process.poll() is not None for process in processes)
+
+    monkeypatch.setattr(
+        subprocess, "Popen", lambda *args, **kwargs: processes.append(start(*args, **kwargs)) or processes[-1]
+    )
+    monkeypatch.setattr(workers, "open_shared_memory", watch)
+    with pytest.raises(LareError, match="cannot be sent"):
+        SubprocVecEnv([lambda: ToyHostEnv()] * 2, processes=2)
+    assert ended == [True, True]
+
+
+def test_worker_that_starts_too_late(monkeypatch):
+    monkeypatch.setattr(worker_process, "PROGRAM", "import time; time.sleep(60)")
+    monkeypatch.setattr(worker_process, "CONNECT_TIMEOUT_S", 0.2)
+    with pytest.raises(LareError, match=r"did not start within 0\.2 s"):
+        SubprocVecEnv([ToyHostEnv])
+
+
 def test_worker_that_is_killed_between_steps():
     envs = SubprocVecEnv([ToyHostEnv])
     pid = envs.pids[0]
@@ -183,6 +213,23 @@ def test_close(tmp_path):
     for call in (SubprocVecEnv.measure_step_s, lambda envs: envs.find_interference(ToyHostEnv, 1.0), walk):
         with pytest.raises(LareError, match="the worker processes have ended"):
             call(envs)
+
+
+@pytest.mark.parametrize("makers", [[partial(ToyHostEnv, "make")], [partial(ToyHostEnv, size=3)]])
+def test_environments_are_closed_if_another_is_refused(makers, tmp_path):
+    notes = [tmp_path / name for name in ("first", "second")]
+    with pytest.raises(LareError, match="environment 2"):
+        LocalVecEnv([*(partial(ToyHostEnv, note=str(note)) for note in notes), *makers])
+    assert [note.read_text() for note in notes] == ["closed", "closed"]
+
+
+@pytest.mark.parametrize("make_vec_env", [LocalVecEnv, partial(SubprocVecEnv, processes=1)])
+def test_error_in_close_is_a_warning(make_vec_env, tmp_path, capfd, caplog):
+    """The other environments are closed too."""
+    note = tmp_path / "second"
+    make_vec_env([partial(ToyHostEnv, note=str(tmp_path)), partial(ToyHostEnv, note=str(note))]).close()
+    assert note.read_text() == "closed"
+    assert (caplog.text + capfd.readouterr().err).count("environment 0 failed in close: ") == 1
 
 
 def test_makers_that_are_refused():

@@ -102,7 +102,7 @@ class GymnasiumEnv:
             entry_meanings=entry_meanings(task.observation),
             **fields,
         )
-        self._decodes = action_space.dtype not in (np.float32, np.float64)  # such actions are passed on as they are
+        self._decodes = action_space.dtype not in (np.float32, np.float64)  # these are passed on as they are
         self._state, self._alive = np.zeros(0, np.float32), np.ones(1, bool)
         self._available = np.ones((1, self.spec.action_size), bool)
 

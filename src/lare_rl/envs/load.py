@@ -81,9 +81,7 @@ def _read_values(task: str, ancestors: tuple[str, ...] = ()) -> dict[str, Any]:
         values = rename_keys(read_toml(_read_file(task)))
     except ValueError as error:  # TOMLDecodeError, or a number with too many digits
         raise LareError(f"task {task!r} is not valid TOML: {error}") from error
-    like, teams = values.get("like"), values.get("teams")
-
-    paths = *ancestors, os.path.realpath(task)
+    like, teams, paths = values.get("like"), values.get("teams"), (*ancestors, os.path.realpath(task))
 
     def is_valid(name: Any) -> bool:
         return isinstance(name, str) and os.path.realpath(resolve_path(task, name)) not in paths

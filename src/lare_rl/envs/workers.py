@@ -64,7 +64,7 @@ class SubprocVecEnv(VecEnv):
         n_envs = len(makers)
         n_workers = n_envs if reuse_key else min(n_envs, processes or n_usable_cores())
         try:
-            with open_shared_memory() as memory:
+            with open_shared_memory() as memory, self._kill_after_error():
                 for worker_index in range(n_workers):
                     self._workers.append(_find_idle_worker(reuse_key) or Worker(memory, worker_index))
                 specs = self._make_envs(makers, memory)
@@ -74,11 +74,8 @@ class SubprocVecEnv(VecEnv):
                     worker.send("share", (specs[0], n_envs))
                 self._receive("share")
                 super().__init__(specs[0], self._shared.batch)
-        except BaseException as error:
-            self._kill()
-            if isinstance(error, OSError):
-                raise LareError(f"worker processes cannot be started: {error}") from error
-            raise
+        except OSError as error:
+            raise LareError(f"worker processes cannot be started: {error}") from error
 
     def _make_envs(self, makers: Sequence[Maker], memory: str) -> list[EnvSpec]:
         """Make the environments that the workers do not have yet. Return the specifications of all."""
@@ -133,8 +130,14 @@ class SubprocVecEnv(VecEnv):
         """Yield the workers. Kill them if the block fails. Raises `LareError` if they have ended."""
         if not self._workers:
             raise LareError("the worker processes have ended. Make the environments again.")
-        try:
+        with self._kill_after_error():
             yield self._workers
+
+    @contextlib.contextmanager
+    def _kill_after_error(self) -> Iterator[None]:
+        """Kill the workers if the block fails: in `__init__`, before the directory of their sockets is removed."""
+        try:
+            yield
         except BaseException:  # Ctrl-C too: a pending reply would be taken for the next one
             self._kill()
             raise
