@@ -96,11 +96,13 @@ def test_nothing_is_unpickled(folder, tmp_path):
 
 def test_path_is_not_a_log(tmp_path, monkeypatch):
     (tmp_path / "log.csv").write_text("observation,action\n")
+    np.savez(tmp_path / "log.npz", rewards=np.zeros(3))
     (tmp_path / "empty").mkdir()
     monkeypatch.setitem(sys.modules, "minari", None)
     monkeypatch.delitem(sys.modules, "lare_rl.logs.minari", raising=False)
     for source, message in (
-        (tmp_path / "log.csv", "log.csv is text"),
+        (tmp_path / "log.csv", "log.csv is not a log"),
+        (tmp_path / "log.npz", "give a Parquet file, or a directory"),
         (tmp_path / "empty", "empty holds no .npz"),
         (tmp_path / "gone", "gone does not exist"),
         ("nologs", install_command("minari")),
