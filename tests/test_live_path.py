@@ -173,7 +173,7 @@ def test_terminal_without_unicode(command, tmp_path, monkeypatch):
 
 @pytest.mark.skipif(not Path("/proc/self").exists(), reason="no directory in which nobody can write")
 def test_function_is_printed_if_it_cannot_be_written(command, tmp_path, monkeypatch):
-    monkeypatch.setattr(files, "_check_writable", lambda directory: None)  # as if the error came after the check
+    monkeypatch.setattr(files, "check_writable", lambda path: None)  # as if the error came after the check
     status, out, err = command("design", "Reacher-v4", "--out", "/proc/phi.py")
     assert status == 2
     assert "/proc/phi.py cannot be written" in err.splitlines()[-1]

@@ -39,7 +39,7 @@ def test_store_matches_a_twin_that_stores_all_steps(moves, capacity):
             ended.append((tuple(running.pop(env_id)), float(len(ended))))
         stored = sorted((steps, score) for steps, score in ended if steps[0] >= n_steps - capacity)
         assert sorted((tuple(e.step_ids.tolist()), e.return_) for e in store.episodes.values()) == stored
-        assert {name: episode.step_ids for name, episode in store.running.items()} == running
+        assert {name: list(episode.step_ids) for name, episode in store.running.items()} == running
         assert (store.n_added, store.n_ended, store.dropped) == (n_steps, len(ended), dropped)
         assert store.n_ended_steps == sum(len(steps) for steps, _ in ended)
         assert sorted(number for _, number in store.oldest) == sorted(store.episodes)
@@ -76,7 +76,7 @@ def test_lengths_of_a_running_episode_is_the_mean():
     assert store.mean_length == 1
     for length in (3, 6):
         step_ids = store.add(length).tolist()
-        store.get_running(0, np.zeros(1, np.float32)).step_ids += step_ids
+        store.get_running(0, np.zeros(1, np.float32)).step_ids.extend(step_ids)
         store.end(0, 1.0)
     store.add(1)
     assert store.lengths(np.arange(10)).tolist() == [3] * 3 + [6] * 6 + [4]

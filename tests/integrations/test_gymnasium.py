@@ -252,6 +252,20 @@ def test_task_without_spaces():
     check_episodes(credit, envs)
 
 
+class WholeRewards(VectorWrapper):
+    """Has rewards that are whole numbers, and an info that is the same for all environments."""
+
+    def step(self, actions):
+        observation, reward, *flags, infos = self.env.step(actions)
+        return observation, reward.astype(int), *flags, infos | {"time": 0.1}
+
+
+def test_whole_rewards_and_infos_of_all_environments():
+    vector, envs = make_vector()
+    results = play(VectorCredit(WholeRewards(vector), recording_assigner(envs[0]), score="score"), 9)
+    assert 0.5 in results[0][1]  # what ircr pays before an episode ends
+
+
 class WithoutFinalObs(VectorWrapper):
     def step(self, actions):
         *results, infos = self.env.step(actions)

@@ -35,7 +35,7 @@ def create_dataset(name, episodes, observation_space=None, action_space=None, **
 def episodes_with_infos(count):
     for number, episode in enumerate(logged_episodes(count)):
         height = [float(step) for step in range(len(episode["observations"]))]
-        yield episode | {"seed": number, "infos": {"height": height}}
+        yield episode | {"seed": number, "options": {"level": number}, "infos": {"height": height}}
 
 
 @pytest.mark.parametrize("data_format", ["hdf5", "arrow"])
@@ -53,7 +53,8 @@ def test_round_trip(data_format):
         np.testing.assert_array_equal(new.infos["paid"], np.append(0, old["rewards"]))
         np.testing.assert_array_equal(new.infos["height"], old["infos"]["height"])
         np.testing.assert_allclose(new.rewards, old["rewards"] + 1, rtol=1e-6)
-        assert next(iter(dataset.storage.get_episode_metadata([number])))["seed"] == number
+        metadata = next(iter(dataset.storage.get_episode_metadata([number])))
+        assert (metadata["seed"], metadata["options"]) == (number, {"level": number})
     check_log(open_log(dataset), logged_episodes(12))  # reads `paid`
 
 

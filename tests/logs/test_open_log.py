@@ -2,6 +2,7 @@
 
 import sys
 
+import numpy as np
 import pytest
 
 from lare_rl import LareError
@@ -11,11 +12,13 @@ from lare_rl.logs.open_log import open_log
 
 def test_path_is_not_a_log(tmp_path, monkeypatch):
     (tmp_path / "log.csv").write_text("observation,action\n")
+    np.savez(tmp_path / "log.npz", rewards=np.zeros(3))
     (tmp_path / "empty").mkdir()
     monkeypatch.setitem(sys.modules, "minari", None)
     monkeypatch.delitem(sys.modules, "lare_rl.logs.minari", raising=False)
     for source, message in (
-        (tmp_path / "log.csv", "log.csv is text"),
+        (tmp_path / "log.csv", "log.csv is not a log"),
+        (tmp_path / "log.npz", "give a Parquet file, or a directory"),
         (tmp_path / "empty", "empty holds no .npz"),
         (tmp_path / "gone", "gone does not exist"),
         ("nologs", install_command("minari")),

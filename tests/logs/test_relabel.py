@@ -6,6 +6,7 @@ import math
 import signal
 import sys
 from functools import partial
+from pathlib import Path
 
 import numpy as np
 import pyarrow as pa
@@ -310,6 +311,16 @@ def test_bad_arguments(tmp_path, log, options, message):
     with pytest.raises(LareError, match=message):
         relabel(list(logged_episodes(10)) if log is None else log, tmp_path / "new", **options)
     assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.skipif(not Path("/proc/self").exists(), reason="no directory in which nobody can write")
+def test_output_is_checked_before_the_fit():
+    stages = []
+    with pytest.raises(LareError, match="/proc/new cannot be written"):
+        relabel(
+            list(logged_episodes(10)), "/proc/new", method="rd-linear", listener=lambda *stage: stages.append(stage)
+        )
+    assert stages == []
 
 
 def test_command(command, folder, tmp_path, task):

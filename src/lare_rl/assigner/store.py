@@ -7,8 +7,10 @@ are stored as an episode of their own.
 """
 
 import heapq
-from collections.abc import Hashable, Iterable, Iterator, Sequence
+from array import array
+from collections.abc import Hashable, Iterable, Iterator, MutableSequence, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
@@ -36,8 +38,8 @@ class StoredEpisode(NamedTuple):
 class RunningEpisode:
     """An episode that has not ended."""
 
-    step_ids: list[int] = field(default_factory=list)
-    """The numbers of its steps."""
+    step_ids: MutableSequence[int] = field(default_factory=partial(array, "q"))
+    """The numbers of its steps. An episode may have millions of them."""
     level: int = -1
     """Its level; -1 before a step has one."""
     n_paid: int = 0

@@ -158,7 +158,8 @@ class VectorCredit(VectorWrapper, RecordConstructorArgs):
         }
         if self.pay == "proxy":
             self.credit.fit_pending()
-            reward = self.credit.rewards_at(steps).astype(np.asarray(reward).dtype)
+            dtype = np.result_type(reward, np.float32)  # the environment's rewards may be whole numbers
+            reward = self.credit.rewards_at(steps).astype(dtype)
         return observation, reward, terminated, truncated, infos
 
     def _next_observation(self, observation: Any, infos: Mapping[str, Any], done: Bool[np.ndarray, " envs"]) -> Any:
@@ -199,9 +200,9 @@ def batch_of_one(space: gymnasium.Space, element: Any) -> Any:
 
 
 def _select_env(batch: Any, env_index: Any) -> Any:
-    """Return the row of one environment in an array of objects, or in nested arrays."""
+    """Return the row of one environment in an array of objects, or in nested arrays. A single value is that of all environments."""
     if isinstance(batch, Mapping):
         return {name: _select_env(child, env_index) for name, child in batch.items()}
     if isinstance(batch, tuple):
         return tuple(_select_env(child, env_index) for child in batch)
-    return batch[env_index]
+    return batch[env_index] if np.ndim(batch) else batch

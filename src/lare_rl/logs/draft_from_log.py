@@ -1,6 +1,7 @@
 """The first draft of a task for a log: sizes from its arrays and, for a Minari data set, its description."""
 
 import re
+from pathlib import Path
 from typing import Any
 
 from lare_rl.assigner.space_layout import SpaceLayout
@@ -22,7 +23,7 @@ def draft_log_task(source: Any) -> Draft:
     description, removed = remove_rewards(plain_lines(text))
     texts = {"description": description, "observation": "", "action": ""}
     layouts = {"observation": log.layout.observation, "action": log.layout.action}
-    name = re.sub(r"[^\w.\-]+", "-", re.sub(r"\.parquet$", "", log.name.rstrip("/")).rpartition("/")[2]) or "logs"
+    name = re.sub(r"[^\w.\-]+", "-", Path(log.name).name.removesuffix(".parquet")) or "logs"
     limit = log.layout.max_episode_steps
     lines = [
         *warning_lines(removed, "the log"),

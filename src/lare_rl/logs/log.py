@@ -11,6 +11,7 @@ from uuid import uuid4
 from lare_rl.errors import LareError
 from lare_rl.logs.episode import LoggedEpisode, LogLayout, RelabelledEpisode, infer_layout, parse_episode
 from lare_rl.tasks.spec import TaskSpec
+from lare_rl.util.files import check_writable
 
 __all__ = ["Log", "atomic_output", "batch_by_steps", "check_output"]
 
@@ -96,6 +97,7 @@ def check_output(out: Path, overwrite: bool, folders: Container[str] = ()) -> No
             raise LareError(f"{out} cannot be replaced, because {foreign[0]} in it is not a log: choose another path")
     if not out.name or not out.parent.is_dir():
         raise LareError(f"{out} cannot be written: there is no directory {out.parent}")
+    check_writable(out)
 
 
 @contextlib.contextmanager

@@ -30,7 +30,6 @@ COPIED_METADATA = (
     *("ref_min_score", "ref_max_score", "num_episodes_average_score"),
 )
 
-
 FOLDERS = ("data",)
 """What the directory of a data set has."""
 
@@ -66,7 +65,8 @@ class MinariLog(Log):
             infos = values.get("infos") or {}
             if "paid" in infos:
                 values["paid"] = np.asarray(infos["paid"])[1:]
-            yield name, values, {**values, "infos": infos, "seed": metadata.get("seed")}
+            reset = {key: metadata.get(key) for key in ("seed", "options")}
+            yield name, values, {**values, **reset, "infos": infos}
 
     def check_output(self, out: str | Path, overwrite: bool) -> None:
         """Raise `LareError` if no data set with the id `out` can be written."""
@@ -136,6 +136,7 @@ def _episode_buffer(item: RelabelledEpisode, data_format: str) -> EpisodeBuffer:
     infos = {**contents["infos"], "paid": np.append(0.0, item.episode.reward)}
     return EpisodeBuffer(
         seed=contents["seed"],
+        options=contents["options"],
         observations=contents["observations"],
         actions=contents["actions"],
         rewards=item.r_hat,  # pyright: ignore[reportArgumentType] - an array works as well

@@ -41,9 +41,9 @@ def open_log(source: Any, task: TaskSpec | None = None) -> Log:
 
 def _open_path(source: str | Path, role: TaskSpec | None) -> Log:
     path = Path(source)
-    if path.is_file() and path.suffix.lower() in (".csv", ".tsv", ".txt", ".json", ".jsonl"):
+    if path.is_file() and path.suffix.lower() in (".csv", ".tsv", ".txt", ".json", ".jsonl", ".npz"):
         raise LareError(
-            f"{path} is text, which cannot be read: write the log as .npz or Parquet (docs/reference/logs.md)"
+            f"{path} is not a log: give a Parquet file, or a directory with an .npz file for each episode (docs/reference/logs.md)"
         )
     if path.is_file() or any(path.glob("*.parquet")):
         from lare_rl.logs.tables import ParquetLog

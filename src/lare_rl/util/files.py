@@ -13,7 +13,10 @@ from uuid import uuid4
 
 from lare_rl.errors import LareError
 
-__all__ = ["check_new_path", "find_free_path", "make_directory", "replace_npz", "write_atomically", "write_npz"]
+__all__ = [
+    *("check_new_path", "check_writable", "find_free_path", "make_directory"),
+    *("replace_npz", "write_atomically", "write_npz"),
+]
 
 
 RETRY_S = 0.01, 0.03, 0.1, 0.3, 1.0
@@ -36,13 +39,17 @@ def check_new_path(path: Path, option: str = "file", overwrite: bool | None = No
             raise LareError(f"{path} exists, and is not overwritten; choose another {option}{hint}")
         if not path.parent.is_dir():
             raise LareError(f"{path} cannot be written: there is no directory {path.parent}; choose another {option}")
-        _check_writable(path.parent)
+        check_writable(path)
     except OSError as error:
         raise LareError(f"{path} cannot be written: {error.strerror}") from error
 
 
-def _check_writable(directory: Path) -> None:
-    tempfile.TemporaryFile(dir=directory).close()  # os.access says nothing to root about /proc
+def check_writable(path: Path) -> None:
+    """Raise `LareError` if nothing can be written beside `path`."""
+    try:
+        tempfile.TemporaryFile(dir=path.parent).close()  # os.access says nothing to root about /proc
+    except OSError as error:
+        raise LareError(f"{path} cannot be written: {error.strerror}") from error
 
 
 def find_free_path(directory: Path, name: str, suffix: str = "") -> Path:
