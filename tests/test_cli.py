@@ -240,6 +240,7 @@ def test_design(command, tmp_path):
     assert "phi.py exists" in err
     assert "--function 'my phi.py'" in command("design", "Reacher-v4", "--candidates", 1, "--out", "my phi.py")[1]
     assert {name: (tmp_path / name).read_bytes() for name in content} == content
+    assert "wrote phi.v2.py: " in command("design", "Reacher-v4", "--candidates", 1, "--out", "phi.v2")[1]
     (tmp_path / "phi.json").unlink()
     assert command("design", "Reacher-v4", "--out", "phi.py")[:2] == (2, "")  # not even printed
 

@@ -136,6 +136,8 @@ def test_load_policy(chase_run):
     np.testing.assert_array_equal(load_policy(chase_run)(observation), load_policy(chase_run, 0)(observation))
     with pytest.raises(LareError, match="no seed 7"):
         load_policy(chase_run, 7)
+    with pytest.raises(LareError, match="leave the mask out"):
+        load_policy(chase_run)(observation, np.ones(1, bool))
 
 
 def test_policy_has_few_programs_for_all_sizes_of_a_batch(chase_run):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 import math
 import operator
 from collections.abc import Callable, Mapping, Sequence
@@ -20,6 +21,8 @@ BY_COMPONENT = frozenset(
     "broadcast_to repeat tile split hsplit array_split array asarray hstack vstack column_stack atleast_1d atleast_2d".split()
 )
 """Functions that act on the real and on the imaginary component in the same way."""
+_COMPLEX_OPTIONS = ("initial", "prepend", "append")
+"""Their arguments, beside the first, that are numbers with both components."""
 
 
 def as_complex(value: Any) -> Complex:
@@ -51,14 +54,13 @@ def call_with_complex(name: str, args: Sequence[Any], kwargs: Mapping[str, Any])
             return [component(item, key) for item in value]
         return getattr(as_complex(value), key)
 
+    parameters = inspect.signature(FUNCTIONS[name]).parameters
+    positions = [i for i, parameter in enumerate(parameters) if i == 0 or parameter in _COMPLEX_OPTIONS]
     real, imag = (
         call_numpy(
             name,
-            [component(args[0], key), *args[1:]],
-            {
-                name_: component(x, key) if name_ in ("initial", "prepend", "append") else x
-                for name_, x in kwargs.items()
-            },
+            [component(x, key) if i in positions else x for i, x in enumerate(args)],
+            {option: component(x, key) if option in _COMPLEX_OPTIONS else x for option, x in kwargs.items()},
         )
         for key in ("real", "imag")
     )

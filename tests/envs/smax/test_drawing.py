@@ -5,9 +5,9 @@ import pytest
 from matplotlib.patches import Circle
 
 from helpers.fake_smac import compiled_smax
-from lare_rl.envs.canvas import blank_figure
+from lare_rl.envs.canvas import OTHER_COLOUR, TEAM_COLOUR, blank_figure
 from lare_rl.envs.smax.battle import ATTACK, STOP, Battle
-from lare_rl.envs.smax.drawing import ALLY_COLOUR, ENEMY_COLOUR, find_hits, paint_state
+from lare_rl.envs.smax.drawing import find_hits, paint_state
 from lare_rl.envs.smax.scenarios import SCENARIOS
 
 SCENARIO = SCENARIOS["2s3z"]
@@ -35,7 +35,7 @@ def battles() -> list[Battle]:
 
 def test_living_units_have_the_colours_of_their_sides(battles):
     circles = [patch for patch in paint(battles[0]).patches if isinstance(patch, Circle)]
-    ally, enemy = (Circle((0, 0), edgecolor=colour).get_edgecolor() for colour in (ALLY_COLOUR, ENEMY_COLOUR))
+    ally, enemy = (Circle((0, 0), edgecolor=colour).get_edgecolor() for colour in (TEAM_COLOUR, OTHER_COLOUR))
     assert [circle.get_edgecolor() for circle in circles] == [ally] * 5 + [enemy] * 3
     assert circles[0].radius == 0.625
 

@@ -3,16 +3,7 @@
 import numpy as np
 from jaxtyping import Float
 
-from lare_rl.envs.canvas import (
-    OTHER_COLOUR,
-    TEAM_COLOUR,
-    Axes,
-    Figure,
-    blank_figure,
-    colormaps,
-    paint_frames,
-    patches,
-)
+from lare_rl.envs.canvas import OTHER_COLOUR, TEAM_COLOUR, Axes, Figure, blank_figure, colormaps, paint_frames, patches
 from lare_rl.envs.interface import Frame
 from lare_rl.envs.particles.task import ParticleTask
 
