@@ -50,13 +50,15 @@ def test_instructions_of_an_agent_are_sent():
     seen = []
 
     def answer(messages, info):
-        seen.append((info.instructions, [part.content for message in messages for part in message.parts]))
-        return ModelResponse([TextPart("reply")])
+        seen.append(info.instructions)
+        return recorder.function(messages, info)
 
+    recorder, requests = record_requests("reply")
     agent = pydantic_ai.Agent(FunctionModel(answer, model_name="m"), instructions="Be short.", system_prompt="Be long.")
     messages = [{"role": "system", "content": "Design."}, {"role": "user", "content": "Write."}]
     assert pydantic_ai_model(agent).reply(messages, 0) == "reply"
-    assert seen == [("Be short.", ["Design.", "Write."])]
+    assert seen == ["Be short."]
+    assert [text for _, text in requests[0]] == ["Design.", "Write."]
 
 
 def test_interruption_cancels_the_request(monkeypatch):
