@@ -9,6 +9,7 @@ from gymnasium import spaces
 from gymnasium.wrappers import TimeLimit
 from tensordict import TensorDict
 from torchrl.collectors import Collector
+from torchrl.collectors.utils import split_trajectories
 from torchrl.data import LazyTensorStorage, ReplayBuffer, TensorDictReplayBuffer
 from torchrl.envs import Compose, GymWrapper, RewardScaling, SerialEnv
 from torchrl.envs.utils import step_mdp
@@ -43,7 +44,8 @@ def serial_env(envs):
 
 DISCRETE = (spaces.Discrete(5), spaces.Discrete(3))
 SHAPES = (spaces.Box(-1, 1, (2, 3)), spaces.MultiDiscrete([2, 3]))
-DICT = (spaces.Dict(position=spaces.Box(-1, 1, (2,)), speed=spaces.Box(-1, 1, (1,))), None)
+BODY = spaces.Dict(angle=spaces.Box(-1, 1, (1,)), speed=spaces.Box(-1, 1, (1,)))
+DICT = (spaces.Dict(position=spaces.Box(-1, 1, (2,)), body=BODY), None)
 
 
 @pytest.mark.parametrize(
@@ -92,6 +94,25 @@ def test_time_is_last_dimension():
         buffer.extend(batch.exclude("collector"))
     check_episodes(credit, envs)
     assert (credit.store.n_added, credit.store.dropped) == (63, 0)
+
+
+def test_padding_of_split_trajectories():
+    """Trajectories have different lengths, and go on in the next batch. Padding is no step."""
+    env = make_env()
+    credit = recording_assigner(env)
+    buffer = make_buffer(credit)
+    for batch in Collector(GymWrapper(env), None, frames_per_batch=10, total_frames=50):
+        buffer.extend(split_trajectories(batch).reshape(-1))
+    check_episodes(credit, [env])
+    assert (credit.store.n_added, credit.store.dropped) == (50, 0)
+
+
+def test_whole_rewards():
+    batch = roll_out(20)
+    batch["next", "reward"] = batch["next", "reward"].int()
+    buffer = make_buffer(recording_assigner(make_env()))
+    buffer.extend(batch)
+    assert buffer[:][REWARD].is_floating_point()
 
 
 def test_single_steps():

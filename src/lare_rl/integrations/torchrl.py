@@ -26,8 +26,8 @@ except ModuleNotFoundError as error:
 __all__ = ["CREDIT_STEP", "REWARD", "CreditTransform"]
 
 REWARD = ("next", "reward")
-TRAJECTORY = ("collector", "traj_ids")
-"""The key under which TorchRL's collectors store the trajectory of a step."""
+TRAJECTORY, MASK = ("collector", "traj_ids"), ("collector", "mask")
+"""The keys under which TorchRL's collectors store the trajectory of a step, and whether it is a step: `split_trajs` adds padding."""
 
 
 class CreditTransform(Transform):
@@ -67,6 +67,7 @@ class CreditTransform(Transform):
             )
         next_, config = tensordict.get("next"), self.credit.config
         has_group = config.groups and config.group_key in next_.keys()  # noqa: SIM118
+        has_mask = MASK in tensordict.keys(include_nested=True)
         steps = self.credit.add(
             _read_elements(tensordict, self.observation, config.observation),
             _read_elements(tensordict, self.action, config.action),
@@ -75,6 +76,7 @@ class CreditTransform(Transform):
             _read_flags(next_, "terminated") | _read_flags(next_, "done"),
             _read_flags(next_, "truncated"),
             env_ids=self._trajectories(tensordict),
+            valid=_flatten(tensordict, MASK).reshape(-1) if has_mask else None,
             group=_flatten(next_, config.group_key).reshape(-1).tolist() if has_group else None,
         )
         reward = tensordict.get(REWARD)
@@ -87,7 +89,8 @@ class CreditTransform(Transform):
         if steps is None:
             raise LareError(f"the sample has no {CREDIT_STEP!r}: add the steps to the buffer with this transform")
         self.credit.fit_pending()
-        r_hat = torch.as_tensor(self.credit.rewards_at(steps.cpu().numpy()), dtype=reward.dtype, device=reward.device)
+        dtype = reward.dtype if reward.is_floating_point() else torch.float32  # they may be whole numbers
+        r_hat = torch.as_tensor(self.credit.rewards_at(steps.cpu().numpy()), dtype=dtype, device=reward.device)
         return tensordict.set(REWARD, r_hat.reshape(reward.shape))
 
     def _trajectories(self, tensordict: TensorDictBase) -> list[tuple[object, int]]:
@@ -118,6 +121,8 @@ def _read_elements(tensordict: TensorDictBase, key: Any, layout: SpaceLayout) ->
     if isinstance(key, dict):
         children = zip(layout.names, layout.inner, strict=True)
         return {name: _read_elements(tensordict, key[name], child) for name, child in children}
+    if isinstance(inner := tensordict.get(key), TensorDictBase):  # of a Dict space in a Dict space
+        return _read_elements(inner, {name: name for name in layout.names}, layout)
     values = _flatten(tensordict, key)
     is_one_hot = layout.kind == "choices" and values.ndim == 2 and values.shape[1] == layout.size > 1
     return values.astype(np.float32) if is_one_hot else values
