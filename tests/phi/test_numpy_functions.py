@@ -175,7 +175,8 @@ EXPRESSIONS = {
         z.sum(axis=1).imag | np.sum(z, axis=1, where=b).imag | np.sum(z, axis=1, initial=5.0).imag
         np.sum(z, axis=1, initial=5j).imag | np.mean(z, axis=1, where=b ¦ (x < 9)).imag | np.cumsum(z, axis=1).imag
         np.diff(z, axis=1, prepend=1).imag | np.diff(z, 1, 1, x[:, :1]).imag | np.diff(z, axis=1, append=z[:, :1]).imag
-        z.reshape(-1, 3, 2).imag | np.reshape(z, (len(x), 3, 2)).imag | np.ravel(z).reshape(z.shape).imag | z.flatten().imag.reshape(-1, 6) | z.T.T.imag
+        z.reshape(-1, 3, 2).imag | np.reshape(z, (len(x), 3, 2)).imag | np.ravel(z).reshape(z.shape).imag
+        z.flatten().imag.reshape(-1, 6) | z.T.T.imag
         np.transpose(z).T.imag | np.swapaxes(z[:, :, None], 2, 1).imag | np.moveaxis(z[:, :, None], 2, 1).imag
         np.take(z, indices=np.array([0, 2]), axis=1).imag | np.concatenate([x, z], axis=1).imag | np.stack([x, z], axis=1).imag
         np.roll(z, 1, axis=1).imag | np.flip(z, axis=1).imag | np.expand_dims(z, 1).imag | np.squeeze(z[:, :1]).imag
