@@ -211,4 +211,4 @@ def empty_batch(spec: EnvSpec, *lead: int) -> Timestep:
 def select_row(batch: Timestep) -> Timestep:
     """Return a copy of the timestep of the first environment of a batch."""
     *columns, measures = batch
-    return Timestep(*(column[0].copy() for column in columns), {name: value[0] for name, value in measures.items()})
+    return Timestep(*(column[0].copy() for column in columns), {name: value[0] for name, value in measures.items()})  # pyright: ignore[reportCallIssue]
