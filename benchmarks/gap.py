@@ -71,14 +71,12 @@ def particles(task: str) -> Comparison:
     )
 
 
-def hidden(task: str, dense: Directories = (), on_gpu: bool = True) -> Comparison:
+def hidden(task: str) -> Comparison:
     """A score that the texts of the task do not describe."""
-    extra = {method: [f"{WHY}/{task}/{method}-on-a-gpu"] if on_gpu else [] for method in ("rrdu", "lare-rrdu")}
     return Comparison(
         60_000,
-        dense=dense,
-        raw={"rrdu": [f"{LAPTOP}/{task}/rrdu-td3", *extra["rrdu"]]},
-        paper=[f"{LAPTOP}/{task}/lare-rrdu-td3-draw0", *extra["lare-rrdu"]],
+        raw={"rrdu": [f"{LAPTOP}/{task}/rrdu-td3", f"{WHY}/{task}/rrdu-on-a-gpu"]},
+        paper=[f"{LAPTOP}/{task}/lare-rrdu-td3-draw0", f"{WHY}/{task}/lare-rrdu-on-a-gpu"],
         default=[f"{LAPTOP}/{task}/lare-bayes-td3-draw0", f"{GPU}/{task}/lare-bayes"],
     )
 
@@ -90,6 +88,7 @@ def wheat(run: str, task: str = "Wheat") -> Directories:
 
 HALF_CHEETAH, WALKER, REACHER = "HalfCheetah-v4", "Walker2d-v4", "Reacher-v4"
 TEN_SEEDS = "scores/cheetah/HalfCheetah-v4,paidonce"
+THRESHOLD = "scores/threshold/HalfCheetahThreshold-v4"
 COMPARISONS = {
     "wheat, SAC": Comparison(
         6_000,
@@ -108,6 +107,13 @@ COMPARISONS = {
         [f"{TEN_SEEDS}/lare-rrdu"],
         [f"{TEN_SEEDS}/lare-bayes"],
         [f"{TEN_SEEDS}/bayes"],
+    ),
+    "HalfCheetahThreshold-v4, TD3": Comparison(
+        60_000,
+        [f"{THRESHOLD}/episodic"],
+        [f"{THRESHOLD}/dense"],
+        {"rrdu": [f"{THRESHOLD}/rrdu"]},
+        default=[f"{THRESHOLD}/lare-bayes"],
     ),
     f"{HALF_CHEETAH}, TD3": Comparison(
         100_000,
@@ -163,9 +169,6 @@ COMPARISONS = {
     "HalfCheetahTarget-v4, TD3": hidden("HalfCheetahTarget-v4"),
     "HalfCheetahFoot-v4, TD3": hidden("HalfCheetahFoot-v4"),
     "HalfCheetahSaturating-v4, TD3": hidden("HalfCheetahSaturating-v4"),
-    "HalfCheetahThreshold-v4, TD3": hidden(
-        "HalfCheetahThreshold-v4", [f"{LAPTOP}/HalfCheetahThreshold-v4/dense-td3"], on_gpu=False
-    ),
 }
 
 
