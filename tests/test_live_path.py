@@ -176,7 +176,7 @@ def test_function_is_printed_if_it_cannot_be_written(command, tmp_path, monkeypa
     monkeypatch.setattr(files, "check_writable", lambda path: None)  # as if the error came after the check
     status, out, err = command("design", "Reacher-v4", "--out", "/proc/phi.py")
     assert status == 2
-    assert "/proc/phi.py cannot be written" in err.splitlines()[-1]
+    assert "/proc/phi.json cannot be written" in err.splitlines()[-1]
     assert "def evaluation_func" in out
     status, _, err = command("design", "Reacher-v4", "--record", "/proc/talk.json")
     assert status == 2

@@ -272,7 +272,7 @@ def test_failure_in_second_pass_keeps_old_output(tmp_path, new, message):
 
         def __iter__(self):
             self.passes += 1
-            return logged_episodes(**({"count": 20} | (new if self.passes >= 4 else {})))
+            return logged_episodes(**({"count": 20} | (new if self.passes >= 5 else {})))
 
     (tmp_path / "new").mkdir()
     (tmp_path / "new" / "mine.npz").write_text("old")

@@ -52,7 +52,7 @@ def find_interference(env: HostEnv, maker: Maker) -> str | None:
 
 def fixed_action(spec: EnvSpec, timestep: Timestep) -> Float[np.ndarray, "agents action"]:
     """Return the first available discrete action, or the middle of continuous actions."""
-    return to_env_action(timestep.available, spec) if spec.discrete else (spec.low + spec.high) / 2
+    return to_env_action(timestep.available.astype(np.float32), spec) if spec.discrete else (spec.low + spec.high) / 2
 
 
 def _play(env: HostEnv, seed: int = 0) -> Iterator[np.ndarray]:

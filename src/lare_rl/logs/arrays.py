@@ -1,5 +1,6 @@
 """Logs of NumPy arrays: directories with an .npz file for each episode, and logs in memory."""
 
+import itertools
 from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
@@ -86,9 +87,9 @@ class ListLog(ArrayLog):
             yield f"episode {number}", arrays, arrays
 
     def check_output(self, out: str | Path, overwrite: bool) -> None:
-        """Raise `LareError` if `out` cannot be written, or if an array cannot be saved."""
+        """Raise `LareError` if `out` cannot be written, or if an array of the first episode cannot be saved."""
         super().check_output(out, overwrite)
-        for name, arrays, _ in self.read():
+        for name, arrays, _ in itertools.islice(self.read(), 1):  # reading all may take long
             for key, value in arrays.items():
                 if _has_objects(value):
                     raise LareError(
