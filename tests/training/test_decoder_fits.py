@@ -1,4 +1,4 @@
-"""Gradient updates of decoders: in chunks, for all seeds at once, and in the first fit of many agents' decoders.
+"""Decoders are updated by gradients: in chunks, for all seeds at once, and in the first fit for many agents.
 
 In the first fit, held-out episodes are not fitted to, and each seed keeps its best decoder.
 """

@@ -207,7 +207,7 @@ def _check_shape(values: np.ndarray, name: str, noun: str, *shape: int) -> np.nd
 def to_flags(values: Any, name: str, *shape: int) -> Bool[np.ndarray, "*shape"]:
     """Return flags, of a shape (steps,) or (steps, agents). Raises `LareError` if they do not fit, or are not true or false."""
     flags = _check_shape(to_array(values, name), name, "flag", *shape)
-    if not np.isin(flags, (0, 1)).all():
+    if flags.dtype != bool and not np.isin(flags, (0, 1)).all():
         raise LareError(f"{name} must be true or false, and is {short_repr(values)}")
     return flags.astype(bool)
 

@@ -142,7 +142,7 @@ def relabel(
         hold_out: share of the complete episodes that are held out of the fit, to measure how well returns are predicted.
         settings: the settings of the decoder. With `exact`, the rewards of a complete episode add up to its return. With the task's
             `paid_for`, those of the steps of a payment add up to it, unless payments share steps: what each payment then lacks is
-            spread over its own steps, or added to the last of them.
+            added to its last step.
         updates: number of gradient updates of the decoder. A closed-form decoder has none.
         memory: approximate limit of the memory for the decoder's inputs, in GiB; at least 100,000 steps are stored. A closed-form fit
             uses all episodes, other fits use the last episodes that fit into it.

@@ -18,6 +18,7 @@ import jax
 import numpy as np
 
 from lare_rl.errors import LareError, short_repr
+from lare_rl.runs.metrics_file import MAX_INTEGER
 from lare_rl.util.files import make_directory, replace_npz
 from lare_rl.util.npz import DAMAGED_FILE_ERRORS, open_npz, report_damage
 from lare_rl.util.renamed_fields import rename_fields
@@ -49,9 +50,6 @@ NEW_STATE = (
     *(".is_log_odds", ".predictions.level", ".score_type_predictions.level"),
 )
 """Paths of arrays that earlier checkpoints do not have. Zeros mean that they have not been computed yet, or make no difference."""
-
-MAX_COUNT = 2**53
-"""The largest whole number that JSON readers agree on."""
 
 State = TypeVar("State")
 """A training state with a replay: `replay.columns` are arrays of [seeds envs rows ...], which are saved by row.
@@ -272,6 +270,6 @@ def _check_counts(value: Any) -> Any:
     """Return a count, or nested lists of counts, unchanged. Raise `ValueError` for anything else."""
     if isinstance(value, list):
         return [_check_counts(element) for element in value]
-    if type(value) is not int or not 0 <= value <= MAX_COUNT:
+    if type(value) is not int or not 0 <= value <= MAX_INTEGER:
         raise ValueError(f"{short_repr(value)} is not a count")
     return value

@@ -11,7 +11,7 @@ from lare_rl.errors import LareError
 from lare_rl.util.renamed_fields import rename_metrics
 from lare_rl.util.safe_io import read_json, read_text
 
-__all__ = ["append_metrics", "read_metrics", "truncate_metrics"]
+__all__ = ["MAX_INTEGER", "append_metrics", "read_metrics", "truncate_metrics"]
 
 METRICS_FILE = "metrics.jsonl"
 

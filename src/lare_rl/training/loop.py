@@ -118,7 +118,7 @@ def _advance(session: Session, until: int, stop: threading.Event) -> None:
     try:
         session.advance(until)
     except FirstFitStoppedError:
-        raise RunInterruptedError(f"stopped during the decoder's first fit, of which nothing is kept; {hint}") from None
+        raise RunInterruptedError(f"stopped during the decoder's first fit: nothing is kept of it; {hint}") from None
 
 
 def _save(session: Session) -> None:

@@ -33,7 +33,7 @@ from lare_rl.phi.operand import BatchSize
 
 
 def _register(names: str, convert: Callable[[Any], Any]) -> None:
-    """Register a function that moves the numbers of its first argument. It has NumPy's parameters, except those that move nothing."""
+    """Register a function that moves the numbers of its first argument. Parameters of NumPy's that move nothing are left out."""
     function: Any = functools.reduce(getattr, names.split()[0].split("."), np)
 
     def apply(moved: Any, *args: Any, **kwargs: Any) -> Any:
