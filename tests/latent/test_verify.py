@@ -70,12 +70,13 @@ def test_verify_not_finite(chase, factor, value, operation, batch):
 
 def test_verify_advice_is_no_error(chase):
     body = (
-        "still = 0 * action\nones = np.ones((len(action), 1))\nagain = -2 * action\nreturn [action, still, ones, again]"
+        "unit = np.sin(action)**2 + np.cos(action)**2\nones = np.ones((len(action), 1))\nagain = -2e25 * action\n"
+        "return [action, unit, ones, again, 1e-12 * observation[:, :1]]"
     )
     verdict = verify(phi_source(body), chase)
     assert verdict.passed
     assert [(advice.split()[1], advice.split()[2]) for advice in verdict.advice] == [
-        ("'still'", "never"),
+        ("'unit'", "never"),
         ("'ones'", "reads"),
         ("'again'", "repeats"),
     ]
@@ -153,15 +154,19 @@ def test_sample_steps_evenly_spaced(chase):
 
 
 @pytest.mark.parametrize(
-    ("observations", "actions", "words"),
+    ("steps", "words"),
     [
-        (np.zeros((5, 3)), np.zeros((5, 1)), r"observations .*\(n, 2\)"),
-        (np.zeros((5, 2)), np.zeros((4, 1)), r"actions .*\(n, 1\)"),
-        (np.zeros((0, 2)), np.zeros((0, 1)), r"observations .*\(n, 2\)"),
-        (np.full((5, 2), np.nan), np.zeros((5, 1)), "observations .*not finite"),
-        (np.zeros((5, 2)), np.full((5, 1), np.inf), "actions .*not finite"),
+        ((np.zeros((5, 3)), np.zeros((5, 1))), r"observations .*\(n, 2\)"),
+        ((np.zeros((5, 2)), np.zeros((4, 1))), r"actions .*\(n, 1\)"),
+        ((np.zeros((0, 2)), np.zeros((0, 1))), r"observations .*\(n, 2\)"),
+        ((1.0, 2.0), r"observations .*\(n, 2\)"),
+        (([[1, 2], [3]], np.zeros((2, 1))), "observations .*numbers"),
+        ((np.full((5, 2), np.nan), np.zeros((5, 1))), "observations .*not finite"),
+        ((np.full((5, 2), 1e39), np.zeros((5, 1))), "observations .*not finite"),  # in float32
+        ((np.zeros((5, 2)), np.full((5, 1), np.inf)), "actions .*not finite"),
+        ((np.zeros((5, 2)), np.zeros((5, 1)), np.zeros((5, 1))), "two arrays"),
     ],
 )
-def test_invalid_sample_steps(chase, observations, actions, words):
+def test_invalid_sample_steps(chase, steps, words):
     with pytest.raises(LareError, match=words):
-        sample_steps(chase, (observations, actions))
+        sample_steps(chase, steps)

@@ -10,13 +10,14 @@ import hashlib
 import itertools
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float
 
 from lare_rl.envs.placement import make_host_env
 from lare_rl.envs.play import find_team, phi_inputs, play_steps
-from lare_rl.errors import LareError
+from lare_rl.errors import LareError, short_repr
 from lare_rl.latent.factors import compute_batch, find_infinity
 from lare_rl.llm.prompts import FunctionKind
 from lare_rl.phi.graph import Graph
@@ -24,6 +25,8 @@ from lare_rl.phi.limits import MAX_FACTORS, RefusedError
 from lare_rl.phi.names import factor_names
 from lare_rl.phi.read import read
 from lare_rl.tasks.spec import TaskSpec, require_role, select_states
+from lare_rl.util.rows import as_numbers
+from lare_rl.util.statistics import FLOAT32_NOISE
 
 __all__ = ["N_SAMPLE_STEPS", "Check", "Steps", "Verdict", "random_steps", "sample_steps", "verify"]
 
@@ -128,16 +131,16 @@ def _finite_error(
 
 def _advice(graph: Graph, names: Sequence[str], factors: Float[np.ndarray, "steps factors"]) -> Iterator[str]:
     """Yield remarks on factors that are constant or redundant. They are not errors: early steps may show little of a task."""
-    features_read = graph.entries_read("factors")
+    features_read, factors = graph.entries_read("factors"), factors.astype(np.float64)
     std = factors.std(axis=0)
-    varies = std > 1e-9 * (1 + np.abs(factors).max(axis=0))
+    varies = std > FLOAT32_NOISE * np.abs(factors).max(axis=0)
     for i, name in enumerate(names):
         if not any(features_read[i].values()):
             yield f"factor {name!r} reads no entry of the observation or the action: it is the same for all steps"
         elif not varies[i]:
             yield f"factor {name!r} never varies on the recorded steps"
     standardized = (factors[:, varies] - factors[:, varies].mean(axis=0)) / std[varies]
-    same = np.abs(standardized.T @ standardized) / max(1, len(factors)) > 0.9999
+    same = np.abs(standardized.T @ standardized) / len(factors) > 0.9999
     varying = np.flatnonzero(varies).tolist()
     for i, j in np.argwhere(np.triu(same, 1)):
         yield f"factor {names[varying[j]]!r} repeats {names[varying[i]]!r} on the recorded steps"
@@ -146,28 +149,31 @@ def _advice(graph: Graph, names: Sequence[str], factors: Float[np.ndarray, "step
 # --- steps to try a function on -----------------------------------------------------------------------------------------
 
 
-def sample_steps(task: TaskSpec, steps: Steps | None) -> Steps:
-    """Return the steps that a function of a task is tried on: at most 256 of `steps`, evenly spaced, or random steps.
+def sample_steps(task: TaskSpec, steps: Any) -> Steps:
+    """Return the steps that a function of a task is tried on: at most 256 of `steps`, evenly spaced, or random steps for None.
 
     Raises:
-        LareError: as for `verify`.
+        LareError: as for `verify`. `steps` come from the user, and may be anything.
     """
     role = require_role(task)
     if steps is None:
         return random_steps(role)
-    sampled = []
+    try:
+        observation, action = steps
+    except (TypeError, ValueError):
+        raise LareError(f"steps must be two arrays, observations and actions, not {short_repr(steps)}") from None
+    observation, action = as_numbers("observation", observation), as_numbers("action", action)
     sizes = {"observation": role.observation_size, "action": role.action_size}
-    for values, (name, size) in zip(steps, sizes.items(), strict=True):
-        rows = np.asarray(values)
-        if rows.dtype.kind not in "biuf" or rows.shape != (len(steps[0]), size) or not len(rows):
+    for rows, (name, size) in zip((observation, action), sizes.items(), strict=True):
+        if rows.shape != (*observation.shape[:1], size) or not len(rows):
             raise LareError(
                 f"{name}s of steps must have the shape (n, {size}), with the {name}_size of {role.name} and the same n >= 1 for "
                 f"both arrays: the shape is {rows.shape}"
             )
         if not np.isfinite(rows).all():
-            raise LareError(f"{name}s of steps hold a number that is not finite")
-        sampled.append(rows[evenly_spaced(len(rows), N_SAMPLE_STEPS)].astype(np.float32))
-    return sampled[0], sampled[1]
+            raise LareError(f"{name}s of steps hold a number that is not finite in float32")
+    selected = evenly_spaced(len(action), N_SAMPLE_STEPS)
+    return observation[selected], action[selected]
 
 
 def random_steps(task: TaskSpec, n_steps: int = N_SAMPLE_STEPS, seed: int = 0) -> Steps:
