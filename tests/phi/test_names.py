@@ -25,6 +25,8 @@ from lare_rl.phi.names import factor_meanings, factor_names
         (phi_source("return [action] * 2"), 2, ["factor_1", "factor_2"]),
         (phi_source("if True:\n    return [action]"), 1, ["factor_1"]),
         (phi_source("return [x for x in (action, action)]"), 2, ["factor_1", "factor_2"]),
+        (phi_source("return [action, action]"), 2, ["factor_1", "factor_2"]),  # names differ
+        (phi_source("factors: list = [action, -action]\nreturn factors"), 2, ["action", "factor_2"]),
         (phi_source("return action"), 1, ["factor_1"]),
         (PHI, 3, ["factor_1", "factor_2", "factor_3"]),
         (phi_source("return []"), 0, []),
@@ -32,6 +34,7 @@ from lare_rl.phi.names import factor_meanings, factor_names
         ("not (Python", 1, ["factor_1"]),
         # Another function's list is not this one's.
         ("def helper(a, b):\n    return [a, b]\n\n" + phi_source("return [b, action]"), 2, ["b", "action"]),
+        (phi_source("return [a]") + "\n" + phi_source("return [action]"), 1, ["action"]),  # the last definition counts
     ],
 )
 def test_factor_names(source, count, names):
@@ -64,7 +67,7 @@ def test_factor_meanings_comment_above_an_assignment(lines, meaning):
         # Only a numbered comment is for a factor that is assigned some lines below it.
         ("# 1. how near\nd = action\nx = -d\n# 2. effort\ny = action\nz = x", ["how near", "effort"]),
         ("# not numbered\ne = action\nx = e\n# 2. effort\ny = action", ["", "effort"]),
-        ("# 2. effort\ny = action", ["", "effort"]),
+        ("# how near\nx: float = action\n# 2. effort\ny = action", ["how near", "effort"]),
     ],
 )
 def test_factor_meanings_of_two(body, meanings):

@@ -3,7 +3,7 @@
 import ast
 import itertools
 import re
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 
 from lare_rl.phi.limits import RefusedError
 from lare_rl.phi.read import FUNCTION_NAME, parse
@@ -15,8 +15,12 @@ NUMBERING = re.compile(r"^(factor\s*)?\d+\s*[.:)]\s*", re.IGNORECASE)
 
 def factor_names(source: str, count: int) -> list[str]:
     """Return a name for each factor: its variable in the list that the function returns, or else `factor_1` and so on."""
-    names = _returned_names(_parse_or_empty(source))
-    return names if names and len(names) == count else [f"factor_{number}" for number in range(1, count + 1)]
+    numbered = [f"factor_{number}" for number in range(1, count + 1)]
+    items = _returned_items(_parse_or_empty(source))
+    if items is None or len(items) != count:
+        return numbered
+    names = [item.id if isinstance(item, ast.Name) else name for item, name in zip(items, numbered, strict=True)]
+    return names if len(set(names)) == count else numbered
 
 
 def factor_meanings(source: str, names: Sequence[str]) -> list[str]:
@@ -24,12 +28,8 @@ def factor_meanings(source: str, names: Sequence[str]) -> list[str]:
 
     If a factor is computed in several lines, its comment may be above the first of them, but must then be numbered.
     """
-    tree, lines = _parse_or_empty(source), source.split("\n")
-    assigned = {
-        node.lineno - 1: node.targets[0].id
-        for node in ast.walk(tree)
-        if isinstance(node, ast.Assign) and isinstance(node.targets[0], ast.Name)
-    }
+    lines = source.split("\n")
+    assigned = {number - 1: name for name, number, _ in _assignments(_parse_or_empty(source))}
     meanings, comment, numbered = {}, "", ""
     for number, line in enumerate(lines):
         above = number > 0 and _is_comment(lines[number - 1])
@@ -52,32 +52,29 @@ def _parse_or_empty(source: str) -> ast.Module:
         return ast.Module([], [])
 
 
-def _returned_names(tree: ast.Module) -> list[str] | None:
-    """Return the names in the list that the function returns; None if the list is not written out."""
+def _assignments(tree: ast.AST) -> Iterator[tuple[str, int, ast.expr]]:
+    """Yield the name, line and value of each assignment to a name."""
     for node in ast.walk(tree):
-        if isinstance(node, ast.FunctionDef) and node.name == FUNCTION_NAME and isinstance(node.body[-1], ast.Return):
-            items = _returned_items(node, node.body[-1].value)
-            if items is not None:
-                return [
-                    item.id if isinstance(item, ast.Name) else f"factor_{number}"
-                    for number, item in enumerate(items, start=1)
-                ]
-    return None
+        if isinstance(node, ast.Assign | ast.AnnAssign) and node.value:
+            for target in node.targets if isinstance(node, ast.Assign) else [node.target]:
+                if isinstance(target, ast.Name):
+                    yield target.id, node.lineno, node.value
 
 
-def _returned_items(function: ast.FunctionDef, returned: ast.expr | None) -> list[ast.expr] | None:
-    """Return the items of `[a, b]`, or of `factors` or `[f[:, None] for f in factors]`, if `factors` is assigned once."""
+def _returned_items(tree: ast.Module) -> list[ast.expr] | None:
+    """Return the items of the list that the function returns; None if the list is not written out.
+
+    The list is `[a, b]`, or `factors` or `[f[:, None] for f in factors]`, if `factors` is assigned once.
+    """
+    functions = [node for node in tree.body if isinstance(node, ast.FunctionDef) and node.name == FUNCTION_NAME]
+    if not functions or not isinstance(functions[-1].body[-1], ast.Return):
+        return None
+    returned = functions[-1].body[-1].value
     if isinstance(returned, ast.ListComp) and len(returned.generators) == 1 and not returned.generators[0].ifs:
         returned = returned.generators[0].iter
         returned = returned if isinstance(returned, ast.Name) else None
     if isinstance(returned, ast.Name):
-        values = [
-            node.value
-            for node in ast.walk(function)
-            if isinstance(node, ast.Assign)
-            for target in node.targets
-            if isinstance(target, ast.Name) and target.id == returned.id
-        ]
+        values = [value for name, _, value in _assignments(functions[-1]) if name == returned.id]
         returned = values[0] if len(values) == 1 else None
     return returned.elts if isinstance(returned, ast.List | ast.Tuple) else None
 
