@@ -32,6 +32,7 @@ from lare_rl.util.findings import render
     [
         ({}, 1, None),
         ({}, 50, "--algorithm ppo"),
+        ({}, 1e30, "--algorithm ppo"),  # its square overflows in float32
         ({"algorithm": "ppo"}, 50, None),  # it normalises observations
         ({"algorithm": "ppo", "ppo": {"normalise_observations": False}}, 50, "--ppo.normalise-observations"),
     ],
@@ -126,6 +127,7 @@ def test_greedy_actions_of_newest_states(dense_run):
     [
         ({"td3": {"warmup": 60}}, 50, {}, ("steps so far random", {"step": 50, "warmup": 60})),
         ({"td3": {"warmup": 60}}, 50, {"critic/loss": None}, ("steps so far random", {})),
+        ({"td3": {"warmup": 50}}, 60, {}, ("steps so far random", {"step": 60, "warmup": 60})),  # whole iterations
         ({"td3": {"warmup": 60}}, 90, {"critic/loss": 0.0}, None),
         ({"algorithm": "qmix"}, 90, {}, ("too few episodes", {"step": 90, "algorithm": "qmix", "batch_size": 128})),
         ({"algorithm": "qmix"}, 90, {"critic/loss": 2.0, "critic/loss_prey": None}, None),
@@ -133,7 +135,7 @@ def test_greedy_actions_of_newest_states(dense_run):
 )
 def test_untrained_policy(settings, step, loss, expected, tmp_path):
     spec = pick_spec() if "algorithm" in settings else toy_spec()
-    config = make_config(spec, resolve(Settings(method="dense", steps=100, **settings), spec), ())
+    config = make_config(spec, resolve(Settings(method="dense", steps=100, rollout_steps=20, **settings), spec), ())
     run = Run(tmp_path, config, ())
     assert find_untrained(run) is None  # there is no evaluation yet
     line = {"step": step, "seed": 0, "evaluation/return": 1.0, **loss}

@@ -75,8 +75,8 @@ def warmup_warning(settings: ResolvedSettings) -> str | None:
         return None
     name = f"{settings.algorithm}.warmup"
     return (
-        f"all {settings.steps:,} steps are random, and the policy is not trained: {name} is {settings.warmup:,}; use more steps or "
-        f"a smaller {name}"
+        f"all {settings.steps:,} steps are random, as the first {settings.warmup:,} are ({name}), and the policy is not trained: use "
+        f"more steps or a smaller {name}"
     )
 
 

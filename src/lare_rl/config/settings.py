@@ -169,8 +169,8 @@ class ResolvedSettings(_RunSettings[Never]):
 
     @property
     def warmup(self) -> int:
-        """Steps of random actions before the first update."""
-        return getattr(self.hyperparameters, "warmup", 0)
+        """Steps of random actions before the first update: whole iterations."""
+        return round_up(getattr(self.hyperparameters, "warmup", 0), self.iteration_steps)
 
     def choose_scored_observation(self, task: TaskSpec) -> ScoredObservation:
         """Return which observations of a step phi reads."""

@@ -42,7 +42,7 @@ MAX_EVALUATION_SHARE, MIN_EVALUATION_S = 0.3, 5.0
 
 MESSAGES = {
     "all steps random": "{reason}",
-    "steps so far random": "all {step:,} steps so far were random ({algorithm}.warmup is {warmup:,})",
+    "steps so far random": "all {step:,} steps so far were random, as the first {warmup:,} are ({algorithm}.warmup)",
     "too few episodes": "the policy has not been updated in {step:,} steps: {algorithm} needs {batch_size} finished episodes for "
     "its first update ({algorithm}.batch_size)",
     "large observations": (
@@ -101,8 +101,8 @@ def find_large_observations(run: Run, replay: Replay, config: TrainConfig) -> li
     if (can_normalise and hyperparameters.normalise_observations) or "observation" not in replay.columns:
         return []
     n_rows = min(N_PROBE_STATES, int(np.min(np.asarray(replay.next_row)[0])))
-    observation = np.asarray(replay.columns["observation"][0, :, :n_rows]).reshape(-1, config.env.observation_size)
-    rms = np.sqrt(np.mean(np.square(observation), axis=0))
+    observation = np.asarray(replay.columns["observation"][0, :, :n_rows], np.float64)
+    rms = np.sqrt(np.mean(np.square(observation.reshape(-1, config.env.observation_size)), axis=0))
     largest = int(np.argmax(rms))
     if not rms[largest] > MAX_RMS:
         return []
