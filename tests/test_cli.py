@@ -11,7 +11,7 @@ from helpers.scripted_model import to_reply
 from helpers.toy_envs import PHI
 from lare_rl import cli
 from lare_rl.algorithms.registry import ALGORITHMS
-from lare_rl.cli.terminal import EpisodeProgress
+from lare_rl.cli.terminal import EpisodeProgress, print_progress
 from lare_rl.credit.methods import METHODS
 from lare_rl.envs.load import read_task, shipped_tasks
 from lare_rl.llm.prompts import candidate
@@ -153,6 +153,21 @@ def test_progress_of_episodes(monkeypatch, capsys):
     assert capsys.readouterr().err == ""
 
 
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="no disk that is always full")
+def test_progress_on_a_full_disk(monkeypatch):
+    with open("/dev/full", "w", buffering=1) as full:
+        monkeypatch.setattr(sys, "stderr", full)
+        print_progress("half done")
+
+
+def test_closed_streams(monkeypatch):
+    for name, value in (("stdout", None), ("stderr", None), ("argv", ["lare-rl", "tasks"])):
+        monkeypatch.setattr(sys, name, value)
+    cli.main()
+    with sys.stdout, sys.stderr:
+        pass
+
+
 def test_tasks(command):
     status, out, err = command("tasks")
     assert (status, err) == (0, "")
@@ -204,6 +219,10 @@ def test_new_task_of_two_teams(command, tmp_path):
     (prompted,) = re.findall(r"lare-rl prompt (\S+)", out)
     assert command("prompt", prompted)[0] == 0
     assert "lists their files" in command("prompt", "CompetitivePP-6")[2]
+    (tmp_path / files[0]).unlink()
+    for options, words in (((), "choose another folder"), (("--out", files[2]), "of a team")):
+        assert words in command("new-task", "pettingzoo/mpe2.simple_adversary_v3:parallel_env", *options)[2]
+        assert sorted(path.name for path in tmp_path.iterdir()) == files[1:]
 
 
 def test_new_task_without_documentation(command):

@@ -16,7 +16,7 @@ from lare_rl.cli.logs import relabel
 from lare_rl.cli.parse import parse
 from lare_rl.cli.runs import cross_play, evaluate, export, report
 from lare_rl.cli.studies import compare, reproduce, sweep
-from lare_rl.cli.terminal import print_error, print_line
+from lare_rl.cli.terminal import discard_output, print_error, print_line
 from lare_rl.cli.train import train
 from lare_rl.cli.turns import turn_credit, turn_phi
 from lare_rl.errors import LareError
@@ -51,6 +51,11 @@ COMMANDS = {
 
 def main() -> None:
     """Run `lare-rl`. A user's mistake is one line on stderr and exit status 2; --debug prints its traceback too."""
+    for name in ("stdout", "stderr"):
+        if getattr(sys, name) is None:  # it was closed by the caller
+            stream = open(os.devnull, "w")  # noqa: SIM115 - it stays open
+            os.set_inheritable(stream.fileno(), True)
+            setattr(sys, name, stream)
     for stream in (sys.stdout, sys.stderr):  # a character that the terminal cannot show must raise no error
         if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="backslashreplace")
@@ -66,7 +71,7 @@ def main() -> None:
     except KeyboardInterrupt:
         sys.exit(130)
     except BrokenPipeError:
-        _discard_output()
+        discard_output(sys.stdout)
         sys.exit(1)
     except (LareError, OSError) as error:
         if debug:
@@ -75,10 +80,5 @@ def main() -> None:
         if isinstance(error, LareError):
             sys.exit(error.status)
         with contextlib.suppress(OSError):
-            _discard_output()
+            discard_output(sys.stdout)
         sys.exit(2)
-
-
-def _discard_output() -> None:
-    """Discard what is still buffered for standard output. Python would raise again when it flushes at exit."""
-    os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())

@@ -12,7 +12,6 @@ import tyro
 from lare_rl.cli.terminal import (
     DEFAULT_LIVE,
     Data,
-    FunctionKind,
     LiveOptions,
     Task,
     load_playing_policy,
@@ -22,6 +21,7 @@ from lare_rl.cli.terminal import (
     print_progress,
 )
 from lare_rl.errors import LareError
+from lare_rl.llm.prompts import FunctionKind
 from lare_rl.util.files import check_new_path, find_free_path
 
 if TYPE_CHECKING:

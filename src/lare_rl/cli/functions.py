@@ -13,17 +13,17 @@ from tyro.conf import Positional
 from lare_rl.cli.terminal import (
     Data,
     EpisodeProgress,
-    FunctionKind,
     Task,
     load_playing_policy,
     load_steps,
     print_line,
     print_messages,
     print_progress,
-    write_new_file,
 )
 from lare_rl.errors import LareError
+from lare_rl.llm.prompts import FunctionKind
 from lare_rl.tasks.spec import NO_ENVIRONMENT, ScoredObservation
+from lare_rl.util.files import check_new_path, write_atomically
 
 GOOD_R2 = 0.8
 """From here on, the factors are worth training with."""
@@ -69,9 +69,12 @@ def new_task(
     draft = _draft(environment)
     path = out or Path(f"{draft.name}.toml")
     paths = [path, *(path.parent / name for name in draft.teams)]
-    write_new_file(path, draft.toml, "--out")
-    for team_path, text in zip(paths[1:], draft.teams.values(), strict=True):
-        write_new_file(team_path, text, "folder for --out")
+    if path in paths[1:]:
+        raise LareError(f"{path} is the file of a team; choose another --out")
+    for new in paths:
+        check_new_path(new, "--out" if new == path else "folder for --out")
+    for new, text in zip(paths, [draft.toml, *draft.teams.values()], strict=True):
+        write_atomically(new, lambda file, text=text: file.write(text.encode()))
     print_line(f"wrote {', '.join(map(str, paths))}")
     if draft.removed:
         print_line("  left out or cut short, because it seems to speak of rewards:")

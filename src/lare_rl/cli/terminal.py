@@ -1,10 +1,11 @@
 """What the commands share: types of their arguments, and functions that print."""
 
+import os
 import sys
 import time
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, TextIO
 
 import tyro
 from pydantic import Field
@@ -12,7 +13,7 @@ from tyro.conf import Positional
 
 from lare_rl.errors import CheckedModel, Count, LareError
 from lare_rl.llm.budget import Budget
-from lare_rl.util.files import check_new_path
+from lare_rl.llm.prompts import Message
 from lare_rl.util.findings import format_for_reader
 from lare_rl.util.sanitize import one_line, sanitize
 
@@ -27,7 +28,6 @@ RunDirectory = Annotated[Positional[Path], tyro.conf.arg(metavar="RUN")]
 RunDirectories = Annotated[
     Positional[tuple[Path, ...]], tyro.conf.arg(metavar="RUN", help_behavior_hint="(one or more)")
 ]
-FunctionKind = Literal["factors", "reward"]
 Data = Annotated[str | None, tyro.conf.arg(metavar="DATASET")]
 
 FIRST_PROGRESS_S, PROGRESS_S = 5.0, 20.0
@@ -71,7 +71,7 @@ def print_line(text: str) -> None:
     print(sanitize(text), flush=True)  # noqa: T201 - the one place that writes to standard output
 
 
-def print_messages(messages: Iterable[Mapping[str, str]]) -> None:
+def print_messages(messages: Iterable[Message]) -> None:
     """Print the messages of a request to a language model."""
     for message in messages:
         print_line(f"--- {message['role']} ---\n{message['content']}\n")
@@ -90,8 +90,16 @@ def print_table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> None:
 
 
 def print_progress(text: str) -> None:
-    """Print a message to stderr, so that stdout holds only the result."""
-    sys.stderr.write(sanitize(text) + "\n")
+    """Print a message to stderr, so that stdout holds only the result. If that is not possible, the command goes on without it."""
+    try:
+        sys.stderr.write(sanitize(text) + "\n")
+    except OSError:
+        discard_output(sys.stderr)
+
+
+def discard_output(stream: TextIO) -> None:
+    """Discard what is still buffered for a stream, and what follows. Python would raise again when it flushes at exit."""
+    os.dup2(os.open(os.devnull, os.O_WRONLY), stream.fileno())
 
 
 class EpisodeProgress:
@@ -137,13 +145,3 @@ def load_playing_policy(run: Path | None, spec: "TaskSpec") -> "Policy | None":
     if opened.config.task.environment != spec.environment:
         raise LareError(f"{run} is a run of {opened.config.task.name}: its policy cannot play {spec.name}")
     return RunPolicy(opened)
-
-
-def write_new_file(path: Path, text: str, option: str) -> None:
-    """Write a file that must not exist. `option` is the command-line option that names it."""
-    check_new_path(path, option)
-    try:
-        with path.open("x", encoding="utf-8") as file:
-            file.write(text)
-    except OSError as error:
-        raise LareError(f"{path} cannot be written: {error.strerror}") from error

@@ -6,8 +6,9 @@ from typing import Annotated
 import tyro
 from tyro.conf import Positional
 
-from lare_rl.cli.terminal import DEFAULT_LIVE, LiveOptions, print_line, print_messages, print_progress, write_new_file
-from lare_rl.util.files import check_new_path
+from lare_rl.cli.terminal import DEFAULT_LIVE, LiveOptions, print_line, print_messages, print_progress
+from lare_rl.errors import LareError
+from lare_rl.util.files import check_new_path, write_atomically
 from lare_rl.util.sanitize import one_line
 
 
@@ -84,7 +85,6 @@ def turn_phi(
         live: options of the model.
         out: a .py file to write, with the model's replies in a .json beside it; they must not exist. The default is to print the function.
     """
-    from lare_rl.errors import LareError
     from lare_rl.turns.design import choose_examples, design_turn_phi, turn_request
     from lare_rl.turns.files import read_rollout_file, read_tool_file
     from lare_rl.turns.messages import split_turns
@@ -98,6 +98,8 @@ def turn_phi(
         print_messages(turn_request(goal, descriptions, choose_examples(turns)))
         return
     record = None if out is None else out.with_suffix(".json")
+    if out is not None and out == record:
+        raise LareError(f"{out} is for the model's replies; choose another --out, such as {out.with_suffix('.py')}")
     for path in (out, record):
         if path is not None:
             check_new_path(path, "--out")
@@ -109,5 +111,6 @@ def turn_phi(
     if out is None:
         print_line(designed.phi.source)
         return
-    write_new_file(out, f"# A phi over turns, by {one_line(designed.model)}.\n{designed.phi.source}\n", "--out")
+    text = f"# A phi over turns, by {one_line(designed.model)}.\n{designed.phi.source}\n"
+    write_atomically(out, lambda file: file.write(text.encode()))
     print_line(f"wrote {out} and {record}")
