@@ -384,6 +384,14 @@ def test_pauses_count_as_waiting(start_either):
     assert ("120 s at most" in messages[0], messages[1][-6:]) == (True, "60.0 s")
 
 
+@pytest.mark.parametrize(("content", "temperature"), [("half of \ud800", None), ("x", float("nan"))])
+def test_request_that_is_not_json(start_either, content, temperature):
+    server, model, pauses = start_either(reply_with("hello"), temperature=temperature)
+    with pytest.raises(ModelError, match="JSON"):
+        model.reply([{"role": "user", "content": content}], 0)
+    assert (server.requests, pauses, model.budget.tokens_out) == ([], [], 0)
+
+
 @pytest.mark.parametrize(
     ("status", "location"),
     [(301, "https://elsewhere.example/v1"), (302, "http://127.0.0.1:1/v1/chat/completions"), (308, "//127.0.0.2/v1")],

@@ -192,6 +192,8 @@ class LiveModel:
             return self._refusal(error)
         if isinstance(error, RedirectError):
             return _Failure(_safe_text(error), retry=False)
+        if isinstance(error, ValueError):  # half of a surrogate pair in a message, or a temperature that is not finite
+            return _Failure(_safe_text(f"the request cannot be written as JSON: {error}"), retry=False)
         if isinstance(error, BodyTooLargeError):
             self.budget.count_reply(None, messages, MAX_BODY_BYTES)
             return _Failure(str(error), retry=False)
