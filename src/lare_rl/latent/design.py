@@ -11,7 +11,7 @@ from lare_rl.latent.function import LatentFunction, function_from_verdict, norma
 from lare_rl.latent.verify import Check, Steps, Verdict, sample_steps, verify
 from lare_rl.llm import prompts
 from lare_rl.llm.model import Model, ModelFunction, as_model, recorded_model
-from lare_rl.llm.prompts import MAX_CANDIDATES, N_CANDIDATES, FunctionKind, Message, Stage
+from lare_rl.llm.prompts import MAX_CANDIDATES, N_CANDIDATES, FunctionKind, Message, Stage, check_kind
 from lare_rl.llm.recording import Recorder
 from lare_rl.llm.reply import MalformedReplyError, parse_reply
 from lare_rl.tasks.spec import TaskSpec, require_role
@@ -187,9 +187,11 @@ def design(
 
     Raises:
         DesignError: no attempt passed, the model became unavailable, or the user stopped the design.
-        LareError: the model cannot answer, the environment does not run, or each team of the task needs its own function.
+        LareError: there is no such kind, the model cannot answer, the environment does not run, or each team of the task needs
+            its own function.
     """
     task = require_role(resolve_task(task))
+    check_kind(kind)
     if not 1 <= candidates <= MAX_CANDIDATES:
         raise LareError(f"candidates = {candidates}: from 1 to {MAX_CANDIDATES}")
     model = recorded_model(task.name, kind, draw) if model is None else as_model(model)

@@ -10,7 +10,6 @@ import hashlib
 import itertools
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from jaxtyping import Float
@@ -19,7 +18,7 @@ from lare_rl.envs.placement import make_host_env
 from lare_rl.envs.play import find_team, phi_inputs, play_steps
 from lare_rl.errors import LareError, short_repr
 from lare_rl.latent.factors import compute_batch, find_infinity
-from lare_rl.llm.prompts import FunctionKind
+from lare_rl.llm.prompts import FunctionKind, check_kind
 from lare_rl.phi.graph import Graph
 from lare_rl.phi.limits import MAX_FACTORS, RefusedError
 from lare_rl.phi.names import factor_names
@@ -28,7 +27,7 @@ from lare_rl.tasks.spec import TaskSpec, require_role, select_states
 from lare_rl.util.rows import as_numbers
 from lare_rl.util.statistics import FLOAT32_NOISE
 
-__all__ = ["N_SAMPLE_STEPS", "Check", "Steps", "Verdict", "random_steps", "sample_steps", "verify"]
+__all__ = ["N_SAMPLE_STEPS", "Check", "Steps", "Verdict", "evenly_spaced", "random_steps", "sample_steps", "verify"]
 
 N_SAMPLE_STEPS = 256
 """The number of steps that a function is tried on."""
@@ -80,9 +79,10 @@ def verify(source: str, task: TaskSpec, kind: FunctionKind = "factors", steps: S
             256 steps are enough. Without them, it is tried on random steps of the task's environment.
 
     Raises:
-        LareError: the task's environment cannot be made, the steps do not have the task's sizes, or each team of the task
-            needs its own function.
+        LareError: there is no such kind, the task's environment cannot be made, the steps do not have the task's sizes, or each
+            team of the task needs its own function.
     """
+    check_kind(kind)
     observation, action = sample_steps(task, steps)
     try:
         graph = read(source, observation.shape[1], action.shape[1], 1 if kind == "reward" else MAX_FACTORS)
@@ -149,11 +149,11 @@ def _advice(graph: Graph, names: Sequence[str], factors: Float[np.ndarray, "step
 # --- steps to try a function on -----------------------------------------------------------------------------------------
 
 
-def sample_steps(task: TaskSpec, steps: Any) -> Steps:
-    """Return the steps that a function of a task is tried on: at most 256 of `steps`, evenly spaced, or random steps for None.
+def sample_steps(task: TaskSpec, steps: Steps | None) -> Steps:
+    """Return the steps that a function of a task is tried on: at most 256 of `steps`, evenly spaced, or random steps.
 
     Raises:
-        LareError: as for `verify`. `steps` come from the user, and may be anything.
+        LareError: as for `verify`.
     """
     role = require_role(task)
     if steps is None:

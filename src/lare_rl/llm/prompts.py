@@ -6,13 +6,14 @@ request, byte for byte, because recorded replies are found by the request.
 
 from collections.abc import Sequence
 from importlib.resources import files
-from typing import Literal
+from typing import Literal, get_args
 
-from lare_rl.errors import LareError
+from lare_rl.errors import LareError, short_repr
 from lare_rl.tasks.spec import FILL_IN, TaskSpec
 
 __all__ = [
-    "MAX_CANDIDATES", "N_CANDIDATES", "FunctionKind", "Message", "Stage", "candidate", "combine", "correct", "reflect",
+    "MAX_CANDIDATES", "N_CANDIDATES", "FunctionKind", "Message", "Stage", "candidate", "check_kind", "combine", "correct",
+    "reflect",
 ]  # fmt: skip
 
 N_CANDIDATES = 5
@@ -28,6 +29,12 @@ Stage = Literal["candidate", "combine", "correct", "reflect"]
 
 Message = dict[str, str]
 """`role` ("system", "user" or "assistant") and `content`."""
+
+
+def check_kind(kind: str) -> None:
+    """Raise `LareError` if there is no such kind of function."""
+    if kind not in get_args(FunctionKind):
+        raise LareError(f"kind = {short_repr(kind)}: it is {' or '.join(get_args(FunctionKind))}")
 
 
 def _template(name: str) -> str:
