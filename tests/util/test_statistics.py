@@ -64,6 +64,7 @@ def test_format_plus_minus(mean, std, text):
 def test_format_mean_std():
     assert format_mean_std(np.array([70.0, 72.0])) == "71.00 ± 1.41"
     assert format_mean_std(np.array([70.0])) == "70.00"
+    assert format_mean_std(np.array([np.inf, 1.0])) == "inf ± nan"  # a measure may be infinite
 
 
 @pytest.mark.parametrize(

@@ -49,8 +49,9 @@ def wins(x: Float[np.ndarray, "*_"], y: Float[np.ndarray, "*_"]) -> Float[np.nda
 
 
 def sample_std(values: Float[np.ndarray, " values"]) -> float:
-    """Return the standard deviation with n - 1, or 0 for fewer than two values."""
-    return float(np.std(values, ddof=1)) if len(values) > 1 else 0.0
+    """Return the standard deviation with n - 1, or 0 for fewer than two values. It is NaN if a value is infinite."""
+    with np.errstate(invalid="ignore"):
+        return float(np.std(values, ddof=1)) if len(values) > 1 else 0.0
 
 
 def standard_error(values: Float[np.ndarray, " values"]) -> float:
@@ -129,7 +130,7 @@ def format_rounded(number: float, spread: float) -> str:
     A number that six places would not show is written with an exponent.
     """
     n_digits, size = (2, spread) if spread > 0 else (3, abs(number))
-    n_places = max(n_digits - math.floor(math.log10(size)), 0) if size > 0 else 3
+    n_places = max(n_digits - math.floor(math.log10(size)), 0) if 0 < size < math.inf else 3
     if n_places > 6 and 0 < abs(number) < 1e-4:
         return f"{number:.2e}"
     return f"{number:.{min(n_places, 6)}f}"
