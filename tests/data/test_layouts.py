@@ -27,7 +27,7 @@ def test_lay_out_packed(lengths, n_masked, rows):
 
 
 @pytest.mark.parametrize("xp", [np, jnp])
-def test_lay_out_padded_and_drawn(xp):
+def test_lay_out_padded_and_sampled(xp):
     layout = lay_out_padded(xp.array([[3, 1], [2, 4]]), 4)
     assert layout.step.tolist() == [[[0, 1, 2, 2], [0] * 4], [[0, 1, 1, 1], [0, 1, 2, 3]]]
     assert layout.slot.tolist() == [[[0] * 4, [1] * 4]] * 2

@@ -33,6 +33,7 @@ from lare_rl.evaluation.evaluate import (
 from lare_rl.evaluation.video import check_video_path, record_video, write_video
 from lare_rl.report.evaluation_lines import compare_actions, describe_evaluation
 from lare_rl.runs.metric_names import DETERMINISTIC_RETURN
+from lare_rl.training.evaluation import Evaluation
 from lare_rl.training.policy import get_actor
 from lare_rl.training.saved_state import load_learner
 from lare_rl.training.unroll_host import evaluate_on_host, evaluation_policy
@@ -237,9 +238,9 @@ def test_evaluate_in_another_environment(run, command):
 
 @pytest.mark.parametrize(("gain", "text"), [(1.0, "better"), (-1.0, "worse"), (0.0, None)])
 def test_the_better_actions_are_named(run, gain, text):
-    sampled = evaluate_policy(run, 3)
-    noise = np.random.default_rng(0).normal(size=sampled.returns.shape)
-    likeliest = sampled._replace(returns=sampled.returns + 100 * gain + noise - noise.mean())
+    noise = np.random.default_rng(0).normal(size=(2, 3, 1))
+    sampled = Evaluation(np.zeros_like(noise), noise, np.ones((2, 3), int), {})
+    likeliest = sampled._replace(returns=100 * gain + noise - noise.mean())
     lines = list(compare_actions(run, sampled, likeliest))
     assert len(lines) == (text is not None)
     assert all(text in line for line in lines)

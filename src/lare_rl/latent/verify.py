@@ -100,7 +100,7 @@ def _finite_error(
 ) -> str | None:
     """Return a message about the first factor that is not finite on a batch of steps."""
     # Random numbers that are reproducible for a source, but that its author cannot know.
-    rng = np.random.default_rng(list(hashlib.sha256(source.encode(errors="replace")).digest()))
+    rng = np.random.default_rng(list(hashlib.sha256(source.encode()).digest()))
     size, total = observation.shape[1], observation.shape[1] + action.shape[1]
     noise = [rng.standard_normal((N_SAMPLE_STEPS, n)).astype(np.float32) for n in (size, total - size)]
     recorded = np.concatenate([observation, action], axis=1)

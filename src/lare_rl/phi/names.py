@@ -29,14 +29,14 @@ def factor_meanings(source: str, names: Sequence[str]) -> list[str]:
     If a factor is computed in several lines, its comment may be above the first of them, but must then be numbered.
     """
     lines = source.split("\n")
-    assigned = {number - 1: name for name, number, _ in _assignments(_parse_or_empty(source))}
+    assigned = {line: name for name, line, _ in _assignments(_parse_or_empty(source))}
     meanings, comment, numbered = {}, "", ""
-    for number, line in enumerate(lines):
-        above = number > 0 and _is_comment(lines[number - 1])
+    for index, line in enumerate(lines):
+        above = index > 0 and _is_comment(lines[index - 1])
         if _is_comment(line) and not above:
-            comment = _leading_comment(lines[number:])
+            comment = _leading_comment(lines[index:])
             numbered = comment if NUMBERING.match(comment) else ""
-        name = assigned.get(number)
+        name = assigned.get(index + 1)
         if name is not None and (above or (name in names and numbered)):
             meanings[name] = NUMBERING.sub("", comment)
         if name in names:

@@ -136,7 +136,7 @@ def find_constant_returns(returns: Sequence[Float[np.ndarray, " seeds"]]) -> lis
 
 
 def find_slow_evaluations(settings: ResolvedSettings, evaluation_s: float, interval_s: float) -> list[Finding]:
-    """Find out whether an evaluation takes much of the time. `interval_s` is the time from one evaluation to the next, with one of them."""
+    """Find out whether an evaluation takes much of the time. `interval_s` is the time from the end of one to the end of the next."""
     share = evaluation_s / interval_s
     if share <= MAX_EVALUATION_SHARE or evaluation_s <= MIN_EVALUATION_S:
         return []
