@@ -175,6 +175,7 @@ def test_answer_without_completion(start, body, reason):
         (raw_answer(b"Your plan has ended.", 401), 1, ["HTTP 401", "'Your plan has ended.'"]),
         (raw_answer(b"<html>\x1b[2J\xe2\x80\xae" + b"x" * 300, 403), 1, [f"'<html>?[2J?{'x' * 189}...'"]),
         (lambda handler: refuse(401, handler.headers["Authorization"])(handler), 1, ["Bearer [key]"]),
+        (raw_answer(b"x" * 190 + KEY.encode(), 401), 1, [f"'{'x' * 190}[key]'"]),
     ],
 )
 def test_permanent_error_is_not_retried(start, answer, requests, words):

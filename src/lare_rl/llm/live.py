@@ -229,7 +229,7 @@ def _without_password(url: str) -> str:
 
 
 def _excerpt(body: str) -> str:
-    text = one_line(body[:2000])
+    text = one_line(redact_key(body[:2000]))  # before the cut, which could leave a part of the key
     return repr(text if len(text) <= _MAX_EXCERPT else f"{text[:_MAX_EXCERPT]}...")
 
 
