@@ -14,7 +14,10 @@ NUMBERING = re.compile(r"^(factor\s*)?\d+\s*[.:)]\s*", re.IGNORECASE)
 
 
 def factor_names(source: str, count: int) -> list[str]:
-    """Return a name for each factor: its variable in the list that the function returns, or else `factor_1` and so on."""
+    """Return a name for each factor: its variable in the list that the function returns, or else `factor_1` and so on.
+
+    If two factors would have the same name, all are numbered.
+    """
     numbered = [f"factor_{number}" for number in range(1, count + 1)]
     items = _returned_items(_parse_or_empty(source))
     if items is None or len(items) != count:

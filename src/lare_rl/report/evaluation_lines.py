@@ -49,7 +49,7 @@ def evaluation_lines(
     random_episodes = play_random(task, n_random, max(policy_s, RANDOM_PLAY_LIMIT_S), make_listener(n_random), seeds)
     yield from describe_evaluation(run, evaluation, random_episodes, best_steps)
     if 0 < len(random_episodes[0]) < n_random:
-        yield f"random actions ended after {len(random_episodes[0])} of {n_random} episodes, to save time"
+        yield f"random actions played {len(random_episodes[0])} of {n_random} episodes: they are slow, or the environment failed"
     if likeliest is not None:
         yield "The policy samples its actions, as in training. The most likely ones (--deterministic), from the same states:"
         yield from _describe_returns(run, likeliest, best_steps)
