@@ -80,6 +80,7 @@ def test_step_factors_refuse_other_shapes(function, observation, action, next_ob
         (np.zeros((3, 3)), np.zeros((3, 1)), r"observations .*\(batch, 2\).*\(3, 3\)"),
         (np.zeros((3, 2)), np.zeros(3), r"actions .*\(batch, 1\).*\(3,\)"),
         (np.zeros((3, 2)), np.zeros((4, 1)), "differ: 3 and 4"),
+        (np.zeros((3, 2), complex), np.zeros((3, 1)), "observations must be arrays of numbers"),
         (np.zeros((3, 2)), [["a"]] * 3, "actions must be arrays of numbers"),
     ],
 )

@@ -14,7 +14,10 @@ def as_numbers(name: str, values: Any) -> Float[np.ndarray, "*shape"]:
     """Return an argument as an array of float32. Raises `LareError`, which names it, if it is no array of numbers."""
     try:
         with np.errstate(over="ignore"):  # numbers above 3.4e38 become infinite
-            return np.asarray(values, np.float32)
+            array = np.asarray(values)
+            if array.dtype.kind == "c":
+                raise TypeError("complex numbers")
+            return array.astype(np.float32, copy=False)
     except (TypeError, ValueError, OverflowError):
         raise LareError(f"{name}s must be arrays of numbers, not {short_repr(values)}") from None
 
