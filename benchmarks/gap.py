@@ -81,24 +81,30 @@ def hidden(task: str) -> Comparison:
     )
 
 
-def wheat(run: str, task: str = "Wheat") -> Directories:
-    """Seeds 0 to 4, and 5 to 9."""
-    return [f"{LAPTOP}/real/seeds-{first}/{task}/{run}" for first in (0, 5)]
+def simulator(task: str, algorithm: str, steps: int) -> Comparison:
+    """A simulator whose score exists only at the end: seeds 0 to 4, and 5 to 9. True rewards are what a practitioner would pay a step."""
+
+    def runs(name: str, suffix: str = "") -> Directories:
+        return [f"{LAPTOP}/real/seeds-{first}/{task}{suffix}/{name}" for first in (0, 5)]
+
+    return Comparison(
+        steps,
+        runs(f"episodic-{algorithm}"),
+        runs(f"dense-{algorithm}", "Proxy"),
+        {"rrdu": runs(f"rrdu-{algorithm}")},
+        runs(f"lare-rrdu-{algorithm}-published"),
+        runs(f"lare-bayes-{algorithm}"),
+        runs(f"bayes-{algorithm}"),
+    )
 
 
 HALF_CHEETAH, WALKER, REACHER = "HalfCheetah-v4", "Walker2d-v4", "Reacher-v4"
 TEN_SEEDS = "scores/cheetah/HalfCheetah-v4,paidonce"
 THRESHOLD = "scores/threshold/HalfCheetahThreshold-v4"
 COMPARISONS = {
-    "wheat, SAC": Comparison(
-        6_000,
-        wheat("episodic-sac"),
-        wheat("dense-sac", "WheatProxy"),  # what practitioners would pay a step; it adds up to the score
-        {"rrdu": wheat("rrdu-sac")},
-        wheat("lare-rrdu-sac-published"),
-        wheat("lare-bayes-sac"),
-        wheat("bayes-sac"),
-    ),
+    "wheat, SAC": simulator("Wheat", "sac", 6_000),
+    "traffic, PPO": simulator("Traffic", "ppo", 36_000),
+    "job shop, PPO": simulator("JobShop", "ppo", 100_000),
     f"{HALF_CHEETAH}, TD3, short": Comparison(
         30_000,
         [f"{TEN_SEEDS}/episodic"],
