@@ -209,7 +209,8 @@ EXPRESSIONS = {
         np.bincount([1, 1, 3])[1] * x | np.roots([1, -3, 2]).sum() * x | np.polyfit([0, 1, 2], [0, 1, 2], 1)[0] * x
         np.fromfunction(lambda r, c: r + c, (2, 3)).ravel() * x | np.trim_zeros([0, 1, 2, 0])[0] * x | np.cov(t) * x
         np.array_equal(t, t) * x | np.fill_diagonal(np.eye(2), 3) or x | np.finfo(float).eps * x
-        np.finfo(np.float32).max * 0 * x | np.pi * x | len(type(x).__name__) * x | (0, 1, 0).index(0, 1) * x | np.array([[1, 2], [3, 4]])[1, 0] * x
+        np.finfo(np.float32).max * 0 * x | np.pi * x
+        len(type(x).__name__) * x | (0, 1, 0).index(0, 1) * x | np.array([[1, 2], [3, 4]])[1, 0] * x
     """,
 }
 CASES = {}
