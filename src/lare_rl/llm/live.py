@@ -173,7 +173,7 @@ class LiveModel:
             self.budget.count_reply(None, messages, len(body))
             kind = "response" if self.forms.api == "responses" else "chat completion"
             reason = f"the answer is not a {kind} ({type(error).__name__}: {error})"
-            is_missing = self.forms.api == "responses" and not self.forms.is_verified
+            is_missing = self.forms.may_lack_responses
             if is_missing:  # some servers answer any request for an unknown address
                 self.forms = self.forms.without_responses()
             page = _excerpt(body.decode(errors="replace"))
