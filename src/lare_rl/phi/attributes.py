@@ -1,4 +1,4 @@
-"""What a program can import, and which attributes its values have. Every attribute is in a table of this file."""
+"""What a program can import, and which attributes its values have: those that this file names, and no others."""
 
 import ast
 import difflib
