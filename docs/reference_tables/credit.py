@@ -8,7 +8,8 @@ from collections import defaultdict
 from enum import StrEnum
 from textwrap import dedent
 
-from lare_rl.algorithms.registry import ALGORITHMS, Algorithm
+from lare_rl.algorithms.registry import ALGORITHMS
+from lare_rl.cli.lists import abilities, agents_of_method
 from lare_rl.credit.input_names import InputNames
 from lare_rl.credit.methods import METHODS, RAW, Fit, Method
 from lare_rl.envs.load import read_task, shipped_tasks
@@ -80,9 +81,8 @@ def methods_page() -> str:
 
 def notes(method: Method) -> str:
     """Return the inputs, the fit and the number of agents of a method, as far as it has them."""
-    agents = "many agents" if method.multi_agent_only else "one agent" if method.single_agent_only else ""
     fit = "" if method.fit is None or method.inputs is None else f"{symbols(method, method.inputs)}; {method.fit.value}"
-    return "; ".join(filter(None, (fit, agents, "*new*" if method.name in UNMEASURED else "")))
+    return "; ".join(filter(None, (fit, agents_of_method(method), "*new*" if method.name in UNMEASURED else "")))
 
 
 def source_rows() -> list[tuple[str, str]]:
@@ -124,12 +124,6 @@ def algorithms_table() -> str:
     """Return the table of algorithms."""
     rows = ((code(name), str(algorithm.consumes), *abilities(algorithm)) for name, algorithm in ALGORITHMS.items())
     return table(("algorithm", "consumes", "agents", "actions"), rows)
-
-
-def abilities(algorithm: Algorithm) -> tuple[str, str]:
-    agents = "one" if not algorithm.multi_agent else "any" if algorithm.single_agent else "many"
-    actions = "discrete" if not algorithm.continuous else "any" if algorithm.discrete else "continuous"
-    return agents, actions
 
 
 def built_in_tasks_page() -> str:

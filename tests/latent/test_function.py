@@ -98,6 +98,7 @@ def test_factor_that_is_not_finite_in_use(chase):
         function(observation, action)
     assert error.value.observation is observation
     assert error.value.action is action
+    assert str(pickle.loads(pickle.dumps(error.value))) == str(error.value)
 
 
 def test_names_and_meanings(function):
@@ -143,6 +144,8 @@ def test_function_of_another_task(function, chase):
     check_task(function, chase)
     with pytest.raises(LareError, match=r"'Chase', not for 'Depot'.*task='Depot'"):
         check_task(function, other)
+    with pytest.raises(LareError, match=r"\(2, 1\), and Chase has \(3, 1\)"):
+        check_task(function, chase.model_copy(update={"observation_size": 3}))
     assert pair_with_roles([function], chase) == [(function, chase)]
     with pytest.raises(LareError, match="each of Chase; 2 were given"):
         pair_with_roles([function, function], chase)

@@ -26,7 +26,7 @@ from helpers.chat_servers import (
 from lare_rl.errors import LareError
 from lare_rl.llm.budget import Budget, BudgetExceededError, max_request_tokens
 from lare_rl.llm.live import LiveModel, ModelError
-from lare_rl.llm.request_forms import RequestForms
+from lare_rl.llm.request_forms import FailedResponseError, RequestForms
 
 KEY = "sk-secret-key-0123456789"
 REQUEST = [{"role": "user", "content": "Write some."}]
@@ -247,6 +247,8 @@ def test_error_of_a_known_responses_api_is_retried(serve):
     with pytest.raises(ModelError, match="The model crashed"):
         model.reply(REQUEST, 0)
     assert len(pauses) == ATTEMPTS - 1
+    with pytest.raises(FailedResponseError, match="The model crashed"):
+        RequestForms().read_answer(b'{"status": "failed", "error": "The model crashed."}')
 
 
 @pytest.mark.parametrize("status", [403, 404])
@@ -344,6 +346,7 @@ def test_unsupported_options_are_dropped_for_good(start):
         {"prompt_tokens": 10**400, "completion_tokens": 1},
         {"prompt_tokens": 1, "completion_tokens": -1},
         {"input_tokens": 1},
+        "many",
     ],
 )
 def test_bytes_are_counted_without_usage(start_either, usage):

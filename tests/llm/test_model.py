@@ -24,8 +24,9 @@ def test_function_is_a_model():
     assert requests == [["system", "user"], ["system", "user", "assistant", "user"]]
 
 
-def test_key_is_removed(monkeypatch):
+def test_key_and_half_of_surrogate_pair_are_removed(monkeypatch):
     monkeypatch.setenv("OPENAI_API_KEY", "sk-secret-key")
+    assert as_model(lambda messages: "\ud83d").reply([], 0) == "?"
     assert as_model(lambda messages: "It is sk-secret-key.").reply([], 0) == "It is [key]."
     with pytest.raises(LareError, match=r"KeyError: '\[key\]'"):
         as_model(lambda messages: {}["sk-secret-key"]).reply([], 0)

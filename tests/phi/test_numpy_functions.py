@@ -88,6 +88,7 @@ EXPRESSIONS = {
         np.gradient(x, np.array([0, 1, 3, 4, 6, 7.0]), axis=1, edge_order=2)
         np.gradient(x, axis=1, edge_order=2) | np.trapezoid(x, axis=1) | np.trapezoid(x, np.arange(6) ** 2, axis=1)
         np.trapezoid(x, dx=0.1) | np.sort(x, axis=1) | np.argsort(x, axis=1) | np.sort(y, axis=1)
+        [s.sort(axis=1, kind="stable") or s for s in [x.copy()]][0] | [s.partition(2) or s[:, 2] for s in [x.copy()]][0]
         np.partition(x, 2, axis=1)[:, 2] | np.lexsort((x, i)) | np.median(x, axis=1) | np.median(y, axis=(1, 2))
         np.percentile(x, 30, axis=1) | np.quantile(x, 0.25, axis=1, keepdims=True)
         np.quantile(x, [0.25, 0.5], axis=1).T | np.percentile(x, 25, axis=1, method="nearest")
@@ -193,6 +194,7 @@ EXPRESSIONS = {
         np.searchsorted([-1, 0, 1], x) | np.searchsorted(np.array([-1, 0, 1]), x, side="right")
         np.digitize(x, [-1, 0, 1]) | np.digitize(x, [-1, 0, 1], right=True) | np.digitize(x, [1, 0, -1])
         np.polyval([1, -2, 0.5], x) | np.polynomial.polynomial.polyval(x, [1, -2, 0.5]) | np.poly1d([1, 0, 2])(x)
+        np.poly1d([1, 0, 2]).coef[0] * x | np.polynomial.Polynomial([1, 0, 2]).coef[0] * x | np.poly1d([1, 4, 2]).deriv(2).c[0] * x
         np.polynomial.Polynomial([1, 0, 2])(x) | np.polynomial.chebyshev.chebval(x, [1, 0.5, 0.2])
         np.polyval(np.polyder([1, 2, 3]), x) | np.isin(i, [1, 3]) | np.isin(i, [1, 3], invert=True)
         np.unravel_index(i % 6, (2, 3))[1] | np.ravel_multi_index((i[:, :1] % 2, i[:, 1:2] % 3), (2, 3))
@@ -207,7 +209,8 @@ EXPRESSIONS = {
         np.bincount([1, 1, 3])[1] * x | np.roots([1, -3, 2]).sum() * x | np.polyfit([0, 1, 2], [0, 1, 2], 1)[0] * x
         np.fromfunction(lambda r, c: r + c, (2, 3)).ravel() * x | np.trim_zeros([0, 1, 2, 0])[0] * x | np.cov(t) * x
         np.array_equal(t, t) * x | np.fill_diagonal(np.eye(2), 3) or x | np.finfo(float).eps * x
-        np.finfo(np.float32).max * 0 * x | np.pi * x | np.array([[1, 2], [3, 4]])[1, 0] * x
+        np.finfo(np.float32).max * 0 * x | np.pi * x
+        len(type(x).__name__) * x | (0, 1, 0).index(0, 1) * x | np.array([[1, 2], [3, 4]])[1, 0] * x
     """,
 }
 CASES = {}

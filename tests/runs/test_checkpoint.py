@@ -15,6 +15,7 @@ from hypothesis import strategies as st
 from helpers.small_configs import small_config
 from lare_rl.errors import LareError
 from lare_rl.runs import checkpoint
+from lare_rl.runs.best_policy import empty_best, save_best, update_best
 from lare_rl.tasks.payments import PAID_AT_END, PaymentRule
 from lare_rl.training.compiled import learner_shape
 
@@ -113,6 +114,15 @@ def test_files_of_killed_process_are_removed(tmp_path):
     # The last name may be a file that is being written just now.
     expected = {"rows-0.npz", "rows-1.npz", "state.npz", "best.npz.0123.new"}
     assert {path.name for path in directory.iterdir()} == expected
+    save_best(directory, update_best(empty_best(1), np.ones(1), 5, np.zeros((1, 2))))
+    assert {path.name for path in directory.glob("best*")} == {"best.npz"}
+
+
+def test_nan_is_never_the_best_evaluation():
+    best = empty_best(2)
+    for step, returns in ((1, [np.nan, -3.0]), (2, [-5.0, np.nan]), (3, [-5.0, -4.0])):
+        best = update_best(best, np.array(returns), step, np.full((2, 1), step))
+    assert [array.tolist() for array in best] == [[-5.0, -3.0], [2, 1], [[2], [1]]]
 
 
 def test_rows_that_are_dropped_at_once_are_not_written(tmp_path):

@@ -8,6 +8,7 @@ import subprocess
 import sys
 import threading
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -18,6 +19,7 @@ from helpers import untrained_runs
 from helpers.long_tests import long_case
 from lare_rl.errors import LareError
 from lare_rl.latent.function import verify_function
+from lare_rl.sweep import processes
 from lare_rl.sweep.jobs import job_to_json, train_job
 from lare_rl.sweep.processes import RunningProcesses, train_in_process
 from lare_rl.sweep.resources import Slot
@@ -234,12 +236,24 @@ def test_killed_sweep_saves_its_run(file, tmp_path):
         time.sleep(0.1)
 
 
-def test_error_of_process(file):
-    job = read_sweep(file)[1][0]
+def test_error_of_process(file, tmp_path):
+    """The path has a byte that is not UTF-8."""
+    job = replace(read_sweep(file)[1][0], directory=tmp_path / "\udcff" / "dense-td3")
     job.directory.mkdir(parents=True)  # as if another sweep had just started it
     error = train_in_process(job, Slot([], {}), RunningProcesses())
-    assert error.startswith(f"{job.directory} exists")
+    assert error.startswith(f"{tmp_path}/\\udcff/dense-td3 exists")
     assert error.endswith("dense-td3.log)")
+
+
+def test_unexpected_error_is_not_the_note_of_jax(monkeypatch, capfd):
+    def fail(job):
+        error = TypeError("add got incompatible shapes\nand more")
+        error.add_note("JAX has removed its internal frames")
+        raise error
+
+    monkeypatch.setattr(processes, "train_job", fail)
+    assert processes._train_when_free({}) == "TypeError: add got incompatible shapes"
+    assert "Traceback" in capfd.readouterr().err
 
 
 @pytest.mark.parametrize(
@@ -247,9 +261,11 @@ def test_error_of_process(file):
     [
         ("exit 1", "exit status 1"),  # not the last line of an earlier process in the log
         ("kill -9 $$", "it was ended by SIGKILL"),
+        ("kill -40 $$", "it was ended by signal 40"),
         ("exit 0", "it ended at step 0 of 200"),  # an environment that ends the process
         ("echo no space is left; exit 2", "no space is left"),  # the log of a full disk has no room for it
-        ("echo last line >&2; exit 3", "last line"),
+        ("echo last line >&2; echo >&2; exit 3", "last line"),
+        (r"printf '\377'; exit 3", "\ufffd"),
     ],
 )
 def test_end_of_process(file, python_script, script, error):

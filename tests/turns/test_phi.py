@@ -86,13 +86,23 @@ def test_files(tmp_path):
         load_turn_phi(tmp_path / "none.py")
 
 
-def test_design_corrects_until_a_program_passes():
-    model = ScriptedModel(replies=["no JSON", to_reply("x = 1"), to_reply(SOURCE)])
-    designed = design_turn_phi("Repair it.", [{"name": "test"}], [PASSED, FAILED], model)
+ALIAS = "turn_events = f\n"
+RAISE = "def turn_events(tool, arguments, result, text):\n    if text:\n        raise ValueError(text)\n    return {'a': 1}\n"
+
+
+def test_design_corrects_until_a_program_passes(tmp_path):
+    replies = [
+        to_reply(source) for source in ("x = 1", SOURCE.replace("def turn_events", "def f") + ALIAS, RAISE, SOURCE)
+    ]
+    model = ScriptedModel(replies=["no JSON", *replies])
+    half = Turn("\ud83d", (), "")  # half of a surrogate pair, which no file can hold
+    designed = design_turn_phi("\ud83d", [{"name": "test"}], [PASSED, half], model, record=tmp_path / "record.json")
     assert designed.phi.source.strip() == SOURCE.strip()
     assert "not one JSON object" in model.requests[1][-1]["content"]
     assert "E-FORM" in model.requests[2][-1]["content"]
-    assert [exchange.stage for exchange in designed.recorder.exchanges] == ["candidate", "correct", "correct"]
+    assert "no function turn_events" in model.requests[3][-1]["content"]
+    assert "ValueError: ?" in model.requests[4][-1]["content"]
+    assert [exchange.stage for exchange in designed.recorder.exchanges] == ["candidate", *["correct"] * 4]
 
 
 def test_design_gives_up():
@@ -107,8 +117,10 @@ def test_request_has_tools_and_turns():
     system, user = turn_request("Repair it.", [{"function": {"name": "test", "description": "Run."}}], [PASSED])
     assert "find_numbers" in system["content"]
     assert all(text in user["content"] for text in ("Repair it.", "## test\nRun.", '"3 passed"', "not JSON"))
-    with pytest.raises(LareError, match="function with a name"):
-        turn_request("Repair it.", [{}], [])
+    assert "## test\n\nParameters: {}" in turn_request("", [{"name": "test", "description": None}], [])[1]["content"]
+    for tool, message in (({}, "function with a name"), ({"name": "f", "parameters": {1j}}, "JSON")):
+        with pytest.raises(LareError, match=message):
+            turn_request("Repair it.", [tool], [])
 
 
 def test_examples_are_of_different_tools():

@@ -5,6 +5,7 @@ from typing import TYPE_CHECKING
 from lare_rl.cli.terminal import print_table
 
 if TYPE_CHECKING:
+    from lare_rl.algorithms.registry import Algorithm
     from lare_rl.credit.methods import Method
 
 
@@ -25,22 +26,27 @@ def methods() -> None:
     """List the ways to assign credit, and where each comes from."""
     from lare_rl.credit.methods import METHODS
 
-    def note(method: "Method") -> str:
-        return " (many agents)" if method.multi_agent_only else " (one agent)" if method.single_agent_only else ""
+    rows = []
+    for method in METHODS.values():
+        agents = agents_of_method(method)
+        rows.append((method.name, method.summary + (f" ({agents})" if agents else ""), method.source))
+    print_table(("method", "what the algorithm is trained on", "source"), rows)
 
-    print_table(
-        ("method", "what the algorithm is trained on", "source"),
-        ((method.name, method.summary + note(method), method.source) for method in METHODS.values()),
-    )
+
+def agents_of_method(method: "Method") -> str:
+    """Return the number of agents that a method is limited to, or an empty text."""
+    return "many agents" if method.multi_agent_only else "one agent" if method.single_agent_only else ""
 
 
 def algorithms() -> None:
     """List the reinforcement learning algorithms, and where each comes from."""
     from lare_rl.algorithms.registry import ALGORITHMS
 
-    rows = []
-    for row in ALGORITHMS.values():
-        agents = "one" if not row.multi_agent else "any" if row.single_agent else "many"
-        actions = "discrete" if not row.continuous else "any" if row.discrete else "continuous"
-        rows.append((row.name, row.consumes, agents, actions, row.summary, row.source))
+    rows = ((row.name, row.consumes, *abilities(row), row.summary, row.source) for row in ALGORITHMS.values())
     print_table(("algorithm", "consumes", "agents", "actions", "what it is", "source"), rows)
+
+
+def abilities(algorithm: "Algorithm") -> tuple[str, str]:
+    """Return how many agents an algorithm trains, and which actions they may have."""
+    agents = "one" if not algorithm.multi_agent else "any" if algorithm.single_agent else "many"
+    return agents, "discrete" if not algorithm.continuous else "any" if algorithm.discrete else "continuous"

@@ -115,16 +115,12 @@ def _prepare(
 
 def _load_functions(
     files: "Sequence[Path | LatentFunction]", spec: "TaskSpec", resolved: ResolvedSettings
-) -> "list[LatentFunction]":
-    """Load and verify the latent functions of a run."""
-    from lare_rl.latent.function import CHANGED_SUFFIX, pair_with_roles
-    from lare_rl.latent.saved import load_function
-    from lare_rl.training.latent_functions import check_draw_unused
+) -> "Sequence[LatentFunction]":
+    """Load and verify the latent functions of a run, and report those that were changed by hand."""
+    from lare_rl.latent.function import CHANGED_SUFFIX
+    from lare_rl.training.latent_functions import choose_functions
 
-    check_draw_unused(resolved)
-    functions = [
-        load_function(file, role) if isinstance(file, Path) else file for file, role in pair_with_roles(files, spec)
-    ]
+    functions = choose_functions(spec, resolved, files)
     for function in functions:
         if function.changed:
             author = function.model.removesuffix(CHANGED_SUFFIX)

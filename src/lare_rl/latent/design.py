@@ -11,18 +11,12 @@ from lare_rl.latent.function import LatentFunction, function_from_verdict, norma
 from lare_rl.latent.verify import Check, Steps, Verdict, sample_steps, verify
 from lare_rl.llm import prompts
 from lare_rl.llm.model import Model, ModelFunction, as_model, recorded_model
-from lare_rl.llm.prompts import MAX_CANDIDATES, N_CANDIDATES, FunctionKind, Message, Stage, check_kind
+from lare_rl.llm.prompts import MAX_ATTEMPTS, MAX_CANDIDATES, N_CANDIDATES, FunctionKind, Message, Stage, check_kind
 from lare_rl.llm.recording import Recorder
 from lare_rl.llm.reply import MalformedReplyError, parse_reply
 from lare_rl.tasks.spec import TaskSpec, require_role
 
 __all__ = ["Conversation", "DesignError", "check_recorded", "design", "examine_reply"]
-
-_MAX_ATTEMPTS = 5
-"""Attempts at a function that passes verification, the first included."""
-
-_MAX_QUOTE = 20_000
-"""Characters of a failed reply that the model sees again."""
 
 
 class DesignError(LareError):
@@ -95,20 +89,20 @@ class Conversation:
             for number, attempt in enumerate(attempts, start=1):
                 self.on_message(f"candidate {number}: {attempt.first_error}")
             passing = [attempt.reply for attempt in attempts if attempt.verdict.passed]
-        request = prompts.combine(self.task, passing or list(map(_quote, replies)), self.kind)
+        request = prompts.combine(self.task, passing or list(map(prompts.quote, replies)), self.kind)
         return request, self.ask("combine", request)
 
     def correct(self, request: list[Message], reply: str) -> Attempt:
         """Verify a reply, and ask for corrections until one passes. Raises `DesignError` if no attempt has passed."""
         attempt = self._examine(reply)
-        for number in range(1, _MAX_ATTEMPTS + 1):
+        for number in range(1, MAX_ATTEMPTS + 1):
             self.on_message(f"attempt {number}: {attempt.first_error}")
             if attempt.verdict.passed:
                 return attempt
-            if number < _MAX_ATTEMPTS:
-                request = prompts.correct(request, _quote(attempt.reply), attempt.verdict.errors)
+            if number < MAX_ATTEMPTS:
+                request = prompts.correct(request, attempt.reply, attempt.verdict.errors)
                 attempt = self._examine(self.ask("correct", request))
-        raise self._error(f"none of {_MAX_ATTEMPTS} attempts passed; the last one failed: {attempt.first_error}")
+        raise self._error(f"none of {MAX_ATTEMPTS} attempts passed; the last one failed: {attempt.first_error}")
 
     def accept(self, reply: str) -> Attempt:
         """Accept a reply if it can be read: the ablation without pre-verification.
@@ -135,11 +129,6 @@ class Conversation:
 
     def _error(self, reason: str) -> DesignError:
         return DesignError(f"task {self.task.name!r}: {reason}", self.recorder, self.model.name)
-
-
-def _quote(reply: str) -> str:
-    """Shorten a reply that the model sees again. It must not be empty, because some servers refuse empty messages."""
-    return reply[:_MAX_QUOTE] if reply.strip() else "(an empty reply)"
 
 
 def check_recorded(task: TaskSpec, kind: FunctionKind, draw: int, candidates: int) -> None:

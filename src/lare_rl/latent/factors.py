@@ -17,8 +17,11 @@ class NonFiniteFactorError(LareError):
     """A factor is not finite. `observation` and `action` are the batch for which it was computed."""
 
     def __init__(self, message: str, observation: np.ndarray, action: np.ndarray):
-        super().__init__(message)
+        super().__init__(message, observation, action)  # so that a process can send it to another
         self.observation, self.action = observation, action
+
+    def __str__(self) -> str:
+        return self.args[0]
 
 
 def compute_batch(

@@ -253,11 +253,17 @@ def pair_with_roles(items: Sequence[Item], task: TaskSpec) -> list[tuple[Item, T
 
 
 def check_task(function: LatentFunction, task: TaskSpec) -> None:
-    """Check that a function was written for a task. Raises `LareError` if it was written for another task."""
+    """Raise `LareError` if a function was written for another task, or for other sizes of observations and actions."""
     if function.task != task.name:
         raise LareError(
             f"the latent function was written for the task {function.task!r}, not for {task.name!r}. If it is right for both, use "
             f"dataclasses.replace(function, task={task.name!r})"
+        )
+    sizes = task.observation_size, task.action_size
+    if function.sizes != sizes:
+        raise LareError(
+            f"the latent function is for the observation_size and action_size {function.sizes}, and {task.name} has {sizes}: "
+            "save it, and verify it by lare_rl.load_function(path, task)"
         )
 
 

@@ -30,7 +30,7 @@ from lare_rl.llm.key import KEY_VARIABLE, api_key, redact_key
 from lare_rl.llm.prompts import Message
 from lare_rl.llm.request_forms import MIN_REPLY_TOKENS, FailedResponseError, RequestForms
 from lare_rl.util.safe_io import read_json
-from lare_rl.util.sanitize import one_line
+from lare_rl.util.sanitize import one_line, replace_surrogates
 from lare_rl.util.variables import read_variable
 
 __all__ = ["LiveModel", "ModelError"]
@@ -173,13 +173,13 @@ class LiveModel:
             self.budget.count_reply(None, messages, len(body))
             kind = "response" if self.forms.api == "responses" else "chat completion"
             reason = f"the answer is not a {kind} ({type(error).__name__}: {error})"
-            is_missing = self.forms.api == "responses" and not self.forms.is_verified
+            is_missing = self.forms.may_lack_responses
             if is_missing:  # some servers answer any request for an unknown address
                 self.forms = self.forms.without_responses()
             page = _excerpt(body.decode(errors="replace"))
             return _Failure(_safe_text(f"{reason}: {page}"), retry=True, request_changed=is_missing)
         self.forms = replace(self.forms, is_verified=True)
-        text = answer.text.encode(errors="replace").decode()  # replaces lone surrogates
+        text = replace_surrogates(answer.text)
         self.budget.count_reply(answer.usage, messages, len(text.encode()))
         if answer.is_cut_off:
             self.on_message(f"{self.name}: a reply was cut off at the {max_tokens:,} tokens that it was allowed")

@@ -13,6 +13,7 @@ from lare_rl.llm.key import redact_key
 from lare_rl.llm.prompts import FunctionKind, Message
 from lare_rl.llm.recording import RECORDED, RecordedModel, read_recording, shipped_recordings
 from lare_rl.util.safe_io import read_text
+from lare_rl.util.sanitize import replace_surrogates
 
 __all__ = ["RECORDED", "FunctionModel", "Model", "ModelFunction", "as_model", "recorded_model"]
 
@@ -51,7 +52,7 @@ class FunctionModel:
             raise LareError(redact_key(f"the model {self.name} failed: {type(error).__name__}: {error}")) from error
         if not isinstance(text, str):
             raise LareError(f"the model {self.name} must return a text, and returned {short_repr(text)}")
-        return redact_key(text)
+        return redact_key(replace_surrogates(text))
 
 
 def as_model(model: Any) -> Model:

@@ -12,8 +12,8 @@ from lare_rl.errors import LareError, short_repr
 from lare_rl.tasks.spec import FILL_IN, TaskSpec
 
 __all__ = [
-    "MAX_CANDIDATES", "N_CANDIDATES", "FunctionKind", "Message", "Stage", "candidate", "check_kind", "combine", "correct",
-    "reflect",
+    "MAX_ATTEMPTS", "MAX_CANDIDATES", "N_CANDIDATES", "FunctionKind", "Message", "Stage", "candidate", "check_kind", "combine",
+    "correct", "quote", "reflect",
 ]  # fmt: skip
 
 N_CANDIDATES = 5
@@ -21,6 +21,12 @@ N_CANDIDATES = 5
 
 MAX_CANDIDATES = 100
 """The largest number of candidates for a function."""
+
+MAX_ATTEMPTS = 5
+"""Attempts at a function that passes, the first included."""
+
+_MAX_QUOTE = 20_000
+"""Characters of a failed reply that the model sees again."""
 
 FunctionKind = Literal["factors", "reward"]
 """What a function returns: several factors (LaRe), or one reward (LLM reward design)."""
@@ -66,12 +72,17 @@ def combine(task: TaskSpec, replies: Sequence[str], kind: FunctionKind = "factor
 
 def correct(conversation: Sequence[Message], reply: str, errors: str) -> list[Message]:
     """Return the request that shows the model the errors of its function (Eq. 4)."""
-    return [*conversation, *_answer(reply, _template("correct").replace("{error}", errors.strip()))]
+    return [*conversation, *_answer(quote(reply), _template("correct").replace("{error}", errors.strip()))]
 
 
 def reflect(task: TaskSpec, reply: str, evidence: str, kind: FunctionKind = "factors") -> list[Message]:
     """Return the request that shows how a function's factors relate to the returns of episodes. It is not in the paper."""
     return [*candidate(task, kind), *_answer(reply, _template("reflect").replace("{evidence}", evidence))]
+
+
+def quote(reply: str) -> str:
+    """Shorten a reply that the model sees again. It must not be empty, because some servers refuse empty messages."""
+    return reply[:_MAX_QUOTE] if reply.strip() else "(an empty reply)"
 
 
 def _answer(reply: str, request: str) -> list[Message]:

@@ -79,6 +79,11 @@ class RequestForms:
     def api(self) -> str:
         return self.forms[0].api
 
+    @property
+    def may_lack_responses(self) -> bool:
+        """Whether the server is asked for responses, and has not answered such a request yet."""
+        return self.api == "responses" and not self.is_verified
+
     def request(
         self, name: str, messages: Sequence[Message], max_tokens: int, temperature: float | None
     ) -> dict[str, Any]:
@@ -105,8 +110,8 @@ class RequestForms:
         """
         if status in _REFUSED_STATUSES:
             return self._ask_for_less(reason, has_temperature)
-        may_be_missing = self.api == "responses" and not self.is_verified
-        return self.without_responses() if may_be_missing and status in _MISSING_API_STATUSES else None
+        is_missing = self.may_lack_responses and status in _MISSING_API_STATUSES
+        return self.without_responses() if is_missing else None
 
     def _ask_for_less(self, reason: str, has_temperature: bool) -> "RequestForms | None":
         too_long = "token" in reason and re.search("large|at most|maximum|context|exceed", reason)
@@ -145,12 +150,14 @@ def _read_completion(answer: Any) -> Answer:
 
 def _read_response(answer: Any) -> Answer:
     if answer.get("status") == "failed":
-        raise FailedResponseError((answer.get("error") or {}).get("message") or "no reason was named")
+        error = answer.get("error")
+        reason = error.get("message") if isinstance(error, dict) else error
+        raise FailedResponseError(reason or "no reason was named")
     messages = [item for item in answer["output"] if item["type"] == "message"]
     contents = [content for message in messages for content in message["content"]]
     text = "".join(content.get("text") or content.get("refusal") or "" for content in contents)
     is_cut_off = (answer.get("incomplete_details") or {}).get("reason") == "max_output_tokens"
-    usage = answer.get("usage") or {}
-    # Under the names of chat completions.
-    names = {"prompt_tokens": "input_tokens", "completion_tokens": "output_tokens"}
-    return Answer(text, {name: usage.get(source) for name, source in names.items()}, is_cut_off)
+    usage = answer.get("usage")
+    if isinstance(usage, dict):  # under the names of chat completions
+        usage = {"prompt_tokens": usage.get("input_tokens"), "completion_tokens": usage.get("output_tokens")}
+    return Answer(text, usage, is_cut_off)

@@ -1,4 +1,4 @@
-"""What a program can import, and which attributes its values have. Every attribute is in a table of this file."""
+"""What a program can import, and which attributes its values have: those that this file names, and no others."""
 
 import ast
 import difflib
@@ -58,8 +58,7 @@ CONSTANTS: dict[str, Any] = {
 
 ARRAY_METHODS = frozenset(
     "sum prod mean max min any all std var ptp argmax argmin argsort cumsum cumprod astype clip round flatten ravel dot repeat "
-    "reshape squeeze swapaxes take transpose copy diagonal trace searchsorted nonzero partition argpartition conj "
-    "conjugate choose".split()
+    "reshape squeeze swapaxes take transpose copy diagonal trace searchsorted nonzero argpartition conj conjugate choose".split()
 )
 """Methods of arrays that are functions of NumPy with the same name and arguments."""
 
@@ -112,16 +111,16 @@ def get_attribute(runtime: Runtime, owner: Any, name: str) -> Any:
             return call_with_complex("transpose", [owner], {})
         case Complex():
             return Bound(lambda *args, **kwargs: _call_array_method(owner, name, args, kwargs))
-        case Polynomial() if name in ("coef", "coeffs", "c"):
-            return owner.falling if name != "coef" else owner.falling[::-1]
+        case Polynomial() if name == "coef" or (name in ("coeffs", "c") and not owner.rising):
+            return owner.falling[::-1] if owner.rising else owner.falling
         case Polynomial() if name == "deriv":
-            return Bound(lambda: Polynomial(call_numpy("polyder", [owner.falling], {})))
+            return Bound(lambda m=1: Polynomial(call_numpy("polyder", [owner.falling, m], {}), owner.rising))
         case np.finfo() | np.iinfo() if name in ("eps", "tiny", "max", "min", "resolution", "smallest_normal"):
             return np.asarray(getattr(owner, name)).item()
         case str() | list() | dict() if name in METHODS.get(type(owner), METHODS[list]):
             return Bound(lambda *args, **kwargs: call_method(runtime, owner, name, args, kwargs))
         case tuple() if name in ("index", "count"):
-            return Bound(lambda value: call_method(runtime, list(owner), name, [value], {}))
+            return Bound(lambda *args: call_method(runtime, list(owner), name, args, {}))
         case slice() if name in ("start", "stop", "step"):
             return getattr(owner, name)
         case bool() | int() | float():
@@ -143,17 +142,15 @@ def module_attribute(module: str, name: str) -> Any:
     full = f"{module}.{name}"
     if full in CONSTANTS:
         return CONSTANTS[full]
+    if name == "__name__":
+        return module.rpartition(".")[2]
     if module in ("typing", "__future__") or full in NAMES or full in BUILTINS:
         return Symbol(full)
     if module.startswith("np"):
         short = full.removeprefix("np.")
         if short in FUNCTIONS or short in INDEXED or short in KIND_OF_DTYPE or f"{short}.outer" in FUNCTIONS:
             return Symbol(full)
-        if name == "__name__":
-            return module
         raise RefusedError("E-NUMPY", f"{full[:80]} is not available{_hint(full)}")
-    if name == "__name__":
-        return module.rpartition(".")[2]
     raise RefusedError("E-ATTRIBUTE", f"{full[:80]} is not available{_hint(full)}")
 
 
@@ -188,8 +185,8 @@ def _array_attribute(runtime: Runtime, array: Array, name: str) -> Any:
             return Bound(lambda: _to_list(runtime, array))
         case "fill":
             return Bound(lambda value: array.__setitem__(..., value))
-        case "sort":
-            return Bound(lambda axis=-1: array.__setitem__(..., call_numpy("sort", [array], {"axis": axis})))
+        case "sort" | "partition":  # in place, unlike the functions of these names
+            return Bound(lambda *args, **kwargs: array.__setitem__(..., call_numpy(name, [array, *args], kwargs)))
         case "view":
             return Bound(lambda *dtype: array if not dtype else _refuse_view())
         case _ if name in ARRAY_METHODS:
@@ -218,6 +215,4 @@ def _call_array_method(array: Array | Complex, name: str, args: tuple[Any, ...],
         return call("copy", [call("ravel", [array, *args], kwargs)], {})
     if name in ("reshape", "transpose") and (len(args) > 1 or (args and isinstance(args[0], BatchSize))):
         args = (args,)
-    if name == "reshape" and "shape" not in kwargs and not args:
-        args = (kwargs.pop("newshape", ()),)
     return call(name, [array, *args], kwargs)

@@ -56,9 +56,10 @@ def update_best(best: BestPolicy, return_: Float[np.ndarray, " seeds"], step: in
 
 def save_best(directory: Path, best: BestPolicy) -> None:
     """Write the best policies into a checkpoint's directory. Raises `LareError` if they cannot be written."""
-    arrays = {name: np.asarray(leaf) for name, leaf in named_leaves(best).items()}
     make_directory(directory)
-    replace_npz(directory / BEST_FILE, arrays)
+    for partial_file in directory.glob(f"{BEST_FILE}.*.new"):  # of a process that was killed while it wrote
+        partial_file.unlink(missing_ok=True)
+    replace_npz(directory / BEST_FILE, named_leaves(best))
 
 
 def load_best(directory: Path, actor_shape: Any, n_seeds: int) -> BestPolicy:

@@ -14,6 +14,7 @@ import subprocess
 import sys
 import threading
 import time
+import traceback
 from collections.abc import Callable, Generator, Sequence
 from concurrent.futures import ThreadPoolExecutor, as_completed
 from typing import Any
@@ -21,7 +22,8 @@ from typing import Any
 from lare_rl.errors import LareError, missing_extra_error
 from lare_rl.runs.directory import RunBusyError
 from lare_rl.sweep.jobs import Job, job_to_json, train_job
-from lare_rl.sweep.resources import PREALLOCATE, Resources, Slot, assign_slots
+from lare_rl.sweep.resources import PREALLOCATE, Resources, Slot, assign_slots, last_line
+from lare_rl.util.files import make_directory
 from lare_rl.util.processes import own_session
 
 __all__ = ["RunningProcesses", "train_in_process", "train_in_processes", "train_on_ray"]
@@ -98,7 +100,7 @@ class RunningProcesses:
 
 def train_in_process(job: Job, slot: Slot, running: RunningProcesses) -> str | None:
     """Train one job in a new process, which writes its output to RUN.log. Return the error, or None."""
-    job.directory.parent.mkdir(parents=True, exist_ok=True)
+    make_directory(job.directory.parent)
     log = job.directory.with_name(job.directory.name + ".log")
     request = json.dumps({"job": job_to_json(job), "cores": slot.cores})
     with log.open("a", encoding="utf-8") as file:
@@ -111,6 +113,7 @@ def train_in_process(job: Job, slot: Slot, running: RunningProcesses) -> str | N
             stdout=subprocess.PIPE,
             stderr=file,
             encoding="utf-8",
+            errors="replace",
             **own_session(),
             env=os.environ | slot.variables,
         )
@@ -133,12 +136,12 @@ def train_in_process(job: Job, slot: Slot, running: RunningProcesses) -> str | N
     if process.returncode == 0:
         return None if job.done else f"it ended at step {job.step()} of {job.resolved.steps} ({log})"
     if process.returncode < 0:  # a killed process, perhaps for its memory, has sent no error
-        error = f"it was ended by {signal.Signals(-process.returncode).name}"
+        names = {number.value: number.name for number in signal.Signals}  # real-time signals have none
+        error = f"it was ended by {names.get(-process.returncode, f'signal {-process.returncode}')}"
     elif not error:  # the error that was sent comes first, because a full disk may cut the log short
         with log.open("rb") as file:
             file.seek(log_start)
-            lines = file.read().decode(errors="replace").splitlines()
-        error = lines[-1] if lines else f"exit status {process.returncode}"
+            error = last_line(file.read().decode(errors="replace")) or f"exit status {process.returncode}"
     return f"{error} ({log})"
 
 
@@ -169,16 +172,16 @@ def train_on_ray(
             "num_gpus": accelerators,
             "runtime_env": {"env_vars": variables},
         }
-        remote = ray.remote(**options, max_calls=1)(train_job)
+        remote = ray.remote(**options, max_calls=1)(_train_when_free)
         pending = {remote.remote(job_to_json(job)): job for job in jobs}
         while pending:
             (task,), _ = ray.wait(list(pending), num_returns=1)
             job = pending.pop(task)
             try:
-                ray.get(task)
-                yield job, None
-            except RayError as error:
-                yield job, str(error).strip().splitlines()[-1]
+                error = ray.get(task)
+            except RayError as failure:  # such as the end of a machine
+                error = last_line(str(failure)) or type(failure).__name__
+            yield job, error
     finally:
         ray.shutdown()
 
@@ -190,7 +193,8 @@ def main() -> None:
     """
     # Before training begins, there is nothing to save.
     signal.signal(signal.SIGINT, lambda number, frame: os._exit(130))
-    parent = os.fdopen(os.dup(sys.stdout.fileno()), "w", encoding="utf-8")
+    # A path may have bytes that are not UTF-8.
+    parent = os.fdopen(os.dup(sys.stdout.fileno()), "w", encoding="utf-8", errors="backslashreplace")
     os.dup2(sys.stderr.fileno(), sys.stdout.fileno())
     line = sys.stdin.readline()
     if not line:  # it was stopped already
@@ -199,9 +203,7 @@ def main() -> None:
     threading.Thread(target=_interrupt_at_end_of_input, daemon=True).start()
     if request["cores"]:
         os.sched_setaffinity(0, request["cores"])
-    try:
-        _train_when_free(request["job"])
-    except LareError as error:
+    if (error := _train_when_free(request["job"])) is not None:
         for stream in (sys.stderr, parent):  # if one fails (a full disk, a dead parent), the other may work
             with contextlib.suppress(OSError):
                 stream.write(f"{error}\n")
@@ -216,16 +218,25 @@ def _interrupt_at_end_of_input() -> None:
     _thread.interrupt_main()
 
 
-def _train_when_free(job: dict[str, Any]) -> None:
-    """Train as soon as an earlier process has released the run."""
+def _train_when_free(job: dict[str, Any]) -> str | None:
+    """Train as soon as an earlier process has released the run. Return the error in one line, or None.
+
+    An error that is no `LareError` also writes its traceback to the log.
+    """
     deadline = time.monotonic() + LOCK_TIMEOUT_S
     while True:
         try:
             return train_job(job)
-        except RunBusyError:
+        except RunBusyError as error:
             if time.monotonic() > deadline:
-                raise
+                return str(error)
             time.sleep(1)
+        except LareError as error:
+            return str(error)
+        except Exception as error:
+            with contextlib.suppress(OSError):  # a full disk
+                traceback.print_exc()
+            return traceback.format_exception_only(error)[0].splitlines()[0]  # JAX appends notes
 
 
 if __name__ == "__main__":

@@ -12,7 +12,7 @@ from lare_rl.errors import CheckedModel, Count, LareError, short_repr
 from lare_rl.util.processes import usable_cores
 from lare_rl.util.sanitize import one_line
 
-__all__ = ["Resources", "Slot", "assign_accelerators", "assign_cores", "assign_slots"]
+__all__ = ["Resources", "Slot", "assign_accelerators", "assign_cores", "assign_slots", "last_line"]
 
 VISIBLE_ACCELERATORS = ("CUDA_VISIBLE_DEVICES", "HIP_VISIBLE_DEVICES")
 """The variables by which a process sees only some accelerators, by vendor."""
@@ -128,12 +128,12 @@ def _count_accelerators() -> int:
     process = subprocess.run(
         [sys.executable, "-P", "-c", COUNT_ACCELERATORS], capture_output=True, encoding="utf-8", errors="replace"
     )
-    count = _last_line(process.stdout)  # libraries may print other lines before it
+    count = last_line(process.stdout)  # libraries may print other lines before it
     if process.returncode or not count.isdecimal():
-        reason = _last_line(process.stderr) or f"exit status {process.returncode}, output {short_repr(count)}"
+        reason = last_line(process.stderr) or f"exit status {process.returncode}, output {short_repr(count)}"
         raise LareError(f"JAX cannot count the accelerators of this machine: {one_line(reason)}")
     return int(count)
 
 
-def _last_line(text: str) -> str:
+def last_line(text: str) -> str:
     return text.strip().rpartition("\n")[2]

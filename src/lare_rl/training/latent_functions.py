@@ -14,7 +14,7 @@ from lare_rl.latent.saved import load_function
 from lare_rl.llm.prompts import N_CANDIDATES
 from lare_rl.tasks.spec import TaskSpec
 
-__all__ = ["FunctionOrPath", "check_draw_unused", "choose_functions"]
+__all__ = ["FunctionOrPath", "choose_functions"]
 
 FunctionOrPath = LatentFunction | str | Path
 """A latent function, or the path of its file."""
@@ -39,25 +39,22 @@ def choose_functions(
         design_role = partial(design, kind=method.phi_kind, draw=settings.draw, candidates=settings.candidates)
         functions = [design_role(role) for role in task.roles]
     else:
-        check_draw_unused(settings)
+        if (settings.draw, settings.candidates) != (0, N_CANDIDATES):
+            raise LareError("draw and candidates choose a recorded function, and a function is given: leave either out")
         if not isinstance(function, FunctionOrPath | Sequence):
             raise LareError(
                 "a latent function must be the path of its file, or come from lare_rl.design or lare_rl.load_function, and is "
                 f"{short_repr(function)}: write its source to a file, which is verified"
             )
         pairs = pair_with_roles([function] if isinstance(function, FunctionOrPath) else function, task)
-        functions = [
-            function if isinstance(function, LatentFunction) else load_function(function, role)
-            for function, role in pairs
-        ]
-        for function, role in zip(functions, task.roles, strict=True):
-            check_task(function, role)
+        functions = [_load_function(function, role) for function, role in pairs]
     for function in functions:
         check_factors(method, function.n_factors(settings.choose_scored_observation(task)))
     return tuple(functions)
 
 
-def check_draw_unused(settings: ResolvedSettings) -> None:
-    """Raise `LareError` if settings choose a recorded function, for a run whose function the user gives."""
-    if (settings.draw, settings.candidates) != (0, N_CANDIDATES):
-        raise LareError("draw and candidates choose a recorded function, and a function is given: leave either out")
+def _load_function(function: FunctionOrPath, role: TaskSpec) -> LatentFunction:
+    if not isinstance(function, LatentFunction):
+        return load_function(function, role)
+    check_task(function, role)
+    return function

@@ -3,7 +3,6 @@
 from dataclasses import replace
 from typing import Any, NamedTuple
 
-import jax
 import numpy as np
 from jaxtyping import Int
 
@@ -59,7 +58,7 @@ def load_actor(run: Run, best: bool = False) -> tuple[TrainConfig, Any, Int[np.n
     if best:
         config = make_train_config(run)
         best_policy = load_best(run.checkpoint, actor_shape(config, len(run.seeds)), len(run.seeds))
-        return config, jax.device_put(best_policy.actor), best_policy.step
+        return config, best_policy.actor, best_policy.step
     config, learner, metadata, _ = load_learner(run)
     step = metadata["step"]
     return config, get_actor(learner.algorithm, step, config), np.full(len(run.seeds), step)

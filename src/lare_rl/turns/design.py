@@ -7,22 +7,19 @@ from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
-from lare_rl.errors import LareError, short_repr
+from lare_rl.errors import LareError
 from lare_rl.latent.function import normalise_source
 from lare_rl.llm.model import Model, ModelFunction, as_model
-from lare_rl.llm.prompts import Message, correct
+from lare_rl.llm.prompts import MAX_ATTEMPTS, Message, correct
 from lare_rl.llm.recording import Recorder
-from lare_rl.llm.reply import MalformedReplyError, parse_reply
+from lare_rl.llm.reply import parse_reply
 from lare_rl.phi.turn_program import shorten
-from lare_rl.turns.messages import Turn
+from lare_rl.turns.messages import Turn, read_function, to_json
 from lare_rl.turns.phi import TurnPhi, find_problems, read_turn_phi
+from lare_rl.util.sanitize import replace_surrogates
 
 __all__ = ["DesignedTurnPhi", "choose_examples", "design_turn_phi", "turn_request"]
 
-MAX_ATTEMPTS = 5
-"""Attempts at a program that passes, the first included."""
-MAX_QUOTE = 20_000
-"""Characters of a reply that a correction quotes."""
 N_EXAMPLES = 5
 """The number of turns that the language model sees."""
 MAX_EXCERPT = 1500
@@ -72,12 +69,11 @@ def design_turn_phi(
         try:
             source = normalise_source(parse_reply(reply).functions)
             problems = find_problems(source, turns)
-        except MalformedReplyError as error:
-            problems = str(error)
-        else:
             if not problems:
                 return DesignedTurnPhi(read_turn_phi(source), model.name, recorder)
-        request = correct(request, reply[:MAX_QUOTE] if reply.strip() else "(an empty reply)", problems)
+        except LareError as error:
+            problems = str(error)
+        request = correct(request, reply, replace_surrogates(problems))
     raise LareError(f"none of {MAX_ATTEMPTS} attempts passed; the last one failed: {problems.splitlines()[0]}")
 
 
@@ -85,13 +81,13 @@ def turn_request(goal: str, tools: Sequence[Mapping[str, Any]], turns: Sequence[
     """Return the messages that ask for a phi over turns, with example turns. The same arguments always give the same request.
 
     Raises:
-        LareError: a tool has no name.
+        LareError: a tool has no name, or parameters that are not JSON.
     """
     system = (files("lare_rl.llm") / "templates" / "turn_events.txt").read_text(encoding="utf-8").strip()
     examples = "\n\n".join(f"## Turn {number}\n{_show_turn(turn)}" for number, turn in enumerate(turns, start=1))
     sections = (("Task", goal), ("Tools", "\n\n".join(map(_show_tool, tools))), ("Example turns", examples))
     user = "\n\n".join(f"# {title}\n{text.strip()}" for title, text in sections)
-    return [{"role": "system", "content": system}, {"role": "user", "content": user}]
+    return [{"role": "system", "content": system}, {"role": "user", "content": replace_surrogates(user)}]
 
 
 def choose_examples(turns: Sequence[Turn], n_examples: int = N_EXAMPLES) -> list[Turn]:
@@ -109,11 +105,10 @@ def choose_examples(turns: Sequence[Turn], n_examples: int = N_EXAMPLES) -> list
 
 
 def _show_tool(tool: Mapping[str, Any]) -> str:
-    function = tool.get("function", tool)
-    if not isinstance(function, Mapping) or not isinstance(function.get("name"), str):
-        raise LareError(f"a tool must have a function with a name, and is {short_repr(tool)}")
-    parameters = json.dumps(function.get("parameters", {}), ensure_ascii=False, sort_keys=True)
-    return f"## {function['name']}\n{str(function.get('description', '')).strip()}\nParameters: {parameters}"
+    function = read_function(tool, "a tool")
+    name, description = function["name"], str(function.get("description") or "").strip()
+    parameters = to_json(function.get("parameters") or {}, f"the parameters of the tool {name!r}", ensure_ascii=False)
+    return f"## {name}\n{description}\nParameters: {parameters}"
 
 
 def _show_turn(turn: Turn) -> str:

@@ -20,7 +20,16 @@ from lare_rl.errors import LareError, short_repr
 from lare_rl.util.safe_io import read_json
 from lare_rl.util.sanitize import one_line
 
-__all__ = ["Call", "Turn", "check_list", "looks_like_error", "message_features", "split_turns"]
+__all__ = [
+    "Call",
+    "Turn",
+    "check_list",
+    "looks_like_error",
+    "message_features",
+    "read_function",
+    "split_turns",
+    "to_json",
+]
 
 MAX_MESSAGES = 20_000
 MAX_CALLS = 64
@@ -118,25 +127,31 @@ def _read_calls(message: Mapping[str, Any], where: str) -> list[tuple[str, str, 
     check_list(calls, "tool_calls", MAX_CALLS, where)
     result = []
     for k, call in enumerate(calls):
-        function = call.get("function", call) if isinstance(call, Mapping) else None
-        name = function.get("name") if isinstance(function, Mapping) else None
-        if not isinstance(name, str) or not name.strip():
-            raise LareError(f"{where}: tool_calls[{k}] must have a function with a name, and is {short_repr(call)}")
-        assert isinstance(function, Mapping)
+        function = read_function(call, f"{where}: tool_calls[{k}]")
         identifier = call.get("id")
         arguments = function.get("arguments", "")
         if not isinstance(arguments, str):
-            arguments = _to_json(arguments, f"{where}: tool_calls[{k}]")
-        name = one_line(name)[:MAX_TOOL_NAME]
+            arguments = to_json(arguments, f"{where}: the arguments of tool_calls[{k}]")
+        name = one_line(function["name"])[:MAX_TOOL_NAME]
         result.append((name, arguments, identifier if isinstance(identifier, str | int) else None))
     return result
 
 
-def _to_json(value: Any, where: str) -> str:
+def read_function(value: Any, where: str) -> Mapping[str, Any]:
+    """Return the function of a tool or of a call. Raises `LareError` if it has no name."""
+    function = value.get("function", value) if isinstance(value, Mapping) else None
+    name = function.get("name") if isinstance(function, Mapping) else None
+    if not isinstance(function, Mapping) or not isinstance(name, str) or not name.strip():
+        raise LareError(f"{where} must have a function with a name, and is {short_repr(value)}")
+    return function
+
+
+def to_json(values: Any, name: str, ensure_ascii: bool = True) -> str:
+    """Write values as JSON. Raises `LareError` if they have others than JSON has."""
     try:
-        return json.dumps(value, sort_keys=True)
+        return json.dumps(values, sort_keys=True, ensure_ascii=ensure_ascii)
     except (TypeError, ValueError, RecursionError):
-        raise LareError(f"{where} has arguments that are not JSON: {short_repr(value)}") from None
+        raise LareError(f"{name} are not JSON: {short_repr(values)}") from None
 
 
 def _read_text(content: Any, where: str) -> str:

@@ -3,7 +3,7 @@
 import re
 import unicodedata
 
-__all__ = ["first_invisible", "one_line", "sanitize"]
+__all__ = ["first_invisible", "one_line", "replace_surrogates", "sanitize"]
 
 # Letters and marks by their category, but invisible (Default_Ignorable_Code_Point, and the empty Braille pattern).
 _FILLERS = re.compile(
@@ -23,6 +23,11 @@ def sanitize(text: str) -> str:
 def one_line(text: object) -> str:
     """Sanitize a text, and write it in one line."""
     return sanitize(" ".join(str(text).split()))
+
+
+def replace_surrogates(text: str) -> str:
+    """Replace each half of a surrogate pair by `?`: JSON can express it, but no file and no request can hold it."""
+    return text.encode(errors="replace").decode()
 
 
 def first_invisible(text: str) -> int | None:

@@ -167,8 +167,10 @@ def _strides(sizes: Sequence[int], order: Any) -> list[int]:
 class Polynomial:
     """np.poly1d and np.polynomial.Polynomial: a function, with the coefficients from the highest power to the lowest."""
 
-    def __init__(self, falling: Array):
+    def __init__(self, falling: Array, rising: bool = False):
         self.falling = falling
+        self.rising = rising
+        """Whether `coef` begins with the lowest power, as that of np.polynomial.Polynomial."""
 
     def __call__(self, x: Any) -> Any:
         return polyval(self.falling, as_array(x))
@@ -207,7 +209,7 @@ def series_value(name: str, x: Array, c: Any, tensor: Any = True) -> Any:
 
 array_functions(
     {
-        "polynomial.Polynomial polynomial.polynomial.Polynomial": lambda coef: Polynomial(coef[::-1]),
+        "polynomial.Polynomial polynomial.polynomial.Polynomial": lambda coef: Polynomial(coef[::-1], rising=True),
         "poly1d": lambda c_or_r: Polynomial(c_or_r),
     }
 )
