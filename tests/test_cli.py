@@ -203,11 +203,15 @@ def test_new_task_of_two_teams(command, tmp_path):
         assert f"lare-rl design {name} --model NAME" in out
     (prompted,) = re.findall(r"lare-rl prompt (\S+)", out)
     assert command("prompt", prompted)[0] == 0
+    (tmp_path / files[0]).unlink()
+    assert "folder for --out" in command("new-task", "pettingzoo/mpe2.simple_adversary_v3:parallel_env")[2]
+    assert not (tmp_path / files[0]).exists()
     assert "lists their files" in command("prompt", "CompetitivePP-6")[2]
 
 
 def test_new_task_without_documentation(command):
-    out = command("new-task", "Hopper-v4", "--out", "hopper.toml")[1]
+    out = command("new-task", "Hopper-v4", "--out", "a hopper.toml")[1]
+    assert "lare-rl design 'a hopper.toml' --model" in out
     assert re.findall(r"fill in: (\w+) ", out) == ["description", "observation", "action"]
     out = command("new-task", "helpers.toy_envs:toys/Endless-v0", "--out", "endless.toml")[1]
     assert re.findall(r"fill in: (\w+) ", out)[-1] == "max_episode_steps"

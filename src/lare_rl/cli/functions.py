@@ -1,6 +1,7 @@
 """The commands `prompt`, `new-task` and `verify`: the request to a model, your own task, and the checks of a function."""
 
 import math
+import shlex
 import sys
 from collections.abc import Sequence
 from importlib.util import find_spec
@@ -24,6 +25,7 @@ from lare_rl.cli.terminal import (
 )
 from lare_rl.errors import LareError
 from lare_rl.tasks.spec import NO_ENVIRONMENT, ScoredObservation
+from lare_rl.util.files import check_new_path
 
 GOOD_R2 = 0.8
 """From here on, the factors are worth training with."""
@@ -69,9 +71,10 @@ def new_task(
     draft = _draft(environment)
     path = out or Path(f"{draft.name}.toml")
     paths = [path, *(path.parent / name for name in draft.teams)]
-    write_new_file(path, draft.toml, "--out")
-    for team_path, text in zip(paths[1:], draft.teams.values(), strict=True):
-        write_new_file(team_path, text, "folder for --out")
+    for team_path in paths[1:]:  # before the first file is written
+        check_new_path(team_path, "folder for --out")
+    for file, text in zip(paths, (draft.toml, *draft.teams.values()), strict=True):
+        write_new_file(file, text, "--out")
     print_line(f"wrote {', '.join(map(str, paths))}")
     if draft.removed:
         print_line("  left out or cut short, because it seems to speak of rewards:")
@@ -88,14 +91,16 @@ def new_task(
         print_line("  check: observation (its entries are not described one by one)")
     if draft.guesses_limit:
         print_line("  fill in: max_episode_steps (a guess: the environment has no limit of its own)")
-    data = f" --data {environment}" if draft.logs_only else ""
-    roles = [(team_path, f"phi_{team_path.stem}.py") for team_path in paths[1:]] or [(path, "phi.py")]
+    data = ["--data", environment] if draft.logs_only else []
+    roles = [(str(file), f"phi_{file.stem}.py") for file in paths[1:]] or [(str(path), "phi.py")]
     for role_path, function_path in roles:
-        print_line(f"read it, then: lare-rl design {role_path}{data} --model NAME --out {function_path}")
+        design = shlex.join(["lare-rl", "design", role_path, *data, "--model", "NAME", "--out", function_path])
+        print_line(f"read it, then: {design}")
     without_function = "lare-rl relabel without --function" if draft.logs_only else "--method bayes"
     print_line(
-        f"or, without a model: paste the output of lare-rl prompt {roles[0][0]} into a chat, or write phi.py yourself, with a function "
-        f"evaluation_func(observation, action) (docs/how-to/write-phi.md); {without_function} needs no phi.py, and none of the texts"
+        f"or, without a model: paste the output of lare-rl prompt {shlex.quote(roles[0][0])} into a chat, or write phi.py yourself, with "
+        f"a function evaluation_func(observation, action) (docs/how-to/write-phi.md); {without_function} needs no phi.py, and none of "
+        "the texts"
     )
 
 
