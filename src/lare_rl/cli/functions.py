@@ -28,7 +28,7 @@ from lare_rl.tasks.spec import NO_ENVIRONMENT, ScoredObservation
 from lare_rl.util.files import check_new_path
 
 GOOD_R2 = 0.8
-"""From here on, the factors are worth training with."""
+"""From this R² of returns on, factors are worth training with."""
 
 if TYPE_CHECKING:
     from lare_rl.envs.play import Episode, Policy

@@ -66,7 +66,7 @@ def train(
             complete, and `resume` continues from the last checkpoint.
     """
     if tensorboard:
-        import_summary_writer()  # before anything is made
+        import_summary_writer()  # an error before the run directory is created
     if not isinstance(settings, Settings | None):
         raise LareError(
             "settings must be a lare_rl.Settings, such as lare_rl.Settings(method='rrdu', steps=100_000), and are "
@@ -107,8 +107,7 @@ def resume(
         listeners: objects that receive the progress; the default is the terminal.
 
     Raises:
-        LareError: it is not a run, its checkpoint does not exist any more, or `steps` is smaller than before; and as in
-        `train`.
+        LareError: it is not a run, its checkpoint was deleted, or `steps` is smaller than before; and as in `train`.
     """
     run, steps, listeners = as_run(run), Settings(steps=steps).steps, _check_listeners(listeners)
     tensorboard = tensorboard or (run.directory / EVENTS_DIRECTORY).is_dir()
@@ -116,8 +115,8 @@ def resume(
         import_summary_writer()
     with lock_run(run), report_full_memory(run), catch_stop_signals() as stop:
         run = replace(run, config=read_config(run.directory))  # it may have been extended since it was opened
-        if not run.has_checkpoint() and run.metrics():  # metrics are never removed
-            raise LareError(f"{run.directory} has no checkpoint any more: it cannot be resumed")
+        if not run.has_checkpoint() and run.metrics():  # the checkpoint was deleted
+            raise LareError(f"{run.directory} has no checkpoint any more, and cannot be resumed: start a new run")
         earlier_steps = run.config.settings.steps
         run = run if steps is None else extend_run(run, steps)
         messages = _describe_rounding(run.config.settings, steps=steps)
