@@ -1,3 +1,5 @@
+import errno
+import os
 import re
 import shutil
 import subprocess
@@ -178,7 +180,14 @@ def test_prompt(command, kind):
     assert command("prompt", "Reacher-v4", "--kind", kind) == (0, text, "")
 
 
-def test_new_task(command, tmp_path):
+def test_new_task(command, tmp_path, monkeypatch):
+    def fail(file):
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(os, "fsync", fail)
+        assert "No space left" in command("new-task", "Pendulum-v1")[2]
+    assert list(tmp_path.iterdir()) == []
     status, out, err = command("new-task", "Pendulum-v1")
     assert (status, err) == (0, "")
     assert out.splitlines()[0] == "wrote Pendulum-v1.toml"
