@@ -1,3 +1,5 @@
+import errno
+import os
 import re
 import shutil
 import subprocess
@@ -193,7 +195,14 @@ def test_prompt(command, kind):
     assert command("prompt", "Reacher-v4", "--kind", kind) == (0, text, "")
 
 
-def test_new_task(command, tmp_path):
+def test_new_task(command, tmp_path, monkeypatch):
+    def fail(file):
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(os, "fsync", fail)
+        assert "No space left" in command("new-task", "Pendulum-v1")[2]
+    assert list(tmp_path.iterdir()) == []
     status, out, err = command("new-task", "Pendulum-v1")
     assert (status, err) == (0, "")
     assert out.splitlines()[0] == "wrote Pendulum-v1.toml"
@@ -218,6 +227,9 @@ def test_new_task_of_two_teams(command, tmp_path):
         assert f"lare-rl design {name} --model NAME" in out
     (prompted,) = re.findall(r"lare-rl prompt (\S+)", out)
     assert command("prompt", prompted)[0] == 0
+    (tmp_path / files[0]).unlink()
+    assert "folder for --out" in command("new-task", "pettingzoo/mpe2.simple_adversary_v3:parallel_env")[2]
+    assert not (tmp_path / files[0]).exists()
     assert "lists their files" in command("prompt", "CompetitivePP-6")[2]
     (tmp_path / files[0]).unlink()
     for options, words in (((), "choose another folder"), (("--out", files[2]), "of a team")):
@@ -226,7 +238,8 @@ def test_new_task_of_two_teams(command, tmp_path):
 
 
 def test_new_task_without_documentation(command):
-    out = command("new-task", "Hopper-v4", "--out", "hopper.toml")[1]
+    out = command("new-task", "Hopper-v4", "--out", "a hopper.toml")[1]
+    assert "lare-rl design 'a hopper.toml' --model" in out
     assert re.findall(r"fill in: (\w+) ", out) == ["description", "observation", "action"]
     out = command("new-task", "helpers.toy_envs:toys/Endless-v0", "--out", "endless.toml")[1]
     assert re.findall(r"fill in: (\w+) ", out)[-1] == "max_episode_steps"

@@ -73,6 +73,8 @@ def test_tasks_without_common_scale(make_run):
     assert second.p_value == pytest.approx(1 / 200)
     assert compare_over_tasks(compare_tasks(read(runs[:2] + runs[4:]))) == []  # dense is not on Depot
     assert compare_over_tasks(comparisons[:1]) == []
+    results = sorted(read([*runs[:5], make_run("d", high, "Depot", method="rrd")]), key=lambda result: result.task)
+    assert compare_over_tasks(compare_tasks(results[:9] + results[:8:-1])) == []  # the baseline of Depot is rrd
 
 
 def test_interval_of_difference(make_run, monkeypatch):

@@ -1,5 +1,6 @@
 """Exported functions, as ONNX and as NumPy arrays, agree with JAX to the precision of float32."""
 
+import errno
 import importlib.util
 import json
 import subprocess
@@ -26,6 +27,7 @@ from lare_rl.credit.methods import METHODS
 from lare_rl.data import replay
 from lare_rl.envs.interface import to_env_action
 from lare_rl.envs.load import read_task
+from lare_rl.export import export as export_module
 from lare_rl.export.policy_graph import policy_graph
 from lare_rl.latent.function import verify_function
 from lare_rl.phi.evaluate import evaluate
@@ -148,7 +150,7 @@ def test_export_agrees_with_jax(kind, method, export_run):
         check_reward(exported, name, config, steps, np.asarray(stored.length, np.float32), expected, team_index)
 
 
-@pytest.mark.parametrize(("algorithm", "env"), [("qmix", ONE_TEAM), ("ippo", TWO_TEAMS)])
+@pytest.mark.parametrize(("algorithm", "env"), [("qmix", replace(ONE_TEAM, first_choice=1)), ("ippo", TWO_TEAMS)])
 def test_policy_graph_of_teams(algorithm, env):
     """The policies of teams, untrained: recurrent networks, and networks that read the index of the agent."""
     config = small_config("ircr", algorithm, env)
@@ -160,7 +162,7 @@ def test_policy_graph_of_teams(algorithm, env):
         )
         actor = actor._replace(observation_rms=statistics)
     inputs, expected = policy_case(config, actor)
-    outputs = evaluate(policy_graph(jax.tree.map(lambda leaf: leaf[0], actor), config, 0), inputs)
+    outputs = evaluate(policy_graph(jax.tree.map(lambda leaf: leaf[0], actor), config), inputs)
     assert outputs.keys() == expected.keys()
     for name, values in outputs.items():
         np.testing.assert_allclose(values, expected[name], rtol=2e-5, atol=2e-5)
@@ -185,7 +187,7 @@ def policy_case(config, actor):
             hidden=jnp.asarray(hidden),
             last_action=jnp.asarray(np.eye(env.action_size + 1, env.action_size)[last])[None],
         )
-        inputs |= {"hidden": hidden[0], "last_action": last}
+        inputs |= {"hidden": hidden[0], "last_action": last + env.first_choice}
     is_new = jnp.zeros((1, 3), bool)
     action, memory = compile_policy(config, deterministic=True)(
         actor, memory, observation[None], available[None], None, is_new
@@ -196,7 +198,7 @@ def policy_case(config, actor):
         rows = policy_input(jnp.asarray(observation)[None], config)
         expected["logits"] = np.asarray(jax.vmap(ppo.logits)(actor, rows, available[None]))[0]
     action = np.asarray(action)[0]
-    expected["action"] = np.argmax(action, axis=-1) if env.discrete else to_env_action(action, env)
+    expected["action"] = np.argmax(action, axis=-1) + env.first_choice if env.discrete else to_env_action(action, env)
     if env.n_agents == 1:
         inputs = {name: rows[:, 0] for name, rows in inputs.items()}
         expected = {name: rows[:, 0] for name, rows in expected.items()}
@@ -286,6 +288,13 @@ def test_policy_is_that_of_load_policy(export):
 
 def test_command(export, command, monkeypatch, tmp_path):
     run, _ = export
+
+    def fail(graph, name):
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(export_module, "onnx_model", fail)
+        assert "first cannot be written: No space left" in command("export", run.directory, "--out", "first")[2]
     status, out, err = command("export", run.directory, "--out", "first")
     assert (status, err) == (0, "")
     assert out.startswith("wrote policy, reward to first; exported.py")

@@ -67,6 +67,7 @@ EXPRESSIONS = {
         np.unwrap(x * 4, axis=1) | x.real | np.abs(x + 1j * a[:, :1]) | np.angle(np.exp(1j * x))
         (np.exp(1j * x).mean(axis=1) * 2).imag | np.conj(x) | np.real(x) | np.vectorize(lambda v: v * 2)(x)
         np.multiply(x, 2, out=np.zeros_like(x)) | np.divide(x, a[:, :1], out=np.zeros_like(x), where=b)
+        np.add(b, x < 1, dtype=int) | (lambda v: [np.nan_to_num(v, copy=False, nan=7.0), v][1])(n * 1.0)
     """,
     "reductions": """
         np.sum(x, axis=1) | x.sum(-1) | y.sum(axis=(1, 2)) | np.sum(y, axis=2, keepdims=True)
@@ -143,6 +144,7 @@ EXPRESSIONS = {
         np.linalg.pinv(np.ones((2, 3)))[0, 0] * x | np.abs(np.fft.rfft(x, axis=1)) | np.fft.fft(x, axis=1).real
         np.fft.rfftfreq(6) * x[:, :4] | np.abs(np.subtract.outer(t, t)).sum() * x
         np.linalg.cholesky(np.eye(6) * 4)[0] * x | x[:, :, None] * x[:, None, :]
+        b @ np.ones(6, dtype=bool) | np.einsum("bi,bi->b", b, x < 1, dtype=int)
     """,
     "less usual": """
         np.permute_dims(y, (0, 2, 1)) | np.matrix_transpose(y) | np.vsplit(np.eye(6), 2)[1][0] * x | np.dsplit(y, 2)[1]

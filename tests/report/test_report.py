@@ -21,7 +21,7 @@ from lare_rl.evaluation.episode_credit import FactorLabel
 from lare_rl.evaluation.played_episodes import TeamSample
 from lare_rl.evaluation.video import encode_film
 from lare_rl.report import live_page, run_details
-from lare_rl.report.html import render_table
+from lare_rl.report.html import render_table, write_page
 from lare_rl.report.live_page import LivePage
 from lare_rl.report.messages import MESSAGES
 from lare_rl.report.overview import compare_runs, render_learning_curves, sort_runs, summarise_runs
@@ -281,6 +281,11 @@ def test_tables_have_no_empty_columns():
     table = render_table(("<a>", "b", "c"), [("<b>", "", "-"), ("", "-", "1")], numbers=[2])
     assert re.findall(r"<th[^>]*>(.*?)</th>", table) == ["&lt;a&gt;", "c"]
     assert table.count("&lt;") == 2
+
+
+def test_page_of_text_that_is_not_utf8(tmp_path):
+    page = write_page(tmp_path / "page.html", "<a>\udcff", "\ud83d").read_text(encoding="utf-8")
+    assert "<title>&lt;a&gt;\\udcff</title>" in page
 
 
 @pytest.mark.skipif(CHROMIUM is None, reason="there is no Chromium")

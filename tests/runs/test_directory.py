@@ -3,6 +3,7 @@
 import json
 import os
 import re
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -79,6 +80,9 @@ def test_every_metric_has_a_meaning():
 
 def test_lock_refuses_second_process(run):
     with lock_run(run), pytest.raises(RunBusyError, match="another process"), lock_run(run):
+        pass
+    shutil.rmtree(run.directory)
+    with pytest.raises(LareError, match="lock cannot be written"), lock_run(run):
         pass
 
 

@@ -186,6 +186,8 @@ def test_extending_a_run_whose_learning_rate_fell_is_no_long_run(small, tmp_path
     run = train_quietly(CHASE, settings, tmp_path / "run")
     listener = AtStep(0, lambda: None)
     lare_rl.resume(run, steps=70, listeners=[listener])
+    with pytest.raises(LareError, match="planned for 80"):
+        resume_quietly(run, steps=60)  # `run` was opened before it was extended
     assert open_run(run.directory).config.settings.steps == 80
     assert sum("steps = 70 is rounded up to 80" in message for message in listener.messages) == 1
     assert (
@@ -260,8 +262,9 @@ def test_missing_files_are_refused(dense_run, tmp_path):
     path.write_text(text)
     shutil.rmtree(run.checkpoint)
     with pytest.raises(LareError, match="no checkpoint any more"):
-        resume_quietly(run)
+        resume_quietly(run, steps=480)
     assert path.read_text() == text
+    assert open_run(run.directory).config == run.config
 
 
 def test_full_disk_leaves_last_checkpoint(dense, dense_run, tmp_path, monkeypatch):

@@ -1,6 +1,7 @@
 """The commands `prompt`, `new-task` and `verify`: the request to a model, your own task, and the checks of a function."""
 
 import math
+import shlex
 import sys
 from collections.abc import Sequence
 from importlib.util import find_spec
@@ -26,7 +27,7 @@ from lare_rl.tasks.spec import NO_ENVIRONMENT, ScoredObservation
 from lare_rl.util.files import check_new_path, write_atomically
 
 GOOD_R2 = 0.8
-"""From here on, the factors are worth training with."""
+"""From this R² of returns on, factors are worth training with."""
 
 if TYPE_CHECKING:
     from lare_rl.envs.play import Episode, Policy
@@ -91,14 +92,16 @@ def new_task(
         print_line("  check: observation (its entries are not described one by one)")
     if draft.guesses_limit:
         print_line("  fill in: max_episode_steps (a guess: the environment has no limit of its own)")
-    data = f" --data {environment}" if draft.logs_only else ""
-    roles = [(team_path, f"phi_{team_path.stem}.py") for team_path in paths[1:]] or [(path, "phi.py")]
+    data = ["--data", environment] if draft.logs_only else []
+    roles = [(str(file), f"phi_{file.stem}.py") for file in paths[1:]] or [(str(path), "phi.py")]
     for role_path, function_path in roles:
-        print_line(f"read it, then: lare-rl design {role_path}{data} --model NAME --out {function_path}")
+        design = shlex.join(["lare-rl", "design", role_path, *data, "--model", "NAME", "--out", function_path])
+        print_line(f"read it, then: {design}")
     without_function = "lare-rl relabel without --function" if draft.logs_only else "--method bayes"
     print_line(
-        f"or, without a model: paste the output of lare-rl prompt {roles[0][0]} into a chat, or write phi.py yourself, with a function "
-        f"evaluation_func(observation, action) (docs/how-to/write-phi.md); {without_function} needs no phi.py, and none of the texts"
+        f"or, without a model: paste the output of lare-rl prompt {shlex.quote(roles[0][0])} into a chat, or write phi.py yourself, with "
+        f"a function evaluation_func(observation, action) (docs/how-to/write-phi.md); {without_function} needs no phi.py, and none of "
+        "the texts"
     )
 
 

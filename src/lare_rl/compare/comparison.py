@@ -149,12 +149,12 @@ def compare_over_tasks(comparisons: Sequence[Comparison]) -> list[OverallRow]:
 def _make_row(group: LabelScores, baseline: Scores | None) -> Row:
     scores = group.run_scores
     seed_means = scores.mean(axis=1)
+    improvement, p_value = _improvement(scores, baseline)
     draw_mean = difference = None
     if len(group.draws) > 1:
         draw_mean = estimate(lambda samples: samples.mean(axis=(-2, -1)), group.final_scores.mean(axis=1))
-    if baseline is not None and min(len(scores), len(baseline)) > 1:
+    if baseline is not None and improvement is not None:
         difference = estimate(lambda a, b: interquartile_mean(a) - interquartile_mean(b), scores, baseline)
-    improvement, p_value = _improvement(scores, baseline)
     return Row(
         label=group.label,
         n_seeds=len(group.seeds),

@@ -25,7 +25,7 @@ from lare_rl.runs.directory import Run, as_run, function_filename
 from lare_rl.training.policy import get_actor
 from lare_rl.training.saved_state import load_actor, load_learner
 from lare_rl.training.seed_axis import select_seed
-from lare_rl.util.files import replace_npz, write_atomically
+from lare_rl.util.files import new_directory, replace_npz, write_atomically
 from lare_rl.util.provenance import code_version
 
 __all__ = ["ExportResult", "export_run"]
@@ -67,8 +67,7 @@ def export_run(run: Run | str | Path, out: str | Path, seed: int | None = None, 
         step = int(best_steps[seed_index])
     else:
         actors = get_actor(learner.algorithm, step, config)
-    first_choice = config.env.first_choice
-    graphs = {"policy": policy_graph(select_seed(actors, seed_index), config, first_choice)}
+    graphs = {"policy": policy_graph(select_seed(actors, seed_index), config)}
     credit = select_seed(learner.decoders, seed_index)
     no_reward_reason = missing_reward_reason(config.method)
     for team_index, role in enumerate(task.roles if no_reward_reason is None else ()):
@@ -77,21 +76,18 @@ def export_run(run: Run | str | Path, out: str | Path, seed: int | None = None, 
         graphs["reward" if role is task else f"reward_{role.team}"] = graph
     functions = {name: _describe_graph(graph) for name, graph in graphs.items()}
     if config.env.discrete and not config.team_level:
-        choices = {"first": first_choice, "count": config.env.action_size}
+        choices = {"first": config.env.first_choice, "count": config.env.action_size}
         functions |= {name: {**functions[name], "choices": choices} for name in graphs if name != "policy"}
     origin = {"method": settings.method, "algorithm": settings.algorithm, "seed": run.seeds[seed_index], "step": step}
-    _write_directory(out, graphs, {"lare": code_version(), "task": task.name, **origin, **functions})
-    if no_reward_reason is None:
-        for role, function in zip(task.roles, run.functions, strict=False):
-            function.save(out / function_filename(task, role))
+    with new_directory(out) as new:
+        _write_files(new, graphs, {"lare": code_version(), "task": task.name, **origin, **functions})
+        if no_reward_reason is None:
+            for role, function in zip(task.roles, run.functions, strict=False):
+                function.save(new / function_filename(task, role))
     return ExportResult(directory=out, functions=tuple(graphs), no_reward_reason=no_reward_reason, onnx=is_installed())
 
 
-def _write_directory(out: Path, graphs: dict[str, Graph], description: dict[str, Any]) -> None:
-    try:
-        out.mkdir(parents=True)
-    except OSError as error:
-        raise LareError(f"{out} cannot be written: {error.strerror}") from error
+def _write_files(out: Path, graphs: dict[str, Graph], description: dict[str, Any]) -> None:
     for name, graph in graphs.items():
         _write_arrays(out / f"{name}.npz", graph)
         if is_installed():

@@ -4,7 +4,7 @@
 
 PPO and IPPO also return the `logits` of choices, (batch, *agents, choices), from which choices can be sampled. Only tasks of many
 agents have the axis `*agents`. QMIX and VDN have a memory: they also take `hidden` (zeros at the first step, then the last
-`next_hidden`) and `last_action` (the number of choices at the first step, then the last `action`).
+`next_hidden`) and `last_action` (one more than the largest action at the first step, then the last `action`).
 """
 
 from functools import partial
@@ -25,12 +25,11 @@ from lare_rl.training.static_config import TrainConfig
 __all__ = ["policy_graph"]
 
 
-def policy_graph(actor: Any, config: TrainConfig, first_choice: int) -> Graph:
+def policy_graph(actor: Any, config: TrainConfig) -> Graph:
     """Return the graph of an actor of one seed.
 
     Args:
         actor: the part of the algorithm's state that acts.
-        first_choice: the number of the first choice, if actions are choices.
 
     Raises:
         LareError: the policy has an operation that a graph cannot have.
@@ -44,10 +43,10 @@ def policy_graph(actor: Any, config: TrainConfig, first_choice: int) -> Graph:
         if memory := policy.init_memory(config):
             inputs["hidden"] = graph_input("hidden", (*agents, memory.hidden.shape[-1]))
             inputs["last_action"] = graph_input("last_action", agents, "int")
-        return finish(**add_function(partial(_act, actor=actor, config=config, first_choice=first_choice), inputs))
+        return finish(**add_function(partial(_act, actor=actor, config=config), inputs))
 
 
-def _act(inputs: dict[str, Array], actor: Any, config: TrainConfig, first_choice: int) -> dict[str, Array]:
+def _act(inputs: dict[str, Array], actor: Any, config: TrainConfig) -> dict[str, Array]:
     """Return the outputs of the policy for one row of inputs."""
     env, algorithm = config.env, config.algorithm.load()
     inputs = inputs if env.n_agents > 1 else {name: values[None] for name, values in inputs.items()}
@@ -55,14 +54,14 @@ def _act(inputs: dict[str, Array], actor: Any, config: TrainConfig, first_choice
     available = inputs.get("available", jnp.ones((env.n_agents, env.action_size), bool))
     memory = policy.init_memory(config)
     if memory:
-        last_action = jax.nn.one_hot(inputs["last_action"], env.action_size)
+        last_action = jax.nn.one_hot(inputs["last_action"] - env.first_choice, env.action_size)
         memory = memory._replace(hidden=inputs["hidden"], last_action=last_action)
     action, next_memory = policy.act(actor, memory, observation, available, None, config)
     outputs = {"next_hidden": next_memory.hidden} if memory else {}
     if not env.discrete:
         outputs["action"] = to_env_action(action, env)
     else:
-        outputs["action"] = jnp.argmax(action, axis=-1) + first_choice
+        outputs["action"] = jnp.argmax(action, axis=-1) + env.first_choice
         if not config.deterministic_evaluation and hasattr(algorithm, "logits"):
             choices = available if env.masks_actions else None
             outputs["logits"] = algorithm.logits(actor, policy.policy_input(observation, config), choices)

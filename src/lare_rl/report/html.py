@@ -36,8 +36,9 @@ def write_page(path: Path, title: str, body: str, refresh: int | None = None) ->
     """
     reload = "" if refresh is None else f'<meta http-equiv="refresh" content="{refresh}">\n'
     style = (files("lare_rl.report") / "report.css").read_text(encoding="utf-8")
-    page = _PAGE.format(title=escape(title), style=style, body=body, refresh=reload).encode()
-    write_atomically(path, lambda file: file.write(page))
+    page = _PAGE.format(title=escape(title), style=style, body=body, refresh=reload)
+    data = page.encode(errors="backslashreplace")  # a name in the file system need not be UTF-8
+    write_atomically(path, lambda file: file.write(data))
     return path
 
 
@@ -82,6 +83,6 @@ def render_film(film: bytes, description: str) -> str:
 
 def render_function(function: LatentFunction) -> str:
     """Return the source of a latent function, with its author."""
-    by_hand = function.model.startswith("none: written by hand")
+    by_hand = function.model.startswith(LatentFunction.model)
     author = "Written by hand, or from a file that names no language model" if by_hand else f"By {function.model}"
     return render_note(f"{author}. SHA-256 {function.digest}.") + f"<pre>{escape(function.source)}</pre>"

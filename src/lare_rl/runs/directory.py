@@ -8,12 +8,10 @@ failed_batch.npz     the input of the latent function, if it failed
 """
 
 import contextlib
-import shutil
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
-from uuid import uuid4
 
 from lare_rl.config.settings import ResolvedSettings, round_up
 from lare_rl.errors import LareError, short_repr
@@ -25,7 +23,7 @@ from lare_rl.runs.config_file import CONFIG, Config, make_config, read_config, w
 from lare_rl.runs.metrics_file import read_metrics
 from lare_rl.tasks.spec import ScoredObservation, TaskSpec
 from lare_rl.tasks.trust import check_trusted, trust_environment
-from lare_rl.util.files import find_free_path
+from lare_rl.util.files import check_writable, find_free_path, new_directory
 from lare_rl.util.processes import try_lock
 
 __all__ = [
@@ -107,19 +105,15 @@ def create_run(directory: Path, task: TaskSpec, settings: ResolvedSettings, func
     )
     if directory.exists() or directory.is_symlink():
         raise exists
-    new = directory.with_name(f".{directory.name}.{uuid4().hex}.new")  # renamed when it is complete
     try:
-        new.mkdir(parents=True)
-        for function, role in pair_with_roles(functions, task) if functions else ():
-            function.save(new / function_filename(task, role))
-        write_config(new, config)
-        new.rename(directory)
-    except OSError as error:
+        with new_directory(directory) as new:
+            for function, role in pair_with_roles(functions, task) if functions else ():
+                function.save(new / function_filename(task, role))
+            write_config(new, config)
+    except LareError:
         if directory.exists():  # another process has just created it
             raise exists from None
-        raise LareError(f"the run directory {directory} cannot be made: {error.strerror}") from error
-    finally:
-        shutil.rmtree(new, ignore_errors=True)
+        raise
     trust_environment(task)
     return Run(directory, config, tuple(functions))
 
@@ -213,7 +207,9 @@ def lock_run(run: Run) -> Iterator[None]:
 
     Raises:
         RunBusyError: another process trains in it.
+        LareError: nothing can be written there.
     """
+    check_writable(run.directory / "lock")
     with (run.directory / "lock").open("wb") as file:
         if not try_lock(file):
             raise RunBusyError(f"another process is training in {run.directory}")

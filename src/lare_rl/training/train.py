@@ -2,7 +2,7 @@
 
 import contextlib
 import threading
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -14,6 +14,7 @@ from lare_rl.config.settings import ResolvedSettings, Settings
 from lare_rl.envs.load import resolve_task
 from lare_rl.envs.workers import close_idle_workers
 from lare_rl.errors import LareError, short_repr
+from lare_rl.runs.config_file import read_config
 from lare_rl.runs.directory import Run, as_run, create_run, default_directory, extend_run, lock_run
 from lare_rl.runs.metrics_file import truncate_metrics
 from lare_rl.tasks.spec import TaskSpec
@@ -65,7 +66,7 @@ def train(
             complete, and `resume` continues from the last checkpoint.
     """
     if tensorboard:
-        import_summary_writer()  # before anything is made
+        import_summary_writer()  # an error before the run directory is created
     if not isinstance(settings, Settings | None):
         raise LareError(
             "settings must be a lare_rl.Settings, such as lare_rl.Settings(method='rrdu', steps=100_000), and are "
@@ -106,19 +107,19 @@ def resume(
         listeners: objects that receive the progress; the default is the terminal.
 
     Raises:
-        LareError: it is not a run, its checkpoint does not exist any more, or `steps` is smaller than before; and as in
-        `train`.
+        LareError: it is not a run, its checkpoint was deleted, or `steps` is smaller than before; and as in `train`.
     """
-    run, listeners = as_run(run), _check_listeners(listeners)
+    run, steps, listeners = as_run(run), Settings(steps=steps).steps, _check_listeners(listeners)
     tensorboard = tensorboard or (run.directory / EVENTS_DIRECTORY).is_dir()
     if tensorboard:
         import_summary_writer()
     with lock_run(run), report_full_memory(run), catch_stop_signals() as stop:
+        run = replace(run, config=read_config(run.directory))  # it may have been extended since it was opened
+        if not run.has_checkpoint() and run.metrics():  # the checkpoint was deleted
+            raise LareError(f"{run.directory} has no checkpoint any more, and cannot be resumed: start a new run")
         earlier_steps = run.config.settings.steps
         run = run if steps is None else extend_run(run, steps)
         messages = _describe_rounding(run.config.settings, steps=steps)
-        if not run.has_checkpoint() and run.metrics():  # metrics are never removed
-            raise LareError(f"{run.directory} has no checkpoint any more: it cannot be resumed")
         _prepare(run, listeners)
         is_new = not run.has_checkpoint()
         session, restored = (start_session(run), []) if is_new else restore_session(run)
@@ -157,12 +158,14 @@ def _describe_annealing(session: Session, earlier_steps: int) -> list[str]:
 
 def _check_listeners(listeners: Sequence[Listener] | None) -> list[Listener]:
     """Return the listeners, or the terminal. Raise `LareError` if an object is not a listener."""
+    if not isinstance(listeners, Iterable | None):
+        raise LareError(f"listeners must be a list, and are {short_repr(listeners)}")
     checked: list[Listener] = [Terminal()] if listeners is None else list(listeners)
     for listener in checked:
-        if not isinstance(listener, Listener):
+        if isinstance(listener, type) or not isinstance(listener, Listener):
             raise LareError(
-                "a listener must have the methods on_start, on_step, on_evaluation, on_message and on_stop "
-                f"(lare_rl.training.progress.Listener): {short_repr(listener)} does not"
+                "a listener must be an object with the methods on_start, on_step, on_evaluation, on_message and on_stop "
+                f"(lare_rl.training.progress.Listener), and {short_repr(listener)} is not"
             )
     return checked
 

@@ -3,10 +3,11 @@
 import contextlib
 import itertools
 import os
+import shutil
 import tempfile
 import time
 import zipfile
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import IO, Any
 from uuid import uuid4
@@ -14,7 +15,7 @@ from uuid import uuid4
 from lare_rl.errors import LareError
 
 __all__ = [
-    *("check_new_path", "check_writable", "find_free_path", "make_directory"),
+    *("check_new_path", "check_writable", "find_free_path", "make_directory", "new_directory"),
     *("replace_npz", "write_atomically", "write_npz"),
 ]
 
@@ -64,6 +65,23 @@ def make_directory(directory: Path) -> None:
         directory.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise LareError(f"{directory} cannot be written: {error.strerror or error}") from error
+
+
+@contextlib.contextmanager
+def new_directory(directory: Path) -> Iterator[Path]:
+    """Yield an empty directory, which becomes `directory` at the end. After an error nothing is left.
+
+    Raises `LareError` if it cannot be written.
+    """
+    new = directory.with_name(f".{directory.name}.{uuid4().hex}.new")
+    try:
+        new.mkdir(parents=True)
+        yield new
+        new.rename(directory)
+    except OSError as error:
+        raise LareError(f"{directory} cannot be written: {error.strerror or error}") from error
+    finally:
+        shutil.rmtree(new, ignore_errors=True)
 
 
 def write_atomically(path: Path, write: Callable[[Any], object]) -> None:

@@ -16,7 +16,7 @@ UNAVAILABLE_LOGIT = -1e9
 class StochasticPolicy(eqx.Module):
     """A Gaussian whose standard deviation does not depend on the state or, if `log_std` is None, a categorical distribution.
 
-    A choice is a one-hot row, so that every action is a row of numbers. Observations are already normalised, if they are at all.
+    A choice is a one-hot row, so that every action is a row of numbers. The caller normalises the observations.
     """
 
     network: MLP

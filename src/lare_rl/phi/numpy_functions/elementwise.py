@@ -92,9 +92,13 @@ def clip(a: Operand, a_min: Any = None, a_max: Any = None, *, min: Any = None, m
 
 @numpy_function()
 def nan_to_num(x: Operand, copy: Any = True, nan: Any = 0.0, posinf: Any = None, neginf: Any = None) -> Any:
-    x = elementwise("where", x != x, nan, x)
-    x = elementwise("where", x == math.inf, MAX_FLOAT32 if posinf is None else posinf, x)
-    return elementwise("where", x == -math.inf, -MAX_FLOAT32 if neginf is None else neginf, x)
+    numbers = elementwise("where", x != x, nan, x)
+    numbers = elementwise("where", numbers == math.inf, MAX_FLOAT32 if posinf is None else posinf, numbers)
+    numbers = elementwise("where", numbers == -math.inf, -MAX_FLOAT32 if neginf is None else neginf, numbers)
+    if copy or not isinstance(x, Array):
+        return numbers
+    x[...] = numbers
+    return x
 
 
 @numpy_function("round", "around", "round_")

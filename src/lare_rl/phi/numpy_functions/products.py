@@ -70,6 +70,8 @@ def einsum(subscripts: Any, *operands: Array, optimize: Any = False) -> Array:
         raise RefusedError("E-ROWS", f"np.einsum({subscripts!r}) combines the batch axis with another axis")
     present = "".join(c for c in result if any(c in term for term in letters))
     node = current_builder().einsum(letters, present, [a.node for a in arrays])
+    if all(a.kind == "bool" for a in arrays):  # as in NumPy: whether any product is true
+        node = current_builder().cast(node, "bool")
     product = Array(node, present.index(batch) if batch else None)
     return product[tuple(ALL if c in present else None for c in result)] if present != result else product
 

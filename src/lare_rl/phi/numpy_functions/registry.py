@@ -17,7 +17,7 @@ import numpy as np
 
 from lare_rl.phi.arrays import Array, as_array, elementwise
 from lare_rl.phi.builder import current_builder
-from lare_rl.phi.graph import NumberKind
+from lare_rl.phi.graph import NumberKind, widest
 from lare_rl.phi.limits import RefusedError
 from lare_rl.phi.operand import Operand
 from lare_rl.phi.values import Symbol, describe
@@ -123,19 +123,20 @@ def call_numpy(name: str, args: Sequence[Any], kwargs: Mapping[str, Any]) -> Any
         bound = signature.bind(*args, **arguments)
     except TypeError as error:
         raise RefusedError("E-NUMPY", f"np.{name}: {error}; it takes {_signature_text(name)}") from None
-    converters = _CONVERTERS[name]
-    for key, value in bound.arguments.items():
-        if key in converters:
+    out, dtype = kwargs.get("out"), None if "dtype" in signature.parameters else kwargs.get("dtype")
+    kind = None if dtype is None else dtype_kind(dtype)
+    for key, convert in _CONVERTERS[name].items():
+        if key in bound.arguments:
             several = signature.parameters[key].kind is inspect.Parameter.VAR_POSITIONAL
-            bound.arguments[key] = tuple(map(converters[key], value)) if several else converters[key](value)
-    out, dtype = kwargs.get("out"), kwargs.get("dtype")
+            values = [_widen(convert(x), kind) for x in (bound.arguments[key] if several else [bound.arguments[key]])]
+            bound.arguments[key] = tuple(values) if several else values[0]
     if out is None and arguments.get("where", True) is not True and name in UFUNCS:
         raise RefusedError("E-NUMPY", f"np.{name} with where= needs out=, or the other numbers are undefined")
     result = FUNCTIONS[name](*bound.args, **bound.kwargs)
-    if dtype is not None and "dtype" not in signature.parameters:
-        if dtype_kind(dtype) != "float" and as_array(result).kind == "float":
+    if kind is not None:
+        if kind != "float" and as_array(result).kind == "float":
             raise RefusedError("E-NUMPY", f"np.{name} of fractional numbers as another type: use astype")
-        result = astype(result, dtype)
+        result = astype(result, kind)
     if out is not None:
         out = out[0] if isinstance(out, tuple) else out
         if not isinstance(out, Array):
@@ -144,6 +145,11 @@ def call_numpy(name: str, args: Sequence[Any], kwargs: Mapping[str, Any]) -> Any
         out[...] = result if where is True else elementwise("where", where, result, out)
         return out
     return result
+
+
+def _widen(value: Any, kind: NumberKind | None) -> Any:
+    """Convert an argument as `dtype=` does in NumPy: before the function, so that np.add(True, True, dtype=int) is 2."""
+    return value if kind is None or not isinstance(value, Array) else astype(value, widest([value.kind, kind]))
 
 
 def _signature_text(name: str) -> str:
