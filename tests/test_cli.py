@@ -227,9 +227,6 @@ def test_new_task_of_two_teams(command, tmp_path):
         assert f"lare-rl design {name} --model NAME" in out
     (prompted,) = re.findall(r"lare-rl prompt (\S+)", out)
     assert command("prompt", prompted)[0] == 0
-    (tmp_path / files[0]).unlink()
-    assert "folder for --out" in command("new-task", "pettingzoo/mpe2.simple_adversary_v3:parallel_env")[2]
-    assert not (tmp_path / files[0]).exists()
     assert "lists their files" in command("prompt", "CompetitivePP-6")[2]
     (tmp_path / files[0]).unlink()
     for options, words in (((), "choose another folder"), (("--out", files[2]), "of a team")):
