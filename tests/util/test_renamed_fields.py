@@ -52,6 +52,8 @@ def test_rename_keys():
         "judges": "both",
         "scored_observation": "after",
     }
+    names_of_others = {"arguments": {"cards": 5}, "functions": {"judges": ["phi.py"]}}
+    assert rename_keys(names_of_others) == names_of_others
 
 
 def test_rename_options():
