@@ -224,6 +224,13 @@ def test_two_teams(tmp_path):
         assert "reward" not in request
 
 
+def test_team_names_that_no_task_may_have(tmp_path):
+    draft = draft_task("pettingzoo/helpers.parallel_toy_envs:OddNames")
+    assert list(draft.teams) == ["OddNames-red-team.toml", "OddNames-bl-ue.toml", "OddNames--.toml"]
+    roles = [(role.team, role.agents) for role in load_with_teams(tmp_path, draft).roles]
+    assert roles == [("red team", ("red team_[0-9]*",)), ('bl"/ue', ('bl"/ue_[0-9]*',)), ("😀", ("😀_[0-9]*",))]
+
+
 def test_documentation_of_a_module():
     draft = draft_task("pettingzoo/pettingzoo.sisl.multiwalker_v9:parallel_env")
     assert draft.missing_keys == ("action",)
