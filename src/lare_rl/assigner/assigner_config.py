@@ -45,7 +45,7 @@ class AssignerConfig(CheckedModel):
     capacity: Count
     settings: CreditSettings
     seed: Annotated[int, Field(ge=0)]
-    fits_per_step: Annotated[float, Field(ge=0, allow_inf_nan=False)]
+    fits_per_step: Annotated[float, Field(ge=0)]
     scale_rewards: bool
     forget: bool
     payments: PaymentRule = PAID_AT_END
