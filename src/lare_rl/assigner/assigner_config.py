@@ -44,7 +44,7 @@ class AssignerConfig(CheckedModel):
     max_steps: Count | None
     capacity: Count
     settings: CreditSettings
-    seed: Annotated[int, Field(ge=0)]
+    seed: Annotated[int, Field(ge=0, lt=2**63)]
     fits_per_step: Annotated[float, Field(ge=0)]
     scale_rewards: bool
     forget: bool
