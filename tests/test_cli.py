@@ -11,7 +11,7 @@ from helpers.scripted_model import to_reply
 from helpers.toy_envs import PHI
 from lare_rl import cli
 from lare_rl.algorithms.registry import ALGORITHMS
-from lare_rl.cli.terminal import EpisodeProgress
+from lare_rl.cli.terminal import EpisodeProgress, write_new_file
 from lare_rl.credit.methods import METHODS
 from lare_rl.envs.load import read_task, shipped_tasks
 from lare_rl.llm.prompts import candidate
@@ -204,6 +204,12 @@ def test_new_task_of_two_teams(command, tmp_path):
     (prompted,) = re.findall(r"lare-rl prompt (\S+)", out)
     assert command("prompt", prompted)[0] == 0
     assert "lists their files" in command("prompt", "CompetitivePP-6")[2]
+
+
+def test_failed_write_leaves_no_file(tmp_path):
+    with pytest.raises(UnicodeEncodeError):
+        write_new_file(tmp_path / "task.toml", "\ud800", "--out")
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_new_task_without_documentation(command):

@@ -12,7 +12,7 @@ from tyro.conf import Positional
 
 from lare_rl.errors import CheckedModel, Count, LareError
 from lare_rl.llm.budget import Budget
-from lare_rl.util.files import check_new_path
+from lare_rl.util.files import check_new_path, write_atomically
 from lare_rl.util.findings import format_for_reader
 from lare_rl.util.sanitize import one_line, sanitize
 
@@ -142,8 +142,4 @@ def load_playing_policy(run: Path | None, spec: "TaskSpec") -> "Policy | None":
 def write_new_file(path: Path, text: str, option: str) -> None:
     """Write a file that must not exist. `option` is the command-line option that names it."""
     check_new_path(path, option)
-    try:
-        with path.open("x", encoding="utf-8") as file:
-            file.write(text)
-    except OSError as error:
-        raise LareError(f"{path} cannot be written: {error.strerror}") from error
+    write_atomically(path, lambda file: file.write(text.encode()))
