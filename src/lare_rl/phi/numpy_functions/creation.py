@@ -118,9 +118,8 @@ class Indexed:
         self.join, self.is_grid = join, is_grid
 
     def __getitem__(self, index: Any) -> Any:
-        if self.is_grid and not isinstance(index, tuple):
-            return _read_range(index)
-        return self.join(list(map(_read_range, index if isinstance(index, tuple) else (index,))))
+        ranges = list(map(_read_range, index if isinstance(index, tuple) else (index,)))
+        return ranges[0] if self.is_grid and not isinstance(index, tuple) else self.join(ranges)
 
 
 def _read_range(item: Any) -> Array:
