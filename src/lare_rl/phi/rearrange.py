@@ -41,7 +41,9 @@ def map_leaves(function: Callable[[Any], Any], nested: Any) -> Any:
     return [map_leaves(function, item) for item in nested] if type(nested) is list else function(nested)
 
 
-def move(function: Callable[..., Any], sources: Any, args: Sequence[Any], size: int) -> Sequence[Source] | Source:
+def move(
+    function: Callable[..., Any], sources: Any, args: Sequence[Any], size: int
+) -> list[Source] | tuple[Source, ...] | Source:
     """Apply a function of NumPy that only moves, repeats and leaves out numbers.
 
     Args:
