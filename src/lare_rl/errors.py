@@ -108,7 +108,8 @@ _is_validating: ContextVar[bool] = ContextVar("is_validating", default=False)
 class CheckedModel(BaseModel):
     """Validated values from outside. They are frozen, and invalid values raise a `LareError` of one line."""
 
-    model_config = ConfigDict(frozen=True, extra="forbid", use_attribute_docstrings=True)
+    # JSON has neither inf nor nan: a run with such a setting could not be read again.
+    model_config = ConfigDict(frozen=True, extra="forbid", use_attribute_docstrings=True, allow_inf_nan=False)
 
     if TYPE_CHECKING:  # type checkers accept any keyword; Pydantic checks the values
 

@@ -1,5 +1,6 @@
 """Settings as a user gives them, read back, and without effect."""
 
+import math
 import re
 
 import pytest
@@ -37,6 +38,8 @@ def test_settings_complete_hyperparameters_from_the_algorithm(name):
         ({"td3.gamma": 0.9}, ["'td3.gamma'", "td3={'gamma': ...}"]),
         ({"td3": {"gamma": 3}}, ["td3.gamma = 3"]),
         ({"td3": 3}, ["td3 = 3", "table"]),
+        ({"qmix": {"max_grad_norm": math.inf}}, ["qmix.max_grad_norm = inf", "finite"]),
+        ({"credit": {"weight_decay": math.inf}}, ["credit.weight_decay = inf", "finite"]),
         ({"algorithm": "dqn"}, ["'dqn'", "td3, ddpg"]),
         ({"method": "lare"}, ["'lare'", "lare-bayes"]),
         ({"steps": 2**30 + 1}, ["steps = 1073741825", "1073741824"]),

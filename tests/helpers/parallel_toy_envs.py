@@ -75,3 +75,8 @@ def raises():
 
 def nothing():
     return 3
+
+
+class OddNames(Toy):
+    def __init__(self, **more):
+        super().__init__(("red team_0", 'bl"/ue_0', "😀_0"), **more)

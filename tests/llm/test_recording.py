@@ -73,6 +73,19 @@ def test_invalid_recording(text, words):
         read_recording(text if isinstance(text, str) else json.dumps(text), "X.json")
 
 
+def test_only_the_recording_of_the_same_exchanges_is_continued(tmp_path):
+    path = tmp_path / "talk.json"
+    Recorder("Chase", "factors", path=path).add("candidate", REQUEST, "one", "A model")
+    exchanges = read_recording(path.read_text(), "talk.json").exchanges
+    Recorder("Chase", "factors", path=path, exchanges=[*exchanges]).add("candidate", REQUEST, "two", "A model")
+    content = path.read_text()
+    assert read_recording(content, "talk.json").exchanges[0].replies == ["one", "two"]
+    for text in (content, "{}", "my notes"):
+        path.write_text(text)
+        with pytest.raises(LareError, match="exists"):
+            Recorder("Chase", "factors", path=path, exchanges=exchanges)
+
+
 def test_failed_write_loses_no_reply(tmp_path, monkeypatch):
     path = tmp_path / "talk.json"
     recorder = Recorder("Chase", "factors", path=path)

@@ -299,6 +299,7 @@ def test_directory_of_other_files_is_not_replaced(tmp_path):
         (None, {"hold_out": 1.0}, "hold_out = 1.0"),
         (None, {"hold_out": math.nan}, "hold_out = nan"),
         (None, {"memory": 0.0}, "memory = 0.0"),
+        (None, {"memory": 1e300}, "memory = 1e"),
         (None, {"updates": 0}, "updates = 0"),
         ([episode | {"cut": True} for episode in logged_episodes(3)], {}, "none of 3 episodes"),
         ([], {}, "no episode"),

@@ -11,9 +11,10 @@ from lare_rl.errors import LareError
 from lare_rl.latent.function import verify_function
 from lare_rl.llm.prompts import candidate
 from lare_rl.new_task.documentation import plain_lines, remove_rewards
-from lare_rl.new_task.draft import text_lines
+from lare_rl.new_task.draft import make_draft
 from lare_rl.new_task.single_agent import draft_task
 from lare_rl.tasks.spec import FILL_IN
+from lare_rl.util.sanitize import one_line
 
 SIZES = {
     "Pendulum-v1": (3, 1),
@@ -49,7 +50,7 @@ def test_real_environments(tmp_path, name):
 class Told(Chase):
     """Tells of a chase.
 
-    The goal is to catch the *target*. You get a reward of 1 for each catch. See [the docs](https://x.y).
+    The goal is to catch the *target*. You get a reward of \alpha for each catch. See [the docs](https://x.y).
 
     ## Action Space
     | Num | Action | Reward |
@@ -102,10 +103,10 @@ def test_plain_lines():
 def test_first_line_is_not_repeated():
     texts = {"observation": "3 entries: speeds", "action": "31 entries: forces"}
     heads = {"observation": "3 entries.", "action": "3 entries, each between -1 and 1."}
-    assert text_lines(texts, heads) == [
-        '\nobservation = """\n3 entries: speeds\n"""',
-        '\naction = """\n3 entries, each between -1 and 1.\n31 entries: forces\n"""',
-    ]
+    assert make_draft("X", [], texts, heads, ()).toml == (
+        '\nobservation = """\n3 entries: speeds\n"""\n'
+        '\naction = """\n3 entries, each between -1 and 1.\n31 entries: forces\n"""\n'
+    )
 
 
 def test_rewards_are_removed(tmp_path):
@@ -117,10 +118,10 @@ def test_rewards_are_removed(tmp_path):
     assert task.observation == "2 entries.\nA target.\nIt returns nothing."
     assert task.action == "1 entry, between -2 and 2.\n1: The second row; -"
     assert draft.removed == (
-        "You get a reward of 1 for each catch.",
+        "You get a reward of \alpha for each catch.",
         '0: guess a \\o/ """; no cost',
     )
-    assert all(f"\n#   {text}\n" in draft.toml for text in draft.removed)
+    assert all(f"\n#   {one_line(text)}\n" in draft.toml for text in draft.removed)
     assert "2 sentences or rows" in draft.toml
     assert draft.unused_sections == ("rewards",)
 
@@ -221,6 +222,13 @@ def test_two_teams(tmp_path):
     for role in task.roles:
         request = " ".join(message["content"] for message in candidate(role)[1:]).lower()
         assert "reward" not in request
+
+
+def test_team_names_that_no_task_may_have(tmp_path):
+    draft = draft_task("pettingzoo/helpers.parallel_toy_envs:OddNames")
+    assert list(draft.teams) == ["OddNames-red-team.toml", "OddNames-bl-ue.toml", "OddNames--.toml"]
+    roles = [(role.team, role.agents) for role in load_with_teams(tmp_path, draft).roles]
+    assert roles == [("red team", ("red team_[0-9]*",)), ('bl"/ue', ('bl"/ue_[0-9]*',)), ("😀", ("😀_[0-9]*",))]
 
 
 def test_documentation_of_a_module():

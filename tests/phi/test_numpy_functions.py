@@ -106,6 +106,7 @@ EXPRESSIONS = {
         np.concatenate([x, a], axis=1) | np.concatenate((y, y), axis=-1) | np.stack([x, 2 * x], axis=1)
         np.stack([x[:, 0], x[:, 1]], axis=-1) | np.vstack([x[:, 0], x[:, 1]]).T | np.hstack([x, a])
         np.column_stack([x[:, 0], a]) | np.dstack([x, x]) | np.append(x, a, axis=1) | np.c_[x[:, 0], x[:, 1:3]]
+        np.c_[y, y]
         np.block([x, a]) | np.split(x, 3, axis=1)[1] | np.split(x, [1, 4], axis=1)[1] | np.array_split(x, 4, axis=1)[0]
         np.hsplit(x, 2)[1] | np.unstack(x, axis=1)[2] | np.delete(x, 1, axis=1) | np.delete(x, [0, 2], axis=1)
         np.insert(x, 2, 0.5, axis=1)
@@ -204,8 +205,10 @@ EXPRESSIONS = {
         np.diag([1, 2, 3.0]) @ x[:, :3, None] | np.diag(np.ones(2), 1).sum() * x | np.identity(3)[0] * x[:, :3]
         np.linspace(0, 1, 6) * x | np.arange(0, 3, 0.5) * x | np.logspace(0, 1, 6) * x | np.geomspace(1, 8, 6) * x
         np.linspace(-2, 1, 6, dtype=int) * x | np.logspace(0, 1, 6, base=2) * x
-        np.meshgrid(t, t)[0].sum() * x | np.mgrid[0:2, 0:3].sum() * x | np.mgrid[-1:1:5j].sum() * x
+        np.meshgrid(t, t)[0].sum() * x | np.mgrid[0:2, 0:3].sum() * x | np.mgrid[-1:1:-5j][3] * x | np.ogrid[0:6] * x
         np.r_[1, 2, 0:4] * x | np.ix_([0, 1], [1])[0].sum() * x | np.indices((2, 2)).sum() * x
+        np.eye(6)[np.ix_(t > 0, [0])].sum() * x | np.arange(9).reshape(3, 3)[np.meshgrid([0, 2], [1, 2])].sum() * x
+        np.fromiter((k * k for k in range(4)), float, 3)[-1] * x
         np.tril_indices(3)[0].sum() * x | np.hanning(6) * x | np.vander([1, 2, 3]).sum() * x
         np.unique([3, 1, 3]).sum() * x | np.nonzero(t > 0)[0].sum() * x | np.histogram(t, bins=2)[0].sum() * x
         np.bincount([1, 1, 3])[1] * x | np.roots([1, -3, 2]).sum() * x | np.polyfit([0, 1, 2], [0, 1, 2], 1)[0] * x

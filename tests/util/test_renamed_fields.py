@@ -19,6 +19,8 @@ from lare_rl.util.renamed_fields import rename_fields, rename_keys, rename_optio
             ".decoders[1].optimizer[0].mu.network.layers[0].bias",
             ".reward_sources[1].optimizer[0].mu.mlp.layers[0].bias",
         ),
+        ("[0].decoder.number", "[0].network.agent_number"),
+        (".decoders[0].optimizer[0].nu.last.bias", ".reward_sources[0].optimizer[0].nu.head.bias"),
         (".decoders[0].closed_form.decoder.mean", ".reward_sources[0].closed_form.decoder.mean"),
         (".decoders[0].optimizer[0].mu.value.bias", ".reward_sources[0].optimizer[0].mu.readout.bias"),
         (".algorithm.done", ".algorithm.n_due"),
@@ -52,6 +54,8 @@ def test_rename_keys():
         "judges": "both",
         "scored_observation": "after",
     }
+    names_of_others = {"arguments": {"cards": 5}, "functions": {"judges": ["phi.py"]}}
+    assert rename_keys(names_of_others) == names_of_others
 
 
 def test_rename_options():

@@ -44,8 +44,8 @@ class AssignerConfig(CheckedModel):
     max_steps: Count | None
     capacity: Count
     settings: CreditSettings
-    seed: Annotated[int, Field(ge=0)]
-    fits_per_step: Annotated[float, Field(ge=0, allow_inf_nan=False)]
+    seed: Annotated[int, Field(ge=0, lt=2**63)]
+    fits_per_step: Annotated[float, Field(ge=0)]
     scale_rewards: bool
     forget: bool
     payments: PaymentRule = PAID_AT_END

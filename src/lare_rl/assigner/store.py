@@ -74,7 +74,12 @@ class Store:
         """
         self.capacity, self.agents, self.payments, self.has_levels = capacity, agents, payments, has_levels
         self.longest = longest
-        self.inputs = np.zeros((capacity, *row_shape), np.float32)
+        try:
+            self.inputs = np.zeros((capacity, *row_shape), np.float32)
+        except (MemoryError, ValueError) as error:  # ValueError: more numbers than NumPy can count
+            raise LareError(
+                f"capacity = {capacity} steps do not fit into the memory: make it (or memory of relabel) smaller"
+            ) from error
         """The decoder's inputs for each step: [capacity *agents inputs]."""
         self.alive: Bool[np.ndarray, "capacity agents"] | None = None
         """Which agents acted. None: all of them."""

@@ -35,7 +35,7 @@ FIRST_PROGRESS_S, PROGRESS_S = 5.0, 20.0
 _TABLE_WIDTH = 200
 """Characters in a line of a table, where the output is not a terminal."""
 
-_NonNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
+_NonNegative = Annotated[float, Field(ge=0)]
 
 
 class LiveOptions(CheckedModel):
@@ -47,7 +47,7 @@ class LiveOptions(CheckedModel):
     """largest number of tokens, in and out together; a request that might exceed it is not sent."""
     requests: Count = Budget.requests
     """largest number of requests."""
-    minutes: Annotated[float, Field(gt=0, allow_inf_nan=False)] = Budget.seconds / 60
+    minutes: Annotated[float, Field(gt=0)] = Budget.seconds / 60
     """longest time to wait for the model, over all requests and retries. One reply may take an eighth of it, and at least 120 s:
     raise it for a slow model of your own."""
     price: Annotated[tuple[_NonNegative, _NonNegative] | None, tyro.conf.arg(metavar="IN OUT")] = None

@@ -21,7 +21,7 @@ class CreditSettings(CheckedModel):
     """Widths of the decoder's hidden layers."""
     learning_rate: Annotated[float, Field(gt=0)] = 3e-4
     """Adam's step size."""
-    weight_decay: Annotated[float, Field(ge=0)] = 0.0
+    weight_decay: _Weight = 0.0
     """The weights times this are added to their gradient."""
     normalise: bool = True
     """Normalise features and returns by running statistics."""
@@ -44,7 +44,7 @@ class CreditSettings(CheckedModel):
     """Widths of the hidden layers of VIB's encoder."""
     bottleneck: Count = 8
     """Size of VIB's code."""
-    divergence: Annotated[float, Field(ge=0)] = 5e-3
+    divergence: _Weight = 5e-3
     """VIB: weight of the code's divergence against the squared error of the mean (with `sum_form`: T^2 times as much)."""
     sparsity: tuple[_Weight, _Weight, _Weight, _Weight, _Weight] = (1e-5, 1e-5, 1e-5, 1e-6, 1e-5)
     """grd: sparsity weights of five groups of causes. Of the reward: the state, the action. Of an entry of the next state: the other

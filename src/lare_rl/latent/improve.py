@@ -4,6 +4,7 @@ The caller passes the function that assesses (`lare_rl.training.reflect`), becau
 returns.
 """
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -25,7 +26,7 @@ class Assessment:
     """How well a function explains the returns of some episodes."""
 
     r2: float
-    """R^2 of the returns, each predicted from the factors before it was used to fit; NaN if it cannot be computed."""
+    """R^2 of the returns, each predicted from the factors before it was used to fit; NaN if all returns are equal."""
     text: str
     """The description for the model: what the factors explain together, what each one explains, and what may be missing."""
 
@@ -49,14 +50,19 @@ def improve(
         assess: assesses a function by the returns of some episodes, the same ones in each call. It may raise `LareError`.
         rounds: how often the model is asked for a better function.
         record: the file to which every exchange is written. If the design had a file, it is this file.
+
+    Raises:
+        LareError: `record` cannot be written, or it exists and is not the recording of the function's exchanges.
     """
     exchanges = [Exchange(**exchange) for exchange in function.exchanges]
-    recorder = Recorder(
-        task.name, function.kind, getattr(model, "temperature", None), record, exchanges, bool(exchanges)
-    )
+    recorder = Recorder(task.name, function.kind, getattr(model, "temperature", None), record, exchanges)
     conversation = Conversation(task, function.kind, model, recorder, on_message)
     try:
         best, assessment = function, assess(function)
+        if math.isnan(assessment.r2):
+            raise LareError(
+                "the returns of all episodes are equal, and no function can predict them better than another"
+            )
     except (LareError, KeyboardInterrupt) as error:
         on_message(f"no reflection: {str(error) or 'stopped'}")
         return function

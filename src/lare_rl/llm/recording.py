@@ -12,7 +12,7 @@ from lare_rl.errors import CheckedModel, LareError
 from lare_rl.llm.key import redact_key
 from lare_rl.llm.prompts import N_CANDIDATES, Message, Stage
 from lare_rl.util.files import check_new_path, write_atomically
-from lare_rl.util.safe_io import read_json_object
+from lare_rl.util.safe_io import read_json_object, read_text
 
 __all__ = [
     "RECORDED", "SHIPPED_RECORDINGS", "Exchange", "RecordedModel", "Recorder", "read_recording", "shipped_recordings",
@@ -123,8 +123,8 @@ class RecordedModel:
 class Recorder:
     """Records every exchange of a design. With a `path`, it saves them to this file after each reply.
 
-    An existing file is never overwritten: the file must not exist at first. After the first reply it is replaced as a whole, so
-    that no reply is lost.
+    An existing file is never overwritten: the file must not exist at first, or hold exactly the first `exchanges`. After each
+    reply it is replaced as a whole, so that no reply is lost.
     """
 
     task: str
@@ -132,12 +132,22 @@ class Recorder:
     temperature: float | None = None
     path: Path | None = None
     exchanges: list[Exchange] = field(default_factory=list)
-    file_created: bool = False
-    """Whether this recorder has created the file."""
+    file_created: bool = field(init=False, default=False)
+    """Whether the file is of this recorder."""
 
     def __post_init__(self) -> None:
-        if self.path is not None and not self.file_created:
-            check_new_path(self.path)  # before a model is asked and paid
+        if self.path is not None:
+            self.file_created = self._is_recorded(self.path)
+            if not self.file_created:
+                check_new_path(self.path)  # before a model is asked and paid
+
+    def _is_recorded(self, path: Path) -> bool:
+        """Return whether a file is a recording of the exchanges so far. It is without the key."""
+        try:
+            saved = read_recording(read_text(path), str(path))
+        except LareError:
+            return False
+        return saved.exchanges == read_recording(self.to_json(""), "").exchanges
 
     def n_replies(self, stage: Stage, messages: Sequence[Message]) -> int:
         """Return the number of recorded replies to a request."""

@@ -1,17 +1,17 @@
 """The first draft of a task for a log: sizes from its arrays and, for a Minari data set, its description."""
 
-import re
 from pathlib import Path
 from typing import Any
 
 from lare_rl.assigner.space_layout import SpaceLayout
 from lare_rl.logs.open_log import open_log
 from lare_rl.new_task.documentation import plain_lines, remove_rewards
-from lare_rl.new_task.draft import SCORE_LINE, Draft, count_entries, make_draft, warning_lines
+from lare_rl.new_task.draft import SCORE_LINE, Draft, count_entries, file_name, head_lines, make_draft
 from lare_rl.tasks.spec import NO_ENVIRONMENT
 
 __all__ = ["draft_log_task"]
 
+ENVIRONMENT_LINE = "# environment: there are logs only; to train, the id of the environment that they come from"
 LIMIT_LINE = "# max_episode_steps = 1000 # episodes that did not terminate, and are shorter, were cut"
 
 
@@ -23,15 +23,11 @@ def draft_log_task(source: Any) -> Draft:
     description, removed = remove_rewards(plain_lines(text))
     texts = {"description": description, "observation": "", "action": ""}
     layouts = {"observation": log.layout.observation, "action": log.layout.action}
-    name = re.sub(r"[^\w.\-]+", "-", Path(log.name).name.removesuffix(".parquet")) or "logs"
-    limit = log.layout.max_episode_steps
+    name = file_name(Path(log.name).name.removesuffix(".parquet")) or "logs"
+    sizes, limit = (log.layout.observation.size, log.layout.action.size), log.layout.max_episode_steps
     lines = [
-        *warning_lines(removed, "the log"),
-        f'name = "{name}"',
-        f'environment = "{NO_ENVIRONMENT}" # there are logs only; to train, the id of the environment that they come from',
-        f"observation_size = {layouts['observation'].size}",
-        f"action_size = {layouts['action'].size}",
-        'scored_observation = "after"',
+        *head_lines(name, NO_ENVIRONMENT, sizes, removed, origin="the log"),
+        ENVIRONMENT_LINE,
         SCORE_LINE,
         f"max_episode_steps = {limit}" if limit else LIMIT_LINE,
     ]

@@ -203,8 +203,8 @@ def relabel(
 def _check_numbers(hold_out: float, memory: float, updates: int) -> None:
     if not 0 <= hold_out <= 0.9:
         raise LareError(f"hold_out = {hold_out} must be between 0 and 0.9")
-    if not 0 < memory < math.inf:
-        raise LareError(f"memory = {memory} must be positive and finite")
+    if not 0 < memory <= 1e6:
+        raise LareError(f"memory = {memory} must be positive, and at most 1e6 (GiB)")
     if updates < 1:
         raise LareError(f"updates = {updates} must be at least 1")
 

@@ -10,6 +10,7 @@ import gymnasium
 from gymnasium.spaces import Box, Discrete
 
 from lare_rl.tasks.spec import FILL_IN, entry_meanings
+from lare_rl.util.sanitize import one_line
 
 __all__ = [
     "DEFAULT_LIMIT",
@@ -24,8 +25,6 @@ __all__ = [
     "file_name",
     "head_lines",
     "make_draft",
-    "text_lines",
-    "warning_lines",
 ]
 
 SCORED_OBSERVATION_LINE = (
@@ -85,27 +84,30 @@ class Draft:
         return LIMIT_LINE in self.toml
 
 
-def warning_lines(
-    removed: Sequence[str], origin: str = "the documentation of the environment", unused: Sequence[str] = ()
+def head_lines(
+    name: str,
+    environment: str,
+    sizes: tuple[int, int],
+    removed: Sequence[str],
+    unused: Sequence[str] = (),
+    origin: str = "the documentation of the environment",
 ) -> list[str]:
-    """Return the comments at the top of a draft, with the titles of `unused` sections."""
+    """Return the first lines of a draft: comments, and the keys of every task.
+
+    Args:
+        sizes: of an observation and of an action.
+        removed: sentences and table rows that were left out.
+        unused: titles of sections that were not used.
+        origin: the source of the texts.
+    """
     count = "1 sentence or row" if len(removed) == 1 else f"{len(removed)} sentences or rows"
     return [
         f"# A first draft, from {origin}. Read it before you use it: a language model will",
         "# know only these texts.",
         *([f"# Left out on purpose: {count} with words such as reward, cost or score:"] if removed else []),
-        *(f"#   {' '.join(text.split())}" for text in removed),
-        *([f"# Sections that were not used: {', '.join(unused)}."] if unused else []),
+        *(f"#   {one_line(text)}" for text in removed),  # TOML allows no control characters in comments
+        *([f"# Sections that were not used: {one_line(', '.join(unused))}."] if unused else []),
         "# Take out every sentence that still reveals the reward. Describe the goal, not how it is rewarded.",
-    ]
-
-
-def head_lines(
-    name: str, environment: str, sizes: tuple[int, int], removed: Sequence[str], unused: Sequence[str] = ()
-) -> list[str]:
-    """Return the first lines of a draft. `sizes` are those of an observation and of an action."""
-    return [
-        *warning_lines(removed, unused=unused),
         f'name = "{name}"',
         f'environment = "{environment}"',
         f"observation_size = {sizes[0]}",
@@ -122,20 +124,17 @@ def make_draft(
     removed: tuple[str, ...],
     **fields: Any,
 ) -> Draft:
-    """Return the draft of a task file: its lines, and then its texts. `fields` are further fields of `Draft`."""
-    toml = "\n".join([*lines, *text_lines(texts, first_lines)]) + "\n"
-    return Draft(name, toml, tuple(key for key, text in texts.items() if not text), removed, **fields)
+    """Return the draft of a task file: its lines, and then its texts. Missing texts are marked.
 
-
-def text_lines(texts: Mapping[str, str], first_lines: Mapping[str, str]) -> list[str]:
-    """Return the texts of a task file in TOML. Missing texts are marked. `first_lines` precede texts that begin in another way."""
-    lines = []
+    `first_lines` precede texts that begin in another way. `fields` are further fields of `Draft`.
+    """
+    missing_keys, lines = tuple(key for key, text in texts.items() if not text), list(lines)
     for key, text in texts.items():
         text, first = text or f"{FILL_IN}: {CONTENTS[key]}", first_lines.get(key, "")
         if not text.startswith(first.removesuffix(".")):
             text = f"{first}\n{text}"
         lines.append(f"\n{key} = {_quote(text)}")
-    return lines
+    return Draft(name, "\n".join(lines) + "\n", missing_keys, removed, **fields)
 
 
 def _quote(text: str) -> str:

@@ -81,9 +81,10 @@ def write_team_drafts(
         return draft.make_draft(name, task_lines, texts, _first_lines(env, teams[0]), removed)
     files = {}
     for team in teams:
-        lines = [*draft.head_lines(team.name, environment_id, sizes, removed), *_team_lines(env, team)]
+        team_name = file_name(team.name)
+        lines = [*draft.head_lines(team_name, environment_id, sizes, removed), *_team_lines(env, team)]
         team_draft = draft.make_draft(name, lines, _team_texts(env, team, texts), _first_lines(env, team), removed)
-        files[f"{name}-{team.name}.toml"] = team_draft.toml
+        files[f"{name}-{team_name}.toml"] = team_draft.toml
     task_lines += [*TEAMS_COMMENT, f"teams = {json.dumps(list(files))}"]
     task_texts = texts | dict.fromkeys(TEAM_KEYS, "See the teams.")
     task_draft = draft.make_draft(name, task_lines, task_texts, {}, removed, teams=files)
@@ -132,7 +133,8 @@ def _read_texts(env: Any) -> tuple[dict[str, str], tuple[str, ...]]:
 def _team_lines(host: Layouts, team: Team) -> list[str]:
     names = [str(agent.name) for agent in host.layout.agents[team.agents]]
     patterns = [pattern for pattern in _name_patterns(team.name) if any(fnmatchcase(name, pattern) for name in names)]
-    return [f'team = "{team.name}"', f"agents = {json.dumps(patterns)}"]
+    keys = {"team": team.name, "agents": patterns}
+    return [f"{key} = {json.dumps(value, ensure_ascii=False)}" for key, value in keys.items()]
 
 
 def _team_texts(host: Layouts, team: Team, texts: Mapping[str, str]) -> dict[str, str]:

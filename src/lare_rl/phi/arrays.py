@@ -343,7 +343,9 @@ def rearrange(function: Callable[..., Any], arrays: Any, *args: Any) -> Any:
         zero = builder.cast(builder.constant(0), widest([builder.nodes[node].kind for node in nodes]))
         return Array(builder.gather(builder.concat([*nodes, zero]), positions % (size + 1)), batch_axis)
 
-    return [to_array(source) for source in moved] if isinstance(moved, list) else to_array(moved)
+    if isinstance(moved, Source):
+        return to_array(moved)
+    return (list if isinstance(moved, list) else tuple)(map(to_array, moved))
 
 
 def broadcast(array: Array, shape: Sequence[Any]) -> Array:

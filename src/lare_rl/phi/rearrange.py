@@ -41,7 +41,9 @@ def map_leaves(function: Callable[[Any], Any], nested: Any) -> Any:
     return [map_leaves(function, item) for item in nested] if type(nested) is list else function(nested)
 
 
-def move(function: Callable[..., Any], sources: Any, args: Sequence[Any], size: int) -> list[Source] | Source:
+def move(
+    function: Callable[..., Any], sources: Any, args: Sequence[Any], size: int
+) -> list[Source] | tuple[Source, ...] | Source:
     """Apply a function of NumPy that only moves, repeats and leaves out numbers.
 
     Args:
@@ -77,7 +79,7 @@ def move(function: Callable[..., Any], sources: Any, args: Sequence[Any], size: 
         except (ValueError, IndexError):
             text = f"rows of {shapes} would be mixed, added or left out: use axis=1 or axis=-1, and keep the batch axis"
             raise RefusedError("E-ROWS", text) from None
-    return moved if several else moved[0]
+    return type(result)(moved) if several else moved[0]
 
 
 def _to_source(positions: np.ndarray, two_rows: np.ndarray, three_rows: np.ndarray, size: int) -> Source:

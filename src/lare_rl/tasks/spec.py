@@ -141,7 +141,7 @@ class TaskSpec(CheckedModel):
     processes: Literal["auto", "separate"] = "auto"
     """`separate`: every environment has its own process, for a simulator that allows one in a process. `auto`: only if an
     unknown package's environment starts or steps slowly, or if a second one in its process fails, hangs or changes the first."""
-    timeout: Annotated[float, Field(gt=0, allow_inf_nan=False)] = 120.0
+    timeout: Annotated[float, Field(gt=0)] = 120.0
     """Time (s) within which an environment in another process must reply; else the run stops with a message."""
     arguments: dict[str, Any] = Field(default_factory=dict)
     """Keyword arguments of the environment, for families that take them, such as `pettingzoo/...` and `gymnax/...`."""

@@ -40,10 +40,13 @@ __all__ = [
 ]
 
 MIN_SPEED_UP = 2.0
-"""Less may be noise, and then a run would not always choose the same."""
-N_REPETITIONS, N_STARTS = 5, 3
+"""A smaller speed-up may be noise, and then equal runs would choose differently."""
+N_REPETITIONS = 5
+"""How often a factorisation is timed."""
+N_STARTS = 3
+"""The starts of `evidence.fit`, each of which factorises a matrix."""
 MIN_FEATURES = 32
-"""The size of the matrix if no fit is in closed form."""
+"""The least size of the matrices."""
 
 
 class CompiledFunctions(NamedTuple):
@@ -92,7 +95,9 @@ def compile_functions(config: TrainConfig, phi: Sequence[Graph] = ()) -> Compile
             return jax.block_until_ready(learn(learner))
 
     def compile_learning(learner: Learner) -> None:
-        with jax.enable_x64(True):  # as above, but without its limit of threads, which would be that of all threads
+        with jax.enable_x64(
+            True
+        ):  # not `float64()`: its limit of BLAS threads would hold for the threads that run now, too
             learn.lower(learner).compile()
 
     return CompiledFunctions(
@@ -111,7 +116,7 @@ def compile_ahead(
 ) -> CompiledFunctions:
     """Return the functions of a run, compiled for the shapes that they will see, before the run needs its memory.
 
-    The compiler needs hundreds of megabytes for a while. They are returned to the system before the replay is made.
+    The compiler needs hundreds of megabytes for a while. This memory is returned to the system before the replay is made.
     """
     functions = compile_functions(config, phi)
     learner = learner_shape(config, n_seeds)
@@ -157,8 +162,8 @@ def _free_memory() -> None:
 def is_batching_faster(config: TrainConfig, n_seeds: int) -> bool:
     """Measure whether this device factorises the matrices of all fits faster at once than one after the other.
 
-    On a CPU, it is never faster by much, and a choice by time would make runs differ. Besides, batched calls of LAPACK that run at
-    the same time may wait for each other for ever (jaxlib 0.10, `ParallelBatchMap`).
+    It is false on a CPU: there it is never faster by much, and a choice by time would make runs differ. Besides, batched calls of
+    LAPACK that run at the same time may wait for each other for ever (jaxlib 0.10, `ParallelBatchMap`).
     """
     if config.method.fit is None or jax.default_backend() == "cpu":
         return False

@@ -61,7 +61,8 @@ def reflect(
         record: a file to record every exchange in; if the design was recorded, the same file.
 
     Raises:
-        LareError: `rounds` is less than 1, or each team of the task has its own function.
+        LareError: `rounds` is less than 1, `record` exists and does not hold the function's exchanges, or each team of the task has
+            its own function.
     """
     role, model = require_role(resolve_task(task)), as_model(model)
     if rounds < 1:

@@ -14,6 +14,9 @@ _RENAMED_KEYS = {
 }
 """From old to new keys of tasks, settings, sweeps and assigners, and options of the command line."""
 
+_FREE_TABLES = {"arguments", "functions"}
+"""Tables whose keys are not LaRe's: an environment's keyword arguments, and names of tasks."""
+
 _RENAMED_METRICS = {"likeliest_return": "deterministic_return"}
 """From old to new metrics, after the slash."""
 
@@ -55,7 +58,7 @@ _RENAMED_FIELDS = {
     "steps": "n_steps",
     "summed": "sufficient_statistics",
 }
-"""From old to new names."""
+"""From old to new fields of states."""
 
 _DECODER = r"(?:\.reward_sources\[\d+\]|^\[0\])"
 """A decoder in a checkpoint, or in an assigner."""
@@ -90,7 +93,8 @@ def rename_keys(values: Any) -> Any:
     if not isinstance(values, Mapping):
         return values
     names = {name: new for name, new in _RENAMED_KEYS.items() if new not in values}
-    return {names.get(name, name): rename_keys(value) for name, value in values.items()}
+    free = {name: values[name] for name in _FREE_TABLES & values.keys()}
+    return {names.get(name, name): rename_keys(value) for name, value in values.items()} | free
 
 
 def rename_assigner(values: Mapping[str, Any]) -> dict[str, Any]:

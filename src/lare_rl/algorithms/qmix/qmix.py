@@ -124,13 +124,10 @@ def action_values(agent: RecurrentNetwork, batch: Sequences) -> Float[Array, "ep
 def lambda_returns(
     reward: Steps, done: Steps, mask: Steps, value: Float[Array, "episodes steps+1"], settings: QMIXSettings
 ) -> Steps:
-    """Return G, computed backwards from the end of the padding (PyMARL2's `build_td_lambda_targets`).
-
-    After the last step of an episode G is 0: the rewards are masked there, and `done` removes the final value.
-    """
+    """Return G, computed backwards from the end of the padding, where it is 0 (PyMARL2's `build_td_lambda_targets`)."""
     gamma, lambda_ = settings.gamma, settings.td_lambda
     r_t, v_t = reward, value[:, 1:]
-    # The part of each target that does not depend on later steps. In the padding it is 0.
+    # What does not depend on later steps.
     one_step = mask * (r_t + (1 - lambda_) * gamma * (1 - done) * v_t)
     decay = lambda_ * gamma
 
@@ -138,9 +135,7 @@ def lambda_returns(
         return_ = one_step + decay * next_return
         return return_, return_
 
-    # An episode that goes on after its last stored step bootstraps there.
-    final_return = value[:, -1] * (1 - jnp.sum(done, axis=1))
-    return jax.lax.scan(step, final_return, one_step.T, reverse=True)[1].T
+    return jax.lax.scan(step, jnp.zeros(len(reward)), one_step.T, reverse=True)[1].T
 
 
 def td_targets(

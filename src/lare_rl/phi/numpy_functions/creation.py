@@ -34,17 +34,19 @@ def array(object: Any, dtype: Any = None, ndmin: Any = 0) -> Array:  # noqa: A00
     return x[(None,) * (ndmin - x.ndim)] if ndmin > x.ndim else x
 
 
-@numpy_function(
-    "asarray", "asanyarray", "ascontiguousarray", "asfortranarray", "asarray_chkfinite", "require", "fromiter"
-)
-def asarray(a: Array, dtype: Any = None, count: Any = -1) -> Array:
+@numpy_function("asarray", "asanyarray", "ascontiguousarray", "asfortranarray", "asarray_chkfinite", "require")
+def asarray(a: Array, dtype: Any = None, order: Any = None) -> Array:
     return a if dtype is None or dtype_kind(dtype) == a.kind else astype(a, dtype)
 
 
 @numpy_function()
+def fromiter(iter: Array, dtype: Any, count: int = -1) -> Array:  # noqa: A002
+    return asarray(iter, dtype)[: count if count >= 0 else None]
+
+
+@numpy_function()
 def full(shape: Any, fill_value: Any, dtype: Any = None) -> Array:
-    filled = broadcast(as_array(fill_value), as_list(shape)).copy()
-    return filled if dtype is None else astype(filled, dtype)
+    return asarray(broadcast(as_array(fill_value), as_list(shape)).copy(), dtype)
 
 
 @numpy_variants({"zeros": 0, "ones": 1, "empty": math.nan})
@@ -67,13 +69,12 @@ def fill_like(value: Any, a: Array, dtype: Any = None, shape: Any = None) -> Arr
 def arange(start: Any, stop: Any = None, step: Any = 1, dtype: Any = None) -> Array:
     start, stop = (0, start) if stop is None else (start, stop)
     if isinstance(stop, BatchSize) and (start, step) == (0, 1):
-        return Array(current_builder().add("row_number", (), (stop.factor,), "int"), 0)
+        return asarray(Array(current_builder().add("row_number", (), (stop.factor,), "int"), 0), dtype)
     first, last, width = (x if isinstance(x, (int, float)) else as_array(x).number() for x in (start, stop, step))
     if not width or not math.isfinite((last - first) / width):
         raise ValueError("np.arange needs finite numbers, and a step that is not 0")
     current_builder().check_size([max(0, math.ceil((last - first) / width))])
-    numbers = as_array(np.arange(first, last, width))
-    return numbers if dtype is None else astype(numbers, dtype)
+    return asarray(as_array(np.arange(first, last, width)), dtype)
 
 
 @numpy_variants({"linspace": np.linspace, "logspace": np.logspace, "geomspace": np.geomspace})
@@ -106,33 +107,34 @@ def apply_along_axis(func1d: Callable[..., Any], axis: int, arr: Array, *args: A
     if at != arr.ndim - 1:
         raise RefusedError("E-NUMPY", "np.apply_along_axis works along the last axis: use axis=-1")
     in_row = Array(arr.node, None).reshaped((-1, arr.row_shape[at]), None)  # arrays of one row, without a batch axis
-    results = stack([as_array(func1d(series, *args, **kwargs)) for series in in_row], 0)
+    results = stack([as_array(func1d(values, *args, **kwargs)) for values in in_row], 0)
     return results.reshaped((*arr.row_shape[:-1], *results.row_shape[1:]), arr.batch_axis)
 
 
 class Indexed:
-    """An object of NumPy that makes an array of an index. Slices stand for ranges."""
+    """An object of NumPy that makes an array of an index. Slices stand for ranges. A grid of a single slice is its range."""
 
-    def __init__(self, join: Callable[[list[Array]], Any]):
-        self.join = join
+    def __init__(self, join: Callable[[list[Array]], Any], *, is_grid: bool = False):
+        self.join, self.is_grid = join, is_grid
 
     def __getitem__(self, index: Any) -> Any:
-        return self.join(list(map(_read_range, index if isinstance(index, tuple) else (index,))))
+        ranges = list(map(_read_range, index if isinstance(index, tuple) else (index,)))
+        return ranges[0] if self.is_grid and not isinstance(index, tuple) else self.join(ranges)
 
 
 def _read_range(item: Any) -> Array:
     if not isinstance(item, slice):
         return as_array(item)
     if isinstance(item.step, complex):  # 5j: five numbers
-        return FUNCTIONS["linspace"](as_float(item.start or 0), as_float(item.stop), int(item.step.imag))
+        return FUNCTIONS["linspace"](as_float(item.start or 0), as_float(item.stop), int(abs(item.step)))
     return arange(item.start or 0, item.stop, 1 if item.step is None else item.step)
 
 
 INDEXED = {
-    "r_": Indexed(lambda items: rearrange(lambda arrays: np.concatenate(list(map(np.atleast_1d, arrays))), items)),
-    "c_": Indexed(lambda items: rearrange(np.column_stack, items)),
-    "mgrid": Indexed(lambda ranges: stack(meshgrid(*ranges, indexing="ij"), 0)),
-    "ogrid": Indexed(lambda ranges: meshgrid(*ranges, indexing="ij", sparse=True)),
+    "r_": Indexed(lambda items: rearrange(lambda arrays: np.r_[tuple(arrays)], items)),
+    "c_": Indexed(lambda items: rearrange(lambda arrays: np.c_[tuple(arrays)], items)),
+    "mgrid": Indexed(lambda ranges: stack(meshgrid(*ranges, indexing="ij"), 0), is_grid=True),
+    "ogrid": Indexed(lambda ranges: meshgrid(*ranges, indexing="ij", sparse=True), is_grid=True),
 }
 """Objects of NumPy that are used with an index."""
 
@@ -144,10 +146,14 @@ def indices(dimensions: Any, dtype: Any = "int") -> Array:
     return astype(np.indices(sizes), dtype)
 
 
+def _as_indices(a: Array) -> Array:
+    return FUNCTIONS["flatnonzero"](a) if a.kind == "bool" else a
+
+
 array_functions(
     {
         "copy": lambda a: a.copy(),
-        "ix_": lambda *args: rearrange(lambda arrays: np.ix_(*arrays), list(args)),
+        "ix_": lambda *args: rearrange(lambda arrays: np.ix_(*arrays), list(map(_as_indices, args))),
     }
 )
 numpy_functions(

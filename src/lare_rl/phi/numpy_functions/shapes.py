@@ -95,7 +95,7 @@ def squeeze(a: Array, axis: Any = None) -> Any:
 
 
 @numpy_function()
-def broadcast_arrays(*args: Array) -> list[Array]:
+def broadcast_arrays(*args: Array) -> tuple[Array, ...]:
     return rearrange(lambda arrays: np.broadcast_arrays(*arrays), list(args))
 
 
@@ -202,7 +202,7 @@ def sliding_window_view(x: Array, window_shape: Any, axis: Any = None) -> Array:
 
 
 @numpy_function()
-def meshgrid(*xi: Array, indexing: Any = "xy", sparse: Any = False, copy: Any = True) -> list[Any]:
+def meshgrid(*xi: Array, indexing: Any = "xy", sparse: Any = False, copy: Any = True) -> tuple[Array, ...]:
     current_builder().check_size([math.prod(x.row_shape) for x in xi])
     return rearrange(lambda arrays: np.meshgrid(*arrays, indexing=indexing, sparse=bool(sparse)), list(xi))
 
