@@ -95,9 +95,8 @@ def compile_functions(config: TrainConfig, phi: Sequence[Graph] = ()) -> Compile
             return jax.block_until_ready(learn(learner))
 
     def compile_learning(learner: Learner) -> None:
-        with jax.enable_x64(
-            True
-        ):  # not `float64()`: its limit of BLAS threads would hold for the threads that run now, too
+        # Not `float64()`: its limit of BLAS threads would hold for the threads that run now, too.
+        with jax.enable_x64(True):
             learn.lower(learner).compile()
 
     return CompiledFunctions(
