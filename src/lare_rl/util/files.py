@@ -15,10 +15,9 @@ from uuid import uuid4
 from lare_rl.errors import LareError
 
 __all__ = [
-    *("check_new_path", "check_writable", "find_free_path", "make_directory", "new_directory"),
-    *("replace_npz", "write_atomically", "write_npz"),
-]
-
+    "check_new_path", "check_writable", "find_free_path", "make_directory", "new_directory", "replace_npz", "write_atomically",
+    "write_npz",
+]  # fmt: skip
 
 RETRY_S = 0.01, 0.03, 0.1, 0.3, 1.0
 """Windows does not replace a file that another process reads just now. Pauses between the attempts (s)."""
