@@ -1,17 +1,17 @@
-"""Scores that come only at the end, in Stable-Baselines3, ten seeds: SAC on wheat, PPO on pickers.
+"""Scores that come only at the end, in Stable-Baselines3, ten seeds: SAC on wheat, PPO on pickers, a traffic signal and a job shop.
 
-    pip install -e '.[sb3]' -e 'benchmarks/real[wheat]'
+    pip install -e '.[sb3]' -e 'benchmarks/real[wheat,traffic,jobshop]'
     PYTHONPATH=examples python benchmarks/sb3_seeds.py wheat             results/plugs/wheat-REWARDS.jsonl
-    PYTHONPATH=examples python benchmarks/sb3_seeds.py pickers           results/plugs/pickers-REWARDS.jsonl
     PYTHONPATH=examples python benchmarks/sb3_seeds.py wheat --table     results/plugs/wheat.json: tables
 
 The algorithms have the defaults of Stable-Baselines3, except those of `TASKS`. Evaluations play the deterministic policy (wheat: each
-of the seven held-out years once) or the sampled one (pickers: 50 new shifts). A seed that is in a file is not trained again.
+of the seven held-out years once) or the sampled one (new or held-out episodes). A seed that is in a file is not trained again.
 """
 
 import json
 import logging
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
@@ -50,16 +50,21 @@ class Setting(NamedTuple):
     rewards: tuple[str, ...]
 
 
-def make_wheat(rewards: str) -> gymnasium.Env:
-    import final_score.wheat  # noqa: F401 (registers Wheat-v0)
+def make_simulator(task: str, split: Literal["train", "test"], rewards: str = "") -> gymnasium.Env:
+    """Make a simulator of `benchmarks/real`."""
+    from final_score.play import make_task
 
-    return gymnasium.make("Wheat-v0", pay="proxy" if rewards == "proxy" else "end")
+    return make_task(task, split, pay="proxy" if rewards == "proxy" else "end")
 
 
 def wheat_resets() -> tuple[gymnasium.Env, list[dict[str, Any]]]:
     from final_score.wheat import find_years
 
-    return gymnasium.make("WheatTest-v0"), [{"options": {"year": year}} for year in find_years("test")]
+    return make_simulator("wheat", "test"), [{"options": {"year": year}} for year in find_years("test")]
+
+
+def simulator_resets(task: str, episodes: int) -> tuple[gymnasium.Env, list[dict[str, Any]]]:
+    return make_simulator(task, "test"), [{"seed": 1_000_000 + episode} for episode in range(episodes)]
 
 
 def make_pickers(rewards: str) -> gymnasium.Env:
@@ -74,7 +79,7 @@ TASKS = {
     "wheat": Setting(
         ROOT / "benchmarks/real/tasks/wheat.toml",
         ROOT / "benchmarks/real/phi/wheat.py",
-        make_wheat,
+        partial(make_simulator, "wheat", "train"),
         wheat_resets,
         SAC,
         {"learning_starts": 600, "buffer_size": 6_000},
@@ -94,6 +99,30 @@ TASKS = {
         evaluate_every=5_760,
         deterministic=False,
         rewards=("episodic", "lare-bayes", "bayes"),
+    ),
+    "traffic": Setting(
+        ROOT / "benchmarks/real/tasks/traffic.toml",
+        ROOT / "benchmarks/real/phi/traffic.py",
+        partial(make_simulator, "traffic", "train"),
+        partial(simulator_resets, "traffic", 4),
+        PPO,
+        {"n_steps": 1_440, "batch_size": 72},  # 4 hours
+        steps=36_000,
+        evaluate_every=7_200,
+        deterministic=False,
+        rewards=("episodic", "lare-bayes", "bayes", "proxy"),
+    ),
+    "jobshop": Setting(
+        ROOT / "benchmarks/real/tasks/jobshop.toml",
+        ROOT / "benchmarks/real/phi/jobshop.py",
+        partial(make_simulator, "jobshop", "train"),
+        partial(simulator_resets, "jobshop", 20),
+        PPO,
+        {"n_steps": 2_000, "batch_size": 100},
+        steps=100_000,
+        evaluate_every=10_000,
+        deterministic=False,
+        rewards=("episodic", "lare-bayes", "bayes", "proxy"),
     ),
 }
 
@@ -121,6 +150,8 @@ def train(setting: Setting, rewards: str, seed: int) -> list[Line]:
     model.learn(
         setting.steps, log_interval=1_000_000, callback=[*callbacks, Evaluations(setting.evaluate_every, report)]
     )
+    for simulator in (env, model.get_env()):
+        simulator.close()
     return lines
 
 
@@ -153,7 +184,7 @@ def mean_return(lines: list[Line], after: float) -> float:
 
 
 def main(
-    task: tyro.conf.Positional[Literal["wheat", "pickers"]],
+    task: tyro.conf.Positional[Literal["wheat", "pickers", "traffic", "jobshop"]],
     rewards: tuple[str, ...] = (),
     seeds: int = 10,
     table: bool = False,
@@ -162,7 +193,7 @@ def main(
 
     Args:
         task: the task.
-        rewards: `episodic`, `proxy` (wheat), or methods; all of the task by default.
+        rewards: `episodic`, `proxy` (simulators), or methods; all of the task by default.
         seeds: seeds 0 to N - 1.
         table: tabulate the files, and train nothing.
     """
