@@ -82,14 +82,18 @@ def hidden(task: str) -> Comparison:
 
 
 def simulator(task: str, algorithm: str, steps: int) -> Comparison:
-    """A simulator whose score exists only at the end: seeds 0 to 4, and 5 to 9. True rewards are what a practitioner would pay a step."""
+    """A simulator whose score exists only at the end: seeds 0 to 4, and 5 to 9. True rewards are what a practitioner would pay a step.
+
+    From the score at the end, PPO learns better with gamma = lambda = 1, so that it has this setting, and no other method has it.
+    """
 
     def runs(name: str, suffix: str = "") -> Directories:
         return [f"{LAPTOP}/real/seeds-{first}/{task}{suffix}/{name}" for first in (0, 5)]
 
+    whole_episodes = [f"{WHY}/{task}/episodic-whole-episode/seeds-{first}" for first in (0, 5)]
     return Comparison(
         steps,
-        runs(f"episodic-{algorithm}"),
+        whole_episodes if algorithm == "ppo" else runs(f"episodic-{algorithm}"),
         runs(f"dense-{algorithm}", "Proxy"),
         {"rrdu": runs(f"rrdu-{algorithm}")},
         runs(f"lare-rrdu-{algorithm}-published"),

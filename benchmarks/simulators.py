@@ -1,102 +1,163 @@
-"""Training on simulators whose score exists only at the end: tables of the kept runs of `lare-rl reproduce real`.
+"""Training on simulators whose score exists only at the end: the kept runs of `lare-rl reproduce real`.
 
     PYTHONPATH=benchmarks python benchmarks/simulators.py [--runs RUNS]
 
-For each task and method: the mean of all evaluations, its interquartile mean, and the score at the end, of the sampled and of the
-deterministic policy. *above* and p compare with the score at the end alone.
+For each task and method, a table has the mean of all evaluations, its interquartile mean, and the score at the end, of the sampled and
+of the deterministic policy. *above* and p compare with the score at the end alone, in the better of its settings. The curves are in
+`docs/pictures/simulators.svg`.
 """
 
 import json
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
+import matplotlib
 import numpy as np
 import tyro
+from matplotlib.figure import Figure
 
+from lare_rl.report.figures import COLOURS, add_white_background, to_svg
 from scores.training import describe
 
-RUNS = Path(__file__).parent / "results" / "reproduce" / "laptop" / "real"
-TASKS = {"Wheat": "sac", "Traffic": "ppo", "JobShop": "ppo", "Trains": "ippo", "Grid": "ppo"}
+RESULTS = Path(__file__).parent / "results"
+RUNS = RESULTS / "reproduce" / "laptop" / "real"
+PICTURE = Path(__file__).parents[1] / "docs" / "pictures" / "simulators.svg"
+
+
+class Task(NamedTuple):
+    """A task, and the best rule of thumb with its score in 100 held-out episodes, by the pages beside the runs."""
+
+    title: str
+    algorithm: str
+    rule: str
+    rule_score: float
+    lowest: float
+    """Where the picture ends."""
+
+
+TASKS = {
+    "Wheat": Task("wheat, SAC", "sac", "three dates", 13.69, 6.5),
+    "Traffic": Task("traffic signal, PPO", "ppo", "longest queue", -9.27, -60),
+    "JobShop": Task("job shop, PPO", "ppo", "most work remaining", -17.87, -29),
+}
 METHODS = {
     "episodic": "score at the end",
+    "whole-episode": "score at the end, gamma = lambda = 1",
     "lare-bayes": "LaRe, closed form, `lare-bayes`",
     "bayes": "closed form, raw features, `bayes`",
     "rrdu": "RRD-unbiased, `rrdu`",
     "lare-rrdu": "LaRe as published, `lare-rrdu`",
     "dense": "dense proxy",
 }
-
+CURVES = {
+    "episodic": "#bbbbbb",
+    "whole-episode": "#666666",
+    "lare-bayes": COLOURS[0],
+    "bayes": COLOURS[2],
+    "dense": COLOURS[1],
+}
 COLUMNS = "n", "mean of all evaluations", "IQM [95%]", "above", "p", "at the end", "p", "deterministic"
+RETURN, DETERMINISTIC = "evaluation/return", "evaluation/deterministic_return"
+Lines = list[dict[str, Any]]
 
 
-class Seed(NamedTuple):
-    """What a seed of a run reached."""
-
-    area: float
-    """The mean of all evaluations."""
-    end: float
-    deterministic: float
-    """NaN if the policy has no other actions than those it is evaluated by."""
-
-
-def read_seeds(runs: Path, task: str, method: str) -> list[Seed]:
-    """Return the seeds of a method on a task. Runs that have not finished are left out."""
+def read_seeds(runs: Path, task: str, method: str) -> list[Lines]:
+    """Return the evaluations of each seed. Runs that have not finished are left out."""
     suffix = "-published" if method == "lare-rrdu" else ""
-    run = f"{task}{'Proxy' if method == 'dense' else ''}/{method}-{TASKS[task]}{suffix}"
-    seeds: dict[int, list[dict[str, float]]] = {}
-    for file in sorted(runs.glob(f"seeds-*/{run}/metrics.jsonl")):
+    run = f"{task}{'Proxy' if method == 'dense' else ''}/{method}-{TASKS[task].algorithm}{suffix}"
+    seeds: dict[int, Lines] = {}
+    files = runs.glob(f"seeds-*/{run}/metrics.jsonl")
+    if method == "whole-episode":
+        files = (RESULTS / "why" / task / "episodic-whole-episode").glob("seeds-*/metrics.jsonl")
+    for file in sorted(files):
         lines = [json.loads(line) for line in file.read_text().splitlines()]
         settings = json.loads((file.parent / "config.json").read_text())["settings"]
         is_finished = sum(line["step"] == settings["steps"] for line in lines) == settings["seeds"]
         for line in lines if is_finished else []:
             seeds.setdefault(line["seed"], []).append(line)
-    return [
-        Seed(
-            float(np.mean([line["evaluation/return"] for line in lines])),
-            lines[-1]["evaluation/return"],
-            lines[-1].get("evaluation/deterministic_return", float("nan")),
-        )
-        for _, lines in sorted(seeds.items())
-    ]
+    return [lines for _, lines in sorted(seeds.items())]
 
 
-def main(runs: Path = RUNS) -> None:
-    """Print a table for each task that has runs."""
-    for task in TASKS:
-        seeds = {method: read_seeds(runs, task, method) for method in METHODS}
-        if not seeds["episodic"]:
-            continue
-        print(f"\n{task}\n")
-        print(f"| | {' | '.join(COLUMNS)} |\n{'|---' * (len(COLUMNS) + 1)}|")
-        for method, label in METHODS.items():
-            if not seeds[method]:
-                continue
-            area, end = (
-                describe([getattr(seed, name) for seed in seeds[method]], baseline_of(seeds, method, name))
-                for name in ("area", "end")
-            )
-            deterministic = np.array([seed.deterministic for seed in seeds[method]])
-            low, high = area["iqm 95%"]
-            cells = [
-                *(label, str(area["n"]), f"{area['mean']:.2f} ± {area['std']:.2f}"),
+def mean_returns(seeds: list[Lines]) -> list[float]:
+    """Return the mean of all evaluations of each seed."""
+    return [float(np.mean([line[RETURN] for line in lines])) for lines in seeds]
+
+
+def last(seeds: list[Lines], metric: str) -> list[float]:
+    """Return a metric of each seed at the end, or nothing if it has none."""
+    return [lines[-1][metric] for lines in seeds if metric in lines[-1]]
+
+
+def print_table(seeds: dict[str, list[Lines]]) -> None:
+    """Print a row for each method."""
+    print(f"| | {' | '.join(COLUMNS)} |\n{'|---' * (len(COLUMNS) + 1)}|")
+    baseline = "whole-episode" if "whole-episode" in seeds else "episodic"
+    for method, runs in seeds.items():
+        others = None if method == baseline else seeds[baseline]
+        area = describe(mean_returns(runs), others and mean_returns(others))
+        end = describe(last(runs, RETURN), others and last(others, RETURN))
+        deterministic = last(runs, DETERMINISTIC)
+        low, high = area["iqm 95%"]
+        cells = [
+            *(
+                METHODS[method],
+                str(area["n"]),
+                format_mean(mean_returns(runs)),
                 f"{area['iqm']:.2f} [{low:.2f}, {high:.2f}]",
-                *(f"{area['above baseline']:.2f}" if "p" in area else "", format_p(area)),
-                *(f"{end['mean']:.2f} ± {end['std']:.2f}", format_p(end)),
-                "-"
-                if np.isnan(deterministic).all()
-                else f"{deterministic.mean():.2f} ± {deterministic.std(ddof=1):.2f}",
-            ]
-            print(f"| {' | '.join(cells)} |")
+            ),
+            *(f"{area['above baseline']:.2f}" if others else "", format_p(area)),
+            *(format_mean(last(runs, RETURN)), format_p(end), format_mean(deterministic) if deterministic else "-"),
+        ]
+        print(f"| {' | '.join(cells)} |")
 
 
-def baseline_of(seeds: dict[str, list[Seed]], method: str, name: str) -> list[float] | None:
-    return None if method == "episodic" else [getattr(seed, name) for seed in seeds["episodic"]]
+def format_mean(values: list[float]) -> str:
+    return f"{np.mean(values):.2f} ± {np.std(values, ddof=1):.2f}"
 
 
-def format_p(row: dict[str, float]) -> str:
+def format_p(row: dict[str, Any]) -> str:
     if "p" not in row:
         return ""
     return "< .001" if row["p"] < 0.001 else f"{row['p']:.2g}".lstrip("0")
+
+
+def draw(tasks: dict[str, dict[str, list[Lines]]]) -> str:
+    """Draw a panel for each task: the mean over seeds, and two standard errors on each side."""
+    with matplotlib.rc_context(
+        {"font.family": "sans-serif", "font.size": 11, "svg.fonttype": "none", "svg.hashsalt": "lare"}
+    ):
+        figure = Figure(figsize=(11, 3.2), layout="constrained")
+        for axes, (name, seeds) in zip(np.ravel(figure.subplots(1, len(tasks))), tasks.items(), strict=True):
+            task = TASKS[name]
+            for method, colour in CURVES.items():
+                if method not in seeds:
+                    continue
+                steps = np.array([line["step"] for line in seeds[method][0]]) / 1000
+                returns = np.array([[line[RETURN] for line in lines] for lines in seeds[method]])
+                mean, error = returns.mean(axis=0), returns.std(axis=0, ddof=1) / np.sqrt(len(returns))
+                axes.plot(steps, mean, color=colour, label=METHODS[method].partition(", `")[0])
+                axes.fill_between(steps, mean - 2 * error, mean + 2 * error, color=colour, alpha=0.18, linewidth=0)
+            axes.axhline(task.rule_score, color="#000000", linewidth=1, linestyle=":", label="best rule of thumb")
+            axes.set(title=task.title, xlabel="thousand steps")
+            axes.set_ylim(bottom=task.lowest)
+            axes.spines[["top", "right"]].set_visible(False)
+        figure.axes[0].set_ylabel("score of held-out episodes")
+        handles, labels = figure.axes[-1].get_legend_handles_labels()
+        figure.legend(handles, labels, loc="outside upper center", ncols=len(labels), frameon=False)
+    return add_white_background(to_svg(figure))
+
+
+def main(runs: Path = RUNS) -> None:
+    """Print the tables, and draw the picture if all its runs are there."""
+    tasks = {}
+    for name in TASKS:
+        seeds = {method: read_seeds(runs, name, method) for method in METHODS}
+        tasks[name] = {method: lines for method, lines in seeds.items() if lines}
+        if seeds["episodic"]:
+            print(f"\n{name}\n")
+            print_table(tasks[name])
+    if all("dense" in seeds for seeds in tasks.values()):
+        PICTURE.write_text(draw(tasks) + "\n", encoding="utf-8")
 
 
 if __name__ == "__main__":
