@@ -110,7 +110,7 @@ TASKS = {
         steps=36_000,
         evaluate_every=7_200,
         deterministic=False,
-        rewards=("episodic", "lare-bayes", "bayes", "proxy"),
+        rewards=("episodic", "whole-episode", "lare-bayes", "bayes", "proxy"),
     ),
     "jobshop": Setting(
         ROOT / "benchmarks/real/tasks/jobshop.toml",
@@ -122,7 +122,7 @@ TASKS = {
         steps=100_000,
         evaluate_every=10_000,
         deterministic=False,
-        rewards=("episodic", "lare-bayes", "bayes", "proxy"),
+        rewards=("episodic", "whole-episode", "lare-bayes", "bayes", "proxy"),
     ),
 }
 
@@ -131,7 +131,9 @@ def train(setting: Setting, rewards: str, seed: int) -> list[Line]:
     """Train a model. Return its evaluations."""
     arguments: dict[str, Any] = {**setting.arguments, "seed": seed, "device": "cpu"}
     callbacks: list[Any] = []
-    if rewards not in ("episodic", "proxy"):
+    if rewards == "whole-episode":
+        arguments |= {"gamma": 1.0, "gae_lambda": 1.0}
+    elif rewards not in ("episodic", "proxy"):
         task = lare_rl.load_task(setting.task)
         phi = lare_rl.load_function(setting.phi, task) if rewards.startswith("lare-") else None
         credit = lare_rl.CreditAssigner(rewards, phi, task=task, capacity=setting.steps, seed=seed)
@@ -193,7 +195,7 @@ def main(
 
     Args:
         task: the task.
-        rewards: `episodic`, `proxy` (simulators), or methods; all of the task by default.
+        rewards: `episodic`, `whole-episode` (the same, PPO with gamma = lambda = 1), `proxy` (simulators), or methods; all of the task by default.
         seeds: seeds 0 to N - 1.
         table: tabulate the files, and train nothing.
     """
