@@ -195,7 +195,8 @@ def main(
 
     Args:
         task: the task.
-        rewards: `episodic`, `whole-episode` (the same, PPO with gamma = lambda = 1), `proxy` (simulators), or methods; all of the task by default.
+        rewards: `episodic`, `whole-episode` (the same, PPO with gamma = lambda = 1), `proxy` (simulators), or methods; all of the task
+            by default.
         seeds: seeds 0 to N - 1.
         table: tabulate the files, and train nothing.
     """
