@@ -2,9 +2,10 @@
 
     PYTHONPATH=benchmarks python benchmarks/simulators.py [--runs RUNS]
 
-For each task and method, a table has the mean of all evaluations, its interquartile mean, and the score at the end, of the sampled and
-of the deterministic policy. *above* and p compare with the score at the end alone, in the better of its settings. The curves are in
-`docs/pictures/simulators.svg`.
+For each task and method, a table has the mean of all evaluations, and the score at the end of training, of the sampled and of the
+deterministic policy. *More* is the mean difference to learning from the score at the end alone, in the better of its settings, with
+its standard error; p is that of Wilcoxon's signed-rank test. Seeds are paired: a seed has the same held-out episodes in all methods.
+The curves are in `docs/pictures/simulators.svg`.
 """
 
 import json
@@ -15,9 +16,9 @@ import matplotlib
 import numpy as np
 import tyro
 from matplotlib.figure import Figure
+from scipy.stats import wilcoxon
 
 from lare_rl.report.figures import COLOURS, add_white_background, to_svg
-from scores.training import describe
 
 RESULTS = Path(__file__).parent / "results"
 RUNS = RESULTS / "reproduce" / "laptop" / "real"
@@ -37,26 +38,21 @@ class Task(NamedTuple):
 
 TASKS = {
     "Wheat": Task("wheat, SAC", "sac", "three dates", 13.69, 6.5),
-    "Traffic": Task("traffic signal, PPO", "ppo", "longest queue", -9.27, -60),
-    "JobShop": Task("job shop, PPO", "ppo", "most work remaining", -17.87, -29),
+    "Traffic": Task("traffic signal, PPO", "ppo", "longest queue", -9.27, -26),
+    "JobShop": Task("job shop, PPO", "ppo", "most work remaining", -17.87, -27),
 }
 METHODS = {
     "episodic": "score at the end",
-    "whole-episode": "score at the end, gamma = lambda = 1",
+    "episodic-whole-episode": "score at the end, gamma = lambda = 1",
     "lare-bayes": "LaRe, closed form, `lare-bayes`",
     "bayes": "closed form, raw features, `bayes`",
     "rrdu": "RRD-unbiased, `rrdu`",
     "lare-rrdu": "LaRe as published, `lare-rrdu`",
     "dense": "dense proxy",
+    "dense-whole-episode": "dense proxy, gamma = lambda = 1",
 }
-CURVES = {
-    "episodic": "#bbbbbb",
-    "whole-episode": "#666666",
-    "lare-bayes": COLOURS[0],
-    "bayes": COLOURS[2],
-    "dense": COLOURS[1],
-}
-COLUMNS = "n", "mean of all evaluations", "IQM [95%]", "above", "p", "at the end", "p", "deterministic"
+CURVES = {"episodic": "#777777", "lare-bayes": COLOURS[0], "bayes": COLOURS[2], "dense": COLOURS[1]}
+COLUMNS = "n", "mean of all evaluations", "more", "p", "at the end", "more", "p", "deterministic"
 RETURN, DETERMINISTIC = "evaluation/return", "evaluation/deterministic_return"
 Lines = list[dict[str, Any]]
 
@@ -67,8 +63,8 @@ def read_seeds(runs: Path, task: str, method: str) -> list[Lines]:
     run = f"{task}{'Proxy' if method == 'dense' else ''}/{method}-{TASKS[task].algorithm}{suffix}"
     seeds: dict[int, Lines] = {}
     files = runs.glob(f"seeds-*/{run}/metrics.jsonl")
-    if method == "whole-episode":
-        files = (RESULTS / "why" / task / "episodic-whole-episode").glob("seeds-*/metrics.jsonl")
+    if method.endswith("whole-episode"):
+        files = (RESULTS / "why" / task / method).glob("seeds-*/metrics.jsonl")
     for file in sorted(files):
         lines = [json.loads(line) for line in file.read_text().splitlines()]
         settings = json.loads((file.parent / "config.json").read_text())["settings"]
@@ -91,38 +87,38 @@ def last(seeds: list[Lines], metric: str) -> list[float]:
 def print_table(seeds: dict[str, list[Lines]]) -> None:
     """Print a row for each method."""
     print(f"| | {' | '.join(COLUMNS)} |\n{'|---' * (len(COLUMNS) + 1)}|")
-    baseline = "whole-episode" if "whole-episode" in seeds else "episodic"
+    baseline = "episodic-whole-episode" if "episodic-whole-episode" in seeds else "episodic"
     for method, runs in seeds.items():
-        others = None if method == baseline else seeds[baseline]
-        area = describe(mean_returns(runs), others and mean_returns(others))
-        end = describe(last(runs, RETURN), others and last(others, RETURN))
+        others = seeds[baseline]
         deterministic = last(runs, DETERMINISTIC)
-        low, high = area["iqm 95%"]
         cells = [
-            *(
-                METHODS[method],
-                str(area["n"]),
-                format_mean(mean_returns(runs)),
-                f"{area['iqm']:.2f} [{low:.2f}, {high:.2f}]",
-            ),
-            *(f"{area['above baseline']:.2f}" if others else "", format_p(area)),
-            *(format_mean(last(runs, RETURN)), format_p(end), format_mean(deterministic) if deterministic else "-"),
+            *(METHODS[method], str(len(runs))),
+            *compare(mean_returns(runs), mean_returns(others)),
+            *compare(last(runs, RETURN), last(others, RETURN)),
+            format_mean(deterministic) if deterministic else "-",
         ]
         print(f"| {' | '.join(cells)} |")
+
+
+def compare(values: list[float], others: list[float]) -> tuple[str, str, str]:
+    """Return mean and deviation, the difference to others by seed, and p."""
+    if values == others:
+        return format_mean(values), "", ""
+    difference = np.subtract(values, others[: len(values)])
+    error, p = np.std(difference, ddof=1) / np.sqrt(len(difference)), wilcoxon(difference).pvalue
+    p_text = f"{p:.2g}".lstrip("0") if p >= 0.001 else "< .001"
+    return format_mean(values), f"{np.mean(difference):.2f} ± {error:.2f}", p_text
 
 
 def format_mean(values: list[float]) -> str:
     return f"{np.mean(values):.2f} ± {np.std(values, ddof=1):.2f}"
 
 
-def format_p(row: dict[str, Any]) -> str:
-    if "p" not in row:
-        return ""
-    return "< .001" if row["p"] < 0.001 else f"{row['p']:.2g}".lstrip("0")
-
-
 def draw(tasks: dict[str, dict[str, list[Lines]]]) -> str:
-    """Draw a panel for each task: the mean over seeds, and two standard errors on each side."""
+    """Draw a panel for each task: the mean over seeds, and two standard errors on each side.
+
+    From the score at the end, and from the proxy, PPO is drawn with gamma = lambda = 1 where that was trained.
+    """
     with matplotlib.rc_context(
         {"font.family": "sans-serif", "font.size": 11, "svg.fonttype": "none", "svg.hashsalt": "lare"}
     ):
@@ -130,10 +126,9 @@ def draw(tasks: dict[str, dict[str, list[Lines]]]) -> str:
         for axes, (name, seeds) in zip(np.ravel(figure.subplots(1, len(tasks))), tasks.items(), strict=True):
             task = TASKS[name]
             for method, colour in CURVES.items():
-                if method not in seeds:
-                    continue
-                steps = np.array([line["step"] for line in seeds[method][0]]) / 1000
-                returns = np.array([[line[RETURN] for line in lines] for lines in seeds[method]])
+                runs = seeds.get(f"{method}-whole-episode", seeds[method])
+                steps = np.array([line["step"] for line in runs[0]]) / 1000
+                returns = np.array([[line[RETURN] for line in lines] for lines in runs])
                 mean, error = returns.mean(axis=0), returns.std(axis=0, ddof=1) / np.sqrt(len(returns))
                 axes.plot(steps, mean, color=colour, label=METHODS[method].partition(", `")[0])
                 axes.fill_between(steps, mean - 2 * error, mean + 2 * error, color=colour, alpha=0.18, linewidth=0)
