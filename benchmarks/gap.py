@@ -81,20 +81,26 @@ def hidden(task: str) -> Comparison:
     )
 
 
-def simulator(task: str, algorithm: str, steps: int) -> Comparison:
+def simulator(task: str, algorithm: str, steps: int, whole_episodes: Sequence[str] = ()) -> Comparison:
     """A simulator whose score exists only at the end: seeds 0 to 4, and 5 to 9. True rewards are what a practitioner would pay a step.
 
-    From the score at the end, PPO learns better with gamma = lambda = 1, so that it has this setting, and no other method has it.
+    Args:
+        whole_episodes: the references that learn better with gamma = lambda = 1, and have this setting.
     """
 
     def runs(name: str, suffix: str = "") -> Directories:
         return [f"{LAPTOP}/real/seeds-{first}/{task}{suffix}/{name}" for first in (0, 5)]
 
-    whole_episodes = [f"{WHY}/{task}/episodic-whole-episode/seeds-{first}" for first in (0, 5)]
+    episodic, dense = (
+        [f"{WHY}/{task}/{method}-whole-episode/seeds-{first}" for first in (0, 5)]
+        if method in whole_episodes
+        else runs(f"{method}-{algorithm}", suffix)
+        for method, suffix in (("episodic", ""), ("dense", "Proxy"))
+    )
     return Comparison(
         steps,
-        whole_episodes if algorithm == "ppo" else runs(f"episodic-{algorithm}"),
-        runs(f"dense-{algorithm}", "Proxy"),
+        episodic,
+        dense,
         {"rrdu": runs(f"rrdu-{algorithm}")},
         runs(f"lare-rrdu-{algorithm}-published"),
         runs(f"lare-bayes-{algorithm}"),
@@ -107,8 +113,8 @@ TEN_SEEDS = "scores/cheetah/HalfCheetah-v4,paidonce"
 THRESHOLD = "scores/threshold/HalfCheetahThreshold-v4"
 COMPARISONS = {
     "wheat, SAC": simulator("Wheat", "sac", 6_000),
-    "traffic, PPO": simulator("Traffic", "ppo", 36_000),
-    "job shop, PPO": simulator("JobShop", "ppo", 100_000),
+    "traffic, PPO": simulator("Traffic", "ppo", 36_000, ["episodic"]),
+    "job shop, PPO": simulator("JobShop", "ppo", 100_000, ["episodic", "dense"]),
     f"{HALF_CHEETAH}, TD3, short": Comparison(
         30_000,
         [f"{TEN_SEEDS}/episodic"],

@@ -89,22 +89,22 @@ def print_table(seeds: dict[str, list[Lines]]) -> None:
     print(f"| | {' | '.join(COLUMNS)} |\n{'|---' * (len(COLUMNS) + 1)}|")
     baseline = "episodic-whole-episode" if "episodic-whole-episode" in seeds else "episodic"
     for method, runs in seeds.items():
-        others = seeds[baseline]
+        reference = seeds[baseline]
         deterministic = last(runs, DETERMINISTIC)
         cells = [
             *(METHODS[method], str(len(runs))),
-            *compare(mean_returns(runs), mean_returns(others)),
-            *compare(last(runs, RETURN), last(others, RETURN)),
+            *compare(mean_returns(runs), mean_returns(reference)),
+            *compare(last(runs, RETURN), last(reference, RETURN)),
             format_mean(deterministic) if deterministic else "-",
         ]
         print(f"| {' | '.join(cells)} |")
 
 
-def compare(values: list[float], others: list[float]) -> tuple[str, str, str]:
-    """Return mean and deviation, the difference to others by seed, and p."""
-    if values == others:
+def compare(values: list[float], reference: list[float]) -> tuple[str, str, str]:
+    """Return mean and deviation, the difference to reference by seed, and p."""
+    if values == reference:
         return format_mean(values), "", ""
-    difference = np.subtract(values, others[: len(values)])
+    difference = np.subtract(values, reference[: len(values)])
     error, p = np.std(difference, ddof=1) / np.sqrt(len(difference)), wilcoxon(difference).pvalue
     p_text = f"{p:.2g}".lstrip("0") if p >= 0.001 else "< .001"
     return format_mean(values), f"{np.mean(difference):.2f} ± {error:.2f}", p_text
