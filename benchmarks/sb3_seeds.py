@@ -141,7 +141,8 @@ def train(setting: Setting, rewards: str, seed: int) -> list[Line]:
             callbacks = [CreditCallback(credit)]
         else:
             arguments |= {"replay_buffer_class": CreditReplayBuffer, "replay_buffer_kwargs": {"credit": credit}}
-    model = setting.model("MlpPolicy", setting.make(rewards), **arguments)
+    training_env = setting.make(rewards)
+    model = setting.model("MlpPolicy", training_env, **arguments)
     env, resets = setting.resets()
     lines: list[Line] = []
 
@@ -152,8 +153,8 @@ def train(setting: Setting, rewards: str, seed: int) -> list[Line]:
     model.learn(
         setting.steps, log_interval=1_000_000, callback=[*callbacks, Evaluations(setting.evaluate_every, report)]
     )
-    for simulator in (env, model.get_env()):
-        simulator.close()
+    env.close()
+    training_env.close()
     return lines
 
 

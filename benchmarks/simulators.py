@@ -105,7 +105,7 @@ def compare(values: list[float], reference: list[float]) -> tuple[str, str, str]
     if values == reference:
         return format_mean(values), "", ""
     difference = np.subtract(values, reference[: len(values)])
-    error, p = np.std(difference, ddof=1) / np.sqrt(len(difference)), wilcoxon(difference).pvalue
+    error, p = np.std(difference, ddof=1) / np.sqrt(len(difference)), float(np.asarray(wilcoxon(difference))[1])
     p_text = f"{p:.2g}".lstrip("0") if p >= 0.001 else "< .001"
     return format_mean(values), f"{np.mean(difference):.2f} ± {error:.2f}", p_text
 
