@@ -168,14 +168,15 @@ def read_seeds(path: Path) -> dict[int, list[Line]]:
 
 
 def tabulate(name: str, rewards: tuple[str, ...], steps: int) -> None:
-    """Write the mean returns of the last quarter of the evaluations and of all, and each method beside `episodic`."""
+    """Write the mean returns of the last quarter of the evaluations and of all, and each method beside the score at the end."""
     tables = {}
     for measure, after in (("late", 0.75), ("area", 0.0)):
         returns = {}
         for method in rewards:
             seeds = read_seeds(RESULTS / f"{name}-{method}.jsonl").values()
             returns[method] = [mean_return(lines, after * steps) for lines in seeds]
-        tables[measure] = {method: describe(values, returns["episodic"]) for method, values in returns.items()}
+        baseline = returns.get("whole-episode", returns["episodic"])
+        tables[measure] = {method: describe(values, baseline) for method, values in returns.items()}
         for method, row in tables[measure].items():
             print(f"{measure} {method:12s}", {key: np.round(value, 3).tolist() for key, value in row.items()})
     write(f"plugs/{name}", {"tables": tables})
