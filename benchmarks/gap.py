@@ -56,6 +56,9 @@ class Comparison:
 
 LEARNING, SWEEP, GPU = "learning", "sweeps/closed-form", "closed-form-gpu"
 LAPTOP, FULL, WHY = "reproduce/laptop", "sweeps/closed-form-full", "why"
+WHOLE_EPISODE = "-whole-episode"
+STYLE = {"font.family": "sans-serif", "font.size": 11, "svg.fonttype": "none", "svg.hashsalt": "lare"}
+"""Of pictures."""
 
 
 def particles(task: str) -> Comparison:
@@ -81,30 +84,33 @@ def hidden(task: str) -> Comparison:
     )
 
 
+def simulator_runs(task: str, algorithm: str, method: str) -> Directories:
+    """The runs of a method on a simulator: seeds 0 to 4, and 5 to 9. METHOD-whole-episode is PPO with gamma = lambda = 1."""
+    if method.endswith(WHOLE_EPISODE):
+        return [f"{WHY}/{task}/{method}/seeds-{first}" for first in (0, 5)]
+    suffix = "-published" if method == "lare-rrdu" else ""
+    environment = f"{task}Proxy" if method == "dense" else task
+    return [f"{LAPTOP}/real/seeds-{first}/{environment}/{method}-{algorithm}{suffix}" for first in (0, 5)]
+
+
 def simulator(task: str, algorithm: str, steps: int, whole_episodes: Sequence[str] = ()) -> Comparison:
-    """A simulator whose score exists only at the end: seeds 0 to 4, and 5 to 9. True rewards are what a practitioner would pay a step.
+    """A simulator whose score exists only at the end. A dense proxy of the score takes the place of true rewards.
 
     Args:
         whole_episodes: the references that learn better with gamma = lambda = 1, and have this setting.
     """
 
-    def runs(name: str, suffix: str = "") -> Directories:
-        return [f"{LAPTOP}/real/seeds-{first}/{task}{suffix}/{name}" for first in (0, 5)]
+    def runs(method: str) -> Directories:
+        return simulator_runs(task, algorithm, method + WHOLE_EPISODE if method in whole_episodes else method)
 
-    episodic, dense = (
-        [f"{WHY}/{task}/{method}-whole-episode/seeds-{first}" for first in (0, 5)]
-        if method in whole_episodes
-        else runs(f"{method}-{algorithm}", suffix)
-        for method, suffix in (("episodic", ""), ("dense", "Proxy"))
-    )
     return Comparison(
         steps,
-        episodic,
-        dense,
-        {"rrdu": runs(f"rrdu-{algorithm}")},
-        runs(f"lare-rrdu-{algorithm}-published"),
-        runs(f"lare-bayes-{algorithm}"),
-        runs(f"bayes-{algorithm}"),
+        runs("episodic"),
+        runs("dense"),
+        {"rrdu": runs("rrdu")},
+        runs("lare-rrdu"),
+        runs("lare-bayes"),
+        runs("bayes"),
     )
 
 
@@ -297,9 +303,7 @@ def estimate_share(comparisons: Sequence[Comparison], method: str) -> tuple[floa
 
 def draw(rows: Mapping[str, Mapping[str, tuple[float, float, float]]]) -> str:
     """A row for each task, and one for the mean over tasks."""
-    with matplotlib.rc_context(
-        {"font.family": "sans-serif", "font.size": 11, "svg.fonttype": "none", "svg.hashsalt": "lare"}
-    ):
+    with matplotlib.rc_context(STYLE):
         figure = Figure(figsize=(8, 0.75 * len(rows) + 1.2))
         axes = figure.subplots()
         for index, estimates in enumerate(rows.values()):

@@ -1,6 +1,6 @@
 """Training on simulators whose score exists only at the end: the kept runs of `lare-rl reproduce real`.
 
-    PYTHONPATH=benchmarks python benchmarks/simulators.py [--runs RUNS]
+    PYTHONPATH=benchmarks python benchmarks/simulators.py
 
 For each task and method, a table has the mean of all evaluations, and the score at the end of training, of the sampled and of the
 deterministic policy. *More* is the mean difference to learning from the score at the end alone, in the better of its settings, with
@@ -14,14 +14,12 @@ from typing import Any, NamedTuple
 
 import matplotlib
 import numpy as np
-import tyro
 from matplotlib.figure import Figure
 from scipy.stats import wilcoxon
 
+from gap import RESULTS, STYLE, WHOLE_EPISODE, simulator_runs
 from lare_rl.report.figures import COLOURS, add_white_background, to_svg
 
-RESULTS = Path(__file__).parent / "results"
-RUNS = RESULTS / "reproduce" / "laptop" / "real"
 PICTURE = Path(__file__).parents[1] / "docs" / "pictures" / "simulators.svg"
 
 
@@ -57,19 +55,12 @@ RETURN, DETERMINISTIC = "evaluation/return", "evaluation/deterministic_return"
 Lines = list[dict[str, Any]]
 
 
-def read_seeds(runs: Path, task: str, method: str) -> list[Lines]:
-    """Return the evaluations of each seed. Runs that have not finished are left out."""
-    suffix = "-published" if method == "lare-rrdu" else ""
-    run = f"{task}{'Proxy' if method == 'dense' else ''}/{method}-{TASKS[task].algorithm}{suffix}"
+def read_seeds(task: str, method: str) -> list[Lines]:
+    """Return the evaluations of each seed; nothing if the method was not trained on the task."""
     seeds: dict[int, Lines] = {}
-    files = runs.glob(f"seeds-*/{run}/metrics.jsonl")
-    if method.endswith("whole-episode"):
-        files = (RESULTS / "why" / task / method).glob("seeds-*/metrics.jsonl")
-    for file in sorted(files):
-        lines = [json.loads(line) for line in file.read_text().splitlines()]
-        settings = json.loads((file.parent / "config.json").read_text())["settings"]
-        is_finished = sum(line["step"] == settings["steps"] for line in lines) == settings["seeds"]
-        for line in lines if is_finished else []:
+    for directory in simulator_runs(task, TASKS[task].algorithm, method):
+        path = RESULTS / directory / "metrics.jsonl"
+        for line in map(json.loads, path.read_text().splitlines() if path.exists() else []):
             seeds.setdefault(line["seed"], []).append(line)
     return [lines for _, lines in sorted(seeds.items())]
 
@@ -119,14 +110,12 @@ def draw(tasks: dict[str, dict[str, list[Lines]]]) -> str:
 
     From the score at the end, and from the proxy, PPO is drawn with gamma = lambda = 1 where that was trained.
     """
-    with matplotlib.rc_context(
-        {"font.family": "sans-serif", "font.size": 11, "svg.fonttype": "none", "svg.hashsalt": "lare"}
-    ):
+    with matplotlib.rc_context(STYLE):
         figure = Figure(figsize=(11, 3.2), layout="constrained")
         for axes, (name, seeds) in zip(np.ravel(figure.subplots(1, len(tasks))), tasks.items(), strict=True):
             task = TASKS[name]
             for method, colour in CURVES.items():
-                runs = seeds.get(f"{method}-whole-episode", seeds[method])
+                runs = seeds.get(method + WHOLE_EPISODE, seeds[method])
                 steps = np.array([line["step"] for line in runs[0]]) / 1000
                 returns = np.array([[line[RETURN] for line in lines] for lines in runs])
                 mean, error = returns.mean(axis=0), returns.std(axis=0, ddof=1) / np.sqrt(len(returns))
@@ -142,18 +131,16 @@ def draw(tasks: dict[str, dict[str, list[Lines]]]) -> str:
     return add_white_background(to_svg(figure))
 
 
-def main(runs: Path = RUNS) -> None:
-    """Print the tables, and draw the picture if all its runs are there."""
+def main() -> None:
+    """Print the tables, and draw the picture."""
     tasks = {}
     for name in TASKS:
-        seeds = {method: read_seeds(runs, name, method) for method in METHODS}
+        seeds = {method: read_seeds(name, method) for method in METHODS}
         tasks[name] = {method: lines for method, lines in seeds.items() if lines}
-        if seeds["episodic"]:
-            print(f"\n{name}\n")
-            print_table(tasks[name])
-    if all("dense" in seeds for seeds in tasks.values()):
-        PICTURE.write_text(draw(tasks) + "\n", encoding="utf-8")
+        print(f"\n{name}\n")
+        print_table(tasks[name])
+    PICTURE.write_text(draw(tasks) + "\n", encoding="utf-8")
 
 
 if __name__ == "__main__":
-    tyro.cli(main, description=__doc__)
+    main()

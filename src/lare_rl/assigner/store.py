@@ -76,11 +76,11 @@ class Store:
         self.longest = longest
         try:
             self.inputs = np.zeros((capacity, *row_shape), np.float32)
+            """The decoder's inputs for each step: [capacity *agents inputs]."""
         except (MemoryError, ValueError) as error:  # ValueError: more numbers than NumPy can count
             raise LareError(
                 f"capacity = {capacity} steps do not fit into the memory: make it (or memory of relabel) smaller"
             ) from error
-        """The decoder's inputs for each step: [capacity *agents inputs]."""
         self.alive: Bool[np.ndarray, "capacity agents"] | None = None
         """Which agents acted. None: all of them."""
         self.length = np.zeros(capacity, np.int32)

@@ -116,7 +116,7 @@ def _prepare(
 def _load_functions(
     files: "Sequence[Path | LatentFunction]", spec: "TaskSpec", resolved: ResolvedSettings
 ) -> "Sequence[LatentFunction]":
-    """Load and verify the latent functions of a run, and report those that were changed by hand."""
+    """Load and verify the latent functions of a run. Report a function that was changed by hand."""
     from lare_rl.latent.function import CHANGED_SUFFIX
     from lare_rl.training.latent_functions import choose_functions
 

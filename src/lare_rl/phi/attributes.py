@@ -1,4 +1,4 @@
-"""What a program can import, and which attributes its values have: those that this file names, and no others."""
+"""The modules that a program can import, and the attributes of its values. This file names all of them."""
 
 import ast
 import difflib

@@ -44,7 +44,7 @@ MIN_SPEED_UP = 2.0
 N_REPETITIONS = 5
 """How often a factorisation is timed."""
 N_STARTS = 3
-"""The starts of `evidence.fit`, each of which factorises a matrix."""
+"""The number of starts of `evidence.fit`. Each start factorises a matrix."""
 MIN_FEATURES = 32
 """The least size of the matrices."""
 
