@@ -13,7 +13,7 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import matplotlib
 import numpy as np
@@ -57,7 +57,7 @@ class Comparison:
 LEARNING, SWEEP, GPU = "learning", "sweeps/closed-form", "closed-form-gpu"
 LAPTOP, FULL, WHY = "reproduce/laptop", "sweeps/closed-form-full", "why"
 WHOLE_EPISODE = "-whole-episode"
-STYLE = {"font.family": "sans-serif", "font.size": 11, "svg.fonttype": "none", "svg.hashsalt": "lare"}
+STYLE: Any = {"font.family": "sans-serif", "font.size": 11, "svg.fonttype": "none", "svg.hashsalt": "lare"}
 """Of pictures."""
 
 
