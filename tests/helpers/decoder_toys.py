@@ -26,7 +26,7 @@ def make_decoder(name, sizes, steps, agents=1, seed=0, **settings):
         agents=agents,
         max_steps=steps,
     )
-    return DECODERS[name].init_network(jax.random.key(seed), spec)
+    return DECODERS[name].load_init()(jax.random.key(seed), spec)
 
 
 def random_rows(*shape):

@@ -15,10 +15,7 @@ from lare_rl.errors import LareError, short_repr
 from lare_rl.util.plugins import Registry
 
 if TYPE_CHECKING:  # importing JAX takes longer than all else that the command line does before it shows a message
-    from jaxtyping import PRNGKeyArray
-
     from lare_rl.credit.decoder_network import DecoderNetwork
-    from lare_rl.credit.spec import CreditSpec
 
 __all__ = ["DECODERS", "RBT_STEPS", "Decoder", "register_decoder"]
 
@@ -28,8 +25,9 @@ class Decoder:
     """A kind of decoder."""
 
     name: str
-    init: "Callable[[PRNGKeyArray, CreditSpec], DecoderNetwork] | str"
-    """A class or function that returns an untrained decoder, or its place as `module:name`, which is imported when it is needed."""
+    init: "Callable[..., DecoderNetwork] | str"
+    """A class or function that returns an untrained decoder from a random key and a `CreditSpec`. `module:name` is imported when it
+    is needed."""
     settings: frozenset[str] = frozenset()
     """The names of the `CreditSettings` that `init` reads."""
     whole_episodes: bool = False
@@ -57,10 +55,9 @@ class Decoder:
                 f"decoder {self.name}: a decoder that pays shares of an episode's return needs whole_episodes"
             )
 
-    def init_network(self, key: "PRNGKeyArray", spec: "CreditSpec") -> "DecoderNetwork":
-        """Return an untrained decoder."""
-        init = resolve_name(self.init) if isinstance(self.init, str) else self.init
-        return init(key, spec)
+    def load_init(self) -> "Callable[..., DecoderNetwork]":
+        """Return `init`, imported."""
+        return resolve_name(self.init) if isinstance(self.init, str) else self.init
 
 
 RBT_STEPS = 512

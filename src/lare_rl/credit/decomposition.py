@@ -119,7 +119,7 @@ class DecoderState(NamedTuple):
 def init(key: PRNGKeyArray, spec: CreditSpec) -> DecoderState:
     """Return the state with an untrained decoder. All other functions need the same settings and score types."""
     method, settings, basis = spec.method, spec.settings, spec.basis
-    network = method.decoder_kind.init_network(key, spec)
+    network = method.decoder_kind.load_init()(key, spec)
     for leaf in jax.tree.leaves(network):
         if not eqx.is_array_like(leaf):
             raise LareError(

@@ -20,11 +20,12 @@ from typing import Any, NoReturn
 
 import numpy as np
 
+from lare_rl.phi.batch_axis import BATCH, BatchSize, Layout, common_batch_axis
 from lare_rl.phi.builder import current_builder
 from lare_rl.phi.graph import NumberKind, all_positions, widest
 from lare_rl.phi.indices import ALL, computed_positions, fixed_index, index_entries, is_mask, masked_index, overwrite
 from lare_rl.phi.limits import RefusedError
-from lare_rl.phi.operand import BATCH, BatchSize, Operand, common_batch_axis, program_shape
+from lare_rl.phi.operand import Operand
 from lare_rl.phi.rearrange import Source, leaves, map_leaves, move
 from lare_rl.phi.values import describe
 
@@ -65,8 +66,12 @@ class Array(_Value):
         return current_builder().nodes[self._node].shape if self.positions is None else self.positions.shape
 
     @property
+    def layout(self) -> Layout:
+        return Layout(self.row_shape, self.batch_axis)
+
+    @property
     def shape(self) -> tuple[Any, ...]:
-        return program_shape(self.row_shape, self.batch_axis)
+        return self.layout.shape
 
     @property
     def ndim(self) -> int:
@@ -164,14 +169,14 @@ class Array(_Value):
     def __getitem__(self, index: Any) -> Any:
         entries = self._entries(index)
         if entries and is_mask(entries[0]):
-            return Masked(self[masked_index(self, entries)], entries[0])
+            return Masked(self[masked_index(self.layout, entries)], entries[0])
         if any(isinstance(entry, Array) for entry in entries):
-            positions = computed_positions(self, entries, as_array)
+            positions = computed_positions(self.layout, entries, as_array)
             return Array(current_builder().take(self.node, positions.node), positions.batch_axis)
         if self.batch_axis is not None and isinstance([e for e in entries if e is not None][self.batch_axis], int):
             shape = np.empty(self.row_shape)[tuple(0 if isinstance(entry, int) else entry for entry in entries)].shape
             return Array(current_builder().add("first_row", (), shape, self.kind), None)
-        return self.moved(*fixed_index(self, entries))
+        return self.moved(*fixed_index(self.source, entries))
 
     def select(self, axis: int, index: Any) -> Any:
         """Return x[index] along an axis that is counted from the front."""
@@ -187,25 +192,25 @@ class Array(_Value):
                 text = "x[mask] = y differs from row to row: write x[mask] = y[mask], or np.where(mask, y, x)"
                 raise ValueError(text)
             value = elementwise("where", region.mask_for(region.values), value, region.values)
-            self[masked_index(self, entries)] = value
+            self[masked_index(self.layout, entries)] = value
         elif any(isinstance(entry, Array) for entry in entries):
-            positions = computed_positions(self, entries, as_array)
+            positions = computed_positions(self.layout, entries, as_array)
             current_builder().check_size((math.prod(positions.row_shape), math.prod(self.row_shape)))
             values = broadcast(as_array(value), positions.shape)
             self[...] = Array(overwrite(self.node, positions.node, values.node), self.batch_axis)
         else:
-            self._write(value, *fixed_index(self, entries))
+            self._write(value, *fixed_index(self.source, entries))
 
     def _entries(self, index: Any) -> list[Any]:
         items = index if isinstance(index, tuple) else (index,)
-        return index_entries(self, [as_array(x) if isinstance(x, (list, tuple, range)) else x for x in items])
+        return index_entries(self.layout, [as_array(x) if isinstance(x, (list, tuple, range)) else x for x in items])
 
     def _write(self, value: Any, positions: np.ndarray, batch_axis: int | None) -> None:
         """Write into positions of the base."""
         base, builder = self.base, current_builder()
         if base.read_only:
             raise ValueError("the inputs cannot be written into: copy them first, x = observation.copy()")
-        values = broadcast(as_array(value), program_shape(positions.shape, batch_axis))
+        values = broadcast(as_array(value), Layout(positions.shape, batch_axis).shape)
         sources = all_positions(base.row_shape)
         sources.reshape(-1)[positions.reshape(-1)] = sources.size + np.arange(positions.size)
         base._node = builder.gather(builder.concat([base._node, builder.cast(values.node, base.kind)]), sources)
@@ -278,7 +283,7 @@ def elementwise(op: str, *operands: Any) -> Any:
         result = elementwise(op, *(value.values if isinstance(value, Masked) else value for value in operands))
         return Masked(result, *masks.values())
     arrays = [as_array(operand) for operand in operands]
-    batch_axis = common_batch_axis(arrays)
+    batch_axis = common_batch_axis([array.layout for array in arrays])
     builder, nodes = current_builder(), [array.node for array in arrays]
     return Array(builder.where(*nodes) if op == "where" else builder.elementwise(op, *nodes), batch_axis)
 

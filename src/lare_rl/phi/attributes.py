@@ -10,10 +10,10 @@ from typing import Any
 import numpy as np
 
 from lare_rl.phi.arrays import Array, Complex, Masked
+from lare_rl.phi.batch_axis import BatchSize
 from lare_rl.phi.complex_numbers import call_with_complex
 from lare_rl.phi.limits import RefusedError
 from lare_rl.phi.numpy_functions import FUNCTIONS, INDEXED, KIND_OF_DTYPE, Polynomial, call_numpy, find_hint
-from lare_rl.phi.operand import BatchSize
 from lare_rl.phi.python_functions import BUILTINS
 from lare_rl.phi.runtime import Runtime
 from lare_rl.phi.text import METHODS, call_method

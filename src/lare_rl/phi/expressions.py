@@ -6,10 +6,11 @@ from collections.abc import Callable, Iterable, Sequence
 from typing import Any
 
 from lare_rl.phi.arrays import Array, Complex, as_array
+from lare_rl.phi.batch_axis import BatchSize
 from lare_rl.phi.calls import define_function, super_object
 from lare_rl.phi.limits import MAX_INT_BITS, RefusedError
 from lare_rl.phi.numpy_functions import INDEXED, call_numpy
-from lare_rl.phi.operand import BatchSize, Operand
+from lare_rl.phi.operand import Operand
 from lare_rl.phi.runtime import Runtime, check_key, check_number, check_text
 from lare_rl.phi.text import combine_values, format_value
 from lare_rl.phi.values import Class, Function, Instance, Iterator, Scope, Set, Symbol, describe

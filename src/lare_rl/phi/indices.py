@@ -8,17 +8,15 @@ from __future__ import annotations
 import math
 import operator
 from collections.abc import Callable, Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
+from lare_rl.phi.batch_axis import BatchSize, Layout
 from lare_rl.phi.builder import current_builder
 from lare_rl.phi.graph import all_positions
 from lare_rl.phi.limits import RefusedError
-from lare_rl.phi.operand import BatchSize
-
-if TYPE_CHECKING:
-    from lare_rl.phi.arrays import Array
+from lare_rl.phi.rearrange import Source
 
 __all__ = ["ALL", "computed_positions", "fixed_index", "index_entries", "is_mask", "masked_index", "overwrite"]
 
@@ -30,7 +28,7 @@ def is_mask(entry: Any) -> bool:
     return getattr(entry, "kind", None) == "bool"
 
 
-def index_entries(array: Array, items: Sequence[Any]) -> list[Any]:
+def index_entries(layout: Layout, items: Sequence[Any]) -> list[Any]:
     """Return an index as an entry for each axis, and None for each new one: slices, integers, arrays of integers."""
     entries: list[Any] = []
     for item in items:
@@ -49,10 +47,10 @@ def index_entries(array: Array, items: Sequence[Any]) -> list[Any]:
             entries.append(operator.index(item))
     n_axes = sum(entry.ndim if is_mask(entry) else 1 for entry in entries if entry is not None and entry is not ...)
     ellipses = [i for i, entry in enumerate(entries) if entry is ...]
-    if n_axes > array.ndim or len(ellipses) > 1:
-        raise IndexError(f"too many indices for an array of the shape {array.shape}")
+    if n_axes > layout.ndim or len(ellipses) > 1:
+        raise IndexError(f"too many indices for an array of the shape {layout.shape}")
     i = ellipses[0] if ellipses else len(entries)
-    return [*entries[:i], *[ALL] * (array.ndim - n_axes), *entries[i + 1 :]]
+    return [*entries[:i], *[ALL] * (layout.ndim - n_axes), *entries[i + 1 :]]
 
 
 def _read_slice(entry: slice) -> slice:
@@ -60,46 +58,47 @@ def _read_slice(entry: slice) -> slice:
     return slice(*(None if end is None else operator.index(end) for end in (entry.start, stop, entry.step)))
 
 
-def fixed_index(array: Array, entries: Sequence[Any]) -> tuple[np.ndarray, int | None]:
+def fixed_index(source: Source, entries: Sequence[Any]) -> tuple[np.ndarray, int | None]:
     """Return the positions that an index selects, and where the batch axis then is.
 
     Raises:
         RefusedError: it selects rows of the batch, or too many numbers.
     """
+    layout = source.layout
     axes = [entry for entry in entries if entry is not None]
-    if array.batch_axis is not None and axes[array.batch_axis] not in (ALL, slice(0, None), slice(0, None, 1)):
-        raise RefusedError("E-ROWS", f"an index into the rows of {array.shape} takes one row for all: write x[:, i]")
+    if layout.batch_axis is not None and axes[layout.batch_axis] not in (ALL, slice(0, None), slice(0, None, 1)):
+        raise RefusedError("E-ROWS", f"an index into the rows of {layout.shape} takes one row for all: write x[:, i]")
     # NumPy finds the shape on an array without numbers: the batch axis, or else a last axis, has the length 0.
-    at = array.ndim if array.batch_axis is None else array.batch_axis
-    index = (*entries, ALL) if array.batch_axis is None else tuple(entries)
-    shape = np.empty((*array.row_shape[:at], 0, *array.row_shape[at + 1 :]))[index].shape
+    at = layout.ndim if layout.batch_axis is None else layout.batch_axis
+    index = (*entries, ALL) if layout.batch_axis is None else tuple(entries)
+    shape = np.empty((*layout.row_shape[:at], 0, *layout.row_shape[at + 1 :]))[index].shape
     is_empty = shape.count(0) > 1
     current_builder().spend(current_builder().check_size([0 if is_empty else max(size, 1) for size in shape]))
-    return np.asarray(array.source.positions[tuple(entries)]), None if array.batch_axis is None else shape.index(0)
+    return np.asarray(source.positions[tuple(entries)]), None if layout.batch_axis is None else shape.index(0)
 
 
-def masked_index(array: Array, entries: Sequence[Any]) -> tuple[Any, ...]:
+def masked_index(layout: Layout, entries: Sequence[Any]) -> tuple[Any, ...]:
     """Return the index of all numbers that the mask in front of an index may select."""
     mask = entries[0]
-    if mask.batch_axis != array.batch_axis or mask.row_shape != array.row_shape[: mask.ndim]:
-        raise IndexError(f"a mask of the shape {mask.shape} does not fit an array of the shape {array.shape}")
+    if mask.batch_axis != layout.batch_axis or mask.row_shape != layout.row_shape[: mask.ndim]:
+        raise IndexError(f"a mask of the shape {mask.shape} does not fit an array of the shape {layout.shape}")
     if not all(isinstance(entry, (int, slice)) for entry in entries[1:]):
         raise RefusedError("E-NUMPY", "an index with a mask may contain integers and slices only")
     return (ALL,) * mask.ndim + tuple(entries[1:])
 
 
-def computed_positions(array: Array, entries: Sequence[Any], as_array: Callable[[Any], Any]) -> Any:
+def computed_positions(layout: Layout, entries: Sequence[Any], as_array: Callable[[Any], Any]) -> Any:
     """Return the array of the positions of x[np.arange(batch), i, 2:4] in a row.
 
     Each row reads its own numbers, or those of a constant. A computed index beyond the end of an axis stands for the last
     entry.
     """
     computed = as_array(0)
-    axes = iter(range(array.ndim))
+    axes = iter(range(layout.ndim))
     for entry in entries:
         axis = None if entry is None else next(axes)
-        size, stride = (1, 0) if axis is None else (array.row_shape[axis], math.prod(array.row_shape[axis + 1 :]))
-        if axis is not None and axis == array.batch_axis:
+        size, stride = (1, 0) if axis is None else (layout.row_shape[axis], math.prod(layout.row_shape[axis + 1 :]))
+        if axis is not None and axis == layout.batch_axis:
             if entry is None or not getattr(entry, "is_row_number", False) or math.prod(entry.row_shape) != size:
                 raise RefusedError("E-ROWS", "an index that differs from row to row is x[np.arange(len(x)), i]")
             rows = as_array(np.arange(size) * stride).reshaped(entry.row_shape, entry.batch_axis)
@@ -107,7 +106,7 @@ def computed_positions(array: Array, entries: Sequence[Any], as_array: Callable[
         elif not isinstance(entry, slice) and entry is not None:
             computed = _clamp(as_array(entry), size) * stride + computed
     arrays = [i for i, entry in enumerate(entries) if not isinstance(entry, slice) and entry is not None]
-    starts = all_positions(array.row_shape)[tuple(0 if i in arrays else entry for i, entry in enumerate(entries))]
+    starts = all_positions(layout.row_shape)[tuple(0 if i in arrays else entry for i, entry in enumerate(entries))]
     current_builder().check_size((*starts.shape, *computed.row_shape))
     # If slices are between arrays, the axes of the arrays come first in the result.
     before = arrays[0] if arrays == list(range(arrays[0], arrays[-1] + 1)) else 0

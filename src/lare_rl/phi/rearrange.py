@@ -12,9 +12,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from lare_rl.phi.batch_axis import BatchSize, Layout
 from lare_rl.phi.builder import current_builder
 from lare_rl.phi.limits import RefusedError
-from lare_rl.phi.operand import BatchSize, program_shape
 
 __all__ = ["Source", "leaves", "map_leaves", "move"]
 
@@ -24,6 +24,10 @@ class Source(NamedTuple):
 
     positions: np.ndarray
     batch_axis: int | None
+
+    @property
+    def layout(self) -> Layout:
+        return Layout(self.positions.shape, self.batch_axis)
 
     def labels(self, n_rows: int, size: int) -> np.ndarray:
         """Return the labels of some rows. Numbers without a batch axis count as a row behind all others."""
@@ -60,7 +64,7 @@ def move(
         rows = map_leaves(lambda source: source.labels(n_rows, size) if n_rows > 1 else source.positions, sources)
         return function(rows, *(_plain(value, n_rows) for value in args))
 
-    shapes = " and ".join(dict.fromkeys(str(program_shape(x.positions.shape, x.batch_axis)) for x in inputs))
+    shapes = " and ".join(dict.fromkeys(str(x.layout.shape) for x in inputs))
     try:
         result = apply(1)
     except (ValueError, IndexError) as error:

@@ -7,8 +7,9 @@ from collections.abc import Sequence
 from typing import Any
 
 from lare_rl.phi.arrays import Array
+from lare_rl.phi.batch_axis import BatchSize
 from lare_rl.phi.limits import RefusedError
-from lare_rl.phi.operand import BatchSize, Operand
+from lare_rl.phi.operand import Operand
 from lare_rl.phi.runtime import Meter, Runtime, check_key, check_text, check_text_length
 from lare_rl.phi.values import Set, Symbol, value_type
 

@@ -7,7 +7,8 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
-from lare_rl.phi.operand import BatchSize, Operand
+from lare_rl.phi.batch_axis import BatchSize
+from lare_rl.phi.operand import Operand
 
 
 class _Value:

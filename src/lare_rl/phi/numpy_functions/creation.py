@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from lare_rl.phi.arrays import Array, as_array, broadcast, rearrange, stack
+from lare_rl.phi.batch_axis import BatchSize
 from lare_rl.phi.builder import current_builder
 from lare_rl.phi.limits import RefusedError
 from lare_rl.phi.numpy_functions.registry import (
@@ -25,7 +26,6 @@ from lare_rl.phi.numpy_functions.registry import (
     numpy_variants,
 )
 from lare_rl.phi.numpy_functions.shapes import meshgrid
-from lare_rl.phi.operand import BatchSize
 
 
 @numpy_function()

@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 
 from lare_rl.phi.arrays import Array, as_array, rearrange
+from lare_rl.phi.batch_axis import BatchSize
 from lare_rl.phi.builder import current_builder
 from lare_rl.phi.indices import ALL
 from lare_rl.phi.limits import RefusedError
@@ -29,7 +30,6 @@ from lare_rl.phi.numpy_functions.registry import (
     numpy_variants,
     require_constant,
 )
-from lare_rl.phi.operand import BatchSize
 
 
 def _register(names: str, convert: Callable[[Any], Any]) -> None:

@@ -9,9 +9,10 @@ from collections.abc import Callable
 from typing import Any
 
 from lare_rl.phi.arrays import Array
+from lare_rl.phi.batch_axis import BatchSize
 from lare_rl.phi.limits import RefusedError
 from lare_rl.phi.numpy_functions import call_numpy
-from lare_rl.phi.operand import BatchSize, Operand
+from lare_rl.phi.operand import Operand
 from lare_rl.phi.runtime import BUILTINS, Runtime, builtin, builtin_variants, check_number, varies
 
 SAME_IN_NUMPY = {
