@@ -419,6 +419,11 @@ def test_add_and_add_episode_refuse(values, message):
     assert (credit.store.n_ended, credit.store.dropped) == (1, 0)
 
 
+def test_method_by_default_depends_on_phi(phi):
+    assert CreditAssigner(phi=phi, task=TASK).config.method.name == "lare-bayes"
+    assert CreditAssigner(observation_space=2, action_space=1).config.method.name == "bayes"
+
+
 NO_TASK = {"task": None, "observation_space": 2, "action_space": 1}
 
 

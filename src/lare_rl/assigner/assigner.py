@@ -41,7 +41,7 @@ class CreditAssigner:
 
     def __init__(
         self,
-        method: str = "lare-bayes",
+        method: str | None = None,
         phi: LatentFunction | None = None,
         *,
         task: TaskSpec | str | Path | None = None,
@@ -62,7 +62,8 @@ class CreditAssigner:
         """Make an assigner without any steps.
 
         Args:
-            method: the name of a method. `dense` and `episodic` assign no credit.
+            method: the name of a method; the default is `lare-bayes` with a `phi`, and `bayes` without. `dense` and `episodic` assign
+                no credit.
             phi: for the methods that need one: those whose names begin with `lare-`, and `llm-reward`.
             task: the task that `phi` was designed for: a name, a path, or a spec. It decides spaces and
                 `scored_observation` if you do not give them.

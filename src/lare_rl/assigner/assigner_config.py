@@ -112,7 +112,7 @@ class AssignerConfig(CheckedModel):
 
 
 def resolve_config(
-    method: str,
+    method: str | None,
     phi: LatentFunction | None,
     task: TaskSpec | str | Path | None,
     settings: CreditSettings | None,
@@ -129,7 +129,8 @@ def resolve_config(
     Raises:
         LareError: there is no such method or task, or the spaces are not those of the task.
     """
-    task, chosen = None if task is None else resolve_task(task, playable=False), METHODS.find(method)
+    task = None if task is None else resolve_task(task, playable=False)
+    chosen = METHODS.find(method or ("bayes" if phi is None else "lare-bayes"))
     if phi is not None and not isinstance(phi, LatentFunction):
         raise LareError(f"phi is {short_repr(phi)}: give a function from lare_rl.design or lare_rl.load_function")
     settings = default_credit(agents) if settings is None else CreditSettings.model_validate(settings)

@@ -157,8 +157,7 @@ def relabel(
     task = None if task is None else resolve_task(task, playable=False)
     log = open_log(source, task)
     log.check_output(out, overwrite)
-    method = method or ("bayes" if phi is None else "lare-bayes")
-    if METHODS.find(method).reward is Reward.UNIFORM:
+    if method is not None and METHODS.find(method).reward is Reward.UNIFORM:
         raise LareError(
             f"{method} gives all steps of an episode the same reward, and needs no relabelling: compute it from the return"
         )
@@ -179,8 +178,9 @@ def relabel(
     size = _fit(credit, log, hold_out_flags(hold_out, seed), updates, listener)
     explanation, counts = tuple(credit.explanation()), _Counts()
     episodes = _compute_rewards(credit, log, hold_out_flags(hold_out, seed), size, counts, listener)
+    name = credit.config.method.name
     comment = (
-        f"Rewards by lare-rl relabel, {method}; the old rewards are in infos['paid'], after an entry for the reset."
+        f"Rewards by lare-rl relabel, {name}; the old rewards are in infos['paid'], after an entry for the reset."
     )
     path = log.write(out, episodes, overwrite, comment)
     r2, r2_error, return_correlation = predicted_return_statistics(counts.returns, counts.predictions)
@@ -188,7 +188,7 @@ def relabel(
         r2 = r2_error = math.nan
     return Relabelled(
         out=path,
-        method=method,
+        method=name,
         episodes=counts.episodes,
         steps=counts.steps,
         cut=counts.cut,
