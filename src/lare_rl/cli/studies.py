@@ -78,7 +78,7 @@ def compare(
 
     Args:
         runs: run directories, directories that contain some, such as that of a sweep, or .csv files with results of other programs
-            (docs/how-to/sweeps.md). The first method is the baseline that the others are compared with.
+            (docs/how-to/sweeps.md). The baseline is the first method, or episodic for a single directory.
         metric: the key of metrics.jsonl to compare.
         at: the step at which runs are compared; by default the last one at which all were evaluated.
         late: compare means over the evaluations after three quarters of the steps, which vary less than the last one.

@@ -17,7 +17,7 @@ __all__ = ["collect_results", "select_runs"]
 def collect_results(paths: Sequence[Path], metric: str = RETURN) -> tuple[list[LearningCurve], list[Finding]]:
     """Read the results in run directories and tables (.csv), and find what the user should know about them.
 
-    The first label is the baseline. Runs come before tables, unless the first path is a table: its first method is the baseline.
+    The first label is the baseline; of a single directory, it is `episodic`, if that was trained. Runs come before tables, unless the first path is a table: its first method is the baseline.
 
     Raises `LareError` if there is nothing to compare, or a table cannot be read.
     """
@@ -26,6 +26,8 @@ def collect_results(paths: Sequence[Path], metric: str = RETURN) -> tuple[list[L
     runs, findings = [], []
     if directories or not tables:
         runs, findings = select_runs(list(map(open_without_functions, find_run_directories(directories))), metric)
+        if len(directories) == 1:  # the user has not chosen a baseline
+            runs.sort(key=lambda run: run.config.settings.method != "episodic")
     run_results = read_run_results(label_runs(runs), metric)
     table_results = [result for path in tables for result in read_results_table(path, metric)]
     if run_results:
