@@ -33,7 +33,8 @@ CONDITIONS: dict[str, dict[str, str]] = {
         "outcome_unknown": "Returns of random actions are missing.",
     },
     "The comparison with a run of `episodic`": {
-        "above_episodic": f"The difference is more than {CLEAR_ERRORS} of its standard errors. Fewer than {MIN_SEEDS} seeds do not establish it.",
+        "above_episodic": f"The difference is more than {CLEAR_ERRORS} of its standard errors. Fewer than {MIN_SEEDS} seeds do not "
+        "establish it.",
         "like_episodic": "It is smaller.",
         "below_episodic": "It is larger, and negative.",
     },

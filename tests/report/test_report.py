@@ -135,13 +135,16 @@ def test_runs_that_cannot_be_told_apart(make_run):
 
 
 def test_discounts_of_episodic(make_run):
-    """A score at the end may be learned better without discounts."""
-    other = ReportedRun("rd", make_run("rd", [9.0], method="rd"))
+    """A score at the end may be learned better without discounts, which is said unless a run tries it."""
+    other, runs = ReportedRun("rd", make_run("rd", [9.0], method="rd")), []
     for gamma, gae_lambda, is_fair in ((0.99, 1.0, False), (1.0, 0.95, False), (1.0, 1.0, True)):
         settings = {"algorithm": "ppo", "ppo": {"gamma": gamma, "gae_lambda": gae_lambda}}
         run = make_run(f"{gamma} {gae_lambda}", [1.0], method="episodic", **settings)
-        codes = [finding.code for finding in compare_runs([other, ReportedRun("episodic", run)])]
+        runs.append(ReportedRun(run.directory.name, run))
+        codes = [finding.code for finding in compare_runs([other, runs[-1]])]
         assert ("episodic_discounts" not in codes) == is_fair
+    assert "episodic_discounts" in [finding.code for finding in compare_runs([other, *runs[:2]])]
+    assert "episodic_discounts" not in [finding.code for finding in compare_runs([other, *runs])]
 
 
 def test_names_of_runs(make_run, tmp_path):

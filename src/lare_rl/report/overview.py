@@ -150,15 +150,18 @@ def compare_runs(runs: Sequence[ReportedRun]) -> list[Finding]:
 
 
 def _episodic_discounts(runs: Sequence[ReportedRun]) -> list[Finding]:
-    """Report the discounts of PPO, if the best run on the return of the episode alone has some, and another run is compared with it."""
+    """Report the discounts of PPO, if other runs are compared with runs on the return of the episode alone that all have some."""
     episodic = _episodic_runs(runs)
     if not episodic or all(run.is_episodic for run in runs):
         return []
-    settings = episodic[0].run.config.settings.hyperparameters
-    if episodic[0].run.config.settings.algorithm != "ppo" or settings.gamma * settings.gae_lambda == 1:
+    settings = [run.run.config.settings for run in episodic]
+    discounts = [
+        (run.hyperparameters.gamma, run.hyperparameters.gae_lambda) for run in settings if run.algorithm == "ppo"
+    ]
+    if (1, 1) in discounts or settings[0].algorithm != "ppo":
         return []
-    values = {"name": episodic[0].name, "gamma": settings.gamma, "gae_lambda": settings.gae_lambda}
-    return [Finding("episodic_discounts", values)]
+    gamma, gae_lambda = discounts[0]
+    return [Finding("episodic_discounts", {"name": episodic[0].name, "gamma": gamma, "gae_lambda": gae_lambda})]
 
 
 def sort_runs(runs: Iterable[ReportedRun]) -> list[ReportedRun]:
