@@ -64,8 +64,8 @@ MESSAGES = {
         "A seed of {best} ends above a seed of {second} with probability {probability:.2f} (from {n_pairs:count pair} of seeds)."
     ),
     "episodic_discounts": (
-        "{name} learned the score at the end with gamma {gamma:g} and lambda {gae_lambda:g}. In long episodes, PPO learns it better with "
-        "1 for both: for a fair comparison, train `episodic` with `--ppo.gamma 1 --ppo.gae-lambda 1` too."
+        "{name} learned the score at the end with gamma {gamma:g} and lambda {gae_lambda:g}. In long episodes, PPO often learns it better "
+        "with 1 for both: for a fair comparison, train `episodic` with `--ppo.gamma 1 --ppo.gae-lambda 1` too."
     ),
     "different_steps": "The runs ended at different steps, from {least:,} to {most:,}.",
     # The proxy rewards
