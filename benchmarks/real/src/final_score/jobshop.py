@@ -21,6 +21,8 @@ N_JOBS, N_MACHINES, MAX_DURATION = 10, 6, 9
 CRITERIA = ("shortest operation", "longest operation", "most work remaining", "shortest next queue")
 """The criteria by which a machine selects a waiting job, by action. The action after the last one waits for a time unit."""
 WAIT = len(CRITERIA)
+MAX_DECISIONS = 400
+"""After the last one, machines start the shortest operation: every episode ends with all jobs done, and has a score."""
 N_INSTANCES = {"train": 1 << 20, "test": 200}
 JOB_ENTRIES, SHOP_ENTRIES = 5, 6
 
@@ -55,6 +57,7 @@ class JobShop(gymnasium.Env):
         self._durations = np.where(self._machines >= 0, np.asarray(self._state.ops_durations), 0)
         self._bound = lower_bound(self._machines, self._durations)
         self._total = self._durations.sum()
+        self._decisions = 0
         self._begin_time()
         self._advance()
         return self._observe(), {"instance": self._instance}
@@ -62,10 +65,10 @@ class JobShop(gymnasium.Env):
     def step(self, action: Any):
         """Let the machine that waits for a decision start a job, or wait."""
         before = self._time()
-        if int(action) != WAIT:
-            self._starts[self._machine] = self._candidates()[int(action)]
-        self._decided[self._machine] = True
-        self._advance()
+        self._decide(int(action))
+        self._decisions += 1
+        while not self._ended and self._decisions >= MAX_DECISIONS:
+            self._decide(CRITERIA.index("shortest operation"))
         terminated, makespan = self._ended, self._time()
         proxy, score = -100 * (makespan - before) / self._bound, -100 * (makespan / self._bound - 1)
         info: dict[str, Any] = {"proxy": proxy}
@@ -86,6 +89,13 @@ class JobShop(gymnasium.Env):
         axes.axvline(self._bound, color="black", linestyle="--", linewidth=1)
         axes.set(xlim=(0, 1.6 * self._bound), ylim=(-0.5, N_MACHINES - 0.5), xlabel="time", ylabel="machine")
         return to_pixels(figure)
+
+    def _decide(self, action: int) -> None:
+        """Let the machine that waits for a decision start a job, or wait, and go on to the next decision."""
+        if action != WAIT:
+            self._starts[self._machine] = self._candidates()[action]
+        self._decided[self._machine] = True
+        self._advance()
 
     def _time(self) -> int:
         return int(self._state.step_count)
