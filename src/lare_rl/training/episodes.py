@@ -136,7 +136,7 @@ def _predict_then_update(
     def body(decoder: DecoderState, episodes: CreditBatch, first: Index) -> DecoderState:
         return returns.predict_then_update(decoder, episodes, config.credit)
 
-    expected = config.n_envs * config.rollout_steps // config.longest_segment
+    expected = config.iteration_steps // config.longest_segment
     return fold_episodes(decoders, buffer, since, body, config, expected)
 
 

@@ -98,6 +98,11 @@ class TrainConfig:
         return getattr(self.hyperparameters, "warmup", 0)
 
     @property
+    def iteration_steps(self) -> int:
+        """Environment steps of a seed in an iteration."""
+        return self.rollout_steps * self.n_envs
+
+    @property
     def joint_fit(self) -> bool:
         """Whether the decoder is updated with every update of the algorithm."""
         return (

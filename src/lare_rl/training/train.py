@@ -20,8 +20,7 @@ from lare_rl.runs.metrics_file import truncate_metrics
 from lare_rl.tasks.spec import TaskSpec
 from lare_rl.training.collect_device import DeviceCollector, is_reset_cheap, make_jax_env
 from lare_rl.training.collect_host import make_host_collector
-from lare_rl.training.compiled import compile_ahead, init_seeds, is_batching_faster
-from lare_rl.training.iteration import compile_loop
+from lare_rl.training.compiled import compile_ahead, compile_loop, init_seeds, is_batching_faster
 from lare_rl.training.latent_functions import FunctionOrPath, choose_functions
 from lare_rl.training.learner import Learner
 from lare_rl.training.loop import run_session
