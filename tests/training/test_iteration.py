@@ -16,8 +16,7 @@ from lare_rl.errors import LareError
 from lare_rl.latent.function import verify_function
 from lare_rl.runs.directory import create_run
 from lare_rl.training import session
-from lare_rl.training.session import Session
-from lare_rl.training.train import start_session
+from lare_rl.training.session import Session, start_session
 
 
 class BareSession(Session):
