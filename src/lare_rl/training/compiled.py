@@ -18,6 +18,7 @@ from jaxtyping import Array, Bool, Float, Int, Key
 
 from lare_rl.algorithms.batches import Metrics
 from lare_rl.algorithms.registry import Consumes
+from lare_rl.config.train_config import TrainConfig
 from lare_rl.credit.score_type import ScoreType
 from lare_rl.data.trajectory import Trajectory, empty_trajectory
 from lare_rl.envs.interface import JaxEnv
@@ -32,7 +33,6 @@ from lare_rl.training.learner import Learner, init_learner, store
 from lare_rl.training.policy import get_actor, init_algorithm
 from lare_rl.training.rewards import assess
 from lare_rl.training.seed_axis import jit_over_seeds, shape_over_seeds
-from lare_rl.training.static_config import TrainConfig
 from lare_rl.training.streams import Stream, keys_shape, seed_keys, stream_keys
 from lare_rl.util.float64 import float64
 
@@ -80,8 +80,8 @@ class CompiledFunctions(NamedTuple):
 def _train_step_function(config: TrainConfig) -> Callable[..., tuple[Learner, Metrics]]:
     """Return the function for the data that the run's algorithm consumes: `CompiledFunctions.train_step`, not compiled."""
     modules = {Consumes.TRANSITIONS: off_policy, Consumes.ROLLOUTS: on_policy, Consumes.SEQUENCES: sequences}
-    train_step = partial(modules[config.algorithm.consumes].train_step, config=config)
-    if config.algorithm.consumes is Consumes.SEQUENCES:  # written for all seeds
+    train_step = partial(modules[config.consumes].train_step, config=config)
+    if config.consumes is Consumes.SEQUENCES:  # written for all seeds
         return train_step
     return jax.vmap(train_step, in_axes=(0, 0, 0, None))
 

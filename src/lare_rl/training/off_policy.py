@@ -11,6 +11,7 @@ from jaxtyping import Array, Float, Int, PRNGKeyArray, Scalar
 
 from lare_rl.algorithms.batches import Metrics, Transitions
 from lare_rl.algorithms.off_policy import OffPolicySettings
+from lare_rl.config.train_config import TrainConfig
 from lare_rl.credit.engine import RewardSource, select_decoders
 from lare_rl.data import replay
 from lare_rl.data.replay import StoredSteps
@@ -19,7 +20,6 @@ from lare_rl.data.trajectory import Trajectory
 from lare_rl.training.decoder_fits import fit_decoders, sample_credit
 from lare_rl.training.learner import Learner
 from lare_rl.training.rewards import rewards
-from lare_rl.training.static_config import TrainConfig
 
 __all__ = ["train_step"]
 

@@ -8,13 +8,13 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int, PRNGKeyArray, Scalar, Shaped
 
 from lare_rl.algorithms.batches import Metrics, Rollout
+from lare_rl.config.train_config import TrainConfig
 from lare_rl.data import replay
 from lare_rl.data.trajectory import Trajectory
 from lare_rl.training.episodes import predict_returns
 from lare_rl.training.learner import Learner
 from lare_rl.training.policy import policy_input
 from lare_rl.training.rewards import rewards
-from lare_rl.training.static_config import TrainConfig
 
 __all__ = ["train_step"]
 

@@ -14,6 +14,7 @@ from jaxtyping import Array, Float, Key
 from lare_rl.algorithms.batches import Metrics
 from lare_rl.algorithms.off_policy import OffPolicySettings
 from lare_rl.config.settings import ResolvedSettings
+from lare_rl.config.train_config import TrainConfig, make_train_config
 from lare_rl.data.trajectory import Trajectory, empty_trajectory
 from lare_rl.envs.workers import close_idle_workers
 from lare_rl.errors import LareError
@@ -41,7 +42,6 @@ from lare_rl.training.learner import Learner, abandon_episodes
 from lare_rl.training.policy import actor_shape, get_actor
 from lare_rl.training.saved_state import load_learner
 from lare_rl.training.seed_axis import count_seed_devices
-from lare_rl.training.static_config import TrainConfig, make_train_config
 from lare_rl.training.streams import Stream, seed_keys, stream_keys
 from lare_rl.training.unroll_host import DivergedError
 from lare_rl.util.float64 import load_linear_algebra, one_blas_thread
@@ -316,7 +316,10 @@ class Session:
 
 def start_session(run: Run) -> Session:
     """Return a session before its first step."""
-    config = replace(make_train_config(run), n_devices=count_seed_devices(len(run.seeds)))
+    config = replace(
+        make_train_config(run.config.task, run.config.settings, run.functions),
+        n_devices=count_seed_devices(len(run.seeds)),
+    )
     config = replace(config, batched=is_batching_faster(config, len(run.seeds)))
     return _make_session(run, config, None)
 
