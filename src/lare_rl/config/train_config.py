@@ -211,7 +211,7 @@ class TrainConfig(CreditConfig):
 
 
 def make_train_config(
-    task: TaskSpec, settings: ResolvedSettings, functions: Sequence[LatentFunction] = ()
+    task: TaskSpec, settings: ResolvedSettings, functions: Sequence[LatentFunction] = (), n_devices: int = 1
 ) -> TrainConfig:
     """Return the static configuration of a run, by the latent function of each team, if they are chosen already."""
     env, algorithm = load_env_spec(task), ALGORITHMS[settings.algorithm]
@@ -236,6 +236,7 @@ def make_train_config(
         steps=settings.steps,
         fit_every=settings.fit_every,
         held_out_first_fit=settings.first_fit == "held-out",
+        n_devices=n_devices,
     )
 
 

@@ -36,7 +36,7 @@ def load_learner(run: Run, n_devices: int = 1) -> SavedState:
     Raises:
         LareError: there is no checkpoint, it is damaged, or it is of a version of LaRe whose state has another structure.
     """
-    config = replace(make_train_config(run.config.task, run.config.settings, run.functions), n_devices=n_devices)
+    config = make_train_config(run.config.task, run.config.settings, run.functions, n_devices)
     try:
         learner, metadata, arrays = checkpoint.load(run.checkpoint, learner_shape(config, len(run.seeds)))
         return SavedState(replace(config, batched=metadata.get("batched", False)), learner, metadata, arrays)

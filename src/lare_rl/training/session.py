@@ -316,10 +316,8 @@ class Session:
 
 def start_session(run: Run) -> Session:
     """Return a session before its first step."""
-    config = replace(
-        make_train_config(run.config.task, run.config.settings, run.functions),
-        n_devices=count_seed_devices(len(run.seeds)),
-    )
+    n_devices = count_seed_devices(len(run.seeds))
+    config = make_train_config(run.config.task, run.config.settings, run.functions, n_devices)
     config = replace(config, batched=is_batching_faster(config, len(run.seeds)))
     return _make_session(run, config, None)
 
