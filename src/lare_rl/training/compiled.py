@@ -169,6 +169,9 @@ def _free_memory() -> None:
         ctypes.CDLL(None).malloc_trim(0)
 
 
+IsMeasured = dict[str, Bool[Array, " seeds"]]
+
+
 class LoopState(NamedTuple):
     """What a compiled iteration changes. The first axis of an array is the seed."""
 
@@ -176,7 +179,7 @@ class LoopState(NamedTuple):
     envs: VecEnvState
     metrics: Metrics
     """The metrics of the newest updates."""
-    is_measured: dict[str, Bool[Array, " seeds"]]
+    is_measured: IsMeasured
     """For which seeds they have been measured."""
     steps: Trajectory
     """The newest steps, for the message about a factor that is not finite."""
@@ -268,16 +271,16 @@ def _iterate(
         with float64():
             return learn_returns(learner, config)
 
-    def fit(learner: Learner, *measured: Any) -> tuple[Learner, Metrics, Any]:
+    def fit(learner: Learner, old: Metrics, is_measured: IsMeasured) -> tuple[Learner, Metrics, IsMeasured]:
         learner, metrics = fit_seeds(learner, stream_keys(seeds, Stream.FIT, env_steps), config)
-        return learner, *_record(*measured, metrics)
+        return learner, *_record(old, is_measured, metrics)
 
-    def fit_and_update(learner: Learner, *measured: Any) -> tuple[Learner, Metrics, Any]:
+    def fit_and_update(learner: Learner, old: Metrics, is_measured: IsMeasured) -> tuple[Learner, Metrics, IsMeasured]:
         if config.fits_separately:
             is_due = number % config.fit_every == 0
-            learner, *measured = jax.lax.cond(is_due, fit, _keep, learner, *measured)
+            learner, old, is_measured = jax.lax.cond(is_due, fit, _keep, learner, old, is_measured)
         learner, metrics = _train_step_function(config)(learner, steps, seed_keys(seeds, env_steps + 1), env_steps)
-        return learner, *_record(*measured, metrics)
+        return learner, *_record(old, is_measured, metrics)
 
     actor = get_actor(state.learner.algorithm, env_steps, config)
     keys = stream_keys(seeds, Stream.EXPLORATION, env_steps)
@@ -295,9 +298,7 @@ def _keep(*state: Any) -> tuple[Any, ...]:
     return state
 
 
-def _record(
-    old: Metrics, is_measured: dict[str, Bool[Array, " seeds"]], metrics: Metrics
-) -> tuple[Metrics, dict[str, Bool[Array, " seeds"]]]:
+def _record(old: Metrics, is_measured: IsMeasured, metrics: Metrics) -> tuple[Metrics, IsMeasured]:
     """Replace the metrics of the seeds that made updates or, if updates are not counted, of all seeds."""
     is_new = metrics.get("algorithm/updates", 1) > 0
     new = {name: jnp.where(is_new | ~is_measured[name], values, old[name]) for name, values in metrics.items()}
