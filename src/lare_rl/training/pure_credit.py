@@ -21,7 +21,7 @@ from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
 from lare_rl.algorithms.registry import Consumes
 from lare_rl.config.train_config import CreditConfig
-from lare_rl.config.validity import check_credit
+from lare_rl.config.validity import check_training
 from lare_rl.credit.decoder_settings import CreditSettings, default_credit
 from lare_rl.credit.methods import METHODS, Method, Reward
 from lare_rl.data.replay import StoredSteps, mean_length, required_capacity, segments_as_episodes
@@ -148,7 +148,7 @@ def pure_credit(
         masks_steps=phi is not None,  # those whose factors are invalid
     )
     _check_steps(config)
-    check_credit(config.credit_specs[0], agents, discrete_actions=discrete)
+    check_training(config)
     return _make_functions(config, () if phi is None else (phi.graph,))
 
 
