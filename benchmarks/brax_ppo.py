@@ -24,7 +24,7 @@ from lare_rl.algorithms.ppo import PPOSettings
 from lare_rl.config.resolve import resolve
 from lare_rl.runs.directory import create_run
 from lare_rl.training.latent_functions import choose_functions
-from lare_rl.training.train import start_session
+from lare_rl.training.session import start_session
 from measure import advance, write
 
 HIDDEN = (256, 256)

@@ -14,6 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from lare_rl.algorithms.registry import ALGORITHMS
+from lare_rl.config.train_config import TrainConfig
 from lare_rl.credit import arel
 from lare_rl.credit.decoder_settings import CreditSettings
 from lare_rl.credit.methods import METHODS
@@ -27,7 +28,6 @@ from lare_rl.training.decoder_fits import fit_repeatedly
 from lare_rl.training.learner import Learner
 from lare_rl.training.policy import get_actor
 from lare_rl.training.seed_axis import select_seed
-from lare_rl.training.static_config import TrainConfig
 from measure import apart, correlation, write
 
 ENV, STORED, TEST_EPISODES, AT_A_TIME = ParticleEnv("CN-6"), 1600, 200, 100
@@ -43,6 +43,7 @@ def make_config(name: str) -> TrainConfig:
         credit_scope="observation",
         scored_observation="after",
         method=METHODS.find(name),
+        consumes=ippo.consumes,
         algorithm=ippo,
         hyperparameters=ippo.settings,
         credit=CreditSettings(steps=32 * MAX_STEPS),

@@ -15,6 +15,7 @@ import jax
 import jax.numpy as jnp
 import tyro
 
+from lare_rl.config.train_config import TrainConfig
 from lare_rl.credit import accuracy, decomposition
 from lare_rl.credit.decoder_settings import RECENT_STEPS, CreditSettings
 from lare_rl.credit.methods import METHODS
@@ -26,7 +27,6 @@ from lare_rl.training.learner import Learner
 from lare_rl.training.rewards import team_proxy_rewards
 from lare_rl.training.saved_state import load_learner
 from lare_rl.training.seed_axis import select_seed
-from lare_rl.training.static_config import TrainConfig
 from measure import write
 
 AT_A_TIME = 50

@@ -19,8 +19,8 @@ import lare_rl
 from lare_rl.config.resolve import resolve
 from lare_rl.runs.directory import create_run
 from lare_rl.training import decoder_fits
+from lare_rl.training.session import start_session
 from lare_rl.training.streams import Stream, stream_keys
-from lare_rl.training.train import start_session
 from measure import write
 
 LARGE = "held-out, updates as large as later ones"

@@ -20,8 +20,7 @@ import lare_rl
 from lare_rl.config.resolve import resolve
 from lare_rl.runs.directory import create_run
 from lare_rl.training.latent_functions import choose_functions
-from lare_rl.training.session import Session
-from lare_rl.training.train import start_session
+from lare_rl.training.session import Session, start_session
 from lare_rl.util.provenance import code_version
 
 PACKAGES = (

@@ -15,6 +15,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from lare_rl.config.train_config import TrainConfig
 from lare_rl.credit import accuracy, decomposition, descent
 from lare_rl.credit.decoder_settings import RECENT_STEPS
 from lare_rl.credit.decomposition import CreditBatch, DecoderState
@@ -27,7 +28,6 @@ from lare_rl.training.decoder_inputs import decoder_inputs
 from lare_rl.training.learner import Learner
 from lare_rl.training.saved_state import load_learner
 from lare_rl.training.seed_axis import select_seed
-from lare_rl.training.static_config import TrainConfig
 from measure import write
 
 UPDATES, STRETCH = 20_000, 5_000

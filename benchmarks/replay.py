@@ -26,6 +26,7 @@ import tyro
 import lare_rl
 from lare_rl.algorithms.registry import ALGORITHMS
 from lare_rl.algorithms.td3 import TD3Settings
+from lare_rl.config.train_config import TrainConfig
 from lare_rl.credit.decoder_settings import CreditSettings
 from lare_rl.credit.methods import METHODS
 from lare_rl.data import replay
@@ -36,7 +37,6 @@ from lare_rl.envs.interface import EnvSpec, Team, Timestep
 from lare_rl.training.decoder_fits import sample_credit
 from lare_rl.training.decoder_inputs import decoder_inputs
 from lare_rl.training.session import Session
-from lare_rl.training.static_config import TrainConfig
 from measure import advance, interleave, new_session, show, summary, write
 
 SEED, EPISODE, UPDATES = 0, 1000, 50
@@ -47,6 +47,7 @@ CONFIG = TrainConfig(
     credit_scope="observation",
     scored_observation="after",
     method=METHODS.find("lare-rrdu"),
+    consumes=ALGORITHMS["td3"].consumes,
     algorithm=ALGORITHMS["td3"],
     hyperparameters=SETTINGS,
     credit=CreditSettings(),

@@ -26,7 +26,7 @@ from lare_rl.config.settings import Settings
 from lare_rl.envs.placement import make_host_env, needs_process
 from lare_rl.envs.trials import fixed_action
 from lare_rl.tasks.spec import TaskSpec
-from lare_rl.training import loop
+from lare_rl.training import train as training
 from lare_rl.training.collect_host import HostCollector
 from lare_rl.training.session import Session
 from measure import write
@@ -106,7 +106,7 @@ MEASURED = {
     "storing": (Session, "_store"),
     "updating": (Session, "_update"),
     "evaluating": (Session, "evaluate"),
-    "explaining": (loop, "describe_returns"),
+    "explaining": (training, "describe_returns"),
     "checkpoints": (Session, "save"),
 }
 

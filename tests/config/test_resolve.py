@@ -1,14 +1,19 @@
 """Which settings, method, algorithm and task go together, and the defaults of open values."""
 
+from dataclasses import replace
+from functools import partial
+
 import pytest
 
+from helpers.small_configs import ONE_TEAM, SUM_CREDIT, small_config
 from helpers.toy_envs import pick_spec, toy_spec
 from lare_rl.algorithms.qmix import QMIXSettings
-from lare_rl.config.resolve import replay_rows, resolve
+from lare_rl.config.resolve import resolve
 from lare_rl.config.settings import Settings
-from lare_rl.config.validity import CreditContext, check_credit
+from lare_rl.config.train_config import replay_rows
+from lare_rl.config.validity import check_training
 from lare_rl.credit.decoder_settings import MULTI_AGENT_CREDIT, RECENT_STEPS, CreditSettings
-from lare_rl.credit.methods import METHODS
+from lare_rl.envs.interface import EnvSpec, Team
 from lare_rl.envs.load import read_task
 from lare_rl.errors import LareError
 
@@ -159,43 +164,63 @@ def test_replay_rows():
         assert replay_rows(resolve_named(task, settings), max_steps) == rows
 
 
-def check(method, changes):
-    credit, context = (
-        changes.get("credit", CreditSettings()),
-        {name: v for name, v in changes.items() if name != "credit"},
-    )
-    check_credit(METHODS.find(method), credit, CreditContext(**{"n_agents": 1, "n_raw_features": 9} | context))
+def check(method, agents=1, observation_size=9, credit=SUM_CREDIT, **changes):
+    """Check a method for episodes of twelve steps with discrete actions."""
+    env = EnvSpec((Team("agent", 0, agents),), observation_size, 1, True, 12, **changes)
+    check_training(small_config(method, "ppo", env=env, rollout_steps=12, credit=credit))
 
 
 @pytest.mark.parametrize(
     ("method", "changes", "texts"),
     [
-        ("arel", {"n_agents": 1, "fixed_length": True}, ["among agents"]),
-        ("arel", {"n_agents": 3}, ["whole episodes"]),
-        ("stas", {"n_agents": 3, "team_level": True, "fixed_length": True}, ["credit_scope"]),
-        ("bayes", {"n_raw_features": 7057}, ["1024", "7057", "rrdu"]),
-        ("rd-linear", {"n_raw_features": 1025}, ["1024", "1025"]),
+        ("arel", {"fixed_length": True}, ["among agents"]),
+        ("arel", {"agents": 3}, ["whole episodes of one length"]),
+        ("rudder", {"agents": 3}, ["single agent", "3"]),
+        ("bayes", {"observation_size": 7056}, ["1024", "7057", "rrdu"]),
+        ("rd-linear", {"observation_size": 1024}, ["1024", "1025"]),
+        ("rrd", {"credit": CreditSettings(steps=16)}, ["sampled_steps"]),
         ("diaster", {"credit": CreditSettings(hidden=())}, ["hidden"]),
     ],
 )
-def test_check_credit_refuses(method, changes, texts):
+def test_check_training_refuses(method, changes, texts):
     with pytest.raises(LareError) as error:
-        check(method, changes)
+        check(method, **changes)
     assert all(text in str(error.value) for text in texts)
 
 
-def test_check_credit_accepts():
+def test_check_training_accepts():
     cases = [
-        ("lare-bayes", {"n_raw_features": 7057}),
-        ("bayes", {"n_raw_features": 1024, "team_level": True}),
-        ("rrdu", {"n_raw_features": 7057}),
-        ("arel", {"n_agents": 3, "fixed_length": True}),
+        ("lare-bayes", {"observation_size": 7056}),
+        ("bayes", {"observation_size": 1023}),
+        ("rrdu", {"observation_size": 7056}),
+        ("arel", {"agents": 3, "fixed_length": True}),
         ("rrd", {"credit": CreditSettings(steps=16), "fixed_length": True}),
         ("rrd", {"credit": CreditSettings(steps=64)}),
         ("rd", {"credit": CreditSettings(steps=16)}),
     ]
     for method, changes in cases:
-        check(method, changes)
+        check(method, **changes)
+
+
+def test_raw_features_of_both_observations_count():
+    env = EnvSpec((Team("agent", 0, 1),), 600, 1, True, 12)
+    check_training(small_config("bayes", "ppo", env=env))
+    with pytest.raises(LareError, match=r"1024.* 1201"):
+        check_training(small_config("bayes", "ppo", env=env, scored_observation="both"))
+
+
+def test_check_training_refuses_a_loop_that_does_not_fit():
+    fixed_length = replace(ONE_TEAM, fixed_length=True)
+    arel = partial(small_config, "arel", "ippo", env=fixed_length)
+    check_training(arel(rollout_steps=24))
+    with pytest.raises(LareError, match="20 is not a multiple of their length, 12"):
+        check_training(arel(rollout_steps=20))
+    with pytest.raises(LareError, match="credit_scope"):
+        check_training(arel(rollout_steps=24, credit_scope="state"))
+    exact = SUM_CREDIT.model_copy(update={"exact": "last"})
+    check_training(small_config("rd", "ppo", credit=exact))
+    with pytest.raises(LareError, match="off-policy"):
+        check_training(small_config("rd", "td3", credit=exact))
 
 
 @pytest.mark.parametrize(

@@ -5,10 +5,11 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from helpers.credit_specs import observation_spec
 from helpers.decoder_toys import check_loss, make_decoder, random_rows, train_by_loss
 from helpers.numpy_attention import numpy_attention, numpy_layer_norm, numpy_linear, numpy_mlp
 from lare_rl.assigner.assigner import CreditAssigner
-from lare_rl.config.validity import CreditContext, check_credit
+from lare_rl.config.validity import check_credit
 from lare_rl.credit import rbt
 from lare_rl.credit.decoder_settings import CreditSettings
 from lare_rl.credit.methods import METHODS
@@ -98,10 +99,10 @@ def test_long_payments_are_refused():
         (PAID_AT_END, 1000, "at most 512 steps .* 1000: use rudder, or payments"),
         (PaymentRule(window=600), 1000, "up to 600"),
         (PaymentRule(period=50), 1000, None),
-        (PAID_AT_END, None, None),
+        (PAID_AT_END, 512, None),
     ],
 )
 def test_length_of_payments(payments, max_steps, words):
-    sizes = {"n_agents": 1, "n_raw_features": 5, "max_steps": max_steps}
+    spec = observation_spec(STATES, METHODS["rbt"], CreditSettings(), max_steps, payments=payments)
     with nullcontext() if words is None else pytest.raises(LareError, match=words):
-        check_credit(METHODS["rbt"], CreditSettings(), CreditContext(payments=payments, **sizes))
+        check_credit(spec, 1)

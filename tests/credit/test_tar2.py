@@ -3,9 +3,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from helpers.credit_specs import observation_spec
 from helpers.decoder_toys import make_decoder
 from helpers.numpy_attention import numpy_coalitions, numpy_gelu, numpy_linear, numpy_mlp, numpy_time_layer
-from lare_rl.config.validity import CreditContext, check_credit
+from lare_rl.config.validity import check_credit
 from lare_rl.credit.decoder_settings import CreditSettings
 from lare_rl.credit.engine import return_shares
 from lare_rl.credit.methods import METHODS
@@ -92,15 +93,17 @@ def test_must_learn_contributions_and_actions():
 @pytest.mark.parametrize(
     ("changes", "words"),
     [
-        ({"n_agents": 1}, "among agents"),
+        ({"agents": 1}, "among agents"),
         ({"fixed_length": False}, "whole episodes of one length"),
         ({"discrete_actions": False}, "tar2 learns which .* continuous .*: use stas"),
     ],
 )
 def test_refusals(changes, words):
-    args = {"n_agents": 3, "n_raw_features": 7, "fixed_length": True} | changes
+    args = {"agents": AGENTS, "fixed_length": True, "discrete_actions": True} | changes
+    is_discrete = args.pop("discrete_actions")
+    spec = observation_spec(OBSERVATIONS, METHODS["tar2"], CreditSettings(), STEPS, **args)
     with pytest.raises(LareError, match=words):
-        check_credit(METHODS["tar2"], CreditSettings(), CreditContext(**args))
+        check_credit(spec, spec.agents, discrete_actions=is_discrete)
 
 
 def test_exact_is_no_setting():

@@ -18,7 +18,7 @@ from lare_rl.errors import LareError
 from lare_rl.evaluation.policy import load_policy
 from lare_rl.runs.directory import create_run
 from lare_rl.training.saved_state import load_learner
-from lare_rl.training.train import start_session
+from lare_rl.training.session import start_session
 
 
 class DialsState(NamedTuple):

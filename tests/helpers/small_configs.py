@@ -10,6 +10,7 @@ from lare_rl.algorithms.ppo import PPOSettings
 from lare_rl.algorithms.qmix import QMIXSettings
 from lare_rl.algorithms.registry import ALGORITHMS
 from lare_rl.algorithms.td3 import TD3Settings
+from lare_rl.config.train_config import TrainConfig
 from lare_rl.credit.basis import Basis
 from lare_rl.credit.closed_form import LinearDecoder
 from lare_rl.credit.decoder_settings import CreditSettings
@@ -21,7 +22,6 @@ from lare_rl.envs.interface import EnvSpec, Team, Timestep, to_env_action
 from lare_rl.training import learner as learners
 from lare_rl.training.episodes import learn_returns
 from lare_rl.training.policy import init_algorithm
-from lare_rl.training.static_config import TrainConfig
 
 LENGTHS = (5, 12, 3, 9, 12)
 """The lengths of the episodes of one environment. The next environments have them in another order."""
@@ -55,6 +55,7 @@ def small_config(method, algorithm="td3", env=ONE_AGENT, **changes):
         "env": env,
         "credit_scope": "observation",
         "method": METHODS[method],
+        "consumes": ALGORITHMS[algorithm].consumes,
         "algorithm": ALGORITHMS[algorithm],
         "hyperparameters": SMALL_SETTINGS.get(algorithm),
         "credit": SUM_CREDIT,

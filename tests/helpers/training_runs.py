@@ -10,7 +10,7 @@ import lare_rl
 from helpers.listeners import AtStep, metrics_without_times
 from helpers.toy_envs import toy_spec
 from lare_rl.runs.directory import open_run
-from lare_rl.training.loop import RunInterruptedError
+from lare_rl.training.train import RunInterruptedError
 
 QUICK_CREDIT = {"hidden": (8,), "sampled_steps": 4, "steps": 16, "score": "sum"}
 """To find out the type of the score would take seconds of compilation."""

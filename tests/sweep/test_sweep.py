@@ -24,7 +24,7 @@ from lare_rl.sweep.jobs import job_to_json, train_job
 from lare_rl.sweep.processes import RunningProcesses, train_in_process
 from lare_rl.sweep.resources import Slot
 from lare_rl.sweep.sweep import read_sweep, run_sweep
-from lare_rl.training.loop import RunInterruptedError
+from lare_rl.training.train import RunInterruptedError
 
 FILE = """
 tasks = ["Reacher-v4"]

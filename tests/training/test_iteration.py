@@ -1,5 +1,7 @@
 """The order of an iteration. Iterations in one compiled call make the same training state as iterations on the host."""
 
+from types import SimpleNamespace
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -7,21 +9,27 @@ import pytest
 
 from helpers.jax_toy_envs import echo_spec
 from helpers.long_tests import long_case
-from helpers.small_configs import random_steps, small_config, untrained_learner
+from helpers.small_configs import ONE_TEAM, random_steps, small_config, untrained_learner
 from helpers.training_runs import ECHO_PHI, QUICK_CREDIT
 from lare_rl.config.resolve import resolve
 from lare_rl.errors import LareError
 from lare_rl.latent.function import verify_function
 from lare_rl.runs.directory import create_run
 from lare_rl.training import session
-from lare_rl.training.iteration import IterationFunctions, update
-from lare_rl.training.train import start_session
+from lare_rl.training.session import Session, start_session
+
+
+class BareSession(Session):
+    """A session of two seeds without environments, and with other functions."""
+
+    def __init__(self, config, **functions):
+        self.config, self.functions, self.run = config, SimpleNamespace(**functions), SimpleNamespace(seeds=[0, 1])
+        self.learner, self.latest_metrics = untrained_learner(config), {}
 
 
 def test_update_fits_decoders_before_the_algorithm():
     """Iterations have 20 steps, and the decoders are fitted in every second of them."""
     config, calls = small_config("lare-rd", "ippo", rollout_steps=20, fit_every=2), []
-    steps, measured = random_steps(), ({}, {})
 
     def fit(learner, keys):
         calls.append("fit")
@@ -31,13 +39,27 @@ def test_update_fits_decoders_before_the_algorithm():
         calls.append(("train", step))
         return learner, {}
 
-    functions = IterationFunctions(lambda *_: None, lambda *_: None, fit, train_step)
-    for step in (80, 100, 120):
-        arguments = jnp.arange(2), step, functions, config
-        _, measured = update(untrained_learner(config), measured, steps, *arguments)
+    training = BareSession(config, fit=fit, train_step=train_step)
+    for training.step in (80, 100, 120):
+        training._update(random_steps())
     assert calls == ["fit", ("train", 80), ("train", 100), "fit", ("train", 120)]
-    for values in measured:
-        assert {name: array.tolist() for name, array in values.items()} == {"credit/loss": [1, 1]}
+    assert {name: values.tolist() for name, values in training.latest_metrics.items()} == {"credit/loss": [1, 1]}
+
+
+def test_update_keeps_the_metrics_of_seeds_without_updates():
+    config, metrics = small_config("episodic", "qmix", env=ONE_TEAM), []
+    training = BareSession(config, train_step=lambda learner, *_: (learner, metrics.pop(0)))
+    for updates, losses, latest in [
+        ([0, 0], [np.nan, np.nan], {}),
+        ([2, 0], [3, np.nan], {"algorithm/updates": [2, 0], "loss": [3, np.nan]}),
+        ([0, 1], [np.nan, 5], {"algorithm/updates": [2, 1], "loss": [3, 5]}),
+        ([0, 0], [np.nan, np.nan], {"algorithm/updates": [2, 1], "loss": [3, 5]}),
+    ]:
+        metrics.append({"algorithm/updates": jnp.array(updates), "loss": jnp.array(losses)})
+        training._update(random_steps())
+        np.testing.assert_equal(
+            {name: list(map(float, values)) for name, values in training.latest_metrics.items()}, latest
+        )
 
 
 @pytest.fixture(scope="module")

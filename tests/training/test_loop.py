@@ -12,7 +12,7 @@ from lare_rl.config.settings import Settings
 from lare_rl.errors import LareError
 from lare_rl.runs.config_file import make_config
 from lare_rl.runs.directory import Run
-from lare_rl.training import loop
+from lare_rl.training import session as sessions
 from lare_rl.training import train as training
 from lare_rl.training.decoder_fits import FirstFitStoppedError
 from lare_rl.training.progress import Listener
@@ -64,15 +64,15 @@ class Recorder(Listener):
 
 @pytest.fixture(autouse=True)
 def no_files(monkeypatch):
-    monkeypatch.setattr(loop, "append_metrics", lambda directory, lines: 0)
-    monkeypatch.setattr(loop, "_final_findings", lambda run, lines: [])
+    monkeypatch.setattr(training, "append_metrics", lambda directory, lines: 0)
+    monkeypatch.setattr(training, "_final_findings", lambda run, lines: [])
 
 
 @pytest.mark.parametrize(("seconds", "is_slow"), [({"save_s": 9.0}, False), ({"evaluation_s": 9.0}, True)])
 def test_time_of_an_evaluation_has_no_checkpoint_in_it(seconds, is_slow, tmp_path, monkeypatch):
     listener, session = Recorder(), EmptySession(tmp_path, **seconds)
     monkeypatch.setattr(time, "monotonic", lambda: session.clock)
-    loop.run_session(session, [listener], threading.Event())
+    training.run_session(session, [listener], threading.Event())
     assert any("--evaluation-episodes" in message for message in listener.messages) == is_slow
 
 
@@ -80,23 +80,26 @@ def test_first_fit_that_is_stopped_is_not_kept(tmp_path):
     def stop(until):
         raise FirstFitStoppedError
 
-    with pytest.raises(loop.RunInterruptedError, match=r"nothing is kept.*--resume"):
-        loop.run_session(EmptySession(tmp_path, advance=stop), [], threading.Event())
+    with pytest.raises(training.RunInterruptedError, match=r"nothing is kept.*--resume"):
+        training.run_session(EmptySession(tmp_path, advance=stop), [], threading.Event())
 
 
 def test_steps_are_passed_on_at_most_once_a_second(monkeypatch):
     now, steps = iter(np.arange(0.0, 5, 0.3)), []
     monkeypatch.setattr(time, "monotonic", lambda: float(next(now)))
-    call = loop._limit_rate(steps.append)
+    call = training._limit_rate(steps.append)
     for step in range(6):
         call(step)
     assert steps == [3]
 
 
-def test_every_listener_is_stopped(tmp_path):
+def test_every_listener_is_stopped(tmp_path, monkeypatch):
     listeners = [Recorder(fails=True), Recorder(), Recorder(fails=True)]
+    session = EmptySession(tmp_path)
+    monkeypatch.setattr(training, "start_session", lambda run: session)
     with pytest.raises(OSError, match="disk full"):
-        training._finish(EmptySession(tmp_path), False, listeners, threading.Event(), [])
+        training._finish(session.run, False, listeners, threading.Event(), [], 36)
+    assert session.is_closed
     assert [listener.n_stops for listener in listeners] == [1, 1, 1]
 
 
@@ -109,8 +112,8 @@ def test_session_that_cannot_be_restored_is_closed(error, message, tmp_path, mon
         raise error
 
     session = EmptySession(tmp_path, restore=restore)
-    monkeypatch.setattr(training, "load_learner", lambda run, n_devices: (None, None, {}, {}))
-    monkeypatch.setattr(training, "_make_session", lambda run, config, learner: session)
+    monkeypatch.setattr(sessions, "load_learner", lambda run, n_devices: (None, None, {}, {}))
+    monkeypatch.setattr(sessions, "_make_session", lambda run, config, learner: session)
     with pytest.raises(KeyboardInterrupt if message is None else LareError, match=message):
-        training.restore_session(session.run)
+        sessions.restore_session(session.run)
     assert session.is_closed

@@ -29,7 +29,7 @@ def test_train_step_relabels_by_the_newest_decoder():
     credit = CreditSettings(hidden=(8,), sampled_steps=4, steps=24, learning_rate=0.3, score="sum")
     config = small_config("lare-rrdu", rollout_steps=1, credit=credit)
     learner = learner_with_episodes(config)
-    updated, metrics = jitted(off_policy._train_seed, config)(learner, jax.random.key(0), jnp.array(0))
+    updated, metrics = jitted(off_policy.train_step, config)(learner, random_steps(), jax.random.key(0), jnp.array(0))
     sample_key, _, noise_key = jax.random.split(jax.random.key(0), 3)
     index = sample_transitions(learner.replay, jax.random.split(sample_key)[0], (8,))
     steps, losses = read(learner.replay, index), []
@@ -56,7 +56,7 @@ def test_train_step_updates_once_for_each_step(monkeypatch):
         return td3_update(state, batch, key, update_index, settings)
 
     monkeypatch.setattr(td3, "update", update)
-    off_policy._train_seed(learner, jax.random.key(0), jnp.array(14), config)
+    off_policy.train_step(learner, steps, jax.random.key(0), jnp.array(14), config)
     jax.effects_barrier()
     assert sorted(int(update_index) for update_index, *_ in batches) == list(range(10, 10 + 3 * envs))
 

@@ -82,7 +82,7 @@ def test_train_step_hands_on_the_remaining_progress(monkeypatch):
     monkeypatch.setattr(ppo, "update", update)
     learner, _ = store_and_roll_out(config, random_steps())
     for env_steps in (0, 20, 80):
-        on_policy._train_seed(learner, newest(random_steps()), jax.random.key(0), jnp.array(env_steps), config)
+        on_policy.train_step(learner, newest(random_steps()), jax.random.key(0), jnp.array(env_steps), config)
     assert progress == pytest.approx([1.0, 0.8, 0.2])
 
 
@@ -91,7 +91,7 @@ def test_act_normalises_by_the_statistics_of_earlier_rollouts():
     config, steps = ppo_config("dense"), random_steps()
     learner, rollout = store_and_roll_out(config, steps)
     assert float(learner.algorithm.observation_rms.n_rows) == 0
-    train = jax.jit(partial(on_policy._train_seed, config=config))
+    train = jax.jit(partial(on_policy.train_step, config=config))
     learner, _ = train(learner, newest(steps), jax.random.key(0), jnp.array(0))
     statistics = learner.algorithm.observation_rms
     expected = steps.timestep.observation[-20:, 0, 0].mean(axis=0)
@@ -150,7 +150,7 @@ def test_rollout_of_many_agents():
 
 def test_train_step_ignores_dead_agents():
     config, steps = ippo_config("dense", env=ONE_TEAM), random_steps(ONE_TEAM)
-    train, results = jax.jit(partial(on_policy._train_seed, config=config)), []
+    train, results = jax.jit(partial(on_policy.train_step, config=config)), []
     for trajectory in (steps, with_other_dead_values(steps)):
         learner, _ = store_and_roll_out(config, trajectory)
         learner, metrics = train(learner, newest(trajectory), jax.random.key(0), jnp.array(0))

@@ -31,9 +31,9 @@ from lare_rl.errors import LareError
 from lare_rl.latent.function import verify_function
 from lare_rl.runs.checkpoint import read_metadata
 from lare_rl.runs.directory import open_run
-from lare_rl.training import loop
-from lare_rl.training.loop import RunInterruptedError
+from lare_rl.training import train as training
 from lare_rl.training.saved_state import load_learner
+from lare_rl.training.train import RunInterruptedError
 
 FORGETFUL = CHASE.model_copy(update={"environment": "toys/Forgetful-v0"})
 """Its episodes cannot be restored."""
@@ -69,7 +69,7 @@ def test_resume_after_kill_is_exact(small, phi, factor_run, tmp_path):
 
 def test_checkpoint_by_time(dense, dense_run, tmp_path, monkeypatch):
     """A crash between two evaluations costs only the steps since the newest checkpoint, and the continuation is exact."""
-    monkeypatch.setattr(loop, "CHECKPOINT_S", 0.0)
+    monkeypatch.setattr(training, "CHECKPOINT_S", 0.0)
     with pytest.raises(ZeroDivisionError):
         train_quietly(CHASE, dense(), tmp_path / "run", listeners=[AtStep(108, lambda: 1 / 0)])
     assert [line["step"] for line in open_run(tmp_path / "run").metrics()] == [60, 60]

@@ -24,7 +24,7 @@ import lare_rl
 from helpers.training_runs import train_and_stop
 from lare_rl.runs.directory import open_run
 from lare_rl.tasks.spec import TaskSpec
-from lare_rl.training.train import restore_session
+from lare_rl.training.session import restore_session
 
 task, settings = TaskSpec(**json.loads(sys.argv[1])), lare_rl.Settings(**json.loads(sys.argv[2]))
 train_and_stop(task, settings, "run", settings.evaluate_every)

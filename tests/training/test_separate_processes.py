@@ -11,7 +11,7 @@ from lare_rl.envs import placement
 from lare_rl.envs.workers import _idle_workers
 from lare_rl.errors import LareError
 from lare_rl.runs.directory import open_run
-from lare_rl.training import loop
+from lare_rl.training import train as training
 
 SEPARATE = single_spec("Fails", processes="separate")
 
@@ -37,7 +37,7 @@ def test_run_equals_one_in_a_single_process(settings, tmp_path, monkeypatch):
     steps, listener = [], MessageListener()
     listener.on_step = steps.append
     with monkeypatch.context() as patch:
-        patch.setattr(loop, "PROGRESS_S", -1.0)
+        patch.setattr(training, "PROGRESS_S", -1.0)
         local = train_quietly(single_spec("Many"), settings, tmp_path / "local", listeners=[listener])
     assert [step for step in steps if step <= 10] == [*range(1, 11), 10]
     assert steps.count(30) == 1 + 1 + N_STEPS  # the last step, the iteration, and each step of the evaluation

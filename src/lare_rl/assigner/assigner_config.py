@@ -11,7 +11,7 @@ from jaxtyping import Bool, Float
 from pydantic import Field, InstanceOf
 
 from lare_rl.assigner.space_layout import SpaceLayout, make_layout
-from lare_rl.config.validity import CreditContext, check_credit, check_factors
+from lare_rl.config.validity import check_credit, check_factors
 from lare_rl.credit.decoder_settings import CreditSettings, default_credit
 from lare_rl.credit.history import next_history_columns
 from lare_rl.credit.input_names import input_arrays
@@ -187,15 +187,7 @@ def check_config(config: AssignerConfig) -> None:
         raise LareError("a phi needs the task that it was designed for: CreditAssigner(..., phi, task=task)")
     else:
         check_task(phi, config.task)
-    context = CreditContext(
-        n_agents=config.agents,
-        n_raw_features=config.spec.basis.n_raw,
-        scored_observation=config.scored_observation,
-        scale_rewards=config.scale_rewards,
-        payments=config.payments,
-        max_steps=config.max_steps,
-    )
-    check_credit(method, config.settings, context)
+    check_credit(config.spec, config.agents)
     if phi is not None:
         check_factors(method, phi.n_factors(config.scored_observation))
     if config.agents > 1 and config.max_steps is None and method.uses_gradient:

@@ -135,7 +135,7 @@ def reproduce(
     """
     from lare_rl.cli.sweep_progress import show_progress
     from lare_rl.sweep.resources import Resources
-    from lare_rl.training.loop import RunInterruptedError
+    from lare_rl.training.train import RunInterruptedError
 
     paper = _import_from_checkout("reproduce")
     if exhibit is None:

@@ -5,8 +5,9 @@ from typing import Any
 from lare_rl.algorithms.registry import ALGORITHMS, Algorithm, Consumes
 from lare_rl.config.effective import needs_replay, unused_names
 from lare_rl.config.settings import ResolvedSettings, Settings, round_up
-from lare_rl.config.validity import CreditContext, check_credit
-from lare_rl.credit.decoder_settings import MULTI_AGENT_CREDIT, RECENT_STEPS, CreditSettings
+from lare_rl.config.train_config import make_train_config
+from lare_rl.config.validity import check_training
+from lare_rl.credit.decoder_settings import MULTI_AGENT_CREDIT, CreditSettings
 from lare_rl.credit.methods import METHODS
 from lare_rl.data.replay import required_capacity
 from lare_rl.envs.families import find_score_type
@@ -15,7 +16,7 @@ from lare_rl.envs.placement import load_env_spec
 from lare_rl.errors import LareError
 from lare_rl.tasks.spec import TaskSpec
 
-__all__ = ["choose_algorithm", "fill_in", "replay_rows", "resolve"]
+__all__ = ["choose_algorithm", "fill_in", "resolve"]
 
 MIN_EVALUATIONS = 5
 """Evaluations of a short run of PPO, by default."""
@@ -31,29 +32,14 @@ def resolve(settings: Settings, task: TaskSpec) -> ResolvedSettings:
     env = load_env_spec(task)
     _check_algorithm(ALGORITHMS[choose_algorithm(settings.algorithm, env)], task, env)
     resolved = fill_in(settings, task, env)
-    team_level = task.credit_scope == "state"
-    consumes = ALGORITHMS[resolved.algorithm].consumes
-    n_state_features = env.state_size + env.n_agents * env.action_size
-    context = CreditContext(
-        n_agents=env.n_agents,
-        n_raw_features=n_state_features if team_level else env.observation_size + env.action_size,
-        scored_observation=resolved.choose_scored_observation(task),
-        team_level=team_level,
-        fixed_length=env.fixed_length,
-        scale_rewards=resolved.scale_rewards,
-        payments=task.payment_rule,
-        discrete_actions=env.discrete,
-        max_steps=env.max_steps,
-        rollout_steps=resolved.rollout_steps,
-        off_policy=consumes is not Consumes.ROLLOUTS,
-    )
-    check_credit(METHODS.find(resolved.method), resolved.credit, context)
+    config = make_train_config(task, resolved)
+    check_training(config)
     monotonic = getattr(resolved.hyperparameters, "monotonic", None)
     if monotonic != getattr(ALGORITHMS[resolved.algorithm].settings, "monotonic", None):
         raise LareError(
             f"{resolved.algorithm}.monotonic = {monotonic}: use --algorithm {'qmix' if monotonic else 'vdn'}"
         )
-    if resolved.overlap_collection and (env.is_jax or consumes is not Consumes.TRANSITIONS):
+    if resolved.overlap_collection and (env.is_jax or config.consumes is not Consumes.TRANSITIONS):
         raise LareError(
             f"overlap_collection needs td3, ddpg or sac and an environment on the host: remove it for {resolved.algorithm} on "
             f"{task.name}"
@@ -161,12 +147,3 @@ def _check_size(resolved: ResolvedSettings, task: TaskSpec, env: EnvSpec) -> Non
     if needs_replay(resolved) and resolved.capacity < required:
         data = "a rollout" if ALGORITHMS[resolved.algorithm].consumes is Consumes.ROLLOUTS else "an iteration"
         raise LareError(f"capacity = {resolved.capacity} is too small: {data} of {task.name} takes up to {required}")
-
-
-def replay_rows(settings: ResolvedSettings, max_steps: int) -> int:
-    """Return the rows of each environment, if an episode has up to `max_steps` steps."""
-    required = required_capacity(settings.rollout_steps, max_steps)
-    rows = settings.capacity // settings.environments
-    if not needs_replay(settings):  # only to compare the newest rewards with the true ones
-        rows = required + RECENT_STEPS // settings.environments
-    return min(rows, max(required, 2 * settings.steps // settings.environments + 2))

@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 
+from lare_rl.config.train_config import TrainConfig
 from lare_rl.envs.interface import JaxEnv, Team, team_mean
 from lare_rl.envs.placement import load_env_spec
 from lare_rl.errors import LareError, check_count
@@ -16,7 +17,6 @@ from lare_rl.runs.directory import Run
 from lare_rl.training.collect_device import make_jax_env, unroll_on_device
 from lare_rl.training.policy import get_actor, make_policy
 from lare_rl.training.saved_state import load_learner
-from lare_rl.training.static_config import TrainConfig
 
 __all__ = ["Match", "combine_policies", "cross_play"]
 

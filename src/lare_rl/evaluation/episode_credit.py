@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from lare_rl.config.train_config import TrainConfig
 from lare_rl.credit.decoder_settings import RECENT_STEPS
 from lare_rl.credit.decomposition import DecoderState
 from lare_rl.credit.methods import Fit
@@ -20,7 +21,6 @@ from lare_rl.training.learner import Learner
 from lare_rl.training.rewards import rewards
 from lare_rl.training.saved_state import load_learner
 from lare_rl.training.seed_axis import select_seed
-from lare_rl.training.static_config import TrainConfig
 from lare_rl.util.float64 import float64
 from lare_rl.util.statistics import column_correlations
 

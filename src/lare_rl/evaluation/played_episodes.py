@@ -11,6 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
+from lare_rl.config.train_config import TrainConfig
 from lare_rl.data import replay
 from lare_rl.data.trajectory import Trajectory
 from lare_rl.envs.interface import JaxEnv
@@ -26,7 +27,6 @@ from lare_rl.training.policy import get_actor
 from lare_rl.training.rewards import rewards
 from lare_rl.training.saved_state import load_learner
 from lare_rl.training.seed_axis import select_seed
-from lare_rl.training.static_config import TrainConfig
 from lare_rl.training.streams import Stream, episode_seed
 from lare_rl.training.unroll_host import policy_turns, record_on_host
 from lare_rl.util.statistics import column_correlations

@@ -14,13 +14,13 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array
 
+from lare_rl.config.train_config import TrainConfig
 from lare_rl.envs.interface import to_env_action
 from lare_rl.export.translate import add_function, finish, graph_input
 from lare_rl.phi.builder import Builder, building
 from lare_rl.phi.graph import Graph
 from lare_rl.phi.limits import UNLIMITED
 from lare_rl.training import policy
-from lare_rl.training.static_config import TrainConfig
 
 __all__ = ["policy_graph"]
 

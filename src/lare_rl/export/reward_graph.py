@@ -15,6 +15,7 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 
+from lare_rl.config.train_config import TrainConfig
 from lare_rl.credit.decomposition import DecoderState, decoder_rewards
 from lare_rl.credit.input_names import input_arrays
 from lare_rl.credit.methods import Method, Reward
@@ -27,7 +28,6 @@ from lare_rl.phi.graph import Graph
 from lare_rl.phi.limits import UNLIMITED
 from lare_rl.phi.read import apply_program
 from lare_rl.tasks.spec import select_states
-from lare_rl.training.static_config import TrainConfig
 
 __all__ = ["missing_reward_reason", "reward_graph"]
 

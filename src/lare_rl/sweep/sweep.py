@@ -20,7 +20,7 @@ from lare_rl.errors import LareError
 from lare_rl.sweep.jobs import Job, check_job, make_job
 from lare_rl.sweep.processes import train_in_processes, train_on_ray
 from lare_rl.sweep.resources import Resources
-from lare_rl.training.loop import RunInterruptedError
+from lare_rl.training.train import RunInterruptedError
 from lare_rl.util.renamed_fields import rename_keys
 from lare_rl.util.safe_io import read_table
 

@@ -8,13 +8,13 @@ from jaxtyping import Float
 from lare_rl.algorithms.ppo import PPOSettings
 from lare_rl.config.effective import warmup_warning
 from lare_rl.config.settings import ResolvedSettings
+from lare_rl.config.train_config import TrainConfig
 from lare_rl.credit.input_names import raw_feature_names
 from lare_rl.data.replay import Replay
 from lare_rl.new_task.draft import DEFAULT_LIMIT
 from lare_rl.runs.directory import Run
 from lare_rl.runs.metric_names import RETURN, RETURN_STD, was_updated
 from lare_rl.tasks.spec import FILL_IN, TaskSpec, unwritten_texts
-from lare_rl.training.static_config import TrainConfig
 from lare_rl.util.findings import Finding, render
 from lare_rl.util.statistics import FLOAT32_NOISE
 

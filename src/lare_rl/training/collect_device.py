@@ -11,6 +11,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int, Key
 
 from lare_rl.algorithms.registry import Noise
+from lare_rl.config.train_config import TrainConfig
 from lare_rl.data.trajectory import Trajectory
 from lare_rl.envs.families import make_env
 from lare_rl.envs.interface import JaxEnv, Timestep, team_mean, to_env_action
@@ -21,7 +22,6 @@ from lare_rl.training.compile_cache import cache_by_value
 from lare_rl.training.evaluation import EpisodeBatch, Evaluation
 from lare_rl.training.policy import Policy, init_memory, make_policy
 from lare_rl.training.seed_axis import jit_over_seeds, seed_sharding
-from lare_rl.training.static_config import TrainConfig
 from lare_rl.training.streams import Stream, device_noise, stream_keys
 
 __all__ = ["DeviceCollector", "VecEnvState", "collect", "is_reset_cheap", "make_jax_env", "reset", "unroll_on_device"]

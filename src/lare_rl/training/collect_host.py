@@ -15,6 +15,7 @@ import jax
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from lare_rl.config.train_config import TrainConfig
 from lare_rl.data.trajectory import Trajectory, empty_trajectory
 from lare_rl.envs.env_errors import EnvOutputError
 from lare_rl.envs.interface import Timestep, to_env_action
@@ -23,7 +24,6 @@ from lare_rl.envs.vec_env import VecEnv
 from lare_rl.tasks.spec import TaskSpec
 from lare_rl.training.evaluation import Evaluation
 from lare_rl.training.policy import draw_noise, init_host_memory, make_host_policy
-from lare_rl.training.static_config import TrainConfig
 from lare_rl.training.streams import Stream, episode_seed, numpy_generator
 from lare_rl.training.unroll_host import add_seed_axis, check_actions, evaluate_policy_on_host
 

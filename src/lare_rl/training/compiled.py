@@ -1,4 +1,9 @@
-"""The functions of a run, compiled, with a leading seed axis on every array but the number of steps done."""
+"""The functions of a run, compiled, with a leading seed axis on every array but the number of steps done.
+
+If environments step on the host, each function is a program of its own (`Session.advance` calls them in order). In an environment of
+pure functions, collection, factors, replay, fits, relabelling and updates of many iterations are one program (`compile_loop`), so
+nothing is transferred between two iterations. Both make Algorithm 1 of the LaRe paper.
+"""
 
 import contextlib
 import timeit
@@ -9,34 +14,37 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Key
+from jaxtyping import Array, Bool, Float, Int, Key
 
 from lare_rl.algorithms.batches import Metrics
 from lare_rl.algorithms.registry import Consumes
+from lare_rl.config.train_config import TrainConfig
 from lare_rl.credit.score_type import ScoreType
 from lare_rl.data.trajectory import Trajectory, empty_trajectory
+from lare_rl.envs.interface import JaxEnv
 from lare_rl.nn.leading_axis import map_leading_axis
 from lare_rl.phi.graph import Graph
-from lare_rl.training import off_policy, on_policy, sequences
+from lare_rl.training import collect_device, off_policy, on_policy, sequences
+from lare_rl.training.collect_device import VecEnvState
 from lare_rl.training.compile_cache import cache_by_value
 from lare_rl.training.decoder_fits import fit_seeds
 from lare_rl.training.episodes import learn_returns
 from lare_rl.training.learner import Learner, init_learner, store
-from lare_rl.training.policy import init_algorithm
+from lare_rl.training.policy import get_actor, init_algorithm
 from lare_rl.training.rewards import assess
 from lare_rl.training.seed_axis import jit_over_seeds, shape_over_seeds
-from lare_rl.training.static_config import TrainConfig
-from lare_rl.training.streams import keys_shape
+from lare_rl.training.streams import Stream, keys_shape, seed_keys, stream_keys
 from lare_rl.util.float64 import float64
 
 __all__ = [
     "CompiledFunctions",
+    "LoopState",
     "compile_ahead",
     "compile_functions",
+    "compile_loop",
     "init_seeds",
     "is_batching_faster",
     "learner_shape",
-    "train_step_function",
 ]
 
 MIN_SPEED_UP = 2.0
@@ -69,10 +77,13 @@ class CompiledFunctions(NamedTuple):
     """Compare proxy rewards with true rewards."""
 
 
-def train_step_function(config: TrainConfig) -> Callable[..., tuple[Learner, Metrics]]:
+def _train_step_function(config: TrainConfig) -> Callable[..., tuple[Learner, Metrics]]:
     """Return the function for the data that the run's algorithm consumes: `CompiledFunctions.train_step`, not compiled."""
     modules = {Consumes.TRANSITIONS: off_policy, Consumes.ROLLOUTS: on_policy, Consumes.SEQUENCES: sequences}
-    return partial(modules[config.algorithm.consumes].train_step, config=config)
+    train_step = partial(modules[config.consumes].train_step, config=config)
+    if config.consumes is Consumes.SEQUENCES:  # written for all seeds
+        return train_step
+    return jax.vmap(train_step, in_axes=(0, 0, 0, None))
 
 
 @cache_by_value
@@ -105,7 +116,7 @@ def compile_functions(config: TrainConfig, phi: Sequence[Graph] = ()) -> Compile
         learn_returns=learn_in_float64,
         compile_learning=compile_learning,
         fit=jit(partial(fit_seeds, config=config), donate=(0,)),
-        train_step=jit(train_step_function(config), shared=(3,), donate=(0,)),
+        train_step=jit(_train_step_function(config), shared=(3,), donate=(0,)),
         assess=jit(jax.vmap(partial(assess, config=config))),
     )
 
@@ -156,6 +167,142 @@ def _free_memory() -> None:
         import ctypes
 
         ctypes.CDLL(None).malloc_trim(0)
+
+
+IsMeasured = dict[str, Bool[Array, " seeds"]]
+
+
+class LoopState(NamedTuple):
+    """What a compiled iteration changes. The first axis of an array is the seed."""
+
+    learner: Learner
+    envs: VecEnvState
+    metrics: Metrics
+    """The metrics of the newest updates."""
+    is_measured: IsMeasured
+    """For which seeds they have been measured."""
+    steps: Trajectory
+    """The newest steps, for the message about a factor that is not finite."""
+    is_finite: Bool[Array, " seeds"]
+    """Whether all factors of the newest steps are finite."""
+
+
+@cache_by_value
+def compile_loop(env: JaxEnv, config: TrainConfig, phi: Sequence[Graph], n_seeds: int) -> Callable[..., LoopState]:
+    """Compile the iterations of a run. `phi` holds the graph of each team's phi.
+
+    Returns:
+        A function from the learner and the environments, which it consumes, the metrics of the newest updates (empty before the first), the
+        seeds, the number of iterations before, and the number of iterations to make. A device stops after an iteration with a factor that
+        is not finite.
+    """
+
+    def loop(
+        state: LoopState, seeds: Int[Array, " seeds"], n_done: Int[Array, ""], n_iterations: Int[Array, ""]
+    ) -> LoopState:
+        def is_running(carry: tuple[Int[Array, ""], LoopState]) -> Bool[Array, ""]:
+            return (carry[0] < n_done + n_iterations) & jnp.all(carry[1].is_finite)
+
+        def body(carry: tuple[Int[Array, ""], LoopState]) -> tuple[Int[Array, ""], LoopState]:
+            return carry[0] + 1, _iterate(carry[1], seeds, carry[0], env, config, phi)
+
+        return jax.lax.while_loop(is_running, body, (n_done, state))[1]
+
+    number = jax.ShapeDtypeStruct((), jnp.result_type(int))
+    seeds = jax.ShapeDtypeStruct((n_seeds,), number.dtype)
+    shape, seeds = shape_over_seeds((_loop_shape(env, config, n_seeds), seeds), config.n_devices)
+    jitted = jit_over_seeds(loop, config.n_devices, shared=(2, 3), donate=(0,))
+    return partial(_run_loop, jitted.lower(shape, seeds, number, number).compile(), shape)
+
+
+def _run_loop(
+    program: Callable[..., LoopState],
+    shape: LoopState,
+    learner: Learner,
+    envs: VecEnvState,
+    metrics: Metrics,
+    seeds: Int[Array, " seeds"],
+    n_done: int,
+    n_iterations: int,
+) -> LoopState:
+    def fill(leaf: Any, value: int) -> Array:
+        return jnp.full(leaf.shape, value, leaf.dtype, device=leaf.sharding)
+
+    state = LoopState(
+        learner=learner,
+        envs=envs,
+        metrics={name: jnp.array(metrics.get(name, fill(leaf, 0))) for name, leaf in shape.metrics.items()},
+        is_measured={name: fill(leaf, name in metrics) for name, leaf in shape.is_measured.items()},
+        steps=jax.tree.map(lambda leaf: fill(leaf, 0), shape.steps),
+        is_finite=fill(shape.is_finite, True),
+    )
+    return program(state, seeds, jnp.int32(n_done), jnp.int32(n_iterations))
+
+
+def _loop_shape(env: JaxEnv, config: TrainConfig, n_seeds: int) -> LoopState:
+    def measure_and_collect(learner: Learner, keys: Key[Array, " seeds"]) -> LoopState:
+        start = jnp.int32(0)
+        envs, actor = (
+            collect_device.reset(env, keys, config.n_envs, config),
+            get_actor(learner.algorithm, start, config),
+        )
+        _, steps = collect_device.collect(env, envs, actor, keys, start, config)
+        metrics = _train_step_function(config)(learner, steps, keys, start)[1]
+        if config.fits_separately:
+            metrics |= fit_seeds(learner, keys, config)[1]
+        is_measured = {name: jnp.zeros(n_seeds, bool) for name in metrics}
+        return LoopState(learner, envs, metrics, is_measured, steps, jnp.ones(n_seeds, bool))
+
+    return jax.eval_shape(measure_and_collect, learner_shape(config, n_seeds), keys_shape(n_seeds))
+
+
+def _iterate(
+    state: LoopState,
+    seeds: Int[Array, " seeds"],
+    number: Int[Array, ""],
+    env: JaxEnv,
+    config: TrainConfig,
+    phi: Sequence[Graph],
+) -> LoopState:
+    """Make one iteration, in the order of `Session.advance`."""
+    env_steps = number * config.iteration_steps
+
+    def learn(learner: Learner) -> Learner:
+        with float64():
+            return learn_returns(learner, config)
+
+    def fit(learner: Learner, old: Metrics, is_measured: IsMeasured) -> tuple[Learner, Metrics, IsMeasured]:
+        learner, metrics = fit_seeds(learner, stream_keys(seeds, Stream.FIT, env_steps), config)
+        return learner, *_record(old, is_measured, metrics)
+
+    def fit_and_update(learner: Learner, old: Metrics, is_measured: IsMeasured) -> tuple[Learner, Metrics, IsMeasured]:
+        if config.fits_separately:
+            is_due = number % config.fit_every == 0
+            learner, old, is_measured = jax.lax.cond(is_due, fit, _keep, learner, old, is_measured)
+        learner, metrics = _train_step_function(config)(learner, steps, seed_keys(seeds, env_steps + 1), env_steps)
+        return learner, *_record(old, is_measured, metrics)
+
+    actor = get_actor(state.learner.algorithm, env_steps, config)
+    keys = stream_keys(seeds, Stream.EXPLORATION, env_steps)
+    envs, steps = collect_device.collect(env, state.envs, actor, keys, env_steps, config)
+    learner, is_finite = jax.vmap(partial(store, config=config, phi=phi))(state.learner, steps)
+    if learner.decoders:
+        is_paid = jnp.any(steps.ended) | (not config.payments.only_at_end)
+        learner = jax.lax.cond(is_paid, learn, lambda unchanged: unchanged, learner)
+    updated = jax.lax.cond(env_steps >= config.warmup, fit_and_update, _keep, learner, state.metrics, state.is_measured)
+    learner, metrics, is_measured = updated
+    return LoopState(learner, envs, metrics, is_measured, steps, is_finite)
+
+
+def _keep(*state: Any) -> tuple[Any, ...]:
+    return state
+
+
+def _record(old: Metrics, is_measured: IsMeasured, metrics: Metrics) -> tuple[Metrics, IsMeasured]:
+    """Replace the metrics of the seeds that made updates or, if updates are not counted, of all seeds."""
+    is_new = metrics.get("algorithm/updates", 1) > 0
+    new = {name: jnp.where(is_new | ~is_measured[name], values, old[name]) for name, values in metrics.items()}
+    return old | new, is_measured | {name: is_measured[name] | is_new for name in metrics}
 
 
 def is_batching_faster(config: TrainConfig, n_seeds: int) -> bool:

@@ -15,6 +15,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int, Key, PRNGKeyArray
 
 from lare_rl.algorithms.batches import Metrics
+from lare_rl.config.train_config import CreditConfig, TrainConfig
 from lare_rl.credit import descent, returns
 from lare_rl.credit.decomposition import CreditBatch, DecoderState
 from lare_rl.credit.descent import plan_batch
@@ -30,7 +31,6 @@ from lare_rl.training.episodes import Decoders, fold_episodes
 from lare_rl.training.learner import Learner
 from lare_rl.training.rewards import team_metrics
 from lare_rl.training.seed_axis import jit_over_seeds
-from lare_rl.training.static_config import TrainConfig
 
 __all__ = [
     "FirstFitStoppedError",
@@ -63,7 +63,7 @@ class FirstFitStoppedError(Exception):
     """The user asked the run to stop during the first fit. Nothing of this iteration is kept."""
 
 
-def sample_credit(buffer: Replay, key: PRNGKeyArray, updates: int, config: TrainConfig) -> CreditSample:
+def sample_credit(buffer: Replay, key: PRNGKeyArray, updates: int, config: CreditConfig) -> CreditSample:
     """Draw the steps that each of some updates of the decoders reads."""
     fit, longest = config.method.fit, config.longest_segment
     assert fit is not None
@@ -79,7 +79,7 @@ def sample_credit(buffer: Replay, key: PRNGKeyArray, updates: int, config: Train
 
 
 def fit_decoders(
-    decoders: Decoders, buffer: Replay, sample: CreditSample, key: PRNGKeyArray, config: TrainConfig
+    decoders: Decoders, buffer: Replay, sample: CreditSample, key: PRNGKeyArray, config: CreditConfig
 ) -> tuple[Decoders, Metrics]:
     """Update every team's decoder once."""
     steps = replay.read(buffer, sample.steps)
@@ -92,7 +92,7 @@ def fit_decoders(
 
 
 def _update_decoder(
-    decoder: DecoderState, batch: CreditBatch, key: PRNGKeyArray, config: TrainConfig
+    decoder: DecoderState, batch: CreditBatch, key: PRNGKeyArray, config: CreditConfig
 ) -> tuple[DecoderState, Metrics]:
     """Take one gradient step. The gradient of a large batch of equally long episodes is computed in chunks."""
     assert config.method.fit is not None
@@ -110,7 +110,7 @@ def _update_decoder(
     return descent.update_in_chunks(decoder, chunks, key, config.method.fit, config.credit)
 
 
-def fit_seeds(learner: Learner, keys: Key[Array, " seeds"], config: TrainConfig) -> tuple[Learner, Metrics]:
+def fit_seeds(learner: Learner, keys: Key[Array, " seeds"], config: CreditConfig) -> tuple[Learner, Metrics]:
     """Update the decoders of every seed `fit_updates` times. Return the mean of each metric."""
     # On a CPU, one seed after the other: a batch of one seed fills the caches already.
     decoders, metrics = map_leading_axis(
@@ -119,7 +119,7 @@ def fit_seeds(learner: Learner, keys: Key[Array, " seeds"], config: TrainConfig)
     return learner._replace(reward_sources=decoders), metrics
 
 
-def fit_repeatedly(learner: Learner, key: PRNGKeyArray, config: TrainConfig) -> tuple[Decoders, Metrics]:
+def fit_repeatedly(learner: Learner, key: PRNGKeyArray, config: CreditConfig) -> tuple[Decoders, Metrics]:
     """Update the decoders `fit_updates` times. Return them, and the mean of each metric."""
     sample_key, key = jax.random.split(key)
     samples = sample_credit(learner.replay, sample_key, config.fit_updates, config)
@@ -200,7 +200,7 @@ def _count_held_out(buffer: Replay, window: int) -> Int[Array, " envs"]:
 
 
 def _held_out_error(
-    decoders: Decoders, buffer: Replay, n_hidden: Int[Array, " envs"], config: TrainConfig
+    decoders: Decoders, buffer: Replay, n_hidden: Int[Array, " envs"], config: CreditConfig
 ) -> Float[Array, ""]:
     """Return the squared error of the returns of held-out episodes, summed over the teams, each in units of its returns."""
     empty = empty_predictions(1, config.credit_specs[0].window)

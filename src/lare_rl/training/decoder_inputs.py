@@ -14,6 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
+from lare_rl.config.train_config import CreditConfig
 from lare_rl.credit.decomposition import CreditBatch
 from lare_rl.credit.engine import StepBatch
 from lare_rl.credit.input_names import input_arrays
@@ -27,7 +28,6 @@ from lare_rl.phi.evaluate import evaluate
 from lare_rl.phi.graph import Graph
 from lare_rl.runs.directory import Run
 from lare_rl.tasks.spec import select_states
-from lare_rl.training.static_config import TrainConfig
 from lare_rl.util.files import replace_npz
 
 __all__ = [
@@ -54,7 +54,7 @@ def is_compilable(graph: Graph) -> bool:
 
 
 def compute_factors(
-    graphs: Sequence[Graph], steps: Trajectory, config: TrainConfig
+    graphs: Sequence[Graph], steps: Trajectory, config: CreditConfig
 ) -> Float[Array, "*lead rows factors"]:
     """Compute the factors z of steps inside a compiled function, by each team's phi.
 
@@ -82,7 +82,7 @@ def _evaluate_graph(graph: Graph, observation: Array, action: Array) -> Float[Ar
     return jax.pure_callback(evaluate_on_host, shape, observation, action, vmap_method="broadcast_all")
 
 
-def compute_host_factors(run: Run, config: TrainConfig, steps: Trajectory) -> Float[np.ndarray, "*lead rows factors"]:
+def compute_host_factors(run: Run, config: CreditConfig, steps: Trajectory) -> Float[np.ndarray, "*lead rows factors"]:
     """Compute the factors z of steps on the host. They are empty for a method without phi.
 
     Raises:
@@ -105,7 +105,7 @@ def compute_host_factors(run: Run, config: TrainConfig, steps: Trajectory) -> Fl
 
 
 def decoder_inputs(
-    steps: StoredSteps, config: TrainConfig, team_index: int, names: tuple[str, ...] | None = None
+    steps: StoredSteps, config: CreditConfig, team_index: int, names: tuple[str, ...] | None = None
 ) -> Float[Array, "*batch rows inputs"]:
     """Return the inputs of a team's decoder for some steps, or those of these names."""
     names = config.credit_specs[team_index].inputs if names is None else names
@@ -130,7 +130,7 @@ def decoder_inputs(
     return jnp.concatenate(input_arrays(names, arrays), axis=-1)
 
 
-def tracked_inputs(steps: StoredSteps, config: TrainConfig) -> Float[Array, "*batch rows entries"]:
+def tracked_inputs(steps: StoredSteps, config: CreditConfig) -> Float[Array, "*batch rows entries"]:
     """Return the entries whose history is stored, of all teams, padded to the largest number."""
     entries = jnp.zeros((*steps.episode_ended.shape, config.n_proxy_rewards, config.n_tracked))
     for i, spec in enumerate(config.credit_specs):
@@ -140,21 +140,21 @@ def tracked_inputs(steps: StoredSteps, config: TrainConfig) -> Float[Array, "*ba
     return entries
 
 
-def alive_agents(steps: StoredSteps, config: TrainConfig) -> Bool[Array, "*batch agents"]:
+def alive_agents(steps: StoredSteps, config: CreditConfig) -> Bool[Array, "*batch agents"]:
     """Return which agents acted."""
     if "alive" in steps.columns:
         return steps.columns["alive"]
     return jnp.ones((*steps.episode_ended.shape, config.env.n_agents), bool)
 
 
-def row_mask(steps: StoredSteps, config: TrainConfig, team_index: int) -> Bool[Array, "*batch rows"] | None:
+def row_mask(steps: StoredSteps, config: CreditConfig, team_index: int) -> Bool[Array, "*batch rows"] | None:
     """Return which rows of a team's decoder inputs count. None means all."""
     if "alive" not in steps.columns or config.team_level:
         return None
     return steps.columns["alive"][..., config.team_slice(team_index)]
 
 
-def step_batch(steps: StoredSteps, config: TrainConfig, team_index: int) -> StepBatch:
+def step_batch(steps: StoredSteps, config: CreditConfig, team_index: int) -> StepBatch:
     """Return the steps as the input of the engine."""
     length = steps.length
     if config.payments.window is not None:  # steps that are not paid yet: most payments are for the whole window
@@ -170,7 +170,7 @@ def step_batch(steps: StoredSteps, config: TrainConfig, team_index: int) -> Step
     )
 
 
-def episode_batch(steps: StoredSteps, sample: CreditSample, config: TrainConfig, team_index: int) -> CreditBatch:
+def episode_batch(steps: StoredSteps, sample: CreditSample, config: CreditConfig, team_index: int) -> CreditBatch:
     """Return the batch that a team's decoder is fitted to, from the sampled steps."""
     episodes = sample.episodes
     return CreditBatch(

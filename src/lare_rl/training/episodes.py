@@ -15,6 +15,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Int
 
+from lare_rl.config.train_config import CreditConfig
 from lare_rl.credit import returns
 from lare_rl.credit.decomposition import CreditBatch, DecoderState
 from lare_rl.credit.methods import Fit
@@ -26,7 +27,6 @@ from lare_rl.nn.leading_axis import map_leading_axis
 from lare_rl.nn.masks import select
 from lare_rl.training.decoder_inputs import episode_batch
 from lare_rl.training.learner import Learner
-from lare_rl.training.static_config import TrainConfig
 
 __all__ = ["Decoders", "fold_episodes", "learn_returns", "predict_returns"]
 
@@ -37,7 +37,7 @@ Decoders = tuple[DecoderState, ...]
 State = TypeVar("State")
 
 
-def learn_returns(learner: Learner, config: TrainConfig) -> Learner:
+def learn_returns(learner: Learner, config: CreditConfig) -> Learner:
     """Let the decoders learn from episodes that have finished, and predict returns anew. Every array has a leading seed axis."""
     buffer, n_learned = replay.segments_as_episodes(learner.replay), learner.n_learned
     n_before = jnp.sum(n_learned, axis=1)
@@ -57,7 +57,7 @@ def learn_returns(learner: Learner, config: TrainConfig) -> Learner:
     return jax.vmap(partial(predict_returns, config=config))(learned, since)
 
 
-def predict_returns(learner: Learner, since: Int[Array, " envs"], config: TrainConfig) -> Learner:
+def predict_returns(learner: Learner, since: Int[Array, " envs"], config: CreditConfig) -> Learner:
     """Return the learner of one seed with the predicted returns of the episodes from `since` on, computed anew."""
     buffer = replay.segments_as_episodes(learner.replay)
     slots = buffer.first.shape[-1]
@@ -83,7 +83,7 @@ def _learn_if_due(
     buffer: Replay,
     n_learned: Int[Array, "seeds envs"],
     is_due: Bool[Array, " seeds"],
-    config: TrainConfig,
+    config: CreditConfig,
 ) -> Decoders:
     since = jnp.where(is_due[:, None], n_learned, buffer.current_episode)
     decoders = jax.vmap(partial(_predict_then_update, config=config))(decoders, buffer, since)
@@ -102,7 +102,7 @@ def fold_episodes(
     buffer: Replay,
     since: Int[Array, " envs"],
     body: Callable[[State, CreditBatch, Index], State],
-    config: TrainConfig,
+    config: CreditConfig,
     expected: int | None = None,
 ) -> tuple[State, ...]:
     """Apply `body` to each team's state (such as its decoder) and to batches of the finished episodes of one seed.
@@ -131,16 +131,18 @@ def fold_episodes(
 
 
 def _predict_then_update(
-    decoders: Decoders, buffer: Replay, since: Int[Array, " envs"], config: TrainConfig
+    decoders: Decoders, buffer: Replay, since: Int[Array, " envs"], config: CreditConfig
 ) -> Decoders:
     def body(decoder: DecoderState, episodes: CreditBatch, first: Index) -> DecoderState:
         return returns.predict_then_update(decoder, episodes, config.credit)
 
-    expected = config.n_envs * config.rollout_steps // config.longest_segment
+    expected = config.iteration_steps // config.longest_segment
     return fold_episodes(decoders, buffer, since, body, config, expected)
 
 
-def _rebuild_statistics(decoders: Decoders, buffer: Replay, is_stale: Bool[Array, ""], config: TrainConfig) -> Decoders:
+def _rebuild_statistics(
+    decoders: Decoders, buffer: Replay, is_stale: Bool[Array, ""], config: CreditConfig
+) -> Decoders:
     """Add all stored episodes to new sums if `is_stale` is true, with features standardised by the current statistics."""
     empty = tuple(map(returns.reset_statistics, decoders))
     since = jnp.where(is_stale, buffer.oldest, buffer.current_episode)

@@ -8,13 +8,13 @@ import jax
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from lare_rl.config.train_config import TrainConfig
 from lare_rl.data.replay import Replay, capacity
 from lare_rl.data.trajectory import Trajectory
 from lare_rl.envs.interface import AnyArray, EnvSpec
 from lare_rl.tasks.spec import TaskSpec
 from lare_rl.training.policy import compile_policy
 from lare_rl.training.rewards import team_metrics
-from lare_rl.training.static_config import TrainConfig
 
 __all__ = [
     "EpisodeBatch",

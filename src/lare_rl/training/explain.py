@@ -8,6 +8,7 @@ import jax
 import numpy as np
 from jaxtyping import Array, Bool
 
+from lare_rl.config.train_config import TrainConfig
 from lare_rl.credit.decomposition import CreditBatch, valid_rows
 from lare_rl.credit.explanation import Explanation, add_to_explanation, explain, init_explanation
 from lare_rl.credit.explanation_text import LEGEND_CODES, MESSAGES, MIN_EXPLAINED_EPISODES, returns_findings
@@ -20,7 +21,6 @@ from lare_rl.training.episodes import fold_episodes
 from lare_rl.training.learner import Learner
 from lare_rl.training.saved_state import load_learner
 from lare_rl.training.seed_axis import first_shard, select_seed
-from lare_rl.training.static_config import TrainConfig
 from lare_rl.util.findings import Finding, render
 from lare_rl.util.float64 import float64
 

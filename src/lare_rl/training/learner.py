@@ -13,6 +13,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
+from lare_rl.config.train_config import CreditConfig
 from lare_rl.credit import decomposition
 from lare_rl.credit.decomposition import DecoderState
 from lare_rl.credit.engine import RewardSource, init_source, select_decoders
@@ -26,7 +27,6 @@ from lare_rl.nn.normalise import update_scale
 from lare_rl.phi.graph import Graph
 from lare_rl.tasks.spec import MAX_LEVELS
 from lare_rl.training.decoder_inputs import compute_factors, decoder_inputs, row_mask, tracked_inputs
-from lare_rl.training.static_config import TrainConfig
 
 __all__ = [
     "Learner",
@@ -56,7 +56,7 @@ class Learner(NamedTuple):
         return select_decoders(self.reward_sources)
 
 
-def init_learner(key: PRNGKeyArray, config: TrainConfig, init_algorithm: Callable[[PRNGKeyArray], Any]) -> Learner:
+def init_learner(key: PRNGKeyArray, config: CreditConfig, init_algorithm: Callable[[PRNGKeyArray], Any]) -> Learner:
     """Return an untrained learner."""
     algorithm_key, *keys = jax.random.split(key, 1 + len(config.env.teams))
     return Learner(
@@ -67,7 +67,7 @@ def init_learner(key: PRNGKeyArray, config: TrainConfig, init_algorithm: Callabl
     )
 
 
-def empty_replay(config: TrainConfig, n_envs: int, capacity: int) -> Replay:
+def empty_replay(config: CreditConfig, n_envs: int, capacity: int) -> Replay:
     """Return a replay for steps of these environments, with all that the method reads of them."""
     with_predictions, with_levels = config.is_exact, config.group is not None
     n_teams = len(config.env.teams)
@@ -75,7 +75,7 @@ def empty_replay(config: TrainConfig, n_envs: int, capacity: int) -> Replay:
 
 
 def store(
-    learner: Learner, steps: Trajectory, config: TrainConfig, phi: Sequence[Graph] = ()
+    learner: Learner, steps: Trajectory, config: CreditConfig, phi: Sequence[Graph] = ()
 ) -> tuple[Learner, Bool[Array, ""]]:
     """Compute the factors of new steps by each team's phi, and put both into the replay and the running statistics.
 
@@ -90,7 +90,7 @@ def store_with_factors(
     learner: Learner,
     steps: Trajectory,
     factors: Float[Array, "time envs rows factors"],
-    config: TrainConfig,
+    config: CreditConfig,
     scored: Bool[Array, "time envs agents"] | None = None,
 ) -> Learner:
     """Put new steps into the replay and into the running statistics.
@@ -109,7 +109,7 @@ def store_with_factors(
     return learner._replace(reward_sources=sources, replay=buffer)
 
 
-def _with_history(before: Replay, buffer: Replay, n_steps: int, config: TrainConfig) -> Replay:
+def _with_history(before: Replay, buffer: Replay, n_steps: int, config: CreditConfig) -> Replay:
     """Return the replay with the history of its newest steps, which `before` does not have yet."""
     last_step = replay.read(before, replay.newest_steps(before, 1))
     new_steps = replay.read(buffer, replay.newest_steps(buffer, n_steps))
@@ -121,7 +121,7 @@ def _with_history(before: Replay, buffer: Replay, n_steps: int, config: TrainCon
 
 
 def replay_columns(
-    steps: Trajectory, factors: Array, config: TrainConfig, scored: Bool[Array, "time envs agents"] | None = None
+    steps: Trajectory, factors: Array, config: CreditConfig, scored: Bool[Array, "time envs agents"] | None = None
 ) -> tuple[dict[str, Any], dict[str, Any]]:
     """Return the replay's columns for new steps, and the columns of `STEP_COLUMNS` after the steps.
 
@@ -142,14 +142,14 @@ def replay_columns(
     )
 
 
-def _levels(steps: Trajectory, config: TrainConfig) -> Int[Array, "time envs"] | None:
+def _levels(steps: Trajectory, config: CreditConfig) -> Int[Array, "time envs"] | None:
     """Return the level of each step's episode, which is valid at the steps that are paid."""
     if config.group is None:
         return None
     return jnp.clip(jnp.asarray(steps.next_timestep.measures[config.group]).astype(jnp.int32), 0, MAX_LEVELS - 1)
 
 
-def _observe(source: RewardSource, steps: StoredSteps, config: TrainConfig, team_index: int) -> RewardSource:
+def _observe(source: RewardSource, steps: StoredSteps, config: CreditConfig, team_index: int) -> RewardSource:
     """Add new steps, and the episodes that were paid in them, to the statistics of a team's decoder, or to its scale."""
     mean_reward = steps.mean_reward[..., team_index].ravel()
     if not isinstance(source, DecoderState):

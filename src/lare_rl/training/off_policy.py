@@ -3,15 +3,15 @@
 Algorithm 1 of the LaRe paper, lines 6 to 8, for TD3, DDPG and SAC. They train a single agent.
 """
 
-from functools import partial
 from typing import Any
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, Int, Key, PRNGKeyArray, Scalar
+from jaxtyping import Array, Float, Int, PRNGKeyArray, Scalar
 
 from lare_rl.algorithms.batches import Metrics, Transitions
 from lare_rl.algorithms.off_policy import OffPolicySettings
+from lare_rl.config.train_config import TrainConfig
 from lare_rl.credit.engine import RewardSource, select_decoders
 from lare_rl.data import replay
 from lare_rl.data.replay import StoredSteps
@@ -20,25 +20,17 @@ from lare_rl.data.trajectory import Trajectory
 from lare_rl.training.decoder_fits import fit_decoders, sample_credit
 from lare_rl.training.learner import Learner
 from lare_rl.training.rewards import rewards
-from lare_rl.training.static_config import TrainConfig
 
 __all__ = ["train_step"]
 
 
 def train_step(
-    learner: Learner, steps: Trajectory, keys: Key[Array, " seeds"], env_steps: Int[Scalar, ""], config: TrainConfig
+    learner: Learner, steps: Trajectory, key: PRNGKeyArray, env_steps: Int[Scalar, ""], config: TrainConfig
 ) -> tuple[Learner, Metrics]:
     """Update decoder and algorithm once for each new step of an environment. Of `steps`, only the number matters."""
-    return jax.vmap(partial(_train_seed, config=config), in_axes=(0, 0, None))(learner, keys, env_steps)
-
-
-def _train_seed(
-    learner: Learner, key: PRNGKeyArray, env_steps: Int[Scalar, ""], config: TrainConfig
-) -> tuple[Learner, Metrics]:
     sample_key, _, noise_key = jax.random.split(key, 3)
     algorithm, settings, buffer = config.algorithm.load(), config.hyperparameters, learner.replay
     assert isinstance(settings, OffPolicySettings)
-    n_updates = config.rollout_steps * config.n_envs
 
     def update(carry: tuple[Any, tuple[RewardSource, ...]], inputs: Any) -> tuple[Any, Metrics]:
         state, sources = carry
@@ -55,10 +47,10 @@ def _train_seed(
     # The steps of all updates are sampled at once. Their rows are read when the update runs.
     batch_key, credit_key = jax.random.split(sample_key)
     inputs = (
-        env_steps - settings.warmup + jnp.arange(n_updates),
-        sample_transitions(buffer, batch_key, (n_updates, settings.batch_size)),
-        sample_credit(buffer, credit_key, n_updates, config) if config.joint_fit else None,
-        jax.random.split(noise_key, n_updates),
+        env_steps - settings.warmup + jnp.arange(config.iteration_steps),
+        sample_transitions(buffer, batch_key, (config.iteration_steps, settings.batch_size)),
+        sample_credit(buffer, credit_key, config.iteration_steps, config) if config.joint_fit else None,
+        jax.random.split(noise_key, config.iteration_steps),
     )
     (state, sources), metrics = jax.lax.scan(update, (learner.algorithm, learner.reward_sources), inputs)
     return learner._replace(algorithm=state, reward_sources=sources), jax.tree.map(jnp.mean, metrics)

@@ -3,34 +3,26 @@
 Algorithm 1 of the LaRe paper, lines 6 to 8, for PPO and IPPO. The decoder was fitted to all stored episodes before.
 """
 
-from functools import partial
-
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, Int, Key, PRNGKeyArray, Scalar, Shaped
+from jaxtyping import Array, Float, Int, PRNGKeyArray, Scalar, Shaped
 
 from lare_rl.algorithms.batches import Metrics, Rollout
+from lare_rl.config.train_config import TrainConfig
 from lare_rl.data import replay
 from lare_rl.data.trajectory import Trajectory
 from lare_rl.training.episodes import predict_returns
 from lare_rl.training.learner import Learner
 from lare_rl.training.policy import policy_input
 from lare_rl.training.rewards import rewards
-from lare_rl.training.static_config import TrainConfig
 
 __all__ = ["train_step"]
 
 
 def train_step(
-    learner: Learner, steps: Trajectory, keys: Key[Array, " seeds"], env_steps: Int[Scalar, ""], config: TrainConfig
-) -> tuple[Learner, Metrics]:
-    """Update the policy on `steps`, which have just been stored."""
-    return jax.vmap(partial(_train_seed, config=config), in_axes=(0, 0, 0, None))(learner, steps, keys, env_steps)
-
-
-def _train_seed(
     learner: Learner, steps: Trajectory, key: PRNGKeyArray, env_steps: Int[Scalar, ""], config: TrainConfig
 ) -> tuple[Learner, Metrics]:
+    """Update the policy on `steps`, which have just been stored."""
     remaining = 1 - env_steps / config.steps
     rollout = _rollout(learner, jax.tree.map(jnp.asarray, steps), config)
     state, metrics = config.algorithm.load().update(learner.algorithm, rollout, key, remaining, config.hyperparameters)

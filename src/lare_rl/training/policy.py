@@ -17,12 +17,12 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
 from lare_rl.algorithms.registry import Consumes
+from lare_rl.config.train_config import TrainConfig
 from lare_rl.nn.masks import select
 from lare_rl.training import sequences
 from lare_rl.training.compile_cache import cache_by_value
 from lare_rl.training.numpy_program import UnsupportedOperationError, to_numpy
 from lare_rl.training.seed_axis import jit_over_seeds
-from lare_rl.training.static_config import TrainConfig
 from lare_rl.training.streams import host_noise, keys_shape
 
 __all__ = [
@@ -49,7 +49,7 @@ HostPolicy = Callable[..., tuple[Float[np.ndarray, "seeds envs agents action"], 
 def init_algorithm(key: PRNGKeyArray, config: TrainConfig) -> Any:
     """Return the untrained state of a run's algorithm."""
     env, algorithm, settings = config.env, config.algorithm.load(), config.hyperparameters
-    match config.algorithm.consumes:
+    match config.consumes:
         case Consumes.TRANSITIONS:
             return algorithm.init(key, env.observation_size, env.action_size, settings)
         case Consumes.ROLLOUTS:
@@ -62,14 +62,14 @@ def init_algorithm(key: PRNGKeyArray, config: TrainConfig) -> Any:
 
 def get_actor(state: Any, env_steps: int | Int[Array, ""], config: TrainConfig) -> Any:
     """Return what is needed to act after `env_steps` environment steps, from the algorithm's state, of one seed or of all."""
-    if config.algorithm.consumes is Consumes.SEQUENCES:
+    if config.consumes is Consumes.SEQUENCES:
         return sequences.get_actor(state, env_steps, config)
     return config.algorithm.load().get_actor(state)
 
 
 def init_memory(config: TrainConfig, *lead: int) -> Any:
     """Return the memory of actors before the first step of an episode, for seeds and environments of shape `lead`."""
-    if config.algorithm.consumes is not Consumes.SEQUENCES:
+    if config.consumes is not Consumes.SEQUENCES:
         return ()
     env = config.env
     memory = config.algorithm.load().init_memory((env.n_agents,), env.action_size, config.hyperparameters)
@@ -97,7 +97,7 @@ def act(
 ) -> tuple[Float[Array, "*batch agents action"], Any]:
     """Return the actions of one seed's policy, and its new memory."""
     algorithm, settings = config.algorithm.load(), config.hyperparameters
-    match config.algorithm.consumes:
+    match config.consumes:
         case Consumes.SEQUENCES:
             return algorithm.act(actor.agent, memory, observation, available, noise, actor.epsilon)
         case Consumes.ROLLOUTS:

@@ -10,7 +10,7 @@ from collections.abc import Iterator
 
 import jax
 
-from lare_rl.config.resolve import replay_rows
+from lare_rl.config.train_config import replay_rows
 from lare_rl.errors import LareError
 from lare_rl.runs.directory import Run
 

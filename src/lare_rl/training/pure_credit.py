@@ -19,10 +19,11 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
-from lare_rl.algorithms.registry import ALGORITHMS
-from lare_rl.config.validity import CreditContext, check_credit
+from lare_rl.algorithms.registry import Consumes
+from lare_rl.config.train_config import CreditConfig
+from lare_rl.config.validity import check_training
 from lare_rl.credit.decoder_settings import CreditSettings, default_credit
-from lare_rl.credit.methods import METHODS, Method
+from lare_rl.credit.methods import METHODS, Method, Reward
 from lare_rl.data.replay import StoredSteps, mean_length, required_capacity, segments_as_episodes
 from lare_rl.data.trajectory import Trajectory
 from lare_rl.envs.interface import EnvSpec, Team, to_env_action
@@ -36,7 +37,6 @@ from lare_rl.training.decoder_fits import fit_repeatedly
 from lare_rl.training.decoder_inputs import compute_factors
 from lare_rl.training.learner import Learner, init_learner, replay_columns, store_with_factors
 from lare_rl.training.rewards import rewards
-from lare_rl.training.static_config import TrainConfig
 from lare_rl.util.float64 import float64
 
 __all__ = ["CreditSteps", "PureCredit", "PureCreditState", "pure_credit"]
@@ -129,38 +129,26 @@ def pure_credit(
         action_size=action_size,
         discrete=discrete,
         max_steps=max_steps,
-        agents_leave=phi is not None,  # steps with an invalid factor are stored as steps of agents that have left
         low=np.broadcast_to(np.asarray(low, np.float32), (agents, action_size)),
         high=np.broadcast_to(np.asarray(high, np.float32), (agents, action_size)),
         is_jax=True,
     )
-    algorithm = ALGORITHMS["ppo" if agents == 1 else "ippo"]  # on-policy, so that only what the decoder reads is stored
-    config = TrainConfig(
+    config = CreditConfig(
         env=env,
-        credit_scope="observation",
         scored_observation=scored_observation,
         method=chosen,
-        algorithm=algorithm,
-        hyperparameters=algorithm.settings,
         credit=credit,
         scale_rewards=scale_rewards,
         n_factors=() if phi is None else (phi.n_factors(scored_observation),),
         n_envs=n_envs,
         rollout_steps=n_steps,
         capacity=max(capacity // n_envs, required_capacity(n_steps, max_steps)),
-        steps=0,
         fit_updates=fit_updates,
+        consumes=Consumes.ROLLOUTS,
+        masks_steps=phi is not None,  # those whose factors are invalid
     )
-    context = CreditContext(
-        n_agents=agents,
-        n_raw_features=observation_size + action_size,
-        scored_observation=scored_observation,
-        scale_rewards=scale_rewards,
-        discrete_actions=discrete,
-        max_steps=max_steps,
-        step_at_a_time=True,  # the reward of a step is computed from this step alone
-    )
-    check_credit(chosen, credit, context)
+    _check_steps(config)
+    check_training(config)
     return _make_functions(config, () if phi is None else (phi.graph,))
 
 
@@ -175,7 +163,17 @@ def _check_phi(method: Method, phi: LatentFunction | None, sizes: tuple[int, int
     return phi if method.needs_phi else None
 
 
-def _make_functions(config: TrainConfig, phi: tuple[Graph, ...]) -> PureCredit:
+def _check_steps(config: CreditConfig) -> None:
+    """Raise `LareError` if the reward of a step is not computed from this step alone."""
+    method, name = config.method, config.method.name
+    reads_history = method.decoder_kind.whole_episodes or "history" in config.credit_specs[0].inputs
+    if method.reward not in (Reward.PROXY, Reward.DESIGNED) or reads_history:
+        raise LareError(f"{name} does not compute the reward of a step from this step alone: use bayes or lare-bayes")
+    if config.credit.exact not in ("auto", "no"):
+        raise LareError("exact needs the other steps of an episode: leave it out")
+
+
+def _make_functions(config: CreditConfig, phi: tuple[Graph, ...]) -> PureCredit:
     learn_returns = _make_learn_returns(config)
     batch_shape = (config.rollout_steps, config.n_envs)
 
@@ -216,7 +214,7 @@ def _make_functions(config: TrainConfig, phi: tuple[Graph, ...]) -> PureCredit:
 
 
 def _valid_factors(
-    phi: tuple[Graph, ...], steps: Trajectory, config: TrainConfig
+    phi: tuple[Graph, ...], steps: Trajectory, config: CreditConfig
 ) -> tuple[Float[Array, "time envs agents factors"], Bool[Array, "time envs agents"]]:
     """Return the factors of steps, and for which steps of an agent all of them are finite. The others are 0."""
     factors = compute_factors(phi, steps, config)
@@ -224,7 +222,7 @@ def _valid_factors(
     return jnp.where(is_valid[..., None], factors, 0), is_valid
 
 
-def _trajectory(steps: CreditSteps, config: TrainConfig) -> Trajectory:
+def _trajectory(steps: CreditSteps, config: CreditConfig) -> Trajectory:
     """Return the steps with an axis of agents."""
     env, lead = config.env, jnp.shape(steps.terminated)
 
@@ -263,7 +261,7 @@ def _stored_steps(learner: Learner, columns: dict[str, Any], next_columns: dict[
     )
 
 
-def _make_learn_returns(config: TrainConfig) -> Callable[[Learner], tuple[Any, Any]]:
+def _make_learn_returns(config: CreditConfig) -> Callable[[Learner], tuple[Any, Any]]:
     """Return a function from learners to their decoders after `learn_returns`, and `n_learned`, that `vmap` can map at any time.
 
     `learn_returns` must be traced with float64 enabled, but a user's `vmap` may trace it later, when it is not. So a mapped axis is

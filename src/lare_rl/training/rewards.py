@@ -7,6 +7,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from lare_rl.algorithms.batches import Metrics
+from lare_rl.config.train_config import CreditConfig
 from lare_rl.credit import accuracy, engine, prequential
 from lare_rl.credit.decoder_settings import RECENT_STEPS
 from lare_rl.credit.engine import RewardSource
@@ -16,13 +17,12 @@ from lare_rl.data.replay import StoredSteps
 from lare_rl.envs.interface import Team, team_mean
 from lare_rl.training.decoder_inputs import alive_agents, step_batch
 from lare_rl.training.learner import Learner
-from lare_rl.training.static_config import TrainConfig
 
 __all__ = ["assess", "rewards", "team_metrics", "team_proxy_rewards"]
 
 
 def rewards(
-    steps: StoredSteps, reward_sources: tuple[RewardSource, ...], config: TrainConfig
+    steps: StoredSteps, reward_sources: tuple[RewardSource, ...], config: CreditConfig
 ) -> Float[Array, "*batch agents"]:
     """Return the rewards that the algorithm is trained on, for each agent, by `Learner.reward_sources`."""
     alive = alive_agents(steps, config)
@@ -39,14 +39,14 @@ def rewards(
 
 
 def team_proxy_rewards(
-    steps: StoredSteps, reward_sources: tuple[RewardSource, ...], config: TrainConfig, team_index: int
+    steps: StoredSteps, reward_sources: tuple[RewardSource, ...], config: CreditConfig, team_index: int
 ) -> Float[Array, "*batch rows"]:
     """Return r_hat of a team: one for each of its agents, or one for all if credit goes to whole teams."""
     batch, spec = step_batch(steps, config, team_index), config.credit_specs[team_index]
     return engine.proxy_rewards(reward_sources[team_index], batch, spec)
 
 
-def assess(learner: Learner, config: TrainConfig) -> Metrics:
+def assess(learner: Learner, config: CreditConfig) -> Metrics:
     """Compare the newest proxy rewards with the true rewards, over the last steps of every environment."""
     if not config.method.has_proxy_rewards:
         return {}

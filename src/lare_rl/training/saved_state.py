@@ -6,6 +6,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Int
 
+from lare_rl.config.train_config import TrainConfig, make_train_config
 from lare_rl.errors import LareError
 from lare_rl.runs import checkpoint
 from lare_rl.runs.best_policy import load_best
@@ -13,7 +14,6 @@ from lare_rl.runs.directory import Run
 from lare_rl.training.compiled import learner_shape
 from lare_rl.training.learner import Learner
 from lare_rl.training.policy import actor_shape, get_actor
-from lare_rl.training.static_config import TrainConfig, make_train_config
 from lare_rl.util.provenance import code_version
 
 __all__ = ["SavedState", "load_actor", "load_learner"]
@@ -36,7 +36,7 @@ def load_learner(run: Run, n_devices: int = 1) -> SavedState:
     Raises:
         LareError: there is no checkpoint, it is damaged, or it is of a version of LaRe whose state has another structure.
     """
-    config = replace(make_train_config(run), n_devices=n_devices)
+    config = make_train_config(run.config.task, run.config.settings, run.functions, n_devices)
     try:
         learner, metadata, arrays = checkpoint.load(run.checkpoint, learner_shape(config, len(run.seeds)))
         return SavedState(replace(config, batched=metadata.get("batched", False)), learner, metadata, arrays)
@@ -56,7 +56,7 @@ def load_actor(run: Run, best: bool = False) -> tuple[TrainConfig, Any, Int[np.n
         LareError: no actor has been saved.
     """
     if best:
-        config = make_train_config(run)
+        config = make_train_config(run.config.task, run.config.settings, run.functions)
         best_policy = load_best(run.checkpoint, actor_shape(config, len(run.seeds)), len(run.seeds))
         return config, best_policy.actor, best_policy.step
     config, learner, metadata, _ = load_learner(run)

@@ -15,6 +15,7 @@ from jaxtyping import Array, Float, Int, Key, PRNGKeyArray, Scalar
 
 from lare_rl.algorithms.batches import Metrics, Sequences
 from lare_rl.algorithms.registry import SequenceSettings
+from lare_rl.config.train_config import TrainConfig
 from lare_rl.credit.engine import RewardSource
 from lare_rl.data import replay
 from lare_rl.data.layouts import lay_out_padded
@@ -28,7 +29,6 @@ from lare_rl.training.decoder_fits import fit_decoders, sample_credit
 from lare_rl.training.decoder_inputs import alive_agents
 from lare_rl.training.learner import Learner
 from lare_rl.training.rewards import rewards
-from lare_rl.training.static_config import TrainConfig
 
 __all__ = ["Actor", "SequenceState", "get_actor", "init", "train_step"]
 

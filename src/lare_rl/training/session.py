@@ -1,9 +1,9 @@
-"""A running training: the training state, its environments, and the functions that advance it by one iteration."""
+"""A running training: its state, its environments, and the iterations of Algorithm 1 of the LaRe paper."""
 
 import time
 from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import jax
@@ -14,26 +14,40 @@ from jaxtyping import Array, Float, Key
 from lare_rl.algorithms.batches import Metrics
 from lare_rl.algorithms.off_policy import OffPolicySettings
 from lare_rl.config.settings import ResolvedSettings
+from lare_rl.config.train_config import TrainConfig, make_train_config
 from lare_rl.data.trajectory import Trajectory, empty_trajectory
+from lare_rl.envs.workers import close_idle_workers
 from lare_rl.errors import LareError
 from lare_rl.runs import checkpoint
 from lare_rl.runs.best_policy import BEST_FILE, BestPolicy, empty_best, load_best, save_best, update_best
 from lare_rl.runs.directory import Run
 from lare_rl.runs.metric_names import ACTOR_SATURATION, DETERMINISTIC_RETURN
-from lare_rl.training import decoder_fits, iteration
-from lare_rl.training.collect_device import DeviceCollector
-from lare_rl.training.collect_host import HostCollector
-from lare_rl.training.compiled import CompiledFunctions, compile_functions, learner_shape
+from lare_rl.training import decoder_fits
+from lare_rl.training.collect_device import DeviceCollector, is_reset_cheap, make_jax_env
+from lare_rl.training.collect_host import HostCollector, make_host_collector
+from lare_rl.training.compiled import (
+    CompiledFunctions,
+    LoopState,
+    compile_ahead,
+    compile_functions,
+    compile_loop,
+    init_seeds,
+    is_batching_faster,
+    learner_shape,
+)
 from lare_rl.training.decoder_inputs import compute_host_factors
 from lare_rl.training.evaluation import greedy_actions, metrics_lines, saturation
 from lare_rl.training.explain import compile_explanation
-from lare_rl.training.iteration import IterationFunctions, LoopState
 from lare_rl.training.learner import Learner, abandon_episodes
 from lare_rl.training.policy import actor_shape, get_actor
-from lare_rl.training.static_config import TrainConfig
+from lare_rl.training.saved_state import load_learner
+from lare_rl.training.seed_axis import count_seed_devices
+from lare_rl.training.streams import Stream, seed_keys, stream_keys
+from lare_rl.training.unroll_host import DivergedError
 from lare_rl.util.float64 import load_linear_algebra, one_blas_thread
+from lare_rl.util.npz import DAMAGED_FILE_ERRORS
 
-__all__ = ["Session"]
+__all__ = ["Session", "restore_session", "start_session"]
 
 MAX_CALL_S = 5.0
 """About how long one compiled call may take. Until it returns, the user cannot stop the run."""
@@ -99,10 +113,23 @@ class Session:
             FirstFitStoppedError: the user has asked the run to stop, during the decoder's first fit. The session cannot
                 continue.
         """
-        if self.loop is None or self._is_before_first_fit:
-            self._iterate()
+        if self.loop is not None and not self._is_before_first_fit:
+            self._iterate_compiled(self.loop, (until - self.step) // self.config.iteration_steps)
+            return
+        if self.settings.overlap_collection:
+            # The host collects by the policy from before the update. It needs a copy, because the update reuses the learner's memory.
+            actor, config = jax.tree.map(jnp.copy, self.actor), self.config
+            # In a thread, because the call of an update returns when the device has nearly finished it. It reads only stored steps.
+            no_steps = empty_trajectory(config.env, len(self.run.seeds), config.rollout_steps, config.n_envs)
+            updating = self._threads.submit(self._update, no_steps)
+            steps = self.collector.collect(actor, self.step)
+            updating.result()
+            self._store(steps)
         else:
-            self._iterate_compiled(self.loop, (until - self.step) // self.settings.iteration_steps)
+            steps = self.collector.collect(self.actor, self.step)
+            self._store(steps)
+            self._update(steps)
+        self.step += self.config.iteration_steps
 
     @property
     def _is_before_first_fit(self) -> bool:
@@ -114,7 +141,7 @@ class Session:
         assert isinstance(self.collector, DeviceCollector)
         n_iterations = max(1, min(max_iterations, int(MAX_CALL_S / self._iteration_s)))
         start = time.perf_counter()
-        seeds, n_done = jnp.asarray(self.run.seeds), self.step // self.settings.iteration_steps
+        seeds, n_done = jnp.asarray(self.run.seeds), self.step // self.config.iteration_steps
         with one_blas_thread():
             state = loop(self.learner, self.collector.envs, self.latest_metrics, seeds, n_done, n_iterations)
             is_measured, is_finite = jax.device_get((state.is_measured, state.is_finite))
@@ -122,33 +149,56 @@ class Session:
         self.learner, self.collector.envs = state.learner, state.envs
         self._unchecked = is_finite, state.steps
         self._check_factors()
-        self._keep_metrics(state.metrics, is_measured)
-        self.step += n_iterations * self.settings.iteration_steps
-
-    def _iterate(self) -> None:
-        """Collect steps, compute factors, store them, sometimes fit the decoder, update the algorithm.
-
-        With `overlap_collection`, the device updates while the host collects, by the policy from before the update.
-        """
-        if self.settings.overlap_collection:
-            actor = jax.tree.map(jnp.copy, self.actor)  # the update reuses the memory of its learner
-            # In a thread, because the call of an update returns when the device has nearly finished it. It reads only stored steps.
-            config = self.config
-            no_steps = empty_trajectory(config.env, len(self.run.seeds), config.rollout_steps, config.n_envs)
-            updating = self._threads.submit(self._update, no_steps)
-            steps = self.collector.collect(actor, self.step)
-            updating.result()
-            self._store(steps)
-        else:
-            steps = self.collector.collect(self.actor, self.step)
-            self._store(steps)
-            self._update(steps)
-        self.step += self.settings.iteration_steps
+        self.latest_metrics |= {name: state.metrics[name] for name, seeds in is_measured.items() if seeds.any()}
+        self.step += n_iterations * self.config.iteration_steps
 
     def _store(self, steps: Trajectory) -> None:
+        """Store new steps, and let the decoders learn from episodes that have finished."""
         self._check_factors()
-        self.learner, is_finite = iteration.store_steps(self.learner, steps, self._iteration_functions, self.config)
+        self.learner, is_finite = self.functions.store(self.learner, steps)
+        if self.learner.decoders and (steps.ended.any() or not self.config.payments.only_at_end):
+            self.learner = self.functions.learn_returns(self.learner)
         self._unchecked = is_finite, steps
+
+    def _check_losses(self) -> None:
+        """Raise `DivergedError` if a loss is not finite, so that the useless state is not saved."""
+        seeds, metrics = self.run.seeds, self.latest_metrics
+        updates = np.asarray(metrics.get("algorithm/updates", np.ones(len(seeds))))
+        for name in metrics:
+            if not name.startswith(("critic/loss", "credit/loss")):
+                continue
+            for seed, loss, n_updates in zip(seeds, np.asarray(metrics[name]), updates, strict=True):
+                if n_updates and not np.isfinite(loss):
+                    raise DivergedError(
+                        f"training diverged: {name} of seed {seed} is not finite at step {self.step}; the last checkpoint is "
+                        "whole: train again with a smaller learning rate (a JaxEnv may also have returned NaN)"
+                    )
+
+    def _update(self, steps: Trajectory) -> None:
+        """Fit the decoders if they have updates of their own that are due, and update the algorithm. Do nothing during the warmup."""
+        config, seeds = self.config, jnp.asarray(self.run.seeds)
+        if self.step < config.warmup:
+            return
+        if config.fits_separately and self.step // config.iteration_steps % config.fit_every == 0:
+            self._fit(stream_keys(seeds, Stream.FIT, self.step))
+        keys = seed_keys(seeds, self.step + 1)
+        self.learner, metrics = self.functions.train_step(self.learner, steps, keys, self.step)
+        if "algorithm/updates" in metrics:  # the newest metrics of a seed are those of its last updates
+            is_new, old = metrics["algorithm/updates"] > 0, self.latest_metrics
+            metrics = {name: jnp.where(is_new, values, old.get(name, values)) for name, values in metrics.items()}
+            metrics = metrics if np.any(is_new) else {}
+        self.latest_metrics |= metrics
+
+    def _fit(self, keys: Key[Array, " seeds"]) -> None:
+        """Fit the decoders. The first fit lasts until it brings no improvement."""
+        if self._is_before_first_fit and decoder_fits.has_enough_episodes(self.learner):
+            fit = compile_functions(decoder_fits.config_of_first_fit(self.config)).fit
+            inputs = self.learner, fit, keys, self.config, self._stop_requested
+            self.learner, metrics = decoder_fits.fit_until_converged(*inputs)
+            self.first_fit_done = True
+        else:
+            self.learner, metrics = self.functions.fit(self.learner, keys)
+        self.latest_metrics |= metrics
 
     def _check_factors(self) -> None:
         """Raise `LareError` if a factor of the newest steps is not finite.
@@ -165,32 +215,7 @@ class Session:
                 "float32; the last checkpoint is whole"
             )
 
-    def _update(self, steps: Trajectory) -> None:
-        seeds, functions = jnp.asarray(self.run.seeds), self._iteration_functions
-        measured = self.latest_metrics, dict.fromkeys(self.latest_metrics, np.ones(len(seeds), bool))
-        self.learner, measured = iteration.update(
-            self.learner, measured, steps, seeds, self.step, functions, self.config
-        )
-        self._keep_metrics(*measured)
-
-    def _keep_metrics(self, metrics: Metrics, is_measured: dict[str, Any]) -> None:
-        self.latest_metrics |= {name: values for name, values in metrics.items() if np.any(is_measured[name])}
-
-    @property
-    def _iteration_functions(self) -> IterationFunctions:
-        functions = self.functions
-        return IterationFunctions(functions.store, functions.learn_returns, self._fit, functions.train_step)
-
-    def _fit(self, learner: Learner, keys: Key[Array, " seeds"]) -> tuple[Learner, Metrics]:
-        """Fit the decoders. The first fit lasts until it brings no improvement."""
-        if not (self._is_before_first_fit and decoder_fits.has_enough_episodes(learner)):
-            return self.functions.fit(learner, keys)
-        fit = compile_functions(decoder_fits.config_of_first_fit(self.config)).fit
-        fitted = decoder_fits.fit_until_converged(learner, fit, keys, self.config, self._stop_requested)
-        self.first_fit_done = True
-        return fitted
-
-    def compile_while_collecting(self) -> None:
+    def _compile_while_collecting(self) -> None:
         """Compile in threads what the first finished episodes need. Until then, the processor often waits for a simulator.
 
         An error is left to the call that needs the program: it compiles again.
@@ -208,6 +233,7 @@ class Session:
             One line of metrics.jsonl for each seed.
 
         Raises:
+            DivergedError: a policy or a loss is not finite any more.
             LareError: a factor is not finite, an environment fails, or the best policies cannot be written.
         """
         self._check_factors()
@@ -225,6 +251,7 @@ class Session:
             metrics[DETERMINISTIC_RETURN] = deterministic.returns[..., 0].mean(axis=1)
         if self.step > self.config.warmup and isinstance(self.settings.hyperparameters, OffPolicySettings):
             metrics[ACTOR_SATURATION] = saturation(greedy_actions(actor, self.learner.replay, self.config))
+        self._check_losses()
         return metrics_lines(self.run.seeds, self.step, metrics, rate)
 
     def _keep_best(self, score: Float[np.ndarray, " seeds"], actor: Any) -> None:
@@ -238,9 +265,10 @@ class Session:
         """Write a checkpoint, while the run goes on. `finish_saving` waits until it is written.
 
         Raises:
-            LareError: the last checkpoint could not be written, or a factor is not finite.
+            LareError: the last checkpoint could not be written, or a factor or a loss is not finite.
         """
         self._check_factors()
+        self._check_losses()
         self.finish_saving()
         metadata = {
             "step": self.step,
@@ -276,13 +304,62 @@ class Session:
         return messages
 
     def close(self) -> None:
-        """Close the environments, and finish the last checkpoint. Raises `LareError` if it cannot be written."""
+        """Close the environments and worker processes, and finish the last checkpoint. Raises `LareError` if it cannot be written."""
         try:
             if isinstance(self.collector, HostCollector):
                 self.collector.close()
         finally:
             self._threads.shutdown()
+            close_idle_workers()
             self.finish_saving()
+
+
+def start_session(run: Run) -> Session:
+    """Return a session before its first step."""
+    n_devices = count_seed_devices(len(run.seeds))
+    config = make_train_config(run.config.task, run.config.settings, run.functions, n_devices)
+    config = replace(config, batched=is_batching_faster(config, len(run.seeds)))
+    return _make_session(run, config, None)
+
+
+def restore_session(run: Run) -> tuple[Session, list[str]]:
+    """Return a session at the last checkpoint, and messages for the user.
+
+    Raises:
+        LareError: there is no checkpoint, or it cannot be used.
+    """
+    config, learner, metadata, arrays = load_learner(run, count_seed_devices(len(run.seeds)))
+    session = _make_session(run, config, learner)
+    try:
+        return session, session.restore(metadata, arrays)
+    except BaseException as error:
+        session.close()
+        if not isinstance(error, DAMAGED_FILE_ERRORS):
+            raise
+        raise LareError(
+            f"the checkpoint in {run.checkpoint} does not fit its environments ({type(error).__name__}: {error}): start a new run, or "
+            "install the version that the run names"
+        ) from error
+
+
+def _make_session(run: Run, config: TrainConfig, learner: Learner | None) -> Session:
+    """Compile the functions of a session and make its environments. Without a learner, start with an untrained one."""
+    task, n_seeds = run.config.task, len(run.seeds)
+    env = make_jax_env(task) if config.env.is_jax else None
+    if env is not None and config.batched:
+        n_envs = config.n_envs * n_seeds // config.n_devices
+        config = replace(config, resets_with_steps=is_reset_cheap(env, n_envs))
+    iterates_on_host = env is None or config.has_first_fit
+    functions = compile_ahead(config, run.graphs, n_seeds, iterates_on_host=iterates_on_host)
+    loop = None if env is None else compile_loop(env, config, run.graphs, n_seeds)
+    learner = learner or init_seeds(functions, seed_keys(jnp.asarray(run.seeds), 0))
+    if env is not None:
+        return Session(run, config, functions, learner, DeviceCollector(env, config, run.seeds), loop)
+    collector = make_host_collector(task, config, run.seeds, run.config.settings.evaluation_episodes)
+    session = Session(run, config, functions, learner, collector)
+    if learner.decoders:
+        session._compile_while_collecting()
+    return session
 
 
 def _select_prefix(arrays: dict[str, np.ndarray], prefix: str) -> dict[str, np.ndarray]:

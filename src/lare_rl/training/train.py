@@ -1,44 +1,51 @@
-"""Trains a run from its start, or from its last checkpoint, to its end."""
+"""Trains a run from its start, or from its last checkpoint, to its end: iterations, evaluations, checkpoints, messages."""
 
 import contextlib
+import shlex
 import threading
-from collections.abc import Iterable, Sequence
+import time
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
-import jax.numpy as jnp
+import numpy as np
 
 from lare_rl.config.effective import unused_settings, warmup_warning
 from lare_rl.config.resolve import resolve
 from lare_rl.config.settings import ResolvedSettings, Settings
 from lare_rl.envs.load import resolve_task
-from lare_rl.envs.workers import close_idle_workers
 from lare_rl.errors import LareError, short_repr
 from lare_rl.runs.config_file import read_config
 from lare_rl.runs.directory import Run, as_run, create_run, default_directory, extend_run, lock_run
-from lare_rl.runs.metrics_file import truncate_metrics
+from lare_rl.runs.metric_names import ACTOR_SATURATION, RETURN, was_updated
+from lare_rl.runs.metrics_file import append_metrics, truncate_metrics
 from lare_rl.tasks.spec import TaskSpec
-from lare_rl.training.collect_device import DeviceCollector, is_reset_cheap, make_jax_env
-from lare_rl.training.collect_host import make_host_collector
-from lare_rl.training.compiled import compile_ahead, init_seeds, is_batching_faster
-from lare_rl.training.iteration import compile_loop
+from lare_rl.training import advice
+from lare_rl.training.decoder_fits import FirstFitStoppedError
+from lare_rl.training.explain import describe_returns
 from lare_rl.training.latent_functions import FunctionOrPath, choose_functions
-from lare_rl.training.learner import Learner
-from lare_rl.training.loop import run_session
 from lare_rl.training.process import catch_stop_signals, report_full_memory
 from lare_rl.training.progress import Listener, TensorBoard, Terminal, import_summary_writer
-from lare_rl.training.saved_state import load_learner
-from lare_rl.training.seed_axis import count_seed_devices
-from lare_rl.training.session import Session
-from lare_rl.training.static_config import TrainConfig, make_train_config
-from lare_rl.training.streams import seed_keys
+from lare_rl.training.seed_axis import first_shard
+from lare_rl.training.session import Session, restore_session, start_session
 from lare_rl.util import compilation
-from lare_rl.util.npz import DAMAGED_FILE_ERRORS
+from lare_rl.util.findings import Finding, render
 
-__all__ = ["restore_session", "resume", "start_session", "train"]
+__all__ = ["RunInterruptedError", "resume", "run_session", "train"]
 
 EVENTS_DIRECTORY = "tensorboard"
 """Within the run directory."""
+CHECKPOINT_S = 300.0
+"""Seconds after which a checkpoint is written between two evaluations: what a crash may cost."""
+PROGRESS_S = 1.0
+"""Listeners hear of steps inside an iteration at most this often (s)."""
+
+
+class RunInterruptedError(LareError):
+    """The user stopped a run, which can be continued from its last checkpoint."""
+
+    status = 130
 
 
 def train(
@@ -80,13 +87,7 @@ def train(
     messages = unused[:1] if len(unused) < 2 else [f"{unused[0]} (and {len(unused) - 1} more)"]
     messages += _describe_rounding(resolved, steps=settings.steps, evaluate_every=settings.evaluate_every)
     with lock_run(run), report_full_memory(run), catch_stop_signals() as stop:
-        _prepare(run, listeners)
-        session = start_session(run)
-        try:
-            session.save()  # so that there is always a checkpoint
-            return _finish(session, tensorboard, listeners, stop, messages)
-        finally:
-            _close(session)
+        return _finish(run, tensorboard, listeners, stop, messages, resolved.steps)
 
 
 def resume(
@@ -120,18 +121,7 @@ def resume(
         earlier_steps = run.config.settings.steps
         run = run if steps is None else extend_run(run, steps)
         messages = _describe_rounding(run.config.settings, steps=steps)
-        _prepare(run, listeners)
-        is_new = not run.has_checkpoint()
-        session, restored = (start_session(run), []) if is_new else restore_session(run)
-        try:
-            if is_new:
-                session.save()
-            else:
-                truncate_metrics(run.directory, session.metrics_bytes)
-            messages += [*restored, *_describe_annealing(session, earlier_steps)]
-            return _finish(session, tensorboard, listeners, stop, messages)
-        finally:
-            _close(session)
+        return _finish(run, tensorboard, listeners, stop, messages, earlier_steps)
 
 
 def _describe_rounding(resolved: ResolvedSettings, **requested: int | None) -> list[str]:
@@ -141,18 +131,6 @@ def _describe_rounding(resolved: ResolvedSettings, **requested: int | None) -> l
         f"{name} = {steps:,} is rounded up to {rounded:,}: {iteration}"
         for name, steps in requested.items()
         if steps is not None and (rounded := getattr(resolved, name)) != steps
-    ]
-
-
-def _describe_annealing(session: Session, earlier_steps: int) -> list[str]:
-    """Return a message if a run is extended whose learning rate fell towards 0."""
-    settings, step = session.settings, session.step
-    if not (step and settings.steps > earlier_steps and getattr(settings.hyperparameters, "anneal", False)):
-        return []
-    return [
-        f"{settings.algorithm}.anneal: the learning rate had fallen to {max(0, 1 - step / earlier_steps):.0%} of its initial value, and "
-        f"falls again from {1 - step / settings.steps:.0%}, so the result is not that of one long run; a run that began with "
-        f"--{settings.algorithm}.no-anneal can be extended"
     ]
 
 
@@ -170,81 +148,33 @@ def _check_listeners(listeners: Sequence[Listener] | None) -> list[Listener]:
     return checked
 
 
-def _prepare(run: Run, listeners: Sequence[Listener]) -> None:
-    """Turn on the compilation cache, and tell the listeners how long compiling takes."""
+def _finish(
+    run: Run,
+    tensorboard: bool,
+    listeners: Sequence[Listener],
+    stop: threading.Event,
+    messages: Sequence[str],
+    earlier_steps: int,
+) -> Run:
+    """Run to the end, from the last checkpoint if there is one. Every listener that was started is stopped, also after an error."""
     for listener in listeners:
         listener.on_message(
             f"preparing {run.directory}: compiling takes about half a minute, or about ten seconds if it was done before"
         )
     compilation.enable_cache()
-
-
-def start_session(run: Run) -> Session:
-    """Return a session before its first step."""
-    config = replace(make_train_config(run), n_devices=count_seed_devices(len(run.seeds)))
-    config = replace(config, batched=is_batching_faster(config, len(run.seeds)))
-    return _make_session(run, config, None)
-
-
-def restore_session(run: Run) -> tuple[Session, list[str]]:
-    """Return a session at the last checkpoint, and messages for the user.
-
-    Raises:
-        LareError: there is no checkpoint, or it cannot be used.
-    """
-    config, learner, metadata, arrays = load_learner(run, count_seed_devices(len(run.seeds)))
-    session = _make_session(run, config, learner)
-    try:
-        return session, session.restore(metadata, arrays)
-    except BaseException as error:
-        _close(session)
-        if not isinstance(error, DAMAGED_FILE_ERRORS):
-            raise
-        raise LareError(
-            f"the checkpoint in {run.checkpoint} does not fit its environments ({type(error).__name__}: {error}): start a new run, or "
-            "install the version that the run names"
-        ) from error
-
-
-def _make_session(run: Run, config: TrainConfig, learner: Learner | None) -> Session:
-    """Compile the functions of a session and make its environments. Without a learner, start with an untrained one."""
-    task, n_seeds = run.config.task, len(run.seeds)
-    env = make_jax_env(task) if config.env.is_jax else None
-    if env is not None and config.batched:
-        n_envs = config.n_envs * n_seeds // config.n_devices
-        config = replace(config, resets_with_steps=is_reset_cheap(env, n_envs))
-    iterates_on_host = env is None or config.has_first_fit
-    functions = compile_ahead(config, run.graphs, n_seeds, iterates_on_host=iterates_on_host)
-    loop = None if env is None else compile_loop(env, config, run.graphs, n_seeds)
-    learner = learner or init_seeds(functions, seed_keys(jnp.asarray(run.seeds), 0))
-    if env is not None:
-        return Session(run, config, functions, learner, DeviceCollector(env, config, run.seeds), loop)
-    collector = make_host_collector(task, config, run.seeds, run.config.settings.evaluation_episodes)
-    session = Session(run, config, functions, learner, collector)
-    if learner.decoders:
-        session.compile_while_collecting()
-    return session
-
-
-def _close(session: Session) -> None:
-    """Close a session, and its worker processes."""
-    try:
-        session.close()
-    finally:
-        close_idle_workers()
-
-
-def _finish(
-    session: Session, tensorboard: bool, listeners: list[Listener], stop: threading.Event, messages: Sequence[str]
-) -> Run:
-    """Run a session to its end. Every listener that was started is stopped, also after an error."""
-    run = session.run
-    if tensorboard:
-        listeners.append(TensorBoard(run.directory / EVENTS_DIRECTORY, session.step, run.seeds))
-    with contextlib.ExitStack() as started:
+    is_new = not run.has_checkpoint()
+    session, restored = (start_session(run), []) if is_new else restore_session(run)
+    with contextlib.ExitStack() as opened:
+        opened.callback(session.close)
+        if is_new:
+            session.save()  # so that there is always a checkpoint
+        else:
+            truncate_metrics(run.directory, session.metrics_bytes)
+        if tensorboard:
+            listeners = [*listeners, TensorBoard(run.directory / EVENTS_DIRECTORY, session.step, run.seeds)]
         for listener in listeners:
-            started.callback(listener.on_stop)
-            for message in (*messages, *_introduction(session)):
+            opened.callback(listener.on_stop)
+            for message in (*messages, *restored, *_introduction(session, earlier_steps)):
                 listener.on_message(message)
             name = f"{run.config.task.name} {session.settings.method}"
             listener.on_start(name, session.step, session.settings.steps)
@@ -252,14 +182,115 @@ def _finish(
     return run
 
 
-def _introduction(session: Session) -> list[str]:
-    """Return messages about a session before its next step."""
-    settings, warning = session.settings, warmup_warning(session.settings)
-    if warning is None and session.step < settings.warmup:
+def _introduction(session: Session, earlier_steps: int) -> list[str]:
+    """Return messages about a session before its next step. A run that is extended had `earlier_steps` before."""
+    settings, step, messages = session.settings, session.step, []
+    if step and settings.steps > earlier_steps and getattr(settings.hyperparameters, "anneal", False):
+        messages.append(
+            f"{settings.algorithm}.anneal: the learning rate had fallen to {max(0, 1 - step / earlier_steps):.0%} of its initial value, "
+            f"and falls again from {1 - step / settings.steps:.0%}, so the result is not that of one long run; a run that began with "
+            f"--{settings.algorithm}.no-anneal can be extended"
+        )
+    warning = warmup_warning(settings)
+    if warning is None and step < settings.warmup:
         warning = f"the first {settings.warmup:,} steps are random ({settings.algorithm}.warmup): the policy is not trained yet"
-    messages = [] if warning is None else [warning]
-    if session.step >= settings.steps:
+    messages += [] if warning is None else [warning]
+    if step >= settings.steps:
         messages.append(
             f"the run is complete ({settings.steps:,} steps): to continue it, give a larger --steps (steps=... in Python)"
         )
     return messages
+
+
+def run_session(session: Session, listeners: Sequence[Listener], stop: threading.Event) -> None:
+    """Make iterations, evaluations and checkpoints to the end of a run: the outer loop of Algorithm 1 of the LaRe paper.
+
+    Raises:
+        RunInterruptedError: `stop` was set.
+        DivergedError: a policy or a loss is not finite any more.
+    """
+    run, settings = session.run, session.settings
+    hint = f"to continue: lare-rl train --resume {shlex.quote(str(run.directory))}"
+    explained, saved_at = False, time.monotonic()
+    rated_step, rated_at = session.step, saved_at
+    returns: list[np.ndarray] = []
+    evaluated_at: list[float] = []
+    session.watch(_limit_rate(lambda step: [listener.on_step(step) for listener in listeners]), stop.is_set)
+
+    def say(lines: Iterable[str]) -> None:
+        for line in lines:
+            for listener in listeners:
+                listener.on_message(line)
+
+    def report(findings: Iterable[Finding]) -> None:
+        say(render(finding, advice.MESSAGES) for finding in findings)
+
+    report(advice.find_unwritten_texts(run.config.task) if session.step == 0 else [])
+    while session.step < settings.steps:
+        before = session.step
+        if stop.is_set():
+            session.save()
+            session.finish_saving()
+            raise RunInterruptedError(f"stopped at step {before} of {settings.steps} and saved; {hint}")
+        try:
+            session.advance(min(settings.steps, (before // settings.evaluate_every + 1) * settings.evaluate_every))
+        except FirstFitStoppedError:
+            raise RunInterruptedError(
+                f"stopped during the decoder's first fit: nothing is kept of it; {hint}"
+            ) from None
+        for listener in listeners:
+            listener.on_step(session.step)
+        if before <= settings.warmup < session.step:
+            report(advice.find_large_observations(run, first_shard(session.learner.replay), session.config))
+        is_last = session.step == settings.steps
+        if not is_last and session.step % settings.evaluate_every:
+            if time.monotonic() - saved_at > CHECKPOINT_S:
+                session.save()
+                saved_at = time.monotonic()
+            continue
+        began_at = time.monotonic()
+        rate = (session.step - rated_step) / max(began_at - rated_at, 1e-9)
+        rated_step, rated_at = session.step, began_at
+        lines = session.evaluate(rate)
+        evaluation_s = time.monotonic() - began_at
+        session.metrics_bytes = append_metrics(run.directory, lines)
+        session.save()
+        saved_at = time.monotonic()
+        evaluated_at.append(saved_at)
+        for listener in listeners:
+            listener.on_evaluation(lines)
+        if any(map(was_updated, lines)):
+            returns.append(np.array([line[RETURN] for line in lines]))
+            report(advice.find_constant_returns(returns))
+        if len(evaluated_at) == 2:  # the first one compiles the policy
+            report(advice.find_slow_evaluations(settings, evaluation_s, saved_at - evaluated_at[0]))
+        if session.step >= settings.warmup and (is_last or not explained):
+            sentences = describe_returns(run, session.learner, session.config, legend=not explained)
+            report([Finding("provisional")] if sentences and not is_last else [])
+            say(sentences)
+            explained = bool(sentences)
+        if is_last:
+            report(_final_findings(run, lines))
+
+
+def _limit_rate(call: Callable[[int], object]) -> Callable[[int], None]:
+    """Return a function that passes on at most one call in `PROGRESS_S`."""
+    called_at = time.monotonic()
+
+    def call_rarely(step: int) -> None:
+        nonlocal called_at
+        if time.monotonic() - called_at > PROGRESS_S:
+            called_at = time.monotonic()
+            call(step)
+
+    return call_rarely
+
+
+def _final_findings(run: Run, lines: Sequence[dict[str, Any]]) -> list[Finding]:
+    findings = advice.find_equal_returns(run)
+    if ACTOR_SATURATION in lines[0]:
+        findings = advice.find_saturated_policies([line[ACTOR_SATURATION] for line in lines], run.seeds) + findings
+    untrained = advice.find_untrained(run)
+    if untrained is not None and untrained.code != "all steps random":  # that was the first message
+        findings.append(untrained)
+    return findings

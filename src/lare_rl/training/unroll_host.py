@@ -7,6 +7,7 @@ import jax
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from lare_rl.config.train_config import TrainConfig
 from lare_rl.data.trajectory import Trajectory
 from lare_rl.envs.env_errors import EnvOutputError, name_step
 from lare_rl.envs.interface import Timestep, team_mean, to_env_action
@@ -15,7 +16,6 @@ from lare_rl.envs.vec_env import VecEnv
 from lare_rl.errors import LareError
 from lare_rl.training.evaluation import EpisodeBatch, Evaluation, concatenate
 from lare_rl.training.policy import draw_noise, init_host_memory, make_host_policy
-from lare_rl.training.static_config import TrainConfig
 from lare_rl.training.streams import Stream, episode_seed, numpy_generator
 
 __all__ = [

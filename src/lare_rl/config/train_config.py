@@ -1,5 +1,6 @@
-"""The static configuration of a run's compiled functions."""
+"""The static configuration of a run's compiled functions: `CreditConfig`, and with an algorithm `TrainConfig`."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -7,76 +8,53 @@ import jax
 import numpy as np
 
 from lare_rl.algorithms.registry import ALGORITHMS, Algorithm, AlgorithmSettings, Consumes, Noise
-from lare_rl.config.resolve import replay_rows
-from lare_rl.credit.decoder_settings import CreditSettings
+from lare_rl.config.effective import needs_replay
+from lare_rl.config.settings import ResolvedSettings
+from lare_rl.credit.decoder_settings import RECENT_STEPS, CreditSettings
 from lare_rl.credit.methods import METHODS, Method
 from lare_rl.credit.spec import CreditSpec
+from lare_rl.data.replay import required_capacity
 from lare_rl.envs.interface import EnvSpec
 from lare_rl.envs.placement import load_env_spec
-from lare_rl.runs.directory import Run
+from lare_rl.latent.function import LatentFunction
 from lare_rl.tasks.payments import PAID_AT_END, PaymentRule
-from lare_rl.tasks.spec import CreditScope, ScoredObservation
+from lare_rl.tasks.spec import CreditScope, ScoredObservation, TaskSpec
+
+__all__ = ["CreditConfig", "TrainConfig", "make_train_config", "replay_rows"]
 
 
-@dataclass(frozen=True)
-class TrainConfig:
-    """What is trained, and how."""
+@dataclass(frozen=True, kw_only=True)
+class CreditConfig:
+    """What credit is assigned to, and how: all that the decoders, their inputs and the replay follow from."""
 
     env: EnvSpec
-    credit_scope: CreditScope
+    credit_scope: CreditScope = "observation"
     scored_observation: ScoredObservation
     method: Method
-    algorithm: Algorithm
-    hyperparameters: AlgorithmSettings
     credit: CreditSettings
     scale_rewards: bool
     """Divide the rewards that the algorithm sees by the running root mean square of R/T."""
     n_factors: tuple[int, ...]
-    """The number of factors of each team's latent function; empty for a method that needs none."""
+    """The number of factors of each team's latent function; empty for a method that needs none, or before it is chosen."""
     n_envs: int
     """The number of environments that each seed collects from."""
     rollout_steps: int
     """Steps of each environment in an iteration."""
     capacity: int
     """Rows of the replay, of each environment."""
-    steps: int
-    """Environment steps of the whole run."""
     fit_updates: int
     """Updates of the decoder in an iteration that fits it. Unused if the decoder is updated with every update of the
     algorithm."""
-    fit_every: int = 1
-    """The decoder makes updates of its own in each iteration whose number is a multiple of this."""
-    held_out_first_fit: bool = False
-    """Whether the first of these fits lasts until it brings no improvement on held-out episodes."""
+    consumes: Consumes
+    """What the updates of the policy read. If it is only the newest steps, the replay holds what the decoders read, and no more."""
+    masks_steps: bool = False
+    """Whether decoders leave out single steps of an agent, as if it had left (`pure_credit`)."""
     batched: bool = False
     """Whether the device is faster with much work at once (`compiled.is_batching_faster`). It changes the last bits of a fit."""
-    resets_with_steps: bool = False
-    """Reset all environments with each step, and use the result where an episode has ended."""
-    n_devices: int = 1
-    """The number of devices over which the seeds are spread (`seed_axis.py`)."""
     payments: PaymentRule = PAID_AT_END
     """When the environment pays."""
     group: str | None = None
     """The measure that tells the level of an episode."""
-    deterministic: bool | None = None
-    """Whether a policy acts without noise outside training. None: its algorithm decides."""
-
-    @property
-    def noise(self) -> Noise:
-        """The exploration noise of the policy."""
-        return self.algorithm.noise(self.env.discrete)
-
-    @property
-    def deterministic_evaluation(self) -> bool:
-        """Whether the policy acts without noise outside training."""
-        if self.deterministic is not None:
-            return self.deterministic
-        return self.algorithm.deterministic_evaluation(self.env.discrete)
-
-    @property
-    def noise_size(self) -> int:
-        """Numbers of noise for an agent's action."""
-        return self.env.action_size + (self.noise is Noise.UNIFORM)
 
     @property
     def team_level(self) -> bool:
@@ -93,29 +71,9 @@ class TrainConfig:
         return slice(team_index, team_index + 1) if self.team_level else self.env.teams[team_index].agents
 
     @property
-    def warmup(self) -> int:
-        """Environment steps with random actions before the first update."""
-        return getattr(self.hyperparameters, "warmup", 0)
-
-    @property
-    def joint_fit(self) -> bool:
-        """Whether the decoder is updated with every update of the algorithm."""
-        return (
-            self.algorithm.consumes is not Consumes.ROLLOUTS
-            and self.method.uses_gradient
-            and self.method.fit is not None
-            and not self.method.fit.separate
-        )
-
-    @property
-    def fits_separately(self) -> bool:
-        """Whether the decoder makes gradient updates of its own, between iterations."""
-        return self.method.uses_gradient and not self.joint_fit
-
-    @property
-    def has_first_fit(self) -> bool:
-        """Whether the decoder has a first fit that lasts until it brings no improvement."""
-        return self.fits_separately and self.held_out_first_fit
+    def iteration_steps(self) -> int:
+        """Environment steps of a seed in an iteration."""
+        return self.rollout_steps * self.n_envs
 
     @property
     def longest_segment(self) -> int:
@@ -130,7 +88,7 @@ class TrainConfig:
     @property
     def predicts_ahead(self) -> bool:
         """Whether the sums of proxy rewards are computed after each fit. For rollouts, they are computed with each update."""
-        return self.is_exact and self.algorithm.consumes is not Consumes.ROLLOUTS
+        return self.is_exact and self.consumes is not Consumes.ROLLOUTS
 
     @property
     def has_fixed_segments(self) -> bool:
@@ -168,7 +126,7 @@ class TrainConfig:
     @property
     def columns(self) -> dict[str, jax.ShapeDtypeStruct]:
         """The columns of a row of the replay: what the algorithm and the decoder read, and no more."""
-        env, consumes = self.env, self.algorithm.consumes
+        env, consumes = self.env, self.consumes
         is_replayed = consumes is not Consumes.ROLLOUTS
         inputs = self.credit_specs[0].inputs
         has_raw_features = any(name not in ("factors", "history") for name in inputs)
@@ -184,32 +142,108 @@ class TrainConfig:
             "reward": (True, (env.n_agents,), np.float32),
             "state": (env.state_size > 0 and reads_state, (env.state_size,), np.float32),
             "available": (env.masks_actions and consumes is Consumes.SEQUENCES, actions, np.bool_),
-            "alive": (env.agents_leave, (env.n_agents,), np.bool_),
+            "alive": (env.agents_leave or self.masks_steps, (env.n_agents,), np.bool_),
             "terminated": (consumes is Consumes.TRANSITIONS, (), np.bool_),
         }
         return {name: jax.ShapeDtypeStruct(shape, dtype) for name, (stored, shape, dtype) in columns.items() if stored}
 
 
-def make_train_config(run: Run) -> TrainConfig:
-    """Return the static configuration of a run's compiled functions."""
-    task, settings, env = run.config.task, run.config.settings, load_env_spec(run.config.task)
+@dataclass(frozen=True, kw_only=True)
+class TrainConfig(CreditConfig):
+    """What is trained, and how."""
+
+    algorithm: Algorithm
+    hyperparameters: AlgorithmSettings
+    steps: int
+    """Environment steps of the whole run."""
+    fit_every: int = 1
+    """The decoder makes updates of its own in each iteration whose number is a multiple of this."""
+    held_out_first_fit: bool = False
+    """Whether the first of these fits lasts until it brings no improvement on held-out episodes."""
+    resets_with_steps: bool = False
+    """Reset all environments with each step, and use the result where an episode has ended."""
+    n_devices: int = 1
+    """The number of devices over which the seeds are spread (`seed_axis.py`)."""
+    deterministic: bool | None = None
+    """Whether a policy acts without noise outside training. None: its algorithm decides."""
+
+    @property
+    def noise(self) -> Noise:
+        """The exploration noise of the policy."""
+        return self.algorithm.noise(self.env.discrete)
+
+    @property
+    def deterministic_evaluation(self) -> bool:
+        """Whether the policy acts without noise outside training."""
+        if self.deterministic is not None:
+            return self.deterministic
+        return self.algorithm.deterministic_evaluation(self.env.discrete)
+
+    @property
+    def noise_size(self) -> int:
+        """Numbers of noise for an agent's action."""
+        return self.env.action_size + (self.noise is Noise.UNIFORM)
+
+    @property
+    def warmup(self) -> int:
+        """Environment steps with random actions before the first update."""
+        return getattr(self.hyperparameters, "warmup", 0)
+
+    @property
+    def joint_fit(self) -> bool:
+        """Whether the decoder is updated with every update of the algorithm."""
+        return (
+            self.consumes is not Consumes.ROLLOUTS
+            and self.method.uses_gradient
+            and self.method.fit is not None
+            and not self.method.fit.separate
+        )
+
+    @property
+    def fits_separately(self) -> bool:
+        """Whether the decoder makes gradient updates of its own, between iterations."""
+        return self.method.uses_gradient and not self.joint_fit
+
+    @property
+    def has_first_fit(self) -> bool:
+        """Whether the decoder has a first fit that lasts until it brings no improvement."""
+        return self.fits_separately and self.held_out_first_fit
+
+
+def make_train_config(
+    task: TaskSpec, settings: ResolvedSettings, functions: Sequence[LatentFunction] = (), n_devices: int = 1
+) -> TrainConfig:
+    """Return the static configuration of a run, by the latent function of each team, if they are chosen already."""
+    env, algorithm = load_env_spec(task), ALGORITHMS[settings.algorithm]
+    scored_observation = settings.choose_scored_observation(task)
     return TrainConfig(
         env=env,
         credit_scope=task.credit_scope,
-        scored_observation=run.scored_observation,
+        scored_observation=scored_observation,
         method=METHODS.find(settings.method),
-        algorithm=ALGORITHMS[settings.algorithm],
-        hyperparameters=settings.hyperparameters,
         credit=settings.credit,
         scale_rewards=settings.scale_rewards,
-        n_factors=tuple(function.n_factors(run.scored_observation) for function in run.functions),
+        n_factors=tuple(function.n_factors(scored_observation) for function in functions),
         n_envs=settings.environments,
         rollout_steps=settings.rollout_steps,
         capacity=replay_rows(settings, env.max_steps),
-        steps=settings.steps,
         fit_updates=settings.fit_updates,
-        fit_every=settings.fit_every,
-        held_out_first_fit=settings.first_fit == "held-out",
+        consumes=algorithm.consumes,
         payments=task.payment_rule,
         group=task.group,
+        algorithm=algorithm,
+        hyperparameters=settings.hyperparameters,
+        steps=settings.steps,
+        fit_every=settings.fit_every,
+        held_out_first_fit=settings.first_fit == "held-out",
+        n_devices=n_devices,
     )
+
+
+def replay_rows(settings: ResolvedSettings, max_steps: int) -> int:
+    """Return the rows of each environment, if an episode has up to `max_steps` steps."""
+    required = required_capacity(settings.rollout_steps, max_steps)
+    rows = settings.capacity // settings.environments
+    if not needs_replay(settings):  # only to compare the newest rewards with the true ones
+        rows = required + RECENT_STEPS // settings.environments
+    return min(rows, max(required, 2 * settings.steps // settings.environments + 2))
