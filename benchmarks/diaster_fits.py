@@ -41,7 +41,7 @@ def untrained(learner: Learner, config: TrainConfig, key: jax.Array) -> Learner:
         stored_replay, replay.newest_steps(stored_replay, int(replay.n_stored_transitions(stored_replay)[0]))
     )
     credit = decomposition.observe_steps(credit, decoder_inputs(valid, config, 0))
-    return learner._replace(reward_sources=(credit._replace(scale=learner.decoders[0].scale),))
+    return learner._replace(decoders=(credit._replace(scale=learner.decoders[0].scale),))
 
 
 def curve(learner: Learner, config: TrainConfig, fits: tuple[int, ...], seed: int) -> list[dict[str, float]]:
@@ -56,9 +56,9 @@ def curve(learner: Learner, config: TrainConfig, fits: tuple[int, ...], seed: in
     for n_fits in fits:
         while done < n_fits:
             credit, _ = fit_some(learner, jax.random.key(1000 * seed + done), config=config)
-            learner = learner._replace(reward_sources=credit)
+            learner = learner._replace(decoders=credit)
             done += AT_A_TIME
-        r_hat = team_proxy_rewards(recent, learner.reward_sources, config, 0)[:, 0]
+        r_hat = team_proxy_rewards(recent, learner.decoders, config, 0)[:, 0]
         accuracies.append(
             {
                 "fits": done,

@@ -9,6 +9,7 @@ rewards of the same steps.
 """
 
 import sys
+from dataclasses import replace
 from functools import partial
 
 import jax
@@ -19,6 +20,7 @@ from lare_rl.credit import accuracy, decomposition, descent
 from lare_rl.credit.decoder_settings import RECENT_STEPS
 from lare_rl.credit.decomposition import CreditBatch, DecoderState
 from lare_rl.credit.methods import Fit
+from lare_rl.credit.spec import CreditSpec
 from lare_rl.data import replay
 from lare_rl.data.sampling import CreditSample, sample_episode_steps
 from lare_rl.nn.normalise import Scale
@@ -33,15 +35,15 @@ from measure import write
 UPDATES, STRETCH = 20_000, 5_000
 
 
-@partial(jax.jit, static_argnames=("fit", "config"))
+@partial(jax.jit, static_argnames=("spec", "config"))
 def updates(
-    credit: DecoderState, stored_replay: replay.Replay, key: jax.Array, fit: Fit, config: TrainConfig
+    credit: DecoderState, stored_replay: replay.Replay, key: jax.Array, spec: CreditSpec, config: TrainConfig
 ) -> DecoderState:
     def update(credit: DecoderState, sample: CreditSample) -> tuple[DecoderState, None]:
         features = decoder_inputs(replay.read(stored_replay, sample.steps), config, 0)
         chosen = sample.episodes
         episodes = CreditBatch(features, sample.episode, chosen.length, chosen.mean_reward[..., 0], chosen.mask)
-        return descent.update(credit, episodes, key, fit, config.credit)[0], None
+        return descent.update(credit, episodes, key, spec)[0], None
 
     n_steps = min(config.credit.sampled_steps, config.env.max_steps)
     n_episodes = max(1, config.credit.steps // config.credit.sampled_steps)
@@ -55,15 +57,17 @@ def newest(learner: Learner, config: TrainConfig) -> tuple[jax.Array, jax.Array]
     return decoder_inputs(recent, config, 0)[0], recent.columns["reward"][0, :, 0]
 
 
-def refit(learner: Learner, config: TrainConfig, fit: Fit, scale: Scale) -> list[dict[str, float]]:
+def refit(learner: Learner, config: TrainConfig, fit: Fit | None, scale: Scale) -> list[dict[str, float]]:
     (decoder,) = learner.decoders
     (features, reward), valid = newest(learner, config), jnp.ones(RECENT_STEPS, bool)
-    credit = decomposition.init(jax.random.key(0), config.credit_specs[0])
+    spec = config.credit_specs[0]
+    spec = replace(spec, method=replace(spec.method, fit=fit))
+    credit = decomposition.init(jax.random.key(0), spec)
     credit = credit._replace(statistics=decoder.statistics, scale=scale)
     rows = []
     for number in range(UPDATES // STRETCH):
-        credit = updates(credit, learner.replay, jax.random.key(number), fit, config)
-        r_hat = decomposition.decoder_rewards(credit, features, config.credit)[:, 0]
+        credit = updates(credit, learner.replay, jax.random.key(number), spec, config)
+        r_hat = decomposition.decoder_rewards(credit, features, spec)[:, 0]
         rows.append(
             {
                 "updates": (number + 1) * STRETCH,
@@ -89,7 +93,6 @@ def main(directories: list[str]) -> None:
         learner = select_seed(everyone)
         scale_state = learner.decoders[0].scale
         unit = scale_state._replace(mean_square=jnp.ones(()))
-        assert config.method.fit is not None
         cases = {
             "as it is": (config.method.fit, scale_state),
             "targets as they are": (config.method.fit, unit),

@@ -27,7 +27,7 @@ def fit(state):
 
 @jax.jit
 def learn(state, episode):
-    return fit(returns.predict_then_update(state, episode, SETTINGS))
+    return fit(returns.predict_then_update(state, episode, SPEC))
 
 
 def untrained():
@@ -75,8 +75,8 @@ def test_prefixes_are_summed_like_separate_cases():
         level=jnp.asarray(level),
     )
     with float64():
-        state = returns.add_episodes(decoder, batch)
-        statistics = jax.tree.map(np.asarray, closed_form.to_float64(state.closed_form.sufficient_statistics))
+        closed = returns.add_to_sums(decoder.closed_form, batch)
+        statistics = jax.tree.map(np.asarray, closed_form.to_float64(closed.sufficient_statistics))
     cases = []
     for first, k in ((0, 0), (4, 2)):
         for t in range(1, lengths[k] + 1):
@@ -93,6 +93,7 @@ def test_the_rival_of_a_sum_may_be_the_log_odds():
     won = jnp.arange(WINDOW) % 2 * 1.0
     predicted = jnp.stack([0.9 * won, 0.1 * won], axis=1)
     predictions = Predictions(jnp.float32(WINDOW), won, predicted, jnp.zeros(WINDOW, jnp.int32))
-    state = init(jax.random.key(0), observation_spec(2, METHOD, CreditSettings(score="binary"), 4))
-    estimate = returns.estimate_score_type(state._replace(score_type_predictions=predictions))
+    spec = observation_spec(2, METHOD, CreditSettings(score="binary"), 4)
+    state = init(jax.random.key(0), spec)._replace(score_type_predictions=predictions)
+    estimate = returns.estimate_score_type(state, spec)
     assert estimate == ScoreTypeEstimate(ScoreType.SUM, is_certain=True, rival=ScoreType.LOG_ODDS)

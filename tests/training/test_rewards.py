@@ -58,7 +58,7 @@ def test_exact_rewards_add_up_to_payments(method, algorithm, env, exact, payment
     else:
         steps = stored_steps(learner)
     r_hat, inexact = (
-        np.asarray(rewards(values, learner.reward_sources, config), np.float64)
+        np.asarray(rewards(values, learner.decoders, config), np.float64)
         for values in (steps, steps._replace(residual=None))
     )
     alive = np.asarray(steps.columns.get("alive", np.ones((len(r_hat), env.n_agents), bool)))

@@ -24,11 +24,9 @@ def sample_batch(store: Store, spec: CreditSpec, random: np.random.Generator, lo
 
     The store needs an episode. `longest` is the most steps of an episode; batches for the same `longest` have the same shape.
     """
-    settings, fit = spec.settings, spec.method.fit
-    assert fit is not None
-    plan = plan_batch(fit, settings, longest, fixed_length=False)
+    plan = plan_batch(spec, longest)
     if plan.layout == "packed":
-        count = max(1, settings.steps * store.n_ended // store.n_ended_steps)
+        count = max(1, spec.settings.steps * store.n_ended // store.n_ended_steps)
         return _pack(store, _sample_episodes(store, count, random)[: plan.episodes], plan.episodes, plan.rows)
     episodes = _sample_episodes(store, plan.episodes, random)
     length = _lengths(episodes)

@@ -9,8 +9,8 @@ from lare_rl.credit import decomposition, returns
 from lare_rl.credit.basis import MAX_PAIRED_RAW_FEATURES
 from lare_rl.credit.decomposition import DecoderState
 from lare_rl.credit.explanation import Explanation
-from lare_rl.credit.methods import Method
 from lare_rl.credit.score_type import ScoreType, ScoreTypeEstimate
+from lare_rl.credit.spec import CreditSpec
 from lare_rl.tasks.spec import base_name
 from lare_rl.util.findings import Finding
 from lare_rl.util.statistics import CLEAR_ERRORS, round_shares
@@ -134,7 +134,7 @@ MESSAGES = {
 def returns_findings(
     explanation: Explanation,
     decoder: DecoderState,
-    method: Method,
+    spec: CreditSpec,
     factor_names: Sequence[str],
     raw_names: Sequence[str],
     group_names: Iterable[Hashable],
@@ -143,15 +143,15 @@ def returns_findings(
 
     `group_names` are the names of the first levels, or of all.
     """
-    effects = decomposition.level_effects(decoder, float(explanation.mean_length)).tolist()
+    effects = decomposition.level_effects(decoder, float(explanation.mean_length), spec.basis.n_levels).tolist()
     return explanation_findings(
         explanation,
-        returns.estimate_score_type(decoder),
+        returns.estimate_score_type(decoder, spec),
         factor_names,
         raw_names,
-        looks_binary=returns.looks_binary(decoder, method),
+        looks_binary=returns.looks_binary(decoder, spec),
         groups=dict(zip(group_names, effects, strict=False)),
-        lacks_pairs=method.decoder_kind.extended_basis and len(raw_names) > MAX_PAIRED_RAW_FEATURES,
+        lacks_pairs=spec.method.decoder_kind.extended_basis and len(raw_names) > MAX_PAIRED_RAW_FEATURES,
     )
 
 

@@ -143,6 +143,11 @@ class Method:
         return self.fit is not None and not self.fit.closed_form
 
     @property
+    def samples_steps(self) -> bool:
+        """Whether an update of its decoder reads K steps of each episode."""
+        return self.fit is not None and self.fit.samples_steps
+
+    @property
     def decoder_kind(self) -> Decoder:
         """What is registered about its decoder."""
         return DECODERS[self.decoder]

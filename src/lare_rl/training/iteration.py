@@ -56,7 +56,7 @@ def store_steps(
 ) -> tuple[Learner, Bool[Array, " seeds"]]:
     """Store new steps, and let the decoders learn from episodes that have finished. Return whether all factors are finite."""
     learner, is_finite = functions.store(learner, steps)
-    if learner.decoders:
+    if config.method.fit is not None:
         is_paid = steps.ended.any() | (not config.payments.only_at_end)
         (learner,) = _when(is_paid, lambda learner: (functions.learn_returns(learner),), learner)
     return learner, is_finite

@@ -9,7 +9,7 @@ from jaxtyping import Array, Float
 from lare_rl.algorithms.batches import Metrics
 from lare_rl.credit import accuracy, engine, prequential
 from lare_rl.credit.decoder_settings import RECENT_STEPS
-from lare_rl.credit.engine import RewardSource
+from lare_rl.credit.decomposition import DecoderState
 from lare_rl.credit.methods import Reward
 from lare_rl.data import replay
 from lare_rl.data.replay import StoredSteps
@@ -22,28 +22,29 @@ __all__ = ["assess", "rewards", "team_metrics", "team_proxy_rewards"]
 
 
 def rewards(
-    steps: StoredSteps, reward_sources: tuple[RewardSource, ...], config: TrainConfig
+    steps: StoredSteps, decoders: tuple[DecoderState, ...], config: TrainConfig
 ) -> Float[Array, "*batch agents"]:
-    """Return the rewards that the algorithm is trained on, for each agent, by `Learner.reward_sources`."""
+    """Return the rewards that the algorithm is trained on, for each agent."""
     alive = alive_agents(steps, config)
     team_rewards = []
-    for i, (team, source) in enumerate(zip(config.env.teams, reward_sources, strict=True)):
+    for i, (team, decoder) in enumerate(zip(config.env.teams, decoders, strict=True)):
         if config.method.has_proxy_rewards:
-            team_rewards.append(engine.training_rewards(source, step_batch(steps, config, i), config.credit_specs[i]))
+            team_rewards.append(engine.training_rewards(decoder, step_batch(steps, config, i), config.credit_specs[i]))
             continue
         is_dense, team_alive = config.method.reward is Reward.TRUE, alive[..., team.agents]
         reward = steps.columns["reward"][..., team.agents] if is_dense else steps.episodic_reward[..., i, None]
-        reward, scale = jnp.broadcast_to(reward, team_alive.shape), engine.return_scale(source)
-        team_rewards.append(engine.scale_and_mask(reward, scale, team_alive, scale_rewards=config.scale_rewards))
+        reward = jnp.broadcast_to(reward, team_alive.shape)
+        scaled = engine.scale_and_mask(reward, decoder.scale, team_alive, scale_rewards=config.scale_rewards)
+        team_rewards.append(scaled)
     return jnp.concatenate(team_rewards, axis=-1)
 
 
 def team_proxy_rewards(
-    steps: StoredSteps, reward_sources: tuple[RewardSource, ...], config: TrainConfig, team_index: int
+    steps: StoredSteps, decoders: tuple[DecoderState, ...], config: TrainConfig, team_index: int
 ) -> Float[Array, "*batch rows"]:
     """Return r_hat of a team: one for each of its agents, or one for all if credit goes to whole teams."""
     batch, spec = step_batch(steps, config, team_index), config.credit_specs[team_index]
-    return engine.proxy_rewards(reward_sources[team_index], batch, spec)
+    return engine.proxy_rewards(decoders[team_index], batch, spec)
 
 
 def assess(learner: Learner, config: TrainConfig) -> Metrics:
@@ -63,12 +64,12 @@ def assess(learner: Learner, config: TrainConfig) -> Metrics:
         reward, mask = steps.columns["reward"][..., team.agents], is_stored & alive[..., team.agents]
         if config.team_level:
             reward, mask = team_mean(steps.columns["reward"], alive, team)[..., None], is_stored
-        r_hat = jnp.broadcast_to(team_proxy_rewards(steps, learner.reward_sources, config, i), reward.shape)
+        r_hat = jnp.broadcast_to(team_proxy_rewards(steps, learner.decoders, config, i), reward.shape)
         last = jnp.broadcast_to(steps.last[..., None], reward.shape)
         rows = (values.ravel() for values in (r_hat, reward, last, mask))
         metrics.append(accuracy.metrics(*rows, calibrated=config.method.calibrated))
-        if learner.decoders:
-            decoder = learner.decoders[i]
+        decoder = learner.decoders[i]
+        if config.method.fit is not None:
             metrics[-1] |= prequential.metrics(decoder.predictions)
             if decoder.score_type_predictions is not None:
                 metrics[-1]["credit/average"] = decoder.is_average.astype(jnp.float32)

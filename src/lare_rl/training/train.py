@@ -221,7 +221,7 @@ def _make_session(run: Run, config: TrainConfig, learner: Learner | None) -> Ses
         return Session(run, config, functions, learner, DeviceCollector(env, config, run.seeds), loop)
     collector = make_host_collector(task, config, run.seeds, run.config.settings.evaluation_episodes)
     session = Session(run, config, functions, learner, collector)
-    if learner.decoders:
+    if config.method.fit is not None:
         session.compile_while_collecting()
     return session
 
