@@ -15,15 +15,16 @@ import jax
 import jax.numpy as jnp
 import tyro
 
-from lare_rl.credit import accuracy, decomposition
+from lare_rl.credit import decomposition
 from lare_rl.credit.decoder_settings import RECENT_STEPS, CreditSettings
+from lare_rl.credit.engine import proxy_rewards
 from lare_rl.credit.methods import METHODS
 from lare_rl.data import replay
 from lare_rl.runs.directory import open_run
 from lare_rl.training.decoder_fits import fit_repeatedly
-from lare_rl.training.decoder_inputs import decoder_inputs
+from lare_rl.training.decoder_inputs import decoder_inputs, step_batch
 from lare_rl.training.learner import Learner
-from lare_rl.training.rewards import team_proxy_rewards
+from lare_rl.training.rewards import masked_correlation, mean_absolute_error
 from lare_rl.training.saved_state import load_learner
 from lare_rl.training.seed_axis import select_seed
 from lare_rl.training.static_config import TrainConfig
@@ -58,12 +59,12 @@ def curve(learner: Learner, config: TrainConfig, fits: tuple[int, ...], seed: in
             credit, _ = fit_some(learner, jax.random.key(1000 * seed + done), config=config)
             learner = learner._replace(decoders=credit)
             done += AT_A_TIME
-        r_hat = team_proxy_rewards(recent, learner.decoders, config, 0)[:, 0]
+        r_hat = proxy_rewards(learner.decoders[0], step_batch(recent, config, 0), config.credit_specs[0])[:, 0]
         accuracies.append(
             {
                 "fits": done,
-                "correlation": float(accuracy.masked_correlation(r_hat, reward, valid)),
-                "error": float(accuracy.mean_absolute_error(r_hat, reward, valid)),
+                "correlation": float(masked_correlation(r_hat, reward, valid)),
+                "error": float(mean_absolute_error(r_hat, reward, valid)),
                 "r_hat of the first step": float(r_hat[first].mean()),
                 "r of the first step": float(reward[first].mean()),
                 "return": float(recent.mean_reward.mean() * config.env.max_steps),

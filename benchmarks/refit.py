@@ -16,7 +16,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from lare_rl.credit import accuracy, decomposition, descent
+from lare_rl.credit import decomposition, descent
 from lare_rl.credit.decoder_settings import RECENT_STEPS
 from lare_rl.credit.decomposition import CreditBatch, DecoderState
 from lare_rl.credit.methods import Fit
@@ -27,6 +27,7 @@ from lare_rl.nn.normalise import Scale
 from lare_rl.runs.directory import open_run
 from lare_rl.training.decoder_inputs import decoder_inputs
 from lare_rl.training.learner import Learner
+from lare_rl.training.rewards import masked_correlation, mean_absolute_error
 from lare_rl.training.saved_state import load_learner
 from lare_rl.training.seed_axis import select_seed
 from lare_rl.training.static_config import TrainConfig
@@ -71,8 +72,8 @@ def refit(learner: Learner, config: TrainConfig, fit: Fit | None, scale: Scale) 
         rows.append(
             {
                 "updates": (number + 1) * STRETCH,
-                "correlation": float(accuracy.masked_correlation(r_hat, reward, valid)),
-                "error": float(accuracy.mean_absolute_error(r_hat, reward, valid)),
+                "correlation": float(masked_correlation(r_hat, reward, valid)),
+                "error": float(mean_absolute_error(r_hat, reward, valid)),
             }
         )
     return rows

@@ -27,21 +27,22 @@ from helpers.small_configs import (
     with_factor_decoders,
     with_other_dead_values,
 )
-from lare_rl.credit import closed_form
+from lare_rl.credit import closed_form, engine
 from lare_rl.credit.decoder_settings import CreditSettings
 from lare_rl.envs.interface import EnvSpec, Team
 from lare_rl.nn.normalise import root_mean_square
 from lare_rl.training.decoder_fits import fit_decoders, fit_repeatedly, sample_credit
+from lare_rl.training.decoder_inputs import step_batch
 from lare_rl.training.learner import abandon_episodes
-from lare_rl.training.rewards import assess, rewards, team_proxy_rewards
+from lare_rl.training.rewards import assess, rewards
 
 ENDS = np.cumsum(LENGTHS)[:-1]
 MANY = partial(small_config, algorithm="ippo", env=ONE_TEAM)
 TEAMS = partial(small_config, algorithm="ippo", env=TWO_TEAMS)
 
 
-def proxy_rewards(steps, state, config):
-    return team_proxy_rewards(steps, state, config, 0)
+def proxy_rewards(steps, decoders, config):
+    return engine.proxy_rewards(decoders[0], step_batch(steps, config, 0), config.credit_specs[0])
 
 
 def update_once(learner, config, key=0):

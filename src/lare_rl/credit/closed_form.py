@@ -122,25 +122,22 @@ class ClosedForm(NamedTuple):
 
 def init(basis: Basis, score_types: tuple[int, ...]) -> ClosedForm:
     """Return the state before the first episode."""
-    is_binary = ScoreType.LOG_ODDS in score_types
-    n_score_types = len(score_types)
-    n_features, n_columns, zero = basis.n_features, basis.n_columns, jnp.zeros(())
-    posterior = evidence.init_posterior(basis.column_group_index)
-    strengths = evidence.init_posterior(basis.column_strength_index)
+    n_score_types, is_binary = len(score_types), ScoreType.LOG_ODDS in score_types
+    posteriors = tuple(map(evidence.init_posterior, (basis.column_group_index, basis.column_strength_index)))
     posterior, strengths = jax.tree.map(
-        lambda leaf: jnp.tile(leaf, (n_score_types - is_binary, *[1] * leaf.ndim)), (posterior, strengths)
+        lambda leaf: jnp.tile(leaf, (n_score_types - is_binary, *[1] * leaf.ndim)), posteriors
     )
     return ClosedForm(
         decoder=LinearDecoder(
             basis=basis,
             mean=jnp.zeros(basis.n_standardised),
             std=jnp.ones(basis.n_standardised),
-            weight=jnp.zeros((n_score_types, n_features)),
+            weight=jnp.zeros((n_score_types, basis.n_features)),
             bias=jnp.zeros(n_score_types),
         ),
-        sufficient_statistics=split_double(evidence.empty_statistics(n_columns)),
-        n_steps=zero,
-        n_fitted=jnp.copy(zero),
+        sufficient_statistics=split_double(evidence.empty_statistics(basis.n_columns)),
+        n_steps=jnp.zeros(()),
+        n_fitted=jnp.zeros(()),
         posterior=posterior,
         strengths=strengths,
         intercept=jnp.zeros((n_score_types, basis.n_levels)),
@@ -194,7 +191,7 @@ class _Weights(NamedTuple):
     """The result of a fit, for some score types."""
 
     columns: Float[Array, "score_types columns"]
-    """The weights of all columns: features and levels, and the time if there are prefixes."""
+    """The weights of features, of the time if there are prefixes, and of levels."""
     bias: Float[Array, " score_types"]
     start_value: Float[Array, " score_types"]
 

@@ -63,8 +63,8 @@ def proxy_rewards(state: DecoderState, steps: StepBatch, spec: CreditSpec) -> Fl
     r_hat = decomposition.decoder_rewards(state, rows, spec, steps.length.ravel()).reshape(shape[:-1])
     if not spec.method.decoder_kind.pays_shares:
         return r_hat
-    paid = pay_shares(r_hat, steps.alive, steps.mean_reward * steps.length, spec.max_steps)
-    return jnp.where(steps.episode_ended[..., None], paid, r_hat)
+    shares = pay_shares(r_hat, steps.alive, steps.mean_reward * steps.length, spec.max_steps)
+    return jnp.where(steps.episode_ended[..., None], shares, r_hat)
 
 
 def training_rewards(state: DecoderState, steps: StepBatch, spec: CreditSpec) -> Float[Array, "*batch team"]:

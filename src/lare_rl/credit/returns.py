@@ -15,7 +15,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import optax
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, Int
 
 from lare_rl.credit import closed_form, decomposition, evidence, logistic
 from lare_rl.credit.closed_form import ClosedForm, LinearDecoder
@@ -141,21 +141,22 @@ def _prefix_columns(decoder: LinearDecoder, episodes: CreditBatch) -> Float[Arra
     first = jnp.clip(first, 0, n_rows - 1)
     total = jnp.cumsum(features, axis=0)
     before = total - features
-    columns = [total - before[first], (row - first + 1.0)[:, None]]
-    if decoder.basis.n_levels:
-        assert episodes.level is not None
-        columns.append(jax.nn.one_hot(episodes.level[index], decoder.basis.n_levels, dtype=features.dtype))
-    return jnp.concatenate(columns, axis=1)
+    columns = jnp.concatenate([total - before[first], (row - first + 1.0)[:, None]], axis=1)
+    return _append_levels(columns, None if episodes.level is None else episodes.level[index], decoder.basis.n_levels)
 
 
 def _columns(decoder: LinearDecoder, episodes: CreditBatch) -> Float[Array, "episodes columns"]:
     """Return the mean features of each episode, and which level it has."""
-    features, n_levels = mean_features(decoder, episodes), decoder.basis.n_levels
-    if not n_levels:
-        return features
-    assert episodes.level is not None
-    one_hot = jax.nn.one_hot(episodes.level, n_levels, dtype=features.dtype)
-    return jnp.concatenate([features, one_hot], axis=1)
+    return _append_levels(mean_features(decoder, episodes), episodes.level, decoder.basis.n_levels)
+
+
+def _append_levels(
+    columns: Float[Array, "rows columns"], level: Int[Array, " rows"] | None, n_levels: int
+) -> Float[Array, "rows all_columns"]:
+    """Append which level the episode of each row has, if there are levels."""
+    if level is None or not n_levels:
+        return columns
+    return jnp.concatenate([columns, jax.nn.one_hot(level, n_levels, dtype=columns.dtype)], axis=1)
 
 
 def add_to_sums(closed: ClosedForm, episodes: CreditBatch) -> ClosedForm:
