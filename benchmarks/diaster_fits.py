@@ -15,10 +15,10 @@ import jax
 import jax.numpy as jnp
 import tyro
 
-from lare_rl.credit import decomposition
+from lare_rl.credit import decoder_state
 from lare_rl.credit.decoder_settings import RECENT_STEPS, CreditSettings
-from lare_rl.credit.engine import proxy_rewards
 from lare_rl.credit.methods import METHODS
+from lare_rl.credit.rewards import proxy_rewards
 from lare_rl.data import replay
 from lare_rl.runs.directory import open_run
 from lare_rl.training.decoder_fits import fit_repeatedly
@@ -36,12 +36,12 @@ AT_A_TIME = 50
 
 def untrained(learner: Learner, config: TrainConfig, key: jax.Array) -> Learner:
     """The learner with a new decoder, which has the statistics of all stored steps."""
-    credit = decomposition.init(key, config.credit_specs[0])
+    credit = decoder_state.init(key, config.credit_specs[0])
     stored_replay = learner.replay
     valid = replay.read(
         stored_replay, replay.newest_steps(stored_replay, int(replay.n_stored_transitions(stored_replay)[0]))
     )
-    credit = decomposition.observe_steps(credit, decoder_inputs(valid, config, 0))
+    credit = decoder_state.observe_steps(credit, decoder_inputs(valid, config, 0))
     return learner._replace(decoders=(credit._replace(scale=learner.decoders[0].scale),))
 
 

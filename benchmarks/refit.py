@@ -16,9 +16,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from lare_rl.credit import decomposition, descent
+from lare_rl.credit import decoder_state, descent
 from lare_rl.credit.decoder_settings import RECENT_STEPS
-from lare_rl.credit.decomposition import CreditBatch, DecoderState
+from lare_rl.credit.decoder_state import CreditBatch, DecoderState
 from lare_rl.credit.methods import Fit
 from lare_rl.credit.spec import CreditSpec
 from lare_rl.data import replay
@@ -63,12 +63,12 @@ def refit(learner: Learner, config: TrainConfig, fit: Fit | None, scale: Scale) 
     (features, reward), valid = newest(learner, config), jnp.ones(RECENT_STEPS, bool)
     spec = config.credit_specs[0]
     spec = replace(spec, method=replace(spec.method, fit=fit))
-    credit = decomposition.init(jax.random.key(0), spec)
+    credit = decoder_state.init(jax.random.key(0), spec)
     credit = credit._replace(statistics=decoder.statistics, scale=scale)
     rows = []
     for number in range(UPDATES // STRETCH):
         credit = updates(credit, learner.replay, jax.random.key(number), spec, config)
-        r_hat = decomposition.decoder_rewards(credit, features, spec)[:, 0]
+        r_hat = decoder_state.decoder_rewards(credit, features, spec)[:, 0]
         rows.append(
             {
                 "updates": (number + 1) * STRETCH,

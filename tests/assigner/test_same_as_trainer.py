@@ -1,4 +1,4 @@
-"""An assigner and the trainer hand the same steps to the same engine: their rewards agree."""
+"""An assigner and the trainer compute the same rewards of the same steps."""
 
 from dataclasses import replace
 

@@ -5,10 +5,10 @@ import pytest
 
 from helpers.credit_specs import observation_spec
 from helpers.numpy_attention import numpy_attention, numpy_layer_norm, numpy_linear
-from lare_rl.credit import decomposition, descent
+from lare_rl.credit import decoder_state, descent
 from lare_rl.credit.arel import Block
 from lare_rl.credit.decoder_settings import CreditSettings
-from lare_rl.credit.decomposition import CreditBatch
+from lare_rl.credit.decoder_state import CreditBatch
 from lare_rl.credit.methods import METHODS
 from lare_rl.nn.attention import causal_mask
 
@@ -37,13 +37,13 @@ def test_loss_is_the_published_one_in_other_units():
 
     @jax.jit
     def compute():
-        state = decomposition.init(KEY, spec)
-        state = decomposition.observe_steps(state, jnp.asarray(ROWS))
-        state = decomposition.observe_returns(state, mean_reward, length, jnp.ones(EPISODES, bool), None)
+        state = decoder_state.init(KEY, spec)
+        state = decoder_state.observe_steps(state, jnp.asarray(ROWS))
+        state = decoder_state.observe_returns(state, mean_reward, length, jnp.ones(EPISODES, bool), None)
         episode_index = jnp.repeat(jnp.arange(EPISODES), STEPS)
         batch = CreditBatch(jnp.asarray(ROWS), episode_index, length, mean_reward, mask=jnp.ones(EPISODES))
         loss, _ = descent.loss_and_gradient(state, batch, KEY, spec)
-        return decomposition.decoder_rewards(state, batch.inputs, spec), loss
+        return decoder_state.decoder_rewards(state, batch.inputs, spec), loss
 
     y, loss = map(np.asarray, compute())
     y, mean_reward = y.reshape(EPISODES, STEPS, AGENTS)[..., 0], np.asarray(mean_reward)

@@ -8,9 +8,9 @@ import pytest
 from helpers.credit_specs import observation_spec
 from helpers.decoder_toys import make_decoder
 from helpers.long_tests import long_case
-from lare_rl.credit import decomposition, descent
+from lare_rl.credit import decoder_state, descent
 from lare_rl.credit.decoder_settings import CreditSettings
-from lare_rl.credit.decomposition import CreditBatch
+from lare_rl.credit.decoder_state import CreditBatch
 from lare_rl.credit.input_names import InputNames
 from lare_rl.credit.methods import METHODS, Fit
 
@@ -104,11 +104,11 @@ def test_must_learn_credit_among_agents_from_the_mean_return(name):
 
     @jax.jit
     def train():
-        state = decomposition.init(KEY, spec)
-        state = decomposition.observe_steps(state, jnp.asarray(rows))
-        state = decomposition.observe_returns(state, jnp.asarray(mean_reward), length, jnp.ones(n_episodes, bool), None)
+        state = decoder_state.init(KEY, spec)
+        state = decoder_state.observe_steps(state, jnp.asarray(rows))
+        state = decoder_state.observe_returns(state, jnp.asarray(mean_reward), length, jnp.ones(n_episodes, bool), None)
         state, losses = jax.lax.scan(body, state, jax.random.split(jax.random.key(0), n_updates))
-        return decomposition.decoder_rewards(state, jnp.asarray(rows).reshape(-1, AGENTS, 2), spec), losses
+        return decoder_state.decoder_rewards(state, jnp.asarray(rows).reshape(-1, AGENTS, 2), spec), losses
 
     r_hat, losses = train()
     assert float(losses[-5:].mean()) < float(losses[:5].mean())

@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 
 from helpers.credit_specs import observation_spec
-from lare_rl.credit import decomposition, descent
+from lare_rl.credit import decoder_state, descent
 from lare_rl.credit.decoder_settings import CreditSettings
-from lare_rl.credit.decomposition import CreditBatch
+from lare_rl.credit.decoder_state import CreditBatch
 from lare_rl.credit.methods import METHODS, Fit
 
 EPISODES, SAMPLED, FEATURES, LENGTH = 3, 4, 2, 8
@@ -20,7 +20,7 @@ SPEC = observation_spec(FEATURES, METHODS["lrr"], CreditSettings(hidden=(8,), no
 
 @pytest.fixture(scope="module")
 def state():
-    return decomposition.init(KEY, SPEC)
+    return decoder_state.init(KEY, SPEC)
 
 
 @pytest.fixture(scope="module")
@@ -88,14 +88,14 @@ def test_must_learn_rewards_and_where_they_are_uncertain():
 
     @jax.jit
     def train():
-        state = decomposition.init(KEY, spec)
-        state = decomposition.observe_steps(state, jnp.asarray(rows[0]))
-        state = decomposition.observe_returns(state, mean_reward[0], length, jnp.ones(n_episodes, bool), None)
+        state = decoder_state.init(KEY, spec)
+        state = decoder_state.observe_steps(state, jnp.asarray(rows[0]))
+        state = decoder_state.observe_returns(state, mean_reward[0], length, jnp.ones(n_episodes, bool), None)
         return jax.lax.scan(body, state, (jnp.asarray(rows), mean_reward))[0]
 
     state = train()
     x = jnp.asarray(rows[0].reshape(-1, FEATURES))
-    output = decomposition.decode(state.network, state, x, spec)
+    output = decoder_state.decode(state.network, state, x, spec)
     assert np.corrcoef(output.r_hat, x[:, 0])[0, 1] > 0.9
     log_std = np.asarray(output.log_std)
     assert log_std[x[:, 1] > 0.3].mean() > log_std[x[:, 1] < -0.3].mean() + 0.2

@@ -22,7 +22,7 @@ from helpers.small_configs import ONE_TEAM, TOTAL, TWO_TEAMS, random_steps, smal
 from helpers.toy_envs import pick_spec, toy_spec
 from helpers.training_runs import QUICK_CREDIT
 from lare_rl.algorithms.ppo import ppo
-from lare_rl.credit import decomposition
+from lare_rl.credit import decoder_state
 from lare_rl.credit.methods import METHODS
 from lare_rl.data import replay
 from lare_rl.envs.interface import to_env_action
@@ -271,7 +271,7 @@ def test_reward_without_lare(export):
     config, learner, _, _ = load_learner(run)
     # Actions of the toy are in [-2, 2], and those of the trainer in [-1, 1].
     features = np.concatenate([run.functions[0](before, action), before, action / 2], axis=1)
-    expected = decomposition.decoder_rewards(
+    expected = decoder_state.decoder_rewards(
         select_seed(learner, 1).decoders[0], jnp.asarray(features), config.credit_specs[0]
     )
     np.testing.assert_allclose(json.loads(process.stdout), expected, rtol=1e-4, atol=1e-6)

@@ -23,7 +23,7 @@ from helpers.small_configs import (
     small_config,
     untrained_learner,
 )
-from lare_rl.credit import closed_form, decomposition, returns
+from lare_rl.credit import closed_form, decoder_state, learning
 from lare_rl.credit.decoder_settings import CreditSettings
 from lare_rl.credit.score_type import ScoreType, ScoreTypeEstimate
 from lare_rl.data import replay
@@ -77,7 +77,7 @@ def statistics_from_scratch(learner, config):
 
 def add_all(closed, buffer, config):
     def body(closed, batch, first):
-        return returns.add_to_sums(closed, batch)
+        return learning.add_to_sums(closed, batch)
 
     return episodes.fold_episodes(closed, buffer, jnp.zeros_like(buffer.oldest), body, config)
 
@@ -158,7 +158,7 @@ def test_learn_returns_predicts_first(method):
         if int(after.n_episodes) > int(before.predictions.n_episodes):
             i = int(after.n_episodes) - 1
             inputs = jitted(inputs_from, config)(learner.replay, start)[: end - start]
-            r_hat = decomposition.decoder_rewards(before, inputs, spec, jnp.full(end - start, end - start))
+            r_hat = decoder_state.decoder_rewards(before, inputs, spec, jnp.full(end - start, end - start))
             predictions.append((float(after.predicted[i, 0]), float(r_hat.sum())))
             assert float(after.returns[i]) == pytest.approx(steps.next_timestep.reward[start:end].sum(), rel=1e-4)
     assert len(predictions) == (0 if method == "lare-rd" else 4)
@@ -180,12 +180,12 @@ def test_learn_returns_finds_the_score_type(method, score):
     *_, last = learn_in_chunks(config, steps, factors[:, None, None].astype(np.float32), 6)
     assert bool(last.decoders[0].is_average) == (score == "average")
     types = (ScoreType.SUM, ScoreType.AVERAGE) if score == "sum" else (ScoreType.AVERAGE, ScoreType.SUM)
-    estimate = returns.estimate_score_type(last.decoders[0], config.credit_specs[0])
+    estimate = learning.estimate_score_type(last.decoders[0], config.credit_specs[0])
     assert estimate == ScoreTypeEstimate(types[0], is_certain=True, rival=types[1])
     fixed = small_config(method, credit=CreditSettings(score=score))
     for untrained in (config, fixed):
         decoder = untrained_learner(untrained).decoders[0]
-        assert returns.estimate_score_type(decoder, untrained.credit_specs[0]) is None
+        assert learning.estimate_score_type(decoder, untrained.credit_specs[0]) is None
 
 
 def test_score_types_that_are_fitted():
@@ -206,4 +206,4 @@ def test_learn_returns_waits_for_enough_short_episodes():
     assert counts[:40] == list(range(1, 41))
     waits = np.diff(np.flatnonzero(np.diff(counts[100:])))
     assert waits.min() >= 2
-    assert counts[-1] >= 200 / (1 + returns.MIN_GROWTH) - 1
+    assert counts[-1] >= 200 / (1 + learning.MIN_GROWTH) - 1

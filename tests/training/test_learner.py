@@ -27,8 +27,9 @@ from helpers.small_configs import (
     with_factor_decoders,
     with_other_dead_values,
 )
-from lare_rl.credit import closed_form, engine
+from lare_rl.credit import closed_form
 from lare_rl.credit.decoder_settings import CreditSettings
+from lare_rl.credit.rewards import proxy_rewards
 from lare_rl.envs.interface import EnvSpec, Team
 from lare_rl.nn.normalise import root_mean_square
 from lare_rl.training.decoder_fits import fit_decoders, fit_repeatedly, sample_credit
@@ -41,8 +42,8 @@ MANY = partial(small_config, algorithm="ippo", env=ONE_TEAM)
 TEAMS = partial(small_config, algorithm="ippo", env=TWO_TEAMS)
 
 
-def proxy_rewards(steps, decoders, config):
-    return engine.proxy_rewards(decoders[0], step_batch(steps, config, 0), config.credit_specs[0])
+def team_proxy_rewards(steps, decoders, config):
+    return proxy_rewards(decoders[0], step_batch(steps, config, 0), config.credit_specs[0])
 
 
 def update_once(learner, config, key=0):
@@ -88,7 +89,7 @@ def test_rewards(method, scale_rewards):
         case "llm-reward":
             np.testing.assert_allclose(reward, random_factors(config, steps)[:, 0, 0, 0], rtol=1e-5)
         case _:
-            r_hat = jitted(proxy_rewards, config)(stored_steps(learner), learner.decoders)
+            r_hat = jitted(team_proxy_rewards, config)(stored_steps(learner), learner.decoders)
             np.testing.assert_allclose(reward, r_hat[:, 0], rtol=1e-5)
             assert reward.std() > 0
 

@@ -10,7 +10,7 @@ from jaxtyping import Int
 from lare_rl.assigner import compiled_functions as compiled
 from lare_rl.assigner.compiled_functions import MAX_CALL_ROWS
 from lare_rl.assigner.store import Store, StoredEpisode
-from lare_rl.credit.decomposition import CreditBatch
+from lare_rl.credit.decoder_state import CreditBatch
 from lare_rl.credit.descent import plan_batch
 from lare_rl.credit.spec import CreditSpec
 from lare_rl.data.layouts import Layout, lay_out_packed, lay_out_padded, lay_out_sampled

@@ -8,22 +8,22 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Key
 
-from lare_rl.credit import closed_form, decomposition, descent, engine, explanation, returns
-from lare_rl.credit.decomposition import CreditBatch, DecoderState
-from lare_rl.credit.engine import StepBatch
+from lare_rl.credit import closed_form, decoder_state, descent, explanation, learning, rewards
+from lare_rl.credit.decoder_state import CreditBatch, DecoderState
+from lare_rl.credit.rewards import StepBatch
 from lare_rl.credit.spec import CreditSpec
 from lare_rl.data.layouts import sample_steps as _sample_steps
 
 MAX_CALL_ROWS = 8192
 """Rows that are processed in one call."""
 
-init_decoder = jax.jit(decomposition.init, static_argnames="spec")
-observe_steps = jax.jit(decomposition.observe_steps)
-observe_returns = jax.jit(decomposition.observe_returns)
-predict_then_update = jax.jit(returns.predict_then_update, static_argnames="spec")
-predicted_returns = jax.jit(returns.predicted_returns, static_argnames="spec")
-add_to_sums = jax.jit(returns.add_to_sums)
-fit_closed_form = jax.jit(returns.fit_closed_form, static_argnames="spec")
+init_decoder = jax.jit(decoder_state.init, static_argnames="spec")
+observe_steps = jax.jit(decoder_state.observe_steps)
+observe_returns = jax.jit(decoder_state.observe_returns)
+predict_then_update = jax.jit(learning.predict_then_update, static_argnames="spec")
+predicted_returns = jax.jit(learning.predicted_returns, static_argnames="spec")
+add_to_sums = jax.jit(learning.add_to_sums)
+fit_closed_form = jax.jit(learning.fit_closed_form, static_argnames="spec")
 is_due = jax.jit(closed_form.is_due)
 is_stale = jax.jit(closed_form.is_stale)
 reset_statistics = jax.jit(closed_form.reset_statistics)
@@ -52,7 +52,7 @@ def training_rewards(
     leaves: list[Array], steps: StepBatch, structure: Any, spec: CreditSpec
 ) -> Float[Array, "rows agents"]:
     """Return the rewards of steps by a flat `DecoderState`: its leaves and structure, from `jax.tree.flatten`."""
-    return engine.training_rewards(jax.tree.unflatten(structure, leaves), steps, spec)
+    return rewards.training_rewards(jax.tree.unflatten(structure, leaves), steps, spec)
 
 
 def on_cpu() -> AbstractContextManager:

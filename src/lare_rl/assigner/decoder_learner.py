@@ -22,8 +22,8 @@ from lare_rl.assigner.assigner_config import AssignerConfig
 from lare_rl.assigner.batches import sample_batch, whole_episodes
 from lare_rl.assigner.compiled_functions import MAX_CALL_ROWS, on_cpu
 from lare_rl.assigner.store import Store, StoredEpisode
-from lare_rl.credit import closed_form, prequential, returns
-from lare_rl.credit.decomposition import DecoderState
+from lare_rl.credit import closed_form, learning, prequential
+from lare_rl.credit.decoder_state import DecoderState
 from lare_rl.credit.history import next_history_columns
 from lare_rl.credit.methods import Fit
 from lare_rl.util.float64 import float64
@@ -73,7 +73,7 @@ class DecoderLearner:
         """Whether the decoder has been fitted yet."""
         if not self._is_fitted and self.config.method.fit is not None:  # cached, because reading the flag waits for JAX
             uses_gradient = self.config.method.uses_gradient
-            self._is_fitted = self.n_updates > 0 if uses_gradient else bool(returns.is_fitted(self.decoder))
+            self._is_fitted = self.n_updates > 0 if uses_gradient else bool(learning.is_fitted(self.decoder))
         return self._is_fitted
 
     def add_steps(
@@ -164,7 +164,7 @@ class DecoderLearner:
     def learn_if_due(self) -> None:
         """Add pending returns to the scales, and let the decoder learn if there are enough new episodes."""
         self._flush_returns()
-        if sum(map(len, self._pending_episodes)) >= max(returns.MIN_GROWTH * self.n_learned, 1):
+        if sum(map(len, self._pending_episodes)) >= max(learning.MIN_GROWTH * self.n_learned, 1):
             self.learn_returns()
 
     def learn_returns(self) -> None:

@@ -14,10 +14,10 @@ from lare_rl.assigner import compiled_functions as compiled
 from lare_rl.assigner.batches import whole_episodes
 from lare_rl.assigner.compiled_functions import MAX_CALL_ROWS, on_cpu
 from lare_rl.assigner.decoder_learner import DecoderLearner
-from lare_rl.credit import decomposition
-from lare_rl.credit.decomposition import DecoderState
-from lare_rl.credit.engine import StepBatch
+from lare_rl.credit import decoder_state
+from lare_rl.credit.decoder_state import DecoderState
 from lare_rl.credit.methods import Reward
+from lare_rl.credit.rewards import StepBatch
 from lare_rl.util.shapes import pad_rows, padded_size
 
 __all__ = ["StepRewards"]
@@ -121,5 +121,5 @@ class StepRewards:
         size = padded_size(len(length))
         with on_cpu():
             levels = None if level is None else jnp.full(size, level)
-            values = decomposition.level_returns(decoder, levels, jnp.asarray(pad_rows(length, size)))
+            values = decoder_state.level_returns(decoder, levels, jnp.asarray(pad_rows(length, size)))
         return float(np.sum(np.asarray(values)[: len(length)]))

@@ -6,9 +6,9 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, PRNGKeyArray
 
-from lare_rl.credit import decomposition, losses
+from lare_rl.credit import decoder_state, losses
 from lare_rl.credit.decoder_network import DecoderNetwork
-from lare_rl.credit.decomposition import CreditBatch, DecoderState
+from lare_rl.credit.decoder_state import CreditBatch, DecoderState
 from lare_rl.credit.methods import Fit
 from lare_rl.credit.spec import CreditSpec
 from lare_rl.nn.masks import masked_mean
@@ -96,8 +96,8 @@ def _mean_loss(
     """Return the loss of RD, RRD, RRD-unbiased or LRR: mean r_hat of an episode's steps against R/T, plus the decoder's penalty."""
     fit, target, n_episodes = spec.method.fit, _targets(state, episodes, spec), len(episodes.length)
     weight = losses.episode_weight(episodes.length, episodes.mask, spec.settings.sum_form)
-    output = decomposition.decode(network, state, episodes.inputs, spec, key)
-    r_hat, penalty = (decomposition.agent_mean(values, episodes.alive) for values in (output.r_hat, output.penalty))
+    output = decoder_state.decode(network, state, episodes.inputs, spec, key)
+    r_hat, penalty = (decoder_state.agent_mean(values, episodes.alive) for values in (output.r_hat, output.penalty))
     n_steps = jnp.minimum(episodes.length, len(r_hat) // n_episodes) if spec.method.samples_steps else episodes.length
 
     def means(values: Float[Array, " rows"]) -> Float[Array, " episodes"]:
@@ -107,14 +107,14 @@ def _mean_loss(
     if fit is Fit.LIKELIHOOD:
         assert output.log_std is not None
         uncertainties = jnp.exp(-2 * output.log_std), output.log_std
-        precision, log_std = (means(decomposition.agent_mean(values, episodes.alive)) for values in uncertainties)
+        precision, log_std = (means(decoder_state.agent_mean(values, episodes.alive)) for values in uncertainties)
         loss = losses.leave_one_out_likelihood(mean, target, weight, precision, log_std)
     elif fit is Fit.SAMPLED_STEPS_UNBIASED:
         variance = losses.subsampling_variance(r_hat.reshape(n_episodes, -1), episodes.length)
         loss = losses.unbiased_squared_error(mean, target, weight, variance)
     else:
         loss = losses.squared_error(mean, target, weight)
-    penalty = masked_mean(penalty, decomposition.step_rows(episodes))
+    penalty = masked_mean(penalty, decoder_state.step_rows(episodes))
     return loss + penalty * losses.batch_mean(weight, weight)
 
 
@@ -123,7 +123,7 @@ def _decoder_loss(
 ) -> Float[Array, ""]:
     """Return the decoder's `loss` on whole episodes, which are padded to the same length."""
     target = _targets(state, episodes, spec)
-    inputs = decomposition.normalise_inputs(state, episodes.inputs, spec)
+    inputs = decoder_state.normalise_inputs(state, episodes.inputs, spec)
     inputs = inputs.reshape(len(target), -1, inputs.shape[-1])  # without the axis of the single agent
     return network.loss(inputs, episodes.length, target, episodes.mask, key)
 
@@ -132,6 +132,6 @@ def _targets(state: DecoderState, episodes: CreditBatch, spec: CreditSpec) -> Fl
     """Return R/T of each episode, or R if the score is an average, in the decoder's unit, without what its level explains."""
     mean_reward = episodes.mean_reward
     if episodes.level is not None:
-        level_return = decomposition.level_returns(state, episodes.level, episodes.length)
+        level_return = decoder_state.level_returns(state, episodes.level, episodes.length)
         mean_reward = mean_reward - level_return / jnp.maximum(episodes.length, 1)
-    return mean_reward * jnp.where(state.is_average, episodes.length, 1) / decomposition.reward_unit(state, spec)
+    return mean_reward * jnp.where(state.is_average, episodes.length, 1) / decoder_state.reward_unit(state, spec)

@@ -35,7 +35,7 @@ class Fit(StrEnum):
     EVIDENCE = "evidence"
     """In closed form, on all episodes (`evidence.py`)."""
     PREFIX_EVIDENCE = "evidence of prefixes"
-    """In closed form, on all prefixes: a step is paid the change of the expected return (`returns.py`)."""
+    """In closed form, on all prefixes: a step is paid the change of the expected return (`learning.py`)."""
     SIGNS = "best signs"
     """The best signs of a sum of the factors (`closed_form.py`)."""
 

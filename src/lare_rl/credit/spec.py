@@ -122,7 +122,7 @@ class CreditSpec:
 
     @property
     def output_scale(self) -> float:
-        """The factor of the output of decoders for several agents (see `decomposition.py`)."""
+        """The factor of the output of decoders for several agents (see `decoder_state.py`)."""
         return 1.0 if self.agents == 1 else math.sqrt(self.max_steps * self.agents)
 
     def raw_feature_names(self, observation: str, action: str) -> list[str]:

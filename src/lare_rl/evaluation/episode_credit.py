@@ -10,7 +10,7 @@ from jaxtyping import Array, Float
 
 from lare_rl.credit.closed_form import ClosedForm, reward_std
 from lare_rl.credit.decoder_settings import RECENT_STEPS
-from lare_rl.credit.decomposition import score_type_index
+from lare_rl.credit.decoder_state import score_type_index
 from lare_rl.credit.methods import Fit
 from lare_rl.data import replay
 from lare_rl.data.replay import Index, StoredSteps

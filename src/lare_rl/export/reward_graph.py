@@ -15,7 +15,7 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 
-from lare_rl.credit.decomposition import DecoderState, decoder_rewards
+from lare_rl.credit.decoder_state import DecoderState, decoder_rewards
 from lare_rl.credit.input_names import input_arrays
 from lare_rl.credit.methods import Method, Reward
 from lare_rl.credit.spec import CreditSpec

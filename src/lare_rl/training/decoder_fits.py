@@ -15,8 +15,8 @@ import numpy as np
 from jaxtyping import Array, Float, Int, Key, PRNGKeyArray
 
 from lare_rl.algorithms.batches import Metrics
-from lare_rl.credit import descent, returns
-from lare_rl.credit.decomposition import CreditBatch, DecoderState
+from lare_rl.credit import descent, learning
+from lare_rl.credit.decoder_state import CreditBatch, DecoderState
 from lare_rl.credit.descent import plan_batch
 from lare_rl.credit.prequential import empty_predictions, squared_errors
 from lare_rl.credit.spec import CreditSpec
@@ -206,7 +206,7 @@ def _held_out_error(
     buffer = replay.segments_as_episodes(buffer)
 
     def predict(decoder: DecoderState, episodes: CreditBatch, first: Index) -> DecoderState:
-        return returns.predict(decoder, episodes, config.credit_specs[0])
+        return learning.predict(decoder, episodes, config.credit_specs[0])
 
     decoders = fold_episodes(decoders, buffer, buffer.current_episode - n_hidden, predict, config)
     errors = [

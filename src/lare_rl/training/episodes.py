@@ -15,9 +15,9 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Int
 
-from lare_rl.credit import closed_form, returns
+from lare_rl.credit import closed_form, learning
 from lare_rl.credit.closed_form import ClosedForm
-from lare_rl.credit.decomposition import CreditBatch, DecoderState
+from lare_rl.credit.decoder_state import CreditBatch, DecoderState
 from lare_rl.credit.methods import Fit
 from lare_rl.credit.spec import CreditSpec
 from lare_rl.data import replay
@@ -44,7 +44,7 @@ def learn_returns(learner: Learner, config: TrainConfig) -> Learner:
     buffer, n_learned = replay.segments_as_episodes(learner.replay), learner.n_learned
     n_before = jnp.sum(n_learned, axis=1)
     n_new = jnp.sum(buffer.current_episode, axis=1) - n_before
-    is_due = n_new >= jnp.maximum(returns.MIN_GROWTH * n_before, 1)
+    is_due = n_new >= jnp.maximum(learning.MIN_GROWTH * n_before, 1)
     learn = partial(_learn_if_due, buffer=buffer, n_learned=n_learned, is_due=is_due, config=config)
     decoders = jax.lax.cond(jnp.any(is_due), learn, lambda unchanged: unchanged, learner.decoders)
     n_now = jnp.where(is_due[:, None], buffer.current_episode, n_learned).astype(n_learned.dtype)
@@ -68,7 +68,7 @@ def predict_returns(learner: Learner, since: Int[Array, " envs"], config: TrainC
         last = first.number + episodes.length - 1
         episode = replay.look_up(buffer.episode, first.env, last)
         slot = jnp.where(episodes.mask > 0, episode % slots, slots)  # an index out of range, which is dropped
-        values = returns.predicted_returns(decoder, episodes, config.credit_specs[0])
+        values = learning.predicted_returns(decoder, episodes, config.credit_specs[0])
         return decoder, predicted.at[first.env, slot].set(values.astype(predicted.dtype), mode="drop")
 
     assert buffer.predicted_return is not None
@@ -146,7 +146,7 @@ def _predict_then_update(
     decoders: Decoders, buffer: Replay, since: Int[Array, " envs"], config: TrainConfig
 ) -> Decoders:
     def body(decoder: DecoderState, episodes: CreditBatch, first: Index) -> DecoderState:
-        return returns.predict_then_update(decoder, episodes, config.credit_specs[0])
+        return learning.predict_then_update(decoder, episodes, config.credit_specs[0])
 
     expected = config.n_envs * config.rollout_steps // config.longest_segment
     return fold_episodes(decoders, buffer, since, body, config, expected)
@@ -162,13 +162,13 @@ def _rebuild_sums(
     """Add all stored episodes to new sums if `is_stale` is true, with features standardised by the current statistics."""
     empty = tuple(map(closed_form.reset_statistics, closed, statistics))
     since = jnp.where(is_stale, buffer.oldest, buffer.current_episode)
-    rebuilt = fold_episodes(empty, buffer, since, lambda state, batch, _: returns.add_to_sums(state, batch), config)
+    rebuilt = fold_episodes(empty, buffer, since, lambda state, batch, _: learning.add_to_sums(state, batch), config)
     return select(is_stale, rebuilt, closed)
 
 
 def _fit_seeds(decoder: DecoderState, is_due: Bool[Array, " seeds"], spec: CreditSpec, batched: bool) -> DecoderState:
     """Make the closed-form fits of a team's decoder for the seeds that are due."""
-    fit = partial(returns.fit_closed_form, spec=spec, batched=batched)
+    fit = partial(learning.fit_closed_form, spec=spec, batched=batched)
 
     def fit_seed(seed: tuple[DecoderState, Bool[Array, ""]]) -> DecoderState:
         decoder, is_due = seed

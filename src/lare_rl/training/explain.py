@@ -8,7 +8,7 @@ import jax
 import numpy as np
 from jaxtyping import Array, Bool
 
-from lare_rl.credit.decomposition import CreditBatch, valid_rows
+from lare_rl.credit.decoder_state import CreditBatch, valid_rows
 from lare_rl.credit.explanation import Explanation, add_to_explanation, explain, init_explanation
 from lare_rl.credit.explanation_text import LEGEND_CODES, MESSAGES, MIN_EXPLAINED_EPISODES, returns_findings
 from lare_rl.credit.methods import METHODS, Method

@@ -13,8 +13,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
-from lare_rl.credit import decomposition
-from lare_rl.credit.decomposition import DecoderState
+from lare_rl.credit import decoder_state
+from lare_rl.credit.decoder_state import DecoderState
 from lare_rl.credit.history import next_history, scan_history
 from lare_rl.data import replay
 from lare_rl.data.extend import abandon_running, extend, set_newest
@@ -54,7 +54,7 @@ def init_learner(key: PRNGKeyArray, config: TrainConfig, init_algorithm: Callabl
     algorithm_key, *keys = jax.random.split(key, 1 + len(config.env.teams))
     return Learner(
         algorithm=init_algorithm(algorithm_key),
-        decoders=tuple(map(decomposition.init, keys, config.credit_specs)),
+        decoders=tuple(map(decoder_state.init, keys, config.credit_specs)),
         replay=empty_replay(config, config.n_envs, config.capacity),
         n_learned=jnp.zeros(config.n_envs, jnp.int32),
     )
@@ -145,12 +145,12 @@ def _levels(steps: Trajectory, config: TrainConfig) -> Int[Array, "time envs"] |
 def _observe(decoder: DecoderState, steps: StoredSteps, config: TrainConfig, team_index: int) -> DecoderState:
     """Add new steps, and the episodes that were paid in them, to the statistics of a team's decoder."""
     rows, mask = decoder_inputs(steps, config, team_index), row_mask(steps, config, team_index)
-    decoder = decomposition.observe_steps(decoder, rows, mask)
+    decoder = decoder_state.observe_steps(decoder, rows, mask)
     mean_reward, level = (
         steps.mean_reward[..., team_index].ravel(),
         None if steps.level is None else steps.level.ravel(),
     )
-    return decomposition.observe_returns(decoder, mean_reward, steps.length.ravel(), steps.last.ravel(), level)
+    return decoder_state.observe_returns(decoder, mean_reward, steps.length.ravel(), steps.last.ravel(), level)
 
 
 def abandon_episodes(learner: Learner, abandoned: Bool[Array, " envs"]) -> Learner:

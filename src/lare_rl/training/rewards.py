@@ -7,10 +7,11 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from lare_rl.algorithms.batches import Metrics
-from lare_rl.credit import engine, prequential
+from lare_rl.credit import prequential
 from lare_rl.credit.decoder_settings import RECENT_STEPS
-from lare_rl.credit.decomposition import DecoderState
+from lare_rl.credit.decoder_state import DecoderState
 from lare_rl.credit.methods import Reward
+from lare_rl.credit.rewards import proxy_rewards, scale_and_mask, training_rewards
 from lare_rl.data import replay
 from lare_rl.data.replay import StoredSteps
 from lare_rl.envs.interface import Team, team_mean
@@ -37,12 +38,12 @@ def rewards(
     team_rewards = []
     for i, (team, decoder) in enumerate(zip(config.env.teams, decoders, strict=True)):
         if config.method.has_proxy_rewards:
-            team_rewards.append(engine.training_rewards(decoder, step_batch(steps, config, i), config.credit_specs[i]))
+            team_rewards.append(training_rewards(decoder, step_batch(steps, config, i), config.credit_specs[i]))
             continue
         is_dense, team_alive = config.method.reward is Reward.TRUE, alive[..., team.agents]
         reward = steps.columns["reward"][..., team.agents] if is_dense else steps.episodic_reward[..., i, None]
         reward = jnp.broadcast_to(reward, team_alive.shape)
-        scaled = engine.scale_and_mask(reward, decoder.scale, team_alive, scale_rewards=config.scale_rewards)
+        scaled = scale_and_mask(reward, decoder.scale, team_alive, scale_rewards=config.scale_rewards)
         team_rewards.append(scaled)
     return jnp.concatenate(team_rewards, axis=-1)
 
@@ -65,7 +66,7 @@ def assess(learner: Learner, config: TrainConfig) -> Metrics:
         if config.team_level:
             reward, mask = team_mean(steps.columns["reward"], alive, team)[..., None], is_stored
         decoder = learner.decoders[i]
-        r_hat = engine.proxy_rewards(decoder, step_batch(steps, config, i), config.credit_specs[i])
+        r_hat = proxy_rewards(decoder, step_batch(steps, config, i), config.credit_specs[i])
         r_hat = jnp.broadcast_to(r_hat, reward.shape)
         last = jnp.broadcast_to(steps.last[..., None], reward.shape)
         rows = (values.ravel() for values in (r_hat, reward, last, mask))

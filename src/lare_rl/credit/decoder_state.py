@@ -2,7 +2,7 @@
 
     r_hat = scale * f_psi(normalise(x)),    psi <- argmin loss(r_hat / scale, R / (T * scale))
 
-psi is fitted by gradient descent in `descent.py` and in closed form in `returns.py`.
+psi is fitted by gradient descent in `descent.py` and in closed form in `learning.py`.
 
 x are the method's inputs: the factors z = phi(s, a), or raw features. `scale` is the running root mean square of R/T.
 With n agents, each agent has its own proxy rewards, R is the mean of the agents' returns, and the mean of the agents' r_hat is

@@ -1,6 +1,6 @@
-"""The rewards that credit assignment pays for steps: one engine for the trainer, `CreditAssigner` and logs.
+"""The rewards that credit assignment pays for steps, in the trainer and in `CreditAssigner`.
 
-A `CreditSpec` (`spec.py`) says what is fitted to what. With the state of a decoder (`decomposition.py`), the functions here turn steps
+A `CreditSpec` (`spec.py`) says what is fitted to what. With the state of a decoder (`decoder_state.py`), the functions here turn steps
 into the rewards that an algorithm is trained on:
 
     proxy reward       r_hat of each agent, by the method
@@ -19,8 +19,8 @@ from typing import NamedTuple
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from lare_rl.credit import decomposition
-from lare_rl.credit.decomposition import DecoderState
+from lare_rl.credit import decoder_state
+from lare_rl.credit.decoder_state import DecoderState
 from lare_rl.credit.methods import Reward
 from lare_rl.credit.spec import CreditSpec
 from lare_rl.credit.tar2 import pay_shares
@@ -60,7 +60,7 @@ def proxy_rewards(state: DecoderState, steps: StepBatch, spec: CreditSpec) -> Fl
         share = jnp.where(steps.episode_ended, min_max_scale(state.scale, steps.mean_reward), 0.5)
         return jnp.broadcast_to(share[..., None], shape[:-1])
     rows = steps.inputs.reshape(-1, *shape[-2:])
-    r_hat = decomposition.decoder_rewards(state, rows, spec, steps.length.ravel()).reshape(shape[:-1])
+    r_hat = decoder_state.decoder_rewards(state, rows, spec, steps.length.ravel()).reshape(shape[:-1])
     if not spec.method.decoder_kind.pays_shares:
         return r_hat
     shares = pay_shares(r_hat, steps.alive, steps.mean_reward * steps.length, spec.max_steps)

@@ -17,9 +17,9 @@ import numpy as np
 import optax
 from jaxtyping import Array, Bool, Float, Int
 
-from lare_rl.credit import closed_form, decomposition, evidence, logistic
+from lare_rl.credit import closed_form, decoder_state, evidence, logistic
 from lare_rl.credit.closed_form import ClosedForm, LinearDecoder
-from lare_rl.credit.decomposition import CreditBatch, DecoderState
+from lare_rl.credit.decoder_state import CreditBatch, DecoderState
 from lare_rl.credit.methods import Fit
 from lare_rl.credit.prequential import Predictions, add_predictions, squared_errors
 from lare_rl.credit.score_type import MAX_ERROR_RATIO, ROUNDING, ScoreType, ScoreTypeEstimate, compare_score_types
@@ -66,7 +66,7 @@ def predict(state: DecoderState, episodes: CreditBatch, spec: CreditSpec) -> Dec
     """
     is_new, returns = episodes.mask > 0, episodes.mean_reward * episodes.length
     predicted = predicted_returns(state, episodes, spec)
-    predicted = predicted + decomposition.level_returns(state, episodes.level, episodes.length)
+    predicted = predicted + decoder_state.level_returns(state, episodes.level, episodes.length)
     closed = state.closed_form
     if state.score_type_predictions is not None and closed is not None:
         by_score_type = _predict_by_score_type(closed, episodes)
@@ -106,8 +106,8 @@ def predicted_returns(state: DecoderState, episodes: CreditBatch, spec: CreditSp
     """Return the sum of each episode's proxy rewards, which are the mean over the agents that are alive."""
     n_episodes = len(episodes.length)
     row_length = episodes.length[jnp.clip(episodes.episode_index, 0, n_episodes - 1)]
-    r_hat = decomposition.decoder_rewards(state, episodes.inputs, spec, row_length)
-    team_r_hat = decomposition.agent_mean(r_hat, episodes.alive)
+    r_hat = decoder_state.decoder_rewards(state, episodes.inputs, spec, row_length)
+    team_r_hat = decoder_state.agent_mean(r_hat, episodes.alive)
     return jax.ops.segment_sum(team_r_hat, episodes.episode_index, n_episodes)
 
 
@@ -165,7 +165,7 @@ def add_to_sums(closed: ClosedForm, episodes: CreditBatch) -> ClosedForm:
     returns, mask = episodes.mean_reward * episodes.length, episodes.mask > 0
     if closed.decoder.basis.prefixes:
         index = jnp.minimum(episodes.episode_index, len(mask) - 1)
-        columns, is_step = _prefix_columns(closed.decoder, episodes), decomposition.step_rows(episodes)
+        columns, is_step = _prefix_columns(closed.decoder, episodes), decoder_state.step_rows(episodes)
         statistics = evidence.add_prefixes(statistics, columns, returns[index], is_step, jnp.sum(mask))
         return closed._replace(sufficient_statistics=closed_form.split_double(statistics))
     columns = _columns(closed.decoder, episodes)
@@ -196,7 +196,7 @@ def fit_closed_form(state: DecoderState, spec: CreditSpec, *, batched: bool = Fa
         is_average = (errors[1] < MAX_ERROR_RATIO * errors[0]) & ~is_log_odds if len(errors) > 1 else state.is_average
         state = state._replace(is_average=is_average, is_log_odds=is_log_odds)
     if not spec.method.uses_gradient:
-        index = decomposition.score_type_index(state, len(score_types))
+        index = decoder_state.score_type_index(state, len(score_types))
         state = state._replace(network=closed_form.select_score_type(closed.decoder, index))
     return state
 
@@ -209,7 +209,7 @@ def estimate_score_type(state: DecoderState, spec: CreditSpec) -> ScoreTypeEstim
     if state.score_type_predictions is None:
         return None
     errors = np.asarray(_score_type_errors(state.score_type_predictions))
-    index = int(decomposition.score_type_index(state, len(errors)))
+    index = int(decoder_state.score_type_index(state, len(errors)))
     if np.allclose(errors[index], np.delete(errors, index), rtol=1e-3):
         return None
     types = spec.score_types

@@ -7,16 +7,16 @@ import numpy as np
 import pytest
 
 from helpers.credit_specs import observation_spec
-from lare_rl.credit import decomposition, descent
+from lare_rl.credit import decoder_state, descent
 from lare_rl.credit.decoder_settings import CreditSettings
-from lare_rl.credit.decomposition import CreditBatch
+from lare_rl.credit.decoder_state import CreditBatch
 from lare_rl.credit.methods import METHODS, Fit
 
 EPISODES, STEPS, FEATURES = 64, 10, 3
 KEY = jax.random.key(3)
-init = jax.jit(decomposition.init, static_argnames="spec")
+init = jax.jit(decoder_state.init, static_argnames="spec")
 update = jax.jit(descent.update, static_argnames="spec")
-proxy_rewards = jax.jit(decomposition.decoder_rewards, static_argnames="spec")
+proxy_rewards = jax.jit(decoder_state.decoder_rewards, static_argnames="spec")
 
 
 @partial(jax.jit, static_argnames="spec")
@@ -32,8 +32,8 @@ def fit_batches(state, batches, spec):
 
 @jax.jit
 def observe(state, rows, mean_reward, length):
-    state = decomposition.observe_steps(state, rows)
-    return decomposition.observe_returns(state, mean_reward, length, jnp.ones(len(length), bool), None)
+    state = decoder_state.observe_steps(state, rows)
+    return decoder_state.observe_returns(state, mean_reward, length, jnp.ones(len(length), bool), None)
 
 
 def train(fit, settings, reward_scale=1.0, feature_scale=1.0, updates=400):
@@ -94,7 +94,7 @@ def test_unit_of_proxy_rewards(score_type):
     mean_reward, rows = np.array([3.0, -1.0, 0.5], np.float32), np.eye(FEATURES, dtype=np.float32)
     spec = observation_spec(FEATURES, METHODS["rd"], settings, STEPS)
     state = observe(init(KEY, spec), rows, mean_reward, length)
-    output = decomposition.decode(state.network, state, jnp.asarray(rows), spec).r_hat
+    output = decoder_state.decode(state.network, state, jnp.asarray(rows), spec).r_hat
     unit = np.sqrt(np.mean((mean_reward * (length if score_type else 1)) ** 2)) / (length if score_type else 1)
     np.testing.assert_allclose(proxy_rewards(state, rows, spec, length), unit * output, rtol=1e-5)
 
@@ -104,9 +104,9 @@ def test_valid_rows():
     episode_index, zeros = np.array([0, 0, 1, 1, 2, 3]), np.zeros((6, 2, FEATURES), np.float32)
     alive = np.array([[True, False], *[[True, True]] * 5])
     batch = CreditBatch(zeros, episode_index, np.array([2, 2]), zeros[0, :, 0], mask=np.float32([1, 0]), alive=alive)
-    np.testing.assert_array_equal(jax.jit(decomposition.valid_rows)(batch), [alive[0], alive[1], *[[False, False]] * 4])
+    np.testing.assert_array_equal(jax.jit(decoder_state.valid_rows)(batch), [alive[0], alive[1], *[[False, False]] * 4])
     batch = batch._replace(inputs=zeros[:, 0], alive=None)
-    np.testing.assert_array_equal(jax.jit(decomposition.valid_rows)(batch), [True, True, *[False] * 4])
+    np.testing.assert_array_equal(jax.jit(decoder_state.valid_rows)(batch), [True, True, *[False] * 4])
 
 
 def test_decoder_of_many_agents_soon_reaches_the_size_of_rare_rewards():
@@ -181,4 +181,4 @@ def test_gradient_in_chunks_is_that_of_the_batch(name, sum_form):
 
 def test_values_of_agents_that_have_left_make_no_difference():
     values, alive = jnp.array([[1.0, jnp.nan, 3.0]]), jnp.array([[True, False, True]])
-    assert decomposition.agent_mean(values, alive).tolist() == [2.0]
+    assert decoder_state.agent_mean(values, alive).tolist() == [2.0]
