@@ -172,9 +172,8 @@ def reset_statistics(state: ClosedForm, statistics: RunningMeanStd) -> ClosedFor
 
     The next fit starts from the precisions of the last one. Until then, the weights do not match the features.
     """
-    decoder = eqx.tree_at(lambda d: (d.mean, d.std), state.decoder, (statistics.mean, running_std(statistics)))
     return state._replace(
-        decoder=decoder,
+        decoder=eqx.tree_at(lambda d: (d.mean, d.std), state.decoder, (statistics.mean, running_std(statistics))),
         sufficient_statistics=jax.tree.map(jnp.zeros_like, state.sufficient_statistics),
         n_steps=statistics.n_rows,
         n_fitted=jnp.zeros_like(state.n_fitted),
@@ -282,8 +281,7 @@ def fit_signs(state: ClosedForm) -> ClosedForm:
 
 def _set_weights(state: ClosedForm, weights: _Weights) -> ClosedForm:
     """Set weights that were fitted to all episodes in the sums."""
-    columns, bias, start_value = (values.astype(jnp.float32) for values in weights)
-    basis = state.decoder.basis
+    basis, (columns, bias, start_value) = state.decoder.basis, (values.astype(jnp.float32) for values in weights)
     return state._replace(
         decoder=eqx.tree_at(lambda d: (d.weight, d.bias), state.decoder, (columns[:, : basis.n_features], bias)),
         n_fitted=jnp.sum(state.sufficient_statistics.n_episodes),
