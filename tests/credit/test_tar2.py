@@ -12,7 +12,7 @@ from lare_rl.config.validity import CreditContext, check_credit
 from lare_rl.credit import decoder_state
 from lare_rl.credit.decoder_settings import CreditSettings
 from lare_rl.credit.methods import METHODS
-from lare_rl.credit.rewards import StepBatch
+from lare_rl.credit.rewards import StepBatch, training_rewards
 from lare_rl.credit.spec import CreditSpec
 from lare_rl.credit.tar2 import return_shares
 from lare_rl.errors import LareError
@@ -181,7 +181,7 @@ def test_rewards_add_up_to_the_return():
         decoder = decoder_state.init(
             jax.random.key(0), observation_spec(4, METHODS["rd"], CreditSettings(hidden=(4,)), STEPS, AGENTS)
         )
-        return rewards.training_rewards(decoder, steps, spec)
+        return training_rewards(decoder, steps, spec)
 
     rewards, contributions = np.asarray(compute(jax.tree.map(lambda *pair: jnp.stack(pair), steps, unfinished)))
     step_rewards = rewards.sum(axis=-1) / np.maximum(alive.sum(axis=-1), 1)
