@@ -86,7 +86,7 @@ def curve(name: str, updates: int) -> Iterator[tuple[int, tuple[float, float]]]:
     fit = jax.jit(partial(fit_repeatedly, config=config))
     for done in range(AT_A_TIME, updates + 1, AT_A_TIME):
         credit, _ = fit(learner, jax.random.key(done))
-        learner = learner._replace(reward_sources=credit)
+        learner = learner._replace(decoders=credit)
         if (done // AT_A_TIME).bit_count() == 1:
             yield done, correlations(learner, test_steps, config)
 

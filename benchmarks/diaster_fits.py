@@ -16,15 +16,16 @@ import jax.numpy as jnp
 import tyro
 
 from lare_rl.config.train_config import TrainConfig
-from lare_rl.credit import accuracy, decomposition
+from lare_rl.credit import decoder_state
 from lare_rl.credit.decoder_settings import RECENT_STEPS, CreditSettings
 from lare_rl.credit.methods import METHODS
+from lare_rl.credit.rewards import proxy_rewards
 from lare_rl.data import replay
 from lare_rl.runs.directory import open_run
 from lare_rl.training.decoder_fits import fit_repeatedly
-from lare_rl.training.decoder_inputs import decoder_inputs
+from lare_rl.training.decoder_inputs import decoder_inputs, step_batch
 from lare_rl.training.learner import Learner
-from lare_rl.training.rewards import team_proxy_rewards
+from lare_rl.training.rewards import masked_correlation, mean_absolute_error
 from lare_rl.training.saved_state import load_learner
 from lare_rl.training.seed_axis import select_seed
 from measure import write
@@ -35,13 +36,13 @@ AT_A_TIME = 50
 
 def untrained(learner: Learner, config: TrainConfig, key: jax.Array) -> Learner:
     """The learner with a new decoder, which has the statistics of all stored steps."""
-    credit = decomposition.init(key, config.credit_specs[0])
+    credit = decoder_state.init(key, config.credit_specs[0])
     stored_replay = learner.replay
     valid = replay.read(
         stored_replay, replay.newest_steps(stored_replay, int(replay.n_stored_transitions(stored_replay)[0]))
     )
-    credit = decomposition.observe_steps(credit, decoder_inputs(valid, config, 0))
-    return learner._replace(reward_sources=(credit._replace(scale=learner.decoders[0].scale),))
+    credit = decoder_state.observe_steps(credit, decoder_inputs(valid, config, 0))
+    return learner._replace(decoders=(credit._replace(scale=learner.decoders[0].scale),))
 
 
 def curve(learner: Learner, config: TrainConfig, fits: tuple[int, ...], seed: int) -> list[dict[str, float]]:
@@ -56,14 +57,14 @@ def curve(learner: Learner, config: TrainConfig, fits: tuple[int, ...], seed: in
     for n_fits in fits:
         while done < n_fits:
             credit, _ = fit_some(learner, jax.random.key(1000 * seed + done), config=config)
-            learner = learner._replace(reward_sources=credit)
+            learner = learner._replace(decoders=credit)
             done += AT_A_TIME
-        r_hat = team_proxy_rewards(recent, learner.reward_sources, config, 0)[:, 0]
+        r_hat = proxy_rewards(learner.decoders[0], step_batch(recent, config, 0), config.credit_specs[0])[:, 0]
         accuracies.append(
             {
                 "fits": done,
-                "correlation": float(accuracy.masked_correlation(r_hat, reward, valid)),
-                "error": float(accuracy.mean_absolute_error(r_hat, reward, valid)),
+                "correlation": float(masked_correlation(r_hat, reward, valid)),
+                "error": float(mean_absolute_error(r_hat, reward, valid)),
                 "r_hat of the first step": float(r_hat[first].mean()),
                 "r of the first step": float(reward[first].mean()),
                 "return": float(recent.mean_reward.mean() * config.env.max_steps),

@@ -9,6 +9,7 @@ rewards of the same steps.
 """
 
 import sys
+from dataclasses import replace
 from functools import partial
 
 import jax
@@ -16,16 +17,18 @@ import jax.numpy as jnp
 import numpy as np
 
 from lare_rl.config.train_config import TrainConfig
-from lare_rl.credit import accuracy, decomposition, descent
+from lare_rl.credit import decoder_state, descent
 from lare_rl.credit.decoder_settings import RECENT_STEPS
-from lare_rl.credit.decomposition import CreditBatch, DecoderState
+from lare_rl.credit.decoder_state import CreditBatch, DecoderState
 from lare_rl.credit.methods import Fit
+from lare_rl.credit.spec import CreditSpec
 from lare_rl.data import replay
 from lare_rl.data.sampling import CreditSample, sample_episode_steps
 from lare_rl.nn.normalise import Scale
 from lare_rl.runs.directory import open_run
 from lare_rl.training.decoder_inputs import decoder_inputs
 from lare_rl.training.learner import Learner
+from lare_rl.training.rewards import masked_correlation, mean_absolute_error
 from lare_rl.training.saved_state import load_learner
 from lare_rl.training.seed_axis import select_seed
 from measure import write
@@ -33,15 +36,15 @@ from measure import write
 UPDATES, STRETCH = 20_000, 5_000
 
 
-@partial(jax.jit, static_argnames=("fit", "config"))
+@partial(jax.jit, static_argnames=("spec", "config"))
 def updates(
-    credit: DecoderState, stored_replay: replay.Replay, key: jax.Array, fit: Fit, config: TrainConfig
+    credit: DecoderState, stored_replay: replay.Replay, key: jax.Array, spec: CreditSpec, config: TrainConfig
 ) -> DecoderState:
     def update(credit: DecoderState, sample: CreditSample) -> tuple[DecoderState, None]:
         features = decoder_inputs(replay.read(stored_replay, sample.steps), config, 0)
         chosen = sample.episodes
         episodes = CreditBatch(features, sample.episode, chosen.length, chosen.mean_reward[..., 0], chosen.mask)
-        return descent.update(credit, episodes, key, fit, config.credit)[0], None
+        return descent.update(credit, episodes, key, spec)[0], None
 
     n_steps = min(config.credit.sampled_steps, config.env.max_steps)
     n_episodes = max(1, config.credit.steps // config.credit.sampled_steps)
@@ -55,20 +58,22 @@ def newest(learner: Learner, config: TrainConfig) -> tuple[jax.Array, jax.Array]
     return decoder_inputs(recent, config, 0)[0], recent.columns["reward"][0, :, 0]
 
 
-def refit(learner: Learner, config: TrainConfig, fit: Fit, scale: Scale) -> list[dict[str, float]]:
+def refit(learner: Learner, config: TrainConfig, fit: Fit | None, scale: Scale) -> list[dict[str, float]]:
     (decoder,) = learner.decoders
     (features, reward), valid = newest(learner, config), jnp.ones(RECENT_STEPS, bool)
-    credit = decomposition.init(jax.random.key(0), config.credit_specs[0])
+    spec = config.credit_specs[0]
+    spec = replace(spec, method=replace(spec.method, fit=fit))
+    credit = decoder_state.init(jax.random.key(0), spec)
     credit = credit._replace(statistics=decoder.statistics, scale=scale)
     rows = []
     for number in range(UPDATES // STRETCH):
-        credit = updates(credit, learner.replay, jax.random.key(number), fit, config)
-        r_hat = decomposition.decoder_rewards(credit, features, config.credit)[:, 0]
+        credit = updates(credit, learner.replay, jax.random.key(number), spec, config)
+        r_hat = decoder_state.decoder_rewards(credit, features, spec)[:, 0]
         rows.append(
             {
                 "updates": (number + 1) * STRETCH,
-                "correlation": float(accuracy.masked_correlation(r_hat, reward, valid)),
-                "error": float(accuracy.mean_absolute_error(r_hat, reward, valid)),
+                "correlation": float(masked_correlation(r_hat, reward, valid)),
+                "error": float(mean_absolute_error(r_hat, reward, valid)),
             }
         )
     return rows
@@ -89,7 +94,6 @@ def main(directories: list[str]) -> None:
         learner = select_seed(everyone)
         scale_state = learner.decoders[0].scale
         unit = scale_state._replace(mean_square=jnp.ones(()))
-        assert config.method.fit is not None
         cases = {
             "as it is": (config.method.fit, scale_state),
             "targets as they are": (config.method.fit, unit),

@@ -1,4 +1,4 @@
-"""An assigner and the trainer hand the same steps to the same engine: their rewards agree."""
+"""An assigner and the trainer compute the same rewards of the same steps."""
 
 from dataclasses import replace
 
@@ -118,13 +118,13 @@ def test_rewards_and_lengths_agree(method, env, changes, phi):
     assert (~steps.episode_ended).sum() == n_unpaid
     lengths = credit.store.lengths(np.arange(credit.store.n_added))
     np.testing.assert_array_equal(lengths, np.asarray(step_batch(steps, config, 0).length).ravel())
-    expected = np.asarray(jitted(rewards, config)(steps, learner.reward_sources))
+    expected = np.asarray(jitted(rewards, config)(steps, learner.decoders))
     expected = expected if env.n_agents > 1 else expected[..., 0]
     r_hat = credit.rewards_at(np.arange(credit.store.n_added))
     rtol = 1e-3 if changes.get("score") == "binary" else 1e-4
     np.testing.assert_allclose(r_hat, expected, rtol=rtol, atol=0.1 * rtol * np.abs(expected).max())
     assert np.abs(expected).max() > 0
-    if not learner.decoders:
+    if config.method.fit is None:
         return
     assert credit.learner.n_learned == int(learner.n_learned.sum())
     fits = learner.decoders[0].closed_form, credit.learner.decoder.closed_form

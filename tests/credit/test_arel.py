@@ -5,11 +5,11 @@ import pytest
 
 from helpers.credit_specs import observation_spec
 from helpers.numpy_attention import numpy_attention, numpy_layer_norm, numpy_linear
-from lare_rl.credit import decomposition, descent
+from lare_rl.credit import decoder_state, descent
 from lare_rl.credit.arel import Block
 from lare_rl.credit.decoder_settings import CreditSettings
-from lare_rl.credit.decomposition import CreditBatch
-from lare_rl.credit.methods import METHODS, Fit
+from lare_rl.credit.decoder_state import CreditBatch
+from lare_rl.credit.methods import METHODS
 from lare_rl.nn.attention import causal_mask
 
 EPISODES, STEPS, AGENTS, FEATURES = 4, 5, 3, 6
@@ -32,18 +32,18 @@ def test_block_against_numpy():
 @pytest.mark.long
 def test_loss_is_the_published_one_in_other_units():
     """(R - sum_t y_t)^2 + 20 Var_t(y), as published, divided by T^2 and by the square of the scale."""
-    settings, method = CreditSettings(), METHODS["arel"]
+    spec = observation_spec(FEATURES, METHODS["arel"], CreditSettings(), STEPS, AGENTS)
     mean_reward, length = jnp.array([3.0, -1.0, 2.0, 0.5]), jnp.full(EPISODES, STEPS)
 
     @jax.jit
     def compute():
-        state = decomposition.init(KEY, observation_spec(FEATURES, method, settings, STEPS, AGENTS))
-        state = decomposition.observe_steps(state, jnp.asarray(ROWS))
-        state = decomposition.observe_returns(state, mean_reward, length, jnp.ones(EPISODES, bool), None)
+        state = decoder_state.init(KEY, spec)
+        state = decoder_state.observe_steps(state, jnp.asarray(ROWS))
+        state = decoder_state.observe_returns(state, mean_reward, length, jnp.ones(EPISODES, bool), None)
         episode_index = jnp.repeat(jnp.arange(EPISODES), STEPS)
         batch = CreditBatch(jnp.asarray(ROWS), episode_index, length, mean_reward, mask=jnp.ones(EPISODES))
-        loss, _ = descent.loss_and_gradient(state, batch, KEY, Fit.ALL_STEPS, settings)
-        return decomposition.decoder_rewards(state, batch.inputs, settings), loss
+        loss, _ = descent.loss_and_gradient(state, batch, KEY, spec)
+        return decoder_state.decoder_rewards(state, batch.inputs, spec), loss
 
     y, loss = map(np.asarray, compute())
     y, mean_reward = y.reshape(EPISODES, STEPS, AGENTS)[..., 0], np.asarray(mean_reward)

@@ -8,9 +8,9 @@ import pytest
 from helpers.credit_specs import observation_spec
 from helpers.decoder_toys import make_decoder
 from helpers.long_tests import long_case
-from lare_rl.credit import decomposition, descent
+from lare_rl.credit import decoder_state, descent
 from lare_rl.credit.decoder_settings import CreditSettings
-from lare_rl.credit.decomposition import CreditBatch
+from lare_rl.credit.decoder_state import CreditBatch
 from lare_rl.credit.input_names import InputNames
 from lare_rl.credit.methods import METHODS, Fit
 
@@ -91,23 +91,24 @@ def test_must_learn_credit_among_agents_from_the_mean_return(name):
     mean_reward = reward.mean(axis=(1, 2))
     k = STEPS if method.fit is Fit.ALL_STEPS else 3
 
+    two_inputs = replace(method, inputs=InputNames(("observation", "action")))
+    spec = replace(observation_spec(1, method, settings, STEPS, AGENTS), method=two_inputs, action_size=1)
+
     def body(state, key):
         order = jax.vmap(lambda key: jax.random.permutation(key, STEPS)[:k])(jax.random.split(key, n_episodes))
         sample = jnp.asarray(rows)[jnp.arange(n_episodes)[:, None], jnp.sort(order, axis=1)].reshape(-1, AGENTS, 2)
         episode_index = jnp.repeat(jnp.arange(n_episodes), k)
         batch = CreditBatch(sample, episode_index, length, jnp.asarray(mean_reward), mask=jnp.ones(n_episodes))
-        state, metrics = descent.update(state, batch, key, method.fit, settings)
+        state, metrics = descent.update(state, batch, key, spec)
         return state, metrics["credit/loss"]
 
     @jax.jit
     def train():
-        spec = observation_spec(1, method, settings, STEPS, AGENTS)
-        two_inputs = replace(method, inputs=InputNames(("observation", "action")))
-        state = decomposition.init(KEY, replace(spec, method=two_inputs, action_size=1))
-        state = decomposition.observe_steps(state, jnp.asarray(rows))
-        state = decomposition.observe_returns(state, jnp.asarray(mean_reward), length, jnp.ones(n_episodes, bool), None)
+        state = decoder_state.init(KEY, spec)
+        state = decoder_state.observe_steps(state, jnp.asarray(rows))
+        state = decoder_state.observe_returns(state, jnp.asarray(mean_reward), length, jnp.ones(n_episodes, bool), None)
         state, losses = jax.lax.scan(body, state, jax.random.split(jax.random.key(0), n_updates))
-        return decomposition.decoder_rewards(state, jnp.asarray(rows).reshape(-1, AGENTS, 2), settings), losses
+        return decoder_state.decoder_rewards(state, jnp.asarray(rows).reshape(-1, AGENTS, 2), spec), losses
 
     r_hat, losses = train()
     assert float(losses[-5:].mean()) < float(losses[:5].mean())

@@ -1,8 +1,11 @@
+from dataclasses import replace
+
 import pytest
 
+from helpers.credit_specs import observation_spec
 from lare_rl.credit.decoder_settings import CreditSettings
 from lare_rl.credit.descent import BatchPlan, plan_batch
-from lare_rl.credit.methods import Fit
+from lare_rl.credit.methods import METHODS, Fit
 
 
 @pytest.mark.parametrize(
@@ -19,5 +22,6 @@ from lare_rl.credit.methods import Fit
     ],
 )
 def test_plan_batch(fit, longest, fixed_length, plan):
-    settings = CreditSettings(steps=100, sampled_steps=8, episodes=7)
-    assert plan_batch(fit, settings, longest, fixed_length=fixed_length) == plan
+    method, settings = replace(METHODS["rd"], fit=fit), CreditSettings(steps=100, sampled_steps=8, episodes=7)
+    spec = observation_spec(1, method, settings, max_steps=1000, fixed_length=fixed_length)
+    assert plan_batch(spec, longest) == plan

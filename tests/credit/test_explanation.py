@@ -5,7 +5,7 @@ import pytest
 
 from lare_rl.credit import explanation
 from lare_rl.credit.basis import Basis
-from lare_rl.credit.decomposition import CreditBatch
+from lare_rl.credit.decoder_state import CreditBatch
 from lare_rl.nn.normalise import RunningMeanStd
 
 pytestmark = pytest.mark.usefixtures("in_float64")

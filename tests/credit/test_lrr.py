@@ -1,3 +1,5 @@
+from dataclasses import replace
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -5,21 +7,20 @@ import numpy as np
 import pytest
 
 from helpers.credit_specs import observation_spec
-from lare_rl.credit import decomposition, descent
+from lare_rl.credit import decoder_state, descent
 from lare_rl.credit.decoder_settings import CreditSettings
-from lare_rl.credit.decomposition import CreditBatch
+from lare_rl.credit.decoder_state import CreditBatch
 from lare_rl.credit.methods import METHODS, Fit
 
 EPISODES, SAMPLED, FEATURES, LENGTH = 3, 4, 2, 8
 KEY = jax.random.key(0)
 SETTINGS = CreditSettings(hidden=(16,), learning_rate=3e-3)
+SPEC = observation_spec(FEATURES, METHODS["lrr"], CreditSettings(hidden=(8,), normalise=False), LENGTH)
 
 
 @pytest.fixture(scope="module")
 def state():
-    return decomposition.init(
-        KEY, observation_spec(FEATURES, METHODS["lrr"], CreditSettings(hidden=(8,), normalise=False), LENGTH)
-    )
+    return decoder_state.init(KEY, SPEC)
 
 
 @pytest.fixture(scope="module")
@@ -35,9 +36,8 @@ def batch():
 
 
 def loss(state, batch, fit):
-    return jax.jit(
-        lambda: descent.loss_and_gradient(state, batch, KEY, fit, CreditSettings(hidden=(8,), normalise=False))
-    )()
+    spec = replace(SPEC, method=replace(SPEC.method, fit=fit))
+    return jax.jit(lambda: descent.loss_and_gradient(state, batch, KEY, spec))()
 
 
 def test_loss_against_numpy(state, batch):
@@ -74,6 +74,7 @@ def test_fixed_uncertainty_is_rrd(state, batch):
 def test_must_learn_rewards_and_where_they_are_uncertain():
     """The mean reward is the first feature. Rewards are noisy where the second feature is positive."""
     steps, n_episodes, updates = 3, 128, 500
+    spec = observation_spec(FEATURES, METHODS["lrr"], SETTINGS, steps)
     rng = np.random.default_rng(0)
     rows = rng.normal(size=(updates, n_episodes, steps, FEATURES)).astype(np.float32)
     noise = 2 * rng.normal(size=rows.shape[:-1]) * (rows[..., 1] > 0)
@@ -83,18 +84,18 @@ def test_must_learn_rewards_and_where_they_are_uncertain():
     def body(state, episodes):
         x, target = episodes
         batch = CreditBatch(x.reshape(-1, 1, FEATURES), episode_index, length, target, mask=jnp.ones(n_episodes))
-        return descent.update(state, batch, KEY, Fit.LIKELIHOOD, SETTINGS)[0], None
+        return descent.update(state, batch, KEY, spec)[0], None
 
     @jax.jit
     def train():
-        state = decomposition.init(KEY, observation_spec(FEATURES, METHODS["lrr"], SETTINGS, steps))
-        state = decomposition.observe_steps(state, jnp.asarray(rows[0]))
-        state = decomposition.observe_returns(state, mean_reward[0], length, jnp.ones(n_episodes, bool), None)
+        state = decoder_state.init(KEY, spec)
+        state = decoder_state.observe_steps(state, jnp.asarray(rows[0]))
+        state = decoder_state.observe_returns(state, mean_reward[0], length, jnp.ones(n_episodes, bool), None)
         return jax.lax.scan(body, state, (jnp.asarray(rows), mean_reward))[0]
 
     state = train()
     x = jnp.asarray(rows[0].reshape(-1, FEATURES))
-    output = decomposition.decode(state.network, state, x, SETTINGS)
+    output = decoder_state.decode(state.network, state, x, spec)
     assert np.corrcoef(output.r_hat, x[:, 0])[0, 1] > 0.9
     log_std = np.asarray(output.log_std)
     assert log_std[x[:, 1] > 0.3].mean() > log_std[x[:, 1] < -0.3].mean() + 0.2

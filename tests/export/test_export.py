@@ -22,7 +22,7 @@ from helpers.small_configs import ONE_TEAM, TOTAL, TWO_TEAMS, random_steps, smal
 from helpers.toy_envs import pick_spec, toy_spec
 from helpers.training_runs import QUICK_CREDIT
 from lare_rl.algorithms.ppo import ppo
-from lare_rl.credit import decomposition
+from lare_rl.credit import decoder_state
 from lare_rl.credit.methods import METHODS
 from lare_rl.data import replay
 from lare_rl.envs.interface import to_env_action
@@ -145,7 +145,7 @@ def test_export_agrees_with_jax(kind, method, export_run):
     steps = jax.tree.map(lambda leaf: np.concatenate(np.swapaxes(leaf, 0, 1)), steps)
     # Exported rewards are in the unit of the true rewards, before they are scaled.
     unscaled = replace(config, scale_rewards=False)
-    expected = np.asarray(rewards(stored, seed_learner.reward_sources, unscaled))
+    expected = np.asarray(rewards(stored, seed_learner.decoders, unscaled))
     for team_index, name in enumerate(names):
         check_reward(exported, name, config, steps, np.asarray(stored.length, np.float32), expected, team_index)
 
@@ -271,7 +271,9 @@ def test_reward_without_lare(export):
     config, learner, _, _ = load_learner(run)
     # Actions of the toy are in [-2, 2], and those of the trainer in [-1, 1].
     features = np.concatenate([run.functions[0](before, action), before, action / 2], axis=1)
-    expected = decomposition.decoder_rewards(select_seed(learner, 1).decoders[0], jnp.asarray(features), config.credit)
+    expected = decoder_state.decoder_rewards(
+        select_seed(learner, 1).decoders[0], jnp.asarray(features), config.credit_specs[0]
+    )
     np.testing.assert_allclose(json.loads(process.stdout), expected, rtol=1e-4, atol=1e-6)
     np.testing.assert_allclose(exported.reward(before[0], action[0], after[0]), expected[0], rtol=1e-4)
     assert np.std(expected) > 0

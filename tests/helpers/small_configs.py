@@ -203,7 +203,7 @@ def add_steps(learner, config, steps, factors=None, learn=None):
     """
     factors = random_factors(config, steps) if factors is None else factors
     learner = jitted(learners.store_with_factors, config)(learner, steps, factors)
-    learns = learner.decoders and (not config.method.uses_gradient if learn is None else learn)
+    learns = config.method.fit is not None and (not config.method.uses_gradient if learn is None else learn)
     return learn_stored_returns(learner, config) if learns else learner
 
 
@@ -239,7 +239,7 @@ def with_factor_decoders(learner, weights):
         )
         for team, weight in zip(learner.decoders, weights, strict=True)
     )
-    return learner._replace(reward_sources=decoders)
+    return learner._replace(decoders=decoders)
 
 
 def learner_with_episodes(config, seed=0):

@@ -91,9 +91,18 @@ def test_learner_comes_back(method, payments, tmp_path):
     jax.tree.map(np.testing.assert_array_equal, checkpoint.named_leaves(checkpoint.load(tmp_path, shape)[0]), expected)
     with np.load(tmp_path / "state.npz") as saved:
         arrays = {re.sub(r"(?<=\.)\w+", lambda m: OLD_NAMES.get(m[0], m[0]), name): saved[name] for name in saved.files}
-    old = ".scale[" if method == "ircr" else ".decoders["
-    np.savez(tmp_path / "state.npz", **{name.replace(".reward_sources[", old): arrays[name] for name in arrays})
-    jax.tree.map(np.testing.assert_array_equal, checkpoint.named_leaves(checkpoint.load(tmp_path, shape)[0]), expected)
+    if method == "ircr":  # it had only a scale
+        expected = {
+            name: values for name, values in expected.items() if ".decoders[" not in name or "[0].scale." in name
+        }
+        arrays = {
+            name.replace(".decoders[0].scale.", ".scale[0]."): values
+            for name, values in arrays.items()
+            if ".decoders[" not in name or "[0].scale." in name
+        }
+    np.savez(tmp_path / "state.npz", **arrays)
+    loaded = checkpoint.named_leaves(checkpoint.load(tmp_path, shape)[0])
+    jax.tree.map(np.testing.assert_array_equal, {name: loaded[name] for name in expected}, expected)
 
 
 def test_row_file_before_dropped_episode_is_kept(tmp_path):

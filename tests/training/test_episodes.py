@@ -23,7 +23,7 @@ from helpers.small_configs import (
     small_config,
     untrained_learner,
 )
-from lare_rl.credit import closed_form, decomposition, returns
+from lare_rl.credit import closed_form, decoder_state, learning
 from lare_rl.credit.decoder_settings import CreditSettings
 from lare_rl.credit.score_type import ScoreType, ScoreTypeEstimate
 from lare_rl.data import replay
@@ -69,17 +69,17 @@ def statistics_from_scratch(learner, config):
     """Return sums over all stored episodes, of features standardised as the learner's are."""
     decoder = learner.decoders[0]
     zeros = jax.tree.map(jnp.zeros_like, decoder.closed_form.sufficient_statistics)
-    empty = decoder._replace(closed_form=decoder.closed_form._replace(sufficient_statistics=zeros))
+    empty = decoder.closed_form._replace(sufficient_statistics=zeros)
     with jax.enable_x64(True):
         rebuilt = jitted(add_all, config)((empty,), learner.replay)
-        return to_float64(rebuilt[0].closed_form.sufficient_statistics)
+        return to_float64(rebuilt[0].sufficient_statistics)
 
 
-def add_all(decoders, buffer, config):
-    def body(decoder, batch, first):
-        return returns.add_episodes(decoder, batch)
+def add_all(closed, buffer, config):
+    def body(closed, batch, first):
+        return learning.add_to_sums(closed, batch)
 
-    return episodes.fold_episodes(decoders, buffer, jnp.zeros_like(buffer.oldest), body, config)
+    return episodes.fold_episodes(closed, buffer, jnp.zeros_like(buffer.oldest), body, config)
 
 
 @pytest.mark.parametrize(
@@ -117,7 +117,7 @@ def test_a_seed_without_new_episodes_does_not_change():
     learned = learner_with_episodes(config)
     decoder = learned.decoders[0]
     statistics = decoder.statistics._replace(n_rows=10 * decoder.statistics.n_rows)
-    learned = learned._replace(reward_sources=(decoder._replace(statistics=statistics),))
+    learned = learned._replace(decoders=(decoder._replace(statistics=statistics),))
     new = learned._replace(n_learned=jnp.zeros_like(learned.n_learned))
     seeds = jax.tree.map(lambda *leaves: jnp.stack(leaves), new, learned)
     with jax.enable_x64(True):
@@ -146,6 +146,7 @@ def inputs_from(buffer, start, config):
 def test_learn_returns_predicts_first(method):
     # The first episodes are not predicted, because nothing is fitted yet. Gradient updates are not made here at all.
     config, lengths = small_config(method, capacity=1000), (5, 12) * 3
+    spec = config.credit_specs[0]
     steps = random_steps(lengths=lengths)
     factors = random_factors(config, steps)
     ends, learner, predictions = np.cumsum(lengths), untrained_learner(config), []
@@ -157,7 +158,7 @@ def test_learn_returns_predicts_first(method):
         if int(after.n_episodes) > int(before.predictions.n_episodes):
             i = int(after.n_episodes) - 1
             inputs = jitted(inputs_from, config)(learner.replay, start)[: end - start]
-            r_hat = decomposition.decoder_rewards(before, inputs, config.credit, jnp.full(end - start, end - start))
+            r_hat = decoder_state.decoder_rewards(before, inputs, spec, jnp.full(end - start, end - start))
             predictions.append((float(after.predicted[i, 0]), float(r_hat.sum())))
             assert float(after.returns[i]) == pytest.approx(steps.next_timestep.reward[start:end].sum(), rel=1e-4)
     assert len(predictions) == (0 if method == "lare-rd" else 4)
@@ -179,10 +180,12 @@ def test_learn_returns_finds_the_score_type(method, score):
     *_, last = learn_in_chunks(config, steps, factors[:, None, None].astype(np.float32), 6)
     assert bool(last.decoders[0].is_average) == (score == "average")
     types = (ScoreType.SUM, ScoreType.AVERAGE) if score == "sum" else (ScoreType.AVERAGE, ScoreType.SUM)
-    assert returns.estimate_score_type(last.decoders[0]) == ScoreTypeEstimate(types[0], is_certain=True, rival=types[1])
+    estimate = learning.estimate_score_type(last.decoders[0], config.credit_specs[0])
+    assert estimate == ScoreTypeEstimate(types[0], is_certain=True, rival=types[1])
     fixed = small_config(method, credit=CreditSettings(score=score))
     for untrained in (config, fixed):
-        assert returns.estimate_score_type(untrained_learner(untrained).decoders[0]) is None
+        decoder = untrained_learner(untrained).decoders[0]
+        assert learning.estimate_score_type(decoder, untrained.credit_specs[0]) is None
 
 
 def test_score_types_that_are_fitted():
@@ -203,4 +206,4 @@ def test_learn_returns_waits_for_enough_short_episodes():
     assert counts[:40] == list(range(1, 41))
     waits = np.diff(np.flatnonzero(np.diff(counts[100:])))
     assert waits.min() >= 2
-    assert counts[-1] >= 200 / (1 + returns.MIN_GROWTH) - 1
+    assert counts[-1] >= 200 / (1 + learning.MIN_GROWTH) - 1

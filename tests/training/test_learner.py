@@ -29,20 +29,21 @@ from helpers.small_configs import (
 )
 from lare_rl.credit import closed_form
 from lare_rl.credit.decoder_settings import CreditSettings
-from lare_rl.credit.engine import return_scale
+from lare_rl.credit.rewards import proxy_rewards
 from lare_rl.envs.interface import EnvSpec, Team
 from lare_rl.nn.normalise import root_mean_square
 from lare_rl.training.decoder_fits import fit_decoders, fit_repeatedly, sample_credit
+from lare_rl.training.decoder_inputs import step_batch
 from lare_rl.training.learner import abandon_episodes
-from lare_rl.training.rewards import assess, rewards, team_proxy_rewards
+from lare_rl.training.rewards import assess, rewards
 
 ENDS = np.cumsum(LENGTHS)[:-1]
 MANY = partial(small_config, algorithm="ippo", env=ONE_TEAM)
 TEAMS = partial(small_config, algorithm="ippo", env=TWO_TEAMS)
 
 
-def proxy_rewards(steps, state, config):
-    return team_proxy_rewards(steps, state, config, 0)
+def team_proxy_rewards(steps, decoders, config):
+    return proxy_rewards(decoders[0], step_batch(steps, config, 0), config.credit_specs[0])
 
 
 def update_once(learner, config, key=0):
@@ -78,8 +79,8 @@ def test_fit_ignores_padding(method):
 def test_rewards(method, scale_rewards):
     config = small_config(method, scale_rewards=scale_rewards)
     learner, steps = learner_with_episodes(config), random_steps()
-    unit = root_mean_square(return_scale(learner.reward_sources[0])) if scale_rewards else 1
-    reward = jitted(rewards, config)(stored_steps(learner), learner.reward_sources)
+    unit = root_mean_square(learner.decoders[0].scale) if scale_rewards else 1
+    reward = jitted(rewards, config)(stored_steps(learner), learner.decoders)
     assert reward.shape == (TOTAL, 1)
     reward = np.asarray(reward)[:, 0] * unit
     match method:
@@ -88,7 +89,7 @@ def test_rewards(method, scale_rewards):
         case "llm-reward":
             np.testing.assert_allclose(reward, random_factors(config, steps)[:, 0, 0, 0], rtol=1e-5)
         case _:
-            r_hat = jitted(proxy_rewards, config)(stored_steps(learner), learner.reward_sources)
+            r_hat = jitted(team_proxy_rewards, config)(stored_steps(learner), learner.decoders)
             np.testing.assert_allclose(reward, r_hat[:, 0], rtol=1e-5)
             assert reward.std() > 0
 
@@ -102,7 +103,7 @@ def with_running_episode(config):
 def test_ircr_pays_half_until_an_episode_ends():
     config = small_config("ircr")
     learner, _ = with_running_episode(config)
-    reward = jitted(rewards, config)(stored_steps(learner), learner.reward_sources)[:, 0]
+    reward = jitted(rewards, config)(stored_steps(learner), learner.decoders)[:, 0]
     np.testing.assert_array_equal(reward[-2:], [0.5, 0.5])
     assert float(reward[0]) != 0.5
 
@@ -165,7 +166,7 @@ def test_teams_have_separate_decoders_and_returns():
 def test_rewards_of_teams(method):
     config, steps = TEAMS(method), random_steps(TWO_TEAMS)
     learner, alive = learner_with_episodes(config), steps.timestep.alive[:, 0]
-    reward = np.asarray(jitted(rewards, config)(stored_steps(learner), learner.reward_sources))
+    reward = np.asarray(jitted(rewards, config)(stored_steps(learner), learner.decoders))
     assert not alive.all()
     for team in TWO_TEAMS.teams:
         episode_rewards = np.split(team_rewards(steps, team), ENDS)
@@ -186,7 +187,7 @@ def test_rewards_of_each_agent_and_shared_among_agents_that_are_alive():
         add_steps(untrained_learner(config), config, steps, number[..., None], learn=False), [1.0, -1.0]
     )
     r_hat, alive = number[:, 0] * np.repeat([1.0, -1.0], [3, 2]), steps.timestep.alive[:, 0]
-    stored, state = stored_steps(learner), learner.reward_sources
+    stored, state = stored_steps(learner), learner.decoders
     np.testing.assert_array_equal(jitted(rewards, config)(stored, state), r_hat * alive)
     shared = replace(config, method=replace(config.method, shared=True))
     reward = np.asarray(jitted(rewards, shared)(stored, state))
@@ -247,7 +248,7 @@ def test_must_learn_which_agent_earned_the_reward(method, fixed_length):
         untrained_learner(config), config, steps, np.stack([steps.next_timestep.reward, noise], axis=-1)
     )
     decoders, _ = jax.jit(partial(fit_repeatedly, config=config))(learner, jax.random.key(2))
-    results = jitted(assess, config)(learner._replace(reward_sources=decoders))
+    results = jitted(assess, config)(learner._replace(decoders=decoders))
     assert float(results["credit/correlation"]) > 0.9
     assert float(results["credit/error"]) < 0.35  # untrained, it is 0.8 and more
 
@@ -265,10 +266,10 @@ def test_values_of_dead_agents_change_nothing(method):
     results = []
     for trajectory, z in ((steps, factors), (changed, np.where(dead[..., None], 99, factors).astype(np.float32))):
         learner = add_steps(untrained_learner(config), config, trajectory, z)
-        reward = jitted(rewards, config)(stored_steps(learner), learner.reward_sources)
+        reward = jitted(rewards, config)(stored_steps(learner), learner.decoders)
         assert not np.asarray(reward)[dead[:, 0]].any()
         update = update_once(learner, config) if config.method.uses_gradient else ()
-        results.append((learner.reward_sources, reward, update, jitted(assess, config)(learner)))
+        results.append((learner.decoders, reward, update, jitted(assess, config)(learner)))
     assert_close(*results)
 
 
@@ -283,11 +284,11 @@ def team_level_config(method, **changes):
 def test_team_level_rewards_are_the_same_for_all_alive_agents(method):
     config = team_level_config(method, n_factors=(2,) if method[0] == "l" else ())
     learner, alive = learner_with_episodes(config), random_steps(ONE_TEAM).timestep.alive[:, 0]
-    reward = np.asarray(jitted(rewards, config)(stored_steps(learner), learner.reward_sources))
+    reward = np.asarray(jitted(rewards, config)(stored_steps(learner), learner.decoders))
     team_reward = reward.sum(axis=1) / np.maximum(alive.sum(axis=1), 1)
     np.testing.assert_allclose(reward, team_reward[:, None] * alive, rtol=1e-5, atol=1e-6)
     assert team_reward[alive.any(axis=1)].std() > 0
-    if learner.decoders:
+    if config.method.fit is not None:
         assert float(learner.decoders[0].statistics.n_rows) == TOTAL
         if config.method.uses_gradient:
             _, metrics = update_once(learner, config)

@@ -50,7 +50,7 @@ def test_rollout_has_the_newest_steps_with_the_rewards_of_the_method():
     np.testing.assert_array_equal(rollout.next_observation, last.next_timestep.observation[:, 0])
     np.testing.assert_array_equal(rollout.action, last.action[:, 0])
     np.testing.assert_array_equal(rollout.done, last.ended)
-    expected = jitted(rewards, config)(stored_steps(learner), learner.reward_sources)[-20:]
+    expected = jitted(rewards, config)(stored_steps(learner), learner.decoders)[-20:]
     np.testing.assert_allclose(rollout.reward, expected, rtol=1e-5)
     assert rollout.mask is rollout.available is None
 

@@ -3,6 +3,7 @@
 from dataclasses import replace
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
@@ -22,7 +23,7 @@ from lare_rl.data import replay
 from lare_rl.envs.interface import team_mean
 from lare_rl.tasks.payments import PAID_AT_END, PaymentRule
 from lare_rl.training import on_policy
-from lare_rl.training.rewards import rewards
+from lare_rl.training.rewards import accuracy_metrics, masked_correlation, rewards
 
 
 def exact_config(method, algorithm, env, exact, payments):
@@ -58,7 +59,7 @@ def test_exact_rewards_add_up_to_payments(method, algorithm, env, exact, payment
     else:
         steps = stored_steps(learner)
     r_hat, inexact = (
-        np.asarray(rewards(values, learner.reward_sources, config), np.float64)
+        np.asarray(rewards(values, learner.decoders, config), np.float64)
         for values in (steps, steps._replace(residual=None))
     )
     alive = np.asarray(steps.columns.get("alive", np.ones((len(r_hat), env.n_agents), bool)))
@@ -88,3 +89,25 @@ def test_rewards_of_episodes_that_are_not_learned_yet_are_not_corrected():
     residual = np.asarray(stored_steps(learner).residual)[:, 0]
     assert (residual[: sum(LENGTHS)] != 0).all()
     assert (residual[sum(LENGTHS) :] == 0).all()
+
+
+def test_metrics_against_numpy():
+    rng = np.random.default_rng(0)
+    reward, noise = rng.normal(size=(2, 50)).astype(np.float32)
+    r_hat, mask, last = 2 * reward + noise, np.arange(50) < 40, np.arange(50) % 10 == 9
+    args = [jnp.asarray(values) for values in (r_hat, reward, last, mask)]
+    metrics = accuracy_metrics(*args, calibrated=True)
+    assert float(metrics["credit/error"]) == pytest.approx(np.abs(r_hat - reward)[:40].mean(), rel=1e-5)
+    want = np.corrcoef(r_hat[:40], reward[:40])[0, 1]
+    assert float(metrics["credit/correlation"]) == pytest.approx(want, rel=1e-4)
+    assert list(accuracy_metrics(*args, calibrated=False)) == ["credit/correlation"]
+
+
+def test_metrics_without_step_rewards_are_nan():
+    last = jnp.arange(6) % 3 == 2
+    metrics = accuracy_metrics(jnp.arange(6.0), 5.0 * last, last, jnp.ones(6, bool), calibrated=True)
+    assert np.isnan(list(metrics.values())).all()
+
+
+def test_correlation_with_a_constant_is_nan():
+    assert np.isnan(float(masked_correlation(jnp.arange(5.0), jnp.ones(5), jnp.ones(5, bool))))

@@ -45,7 +45,7 @@ def add_seed_axis(leaves):
 def compute_sequences(learner, episodes, n_steps, config):
     def compute(learner, episodes):
         statistics = learner.algorithm.mixer_statistics
-        return sequences._sequences(learner.replay, episodes, n_steps, learner.reward_sources, statistics, config)
+        return sequences._sequences(learner.replay, episodes, n_steps, learner.decoders, statistics, config)
 
     return jax.jit(compute)(learner, episodes)
 
@@ -82,7 +82,7 @@ def test_sequences_are_the_stored_episodes(method):
                 np.testing.assert_array_equal(values[length:], np.broadcast_to(final, values[length:].shape))
         np.testing.assert_array_equal(batch.action[i, :length], steps.action[rows, env])
         index = replay.Index(np.full(12, env), np.concatenate([rows, np.full(12 - length, last)]))
-        reward = np.asarray(jitted(rewards, config)(read(learner.replay, index), learner.reward_sources))[:length]
+        reward = np.asarray(jitted(rewards, config)(read(learner.replay, index), learner.decoders))[:length]
         alive = timestep.alive[rows, env]
         expected = (reward * alive).sum(axis=1) / np.maximum(alive.sum(axis=1), 1)
         np.testing.assert_allclose(batch.reward[i, :length], expected, rtol=1e-4, atol=1e-6)

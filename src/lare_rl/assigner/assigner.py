@@ -304,7 +304,7 @@ class CreditAssigner:
         with self.lock:
             self.learner.learn_if_due()
             decoder = self.learner.decoder
-            if decoder is None or not (decoder.is_average | decoder.is_log_odds):
+            if not (decoder.is_average | decoder.is_log_odds):
                 return "sum"
             return "average" if bool(decoder.is_average) else "log odds"
 

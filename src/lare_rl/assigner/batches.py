@@ -10,7 +10,7 @@ from jaxtyping import Int
 from lare_rl.assigner import compiled_functions as compiled
 from lare_rl.assigner.compiled_functions import MAX_CALL_ROWS
 from lare_rl.assigner.store import Store, StoredEpisode
-from lare_rl.credit.decomposition import CreditBatch
+from lare_rl.credit.decoder_state import CreditBatch
 from lare_rl.credit.descent import plan_batch
 from lare_rl.credit.spec import CreditSpec
 from lare_rl.data.layouts import Layout, lay_out_packed, lay_out_padded, lay_out_sampled
@@ -24,11 +24,9 @@ def sample_batch(store: Store, spec: CreditSpec, random: np.random.Generator, lo
 
     The store needs an episode. `longest` is the most steps of an episode; batches for the same `longest` have the same shape.
     """
-    settings, fit = spec.settings, spec.method.fit
-    assert fit is not None
-    plan = plan_batch(fit, settings, longest, fixed_length=False)
+    plan = plan_batch(spec, longest)
     if plan.layout == "packed":
-        count = max(1, settings.steps * store.n_ended // store.n_ended_steps)
+        count = max(1, spec.settings.steps * store.n_ended // store.n_ended_steps)
         return _pack(store, _sample_episodes(store, count, random)[: plan.episodes], plan.episodes, plan.rows)
     episodes = _sample_episodes(store, plan.episodes, random)
     length = _lengths(episodes)

@@ -8,27 +8,25 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Key
 
-from lare_rl.credit import decomposition, descent, engine, explanation, returns
-from lare_rl.credit.decomposition import CreditBatch, DecoderState
-from lare_rl.credit.engine import StepBatch
+from lare_rl.credit import closed_form, decoder_state, descent, explanation, learning, rewards
+from lare_rl.credit.decoder_state import CreditBatch, DecoderState
+from lare_rl.credit.rewards import StepBatch
 from lare_rl.credit.spec import CreditSpec
 from lare_rl.data.layouts import sample_steps as _sample_steps
-from lare_rl.nn.normalise import update_scale
 
 MAX_CALL_ROWS = 8192
 """Rows that are processed in one call."""
 
-init_source = jax.jit(engine.init_source, static_argnames="spec")
-observe_steps = jax.jit(decomposition.observe_steps)
-observe_returns = jax.jit(decomposition.observe_returns)
-observe_scale = jax.jit(update_scale)
-predict_then_update = jax.jit(returns.predict_then_update, static_argnames="settings")
-predicted_returns = jax.jit(returns.predicted_returns, static_argnames="settings")
-add_episodes = jax.jit(returns.add_episodes)
-fit_closed_form = jax.jit(returns.fit_closed_form, static_argnames="spec")
-is_due = jax.jit(returns.is_due)
-is_stale = jax.jit(returns.is_stale)
-reset_statistics = jax.jit(returns.reset_statistics)
+init_decoder = jax.jit(decoder_state.init, static_argnames="spec")
+observe_steps = jax.jit(decoder_state.observe_steps)
+observe_returns = jax.jit(decoder_state.observe_returns)
+predict_then_update = jax.jit(learning.predict_then_update, static_argnames="spec")
+predicted_returns = jax.jit(learning.predicted_returns, static_argnames="spec")
+add_to_sums = jax.jit(learning.add_to_sums)
+fit_closed_form = jax.jit(learning.fit_closed_form, static_argnames="spec")
+is_due = jax.jit(closed_form.is_due)
+is_stale = jax.jit(closed_form.is_stale)
+reset_statistics = jax.jit(closed_form.reset_statistics)
 init_explanation = jax.jit(explanation.init_explanation, static_argnames="basis")
 add_to_explanation = jax.jit(explanation.add_to_explanation)
 explain = jax.jit(explanation.explain)
@@ -40,11 +38,9 @@ def fit_by_gradient(
     state: DecoderState, batches: CreditBatch, keys: Key[Array, " updates"], spec: CreditSpec
 ) -> tuple[DecoderState, Float[Array, ""]]:
     """Update the decoder once for each of some batches. Also return the mean of their losses."""
-    fit, settings = spec.method.fit, spec.settings
-    assert fit is not None
 
     def body(state: DecoderState, inputs: tuple[CreditBatch, Key[Array, ""]]) -> tuple[DecoderState, Float[Array, ""]]:
-        state, metrics = descent.update(state, *inputs, fit, settings)
+        state, metrics = descent.update(state, *inputs, spec)
         return state, metrics["credit/loss"]
 
     state, losses = jax.lax.scan(body, state, (batches, keys))
@@ -55,8 +51,8 @@ def fit_by_gradient(
 def training_rewards(
     leaves: list[Array], steps: StepBatch, structure: Any, spec: CreditSpec
 ) -> Float[Array, "rows agents"]:
-    """Return the rewards of steps by a flat `RewardSource`: its leaves and structure, from `jax.tree.flatten`."""
-    return engine.training_rewards(jax.tree.unflatten(structure, leaves), steps, spec)
+    """Return the rewards of steps by a flat `DecoderState`: its leaves and structure, from `jax.tree.flatten`."""
+    return rewards.training_rewards(jax.tree.unflatten(structure, leaves), steps, spec)
 
 
 def on_cpu() -> AbstractContextManager:

@@ -22,9 +22,8 @@ from lare_rl.assigner.assigner_config import AssignerConfig
 from lare_rl.assigner.batches import sample_batch, whole_episodes
 from lare_rl.assigner.compiled_functions import MAX_CALL_ROWS, on_cpu
 from lare_rl.assigner.store import Store, StoredEpisode
-from lare_rl.credit import closed_form, prequential, returns
-from lare_rl.credit.decomposition import DecoderState
-from lare_rl.credit.engine import RewardSource
+from lare_rl.credit import closed_form, learning, prequential
+from lare_rl.credit.decoder_state import DecoderState
 from lare_rl.credit.history import next_history_columns
 from lare_rl.credit.methods import Fit
 from lare_rl.util.float64 import float64
@@ -48,8 +47,7 @@ class DecoderLearner:
     def __init__(self, config: AssignerConfig, store: Store):
         self.config, self.store = config, store
         with on_cpu():
-            self.source: RewardSource = compiled.init_source(jax.random.key(config.seed), spec=config.spec)
-        """What rewards are computed from."""
+            self.decoder: DecoderState = compiled.init_decoder(jax.random.key(config.seed), spec=config.spec)
         self.n_learned = 0
         """Episodes that the decoder has learned from."""
         self.n_updates = 0
@@ -71,16 +69,11 @@ class DecoderLearner:
         self._is_fitted = False
 
     @property
-    def decoder(self) -> DecoderState | None:
-        """The decoder. None for a method that fits nothing."""
-        return self.source if isinstance(self.source, DecoderState) else None
-
-    @property
     def is_fitted(self) -> bool:
         """Whether the decoder has been fitted yet."""
-        if not self._is_fitted and self.decoder is not None:  # cached, because reading the flag waits for JAX
+        if not self._is_fitted and self.config.method.fit is not None:  # cached, because reading the flag waits for JAX
             uses_gradient = self.config.method.uses_gradient
-            self._is_fitted = self.n_updates > 0 if uses_gradient else bool(returns.is_fitted(self.decoder))
+            self._is_fitted = self.n_updates > 0 if uses_gradient else bool(learning.is_fitted(self.decoder))
         return self._is_fitted
 
     def add_steps(
@@ -124,8 +117,7 @@ class DecoderLearner:
             if self.config.spec.basis.n_tracked:
                 self._fill_history(step_ids[chunk])
             alive = np.ones(inputs.shape[:-1], bool) if self.store.alive is None else self.store.alive[rows]
-            if self.decoder is not None:
-                self._pending_inputs.append((inputs, alive))
+            self._pending_inputs.append((inputs, alive))
         if self.config.phi is not None and sum(len(action) for _, action in self.phi_sample) < PHI_SAMPLE_STEPS:
             _, action, next_observation = (rows.reshape(-1, rows.shape[-1])[:PHI_SAMPLE_STEPS].copy() for rows in steps)
             self.phi_sample.append((next_observation, action))
@@ -145,7 +137,7 @@ class DecoderLearner:
     def flush_statistics(self) -> None:
         """Add pending inputs to the running statistics, and pending returns to the scales."""
         self._flush_returns()
-        if self.decoder is None or not self._pending_inputs:
+        if not self._pending_inputs:
             return
         inputs, alive = (np.concatenate(arrays) for arrays in zip(*self._pending_inputs, strict=True))
         self._pending_inputs.clear()
@@ -153,9 +145,8 @@ class DecoderLearner:
             chunk = slice(start, start + MAX_CALL_ROWS)
             size = padded_size(len(inputs[chunk]))
             with on_cpu():
-                self.source = compiled.observe_steps(
-                    self.source, pad_rows(inputs[chunk], size), pad_rows(alive[chunk], size)
-                )
+                rows, mask = pad_rows(inputs[chunk], size), pad_rows(alive[chunk], size)
+                self.decoder = compiled.observe_steps(self.decoder, rows, mask)
 
     def _flush_returns(self) -> None:
         if not self._pending_returns:
@@ -168,15 +159,12 @@ class DecoderLearner:
         mean_reward = (return_ / np.maximum(length, 1)).astype(np.float32)
         length, level = length.astype(np.int32), level.astype(np.int32) if self.config.groups else None
         with on_cpu():
-            if self.decoder is None:
-                self.source = compiled.observe_scale(self.source, mean_reward, mask)
-            else:
-                self.source = compiled.observe_returns(self.source, mean_reward, length, mask, level)
+            self.decoder = compiled.observe_returns(self.decoder, mean_reward, length, mask, level)
 
     def learn_if_due(self) -> None:
         """Add pending returns to the scales, and let the decoder learn if there are enough new episodes."""
         self._flush_returns()
-        if sum(map(len, self._pending_episodes)) >= max(returns.MIN_GROWTH * self.n_learned, 1):
+        if sum(map(len, self._pending_episodes)) >= max(learning.MIN_GROWTH * self.n_learned, 1):
             self.learn_returns()
 
     def learn_returns(self) -> None:
@@ -196,37 +184,37 @@ class DecoderLearner:
                 while pending and len(new) < self._episodes_until_fit():
                     new += pending.popleft()
                 self.n_learned += len(new)
-                if self.decoder is not None:
-                    self.source = jax.block_until_ready(self._learn(self.decoder, new))
+                if self.config.method.fit is not None:
+                    self.decoder = jax.block_until_ready(self._learn(self.decoder, new))
 
     def _episodes_until_fit(self) -> float:
         """Return the number of new episodes until the next fit in closed form. Other decoders are not fitted here."""
-        if self.decoder is None or self.decoder.closed_form is None:
-            return inf
-        return (closed_form.FIT_GROWTH - 1) * self.n_learned
+        return (closed_form.FIT_GROWTH - 1) * self.n_learned if self.config.spec.has_closed_form else inf
 
     def _learn(self, decoder: DecoderState, new: Sequence[StoredEpisode]) -> DecoderState:
         """Return a decoder that has learned from some new episodes, while later ones are still pending."""
         for batch in whole_episodes(self.store, self.config.spec, new):
-            decoder = compiled.predict_then_update(decoder, batch, settings=self.config.settings)
-        if decoder.closed_form is None:
+            decoder = compiled.predict_then_update(decoder, batch, spec=self.config.spec)
+        closed = decoder.closed_form
+        if closed is None:
             return decoder
         may_rebuild = self.config.forget or self.store.n_added <= self.store.capacity
-        if self.config.method.fit is not Fit.SIGNS and may_rebuild and compiled.is_stale(decoder):
-            decoder = compiled.reset_statistics(decoder)
+        if self.config.method.fit is not Fit.SIGNS and may_rebuild and compiled.is_stale(closed, decoder.statistics):
+            closed = compiled.reset_statistics(closed, decoder.statistics)
             pending = set(map(id, chain.from_iterable(self._pending_episodes)))
             earlier = [episode for episode in self.store.episodes.values() if id(episode) not in pending]
             for batch in whole_episodes(self.store, self.config.spec, earlier):
-                decoder = compiled.add_episodes(decoder, batch)
-        return compiled.fit_closed_form(decoder, spec=self.config.spec) if compiled.is_due(decoder) else decoder
+                closed = compiled.add_to_sums(closed, batch)
+            decoder = decoder._replace(closed_form=closed)
+        return compiled.fit_closed_form(decoder, spec=self.config.spec) if compiled.is_due(closed) else decoder
 
     def fit(self, n_updates: int) -> None:
         """Fit now, by this many gradient updates. A closed-form decoder is fitted once, whatever the number is."""
-        if self.decoder is None or not self.store.episodes:
+        if self.config.method.fit is None or not self.store.episodes:
             return
         if not self.config.method.uses_gradient:
             with on_cpu(), float64():
-                self.source = jax.block_until_ready(compiled.fit_closed_form(self.decoder, spec=self.config.spec))
+                self.decoder = jax.block_until_ready(compiled.fit_closed_form(self.decoder, spec=self.config.spec))
             return
         self._pending_updates = 0.0
         for start in range(0, n_updates, CHUNK_UPDATES):
@@ -245,7 +233,6 @@ class DecoderLearner:
 
     def _update(self, n_updates: int) -> None:
         """Make gradient updates. Their batches are seeded by the number of updates so far."""
-        assert self.decoder is not None
         spec, seed = self.config.spec, self.config.seed
         rng = np.random.default_rng([seed, self.n_updates])
         longest = padded_size(max(len(episode.step_ids) for episode in self.store.episodes.values()))
@@ -253,16 +240,15 @@ class DecoderLearner:
             samples = [sample_batch(self.store, spec, rng, longest) for _ in range(n_updates)]
             stacked = jax.tree.map(lambda *leaves: np.stack(leaves), *samples)
             keys = jax.random.split(jax.random.fold_in(jax.random.key(seed), self.n_updates), n_updates)
-            self.source, loss = compiled.fit_by_gradient(self.source, stacked, keys, spec=spec)
+            self.decoder, loss = compiled.fit_by_gradient(self.decoder, stacked, keys, spec=spec)
         self.n_updates += n_updates
         self.loss = float(loss)
 
     def metrics(self) -> dict[str, float]:
         """Return metrics that need no true rewards. Returns are predicted before they are learned from."""
         self.learn_returns()
-        predictions = prequential.empty_predictions(1) if self.decoder is None else self.decoder.predictions
         with on_cpu():
-            predicted = {name: float(value) for name, value in prequential.metrics(predictions).items()}
+            predicted = {name: float(value) for name, value in prequential.metrics(self.decoder.predictions).items()}
         return {
             **predicted,
             "credit/episodes": float(self.store.n_ended),

@@ -22,11 +22,11 @@ def describe_returns(learner: DecoderLearner, group_names: Iterable[Hashable]) -
     """Return the explanation in sentences. The list is empty for too few episodes, and for a method without a decoder."""
     learner.learn_returns()
     explanation, decoder, config = explain(learner), learner.decoder, learner.config
-    if explanation is None or decoder is None:
+    if explanation is None:
         return []
     factor_names = [] if config.phi is None else config.phi.factor_columns(config.scored_observation)
     raw_names = config.raw_feature_names
-    findings = returns_findings(explanation, decoder, config.method, factor_names, raw_names, group_names)
+    findings = returns_findings(explanation, decoder, config.spec, factor_names, raw_names, group_names)
     return [render(finding, MESSAGES) for finding in findings]
 
 
@@ -35,7 +35,7 @@ def explain(learner: DecoderLearner) -> Explanation | None:
     decoder, store, spec = learner.decoder, learner.store, learner.config.spec
     # Shares are of factors and raw features alone.
     basis = replace(spec.basis, extended=True, n_tracked=0, n_levels=0, prefixes=False)
-    if decoder is None or not store.episodes or not basis.n_features:
+    if spec.method.fit is None or not store.episodes or not basis.n_features:
         return None
     with on_cpu(), float64():
         state = compiled.init_explanation(decoder.statistics, basis=basis)

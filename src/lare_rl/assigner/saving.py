@@ -33,7 +33,7 @@ __all__ = ["AssignerState", "get_state", "read_state", "report_damage", "restore
 FORMAT = 1
 TEXT_FILE, ARRAYS_FILE, FUNCTION_FILE = "assigner.json", "state.npz", "phi.py"
 LEARNED = "learned"
-"""The names of the arrays of the decoder, or of the scale, begin with it."""
+"""The names of the arrays of the decoder begin with it."""
 STORE_ARRAYS = ("inputs", "length", "mean_reward", "episode")
 """The arrays of a store, for each step."""
 PHI_SAMPLE = ("phi_sample/observation", "phi_sample/action")
@@ -56,7 +56,7 @@ def get_state(learner: DecoderLearner, group_names: Iterable[GroupName], *, epis
     """Return the state of an assigner, with stored steps and episodes if `episodes` is true."""
     learner.learn_returns()
     store = learner.store
-    leaves = named_leaves((learner.source,))
+    leaves = named_leaves((learner.decoder,))
     arrays = {LEARNED + name: np.asarray(leaf) for name, leaf in leaves.items()}
     arrays["counts"] = np.array([store.n_ended, store.n_ended_steps, store.dropped + len(store.running)])
     for name, chunks in zip(PHI_SAMPLE, zip(*learner.phi_sample, strict=True), strict=False):
@@ -73,7 +73,7 @@ def restore(learner: DecoderLearner, state: AssignerState) -> None:
     if set(PHI_SAMPLE) <= set(arrays):
         learner.phi_sample.append((arrays[PHI_SAMPLE[0]], arrays[PHI_SAMPLE[1]]))
     learned = {name.removeprefix(LEARNED): array for name, array in arrays.items()}
-    (learner.source,) = fill_template((learner.source,), learned)
+    (learner.decoder,) = fill_template((learner.decoder,), learned)
     store = learner.store
     store.n_ended, store.n_ended_steps, store.dropped = map(int, arrays["counts"])
     if "n_added" in arrays:

@@ -14,10 +14,10 @@ from lare_rl.assigner import compiled_functions as compiled
 from lare_rl.assigner.batches import whole_episodes
 from lare_rl.assigner.compiled_functions import MAX_CALL_ROWS, on_cpu
 from lare_rl.assigner.decoder_learner import DecoderLearner
-from lare_rl.credit import decomposition
-from lare_rl.credit.decomposition import DecoderState
-from lare_rl.credit.engine import StepBatch
+from lare_rl.credit import decoder_state
+from lare_rl.credit.decoder_state import DecoderState
 from lare_rl.credit.methods import Reward
+from lare_rl.credit.rewards import StepBatch
 from lare_rl.util.shapes import pad_rows, padded_size
 
 __all__ = ["StepRewards"]
@@ -29,7 +29,7 @@ class StepRewards:
     def __init__(self, learner: DecoderLearner):
         self.learner, self.config, self.store = learner, learner.config, learner.store
         self._flat_cache: tuple[Any, list[Array], Any] = None, [], None
-        """A decoder or a scale, its leaves, and its structure. Flattening it anew for every call would take longer than the call."""
+        """A decoder, its leaves, and its structure. Flattening it anew for every call would take longer than the call."""
         self._residual_cache: tuple[DecoderState | None, dict[int, float]] = None, {}
         """A decoder, and the residuals R - sum_t r_hat_t of episodes, by their numbers."""
 
@@ -74,12 +74,10 @@ class StepRewards:
 
     def _flat_state(self) -> tuple[list[Array], Any]:
         """Return the leaves and the structure of what rewards are computed from."""
-        source = self.learner.source
-        if self._flat_cache[0] is not source:
-            newest = source
-            if isinstance(source, DecoderState):
-                source = source._replace(optimizer=(), score_type_predictions=None, closed_form=None)
-            self._flat_cache = newest, *jax.tree.flatten(source)
+        decoder = self.learner.decoder
+        if self._flat_cache[0] is not decoder:
+            used = decoder._replace(optimizer=(), score_type_predictions=None, closed_form=None)
+            self._flat_cache = decoder, *jax.tree.flatten(used)
         return self._flat_cache[1:]
 
     def _residuals(
@@ -106,7 +104,7 @@ class StepRewards:
         predicted: list[float] = []
         with on_cpu():
             for batch in whole_episodes(self.store, self.config.spec, episodes):
-                sums = compiled.predicted_returns(decoder, batch, settings=self.config.settings)
+                sums = compiled.predicted_returns(decoder, batch, spec=self.config.spec)
                 predicted += np.asarray(sums)[np.asarray(batch.mask) > 0].tolist()
         scores = [episode.return_ for episode in episodes]
         residuals.update(zip(new, np.subtract(scores, predicted).tolist(), strict=True))
@@ -118,10 +116,10 @@ class StepRewards:
         `level` is None if it is unknown. `length` has the number of steps of each segment.
         """
         decoder = self.learner.decoder
-        if decoder is None or not self.learner.is_fitted:
+        if not self.learner.is_fitted:
             return 0.0
         size = padded_size(len(length))
         with on_cpu():
             levels = None if level is None else jnp.full(size, level)
-            values = decomposition.level_returns(decoder, levels, jnp.asarray(pad_rows(length, size)))
+            values = decoder_state.level_returns(decoder, levels, jnp.asarray(pad_rows(length, size)))
         return float(np.sum(np.asarray(values)[: len(length)]))

@@ -45,7 +45,6 @@ from lare_rl.nn.normalise import RunningMeanStd, running_std
 __all__ = [
     "ClosedForm",
     "LinearDecoder",
-    "best_posterior",
     "fit",
     "fit_signs",
     "init",
@@ -53,6 +52,7 @@ __all__ = [
     "is_due",
     "is_stale",
     "reset_statistics",
+    "reward_std",
     "select_score_type",
     "split_double",
     "to_float64",
@@ -122,25 +122,22 @@ class ClosedForm(NamedTuple):
 
 def init(basis: Basis, score_types: tuple[int, ...]) -> ClosedForm:
     """Return the state before the first episode."""
-    is_binary = ScoreType.LOG_ODDS in score_types
-    n_score_types = len(score_types)
-    n_features, n_columns, zero = basis.n_features, basis.n_columns, jnp.zeros(())
-    posterior = evidence.init_posterior(basis.column_group_index)
-    strengths = evidence.init_posterior(basis.column_strength_index)
+    n_score_types, is_binary = len(score_types), ScoreType.LOG_ODDS in score_types
+    posteriors = tuple(map(evidence.init_posterior, (basis.column_group_index, basis.column_strength_index)))
     posterior, strengths = jax.tree.map(
-        lambda leaf: jnp.tile(leaf, (n_score_types - is_binary, *[1] * leaf.ndim)), (posterior, strengths)
+        lambda leaf: jnp.tile(leaf, (n_score_types - is_binary, *[1] * leaf.ndim)), posteriors
     )
     return ClosedForm(
         decoder=LinearDecoder(
             basis=basis,
             mean=jnp.zeros(basis.n_standardised),
             std=jnp.ones(basis.n_standardised),
-            weight=jnp.zeros((n_score_types, n_features)),
+            weight=jnp.zeros((n_score_types, basis.n_features)),
             bias=jnp.zeros(n_score_types),
         ),
-        sufficient_statistics=split_double(evidence.empty_statistics(n_columns)),
-        n_steps=zero,
-        n_fitted=jnp.copy(zero),
+        sufficient_statistics=split_double(evidence.empty_statistics(basis.n_columns)),
+        n_steps=jnp.zeros(()),
+        n_fitted=jnp.zeros(()),
         posterior=posterior,
         strengths=strengths,
         intercept=jnp.zeros((n_score_types, basis.n_levels)),
@@ -175,9 +172,8 @@ def reset_statistics(state: ClosedForm, statistics: RunningMeanStd) -> ClosedFor
 
     The next fit starts from the precisions of the last one. Until then, the weights do not match the features.
     """
-    decoder = eqx.tree_at(lambda d: (d.mean, d.std), state.decoder, (statistics.mean, running_std(statistics)))
     return state._replace(
-        decoder=decoder,
+        decoder=eqx.tree_at(lambda d: (d.mean, d.std), state.decoder, (statistics.mean, running_std(statistics))),
         sufficient_statistics=jax.tree.map(jnp.zeros_like, state.sufficient_statistics),
         n_steps=statistics.n_rows,
         n_fitted=jnp.zeros_like(state.n_fitted),
@@ -190,46 +186,84 @@ def is_due(state: ClosedForm) -> Bool[Array, ""]:
     return jnp.sum(state.sufficient_statistics.n_episodes) >= jnp.maximum(FIT_GROWTH * state.n_fitted, 1)
 
 
+class _Weights(NamedTuple):
+    """The result of a fit, for some score types."""
+
+    columns: Float[Array, "score_types columns"]
+    """The weights of features, of the time if there are prefixes, and of levels."""
+    bias: Float[Array, " score_types"]
+    start_value: Float[Array, " score_types"]
+
+
 def fit(
     state: ClosedForm, score_types: tuple[int, ...], max_rounds: int = MAX_EVIDENCE_ROUNDS, *, batched: bool = False
 ) -> ClosedForm:
     """Fit the decoder of each score type. If `batched` is true, sums and averages are fitted at once."""
-    linear_types = tuple(score_type for score_type in score_types if score_type != ScoreType.LOG_ODDS)
+    basis = state.decoder.basis
+    groups, strengths = _fit_linear_types(state, score_types, max_rounds, batched=batched)
+    weights = _linear_weights(basis, groups, strengths)
+    posterior, strengths = jax.tree.map(lambda leaf: leaf.astype(jnp.float32), (groups, strengths))
+    state = state._replace(posterior=posterior, strengths=strengths)
+    if state.log_odds is not None:
+        log_odds = logistic.fit(state.log_odds, basis.column_group_index, max_rounds)
+        state = state._replace(log_odds=log_odds)
+        weights = jax.tree.map(lambda *rows: jnp.concatenate(rows), weights, _log_odds_weights(log_odds))
+    return _set_weights(state, weights)
+
+
+def _fit_linear_types(
+    state: ClosedForm, score_types: tuple[int, ...], max_rounds: int, *, batched: bool
+) -> tuple[Posterior, Posterior]:
+    """Return the fits by groups and by strengths of all score types but log odds, along a leading axis."""
+    linear_types = [score_type for score_type in score_types if score_type != ScoreType.LOG_ODDS]
     basis, statistics = state.decoder.basis, to_float64(state.sufficient_statistics)
-    group_index, strength_index = basis.column_group_index, basis.column_strength_index
+    indices = basis.column_group_index, basis.column_strength_index
 
     def fit_score_type(args: tuple[Int[Array, ""], Posterior, Posterior]) -> tuple[Posterior, Posterior]:
         score_type, *starts = args
         start, earlier = jax.tree.map(lambda leaf: leaf.astype(float), starts)
-        return relevance.fit(
-            statistics, score_type, group_index, strength_index, start, earlier, max_rounds, batched=batched
-        )
+        return relevance.fit(statistics, score_type, *indices, start, earlier, max_rounds, batched=batched)
 
-    fits = map_leading_axis(
-        fit_score_type, (jnp.asarray(linear_types), state.posterior, state.strengths), batched=batched
-    )
-    posterior, strengths = jax.tree.map(lambda leaf: leaf.astype(jnp.float32), fits)
-    state = state._replace(posterior=posterior, strengths=strengths)
-    best = relevance.select(fits[1], fits[0], group_index, strength_index)
-    n_features, weight, bias, start_value = basis.n_features, best.weight, best.bias, jnp.zeros_like(best.bias)
+    rows = jnp.asarray(linear_types), state.posterior, state.strengths
+    return map_leading_axis(fit_score_type, rows, batched=batched)
+
+
+def _linear_weights(basis: Basis, groups: Posterior, strengths: Posterior) -> _Weights:
+    best = relevance.select(strengths, groups, basis.column_group_index, basis.column_strength_index)
     if basis.prefixes:  # the value before the first step is no reward, and time is
-        bias, start_value = best.weight[:, n_features], best.bias
-    if state.log_odds is not None:
-        log_odds = logistic.fit(state.log_odds, group_index, max_rounds)
-        state = state._replace(log_odds=log_odds)
-        level, slope = logistic.to_returns(log_odds)
-        weight = jnp.concatenate([weight, slope * log_odds.posterior.weight[None]])
-        bias, start_value = jnp.append(bias, 0), jnp.append(start_value, level)
-    return _set_weights(state, weight[:, :n_features], bias)._replace(
-        intercept=weight[:, basis.n_columns - basis.n_levels :].astype(jnp.float32),
-        start_value=start_value.astype(jnp.float32),
+        return _Weights(best.weight, best.weight[:, basis.n_features], best.bias)
+    return _Weights(best.weight, best.bias, jnp.zeros_like(best.bias))
+
+
+def _log_odds_weights(log_odds: LogOddsFit) -> _Weights:
+    start_value, slope = logistic.to_returns(log_odds)
+    return _Weights(slope * log_odds.posterior.weight[None], jnp.zeros(1), start_value[None])
+
+
+def reward_std(
+    state: ClosedForm, rows: Float[Array, "rows inputs"], score_types: tuple[int, ...], index: Int[Array, ""] | int
+) -> Float[Array, " rows"]:
+    """Return the posterior standard deviation of r_hat, or of T r_hat if the score is an average. Call this within `float64()`.
+
+    The fit must be that of the evidence. `index` is the position of the score type among all that are fitted.
+    """
+    basis, features, n_linear = state.decoder.basis, state.decoder.features(rows), len(state.posterior.bias)
+    linear_index = jnp.minimum(index, n_linear - 1)
+    best = relevance.select(state.strengths, state.posterior, basis.column_group_index, basis.column_strength_index)
+    covariance = evidence.posterior_covariance(
+        to_float64(state.sufficient_statistics),
+        jnp.asarray(score_types)[linear_index],
+        basis.column_strength_index,
+        jax.tree.map(lambda leaf: leaf[linear_index].astype(float), best),
     )
-
-
-def best_posterior(state: ClosedForm) -> Posterior:
-    """Return the fit that is used of each score type but log odds, with a precision for each strength."""
-    basis = state.decoder.basis
-    return relevance.select(state.strengths, state.posterior, basis.column_group_index, basis.column_strength_index)
+    if basis.prefixes:  # the value before the first step is no part of a reward, and time is
+        features = jnp.append(features, jnp.ones((*features.shape[:-1], 1)), axis=-1)
+        covariance = covariance._replace(centre=jnp.zeros_like(covariance.centre), centre_variance=jnp.zeros(()))
+    std = evidence.posterior_std(covariance, features)
+    if state.log_odds is None:
+        return std
+    log_odds_std = evidence.posterior_std(logistic.covariance(state.log_odds), features)
+    return jnp.where(index == n_linear, log_odds_std, std)
 
 
 def fit_signs(state: ClosedForm) -> ClosedForm:
@@ -242,16 +276,18 @@ def fit_signs(state: ClosedForm) -> ClosedForm:
     error = error + statistics.n_steps * (v @ statistics.mean[:-1]) ** 2
     # The first index where it is true, as int32: the program around this one may be compiled without float64.
     best = jax.lax.argmax(error == jnp.min(error), 0, jnp.int32)
-    return _set_weights(state, signs[best][None], jnp.zeros(1))
+    return _set_weights(state, _Weights(signs[best][None], jnp.zeros(1), jnp.zeros(1)))
 
 
-def _set_weights(
-    state: ClosedForm, weight: Float[Array, "score_types features"], bias: Float[Array, " score_types"]
-) -> ClosedForm:
+def _set_weights(state: ClosedForm, weights: _Weights) -> ClosedForm:
     """Set weights that were fitted to all episodes in the sums."""
-    weights = weight.astype(jnp.float32), bias.astype(jnp.float32)
-    decoder = eqx.tree_at(lambda d: (d.weight, d.bias), state.decoder, weights)
-    return state._replace(decoder=decoder, n_fitted=jnp.sum(state.sufficient_statistics.n_episodes))
+    basis, (columns, bias, start_value) = state.decoder.basis, (values.astype(jnp.float32) for values in weights)
+    return state._replace(
+        decoder=eqx.tree_at(lambda d: (d.weight, d.bias), state.decoder, (columns[:, : basis.n_features], bias)),
+        n_fitted=jnp.sum(state.sufficient_statistics.n_episodes),
+        intercept=columns[:, basis.n_columns - basis.n_levels :],
+        start_value=start_value,
+    )
 
 
 def select_score_type(decoder: LinearDecoder, index: Int[Array, ""] | int) -> LinearDecoder:

@@ -38,7 +38,7 @@ class Decoder:
     extended_basis: bool = False
     """Whether a closed-form decoder has shapes and pairs of its inputs as features (`basis.py`)."""
     pays_shares: bool = False
-    """Whether its outputs are shares of the return, over steps and agents (`engine.return_shares`). It needs `whole_episodes`."""
+    """Whether its outputs are shares of the return, over steps and agents (`tar2.py`). It needs `whole_episodes`."""
     predicts_actions: bool = False
     """Whether it learns to predict which action an agent took, which must then be discrete."""
     longest_segment: int | None = None

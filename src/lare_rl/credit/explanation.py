@@ -34,10 +34,10 @@ from jaxtyping import Array, Bool, Float, Int
 from lare_rl.credit import closed_form, evidence, relevance
 from lare_rl.credit.basis import N_FREQUENCIES, Basis
 from lare_rl.credit.closed_form import ClosedForm
-from lare_rl.credit.decomposition import CreditBatch, valid_rows
+from lare_rl.credit.decoder_state import CreditBatch, valid_rows
 from lare_rl.credit.evidence import SufficientStatistics
+from lare_rl.credit.learning import add_to_sums
 from lare_rl.credit.precisions import AlphaIndex, Posterior, Regression
-from lare_rl.credit.returns import add_to_sums
 from lare_rl.credit.score_type import ScoreType
 from lare_rl.nn.normalise import RunningMeanStd
 

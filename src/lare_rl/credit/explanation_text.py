@@ -5,12 +5,12 @@ from typing import Any
 
 import numpy as np
 
-from lare_rl.credit import decomposition, returns
+from lare_rl.credit import decoder_state, learning
 from lare_rl.credit.basis import MAX_PAIRED_RAW_FEATURES
-from lare_rl.credit.decomposition import DecoderState
+from lare_rl.credit.decoder_state import DecoderState
 from lare_rl.credit.explanation import Explanation
-from lare_rl.credit.methods import Method
 from lare_rl.credit.score_type import ScoreType, ScoreTypeEstimate
+from lare_rl.credit.spec import CreditSpec
 from lare_rl.tasks.spec import base_name
 from lare_rl.util.findings import Finding
 from lare_rl.util.statistics import CLEAR_ERRORS, round_shares
@@ -135,7 +135,7 @@ MESSAGES = {
 def returns_findings(
     explanation: Explanation,
     decoder: DecoderState,
-    method: Method,
+    spec: CreditSpec,
     factor_names: Sequence[str],
     raw_names: Sequence[str],
     group_names: Iterable[Hashable],
@@ -144,15 +144,15 @@ def returns_findings(
 
     `group_names` are the names of the first levels, or of all.
     """
-    effects = decomposition.level_effects(decoder, float(explanation.mean_length)).tolist()
+    effects = decoder_state.level_effects(decoder, float(explanation.mean_length), spec.basis.n_levels).tolist()
     return explanation_findings(
         explanation,
-        returns.estimate_score_type(decoder),
+        learning.estimate_score_type(decoder, spec),
         factor_names,
         raw_names,
-        looks_binary=returns.looks_binary(decoder, method),
+        looks_binary=learning.looks_binary(decoder, spec),
         groups=dict(zip(group_names, effects, strict=False)),
-        lacks_pairs=method.decoder_kind.extended_basis and len(raw_names) > MAX_PAIRED_RAW_FEATURES,
+        lacks_pairs=spec.method.decoder_kind.extended_basis and len(raw_names) > MAX_PAIRED_RAW_FEATURES,
     )
 
 
@@ -173,8 +173,8 @@ def explanation_findings(
         score_type: the estimated type of the score. None if it is set, or makes no difference.
         factors: names of the factors; empty for a method without factors.
         raw_features: names of the raw features; empty if they have none. Then nothing is said of single features.
-        looks_binary: whether the score should be tried as one that is won or lost (`returns.looks_binary`).
-        groups: what an episode of each group returns beside its steps (`decomposition.level_effects`), by the group's name.
+        looks_binary: whether the score should be tried as one that is won or lost (`learning.looks_binary`).
+        groups: what an episode of each group returns beside its steps (`decoder_state.level_effects`), by the group's name.
         lacks_pairs: whether pairs of raw features are left out, because there are too many raw features.
     """
     n_episodes, factors_r2 = int(explanation.n_episodes), float(explanation.factors_r2)

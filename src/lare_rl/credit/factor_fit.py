@@ -24,11 +24,11 @@ from jaxtyping import Array, Bool, Float, Int
 from lare_rl.credit import evidence, explanation
 from lare_rl.credit.basis import Basis
 from lare_rl.credit.closed_form import FIT_GROWTH, MAX_EVIDENCE_ROUNDS
-from lare_rl.credit.decomposition import CreditBatch
+from lare_rl.credit.decoder_state import CreditBatch
 from lare_rl.credit.evidence import SufficientStatistics
 from lare_rl.credit.explanation import Explanation, ExplanationState
+from lare_rl.credit.learning import mean_features
 from lare_rl.credit.precisions import Posterior
-from lare_rl.credit.returns import mean_features
 from lare_rl.credit.score_type import (
     MAX_ERROR_RATIO,
     ROUNDING,

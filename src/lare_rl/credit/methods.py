@@ -35,7 +35,7 @@ class Fit(StrEnum):
     EVIDENCE = "evidence"
     """In closed form, on all episodes (`evidence.py`)."""
     PREFIX_EVIDENCE = "evidence of prefixes"
-    """In closed form, on all prefixes: a step is paid the change of the expected return (`returns.py`)."""
+    """In closed form, on all prefixes: a step is paid the change of the expected return (`learning.py`)."""
     SIGNS = "best signs"
     """The best signs of a sum of the factors (`closed_form.py`)."""
 
@@ -141,6 +141,11 @@ class Method:
     def uses_gradient(self) -> bool:
         """Whether its decoder is fitted by gradient descent."""
         return self.fit is not None and not self.fit.closed_form
+
+    @property
+    def samples_steps(self) -> bool:
+        """Whether an update of its decoder reads K steps of each episode."""
+        return self.fit is not None and self.fit.samples_steps
 
     @property
     def decoder_kind(self) -> Decoder:

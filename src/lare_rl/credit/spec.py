@@ -96,6 +96,16 @@ class CreditSpec:
         allow_log_odds = not self.method.uses_gradient
         return score_types_to_fit(self.settings.score, self.fixed_length, allow_log_odds=allow_log_odds)
 
+    @property
+    def has_closed_form(self) -> bool:
+        """Whether there is a fit in closed form: it is the decoder, or it determines the type of the score."""
+        return self.method.fit is not None and (self.method.fit.closed_form or len(self.score_types) > 1)
+
+    @property
+    def normalises(self) -> bool:
+        """Whether the decoder's inputs and outputs are normalised. A decoder in closed form does not need this."""
+        return self.settings.normalise and self.method.uses_gradient
+
     def sizes(self, *names: str) -> list[int]:
         """Return the sizes of the inputs. Raises `LareError` if their names, in order, are not `names`."""
         if self.inputs != names:
@@ -112,7 +122,7 @@ class CreditSpec:
 
     @property
     def output_scale(self) -> float:
-        """The factor of the output of decoders for several agents (see `decomposition.py`)."""
+        """The factor of the output of decoders for several agents (see `decoder_state.py`)."""
         return 1.0 if self.agents == 1 else math.sqrt(self.max_steps * self.agents)
 
     def raw_feature_names(self, observation: str, action: str) -> list[str]:

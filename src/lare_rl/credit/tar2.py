@@ -9,7 +9,7 @@ the return. The states and the past must tell which action an agent takes next:
     (sum_{i,t} c_{i,t} - R)^2 - 0.05 mean_{i,t} log p(a_{i,t})
 
 e is the embedding of an observation and its position. The rewards of an episode are not c, but shares of the return
-(`engine.return_shares`).
+(`return_shares`).
 
 The network, the loss and the settings are those of the authors' code (github.com/AdityaKapoor74/MARL_Agent_Temporal_Credit_Assignment,
 `TARR_v2` at commit 2708495; the commit after it leaves out the outcome, as an ablation). The text of the paper could not be read, but
@@ -19,14 +19,14 @@ for its abstract. docs/reference/differences.md lists the differences.
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, PRNGKeyArray
+from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
 from lare_rl.credit.decoder_network import DecoderOutput
 from lare_rl.credit.spec import CreditSpec
 from lare_rl.credit.stas import REWARD_SAMPLES, Coalitions, TimeLayer, gelu
 from lare_rl.nn.networks import MLP, Linear
 
-__all__ = ["TAR2"]
+__all__ = ["TAR2", "pay_shares", "return_shares"]
 
 SIZE, LAYERS = 64, 3
 """The width of a token, and the number of pairs of layers."""
@@ -100,3 +100,45 @@ class TAR2(eqx.Module):
     def _contributions(self, h: Float[Array, "episodes steps agents stacked"]) -> Float[Array, "episodes steps agents"]:
         outcome = jax.lax.stop_gradient(jnp.mean(h[:, -1:], axis=2, keepdims=True))
         return self.contribution_model(jnp.concatenate([h, jnp.broadcast_to(outcome, h.shape)], axis=-1))[..., 0]
+
+
+def pay_shares(
+    contributions: Float[Array, "*batch agents"],
+    alive: Bool[Array, "*batch agents"],
+    returns: Float[Array, "*batch"],
+    max_steps: int,
+) -> Float[Array, "*batch agents"]:
+    """Return each agent's share of the return of its episode. All episodes have `max_steps` steps, and are whole.
+
+    The mean over the agents that are alive is the share of the step, and R is the sum of these means.
+    """
+    shares = return_shares(*(values.reshape(-1, max_steps, values.shape[-1]) for values in (contributions, alive)))
+    return shares.reshape(contributions.shape) * (returns * jnp.sum(alive, axis=-1))[..., None]
+
+
+def return_shares(
+    contributions: Float[Array, "episodes steps agents"], alive: Bool[Array, "episodes steps agents"]
+) -> Float[Array, "episodes steps agents"]:
+    """Return the share of each agent at each step: the deterministic normalisation of TAR2 (Kapoor et al., 2025, arXiv 2502.04864).
+
+    A decoder gives contributions c_{i,t}. Those of a step, and those of the agents of a step, become weights that add up to 1:
+
+        w_t     = (C_t - min C) / sum_u (C_u - min C),              C_t = sum_i c_{i,t}
+        w_{i,t} = (c_{i,t} - min_j c_{j,t}) / sum_j (c_{j,t} - min_k c_{k,t})
+
+    The share of agent i at step t is w_t w_{i,t}. The shares of an episode add up to 1 whatever the contributions are, so that the
+    rewards share * R add up to the return. Only agents that are alive have a share. If all contributions of a sum are equal, their
+    weights are equal, too: the authors' code pays nothing then, and adds 1e-5 to each denominator.
+    """
+    step_contribution = jnp.sum(jnp.where(alive, contributions, 0), axis=-1)
+    step_weight = _weights(step_contribution, jnp.any(alive, axis=-1))
+    return step_weight[..., None] * _weights(contributions, alive)
+
+
+def _weights(values: Float[Array, "*batch size"], mask: Bool[Array, "*batch size"]) -> Float[Array, "*batch size"]:
+    """Return weights over the last axis that add up to 1: how much each value exceeds the least one. 0 where `mask` is false."""
+    lowest = jnp.min(jnp.where(mask, values, jnp.inf), axis=-1, keepdims=True)
+    excess = jnp.where(mask, values - lowest, 0)
+    total = jnp.sum(excess, axis=-1, keepdims=True)
+    equal = mask / jnp.maximum(jnp.sum(mask, axis=-1, keepdims=True), 1)
+    return jnp.where(total > 0, excess / jnp.where(total > 0, total, 1), equal)

@@ -9,10 +9,10 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from lare_rl.config.train_config import TrainConfig
+from lare_rl.credit.closed_form import ClosedForm, reward_std
 from lare_rl.credit.decoder_settings import RECENT_STEPS
-from lare_rl.credit.decomposition import DecoderState
+from lare_rl.credit.decoder_state import score_type_index
 from lare_rl.credit.methods import Fit
-from lare_rl.credit.returns import reward_std
 from lare_rl.data import replay
 from lare_rl.data.replay import Index, StoredSteps
 from lare_rl.runs.directory import Run
@@ -74,18 +74,21 @@ def load_episode_credit(run: Run) -> EpisodeCredit | None:
     @jax.jit
     def read_rewards(learner: Learner, index: Index) -> tuple[StoredSteps, Float[Array, "steps agents"]]:
         steps = replay.read(learner.replay, index)
-        return steps, rewards(steps, learner.reward_sources, config)
+        return steps, rewards(steps, learner.decoders, config)
 
     steps, training_reward = read_rewards(learner, index)
 
-    def posterior_std(decoder: DecoderState, steps: StoredSteps) -> Float[Array, " steps"]:
-        return reward_std(decoder, decoder_inputs(steps, config, 0)[:, 0], config.credit_specs[0])
+    decoder, score_types = learner.decoders[0], config.credit_specs[0].score_types
+
+    def posterior_std(closed: ClosedForm, steps: StoredSteps) -> Float[Array, " steps"]:
+        index = score_type_index(decoder, len(score_types))
+        return reward_std(closed, decoder_inputs(steps, config, 0)[:, 0], score_types, index)
 
     uncertainty = None
-    if learner.decoders and config.method.fit in (Fit.EVIDENCE, Fit.PREFIX_EVIDENCE) and config.n_proxy_rewards == 1:
+    if decoder.closed_decoder is not None and config.method.fit is not Fit.SIGNS and config.n_proxy_rewards == 1:
         with float64():
-            std = np.asarray(jax.jit(posterior_std)(learner.decoders[0], steps))
-        uncertainty = 2 * std / np.where(learner.decoders[0].is_average, steps.length, 1)
+            std = np.asarray(jax.jit(posterior_std)(decoder.closed_decoder, steps))
+        uncertainty = 2 * std / np.where(decoder.is_average, steps.length, 1)
     reward = np.asarray(steps.columns["reward"])
     return EpisodeCredit(
         reward=reward,

@@ -151,9 +151,9 @@ def compute_training_rewards(
         filled = store_with_factors(learner._replace(replay=buffer), steps, factors, config)
         if config.is_exact:
             since = replay.segments_as_episodes(filled.replay).oldest
-            filled = predict_returns(filled._replace(reward_sources=learner.reward_sources), since, config)
+            filled = predict_returns(filled._replace(decoders=learner.decoders), since, config)
         stored = replay.read(filled.replay, replay.newest_steps(filled.replay, n_steps))
-        return jnp.swapaxes(rewards(stored, learner.reward_sources, config), 0, 1)
+        return jnp.swapaxes(rewards(stored, learner.decoders, config), 0, 1)
 
     return np.asarray(compute(jax.tree.map(jnp.asarray, steps), jnp.asarray(factors)))
 

@@ -68,11 +68,11 @@ def export_run(run: Run | str | Path, out: str | Path, seed: int | None = None, 
     else:
         actors = get_actor(learner.algorithm, step, config)
     graphs = {"policy": policy_graph(select_seed(actors, seed_index), config)}
-    credit = select_seed(learner.decoders, seed_index)
+    decoders = select_seed(learner.decoders, seed_index)
     no_reward_reason = missing_reward_reason(config.method)
     for team_index, role in enumerate(task.roles if no_reward_reason is None else ()):
         phi = run.functions[team_index] if run.functions else None
-        graph = reward_graph(credit[team_index] if credit else None, config, team_index, phi)
+        graph = reward_graph(decoders[team_index], config, team_index, phi)
         graphs["reward" if role is task else f"reward_{role.team}"] = graph
     functions = {name: _describe_graph(graph) for name, graph in graphs.items()}
     if config.env.discrete and not config.team_level:

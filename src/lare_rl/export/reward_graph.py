@@ -16,9 +16,10 @@ import jax.numpy as jnp
 import numpy as np
 
 from lare_rl.config.train_config import TrainConfig
-from lare_rl.credit.decomposition import DecoderState, decoder_rewards
+from lare_rl.credit.decoder_state import DecoderState, decoder_rewards
 from lare_rl.credit.input_names import input_arrays
 from lare_rl.credit.methods import Method, Reward
+from lare_rl.credit.spec import CreditSpec
 from lare_rl.envs.interface import alive_mean
 from lare_rl.export.translate import add_function, finish, graph_input
 from lare_rl.latent.function import LatentFunction
@@ -46,37 +47,34 @@ def missing_reward_reason(method: Method) -> str | None:
 
 
 def reward_graph(
-    credit: DecoderState | None, config: TrainConfig, team_index: int, phi: LatentFunction | None = None
+    decoder: DecoderState, config: TrainConfig, team_index: int, phi: LatentFunction | None = None
 ) -> Graph:
     """Return the graph of a team's proxy rewards.
 
     Args:
-        credit: the decoder of one seed, or None if phi itself is the reward.
+        decoder: the decoder of one seed.
         phi: the team's phi, if the method has one.
 
     Raises:
         LareError: the decoder has an operation that a graph cannot have.
     """
-    team = config.env.teams[team_index]
+    team, spec = config.env.teams[team_index], config.credit_specs[team_index]
     rows = () if config.team_level or team.n_agents == 1 else (team.n_agents,)
     with building(Builder(UNLIMITED)):
-        arrays = input_arrays(config.credit_specs[team_index].inputs, _StepInputs(config, rows, team_index, phi))
+        arrays = input_arrays(spec.inputs, _StepInputs(config, rows, team_index, phi))
         inputs = {"inputs": concatenate(arrays, -1)}
-        if credit is not None and bool(credit.is_average):
+        if bool(decoder.is_average):
             inputs["length"] = graph_input("length", (1,) if rows else ())
         if config.method.shared and rows and config.env.agents_leave:
             inputs["alive"] = graph_input("alive", rows)
-        return finish(r_hat=add_function(partial(_reward, credit=credit, config=config), inputs))
+        return finish(r_hat=add_function(partial(_reward, decoder=decoder, spec=spec), inputs))
 
 
-def _reward(arrays: dict[str, Any], credit: DecoderState | None, config: TrainConfig) -> Any:
+def _reward(arrays: dict[str, Any], decoder: DecoderState, spec: CreditSpec) -> Any:
     inputs, length = arrays["inputs"], arrays.get("length")
     rows = inputs if inputs.ndim > 1 else inputs[None]
-    if credit is None:
-        r_hat = rows[:, 0]
-    else:
-        r_hat = decoder_rewards(credit, rows[None], config.credit, None if length is None else length.reshape(1))[0]
-    if config.method.shared:
+    r_hat = decoder_rewards(decoder, rows[None], spec, None if length is None else length.reshape(1))[0]
+    if spec.method.shared:
         alive = arrays["alive"] > 0 if "alive" in arrays else jnp.ones(r_hat.shape, bool)
         r_hat = jnp.where(alive, alive_mean(r_hat, alive), 0)
     return r_hat if inputs.ndim > 1 else r_hat[0]

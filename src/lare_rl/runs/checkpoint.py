@@ -48,6 +48,7 @@ SAVED_BY_ROW = f"{REPLAY}columns"
 NEW_STATE = (
     *(".closed_form.strengths.", ".closed_form.intercept", ".closed_form.start_value"),
     *(".is_log_odds", ".predictions.level", ".score_type_predictions.level"),
+    *(".statistics.", ".return_scale.", ".is_average", ".predictions."),  # of a method that fits nothing
 )
 """Paths of arrays that earlier checkpoints do not have. Zeros mean that they have not been computed yet, or make no difference."""
 

@@ -286,7 +286,7 @@ def _iterate(
     keys = stream_keys(seeds, Stream.EXPLORATION, env_steps)
     envs, steps = collect_device.collect(env, state.envs, actor, keys, env_steps, config)
     learner, is_finite = jax.vmap(partial(store, config=config, phi=phi))(state.learner, steps)
-    if learner.decoders:
+    if config.method.fit is not None:
         is_paid = jnp.any(steps.ended) | (not config.payments.only_at_end)
         learner = jax.lax.cond(is_paid, learn, lambda unchanged: unchanged, learner)
     updated = jax.lax.cond(env_steps >= config.warmup, fit_and_update, _keep, learner, state.metrics, state.is_measured)

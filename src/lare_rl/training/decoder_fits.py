@@ -16,10 +16,11 @@ from jaxtyping import Array, Float, Int, Key, PRNGKeyArray
 
 from lare_rl.algorithms.batches import Metrics
 from lare_rl.config.train_config import CreditConfig, TrainConfig
-from lare_rl.credit import descent, returns
-from lare_rl.credit.decomposition import CreditBatch, DecoderState
+from lare_rl.credit import descent, learning
+from lare_rl.credit.decoder_state import CreditBatch, DecoderState
 from lare_rl.credit.descent import plan_batch
 from lare_rl.credit.prequential import empty_predictions, squared_errors
+from lare_rl.credit.spec import CreditSpec
 from lare_rl.data import replay
 from lare_rl.data.replay import Index, Replay
 from lare_rl.data.sampling import CreditSample, sample_episode_steps, sample_packed, sample_padded
@@ -65,10 +66,8 @@ class FirstFitStoppedError(Exception):
 
 def sample_credit(buffer: Replay, key: PRNGKeyArray, updates: int, config: CreditConfig) -> CreditSample:
     """Draw the steps that each of some updates of the decoders reads."""
-    fit, longest = config.method.fit, config.longest_segment
-    assert fit is not None
-    buffer = replay.segments_as_episodes(buffer)
-    plan = plan_batch(fit, config.credit, longest, fixed_length=config.has_fixed_segments)
+    buffer, longest = replay.segments_as_episodes(buffer), config.longest_segment
+    plan = plan_batch(config.credit_specs[0], longest)
     match plan.layout:
         case "sampled":
             return sample_episode_steps(buffer, key, updates, plan.episodes, plan.rows)
@@ -85,17 +84,16 @@ def fit_decoders(
     steps = replay.read(buffer, sample.steps)
     keys = jax.random.split(key, len(decoders))
     updates = [
-        _update_decoder(decoder, episode_batch(steps, sample, config, i), keys[i], config)
+        _update_decoder(decoder, episode_batch(steps, sample, config, i), keys[i], config, config.credit_specs[i])
         for i, decoder in enumerate(decoders)
     ]
     return tuple(decoder for decoder, _ in updates), team_metrics([metrics for _, metrics in updates], config.env.teams)
 
 
 def _update_decoder(
-    decoder: DecoderState, batch: CreditBatch, key: PRNGKeyArray, config: CreditConfig
+    decoder: DecoderState, batch: CreditBatch, key: PRNGKeyArray, config: CreditConfig, spec: CreditSpec
 ) -> tuple[DecoderState, Metrics]:
     """Take one gradient step. The gradient of a large batch of equally long episodes is computed in chunks."""
-    assert config.method.fit is not None
     n_rows, n_episodes = batch.inputs[..., 0].size, len(batch.length)
     n_chunks = 1
     if not config.batched and config.has_fixed_segments and n_rows > CHUNK_ROWS:
@@ -103,11 +101,11 @@ def _update_decoder(
         chunk_counts = range(-(-n_episodes // chunk_episodes), n_episodes + 1)
         n_chunks = next(n for n in chunk_counts if n_episodes % n == 0)
     if n_chunks == 1:
-        return descent.update(decoder, batch, key, config.method.fit, config.credit)
+        return descent.update(decoder, batch, key, spec)
     # Every chunk counts its episodes from 0.
     batch = batch._replace(episode_index=batch.episode_index % (n_episodes // n_chunks))
     chunks = jax.tree.map(lambda leaf: leaf.reshape(n_chunks, -1, *leaf.shape[1:]), batch)
-    return descent.update_in_chunks(decoder, chunks, key, config.method.fit, config.credit)
+    return descent.update_in_chunks(decoder, chunks, key, spec)
 
 
 def fit_seeds(learner: Learner, keys: Key[Array, " seeds"], config: CreditConfig) -> tuple[Learner, Metrics]:
@@ -116,7 +114,7 @@ def fit_seeds(learner: Learner, keys: Key[Array, " seeds"], config: CreditConfig
     decoders, metrics = map_leading_axis(
         lambda pair: fit_repeatedly(*pair, config), (learner, keys), batched=config.batched
     )
-    return learner._replace(reward_sources=decoders), metrics
+    return learner._replace(decoders=decoders), metrics
 
 
 def fit_repeatedly(learner: Learner, key: PRNGKeyArray, config: CreditConfig) -> tuple[Decoders, Metrics]:
@@ -188,7 +186,7 @@ def fit_until_converged(
         rounds_without_gain = np.where(is_better, 0, rounds_without_gain + 1)
         if (rounds_without_gain >= PATIENCE).all():
             break
-    return learner._replace(reward_sources=best_decoders), metrics
+    return learner._replace(decoders=best_decoders), metrics
 
 
 def _count_held_out(buffer: Replay, window: int) -> Int[Array, " envs"]:
@@ -208,7 +206,7 @@ def _held_out_error(
     buffer = replay.segments_as_episodes(buffer)
 
     def predict(decoder: DecoderState, episodes: CreditBatch, first: Index) -> DecoderState:
-        return returns.predict(decoder, episodes, config.credit)
+        return learning.predict(decoder, episodes, config.credit_specs[0])
 
     decoders = fold_episodes(decoders, buffer, buffer.current_episode - n_hidden, predict, config)
     errors = [

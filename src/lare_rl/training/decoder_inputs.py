@@ -15,9 +15,9 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from lare_rl.config.train_config import CreditConfig
-from lare_rl.credit.decomposition import CreditBatch
-from lare_rl.credit.engine import StepBatch
+from lare_rl.credit.decoder_state import CreditBatch
 from lare_rl.credit.input_names import input_arrays
+from lare_rl.credit.rewards import StepBatch
 from lare_rl.data.replay import StoredSteps
 from lare_rl.data.sampling import CreditSample
 from lare_rl.data.trajectory import Trajectory
@@ -155,7 +155,7 @@ def row_mask(steps: StoredSteps, config: CreditConfig, team_index: int) -> Bool[
 
 
 def step_batch(steps: StoredSteps, config: CreditConfig, team_index: int) -> StepBatch:
-    """Return the steps as the input of the engine."""
+    """Return the steps as the rewards are computed from them."""
     length = steps.length
     if config.payments.window is not None:  # steps that are not paid yet: most payments are for the whole window
         length = jnp.where(steps.episode_ended, length, config.longest_segment)

@@ -16,8 +16,9 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Int
 
 from lare_rl.config.train_config import CreditConfig
-from lare_rl.credit import returns
-from lare_rl.credit.decomposition import CreditBatch, DecoderState
+from lare_rl.credit import closed_form, learning
+from lare_rl.credit.closed_form import ClosedForm
+from lare_rl.credit.decoder_state import CreditBatch, DecoderState
 from lare_rl.credit.methods import Fit
 from lare_rl.credit.spec import CreditSpec
 from lare_rl.data import replay
@@ -25,6 +26,7 @@ from lare_rl.data.replay import Index, Replay
 from lare_rl.data.sampling import count_episodes_since, episodes_in_order
 from lare_rl.nn.leading_axis import map_leading_axis
 from lare_rl.nn.masks import select
+from lare_rl.nn.normalise import RunningMeanStd
 from lare_rl.training.decoder_inputs import episode_batch
 from lare_rl.training.learner import Learner
 
@@ -42,16 +44,14 @@ def learn_returns(learner: Learner, config: CreditConfig) -> Learner:
     buffer, n_learned = replay.segments_as_episodes(learner.replay), learner.n_learned
     n_before = jnp.sum(n_learned, axis=1)
     n_new = jnp.sum(buffer.current_episode, axis=1) - n_before
-    is_due = n_new >= jnp.maximum(returns.MIN_GROWTH * n_before, 1)
+    is_due = n_new >= jnp.maximum(learning.MIN_GROWTH * n_before, 1)
     learn = partial(_learn_if_due, buffer=buffer, n_learned=n_learned, is_due=is_due, config=config)
     decoders = jax.lax.cond(jnp.any(is_due), learn, lambda unchanged: unchanged, learner.decoders)
     n_now = jnp.where(is_due[:, None], buffer.current_episode, n_learned).astype(n_learned.dtype)
-    learned = learner._replace(reward_sources=decoders, n_learned=n_now)
+    learned = learner._replace(decoders=decoders, n_learned=n_now)
     if not config.predicts_ahead:
         return learned
-    old, new = learner.decoders[0].closed_form, decoders[0].closed_form
-    assert old is not None
-    assert new is not None
+    (old, *_), (new, *_) = map(_closed_forms, (learner.decoders, decoders))
     is_new = (old.n_fitted != new.n_fitted)[:, None]  # a new fit changes the proxy rewards of all episodes
     since = jnp.where(is_new, buffer.oldest, jnp.where(is_due[:, None], n_learned, buffer.current_episode))
     return jax.vmap(partial(predict_returns, config=config))(learned, since)
@@ -68,7 +68,7 @@ def predict_returns(learner: Learner, since: Int[Array, " envs"], config: Credit
         last = first.number + episodes.length - 1
         episode = replay.look_up(buffer.episode, first.env, last)
         slot = jnp.where(episodes.mask > 0, episode % slots, slots)  # an index out of range, which is dropped
-        values = returns.predicted_returns(decoder, episodes, config.credit)
+        values = learning.predicted_returns(decoder, episodes, config.credit_specs[0])
         return decoder, predicted.at[first.env, slot].set(values.astype(predicted.dtype), mode="drop")
 
     assert buffer.predicted_return is not None
@@ -87,14 +87,26 @@ def _learn_if_due(
 ) -> Decoders:
     since = jnp.where(is_due[:, None], n_learned, buffer.current_episode)
     decoders = jax.vmap(partial(_predict_then_update, config=config))(decoders, buffer, since)
-    if decoders[0].closed_form is None:
+    closed = _closed_forms(decoders)
+    if not closed:
         return decoders
     if config.method.fit is not Fit.SIGNS:  # signs need no standardised factors
-        is_stale = is_due & jax.vmap(returns.is_stale)(decoders[0])
-        rebuild = jax.vmap(partial(_rebuild_statistics, config=config))
-        decoders = jax.lax.cond(jnp.any(is_stale), rebuild, lambda unchanged, *_: unchanged, decoders, buffer, is_stale)
-    fit_teams = zip(decoders, config.credit_specs, strict=True)
-    return tuple(_fit_closed_forms(decoder, is_due, spec, config.batched) for decoder, spec in fit_teams)
+        statistics = tuple(decoder.statistics for decoder in decoders)
+        is_stale = is_due & jax.vmap(closed_form.is_stale)(closed[0], statistics[0])
+        rebuild = jax.vmap(partial(_rebuild_sums, config=config))
+        inputs = closed, statistics, buffer, is_stale
+        closed = jax.lax.cond(jnp.any(is_stale), rebuild, lambda unchanged, *_: unchanged, *inputs)
+    return tuple(
+        _fit_seeds(
+            decoder._replace(closed_form=team), is_due & jax.vmap(closed_form.is_due)(team), spec, config.batched
+        )
+        for decoder, team, spec in zip(decoders, closed, config.credit_specs, strict=True)
+    )
+
+
+def _closed_forms(decoders: Decoders) -> tuple[ClosedForm, ...]:
+    """Return the fits in closed form of all teams; none if the method has none."""
+    return tuple(decoder.closed_form for decoder in decoders if decoder.closed_form is not None)
 
 
 def fold_episodes(
@@ -134,30 +146,32 @@ def _predict_then_update(
     decoders: Decoders, buffer: Replay, since: Int[Array, " envs"], config: CreditConfig
 ) -> Decoders:
     def body(decoder: DecoderState, episodes: CreditBatch, first: Index) -> DecoderState:
-        return returns.predict_then_update(decoder, episodes, config.credit)
+        return learning.predict_then_update(decoder, episodes, config.credit_specs[0])
 
     expected = config.iteration_steps // config.longest_segment
     return fold_episodes(decoders, buffer, since, body, config, expected)
 
 
-def _rebuild_statistics(
-    decoders: Decoders, buffer: Replay, is_stale: Bool[Array, ""], config: CreditConfig
-) -> Decoders:
+def _rebuild_sums(
+    closed: tuple[ClosedForm, ...],
+    statistics: tuple[RunningMeanStd, ...],
+    buffer: Replay,
+    is_stale: Bool[Array, ""],
+    config: CreditConfig,
+) -> tuple[ClosedForm, ...]:
     """Add all stored episodes to new sums if `is_stale` is true, with features standardised by the current statistics."""
-    empty = tuple(map(returns.reset_statistics, decoders))
+    empty = tuple(map(closed_form.reset_statistics, closed, statistics))
     since = jnp.where(is_stale, buffer.oldest, buffer.current_episode)
-    rebuilt = fold_episodes(empty, buffer, since, lambda state, batch, _: returns.add_episodes(state, batch), config)
-    return select(is_stale, rebuilt, decoders)
+    rebuilt = fold_episodes(empty, buffer, since, lambda state, batch, _: learning.add_to_sums(state, batch), config)
+    return select(is_stale, rebuilt, closed)
 
 
-def _fit_closed_forms(
-    decoder: DecoderState, is_due: Bool[Array, " seeds"], spec: CreditSpec, batched: bool
-) -> DecoderState:
+def _fit_seeds(decoder: DecoderState, is_due: Bool[Array, " seeds"], spec: CreditSpec, batched: bool) -> DecoderState:
     """Make the closed-form fits of a team's decoder for the seeds that are due."""
-    fit = partial(returns.fit_closed_form, spec=spec, batched=batched)
+    fit = partial(learning.fit_closed_form, spec=spec, batched=batched)
 
     def fit_seed(seed: tuple[DecoderState, Bool[Array, ""]]) -> DecoderState:
         decoder, is_due = seed
-        return jax.lax.cond(is_due & returns.is_due(decoder), fit, lambda unchanged: unchanged, decoder)
+        return jax.lax.cond(is_due, fit, lambda unchanged: unchanged, decoder)
 
     return map_leading_axis(fit_seed, (decoder, is_due), batched=batched)

@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Array, Bool
 
 from lare_rl.config.train_config import TrainConfig
-from lare_rl.credit.decomposition import CreditBatch, valid_rows
+from lare_rl.credit.decoder_state import CreditBatch, valid_rows
 from lare_rl.credit.explanation import Explanation, add_to_explanation, explain, init_explanation
 from lare_rl.credit.explanation_text import LEGEND_CODES, MESSAGES, MIN_EXPLAINED_EPISODES, returns_findings
 from lare_rl.credit.methods import METHODS, Method
@@ -75,8 +75,9 @@ def _find_explanations(run: Run, learner: Learner, config: TrainConfig) -> list[
         factor_names = [] if function is None else function.factor_columns(run.scored_observation)
         raw_names = [] if config.team_level else specs[i].raw_feature_names(role.observation, role.action)
         decoder = select_seed(first_shard(learner.decoders[i]))
-        levels = range(config.credit_specs[i].n_levels)
-        findings.append(returns_findings(explanation, decoder, config.method, factor_names, raw_names, levels))
+        spec = config.credit_specs[i]
+        levels = range(spec.n_levels)
+        findings.append(returns_findings(explanation, decoder, spec, factor_names, raw_names, levels))
     return findings
 
 
@@ -85,10 +86,11 @@ def explain_stored_returns(learner: Learner, config: TrainConfig) -> list[Explan
 
     The list is empty for a method that fits nothing to returns, and for fewer than `MIN_EXPLAINED_EPISODES` episodes.
     """
-    config, replay = _explanation_config(config), segments_as_episodes(learner.replay)
+    fits, replay = config.method.fit is not None, segments_as_episodes(learner.replay)
+    config = _explanation_config(config)
     n_stored = np.sum(np.asarray(replay.current_episode)[0] - np.asarray(replay.oldest)[0])
     has_features = all(spec.basis.n_features for spec in config.credit_specs)
-    if not learner.decoders or not has_features or n_stored < MIN_EXPLAINED_EPISODES:
+    if not fits or not has_features or n_stored < MIN_EXPLAINED_EPISODES:
         return []
     with float64():
         is_average = tuple(decoder.is_average for decoder in learner.decoders)
@@ -98,8 +100,9 @@ def explain_stored_returns(learner: Learner, config: TrainConfig) -> list[Explan
 
 def compile_explanation(learner: Learner, config: TrainConfig) -> None:
     """Compile `explain_stored_returns` for a learner of these shapes, on one device, also in another thread."""
-    config, replay = _explanation_config(config), segments_as_episodes(learner.replay)
-    if not learner.decoders or not all(spec.basis.n_features for spec in config.credit_specs):
+    fits, replay = config.method.fit is not None, segments_as_episodes(learner.replay)
+    config = _explanation_config(config)
+    if not fits or not all(spec.basis.n_features for spec in config.credit_specs):
         return
     inputs = replay, tuple(decoder.is_average for decoder in learner.decoders)
     shapes = jax.tree.map(lambda leaf: jax.ShapeDtypeStruct(leaf.shape, leaf.dtype), inputs)

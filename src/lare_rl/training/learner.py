@@ -14,16 +14,14 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
 from lare_rl.config.train_config import CreditConfig
-from lare_rl.credit import decomposition
-from lare_rl.credit.decomposition import DecoderState
-from lare_rl.credit.engine import RewardSource, init_source, select_decoders
+from lare_rl.credit import decoder_state
+from lare_rl.credit.decoder_state import DecoderState
 from lare_rl.credit.history import next_history, scan_history
 from lare_rl.data import replay
 from lare_rl.data.extend import abandon_running, extend, set_newest
 from lare_rl.data.replay import STEP_COLUMNS, Replay, StoredSteps
 from lare_rl.data.trajectory import Trajectory
 from lare_rl.envs.interface import team_mean
-from lare_rl.nn.normalise import update_scale
 from lare_rl.phi.graph import Graph
 from lare_rl.tasks.spec import MAX_LEVELS
 from lare_rl.training.decoder_inputs import compute_factors, decoder_inputs, row_mask, tracked_inputs
@@ -44,16 +42,11 @@ class Learner(NamedTuple):
 
     algorithm: Any
     """The state of the algorithm."""
-    reward_sources: tuple[RewardSource, ...]
-    """What the rewards of each team are computed from: its decoder or, for a method that fits nothing, the scale of its R/T."""
+    decoders: tuple[DecoderState, ...]
+    """The decoder of each team."""
     replay: Replay
     n_learned: Int[Array, " envs"]
     """Payments of each environment that the decoders have learned from: finished episodes, if each is paid once."""
-
-    @property
-    def decoders(self) -> tuple[DecoderState, ...]:
-        """The decoders, one for each team; none for a method that fits nothing."""
-        return select_decoders(self.reward_sources)
 
 
 def init_learner(key: PRNGKeyArray, config: CreditConfig, init_algorithm: Callable[[PRNGKeyArray], Any]) -> Learner:
@@ -61,7 +54,7 @@ def init_learner(key: PRNGKeyArray, config: CreditConfig, init_algorithm: Callab
     algorithm_key, *keys = jax.random.split(key, 1 + len(config.env.teams))
     return Learner(
         algorithm=init_algorithm(algorithm_key),
-        reward_sources=tuple(map(init_source, keys, config.credit_specs)),
+        decoders=tuple(map(decoder_state.init, keys, config.credit_specs)),
         replay=empty_replay(config, config.n_envs, config.capacity),
         n_learned=jnp.zeros(config.n_envs, jnp.int32),
     )
@@ -105,8 +98,8 @@ def store_with_factors(
         buffer = _with_history(learner.replay, buffer, len(steps.ended), config)
     new_steps = replay.read(buffer, replay.newest_steps(buffer, len(steps.ended)))
     new_steps = jax.tree.map(lambda rows: jnp.swapaxes(rows, 0, 1), new_steps)
-    sources = tuple(_observe(source, new_steps, config, i) for i, source in enumerate(learner.reward_sources))
-    return learner._replace(reward_sources=sources, replay=buffer)
+    decoders = tuple(_observe(decoder, new_steps, config, i) for i, decoder in enumerate(learner.decoders))
+    return learner._replace(decoders=decoders, replay=buffer)
 
 
 def _with_history(before: Replay, buffer: Replay, n_steps: int, config: CreditConfig) -> Replay:
@@ -149,15 +142,15 @@ def _levels(steps: Trajectory, config: CreditConfig) -> Int[Array, "time envs"] 
     return jnp.clip(jnp.asarray(steps.next_timestep.measures[config.group]).astype(jnp.int32), 0, MAX_LEVELS - 1)
 
 
-def _observe(source: RewardSource, steps: StoredSteps, config: CreditConfig, team_index: int) -> RewardSource:
-    """Add new steps, and the episodes that were paid in them, to the statistics of a team's decoder, or to its scale."""
-    mean_reward = steps.mean_reward[..., team_index].ravel()
-    if not isinstance(source, DecoderState):
-        return update_scale(source, mean_reward, steps.last.ravel())
+def _observe(decoder: DecoderState, steps: StoredSteps, config: CreditConfig, team_index: int) -> DecoderState:
+    """Add new steps, and the episodes that were paid in them, to the statistics of a team's decoder."""
     rows, mask = decoder_inputs(steps, config, team_index), row_mask(steps, config, team_index)
-    decoder = decomposition.observe_steps(source, rows, mask)
-    level = None if steps.level is None else steps.level.ravel()
-    return decomposition.observe_returns(decoder, mean_reward, steps.length.ravel(), steps.last.ravel(), level)
+    decoder = decoder_state.observe_steps(decoder, rows, mask)
+    mean_reward, level = (
+        steps.mean_reward[..., team_index].ravel(),
+        None if steps.level is None else steps.level.ravel(),
+    )
+    return decoder_state.observe_returns(decoder, mean_reward, steps.length.ravel(), steps.last.ravel(), level)
 
 
 def abandon_episodes(learner: Learner, abandoned: Bool[Array, " envs"]) -> Learner:

@@ -12,12 +12,12 @@ from jaxtyping import Array, Float, Int, PRNGKeyArray, Scalar
 from lare_rl.algorithms.batches import Metrics, Transitions
 from lare_rl.algorithms.off_policy import OffPolicySettings
 from lare_rl.config.train_config import TrainConfig
-from lare_rl.credit.engine import RewardSource, select_decoders
 from lare_rl.data import replay
 from lare_rl.data.replay import StoredSteps
 from lare_rl.data.sampling import sample_transitions
 from lare_rl.data.trajectory import Trajectory
 from lare_rl.training.decoder_fits import fit_decoders, sample_credit
+from lare_rl.training.episodes import Decoders
 from lare_rl.training.learner import Learner
 from lare_rl.training.rewards import rewards
 
@@ -32,17 +32,17 @@ def train_step(
     algorithm, settings, buffer = config.algorithm.load(), config.hyperparameters, learner.replay
     assert isinstance(settings, OffPolicySettings)
 
-    def update(carry: tuple[Any, tuple[RewardSource, ...]], inputs: Any) -> tuple[Any, Metrics]:
-        state, sources = carry
+    def update(carry: tuple[Any, Decoders], inputs: Any) -> tuple[Any, Metrics]:
+        state, decoders = carry
         update_index, index, credit_sample, key = inputs
         fit_key, key = jax.random.split(key)
         metrics = {}
         if credit_sample is not None:
-            sources, metrics = fit_decoders(select_decoders(sources), buffer, credit_sample, fit_key, config)
+            decoders, metrics = fit_decoders(decoders, buffer, credit_sample, fit_key, config)
         steps = replay.read(buffer, index)
-        batch = _transitions(steps, rewards(steps, sources, config))
+        batch = _transitions(steps, rewards(steps, decoders, config))
         state, algorithm_metrics = algorithm.update(state, batch, key, update_index, settings)
-        return (state, sources), metrics | algorithm_metrics
+        return (state, decoders), metrics | algorithm_metrics
 
     # The steps of all updates are sampled at once. Their rows are read when the update runs.
     batch_key, credit_key = jax.random.split(sample_key)
@@ -52,8 +52,8 @@ def train_step(
         sample_credit(buffer, credit_key, config.iteration_steps, config) if config.joint_fit else None,
         jax.random.split(noise_key, config.iteration_steps),
     )
-    (state, sources), metrics = jax.lax.scan(update, (learner.algorithm, learner.reward_sources), inputs)
-    return learner._replace(algorithm=state, reward_sources=sources), jax.tree.map(jnp.mean, metrics)
+    (state, decoders), metrics = jax.lax.scan(update, (learner.algorithm, learner.decoders), inputs)
+    return learner._replace(algorithm=state, decoders=decoders), jax.tree.map(jnp.mean, metrics)
 
 
 def _transitions(steps: StoredSteps, reward: Float[Array, "batch 1"]) -> Transitions:

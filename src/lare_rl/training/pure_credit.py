@@ -192,22 +192,22 @@ def _make_functions(config: CreditConfig, phi: tuple[Graph, ...]) -> PureCredit:
 
     def refit(state: PureCreditState, key: PRNGKeyArray) -> PureCreditState:
         learner = state.learner
-        if not learner.decoders:
+        if config.method.fit is None:
             return state
         seeds = jax.tree.map(lambda leaf: leaf[None], learner)
         decoders, n_learned = jax.tree.map(lambda leaf: leaf[0], learn_returns(seeds))
-        learner = learner._replace(reward_sources=decoders, n_learned=n_learned)
+        learner = learner._replace(decoders=decoders, n_learned=n_learned)
         if config.method.uses_gradient:
             has_episode = jnp.any(segments_as_episodes(learner.replay).current_episode > 0)
             fitted = jax.lax.cond(has_episode, lambda: fit_repeatedly(learner, key, config)[0], lambda: decoders)
-            learner = learner._replace(reward_sources=fitted)
+            learner = learner._replace(decoders=fitted)
         return state._replace(learner=learner)
 
     def reward(state: PureCreditState, steps: CreditSteps) -> Float[Array, "time envs *agents"]:
         trajectory = _trajectory(steps, config)
         factors, is_valid = _valid_factors(phi, trajectory, config)
         columns = replay_columns(trajectory, factors, config, is_valid)
-        r_hat = rewards(_stored_steps(state.learner, *columns), state.learner.reward_sources, config)
+        r_hat = rewards(_stored_steps(state.learner, *columns), state.learner.decoders, config)
         return r_hat if config.env.n_agents > 1 else r_hat[..., 0]
 
     return PureCredit(init, observe, refit, reward)

@@ -4,46 +4,48 @@ from collections.abc import Sequence
 from typing import Any
 
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from lare_rl.algorithms.batches import Metrics
 from lare_rl.config.train_config import CreditConfig
-from lare_rl.credit import accuracy, engine, prequential
+from lare_rl.credit import prequential
 from lare_rl.credit.decoder_settings import RECENT_STEPS
-from lare_rl.credit.engine import RewardSource
+from lare_rl.credit.decoder_state import DecoderState
 from lare_rl.credit.methods import Reward
+from lare_rl.credit.rewards import proxy_rewards, scale_and_mask, training_rewards
 from lare_rl.data import replay
 from lare_rl.data.replay import StoredSteps
 from lare_rl.envs.interface import Team, team_mean
+from lare_rl.nn.masks import masked_mean
 from lare_rl.training.decoder_inputs import alive_agents, step_batch
 from lare_rl.training.learner import Learner
 
-__all__ = ["assess", "rewards", "team_metrics", "team_proxy_rewards"]
+__all__ = [
+    "accuracy_metrics",
+    "assess",
+    "masked_correlation",
+    "mean_absolute_error",
+    "rewards",
+    "team_metrics",
+]
 
 
 def rewards(
-    steps: StoredSteps, reward_sources: tuple[RewardSource, ...], config: CreditConfig
+    steps: StoredSteps, decoders: tuple[DecoderState, ...], config: CreditConfig
 ) -> Float[Array, "*batch agents"]:
-    """Return the rewards that the algorithm is trained on, for each agent, by `Learner.reward_sources`."""
+    """Return the rewards that the algorithm is trained on, for each agent."""
     alive = alive_agents(steps, config)
     team_rewards = []
-    for i, (team, source) in enumerate(zip(config.env.teams, reward_sources, strict=True)):
+    for i, (team, decoder) in enumerate(zip(config.env.teams, decoders, strict=True)):
         if config.method.has_proxy_rewards:
-            team_rewards.append(engine.training_rewards(source, step_batch(steps, config, i), config.credit_specs[i]))
+            team_rewards.append(training_rewards(decoder, step_batch(steps, config, i), config.credit_specs[i]))
             continue
         is_dense, team_alive = config.method.reward is Reward.TRUE, alive[..., team.agents]
         reward = steps.columns["reward"][..., team.agents] if is_dense else steps.episodic_reward[..., i, None]
-        reward, scale = jnp.broadcast_to(reward, team_alive.shape), engine.return_scale(source)
-        team_rewards.append(engine.scale_and_mask(reward, scale, team_alive, scale_rewards=config.scale_rewards))
+        reward = jnp.broadcast_to(reward, team_alive.shape)
+        scaled = scale_and_mask(reward, decoder.scale, team_alive, scale_rewards=config.scale_rewards)
+        team_rewards.append(scaled)
     return jnp.concatenate(team_rewards, axis=-1)
-
-
-def team_proxy_rewards(
-    steps: StoredSteps, reward_sources: tuple[RewardSource, ...], config: CreditConfig, team_index: int
-) -> Float[Array, "*batch rows"]:
-    """Return r_hat of a team: one for each of its agents, or one for all if credit goes to whole teams."""
-    batch, spec = step_batch(steps, config, team_index), config.credit_specs[team_index]
-    return engine.proxy_rewards(reward_sources[team_index], batch, spec)
 
 
 def assess(learner: Learner, config: CreditConfig) -> Metrics:
@@ -63,17 +65,52 @@ def assess(learner: Learner, config: CreditConfig) -> Metrics:
         reward, mask = steps.columns["reward"][..., team.agents], is_stored & alive[..., team.agents]
         if config.team_level:
             reward, mask = team_mean(steps.columns["reward"], alive, team)[..., None], is_stored
-        r_hat = jnp.broadcast_to(team_proxy_rewards(steps, learner.reward_sources, config, i), reward.shape)
+        decoder = learner.decoders[i]
+        r_hat = proxy_rewards(decoder, step_batch(steps, config, i), config.credit_specs[i])
+        r_hat = jnp.broadcast_to(r_hat, reward.shape)
         last = jnp.broadcast_to(steps.last[..., None], reward.shape)
         rows = (values.ravel() for values in (r_hat, reward, last, mask))
-        metrics.append(accuracy.metrics(*rows, calibrated=config.method.calibrated))
-        if learner.decoders:
-            decoder = learner.decoders[i]
+        metrics.append(accuracy_metrics(*rows, calibrated=config.method.calibrated))
+        if config.method.fit is not None:
             metrics[-1] |= prequential.metrics(decoder.predictions)
             if decoder.score_type_predictions is not None:
                 metrics[-1]["credit/average"] = decoder.is_average.astype(jnp.float32)
                 metrics[-1]["credit/log_odds"] = decoder.is_log_odds.astype(jnp.float32)
     return team_metrics(metrics, config.env.teams)
+
+
+def accuracy_metrics(
+    r_hat: Float[Array, " steps"],
+    reward: Float[Array, " steps"],
+    last: Bool[Array, " steps"],
+    mask: Bool[Array, " steps"],
+    calibrated: bool,
+) -> dict[str, Float[Array, ""]]:
+    """Return the accuracy over the steps where `mask` is true, under the keys of metrics.jsonl.
+
+    All values are NaN if only the last steps of episodes (`last`) have a reward, because the true rewards of single steps are then
+    unknown. The error is left out unless proxy rewards are in the unit of the true rewards (`calibrated`).
+    """
+    has_step_rewards = jnp.any((reward != 0) & mask & ~last)
+    values = {"credit/correlation": masked_correlation(r_hat, reward, mask)}
+    if calibrated:
+        values["credit/error"] = mean_absolute_error(r_hat, reward, mask)
+    return {name: jnp.where(has_step_rewards, value, jnp.nan) for name, value in values.items()}
+
+
+def mean_absolute_error(
+    r_hat: Float[Array, " steps"], reward: Float[Array, " steps"], mask: Bool[Array, " steps"]
+) -> Float[Array, ""]:
+    """Return the mean of |r_hat - r| over the steps where `mask` is true (the paper's Table F.5)."""
+    return masked_mean(jnp.abs(r_hat - reward), mask)
+
+
+def masked_correlation(
+    r_hat: Float[Array, " steps"], reward: Float[Array, " steps"], mask: Bool[Array, " steps"]
+) -> Float[Array, ""]:
+    """Return Pearson's correlation over the steps where `mask` is true, or NaN where one of the two never varies."""
+    x, y = ((values - masked_mean(values, mask)) * mask for values in (r_hat, reward))
+    return jnp.clip(jnp.sum(x * y) / jnp.sqrt(jnp.sum(x**2) * jnp.sum(y**2)), -1, 1)  # rounding can exceed 1
 
 
 def team_metrics(metrics: list[dict[str, Any]], teams: Sequence[Team]) -> dict[str, Any]:

@@ -16,7 +16,6 @@ from jaxtyping import Array, Float, Int, Key, PRNGKeyArray, Scalar
 from lare_rl.algorithms.batches import Metrics, Sequences
 from lare_rl.algorithms.registry import SequenceSettings
 from lare_rl.config.train_config import TrainConfig
-from lare_rl.credit.engine import RewardSource
 from lare_rl.data import replay
 from lare_rl.data.layouts import lay_out_padded
 from lare_rl.data.replay import Index, Replay
@@ -27,13 +26,14 @@ from lare_rl.nn.masks import select
 from lare_rl.nn.normalise import RunningMeanStd, empty_mean_std, standardise_if_observed, update_mean_std
 from lare_rl.training.decoder_fits import fit_decoders, sample_credit
 from lare_rl.training.decoder_inputs import alive_agents
+from lare_rl.training.episodes import Decoders
 from lare_rl.training.learner import Learner
 from lare_rl.training.rewards import rewards
 
 __all__ = ["Actor", "SequenceState", "get_actor", "init", "train_step"]
 
-Updated = tuple[Any, tuple[RewardSource, ...]]
-"""The state of the algorithm, and what rewards are computed from."""
+Updated = tuple[Any, Decoders]
+"""The state of the algorithm, and the decoders."""
 
 MIN_CUT_LENGTH = 32
 """Batches are cut to shorter lengths only if the longest episode has at least this many steps. Each length compiles
@@ -103,10 +103,8 @@ def train_step(
     lengths = jnp.asarray(_cut_lengths(config))
     branches = [jax.vmap(partial(_update_seed, config=config, n_steps=length)) for length in _cut_lengths(config)]
 
-    def make_update(
-        number: Int[Scalar, ""], networks: Any, sources: tuple[RewardSource, ...]
-    ) -> tuple[Updated, Metrics]:
-        current = learner._replace(algorithm=learner.algorithm._replace(networks=networks), reward_sources=sources)
+    def make_update(number: Int[Scalar, ""], networks: Any, decoders: Decoders) -> tuple[Updated, Metrics]:
+        current = learner._replace(algorithm=learner.algorithm._replace(networks=networks), decoders=decoders)
         pairs = jax.vmap(lambda key: jax.random.split(jax.random.fold_in(key, number)))(keys)
         sample_keys, update_keys = jnp.unstack(pairs, axis=1)
         sample = partial(sample_distinct_episodes, count=settings.batch_size)
@@ -122,10 +120,10 @@ def train_step(
         sums = {name: sums[name] + jnp.where(is_due, values, 0) for name, values in metrics.items()}
         return select(is_due, updated, before), sums
 
-    start = learner.algorithm.networks, learner.reward_sources
+    start = learner.algorithm.networks, learner.decoders
     zeros = jax.tree.map(jnp.zeros_like, jax.eval_shape(make_update, jnp.int32(0), *start)[1])
-    (networks, sources), sums = jax.lax.fori_loop(0, jnp.max(n_updates), update, (start, zeros))
-    learner = learner._replace(algorithm=learner.algorithm._replace(networks=networks), reward_sources=sources)
+    (networks, decoders), sums = jax.lax.fori_loop(0, jnp.max(n_updates), update, (start, zeros))
+    learner = learner._replace(algorithm=learner.algorithm._replace(networks=networks), decoders=decoders)
     metrics = {name: total / n_updates for name, total in sums.items()}  # NaN where there was no update
     return learner, metrics | {"algorithm/updates": n_updates.astype(jnp.float32)}
 
@@ -155,23 +153,23 @@ def _update_seed(
 ) -> tuple[Updated, Metrics]:
     """Update the decoder and then the algorithm of one seed. Return only what changes: the learner holds much more."""
     sample_key, fit_key = jax.random.split(key)
-    sources, metrics = learner.reward_sources, {}
+    decoders, metrics = learner.decoders, {}
     if config.joint_fit:
         sample = jax.tree.map(lambda leaf: leaf[0], sample_credit(learner.replay, sample_key, 1, config))
-        sources, metrics = fit_decoders(learner.decoders, learner.replay, sample, fit_key, config)
+        decoders, metrics = fit_decoders(learner.decoders, learner.replay, sample, fit_key, config)
     state, settings = learner.algorithm, _settings(config)
-    batch = _sequences(learner.replay, episodes, n_steps, sources, state.mixer_statistics, config)
+    batch = _sequences(learner.replay, episodes, n_steps, decoders, state.mixer_statistics, config)
     n_episodes = number * settings.update_every
     copy_target = n_episodes // settings.target_every > (n_episodes - settings.update_every) // settings.target_every
     networks, algorithm_metrics = config.algorithm.load().update(state.networks, batch, copy_target, settings)
-    return (networks, sources), metrics | algorithm_metrics
+    return (networks, decoders), metrics | algorithm_metrics
 
 
 def _sequences(
     buffer: Replay,
     episodes: EpisodeSample,
     n_steps: int,
-    reward_sources: tuple[RewardSource, ...],
+    decoders: Decoders,
     mixer_statistics: RunningMeanStd,
     config: TrainConfig,
 ) -> Sequences:
@@ -180,7 +178,7 @@ def _sequences(
     env = jnp.broadcast_to(episodes.first.env[:, None], step.shape)
     steps = replay.read(buffer, Index(env, episodes.first.number[:, None] + step))
     mask = (jnp.arange(n_steps) < episodes.length[:, None]) * episodes.mask[:, None]
-    reward = rewards(steps, reward_sources, config)
+    reward = rewards(steps, decoders, config)
 
     def with_last_timestep(name: str) -> Array:
         return jnp.concatenate([steps.columns[name][:, :1], steps.next_columns[name]], axis=1)

@@ -156,7 +156,7 @@ class Session:
         """Store new steps, and let the decoders learn from episodes that have finished."""
         self._check_factors()
         self.learner, is_finite = self.functions.store(self.learner, steps)
-        if self.learner.decoders and (steps.ended.any() or not self.config.payments.only_at_end):
+        if self.config.method.fit is not None and (steps.ended.any() or not self.config.payments.only_at_end):
             self.learner = self.functions.learn_returns(self.learner)
         self._unchecked = is_finite, steps
 
@@ -357,7 +357,7 @@ def _make_session(run: Run, config: TrainConfig, learner: Learner | None) -> Ses
         return Session(run, config, functions, learner, DeviceCollector(env, config, run.seeds), loop)
     collector = make_host_collector(task, config, run.seeds, run.config.settings.evaluation_episodes)
     session = Session(run, config, functions, learner, collector)
-    if learner.decoders:
+    if config.method.fit is not None:
         session._compile_while_collecting()
     return session
 

@@ -35,8 +35,7 @@ _RENAMED_FIELDS = {
     "is_mean": "is_average",
     "closed": "closed_form",
     "counted": "n_learned",
-    "credit": "reward_sources",
-    "decoders": "reward_sources",
+    "credit": "decoders",
     "determined": "n_effective",
     "deviation": "std",
     "done": "n_due",
@@ -48,6 +47,7 @@ _RENAMED_FIELDS = {
     "n_determined": "n_effective",
     "of_mean": "centre_variance",
     "recurrent": "gru",
+    "reward_sources": "decoders",
     "over_agents": "agent_blocks",
     "over_time": "time_blocks",
     "rivals": "score_type_predictions",
@@ -60,7 +60,7 @@ _RENAMED_FIELDS = {
 }
 """From old to new fields of states."""
 
-_DECODER = r"(?:\.reward_sources\[\d+\]|^\[0\])"
+_DECODER = r"(?:\.decoders\[\d+\]|^\[0\])"
 """A decoder in a checkpoint, or in an assigner."""
 _NETWORK = rf"({_DECODER}\.(?:network|.*\.(?:mu|nu)))"
 """Its network, or one of Adam's moments, which have the same fields."""
@@ -79,8 +79,9 @@ _RENAMED_PATHS = {
     r"^\.replay\.transitions\b": ".replay.next_transition",
     r"^\.replay((?:\.segments)?)\.episodes\b": r".replay\1.current_episode",
     r"\.episodes\b": ".n_episodes",
-    r"^\.scales?\b": ".reward_sources",
+    r"^\.scales?\b": ".decoders",
     r"^\[1\]": "[0]",  # the scale of an assigner
+    rf"({_DECODER})(?=\.(n_episodes|mean_square|lowest|highest)$)": r"\1.scale",
     r"(^|\.algorithm|\.actor)\.(return|observation)s(?=\.(n_rows|mean|sum_squares)$)": r"\1.\2_rms",  # PPO
 }
 """From patterns of old names to new names, in the order in which they are applied."""
@@ -121,7 +122,7 @@ def rename_options(arguments: Sequence[str]) -> list[str]:
 
 
 def rename_fields(name: str) -> str:
-    """Return the present name of an array: the fields of a state, such as `.reward_sources[0].is_average` for `.credit[0].average`."""
+    """Return the present name of an array: the fields of a state, such as `.decoders[0].is_average` for `.credit[0].average`."""
     name = re.sub(r"(?<=\.)\w+", lambda match: _RENAMED_FIELDS.get(match.group(), match.group()), name)
     for pattern, new in _RENAMED_PATHS.items():
         name = re.sub(pattern, new, name)

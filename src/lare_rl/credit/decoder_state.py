@@ -2,7 +2,7 @@
 
     r_hat = scale * f_psi(normalise(x)),    psi <- argmin loss(r_hat / scale, R / (T * scale))
 
-psi is fitted by gradient descent in `descent.py` and in closed form in `returns.py`.
+psi is fitted by gradient descent in `descent.py` and in closed form in `learning.py`.
 
 x are the method's inputs: the factors z = phi(s, a), or raw features. `scale` is the running root mean square of R/T.
 With n agents, each agent has its own proxy rewards, R is the mean of the agents' returns, and the mean of the agents' r_hat is
@@ -17,6 +17,7 @@ Inputs and targets are normalised by statistics in the state. Scaling the return
 r_hat. `normalise = false` is the published form, with raw features and raw targets.
 """
 
+import math
 from typing import NamedTuple
 
 import equinox as eqx
@@ -26,9 +27,8 @@ import optax
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
 from lare_rl.credit import closed_form
-from lare_rl.credit.closed_form import ClosedForm, LinearDecoder
-from lare_rl.credit.decoder_network import DecoderNetwork, DecoderOutput
-from lare_rl.credit.decoder_settings import CreditSettings
+from lare_rl.credit.closed_form import ClosedForm
+from lare_rl.credit.decoder_network import DecoderNetwork, DecoderOutput, FirstInput
 from lare_rl.credit.levels import LevelMeans, add_returns, empty_level_means, level_offsets
 from lare_rl.credit.prequential import Predictions, empty_predictions
 from lare_rl.credit.score_type import ScoreType
@@ -90,12 +90,12 @@ def valid_rows(episodes: CreditBatch) -> Bool[Array, "rows *agents"]:
 
 
 class DecoderState(NamedTuple):
-    """The state of return decomposition."""
+    """What the rewards of a team are computed from. A method that fits nothing has no weights: it uses `scale` alone."""
 
     network: DecoderNetwork
     """f_psi."""
     optimizer: optax.OptState
-    """Empty for a decoder that is fitted in closed form."""
+    """Empty unless the decoder is fitted by gradient descent."""
     statistics: RunningMeanStd
     """Running mean and standard deviation of the inputs."""
     scale: Scale
@@ -115,11 +115,16 @@ class DecoderState(NamedTuple):
     score_type_predictions: Predictions | None
     """Predictions of returns by closed-form fits of all score types. Present if the score type must be determined."""
 
+    @property
+    def closed_decoder(self) -> ClosedForm | None:
+        """The fit in closed form that `network` is taken from. None for any other decoder, also if a fit determines its score type."""
+        return None if self.optimizer else self.closed_form
+
 
 def init(key: PRNGKeyArray, spec: CreditSpec) -> DecoderState:
-    """Return the state with an untrained decoder. All other functions need the same settings and score types."""
-    method, settings, basis = spec.method, spec.settings, spec.basis
-    network = method.decoder_kind.load_init()(key, spec)
+    """Return the state with an untrained decoder. All other functions need the same spec."""
+    method, basis = spec.method, spec.basis
+    network = FirstInput() if method.fit is None else method.decoder_kind.load_init()(key, spec)
     for leaf in jax.tree.leaves(network):
         if not eqx.is_array_like(leaf):
             raise LareError(
@@ -128,20 +133,19 @@ def init(key: PRNGKeyArray, spec: CreditSpec) -> DecoderState:
             )
     if not type(network).__module__.startswith("lare_rl."):
         _check_output(network, spec)
-    several = len(spec.score_types) > 1
-    closed = closed_form.init(basis, spec.score_types) if several or not method.uses_gradient else None
+    n_types = len(spec.score_types)
     return DecoderState(
         network=network,
-        optimizer=init_adam(network, settings.learning_rate) if method.uses_gradient else (),
+        optimizer=init_adam(network, spec.settings.learning_rate) if method.uses_gradient else (),
         statistics=normalise.empty_mean_std(basis.n_standardised),
         scale=normalise.empty_scale(),
         return_scale=normalise.empty_scale(),
         is_average=jnp.asarray(spec.score_types == (ScoreType.AVERAGE,)),
         is_log_odds=jnp.asarray(False),
         predictions=empty_predictions(1, spec.window),
-        closed_form=closed,
+        closed_form=closed_form.init(basis, spec.score_types) if spec.has_closed_form else None,
         levels=empty_level_means(basis.n_levels) if basis.n_levels and method.uses_gradient else None,
-        score_type_predictions=empty_predictions(len(spec.score_types), spec.window) if several else None,
+        score_type_predictions=empty_predictions(n_types, spec.window) if n_types > 1 else None,
     )
 
 
@@ -173,8 +177,8 @@ def observe_steps(
 
     Steps where `mask` is false are ignored.
     """
-    # A history has no statistics of its own.
-    rows = inputs.reshape(-1, inputs.shape[-1])[:, : len(state.statistics.mean)]
+    n_standardised = len(state.statistics.mean)  # a history has no statistics of its own
+    rows = inputs[..., :n_standardised].reshape(math.prod(inputs.shape[:-1]), n_standardised)
     mask = None if mask is None else mask.ravel()
     return state._replace(statistics=normalise.update_mean_std(state.statistics, rows, mask))
 
@@ -204,71 +208,60 @@ def level_returns(
     """Return the part of each episode's return that its level explains, or that is the same for all, and that no step is paid for."""
     if state.levels is not None and level is not None:
         return level_offsets(state.levels)[level] * length
-    if state.closed_form is None or not isinstance(state.network, LinearDecoder):
+    closed = state.closed_decoder
+    if closed is None:
         return jnp.zeros(length.shape)
-    index = score_type_index(state, len(state.closed_form.start_value))
-    start_value = jnp.broadcast_to(state.closed_form.start_value[index], length.shape)
+    index = score_type_index(state, len(closed.start_value))
+    start_value = jnp.broadcast_to(closed.start_value[index], length.shape)
     if level is None:
         return start_value
-    per_step = ~(state.is_average | state.is_log_odds | state.closed_form.decoder.basis.prefixes)
-    unit = jnp.where(per_step, length, 1)
-    return start_value + state.closed_form.intercept[index][level] * unit
+    per_step = ~(state.is_average | state.is_log_odds | closed.decoder.basis.prefixes)
+    return start_value + closed.intercept[index][level] * jnp.where(per_step, length, 1)
 
 
-def level_effects(state: DecoderState, mean_length: float) -> Float[Array, " levels"]:
-    """Return what an episode of each level and of this length returns beside its steps; empty without levels."""
-    n_levels = 0
-    if state.levels is not None:
-        n_levels = len(state.levels.mean)
-    elif state.closed_form is not None:
-        n_levels = state.closed_form.intercept.shape[-1]
+def level_effects(state: DecoderState, mean_length: float, n_levels: int) -> Float[Array, " levels"]:
+    """Return what an episode of each level and of this length returns beside its steps."""
     length = jnp.full(n_levels, round(mean_length))
     return level_returns(state, jnp.arange(n_levels), length) - level_returns(state, None, length)
 
 
-def is_normalised(state: DecoderState, settings: CreditSettings) -> bool:
-    """Return whether the decoder's inputs and outputs are normalised. A decoder in closed form does not need this."""
-    return settings.normalise and not isinstance(state.network, LinearDecoder)
-
-
-def reward_unit(state: DecoderState, settings: CreditSettings) -> Float[Array, ""]:
+def reward_unit(state: DecoderState, spec: CreditSpec) -> Float[Array, ""]:
     """Return the unit of the decoder's output: the root mean square of R/T, or of R if the score is an average."""
-    if not is_normalised(state, settings):
+    if not spec.normalises:
         return jnp.ones(())
     return_unit, mean_unit = map(normalise.root_mean_square, (state.return_scale, state.scale))
     return jnp.where(state.is_average, return_unit, mean_unit)
 
 
 def normalise_inputs(
-    state: DecoderState, inputs: Float[Array, "*batch inputs"], settings: CreditSettings
+    state: DecoderState, inputs: Float[Array, "*batch inputs"], spec: CreditSpec
 ) -> Float[Array, "*batch inputs"]:
     """Return the inputs as the decoder receives them."""
-    return normalise.standardise(state.statistics, inputs) if is_normalised(state, settings) else inputs
+    return normalise.standardise(state.statistics, inputs) if spec.normalises else inputs
 
 
 def decode(
     network: DecoderNetwork,
     state: DecoderState,
     inputs: Float[Array, "rows *agents inputs"],
-    settings: CreditSettings,
+    spec: CreditSpec,
     key: PRNGKeyArray | None = None,
 ) -> DecoderOutput:
     """Return the output f_psi of the decoder, in units of `reward_unit`."""
-    return network(normalise_inputs(state, inputs, settings), key)
+    return network(normalise_inputs(state, inputs, spec), key)
 
 
 def decoder_rewards(
     state: DecoderState,
     inputs: Float[Array, "rows *agents inputs"],
-    settings: CreditSettings,
+    spec: CreditSpec,
     length: Float[Array, " rows"] | Int[Array, " rows"] | None = None,
 ) -> Float[Array, "rows *agents"]:
     """Return r_hat of some steps, in the unit of the true rewards. The decoder need not have been fitted yet.
 
     `length` is T, the number of steps of each row's episode. Without it, the score is treated as a sum.
     """
-    output = decode(state.network, state, inputs, settings).r_hat
-    output = reward_unit(state, settings) * output
+    output = reward_unit(state, spec) * decode(state.network, state, inputs, spec).r_hat
     if length is None:
         return output
     divisor = jnp.where(state.is_average, length, 1).astype(jnp.float32)

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from helpers.credit_specs import observation_spec
-from lare_rl.credit import closed_form, decomposition, returns
+from lare_rl.credit import closed_form, decoder_state, learning
 from lare_rl.credit.decoder_settings import CreditSettings
-from lare_rl.credit.decomposition import CreditBatch
+from lare_rl.credit.decoder_state import CreditBatch
 from lare_rl.credit.methods import METHODS, Fit
 from lare_rl.credit.prequential import WINDOW, Predictions
 from lare_rl.credit.score_type import ScoreType, ScoreTypeEstimate
@@ -17,17 +17,17 @@ from lare_rl.util.float64 import float64
 
 METHOD, SETTINGS = METHODS["rd-linear"], CreditSettings()
 SPEC = observation_spec(2, METHOD, SETTINGS, 4, fixed_length=False)
-init = jax.jit(decomposition.init, static_argnames="spec")
+init = jax.jit(decoder_state.init, static_argnames="spec")
 
 
 @jax.jit
 def fit(state):
-    return returns.fit_closed_form(state, SPEC)
+    return learning.fit_closed_form(state, SPEC)
 
 
 @jax.jit
 def learn(state, episode):
-    return fit(returns.predict_then_update(state, episode, SETTINGS))
+    return fit(learning.predict_then_update(state, episode, SPEC))
 
 
 def untrained():
@@ -75,8 +75,8 @@ def test_prefixes_are_summed_like_separate_cases():
         level=jnp.asarray(level),
     )
     with float64():
-        state = returns.add_episodes(decoder, batch)
-        statistics = jax.tree.map(np.asarray, closed_form.to_float64(state.closed_form.sufficient_statistics))
+        closed = learning.add_to_sums(decoder.closed_form, batch)
+        statistics = jax.tree.map(np.asarray, closed_form.to_float64(closed.sufficient_statistics))
     cases = []
     for first, k in ((0, 0), (4, 2)):
         for t in range(1, lengths[k] + 1):
@@ -93,6 +93,7 @@ def test_the_rival_of_a_sum_may_be_the_log_odds():
     won = jnp.arange(WINDOW) % 2 * 1.0
     predicted = jnp.stack([0.9 * won, 0.1 * won], axis=1)
     predictions = Predictions(jnp.float32(WINDOW), won, predicted, jnp.zeros(WINDOW, jnp.int32))
-    state = init(jax.random.key(0), observation_spec(2, METHOD, CreditSettings(score="binary"), 4))
-    estimate = returns.estimate_score_type(state._replace(score_type_predictions=predictions))
+    spec = observation_spec(2, METHOD, CreditSettings(score="binary"), 4)
+    state = init(jax.random.key(0), spec)._replace(score_type_predictions=predictions)
+    estimate = learning.estimate_score_type(state, spec)
     assert estimate == ScoreTypeEstimate(ScoreType.SUM, is_certain=True, rival=ScoreType.LOG_ODDS)

@@ -15,33 +15,27 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import optax
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, Int
 
-from lare_rl.credit import closed_form, decomposition, evidence, logistic
+from lare_rl.credit import closed_form, decoder_state, evidence, logistic
 from lare_rl.credit.closed_form import ClosedForm, LinearDecoder
-from lare_rl.credit.decoder_settings import CreditSettings
-from lare_rl.credit.decomposition import CreditBatch, DecoderState
-from lare_rl.credit.methods import Fit, Method
+from lare_rl.credit.decoder_state import CreditBatch, DecoderState
+from lare_rl.credit.methods import Fit
 from lare_rl.credit.prequential import Predictions, add_predictions, squared_errors
 from lare_rl.credit.score_type import MAX_ERROR_RATIO, ROUNDING, ScoreType, ScoreTypeEstimate, compare_score_types
 from lare_rl.credit.spec import CreditSpec
 
 __all__ = [
     "MIN_GROWTH",
-    "add_episodes",
     "add_to_sums",
     "estimate_score_type",
     "fit_closed_form",
-    "is_due",
     "is_fitted",
-    "is_stale",
     "looks_binary",
     "mean_features",
     "predict",
     "predict_then_update",
     "predicted_returns",
-    "reset_statistics",
-    "reward_std",
 ]
 
 MIN_BINARY_RETURNS = 16
@@ -53,27 +47,26 @@ batches."""
 
 def is_fitted(state: DecoderState) -> Bool[Array, ""]:
     """Return whether the decoder has learned anything yet."""
-    if isinstance(state.network, LinearDecoder):
-        assert state.closed_form is not None
-        return state.closed_form.n_fitted > 1  # from one episode it only learns the mean reward
+    if state.closed_decoder is not None:
+        return state.closed_decoder.n_fitted > 1  # from one episode it only learns the mean reward
     return optax.tree_utils.tree_get(state.optimizer, "count") > 0
 
 
-def predict_then_update(state: DecoderState, episodes: CreditBatch, settings: CreditSettings) -> DecoderState:
+def predict_then_update(state: DecoderState, episodes: CreditBatch, spec: CreditSpec) -> DecoderState:
     """Predict the returns of new episodes, and then add the episodes to the sums of a closed-form fit."""
-    state = predict(state, episodes, settings)
-    return state if state.closed_form is None else add_episodes(state, episodes)
+    state = predict(state, episodes, spec)
+    return state if state.closed_form is None else state._replace(closed_form=add_to_sums(state.closed_form, episodes))
 
 
-def predict(state: DecoderState, episodes: CreditBatch, settings: CreditSettings) -> DecoderState:
+def predict(state: DecoderState, episodes: CreditBatch, spec: CreditSpec) -> DecoderState:
     """Store the returns of episodes, and the decoder's predictions of them before it is fitted to these episodes.
 
     There may be at most as many episodes as the window of `state.predictions` has. Episodes with mask 0 are ignored, and before the
     first fit all of them.
     """
     is_new, returns = episodes.mask > 0, episodes.mean_reward * episodes.length
-    predicted = predicted_returns(state, episodes, settings)
-    predicted = predicted + decomposition.level_returns(state, episodes.level, episodes.length)
+    predicted = predicted_returns(state, episodes, spec)
+    predicted = predicted + decoder_state.level_returns(state, episodes.level, episodes.length)
     closed = state.closed_form
     if state.score_type_predictions is not None and closed is not None:
         by_score_type = _predict_by_score_type(closed, episodes)
@@ -109,14 +102,12 @@ def _episode_sums(
     return columns * jnp.where(is_feature, episodes.length[:, None], 1)
 
 
-def predicted_returns(
-    state: DecoderState, episodes: CreditBatch, settings: CreditSettings
-) -> Float[Array, " episodes"]:
+def predicted_returns(state: DecoderState, episodes: CreditBatch, spec: CreditSpec) -> Float[Array, " episodes"]:
     """Return the sum of each episode's proxy rewards, which are the mean over the agents that are alive."""
     n_episodes = len(episodes.length)
     row_length = episodes.length[jnp.clip(episodes.episode_index, 0, n_episodes - 1)]
-    r_hat = decomposition.decoder_rewards(state, episodes.inputs, settings, row_length)
-    team_r_hat = decomposition.agent_mean(r_hat, episodes.alive)
+    r_hat = decoder_state.decoder_rewards(state, episodes.inputs, spec, row_length)
+    team_r_hat = decoder_state.agent_mean(r_hat, episodes.alive)
     return jax.ops.segment_sum(team_r_hat, episodes.episode_index, n_episodes)
 
 
@@ -150,45 +141,22 @@ def _prefix_columns(decoder: LinearDecoder, episodes: CreditBatch) -> Float[Arra
     first = jnp.clip(first, 0, n_rows - 1)
     total = jnp.cumsum(features, axis=0)
     before = total - features
-    columns = [total - before[first], (row - first + 1.0)[:, None]]
-    if decoder.basis.n_levels:
-        assert episodes.level is not None
-        columns.append(jax.nn.one_hot(episodes.level[index], decoder.basis.n_levels, dtype=features.dtype))
-    return jnp.concatenate(columns, axis=1)
+    columns = jnp.concatenate([total - before[first], (row - first + 1.0)[:, None]], axis=1)
+    return _append_levels(columns, None if episodes.level is None else episodes.level[index], decoder.basis.n_levels)
 
 
 def _columns(decoder: LinearDecoder, episodes: CreditBatch) -> Float[Array, "episodes columns"]:
     """Return the mean features of each episode, and which level it has."""
-    features, n_levels = mean_features(decoder, episodes), decoder.basis.n_levels
-    if not n_levels:
-        return features
-    assert episodes.level is not None
-    one_hot = jax.nn.one_hot(episodes.level, n_levels, dtype=features.dtype)
-    return jnp.concatenate([features, one_hot], axis=1)
+    return _append_levels(mean_features(decoder, episodes), episodes.level, decoder.basis.n_levels)
 
 
-def is_stale(state: DecoderState) -> Bool[Array, ""]:
-    """Return whether the features in the sums were standardised by outdated statistics."""
-    assert state.closed_form is not None
-    return closed_form.is_stale(state.closed_form, state.statistics)
-
-
-def is_due(state: DecoderState) -> Bool[Array, ""]:
-    """Return whether there are enough new episodes for another closed-form fit."""
-    assert state.closed_form is not None
-    return closed_form.is_due(state.closed_form)
-
-
-def reset_statistics(state: DecoderState) -> DecoderState:
-    """Set the sums to zero, and standardise features by the newest statistics. All stored episodes must then be added again."""
-    assert state.closed_form is not None
-    return state._replace(closed_form=closed_form.reset_statistics(state.closed_form, state.statistics))
-
-
-def add_episodes(state: DecoderState, episodes: CreditBatch) -> DecoderState:
-    """Add whole episodes to the sums of a closed-form fit, in float64 if that is enabled."""
-    assert state.closed_form is not None
-    return state._replace(closed_form=add_to_sums(state.closed_form, episodes))
+def _append_levels(
+    columns: Float[Array, "rows columns"], level: Int[Array, " rows"] | None, n_levels: int
+) -> Float[Array, "rows all_columns"]:
+    """Append which level the episode of each row has, if there are levels."""
+    if level is None or not n_levels:
+        return columns
+    return jnp.concatenate([columns, jax.nn.one_hot(level, n_levels, dtype=columns.dtype)], axis=1)
 
 
 def add_to_sums(closed: ClosedForm, episodes: CreditBatch) -> ClosedForm:
@@ -197,7 +165,7 @@ def add_to_sums(closed: ClosedForm, episodes: CreditBatch) -> ClosedForm:
     returns, mask = episodes.mean_reward * episodes.length, episodes.mask > 0
     if closed.decoder.basis.prefixes:
         index = jnp.minimum(episodes.episode_index, len(mask) - 1)
-        columns, is_step = _prefix_columns(closed.decoder, episodes), decomposition.step_rows(episodes)
+        columns, is_step = _prefix_columns(closed.decoder, episodes), decoder_state.step_rows(episodes)
         statistics = evidence.add_prefixes(statistics, columns, returns[index], is_step, jnp.sum(mask))
         return closed._replace(sufficient_statistics=closed_form.split_double(statistics))
     columns = _columns(closed.decoder, episodes)
@@ -212,14 +180,13 @@ def add_to_sums(closed: ClosedForm, episodes: CreditBatch) -> ClosedForm:
 def fit_closed_form(state: DecoderState, spec: CreditSpec, *, batched: bool = False) -> DecoderState:
     """Fit in closed form to all episodes that have been added, and determine the type of the score.
 
-    `batched` is as in `evidence.fit`.
+    `batched` is as in `evidence.fit`. A state without a closed form is returned unchanged.
     """
-    assert state.closed_form is not None
-    method, score_types = spec.method, spec.score_types
-    if method.fit is Fit.SIGNS:
-        closed = closed_form.fit_signs(state.closed_form)
-    else:
-        closed = closed_form.fit(state.closed_form, score_types, batched=batched)
+    closed, score_types = state.closed_form, spec.score_types
+    if closed is None:
+        return state
+    is_signed = spec.method.fit is Fit.SIGNS
+    closed = closed_form.fit_signs(closed) if is_signed else closed_form.fit(closed, score_types, batched=batched)
     state = state._replace(closed_form=closed)
     if state.score_type_predictions is not None:
         errors = _score_type_errors(state.score_type_predictions)
@@ -228,13 +195,13 @@ def fit_closed_form(state: DecoderState, spec: CreditSpec, *, batched: bool = Fa
             is_log_odds, errors = errors[-1] < jnp.min(errors[:-1]), errors[:-1]
         is_average = (errors[1] < MAX_ERROR_RATIO * errors[0]) & ~is_log_odds if len(errors) > 1 else state.is_average
         state = state._replace(is_average=is_average, is_log_odds=is_log_odds)
-    if not method.uses_gradient:
-        index = decomposition.score_type_index(state, len(score_types))
+    if not spec.method.uses_gradient:
+        index = decoder_state.score_type_index(state, len(score_types))
         state = state._replace(network=closed_form.select_score_type(closed.decoder, index))
     return state
 
 
-def estimate_score_type(state: DecoderState) -> ScoreTypeEstimate | None:
+def estimate_score_type(state: DecoderState, spec: CreditSpec) -> ScoreTypeEstimate | None:
     """Return the score type that the decoder uses, or None if the settings give it or it makes no difference.
 
     A sum and an average make no difference as long as all episodes have the same length.
@@ -242,19 +209,17 @@ def estimate_score_type(state: DecoderState) -> ScoreTypeEstimate | None:
     if state.score_type_predictions is None:
         return None
     errors = np.asarray(_score_type_errors(state.score_type_predictions))
-    index = int(decomposition.score_type_index(state, len(errors)))
+    index = int(decoder_state.score_type_index(state, len(errors)))
     if np.allclose(errors[index], np.delete(errors, index), rtol=1e-3):
         return None
-    assert state.closed_form is not None
-    n_binary = int(state.closed_form.log_odds is not None)
-    types = [*ScoreType][: len(errors) - n_binary] + [ScoreType.LOG_ODDS] * n_binary
+    types = spec.score_types
     return compare_score_types(dict(zip(types, errors.tolist(), strict=True)), types[index])
 
 
-def looks_binary(state: DecoderState, method: Method) -> bool:
+def looks_binary(state: DecoderState, spec: CreditSpec) -> bool:
     """Return whether the last returns have two values, and the method could fit their odds, but does not."""
-    closed = state.closed_form
-    if closed is None or closed.log_odds is not None or "score" not in method.settings:
+    is_fitted_otherwise = spec.has_closed_form and ScoreType.LOG_ODDS not in spec.score_types
+    if not is_fitted_otherwise or "score" not in spec.method.settings:
         return False
     n_returns = min(int(state.predictions.n_episodes), len(state.predictions.returns))
     return n_returns >= MIN_BINARY_RETURNS and len(np.unique(np.asarray(state.predictions.returns)[:n_returns])) == 2
@@ -264,28 +229,3 @@ def looks_binary(state: DecoderState, method: Method) -> bool:
 def _score_type_errors(predictions: Predictions) -> Float[Array, " score_types"]:
     """Return the squared error of each type's predictions, plus a margin for rounding."""
     return squared_errors(predictions) + ROUNDING * jnp.sum(predictions.returns**2)
-
-
-def reward_std(state: DecoderState, rows: Float[Array, "rows inputs"], spec: CreditSpec) -> Float[Array, " rows"]:
-    """Return the posterior standard deviation of r_hat, or of T r_hat if the score is an average.
-
-    The method's fit must be `Fit.EVIDENCE` or `Fit.PREFIX_EVIDENCE`. Call this within `float64()`.
-    """
-    assert state.closed_form is not None
-    assert isinstance(state.network, LinearDecoder)
-    features, n_linear = state.network.features(rows), len(state.closed_form.posterior.bias)
-    index = state.is_average.astype(int) if n_linear > 1 else 0
-    covariance = evidence.posterior_covariance(
-        closed_form.to_float64(state.closed_form.sufficient_statistics),
-        jnp.asarray(spec.score_types)[index],
-        state.network.basis.column_strength_index,
-        jax.tree.map(lambda leaf: leaf[index].astype(float), closed_form.best_posterior(state.closed_form)),
-    )
-    if state.network.basis.prefixes:  # the value before the first step is no part of a reward, and time is
-        features = jnp.append(features, jnp.ones((*features.shape[:-1], 1)), axis=-1)
-        covariance = covariance._replace(centre=jnp.zeros_like(covariance.centre), centre_variance=jnp.zeros(()))
-    std = evidence.posterior_std(covariance, features)
-    if state.closed_form.log_odds is None:
-        return std
-    log_odds_std = evidence.posterior_std(logistic.covariance(state.closed_form.log_odds), features)
-    return jnp.where(state.is_log_odds, log_odds_std, std)
