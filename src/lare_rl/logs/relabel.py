@@ -179,9 +179,7 @@ def relabel(
     explanation, counts = tuple(credit.explanation()), _Counts()
     episodes = _compute_rewards(credit, log, hold_out_flags(hold_out, seed), size, counts, listener)
     name = credit.config.method.name
-    comment = (
-        f"Rewards by lare-rl relabel, {name}; the old rewards are in infos['paid'], after an entry for the reset."
-    )
+    comment = f"Rewards by lare-rl relabel, {name}; the old rewards are in infos['paid'], after an entry for the reset."
     path = log.write(out, episodes, overwrite, comment)
     r2, r2_error, return_correlation = predicted_return_statistics(counts.returns, counts.predictions)
     if not credit.config.method.calibrated:
