@@ -304,7 +304,7 @@ def _factor(
         "name": name,
         "share": share,
         "effect": change or _effect(explanation, varied),
-        "per_unit": float((explanation.slope / explanation.std)[varied].sum()) if is_straight else None,
+        "per_unit": float((explanation.slope[varied] / explanation.std[varied]).sum()) if is_straight else None,
         "states": states,
         "shape": shape,
     }
