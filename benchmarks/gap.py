@@ -86,7 +86,7 @@ def hidden(task: str) -> Comparison:
 
 def simulator_runs(task: str, algorithm: str, method: str) -> Directories:
     """The runs of a method on a simulator: seeds 0 to 4, and 5 to 9. METHOD-whole-episode is PPO with gamma = lambda = 1."""
-    if method.endswith(WHOLE_EPISODE):
+    if method.endswith(WHOLE_EPISODE) or method == "ircr":
         return [f"{WHY}/{task}/{method}/seeds-{first}" for first in (0, 5)]
     suffix = "-published" if method == "lare-rrdu" else ""
     environment = f"{task}Proxy" if method == "dense" else task

@@ -42,6 +42,7 @@ TASKS = {
 METHODS = {
     "episodic": "score at the end",
     "episodic-whole-episode": "score at the end, gamma = lambda = 1",
+    "ircr": "one reward for all steps of an episode, `ircr`",
     "lare-bayes": "LaRe, closed form, `lare-bayes`",
     "bayes": "closed form, raw features, `bayes`",
     "rrdu": "RRD-unbiased, `rrdu`",

@@ -17,7 +17,8 @@ __all__ = ["collect_results", "select_runs"]
 def collect_results(paths: Sequence[Path], metric: str = RETURN) -> tuple[list[LearningCurve], list[Finding]]:
     """Read the results in run directories and tables (.csv), and find what the user should know about them.
 
-    The first label is the baseline; of a single directory, it is `episodic`, if that was trained. Runs come before tables, unless the first path is a table: its first method is the baseline.
+    The first label is the baseline; of a single directory, it is `episodic`, if that was trained. Runs come before tables, unless the
+    first path is a table: its first method is the baseline.
 
     Raises `LareError` if there is nothing to compare, or a table cannot be read.
     """
