@@ -262,14 +262,14 @@ def _better_observation(
     from lare_rl.training.reflect import assess_function
     from lare_rl.util.findings import format_for_reader
 
-    others = {}
+    assessments = {}
     for name in get_args(ScoredObservation):
         if name != role.scored_observation:
             other_role = role.model_copy(update={"scored_observation": name})
-            others[name] = assess_function(function, other_role, episodes)
-    better = [name for name, other in others.items() if other.r2 - other.r2_error > r2]
+            assessments[name] = assess_function(function, other_role, episodes)
+    better = [name for name, other in assessments.items() if other.r2 - other.r2_error > r2]
     if not better:
         return None
-    best = max(better, key=lambda name: round(others[name].r2, 2))  # of equally good ones the first, which is simpler
-    other_r2, this_r2 = (format_for_reader(value, "r2") for value in (others[best].r2, r2))
+    best = max(better, key=lambda name: round(assessments[name].r2, 2))  # of equally good ones the first, which is simpler
+    other_r2, this_r2 = (format_for_reader(value, "r2") for value in (assessments[best].r2, r2))
     return f"--scored-observation {best} explains more (R² {other_r2} instead of {this_r2}): set it in the task file."

@@ -275,8 +275,8 @@ def _lines_of_pairs(state: ExplanationState) -> Float[Array, "features features"
     n_steps = jnp.maximum(state.n_steps, 1)
     mean = state.total / n_steps
     covariance = state.factor_products / n_steps - jnp.outer(mean[:n_factors], mean)
-    of_two = covariance[pairs[:, :, None], pairs[:, None, :]]
-    line = jnp.linalg.pinv(of_two, rtol=1e-6, hermitian=True) @ covariance[pairs, columns[:, None]][..., None]
+    pair_covariance = covariance[pairs[:, :, None], pairs[:, None, :]]
+    line = jnp.linalg.pinv(pair_covariance, rtol=1e-6, hermitian=True) @ covariance[pairs, columns[:, None]][..., None]
     return jnp.zeros((n_features, n_features)).at[pairs, columns[:, None]].set(line[..., 0])
 
 
