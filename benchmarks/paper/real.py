@@ -156,9 +156,9 @@ def make_page(page_name: str, budget_name: str, jobs: Jobs, command: str) -> Pag
         sections += [
             f"## {name}",
             f"![{name}](real-{name}.svg)",
-            table(["", "score on held-out episodes: IQM [95%]", "mean ± sd"], rows),
-            f"At step {comparison.last_step:,}. IQM: interquartile mean over the seeds, its interval by {REPETITIONS:,} stratified "
-            f"bootstraps; sd: over the seeds. Rules and random actions: sd over {n_episodes} episodes. "
+            table(["", "score on held-out episodes: IQM [interval]", "mean ± sd"], rows),
+            f"At step {comparison.last_step:,}. IQM: interquartile mean over the seeds, its nominal 95% interval by {REPETITIONS:,} "
+            f"stratified bootstraps; sd: over the seeds. Rules and random actions: sd over {n_episodes} episodes. "
             f"{to_text(find_small_samples(comparison))}".rstrip(),
         ]
     return Page(page_name, "\n\n".join(sections), pictures)

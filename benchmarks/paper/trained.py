@@ -164,7 +164,13 @@ def task_sections(
     )
     beside = ["the paper"] if printed else list(columns.values())
     several = max(len(contender_runs) for contender_runs in runs.values()) > 1
-    head = ["", f"{MEANING[key]}: IQM [95%]", "mean ± sd", *(["mean [95%] over draws"] if several else []), *beside]
+    head = [
+        "",
+        f"{MEANING[key]}: IQM [interval]",
+        "mean ± sd",
+        *(["mean [interval] over draws"] if several else []),
+        *beside,
+    ]
     step, rows = comparison.last_step, []
     for row in comparison.rows:
         cells = [
@@ -183,8 +189,8 @@ def task_sections(
     fewest = min(row.n_seeds for row in comparison.rows)
     few = " (of fewer than four it is the mean)" if fewest < 4 else ""
     yield (
-        f"At step {step:,}. IQM: interquartile mean over the seeds{few}, its interval by {REPETITIONS:,} stratified bootstraps; "
-        f"sd: standard deviation over the seeds. {to_text(find_small_samples(comparison))}".rstrip()
+        f"At step {step:,}. IQM: interquartile mean over the seeds{few}, its nominal 95% interval by {REPETITIONS:,} stratified "
+        f"bootstraps; sd: standard deviation over the seeds. {to_text(find_small_samples(comparison))}".rstrip()
     )
 
 

@@ -10,7 +10,7 @@ from lare_rl.report.diagnosis import (
     HIGH_R2,
     STUCK_FRACTION,
 )
-from lare_rl.report.run_summary import MIN_EVALUATIONS, POSSIBLE_ERRORS, SEED_STDS
+from lare_rl.report.run_summary import MIN_EVALUATIONS, MIN_SEEDS, POSSIBLE_ERRORS, SEED_STDS
 from lare_rl.report.score_use import CLEAR_GAIN
 from lare_rl.util.statistics import CLEAR_ERRORS
 
@@ -33,7 +33,8 @@ CONDITIONS: dict[str, dict[str, str]] = {
         "outcome_unknown": "Returns of random actions are missing.",
     },
     "The comparison with a run of `episodic`": {
-        "above_episodic": f"The difference is more than {CLEAR_ERRORS} of its standard errors.",
+        "above_episodic": f"The difference is more than {CLEAR_ERRORS} of its standard errors. Fewer than {MIN_SEEDS} seeds do not "
+        "establish it.",
         "like_episodic": "It is smaller.",
         "below_episodic": "It is larger, and negative.",
     },

@@ -10,7 +10,7 @@ from reference_tables.conditions import CONDITIONS
 from lare_rl.report import diagnosis
 from lare_rl.report.diagnosis import diagnose
 from lare_rl.report.messages import MESSAGES
-from lare_rl.report.run_summary import RunSummary
+from lare_rl.report.run_summary import EpisodicRun, RunSummary
 from lare_rl.report.score_use import ScoreUse
 from lare_rl.util.findings import Finding, render
 
@@ -36,7 +36,7 @@ def find(returns, **facts):
 @pytest.mark.parametrize(
     ("returns", "facts", "codes"),
     [
-        (RISING_2, {"return_r2": 0.97, "episodic_return": 12.0}, "learned above_episodic explained is_rising"),
+        (RISING_2, {"return_r2": 0.97, "episodic": EpisodicRun(12.0, 2)}, "learned above_episodic explained is_rising"),
         (
             FLAT - 51,
             {"return_r2": -3.0, **FACTORS},
@@ -46,13 +46,13 @@ def find(returns, **facts):
         (FLAT - 51, {"return_r2": -0.9}, "not_learned explained explains_little single_seed"),
         (FLAT - 51, {"return_r2": 0.9}, "not_learned explained needs_training single_seed"),
         (FLAT - 51, {"return_r2": 0.0, "uses_gradient": True}, "not_learned explained try_closed_form single_seed"),
-        (FELL, {"episodic_return": 40.0}, "learned below_episodic has_fallen single_seed"),
+        (FELL, {"episodic": EpisodicRun(40.0, 1)}, "learned below_episodic has_fallen single_seed"),
         (LEVEL, {}, "learned single_seed"),
         (LEVEL, {"task": "TASK.toml"}, "learned needs_baseline single_seed"),
         # Two standard errors of a difference are 17. They would be 22.6 with an error of 8, and the end is lower by 19.75.
         (
             FELL_A_LITTLE,
-            {"episode_error": 6.0, "episodic_return": 26.0},
+            {"episode_error": 6.0, "episodic": EpisodicRun(26.0, 1)},
             "learned like_episodic has_fallen single_seed",
         ),
         (FELL_A_LITTLE, {"episode_error": 8.0}, "learned single_seed"),
@@ -74,6 +74,17 @@ def find(returns, **facts):
 )
 def test_codes(returns, facts, codes):
     assert list(find(returns, **facts)) == codes.split()
+
+
+@pytest.mark.parametrize(
+    ("n_seeds", "n_episodic", "is_hedged"), [(1, 1, True), (4, 3, True), (3, 4, True), (4, 4, False)]
+)
+def test_few_seeds_establish_no_difference(n_seeds, n_episodic, is_hedged):
+    values = find(np.tile(RISING, (n_seeds, 1)), episodic=EpisodicRun(12.0, n_episodic, "its name"))[
+        "above_episodic"
+    ].values
+    assert (values["few_seeds"] is not None) == is_hedged
+    assert "its name" in render(values["episodic"], MESSAGES)
 
 
 @pytest.mark.parametrize(

@@ -110,7 +110,7 @@ def test_report_of_several_runs(make_run, tmp_path):
     names = ["episodic", "bayes", "rrd", "ircr", "rd"]
     positions = [comparison.index(f"{name} {50.5 - 10 * i:.3g}") for i, name in enumerate(names)]
     assert positions == sorted(positions)
-    assert "-" not in comparison
+    assert not re.search(r"-[\d.]", comparison)
     assert "1.00" in comparison  # the probability that the best run wins
     chart = page[page.index('class="chart') :].partition("</svg>")[0]
     assert [n_lines(chart, style) for style in ("c0", "c1", "c2", "c3", "grey other")] == [1, 1, 1, 1, 2]
@@ -127,11 +127,26 @@ def test_runs_that_cannot_be_told_apart(make_run):
         runs = [ReportedRun(str(i), make_run(f"{i} {returns}", values)) for i, values in enumerate(returns)]
         return compare_runs(sort_runs(runs))[0]
 
-    best = headline([1.0, 2.0, 3.0], [4.0, 5.0, 6.0])
+    best = headline([1.0, 2.0, 3.0, 3.0], [4.0, 5.0, 6.0, 6.0])
     assert (best.code, best.values["best"]) == ("is_best", "1")
     assert headline([1.0, 2.0, 9.0], [4.0, 5.0, 6.0]).code == "none_is_best"
-    assert headline([1.0], [4.0]).code == "none_is_best"
+    assert headline([1.0, 2.0, 3.0], [4.0, 5.0, 6.0]).code == "few_seeds"
+    assert headline([1.0], [4.0]).code == "few_seeds"
+    assert headline([4.0], [4.0]).code == "none_is_best"
     assert compare_runs([ReportedRun("a", make_run("a", [1.0]))]) == []
+
+
+def test_discounts_of_episodic(make_run):
+    """A score at the end may be learned better without discounts, which is said unless a run tries it."""
+    other, runs = ReportedRun("rd", make_run("rd", [9.0], method="rd")), []
+    for gamma, gae_lambda, is_fair in ((0.99, 1.0, False), (1.0, 0.95, False), (1.0, 1.0, True)):
+        settings = {"algorithm": "ppo", "ppo": {"gamma": gamma, "gae_lambda": gae_lambda}}
+        run = make_run(f"{gamma} {gae_lambda}", [1.0], method="episodic", **settings)
+        runs.append(ReportedRun(run.directory.name, run))
+        codes = [finding.code for finding in compare_runs([other, runs[-1]])]
+        assert ("episodic_discounts" not in codes) == is_fair
+    assert "episodic_discounts" in [finding.code for finding in compare_runs([other, *runs[:2]])]
+    assert "episodic_discounts" not in [finding.code for finding in compare_runs([other, *runs])]
 
 
 def test_names_of_runs(make_run, tmp_path):
@@ -144,13 +159,14 @@ def test_names_of_runs(make_run, tmp_path):
 
 
 def test_summary_of_runs(make_run):
-    """A run is compared with one that was trained on the return of the episode alone."""
-    first, second = (
-        ReportedRun(method, make_run(method, [value, value + 1], method=method))
-        for method, value in [("rd", 9.0), ("episodic", 1.0)]
+    """A run is compared with the best that was trained on the return of the episode alone, which is not compared with itself."""
+    first, second, third = (
+        ReportedRun(f"{method} {value}", make_run(f"{method} {value}", [value, value + 1], method=method))
+        for method, value in [("rd", 9.0), ("episodic", 1.0), ("episodic", 3.0)]
     )
-    summaries = summarise_runs([first, second], np.zeros((1, 0)))
-    assert [summary.episodic_return for summary in summaries] == [1.5, None]
+    for runs, reference in (([first, second], (1.5, 2, None)), ([first, second, third], (3.5, 2, third.name))):
+        summaries = summarise_runs(runs, np.zeros((1, 0)))
+        assert [summary.episodic for summary in summaries] == [reference] + [None] * (len(runs) - 1)
     assert first.training_seconds() is None
     for line in first.metrics:
         line["time/steps_per_second"] = line["step"] / 10

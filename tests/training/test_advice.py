@@ -9,9 +9,11 @@ import lare_rl
 from helpers.toy_envs import pick_spec, toy_spec
 from lare_rl.config.resolve import resolve
 from lare_rl.config.settings import Settings
+from lare_rl.new_task.draft import DEFAULT_LIMIT
 from lare_rl.runs.config_file import make_config
 from lare_rl.runs.directory import Run
 from lare_rl.runs.metric_names import RETURN, RETURN_STD
+from lare_rl.tasks.spec import FILL_IN
 from lare_rl.training.advice import (
     MESSAGES,
     find_constant_returns,
@@ -20,6 +22,7 @@ from lare_rl.training.advice import (
     find_saturated_policies,
     find_slow_evaluations,
     find_untrained,
+    find_unwritten_texts,
 )
 from lare_rl.training.evaluation import greedy_actions, saturation
 from lare_rl.training.policy import get_actor
@@ -159,3 +162,14 @@ def test_slow_evaluations(evaluation_s, interval_s, is_found):
     assert all(
         text in message for message in messages for text in ("40%", "--evaluation-episodes (now 7)", "--evaluate-every")
     )
+
+
+def test_unwritten_texts():
+    task = toy_spec()
+    assert find_unwritten_texts(task) == []
+    draft = {"observation": f"4 entries.\n{FILL_IN}: what they mean", "action": FILL_IN}
+    for limit, is_guess in ((DEFAULT_LIMIT, True), (30, False)):
+        (finding,) = find_unwritten_texts(task.model_copy(update={**draft, "max_episode_steps": limit}))
+        text = render(finding, MESSAGES)
+        assert "observation, action" in text
+        assert (f"max_episode_steps = {DEFAULT_LIMIT}" in text) == is_guess

@@ -23,6 +23,8 @@ def check_explanation(run, messages):
     assert any("of the variation of the returns of" in line for line in lines)
     legend = [MESSAGES[code] for code in LEGEND_CODES]
     assert all(messages.count(text) == lines.count(text) for text in legend)  # once, though returns are explained twice
+    n_explanations = sum("of the variation of the returns of" in message for message in messages)
+    assert sum(message.startswith("Provisional") for message in messages) == n_explanations - 1
     lines = [line for line in lines if line not in legend]
     assert [message for message in messages if message not in legend][-len(lines) :] == lines
     assert (f"not the decoder of {method}" in lines[0]) == (method != "lare-bayes")

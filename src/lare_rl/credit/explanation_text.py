@@ -91,12 +91,13 @@ MESSAGES = {
         "For each factor: its share of the variation, and by how much a step's reward rises with one standard deviation of it:"
     ),
     "about_shares": (
-        "A share of 0%: the factor does not matter, or its mean hardly differed between episodes, and it may still tell steps apart. "
-        "Below 0%: it offsets others."
+        "A share of 0% does not say that a factor is useless: perhaps its mean hardly differed between episodes. Below 0%: it offsets "
+        "others."
     ),
     "unknown_factor": "- {name}: {effect}",
     "factor": "- {name}: {share:z.0%}, {effect}{states}{shape}",
     "effect": "{slope:+.3g} ± {std:.1g}",
+    "unclear_effect": "{slope:+.3g} ± {std:.1g}, unclear so far: it may matter or not",
     "change_pays": "its change in a step is paid, {slope:+.3g} for a change by one standard deviation",
     "equal_means": "its mean is the same in all episodes, so returns do not tell what it pays",
     "before_and_after": " (before: {before}; after: {after})",
@@ -297,14 +298,18 @@ def _factor(
     if len(indices) == 2 and change is None:
         before, after = (_effect(explanation, [i]) if i in varied else Finding("equal_means") for i in indices)
         states = Finding("before_and_after", {"before": before, "after": after})
-    shapes = (_effect_shape(explanation, i, names) for i in varied)
-    shape = next((shape for shape in shapes if shape is not None), None)
-    is_straight = shape is None and change is None
+    shape = next((shape for i in varied if (shape := _effect_shape(explanation, i, names)) is not None), None)
+    effect, per_unit = change or _effect(explanation, varied), None
+    if change is None and shape is None:
+        if abs(effect.values["slope"]) < CLEAR_ERRORS * effect.values["std"]:
+            effect = Finding("unclear_effect", effect.values)
+        else:
+            per_unit = float((explanation.slope[varied] / explanation.std[varied]).sum())
     values = {
         "name": name,
         "share": share,
-        "effect": change or _effect(explanation, varied),
-        "per_unit": float((explanation.slope[varied] / explanation.std[varied]).sum()) if is_straight else None,
+        "effect": effect,
+        "per_unit": per_unit,
         "states": states,
         "shape": shape,
     }

@@ -9,7 +9,7 @@ from importlib.resources import files
 from typing import Literal, get_args
 
 from lare_rl.errors import LareError, short_repr
-from lare_rl.tasks.spec import FILL_IN, TaskSpec
+from lare_rl.tasks.spec import FILL_IN, TaskSpec, unwritten_texts
 
 __all__ = [
     "MAX_ATTEMPTS", "MAX_CANDIDATES", "N_CANDIDATES", "FunctionKind", "Message", "Stage", "candidate", "check_kind", "combine",
@@ -53,12 +53,11 @@ def candidate(task: TaskSpec, kind: FunctionKind = "factors") -> list[Message]:
     Raises:
         LareError: a text of the task is not filled in.
     """
-    for key in ("description", "observation", "action"):
-        if FILL_IN in getattr(task, key):
-            raise LareError(
-                f"task {task.name!r}: {key} still says {FILL_IN!r}. Replace it by what a language model must know; a phi of your own "
-                "(--function) and --method bayes need no texts."
-            )
+    for key in unwritten_texts(task):
+        raise LareError(
+            f"task {task.name!r}: {key} still says {FILL_IN!r}. Replace it by what a language model must know; a phi of your own "
+            "(--function) and --method bayes need no texts."
+        )
     sections = (("Task", task.description), ("Observation", task.observation), ("Action", task.action))
     user = "\n\n".join(f"# {title}\n{text.strip()}" for title, text in sections)
     return [{"role": "system", "content": _template(kind)}, {"role": "user", "content": user}]

@@ -49,8 +49,8 @@ LIMIT_LINE = (
 
 CONTENTS = {
     "description": "what is to be solved, and what the goal is; not a word about the reward",
-    "observation": "what each entry of the observation means, with its unit",
-    "action": "what each entry of the action means, with its unit",
+    "observation": "what each entry of the observation means, with its unit; one entry per line (0: speed in m/s)",
+    "action": "what each entry of the action means, with its unit; one entry per line",
 }
 
 

@@ -10,7 +10,7 @@ import numpy as np
 
 from lare_rl.credit.basis import MAX_PAIRED_RAW_FEATURES
 from lare_rl.credit.prequential import LITTLE_R2
-from lare_rl.report.run_summary import MIN_EVALUATIONS, RunSummary
+from lare_rl.report.run_summary import MIN_EVALUATIONS, MIN_SEEDS, RunSummary
 from lare_rl.util.findings import Finding
 from lare_rl.util.statistics import CLEAR_ERRORS, sample_std
 
@@ -109,11 +109,14 @@ def _deterministic(run: RunSummary) -> Finding | None:
 
 def _episodic_comparison(run: RunSummary) -> Finding | None:
     """Compare with training on the return of the episode alone, whose standard error is taken to be as large."""
-    if run.episodic_return is None:
+    if run.episodic is None:
         return None
-    difference, bound = run.final_return - run.episodic_return, CLEAR_ERRORS * run.final_difference_error
+    return_, n_seeds, name = run.episodic
+    difference, bound = run.final_return - return_, CLEAR_ERRORS * run.final_difference_error
     code = "like_episodic" if abs(difference) <= bound else "above_episodic" if difference > 0 else "below_episodic"
-    return Finding(code, {"return_": run.episodic_return})
+    best = None if name is None else Finding("best_episodic", {"name": name})
+    few_seeds = Finding("so_few_seeds") if min(run.n_seeds, n_seeds) < MIN_SEEDS else None
+    return Finding(code, {"episodic": Finding("episodic", {"return_": return_, "best": best}), "few_seeds": few_seeds})
 
 
 def _proxy_rewards(run: RunSummary) -> Finding | None:

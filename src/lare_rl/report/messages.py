@@ -42,11 +42,17 @@ MESSAGES = {
     "baseline": "random actions get {return_:number} ± {std:std} in {n_episodes:count episode}{initial}",
     "initial_policies": ", and before training it got {returns:number}",
     # The comparison with another run
-    "above_episodic": "That is more than training on the return of the episode alone gives here ({return_:number}).",
-    "like_episodic": "That is about as much as training on the return of the episode alone gives here ({return_:number}).",
-    "below_episodic": "That is less than training on the return of the episode alone gives here ({return_:number}).",
+    "above_episodic": "That is more than training on the return of the episode alone gives here ({episodic}){few_seeds}.",
+    "like_episodic": "That is about as much as training on the return of the episode alone gives here ({episodic}){few_seeds}.",
+    "below_episodic": "That is less than training on the return of the episode alone gives here ({episodic}){few_seeds}.",
+    "episodic": "{return_:number}{best}",
+    "best_episodic": ", the best of these runs: {name}",
+    "so_few_seeds": ", but so few seeds do not establish it",
     # Several runs
     "is_best": "{best} ends highest",
+    "few_seeds": (
+        "{best} ends higher than {second}, but with so few seeds this is not established: train with `--seeds 5`"
+    ),
     "none_is_best": "No run is clearly the best",
     "not_comparable": "There is no return to compare",
     "ranking": "Final returns: {runs}{more}{seeds}.",
@@ -56,6 +62,10 @@ MESSAGES = {
     "and_more": ", and {count} more down to {last:number}",
     "improvement": (
         "A seed of {best} ends above a seed of {second} with probability {probability:.2f} (from {n_pairs:count pair} of seeds)."
+    ),
+    "episodic_discounts": (
+        "{name} learned the score at the end with gamma {gamma:g} and lambda {gae_lambda:g}. In long episodes, PPO often learns it better "
+        "with 1 for both: for a fair comparison, train `episodic` with `--ppo.gamma 1 --ppo.gae-lambda 1` too."
     ),
     "different_steps": "The runs ended at different steps, from {least:,} to {most:,}.",
     # The proxy rewards
@@ -98,8 +108,8 @@ MESSAGES = {
         "the prediction.{chance}"
     ),
     "trust_sums": (
-        "The credit of whole episodes can be trusted: the squared error of predicted returns is {gain:.0%} ± {error:.0%} smaller than "
-        "with {baseline} as the prediction."
+        "The sums of the credit over whole episodes can be trusted, which says nothing of single steps: the squared error of predicted "
+        "returns is {gain:.0%} ± {error:.0%} smaller than with {baseline} as the prediction."
     ),
     "mean_return": "their mean",
     "mean_of_group": "the mean of their group",
@@ -162,7 +172,7 @@ MESSAGES = {
         " The best evaluation was {return_:number}, at step {step:,}: `lare-rl evaluate {directory} --best` plays its policy on other "
         "episodes."
     ),
-    "single_seed": "One seed says little: another one may reach a different return (`--seeds 3`).",
+    "single_seed": "One seed says little: another one may reach a different return (`--seeds 5`).",
 }
 
 WORDS = {
@@ -189,8 +199,8 @@ WORDS = {
     "factor": ("factor", "A number of a step that phi computes. The decoder turns the factors into the proxy reward."),
     "share": (
         "share",
-        "How much of the variation of the returns a factor explains. Shares add up to the R² of all factors. 0% says that it does "
-        "not matter, or hardly differed between episodes. A factor that offsets others has a negative share.",
+        "How much of the variation of the returns a factor explains. Shares add up to the R² of all factors. 0% does not "
+        "say that it is useless: perhaps its mean hardly differed between episodes. A factor that offsets others has a negative share.",
     ),
     "effect": (
         "effect",

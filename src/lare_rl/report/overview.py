@@ -13,7 +13,7 @@ from lare_rl.report.diagnosis import CREDIT_CODES, NEXT_CODES, diagnose
 from lare_rl.report.html import render_fold, render_note, render_table, render_tiles
 from lare_rl.report.messages import MESSAGES, WORDS
 from lare_rl.report.reported_run import Curve, ReportedRun, finite, mean_over_seeds
-from lare_rl.report.run_summary import RunSummary, summarise_run
+from lare_rl.report.run_summary import MIN_SEEDS, EpisodicRun, RunSummary, summarise_run
 from lare_rl.runs.metric_names import CREDIT_CORRELATION, CREDIT_ERROR, RETURN, RETURN_R2, RETURN_STD
 from lare_rl.tasks.spec import TaskSpec
 from lare_rl.util.findings import Finding, format_for_reader, format_number, render
@@ -33,7 +33,7 @@ __all__ = [
 ]
 
 CLEAR_PROBABILITY = 0.9
-"""A run is the best if a seed of it ends above a seed of the second with this probability."""
+"""A run is the best if a seed of it ends above a seed of the second with this probability, and each has `MIN_SEEDS`."""
 MAX_RANKED = 5
 """The largest number of runs that the comparing sentence names."""
 _METRICS = {
@@ -59,11 +59,18 @@ def summarise_runs(
 ) -> list[RunSummary | None]:
     """Return the summary of each run of a task, with the returns of its first team.
 
-    Each is compared with a run on the return of the episode alone, if there is one.
+    Each is compared with the best run on the return of the episode alone, if there is one. Such runs are not compared.
     """
-    episodic = [run for run in runs if run.run.config.settings.method == "episodic" and np.isfinite(run.final_return)]
-    baselines = [next((other.final_return for other in episodic if other is not run), None) for run in runs]
-    return [summarise_run(run, random_returns[0], baseline) for run, baseline in zip(runs, baselines, strict=True)]
+    episodic = None
+    if trained_so := _episodic_runs(runs):
+        best, name = trained_so[0], trained_so[0].name if len(trained_so) > 1 else None
+        episodic = EpisodicRun(best.final_return, len(best.final_values(RETURN)), name)
+    return [summarise_run(run, random_returns[0], None if run.is_episodic else episodic) for run in runs]
+
+
+def _episodic_runs(runs: Sequence[ReportedRun]) -> list[ReportedRun]:
+    """Return the runs on the return of the episode alone that have returns, the best first."""
+    return sort_runs(run for run in runs if run.is_episodic and np.isfinite(run.final_return))
 
 
 def render_verdict(
@@ -129,14 +136,32 @@ def compare_runs(runs: Sequence[ReportedRun]) -> list[Finding]:
     n_more = len(finals) - len(ranked)
     more = Finding("and_more", {"count": n_more, "last": last}) if n_more else None
     names = {"best": best, "second": second}
+    has_seeds = min(len(best_returns), len(second_returns)) >= MIN_SEEDS
+    is_clear = probability >= CLEAR_PROBABILITY
     findings = [
-        Finding("is_best" if probability >= CLEAR_PROBABILITY and pairs.size > 1 else "none_is_best", names),
+        Finding("none_is_best" if not is_clear else "is_best" if has_seeds else "few_seeds", names),
         Finding("ranking", {"runs": tuple(ranked), "more": more, "seeds": n_seeds}),
         Finding("improvement", names | {"probability": probability, "n_pairs": pairs.size}),
     ]
+    findings += _episodic_discounts(runs)
     steps = {reported.last_step for reported in runs if reported.metrics}
     findings += [Finding("different_steps", {"least": min(steps), "most": max(steps)})] if len(steps) > 1 else []
     return findings
+
+
+def _episodic_discounts(runs: Sequence[ReportedRun]) -> list[Finding]:
+    """Report the discounts of PPO, if other runs are compared with runs on the return of the episode alone that all have some."""
+    episodic = _episodic_runs(runs)
+    if not episodic or all(run.is_episodic for run in runs):
+        return []
+    settings = [run.run.config.settings for run in episodic]
+    discounts = [
+        (run.hyperparameters.gamma, run.hyperparameters.gae_lambda) for run in settings if run.algorithm == "ppo"
+    ]
+    if (1, 1) in discounts or settings[0].algorithm != "ppo":
+        return []
+    gamma, gae_lambda = discounts[0]
+    return [Finding("episodic_discounts", {"name": episodic[0].name, "gamma": gamma, "gae_lambda": gae_lambda})]
 
 
 def sort_runs(runs: Iterable[ReportedRun]) -> list[ReportedRun]:
@@ -181,6 +206,11 @@ def render_learning_curves(
     references = [{"random actions": float(returns.mean())} if len(returns) else {} for returns in random_returns]
     warmups = {reported.run.config.settings.warmup for reported in runs}
     warmup = warmups.pop() if len(warmups) == 1 else 0
+    n_episodes = sorted({reported.run.config.settings.evaluation_episodes for reported in runs})
+    yield render_note(
+        f"A point is the mean of an evaluation of {' or '.join(map(str, n_episodes))} episodes. To quote a final return, play more: "
+        "lare-rl evaluate RUN --episodes 100."
+    )
     yield _render_legend(runs, colours, references[0], warmup)
     for name, role, reference in zip(names, task.roles, references, strict=True):
         title = f"True return, team of {role.team}" if task.teams else "True return"

@@ -30,6 +30,11 @@ class ReportedRun:
         return self.run.metrics()
 
     @property
+    def is_episodic(self) -> bool:
+        """Whether it was trained on the return of the episode alone."""
+        return self.run.config.settings.method == "episodic"
+
+    @property
     def last_step(self) -> int:
         """The step of the last evaluation; 0 before the first."""
         return self.metrics[-1]["step"] if self.metrics else 0

@@ -3,7 +3,7 @@
 import math
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Float
@@ -29,8 +29,10 @@ from lare_rl.util.statistics import CLEAR_ERRORS, episode_error, grouped_standar
 
 __all__ = [
     "MIN_EVALUATIONS",
+    "MIN_SEEDS",
     "POSSIBLE_ERRORS",
     "SEED_STDS",
+    "EpisodicRun",
     "RunSummary",
     "summarise_run",
 ]
@@ -43,6 +45,17 @@ MIN_ERROR = 1e-9
 """The smallest standard error. With it, equal returns do not differ."""
 MIN_EVALUATIONS = 5
 """With fewer evaluations, nothing is said about a trend."""
+MIN_SEEDS = 4
+"""Fewer seeds establish no difference: with three of each run, p of the exact test of Mann and Whitney is at least 0.1."""
+
+
+class EpisodicRun(NamedTuple):
+    """Another run of the task, which was trained on the return of the episode alone."""
+
+    final_return: float
+    n_seeds: int
+    name: str | None = None
+    """Its name, if it is the best of several."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -61,8 +74,8 @@ class RunSummary:
     episode_error: float = 0.0
     """The standard error of the mean final return, from episode to episode of the last evaluation. The most likely actions are taken
     to have the same."""
-    episodic_return: float | None = None
-    """The final return of another run, which was trained on the return of the episode alone. None without such a run."""
+    episodic: EpisodicRun | None = None
+    """The run to compare with. None without such a run, and for such a run itself."""
     return_r2: float | None = None
     """R^2 of the last returns, predicted before anything was fitted to them. None if the method predicts none."""
     median_r2: float | None = None
@@ -224,7 +237,7 @@ class RunSummary:
 
 
 def summarise_run(
-    reported: ReportedRun, random_returns: Float[np.ndarray, " episodes"], episodic_return: float | None
+    reported: ReportedRun, random_returns: Float[np.ndarray, " episodes"], episodic: EpisodicRun | None
 ) -> RunSummary | None:
     """Return the summary of a run for its diagnosis. None if it has no returns."""
     if (curve := reported.curve(RETURN)) is None:
@@ -245,7 +258,7 @@ def summarise_run(
         initial_returns=initial_returns if np.isfinite(initial_returns).all() else None,
         deterministic_returns=deterministic if len(deterministic) == len(returns) else None,
         episode_error=_episode_error(reported),
-        episodic_return=episodic_return,
+        episodic=episodic,
         return_r2=_last_mean(reported, RETURN_R2),
         median_r2=float(np.median(finite(r2s))) if len(finite(r2s)) else None,
         credit_error=_last_mean(reported, CREDIT_ERROR),

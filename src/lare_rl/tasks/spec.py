@@ -26,6 +26,7 @@ __all__ = [
     "select_states",
     "split_environment",
     "step_names",
+    "unwritten_texts",
 ]
 
 ScoredObservation = Literal["before", "after", "both"]
@@ -235,6 +236,11 @@ def split_environment(name: str) -> tuple[str, str]:
 def _module(environment: str) -> tuple[bool, str]:
     """Return whether an environment is PettingZoo's, and the module that its name imports, or ""."""
     return environment.startswith(PETTINGZOO_PREFIX), split_environment(environment)[0]
+
+
+def unwritten_texts(spec: TaskSpec) -> list[str]:
+    """Return the keys of the texts that still have the placeholder of a draft."""
+    return [key for key in ("description", "observation", "action") if FILL_IN in getattr(spec, key)]
 
 
 def require_role(spec: TaskSpec) -> TaskSpec:

@@ -10,8 +10,10 @@ from lare_rl.config.effective import warmup_warning
 from lare_rl.config.settings import ResolvedSettings
 from lare_rl.credit.input_names import raw_feature_names
 from lare_rl.data.replay import Replay
+from lare_rl.new_task.draft import DEFAULT_LIMIT
 from lare_rl.runs.directory import Run
 from lare_rl.runs.metric_names import RETURN, RETURN_STD, was_updated
+from lare_rl.tasks.spec import FILL_IN, TaskSpec, unwritten_texts
 from lare_rl.training.static_config import TrainConfig
 from lare_rl.util.findings import Finding, render
 from lare_rl.util.statistics import FLOAT32_NOISE
@@ -25,6 +27,7 @@ __all__ = [
     "find_saturated_policies",
     "find_slow_evaluations",
     "find_untrained",
+    "find_unwritten_texts",
 ]
 
 MAX_RMS = 10.0
@@ -63,6 +66,9 @@ MESSAGES = {
     "(docs/how-to/scores.md)?",
     "slow evaluations": "An evaluation takes {seconds:.0f} s, {share:.0%} of the time: --evaluation-episodes (now {n_episodes}) or "
     "--evaluate-every (now {every:,}) changes that.",
+    "unwritten texts": "The task file still has the draft's {placeholder!r} ({keys}), so the report cannot name entries.{limit}",
+    "guessed limit": " Its max_episode_steps = {limit} may be the draft's guess, too.",
+    "provisional": "Provisional, from the few episodes so far; the end of the run has another explanation:",
     "constant returns": (
         "The last {n_evaluations} evaluations of every seed have the same return: the behaviour does not change. If this return "
         "is not good, the policy is stuck: see docs/how-to/poor-policies.md."
@@ -88,6 +94,13 @@ def describe_untrained(run: Run) -> str | None:
     """Return `find_untrained` as a sentence."""
     finding = find_untrained(run)
     return None if finding is None else render(finding, MESSAGES)
+
+
+def find_unwritten_texts(task: TaskSpec) -> list[Finding]:
+    """Find texts of a draft that were never written. The time limit may then be the draft's guess, too."""
+    keys = tuple(dict.fromkeys(key for role in task.roles for key in unwritten_texts(role)))
+    limit = Finding("guessed limit", {"limit": DEFAULT_LIMIT}) if task.max_episode_steps == DEFAULT_LIMIT else None
+    return [Finding("unwritten texts", {"placeholder": FILL_IN, "keys": keys, "limit": limit})] if keys else []
 
 
 def find_large_observations(run: Run, replay: Replay, config: TrainConfig) -> list[Finding]:

@@ -57,6 +57,7 @@ def run_session(session: Session, listeners: Sequence[Listener], stop: threading
     def report(findings: Iterable[Finding]) -> None:
         say(render(finding, advice.MESSAGES) for finding in findings)
 
+    report(advice.find_unwritten_texts(run.config.task) if session.step == 0 else [])
     while session.step < settings.steps:
         before = session.step
         _advance(session, min(settings.steps, (before // settings.evaluate_every + 1) * settings.evaluate_every), stop)
@@ -89,6 +90,7 @@ def run_session(session: Session, listeners: Sequence[Listener], stop: threading
             report(advice.find_slow_evaluations(settings, evaluation_s, saved_at - evaluated_at[0]))
         if session.step >= settings.warmup and (is_last or not explained):
             sentences = describe_returns(run, session.learner, session.config, legend=not explained)
+            report([Finding("provisional")] if sentences and not is_last else [])
             say(sentences)
             explained = bool(sentences)
         if is_last:
