@@ -135,10 +135,13 @@ def test_factors_are_in_order_of_shares():
     [(0.49, 1, "effect"), (0.51, 1, "unclear_effect"), (0.51, 0, "effect"), (0, 1, "effect")],
 )
 def test_unclear_effects(std, linear_share, code):
-    """An effect of less than two posterior deviations is unclear. The line through a curved effect may be flat."""
+    """An effect of less than two posterior deviations is unclear, unless both are tiny. The line through a curved effect may be flat."""
     changes = {"slope_covariance": np.diag([std**2, 0.01]), "linear_share": np.array([linear_share, 1.0])}
     (speed,) = (finding for finding in find(changes) if finding.values.get("name") == "speed")
     assert speed.values["effect"].code == code
+    tiny = changes | {"slope": np.array([std / 100, 2.0]), "slope_covariance": np.diag([(std / 60) ** 2, 0.01])}
+    (speed,) = (finding for finding in find(tiny) if finding.values.get("name") == "speed")
+    assert speed.values["effect"].code == "effect"
 
 
 @pytest.mark.parametrize(

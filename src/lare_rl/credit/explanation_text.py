@@ -33,6 +33,8 @@ STRAIGHT_SHARE = 0.8
 """The effect of a factor is curved if the closest line has a smaller share of its variance."""
 CANCELLED_FRACTION = 0.1
 """The effects before and after a step cancel if their sum is smaller than this fraction of the larger effect."""
+NEGLIGIBLE_FRACTION = 0.01
+"""A factor surely has no effect if the deviation of its effect is a smaller fraction of the largest effect."""
 STRIKING_CORRELATION = 0.3
 """A raw feature is reported if its correlation with the residual of the factors is larger."""
 N_LARGEST = 3
@@ -301,7 +303,8 @@ def _factor(
     shape = next((shape for i in varied if (shape := _effect_shape(explanation, i, names)) is not None), None)
     effect, per_unit = change or _effect(explanation, varied), None
     if change is None and shape is None:
-        if abs(effect.values["slope"]) < CLEAR_ERRORS * effect.values["std"]:
+        slope, std = effect.values["slope"], effect.values["std"]
+        if abs(slope) < CLEAR_ERRORS * std and std > NEGLIGIBLE_FRACTION * np.abs(explanation.slope).max():
             effect = Finding("unclear_effect", effect.values)
         else:
             per_unit = float((explanation.slope[varied] / explanation.std[varied]).sum())
