@@ -302,6 +302,8 @@ def test_verify_with_returns(command, phi, spec_file):
     levels = spec_file(environment="toys/Levels-v0", group="level")
     _, grouped, _ = command("verify", phi, "--task", levels, "--fit", "30")
     assert "by the groups alone" in grouped
+    _, wrong, _ = command("verify", phi, "--task", spec_file(scored_observation="after"), "--fit", "30")
+    assert "--scored-observation before explains more" in wrong
 
 
 SAVED_REPLY = to_reply("def evaluation_func(o, a):\n    return [a[:, 0]]")

@@ -172,4 +172,30 @@ def test_effect_of_a_rare_event():
 def test_pair_shares():
     result = explain_function(EXTENDED, lambda u: u[:, 0] * u[:, 1], count=100)
     np.testing.assert_allclose(result.pair_shares, result.factor_shares, atol=0.1)
-    np.testing.assert_allclose(result.slope, 0, atol=0.1)
+    u = sample_inputs(100)[0][:, :2]
+    line = np.linalg.lstsq(np.column_stack([u, np.ones(len(u))]), u[:, 0] * u[:, 1])[0]
+    np.testing.assert_allclose(result.slope, line[:2], atol=0.05)
+
+
+def test_factors_of_different_choices():
+    """Only the factor of the choice is not 0, so that a pair is a line. The first choice earns nothing, and the others their factor."""
+    random = np.random.default_rng(0)
+    length = random.integers(20, 40, size=100)
+    choice = [random.choice(3, count, p=random.dirichlet([3.0, 1, 1])) for count in length]
+    factors = np.eye(3)[np.concatenate(choice)] * random.random((length.sum(), 3)) ** [0, 1, 1]
+    std, basis = factors.std(axis=0), Basis(3, 0, extended=True)
+    reward = factors @ [0, 1.0, 2.0]
+    result = explain_rewards(basis, (factors - factors.mean(axis=0)) / std, length, reward)
+    np.testing.assert_allclose(result.slope, std * [0, 1, 2], atol=1e-3)
+    np.testing.assert_allclose(result.slope_covariance, 0, atol=1e-6)
+    np.testing.assert_allclose(result.pair_shares, 0, atol=1e-3)
+    np.testing.assert_allclose(result.factor_shares[0], 0, atol=1e-3)
+    assert result.same_as.tolist() == [-1, -1, -1]
+
+
+def test_factors_that_are_the_same():
+    u, length = sample_inputs(40)
+    u[:, 1] = -2 * u[:, 0] + 1
+    assert explain_rewards(PLAIN, u, length, u[:, 0]).same_as.tolist() == [1, 0]
+    u[:, 1] += 0.01 * u[:, 2]
+    assert explain_rewards(PLAIN, u, length, u[:, 0]).same_as.tolist() == [-1, -1]

@@ -33,6 +33,8 @@ def explanation(**changes):
         "slope": np.array([1.0, 2.0]),
         "slope_covariance": np.diag([0.01, 0.01]),
         "linear_share": np.array([0.81, 1.0]),
+        "std": np.array([2.0, 0.5]),
+        "same_as": np.array([-1, -1]),
         "residual_correlation": np.array([0.1, -0.8]),
     }
     return Explanation(**(values | changes))
@@ -124,6 +126,8 @@ def test_factors_are_in_order_of_shares():
     assert (cost.values["name"], cost.values["share"], cost.values["shape"]) == ("cost", 0.65, None)
     assert cost.values["effect"].values == pytest.approx({"slope": 2.0, "std": 0.1})
     assert speed.values["name"] == "speed"
+    assert (cost.values["per_unit"], speed.values["per_unit"]) == (4.0, 0.5)
+    assert find({"linear_share": np.zeros(2)})[2].values["per_unit"] is None
 
 
 @pytest.mark.parametrize(
@@ -131,10 +135,13 @@ def test_factors_are_in_order_of_shares():
     [(0.49, 1, "effect"), (0.51, 1, "unclear_effect"), (0.51, 0, "effect"), (0, 1, "effect")],
 )
 def test_unclear_effects(std, linear_share, code):
-    """An effect of less than two posterior deviations is unclear. The line through a curved effect may be flat."""
+    """An effect of less than two posterior deviations is unclear, unless both are tiny. The line through a curved effect may be flat."""
     changes = {"slope_covariance": np.diag([std**2, 0.01]), "linear_share": np.array([linear_share, 1.0])}
     (speed,) = (finding for finding in find(changes) if finding.values.get("name") == "speed")
     assert speed.values["effect"].code == code
+    tiny = changes | {"slope": np.array([std / 100, 2.0]), "slope_covariance": np.diag([(std / 60) ** 2, 0.01])}
+    (speed,) = (finding for finding in find(tiny) if finding.values.get("name") == "speed")
+    assert speed.values["effect"].code == "effect"
 
 
 @pytest.mark.parametrize(
@@ -142,6 +149,7 @@ def test_unclear_effects(std, linear_share, code):
     [
         ({"linear_share": np.array([0.79, 0.1]), "factor_shares": np.array([0.95, 0.04])}, ["is_curved", None]),
         ({"linear_share": np.zeros(2), "pair_shares": np.array([0.13, 0.3])}, ["is_curved", "depends_on_factor"]),
+        ({"same_as": np.array([1, 0])}, ["same_as", "same_as"]),
     ],
 )
 def test_shapes_of_effects(changes, shapes):
@@ -160,6 +168,7 @@ def test_factor_before_and_after():
         assert (values["effect"].code == "change_pays") == (values["states"] is None) == cancels
     effect = find(CANCELLING, BOTH_STATES)[2].values["effect"]
     assert effect.values["slope"] == pytest.approx(20.3)
+    assert find({"same_as": np.array([1, 0])}, BOTH_STATES)[2].values["shape"] is None
     assert find(ONE_VARIES, BOTH_STATES)[2].values["states"].values["after"] == Finding("equal_means")
 
 

@@ -4,6 +4,7 @@ import shutil
 import subprocess
 import webbrowser
 from dataclasses import replace
+from pathlib import Path
 
 import gymnasium
 import numpy as np
@@ -25,6 +26,7 @@ from lare_rl.report.html import render_table, write_page
 from lare_rl.report.live_page import LivePage
 from lare_rl.report.messages import MESSAGES
 from lare_rl.report.overview import compare_runs, render_learning_curves, sort_runs, summarise_runs
+from lare_rl.report.report import default_path
 from lare_rl.report.reported_run import ReportedRun
 from lare_rl.report.run_summary import summarise_run
 from lare_rl.runs.directory import open_without_functions
@@ -235,6 +237,12 @@ def test_report_errors(make_run, tmp_path):
             lare_rl.write_report(sources, tmp_path / out)
 
 
+def test_default_path(tmp_path):
+    """A report of several runs does not replace that of the first one."""
+    assert default_path([tmp_path]) == tmp_path / "report.html"
+    assert default_path([tmp_path, tmp_path / "b"]) == Path("report.html")
+
+
 def test_run_without_evaluation(make_run, tmp_path):
     """Its report has what there is: the settings."""
     empty = make_run("b", [1.0], steps=())
@@ -342,3 +350,15 @@ def test_factor_of_two_states_has_one_row_and_one_curve(make_run):
     curves = "".join(run_details._draw_factors(np.arange(8.0).reshape(4, 2), np.arange(4.0), labels))
     assert curves.count("<figure>") == 1
     assert run_details._make_bar(finding, {}).style == "minus"
+
+
+def test_what_else_there_is_to_say_about_an_effect(make_run):
+    effect = Finding("effect", {"slope": 1.0, "std": 0.1})
+    straight = {"name": "f_late", "share": 0.9, "effect": effect, "per_unit": 4.0, "states": None, "shape": None}
+    labels, run = [FactorLabel("f_late", "late orders", "observation[8]")], make_run("a", [1.0])
+    bent = straight | {"per_unit": None, "shape": Finding("depends_on_factor")}
+    for values, text in ((straight, "+4"), (bent, "depends on another factor")):
+        finding = Finding("factor", values)
+        table = "".join(run_details._render_factor_table([finding], labels, np.array([0.25]), run))
+        assert text in table
+        assert (run_details._make_bar(finding, {}).note != "") == (values["shape"] is not None)

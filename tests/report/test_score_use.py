@@ -24,7 +24,7 @@ def describe(method="bayes", metrics=METRICS, task=None, equal_lengths=False, **
     [
         ("bayes", {}, {}, {}, ["sum over the steps", "in part", "50% ± 5%", "their mean"]),
         ("bayes", {"gain": 0.05}, {}, {}, ["It is not clear", "5% ± 5%", "their mean"]),
-        ("bayes", {"gain": 0.35, "gain_error": 0.2}, {}, {}, ["It is not clear", "remove 35% ± 20%"]),
+        ("bayes", {"gain": 0.35, "gain_error": 0.2}, {}, {}, ["It is not clear", "35% ± 20%"]),
         ("bayes", {"gain": 0.95}, {}, {}, ["can be trusted", "95%"]),
         ("rd", {"average": 1.0}, {}, {}, ["average"]),
         ("bayes", {}, {"payments": 5}, {"exact": "spread"}, ["every 5 steps", "mean payment", "spread"]),

@@ -6,7 +6,7 @@ import sys
 from collections.abc import Sequence
 from importlib.util import find_spec
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, get_args
 
 import tyro
 from tyro.conf import Positional
@@ -217,8 +217,8 @@ def _print_assessment(function: "LatentFunction", role: "TaskSpec", episodes: Se
     n_paid = sum(int((episode.team_reward != 0).sum()) for episode in episodes) / len(episodes)
     if n_paid > 1:
         print_line(
-            f"An episode pays at {n_paid:.0f} of {n_steps:.0f} steps. Its return is the sum: if your reward is a running total, pay only "
-            "the last one."
+            f"An episode pays at {n_paid:.0f} of {n_steps:.0f} steps. Its return is the sum of these rewards. If your reward is a score so "
+            "far, return 0 before the end of an episode, and the score at the end."
         )
     if len({episode.return_ for episode in episodes}) == 1:
         print_line(f"All {len(episodes)} episodes have the same return, which says nothing about the factors.")
@@ -236,8 +236,9 @@ def _print_assessment(function: "LatentFunction", role: "TaskSpec", episodes: Se
         )
         if assessment.r2 < GOOD_R2:
             print_line(
-                f"Play more episodes: if the factors are right, R² rises. If it remains below about {GOOD_R2}, phi lacks something that "
-                "the score depends on, or the score is partly noise or decided by the initial state."
+                _better_observation(function, role, episodes, assessment.r2)
+                or f"Play more episodes: if the factors are right, R² rises. If it remains below about {GOOD_R2}, phi lacks something "
+                "that the score depends on, or the score is partly noise or decided by the initial state."
             )
         if assessment.length_r2 is not None:
             length_r2 = format_for_reader(assessment.length_r2, "r2")
@@ -252,3 +253,25 @@ def _print_assessment(function: "LatentFunction", role: "TaskSpec", episodes: Se
         )
     for line in assessment.sentences:
         print_line(line)
+
+
+def _better_observation(
+    function: "LatentFunction", role: "TaskSpec", episodes: Sequence["Episode"], r2: float
+) -> str | None:
+    """Return a sentence on the other scored observation that explains the returns best; None if none does clearly better."""
+    from lare_rl.training.reflect import assess_function
+    from lare_rl.util.findings import format_for_reader
+
+    assessments = {}
+    for name in get_args(ScoredObservation):
+        if name != role.scored_observation:
+            other_role = role.model_copy(update={"scored_observation": name})
+            assessments[name] = assess_function(function, other_role, episodes)
+    better = [name for name, other in assessments.items() if other.r2 - other.r2_error > r2]
+    if not better:
+        return None
+    best = max(
+        better, key=lambda name: round(assessments[name].r2, 2)
+    )  # of equally good ones the first, which is simpler
+    other_r2, this_r2 = (format_for_reader(value, "r2") for value in (assessments[best].r2, r2))
+    return f"--scored-observation {best} explains more (R² {other_r2} instead of {this_r2}): set it in the task file."

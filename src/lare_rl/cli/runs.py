@@ -85,10 +85,10 @@ def report(runs: RunDirectories, out: Path | None = None, film: bool = True) -> 
     Args:
         runs: run directories, or directories that contain some, such as that of a sweep; their learning curves are drawn in one
             chart, named by method.
-        out: the file to write; the default is report.html in the (first) run's directory.
+        out: the file to write; the default is report.html, in the run's directory or, for several runs, in the current one.
         film: show a film of the policy, or of the best of many, where its environment can be drawn.
     """
-    from lare_rl.report.report import write_report
+    from lare_rl.report.report import default_path, write_report
     from lare_rl.runs.config_file import read_config
     from lare_rl.runs.directory import find_run_directories
     from lare_rl.tasks.trust import TRUST_VARIABLE, untrusted_module
@@ -98,14 +98,14 @@ def report(runs: RunDirectories, out: Path | None = None, film: bool = True) -> 
     directories = find_run_directories(runs)
     modules = {untrusted_module(read_config(directory).task) for directory in directories} - {None}
     untrusted = ",".join(sorted(map(str, modules)))
-    default_path = directories[0] / "report.html"
-    if untrusted and out is None and default_path.exists():
+    path = out or default_path(directories)
+    if untrusted and out is None and path.exists():
         raise LareError(
-            f"the new {default_path} would have no random play, credit and factors, because {untrusted} is not imported: set "
+            f"the new {path} would have no random play, credit and factors, because {untrusted} is not imported: set "
             f"{TRUST_VARIABLE}={untrusted} to allow the import, or write another file with --out"
         )
     print_progress("drawing, which takes up to a minute for each run")
-    print_line(f"wrote {write_report(directories, out, film)}")
+    print_line(f"wrote {write_report(directories, path, film)}")
     if untrusted:
         print_progress(
             f"random play, credit and factors are left out, because {untrusted} was not imported: set {TRUST_VARIABLE}={untrusted} "

@@ -23,6 +23,10 @@ effect's variance:
 The slopes of two factors have the posterior covariance e_i . Sigma_ij e_j. If a factor has two values, such as an event that
 happens or not, all of its features are the same line. The slope is then known as soon as the returns determine the effect of the
 event, though they do not determine the weights.
+
+Pairs can replace lines too. If at most one of two factors is not 0, such as factors of different choices, f_i f_j = 0, and their pair
+is exactly linear in them. So the line c_i u_i + c_j u_j that is closest to a pair over all steps, times the pair's weight, is added to
+the weights of u_i and u_j. Only the rest of the pair says that the effect of a factor depends on another one.
 """
 
 from typing import NamedTuple
@@ -48,7 +52,8 @@ MAX_EXPLANATION_ROUNDS = 100
 MIN_MEAN_STD = 1e-5
 """The means of a standardised factor over episodes vary by more than rounding if their standard deviation exceeds this."""
 
-
+MIN_SAME = 1 - 2e-6
+"""Two factors are the same if the square of the correlation of their means over episodes exceeds this."""
 MIN_DETERMINED = 0.05
 """A raw feature is switched off if the returns determine less than this part of one of its weights."""
 
@@ -58,9 +63,12 @@ class ExplanationState(NamedTuple):
 
     closed_form: ClosedForm
     n_steps: Float[Array, ""]
-    total: Float[Array, "factors single"]
+    total: Float[Array, " features"]
+    """Of all functions of factors."""
     products: Float[Array, "factors single single"]
     """Of two features of the same factor."""
+    factor_products: Float[Array, "factors features"]
+    """Of a factor and any function of factors."""
 
 
 class Explanation(NamedTuple):
@@ -92,6 +100,10 @@ class Explanation(NamedTuple):
     """The posterior covariance of `slope`."""
     linear_share: Float[Array, " factors"]
     """The share of the variance of each factor's effect that this line has; 1 for a factor without effect."""
+    std: Float[Array, " factors"]
+    """The standard deviation that `slope` is for, in the factor's own unit."""
+    same_as: Int[Array, " factors"]
+    """The index of another factor with the same mean in all episodes, up to scale and offset; -1 if there is none."""
     residual_correlation: Float[Array, " raw"]
     """The correlation of each raw feature with the residual of the fit on factors; 0 for a raw feature that has never varied."""
 
@@ -99,20 +111,23 @@ class Explanation(NamedTuple):
 def init_explanation(statistics: RunningMeanStd, basis: Basis) -> ExplanationState:
     """Return empty sums. `statistics` standardise the inputs, and the features of `basis` explain the returns."""
     closed = closed_form.reset_statistics(closed_form.init(basis, (ScoreType.SUM,)), statistics)
-    factors, single = _single_features(basis).shape
-    return ExplanationState(closed, jnp.zeros(()), jnp.zeros((factors, single)), jnp.zeros((factors, single, single)))
+    (factors, single), features = _single_features(basis).shape, int(np.sum(basis.is_factor_feature))
+    products = jnp.zeros((factors, single, single)), jnp.zeros((factors, features))
+    return ExplanationState(closed, jnp.zeros(()), jnp.zeros(features), *products)
 
 
 def add_to_explanation(state: ExplanationState, episodes: CreditBatch) -> ExplanationState:
     """Add whole episodes to the sums, without their levels. Call this within `float64()`."""
     decoder, valid = state.closed_form.decoder, valid_rows(episodes)
-    single = decoder.features(episodes.inputs)[..., _single_features(decoder.basis)].astype(float)
-    single = jnp.where(valid[..., None, None], single, 0)
+    features = decoder.features(episodes.inputs)[..., : len(state.total)].astype(float)
+    features = jnp.where(valid[..., None], features, 0)
+    single = features[..., _single_features(decoder.basis)]
     return ExplanationState(
         add_to_sums(state.closed_form, episodes),
         state.n_steps + jnp.sum(valid),
-        state.total + jnp.einsum("...fi->fi", single),
+        state.total + jnp.einsum("...i->i", features),
         state.products + jnp.einsum("...fi,...fj->fij", single, single),
+        state.factor_products + jnp.einsum("...f,...i->fi", single[..., 0], features),
     )
 
 
@@ -143,17 +158,23 @@ def explain(state: ExplanationState, score_type: Int[Array, ""] | int) -> Explan
         slope=no_factor,
         slope_covariance=jnp.zeros((0, 0)),
         linear_share=no_factor,
+        std=no_factor,
+        same_as=jnp.zeros(0, int),
         residual_correlation=jnp.zeros(basis.n_raw_used),
     )
     if not is_factor.any():
         return explanation
     factor_statistics, group_index = _select(statistics, np.flatnonzero(is_factor)), basis.group_index[is_factor]
-    factors = _fit(factor_statistics, score_type, group_index, group_index)
+    lines = _lines_of_pairs(state)
+    factors = _fit(factor_statistics, score_type, group_index, group_index, lines)
     single, pairs = _input_shares(
         factors.feature_shares, basis.n_factors, extended * N_FREQUENCIES, extended * basis.n_factors
     )
     root = evidence.posterior_covariance(factor_statistics, score_type, group_index, factors.posterior).root
-    slope, slope_covariance, linear_share = _slopes(factors.posterior.weight, root.T @ root, state)
+    root = root + root @ lines.T
+    slope, slope_covariance, linear_share = _slopes(
+        factors.posterior.weight + lines @ factors.posterior.weight, root.T @ root, state
+    )
     divisor = jnp.where(score_type == ScoreType.AVERAGE, mean_length, 1)  # r_hat of an average is divided by T
     return explanation._replace(
         total_r2=jnp.maximum(full.r2, factors.r2),
@@ -164,6 +185,8 @@ def explain(state: ExplanationState, score_type: Int[Array, ""] | int) -> Explan
         slope=slope / divisor,
         slope_covariance=slope_covariance / divisor**2,
         linear_share=linear_share,
+        std=state.closed_form.decoder.std[: basis.n_factors],
+        same_as=_same_as(factors.problem.s[: basis.n_factors, : basis.n_factors]),
         residual_correlation=_residual_correlation(full.problem, basis, factors.posterior),
     )
 
@@ -183,6 +206,7 @@ def _fit(
     score_type: Int[Array, ""] | int,
     group_index: AlphaIndex,
     strength_index: AlphaIndex,
+    lines: Float[Array, "features features"] | float = 0.0,
 ) -> _Fit:
     problem, indices = evidence.regression(statistics, score_type, group_index), (group_index, strength_index)
     start, earlier = map(evidence.init_posterior, indices)
@@ -191,7 +215,8 @@ def _fit(
     r2 = 1 - problem.dof / (problem.q * jnp.where(posterior.beta > 0, posterior.beta, 1))
     r2 = jnp.where((problem.dof > 1) & (problem.y_std > 0), jnp.clip(r2, 0, 1), jnp.nan)
     weight = posterior.weight / jnp.where(problem.y_std > 0, problem.y_std, 1)
-    covariance = weight * (problem.s @ weight)
+    covariance = problem.s @ weight
+    covariance = (weight + jnp.dot(lines, weight)) * (covariance - jnp.dot(covariance, lines))
     total = jnp.sum(covariance)
     has_own_strengths = relevance.is_better(strengths, groups)
     return _Fit(problem, posterior, has_own_strengths, r2, r2 * covariance / jnp.where(total > 0, total, 1))
@@ -242,13 +267,26 @@ def _input_shares(
     return single, jnp.zeros_like(single).at[i].add(half).at[j].add(half)
 
 
+def _lines_of_pairs(state: ExplanationState) -> Float[Array, "features features"]:
+    """Return the matrix that adds, to the weight of each factor, the lines that are closest to its pairs, times their weights."""
+    (n_factors, n_features), basis = state.factor_products.shape, state.closed_form.decoder.basis
+    pairs = np.stack(np.triu_indices(n_factors if basis.extended else 0, 1), axis=1)
+    columns = np.arange(n_features - len(pairs), n_features)
+    n_steps = jnp.maximum(state.n_steps, 1)
+    mean = state.total / n_steps
+    covariance = state.factor_products / n_steps - jnp.outer(mean[:n_factors], mean)
+    pair_covariance = covariance[pairs[:, :, None], pairs[:, None, :]]
+    line = jnp.linalg.pinv(pair_covariance, rtol=1e-6, hermitian=True) @ covariance[pairs, columns[:, None]][..., None]
+    return jnp.zeros((n_features, n_features)).at[pairs, columns[:, None]].set(line[..., 0])
+
+
 def _slopes(
     weight: Float[Array, " features"], sigma: Float[Array, "features features"], state: ExplanationState
 ) -> tuple[Float[Array, " factors"], Float[Array, "factors factors"], Float[Array, " factors"]]:
     """Return the slope of each factor's effect, their posterior covariance, and the linear share of each effect's variance."""
     single = _single_features(state.closed_form.decoder.basis)
     n_steps = jnp.maximum(state.n_steps, 1)
-    mean = state.total / n_steps
+    mean = state.total[single] / n_steps
     covariance = state.products / n_steps - mean[:, :, None] * mean[:, None, :]  # C_i
     single_weight, single_sigma = weight[single], sigma[single[:, :, None, None], single]
     variance = covariance[:, 0, 0]
@@ -258,6 +296,13 @@ def _slopes(
     effect_variance = jnp.einsum("fi,fij,fj->f", single_weight, covariance, single_weight)
     linear_share = slope**2 * variance / jnp.where(effect_variance > 0, effect_variance, 1)
     return slope, slope_covariance, jnp.where(effect_variance > 0, linear_share, 1)
+
+
+def _same_as(s: Float[Array, "factors factors"]) -> Int[Array, " factors"]:
+    """Return `Explanation.same_as`, from the products of the means of factors over episodes."""
+    square = s**2 / jnp.maximum(jnp.outer(jnp.diagonal(s), jnp.diagonal(s)), 1e-300)
+    square = jnp.where(jnp.eye(len(s)) > 0, 0, square)
+    return jnp.where(jnp.max(square, axis=1) > MIN_SAME, jnp.argmax(square, axis=1), -1)
 
 
 def _residual_correlation(problem: Regression, basis: Basis, posterior: Posterior) -> Float[Array, " raw"]:

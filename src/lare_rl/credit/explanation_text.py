@@ -33,6 +33,8 @@ STRAIGHT_SHARE = 0.8
 """The effect of a factor is curved if the closest line has a smaller share of its variance."""
 CANCELLED_FRACTION = 0.1
 """The effects before and after a step cancel if their sum is smaller than this fraction of the larger effect."""
+NEGLIGIBLE_FRACTION = 0.01
+"""A factor surely has no effect if the deviation of its effect is a smaller fraction of the largest effect."""
 STRIKING_CORRELATION = 0.3
 """A raw feature is reported if its correlation with the residual of the factors is larger."""
 N_LARGEST = 3
@@ -82,7 +84,7 @@ MESSAGES = {
     "largest": " The largest shares: {features}.",
     "feature_share": "{name} {share:.0%}",
     "factors_explain": "The factors explain {share:.0%} of the variation of {target}{raw}.",
-    "raw_features_add": ", raw entries another {share:.0%}",
+    "raw_features_add": ", and raw entries of observation and action, which the fit reads too, another {share:.0%}",
     "phi_explains_little": (
         "Warning: phi explains next to nothing of the score. Its factors miss the score, or the episodes are too few or too "
         "much alike."
@@ -103,6 +105,7 @@ MESSAGES = {
     "before_and_after": " (before: {before}; after: {after})",
     "depends_on_factor": " (its effect depends on another factor)",
     "is_curved": " (its effect is curved)",
+    "same_as": " (the same as {name}: their effects cannot be told apart; leave one of the two out of phi)",
     "about_states": (
         "In brackets are the parts of the states before and after the step. If their ± are as large as the numbers, the fit cannot "
         "tell the two apart, and only their sum counts."
@@ -279,29 +282,37 @@ def _factor_findings(explanation: Explanation, names: Sequence[str], total: floa
     shares = {name: float(explanation.factor_shares[numbers].sum()) for name, numbers in varied.items() if numbers}
     rounded = dict(zip(shares, round_shares(list(shares.values()), total), strict=True))
     order = sorted(indices, key=lambda name: -abs(float(explanation.factor_shares[indices[name]].sum())))
-    findings = [_factor(explanation, name, indices[name], varied[name], rounded.get(name, 0.0)) for name in order]
+    findings = [_factor(explanation, names, indices[name], varied[name], rounded.get(name, 0.0)) for name in order]
     findings.append(Finding("about_shares"))
     if any(len(varied[finding.values["name"]]) == 2 and finding.values.get("states") for finding in findings[:-1]):
         findings.append(Finding("about_states"))
     return findings
 
 
-def _factor(explanation: Explanation, name: str, indices: list[int], varied: list[int], share: float) -> Finding:
+def _factor(
+    explanation: Explanation, names: Sequence[str], indices: list[int], varied: list[int], share: float
+) -> Finding:
     """Report a factor. It has one index, or two: before and after the step. `varied` holds the indices whose values varied."""
+    name = base_name(names[indices[0]])
     if not varied:
         return Finding("unknown_factor", {"name": name, "effect": Finding("equal_means")})
     states, change = None, _change_effect(explanation, varied)
     if len(indices) == 2 and change is None:
         before, after = (_effect(explanation, [i]) if i in varied else Finding("equal_means") for i in indices)
         states = Finding("before_and_after", {"before": before, "after": after})
-    shape = next((shape for i in varied if (shape := _effect_shape(explanation, i)) is not None), None)
-    effect = _effect(explanation, varied)
-    if shape is None and abs(effect.values["slope"]) < CLEAR_ERRORS * effect.values["std"]:
-        effect = Finding("unclear_effect", effect.values)
+    shape = next((shape for i in varied if (shape := _effect_shape(explanation, i, names)) is not None), None)
+    effect, per_unit = change or _effect(explanation, varied), None
+    if change is None and shape is None:
+        slope, std = effect.values["slope"], effect.values["std"]
+        if abs(slope) < CLEAR_ERRORS * std and std > NEGLIGIBLE_FRACTION * np.abs(explanation.slope).max():
+            effect = Finding("unclear_effect", effect.values)
+        else:
+            per_unit = float((explanation.slope[varied] / explanation.std[varied]).sum())
     values = {
         "name": name,
         "share": share,
-        "effect": change or effect,
+        "effect": effect,
+        "per_unit": per_unit,
         "states": states,
         "shape": shape,
     }
@@ -315,9 +326,11 @@ def _effect(explanation: Explanation, indices: list[int]) -> Finding:
     return Finding("effect", values)
 
 
-def _effect_shape(explanation: Explanation, i: int) -> Finding | None:
-    """Report a factor if the reward does not simply rise or fall with it."""
-    share = explanation.factor_shares[i]
+def _effect_shape(explanation: Explanation, i: int, names: Sequence[str]) -> Finding | None:
+    """Report a factor if the reward does not simply rise or fall with it, or if another factor is the same."""
+    share, same = explanation.factor_shares[i], explanation.same_as[i]
+    if same >= 0 and base_name(names[same]) != base_name(names[i]):
+        return Finding("same_as", {"name": base_name(names[same])})
     if share <= NOTICEABLE_SHARE:
         return None
     if explanation.pair_shares[i] > share / 2:

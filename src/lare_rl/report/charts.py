@@ -175,6 +175,8 @@ class Bar:
     amount: float
     style: str
     hover: str
+    note: str = ""
+    """A text behind the name."""
 
 
 def draw_legend(entries: Iterable[tuple[str, str]]) -> str:
@@ -198,7 +200,8 @@ def draw_bars(bars: Sequence[Bar]) -> str:
             f'<i class="{bar.style}" style="left:{start:.1%};width:{width:.1%}"></i>' if round(100 * bar.amount) else ""
         )
         items.append(
-            f'<li title="{escape(bar.hover)}"><span class="meaning">{escape(bar.text)} <code>{escape(bar.name)}</code></span>'
+            f'<li title="{escape(bar.hover)}"><span class="meaning">{escape(bar.text)} <code>{escape(bar.name)}</code>'
+            f"{escape(bar.note)}</span>"
             f'<span class="track" style="--zero:{-low / extent:.1%}">{shape}</span><span class="amount">{bar.amount:z.0%}</span></li>'
         )
     return f'<ul class="bars">{"".join(items)}</ul>'

@@ -34,8 +34,8 @@ MESSAGES = {
     "reached": "The return is {return_:number}{std} after {steps:,} steps{seeds}{deterministic}",
     "deterministic": ", by sampled actions as in training; the most likely action gets {return_:number}",
     "deterministic_is_judged": (
-        ", by sampled actions as in training; the most likely action gets {return_:number} and is judged here (`lare-rl evaluate "
-        "--deterministic`)"
+        ", by sampled actions as in training; the most likely action gets {return_:number}, and this verdict is about it (`lare-rl "
+        "evaluate --deterministic`)"
     ),
     "std": " ± {std:std}",
     "over_seeds": " (mean over {n_seeds} seeds)",
@@ -80,7 +80,7 @@ MESSAGES = {
     "worse_than_mean": (
         "Warning: the proxy rewards predict the last returns worse than their mean does (R² {r2:r2}). That is no harm if "
         "these returns hardly differ, or if the policy has just changed and R² rises again. Otherwise, they mislead the "
-        "policy: check `score` and `group` in the task file (docs/how-to/scores.md), and compare with `--method "
+        "policy: check `score` and `group` in the task file (`docs/how-to/scores.md` of LaRe), and compare with `--method "
         "episodic`."
     ),
     "steps_agree": "In single steps, proxy and true rewards agree: their correlation is {correlation:r2}.",
@@ -100,15 +100,16 @@ MESSAGES = {
     "exact_last": "; the rest of the return is added to the reward of the last step",
     "exact_spread": "; the rest of the return is spread evenly over the steps",
     "trust_nothing": (
-        "It is not clear that the credit can be trusted: predictions of returns remove {gain:.0%} ± {error:.0%} of the squared error "
-        "of {baseline}."
+        "It is not clear that the credit can be trusted: the squared error of predicted returns is {gain:.0%} ± {error:.0%} smaller "
+        "than with {baseline} as the prediction."
     ),
     "trust_part": (
-        "Trust the credit in part: predictions of returns remove {gain:.0%} ± {error:.0%} of the squared error of {baseline}.{chance}"
+        "Trust the credit in part: the squared error of predicted returns is {gain:.0%} ± {error:.0%} smaller than with {baseline} as "
+        "the prediction.{chance}"
     ),
     "trust_sums": (
-        "The sums of the credit over whole episodes can be trusted, which says nothing of single steps: predictions of returns remove "
-        "{gain:.0%} ± {error:.0%} of the squared error of {baseline}."
+        "The sums of the credit over whole episodes can be trusted, which says nothing of single steps: the squared error of predicted "
+        "returns is {gain:.0%} ± {error:.0%} smaller than with {baseline} as the prediction."
     ),
     "mean_return": "their mean",
     "mean_of_group": "the mean of their group",
@@ -157,7 +158,7 @@ MESSAGES = {
         "The proxy rewards predict returns well, so the algorithm, or the number of steps, may be the limit{agents}{rule}. "
     ),
     "among_agents": ", or how the rewards are divided among the agents, which returns do not show",
-    "own_rule": " (a rule of your own can tell: docs/how-to/poor-policies.md)",
+    "own_rule": " (a rule of your own can tell: `docs/how-to/poor-policies.md` of LaRe)",
     "evaluate_more": "run `lare-rl evaluate {directory} --episodes 50`. If it is still unclear, try ",
     "products_need_phi": (
         " If state and action have more than {n_features} entries together, a score that depends on products of them, such as price "
@@ -165,7 +166,7 @@ MESSAGES = {
     ),
     "needs_baseline": (
         "Next: better than random actions may be far from good. Compare it with a rule of your own "
-        "(docs/how-to/poor-policies.md).{best}"
+        "(`docs/how-to/poor-policies.md` of LaRe).{best}"
     ),
     "best_evaluation": (
         " The best evaluation was {return_:number}, at step {step:,}: `lare-rl evaluate {directory} --best` plays its policy on other "
@@ -201,6 +202,11 @@ WORDS = {
         "How much of the variation of the returns a factor explains. Shares add up to the R² of all factors. 0% does not "
         "say that it is useless: perhaps its mean hardly differed between episodes. A factor that offsets others has a negative share.",
     ),
-    "effect": ("effect", "By how much the reward of a step rises with one standard deviation of the factor."),
+    "effect": (
+        "effect",
+        "By how much the reward of a step rises with one standard deviation of the factor. It is curved if the reward does not rise or "
+        "fall evenly: one value may be best. It depends on another factor if the reward rises with one factor only, or more, when the "
+        "other is large.",
+    ),
 }
 """The words that a report explains: titles and meanings, by the names of their links."""

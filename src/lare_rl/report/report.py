@@ -31,7 +31,7 @@ from lare_rl.tasks.trust import untrusted_module
 from lare_rl.util.files import check_new_path
 from lare_rl.util.provenance import code_version
 
-__all__ = ["write_report"]
+__all__ = ["default_path", "write_report"]
 
 MAX_TITLE_RUNS = 3
 """The largest number of runs that the title names."""
@@ -48,7 +48,7 @@ def write_report(
 
     Args:
         runs: one run or several, or their directories; finished or not.
-        out: the file; the default is report.html in the first run's directory.
+        out: the file; the default is report.html, in the run's directory or, for several runs, in the current one.
         film: show a film of each policy, or of the best of many, where the environment can be drawn. It is kept in the run's
             directory.
 
@@ -62,9 +62,14 @@ def write_report(
     for source in sources:
         opened += [source] if isinstance(source, Run) else map(_open_run, find_run_directories([Path(source)]))
     reported_runs = _name_runs(opened)
-    path = Path(out) if out is not None else reported_runs[0].run.directory / "report.html"
+    path = default_path([run.directory for run in opened]) if out is None else Path(out)
     check_new_path(path, overwrite=True)
     return write_page(path, _title(reported_runs), "\n".join(_render_body(reported_runs, film)))
+
+
+def default_path(directories: Sequence[Path]) -> Path:
+    """Return the path of the report of some runs. A report of several does not replace that of one of them."""
+    return (directories[0] if len(directories) == 1 else Path()) / "report.html"
 
 
 def _open_run(directory: Path) -> Run:

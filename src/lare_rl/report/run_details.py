@@ -185,7 +185,13 @@ def _make_bar(finding: Finding, meanings: Mapping[str, str]) -> Bar:
     meaning = meanings.get(name) or name.removeprefix("f_").replace("_", " ")
     slope = finding.values["effect"].values.get("slope", 0.0) if round(100 * share) else 0.0
     style = "plus" if slope > 0 else "minus" if slope < 0 else ""
-    return Bar(meaning[:1].upper() + meaning[1:], name, share, style, _sentence(finding))
+    return Bar(meaning[:1].upper() + meaning[1:], name, share, style, _sentence(finding), _shape(finding.values))
+
+
+def _shape(values: Mapping[str, Any]) -> str:
+    """Return what else there is to say about a factor's effect; empty if it is straight."""
+    shape = values.get("shape")
+    return "" if shape is None else render(shape, explanation_text.MESSAGES)
 
 
 def _raw_feature_bars(finding: Finding) -> list[Bar]:
@@ -202,19 +208,29 @@ def _render_factor_table(
     values = {finding.values["name"]: finding.values for finding in findings if finding.code == "factor"}
     rows = []
     for name, label in {base_name(label.name): label for label in labels}.items():
-        described = values.get(name)
-        numbers = (
-            ("", "")
-            if described is None
-            else (f"{described['share']:z.0%}", render(described["effect"], explanation_text.MESSAGES))
-        )
+        numbers = _factor_numbers(values[name]) if name in values else ("", "", "")
         both = [r for other, r in zip(labels, correlations, strict=True) if base_name(other.name) == name]
         text = " / ".join(f"{r:.2f}" for r in both if not np.isnan(r))
         rows.append((name, label.meaning, label.reads, *numbers, text))
-    header = ("factor", "meaning", "entries that it reads", "share", "effect", "correlation with the true reward")
-    yield render_table(header, rows, numbers=(3, 4, 5))
+    header = (
+        "factor",
+        "meaning",
+        "entries that it reads",
+        "share",
+        "effect",
+        "effect of one unit",
+        "correlation with the true reward",
+    )
+    yield render_table(header, rows, numbers=(3, 4, 5, 6))
     two = " Correlations are of the factor before it, and after it." if run.scored_observation == "both" else ""
     yield render_note(f"phi scores the observation {_OBSERVATIONS[run.scored_observation]} the step.{two}")
+
+
+def _factor_numbers(values: Mapping[str, Any]) -> tuple[str, str, str]:
+    """Return the share of a factor, its effect, and the effect of one unit of it if the effect is straight."""
+    effect = render(values["effect"], explanation_text.MESSAGES) + _shape(values)
+    per_unit = values.get("per_unit")
+    return f"{values['share']:z.0%}", effect, "" if per_unit is None else f"{per_unit:+.3g}"
 
 
 def _render_agents(run: Run, played: PlayedEpisodes, trust: Sequence[str]) -> Iterable[str]:

@@ -33,7 +33,9 @@ def choose_functions(
     method = METHODS.find(settings.method)
     if not method.needs_phi:
         if function is not None:
-            raise LareError(f"{method.name} needs no latent function, and one is given: leave it out")
+            raise LareError(
+                f"{method.name} needs no latent function, and one is given: leave out --function (in Python: function)"
+            )
         return ()
     if function is None:
         design_role = partial(design, kind=method.phi_kind, draw=settings.draw, candidates=settings.candidates)
