@@ -7,6 +7,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
+from lare_rl.algorithms.ppo import PPOSettings
 from lare_rl.evaluation.reference_returns import REFERENCE_RETURNS
 from lare_rl.report.charts import N_COLOURS, Chart, Line, draw_legend
 from lare_rl.report.diagnosis import CREDIT_CODES, NEXT_CODES, diagnose
@@ -154,10 +155,9 @@ def _episodic_discounts(runs: Sequence[ReportedRun]) -> list[Finding]:
     episodic = _episodic_runs(runs)
     if not episodic or all(run.is_episodic for run in runs):
         return []
-    settings = [run.run.config.settings for run in episodic]
-    discounts = [
-        (run.hyperparameters.gamma, run.hyperparameters.gae_lambda) for run in settings if run.algorithm == "ppo"
-    ]
+    settings = [reported.run.config.settings for reported in episodic]
+    ppo = [run.hyperparameters for run in settings if run.algorithm == "ppo"]
+    discounts = [(values.gamma, values.gae_lambda) for values in ppo if isinstance(values, PPOSettings)]
     if (1, 1) in discounts or settings[0].algorithm != "ppo":
         return []
     gamma, gae_lambda = discounts[0]
