@@ -328,7 +328,7 @@ def _effect(explanation: Explanation, indices: list[int]) -> Finding:
 
 def _effect_shape(explanation: Explanation, i: int, names: Sequence[str]) -> Finding | None:
     """Report a factor if the reward does not simply rise or fall with it, or if another factor is the same."""
-    share, same = explanation.factor_shares[i], explanation.same_as[i]
+    share, same = explanation.factor_shares[i], int(explanation.same_as[i])
     if same >= 0 and base_name(names[same]) != base_name(names[i]):
         return Finding("same_as", {"name": base_name(names[same])})
     if share <= NOTICEABLE_SHARE:
