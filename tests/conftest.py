@@ -24,6 +24,7 @@ from lare_rl.config.settings import Settings
 from lare_rl.latent.function import LatentFunction, verify_function
 from lare_rl.runs.directory import Run
 from lare_rl.tasks.spec import TaskSpec
+from lare_rl.training import session
 from lare_rl.training.compile_cache import clear_compile_cache
 
 # Most of a small run's time is compilation, and many tests compile the same programs. The options are set both in JAX, which may
@@ -47,6 +48,8 @@ for variable in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
 for option, value in CACHE.items():
     os.environ.setdefault(option.upper(), str(value))
     jax.config.update(option, value)
+# A run compiles its explanation ahead, in a thread, which takes seconds. Most runs of tests have too few episodes to be explained.
+session.compile_explanation = lambda *_: None
 
 
 def pytest_collection_finish():
