@@ -11,6 +11,7 @@ from pathlib import Path
 import jax
 import pytest
 
+import helpers.shape_checks  # noqa: F401 - before the package is imported
 from helpers.jax_toy_envs import echo_spec
 from helpers.toy_envs import PHI, REWARD, toy_spec
 from helpers.training_runs import QUICK_CREDIT
