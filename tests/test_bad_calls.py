@@ -1,6 +1,7 @@
 """Bad calls of public functions: each raises a `LareError` of one line.
 
-They run in another process, without the type checker of the tests. Its run is trained by an algorithm from outside.
+They run in another process, without the type checker of the tests and without the libraries of extras. Its run is trained by an
+algorithm from outside.
 """
 
 import json
@@ -25,19 +26,27 @@ register_algorithm(replace(ALGORITHMS["td3"], name="quiet", settings=settings, m
 """
 SETUP = """
 import contextlib, io, json, sys
+class NoExtras:
+    @staticmethod
+    def find_spec(name, path=None, target=None):
+        if name.partition(".")[0] in ("mujoco", "matplotlib", "PIL", "imageio", "torch", "openai", "pettingzoo"):
+            raise ModuleNotFoundError(name)
+sys.meta_path.insert(0, NoExtras)
 import numpy as np
-import lare_rl, lare_rl.cli
+import lare_rl, lare_rl.cli, lare_rl.cli.design, lare_rl.cli.runs, lare_rl.evaluation.video
 from lare_rl.credit.decoders import Decoder
 from lare_rl.credit.input_names import InputNames
 from lare_rl.credit.methods import Fit, Method
 from lare_rl.errors import LareError
 from lare_rl.latent.function import verify_function
 from helpers.toy_envs import PHI, pick_spec, toy_spec
-task = toy_spec()
+task = toy_spec(measures=("distance",))
 phi = verify_function(PHI, task)
-tiny = dict(method="dense", steps=60, rollout_steps=12, evaluate_every=60, evaluation_episodes=1)
+tiny = dict(method="dense", steps=60, rollout_steps=12, evaluate_every=60, evaluation_episodes=1, seeds=2, capacity=64)
 run = lare_rl.train(task, lare_rl.Settings(algorithm="quiet", quiet={"shift": 0.25}, **tiny), out="run", listeners=[])
 policy = lare_rl.load_policy("run")
+credit = lare_rl.CreditAssigner("ircr", observation_space=3, action_space=1)
+steps = credit.add_episode(np.ones((5, 3)), np.ones((5, 1)), np.ones((5, 3)), reward=1.0)
 def command(*arguments):
     sys.argv[1:] = arguments
     with contextlib.suppress(SystemExit), contextlib.redirect_stdout(io.StringIO()) as out:
@@ -77,7 +86,6 @@ CALLS = {
     "policy([0, 0], [True])": "leave the mask out",
     "policy.select_env_action([[0, 0]])": "of shape (2,), and was given an array of shape (1, 2)",
     "lare_rl.export_run('none', 'out')": "none is not a run",
-    "lare_rl.write_report([])": "run",
     "lare_rl.design(task, 'rewards')": "'rewards': it is factors or reward",
     "verify_function(PHI, task, 'rewards')": "'rewards': it is factors or reward",
     "lare_rl.design(task, steps=7)": "two arrays",
@@ -114,7 +122,9 @@ GOOD_CALLS = {
     "policy([0.5, 0]).shape": "(1,)",
     "policy([[0.5, 0]] * 3).shape": "(3, 1)",
     "bool(np.allclose(policy([[0.5, 0], [0, 1]])[1], policy([0, 1]), rtol=1e-5))": "True",
-    "lare_rl.evaluate_run('run', 2)['Chase'].shape": "(1, 2)",
+    "lare_rl.evaluate_run('run', 2)['Chase'].shape": "(2, 2)",
+    "lare_rl.load_task('CN-6').name": "CN-6",
+    "credit.rewards_at(steps).shape": "(5,)",
     "run.config.settings.hyperparameters": "batch_size=8, ",
     "run.config.settings.hyperparameters.shift": "0.25",
     "lare_rl.open_run('run').config.settings == run.config.settings": "True",

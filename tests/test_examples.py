@@ -7,6 +7,7 @@ import pytest
 import lare_rl
 from helpers.long_tests import long_case
 from helpers.toy_logs import logged_episodes
+from lare_rl.credit.decoder_settings import CreditSettings
 from lare_rl.sweep.sweep import read_sweep
 
 EXAMPLES = Path(__file__).parents[1] / "examples"
@@ -26,7 +27,9 @@ def test_study():
 def test_offline_td3_bc(tmp_path):
     # A few updates on each kind of rewards. That it learns takes longer than a test.
     pytest.importorskip("torch")
-    lare_rl.relabel(list(logged_episodes(12)), tmp_path / "new", method="rd-linear")
+    lare_rl.relabel(
+        list(logged_episodes(12)), tmp_path / "new", method="rd-linear", settings=CreditSettings(score="sum")
+    )
     main = runpy.run_path(str(EXAMPLES / "offline_td3_bc.py"))["main"]
     for rewards in ("rewards", "paid", "end"):
         assert main(str(tmp_path / "new"), rewards, steps=3) == []

@@ -59,12 +59,12 @@ def add_episodes(credit, episodes):
 
 @pytest.mark.parametrize("method", cases([m for m in METHODS_FOR_STEPS if not m.multi_agent_only], SINGLE_AGENT_KINDS))
 def test_rewards_of_every_method(method, function):
-    credit, episodes = small_assigner(method, function), random_episodes([10] * 12)
+    credit, episodes = small_assigner(method, function), random_episodes([8] * 12)
     credit.fit(3)
     first = add_episode(credit, episodes[0], "first", end=False)
     credit.fit_pending()
     before = {"ircr": 0.5, "llm-reward": episodes[0].reward}.get(method, 0.0)
-    np.testing.assert_allclose(credit.rewards_at(first), np.broadcast_to(before, 10), rtol=1e-5)
+    np.testing.assert_allclose(credit.rewards_at(first), np.broadcast_to(before, 8), rtol=1e-5)
     assert credit.rewards_at([[-1, -1]]).tolist() == [[0.0, 0.0]]
     assert credit.rewards_at([]).shape == (0,)
     assert credit.rewards_at(5).shape == ()
@@ -75,14 +75,14 @@ def test_rewards_of_every_method(method, function):
     numbers = [first, *(add_episode(credit, episode, env_id) for env_id, episode in enumerate(episodes[1:]))]
     credit.fit_pending()
     r_hat = credit.rewards_at(numbers)
-    assert (r_hat.shape, r_hat.dtype, r_hat.flags.writeable) == ((12, 10), np.float32, True)
+    assert (r_hat.shape, r_hat.dtype, r_hat.flags.writeable) == ((12, 8), np.float32, True)
     assert np.isfinite(r_hat).all()
     assert r_hat.std() > 0
     if method == "ircr":
         means = np.array([episode.reward.mean() for episode in episodes])
         np.testing.assert_allclose(r_hat[:, 0], (means - means.min()) / np.ptp(means), rtol=1e-5)
         running = add_episode(credit, episodes[0], "running", end=False)
-        assert credit.rewards_at(running).tolist() == [0.5] * 10
+        assert credit.rewards_at(running).tolist() == [0.5] * 8
         with pytest.raises(LareError, match="rewards_at"):
             credit.rewards(*episodes[0][:3])
     else:

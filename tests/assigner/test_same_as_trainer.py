@@ -8,7 +8,6 @@ import pytest
 
 from helpers.long_tests import long_case
 from helpers.small_configs import (
-    LENGTHS,
     ONE_AGENT,
     ONE_TEAM,
     add_steps,
@@ -49,8 +48,8 @@ def learn(method, env, phi=None, payments=PAID_AT_END, exact="no", group=None, s
         **({} if env.n_agents == 1 else {"agents": env.n_agents, "max_steps": env.max_steps}),
     )
     learner = untrained_learner(config)
-    # 12 chunks of 21 steps: each length of a chunk would be compiled.
-    steps = random_steps(env, lengths=(*LENGTHS * 5, 12, 12, 11, 12 - n_running, n_running + 1))
+    # 12 chunks of 21 steps, and episodes of 9 to 12: other lengths of chunks, and of episodes up to 8, would be compiled too.
+    steps = random_steps(env, lengths=(*(9, 12, 10, 11, 12) * 4, 12, 12, 12 - n_running, n_running + 1))
     steps = jax.tree.map(lambda leaf: leaf[:-1], steps)
     episode = np.cumsum(steps.ended[:, 0]) - steps.ended[:, 0]
     level = np.where(episode % 3 == 0, 0, 1)  # in the order in which an assigner counts its groups

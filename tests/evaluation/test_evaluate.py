@@ -68,7 +68,7 @@ TASK = toy_spec(environment="toys/FilmedChase-v0", measures=("distance",))
 @pytest.fixture(scope="module")
 def run(small, tmp_path_factory):
     out = tmp_path_factory.mktemp("runs") / "run"
-    return lare_rl.train(TASK, small(method="dense", steps=60), out=out, listeners=[])
+    return lare_rl.train(TASK, small(method="dense", steps=60, capacity=64), out=out, listeners=[])
 
 
 @pytest.fixture(scope="module")
@@ -214,13 +214,14 @@ def test_measures_of_random_play(run, command):
 
 def test_random_actions_play_the_same_groups(small, tmp_path, command):
     """Otherwise a sentence says so. The mean of the numbers of the groups is not reported."""
-    run = lare_rl.train(levels_spec(), small(method="dense", steps=60), out=tmp_path / "run", listeners=[])
+    settings = small(method="dense", steps=60, capacity=64)
+    run = lare_rl.train(levels_spec(payments=2), settings, out=tmp_path / "run", listeners=[])
     assert not any("level" in key for line in run.metrics() for key in line)
     status, out, err = command("evaluate", run.directory, "--episodes", 3)
     assert (status, err) == (0, "")
     assert "over 12 episodes" in out
     assert "level" not in out
-    by_turns = levels_spec(environment="toys/LevelsByTurns-v0")
+    by_turns = levels_spec(environment="toys/LevelsByTurns-v0", payments=2)
     evaluation = evaluate_policy(replace_task(run, by_turns), 3)
     lines = list(describe_evaluation(replace_task(run, by_turns), evaluation, play_random(by_turns, 3), None))
     assert lines[-1].startswith("random actions played other groups (level)")
@@ -271,7 +272,7 @@ def test_evaluate_continues_after_initial_states_of_run(run, returns):
 def test_policies_and_random_actions_are_evaluated_in_the_evaluation_environment(small, tmp_path):
     gymnasium.register("toys/FarChase-v0", entry_point=lambda: Chase(scale=1000.0), max_episode_steps=20)
     task = TASK.model_copy(update={"evaluation_environment": "toys/FarChase-v0"})
-    run = lare_rl.train(task, small(method="dense", steps=60), out=tmp_path / "run", listeners=[])
+    run = lare_rl.train(task, small(method="dense", steps=60, capacity=64), out=tmp_path / "run", listeners=[])
     evaluations = [line["evaluation/return"] for line in run.metrics()]
     assert max(evaluations) < -500  # a thousand times the training rewards
     assert evaluate_run(run, 2)["Chase"].max() < -500

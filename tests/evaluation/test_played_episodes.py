@@ -6,8 +6,11 @@ import pytest
 import lare_rl
 from helpers.jax_toy_envs import echo_spec
 from helpers.numpy_twins import assert_close
+from lare_rl.config.resolve import resolve
 from lare_rl.evaluation import played_episodes as module
 from lare_rl.evaluation.played_episodes import play_run, sample_steps
+from lare_rl.runs.directory import create_run
+from lare_rl.training.train import start_session
 
 TASK = echo_spec(environment="hosted/three", credit_scope="state", observation_size=9, action_size=9, payments=2)
 N_EPISODES = 12
@@ -15,6 +18,7 @@ N_EPISODES = 12
 
 @pytest.fixture(scope="module")
 def run(tmp_path_factory):
+    """An iteration alone: an evaluation and an explanation would take seconds to compile."""
     settings = lare_rl.Settings(
         method="rd-linear",
         algorithm="ippo",
@@ -22,11 +26,14 @@ def run(tmp_path_factory):
         rollout_steps=60,
         environments=2,
         evaluate_every=120,
-        evaluation_episodes=2,
         credit={"exact": "last", "score": "sum"},
         ippo={"hidden": (8,), "minibatch_size": 60, "epochs": 1},
     )
-    return lare_rl.train(TASK, settings, out=tmp_path_factory.mktemp("runs") / "echo", listeners=[])
+    session = start_session(create_run(tmp_path_factory.mktemp("runs") / "echo", TASK, resolve(settings, TASK), ()))
+    session.advance(120)
+    session.save()
+    session.close()
+    return session.run
 
 
 @pytest.fixture(scope="module")

@@ -85,7 +85,8 @@ def export_run(small, small_many, tmp_path_factory):
         if METHODS[method].needs_phi:
             functions = [verify_function(source, role, phi_kind) for role in task.roles]
             function = functions if len(functions) > 1 else functions[0]
-        values = {"method": method, "algorithm": kind.partition("-")[0], "steps": 120 if single else 200}
+        values = {"method": method, "algorithm": kind.partition("-")[0]}
+        values |= {"steps": 120, "capacity": 240} if single else {"steps": 200}
         # The lengths of the toy with many agents differ, so that the type of the score can be found.
         settings = small(**values) if single else small_many(**values, credit=QUICK_CREDIT | {"score": "auto"})
         directory = tmp_path_factory.mktemp("export")

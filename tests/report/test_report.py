@@ -13,7 +13,6 @@ import pytest
 import lare_rl
 from helpers.markup import check_markup
 from helpers.toy_envs import Chase, toy_spec
-from helpers.training_runs import QUICK_CREDIT
 from helpers.untrained_runs import write_run
 from lare_rl.config.resolve import resolve
 from lare_rl.config.settings import Settings
@@ -26,7 +25,7 @@ from lare_rl.report.html import render_table, write_page
 from lare_rl.report.live_page import LivePage
 from lare_rl.report.messages import MESSAGES
 from lare_rl.report.overview import compare_runs, render_learning_curves, sort_runs, summarise_runs
-from lare_rl.report.report import default_path
+from lare_rl.report.report import _load_film, default_path
 from lare_rl.report.reported_run import ReportedRun
 from lare_rl.report.run_summary import summarise_run
 from lare_rl.runs.directory import open_without_functions
@@ -47,8 +46,8 @@ gymnasium.register("toys/EpisodicChase-v0", entry_point=episodic_chase, max_epis
 
 @pytest.fixture(scope="module")
 def runs(small, phi, tmp_path_factory):
-    """Two small runs of a toy, one with rewards at each step, and one with a reward at the last step."""
-    directory, settings = tmp_path_factory.mktemp("runs"), small(method="lare-bayes", credit=QUICK_CREDIT)
+    """Two small runs of a toy, one with rewards at each step, and one with a reward at the last step. They compile as those of exports."""
+    directory, settings = tmp_path_factory.mktemp("runs"), small(method="lare-bayes", capacity=240)
     return [
         lare_rl.train(toy_spec(environment=name), settings, function=phi, out=directory / name[5:-3], listeners=[])
         for name in ("toys/Chase-v0", "toys/EpisodicChase-v0")
@@ -59,6 +58,12 @@ def page_of(sources, tmp_path, **options):
     page = lare_rl.write_report(sources, tmp_path / "report.html", **options).read_text()
     check_markup(page[page.index("<body>") : page.index("</html>")])
     return page
+
+
+@pytest.fixture(scope="module")
+def pages(runs, tmp_path_factory):
+    """The page of each run."""
+    return [page_of(run, tmp_path_factory.mktemp("page")) for run in runs]
 
 
 def columns(page):
@@ -72,8 +77,8 @@ def n_lines(chart, style):
     return len(re.findall(rf'<polyline class="{style}"', chart))
 
 
-def test_sections_of_report(runs, tmp_path):
-    page = page_of(runs[0], tmp_path)
+def test_sections_of_report(runs, pages):
+    page = pages[0]
     classes = [f'class="{name}' for name in ("headline", "tiles", "chart", "strip")]
     positions = [page.index(section) for section in (*classes, "The latent function", "config.json")]
     assert positions == sorted(positions)
@@ -90,12 +95,14 @@ def test_sections_of_report(runs, tmp_path):
 
 def test_film(runs, tmp_path):
     """It is in the page if it is newer than the checkpoint, and small."""
-    film = runs[0].directory / "film.webp"
-    film.write_bytes(encode_film([np.zeros((300, 300, 3), np.uint8)] * 2, 0.1, 10_000))
+    film, size = runs[0].directory / "film.webp", 10_000
+    film.write_bytes(encode_film([np.zeros((300, 300, 3), np.uint8)] * 2, 0.1, size))
     assert page_of(runs[0], tmp_path).count('src="data:image/webp;base64,') == 1
     assert "data:image/webp" not in page_of(runs[0], tmp_path, film=False)
+    assert _load_film(runs[0], None, size) == film.read_bytes()
+    assert _load_film(runs[0], None, film.stat().st_size - 1) is None
     os.utime(film, (0, 0))
-    assert "data:image/webp" not in page_of(runs[0], tmp_path)
+    assert _load_film(runs[0], None, size) is None
     film.unlink()
 
 
@@ -255,19 +262,17 @@ def test_run_without_evaluation(make_run, tmp_path):
     assert 'class="chart' in page
 
 
-def test_unknown_step_rewards(runs, tmp_path):
+def test_unknown_step_rewards(pages):
     """If only the last step has a reward, there is no error, no correlation, and no picture of true rewards."""
-    pages = [page_of(run, tmp_path) for run in runs]
     for text in ("|proxy - true reward|", "Correlation of", ">true reward</li>", "correlation with the true reward"):
         assert [text in page for page in pages] == [True, False]
     for text in ("R² of returns", ">proxy reward</li>"):
         assert all(text in page for page in pages)
 
 
-def test_equal_lengths_are_not_called_a_sum(runs, tmp_path):
-    page = page_of(runs[1], tmp_path)
-    assert "credit can be trusted" in page or "Trust the credit in part" in page
-    assert "The score was taken as" not in page
+def test_equal_lengths_are_not_called_a_sum(pages):
+    assert "credit can be trusted" in pages[1] or "Trust the credit in part" in pages[1]
+    assert "The score was taken as" not in pages[1]
 
 
 def test_code_in_findings(make_run, monkeypatch):
@@ -314,16 +319,15 @@ def test_page_of_text_that_is_not_utf8(tmp_path):
 
 @pytest.mark.skipif(CHROMIUM is None, reason="there is no Chromium")
 @pytest.mark.parametrize(("width", "columns"), [(390, 1), pytest.param(1280, 2, marks=pytest.mark.long)])
-def test_page_fits_phone_and_desktop(runs, tmp_path, width, columns):
+def test_page_fits_phone_and_desktop(pages, tmp_path, width, columns):
     """Nothing is wider than the screen, no text is smaller than 11 pixels, and curves stand side by side where there is room."""
-    page = lare_rl.write_report(runs[0], tmp_path / "report.html")
     probe = (
         "<script>document.querySelectorAll('details').forEach(fold => fold.open = true);"
         "const sizes = [...document.body.querySelectorAll('*')].map(node => parseFloat(getComputedStyle(node).fontSize));"
         "document.title = JSON.stringify([document.documentElement.scrollWidth, Math.floor(Math.min(...sizes)), "
         "getComputedStyle(document.querySelector('.figures')).gridTemplateColumns.split(' ').length])</script>"
     )
-    (tmp_path / "probe.html").write_text(page.read_text().replace("</body>", f"{probe}</body>"))
+    (tmp_path / "probe.html").write_text(pages[0].replace("</body>", f"{probe}</body>"))
     frame = tmp_path / "frame.html"  # Chromium makes no window as narrow as a phone
     frame.write_text(
         f'<iframe src="probe.html" width="{width}" height="800" style="border: 0"></iframe>'

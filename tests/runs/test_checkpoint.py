@@ -85,7 +85,7 @@ def test_learner_comes_back(method, payments, tmp_path):
     config = replace(config, credit=config.credit.model_copy(update={"exact": "last" if method == "bayes" else "no"}))
     shape = learner_shape(config, 1)
     leaves, structure = jax.tree.flatten(shape)
-    learner = jax.tree.unflatten(structure, [jnp.full(leaf.shape, n, leaf.dtype) for n, leaf in enumerate(leaves)])
+    learner = jax.tree.unflatten(structure, [np.full(leaf.shape, n, leaf.dtype) for n, leaf in enumerate(leaves)])
     expected = checkpoint.named_leaves(learner)
     checkpoint.write(tmp_path, checkpoint.take_snapshot(tmp_path, learner, {}, {}))
     jax.tree.map(np.testing.assert_array_equal, checkpoint.named_leaves(checkpoint.load(tmp_path, shape)[0]), expected)

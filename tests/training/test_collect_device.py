@@ -119,13 +119,27 @@ def test_reset_with_each_step_changes_nothing(learner, steps, monkeypatch):
     jax.tree.map(np.testing.assert_array_equal, collector.collect(learner[1], 0), first)
 
 
+class Diverging(Echo):
+    """Its measure is not a number after the end of an episode."""
+
+    def timestep(self, cues, reward):
+        measure = jnp.where(cues.step > cues.length, jnp.nan, reward.sum())
+        return super().timestep(cues, reward)._replace(measures={"right": measure})
+
+
+DIVERGING = Diverging()
+
+
 def test_evaluate_equals_plain_loop(learner):
     keys = stream_keys(SEEDS, Stream.EVALUATION_EPISODES, 0)
-    batch = jax.jit(partial(unroll_on_device, ENV, n_episodes=5, config=CONFIG, deterministic=True))(learner[1], keys)
+    batch = jax.jit(partial(unroll_on_device, DIVERGING, n_episodes=5, config=CONFIG, deterministic=True))(
+        learner[1], keys
+    )
     steps, mask = jax.tree.map(np.asarray, (batch.steps, batch.mask))
     assert mask.shape == (6, 2, 5)
     np.testing.assert_array_equal(mask, np.cumsum(steps.ended, axis=0) - steps.ended == 0)
-    evaluation = DeviceCollector(ENV, CONFIG, SEEDS).evaluate(learner[1], 5)
+    assert np.isnan(steps.next_timestep.measures["right"]).any()
+    evaluation = DeviceCollector(DIVERGING, CONFIG, SEEDS).evaluate(learner[1], 5)
     for seed_index, episode in np.ndindex(2, 5):
         return_ = summed_return = 0.0
         for t in range(6):
@@ -141,21 +155,8 @@ def test_evaluate_equals_plain_loop(learner):
         assert evaluation.measures["right"][seed_index, episode] == reward.sum()
 
 
-class Diverging(Echo):
-    """Its measure is not a number after the end of an episode."""
-
-    def timestep(self, cues, reward):
-        measure = jnp.where(cues.step > cues.length, jnp.nan, 1.0)
-        return super().timestep(cues, reward)._replace(measures={"right": measure})
-
-
-def test_evaluate_ignores_measures_after_the_end(learner):
-    evaluation = DeviceCollector(Diverging(), CONFIG, SEEDS).evaluate(learner[1], 5)
-    np.testing.assert_array_equal(evaluation.measures["right"], np.ones((2, 5)))
-
-
 def test_evaluate_initial_states_depend_on_number(learner):
-    evaluations = [DeviceCollector(ENV, CONFIG, SEEDS).evaluate(learner[1], 5, number) for number in (0, 0, 1)]
+    evaluations = [DeviceCollector(DIVERGING, CONFIG, SEEDS).evaluate(learner[1], 5, number) for number in (0, 0, 1)]
     np.testing.assert_array_equal(evaluations[0].returns, evaluations[1].returns)
     assert not np.array_equal(evaluations[0].lengths, evaluations[2].lengths)
 

@@ -82,10 +82,9 @@ def test_exact_rewards_add_up_to_payments(method, algorithm, env, exact, payment
 
 
 def test_rewards_of_episodes_that_are_not_learned_yet_are_not_corrected():
-    config = exact_config("rd-linear", "td3", ONE_AGENT, "spread", PAID_AT_END)
-    learner = add_steps(untrained_learner(config), config, random_steps(lengths=LENGTHS))
-    steps = jax.tree.map(lambda leaf: leaf[:4], random_steps(lengths=(4, 3)))
-    learner = add_steps(learner, config, steps, learn=False)
+    config = exact_config("rd-linear", "td3", ONE_AGENT, "last", PaymentRule(period=4))  # compiled as above
+    learner = add_steps(untrained_learner(config), config, random_steps())
+    learner = add_steps(learner, config, random_steps(seed=1), learn=False)
     residual = np.asarray(stored_steps(learner).residual)[:, 0]
     assert (residual[: sum(LENGTHS)] != 0).all()
     assert (residual[sum(LENGTHS) :] == 0).all()

@@ -40,10 +40,14 @@ print(json.dumps({
 """
 
 
+FEW = {"environments": 2, "rollout_steps": 10, "steps": 80, "evaluate_every": 40}
+"""With fewer than 20 episodes, no explanation is compiled."""
+
+
 @pytest.mark.parametrize(
     ("task", "changes"),
     [
-        (echo_spec(), {"algorithm": "ippo", "method": "rd-linear"}),
+        (echo_spec(), {"algorithm": "ippo", "method": "rd-linear"} | FEW),
         long_case(toy_spec(), {"algorithm": "td3", "method": "rrdu"}),
         long_case("CN-6", {"algorithm": "ippo", "method": "bayes"}),
         long_case(echo_spec(), {"algorithm": "qmix", "method": "rd"}),

@@ -127,12 +127,13 @@ def test_stored_factors_follow_scored_observation(factor_run):
 
 
 def test_seeds_do_not_depend_on_each_other(dense, dense_run, tmp_path):
-    other_run = train_quietly(CHASE, dense(seed=1), tmp_path / "run")
+    train_and_stop(CHASE, dense(seed=1), tmp_path / "run", 120)
+    other_run = open_run(tmp_path / "run")
     expected, lines = (
         [line["evaluation/return"] for line in run.metrics() if line["seed"] == 1] for run in (dense_run, other_run)
     )
-    assert lines == pytest.approx(expected, rel=1e-2)
-    assert len({line["evaluation/return"] for line in other_run.metrics()}) == 8
+    assert lines == pytest.approx(expected[:2], rel=1e-2)
+    assert len({line["evaluation/return"] for line in other_run.metrics()}) == 4
 
 
 def test_infinite_factor_stops_run(small, factor_run, phi, tmp_path, monkeypatch):

@@ -1,5 +1,6 @@
 import numpy as np
 import pytest
+from jaxtyping import TypeCheckError
 
 from lare_rl.util.statistics import (
     column_correlations,
@@ -12,6 +13,12 @@ from lare_rl.util.statistics import (
     sample_std,
     standard_error,
 )
+
+
+def test_shapes_are_checked():
+    """In all rooms that `pyproject.toml` names."""
+    with pytest.raises(TypeCheckError, match="values"):
+        sample_std(np.zeros((2, 2)))
 
 
 def test_std_of_single_value():

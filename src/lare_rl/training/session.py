@@ -15,6 +15,7 @@ from lare_rl.algorithms.batches import Metrics
 from lare_rl.algorithms.off_policy import OffPolicySettings
 from lare_rl.config.settings import ResolvedSettings
 from lare_rl.config.train_config import TrainConfig, make_train_config
+from lare_rl.credit.explanation_text import MIN_EXPLAINED_EPISODES
 from lare_rl.data.trajectory import Trajectory, empty_trajectory
 from lare_rl.envs.workers import close_idle_workers
 from lare_rl.errors import LareError
@@ -223,7 +224,9 @@ class Session:
         shape = learner_shape(self.config, len(self.run.seeds))
         load_linear_algebra()
         self._threads.submit(self.functions.compile_learning, shape)
-        if self.config.n_devices == 1:
+        # A shorter run is rarely explained.
+        is_explained = self.settings.steps >= MIN_EXPLAINED_EPISODES * self.config.env.max_steps
+        if is_explained and self.config.n_devices == 1:
             self._threads.submit(compile_explanation, shape, self.config)
 
     def evaluate(self, rate: float) -> list[dict[str, Any]]:
