@@ -48,7 +48,7 @@ def measured(name: str, way: str) -> dict[str, Any]:
             start = time.process_time()
             with mock.patch.object(decoder_fits, "BATCH_DIVISOR", 1 if way == LARGE else decoder_fits.BATCH_DIVISOR):
                 keys = stream_keys(run.seeds, Stream.FIT, 0)
-                begun.learner, _ = begun._fit(begun.learner, keys)
+                begun._fit(keys)
                 jax.block_until_ready(begun.learner)
             seconds = time.process_time() - start
             accuracy = begun.functions.assess(begun.learner)
