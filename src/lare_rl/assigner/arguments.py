@@ -214,7 +214,7 @@ def to_lengths(values: Any, n_rows: int) -> Int[np.ndarray, " rows"]:
 def to_step_ids(steps: Any) -> Int[np.ndarray, "*shape"]:
     """Return numbers of steps as an array. Raises `LareError` for anything else."""
     step_ids = to_array(steps, "steps")
-    if step_ids.size and (step_ids.dtype.kind not in "iu" or step_ids.min() < -1):
+    if step_ids.size and (step_ids.dtype.kind not in "iu" or step_ids.astype(np.int64).min() < -1):
         raise LareError(f"steps are {short_repr(steps)}: give numbers that `add` has returned, or -1")
     return step_ids.astype(np.int64)
 
