@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from helpers.assigner_episodes import small_assigner
-from lare_rl.assigner.arguments import read_steps, to_levels
+from lare_rl.assigner.arguments import read_steps, to_levels, to_step_ids
 from lare_rl.errors import LareError
 
 
@@ -26,10 +26,24 @@ def test_lists_are_needed():
         read([1, 2], env_ids=3)
     with pytest.raises(LareError, match=r"env_ids is array\(3\): give a list"):
         read([1, 2], env_ids=np.array(3))
-    with pytest.raises(LareError, match=r"env_ids .*hashable"):
-        read([1, 2], env_ids=np.zeros((2, 1)))
     with pytest.raises(LareError, match="group is 5: give a list"):
         to_levels(small_assigner(groups=True).config, 5, read([1, 2]), {})
+
+
+@pytest.mark.parametrize("env_ids", [np.zeros((2, 1)), [([0],), 1], [float("nan"), 1]])
+def test_environment_that_cannot_be_a_key_is_refused(env_ids):
+    with pytest.raises(LareError, match=r"env_id .*hashable"):
+        read([1, 2], env_ids=env_ids)
+
+
+def test_episode_is_ended_and_dropped_by_value():
+    credit = small_assigner()
+    for _ in range(2):
+        credit.add(np.zeros((1, 2)), np.zeros((1, 1)), np.zeros((1, 2)), [1], [0], [0], env_ids=["a"])
+        credit.end(np.array("a"))
+    credit.add(np.zeros((1, 2)), np.zeros((1, 1)), np.zeros((1, 2)), [1], [0], [0], env_ids=[5])
+    credit.drop(jnp.array(5))
+    assert (credit.store.n_ended, credit.store.dropped) == (2, 1)
 
 
 def test_team_reward_is_the_mean_over_the_agents_alive():
@@ -51,3 +65,8 @@ def test_team_reward_is_the_mean_over_the_agents_alive():
 def test_team_arguments_are_refused(reward, alive, message):
     with pytest.raises(LareError, match=message):
         read(reward, agents=2, alive=alive)
+
+
+def test_number_that_no_step_has_is_refused():
+    with pytest.raises(LareError, match="steps are"):
+        to_step_ids(np.array([2**63], np.uint64))  # as int64 it would be negative, which is no step

@@ -21,6 +21,7 @@ def test_path_is_not_a_log(tmp_path, monkeypatch):
         (tmp_path / "log.npz", "give a Parquet file, or a directory"),
         (tmp_path / "empty", "empty holds no .npz"),
         (tmp_path / "gone", "gone does not exist"),
+        (tmp_path / ("long" * 100), "File name too long"),
         ("nologs", install_command("minari")),
         (7, "7 is not a log"),
     ):

@@ -1,5 +1,6 @@
 """The arrays that a `CreditAssigner` is given: they are checked, and become rows of numbers."""
 
+import contextlib
 from collections.abc import Hashable
 from typing import Any, NamedTuple
 
@@ -7,6 +8,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from lare_rl.assigner.assigner_config import AssignerConfig
+from lare_rl.assigner.group_names import GroupName, to_group_name
 from lare_rl.assigner.space_layout import MAX_MAGNITUDE, to_array
 from lare_rl.envs.interface import alive_mean
 from lare_rl.errors import LareError, short_repr
@@ -14,10 +16,10 @@ from lare_rl.tasks.payments import PaymentRule
 from lare_rl.tasks.spec import MAX_LEVELS
 
 __all__ = [
-    "GroupName",
     "NewSteps",
     "read_episode",
     "read_steps",
+    "to_env_id",
     "to_flags",
     "to_lengths",
     "to_levels",
@@ -25,10 +27,6 @@ __all__ = [
     "to_score",
     "to_step_ids",
 ]
-
-
-GroupName = str | int | float
-"""What a group may be. It is the same again when it is read from a file."""
 
 
 class NewSteps(NamedTuple):
@@ -67,7 +65,7 @@ def read_steps(
     team_reward = _to_team_reward(config, reward, alive, n_rows)
     ended = to_flags(terminated, "terminated", n_rows) | to_flags(truncated, "truncated", n_rows)
     rows = np.flatnonzero(np.ones(n_rows, bool) if valid is None else to_flags(valid, "valid", n_rows))
-    ids = range(n_rows) if env_ids is None else _to_env_ids(env_ids, n_rows)
+    ids = range(n_rows) if env_ids is None else list(map(to_env_id, _to_list(env_ids, "env_ids", n_rows)))
     # Copies, because an environment may write its next step into the same memory.
     observation, action, next_observation = (array[rows] for array in arrays)
     new = NewSteps(
@@ -86,7 +84,7 @@ def read_steps(
 def read_episode(
     config: AssignerConfig, steps: tuple[Any, Any, Any], reward: Any, alive: Any
 ) -> tuple[NewSteps, PaymentRule]:
-    """Return the arguments of `CreditAssigner.add_episode`, and when the episode was paid. Raises `LareError` if they do not fit."""
+    """Return the steps of the arguments of `CreditAssigner.add_episode`, and the rule of their payments. Raises `LareError` like `add`."""
     arrays = to_rows(config, *steps)
     n_steps = len(arrays[0])
     if not n_steps:
@@ -135,7 +133,7 @@ def to_levels(
     if group is None:
         return np.zeros(len(new.rows), np.int32)
     groups = _to_list(group, "group", new.n_rows)
-    names = [_to_group_name(groups[row]) for row in new.rows.tolist()]
+    names = [None if groups[row] is None else to_group_name(groups[row]) for row in new.rows.tolist()]
     numbers = dict(group_names)
     for name in names:
         if name is not None:
@@ -149,16 +147,8 @@ def to_levels(
     return level
 
 
-def _to_group_name(value: Any) -> GroupName | None:
-    """Return a group as a text or a number of Python, which stay the same in a file. Raises `LareError` for anything else."""
-    name = value.item() if isinstance(value, np.generic | np.ndarray) and value.size == 1 else value
-    if name is not None and (not isinstance(name, str | int | float) or name != name):  # NaN
-        raise LareError(f"a group is a text or a number, and not {short_repr(value)}")
-    return name
-
-
 def _to_list(values: Any, name: str, n_rows: int) -> list[Any]:
-    """Return one value for each row. Raise `LareError` if there are more or fewer, or no list."""
+    """Return a list with a value for each row. Raises `LareError` if there are more or fewer, or if `values` is no list."""
     if isinstance(values, str) or not np.iterable(values):
         raise LareError(f"{name} is {short_repr(values)}: give a list, with an entry for each row")
     entries = list(values)
@@ -167,34 +157,34 @@ def _to_list(values: Any, name: str, n_rows: int) -> list[Any]:
     return entries
 
 
-def _to_env_ids(values: Any, n_rows: int) -> list[Hashable]:
-    """Return the environment of each row. Raise `LareError` for values that cannot be keys of a dictionary."""
-    # The hash of a tensor is its identity, and not its value.
-    ids = [entry.tolist() if hasattr(entry, "tolist") else entry for entry in _to_list(values, "env_ids", n_rows)]
-    if not all(isinstance(env_id, Hashable) for env_id in ids):
-        raise LareError(f"env_ids is {short_repr(values)}: give a hashable value for each row")
-    return ids
+def to_env_id(value: Any) -> Hashable:
+    """Return an environment as a key of a dictionary. Raises `LareError` if it cannot be found again by its value."""
+    env_id = value.tolist() if hasattr(value, "tolist") else value  # the hash of a tensor is its identity
+    with contextlib.suppress(TypeError):
+        if hash(env_id) is not None and env_id == env_id:  # NaN
+            return env_id
+    raise LareError(f"an env_id must be a text, a number or another hashable value, and is {short_repr(value)}")
 
 
-def _to_alive(config: AssignerConfig, alive: Any, n_steps: int) -> Bool[np.ndarray, "n agents"] | None:
-    """Return which agents were alive, if that is given."""
+def _to_alive(config: AssignerConfig, alive: Any, n_rows: int) -> Bool[np.ndarray, "rows agents"] | None:
+    """Return which agents were alive. None means all."""
     if alive is None:
         return None
     if config.agents == 1:
         raise LareError("this assigner has a single agent: leave alive out")
-    return to_flags(alive, "alive", n_steps, config.agents)
+    return to_flags(alive, "alive", n_rows, config.agents)
 
 
 def _to_team_reward(
-    config: AssignerConfig, reward: Any, alive: Bool[np.ndarray, "n agents"] | None, n_steps: int
-) -> Float[np.ndarray, " n"]:
-    """Return the team's reward of each step."""
+    config: AssignerConfig, reward: Any, alive: Bool[np.ndarray, "rows agents"] | None, n_rows: int
+) -> Float[np.ndarray, " rows"]:
+    """Return the team's reward of each row."""
     rewards = to_array(reward, "reward").astype(np.float64)
     if config.agents == 1:
-        return _check_shape(rewards, "reward", "number", n_steps)
-    if rewards.shape == (n_steps, config.agents):
+        return _check_shape(rewards, "reward", "number", n_rows)
+    if rewards.shape == (n_rows, config.agents):
         return alive_mean(rewards, np.ones(rewards.shape, bool) if alive is None else alive)
-    return _check_shape(rewards, "reward", "number, or one for each agent,", n_steps)
+    return _check_shape(rewards, "reward", "number, or one for each agent,", n_rows)
 
 
 def _check_shape(values: np.ndarray, name: str, noun: str, *shape: int) -> np.ndarray:
@@ -212,8 +202,8 @@ def to_flags(values: Any, name: str, *shape: int) -> Bool[np.ndarray, "*shape"]:
     return flags.astype(bool)
 
 
-def to_lengths(values: Any, n_rows: int) -> Int[np.ndarray, " steps"]:
-    """Return the length of each row's episode. Raises `LareError` if there are more or fewer, or for one that is no length."""
+def to_lengths(values: Any, n_rows: int) -> Int[np.ndarray, " rows"]:
+    """Return the length of each row's episode. Raises `LareError` if there are more or fewer, or one is no positive whole number."""
     lengths = _check_shape(to_array(values, "length").astype(np.float64), "length", "number", n_rows)
     wrong = np.flatnonzero(~((lengths >= 1) & (lengths < 2**31)) | (lengths != np.floor(lengths)))
     if len(wrong):
@@ -224,13 +214,13 @@ def to_lengths(values: Any, n_rows: int) -> Int[np.ndarray, " steps"]:
 def to_step_ids(steps: Any) -> Int[np.ndarray, "*shape"]:
     """Return numbers of steps as an array. Raises `LareError` for anything else."""
     step_ids = to_array(steps, "steps")
-    if step_ids.size and (step_ids.dtype.kind not in "iu" or step_ids.min() < -1):
+    if step_ids.size and (step_ids.dtype.kind not in "iu" or step_ids.astype(np.int64).min() < -1):
         raise LareError(f"steps are {short_repr(steps)}: give numbers that `add` has returned, or -1")
     return step_ids.astype(np.int64)
 
 
 def to_score(score: Any, name: str) -> float:
-    """Return a score as a number. Raises `LareError` if it is none, or not finite, or too large."""
+    """Return a score as a number. Raises `LareError` if it is not a single number, not finite, or too large."""
     number = to_array(score, name)
     if number.size != 1 or not abs(number.item()) <= MAX_MAGNITUDE:  # true for NaN
         raise LareError(f"{name} is {short_repr(number.tolist())}: give a finite number, at most {MAX_MAGNITUDE:g}")

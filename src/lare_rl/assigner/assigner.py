@@ -19,10 +19,10 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from lare_rl.assigner import arguments, saving
-from lare_rl.assigner.arguments import GroupName
 from lare_rl.assigner.assigner_config import AssignerConfig, Space, check_config, resolve_config
 from lare_rl.assigner.decoder_learner import DecoderLearner
 from lare_rl.assigner.explain import describe_returns
+from lare_rl.assigner.group_names import GroupName
 from lare_rl.assigner.saving import AssignerState
 from lare_rl.assigner.step_rewards import StepRewards
 from lare_rl.assigner.store import Store
@@ -205,7 +205,7 @@ class CreditAssigner:
             self.learner.flush_large_queues()
             return step_ids
 
-    def end(self, env_id: Hashable, score: float | None = None) -> None:
+    def end(self, env_id: Any, score: float | None = None) -> None:
         """End the episode of an environment, with `score` as its return, or else the sum of its rewards.
 
         Use this if the score is not part of the steps. If the score comes late, give every episode an `env_id` of its own.
@@ -214,12 +214,12 @@ class CreditAssigner:
             LareError: no episode is running in this environment, it has no group, or the score is not finite.
         """
         with self.lock:
-            self.learner.queue_episodes([self.store.end(env_id, score)])
+            self.learner.queue_episodes([self.store.end(arguments.to_env_id(env_id), score)])
 
-    def drop(self, env_id: Hashable) -> None:
+    def drop(self, env_id: Any) -> None:
         """Abandon the episode of an environment: it is never learned from. Its steps still have proxy rewards."""
         with self.lock:
-            self.store.drop(env_id)
+            self.store.drop(arguments.to_env_id(env_id))
 
     def fit(self, updates: int = 500) -> None:
         """Fit now, by this many gradient updates of the decoder. A closed-form decoder is fitted once, whatever `updates` is."""

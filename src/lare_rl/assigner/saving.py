@@ -14,9 +14,9 @@ from pathlib import Path
 
 import numpy as np
 
-from lare_rl.assigner.arguments import GroupName
 from lare_rl.assigner.assigner_config import AssignerConfig
 from lare_rl.assigner.decoder_learner import DecoderLearner
+from lare_rl.assigner.group_names import GroupName
 from lare_rl.assigner.store import Store, StoredEpisode
 from lare_rl.credit.methods import METHODS
 from lare_rl.errors import LareError, short_repr

@@ -7,7 +7,7 @@ gives one reward for each step, which all agents receive:
 
 The published penalty is 20 E Var_t(y), added to the squared error of the sum of T rewards. Here it is added to the squared
 error of their mean, hence 1 / T^2. y is multiplied by sqrt(T), as the outputs of other decoders are by sqrt(nT): see
-`decoder_state.py`.
+`CreditSpec.output_scale`.
 
 The adapter that LaRe's authors published repeats y_t over the agents, but then reads the array in another axis order. It
 thus gives rewards to the wrong agents and steps. Here all agents receive y_t at step t.

@@ -1,17 +1,13 @@
-"""Return decomposition as pure functions on one state: they update statistics and compute proxy rewards.
+"""The state of a team's decoder: the statistics that new steps and returns change, and the proxy rewards that it pays.
 
-    r_hat = scale * f_psi(normalise(x)),    psi <- argmin loss(r_hat / scale, R / (T * scale))
+    r_hat = u f_psi(normalise(x)),         psi <- argmin loss(r_hat / u, R / (u T))       if the score is a sum over the steps
+    r_hat = u f_psi(normalise(x)) / T,     psi <- argmin loss(r_hat T / u, R / u)         if it is an average
 
-psi is fitted by gradient descent in `descent.py` and in closed form in `learning.py`.
+x are the method's inputs: the factors z = phi(s, a), or raw features. The unit u is the running root mean square of the targets, R/T or R.
+psi is fitted by gradient descent in `descent.py` and in closed form in `learning.py`. In closed form, u is 1 and x stays as it is.
 
-x are the method's inputs: the factors z = phi(s, a), or raw features. `scale` is the running root mean square of R/T.
 With n agents, each agent has its own proxy rewards, R is the mean of the agents' returns, and the mean of the agents' r_hat is
 fitted to it. The equations stay the same and assign credit over time and among agents.
-
-With several agents, r_hat is also multiplied by `output_scale`, sqrt(nT). R/T is then the mean of nT rewards, and a rare reward of a
-few agents is larger than this mean by about that factor. Adam changes an output by steps of the same size in any unit, and the decoder
-of many agents is seldom fitted. Without this factor, its output would need dozens of updates of the policy to reach
-the size of a rare reward.
 
 Inputs and targets are normalised by statistics in the state. Scaling the return, or a factor, therefore changes only the scale of
 r_hat. `normalise = false` is the published form, with raw features and raw targets.
@@ -76,7 +72,7 @@ class CreditBatch(NamedTuple):
 
 
 def step_rows(episodes: CreditBatch) -> Bool[Array, " rows"]:
-    """Return which rows are steps of an episode of the batch, and no padding."""
+    """Return which rows are steps of an episode of the batch, and not padding."""
     n_episodes = len(episodes.length)
     in_batch = episodes.mask[jnp.minimum(episodes.episode_index, n_episodes - 1)] > 0
     return (episodes.episode_index < n_episodes) & in_batch
@@ -117,7 +113,7 @@ class DecoderState(NamedTuple):
 
     @property
     def closed_decoder(self) -> ClosedForm | None:
-        """The fit in closed form that `network` is taken from. None for any other decoder, also if a fit determines its score type."""
+        """The fit in closed form that `network` is taken from. None for other decoders, even if it determines their score type."""
         return None if self.optimizer else self.closed_form
 
 
@@ -205,7 +201,7 @@ def observe_returns(
 def level_returns(
     state: DecoderState, level: Int[Array, " episodes"] | None, length: Int[Array, " episodes"]
 ) -> Float[Array, " episodes"]:
-    """Return the part of each episode's return that its level explains, or that is the same for all, and that no step is paid for."""
+    """Return the part of each episode's return that no step is paid for: what its level explains, and what is the same for all."""
     if state.levels is not None and level is not None:
         return level_offsets(state.levels)[level] * length
     closed = state.closed_decoder

@@ -122,7 +122,12 @@ class CreditSpec:
 
     @property
     def output_scale(self) -> float:
-        """The factor of the output of decoders for several agents (see `decoder_state.py`)."""
+        """The factor sqrt(nT) of a decoder's output for n agents, or 1 for a single agent. T is the longest episode.
+
+        R/T is the mean of nT rewards, and a rare reward of a few agents is larger than this mean by about that factor. Adam changes an
+        output by steps of the same size in any unit, and the decoder of many agents is seldom fitted. Without this factor, its output
+        would need dozens of updates of the policy to reach the size of a rare reward.
+        """
         return 1.0 if self.agents == 1 else math.sqrt(self.max_steps * self.agents)
 
     def raw_feature_names(self, observation: str, action: str) -> list[str]:

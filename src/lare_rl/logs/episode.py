@@ -7,6 +7,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Float
 
+from lare_rl.assigner.group_names import GroupName, to_group_name
 from lare_rl.assigner.space_layout import MAX_MAGNITUDE, SpaceLayout, to_array
 from lare_rl.errors import LareError, short_repr
 from lare_rl.tasks.spec import TaskSpec
@@ -35,7 +36,7 @@ class LoggedEpisode:
     """Whether the log has the episode's score, and not its rewards."""
     complete: bool
     """Whether the episode was played to its end. Only then is its return known."""
-    group: str | int | float | None
+    group: GroupName | None
     """The group of the episode, such as its map. None if the log does not tell it."""
     contents: Any = field(repr=False)
     """The episode as it was read, to write it again: a mapping of arrays, or a table."""
@@ -180,16 +181,13 @@ def _original_reward(name: str, values: Mapping[str, Any], n_steps: int) -> Floa
     return reward if shape else np.append(np.zeros(n_steps - 1), reward)
 
 
-def _group(name: str, values: Mapping[str, Any], n_steps: int) -> str | int | float | None:
+def _group(name: str, values: Mapping[str, Any], n_steps: int) -> GroupName | None:
     """Return the group of an episode. If there is one for each step, it is that of the last step."""
     if "group" not in values:
         return None
     groups = np.asarray(values["group"], object)
-    group = groups.ravel()[-1] if groups.shape in ((), (1,), (n_steps,)) else None
-    group = group.item() if isinstance(group, np.generic) else group
-    if not isinstance(group, str | int | float) or group != group:  # NaN
-        raise LareError(f"{name}: group must be a text or a number, and is {short_repr(values['group'])}")
-    return group
+    group = groups.ravel()[-1] if groups.shape in ((), (1,), (n_steps,)) else values["group"]
+    return to_group_name(group, f"{name}: group")
 
 
 def _is_complete(name: str, values: Mapping[str, Any], n_steps: int, max_episode_steps: int | None) -> bool:

@@ -27,7 +27,10 @@ def open_log(source: Any, task: TaskSpec | None = None) -> Log:
     """
     role = None if task is None else require_role(task)
     if isinstance(source, str | Path):
-        return _open_path(source, role)
+        try:
+            return _open_path(source, role)
+        except OSError as error:  # no permission, or a name that is too long
+            raise LareError(f"{short_repr(str(source))} cannot be opened: {error.strerror or error}") from error
     if hasattr(source, "iterate_episodes"):
         from lare_rl.logs.minari import MinariLog
 

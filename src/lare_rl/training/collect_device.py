@@ -72,7 +72,7 @@ class DeviceCollector:
         return {str(i): np.asarray(jax.random.key_data(leaf) if _is_key(leaf) else leaf) for i, leaf in leaves}
 
     def restore(self, arrays: dict[str, np.ndarray]) -> tuple[Bool[np.ndarray, "seeds envs"], list[str]]:
-        """Restore the environments. Return which episodes were dropped, and messages: never any, as on the host."""
+        """Restore the environments. Return which episodes were dropped, and messages, as on the host: here there are none."""
         leaves, structure = jax.tree.flatten(self.envs)
         saved: list[Any] = [arrays[str(i)] for i in range(len(leaves))]
         for i, leaf in enumerate(leaves):

@@ -50,11 +50,11 @@ __all__ = [
 MIN_SPEED_UP = 2.0
 """A smaller speed-up may be noise, and then equal runs would choose differently."""
 N_REPETITIONS = 5
-"""How often a factorisation is timed."""
+"""How often `is_batching_faster` times a factorisation."""
 N_STARTS = 3
 """The number of starts of `evidence.fit`. Each start factorises a matrix."""
 MIN_FEATURES = 32
-"""The least size of the matrices."""
+"""The least size of the matrices that it factorises."""
 
 
 class CompiledFunctions(NamedTuple):
@@ -225,6 +225,8 @@ def _run_loop(
     n_done: int,
     n_iterations: int,
 ) -> LoopState:
+    """Run the program of `compile_loop`. `shape` is the state of the loop with shapes instead of arrays."""
+
     def fill(leaf: Any, value: int) -> Array:
         return jnp.full(leaf.shape, value, leaf.dtype, device=leaf.sharding)
 
@@ -240,12 +242,12 @@ def _run_loop(
 
 
 def _loop_shape(env: JaxEnv, config: TrainConfig, n_seeds: int) -> LoopState:
-    def measure_and_collect(learner: Learner, keys: Key[Array, " seeds"]) -> LoopState:
+    """Return the state of the loop with shapes instead of arrays."""
+
+    def iterate(learner: Learner, keys: Key[Array, " seeds"]) -> LoopState:
         start = jnp.int32(0)
-        envs, actor = (
-            collect_device.reset(env, keys, config.n_envs, config),
-            get_actor(learner.algorithm, start, config),
-        )
+        envs = collect_device.reset(env, keys, config.n_envs, config)
+        actor = get_actor(learner.algorithm, start, config)
         _, steps = collect_device.collect(env, envs, actor, keys, start, config)
         metrics = _train_step_function(config)(learner, steps, keys, start)[1]
         if config.fits_separately:
@@ -253,7 +255,7 @@ def _loop_shape(env: JaxEnv, config: TrainConfig, n_seeds: int) -> LoopState:
         is_measured = {name: jnp.zeros(n_seeds, bool) for name in metrics}
         return LoopState(learner, envs, metrics, is_measured, steps, jnp.ones(n_seeds, bool))
 
-    return jax.eval_shape(measure_and_collect, learner_shape(config, n_seeds), keys_shape(n_seeds))
+    return jax.eval_shape(iterate, learner_shape(config, n_seeds), keys_shape(n_seeds))
 
 
 def _iterate(

@@ -80,11 +80,11 @@ class Session:
     _unchecked: tuple[Any, Trajectory] | None = None
     """Whether all factors of the newest steps are finite, for each seed, and these steps."""
     _threads: ThreadPoolExecutor = field(default_factory=lambda: ThreadPoolExecutor(3))
-    """They write checkpoints, update while steps are collected, and compile."""
+    """Threads that write checkpoints, update while steps are collected, and compile."""
     _saving: Future[None] | None = None
     """The checkpoint that is being written."""
     _iteration_s: float = MAX_CALL_S
-    """How long an iteration of the last compiled call has taken."""
+    """How long an iteration of the last compiled call has taken. The first call thus makes a single iteration."""
     _stop_requested: Callable[[], bool] = field(default=lambda: False)
     """Whether the user has asked the run to stop."""
 
@@ -162,7 +162,7 @@ class Session:
         self._unchecked = is_finite, steps
 
     def _check_losses(self) -> None:
-        """Raise `DivergedError` if a loss is not finite, so that the useless state is not saved."""
+        """Raise `DivergedError` if a loss is not finite, so that no checkpoint has a diverged state."""
         seeds, metrics = self.run.seeds, self.latest_metrics
         updates = np.asarray(metrics.get("algorithm/updates", np.ones(len(seeds))))
         for name in metrics:
@@ -176,7 +176,7 @@ class Session:
                     )
 
     def _update(self, steps: Trajectory) -> None:
-        """Fit the decoders if they have updates of their own that are due, and update the algorithm. Do nothing during the warmup."""
+        """Make the decoders' own updates if they are due, and then update the algorithm. Do nothing during the warmup."""
         config, seeds = self.config, jnp.asarray(self.run.seeds)
         if self.step < config.warmup:
             return

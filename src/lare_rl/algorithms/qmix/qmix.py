@@ -1,6 +1,6 @@
 """QMIX: monotonic value function factorisation (Rashid et al., 2018), as in PyMARL2 (Hu et al., 2021), and VDN.
 
-    a*_t    = the available actions of largest Q_i(h_t, .)                              by the online networks
+    a*_t    = each agent's available action with the largest Q_i(h_t, .)                by the online networks
     V_t     = Q'_tot(s_t, a*_t)                                                         by the target networks
     G_{t-1} = r_t + gamma * (1 - done_t) * ((1 - lambda) V_t + lambda G_t)
     theta  <- descend  sum mask (Q_tot(s_{t-1}, a_{t-1}) - G_{t-1})^2 / 2 / sum mask
