@@ -205,7 +205,7 @@ def observe_returns(
 def level_returns(
     state: DecoderState, level: Int[Array, " episodes"] | None, length: Int[Array, " episodes"]
 ) -> Float[Array, " episodes"]:
-    """Return the part of each episode's return that no step is credited with: the mean of its level, or the same for all episodes."""
+    """Return the part of each episode's return that no step is credited with. It depends on no more than its level and length."""
     if state.levels is not None and level is not None:
         return level_offsets(state.levels)[level] * length
     closed = state.closed_decoder
