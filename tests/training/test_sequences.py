@@ -154,13 +154,13 @@ def test_train_step_waits_for_a_batch_of_episodes():
 
 
 @pytest.mark.long
-def test_cut_lengths_change_nothing(monkeypatch):
+def test_batch_lengths_change_nothing(monkeypatch):
     config, steps = qmix_config("lare-rd"), random_steps(ONE_TEAM, 2, lengths=(5, 3, 2, 6, 4))
     learner = add_steps(untrained_learner(config), config, steps)
-    assert sequences._cut_lengths(config) == [12]
+    assert sequences._batch_lengths(config) == [12]
     results = [train_step(config, learner, steps)]
-    monkeypatch.setattr(sequences, "MIN_CUT_LENGTH", 0)
-    assert sequences._cut_lengths(config) == [3, 6, 12]
+    monkeypatch.setattr(sequences, "MIN_STEPS_TO_SHORTEN", 0)
+    assert sequences._batch_lengths(config) == [3, 6, 12]
     results.append(train_step(config, learner, steps))
     assert float(results[1][1]["algorithm/updates"][0]) == 5
     assert_close(*results, 1e-3)

@@ -1,5 +1,6 @@
-"""Decoders that are fitted by gradient descent: which steps an update reads, the loss of a method's fit, and one step of Adam on it."""
+"""Gradient updates of a decoder: the size of a batch, the loss of each fit, and a step of Adam."""
 
+from functools import partial
 from typing import Any, Literal, NamedTuple
 
 import jax
@@ -22,16 +23,17 @@ class BatchPlan(NamedTuple):
 
     layout: Literal["packed", "padded", "sampled"]
     episodes: int
-    """The number of episodes; for `packed`, the most that there is room for."""
+    """The number of episodes; for `packed`, the largest number."""
     rows: int
-    """The rows of each episode; for `packed`, of all episodes."""
+    """The number of rows (steps) of each episode; for `packed`, of all episodes together."""
 
 
 def plan_batch(spec: CreditSpec, longest: int) -> BatchPlan:
-    """Return which steps an update reads, so that it reads about `settings.steps` of them.
+    """Return the size of a batch with about `settings.steps` steps.
 
-    A decoder with a loss of its own reads `settings.episodes` whole episodes. RRD reads a sample of each episode's steps. Other fits
-    read whole episodes, as many as there is room for. `longest` is the number of steps of the longest episode.
+    RRD and LRR read K sampled steps of each episode. If all episodes have the same length T, they read as many episodes as RD, so K/T
+    of the steps. A decoder with a loss of its own reads `settings.episodes` whole episodes. Other fits read whole episodes.
+    `longest` is the number of steps of the longest episode.
     """
     settings = spec.settings
     if spec.method.fit is Fit.DECODER_LOSS:
@@ -41,7 +43,8 @@ def plan_batch(spec: CreditSpec, longest: int) -> BatchPlan:
         return BatchPlan("sampled", max(1, n_episodes), min(settings.sampled_steps, longest))
     if spec.fixed_length:
         return BatchPlan("padded", max(1, settings.steps // longest), longest)
-    return BatchPlan("packed", max(1, settings.steps // 2), max(settings.steps, longest))
+    n_episodes = max(1, settings.steps // 2)  # enough if the mean length is 2 or more
+    return BatchPlan("packed", n_episodes, max(settings.steps, longest))
 
 
 def loss_and_gradient(
@@ -57,7 +60,7 @@ def update(
 ) -> tuple[DecoderState, dict[str, Float[Array, ""]]]:
     """Take one step of gradient descent on a batch of episodes. Return the new state, and the metric `credit/loss`.
 
-    The loss is in squared units of `scale`, or of the reward if `normalise` is off.
+    The unit of the loss is the square of `decoder_state.reward_unit`.
     """
     return _step(state, *loss_and_gradient(state, episodes, key, spec), spec)
 
@@ -65,10 +68,10 @@ def update(
 def update_in_chunks(
     state: DecoderState, chunks: CreditBatch, key: PRNGKeyArray, spec: CreditSpec
 ) -> tuple[DecoderState, dict[str, Float[Array, ""]]]:
-    """Take one step by the mean of the gradients of several chunks of a batch.
+    """Take one step of gradient descent on a batch that is divided into chunks, by the mean of their gradients.
 
-    The chunks are along a leading axis. Each has the same number of episodes, and all masks are 1. The gradient equals that of all
-    episodes together, but intermediate arrays are only as large as for one chunk, so that they stay in the processor's cache.
+    The chunks are along a leading axis. Each must have the same number of episodes, and all masks must be 1. The gradient then equals
+    that of the whole batch. The intermediate arrays are as small as for one chunk, so that they fit into the processor's cache.
     """
     n_chunks = len(chunks.length)
 
@@ -85,7 +88,7 @@ def _step(
     state: DecoderState, loss: Float[Array, ""], gradient: DecoderNetwork, spec: CreditSpec
 ) -> tuple[DecoderState, dict[str, Float[Array, ""]]]:
     """Take one step of Adam, with the weight decay added to the gradient."""
-    gradient = jax.tree.map(lambda slope, weight: slope + spec.settings.weight_decay * weight, gradient, state.network)
+    gradient = jax.tree.map(lambda leaf, weight: leaf + spec.settings.weight_decay * weight, gradient, state.network)
     network, optimizer = adam_step(state.network, gradient, state.optimizer, spec.settings.learning_rate)
     return state._replace(network=network, optimizer=optimizer), {"credit/loss": loss}
 
@@ -93,21 +96,22 @@ def _step(
 def _mean_loss(
     network: DecoderNetwork, state: DecoderState, episodes: CreditBatch, key: PRNGKeyArray, spec: CreditSpec
 ) -> Float[Array, ""]:
-    """Return the loss of RD, RRD, RRD-unbiased or LRR: mean r_hat of an episode's steps against R/T, plus the decoder's penalty."""
+    """Return the loss of RD, RRD, RRD-unbiased or LRR, which compare the mean r_hat of an episode with R/T, plus the decoder's penalty."""
     fit, target, n_episodes = spec.method.fit, _targets(state, episodes, spec), len(episodes.length)
     weight = losses.episode_weight(episodes.length, episodes.mask, spec.settings.sum_form)
     output = decoder_state.decode(network, state, episodes.inputs, spec, key)
-    r_hat, penalty = (decoder_state.agent_mean(values, episodes.alive) for values in (output.r_hat, output.penalty))
-    n_steps = jnp.minimum(episodes.length, len(r_hat) // n_episodes) if spec.method.samples_steps else episodes.length
-
-    def means(values: Float[Array, " rows"]) -> Float[Array, " episodes"]:
-        return losses.episode_means(values, episodes.episode_index, n_steps)
-
-    mean = means(r_hat)
+    agent_mean = partial(decoder_state.agent_mean, alive=episodes.alive)
+    r_hat, penalty = agent_mean(output.r_hat), agent_mean(output.penalty)
+    n_steps = episodes.length
+    if spec.method.samples_steps:
+        n_sampled = len(r_hat) // n_episodes
+        n_steps = jnp.minimum(n_steps, n_sampled)
+    episode_means = partial(losses.episode_means, episode_index=episodes.episode_index, n_steps=n_steps)
+    mean = episode_means(r_hat)
     if fit is Fit.LIKELIHOOD:
         assert output.log_std is not None
-        uncertainties = jnp.exp(-2 * output.log_std), output.log_std
-        precision, log_std = (means(decoder_state.agent_mean(values, episodes.alive)) for values in uncertainties)
+        precision = episode_means(agent_mean(jnp.exp(-2 * output.log_std)))
+        log_std = episode_means(agent_mean(output.log_std))
         loss = losses.leave_one_out_likelihood(mean, target, weight, precision, log_std)
     elif fit is Fit.SAMPLED_STEPS_UNBIASED:
         variance = losses.subsampling_variance(r_hat.reshape(n_episodes, -1), episodes.length)
@@ -115,7 +119,9 @@ def _mean_loss(
     else:
         loss = losses.squared_error(mean, target, weight)
     penalty = masked_mean(penalty, decoder_state.step_rows(episodes))
-    return loss + penalty * losses.batch_mean(weight, weight)
+    return loss + penalty * losses.batch_mean(
+        weight, weight
+    )  # the mean weight is 1 or, with `sum_form`, the mean of T^2
 
 
 def _decoder_loss(
@@ -129,7 +135,10 @@ def _decoder_loss(
 
 
 def _targets(state: DecoderState, episodes: CreditBatch, spec: CreditSpec) -> Float[Array, " episodes"]:
-    """Return R/T of each episode, or R if the score is an average, in the decoder's unit, without what its level explains."""
+    """Return the target of each episode's mean output: R/T, or R if the score is an average, in units of `reward_unit`.
+
+    The part of R that no step is credited with (`level_returns`) is subtracted.
+    """
     mean_reward = episodes.mean_reward
     if episodes.level is not None:
         level_return = decoder_state.level_returns(state, episodes.level, episodes.length)

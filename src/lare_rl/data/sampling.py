@@ -77,7 +77,7 @@ def sample_episodes(replay: Replay, key: PRNGKeyArray, shape: tuple[int, ...]) -
 
 
 def sample_distinct_episodes(replay: Replay, key: PRNGKeyArray, count: int) -> EpisodeSample:
-    """Sample finished episodes uniformly, without replacement. If there are fewer than `count`, the mask of the others is 0."""
+    """Sample finished episodes uniformly, without replacement. If there are fewer than `count`, the mask of the missing ones is 0."""
     available, slots = n_stored_episodes(replay), replay.first.shape[-1]
     has_episode = jnp.arange(slots) < available[:, None]
     # The first episodes of a random order of all slots.

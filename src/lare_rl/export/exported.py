@@ -35,57 +35,59 @@ def _evaluate_module():
 
 
 @cache
-def _describe(name):
+def _read_entry(name):
     """Return the entry of a function in `export.json`."""
-    description = json.loads((_DIRECTORY / "export.json").read_text(encoding="utf-8"))
-    functions = [key for key, value in description.items() if isinstance(value, dict)]
+    export = json.loads((_DIRECTORY / "export.json").read_text(encoding="utf-8"))
+    functions = [key for key, value in export.items() if isinstance(value, dict)]
     if name not in functions:
         raise ValueError(f"there is no function {name!r}, only {', '.join(functions)}")
-    return description[name]
+    return export[name]
 
 
 @cache
 def _load_graph(name):
-    description = _describe(name)
+    """Return a graph as `evaluate.py` reads it: its operations and, for each output, the index of the operation that computes it."""
+    entry = _read_entry(name)
     with np.load(_DIRECTORY / f"{name}.npz", allow_pickle=False) as file:
         arrays = dict(file)
     nodes = []
-    for i, (op, inputs, shape, kind, option) in enumerate(description["nodes"]):
+    for i, (op, inputs, shape, kind, option) in enumerate(entry["nodes"]):
         if op == "gather":
-            slices = option and tuple(slice(*ends) for ends in option)
+            slices = None if option is None else tuple(slice(*bounds) for bounds in option)
             option = SimpleNamespace(slices=slices, positions=arrays.get(str(i)))
         elif op == "constant":
             option = arrays[str(i)]
         elif isinstance(option, list):
             option = tuple(option)
         nodes.append(_Node(op, inputs, tuple(shape), kind, option))
-    return SimpleNamespace(nodes=nodes, outputs=description["output_nodes"], unused_after=[[]] * len(nodes))
+    # `unused_after` lists the results that may be deleted after each operation. Here none are deleted.
+    return SimpleNamespace(nodes=nodes, outputs=entry["output_nodes"], unused_after=[[]] * len(nodes))
 
 
 @cache
 def load(name):
     """Load the function of NAME.npz. It takes arrays by name, and returns a dictionary of arrays."""
-    description, graph = _describe(name), _load_graph(name)
+    entry, graph = _read_entry(name), _load_graph(name)
 
     def function(**inputs):
-        needed = ", ".join(description["inputs"])
-        if missing := [key for key in description["inputs"] if key not in inputs]:
+        needed = ", ".join(entry["inputs"])
+        if missing := [key for key in entry["inputs"] if key not in inputs]:
             length = " (length is the number of steps of the episode)" if "length" in missing else ""
             raise ValueError(f"{name} needs the inputs {needed}: {', '.join(missing)} is missing{length}")
-        if unknown := [key for key in inputs if key not in description["inputs"]]:
+        if unknown := [key for key in inputs if key not in entry["inputs"]]:
             raise ValueError(f"{name} needs the inputs {needed}: there is no input {', '.join(unknown)}")
-        arrays = {key: _as_array(key, inputs[key], spec) for key, spec in description["inputs"].items()}
-        single = all(arrays[key].ndim < len(spec["shape"]) for key, spec in description["inputs"].items())
-        rows = {key: array[None] for key, array in arrays.items()} if single else _repeat_rows(arrays, description)
-        outputs = _evaluate_module().evaluate(graph, rows)
-        outputs = {key: outputs[key].astype(spec["type"]) for key, spec in description["outputs"].items()}
-        return {key: array[0] if single else array for key, array in outputs.items()}
+        arrays = {key: _as_array(key, inputs[key], spec) for key, spec in entry["inputs"].items()}
+        is_single = all(arrays[key].ndim < len(spec["shape"]) for key, spec in entry["inputs"].items())
+        batch = {key: array[None] for key, array in arrays.items()} if is_single else _repeat_rows(arrays, entry)
+        outputs = _evaluate_module().evaluate(graph, batch)
+        outputs = {key: outputs[key].astype(spec["type"]) for key, spec in entry["outputs"].items()}
+        return {key: array[0] if is_single else array for key, array in outputs.items()}
 
     return function
 
 
 def _as_array(key, values, spec):
-    """Return an array. All axes but the first, the batch, must have the sizes that `export.json` lists."""
+    """Return the values as an array. Its last axes must have the sizes that `export.json` lists after the batch."""
     array = np.asarray(values, spec["type"])
     sizes = tuple(spec["shape"][1:])
     if array.shape[array.ndim - len(sizes) :] != sizes:
@@ -94,33 +96,41 @@ def _as_array(key, values, spec):
     return array
 
 
-def _repeat_rows(arrays, description):
+def _repeat_rows(arrays, entry):
     """Return all arrays with the same batch axes. A single row among batches, such as the length of an episode, is repeated."""
-    row_shapes = {key: spec["shape"][1:] for key, spec in description["inputs"].items()}
-    batches = {key: array.shape[: array.ndim - len(row_shapes[key])] for key, array in arrays.items()}
-    sizes = {batch for batch in batches.values() if batch}
-    if len(sizes) > 1:
-        listed = ", ".join(f"{key} {batch}" for key, batch in batches.items())
+    row_shapes = {key: spec["shape"][1:] for key, spec in entry["inputs"].items()}
+    batch_shapes = {key: array.shape[: array.ndim - len(row_shapes[key])] for key, array in arrays.items()}
+    distinct_shapes = {shape for shape in batch_shapes.values() if shape}  # a single row has the shape ()
+    if len(distinct_shapes) > 1:
+        listed = ", ".join(f"{key} {shape}" for key, shape in batch_shapes.items())
         raise ValueError(f"all inputs must have the same batch, and the batches are: {listed}")
-    (batch,) = sizes
-    return {key: np.broadcast_to(array, (*batch, *row_shapes[key])) for key, array in arrays.items()}
+    (batch_shape,) = distinct_shapes
+    return {key: np.broadcast_to(array, (*batch_shape, *row_shapes[key])) for key, array in arrays.items()}
 
 
 def reward(before, action, after, name="reward", **more):
-    """Return the proxy rewards r_hat of steps, (batch, ...): phi and the decoder as one function.
+    """Return the proxy rewards r_hat of steps: phi and the decoder as one function.
 
-    Observations and actions are (batch, ..., n), in the environment's units; a choice is its number, (batch, ...), or a one-hot
-    row. `more` holds `length` and `alive`, if `export.json` lists them among the inputs.
+    Args:
+        before: the observations before the steps, (batch, n), or (batch, agents, n) if `export.json` lists an axis of agents.
+        action: the actions in the environment's units, with the same axes. A discrete action is its number, without the last axis,
+            or a one-hot row.
+        after: the observations after the steps.
+        name: the function: `reward`, or `reward_TEAM` if `export.json` lists several.
+        more: `length` and `alive`, if `export.json` lists them among the inputs.
+
+    Returns:
+        (batch,) or (batch, agents).
     """
-    action = _one_hot(before, action, _describe(name).get("choices"))
+    action = _one_hot(before, action, _read_entry(name).get("choices"))
     inputs = {"before": before, "action": action, "after": after, **more}
-    return load(name)(**{key: inputs[key] for key in _describe(name)["inputs"] if key in inputs})["r_hat"]
+    return load(name)(**{key: inputs[key] for key in _read_entry(name)["inputs"] if key in inputs})["r_hat"]
 
 
 def _one_hot(before, action, choices):
-    """Return actions as rows: the number of a choice becomes a one-hot row."""
+    """Return actions as rows: the number of a discrete action becomes a one-hot row."""
     number = np.asarray(action)
-    if choices is None or number.ndim != np.ndim(before) - 1:
+    if choices is None or number.ndim != np.ndim(before) - 1:  # continuous, or rows already
         return action
     index, count = number - choices["first"], choices["count"]
     if number.dtype.kind not in "iu" or np.any((index < 0) | (index >= count)):

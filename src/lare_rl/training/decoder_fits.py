@@ -65,7 +65,7 @@ class FirstFitStoppedError(Exception):
 
 
 def sample_credit(buffer: Replay, key: PRNGKeyArray, updates: int, config: CreditConfig) -> CreditSample:
-    """Draw the steps that each of some updates of the decoders reads."""
+    """Sample the steps that decoders read in each of several updates, on a leading axis of updates."""
     buffer, longest = replay.segments_as_episodes(buffer), config.longest_segment
     plan = plan_batch(config.credit_specs[0], longest)
     match plan.layout:

@@ -2,8 +2,8 @@
 
 There is one update for every `update_every` finished episodes. QMIX and VDN work like this. The team has one reward for
 each step: the mean over its agents that are alive. The mixer's input is the global state, standardised by its running
-mean and deviation (PyMARL2 does not standardise it; its environments scale it). If there is no global state, the input
-is all observations side by side.
+mean and deviation (PyMARL2 does not standardise it, because its environments return scaled states). If there is no
+global state, the input is all observations side by side.
 """
 
 from functools import partial
@@ -33,22 +33,23 @@ from lare_rl.training.rewards import rewards
 __all__ = ["Actor", "SequenceState", "get_actor", "init", "train_step"]
 
 Updated = tuple[Any, Decoders]
-"""The state of the algorithm, and the decoders."""
+"""What an update changes: the `networks` of `SequenceState`, and the decoders."""
 
-MIN_CUT_LENGTH = 32
-"""Batches are cut to shorter lengths only if the longest episode has at least this many steps. Each length compiles
-separately, and short episodes save little."""
+MIN_STEPS_TO_SHORTEN = 32
+"""Batches may be shorter than the longest possible episode only if it has at least this many steps. The update is compiled
+once for each length, and a shorter batch of short episodes saves little time."""
 
 
 class SequenceState(NamedTuple):
-    """The state of the algorithm, and of its training."""
+    """The state of the algorithm, and what the training loop adds to it."""
 
     networks: Any
-    """What the algorithm learns."""
+    """The state that the algorithm's `init` returns: networks, target networks and optimizer."""
     mixer_statistics: RunningMeanStd
     """Running statistics of the mixer's input."""
     n_due: Int[Array, ""]
-    """The number of updates that were due so far, made or not: one for every `update_every` episodes."""
+    """The number of updates that were due so far: one for every `update_every` episodes. It includes updates that were not
+    made, because there were too few episodes for a batch."""
 
 
 class Actor(NamedTuple):
@@ -83,6 +84,7 @@ def get_actor(state: SequenceState, env_steps: int | Int[Array, ""], config: Tra
     """Return the parts of the state that are needed to act, of one seed or of all."""
     algorithm = config.algorithm.load()
     epsilon = algorithm.epsilon(env_steps, _settings(config))
+    # `n_due` has the shape (seeds,), or () for one seed.
     return Actor(algorithm.get_actor(state.networks), jnp.full(state.n_due.shape, epsilon))
 
 
@@ -91,53 +93,55 @@ def train_step(
 ) -> tuple[Learner, Metrics]:
     """Make the updates that are due, once there are enough episodes for a batch.
 
-    The function is written for all seeds, so that all of them use the same length of a batch: the smallest that fits
-    the longest episode of any seed.
+    The arguments have a leading axis of seeds, because the batches of all seeds have the same length: the smallest allowed
+    length that fits the longest sampled episode of any seed.
     """
-    settings, n_before = _settings(config), learner.algorithm.n_due
+    settings, n_due_before = _settings(config), learner.algorithm.n_due
     n_due = jnp.sum(learner.replay.current_episode, axis=1) // settings.update_every
     has_batch = jnp.sum(jax.vmap(replay.n_stored_episodes)(learner.replay), axis=1) >= settings.batch_size
-    n_updates = jnp.where(has_batch, n_due - n_before, 0)
+    n_updates = jnp.where(has_batch, n_due - n_due_before, 0)
     statistics = jax.vmap(partial(_observe_states, config=config))(learner.algorithm.mixer_statistics, steps)
     learner = learner._replace(algorithm=learner.algorithm._replace(mixer_statistics=statistics, n_due=n_due))
-    lengths = jnp.asarray(_cut_lengths(config))
-    branches = [jax.vmap(partial(_update_seed, config=config, n_steps=length)) for length in _cut_lengths(config)]
+    batch_lengths = _batch_lengths(config)
+    update_functions = [jax.vmap(partial(_update_seed, config=config, n_steps=length)) for length in batch_lengths]
 
-    def make_update(number: Int[Scalar, ""], networks: Any, decoders: Decoders) -> tuple[Updated, Metrics]:
+    def make_update(i: Int[Scalar, ""], networks: Any, decoders: Decoders) -> tuple[Updated, Metrics]:
         current = learner._replace(algorithm=learner.algorithm._replace(networks=networks), decoders=decoders)
-        pairs = jax.vmap(lambda key: jax.random.split(jax.random.fold_in(key, number)))(keys)
+        pairs = jax.vmap(lambda key: jax.random.split(jax.random.fold_in(key, i)))(keys)
         sample_keys, update_keys = jnp.unstack(pairs, axis=1)
         sample = partial(sample_distinct_episodes, count=settings.batch_size)
         episodes = jax.vmap(sample)(current.replay, sample_keys)
         longest = jnp.max(episodes.length * (episodes.mask > 0))
-        branch = jnp.searchsorted(lengths, longest)
-        return jax.lax.switch(branch, branches, current, episodes, update_keys, n_before + number + 1)
+        function_index = jnp.searchsorted(jnp.asarray(batch_lengths), longest)  # the first length that is not smaller
+        update_number = n_due_before + i + 1
+        return jax.lax.switch(function_index, update_functions, current, episodes, update_keys, update_number)
 
-    def update(number: Int[Scalar, ""], carry: tuple[Updated, Metrics]) -> tuple[Updated, Metrics]:
+    def update(i: Int[Scalar, ""], carry: tuple[Updated, Metrics]) -> tuple[Updated, Metrics]:
         before, sums = carry
-        updated, metrics = make_update(number, *before)
-        is_due = number < n_updates
+        updated, metrics = make_update(i, *before)
+        is_due = i < n_updates  # of each seed
         sums = {name: sums[name] + jnp.where(is_due, values, 0) for name, values in metrics.items()}
         return select(is_due, updated, before), sums
 
     start = learner.algorithm.networks, learner.decoders
-    zeros = jax.tree.map(jnp.zeros_like, jax.eval_shape(make_update, jnp.int32(0), *start)[1])
+    _, metric_shapes = jax.eval_shape(make_update, jnp.int32(0), *start)
+    zeros = jax.tree.map(jnp.zeros_like, metric_shapes)
     (networks, decoders), sums = jax.lax.fori_loop(0, jnp.max(n_updates), update, (start, zeros))
     learner = learner._replace(algorithm=learner.algorithm._replace(networks=networks), decoders=decoders)
     metrics = {name: total / n_updates for name, total in sums.items()}  # NaN where there was no update
     return learner, metrics | {"algorithm/updates": n_updates.astype(jnp.float32)}
 
 
-def _cut_lengths(config: TrainConfig) -> list[int]:
-    """Return the allowed lengths of a batch."""
+def _batch_lengths(config: TrainConfig) -> list[int]:
+    """Return the allowed lengths of a batch: a quarter, a half and all of the steps of the longest possible episode."""
     longest = config.env.max_steps
-    if config.env.fixed_length or longest < MIN_CUT_LENGTH:
+    if config.env.fixed_length or longest < MIN_STEPS_TO_SHORTEN:
         return [longest]
-    return sorted({-(-longest // 4), -(-longest // 2), longest})
+    return sorted({-(-longest // 4), -(-longest // 2), longest})  # rounded up
 
 
 def _observe_states(statistics: RunningMeanStd, steps: Trajectory, config: TrainConfig) -> RunningMeanStd:
-    """Add the mixer's inputs of new steps to their statistics."""
+    """Update the running statistics of the mixer's input by new steps."""
     timestep = steps.next_timestep
     rows = jnp.asarray(_mixer_input(timestep.observation, timestep.state, config))
     return update_mean_std(statistics, rows.reshape(-1, rows.shape[-1]))
@@ -147,19 +151,21 @@ def _update_seed(
     learner: Learner,
     episodes: EpisodeSample,
     key: PRNGKeyArray,
-    number: Int[Scalar, ""],
+    update_number: Int[Scalar, ""],
     config: TrainConfig,
     n_steps: int,
 ) -> tuple[Updated, Metrics]:
-    """Update the decoder and then the algorithm of one seed. Return only what changes: the learner holds much more."""
+    """Update the decoder and then the algorithm of one seed. `update_number` counts the updates that were due, from 1."""
     sample_key, fit_key = jax.random.split(key)
     decoders, metrics = learner.decoders, {}
     if config.joint_fit:
-        sample = jax.tree.map(lambda leaf: leaf[0], sample_credit(learner.replay, sample_key, 1, config))
+        samples = sample_credit(learner.replay, sample_key, 1, config)
+        sample = jax.tree.map(lambda leaf: leaf[0], samples)  # without the axis of updates
         decoders, metrics = fit_decoders(learner.decoders, learner.replay, sample, fit_key, config)
     state, settings = learner.algorithm, _settings(config)
     batch = _sequences(learner.replay, episodes, n_steps, decoders, state.mixer_statistics, config)
-    n_episodes = number * settings.update_every
+    n_episodes = update_number * settings.update_every
+    # Copy if a multiple of `target_every` lies among the newest `update_every` episodes.
     copy_target = n_episodes // settings.target_every > (n_episodes - settings.update_every) // settings.target_every
     networks, algorithm_metrics = config.algorithm.load().update(state.networks, batch, copy_target, settings)
     return (networks, decoders), metrics | algorithm_metrics
@@ -173,23 +179,24 @@ def _sequences(
     mixer_statistics: RunningMeanStd,
     config: TrainConfig,
 ) -> Sequences:
-    """Return episodes with the method's rewards, each padded with its last step to `n_steps` steps."""
+    """Return episodes with the method's rewards. Each is padded to `n_steps` steps by copies of its last step."""
     step = lay_out_padded(episodes.length, n_steps).step
     env = jnp.broadcast_to(episodes.first.env[:, None], step.shape)
     steps = replay.read(buffer, Index(env, episodes.first.number[:, None] + step))
     mask = (jnp.arange(n_steps) < episodes.length[:, None]) * episodes.mask[:, None]
     reward = rewards(steps, decoders, config)
 
-    def with_last_timestep(name: str) -> Array:
+    def all_timesteps(name: str) -> Array:
+        """Return the column at all n_steps + 1 time steps: before the first step, and after each step."""
         return jnp.concatenate([steps.columns[name][:, :1], steps.next_columns[name]], axis=1)
 
-    observation = with_last_timestep("observation")
-    state = with_last_timestep("state") if config.env.state_size else jnp.zeros((*observation.shape[:2], 0))
+    observation = all_timesteps("observation")
+    state = all_timesteps("state") if config.env.state_size else jnp.zeros((*observation.shape[:2], 0))
     n_choices = (*observation.shape[:-1], config.env.action_size)
     return Sequences(
         observation=observation,
         state=standardise_if_observed(mixer_statistics, _mixer_input(observation, state, config)),
-        available=with_last_timestep("available") if config.env.masks_actions else jnp.ones(n_choices, bool),
+        available=all_timesteps("available") if config.env.masks_actions else jnp.ones(n_choices, bool),
         action=steps.columns["action"],
         reward=mask * team_mean(reward, alive_agents(steps, config), config.env.teams[0]),
         done=episodes.mask[:, None] * (jnp.arange(n_steps) == episodes.length[:, None] - 1),
