@@ -270,8 +270,7 @@ def _better_observation(
     better = [name for name, other in assessments.items() if other.r2 - other.r2_error > r2]
     if not better:
         return None
-    best = max(
-        better, key=lambda name: round(assessments[name].r2, 2)
-    )  # of equally good ones the first, which is simpler
+    # Of equally good ones the first, which is simpler.
+    best = max(better, key=lambda name: round(assessments[name].r2, 2))
     other_r2, this_r2 = (format_for_reader(value, "r2") for value in (assessments[best].r2, r2))
     return f"--scored-observation {best} explains more (R² {other_r2} instead of {this_r2}): set it in the task file."
