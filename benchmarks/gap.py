@@ -56,6 +56,8 @@ class Comparison:
 
 LEARNING, SWEEP, GPU = "learning", "sweeps/closed-form", "closed-form-gpu"
 LAPTOP, FULL, WHY = "reproduce/laptop", "sweeps/closed-form-full", "why"
+STUDY = frozenset({"episodic", "dense", "rrdu", "lare-rrdu", "lare-bayes", "bayes"})
+"""The methods of `lare-rl reproduce real`. Other runs on its tasks explain results, and are in `why`."""
 WHOLE_EPISODE = "-whole-episode"
 STYLE: Any = {"font.family": "sans-serif", "font.size": 11, "svg.fonttype": "none", "svg.hashsalt": "lare"}
 """Of pictures."""
@@ -86,7 +88,7 @@ def hidden(task: str) -> Comparison:
 
 def simulator_runs(task: str, algorithm: str, method: str) -> Directories:
     """The runs of a method on a simulator: seeds 0 to 4, and 5 to 9. METHOD-whole-episode is PPO with gamma = lambda = 1."""
-    if method.endswith(WHOLE_EPISODE) or method == "ircr":
+    if method not in STUDY:
         return [f"{WHY}/{task}/{method}/seeds-{first}" for first in (0, 5)]
     suffix = "-published" if method == "lare-rrdu" else ""
     environment = f"{task}Proxy" if method == "dense" else task

@@ -117,7 +117,8 @@ class DecoderLearner:
             if self.config.spec.basis.n_tracked:
                 self._fill_history(step_ids[chunk])
             alive = np.ones(inputs.shape[:-1], bool) if self.store.alive is None else self.store.alive[rows]
-            self._pending_inputs.append((inputs, alive))
+            if self.config.method.fit is not None:
+                self._pending_inputs.append((inputs, alive))
         if self.config.phi is not None and sum(len(action) for _, action in self.phi_sample) < PHI_SAMPLE_STEPS:
             _, action, next_observation = (rows.reshape(-1, rows.shape[-1])[:PHI_SAMPLE_STEPS].copy() for rows in steps)
             self.phi_sample.append((next_observation, action))

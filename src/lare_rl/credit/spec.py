@@ -124,9 +124,9 @@ class CreditSpec:
     def output_scale(self) -> float:
         """The factor sqrt(nT) of a decoder's output for n agents, or 1 for a single agent. T is the longest episode.
 
-        R/T is the mean of nT rewards, and a rare reward of a few agents is larger than this mean by about that factor. Adam changes an
-        output by steps of the same size in any unit, and the decoder of many agents is seldom fitted. Without this factor, its output
-        would need dozens of updates of the policy to reach the size of a rare reward.
+        R/T is the mean of nT rewards, and a rare reward of a few agents is larger than this mean by about that factor. An update of Adam
+        changes the output by about as much whatever unit the targets have, and the decoder of many agents has few updates. Without
+        this factor, its output would reach the size of a rare reward only after dozens of updates of the policy.
         """
         return 1.0 if self.agents == 1 else math.sqrt(self.max_steps * self.agents)
 

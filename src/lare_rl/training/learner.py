@@ -146,10 +146,8 @@ def _observe(decoder: DecoderState, steps: StoredSteps, config: CreditConfig, te
     """Add new steps, and the episodes that were paid in them, to the statistics of a team's decoder."""
     rows, mask = decoder_inputs(steps, config, team_index), row_mask(steps, config, team_index)
     decoder = decoder_state.observe_steps(decoder, rows, mask)
-    mean_reward, level = (
-        steps.mean_reward[..., team_index].ravel(),
-        None if steps.level is None else steps.level.ravel(),
-    )
+    mean_reward = steps.mean_reward[..., team_index].ravel()
+    level = None if steps.level is None else steps.level.ravel()
     return decoder_state.observe_returns(decoder, mean_reward, steps.length.ravel(), steps.last.ravel(), level)
 
 
