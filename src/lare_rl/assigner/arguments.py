@@ -9,7 +9,7 @@ from jaxtyping import Bool, Float, Int
 
 from lare_rl.assigner.assigner_config import AssignerConfig
 from lare_rl.assigner.group_names import GroupName, to_group_name
-from lare_rl.assigner.space_layout import MAX_MAGNITUDE, to_array
+from lare_rl.assigner.space_layout import check_numbers, to_array
 from lare_rl.envs.interface import alive_mean
 from lare_rl.errors import LareError, short_repr
 from lare_rl.tasks.payments import PaymentRule
@@ -77,7 +77,9 @@ def read_steps(
         ended=ended[rows],
         alive=None if alive is None else alive[rows],
     )
-    _check_finite(new)
+    names = ("observation", "action", "next_observation", "reward")
+    for name, values in zip(names, (*new.steps, new.reward), strict=True):
+        check_numbers(values, name, new.rows)
     return new
 
 
@@ -222,18 +224,7 @@ def to_step_ids(steps: Any) -> Int[np.ndarray, "*shape"]:
 def to_score(score: Any, name: str) -> float:
     """Return a score as a number. Raises `LareError` if it is not a single number, not finite, or too large."""
     number = to_array(score, name)
-    if number.size != 1 or not abs(number.item()) <= MAX_MAGNITUDE:  # true for NaN
-        raise LareError(f"{name} is {short_repr(number.tolist())}: give a finite number, at most {MAX_MAGNITUDE:g}")
+    if number.size != 1:
+        raise LareError(f"{name} is {short_repr(number.tolist())}: give a single number")
+    check_numbers(number.reshape(()), name)
     return float(number.item())
-
-
-def _check_finite(new: NewSteps) -> None:
-    """Raise `LareError` for the first number that is not finite, or too large."""
-    names = ("observation", "action", "next_observation", "reward")
-    for name, values in zip(names, (*new.steps, new.reward), strict=True):
-        is_wrong = ~(np.abs(values) <= MAX_MAGNITUDE)  # true for NaN
-        if is_wrong.any():
-            index = np.argwhere(is_wrong)[0]
-            entry = f" in entry {', '.join(map(str, index[1:]))}" if len(index) > 1 else ""
-            number = f"{name} of row {new.rows[index[0]]} has {values[tuple(index)]}{entry}"
-            raise LareError(f"{number}: give finite numbers, at most {MAX_MAGNITUDE:g}")

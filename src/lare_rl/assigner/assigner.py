@@ -32,6 +32,7 @@ from lare_rl.errors import LareError
 from lare_rl.latent.function import LatentFunction
 from lare_rl.tasks.payments import PaymentRule
 from lare_rl.tasks.spec import ScoredObservation, TaskSpec
+from lare_rl.util.npz import report_damage
 
 __all__ = ["CreditAssigner"]
 
@@ -326,7 +327,8 @@ class CreditAssigner:
             LareError: the directory does not exist, is damaged, or was written by another version.
         """
         credit = cls.__new__(cls)
-        with saving.report_damage(Path(directory)):
+        problem = f"{directory} holds no credit assigner, or one that is damaged or of another version"
+        with report_damage(problem):
             credit.__setstate__(saving.read_state(Path(directory)))
         return credit
 

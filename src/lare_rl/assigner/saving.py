@@ -7,8 +7,7 @@ DIRECTORY/
 """
 
 import json
-from collections.abc import Iterable, Iterator
-from contextlib import contextmanager
+from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -19,16 +18,16 @@ from lare_rl.assigner.decoder_learner import DecoderLearner
 from lare_rl.assigner.group_names import GroupName
 from lare_rl.assigner.store import Store, StoredEpisode
 from lare_rl.credit.methods import METHODS
-from lare_rl.errors import LareError, short_repr
+from lare_rl.errors import LareError
 from lare_rl.latent.saved import load_function
 from lare_rl.runs.checkpoint import fill_template, named_leaves
 from lare_rl.tasks.spec import TaskSpec
-from lare_rl.util.files import make_directory, replace_npz, write_atomically
-from lare_rl.util.npz import DAMAGED_FILE_ERRORS, open_npz
+from lare_rl.util.files import make_directory, replace_npz, write_bytes
+from lare_rl.util.npz import open_npz
 from lare_rl.util.renamed_fields import rename_assigner, rename_keys
 from lare_rl.util.safe_io import read_json, read_text
 
-__all__ = ["AssignerState", "get_state", "read_state", "report_damage", "restore", "write_state"]
+__all__ = ["AssignerState", "get_state", "read_state", "restore", "write_state"]
 
 FORMAT = 1
 TEXT_FILE, ARRAYS_FILE, FUNCTION_FILE = "assigner.json", "state.npz", "phi.py"
@@ -96,11 +95,11 @@ def write_state(state: AssignerState, directory: Path) -> None:
         "n_updates": state.n_updates,
     }
     text = json.dumps(values, indent=1).encode()
-    write_atomically(directory / TEXT_FILE, lambda file: file.write(text))
+    write_bytes(directory / TEXT_FILE, text)
 
 
 def read_state(directory: Path) -> AssignerState:
-    """Read what `write_state` has written. `phi` is verified again. Damaged files raise many kinds of errors: see `report_damage`.
+    """Read what `write_state` has written. `phi` is verified again. Damaged files raise `DAMAGED_FILE_ERRORS`.
 
     Raises:
         LareError: another version has written the directory, or `phi` fails.
@@ -121,17 +120,6 @@ def read_state(directory: Path) -> AssignerState:
     config = AssignerConfig(**fields | {"method": METHODS.find(values["method"]), "phi": phi, "task": task})
     group_names = tuple(values.get("group_names", ()))
     return AssignerState(config, values["n_learned"], values["n_updates"], arrays, group_names)
-
-
-@contextmanager
-def report_damage(directory: Path) -> Iterator[None]:
-    """Raise a `LareError` that names the directory, in place of the errors that damaged files cause."""
-    try:
-        yield
-    except DAMAGED_FILE_ERRORS as error:
-        raise LareError(
-            f"{directory} holds no credit assigner, or one that is damaged or of another version: {short_repr(error)}"
-        ) from error
 
 
 def _store_arrays(store: Store) -> dict[str, np.ndarray]:

@@ -5,12 +5,12 @@ from typing import Any, Literal
 
 import numpy as np
 from gymnasium import spaces
-from jaxtyping import Float, Shaped
+from jaxtyping import Float, Int, Shaped
 from pydantic import AliasChoices, Field
 
 from lare_rl.errors import CheckedModel, LareError, short_repr
 
-__all__ = ["MAX_MAGNITUDE", "SpaceLayout", "make_layout", "to_array"]
+__all__ = ["SpaceLayout", "check_numbers", "make_layout", "to_array"]
 
 MAX_MAGNITUDE = 1e18
 """The largest absolute value of a number. Squares of numbers are summed in float32."""
@@ -111,6 +111,17 @@ def to_array(values: Any, name: str) -> Shaped[np.ndarray, "*shape"]:
     if array.dtype.kind not in "biuf":
         raise LareError(f"{name} is {short_repr(values)}: give numbers")
     return array
+
+
+def check_numbers(array: Shaped[np.ndarray, "*shape"], name: str, rows: Int[np.ndarray, " rows"] | None = None) -> None:
+    """Raise `LareError` for the first number that is not finite, or too large. `rows` are the numbers of the rows in the message."""
+    with np.errstate(all="ignore"):
+        is_wrong = ~(np.abs(array.astype(np.float64)) <= MAX_MAGNITUDE)  # true for NaN
+    if is_wrong.any():
+        index = np.argwhere(is_wrong)[0].tolist()
+        value, labels = array[tuple(index)], index if rows is None else [int(rows[index[0]]), *index[1:]]
+        entry = str(labels) if labels else ""
+        raise LareError(f"{name}{entry} is {value}: give finite numbers, at most {MAX_MAGNITUDE:g}")
 
 
 def _to_float32(array: Shaped[np.ndarray, "*shape"]) -> Float[np.ndarray, "*shape"]:

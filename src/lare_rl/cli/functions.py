@@ -24,7 +24,7 @@ from lare_rl.cli.terminal import (
 from lare_rl.errors import LareError
 from lare_rl.llm.prompts import FunctionKind
 from lare_rl.tasks.spec import NO_ENVIRONMENT, ScoredObservation
-from lare_rl.util.files import check_new_path, write_atomically
+from lare_rl.util.files import check_new_path, write_bytes
 
 GOOD_R2 = 0.8
 """From this R² of returns on, factors are worth training with."""
@@ -75,7 +75,7 @@ def new_task(
     for new in paths:
         check_new_path(new, "--out" if new == path else "folder for --out")
     for new, text in zip(paths, [draft.toml, *draft.teams.values()], strict=True):
-        write_atomically(new, lambda file, text=text: file.write(text.encode()))
+        write_bytes(new, text.encode())
     print_line(f"wrote {', '.join(map(str, paths))}")
     if draft.removed:
         print_line("  left out or cut short, because it seems to speak of rewards:")

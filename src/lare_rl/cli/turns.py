@@ -8,7 +8,7 @@ from tyro.conf import Positional
 
 from lare_rl.cli.terminal import DEFAULT_LIVE, LiveOptions, print_line, print_messages, print_progress
 from lare_rl.errors import LareError
-from lare_rl.util.files import check_new_path, write_atomically
+from lare_rl.util.files import check_new_path, write_bytes
 from lare_rl.util.sanitize import one_line
 
 
@@ -112,5 +112,5 @@ def turn_phi(
         print_line(designed.phi.source)
         return
     text = f"# A phi over turns, by {one_line(designed.model)}.\n{designed.phi.source}\n"
-    write_atomically(out, lambda file: file.write(text.encode()))
+    write_bytes(out, text.encode())
     print_line(f"wrote {out} and {record}")

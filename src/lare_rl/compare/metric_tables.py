@@ -8,7 +8,7 @@ from typing import Any
 
 from lare_rl.runs.config_file import CONFIG, read_config
 from lare_rl.runs.metrics_file import read_metrics
-from lare_rl.util.files import write_atomically
+from lare_rl.util.files import write_atomically, write_bytes
 
 __all__ = ["read_metric_rows", "write_table"]
 
@@ -44,7 +44,7 @@ def write_table(rows: Sequence[dict[str, Any]], path: Path) -> list[Path]:
     writer.writeheader()
     writer.writerows(rows)
     csv_path, parquet_path = (path.with_name(path.name + suffix) for suffix in (".csv", ".parquet"))
-    write_atomically(csv_path, lambda file: file.write(text.getvalue().encode()))
+    write_bytes(csv_path, text.getvalue().encode())
     try:
         import pyarrow
         from pyarrow import parquet

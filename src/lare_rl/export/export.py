@@ -25,7 +25,7 @@ from lare_rl.runs.directory import Run, as_run, function_filename
 from lare_rl.training.policy import get_actor
 from lare_rl.training.saved_state import load_actor, load_learner
 from lare_rl.training.seed_axis import select_seed
-from lare_rl.util.files import new_directory, replace_npz, write_atomically
+from lare_rl.util.files import new_directory, replace_npz, write_bytes
 from lare_rl.util.provenance import code_version
 
 __all__ = ["ExportResult", "export_run"]
@@ -91,11 +91,11 @@ def _write_files(out: Path, graphs: dict[str, Graph], description: dict[str, Any
     for name, graph in graphs.items():
         _write_arrays(out / f"{name}.npz", graph)
         if is_installed():
-            _write_bytes(out / f"{name}.onnx", onnx_model(graph, name).SerializeToString())
-    _write_bytes(out / "export.json", json.dumps(description, indent=1).encode())
+            write_bytes(out / f"{name}.onnx", onnx_model(graph, name).SerializeToString())
+    write_bytes(out / "export.json", json.dumps(description, indent=1).encode())
     for module in (exported, evaluate):
         source = Path(str(module.__file__))
-        _write_bytes(out / source.name, source.read_bytes())
+        write_bytes(out / source.name, source.read_bytes())
 
 
 def _describe_graph(graph: Graph) -> dict[str, Any]:
@@ -131,7 +131,3 @@ def _write_arrays(path: Path, graph: Graph) -> None:
         elif node.op == "gather" and node.option.slices is None:
             arrays[str(i)] = node.option.positions
     replace_npz(path, arrays)
-
-
-def _write_bytes(path: Path, content: bytes) -> None:
-    write_atomically(path, lambda file: file.write(content))

@@ -22,7 +22,7 @@ from lare_rl.phi.graph import Graph
 from lare_rl.phi.names import factor_meanings, factor_names
 from lare_rl.phi.read import read
 from lare_rl.tasks.spec import ScoredObservation, TaskSpec, require_role, select_states, step_names
-from lare_rl.util.files import write_atomically
+from lare_rl.util.files import write_bytes
 from lare_rl.util.rows import as_numbers, as_rows
 
 __all__ = [
@@ -178,7 +178,7 @@ class LatentFunction:
         texts = {".json": json.dumps(fields, indent=1), ".py": "\n".join([*lines, self.source])}
         for suffix, text in texts.items():
             data = (redact_key(text) + "\n").encode()
-            write_atomically(path.with_suffix(suffix), lambda file, data=data: file.write(data))
+            write_bytes(path.with_suffix(suffix), data)
 
 
 def python_file(path: Path) -> Path:

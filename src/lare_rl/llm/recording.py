@@ -11,7 +11,7 @@ from typing import Literal
 from lare_rl.errors import CheckedModel, LareError
 from lare_rl.llm.key import redact_key
 from lare_rl.llm.prompts import N_CANDIDATES, Message, Stage
-from lare_rl.util.files import check_new_path, write_atomically
+from lare_rl.util.files import check_new_path, write_bytes
 from lare_rl.util.safe_io import read_json_object, read_text
 
 __all__ = [
@@ -168,7 +168,7 @@ class Recorder:
         """Write the recording to a file. Raises `LareError` if the file cannot be written, or it exists and should be `new`."""
         if new:
             check_new_path(path)
-        write_atomically(path, lambda file: file.write(self.to_json(model).encode()))
+        write_bytes(path, self.to_json(model).encode())
 
     def to_json(self, model: str) -> str:
         """Return the content of the file, without the key."""

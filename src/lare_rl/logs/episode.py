@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Float
 
 from lare_rl.assigner.group_names import GroupName, to_group_name
-from lare_rl.assigner.space_layout import MAX_MAGNITUDE, SpaceLayout, to_array
+from lare_rl.assigner.space_layout import SpaceLayout, check_numbers, to_array
 from lare_rl.errors import LareError, short_repr
 from lare_rl.tasks.spec import TaskSpec
 
@@ -141,7 +141,7 @@ def parse_episode(name: str, values: Mapping[str, Any], layout: LogLayout, conte
 
 def _rows(where: str, values: Any, layout: SpaceLayout) -> Float[np.ndarray, "steps size"]:
     for leaf in _leaves(values):
-        _to_numbers(where, leaf)
+        check_numbers(to_array(leaf, where), where)
     rows = layout.rows(values, where)
     if rows.ndim != 2:
         raise LareError(f"{where} must have rows of {layout.size} numbers, and its shape is {rows.shape}")
@@ -156,28 +156,20 @@ def _leaves(values: Any) -> list[Any]:
     return [values]
 
 
-def _to_numbers(where: str, values: Any) -> np.ndarray:
-    array = to_array(values, where)
-    with np.errstate(all="ignore"):
-        in_range = not array.size or np.abs(array.astype(np.float64)).max() <= MAX_MAGNITUDE  # false for NaN
-    if not in_range:
-        raise LareError(f"{where} has a number that is not finite, or larger than {MAX_MAGNITUDE:g}")
-    return array
-
-
 def _original_reward(name: str, values: Mapping[str, Any], n_steps: int) -> Float[np.ndarray, " steps"]:
     """Return the rewards of an episode, or those before it was relabelled."""
     key = next((key for key in ("paid", "score", "rewards") if key in values), None)
     if key is None:
         raise LareError(f"{name} has no rewards and no score: an episode needs observations, actions, and one of these")
     where = f"{name}: {key}"
-    reward = _to_numbers(where, values[key])
+    reward = to_array(values[key], where)
+    check_numbers(reward, where)
     shape = () if key == "score" else (n_steps,)
     if reward.shape != shape:
         expected = f"have one number for each of {n_steps} steps" if shape else "be a single number"
         raise LareError(f"{where} must {expected}, and its shape is {reward.shape}")
     reward = reward.astype(np.float64)
-    _to_numbers(where, np.abs(reward).sum())
+    check_numbers(np.asarray(np.abs(reward).sum()), f"{where}: the sum of absolute values")
     return reward if shape else np.append(np.zeros(n_steps - 1), reward)
 
 

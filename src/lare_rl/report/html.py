@@ -7,7 +7,7 @@ from importlib.resources import files
 from pathlib import Path
 
 from lare_rl.latent.function import LatentFunction
-from lare_rl.util.files import write_atomically
+from lare_rl.util.files import write_bytes
 
 __all__ = ["render_film", "render_fold", "render_function", "render_note", "render_table", "render_tiles", "write_page"]
 
@@ -38,7 +38,7 @@ def write_page(path: Path, title: str, body: str, refresh: int | None = None) ->
     style = (files("lare_rl.report") / "report.css").read_text(encoding="utf-8")
     page = _PAGE.format(title=escape(title), style=style, body=body, refresh=reload)
     data = page.encode(errors="backslashreplace")  # a name in the file system need not be UTF-8
-    write_atomically(path, lambda file: file.write(data))
+    write_bytes(path, data)
     return path
 
 

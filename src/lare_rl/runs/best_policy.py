@@ -76,5 +76,5 @@ def load_best(directory: Path, actor_shape: Any, n_seeds: int) -> BestPolicy:
         raise LareError(
             f"there is no {path}: the run has not been evaluated yet, trains several teams, or is of an older version"
         )
-    with report_damage(str(path)), open_npz(path) as arrays:
+    with report_damage(f"{path} cannot be read"), open_npz(path) as arrays:
         return fill_template(empty_best(n_seeds)._replace(actor=actor_shape), arrays)

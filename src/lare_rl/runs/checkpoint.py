@@ -149,7 +149,7 @@ def load(directory: Path, template: State) -> tuple[State, dict[str, Any], dict[
     path = directory / STATE_FILE
     if not path.is_file():
         raise LareError(f"there is no checkpoint in {directory}")
-    with report_damage(f"the checkpoint {path}"):
+    with report_damage(f"the checkpoint {path} cannot be read"):
         with open_npz(path) as saved:
             state = {name: saved[name] for name in saved.files}
         metadata, row_files = _parse_metadata(state.pop(METADATA)), _parse_row_files(state.pop(ROW_FILES))

@@ -15,7 +15,7 @@ from lare_rl.envs.placement import load_env_spec
 from lare_rl.errors import CheckedModel, LareError
 from lare_rl.latent.function import LatentFunction
 from lare_rl.tasks.spec import TaskSpec
-from lare_rl.util.files import write_atomically
+from lare_rl.util.files import write_bytes
 from lare_rl.util.processes import n_usable_cores
 from lare_rl.util.provenance import code_version
 from lare_rl.util.safe_io import read_table
@@ -80,7 +80,7 @@ def _describe_cores() -> str:
 def write_config(directory: Path, config: Config) -> None:
     """Write config.json. Raises `LareError` if it cannot be written."""
     text = config.model_dump_json(indent=1) + "\n"
-    write_atomically(directory / CONFIG, lambda file: file.write(text.encode()))
+    write_bytes(directory / CONFIG, text.encode())
 
 
 def read_config(directory: Path) -> Config:

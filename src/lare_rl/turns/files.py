@@ -7,7 +7,7 @@ from typing import Any
 
 from lare_rl.errors import LareError
 from lare_rl.turns.credit import CreditedTurns
-from lare_rl.util.files import write_atomically
+from lare_rl.util.files import write_bytes
 from lare_rl.util.safe_io import read_json, read_text
 
 __all__ = ["MAX_LINE_BYTES", "read_rollout_file", "read_tool_file", "write_credit_file"]
@@ -81,4 +81,4 @@ def write_credit_file(path: Path, rollouts: list[dict[str, Any]], credit: Credit
         lines.append(json.dumps({**rollout, "credit": {**numbers, "lambda": credit.lambda_}}, ensure_ascii=False))
     # A text of a rollout may have half of a surrogate pair, which is valid in JSON, but not in UTF-8.
     content = "".join(f"{line}\n" for line in lines).encode("utf-8", "backslashreplace")
-    write_atomically(path, lambda file: file.write(content))
+    write_bytes(path, content)

@@ -16,7 +16,7 @@ from lare_rl.errors import LareError
 
 __all__ = [
     "check_new_path", "check_writable", "find_free_path", "make_directory", "new_directory", "replace_npz", "write_atomically",
-    "write_npz",
+    "write_bytes", "write_npz",
 ]  # fmt: skip
 
 RETRY_S = 0.01, 0.03, 0.1, 0.3, 1.0
@@ -100,6 +100,11 @@ def write_atomically(path: Path, write: Callable[[Any], object]) -> None:
         raise LareError(f"{path} cannot be written ({reason}); an existing file is unchanged") from error
     finally:  # an interruption must not leave the new file either
         new.unlink(missing_ok=True)
+
+
+def write_bytes(path: Path, content: bytes) -> None:
+    """Write or replace a file as a whole. Raises `LareError` if it cannot be written."""
+    write_atomically(path, lambda file: file.write(content))
 
 
 def replace_npz(path: Path, arrays: Mapping[str, Any]) -> None:

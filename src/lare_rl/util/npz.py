@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from lare_rl.errors import LareError
+from lare_rl.util.sanitize import one_line
 
 __all__ = ["DAMAGED_FILE_ERRORS", "open_npz", "report_damage"]
 
@@ -19,6 +20,8 @@ DAMAGED_FILE_ERRORS = (
 )
 """Errors that may be raised by reading a file that is damaged, or holds something else."""
 
+MAX_REASON = 200
+"""Letters of a message that are shown: some errors repeat the file."""
 _ENCRYPTED = 1  # a flag of an entry
 
 
@@ -47,9 +50,10 @@ def open_npz(path: Path, max_bytes: int | None = None) -> Iterator[np.lib.npyio.
 
 
 @contextlib.contextmanager
-def report_damage(name: str) -> Iterator[None]:
-    """Raise a `LareError` that names the file, in place of the errors that a damaged file causes."""
+def report_damage(problem: str) -> Iterator[None]:
+    """Raise a `LareError` that begins with `problem`, in place of the errors that a damaged file causes."""
     try:
         yield
     except DAMAGED_FILE_ERRORS as error:
-        raise LareError(f"{name} cannot be read: {error or type(error).__name__}") from error
+        reason = one_line(f"{type(error).__name__}: {error}")
+        raise LareError(f"{problem}: {reason[:MAX_REASON]}") from error
