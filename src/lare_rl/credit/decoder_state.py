@@ -203,8 +203,8 @@ def level_returns(
 ) -> Float[Array, " episodes"]:
     """Return the part of each episode's return that no step is paid for: what its level explains, and what is the same for all."""
     closed, value = state.closed_form, jnp.zeros(length.shape)
+    index = 0 if closed is None else score_type_index(state, len(closed.start_value))
     if closed is not None:
-        index = score_type_index(state, len(closed.start_value))
         value = value + closed.start_value[index]
     if level is None:
         return value

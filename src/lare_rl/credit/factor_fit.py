@@ -94,8 +94,8 @@ def assess_factors(
         errors = {key: float(np.sum((returns[N_FIRST:] - values) ** 2) + margin) for key, values in predicted.items()}
         score_type = score_types[0]
         if len(score_types) > 1:
-            pair = map(jnp.asarray, (predicted[ScoreType.AVERAGE], predicted[ScoreType.SUM]))
-            is_average = is_better(jnp.asarray(returns[N_FIRST:]), *pair, jnp.ones(len(returns) - N_FIRST, bool))
+            as_average, as_sum = jnp.asarray(predicted[ScoreType.AVERAGE]), jnp.asarray(predicted[ScoreType.SUM])
+            is_average = is_better(jnp.asarray(returns[N_FIRST:]), as_average, as_sum, jnp.ones(len(as_sum), bool))
             score_type = ScoreType(int(is_average))
         length_r2 = None
         if score_type is ScoreType.SUM and lengths_differ:
