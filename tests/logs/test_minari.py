@@ -39,9 +39,12 @@ def episodes_with_infos(count):
 
 
 @pytest.mark.parametrize("data_format", ["hdf5", "arrow"])
-def test_round_trip(data_format):
+def test_round_trip(data_format, task):
     create_dataset("toy/log-v0", episodes_with_infos(12), data_format=data_format, description="A walk.", author="Ada")
     check_log(open_log("toy/log-v0"), logged_episodes(12))
+    grouped = open_log("toy/log-v0", task.model_copy(update={"group": "height"}))
+    assert grouped.layout.has_groups
+    assert all(episode.group == len(episode) for episode in grouped.episodes())
     assert write_rewards_plus_one("toy/log-v0", "mine/new-v0", "New rewards.") == "mine/new-v0"
     dataset = minari.load_dataset("mine/new-v0")
     metadata = dataset.storage.metadata

@@ -15,9 +15,8 @@ from lare_rl.tasks.spec import TaskSpec
 __all__ = ["KEYS", "LogLayout", "LoggedEpisode", "RelabelledEpisode", "infer_layout", "parse_episode"]
 
 KEYS = (
-    *("observations", "actions", "rewards", "score", "next_observations"),
-    *("terminations", "truncations", "cut", "paid", "group"),
-)
+    "observations", "actions", "rewards", "score", "next_observations", "terminations", "truncations", "cut", "paid", "group",
+)  # fmt: skip
 """The arrays of an episode that are read. The key `paid` has the rewards before the log was relabelled."""
 
 

@@ -26,12 +26,12 @@ except ImportError as missing:
 __all__ = ["MinariLog", "is_local_dataset", "load_dataset"]
 
 COPIED_METADATA = (
-    *("author", "author_email", "code_permalink", "algorithm_name", "requirements", "eval_env_spec"),
-    *("ref_min_score", "ref_max_score", "num_episodes_average_score"),
-)
+    "author", "author_email", "code_permalink", "algorithm_name", "requirements", "eval_env_spec",
+    "ref_min_score", "ref_max_score", "num_episodes_average_score",
+)  # fmt: skip
 
-FOLDERS = ("data",)
-"""What the directory of a data set has."""
+DATA_FOLDER = "data"
+"""The only folder in the directory of a data set."""
 
 
 class MinariLog(Log):
@@ -43,6 +43,7 @@ class MinariLog(Log):
         self.n_episodes = int(dataset.total_episodes)
         if not self.n_episodes:
             raise LareError(f"{self.name} has no episode")
+        self.group_key = None if role is None else role.group
         max_episode_steps = None if role is None else role.max_episode_steps
         if max_episode_steps is None and dataset.env_spec is not None:
             max_episode_steps = dataset.env_spec.max_episode_steps
@@ -50,6 +51,7 @@ class MinariLog(Log):
             observation=make_layout(dataset.observation_space, f"the observation space of {self.name}"),
             action=make_layout(dataset.action_space, f"the action space of {self.name}"),
             max_episode_steps=max_episode_steps,
+            has_groups=self.group_key is not None and "group" in next(self.read())[1],
         )
 
     def read(self) -> Iterator[tuple[str, dict[str, Any], dict[str, Any]]]:
@@ -65,6 +67,8 @@ class MinariLog(Log):
             infos = values.get("infos") or {}
             if "paid" in infos:
                 values["paid"] = np.asarray(infos["paid"])[1:]
+            if self.group_key in infos:
+                values["group"] = np.atleast_1d(np.asarray(infos[self.group_key], object))[-1:]
             reset = {key: metadata.get(key) for key in ("seed", "options")}
             yield name, values, {**values, **reset, "infos": infos}
 
@@ -72,7 +76,7 @@ class MinariLog(Log):
         """Raise `LareError` if no data set with the id `out` can be written."""
         path = _dataset_path(out)
         if path.parent.exists():  # otherwise `write` creates the namespace
-            check_output(path, overwrite, FOLDERS)
+            check_output(path, overwrite, (DATA_FOLDER,))
 
     def write(self, out: str | Path, episodes: Iterable[RelabelledEpisode], overwrite: bool, comment: str) -> str:
         """Write a data set with the id `out`, in the same format."""
@@ -81,11 +85,11 @@ class MinariLog(Log):
         if namespace is not None and namespace not in list_local_namespaces():
             create_namespace(namespace)
         metadata = source.metadata
-        with atomic_output(path, overwrite, FOLDERS) as directory, warnings.catch_warnings():
+        with atomic_output(path, overwrite, (DATA_FOLDER,)) as directory, warnings.catch_warnings():
             warnings.simplefilter("ignore")  # Minari warns if the spec of an environment cannot be saved
             directory.mkdir()
             storage = MinariStorage.new(
-                directory / FOLDERS[0],
+                directory / DATA_FOLDER,
                 source.observation_space,
                 source.action_space,
                 self.dataset.env_spec,
@@ -118,7 +122,7 @@ def load_dataset(dataset_id: str) -> MinariDataset:
 
 def is_local_dataset(dataset_id: str) -> bool:
     """Return whether a local Minari data set has that id."""
-    return (get_dataset_path(dataset_id) / FOLDERS[0]).is_dir()
+    return (get_dataset_path(dataset_id) / DATA_FOLDER).is_dir()
 
 
 def _dataset_path(dataset_id: str | Path) -> Path:
@@ -142,16 +146,16 @@ def _episode_buffer(item: RelabelledEpisode, data_format: str) -> EpisodeBuffer:
         rewards=item.r_hat,  # pyright: ignore[reportArgumentType] - an array works as well
         terminations=contents["terminations"],
         truncations=contents["truncations"],
-        infos=infos if data_format == "hdf5" else _lists_of_numbers(infos),
+        infos=infos if data_format == "hdf5" else _flat_arrays_to_lists(infos),
     )
 
 
-def _lists_of_numbers(infos: dict[str, Any]) -> dict[str, Any]:
-    """Convert flat arrays to lists. Minari writes such arrays into Arrow, and cannot read them again."""
+def _flat_arrays_to_lists(infos: dict[str, Any]) -> dict[str, Any]:
+    """Convert arrays with one axis to lists, because Minari cannot read such an array again from Arrow."""
 
     def convert(value: Any) -> Any:
         if isinstance(value, dict):
-            return _lists_of_numbers(value)
+            return _flat_arrays_to_lists(value)
         return value.tolist() if isinstance(value, np.ndarray) and value.ndim == 1 else value
 
     return {key: convert(value) for key, value in infos.items()}

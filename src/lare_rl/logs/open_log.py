@@ -20,7 +20,8 @@ def open_log(source: Any, task: TaskSpec | None = None) -> Log:
     Args:
         source: a directory of .npz or Parquet files, a Parquet file, a Hugging Face data set on the disk, a Minari id or data set,
             flat arrays by name (as in D4RL), or a list of episodes, each a mapping of arrays.
-        task: has the time limit, and the number of choices if observations or actions are whole numbers.
+        task: has the time limit, the number of choices if observations or actions are whole numbers, and the key of groups in
+            the infos of a Minari data set.
 
     Raises:
         LareError: the log does not exist, is not a log, or its first episode is damaged.
