@@ -53,7 +53,7 @@ class Corridor:
     """The corridor, with one of `SCORES` paid at the end."""
 
     def __init__(self, task: TaskSpec, **_: Any):
-        self.score = task.environment_name
+        self.score = task.name_in_family
         self.spec = EnvSpec(
             teams=(Team("agent", 0, 1),),
             observation_size=4,
@@ -131,7 +131,7 @@ class LevelEnv:
     """A particle task in three levels: agents start up to 1, 2 or 3 times as far from the centre."""
 
     def __init__(self, task: TaskSpec, **_: Any):
-        self.inner = ParticleEnv(task.environment_name)
+        self.inner = ParticleEnv(task.name_in_family)
         self.spec = EnvSpec(**{**vars(self.inner.spec), "measures": ("level",)})
 
     def reset(self, key: PRNGKeyArray) -> tuple[LevelState, Timestep]:

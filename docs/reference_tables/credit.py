@@ -155,10 +155,10 @@ def agents(spec: TaskSpec) -> str:
     """Return the number of agents that learn, or an empty text for one agent."""
     match spec.family:
         case "particles":
-            teams = {team.name: team.n_agents for team in find_particle_task(spec.environment_name).teams}
+            teams = {team.name: team.n_agents for team in find_particle_task(spec.name_in_family).teams}
             return f"{teams[spec.team] if spec.team else ' + '.join(map(str, teams.values()))} agents"
         case "smax" | "smac":
-            return f"{find_scenario(spec.environment_name).n_allies} agents"
+            return f"{find_scenario(spec.name_in_family).n_allies} agents"
     return ""
 
 

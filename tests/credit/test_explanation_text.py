@@ -203,11 +203,11 @@ def test_messages_and_lines():
 
 
 def test_raw_feature_names():
-    observation, action = "- 0: price\n[1] (none)\n2. angle (rad)\n", "0: torque"
+    observation, action = "- 0: price\n[1] (none)\n1:\n2. angle (rad), in a room of\n0.5 m\n", "0: torque"
     assert raw_feature_names(observation, action, {"next_observation": 3, "action": 1}) == [
         "entry 0 of the observation (price)",
         "entry 1 of the observation",
-        "entry 2 of the observation (angle (rad))",
+        "entry 2 of the observation (angle (rad), in a room of)",
         "entry 0 of the action (torque)",
     ]
     assert raw_feature_names("0: price", "", {"observation": 1, "next_observation": 1, "action": 1}) == [

@@ -200,7 +200,7 @@ class Incomplete:
     """An environment without the functions of its kind."""
 
     def __init__(self, task):
-        self.spec = replace(HUNT, is_jax=task.environment_name == "jax")
+        self.spec = replace(HUNT, is_jax=task.name_in_family == "jax")
 
     def reset(self, key): ...
 

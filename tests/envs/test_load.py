@@ -115,6 +115,12 @@ def test_file_without_a_task(tmp_path, text, content):
         load_task(path)
 
 
+def test_arguments_are_as_a_run_stores_them():
+    assert toy_spec(arguments={"a": ({"size": (3, 4)}, 1.0)}).arguments == {"a": [{"size": [3, 4]}, 1.0]}
+    with pytest.raises(LareError, match=r"arguments = .*keys"):
+        toy_spec(arguments={"rewards": [{0: 1.0}]})
+
+
 @pytest.mark.parametrize(
     ("task", "content"),
     [
@@ -156,7 +162,7 @@ def test_like_keeps_teams(tmp_path):
         ("CompetitivePP-6-predator", "predator"),
         ("CompetitivePP-6-prey", "prey"),
     ]
-    assert (task.family, task.environment_name, task.team) == ("particles", "CompetitivePP-6", None)
+    assert (task.family, task.name_in_family, task.team) == ("particles", "CompetitivePP-6", None)
     assert read_task("CN-6").roles == (read_task("CN-6"),)
 
 

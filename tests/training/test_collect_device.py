@@ -238,7 +238,7 @@ class BadEcho(Echo):
     }
 
     def __init__(self, task):
-        self.change = self.CHANGES[task.environment_name]
+        self.change = self.CHANGES[task.name_in_family]
 
     def reset(self, key):
         state, timestep = super().reset(key)

@@ -81,7 +81,7 @@ def construct(
 
     Raises `LareError` if the name is not among the package's names, or if `make` raises an error.
     """
-    name, names = task.environment_name, list(names)
+    name, names = task.name_in_family, list(names)
     message = f"environment {task.environment!r} cannot be made"
     if name not in names:
         hint = did_you_mean(name, names) or f"; it has {', '.join(map(str, names))}"

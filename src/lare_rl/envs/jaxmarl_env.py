@@ -38,7 +38,7 @@ def make(task: TaskSpec, **_: Any) -> "JaxMARLEnv":
     """
     jaxmarl = jax_spaces.import_package("jaxmarl", task)
     names = jaxmarl.registered_envs
-    if task.environment_name in RESETS_ITSELF:
+    if task.name_in_family in RESETS_ITSELF:
         raise jax_spaces.unusable(task.environment, "its steps hide the last observation of a game")
     env = jax_spaces.construct(task, names, jaxmarl.make)
     limit_name = next((name for name in LIMITS if getattr(env, name, None)), None)

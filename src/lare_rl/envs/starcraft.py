@@ -34,7 +34,7 @@ NO_OP = 0
 
 def make(task: TaskSpec, **_: Any) -> "StarCraft":
     """Make the environment of a task with the name `smac/MAP`."""
-    return StarCraft(task.environment_name)
+    return StarCraft(task.name_in_family)
 
 
 class StarCraft:

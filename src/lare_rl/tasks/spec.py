@@ -30,8 +30,8 @@ __all__ = [
 ]
 
 ScoredObservation = Literal["before", "after", "both"]
-"""The observations of a step that `phi` reads: before the action, after it, or both. For both, `phi` is called on each, and the
-factors are concatenated. A decoder's input `scored_observation` is then both observations."""
+"""See `TaskSpec.scored_observation`. For both, `phi` is called on each observation, and the factors are concatenated. A decoder's
+input `scored_observation` is then both observations."""
 
 State = TypeVar("State")
 
@@ -42,7 +42,10 @@ def select_states(scored_observation: ScoredObservation, state: State, next_stat
 
 
 def step_names(scored_observation: ScoredObservation, names: Sequence[str]) -> list[str]:
-    """Return the names of values that are computed from each of `select_states`."""
+    """Return the names of the values that are computed from `select_states`.
+
+    For both states, each name occurs twice: first all as in `speed (before)`, then all as in `speed (after)`.
+    """
     if scored_observation != "both":
         return list(names)
     return [f"{name} ({side})" for side in ("before", "after") for name in names]
@@ -55,12 +58,12 @@ def base_name(step_name: str) -> str:
 
 def entry_meanings(text: str) -> dict[int, str]:
     """Return the meanings of the entries of an observation or action by its text: the line `7: angle of the foot` is about entry 7."""
-    lines = re.findall(r"^[\s\-*\[]*(\d+)\]?\s*[:.)]\s*(.+)$", text, flags=re.MULTILINE)
+    lines = re.findall(r"^[ \t\-*\[]*(\d+)\]?[ \t]*[:.)](?!\d)[ \t]*(\S.*)$", text, flags=re.MULTILINE)
     return {int(number): meaning.strip() for number, meaning in lines}
 
 
 CreditScope = Literal["observation", "state"]
-"""What `phi` reads: each agent's observation and action, or the global state and the concatenated actions of the team."""
+"""See `TaskSpec.credit_scope`."""
 
 PETTINGZOO_PREFIX = "pettingzoo/"
 """The prefix of the names of PettingZoo environments. The rest is MODULE:NAME."""
@@ -83,10 +86,10 @@ values."""
 
 
 class PaidSteps(CheckedModel):
-    """The value of `paid_for` for payments that are for a fixed number of steps."""
+    """The value of `paid_for` if each payment is for a fixed number of steps."""
 
     steps: Annotated[StrictInt, Field(ge=1)]
-    """The number of last steps that a payment is for."""
+    """A payment is for this many of the last steps."""
 
 
 MAX_LEVELS = 64
@@ -160,10 +163,14 @@ class TaskSpec(CheckedModel):
     @classmethod
     def _check_arguments(cls, arguments: dict[str, Any]) -> dict[str, Any]:
         try:
-            json.dumps(arguments, allow_nan=False)  # a run stores its task as JSON, which would change such values
+            stored = json.loads(json.dumps(arguments, allow_nan=False))  # as in the file of a run
         except (TypeError, ValueError):
-            raise ValueError("a run cannot store dates, inf or nan. Use numbers, strings, lists and tables.") from None
-        return arguments
+            stored = None
+        if stored != _tuples_to_lists(arguments):
+            raise ValueError(
+                "a run cannot store dates, inf, nan, or keys that are no strings. Use numbers, strings, lists and tables."
+            )
+        return stored
 
     @model_validator(mode="after")
     def _check_teams(self) -> "TaskSpec":
@@ -178,7 +185,7 @@ class TaskSpec(CheckedModel):
     def _check_evaluation_environment(self) -> "TaskSpec":
         # A run's file may name any module, but only the module of `environment` is checked for trust before its import.
         other = self.evaluation_environment
-        if other is not None and _module(other) != _module(self.environment):
+        if other is not None and _import_origin(other) != _import_origin(self.environment):
             raise ValueError(
                 f"evaluation_environment = {other!r} is not of the module of environment = {self.environment!r}"
             )
@@ -198,8 +205,8 @@ class TaskSpec(CheckedModel):
         return self.environment.partition("/")[0] if "/" in self.environment else ""
 
     @property
-    def environment_name(self) -> str:
-        """The part of `environment` after the first slash."""
+    def name_in_family(self) -> str:
+        """The part of `environment` after the first slash, or "" without a slash."""
         return self.environment.partition("/")[2]
 
     @property
@@ -228,27 +235,33 @@ class TaskSpec(CheckedModel):
 
 
 def split_environment(name: str) -> tuple[str, str]:
-    """Split MODULE:NAME or NAME, which may follow the prefix of PettingZoo, into the module, or "", and the name."""
+    """Return the module and the name of MODULE:NAME, with or without `pettingzoo/` in front. The module of NAME alone is ""."""
     module, colon, rest = name.removeprefix(PETTINGZOO_PREFIX).partition(":")
     return (module, rest) if colon else ("", module)
 
 
-def _module(environment: str) -> tuple[bool, str]:
+def _import_origin(environment: str) -> tuple[bool, str]:
     """Return whether an environment is PettingZoo's, and the module that its name imports, or ""."""
     return environment.startswith(PETTINGZOO_PREFIX), split_environment(environment)[0]
 
 
-def unwritten_texts(spec: TaskSpec) -> list[str]:
+def _tuples_to_lists(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {key: _tuples_to_lists(item) for key, item in value.items()}
+    return [_tuples_to_lists(item) for item in value] if isinstance(value, list | tuple) else value
+
+
+def unwritten_texts(task: TaskSpec) -> list[str]:
     """Return the keys of the texts that still have the placeholder of a draft."""
-    return [key for key in ("description", "observation", "action") if FILL_IN in getattr(spec, key)]
+    return [key for key in ("description", "observation", "action") if FILL_IN in getattr(task, key)]
 
 
-def require_role(spec: TaskSpec) -> TaskSpec:
+def require_role(task: TaskSpec) -> TaskSpec:
     """Return a task without teams unchanged. Raise `LareError` for a task with teams, which has several latent functions."""
-    if spec.teams:
-        names = ", ".join(role.name for role in spec.roles)
+    if task.teams:
+        names = ", ".join(team.name for team in task.teams)
         raise LareError(
-            f"{spec.name} has a latent function for each of its teams ({names}). Name the task of one of them instead: the key "
+            f"{task.name} has a latent function for each of its teams ({names}). Name the task of one of them instead: the key "
             "teams of its file lists their files."
         )
-    return spec
+    return task

@@ -17,7 +17,7 @@ __all__ = ["ParticleEnv", "ParticleState", "make"]
 
 def make(task: TaskSpec, **_: Any) -> "ParticleEnv":
     """Make the environment of a task with the name `particles/NAME`."""
-    return ParticleEnv(task.environment_name)
+    return ParticleEnv(task.name_in_family)
 
 
 class ParticleState(NamedTuple):

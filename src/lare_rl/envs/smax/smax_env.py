@@ -27,7 +27,7 @@ WIN_RETURN = 20.0
 
 def make(task: TaskSpec, **_: Any) -> "SMAX":
     """Make the environment of a task with the name `smax/SCENARIO`."""
-    return SMAX(task.environment_name)
+    return SMAX(task.name_in_family)
 
 
 class SmaxState(NamedTuple):
