@@ -95,7 +95,7 @@ CALLS = {
     "lare_rl.load_function(0, task)": "not from 0",
     "lare_rl.load_function('none.py', 7)": "none.py does not exist",
     "lare_rl.design(7)": "TaskSpec",
-    "lare_rl.design(task, model='gpt')": "reply(messages, sample)",
+    "lare_rl.design(task, model='gpt')": "reply(messages, number)",
     "lare_rl.reflect(phi, 7, None)": "TaskSpec",
     "phi([[0, 0]] * 5, [[0]] * 4)": "differ: 5 and 4",
     "phi([0, 0, 0], [0])": "(batch, 2)",

@@ -225,7 +225,7 @@ class RepeatingModel:
     def __init__(self, replies):
         self.replies, self.n_requests = replies, 0
 
-    def reply(self, messages, sample):
+    def reply(self, messages, number):
         self.n_requests += 1
         return self.replies[self.n_requests % len(self.replies)]
 

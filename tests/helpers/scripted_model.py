@@ -18,11 +18,11 @@ class ScriptedModel:
     def __init__(self, *sources, replies=(), error: BaseException | None = None):
         self.replies = [*map(to_reply, sources), *replies]
         self.error = error or LareError("no reply is left")
-        self.requests, self.samples = [], []
+        self.requests, self.numbers = [], []
 
-    def reply(self, messages, sample):
+    def reply(self, messages, number):
         self.requests.append(messages)
-        self.samples.append(sample)
+        self.numbers.append(number)
         if not self.replies:
             raise self.error
         return self.replies.pop(0)

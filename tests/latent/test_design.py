@@ -82,7 +82,7 @@ def test_error_goes_back(chase):
     first = candidate(chase)
     second = combine(chase, [GOOD, OTHER])
     third = correct(second, bad, error_text("no_idea"))
-    assert (model.requests, model.samples) == ([first, first, second, third], [0, 1, 0, 0])
+    assert (model.requests, model.numbers) == ([first, first, second, third], [0, 1, 0, 0])
     assert function.exchanges == (
         {"stage": "candidate", "messages": first, "replies": [GOOD, OTHER]},
         {"stage": "combine", "messages": second, "replies": [bad]},
@@ -163,9 +163,9 @@ def test_record(chase, tmp_path):
     path, existed = tmp_path / "record.json", []
 
     class CheckingModel(ScriptedModel):
-        def reply(self, messages, sample):
+        def reply(self, messages, number):
             existed.append(path.exists())
-            return super().reply(messages, sample)
+            return super().reply(messages, number)
 
     function = design(chase, model=CheckingModel(replies=[MALFORMED, GOOD]), candidates=1, record=path)
     assert existed == [False, True]

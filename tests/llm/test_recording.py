@@ -28,7 +28,7 @@ def test_replies():
     assert [model.reply(REQUEST, sample) for sample in (0, 1, 2, 0)] == ["one", "two", "three", "one"]
     assert model.name == "A model, recorded 2026-01-31, draw 3"
     for messages, sample in (([REQUEST[0] | {"role": "system"}], 0), (REQUEST * 2, 0), ([], 1), (REQUEST, 3)):
-        with pytest.raises(LareError, match=rf"'Chase' \(reply {sample + 1}\)"):
+        with pytest.raises(LareError, match=rf"'Chase' \(reply {sample + 1}\): .*its exact requests"):
             model.reply(messages, sample)
 
 
@@ -76,11 +76,12 @@ def test_invalid_recording(text, words):
 def test_only_the_recording_of_the_same_exchanges_is_continued(tmp_path):
     path = tmp_path / "talk.json"
     Recorder("Chase", "factors", path=path).add("candidate", REQUEST, "one", "A model")
-    exchanges = read_recording(path.read_text(), "talk.json").exchanges
+    first = path.read_text()
+    exchanges = read_recording(first, "talk.json").exchanges
     Recorder("Chase", "factors", path=path, exchanges=[*exchanges]).add("candidate", REQUEST, "two", "A model")
     content = path.read_text()
     assert read_recording(content, "talk.json").exchanges[0].replies == ["one", "two"]
-    for text in (content, "{}", "my notes"):
+    for text in (content, first.replace("Chase", "Walk"), first.replace("factors", "reward"), "{}", "my notes"):
         path.write_text(text)
         with pytest.raises(LareError, match="exists"):
             Recorder("Chase", "factors", path=path, exchanges=exchanges)

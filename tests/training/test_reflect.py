@@ -150,10 +150,10 @@ def test_recording_answers_again(tmp_path):
 
 
 class StoppingModel(ScriptedModel):
-    def reply(self, messages, sample):
+    def reply(self, messages, number):
         if not self.replies:
             raise KeyboardInterrupt
-        return super().reply(messages, sample)
+        return super().reply(messages, number)
 
 
 @pytest.mark.parametrize(

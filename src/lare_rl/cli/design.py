@@ -159,7 +159,7 @@ def _check_files(out: Path | None, record: Path | None) -> Path | None:
 def _save_attempts(error: "DesignError", other: Path) -> None:
     """Save the replies, which were paid for, in the recorder's file or in another one. If both fail, print them."""
     recorder, model = error.recorder, error.model
-    recorded = [recorder.path] if recorder.path and recorder.file_created else []
+    recorded = [recorder.path] if recorder.path and recorder.owns_file else []
     for path in (*recorded, other):
         try:
             recorder.save(path, model, new=path not in recorded)

@@ -138,7 +138,7 @@ def check_recorded(task: TaskSpec, kind: FunctionKind, draw: int, candidates: in
         LareError: a reply is missing.
     """
     model, request = recorded_model(task.name, kind, draw), prompts.candidate(task, kind)
-    replies = [model.reply(request, sample) for sample in range(candidates)]
+    replies = [model.reply(request, number) for number in range(candidates)]
     if candidates > 1:
         model.reply(prompts.combine(task, replies, kind), 0)
 
@@ -164,7 +164,7 @@ def design(
     Args:
         task: a name, a path, or a spec.
         kind: several factors, or one reward.
-        model: the language model to ask: an object with `name` and `reply(messages, sample)`, or a function from messages to a
+        model: the language model to ask: an object with `name` and `reply(messages, number)`, or a function from messages to a
             text. Without one, the shipped recordings answer.
         draw: the number of the shipped recording that answers (0 to 4). It is independent of the training seed.
         candidates: n. With 1 (the paper's ablation without self-prompting), the single candidate is the function and

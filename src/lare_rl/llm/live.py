@@ -117,8 +117,8 @@ class LiveModel:
             default_headers={"Accept-Encoding": "identity"},  # answers that are not compressed need no unpacking
         )
 
-    def reply(self, messages: Sequence[Message], sample: int) -> str:
-        """Return a reply. `sample` is not used: a live model gives a new reply each time.
+    def reply(self, messages: Sequence[Message], number: int) -> str:
+        """Return a reply. `number` is not used: a live model gives a new reply each time.
 
         Raises:
             ModelError: no attempt gave a reply.

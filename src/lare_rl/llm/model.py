@@ -27,8 +27,11 @@ class Model(Protocol):
         """What provenance calls it."""
         ...
 
-    def reply(self, messages: Sequence[Message], sample: int) -> str:
-        """Return the text of reply number `sample` (0, 1, ...) to the same request. Raises `LareError` if there is no reply."""
+    def reply(self, messages: Sequence[Message], number: int) -> str:
+        """Return the text of a reply. `number` counts the replies to the same request: 0, 1, ...
+
+        Raises `LareError` if there is no reply.
+        """
         ...
 
 
@@ -43,7 +46,7 @@ class FunctionModel:
     function: ModelFunction
     name: str
 
-    def reply(self, messages: Sequence[Message], sample: int) -> str:
+    def reply(self, messages: Sequence[Message], number: int) -> str:
         try:
             text = self.function([dict(message) for message in messages])
         except LareError:
@@ -62,7 +65,7 @@ def as_model(model: Any) -> Model:
     if callable(model):
         return FunctionModel(cast(ModelFunction, model), getattr(model, "__name__", type(model).__name__))
     raise LareError(
-        "a model must be a function from messages to a text, or have a name and a method reply(messages, sample), as "
+        "a model must be a function from messages to a text, or have a name and a method reply(messages, number), as "
         f"lare_rl.llm.live.LiveModel('NAME') has: {short_repr(model)} does not"
     )
 

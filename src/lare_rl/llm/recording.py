@@ -36,13 +36,15 @@ class Exchange(CheckedModel):
 
 
 class Recording(CheckedModel):
-    """One complete sample of a model: its candidates, their combination, and corrections if they were needed."""
+    """One design by a model: its candidates, their combination, corrections and reflections, as far as there were any."""
 
     task: str
     kind: RecordingKind
     draw: int
     model: str
+    """The name of the model that was asked last."""
     recorded: str
+    """The date of the last reply (ISO)."""
     temperature: float | None
     exchanges: list[Exchange]
 
@@ -73,7 +75,7 @@ def read_recording(text: str, name: str) -> Recording:
     """
     try:
         values = read_json_object(text)
-        json.dumps(values, ensure_ascii=False).encode()
+        json.dumps(values, ensure_ascii=False).encode()  # raises for surrogates, which cannot be encoded
     except UnicodeEncodeError as error:
         raise LareError(f"recording {name} holds half a character (a surrogate), which no file can store") from error
     except ValueError as error:
@@ -100,19 +102,17 @@ class RecordedModel:
         self.task = task
         self.name = RECORDED
 
-    def reply(self, messages: Sequence[Message], sample: int) -> str:
-        """Return the reply number `sample` to a request. See `Model.reply`."""
+    def reply(self, messages: Sequence[Message], number: int) -> str:
+        """Return a recorded reply to a request. See `Model.reply`."""
         request = list(messages)
         for recording in self.recordings:
             replies = [reply for x in recording.exchanges if x.messages == request for reply in x.replies]
-            if sample < len(replies):
+            if number < len(replies):
                 self.name = f"{recording.model}, recorded {recording.recorded}, draw {recording.draw}"
-                return replies[sample]
-        reason = "most shipped tasks have some, for their exact texts"
-        if self.name != RECORDED:  # an earlier request was answered
-            reason = f"shipped recordings have 1 or {N_CANDIDATES} candidates, and no reflection"
+                return replies[number]
         raise LareError(
-            f"no recorded reply fits task {self.task!r} (reply {sample + 1}): {reason}. "
+            f"no recorded reply fits task {self.task!r} (reply {number + 1}): a recording answers only its exact requests (those "
+            f"that are shipped: most shipped tasks, 1 or {N_CANDIDATES} candidates, no reflection). "
             "Ask a model (lare_rl.design(task, model=...), or lare-rl design TASK --model NAME --out phi.py), train with a "
             "function of your own (--function phi.py; in a sweep file, the table [functions]), or with a method that needs none "
             "(--method bayes)"
@@ -123,8 +123,8 @@ class RecordedModel:
 class Recorder:
     """Records every exchange of a design. With a `path`, it saves them to this file after each reply.
 
-    An existing file is never overwritten: the file must not exist at first, or hold exactly the first `exchanges`. After each
-    reply it is replaced as a whole, so that no reply is lost.
+    Other files are never overwritten: the file must not exist at first, or be a recording of the same task and kind with exactly
+    the `exchanges` that are passed here. After each reply it is replaced as a whole, so that no reply is lost.
     """
 
     task: str
@@ -132,22 +132,26 @@ class Recorder:
     temperature: float | None = None
     path: Path | None = None
     exchanges: list[Exchange] = field(default_factory=list)
-    file_created: bool = field(init=False, default=False)
-    """Whether the file is of this recorder."""
+    owns_file: bool = field(init=False, default=False)
+    """Whether the file at `path` is this recorder's, so that it may be replaced."""
 
     def __post_init__(self) -> None:
         if self.path is not None:
-            self.file_created = self._is_recorded(self.path)
-            if not self.file_created:
+            self.owns_file = self._is_recorded(self.path)
+            if not self.owns_file:
                 check_new_path(self.path)  # before a model is asked and paid
 
     def _is_recorded(self, path: Path) -> bool:
-        """Return whether a file is a recording of the exchanges so far. It is without the key."""
+        """Return whether a file is a recording of the exchanges so far, of the same task and kind.
+
+        They are compared as they are saved: without the API key.
+        """
         try:
             saved = read_recording(read_text(path), str(path))
         except LareError:
             return False
-        return saved.exchanges == read_recording(self.to_json(""), "").exchanges
+        ours, keys = read_recording(self.to_json(""), ""), {"task", "kind", "exchanges"}
+        return saved.model_dump(include=keys) == ours.model_dump(include=keys)
 
     def n_replies(self, stage: Stage, messages: Sequence[Message]) -> int:
         """Return the number of recorded replies to a request."""
@@ -155,14 +159,17 @@ class Recorder:
         return sum(len(x.replies) for x in self.exchanges if (x.stage, x.messages) == request)
 
     def add(self, stage: Stage, messages: Sequence[Message], reply: str, model: str) -> None:
-        """Add a reply to a request. If the last request was the same, the reply is added to its replies."""
+        """Add a reply to a request. If the last request was the same, the reply is added to its replies.
+
+        `model` is the name of the model that replied. A file has one name: that of its last reply.
+        """
         replies = [reply]
         if self.exchanges and (self.exchanges[-1].stage, self.exchanges[-1].messages) == (stage, list(messages)):
             replies = [*self.exchanges.pop().replies, reply]
         self.exchanges.append(Exchange(stage=stage, messages=list(messages), replies=replies))
         if self.path is not None:
-            self.save(self.path, model, new=not self.file_created)
-            self.file_created = True
+            self.save(self.path, model, new=not self.owns_file)
+            self.owns_file = True
 
     def save(self, path: Path, model: str, new: bool = True) -> None:
         """Write the recording to a file. Raises `LareError` if the file cannot be written, or it exists and should be `new`."""
