@@ -71,7 +71,7 @@ def test_draws_and_kinds():
     with pytest.raises(LareError, match=r"'Chase'.*model=.*--model NAME.*--function phi\.py.*bayes") as error:
         design(toy_spec())
     assert "\n" not in str(error.value)
-    with pytest.raises(LareError, match="have 1 or 5 candidates"):
+    with pytest.raises(LareError, match="1 or 5 candidates"):
         design(task, candidates=3)
 
 
