@@ -2,21 +2,23 @@
 
     r_hat = b + w . f(u),    u = (x - mean) / std
 
-f are the features of `basis.py`. w and b are computed from sums over episodes (`evidence.py`), without gradient descent. In LaRe
-without a reward model, w are signs instead:
+x are a step's inputs, and f the features of `basis.py`. If the score is an average, the left side is T r_hat. w and b are computed
+from sums over episodes (`evidence.py`), without gradient descent. Episode k has T_k steps, the mean features m_k, the return R_k, and
+y_k = R_k / T_k, or R_k if the score is an average. In LaRe without a reward model (`lare-signs`), w are signs instead:
 
     w = argmin sum_k T_k (R_k/T_k - w . m_k)^2  over  w in {-1, 1}^d,    b = 0,    f(u) = x
 
 Episodes may belong to levels, which differ in difficulty: maps, weather, demand. A fit then has a random intercept for each level,
-whose strength is set by the evidence as that of a group of features is:
+whose prior precision is set by the evidence, like that of a group of features:
 
     y_k = b + c_level(k) + w . m_k + noise,     c ~ N(0, 1 / alpha_levels)
 
 The intercept takes part in the prediction of a return, but no step is paid for it: an easy level does not credit what happens on it.
 
-The features depend on the mean and the std that standardise u. If these changed with every step, the sums over earlier steps would
+The features depend on the mean and the std that standardise x. If these changed with every step, the sums over earlier steps would
 be wrong, so they are kept constant for a while. Whenever the number of steps has grown by a half, they are updated and all stored
-episodes are summed again. Each step is summed three times on average, however many steps there are.
+episodes are summed again. As long as all episodes are stored, each step is summed three to four times in total, however many steps
+there are.
 
 The sums need float64: if features are nearly collinear, float32 loses all precision. The stored state holds each number as the
 sum of two float32 numbers. Call functions that take or return `SufficientStatistics` within `float64()`.
@@ -69,7 +71,7 @@ MAX_EVIDENCE_ROUNDS = 20
 
 
 class LinearDecoder(eqx.Module):
-    """r_hat = b + w . f(u)."""
+    """r_hat = b + w . f(u), or T r_hat if the score is an average."""
 
     basis: Basis = eqx.field(static=True)
     mean: Float[Array, " inputs"]
@@ -109,9 +111,10 @@ class ClosedForm(NamedTuple):
     n_fitted: Float[Array, ""]
     """The number of episodes that the decoder is fitted to."""
     posterior: Posterior
-    """The fit by groups of each score type but log odds, along a leading axis."""
+    """The fit with a precision for each group of features, of each score type but log odds, along a leading axis."""
     strengths: Posterior
-    """The fit by strengths (`relevance.py`) of the same score types. The decoder has the weights of the better fit."""
+    """The fit with a precision of its own for each raw feature, and for its shapes (`relevance.py`), of the same score
+    types. The decoder has the weights of the better fit."""
     intercept: Float[Array, "score_types levels"]
     """The intercept of each level, for each score type: part of R/T for a score that is a sum, else of R."""
     start_value: Float[Array, " score_types"]
@@ -190,7 +193,7 @@ class _Weights(NamedTuple):
     """The result of a fit, for some score types."""
 
     columns: Float[Array, "score_types columns"]
-    """The weights of features, of the time if there are prefixes, and of levels."""
+    """The weights of features, of the number of steps so far (only in fits to prefixes), and of levels."""
     bias: Float[Array, " score_types"]
     start_value: Float[Array, " score_types"]
 
@@ -203,9 +206,10 @@ def fit(
     fixed_length: bool = False,
     batched: bool = False,
 ) -> ClosedForm:
-    """Fit the decoder of each score type. If `batched` is true, sums and averages are fitted at once.
+    """Fit the decoder of each score type.
 
-    If the score is an average, and not all episodes have the same length (`fixed_length`), no step is paid for the mean return.
+    If `batched` is true, the score types sum and average are fitted in one batch, else one after the other. If the score is an
+    average, and not all episodes have the same length (`fixed_length`), no step is paid for the mean return.
     """
     basis = state.decoder.basis
     groups, strengths = _fit_linear_types(state, score_types, max_rounds, batched=batched)
@@ -240,7 +244,7 @@ def _fit_linear_types(
 
 def _linear_weights(basis: Basis, groups: Posterior, strengths: Posterior) -> _Weights:
     best = relevance.select(strengths, groups, basis.column_group_index, basis.column_strength_index)
-    if basis.prefixes:  # the value before the first step is no reward, and time is
+    if basis.prefixes:  # b is the weight of the number of steps; the bias is V_0, which no step is paid for
         return _Weights(best.weight, best.weight[:, basis.n_features], best.bias)
     return _Weights(best.weight, best.bias, jnp.zeros_like(best.bias))
 
@@ -266,7 +270,7 @@ def reward_std(
 ) -> Float[Array, " rows"]:
     """Return the posterior standard deviation of r_hat, or of T r_hat if the score is an average. Call this within `float64()`.
 
-    The fit must be that of the evidence. `index` is the position of the score type among all that are fitted.
+    Only after `fit`, not after `fit_signs`. `index` is the position of the score type among all that are fitted.
     """
     basis, features, n_linear = state.decoder.basis, state.decoder.features(rows), len(state.posterior.bias)
     linear_index = jnp.minimum(index, n_linear - 1)
@@ -277,7 +281,7 @@ def reward_std(
         basis.column_strength_index,
         jax.tree.map(lambda leaf: leaf[linear_index].astype(float), best),
     )
-    if basis.prefixes:  # the value before the first step is no part of a reward, and time is
+    if basis.prefixes:  # a step adds 1 to the number of steps, and V_0 is no part of its reward
         features = jnp.append(features, jnp.ones((*features.shape[:-1], 1)), axis=-1)
         covariance = covariance._replace(centre=jnp.zeros_like(covariance.centre), centre_variance=jnp.zeros(()))
     std = evidence.posterior_std(covariance, features)
