@@ -254,9 +254,10 @@ def decoder_rewards(
     spec: CreditSpec,
     length: Float[Array, " rows"] | Int[Array, " rows"] | None = None,
 ) -> Float[Array, "rows *agents"]:
-    """Return r_hat of some steps, in the unit of the true rewards. The decoder need not have been fitted yet.
+    """Return r_hat of some steps, in the unit of the return (of `llm-reward`: as the function returns it).
 
-    `length` is T, the number of steps of each row's episode. Without it, the score is treated as a sum.
+    The decoder need not have been fitted yet. `length` is T, the number of steps of each row's episode. Without it, the score is treated
+    as a sum.
     """
     output = reward_unit(state, spec) * decode(state.network, state, inputs, spec).r_hat
     if length is None:

@@ -1,11 +1,11 @@
 """`lare-rl export`: what a run has learned, for programs that have neither LaRe nor JAX.
 
 DIRECTORY/
-  export.json              task, seed, step; inputs, outputs and operations of each function
+  export.json              task, method, algorithm, seed, the policy's step; inputs, outputs and operations of each function
   policy.npz, .onnx        observation -> action
   reward.npz, .onnx        steps -> r_hat, phi and decoder as one function; one reward_TEAM each if several teams learn
   latent_function.py       the source of phi, for readers
-  exported.py, evaluate.py NumPy code that computes the .npz files
+  exported.py, evaluate.py NumPy code that evaluates the functions in export.json and the .npz files
 """
 
 import json
@@ -20,7 +20,7 @@ from lare_rl.export.policy_graph import policy_graph
 from lare_rl.export.reward_graph import missing_reward_reason, reward_graph
 from lare_rl.phi import evaluate
 from lare_rl.phi.graph import Gather, Graph, Node
-from lare_rl.phi.onnx import BATCH, DTYPES, is_installed, onnx_model
+from lare_rl.phi.onnx import BATCH, DTYPES, is_onnx_installed, onnx_model
 from lare_rl.runs.directory import Run, as_run, function_filename
 from lare_rl.training.policy import get_actor
 from lare_rl.training.saved_state import load_actor, load_learner
@@ -44,10 +44,10 @@ class ExportResult(NamedTuple):
 
 
 def export_run(run: Run | str | Path, out: str | Path, seed: int | None = None, best: bool = False) -> ExportResult:
-    """Write the policy and the proxy rewards of a seed to a directory that must not exist.
+    """Write the policy and the reward functions of a seed to a directory that must not exist.
 
-    A policy returns its most likely action; if evaluations sample choices, it returns their logits too. Rewards are those
-    of the last checkpoint's decoder, in the unit of the true rewards.
+    A policy returns its most likely action; of discrete actions in PPO and IPPO, also the logits. Rewards are those of the last
+    checkpoint's decoder, in the unit of the return (of `llm-reward`: as the function returns them).
 
     Args:
         seed: one of the run's seeds; the default is the first.
@@ -70,27 +70,28 @@ def export_run(run: Run | str | Path, out: str | Path, seed: int | None = None, 
     graphs = {"policy": policy_graph(select_seed(actors, seed_index), config)}
     decoders = select_seed(learner.decoders, seed_index)
     no_reward_reason = missing_reward_reason(config.method)
-    for team_index, role in enumerate(task.roles if no_reward_reason is None else ()):
-        phi = run.functions[team_index] if run.functions else None
-        graph = reward_graph(decoders[team_index], config, team_index, phi)
-        graphs["reward" if role is task else f"reward_{role.team}"] = graph
+    if no_reward_reason is None:
+        for team_index, role in enumerate(task.roles):
+            phi = run.functions[team_index] if run.functions else None
+            graph = reward_graph(decoders[team_index], config, team_index, phi)
+            graphs["reward" if role is task else f"reward_{role.team}"] = graph
     functions = {name: _describe_graph(graph) for name, graph in graphs.items()}
-    if config.env.discrete and not config.team_level:
+    if config.env.discrete and not config.team_level:  # for `exported.reward`, which makes one-hot rows of choices
         choices = {"first": config.env.first_choice, "count": config.env.action_size}
         functions |= {name: {**functions[name], "choices": choices} for name in graphs if name != "policy"}
     origin = {"method": settings.method, "algorithm": settings.algorithm, "seed": run.seeds[seed_index], "step": step}
     with new_directory(out) as new:
         _write_files(new, graphs, {"lare": code_version(), "task": task.name, **origin, **functions})
         if no_reward_reason is None:
-            for role, function in zip(task.roles, run.functions, strict=False):
+            for role, function in zip(task.roles, run.functions, strict=False):  # a method without phi has no functions
                 function.save(new / function_filename(task, role))
-    return ExportResult(directory=out, functions=tuple(graphs), no_reward_reason=no_reward_reason, onnx=is_installed())
+    return ExportResult(out, tuple(graphs), no_reward_reason, onnx=is_onnx_installed())
 
 
 def _write_files(out: Path, graphs: dict[str, Graph], description: dict[str, Any]) -> None:
     for name, graph in graphs.items():
         _write_arrays(out / f"{name}.npz", graph)
-        if is_installed():
+        if is_onnx_installed():
             write_bytes(out / f"{name}.onnx", onnx_model(graph, name).SerializeToString())
     write_bytes(out / "export.json", json.dumps(description, indent=1).encode())
     for module in (exported, evaluate):
@@ -99,7 +100,7 @@ def _write_files(out: Path, graphs: dict[str, Graph], description: dict[str, Any
 
 
 def _describe_graph(graph: Graph) -> dict[str, Any]:
-    """Return a graph as JSON, without its constants and positions."""
+    """Return a description of a graph for JSON, without the arrays that `_write_arrays` writes."""
 
     def describe_arrays(nodes: dict[str, Node]) -> dict[str, Any]:
         return {
@@ -123,7 +124,7 @@ def _option_json(option: Any) -> Any:
 
 
 def _write_arrays(path: Path, graph: Graph) -> None:
-    """Write the constants of a graph, and the positions that are not slices, by the indices of their nodes."""
+    """Write the constants of a graph, and the positions of each gather without slices. An array's name is the index of its node."""
     arrays = {}
     for i, node in enumerate(graph.nodes):
         if node.op == "constant":

@@ -1,4 +1,4 @@
-"""The proxy rewards of a team as a graph: from steps to r_hat, in the unit of the true rewards.
+"""The proxy rewards of a team as a graph: from steps to r_hat, in the unit of the return.
 
     before, after [batch *agents observation]       observations before and after a step
     action [batch *agents action]                   in the environment's units; a choice is a one-hot row
@@ -7,6 +7,7 @@
 
 The graph has only the inputs that the method uses, and phi is a part of it: its rows are agents. If credit is assigned by the global state,
 `before` and `after` are states, `action` holds the actions of all agents side by side, and there is one r_hat for the team.
+The r_hat of `llm-reward` is what its function returns, in any unit.
 """
 
 from functools import partial

@@ -1,4 +1,4 @@
-"""A transform for TorchRL's replay buffers, which samples steps with r_hat of a `CreditAssigner` as their rewards.
+"""A transform for TorchRL's replay buffers: the rewards of sampled steps are r_hat of a `CreditAssigner`.
 
     buffer = TensorDictReplayBuffer(storage=LazyTensorStorage(1_000_000), batch_size=256, transform=CreditTransform(credit))
     buffer.extend(collected)   # shows the steps to the assigner
@@ -27,7 +27,8 @@ __all__ = ["CREDIT_STEP", "REWARD", "CreditTransform"]
 
 REWARD = ("next", "reward")
 TRAJECTORY, MASK = ("collector", "traj_ids"), ("collector", "mask")
-"""The keys under which TorchRL's collectors store the trajectory of a step, and whether it is a step: `split_trajs` adds padding."""
+"""The keys under which TorchRL's collectors store the trajectory of a step, and whether a row is a step. `split_trajs` adds other rows, as
+padding."""
 
 
 class CreditTransform(Transform):
@@ -36,7 +37,7 @@ class CreditTransform(Transform):
     The buffer stores the number of each step ("credit_step") and a reward of 0 instead of the environment's. An episode ends
     where ("next", "done"), "terminated" or "truncated" is true. A collector names the trajectory of each step. Without a collector,
     the last dimension of the batch is time, and the next batch continues the episodes of this one. If the task has a `group`, each step
-    has it at ("next", GROUP), which an info reader of TorchRL fills.
+    has its group at ("next", KEY), where KEY is the value of `group`. An info reader of TorchRL fills it.
 
     It may be called from several threads. Before every sample, the pending updates of the decoder are made.
     """
@@ -94,7 +95,7 @@ class CreditTransform(Transform):
         return tensordict.set(REWARD, r_hat.reshape(reward.shape))
 
     def _trajectories(self, tensordict: TensorDictBase) -> list[tuple[object, int]]:
-        """Return a key for the trajectory of each step."""
+        """Return a key for the episode (TorchRL: trajectory) of each step."""
         trajectories = tensordict.get(TRAJECTORY, None)
         if trajectories is not None:
             return [(self._id, number) for number in trajectories.reshape(-1).tolist()]

@@ -12,7 +12,7 @@ import numpy as np
 
 from lare_rl.phi.graph import KIND_OF_CODE, Graph, Node
 
-__all__ = ["BATCH", "DTYPES", "is_installed", "onnx_model"]
+__all__ = ["BATCH", "DTYPES", "is_onnx_installed", "onnx_model"]
 
 OPSET = 18
 """Version of ONNX's operations. Runtimes of 2023 and later support it."""
@@ -51,7 +51,7 @@ DTYPES = {"float": np.float32, "int": np.int64, "bool": np.bool_}
 """The types of inputs and outputs."""
 
 
-def is_installed() -> bool:
+def is_onnx_installed() -> bool:
     """Return whether the package `onnx` is installed."""
     return find_spec("onnx") is not None
 

@@ -1,4 +1,4 @@
-"""Names in files that an earlier version has written: of arrays in checkpoints and assigners, of keys, and of metrics."""
+"""Old names: of arrays in checkpoints and assigners, of keys in files, of metrics, and of options of the command line."""
 
 import re
 from collections.abc import Mapping, Sequence
@@ -61,7 +61,7 @@ _RENAMED_FIELDS = {
 """From old to new fields of states."""
 
 _DECODER = r"(?:\.decoders\[\d+\]|^\[0\])"
-"""A decoder in a checkpoint, or in an assigner."""
+"""The pattern of a decoder's path in a checkpoint, or in an assigner."""
 _NETWORK = rf"({_DECODER}\.(?:network|.*\.(?:mu|nu)))"
 """Its network, or one of Adam's moments, which have the same fields."""
 _RENAMED_PATHS = {
@@ -88,7 +88,10 @@ _RENAMED_PATHS = {
 
 
 def rename_keys(values: Any) -> Any:
-    """Return a table, with the tables in it, under the present names of keys. A key beside its old name is not overwritten."""
+    """Return a table, with the tables in it, under the present names of keys.
+
+    If a table has both names of a key, both stay, and the old one is refused later as unknown.
+    """
     if isinstance(values, list):
         return [rename_keys(value) for value in values]
     if not isinstance(values, Mapping):
@@ -122,7 +125,7 @@ def rename_options(arguments: Sequence[str]) -> list[str]:
 
 
 def rename_fields(name: str) -> str:
-    """Return the present name of an array: the fields of a state, such as `.decoders[0].is_average` for `.credit[0].average`."""
+    """Return the present name of an array by the path of its fields: `.credit[0].average` becomes `.decoders[0].is_average`."""
     name = re.sub(r"(?<=\.)\w+", lambda match: _RENAMED_FIELDS.get(match.group(), match.group()), name)
     for pattern, new in _RENAMED_PATHS.items():
         name = re.sub(pattern, new, name)
