@@ -150,8 +150,8 @@ class Recorder:
             saved = read_recording(read_text(path), str(path))
         except LareError:
             return False
-        ours, keys = read_recording(self.to_json(""), ""), {"task", "kind", "exchanges"}
-        return saved.model_dump(include=keys) == ours.model_dump(include=keys)
+        current, keys = read_recording(self.to_json(""), ""), {"task", "kind", "exchanges"}
+        return saved.model_dump(include=keys) == current.model_dump(include=keys)
 
     def n_replies(self, stage: Stage, messages: Sequence[Message]) -> int:
         """Return the number of recorded replies to a request."""
