@@ -125,17 +125,17 @@ class Basis:
 
     @property
     def n_columns(self) -> int:
-        """The number of weights of a fit: those of the features, of the time if there are prefixes, and an intercept for each level."""
+        """The number of weights of a fit: those of features, of the steps so far (only for prefixes), and an intercept for each level."""
         return self.n_features + self.prefixes + self.n_levels
 
     @property
     def column_group_index(self) -> Int[np.ndarray, " columns"]:
-        """The index of each weight's group. The time is a group, and the intercepts are the last one."""
+        """The index of each weight's group. The number of steps so far is a group, and the intercepts are the last one."""
         return self._append_columns(self.group_index)
 
     @property
     def column_strength_index(self) -> Int[np.ndarray, " columns"]:
-        """The index of each weight's strength. The time has one, and the intercepts share the last one."""
+        """The index of each weight's strength. The number of steps so far has one, and the intercepts share the last one."""
         return self._append_columns(self.strength_index)
 
     def _append_columns(self, index: Int[np.ndarray, " features"]) -> Int[np.ndarray, " columns"]:
