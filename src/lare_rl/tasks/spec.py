@@ -162,14 +162,15 @@ class TaskSpec(CheckedModel):
     @field_validator("arguments")
     @classmethod
     def _check_arguments(cls, arguments: dict[str, Any]) -> dict[str, Any]:
+        problem = (
+            "a run cannot store dates, inf, nan, or keys that are no strings. Use numbers, strings, lists and tables."
+        )
         try:
             stored = json.loads(json.dumps(arguments, allow_nan=False))  # as in the file of a run
         except (TypeError, ValueError):
-            stored = None
+            raise ValueError(problem) from None
         if stored != _tuples_to_lists(arguments):
-            raise ValueError(
-                "a run cannot store dates, inf, nan, or keys that are no strings. Use numbers, strings, lists and tables."
-            )
+            raise ValueError(problem)
         return stored
 
     @model_validator(mode="after")
