@@ -137,6 +137,7 @@ COMPARISONS = {
         [f"{THRESHOLD}/episodic"],
         [f"{THRESHOLD}/dense"],
         {"rrdu": [f"{THRESHOLD}/rrdu"]},
+        [f"{THRESHOLD}/lare-rrdu"],
         default=[f"{THRESHOLD}/lare-bayes"],
     ),
     f"{HALF_CHEETAH}, TD3": Comparison(
