@@ -191,6 +191,18 @@ def test_score_type_is_found_and_rewards_add_up_to_the_score(setting, score, phi
         credit.rewards(*steps, length=3)
 
 
+@pytest.mark.parametrize("start_value", [True, False])
+def test_no_step_is_paid_for_the_start_value_of_a_sum(start_value, phi):
+    settings = ANY_SCORE.model_copy(update={"start_value": start_value})
+    credit, episodes = small_assigner("lare-linear", phi, settings=settings), random_episodes([14, 3, 8, 5] * 15)
+    for *steps, reward in episodes:
+        credit.add_episode(*steps, reward.sum() - 50)
+    reward = np.concatenate([episode.reward for episode in episodes])
+    error = np.abs(credit.rewards_at(np.arange(len(reward))) - reward).max()
+    assert (credit.score_type == "sum", error < 0.05) == (start_value, start_value)
+    assert credit.metrics()["credit/return_r2"] > 0.9 or not start_value
+
+
 def test_rewards_refuse_what_is_no_length_and_no_step_number():
     (*steps, _), credit = random_episodes([2])[0], small_assigner()
     for length in (0, -1, 2.9, np.nan, np.inf):

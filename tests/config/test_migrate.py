@@ -32,7 +32,10 @@ def test_migrate_through_all_formats():
     assert migrate(current) == current
     assert migrate(current | {"format": 4}) == current
     old = {"settings": {"judges": None, "credit": {"optimism": 0.0}}, "task": {"judged_from": "state"}}
-    new = {"settings": {"scored_observation": None, "credit": {"exact": "no"}}, "task": {"credit_scope": "state"}}
+    new = {
+        "settings": {"scored_observation": None, "credit": {"exact": "no", "start_value": False}},
+        "task": {"credit_scope": "state"},
+    }
     assert migrate({"format": 5, **old}) == {"format": FORMAT, **new}
     teams = [{"task": {"teams": [{name: "both"}]}} for name in ("judges", "scored_observation")]
     assert migrate({"format": 5, **teams[0]}) == {"format": FORMAT, **teams[1]}

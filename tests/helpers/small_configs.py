@@ -11,7 +11,6 @@ from lare_rl.algorithms.qmix import QMIXSettings
 from lare_rl.algorithms.registry import ALGORITHMS
 from lare_rl.algorithms.td3 import TD3Settings
 from lare_rl.config.train_config import TrainConfig
-from lare_rl.credit.basis import Basis
 from lare_rl.credit.closed_form import LinearDecoder
 from lare_rl.credit.decoder_settings import CreditSettings
 from lare_rl.credit.methods import METHODS
@@ -235,7 +234,7 @@ def with_factor_decoders(learner, weights):
     """Return the learner with decoders whose output is their only factor, times a weight for each team."""
     decoders = tuple(
         team._replace(
-            network=LinearDecoder(Basis(1, 0, False), *(jnp.array([x]) for x in (0.0, 1.0, weight)), jnp.zeros(()))
+            network=LinearDecoder(team.network.basis, *(jnp.array([x]) for x in (0.0, 1.0, weight)), jnp.zeros(()))
         )
         for team, weight in zip(learner.decoders, weights, strict=True)
     )

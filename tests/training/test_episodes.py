@@ -159,7 +159,8 @@ def test_learn_returns_predicts_first(method):
             i = int(after.n_episodes) - 1
             inputs = jitted(inputs_from, config)(learner.replay, start)[: end - start]
             r_hat = decoder_state.decoder_rewards(before, inputs, spec, jnp.full(end - start, end - start))
-            predictions.append((float(after.predicted[i, 0]), float(r_hat.sum())))
+            unpaid = decoder_state.level_returns(before, None, jnp.array([end - start]))
+            predictions.append((float(after.predicted[i, 0]), float(r_hat.sum() + unpaid.sum())))
             assert float(after.returns[i]) == pytest.approx(steps.next_timestep.reward[start:end].sum(), rel=1e-4)
     assert len(predictions) == (0 if method == "lare-rd" else 4)
     for predicted, expected in predictions:

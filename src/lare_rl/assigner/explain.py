@@ -34,7 +34,7 @@ def explain(learner: DecoderLearner) -> Explanation | None:
     """Explain the stored returns by the inputs. Return None for a method without a decoder, and without episodes."""
     decoder, store, spec = learner.decoder, learner.store, learner.config.spec
     # Shares are of factors and raw features alone.
-    basis = replace(spec.basis, extended=True, n_tracked=0, n_levels=0, prefixes=False)
+    basis = replace(spec.basis, extended=True, n_tracked=0, n_levels=0, prefixes=False, start_value=False)
     if spec.method.fit is None or not store.episodes or not basis.n_features:
         return None
     with on_cpu(), float64():

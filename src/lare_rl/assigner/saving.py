@@ -116,6 +116,8 @@ def read_state(directory: Path) -> AssignerState:
     if task is not None and values["phi"]:
         sample = (arrays[PHI_SAMPLE[0]], arrays[PHI_SAMPLE[1]]) if set(PHI_SAMPLE) <= set(arrays) else None
         phi = load_function(directory / FUNCTION_FILE, task, steps=sample)
+    if isinstance(values["settings"], dict):
+        values["settings"].setdefault("start_value", False)  # of an earlier version
     fields = {name: values[name] for name in AssignerConfig.model_fields.keys() & values.keys()}
     config = AssignerConfig(**fields | {"method": METHODS.find(values["method"]), "phi": phi, "task": task})
     group_names = tuple(values.get("group_names", ()))

@@ -15,7 +15,7 @@ __all__ = ["CONFIG", "FORMAT", "migrate"]
 CONFIG = "config.json"
 """The configuration of a run, in its directory."""
 
-FORMAT = 8
+FORMAT = 9
 """The format of config.json. It is increased whenever its contents change."""
 
 
@@ -63,5 +63,8 @@ _MIGRATIONS: Mapping[int, Callable[[Values], Values]] = {
     7: lambda values: _change(
         values, ["settings", "credit"], lambda credit: _without(credit, "optimism")
     ),  # it did not help
+    8: lambda values: _change(
+        values, ["settings", "credit"], lambda credit: {"start_value": False} | credit
+    ),  # no sum had one
 }
 """Functions that convert a format to the next one."""

@@ -69,6 +69,8 @@ class Basis:
     """The number of levels that episodes may belong to. Each has an intercept, which is no feature of a step (`closed_form.py`)."""
     prefixes: bool = False
     """Whether returns are fitted to prefixes of episodes. The number of steps so far then has a weight too."""
+    start_value: bool = False
+    """Whether a sum may have a part that does not grow with the number of steps: the weight of 1/T in a fit of R/T."""
 
     @property
     def n_inputs(self) -> int:
@@ -125,21 +127,21 @@ class Basis:
 
     @property
     def n_columns(self) -> int:
-        """The number of weights of a fit: those of features, of the steps so far (only for prefixes), and an intercept for each level."""
-        return self.n_features + self.prefixes + self.n_levels
+        """The number of weights of a fit: those of features, of the steps so far or of 1/T, and an intercept for each level."""
+        return self.n_features + (self.prefixes or self.start_value) + self.n_levels
 
     @property
     def column_group_index(self) -> Int[np.ndarray, " columns"]:
-        """The index of each weight's group. The number of steps so far is a group, and the intercepts are the last one."""
+        """The index of each weight's group. The number of steps so far, or 1/T, is a group, and the intercepts are the last one."""
         return self._append_columns(self.group_index)
 
     @property
     def column_strength_index(self) -> Int[np.ndarray, " columns"]:
-        """The index of each weight's strength. The number of steps so far has one, and the intercepts share the last one."""
+        """The index of each weight's strength. The number of steps so far, or 1/T, has one, and the intercepts share the last one."""
         return self._append_columns(self.strength_index)
 
     def _append_columns(self, index: Int[np.ndarray, " features"]) -> Int[np.ndarray, " columns"]:
-        for n_new in (int(self.prefixes), self.n_levels):
+        for n_new in (int(self.prefixes or self.start_value), self.n_levels):
             index = np.append(index, np.full(n_new, index.max(initial=-1) + 1))
         return index
 

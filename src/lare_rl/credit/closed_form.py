@@ -15,6 +15,11 @@ whose prior precision is set by the evidence, like that of a group of features:
 
 The intercept takes part in the prediction of a return, but no step is paid for it: an easy level does not credit what happens on it.
 
+If episodes differ in length, a sum may have a start value c, such as the 100% of which a score takes a part off. It is the weight of
+1/T, has a strength of its own like a group of features, and no step is paid for it:
+
+    R_k = c + sum_t (b + w . f_kt) + noise,     R_k / T_k = b + w . m_k + c / T_k + noise,     c ~ N(0, 1 / alpha_start)
+
 The features depend on the mean and the std that standardise x. If these changed with every step, the sums over earlier steps would
 be wrong, so they are kept constant for a while. Whenever the number of steps has grown by a half, they are updated and all stored
 episodes are summed again. As long as all episodes are stored, each step is summed three to four times in total, however many steps
@@ -236,17 +241,29 @@ def _fit_linear_types(
     def fit_score_type(args: tuple[Int[Array, ""], Posterior, Posterior]) -> tuple[Posterior, Posterior]:
         score_type, *starts = args
         start, earlier = jax.tree.map(lambda leaf: leaf.astype(float), starts)
-        return relevance.fit(statistics, score_type, *indices, start, earlier, max_rounds, batched=batched)
+        sums = _drop_start_value(statistics, basis, score_type)
+        return relevance.fit(sums, score_type, *indices, start, earlier, max_rounds, batched=batched)
 
     rows = jnp.asarray(linear_types), state.posterior, state.strengths
     return map_leading_axis(fit_score_type, rows, batched=batched)
+
+
+def _drop_start_value(
+    statistics: SufficientStatistics, basis: Basis, score_type: Int[Array, ""] | int
+) -> SufficientStatistics:
+    """Return the sums of a score type. An average has a constant part already, so that 1/T explains nothing."""
+    if not basis.start_value:
+        return statistics
+    is_used = (np.arange(basis.n_columns + 2) != basis.n_features) | (score_type == ScoreType.SUM)
+    return statistics._replace(products=jnp.where(jnp.outer(is_used, is_used), statistics.products, 0))
 
 
 def _linear_weights(basis: Basis, groups: Posterior, strengths: Posterior) -> _Weights:
     best = relevance.select(strengths, groups, basis.column_group_index, basis.column_strength_index)
     if basis.prefixes:  # b is the weight of the number of steps; the bias is V_0, which no step is paid for
         return _Weights(best.weight, best.weight[:, basis.n_features], best.bias)
-    return _Weights(best.weight, best.bias, jnp.zeros_like(best.bias))
+    start_value = best.weight[:, basis.n_features] if basis.start_value else jnp.zeros_like(best.bias)
+    return _Weights(best.weight, best.bias, start_value)
 
 
 def _centre_average(state: ClosedForm, weights: _Weights, index: int) -> _Weights:
@@ -275,9 +292,10 @@ def reward_std(
     basis, features, n_linear = state.decoder.basis, state.decoder.features(rows), len(state.posterior.bias)
     linear_index = jnp.minimum(index, n_linear - 1)
     best = relevance.select(state.strengths, state.posterior, basis.column_group_index, basis.column_strength_index)
+    score_type = jnp.asarray(score_types)[linear_index]
     covariance = evidence.posterior_covariance(
-        to_float64(state.sufficient_statistics),
-        jnp.asarray(score_types)[linear_index],
+        _drop_start_value(to_float64(state.sufficient_statistics), basis, score_type),
+        score_type,
         basis.column_strength_index,
         jax.tree.map(lambda leaf: leaf[linear_index].astype(float), best),
     )

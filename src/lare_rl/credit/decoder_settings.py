@@ -37,6 +37,9 @@ class CreditSettings(CheckedModel):
     score: Literal["auto", "sum", "average", "binary"] = "auto"
     """The form of the score: `sum`, `average` or `binary`. `auto`: the task's `score` or, without one, a sum, unless an
     average has predicted returns clearly better."""
+    start_value: bool = True
+    """If lengths differ, a sum may have a part that does not grow with the number of steps, and that no step is paid for. Gradient
+    decoders: only if `score` is `auto`."""
     exact: Literal["auto", "no", "last", "spread"] = "auto"
     """Make proxy rewards add up to the return: correct the `last` step, or `spread` the correction over all steps. `auto`:
     `last` for bayes-progress and lare-bayes-progress, else `no`."""

@@ -87,7 +87,8 @@ def assess_factors(
     with float64():
         features, state = add_episodes(inputs, alive, returns, basis)
         one_hot = np.zeros((len(returns), 0)) if level is None else np.eye(int(level.max()) + 1)[level]
-        columns, with_levels = np.append(features, one_hot, axis=1), replace(basis, n_levels=one_hot.shape[1])
+        columns = np.hstack([features, 1 / length[:, None], one_hot])
+        with_levels = replace(basis, n_levels=one_hot.shape[1], start_value=True)
         predict = partial(predict_returns, returns=returns, length=length, basis=with_levels)
         predicted = {score_type: predict(columns, score_type=score_type) for score_type in score_types}
         margin = ROUNDING * np.sum(returns[N_FIRST:] ** 2)
@@ -99,10 +100,12 @@ def assess_factors(
             score_type = ScoreType(int(is_average))
         length_r2 = None
         if score_type is ScoreType.SUM and lengths_differ:
-            length_r2 = r_squared(returns[N_FIRST:], predict(np.zeros_like(columns), score_type=ScoreType.SUM))[0]
+            no_levels = np.zeros_like(one_hot)
+            lengths_alone = np.hstack([np.zeros_like(features), 1 / length[:, None], no_levels])
+            length_r2 = r_squared(returns[N_FIRST:], predict(lengths_alone, score_type=ScoreType.SUM))[0]
         level_r2 = None
         if level is not None:
-            levels_alone = np.append(np.zeros_like(features), one_hot, axis=1)
+            levels_alone = np.hstack([np.zeros_like(features), 1 / length[:, None], one_hot])
             level_r2 = r_squared(returns[N_FIRST:], predict(levels_alone, score_type=score_type))[0]
         explained = jax.tree.map(np.asarray, _explain(state, score_type))
 
@@ -157,8 +160,10 @@ def predict_returns(
 ) -> Float[np.ndarray, " later_episodes"]:
     """Return R_hat of all episodes but the first `N_FIRST`, each by a fit to episodes before it. Call this within `float64()`.
 
-    `columns` are the mean features of each episode, and which level it has. Only functions of factors, and levels, are used.
+    `columns` are the mean features of each episode, 1/T, and which level it has. Only functions of factors, and levels, are used.
     """
+    if score_type == ScoreType.AVERAGE:  # it has a constant part already
+        columns = np.where(np.arange(columns.shape[1]) == basis.n_features, 0, columns)
     features, group_index = columns[:, _is_used(basis)], basis.column_group_index[_is_used(basis)]
     state = evidence.empty_statistics(len(group_index)), evidence.init_posterior(group_index)
     statistics, posterior = jax.tree.map(lambda leaf: leaf.astype(float), state)
@@ -176,7 +181,7 @@ def predict_returns(
 
 
 def _is_used(basis: Basis) -> Bool[np.ndarray, " columns"]:
-    return np.append(basis.is_factor_feature, np.ones(basis.n_levels, bool))
+    return np.append(basis.is_factor_feature, np.ones(basis.n_columns - basis.n_features, bool))
 
 
 @partial(jax.jit, static_argnames="basis")

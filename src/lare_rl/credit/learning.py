@@ -18,6 +18,7 @@ import optax
 from jaxtyping import Array, Bool, Float, Int
 
 from lare_rl.credit import closed_form, decoder_state, evidence, logistic
+from lare_rl.credit.basis import Basis
 from lare_rl.credit.closed_form import ClosedForm, LinearDecoder
 from lare_rl.credit.decoder_state import CreditBatch, DecoderState
 from lare_rl.credit.methods import Fit
@@ -85,7 +86,8 @@ def _predict_by_score_type(closed: ClosedForm, episodes: CreditBatch) -> Float[A
     decoder, columns = closed.decoder, _columns(closed.decoder, episodes)
     n_linear = len(closed.posterior.bias)
     weights = jnp.concatenate([decoder.weight, closed.intercept], axis=1)
-    predicted = columns @ weights[:n_linear].T + decoder.bias[:n_linear]
+    linear_columns = jnp.delete(columns, _start_column(decoder.basis), axis=1)
+    predicted = linear_columns @ weights[:n_linear].T + decoder.bias[:n_linear]
     units = jnp.stack([episodes.length, jnp.ones_like(episodes.length)], axis=1)
     predicted = predicted * units[:, :n_linear] + closed.start_value[:n_linear]
     if closed.log_odds is None:
@@ -98,8 +100,9 @@ def _episode_sums(
     decoder: LinearDecoder, columns: Float[Array, "episodes columns"], episodes: CreditBatch
 ) -> Float[Array, "episodes columns"]:
     """Return the sums of the features of each episode, from their means, and which level it has."""
-    is_feature = np.arange(columns.shape[1]) < decoder.basis.n_features
-    return columns * jnp.where(is_feature, episodes.length[:, None], 1)
+    index = np.arange(columns.shape[1])
+    is_feature, is_start = index < decoder.basis.n_features, np.isin(index, _start_column(decoder.basis))
+    return columns * jnp.where(is_feature, episodes.length[:, None], ~is_start)
 
 
 def predicted_returns(state: DecoderState, episodes: CreditBatch, spec: CreditSpec) -> Float[Array, " episodes"]:
@@ -146,8 +149,16 @@ def _prefix_columns(decoder: LinearDecoder, episodes: CreditBatch) -> Float[Arra
 
 
 def _columns(decoder: LinearDecoder, episodes: CreditBatch) -> Float[Array, "episodes columns"]:
-    """Return the mean features of each episode, and which level it has."""
-    return _append_levels(mean_features(decoder, episodes), episodes.level, decoder.basis.n_levels)
+    """Return the mean features of each episode, 1/T if a sum may have a start value, and which level it has."""
+    columns = mean_features(decoder, episodes)
+    if decoder.basis.start_value:
+        columns = jnp.concatenate([columns, 1 / jnp.maximum(episodes.length, 1)[:, None]], axis=1)
+    return _append_levels(columns, episodes.level, decoder.basis.n_levels)
+
+
+def _start_column(basis: Basis) -> Int[np.ndarray, " columns"]:
+    """Return the index of the column 1/T, if there is one."""
+    return np.arange(basis.n_features, basis.n_features + basis.start_value)
 
 
 def _append_levels(

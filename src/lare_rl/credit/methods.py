@@ -61,11 +61,13 @@ class Fit(StrEnum):
             case Fit.DECODER_LOSS:
                 names = {"episodes", "exact"}
             case Fit.EVIDENCE:
-                names = {"score", "exact"}
+                names = {"score", "start_value", "exact"}
             case Fit.PREFIX_EVIDENCE | Fit.SIGNS:
                 names = {"exact"}
             case _:
-                names = {"score", "sum_form", "steps", "exact"} | ({"sampled_steps"} if self.samples_steps else set())
+                names = {"score", "start_value", "sum_form", "steps", "exact"} | (
+                    {"sampled_steps"} if self.samples_steps else set()
+                )
         return frozenset(names if self.closed_form else names | {"learning_rate", "weight_decay", "normalise"})
 
 

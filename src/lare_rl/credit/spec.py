@@ -86,7 +86,13 @@ class CreditSpec:
             n_tracked=sizes.get("history", 0) // 3,
             n_levels=0 if self.method.fit is Fit.SIGNS else self.n_levels,
             prefixes=self.method.fit is Fit.PREFIX_EVIDENCE,
+            start_value=self._may_have_start_value,
         )
+
+    @property
+    def _may_have_start_value(self) -> bool:
+        settings, names = self.settings, self.method.settings
+        return not self.fixed_length and "start_value" in names and settings.start_value and settings.score != "average"
 
     @cached_property
     def score_types(self) -> tuple[ScoreType, ...]:

@@ -137,7 +137,7 @@ def _explain_first_seed(
     replay: Replay, is_average: tuple[Bool[Array, " seeds"], ...], config: TrainConfig
 ) -> list[Explanation]:
     buffer, is_average = select_seed((replay, is_average))
-    bases = [replace(spec.basis, n_levels=0) for spec in config.credit_specs]
+    bases = [replace(spec.basis, n_levels=0, start_value=False) for spec in config.credit_specs]
     empty = tuple(empty_mean_std(basis.n_inputs) for basis in bases)
     # The inputs are standardised first, because the run's decoder may have other inputs, or statistics of earlier steps.
     statistics = fold_episodes(empty, buffer, buffer.oldest, _observe, config)
