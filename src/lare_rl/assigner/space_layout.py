@@ -134,7 +134,7 @@ def _to_float32(array: Shaped[np.ndarray, "*shape"]) -> Float[np.ndarray, "*shap
         return array.astype(np.float32, copy=False)
 
 
-def make_layout(space: "spaces.Space | int | SpaceLayout", name: str) -> SpaceLayout:
+def make_layout(space: "spaces.Space | int | np.integer | SpaceLayout", name: str) -> SpaceLayout:
     """Return the layout of a Gymnasium space, or of rows of this many numbers.
 
     Raises:

@@ -141,7 +141,9 @@ def _add_cases(
 def init_posterior(alpha_index: AlphaIndex) -> Posterior:
     """Return the posterior before the first episode. Its precisions are 0, which means that they have no value yet."""
     zero, zeros = jnp.zeros(()), jnp.zeros(n_alphas(alpha_index))
-    return Posterior(jnp.zeros(len(alpha_index)), bias=zero, alpha=zeros, beta=zero, n_effective=zeros, log_evidence=zero)
+    return Posterior(
+        jnp.zeros(len(alpha_index)), bias=zero, alpha=zeros, beta=zero, n_effective=zeros, log_evidence=zero
+    )
 
 
 def regression(

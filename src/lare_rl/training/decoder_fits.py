@@ -190,8 +190,10 @@ def fit_until_converged(
 
 
 def _count_held_out(buffer: Replay, window: int) -> Int[Array, " envs"]:
-    """Return how many of each environment's newest episodes are held out: a fifth of all but at most `window`,
-    from the last environments first."""
+    """Return how many of each environment's newest episodes are held out: a fifth of all, but at most `window`.
+
+    They are from the last environments first.
+    """
     available = replay.n_stored_episodes(buffer)
     count = jnp.minimum(jnp.sum(available) // 5, window)
     in_later_envs = jnp.cumsum(available[::-1])[::-1] - available
