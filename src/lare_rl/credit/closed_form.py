@@ -115,7 +115,7 @@ class ClosedForm(NamedTuple):
     intercept: Float[Array, "score_types levels"]
     """The intercept of each level, for each score type: part of R/T for a score that is a sum, else of R."""
     start_value: Float[Array, " score_types"]
-    """The part of R that neither steps nor levels explain, for each score type; 0 if the bias of the decoder includes it."""
+    """The part of R that no step is paid for and no level explains, for each score type; 0 if the bias of the decoder includes it."""
     log_odds: LogOddsFit | None
     """The fit of log odds. Only present if the score may be of this type, which is then the last of the decoder's score types."""
 
@@ -196,12 +196,22 @@ class _Weights(NamedTuple):
 
 
 def fit(
-    state: ClosedForm, score_types: tuple[int, ...], max_rounds: int = MAX_EVIDENCE_ROUNDS, *, batched: bool = False
+    state: ClosedForm,
+    score_types: tuple[int, ...],
+    max_rounds: int = MAX_EVIDENCE_ROUNDS,
+    *,
+    fixed_length: bool = False,
+    batched: bool = False,
 ) -> ClosedForm:
-    """Fit the decoder of each score type. If `batched` is true, sums and averages are fitted at once."""
+    """Fit the decoder of each score type. If `batched` is true, sums and averages are fitted at once.
+
+    If the score is an average, and not all episodes have the same length (`fixed_length`), no step is paid for the mean return.
+    """
     basis = state.decoder.basis
     groups, strengths = _fit_linear_types(state, score_types, max_rounds, batched=batched)
     weights = _linear_weights(basis, groups, strengths)
+    if ScoreType.AVERAGE in score_types and not fixed_length:
+        weights = _centre_average(state, weights, score_types.index(ScoreType.AVERAGE))
     posterior, strengths = jax.tree.map(lambda leaf: leaf.astype(jnp.float32), (groups, strengths))
     state = state._replace(posterior=posterior, strengths=strengths)
     if state.log_odds is not None:
@@ -233,6 +243,17 @@ def _linear_weights(basis: Basis, groups: Posterior, strengths: Posterior) -> _W
     if basis.prefixes:  # the value before the first step is no reward, and time is
         return _Weights(best.weight, best.weight[:, basis.n_features], best.bias)
     return _Weights(best.weight, best.bias, jnp.zeros_like(best.bias))
+
+
+def _centre_average(state: ClosedForm, weights: _Weights, index: int) -> _Weights:
+    """Move the mean return from the rewards of an average to its start value.
+
+    Otherwise T r_hat would be near the mean return at every step. If that is negative, each step costs something, and an agent that can end
+    an episode learns to end it, although this does not raise the average.
+    """
+    mean = jnp.sum(state.sufficient_statistics.mean[..., state.decoder.basis.n_columns + ScoreType.AVERAGE])
+    bias, start_value = weights.bias.at[index].add(-mean), weights.start_value.at[index].add(mean)
+    return weights._replace(bias=bias, start_value=start_value)
 
 
 def _log_odds_weights(log_odds: LogOddsFit) -> _Weights:

@@ -35,8 +35,8 @@ class CreditSettings(CheckedModel):
     episodes: Count = 8
     """diaster, rudder, grd and rbt: whole episodes in one update."""
     score: Literal["auto", "sum", "average", "binary"] = "auto"
-    """The form of the score: `sum`, `average` or `binary`. `auto`: the task's `score` or, without one, whichever of sum and
-    average has predicted returns better."""
+    """The form of the score: `sum`, `average` or `binary`. `auto`: the task's `score` or, without one, a sum, unless an
+    average has predicted returns clearly better."""
     exact: Literal["auto", "no", "last", "spread"] = "auto"
     """Make proxy rewards add up to the return: correct the `last` step, or `spread` the correction over all steps. `auto`:
     `last` for bayes-progress and lare-bayes-progress, else `no`."""

@@ -202,17 +202,18 @@ def level_returns(
     state: DecoderState, level: Int[Array, " episodes"] | None, length: Int[Array, " episodes"]
 ) -> Float[Array, " episodes"]:
     """Return the part of each episode's return that no step is paid for: what its level explains, and what is the same for all."""
-    if state.levels is not None and level is not None:
-        return level_offsets(state.levels)[level] * length
-    closed = state.closed_decoder
-    if closed is None:
-        return jnp.zeros(length.shape)
-    index = score_type_index(state, len(closed.start_value))
-    start_value = jnp.broadcast_to(closed.start_value[index], length.shape)
+    closed, value = state.closed_form, jnp.zeros(length.shape)
+    index = 0 if closed is None else score_type_index(state, len(closed.start_value))
+    if closed is not None:
+        value = value + closed.start_value[index]
     if level is None:
-        return start_value
+        return value
+    if state.levels is not None:
+        return value + level_offsets(state.levels)[level] * length
+    if closed is None or state.closed_decoder is None:
+        return value
     per_step = ~(state.is_average | state.is_log_odds | closed.decoder.basis.prefixes)
-    return start_value + closed.intercept[index][level] * jnp.where(per_step, length, 1)
+    return value + closed.intercept[index][level] * jnp.where(per_step, length, 1)
 
 
 def level_effects(state: DecoderState, mean_length: float, n_levels: int) -> Float[Array, " levels"]:

@@ -30,11 +30,11 @@ from lare_rl.credit.explanation import Explanation, ExplanationState
 from lare_rl.credit.learning import mean_features
 from lare_rl.credit.precisions import Posterior
 from lare_rl.credit.score_type import (
-    MAX_ERROR_RATIO,
     ROUNDING,
     ScoreType,
     ScoreTypeEstimate,
     compare_score_types,
+    is_better,
     score_types_to_fit,
 )
 from lare_rl.nn.normalise import RunningMeanStd
@@ -92,8 +92,11 @@ def assess_factors(
         predicted = {score_type: predict(columns, score_type=score_type) for score_type in score_types}
         margin = ROUNDING * np.sum(returns[N_FIRST:] ** 2)
         errors = {key: float(np.sum((returns[N_FIRST:] - values) ** 2) + margin) for key, values in predicted.items()}
-        is_average = errors.get(ScoreType.AVERAGE, np.inf) < MAX_ERROR_RATIO * errors.get(ScoreType.SUM, np.inf)
-        score_type = ScoreType(int(is_average))
+        score_type = score_types[0]
+        if len(score_types) > 1:
+            as_average, as_sum = jnp.asarray(predicted[ScoreType.AVERAGE]), jnp.asarray(predicted[ScoreType.SUM])
+            is_average = is_better(jnp.asarray(returns[N_FIRST:]), as_average, as_sum, jnp.ones(len(as_sum), bool))
+            score_type = ScoreType(int(is_average))
         length_r2 = None
         if score_type is ScoreType.SUM and lengths_differ:
             length_r2 = r_squared(returns[N_FIRST:], predict(np.zeros_like(columns), score_type=ScoreType.SUM))[0]

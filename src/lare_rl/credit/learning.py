@@ -22,7 +22,7 @@ from lare_rl.credit.closed_form import ClosedForm, LinearDecoder
 from lare_rl.credit.decoder_state import CreditBatch, DecoderState
 from lare_rl.credit.methods import Fit
 from lare_rl.credit.prequential import Predictions, add_predictions, squared_errors
-from lare_rl.credit.score_type import MAX_ERROR_RATIO, ROUNDING, ScoreType, ScoreTypeEstimate, compare_score_types
+from lare_rl.credit.score_type import ROUNDING, ScoreType, ScoreTypeEstimate, compare_score_types, is_better
 from lare_rl.credit.spec import CreditSpec
 
 __all__ = [
@@ -87,7 +87,7 @@ def _predict_by_score_type(closed: ClosedForm, episodes: CreditBatch) -> Float[A
     weights = jnp.concatenate([decoder.weight, closed.intercept], axis=1)
     predicted = columns @ weights[:n_linear].T + decoder.bias[:n_linear]
     units = jnp.stack([episodes.length, jnp.ones_like(episodes.length)], axis=1)
-    predicted = predicted * units[:, :n_linear]
+    predicted = predicted * units[:, :n_linear] + closed.start_value[:n_linear]
     if closed.log_odds is None:
         return predicted
     expected = logistic.predict(closed.log_odds, _episode_sums(closed.decoder, columns, episodes))
@@ -186,19 +186,30 @@ def fit_closed_form(state: DecoderState, spec: CreditSpec, *, batched: bool = Fa
     if closed is None:
         return state
     is_signed = spec.method.fit is Fit.SIGNS
-    closed = closed_form.fit_signs(closed) if is_signed else closed_form.fit(closed, score_types, batched=batched)
+    if is_signed:
+        closed = closed_form.fit_signs(closed)
+    else:
+        closed = closed_form.fit(closed, score_types, fixed_length=spec.fixed_length, batched=batched)
     state = state._replace(closed_form=closed)
     if state.score_type_predictions is not None:
-        errors = _score_type_errors(state.score_type_predictions)
-        is_log_odds = jnp.asarray(False)
-        if score_types[-1] == ScoreType.LOG_ODDS:
-            is_log_odds, errors = errors[-1] < jnp.min(errors[:-1]), errors[:-1]
-        is_average = (errors[1] < MAX_ERROR_RATIO * errors[0]) & ~is_log_odds if len(errors) > 1 else state.is_average
-        state = state._replace(is_average=is_average, is_log_odds=is_log_odds)
+        state = _choose_score_type(state, state.score_type_predictions, score_types)
     if not spec.method.uses_gradient:
         index = decoder_state.score_type_index(state, len(score_types))
         state = state._replace(network=closed_form.select_score_type(closed.decoder, index))
     return state
+
+
+def _choose_score_type(
+    state: DecoderState, predictions: Predictions, score_types: tuple[ScoreType, ...]
+) -> DecoderState:
+    """Choose the type that predicts returns best. An average must do so beyond chance."""
+    errors, is_log_odds, is_average = _score_type_errors(predictions), jnp.asarray(False), state.is_average
+    if score_types[-1] == ScoreType.LOG_ODDS:
+        is_log_odds, errors = errors[-1] < jnp.min(errors[:-1]), errors[:-1]
+    if len(errors) > 1:
+        as_sum, as_average = predictions.predicted[:, 0], predictions.predicted[:, 1]
+        is_average = is_better(predictions.returns, as_average, as_sum, predictions.valid) & ~is_log_odds
+    return state._replace(is_average=is_average, is_log_odds=is_log_odds)
 
 
 def estimate_score_type(state: DecoderState, spec: CreditSpec) -> ScoreTypeEstimate | None:

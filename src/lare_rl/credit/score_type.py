@@ -4,18 +4,24 @@ from collections.abc import Mapping
 from enum import IntEnum
 from typing import NamedTuple
 
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float
+
 __all__ = [
     "MAX_ERROR_RATIO",
     "ROUNDING",
     "ScoreType",
     "ScoreTypeEstimate",
     "compare_score_types",
+    "is_better",
     "score_types_to_fit",
 ]
 
 MAX_ERROR_RATIO = 0.95
-"""A score is treated as an average if its predictions as an average have a squared error below this fraction of the error as a sum. If all
-episodes are equally long, both errors are equal except for rounding."""
+"""Predictions of one type are better if their squared error is below this fraction of that of another type. If all episodes are equally
+long, both errors are equal except for rounding."""
+MIN_Z = 2.0
+"""The difference of the errors must also exceed this number of its standard errors. Otherwise a single episode could decide."""
 ROUNDING = 1e-6
 """Squared errors below this fraction of the squared returns are treated as equal."""
 
@@ -53,6 +59,22 @@ def score_types_to_fit(score: str, fixed_length: bool, *, allow_log_odds: bool) 
         return (ScoreType.SUM,) if score == "sum" else (ScoreType.AVERAGE,)
     linear = (ScoreType.SUM,) if fixed_length else (ScoreType.SUM, ScoreType.AVERAGE)
     return (*linear, ScoreType.LOG_ODDS) if score == "binary" and allow_log_odds else linear
+
+
+def is_better(
+    returns: Float[Array, " episodes"],
+    predicted: Float[Array, " episodes"],
+    rival: Float[Array, " episodes"],
+    valid: Bool[Array, " episodes"],
+) -> Bool[Array, ""]:
+    """Return whether `predicted` is closer to the returns than `rival` in the mean of the squared error, beyond chance."""
+    rounding = ROUNDING * returns**2
+    error, rival_error = (jnp.where(valid, (returns - x) ** 2 + rounding, 0) for x in (predicted, rival))
+    n, difference = jnp.sum(valid), rival_error - error
+    mean = jnp.sum(difference) / jnp.maximum(n, 1)
+    variance = jnp.sum(jnp.where(valid, (difference - mean) ** 2, 0)) / jnp.maximum(n - 1, 1)
+    is_beyond_chance = (n > 1) & (mean > MIN_Z * jnp.sqrt(variance / jnp.maximum(n, 1)))
+    return is_beyond_chance & (jnp.sum(error) < MAX_ERROR_RATIO * jnp.sum(rival_error))
 
 
 def compare_score_types(errors: Mapping[ScoreType, float], chosen: ScoreType) -> ScoreTypeEstimate:

@@ -98,8 +98,8 @@ class CreditSpec:
 
     @property
     def has_closed_form(self) -> bool:
-        """Whether there is a fit in closed form: it is the decoder, or it determines the type of the score."""
-        return self.method.fit is not None and (self.method.fit.closed_form or len(self.score_types) > 1)
+        """Whether there is a fit in closed form: it is the decoder, or it determines the type of a score or the mean of averages."""
+        return self.method.fit is not None and (self.method.fit.closed_form or self.score_types != (ScoreType.SUM,))
 
     @property
     def normalises(self) -> bool:

@@ -128,7 +128,7 @@ class TaskSpec(CheckedModel):
     """Time limit (steps) of an environment without its own, or of the episodes of logs."""
     score: Literal["sum", "average", "binary"] | None = None
     """The form of an episode's return: a sum over its steps; an average or grade, which does not grow with its length; or binary,
-    won or lost. By default, whichever of sum and average predicts returns better."""
+    won or lost. By default a sum, unless an average predicts returns clearly better."""
     payments: Literal["end", "nonzero"] | Annotated[StrictInt, Field(ge=1)] = "end"
     """When the environment pays: once, at the end of an episode; with every reward that is not 0; or every so many steps and at
     the end. Rewards between payments are added up."""
