@@ -19,10 +19,10 @@ def test_register_algorithm_refuses_used_name():
 
 
 def test_consumes_is_a_member():
-    mine = replace(ALGORITHMS["ppo"], name="mine")
-    object.__setattr__(mine, "consumes", "rollouts")  # type checks are only made in tests
+    algorithm = replace(ALGORITHMS["ppo"], name="mine")
+    object.__setattr__(algorithm, "consumes", "rollouts")  # type checks are only made in tests
     with pytest.raises(LareError, match="algorithm mine: consumes is 'rollouts'"):
-        register_algorithm(mine)
+        register_algorithm(algorithm)
 
 
 @pytest.mark.parametrize(("name", "base"), [("td3", "OffPolicySettings"), ("vdn", "SequenceSettings")])
