@@ -111,7 +111,7 @@ def defaults(setting: str, variants: Mapping[str, CheckedModel]) -> str:
 
 def decoder_settings() -> str:
     """Return the settings of the decoder."""
-    changes = ALGORITHMS["qmix"].run_defaults(SimpleNamespace(is_jax=True, max_steps=1), 0)["credit"]
+    changes = ALGORITHMS["qmix"].run_defaults(SimpleNamespace(is_jax=True, max_steps=1), None)["credit"]
     variants = {"one agent": CreditSettings(), "many agents": MULTI_AGENT_CREDIT}
     rows = []
     for name, field in CreditSettings.model_fields.items():

@@ -184,6 +184,10 @@ def _describe_problem(problem: Mapping[str, Any], keys: Sequence[str]) -> str:
         siblings = [name.removeprefix(f"{table}.") for name in keys if table and name.startswith(f"{table}.")]
         all_keys = f"; the keys of {table} are {', '.join(siblings)}" if siblings else ""
         return f"there is no key {path!r}{did_you_mean(key, siblings or keys) or all_keys}"
-    messages = {"model_type": "should be a table of settings, such as {'KEY': VALUE}", "tuple_type": "should be a list"}
+    messages = {
+        "model_type": "should be a table of settings, such as {'KEY': VALUE}",
+        "too_short": "should not be empty",
+        "tuple_type": "should be a list",
+    }
     message: str = messages.get(problem["type"]) or problem["msg"].removeprefix("Value error, ")
     return f"{path} = {short_repr(problem['input'])}: {message[0].lower()}{message[1:]}" if path else message

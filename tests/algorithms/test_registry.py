@@ -18,6 +18,13 @@ def test_register_algorithm_refuses_used_name():
         register_algorithm(replace(ALGORITHMS["sac"], name="td3"))
 
 
+def test_consumes_is_a_member():
+    algorithm = replace(ALGORITHMS["ppo"], name="mine")
+    object.__setattr__(algorithm, "consumes", "rollouts")  # type checks are only made in tests
+    with pytest.raises(LareError, match="algorithm mine: consumes is 'rollouts'"):
+        register_algorithm(algorithm)
+
+
 @pytest.mark.parametrize(("name", "base"), [("td3", "OffPolicySettings"), ("vdn", "SequenceSettings")])
 def test_settings_must_derive_from_those_of_the_loop(name, base):
     with pytest.raises(

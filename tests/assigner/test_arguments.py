@@ -3,9 +3,10 @@
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from gymnasium import spaces
 
 from helpers.assigner_episodes import small_assigner
-from lare_rl.assigner.arguments import read_steps, to_levels, to_step_ids
+from lare_rl.assigner.arguments import read_steps, to_levels, to_rows, to_step_ids
 from lare_rl.errors import LareError
 
 
@@ -65,6 +66,14 @@ def test_team_reward_is_the_mean_over_the_agents_alive():
 def test_team_arguments_are_refused(reward, alive, message):
     with pytest.raises(LareError, match=message):
         read(reward, agents=2, alive=alive)
+
+
+def test_one_hot_rows_are_floats():
+    config = small_assigner(action_space=spaces.Discrete(3)).config
+    rows = np.zeros((4, 2)), np.eye(3)[[0, 1, 2, 0]], np.zeros((4, 2))
+    assert to_rows(config, *rows)[1].shape == (4, 3)
+    with pytest.raises(LareError, match=r"action .*\(4, 3, 3\).*\(steps, 3\).*one-hot rows of floats"):
+        to_rows(config, rows[0], rows[1].astype(int), rows[2])
 
 
 def test_number_that_no_step_has_is_refused():

@@ -63,6 +63,7 @@ def test_rows_equal_flatten_of_gymnasium(space, count, seed):
 def test_rows_of_a_size_accept_all_numbers():
     layout = make_layout(2, "observation_space")
     assert make_layout(layout, "observation_space") is layout
+    assert make_layout(np.prod((2, 1)), "observation_space") == layout
     for values in ([[1, 0]], np.array([[True, False]]), np.float16([[1, 0]])):
         assert layout.rows(values, "observation").tolist() == [[1.0, 0.0]]
     assert layout.rows(np.array([[1e300, 0]]), "observation").tolist() == [[np.inf, 0.0]]  # beyond float32
@@ -100,7 +101,11 @@ def test_rows_refuses(space, values, message):
     [
         (spaces.Text(3), r"observation_space is Text"),
         (spaces.Sequence(spaces.Discrete(2)), r"observation_space is Sequence"),
-        (spaces.MultiDiscrete([[2, 2], [2, 2]]), r"observation_space is MultiDiscrete"),
+        (spaces.MultiDiscrete([[2, 2], [2, 2]]), r"observation_space is MultiDiscrete.*MultiDiscrete with one axis"),
+        (-2, "observation_space is -2"),
+        (spaces.Dict(), r"observation_space is Dict\(\).*not empty"),
+        (spaces.Tuple([]), r"observation_space is Tuple\(\).*not empty"),
+        (spaces.Dict({0: spaces.Discrete(2)}), "observation_space is Dict.*keys are texts"),
         (spaces.Dict(a=spaces.Tuple([spaces.Text(3)])), r"observation_space\['a'\]\[0\] is Text"),
     ],
 )
@@ -112,7 +117,15 @@ def test_make_layout_refuses(space, message):
 def test_a_choice_for_rows_of_numbers():
     """The message names the space that the assigner needs."""
     layout = make_layout(6, "action_space")
-    with pytest.raises(LareError, match=r"rows of 6 numbers.*action_space=gymnasium.spaces.Discrete\(6\)"):
+    with pytest.raises(LareError, match=r"rows of 6 numbers.*action_space=gymnasium.spaces.Discrete\(N\)"):
         layout.rows(np.int64(3), "action")
     with pytest.raises(LareError, match=r"rows of 6 numbers$"):
         layout.rows(0.5, "action")
+
+
+def test_kinds_of_earlier_versions():
+    inner = {"kind": "in a row", "parts": [{"kind": "numbers", "shape": [2]}]}
+    layout = SpaceLayout(kind="named", names=["a"], inner=[inner])
+    assert layout == make_layout(spaces.Dict(a=spaces.Tuple([spaces.Box(-1, 1, (2,))])), "observation_space")
+    with pytest.raises(LareError, match="kind"):
+        SpaceLayout(kind=["named"])

@@ -55,6 +55,9 @@ def test_resolve_refuses(task, settings, texts):
         ("CN-6", {"steps": 5000, "method": "rd"}, 6150, 2050),  # five evaluations of a short run
         ("CN-6", {"steps": 20_500, "method": "rd"}, 20_500, 4100),
         ("CN-6", {"steps": 5000, "evaluate_every": 4000, "method": "rd"}, 6150, 4100),
+        ("CN-6", {"environments": 8, "method": "rd"}, 2_050_000, 20_400),
+        ("CN-6", {"environments": 1, "method": "rd"}, 2_050_000, 20_500),
+        ("CN-6", {"rollout_steps": 50, "method": "rd"}, 2_050_000, 20_500),
         ("Reacher-v4", {"steps": 1001, "method": "rd"}, 1050, 5000),
         ("Reacher-v4", {"steps": 1000, "evaluate_every": 40, "method": "rd"}, 1000, 50),
     ],

@@ -80,7 +80,7 @@ def test_samples_of_an_empty_replay_are_masked():
     np.testing.assert_array_equal(sample_transitions(empty, key, (3,)).number, 0)
     np.testing.assert_array_equal(sample_episodes(empty, key, (3,)).mask, 0)
     np.testing.assert_array_equal(sample_distinct_episodes(empty, key, 3).mask, 0)
-    np.testing.assert_array_equal(sample_packed(empty, key, 2, 60, LONGEST).episodes.mask, 0)
+    np.testing.assert_array_equal(sample_packed(empty, key, 2, 60, 60).episodes.mask, 0)
 
 
 def assert_packed(sample, expected):
@@ -98,7 +98,7 @@ def assert_packed(sample, expected):
 @pytest.mark.parametrize(("steps", "rows"), [(60, 60), (5, LONGEST)])
 def test_sample_packed(buffer, steps, rows):
     """As many episodes as their mean length says, unless they do not fit; at least one."""
-    samples = jax.tree.map(np.asarray, sample_packed(buffer, jax.random.key(0), 24, steps, LONGEST))
+    samples = jax.tree.map(np.asarray, sample_packed(buffer, jax.random.key(0), 24, steps, rows))
     requested = max(1, steps * len(FIRST) // sum(length for length, _ in FIRST.values()))
     counts = []
     for i in range(24):

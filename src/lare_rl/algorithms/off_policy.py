@@ -32,6 +32,6 @@ class OffPolicySettings(AlgorithmSettings):
     """Environment steps with uniformly random actions before the first update."""
 
 
-def run_defaults(env: "EnvSpec", environments: int) -> dict[str, Any]:
+def run_defaults(env: "EnvSpec", environments: int | None) -> dict[str, Any]:
     """Return the default run settings."""
-    return {"environments": environments or 1, "rollout_steps": 50, "evaluate_every": 5000, "capacity": 1_000_000}
+    return {"environments": environments or 1, "evaluate_every": 5000}

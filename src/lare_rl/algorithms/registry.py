@@ -1,8 +1,7 @@
 """The registry of reinforcement learning algorithms, built-in ones and plugins.
 
-An algorithm is one package or one file: its settings, its update, and a call of `register_algorithm`. It does not know which
-method computed its rewards. `Algorithm.module` names the module of its functions, which is imported when the algorithm is first
-used: listing the algorithms does not import JAX. The training loop calls these functions:
+An algorithm is one package or one file: its settings, its update, and a call of `register_algorithm`. `Algorithm.module` names the
+module of its functions, which is imported when the algorithm is first used. The training loop calls these functions:
 
     TRANSITIONS    init, get_actor, act, explore, update     as in `td3/td3.py`; the settings derive from `OffPolicySettings`
     ROLLOUTS       init, get_actor, act, explore, update     as in `ppo/ppo.py`
@@ -84,10 +83,9 @@ class Algorithm:
     """The published hyperparameters."""
     module: str
     """The module with the functions that the training loop calls (see above)."""
-    run_defaults: "Callable[[EnvSpec, int], dict[str, Any]]"
-    """From an environment and the requested number of copies (0 if none was requested) to the defaults of `Settings`, by name. In place
-    of `steps` and `evaluate_every`, `steps_iterations` and `evaluate_iterations` may count iterations. `credit` holds only the settings
-    that differ."""
+    run_defaults: "Callable[[EnvSpec, int | None], dict[str, Any]]"
+    """From an environment and the requested number of copies (None if none was requested) to the defaults of `Settings`, by name. In
+    place of `evaluate_every`, `evaluate_iterations` may count iterations. `credit` holds only the settings that differ."""
     summary: str
     source: str
     continuous: bool = True
@@ -114,8 +112,8 @@ class Algorithm:
     def deterministic_evaluation(self, discrete: bool) -> bool:
         """Return whether a policy acts without noise outside training.
 
-        A policy over choices is trained as a distribution. Until it is nearly deterministic, always taking its most likely choice
-        can earn far less than sampling.
+        A policy that is trained on rollouts is a distribution. Until it is nearly deterministic, its mode can earn far less than its
+        samples. Only the continuous actions of a single agent are taken at the mode.
         """
         return self.consumes is not Consumes.ROLLOUTS or not (discrete or self.multi_agent)
 
@@ -134,8 +132,12 @@ def register_algorithm(algorithm: Algorithm) -> None:
     """Add an algorithm. Its name then works in `Settings(algorithm=...)` and on the command line.
 
     Raises:
-        LareError: another algorithm has this name, or its settings are of the wrong class.
+        LareError: another algorithm has this name, or its settings or `consumes` are of the wrong class.
     """
+    if not isinstance(algorithm.consumes, Consumes):
+        raise LareError(
+            f"algorithm {algorithm.name}: consumes is {algorithm.consumes!r}: pass a member of lare_rl.algorithms.registry.Consumes"
+        )
     base = _SETTINGS[algorithm.consumes]
     if not isinstance(algorithm.settings, resolve_name(base)):
         raise LareError(

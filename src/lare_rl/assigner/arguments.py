@@ -116,7 +116,9 @@ def to_rows(
         if values.shape[:-1] != (n_steps, *config.agent_axis):
             shape = ", ".join(["steps", *map(str, config.agent_axis), str(values.shape[-1])])
             hint = "" if name == "observation" else ", with as many steps as observation"
-            raise LareError(f"{name} has the shape {values.shape}: give it the axes ({shape}){hint}")
+            if name == "action" and config.action.kind == "choices":
+                hint += "; give choices as whole numbers, or as one-hot rows of floats"
+            raise LareError(f"{name} becomes rows of the shape {values.shape}: its axes must be ({shape}){hint}")
     return rows["observation"], rows["action"], rows["next_observation"]
 
 

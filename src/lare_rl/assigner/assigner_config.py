@@ -27,7 +27,7 @@ from lare_rl.tasks.spec import ScoredObservation, TaskSpec
 
 __all__ = ["AssignerConfig", "Space", "check_config", "resolve_config"]
 
-Space = gymnasium.Space | SpaceLayout | int
+Space = gymnasium.Space | SpaceLayout | int | np.integer
 """A space of Gymnasium, a layout, or the length of a row of numbers."""
 
 

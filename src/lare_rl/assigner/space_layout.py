@@ -1,21 +1,25 @@
 """Spaces as rows of numbers: every observation and action becomes a row of float32, in Gymnasium's own order."""
 
 import functools
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 import numpy as np
 from gymnasium import spaces
 from jaxtyping import Float, Int, Shaped
-from pydantic import AliasChoices, Field
+from pydantic import AliasChoices, BeforeValidator, Field
 
 from lare_rl.errors import CheckedModel, LareError, short_repr
 
 __all__ = ["SpaceLayout", "check_numbers", "make_layout", "to_array"]
 
-MAX_MAGNITUDE = 1e18
-"""The largest absolute value of a number. Squares of numbers are summed in float32."""
+MAX_MAGNITUDE = 1e15
+"""The largest absolute value of a number. In float32, the squares of 10^8 such numbers have a finite sum."""
 
-Kind = Literal["numbers", "choices", "named", "in a row"]
+_RENAMED_KINDS = {"in a row": "tuple", "named": "dict"}
+"""From old to new kinds in files."""
+Kind = Annotated[
+    Literal["numbers", "choices", "dict", "tuple"], BeforeValidator(lambda kind: _RENAMED_KINDS.get(str(kind), kind))
+]
 
 
 class SpaceLayout(CheckedModel):
@@ -23,15 +27,15 @@ class SpaceLayout(CheckedModel):
 
     kind: Kind
     shape: tuple[int, ...] = ()
-    """For `numbers`: the shape of one element."""
+    """For `numbers`: the shape of one element. For `choices`: () for a single choice, (n,) for n of them."""
     choices: tuple[int, ...] = ()
     """For `choices`: the number of options of each choice, which is the length of its one-hot vector."""
     first: tuple[int, ...] = ()
     """For `choices`: the number of the first option, of each choice."""
     names: tuple[str, ...] = ()
-    """For `named`: the keys, in order."""
+    """For `dict`: the keys, in order."""
     inner: tuple["SpaceLayout", ...] = Field(default=(), validation_alias=AliasChoices("inner", "parts"))
-    """For `named` and `in a row`: the layouts of the spaces inside. Earlier versions saved them as `parts`."""
+    """For `dict` and `tuple`: the layouts of the spaces inside. Earlier versions saved them as `parts`."""
 
     @functools.cached_property
     def size(self) -> int:
@@ -49,12 +53,12 @@ class SpaceLayout(CheckedModel):
         Raises:
             LareError: the values are not elements of the space.
         """
-        if self.kind == "named" and isinstance(values, dict):
+        if self.kind == "dict" and isinstance(values, dict):
             missing = [key for key in self.names if key not in values]
             if missing:
                 raise LareError(f"{name} has no {missing[0]!r}: it needs {', '.join(map(repr, self.names))}")
             return self._concatenate([values[key] for key in self.names], name)
-        if self.kind == "in a row" and isinstance(values, tuple | list) and len(values) == len(self.inner):
+        if self.kind == "tuple" and isinstance(values, tuple | list) and len(values) == len(self.inner):
             return self._concatenate(values, name)
         array = to_array(values, name)
         if self.kind == "choices":
@@ -97,7 +101,7 @@ class SpaceLayout(CheckedModel):
         if array.ndim == 0 or array.shape[-1] != self.size:
             hint = ""
             if name == "action" and array.dtype.kind in "iu" and self.kind == "numbers":
-                hint = f", or for a choice, make the assigner with action_space=gymnasium.spaces.Discrete({self.size})"
+                hint = ", or for one of N choices, make the assigner with action_space=gymnasium.spaces.Discrete(N)"
             raise LareError(f"{name} has the shape {array.shape}: give rows of {self.size} numbers{hint}")
         return _to_float32(array)
 
@@ -130,17 +134,17 @@ def _to_float32(array: Shaped[np.ndarray, "*shape"]) -> Float[np.ndarray, "*shap
         return array.astype(np.float32, copy=False)
 
 
-def make_layout(space: "spaces.Space | int | SpaceLayout", name: str) -> SpaceLayout:
+def make_layout(space: "spaces.Space | int | np.integer | SpaceLayout", name: str) -> SpaceLayout:
     """Return the layout of a Gymnasium space, or of rows of this many numbers.
 
     Raises:
-        LareError: its elements have no fixed size.
+        LareError: it is another space, or no space.
     """
     match space:
         case SpaceLayout():
             return space
-        case int():
-            return SpaceLayout(kind="numbers", shape=(space,))
+        case int() | np.integer() if space >= 0:
+            return SpaceLayout(kind="numbers", shape=(int(space),))
         case spaces.Box() | spaces.MultiBinary():
             return SpaceLayout(kind="numbers", shape=space.shape)
         case spaces.Discrete():
@@ -148,10 +152,13 @@ def make_layout(space: "spaces.Space | int | SpaceLayout", name: str) -> SpaceLa
         case spaces.MultiDiscrete() if space.nvec.ndim == 1:
             first = tuple(map(int, space.start))
             return SpaceLayout(kind="choices", shape=space.shape, choices=tuple(map(int, space.nvec)), first=first)
-        case spaces.Dict():
+        case spaces.Dict() if space.spaces and all(isinstance(key, str) for key in space.spaces):
             inner = tuple(make_layout(value, f"{name}[{key!r}]") for key, value in space.spaces.items())
-            return SpaceLayout(kind="named", names=tuple(space.spaces), inner=inner)
-        case spaces.Tuple():
+            return SpaceLayout(kind="dict", names=tuple(space.spaces), inner=inner)
+        case spaces.Tuple() if space.spaces:
             inner = tuple(make_layout(value, f"{name}[{i}]") for i, value in enumerate(space.spaces))
-            return SpaceLayout(kind="in a row", inner=inner)
-    raise LareError(f"{name} is {short_repr(space)}: its elements cannot be written as rows of numbers of one size")
+            return SpaceLayout(kind="tuple", inner=inner)
+    raise LareError(
+        f"{name} is {short_repr(space)}: give the number of entries, or a Gymnasium space: Box, Discrete, MultiBinary, MultiDiscrete with "
+        "one axis, or a Dict (whose keys are texts) or Tuple of these that is not empty"
+    )

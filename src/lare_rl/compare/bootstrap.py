@@ -106,7 +106,8 @@ def bootstrap(function: Callable[..., Float[np.ndarray, "*_"]], *scores: Float[n
 
         x*_nm = x_(i_nm) m,   i_nm uniform in 1 .. N, independent for each run n and task m
 
-    A sample of a learning curve has whole runs: further axes of `scores` share the indices, which are the same in every call.
+    Axes before the last two, such as the points of a learning curve, share the indices, so that a sample has whole runs. Every call
+    draws the same indices.
 
     Args:
         function: one of the statistics above, or a combination of them. The first axis of its arguments is the sample.
@@ -166,6 +167,6 @@ def _distribution(values: Float[np.ndarray, " values"], n_a: int) -> Float[np.nd
     counts = np.zeros((n_a + 1, int(doubled_ranks.sum()) + 1))
     counts[0, 0] = 1
     for rank in doubled_ranks:
-        counts[1:, rank:] += counts[:-1, :-rank].copy()
+        counts[1:, rank:] += counts[:-1, :-rank]
     first, last = n_a * (n_a + 1), n_a * (n_a + 1) + 2 * n_a * (len(values) - n_a)
     return counts[n_a, first : last + 1] / math.comb(len(values), n_a)

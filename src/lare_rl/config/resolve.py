@@ -72,14 +72,16 @@ def _apply_defaults(settings: Settings, env: EnvSpec) -> ResolvedSettings:
     defaults: dict[str, Any] = {
         "method": "lare-bayes",
         "steps": 1_000_000,
+        "rollout_steps": 50,
+        "capacity": 1_000_000,
         "fit_every": 1,
         "fit_updates": 1,
         "evaluation_episodes": 10,
         "credit": {},
-        **row.run_defaults(env, settings.environments or 0),
+        **row.run_defaults(env, settings.environments),
     }
     iteration = (settings.rollout_steps or defaults["rollout_steps"]) * defaults["environments"]
-    n_iterations = defaults.pop("steps_iterations", None) or max(1, round(defaults["steps"] / iteration))
+    n_iterations = max(1, round(defaults["steps"] / iteration))
     defaults["steps"] = round_up(settings.steps or n_iterations * iteration, iteration)
     n_iterations = defaults.pop("evaluate_iterations", None) or max(1, round(defaults["evaluate_every"] / iteration))
     if row.consumes is Consumes.ROLLOUTS:

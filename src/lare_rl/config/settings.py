@@ -52,7 +52,7 @@ class _RunSettings(CheckedModel, Generic[Undecided]):
     rollout_steps: Count | Undecided = UNDECIDED
     """Steps of each copy in an iteration (collect, store, fit, update). By default 50. For ppo, all copies together have 2000,
     rounded to episodes of the maximum length. For ippo, a copy has one episode if all episodes are equally long; else all copies
-    together have 2050 in JAX, and 2000 on the host. For ppo and ippo at least 16."""
+    together have 2050 in JAX, and 2000 on the host. For ppo and ippo at least 16, unless rounded to whole episodes."""
     fit_every: Count | Undecided = UNDECIDED
     """Iterations between two fits of the decoder, for ppo and ippo, and for methods with a loss of their own (diaster, rudder, grd,
     rbt). By default 10 for ippo, else 1."""
@@ -64,7 +64,7 @@ class _RunSettings(CheckedModel, Generic[Undecided]):
     (published)."""
     evaluate_every: Count | Undecided = UNDECIDED
     """Environment steps between two evaluations; one also follows the last step. By default 5000 for td3, ddpg and sac, about
-    10,000 for qmix, 10 iterations for ippo, and 5 iterations for ppo. A short run of ippo or ppo is evaluated more often, so that
+    10,000 for qmix, about 20,000 for ippo, and 5 iterations for ppo. A short run of ippo or ppo is evaluated more often, so that
     it has 5 evaluations."""
     evaluation_episodes: Count | Undecided = UNDECIDED
     """Episodes in one evaluation. By default 10; in JAX 50 for ippo and 32 for qmix."""

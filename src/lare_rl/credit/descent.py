@@ -23,7 +23,7 @@ class BatchPlan(NamedTuple):
 
     layout: Literal["packed", "padded", "sampled"]
     episodes: int
-    """The number of episodes; for `packed`, the largest number."""
+    """The number of episodes; for `packed`, the largest number in a batch of `CreditAssigner`."""
     rows: int
     """The number of rows (steps) of each episode; for `packed`, of all episodes together."""
 

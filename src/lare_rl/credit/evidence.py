@@ -22,7 +22,7 @@ a group and gamma_g of them determined by the data (MacKay, Neural Computation 4
     beta = (N - 1 - sum gamma) / (q - 2 mu . p + mu . S mu)
 
 The data switch off a group that does not help (its alpha grows), and switch on a group that is needed. Law et al. (NeurIPS 2018)
-regress on sums over groups of cases. Efroni et al. (AAAI 2021) show that such a regression recovers rewards.
+regress on sums as well. Efroni et al. (AAAI 2021) show that such a regression recovers rewards.
 
 A score may instead be an average over the steps: R_k = b + w . m_k + N(0, 1 / (beta T_k)). The equations are the same, with y_k = R_k
 and the same S. The reward of a step is then (b + w . f) / T.
@@ -39,8 +39,7 @@ from jaxtyping import Array, Bool, Float, Int
 from lare_rl.credit.precisions import JITTER, TOLERANCE, AlphaIndex, Backend, Posterior, Regression, n_alphas, varies
 from lare_rl.nn.leading_axis import map_leading_axis
 from lare_rl.nn.masks import select
-from lare_rl.nn.normalise import merge_means
-from lare_rl.util.statistics import FLOAT32_NOISE
+from lare_rl.nn.normalise import RunningMeanStd, merge_means, running_std
 
 __all__ = [
     "JAX_BACKEND",
@@ -63,8 +62,6 @@ __all__ = [
 FIRST_GROUP_GAIN, OTHER_GROUPS_LOSS, LOW_NOISE = 100, 1e4, 1e-6
 """Start 3 of `fit`: the first group may explain `FIRST_GROUP_GAIN` times its equal share, each other group its equal share
 divided by `OTHER_GROUPS_LOSS`, and the noise `LOW_NOISE` times the variance of the returns."""
-MANY_EPISODES_PER_FEATURE = 2
-"""With more episodes than this for each feature, and an earlier fit, starts 2 and 3 of `fit` have one round each."""
 
 
 def _sum_by_alpha(values: Float[Array, " features"], alpha_index: AlphaIndex) -> Float[Array, " alphas"]:
@@ -112,8 +109,8 @@ def add_prefixes(
 ) -> SufficientStatistics:
     """Add the prefixes of some episodes, each with the return of its whole episode. Rows where `mask` is false are ignored.
 
-    Every prefix counts the same. Only the number of episodes counts as the number of cases, because the prefixes of an episode have
-    the same noise. R takes the place of R/T too, so that it is regressed for every score type.
+    Each prefix has weight 1. N is still the number of episodes, because the prefixes of an episode have the same noise. R takes the place
+    of R/T too, so that it is regressed for every score type.
     """
     weight = mask.astype(statistics.mean.dtype)
     v = jnp.concatenate([features, returns[:, None], returns[:, None]], axis=1)
@@ -143,8 +140,10 @@ def _add_cases(
 
 def init_posterior(alpha_index: AlphaIndex) -> Posterior:
     """Return the posterior before the first episode. Its precisions are 0, which means that they have no value yet."""
-    zero, zeros, weight = (jnp.zeros(shape) for shape in ((), n_alphas(alpha_index), len(alpha_index)))
-    return Posterior(weight, bias=zero, alpha=zeros, beta=zero, n_effective=zeros, log_evidence=zero)
+    zero, zeros = jnp.zeros(()), jnp.zeros(n_alphas(alpha_index))
+    return Posterior(
+        jnp.zeros(len(alpha_index)), bias=zero, alpha=zeros, beta=zero, n_effective=zeros, log_evidence=zero
+    )
 
 
 def regression(
@@ -156,8 +155,7 @@ def regression(
     column = n_features + score_type
     n_steps = jnp.maximum(statistics.n_steps, 1)
     y_mean = statistics.mean[column]
-    y_std = jnp.sqrt(statistics.products[column, column] / n_steps)
-    y_std = jnp.where(y_std > FLOAT32_NOISE * jnp.abs(y_mean), y_std, 0)
+    y_std = running_std(RunningMeanStd(statistics.n_steps, y_mean, statistics.products[column, column]))
     s, p = statistics.products[:n_features, :n_features], statistics.products[:n_features, column]
     is_used = varies(jnp.diagonal(s) / n_steps, statistics.mean[:n_features] ** 2)
     s = jnp.where(jnp.outer(is_used, is_used), s + JITTER * jnp.diag(jnp.diagonal(s)), 0)
@@ -192,8 +190,8 @@ def fit(
     2. equal shares, half of the variance noise;
     3. first group alone, almost no noise.
 
-    Without an earlier fit, start 1 is start 2, which then has one round. With an earlier fit and more than
-    `MANY_EPISODES_PER_FEATURE` episodes for each feature, starts 2 and 3 have one round each.
+    Without an earlier fit, start 1 is start 2, which then has one round. With an earlier fit and `Regression.has_many_episodes`, starts
+    2 and 3 have one round each.
 
     Args:
         alpha_index: for each feature, the index of its precision in alpha: that of its group, for example.
@@ -202,8 +200,8 @@ def fit(
         batched: whether the three iterations run at once.
     """
     problem = regression(statistics, score_type, alpha_index)
-    has_start, few = start.beta > 0, problem.dof < MANY_EPISODES_PER_FEATURE * len(alpha_index)
-    limits = jnp.where(jnp.stack([jnp.array(True), has_start & few, ~has_start | few]), max_rounds, 1)
+    few = ~problem.has_many_episodes
+    limits = jnp.where(jnp.stack([jnp.array(True), start.has_fit & few, ~start.has_fit | few]), max_rounds, 1)
     starts = starting_precisions(problem, start)
     candidates = map_leading_axis(lambda args: fixed_point(problem, *args), (*starts, limits), batched=batched)
     return unscale(statistics, problem, most_likely(candidates), fallback=start)
@@ -211,9 +209,8 @@ def fit(
 
 def starting_precisions(problem: Regression, start: Posterior) -> tuple[Float[Array, "3 alphas"], Float[Array, "3"]]:
     """Return alpha and beta of the three starts of `fit`."""
-    has_start = start.beta > 0
     equal = problem.equal_alpha, 2 * problem.dof / problem.q
-    earlier = jax.tree.map(lambda old, new: jnp.where(has_start, old, new), (start.alpha, start.beta), equal)
+    earlier = jax.tree.map(lambda old, new: jnp.where(start.has_fit, old, new), (start.alpha, start.beta), equal)
     first_group = (OTHER_GROUPS_LOSS * problem.equal_alpha).at[0].set(problem.equal_alpha[0] / FIRST_GROUP_GAIN)
     first_alone = first_group, problem.dof / (LOW_NOISE * problem.q)
     return jax.tree.map(lambda *leaves: jnp.stack(leaves), earlier, equal, first_alone)

@@ -150,8 +150,8 @@ def fit(state: LogOddsFit, alpha_index: AlphaIndex, max_rounds: int | Int[Array,
     def is_unsettled(carry: _State) -> Bool[Array, ""]:
         return (carry[0] < max_rounds) & (carry[1] > XI_TOLERANCE)
 
-    has_start = state.posterior.beta > 0
-    start = state.posterior._replace(alpha=jnp.where(has_start, jnp.clip(state.posterior.alpha, *limits), equal_alpha))
+    alpha = jnp.where(state.posterior.has_fit, jnp.clip(state.posterior.alpha, *limits), equal_alpha)
+    start = state.posterior._replace(alpha=alpha)
     initial = (jnp.array(0), jnp.array(jnp.inf), jnp.ones(WINDOW), start, state.root)
     initial = jax.tree.map(lambda leaf: leaf.astype(float) if leaf.dtype == jnp.float32 else leaf, initial)
     *_, posterior, root = jax.lax.while_loop(is_unsettled, body, initial)

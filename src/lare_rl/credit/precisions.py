@@ -9,7 +9,7 @@ from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 
 __all__ = [
     "JITTER",
@@ -39,6 +39,8 @@ MIN_VARIATION = 1e-5
 """A feature is taken to be constant if its standard deviation between cases is below this fraction of sqrt(1 + mean^2). So features must
 have a size of about 1, or more. The rounding errors of a constant in float32 are smaller. An episode's mean of the time is constant, for
 example, if all episodes are equally long. A weight for it would be the quotient of two rounding errors."""
+MANY_EPISODES_PER_FEATURE = 2
+"""With fewer episodes for each feature, the evidence may have several maxima (`evidence.fit`)."""
 MIN_NOISE = 1e-10
 """The smallest variance of the noise, relative to that of the returns. Float32 features and returns cannot resolve less."""
 
@@ -67,6 +69,11 @@ class Posterior(NamedTuple):
     log_evidence: Float[Array, "*batch"]
     """The log evidence of the precisions of this round, up to a constant that does not depend on groups and precisions."""
 
+    @property
+    def has_fit(self) -> Bool[Array, "*batch"]:
+        """Whether this is the result of a fit. The precisions are 0 before the first one."""
+        return self.beta > 0
+
 
 class Regression(NamedTuple):
     """A regression problem. S, p and q are those of `evidence.py`, with y in units of its standard deviation."""
@@ -81,6 +88,11 @@ class Regression(NamedTuple):
     alpha_index: AlphaIndex
     equal_alpha: Alphas
     """The alpha of each group by which all groups explain equal parts of the returns, and together half of them if all of them vary."""
+
+    @property
+    def has_many_episodes(self) -> Bool[Array, ""]:
+        """Whether there are `MANY_EPISODES_PER_FEATURE` degrees of freedom or more for each feature."""
+        return self.dof >= MANY_EPISODES_PER_FEATURE * len(self.alpha_index)
 
 
 class Moments(NamedTuple):

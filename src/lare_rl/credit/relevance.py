@@ -42,15 +42,14 @@ def fit(
 
     Both are the same if each group has one strength. The arguments are those of `evidence.fit`, and the index of each feature's strength.
     `earlier_groups` and `earlier` are earlier results, or `evidence.init_posterior`. The iteration for the strengths starts from the
-    precisions of the groups. With more than `evidence.MANY_EPISODES_PER_FEATURE` episodes for each feature, it continues from `earlier`.
+    precisions of the groups. With `Regression.has_many_episodes`, it continues from `earlier`.
     """
     groups = evidence.fit(statistics, score_type, group_index, earlier_groups, max_rounds, batched=batched)
     if np.array_equal(group_index, strength_index):
         return groups, groups
     start = expand_groups(groups, group_index, strength_index)
     problem = evidence.regression(statistics, score_type, strength_index)
-    many = problem.dof >= evidence.MANY_EPISODES_PER_FEATURE * len(group_index)
-    continues = many & (earlier.beta > 0)
+    continues = problem.has_many_episodes & earlier.has_fit
     alpha, beta = (
         jnp.where(continues, old, new) for old, new in ((earlier.alpha, start.alpha), (earlier.beta, start.beta))
     )
@@ -61,8 +60,7 @@ def fit(
 def is_better(strengths: Posterior, groups: Posterior) -> Bool[Array, "*score_types"]:
     """Return whether the fit by strengths is used."""
     n_more = strengths.alpha.shape[-1] - groups.alpha.shape[-1]
-    has_fit = strengths.beta > 0
-    return has_fit & (strengths.log_evidence > groups.log_evidence + MIN_GAIN * n_more)
+    return strengths.has_fit & (strengths.log_evidence > groups.log_evidence + MIN_GAIN * n_more)
 
 
 def select(strengths: Posterior, groups: Posterior, group_index: AlphaIndex, strength_index: AlphaIndex) -> Posterior:

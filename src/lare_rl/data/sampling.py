@@ -127,14 +127,14 @@ def sample_padded(replay: Replay, key: PRNGKeyArray, updates: int, count: int, l
     return _credit_sample(episodes, lay_out_padded(episodes.length, longest))
 
 
-def sample_packed(replay: Replay, key: PRNGKeyArray, updates: int, steps: int, longest: int) -> CreditSample:
-    """Sample max(1, steps / mean length) whole episodes, and put them one after the other into max(steps, longest) rows, for RD."""
+def sample_packed(replay: Replay, key: PRNGKeyArray, updates: int, steps: int, rows: int) -> CreditSample:
+    """Sample max(1, steps / mean length) whole episodes, and put them one after the other into the rows, for RD."""
 
     def sample_update(key: PRNGKeyArray) -> CreditSample:
         episodes = sample_episodes(replay, key, (steps,))
         count = steps * jnp.sum(n_stored_episodes(replay)) // jnp.maximum(_n_finished_steps(replay), 1)
         mask = episodes.mask * (jnp.arange(steps) < jnp.maximum(count, 1))
-        return _pack(episodes._replace(mask=mask), max(steps, longest))
+        return _pack(episodes._replace(mask=mask), rows)
 
     return jax.vmap(sample_update)(jax.random.split(key, updates))
 

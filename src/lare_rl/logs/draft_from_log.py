@@ -40,7 +40,7 @@ def _first_line(layout: SpaceLayout, key: str) -> str:
     n_entries = count_entries(layout.size)
     if layout.kind == "choices":
         return f"{n_entries}, all 0 but one: the {'action that is taken' if key == 'action' else 'state'}."
-    if layout.kind == "named":
+    if layout.kind == "dict":
         children = zip(layout.names, layout.inner, strict=True)
         return f"{n_entries}: " + ", then ".join(f"{child.size} of {name}" for name, child in children) + "."
     return f"{n_entries}."

@@ -31,8 +31,8 @@ class RunningMeanStd(NamedTuple):
     """Mean and standard deviation of each feature over all rows so far."""
 
     n_rows: Float[Array, ""]
-    mean: Float[Array, " features"]
-    sum_squares: Float[Array, " features"]
+    mean: Float[Array, "*features"]
+    sum_squares: Float[Array, "*features"]
     """The sum of the squared deviations from the mean."""
 
 
@@ -68,7 +68,7 @@ def merge_means(n: Any, mean: Any, n_new: Any, new_mean: Any) -> tuple[Any, Any,
     return n_all, mean + fraction * difference, difference, fraction
 
 
-def running_std(statistics: RunningMeanStd) -> Float[Array, " features"]:
+def running_std(statistics: RunningMeanStd) -> Float[Array, "*features"]:
     """Return the standard deviations. That of a feature that has never varied is 0."""
     std = jnp.sqrt(statistics.sum_squares / jnp.maximum(statistics.n_rows, 1))
     return jnp.where(std > FLOAT32_NOISE * jnp.abs(statistics.mean), std, 0)

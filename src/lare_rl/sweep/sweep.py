@@ -39,9 +39,9 @@ class Sweep(Resources):
     algorithms: tuple[str, ...] = ()
     """The default is each task's own."""
     draws: Draws = (0,)
-    """Draws of the recorded replies. Methods without a latent function are trained once."""
+    """Draws of the recorded replies, which the latent functions come from. Methods without a latent function are trained once."""
     functions: dict[str, tuple[Path, ...]] = Field(default_factory=dict)
-    """Files of latent functions by the name of their task, one for each team. The default is the recorded functions."""
+    """Files of latent functions by the name of their task, one for each team. The default is the recorded replies."""
     settings: dict[str, Any] = Field(default_factory=dict)
     """Other settings of `lare-rl train`, such as steps and seeds."""
     out: Path | None = None
@@ -52,15 +52,16 @@ class Sweep(Resources):
     def _keys_are_in_their_tables(cls, values: Any) -> Any:
         if not isinstance(values, Mapping):
             return values
-        for name in values.keys() - cls.model_fields.keys():
+        settings = values["settings"] if isinstance(values.get("settings"), Mapping) else {}
+        for name in ("method", "algorithm", "draw"):
+            if name in values or name in settings:
+                raise ValueError(f"{name} is chosen by a list: write {name}s = [...] above all tables")
+        for name in sorted(values.keys() - cls.model_fields.keys()):
             if name in Settings.model_fields:
                 raise ValueError(f"{name} is a setting: write it into the table [settings]")
-        settings = values.get("settings")
-        for name in settings if isinstance(settings, Mapping) else ():
-            if name in ("method", "algorithm", "draw"):
-                raise ValueError(f"{name} does not belong into [settings]: write {name}s = [...] above it")
+        for name in settings:
             if name in cls.model_fields:
-                raise ValueError(f"{name} does not belong into [settings]: write it above")
+                raise ValueError(f"{name} is not a setting of a run: write it above all tables")
         return values
 
 
@@ -72,12 +73,12 @@ def read_sweep(path: Path) -> tuple[Sweep, list[Job]]:
     table = read_table(path)
     try:
         sweep = Sweep(**rename_keys(table))
-        _check_functions(sweep)
+        _check_phi_is_used(sweep)
         jobs = list(_make_jobs(sweep, path))
         directories: set[Path] = set()
         for job in jobs:
             if job.directory in directories:
-                raise LareError(f"{job.name} is listed twice: give two task files two names")
+                raise LareError(f"{job.name} is listed twice: leave one out, or give two task files two names")
             directories.add(job.directory)
             check_job(job)
         _check_settings(jobs)
@@ -113,7 +114,7 @@ def run_sweep(
     return failed
 
 
-def _check_functions(sweep: Sweep) -> None:
+def _check_phi_is_used(sweep: Sweep) -> None:
     """Raise `LareError` if draws or functions affect no run."""
     if any(METHODS.find(method).needs_phi for method in sweep.methods):
         return
@@ -130,7 +131,7 @@ def _make_jobs(sweep: Sweep, path: Path) -> Iterator[Job]:
     if unknown := sorted(sweep.functions.keys() - set(names)):
         raise LareError(f"functions of {unknown[0]}, which is none of the tasks {', '.join(names)}")
     if sweep.draws != (0,) and sweep.functions.keys() >= set(names):
-        raise LareError("draws choose recorded functions, but all tasks have some in [functions]: leave out either")
+        raise LareError("draws choose recorded replies, but all tasks have functions in [functions]: leave out either")
     for task, method, algorithm in product(tasks, sweep.methods, sweep.algorithms or (None,)):
         functions = [path.parent / function for function in sweep.functions.get(task.name, ())]
         for draw in sweep.draws if METHODS.find(method).needs_phi and not functions else (0,):
@@ -139,14 +140,14 @@ def _make_jobs(sweep: Sweep, path: Path) -> Iterator[Job]:
             try:
                 yield make_job(root, task, settings, functions)
             except LareError as error:
-                raise error if task.name in str(error) else LareError(f"on {task.name}, {error}") from error
+                if task.name in str(error):
+                    raise
+                raise LareError(f"on {task.name}, {error}") from error
 
 
 def _check_settings(jobs: Sequence[Job]) -> None:
     """Raise `LareError` if a setting affects none of the jobs."""
     unused = [unused_settings(job.settings, job.resolved, job.task) for job in jobs]
-    for name in unused[0]:
+    for name, message in unused[0].items():
         if all(name in messages for messages in unused):
-            prefix = f"{name} makes no difference to "
-            reasons = dict.fromkeys(messages[name].removeprefix(prefix) for messages in unused)
-            raise LareError(prefix + ", nor to ".join(reasons))
+            raise LareError(f"no run uses {name}; in the first, {message}")

@@ -18,7 +18,6 @@ from lare_rl.algorithms.batches import Metrics
 from lare_rl.config.train_config import CreditConfig, TrainConfig
 from lare_rl.credit import descent, learning
 from lare_rl.credit.decoder_state import CreditBatch, DecoderState
-from lare_rl.credit.descent import plan_batch
 from lare_rl.credit.prequential import empty_predictions, squared_errors
 from lare_rl.credit.spec import CreditSpec
 from lare_rl.data import replay
@@ -48,12 +47,12 @@ CHUNK_ROWS = 2400
 """The size of a chunk of a decoder's gradient, in rows. More rows do not fit into the cache of a core, and fewer make the matrix products
 inefficient."""
 
-
 MIN_FIRST_EPISODES = 10
-"""With fewer finished episodes of a seed, none are held out."""
+"""With fewer finished episodes of a seed, the first fit waits, and decoders are fitted as published."""
 PATIENCE = 2
 """A seed's first fit ends after this many rounds in a row without improvement."""
-MAX_FIT_CALLS = 40
+MAX_ROUNDS = 40
+"""The most rounds of a first fit."""
 BATCH_DIVISOR = 8
 """Updates of the first fit read this fraction of the steps of later updates. There are few episodes yet, and large
 updates would read each of them several times. The decoder becomes as accurate in an eighth of the time
@@ -67,14 +66,14 @@ class FirstFitStoppedError(Exception):
 def sample_credit(buffer: Replay, key: PRNGKeyArray, updates: int, config: CreditConfig) -> CreditSample:
     """Sample the steps that decoders read in each of several updates, on a leading axis of updates."""
     buffer, longest = replay.segments_as_episodes(buffer), config.longest_segment
-    plan = plan_batch(config.credit_specs[0], longest)
+    plan = descent.plan_batch(config.credit_specs[0], longest)
     match plan.layout:
         case "sampled":
             return sample_episode_steps(buffer, key, updates, plan.episodes, plan.rows)
         case "padded":
             return sample_padded(buffer, key, updates, plan.episodes, plan.rows)
         case "packed":
-            return sample_packed(buffer, key, updates, config.credit.steps, longest)
+            return sample_packed(buffer, key, updates, config.credit.steps, plan.rows)
 
 
 def fit_decoders(
@@ -150,7 +149,7 @@ def fit_until_converged(
     config: TrainConfig,
     stop_requested: Callable[[], bool],
 ) -> tuple[Learner, Metrics]:
-    """Fit the decoders repeatedly. Keep, for each seed, the decoders with the least error on held-out episodes.
+    """Fit the decoders repeatedly. Keep, for each seed, the decoders with the least error on held-out episodes, and their metrics.
 
     Args:
         learner: the learner of all seeds, with enough episodes.
@@ -161,27 +160,28 @@ def fit_until_converged(
     Raises:
         FirstFitStoppedError: the user has asked the run to stop.
     """
-    hidden_fields = {name: getattr(learner.replay, name) for name in ("current_episode", "running", "segments")}
-    unhidden, n_seeds = jax.tree.map(jnp.copy, hidden_fields), len(learner.n_learned)
+    # Copies, here and below, because each round consumes its learner.
+    hidden_fields = ("current_episode", "running", "segments")
+    unhidden = {name: jax.tree.map(jnp.copy, getattr(learner.replay, name)) for name in hidden_fields}
     n_hidden = jax.vmap(partial(_count_held_out, window=config.credit_specs[0].window))(
         replay.segments_as_episodes(learner.replay)
     )
     compute_error = jit_over_seeds(jax.vmap(partial(_held_out_error, config=config)), config.n_devices)
-    best_decoders, best_error = jax.tree.map(jnp.copy, learner.decoders), np.full(n_seeds, np.inf)
-    rounds_without_gain = np.zeros(n_seeds, int)
+    best_decoders, best_error = jax.tree.map(jnp.copy, learner.decoders), np.full(len(keys), np.inf)
+    rounds_without_gain = np.zeros(len(keys), int)
     metrics: Metrics = {}
-    for number in range(MAX_FIT_CALLS):
+    for number in range(MAX_ROUNDS):
         if stop_requested():
             raise FirstFitStoppedError
         round_keys = jax.vmap(jax.random.fold_in, in_axes=(0, None))(keys, number)
-        learner, metrics = fit(learner._replace(replay=replay.hide_newest(learner.replay, n_hidden)), round_keys)
-        # Copies, because the next round consumes its learner.
+        learner, new_metrics = fit(learner._replace(replay=replay.hide_newest(learner.replay, n_hidden)), round_keys)
         full = learner.replay._replace(**jax.tree.map(jnp.copy, unhidden))
         learner = learner._replace(replay=full)
         error = np.asarray(compute_error(learner.decoders, full, n_hidden))
         # How long a seed is fitted does not depend on the other seeds.
         is_better = (error < best_error) & (rounds_without_gain < PATIENCE)
         best_decoders = select(jnp.asarray(is_better), learner.decoders, best_decoders)
+        metrics = select(jnp.asarray(is_better), new_metrics, metrics or new_metrics)
         best_error = np.where(is_better, error, best_error)
         rounds_without_gain = np.where(is_better, 0, rounds_without_gain + 1)
         if (rounds_without_gain >= PATIENCE).all():
@@ -190,7 +190,10 @@ def fit_until_converged(
 
 
 def _count_held_out(buffer: Replay, window: int) -> Int[Array, " envs"]:
-    """Return how many of each environment's newest episodes are held out: a fifth of all, from the last environments first."""
+    """Return how many of each environment's newest episodes are held out: a fifth of all, but at most `window`.
+
+    They are from the last environments first.
+    """
     available = replay.n_stored_episodes(buffer)
     count = jnp.minimum(jnp.sum(available) // 5, window)
     in_later_envs = jnp.cumsum(available[::-1])[::-1] - available

@@ -13,7 +13,8 @@ if TYPE_CHECKING:
 __all__ = ["PPOSettings"]
 
 MIN_ROLLOUT_STEPS = 16
-"""The least number of steps of each environment between two updates, by default: advantages need some steps in a row."""
+"""The least number of steps of each environment between two updates, by default, before they are rounded to whole episodes. Advantages
+need some steps in a row."""
 ROLLOUT_STEPS = 2000
 """The steps of all environments together between two updates, by default."""
 
@@ -56,29 +57,28 @@ def _whole_episodes(env: "EnvSpec", n_steps: int) -> int:
     return round(n_steps / env.max_steps) * env.max_steps or n_steps
 
 
-def _ppo_defaults(env: "EnvSpec", environments: int) -> dict[str, Any]:
+def _ppo_defaults(env: "EnvSpec", environments: int | None) -> dict[str, Any]:
     environments = environments or 1
     return {
         "environments": environments,
         "rollout_steps": _whole_episodes(env, max(MIN_ROLLOUT_STEPS, ROLLOUT_STEPS // environments)),
         "fit_updates": 500,
         "evaluate_iterations": 5,
-        "capacity": 1_000_000,
     }
 
 
-def _ippo_defaults(env: "EnvSpec", environments: int) -> dict[str, Any]:
+def _ippo_defaults(env: "EnvSpec", environments: int | None) -> dict[str, Any]:
     # In JAX, as published for particle tasks: 82 episodes of 25 steps between two updates.
     environments = environments or (82 if env.is_jax else 1)
-    n_steps = max(MIN_ROLLOUT_STEPS, (2050 if env.is_jax else ROLLOUT_STEPS) // environments)
+    all_steps = 2050 if env.is_jax else ROLLOUT_STEPS
     return {
         "environments": environments,
-        "rollout_steps": env.max_steps if env.fixed_length else n_steps,
+        "rollout_steps": env.max_steps if env.fixed_length else max(MIN_ROLLOUT_STEPS, all_steps // environments),
         "fit_every": 10,
         "fit_updates": 50,
         "first_fit": "held-out",
-        "steps_iterations": 1000,
-        "evaluate_iterations": 10,
+        "steps": 1000 * all_steps,
+        "evaluate_every": 10 * all_steps,
         "evaluation_episodes": 50 if env.is_jax else 10,
         "capacity": 15_000 * (env.max_steps + 1),
     }

@@ -41,11 +41,10 @@ class QMIXSettings(SequenceSettings):
     """Environment steps of the linear fall from `epsilon_start` to `epsilon_end`."""
 
 
-def _run_defaults(env: "EnvSpec", environments: int) -> dict[str, Any]:
+def _run_defaults(env: "EnvSpec", environments: int | None) -> dict[str, Any]:
     return {
         "method": "lare-rd",  # the paper's: closed-form credit has not been measured with these algorithms
         "environments": environments or (8 if env.is_jax else 1),
-        "rollout_steps": 50,
         "steps": 2_000_000,
         "evaluate_every": 10_000,
         "evaluation_episodes": 32 if env.is_jax else 10,
