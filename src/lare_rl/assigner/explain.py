@@ -10,6 +10,7 @@ from lare_rl.assigner import compiled_functions as compiled
 from lare_rl.assigner.batches import whole_episodes
 from lare_rl.assigner.compiled_functions import on_cpu
 from lare_rl.assigner.decoder_learner import DecoderLearner
+from lare_rl.credit import decoder_state
 from lare_rl.credit.explanation import Explanation
 from lare_rl.credit.explanation_text import MESSAGES, returns_findings
 from lare_rl.util.findings import render
@@ -34,11 +35,12 @@ def explain(learner: DecoderLearner) -> Explanation | None:
     """Explain the stored returns by the inputs. Return None for a method without a decoder, and without episodes."""
     decoder, store, spec = learner.decoder, learner.store, learner.config.spec
     # Shares are of factors and raw features alone.
-    basis = replace(spec.basis, extended=True, n_tracked=0, n_levels=0, prefixes=False, start_value=False)
+    basis = replace(spec.basis, extended=True, n_tracked=0, n_levels=0, prefixes=False, start_value=True)
     if spec.method.fit is None or not store.episodes or not basis.n_features:
         return None
     with on_cpu(), float64():
         state = compiled.init_explanation(decoder.statistics, basis=basis)
         for batch in whole_episodes(store, spec, list(store.episodes.values())):
             state = compiled.add_to_explanation(state, batch)
-        return jax.tree.map(np.asarray, compiled.explain(state, decoder.is_average.astype(int)))
+        facts = decoder.is_average.astype(int), decoder_state.start_value(decoder)
+        return jax.tree.map(np.asarray, compiled.explain(state, *facts))

@@ -49,6 +49,7 @@ __all__ = [
     "observe_steps",
     "reward_unit",
     "score_type_index",
+    "start_value",
     "step_rows",
     "valid_rows",
 ]
@@ -214,6 +215,12 @@ def level_returns(
         return value
     per_step = ~(state.is_average | state.is_log_odds | closed.decoder.basis.prefixes)
     return value + closed.intercept[index][level] * jnp.where(per_step, length, 1)
+
+
+def start_value(state: DecoderState) -> Float[Array, ""]:
+    """Return the start value of a score that is a sum, or 0."""
+    is_sum = ~(state.is_average | state.is_log_odds)
+    return jnp.zeros(()) if state.closed_form is None else jnp.where(is_sum, state.closed_form.start_value[0], 0)
 
 
 def level_effects(state: DecoderState, mean_length: float, n_levels: int) -> Float[Array, " levels"]:

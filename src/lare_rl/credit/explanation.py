@@ -27,8 +27,11 @@ event, though they do not determine the weights.
 Pairs can replace lines too. If at most one of two factors is not 0, such as factors of different choices, f_i f_j = 0, and their pair
 is exactly linear in them. So the line c_i u_i + c_j u_j that is closest to a pair over all steps, times the pair's weight, is added to
 the weights of u_i and u_j. Only the rest of the pair says that the effect of a factor depends on another one.
+
+A start value of the returns is subtracted first: R - c is explained, and (R - c) / T in place of R / T.
 """
 
+from dataclasses import replace
 from typing import NamedTuple
 
 import jax.numpy as jnp
@@ -131,9 +134,14 @@ def add_to_explanation(state: ExplanationState, episodes: CreditBatch) -> Explan
     )
 
 
-def explain(state: ExplanationState, score_type: Int[Array, ""] | int) -> Explanation:
-    """Explain the returns of the episodes in the sums. Call this within `float64()`."""
+def explain(
+    state: ExplanationState, score_type: Int[Array, ""] | int, start_value: Float[Array, ""] | float = 0.0
+) -> Explanation:
+    """Explain the returns of the episodes in the sums, less their start value. Call this within `float64()`."""
     statistics, basis = closed_form.to_float64(state.closed_form.sufficient_statistics), state.closed_form.decoder.basis
+    explains_mean_reward = (score_type == ScoreType.SUM) & _lengths_differ(statistics)
+    if basis.start_value:
+        statistics, basis = _subtract(statistics, basis.n_features, start_value), replace(basis, start_value=False)
     is_factor, extended = basis.is_factor_feature, int(basis.extended)
     full = _fit(statistics, score_type, basis.group_index, basis.strength_index)
     raw_single, raw_pairs = _input_shares(
@@ -147,7 +155,7 @@ def explain(state: ExplanationState, score_type: Int[Array, ""] | int) -> Explan
     explanation = Explanation(
         n_episodes=statistics.n_episodes,
         mean_length=mean_length,
-        explains_mean_reward=(score_type == ScoreType.SUM) & _lengths_differ(statistics),
+        explains_mean_reward=explains_mean_reward,
         total_r2=full.r2,
         raw_feature_used=_is_used(full, basis),
         raw_feature_shares=raw_single + raw_pairs,
@@ -239,6 +247,15 @@ def _lengths_differ(statistics: SufficientStatistics) -> Bool[Array, ""]:
     length = statistics.n_steps / jnp.maximum(statistics.n_episodes, 1)
     (yy, yr), (_, rr) = statistics.products[-2:, -2:]
     return rr - 2 * length * yr + length**2 * yy > 1e-6 * rr
+
+
+def _subtract(
+    statistics: SufficientStatistics, column: int, start_value: Float[Array, ""] | float
+) -> SufficientStatistics:
+    """Return the sums with R/T - c/T in place of R/T, and without 1/T, which is this column."""
+    transform = np.delete(np.eye(len(statistics.mean)), column, axis=0)
+    transform = jnp.asarray(transform).at[-2, column].set(-start_value)
+    return statistics._replace(mean=transform @ statistics.mean, products=transform @ statistics.products @ transform.T)
 
 
 def _select(statistics: SufficientStatistics, features: Int[np.ndarray, " selected"]) -> SufficientStatistics:

@@ -3,6 +3,7 @@
 from collections.abc import Hashable, Iterable, Mapping, Sequence
 from typing import Any
 
+import jax.numpy as jnp
 import numpy as np
 
 from lare_rl.credit import decoder_state, learning
@@ -75,6 +76,7 @@ MESSAGES = {
         "`--credit.score`, or `CreditSettings(score=...)`."
     ),
     "groups_differ": "Beside what its steps earn, an episode returns: {groups}{more}. No step is paid for this.",
+    "start_value": "Beside what its steps earn, each episode returns {value:+.3g}. No step is paid for this.",
     "group_effect": "{value:+.3g} in group {name}",
     "sum": "a sum",
     "mean": "an average",
@@ -154,6 +156,7 @@ def returns_findings(
         factor_names,
         raw_names,
         looks_binary=learning.looks_binary(decoder, spec),
+        start_value=_noticeable_start_value(decoder) if spec.basis.start_value else 0.0,
         groups=dict(zip(group_names, effects, strict=False)),
         lacks_pairs=spec.method.decoder_kind.extended_basis and len(raw_names) > MAX_PAIRED_RAW_FEATURES,
     )
@@ -166,6 +169,7 @@ def explanation_findings(
     raw_features: Sequence[str],
     *,
     looks_binary: bool = False,
+    start_value: float = 0.0,
     groups: Mapping[Any, float] | None = None,
     lacks_pairs: bool = False,
 ) -> list[Finding]:
@@ -177,6 +181,7 @@ def explanation_findings(
         factors: names of the factors; empty for a method without factors.
         raw_features: names of the raw features; empty if they have none. Then nothing is said of single features.
         looks_binary: whether the score should be tried as one that is won or lost (`learning.looks_binary`).
+        start_value: what each episode returns beside its steps (`decoder_state.start_value`).
         groups: what an episode of each group returns beside its steps (`decoder_state.level_effects`), by the group's name.
         lacks_pairs: whether pairs of raw features are left out, because there are too many raw features.
     """
@@ -189,6 +194,7 @@ def explanation_findings(
     largest = _largest_raw_features(explanation, raw_features)
     findings = [] if score_type is None else [_score_type(score_type)]
     findings += [Finding("looks_binary")] if looks_binary else []
+    findings += [Finding("start_value", {"value": start_value})] if start_value else []
     findings += _groups(groups or {})
     if not factors:
         largest_features = Finding("largest", {"features": largest}) if largest else None
@@ -209,6 +215,12 @@ def explanation_findings(
     if raw_features and factors_r2 < COMPLETE_SHARE:
         findings += _residual_findings(explanation, factors, raw_features)
     return findings + _unused_raw_features(explanation, raw_features)
+
+
+def _noticeable_start_value(decoder: DecoderState) -> float:
+    """Return the start value of a sum, or 0 if it is small beside the deviation of the last returns."""
+    value, returns = float(decoder_state.start_value(decoder)), decoder.predictions.returns[decoder.predictions.valid]
+    return value if returns.size and abs(value) > NOTICEABLE_SHARE * float(jnp.std(returns)) else 0.0
 
 
 def _groups(effects: Mapping[Any, float]) -> list[Finding]:

@@ -85,12 +85,13 @@ def assess_factors(
     lengths_differ = len(set(length)) > 1
     score_types = score_types_to_fit(score or "auto", fixed_length=not lengths_differ, allow_log_odds=False)
     with float64():
-        features, state = add_episodes(inputs, alive, returns, basis)
+        features, state = add_episodes(inputs, alive, returns, replace(basis, start_value=True))
         one_hot = np.zeros((len(returns), 0)) if level is None else np.eye(int(level.max()) + 1)[level]
         columns = np.hstack([features, 1 / length[:, None], one_hot])
         with_levels = replace(basis, n_levels=one_hot.shape[1], start_value=True)
         predict = partial(predict_returns, returns=returns, length=length, basis=with_levels)
-        predicted = {score_type: predict(columns, score_type=score_type) for score_type in score_types}
+        fits = {score_type: predict(columns, score_type=score_type) for score_type in score_types}
+        predicted = {score_type: values for score_type, (values, _) in fits.items()}
         margin = ROUNDING * np.sum(returns[N_FIRST:] ** 2)
         errors = {key: float(np.sum((returns[N_FIRST:] - values) ** 2) + margin) for key, values in predicted.items()}
         score_type = score_types[0]
@@ -102,12 +103,13 @@ def assess_factors(
         if score_type is ScoreType.SUM and lengths_differ:
             no_levels = np.zeros_like(one_hot)
             lengths_alone = np.hstack([np.zeros_like(features), 1 / length[:, None], no_levels])
-            length_r2 = r_squared(returns[N_FIRST:], predict(lengths_alone, score_type=ScoreType.SUM))[0]
+            length_r2 = r_squared(returns[N_FIRST:], predict(lengths_alone, score_type=ScoreType.SUM)[0])[0]
         level_r2 = None
         if level is not None:
             levels_alone = np.hstack([np.zeros_like(features), 1 / length[:, None], one_hot])
-            level_r2 = r_squared(returns[N_FIRST:], predict(levels_alone, score_type=score_type))[0]
-        explained = jax.tree.map(np.asarray, _explain(state, score_type))
+            level_r2 = r_squared(returns[N_FIRST:], predict(levels_alone, score_type=score_type)[0])[0]
+        start_value = fits[score_type][1][int(basis.is_factor_feature.sum())]
+        explained = jax.tree.map(np.asarray, _explain(state, score_type, start_value))
 
     r2, r2_error = r_squared(returns[N_FIRST:], predicted[score_type])
     estimate = compare_score_types(errors, score_type) if len(score_types) > 1 else None
@@ -157,8 +159,10 @@ def predict_returns(
     length: Int[np.ndarray, " episodes"],
     basis: Basis,
     score_type: int,
-) -> Float[np.ndarray, " later_episodes"]:
-    """Return R_hat of all episodes but the first `N_FIRST`, each by a fit to episodes before it. Call this within `float64()`.
+) -> tuple[Float[np.ndarray, " later_episodes"], Float[np.ndarray, " used_columns"]]:
+    """Return R_hat of all episodes but the first `N_FIRST`, each by a fit to episodes before it, and the weights of the last fit.
+
+    Call this within `float64()`.
 
     `columns` are the mean features of each episode, 1/T, and which level it has. Only functions of factors, and levels, are used.
     """
@@ -177,7 +181,7 @@ def predict_returns(
         statistics, posterior = _add_and_fit(statistics, posterior, *block, score_type=score_type, basis=basis)
         output = features[end:next_end] @ np.asarray(posterior.weight) + float(posterior.bias)
         predicted.append(output if score_type == ScoreType.AVERAGE else length[end:next_end] * output)
-    return np.concatenate(predicted)
+    return np.concatenate(predicted), np.asarray(posterior.weight)
 
 
 def _is_used(basis: Basis) -> Bool[np.ndarray, " columns"]:

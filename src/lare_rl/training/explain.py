@@ -6,10 +6,10 @@ from typing import Any
 
 import jax
 import numpy as np
-from jaxtyping import Array, Bool
+from jaxtyping import Array, Bool, Float
 
 from lare_rl.config.train_config import TrainConfig
-from lare_rl.credit.decoder_state import CreditBatch, valid_rows
+from lare_rl.credit.decoder_state import CreditBatch, start_value, valid_rows
 from lare_rl.credit.explanation import Explanation, add_to_explanation, explain, init_explanation
 from lare_rl.credit.explanation_text import LEGEND_CODES, MESSAGES, MIN_EXPLAINED_EPISODES, returns_findings
 from lare_rl.credit.methods import METHODS, Method
@@ -93,8 +93,7 @@ def explain_stored_returns(learner: Learner, config: TrainConfig) -> list[Explan
     if not fits or not has_features or n_stored < MIN_EXPLAINED_EPISODES:
         return []
     with float64():
-        is_average = tuple(decoder.is_average for decoder in learner.decoders)
-        explanations = _compile(config)(*first_shard((replay, is_average)))
+        explanations = _compile(config)(*first_shard((replay, _score_facts(learner))))
         return jax.tree.map(np.asarray, explanations)
 
 
@@ -104,7 +103,7 @@ def compile_explanation(learner: Learner, config: TrainConfig) -> None:
     config = _explanation_config(config)
     if not fits or not all(spec.basis.n_features for spec in config.credit_specs):
         return
-    inputs = replay, tuple(decoder.is_average for decoder in learner.decoders)
+    inputs = replay, jax.eval_shape(_score_facts, learner)
     shapes = jax.tree.map(lambda leaf: jax.ShapeDtypeStruct(leaf.shape, leaf.dtype), inputs)
     with jax.enable_x64(True):
         _compile(config).lower(*shapes).compile()
@@ -133,11 +132,17 @@ def _compile(config: TrainConfig) -> Any:
     return jax.jit(partial(_explain_first_seed, config=config))
 
 
-def _explain_first_seed(
-    replay: Replay, is_average: tuple[Bool[Array, " seeds"], ...], config: TrainConfig
-) -> list[Explanation]:
-    buffer, is_average = select_seed((replay, is_average))
-    bases = [replace(spec.basis, n_levels=0, start_value=False) for spec in config.credit_specs]
+_ScoreFacts = tuple[tuple[Bool[Array, " seeds"], Float[Array, " seeds"]], ...]
+"""For each team, whether its score is an average, and the start value of a sum."""
+
+
+def _score_facts(learner: Learner) -> _ScoreFacts:
+    return tuple((decoder.is_average, jax.vmap(start_value)(decoder)) for decoder in learner.decoders)
+
+
+def _explain_first_seed(replay: Replay, score_facts: _ScoreFacts, config: TrainConfig) -> list[Explanation]:
+    buffer, score_facts = select_seed((replay, score_facts))
+    bases = [replace(spec.basis, n_levels=0) for spec in config.credit_specs]
     empty = tuple(empty_mean_std(basis.n_inputs) for basis in bases)
     # The inputs are standardised first, because the run's decoder may have other inputs, or statistics of earlier steps.
     statistics = fold_episodes(empty, buffer, buffer.oldest, _observe, config)
@@ -145,7 +150,7 @@ def _explain_first_seed(
     states = fold_episodes(
         states, buffer, buffer.oldest, lambda state, batch, _: add_to_explanation(state, batch), config
     )
-    return [explain(state, mean.astype(int)) for state, mean in zip(states, is_average, strict=True)]
+    return [explain(state, mean.astype(int), start) for state, (mean, start) in zip(states, score_facts, strict=True)]
 
 
 def _observe(statistics: RunningMeanStd, episodes: CreditBatch, first: Index) -> RunningMeanStd:
