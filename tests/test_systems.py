@@ -116,7 +116,6 @@ def test_host_environment_in_worker_processes(run_elsewhere, tmp_path):
         "new-task Pendulum-v1 --out new.toml",
         "verify phi.py --task pendulum.toml --kind reward",
         "sweep study.toml",
-        f"train --resume {job.directory} --steps 300",
         f"evaluate {job.directory} --episodes 2",
         f"report {job.directory}",
         f"compare {job.directory}",

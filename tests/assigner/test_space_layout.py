@@ -41,7 +41,7 @@ def split(batch):
     return batch.reshape(2, -1, *batch.shape[1:])
 
 
-@settings(max_examples=150, deadline=None)
+@settings(max_examples=80, deadline=None)
 @given(ANY, st.sampled_from([2, 4, 6]), st.integers(0, 99))
 def test_rows_equal_flatten_of_gymnasium(space, count, seed):
     space.seed(seed)

@@ -69,19 +69,18 @@ def test_maker_may_be_a_location(tmp_path, monkeypatch):
     assert isinstance(make_env(toy_spec(environment="located/two", action_size=2)), ToyHostEnv)
 
 
-def test_foreign_errors_are_one_line():
+def test_register_family():
     def make(task, **_):
         raise OSError("no asset\ntrack.bin")
 
-    register_family("raising", make)
-    with pytest.raises(LareError, match=r"'raising/x' cannot be made: no asset track.bin$"):
-        make_env(toy_spec(environment="raising/x"))
-
-
-def test_family_names_are_unique():
     register_family("logged", Logged, reads=tuple(KEYS))
     with pytest.raises(LareError, match="another"):
         register_family("logged", ToyHostEnv)
+    register_family("raising", make)
+    with pytest.raises(LareError, match=r"arguments has no effect .*reads=\('arguments',\) to register_family"):
+        make_env(toy_spec(environment="raising/x", arguments={"N": 3}))
+    with pytest.raises(LareError, match=r"'raising/x' cannot be made: no asset track.bin$"):
+        make_env(toy_spec(environment="raising/x"))
 
 
 @pytest.mark.parametrize(("argument", "value"), [("reads", "arguments"), ("reads", ("seed",)), ("score", "sums")])
@@ -106,12 +105,6 @@ def test_keys_without_effect_are_refused(environment, key):
         make_env(toy_spec(environment=environment, **{key: KEYS[key]}))
 
 
-def test_family_of_a_plugin_may_read_a_key():
-    register_family("reader", ToyHostEnv)
-    with pytest.raises(LareError, match=r"arguments has no effect .*reads=\('arguments',\) to register_family"):
-        make_env(toy_spec(environment="reader/two", arguments={"N": 3}))
-
-
 def test_keys_of_teams_without_effect_are_refused():
     task = read_task("CompetitivePP-6")
     predator, prey = task.teams
@@ -127,12 +120,6 @@ def test_pettingzoo_reads_its_keys():
     assert load_env_spec(task.model_copy(update={"max_episode_steps": 3})).max_steps == 3
     with pytest.raises(LareError, match="a_1 is in no team"):
         load_env_spec(task.model_copy(update={"agents": ("a_0",)}))
-
-
-def test_unregistered_names_belong_to_gymnasium():
-    spec = load_env_spec(read_task("HalfCheetahSparse-v4"))
-    assert (spec.teams, spec.max_steps, spec.measures) == ((Team("agent", 0, 1),), 1000, ("x_position",))
-    np.testing.assert_array_equal(spec.high, np.ones((1, 6)))
 
 
 def test_score_of_a_task_comes_before_its_family():
@@ -190,12 +177,6 @@ def make_toy_task(**changes) -> TaskSpec:
     return toy_spec(**{"environment": "logged/two", "action_size": 2} | changes)
 
 
-def test_refused_environment_is_closed(log):
-    with pytest.raises(LareError, match="action_size = 3"):
-        make_env(make_toy_task(action_size=3))
-    assert log == [("made", {}), "closed"]
-
-
 class Incomplete:
     """An environment without the functions of its kind."""
 
@@ -224,6 +205,10 @@ def test_sizes_are_read_once(log):
     assert load_env_spec(make_toy_task(name="sizes", description="Walk.")) is first
     assert log == [("made", {}), "closed"]
     assert load_env_spec(make_toy_task(name="sizes", description="Run.")) is not first
+    log.clear()
+    with pytest.raises(LareError, match="action_size = 3"):
+        make_env(make_toy_task(action_size=3))
+    assert log == [("made", {}), "closed"]
 
 
 @pytest.mark.parametrize(

@@ -179,7 +179,7 @@ def test_workers_end_before_their_directory(monkeypatch):
         subprocess, "Popen", lambda *args, **kwargs: processes.append(start(*args, **kwargs)) or processes[-1]
     )
     monkeypatch.setattr(workers, "open_shared_memory", watch)
-    with pytest.raises(LareError, match="cannot be sent"):
+    with pytest.raises(LareError, match=r"^environment 0 cannot be sent to a worker process: .*lambda"):
         SubprocVecEnv([lambda: ToyHostEnv()] * 2, processes=2)
     assert ended == [True, True]
 
@@ -215,11 +215,17 @@ def test_close(tmp_path):
             call(envs)
 
 
-@pytest.mark.parametrize("makers", [[partial(ToyHostEnv, "make")], [partial(ToyHostEnv, size=3)]])
-def test_environments_are_closed_if_another_is_refused(makers, tmp_path):
+@pytest.mark.parametrize(
+    ("maker", "message"),
+    [
+        (partial(ToyHostEnv, "make"), "environment 2"),
+        (partial(ToyHostEnv, size=3), "^environment 2 differs from environment 0: .* 3, .*, not .* 2, "),
+    ],
+)
+def test_environments_are_closed_if_another_is_refused(maker, message, tmp_path):
     notes = [tmp_path / name for name in ("first", "second")]
-    with pytest.raises(LareError, match="environment 2"):
-        LocalVecEnv([*(partial(ToyHostEnv, note=str(note)) for note in notes), *makers])
+    with pytest.raises(LareError, match=message):
+        LocalVecEnv([*(partial(ToyHostEnv, note=str(note)) for note in notes), maker])
     assert [note.read_text() for note in notes] == ["closed", "closed"]
 
 
@@ -230,13 +236,6 @@ def test_error_in_close_is_a_warning(make_vec_env, tmp_path, capfd, caplog):
     make_vec_env([partial(ToyHostEnv, note=str(tmp_path)), partial(ToyHostEnv, note=str(note))]).close()
     assert note.read_text() == "closed"
     assert (caplog.text + capfd.readouterr().err).count("environment 0 failed in close: ") == 1
-
-
-def test_makers_that_are_refused():
-    with pytest.raises(LareError, match=r"^environment 1 differs from environment 0: .* 3, .*, not .* 2, "):
-        LocalVecEnv([ToyHostEnv, partial(ToyHostEnv, size=3)])
-    with pytest.raises(LareError, match=r"^environment 0 cannot be sent to a worker process: .*lambda"):
-        SubprocVecEnv([lambda: ToyHostEnv()])
 
 
 PROGRAM = """

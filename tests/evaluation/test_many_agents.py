@@ -49,17 +49,6 @@ def test_rollout(runs):
     assert [frame.shape for frame in record_frames(runs[0], played=played)[0]] == [(400, 400, 3)] * 25
 
 
-@pytest.mark.long
-def test_rollout_without_proxy_rewards(small_many, tmp_path):
-    run = lare_rl.train("TriangleArea", small_many(method="dense"), out=tmp_path / "run", listeners=[])
-    played = play_run(run)
-    assert played.training_reward is None
-    np.testing.assert_array_equal(played.credit, played.reward)
-    page = lare_rl.write_report(run, tmp_path / "report.html").read_text()
-    assert page.count('class="strip"') == 1
-    assert page.count("data:image/webp") == 1
-
-
 def first_actor(run):
     return jax.tree.map(lambda leaf: leaf[:1], load_actor(run)[1])
 

@@ -96,8 +96,8 @@ def test_time_is_last_dimension():
     assert (credit.store.n_added, credit.store.dropped) == (63, 0)
 
 
-def test_padding_of_split_trajectories():
-    """Trajectories have different lengths, and go on in the next batch. Padding is no step."""
+def test_steps_in_other_forms():
+    """Single steps; `done` alone; and split trajectories, which go on in the next batch, and whose padding is no step."""
     env = make_env()
     credit = recording_assigner(env)
     buffer = make_buffer(credit)
@@ -105,30 +105,19 @@ def test_padding_of_split_trajectories():
         buffer.extend(split_trajectories(batch).reshape(-1))
     check_episodes(credit, [env])
     assert (credit.store.n_added, credit.store.dropped) == (50, 0)
-
-
-def test_whole_rewards():
-    batch = roll_out(20)
-    batch["next", "reward"] = batch["next", "reward"].int()
-    buffer = make_buffer(recording_assigner(make_env()))
-    buffer.extend(batch)
-    assert buffer[:][REWARD].is_floating_point()
-
-
-def test_single_steps():
     env = make_env()
     credit = recording_assigner(env)
     buffer = make_buffer(credit)
     for step in roll_out(30, env):
         buffer.add(step)
     check_episodes(credit, [env])
-
-
-def test_done_alone_ends_an_episode():
     batch = roll_out(30).exclude(("next", "terminated"), ("next", "truncated"))
+    batch["next", "reward"] = batch["next", "reward"].int()
     credit = recording_assigner(make_env())
-    make_buffer(credit).extend(batch)
+    buffer = make_buffer(credit)
+    buffer.extend(batch)
     assert credit.store.n_ended == int(batch["next", "done"].sum()) > 0
+    assert buffer[:][REWARD].is_floating_point()
 
 
 def test_samples():

@@ -278,8 +278,8 @@ def hang(handler):
     threading.Event().wait(30)
 
 
-def test_closed_port(start_either):
-    server, model, pauses = start_either(reply_with("hello"))
+def test_closed_port(start):
+    server, model, pauses = start(reply_with("hello"))
     server.stop()
     with pytest.raises(ModelError, match=r"http://127\.0\.0\.1:\d+/v1/ cannot be reached"):
         model.reply(REQUEST, 0)
@@ -287,9 +287,9 @@ def test_closed_port(start_either):
 
 
 @pytest.mark.parametrize("answer", [drip_body(200), drip_body(500), drip_headers, hang])
-def test_slow_answer_ends_with_the_time_of_the_design(start_either, answer):
+def test_slow_answer_ends_with_the_time_of_the_design(start, answer):
     messages = []
-    server, model, _ = start_either(answer, budget=Budget(seconds=0.4), on_message=messages.append)
+    server, model, _ = start(answer, budget=Budget(seconds=0.4), on_message=messages.append)
     began = time.monotonic()
     with pytest.raises(BudgetExceededError, match="TimeoutError"):
         model.reply(REQUEST, 0)
@@ -309,8 +309,8 @@ def test_slow_answer_ends_with_the_time_of_the_design(start_either, answer):
         (compress("gzip, gzip", 2), "gzip, gzip"),
     ],
 )
-def test_large_answer(start_either, answer, words):
-    server, model, _ = start_either(answer, budget=Budget(requests=1, tokens=100_000_000))
+def test_large_answer(start, answer, words):
+    server, model, _ = start(answer, budget=Budget(requests=1, tokens=100_000_000))
     with pytest.raises(LareError, match=words):
         model.reply(REQUEST, 0)
     assert server.headers[0]["Accept-Encoding"] == "identity"
@@ -377,9 +377,9 @@ def test_token_budget(start):
     assert [request["max_completion_tokens"] for request in server.requests[:2]] == [REPLY_TOKENS] * 2
 
 
-def test_pauses_count_as_waiting(start_either):
+def test_pauses_count_as_waiting(start):
     messages = []
-    _, model, pauses = start_either(
+    _, model, pauses = start(
         refuse(429, Retry_After="999999999"), budget=Budget(seconds=150.0), on_message=messages.append
     )
     with pytest.raises(BudgetExceededError, match="3 min"):
@@ -389,8 +389,8 @@ def test_pauses_count_as_waiting(start_either):
 
 
 @pytest.mark.parametrize(("content", "temperature"), [("half of \ud800", None), ("x", float("nan"))])
-def test_request_that_is_not_json(start_either, content, temperature):
-    server, model, pauses = start_either(reply_with("hello"), temperature=temperature)
+def test_request_that_is_not_json(start, content, temperature):
+    server, model, pauses = start(reply_with("hello"), temperature=temperature)
     with pytest.raises(ModelError, match="JSON"):
         model.reply([{"role": "user", "content": content}], 0)
     assert (server.requests, pauses, model.budget.tokens_out) == ([], [], 0)
@@ -400,8 +400,8 @@ def test_request_that_is_not_json(start_either, content, temperature):
     ("status", "location"),
     [(301, "https://elsewhere.example/v1"), (302, "http://127.0.0.1:1/v1/chat/completions"), (308, "//127.0.0.2/v1")],
 )
-def test_redirect_to_another_server(start_either, status, location):
-    server, model, pauses = start_either(raw_answer(b"", status, Location=location))
+def test_redirect_to_another_server(start, status, location):
+    server, model, pauses = start(raw_answer(b"", status, Location=location))
     with pytest.raises(ModelError, match="redirects to http"):
         model.reply(REQUEST, 0)
     assert (len(server.requests), pauses) == (1, [])

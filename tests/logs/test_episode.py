@@ -79,11 +79,6 @@ def test_complete_episodes(flags, max_episode_steps, complete):
     assert parse(changes, layout).complete is complete
 
 
-def test_next_observations():
-    episode = parse({"observations": np.zeros((3, 2)), "next_observations": np.ones((3, 2))})
-    assert (episode.observation.sum(), episode.next_observation.sum(), len(episode)) == (0, 6, 3)
-
-
 def test_infer_layout_of_choices(task):
     values = GOOD | {"actions": np.array([0, 2, 1])}
     layout = infer_layout("a", values, task.model_copy(update={"action_size": 3}))
@@ -92,12 +87,6 @@ def test_infer_layout_of_choices(task):
         infer_layout("a", values, None)
     with pytest.raises(LareError, match=r"actions.*\[0, 3, 1\]"):
         parse({"actions": np.array([0, 3, 1])}, layout)
-
-
-def test_infer_layout_of_images():
-    values = {"observations": np.zeros((4, 3, 2), np.uint8), "actions": np.zeros(3), "rewards": None, "score": 1}
-    episode = parse(values, infer_layout("a", values, None))
-    assert (episode.observation.shape, episode.action.shape) == ((3, 6), (3, 1))
 
 
 def any_array():
@@ -139,3 +128,11 @@ def test_group_of_an_episode(group):
     assert parse({"group": group}).group == "map 3"
     assert parse({}).group is None
     assert infer_layout("a.npz", GOOD | {"group": group}, None).has_groups
+
+
+def test_rows_of_steps():
+    episode = parse({"observations": np.zeros((3, 2)), "next_observations": np.ones((3, 2))})
+    assert (episode.observation.sum(), episode.next_observation.sum(), len(episode)) == (0, 6, 3)
+    pictures = {"observations": np.zeros((4, 3, 2), np.uint8), "actions": np.zeros(3), "rewards": None, "score": 1}
+    episode = parse(pictures, infer_layout("a", pictures, None))
+    assert (episode.observation.shape, episode.action.shape) == ((3, 6), (3, 1))

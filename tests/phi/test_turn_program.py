@@ -93,7 +93,7 @@ PIECES = st.sampled_from(
 )
 
 
-@settings(max_examples=300, deadline=None)
+@settings(max_examples=150, deadline=None)
 @given(
     st.lists(PIECES, max_size=14), st.text(max_size=30), st.dictionaries(st.text(max_size=3), st.floats() | st.text())
 )

@@ -129,18 +129,6 @@ def test_better_of_sampled_and_most_likely_actions_is_judged(likeliest, outcome,
     assert (finding.code, finding.values["return_"]) == (named, likeliest)
 
 
-def test_seeds_that_learned_by_most_likely_actions_are_counted():
-    finding = find(FLAT_2, deterministic_returns=np.array([90.0, 0.5]))["some_seeds_learned"]
-    assert finding.values["n_learned"] == 1
-
-
-def test_seeds_that_learned_are_counted():
-    returns = np.vstack([FLAT, FLAT - 52, FLAT - 51])
-    finding = find(returns)["some_seeds_learned"]
-    assert (finding.values["n_learned"], finding.values["n_seeds"]) == (1, 3)
-    assert "not_learned" in find(returns, initial_returns=np.array([51.0, 51.5, 51.0]))
-
-
 def test_initial_policy_as_good():
     assert list(find(FLAT, initial_returns=np.array([51.0])))[:2] == ["not_learned", "needs_training"]
     assert "learned" in find(FLAT, initial_returns=np.array([30.0]))
@@ -193,14 +181,6 @@ def test_little_explained_values(facts, cause, remedy, method):
     assert finding.values["remedy"] == Finding(remedy, {"task": "Toy"})
 
 
-def test_small_r2_of_a_binary_score_is_no_alarm():
-    use = ScoreUse(form="form_log_odds", is_binary=True, gain=0.07, gain_error=0.02)
-    assert "explains_little" not in find(FLAT - 51, return_r2=0.06, score_use=use)
-    assert find(FLAT - 51, return_r2=0.06, score_use=use)["score_use"].values["trust"].code == "trust_part"
-    doubtful = replace(use, gain_error=0.05)
-    assert {"explains_little", "score_use"} <= set(find(FLAT - 51, return_r2=0.06, score_use=doubtful))
-
-
 def test_next_step_values():
     command = Finding("resume_longer", {"directory": "runs/x", "steps": 16_000})
     assert find(RISING)["is_rising"].values == {"command": command}
@@ -228,12 +208,40 @@ def test_needs_training_values():
     assert find(FLAT - 50)["needs_training"].values["evaluate"].values == {"directory": "runs/x"}
 
 
-def test_best_evaluation_is_trained():
+def test_best_evaluation():
+    """It is one of a trained policy. Of an own task, the last evaluations may vary too much to say that the policy fell."""
     lucky = np.array([[90.0, 80, 0, 0, 1, 0, 1, 0]])
     assert find(lucky)["one_seed_was_better"].values["step"] == 1000
     assert "needs_training" in find(lucky, warmup=2000)
     assert find(FELL, warmup=2999)["has_fallen"].values["return_"] == 92
     assert find(FELL, warmup=4000)["has_fallen"].values["return_"] == 60
+    returns = np.array([[0.0, 20, 60, 50, 88, 60, 85, 60]])
+    best = find(returns, task="mine.toml")["needs_baseline"].values["best"]
+    assert best.values == {"step": 5000, "return_": 88, "directory": "runs/x"}
+    assert find(LEVEL, task="mine.toml")["needs_baseline"].values["best"] is None
+
+
+def test_seeds_that_learned_are_counted():
+    returns = np.vstack([FLAT, FLAT - 52, FLAT - 51])
+    finding = find(returns)["some_seeds_learned"]
+    assert (finding.values["n_learned"], finding.values["n_seeds"]) == (1, 3)
+    assert "not_learned" in find(returns, initial_returns=np.array([51.0, 51.5, 51.0]))
+    likeliest = find(FLAT_2, deterministic_returns=np.array([90.0, 0.5]))["some_seeds_learned"]
+    assert likeliest.values["n_learned"] == 1
+
+
+def test_credit():
+    """Single steps are compared where they are known. A small R² of a binary score is no alarm."""
+    assert "single_steps" not in find(RISING_2, return_r2=0.9)
+    assert "steps_agree" in find(RISING_2, credit_error=1e-9, credit_correlation=0.999)
+    finding = find(RISING_2, credit_error=0.25, credit_correlation=0.5)["single_steps"]
+    assert (finding.values["error"], finding.values["correlation"]) == (0.25, 0.5)
+    use = ScoreUse(form="form_log_odds", is_binary=True, gain=0.07, gain_error=0.02)
+    findings = find(FLAT - 51, return_r2=0.06, score_use=use)
+    assert "explains_little" not in findings
+    assert findings["score_use"].values["trust"].code == "trust_part"
+    doubtful = find(FLAT - 51, return_r2=0.06, score_use=replace(use, gain_error=0.05))
+    assert {"explains_little", "score_use"} <= set(doubtful)
 
 
 def test_an_evaluation_without_a_return_is_no_fall():
@@ -246,14 +254,6 @@ def test_an_evaluation_without_a_return_is_no_fall():
     assert "has_fallen" not in no_start
 
 
-def test_best_evaluation_of_own_task():
-    """The last evaluations vary too much to say that the policy fell."""
-    returns = np.array([[0.0, 20, 60, 50, 88, 60, 85, 60]])
-    best = find(returns, task="mine.toml")["needs_baseline"].values["best"]
-    assert best.values == {"step": 5000, "return_": 88, "directory": "runs/x"}
-    assert find(LEVEL, task="mine.toml")["needs_baseline"].values["best"] is None
-
-
 def test_messages_render():
     for code in MESSAGES:
         text = render(Finding(code, defaultdict(lambda: 3)), MESSAGES)
@@ -261,13 +261,6 @@ def test_messages_render():
         assert "{" not in text
     for group in ("Findings that stand alone", "The outcome"):
         assert {f"headline_{code}" for code in CONDITIONS[group]} <= MESSAGES.keys()
-
-
-def test_single_steps_are_compared_where_they_are_known():
-    assert "single_steps" not in find(RISING_2, return_r2=0.9)
-    assert "steps_agree" in find(RISING_2, credit_error=1e-9, credit_correlation=0.999)
-    finding = find(RISING_2, credit_error=0.25, credit_correlation=0.5)["single_steps"]
-    assert (finding.values["error"], finding.values["correlation"]) == (0.25, 0.5)
 
 
 CODES = [code for group in CONDITIONS.values() for code in group]

@@ -16,7 +16,6 @@ from pyarrow import parquet
 
 import lare_rl
 from helpers import untrained_runs
-from helpers.long_tests import long_case
 from lare_rl.errors import LareError
 from lare_rl.latent.function import verify_function
 from lare_rl.sweep import processes
@@ -164,21 +163,11 @@ def test_tables_of_command(command, file, copying_python, tmp_path):
     assert [row["credit/error"] == "" for row in table] == 4 * [True] + 4 * [False]
 
 
-@pytest.mark.long
-def test_ray(file, tmp_path):
-    """In its own process: Ray forks, and this one has threads."""
-    file.write_text(FILE.replace('"dense", ', "").replace("[0, 3]", "[0]"))
-    command = [sys.executable, "-c", "from lare_rl.cli import main; main()", "sweep", str(file), "--ray", "local"]
-    result = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True)
-    assert result.returncode == 0, result.stderr
-    assert result.stderr.splitlines()[-1] == "1 of 1: Reacher-v4/lare-linear-td3-draw0 is done"
-    assert read_sweep(file)[1][0].done
-
-
 SWEEPS = sorted((Path(__file__).parents[2] / "benchmarks" / "sweeps").glob("*.toml"))
 
 
-@pytest.mark.parametrize("path", [path if path.stem == "large" else long_case(path) for path in SWEEPS])
+@pytest.mark.long
+@pytest.mark.parametrize("path", SWEEPS)
 def test_sweeps_of_benchmarks(path):
     assert read_sweep(path)[1]
 
@@ -243,6 +232,9 @@ def test_error_of_process(file, tmp_path):
     error = train_in_process(job, Slot([], {}), RunningProcesses())
     assert error.startswith(f"{tmp_path}/\\udcff/dense-td3 exists")
     assert error.endswith("dense-td3.log)")
+    running = RunningProcesses()
+    running.stop()
+    assert "not started" in train_in_process(job, Slot([], {}), running)
 
 
 def test_unexpected_error_is_not_the_note_of_jax(monkeypatch, capfd):
@@ -277,21 +269,13 @@ def test_end_of_process(file, python_script, script, error):
     assert train_in_process(job, Slot([], {}), RunningProcesses()) == f"{error} ({log})"
 
 
-def test_no_process_after_stop(file):
-    running = RunningProcesses()
-    running.stop()
-    assert "not started" in train_in_process(read_sweep(file)[1][0], Slot([], {}), running)
-
-
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        (("tasks", "task"), "'tasks'"),
         (('"dense"', '"dence"'), "'dence' .*'dense'"),
         (("tasks = ", "seeds = 3\ntasks = "), "seeds is a setting"),
         (("seeds = 2", "seeds = 2\nprocesses = 2"), "processes .*above"),
         (('["Reacher-v4"]', "[]"), r"tasks = \[\]"),
-        (("seeds = 2", "seed = -1"), "seed = -1"),
         (('["Reacher-v4"]', '["Reacher-v5"]'), "no recorded reply .* 'Reacher-v5'"),
         (("rollout_steps = 50", 'method = "rd"'), "method .*methods = "),
         (("[settings]", '[functions]\nReacher = ["phi.py"]\n[settings]'), "functions of Reacher,"),

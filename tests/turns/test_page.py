@@ -33,7 +33,7 @@ def write(directory, rollouts, **options):
 
 @pytest.mark.parametrize(
     ("n_successes", "outcomes"),
-    [(n, [1, 0, 1, 0, 1, 0]) for n in (1, 3, 5, 7, 9)] + [(n, [n / 10] * 6) for n in (0, 10)],
+    [(n, [1, 0, 1, 0, 1, 0]) for n in (1, 5, 9)] + [(10, [1] * 6)],
 )
 def test_successes_and_failures_alternate(n_successes, outcomes):
     checked = read_rollouts(random_rollouts(n_successes))

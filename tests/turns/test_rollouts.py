@@ -196,7 +196,7 @@ ROLLOUT = st.fixed_dictionaries(
 )
 
 
-@settings(max_examples=300, deadline=None)
+@settings(max_examples=120, deadline=None)
 @given(st.lists(ROLLOUT | VALUES, max_size=4))
 def test_foreign_rollouts_give_numbers_or_one_line(rollouts):
     message, result = "", None
@@ -215,7 +215,7 @@ def test_foreign_rollouts_give_numbers_or_one_line(rollouts):
 NUMBERS = st.dictionaries(st.sampled_from("abc"), st.floats(-1e9, 1e9) | st.sampled_from([0.0, 1.0]), max_size=3)
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=30, deadline=None)
 @given(
     st.lists(
         st.tuples(st.lists(NUMBERS, min_size=1, max_size=6), st.floats(-1e6, 1e6), st.integers(0, 3)),

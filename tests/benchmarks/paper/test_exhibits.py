@@ -17,7 +17,7 @@ from lare_rl.sweep.jobs import check_job, job_to_json, train_job
 from lare_rl.sweep.resources import Resources
 from lare_rl.training import train as training
 from lare_rl.util.statistics import Band
-from paper.exhibits import LARE_SOURCE, Exhibit, budgets, exhibit_jobs, exhibits
+from paper.exhibits import LARE_SOURCE, Exhibit, exhibit_jobs, exhibits
 from paper.reproduce import REAL, UNTRAINED, listed, reproduce
 from paper.trained import MEANING, TRAVELLED, WON, draw_panels, verdict
 
@@ -74,7 +74,7 @@ def test_exhibit_without_tasks():
         Exhibit(title="none", source=LARE_SOURCE, contenders={"dense": "dense"}, claims=[])
 
 
-@pytest.mark.parametrize("budget", budgets())
+@pytest.mark.parametrize("budget", ["smoke", "laptop", long_case("paper")])
 def test_exhibit_jobs(budget):
     """Settings are valid, recordings exist, runs that share a directory have equal settings, and so have runs in the repository."""
     settings, root = {}, Path(__file__).parents[3] / "benchmarks" / "results" / "reproduce" / budget
