@@ -24,6 +24,7 @@ from helpers.toy_envs import pick_spec
 from lare_rl.assigner.assigner import CreditAssigner
 from lare_rl.assigner.decoder_learner import MAX_PENDING_UPDATES
 from lare_rl.assigner.explain import explain
+from lare_rl.credit.decoder_settings import CreditSettings
 from lare_rl.credit.methods import METHODS
 from lare_rl.errors import LareError
 from lare_rl.latent.function import LatentFunction, verify_function
@@ -408,6 +409,35 @@ def test_add_and_add_episode_refuse(values, message):
 NO_TASK = {"task": None, "observation_space": 2, "action_space": 1}
 
 
+@pytest.mark.parametrize(
+    ("method", "kind", "changes", "message"),
+    [
+        ("dense", None, {}, "assigns no credit"),
+        ("episodic", None, {}, "assigns no credit"),
+        ("arel", None, {"agents": 2, "max_steps": 5}, "lare_rl.train"),
+        ("lare-rd", None, {}, "needs a phi"),
+        ("diaster", None, {"agents": 2, "max_steps": 5}, "2 agents"),
+        ("rd", None, {"agents": 2}, "max_steps"),
+        ("ircr", None, {"scale_rewards": True}, "scale_rewards"),
+        ("rd-linear", None, {"observation_space": 10_000}, "1024 .*10001"),
+        ("rrdu", None, {"settings": CreditSettings(sampled_steps=8, steps=4)}, r"steps = 4,.*sampled_steps = 8"),
+        ("rd", None, {"action_space": None}, "action_space"),
+        ("rd", None, {"task": TASK, "observation_space": 3}, "observation_space .*3 .*observation_size = 2"),
+        ("rd", None, {"capacity": 0}, "capacity = 0"),
+        ("rd", None, {"capacity": 10**15}, "capacity = 1000"),
+        ("rd", None, {"capacity": 10**20}, "capacity = 1000"),
+        ("rd", None, {"agents": 0}, "agents = 0"),
+        ("rd", None, {"agents": 2, "max_steps": -3}, "max_steps = -3"),
+        ("rd", None, {"seed": -1}, "seed = -1"),
+        ("rd", None, {"seed": 2**63}, "seed = 9223"),
+        ("rd", None, {"fits_per_step": float("nan")}, "fits_per_step = nan"),
+        ("rd", "factors", {}, "no phi"),
+        ("lare-rd", "reward", {}, "'factors'.*'reward'"),
+        ("lare-rd", "factors", NO_TASK, "task=task"),
+        ("llm-reward", "reward", {"scored_observation": "both"}, "scored_observation"),
+        ("lare-rd-shared", "factors", {}, "single agent"),
+    ],
+)
 def test_init_refuses(method, kind, changes, message, phi, reward):
     function = {"factors": phi, "reward": reward, None: None}[kind]
     with pytest.raises(LareError, match=message):

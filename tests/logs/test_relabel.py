@@ -6,6 +6,7 @@ import math
 import signal
 import sys
 from functools import partial
+from pathlib import Path
 
 import numpy as np
 import pyarrow as pa
@@ -278,6 +279,7 @@ def test_bad_arguments(tmp_path, log, options, message):
     assert list(tmp_path.iterdir()) == []
 
 
+@pytest.mark.skipif(not Path("/proc/self").exists(), reason="no directory in which nobody can write")
 def test_output_is_checked_before_the_fit():
     stages, log = [], list(logged_episodes(10))
     with pytest.raises(LareError, match="/proc/new cannot be written"):
