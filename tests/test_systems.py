@@ -124,15 +124,3 @@ def test_host_environment_in_worker_processes(run_elsewhere, tmp_path):
     assert "over 2 episodes" in output
     assert (job.directory / "report.html").stat().st_size > 10_000
     assert (tmp_path / "runs" / "study" / "results.csv").is_file()
-
-
-@pytest.mark.long
-def test_compiled_environment(run_elsewhere, tmp_path):
-    run_elsewhere(
-        PROGRAM,
-        "design CN-6 --out phi.py",
-        "train CN-6 --method dense --steps 50 --environments 2 --evaluate-every 50 --evaluation-episodes 2 --ippo.hidden 8 "
-        "--out run",
-        "report run --no-film",
-    )
-    assert (tmp_path / "run" / "report.html").stat().st_size > 10_000

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from helpers.assigner_episodes import small_assigner
-from lare_rl.assigner.arguments import read_steps, to_levels, to_step_ids
+from lare_rl.assigner.arguments import read_steps, to_levels
 from lare_rl.errors import LareError
 
 
@@ -63,8 +63,3 @@ def test_team_reward_is_the_mean_over_the_agents_alive():
 def test_team_arguments_are_refused(reward, alive, message):
     with pytest.raises(LareError, match=message):
         read(reward, agents=2, alive=alive)
-
-
-def test_number_that_no_step_has_is_refused():
-    with pytest.raises(LareError, match="steps are"):
-        to_step_ids(np.array([2**63], np.uint64))  # as int64 it would be negative, which is no step

@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 
 from helpers.assigner_episodes import (
-    ANY_SCORE,
     SMALL_CREDIT,
     TASK,
     Episode,
@@ -27,7 +26,7 @@ from lare_rl.assigner.explain import explain
 from lare_rl.credit.decoder_settings import CreditSettings
 from lare_rl.credit.methods import METHODS
 from lare_rl.errors import LareError
-from lare_rl.latent.function import LatentFunction, verify_function
+from lare_rl.latent.function import LatentFunction
 
 METHODS_FOR_STEPS = [m for m in METHODS.values() if m.has_proxy_rewards and not m.decoder_kind.whole_episodes]
 SINGLE_AGENT_KINDS = {"rrdu", "diaster", "lare-bayes", "lare-signs", "ircr", "llm-reward"}
@@ -124,15 +123,6 @@ def test_rewards_depend_on_the_seed_and_the_newest_decoder():
     assert {device.platform for leaf in leaves for device in leaf.devices()} == {"cpu"}
 
 
-def test_many_raw_entries_and_different_lengths():
-    """A closed form that compares sum and average has no features of so many entries: the score is then a sum."""
-    credit = CreditAssigner("rrdu", observation_space=600, action_space=1, settings=ANY_SCORE)
-    for *steps, reward in random_episodes([5, 7]):
-        credit.add_episode(np.tile(steps[0], 300), steps[1], np.tile(steps[2], 300), reward)
-    credit.fit(1)
-    assert (credit.score_type, np.isfinite(credit.rewards_at([0])).all()) == ("sum", True)
-
-
 def test_rewards_can_be_scaled():
     episodes = random_episodes([8] * 12)
     assigners = [small_assigner(), small_assigner(scale_rewards=True)]
@@ -152,20 +142,6 @@ def test_explanation_of_noise():
     assert explain(credit.learner).total_r2 < 0.3
 
 
-def test_steps_episodes_and_scores_give_the_same_rewards():
-    by_step, by_episode, by_score = (small_assigner("rrdu") for _ in range(3))
-    for episode in random_episodes([8, 5, 6, 8, 7] * 3):
-        add_episode(by_step, episode)
-        by_episode.add_episode(*episode)
-        by_score.add_episode(*episode[:3], episode.reward.sum())
-        for credit in (by_step, by_episode, by_score):
-            credit.fit_pending()
-    steps = np.arange(by_step.store.n_added)
-    np.testing.assert_array_equal(by_episode.store.inputs, by_step.store.inputs)
-    np.testing.assert_array_equal(by_episode.rewards_at(steps), by_step.rewards_at(steps))
-    np.testing.assert_allclose(by_score.rewards_at(steps), by_step.rewards_at(steps), rtol=1e-3, atol=1e-4)
-
-
 @pytest.mark.parametrize(("setting", "score"), [("auto", "sum"), ("auto", "average"), ("average", "sum")])
 def test_score_type_is_found_and_rewards_add_up_to_the_score(setting, score, phi):
     lengths = np.random.default_rng(0).integers(5, 9, size=80)
@@ -181,16 +157,10 @@ def test_score_type_is_found_and_rewards_add_up_to_the_score(setting, score, phi
     *steps, _ = random_episodes([5])[0]
     short, long = (credit.rewards(*steps, length=[n] * 5) for n in (10, 20))
     np.testing.assert_allclose(short, (2 if credit.score_type == "average" else 1) * long, rtol=1e-5)
-    with pytest.raises(LareError, match="length"):
-        credit.rewards(*steps, length=3)
-
-
-def test_rewards_refuse_what_is_no_length_and_no_step_number():
-    (*steps, _), credit = random_episodes([2])[0], small_assigner()
     for length in (0, -1, 2.9, np.nan, np.inf):
         with pytest.raises(LareError, match=r"length of row 1 .* number of steps"):
-            credit.rewards(*steps, length=[2, length])
-    for numbers in ([0.5], [-2], ["0"], [True], 0.5, None, [[0], [1, 2]]):
+            credit.rewards(*steps, length=[2, length, 2, 2, 2])
+    for numbers in ([0.5], [-2], ["0"], [True], None, [[0], [1, 2]]):
         with pytest.raises(LareError, match="numbers"):
             credit.rewards_at(numbers)
 
@@ -367,30 +337,21 @@ STEPS = {name: ROWS[name] for name in ("observation", "action", "next_observatio
     [
         (ROWS | {"observation": np.zeros((2, 3))}, r"observation .*\(2, 3\).* 2 numbers"),
         (ROWS | {"observation": np.zeros(2)}, r"observation .*\(2,\).*\(steps, 2\)"),
-        (ROWS | {"action": np.zeros((3, 1))}, r"action .*\(3, 1\).*\(steps, 1\)"),
         (ROWS | {"next_observation": np.zeros((2, 1))}, r"next_observation .*\(2, 1\).* 2 numbers"),
         (ROWS | {"reward": np.zeros((2, 1))}, r"reward .*\(2, 1\).* 2 steps"),
         (ROWS | {"terminated": np.zeros(3)}, r"terminated .*\(3,\).* 2 steps"),
-        (ROWS | {"truncated": False}, r"truncated .*\(\).* 2 steps"),
         (ROWS | {"valid": [True]}, r"valid .*\(1,\).* 2 steps"),
-        (ROWS | {"env_ids": [0]}, "env_ids has 1 .* 2 steps"),
         (ROWS | {"env_ids": [0, 1], "lanes": [0, 1]}, "env_ids and lanes"),
         (ROWS | {"alive": np.ones((2, 1))}, "single agent.* alive"),
         (ROWS | {"terminated": ["False", "False"]}, "terminated .*'False'.* numbers"),
         (ROWS | {"truncated": [np.nan, 0.5]}, "truncated .*true or false"),
-        (ROWS | {"reward": [[1], [1, 2]]}, "reward .*numbers"),
         (ROWS | {"reward": [0, 1e19]}, "reward of row 1 .*1e\\+19"),
         (ROWS | {"observation": [[0, 0], [0, np.nan]]}, "observation of row 1 .*nan in entry 1"),
-        (ROWS | {"action": [[np.inf], [0]]}, "action of row 0 .*inf"),
         (ROWS | {"next_observation": [[0, 0], [0, 1e300]]}, "next_observation of row 1 .*inf"),
         (ROWS | {"reward": [0, -np.inf], "valid": [False, True]}, "reward of row 1 .*-inf"),
-        (STEPS | {"reward": None}, "reward is None"),
         (STEPS | {"reward": np.nan}, "score is nan"),
-        (STEPS | {"reward": 1e300}, "score is 1e\\+300"),
         (STEPS | {"reward": [1e18, 1e18]}, "score is 2e\\+18"),
-        (STEPS | {"reward": [0.0, np.inf]}, "reward of row 1 .*inf"),
         (STEPS | {"reward": 1.0, "next_observation": np.full((2, 2), np.nan)}, "next_observation of row 0 .*nan"),
-        (STEPS | {"reward": [1.0]}, r"reward .*\(1,\).* 2 steps"),
         ({name: rows[:0] for name, rows in STEPS.items()} | {"reward": 1.0}, "no step"),
     ],
 )
@@ -413,7 +374,6 @@ NO_TASK = {"task": None, "observation_space": 2, "action_space": 1}
     ("method", "kind", "changes", "message"),
     [
         ("dense", None, {}, "assigns no credit"),
-        ("episodic", None, {}, "assigns no credit"),
         ("arel", None, {"agents": 2, "max_steps": 5}, "lare_rl.train"),
         ("lare-rd", None, {}, "needs a phi"),
         ("diaster", None, {"agents": 2, "max_steps": 5}, "2 agents"),
@@ -424,12 +384,8 @@ NO_TASK = {"task": None, "observation_space": 2, "action_space": 1}
         ("rd", None, {"action_space": None}, "action_space"),
         ("rd", None, {"task": TASK, "observation_space": 3}, "observation_space .*3 .*observation_size = 2"),
         ("rd", None, {"capacity": 0}, "capacity = 0"),
-        ("rd", None, {"capacity": 10**15}, "capacity = 1000"),
         ("rd", None, {"capacity": 10**20}, "capacity = 1000"),
-        ("rd", None, {"agents": 0}, "agents = 0"),
         ("rd", None, {"agents": 2, "max_steps": -3}, "max_steps = -3"),
-        ("rd", None, {"seed": -1}, "seed = -1"),
-        ("rd", None, {"seed": 2**63}, "seed = 9223"),
         ("rd", None, {"fits_per_step": float("nan")}, "fits_per_step = nan"),
         ("rd", "factors", {}, "no phi"),
         ("lare-rd", "reward", {}, "'factors'.*'reward'"),
@@ -448,13 +404,6 @@ def test_defaults(phi):
     assert CreditAssigner(phi=phi, task=TASK).config.method.name == "lare-bayes"
     assert CreditAssigner(observation_space=2, action_space=1).config.method.name == "bayes"
     assert CreditAssigner("bayes", task=pick_spec(score="average")).config.settings.score == "average"
-
-
-def test_signs_of_too_many_factors_are_refused():
-    columns = ", ".join(f"o[:, 0:1] * {k + 1}" for k in range(17))
-    many = verify_function(f"def evaluation_func(o, a):\n    return [{columns}]\n", TASK)
-    with pytest.raises(LareError, match=r"16 factors.* 17"):
-        small_assigner("lare-signs", many)
 
 
 def test_spaces_of_gymnasium_and_tasks():

@@ -6,13 +6,11 @@ import numpy as np
 import pytest
 
 from helpers.host_envs import ToyHostEnv
-from helpers.jax_toy_envs import Echo
 from helpers.toy_envs import toy_spec
 from lare_rl.envs.families import find_score_type, make_env, register_family
 from lare_rl.envs.interface import EnvSpec, Team
-from lare_rl.envs.jax_on_host import JaxOnHost
 from lare_rl.envs.load import read_task
-from lare_rl.envs.placement import load_env_spec, make_host_env
+from lare_rl.envs.placement import load_env_spec
 from lare_rl.errors import LareError
 from lare_rl.tasks.spec import TaskSpec
 
@@ -83,12 +81,6 @@ def test_register_family():
         make_env(toy_spec(environment="raising/x"))
 
 
-@pytest.mark.parametrize(("argument", "value"), [("reads", "arguments"), ("reads", ("seed",)), ("score", "sums")])
-def test_arguments_of_families_are_checked(argument, value):
-    with pytest.raises(LareError, match=rf"family new: {argument} = .*{value[0]}"):
-        register_family("new", ToyHostEnv, **{argument: value})
-
-
 @pytest.mark.parametrize(
     ("environment", "key"),
     [
@@ -103,23 +95,6 @@ def test_keys_without_effect_are_refused(environment, key):
     """Before the environment is made: StarCraft II is not installed."""
     with pytest.raises(LareError, match=f"'Chase': {key} has no effect on {environment}"):
         make_env(toy_spec(environment=environment, **{key: KEYS[key]}))
-
-
-def test_keys_of_teams_without_effect_are_refused():
-    task = read_task("CompetitivePP-6")
-    predator, prey = task.teams
-    task = task.model_copy(update={"teams": (predator, prey.model_copy(update={"agents": ("prey_*",)}))})
-    with pytest.raises(LareError, match="CompetitivePP-6-prey': agents has no effect"):
-        make_env(task)
-
-
-def test_pettingzoo_reads_its_keys():
-    task = toy_spec(environment=TOY, observation_size=2, action_size=3)
-    assert load_env_spec(task).max_steps == 5
-    assert load_env_spec(task.model_copy(update={"arguments": {"cycles": 9}})).max_steps == 9
-    assert load_env_spec(task.model_copy(update={"max_episode_steps": 3})).max_steps == 3
-    with pytest.raises(LareError, match="a_1 is in no team"):
-        load_env_spec(task.model_copy(update={"agents": ("a_0",)}))
 
 
 def test_score_of_a_task_comes_before_its_family():
@@ -231,12 +206,3 @@ def test_spec_is_checked(changes, message):
     register_family(name, Unbounded)
     with pytest.raises(LareError, match=message):
         make_env(toy_spec(environment=f"{name}/two", observation_size=2, action_size=2))
-
-
-def test_make_host_env(echo, log):
-    assert isinstance(make_host_env(make_toy_task(), render_mode="rgb_array"), Logged)
-    assert log == [("made", {"render_mode": "rgb_array"})]
-    assert isinstance(make_env(echo), Echo)
-    env = make_host_env(echo)
-    assert isinstance(env, JaxOnHost)
-    assert env.spec is Echo.spec

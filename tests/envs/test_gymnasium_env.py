@@ -181,21 +181,16 @@ def test_measures_are_those_of_the_last_step():
         ({"observation": np.array([0, np.nan], np.float32)}, r"observation contains nan in entry 1 \(noise\)$"),
         ({"observation": np.zeros(3)}, "observation has the shape"),
         ({"reward": 1e39}, "reward contains inf"),
-        ({"reward": None}, "reward is None"),
         ({"info": None}, "info None, which is not a dictionary"),
         ({"terminated": np.array([True, False])}, "failed in step: The truth value"),
-        ({"reset": [0.5, 0.25]}, "info 0.25, which is not a dictionary"),
         ({"fail_in": "reset", "error": OSError("no asset\ntrack.bin")}, "reset: no asset track.bin$"),
         ({"fail_in": "reset", "error": OSError("x" * 1000)}, f"reset: {'x' * MAX_ERROR}...$"),
         ({"fail_in": "step", "error": ZeroDivisionError()}, "step: ZeroDivisionError$"),
-        ({"fail_in": "step", "error": SystemExit(0)}, "step: 0$"),
         ({"fail_in": "step", "error": LareError("no battery")}, "^no battery$"),
         ({"fail_in": "render", "error": IndexError("range")}, "render: range$"),
         ({"info": {}, "terminated": True}, "'won'.*is empty"),
         ({"info": {"lost": 1, 3: 4}, "terminated": True}, "'won'.*only 3, lost"),
-        ({"info": {"won": 10**400}, "terminated": True}, "'won'.*not a number"),
         ({"info": {"level": 64}}, "group 'level'.*64.*from 0 to 63"),
-        ({"info": {"level": 0.5}}, "group 'level'.*0.5"),
         ({"info": {"level": np.nan}}, "group 'level'.*nan"),
     ],
 )
@@ -214,12 +209,6 @@ def test_invalid_value_or_failure(kwargs, content):
         use(env)
     assert "\n" not in str(error.value)
     assert isinstance(error.value, EnvOutputError) == content.startswith(("observation", "reward"))
-
-
-def test_error_in_close_is_a_warning(caplog):
-    """It would hide the error for which the environment is closed."""
-    make_env("Invalid", fail_in="close", error=OSError("no\nlink")).close()
-    assert caplog.messages == ["environment 'foreign/Invalid-v0' failed in close: no link"]
 
 
 @pytest.mark.filterwarnings("ignore:.*render_mode")

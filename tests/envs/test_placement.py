@@ -135,9 +135,3 @@ def test_few_simulations_are_open_at_a_time(monkeypatch):
     assert [n_open_envs(separate, n_seeds, 10) for n_seeds in (1, 2, 3, 9)] == [4, 2, 1, 1]
     assert n_open_envs(separate, 1, 3) == 3
     assert n_open_envs(toy_spec(), 2, 10) == 10
-
-
-@pytest.mark.parametrize(("key", "value"), [("processes", "own"), ("timeout", 0), ("timeout", float("inf"))])
-def test_bad_keys(key, value):
-    with pytest.raises(LareError, match=key):
-        single_spec("Many", **{key: value})

@@ -157,12 +157,6 @@ def test_worker_that_fails(fault, timeout, message):
         envs.step(np.zeros((4, 2, 2), np.float32))
 
 
-def test_worker_that_does_not_start(monkeypatch):
-    monkeypatch.setattr(worker_process, "PROGRAM", "raise SystemExit(7)")
-    with pytest.raises(LareError, match=r"^environment 0 \(in worker process \d+\) died: exit status 7$"):
-        SubprocVecEnv([ToyHostEnv])
-
-
 def test_workers_end_before_their_directory(monkeypatch):
     """One that is just starting would make its socket there, or fail to."""
     processes, ended, start = [], [], subprocess.Popen

@@ -10,9 +10,6 @@ from PIL import Image
 
 import lare_rl
 from helpers.toy_envs import Chase, levels_spec, pick_spec, toy_spec
-from lare_rl.envs.families import register_family
-from lare_rl.envs.gymnasium_env import GymnasiumEnv
-from lare_rl.envs.load import load_task
 from lare_rl.envs.placement import make_host_env
 from lare_rl.envs.vec_env import LocalVecEnv
 from lare_rl.errors import LareError, check_count, install_command
@@ -115,25 +112,6 @@ def test_record_video_refuses(run, tmp_path, monkeypatch):
             record_video(replace_task(run, task), tmp_path / "film.gif")
 
 
-class Painted:
-    """A host environment of a family of its own."""
-
-    def __init__(self, task, render_mode=None, **_):
-        self._env = GymnasiumEnv(TASK, render_mode=render_mode)
-
-    def __getattr__(self, name):
-        return getattr(self._env, name)
-
-
-register_family("painted", Painted)
-
-
-def test_host_environment_of_a_plugin_is_filmed(run, tmp_path):
-    record_video(replace_task(run, toy_spec(environment="painted/chase")), tmp_path / "film.gif")
-    with Image.open(tmp_path / "film.gif") as film:
-        assert film.n_frames > 5
-
-
 def replace_task(run, task):
     return type(run)(run.directory, run.config.model_copy(update={"task": task}), run.functions)
 
@@ -169,14 +147,6 @@ def test_random_play_is_bounded(monkeypatch):
 def test_number_of_random_episodes(run_steps, longest, n_episodes):
     """It follows from numbers of steps, not from a stopwatch."""
     assert n_random_episodes(run_steps, longest) == n_episodes
-
-
-def test_random_returns_of_each_team():
-    """They are those of the same episodes."""
-    predators, preys = play_random(load_task("CompetitivePP-6"), 2)
-    for predator, prey in zip(predators, preys, strict=True):
-        assert (predator.reward.shape, prey.reward.shape) == ((25, 6), (25, 2))
-        assert predator.return_ != prey.return_
 
 
 def test_most_likely_actions_beside_sampled_ones(small, tmp_path, command):

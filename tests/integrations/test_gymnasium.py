@@ -13,7 +13,7 @@ from gymnasium.wrappers import TimeLimit
 
 from helpers.logged_envs import LoggedEnv, RandomEnv, RecordingAssigner, check_episodes, recording_assigner
 from helpers.toy_envs import Levels, levels_spec, toy_spec
-from lare_rl.envs.episodic import TRUE_REWARD, EpisodicReward
+from lare_rl.envs.episodic import TRUE_REWARD
 from lare_rl.errors import LareError
 from lare_rl.integrations.gymnasium import Credit, VectorCredit
 from lare_rl.integrations.recorder import CREDIT_STEP, check_assigner, check_pay
@@ -198,17 +198,6 @@ def test_groups_are_read_from_info(mode, payments):
         assert [names[episode.level] for episode in episodes] == levels
     assert set(levels) <= set(names)
     assert {type(name) for name in names} == {int}
-
-
-@all_modes
-def test_rewards_replaced_by_inner_wrapper(mode):
-    """`infos` still has the environment's own rewards."""
-    envs = [LoggedEnv(RandomEnv(seed=3 + seed)) for seed in range(2)]
-    vector = SyncVectorEnv([lambda env=env: EpisodicReward(env) for env in envs], autoreset_mode=mode)
-    results = play(VectorCredit(vector, recording_assigner(envs[0])), 20)
-    rewards = {step[3] for env in envs for step in env.all_steps()}
-    for *_, infos in results:
-        assert set(infos[TRUE_REWARD][infos[f"_{TRUE_REWARD}"]].tolist()) <= rewards
 
 
 def test_task_without_spaces():

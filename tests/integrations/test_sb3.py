@@ -308,11 +308,6 @@ def test_full_buffer():
     assert np.isfinite(buffer.sample(16).rewards.numpy()).all()
 
 
-def test_rollout_without_end():
-    with pytest.warns(UserWarning, match="n_steps"):
-        on_policy(make_env(), n_steps=8).learn(8, callback=CreditCallback(make_assigner()))
-
-
 def learn_with_callback(env, credit):
     on_policy(env).learn(32, callback=CreditCallback(credit))
 

@@ -1,7 +1,5 @@
 """Replay buffers of TorchRL: the assigner receives new steps, sampled steps have r_hat."""
 
-import threading
-
 import numpy as np
 import pytest
 import torch
@@ -139,28 +137,6 @@ def test_samples():
     assert before[REWARD].abs().max() > 0
     buffer.extend(roll_out(60, env))
     assert not torch.equal(buffer[:60][REWARD], before[REWARD])  # by a newer decoder
-
-
-def test_threads():
-    buffer = make_buffer(recording_assigner(make_env(), "rd-linear"), prefetch=2)
-    env = GymWrapper(make_env())
-    buffer.extend(env.rollout(60, break_when_any_done=False))
-    errors = []
-
-    def sample():
-        try:
-            for _ in range(10):
-                assert torch.isfinite(buffer.sample()[REWARD]).all()
-        except BaseException as error:  # a thread would keep it to itself
-            errors.append(error)
-
-    threads = [threading.Thread(target=sample) for _ in range(2)]
-    for thread in threads:
-        thread.start()
-    buffer.extend(env.rollout(60, break_when_any_done=False))
-    for thread in threads:
-        thread.join()
-    assert errors == []
 
 
 def test_bad_arguments():

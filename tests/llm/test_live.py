@@ -86,7 +86,6 @@ def test_request(start_either):
 @pytest.mark.parametrize(
     ("answer", "text"),
     [
-        (reply_with(""), ""),
         (reply_with(None), ""),
         (reply_with(None, refusal="I would rather not."), "I would rather not."),
         (reply_with("x" * 100_000), "x" * 100_000),
@@ -148,9 +147,7 @@ def test_reply_after_temporary_errors(start, answers, expected_pauses):
     [
         (b'{"choices": [', "JSONDecodeError"),
         (b"<html>Bad gateway</html>", "'<html>Bad gateway</html>'"),
-        (b"null", "TypeError"),
         (b"{}", "KeyError: 'choices'"),
-        (b'{"choices": []}', "IndexError"),
         (b'{"choices": [{"message": null}]}', "AttributeError"),
         (b'{"choices": [{"message": {"content": ["x"]}}]}', "TypeError"),
         (b"[" * 5_000, "nested"),
@@ -172,7 +169,6 @@ def test_answer_without_completion(start, body, reason):
         (refuse(401, "you may not"), 1, ["HTTP 401", "you may not"]),
         (refuse(422, "you may not"), 4, ["HTTP 422", "you may not"]),
         (refuse(429, "insufficient_quota: pay first"), 1, ["HTTP 429", "pay first"]),
-        (raw_answer(b"Your plan has ended.", 401), 1, ["HTTP 401", "'Your plan has ended.'"]),
         (raw_answer(b"<html>\x1b[2J\xe2\x80\xae" + b"x" * 300, 403), 1, [f"'<html>?[2J?{'x' * 189}...'"]),
         (lambda handler: refuse(401, handler.headers["Authorization"])(handler), 1, ["Bearer [key]"]),
         (raw_answer(b"x" * 190 + KEY.encode(), 401), 1, [f"'{'x' * 190}[key]'"]),
@@ -251,29 +247,6 @@ def test_error_of_a_known_responses_api_is_retried(serve):
         RequestForms().read_answer(b'{"status": "failed", "error": "The model crashed."}')
 
 
-@pytest.mark.parametrize("status", [403, 404])
-def test_error_of_both_apis(serve, status):
-    server, model, _ = serve(refuse_responses(refuse(status, "first"), refuse(status, "there is no model m")))
-    with pytest.raises(ModelError, match="there is no model m"):
-        model.reply(REQUEST, 0)
-    assert server.apis == ["responses", "completions"]
-
-
-def test_client_without_the_responses_api(serve, monkeypatch):
-    server, _, _ = serve(reply_with("hello"), forms=RequestForms())
-    connect = LiveModel._connect
-    monkeypatch.setattr(LiveModel, "_connect", lambda self: OldClient(connect(self)))
-    assert LiveModel("m", server.url).reply(REQUEST, 0) == "hello"
-    assert server.apis == ["completions"]
-
-
-class OldClient:
-    """A client as before version 1.66 of OpenAI's package."""
-
-    def __init__(self, client):
-        self.chat, self.base_url = client.chat, client.base_url
-
-
 def hang(handler):
     threading.Event().wait(30)
 
@@ -304,8 +277,6 @@ def test_slow_answer_ends_with_the_time_of_the_design(start, answer):
     ("answer", "words"),
     [
         (flood(200), "more than 8 MB"),
-        (flood(500), "more than 8 MB"),
-        (compress("gzip", 1), "more than 8 MB"),
         (compress("gzip, gzip", 2), "gzip, gzip"),
     ],
 )
@@ -343,9 +314,7 @@ def test_unsupported_options_are_dropped_for_good(start):
         {},
         {"prompt_tokens": "many", "completion_tokens": 1},
         {"prompt_tokens": float("inf"), "completion_tokens": 1},
-        {"prompt_tokens": 10**400, "completion_tokens": 1},
         {"prompt_tokens": 1, "completion_tokens": -1},
-        {"input_tokens": 1},
         "many",
     ],
 )
@@ -431,14 +400,10 @@ def test_key_is_required_for_openai_only(start, monkeypatch):
     ("url", "n_pauses"),
     [
         ("nowhere", 0),
-        ("ftp://127.0.0.1:1/v1", 0),
-        (" ", 0),
         ("http://[", 5),
         ("http://127.0.0.1:99999/v1", 5),
         ("http://user:secret@127.0.0.1:notaport/v1", 0),
-        ("http://user:secret@[", 5),
         ("user:secret@127.0.0.1/v1", 0),
-        ("http://user:secret@x@127.0.0.1:notaport/v1", 0),
         ("http://user:secret@127.0.0.1:1/v1", 5),
     ],
 )

@@ -24,13 +24,6 @@ def test_round_trip_keeps_other_arrays(folder, tmp_path):
         assert all(np.array_equal(old[key], new[key]) for key in old if key != "rewards")
 
 
-def test_time_limit_of_task(task):
-    log = open_log(list(logged_episodes(20)), task.model_copy(update={"max_episode_steps": 29}))
-    expected = [episode["terminations"].any() or len(episode["actions"]) == 29 for episode in logged_episodes(20)]
-    assert [episode.complete for episode in log.episodes()] == expected
-    assert 0 < sum(expected) < 20
-
-
 def test_score_instead_of_rewards(folder, tmp_path):
     def scored():
         for episode in logged_episodes(3):

@@ -10,7 +10,6 @@ from helpers.toy_logs import check_log, logged_episodes, write_rewards_plus_one
 from lare_rl import LareError
 from lare_rl.logs import log as log_module
 from lare_rl.logs import tables as tables_module
-from lare_rl.logs.episode import RelabelledEpisode
 from lare_rl.logs.open_log import open_log
 
 
@@ -132,7 +131,6 @@ def with_column(name, values):
     ("rows", "message"),
     [
         (ROWS.drop_columns("episode"), "one column episode"),
-        (ROWS.drop_columns("next_observations"), "one column next_observations"),
         (with_column("episode", pa.array(np.ones(N_ROWS))), "episode must be whole numbers or strings, and is double"),
         (ROWS.drop_columns("actions"), "episode 0 has no actions"),
         (with_column("actions", pa.array(["left"] * N_ROWS)), "episode 0: actions must be numbers, and is string"),
@@ -141,7 +139,6 @@ def with_column(name, values):
         (pa.concat_tables([ROWS, with_column("episode", pa.array([1] * N_ROWS)), ROWS]), "episode 0 comes twice"),
         (with_column("episode", pa.array([0] * (N_ROWS - 2) + [None] * 2)), "episode has rows without a value"),
         (ROWS.append_column("actions", ROWS["actions"]), "has 2 columns actions"),
-        (ROWS.append_column("episode", ROWS["episode"]), "one column episode"),
         (ROWS.slice(0, 0), "no episode"),
     ],
 )
@@ -168,24 +165,6 @@ def test_texts_of_any_type(tmp_path):
     assert pq.read_table(out)["episode"].to_pylist() == texts.to_pylist()
     pq.write_table(episode_rows(logged_episodes(3)).append_column("episode", pa.array([7, 8, 9])), path)
     check_log(open_log(path), logged_episodes(3))
-
-
-def test_few_episodes_are_read_before_the_first_write(tmp_path, monkeypatch):
-    monkeypatch.setattr(log_module, "BATCH_STEPS", 100)
-    pq.write_table(episode_rows(logged_episodes(60)), tmp_path / "log.parquet")
-    read, counts = [], []
-
-    def write(tables, open_writer):
-        for table in tables:
-            counts.append(len(read))
-            assert table.num_rows
-
-    monkeypatch.setattr(tables_module, "write_tables", write)
-    log = open_log(tmp_path / "log.parquet")
-    episodes = (read.append(item) or RelabelledEpisode(item, item.reward) for item in log.episodes())
-    with pytest.raises(LareError):  # there is no file to rename
-        log.write(tmp_path / "new.parquet", episodes, False, "")
-    assert (counts[0] < 10, len(counts) > 6, counts[-1]) == (True, True, 60)
 
 
 def truncate(path):

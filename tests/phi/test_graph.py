@@ -15,18 +15,6 @@ from lare_rl.phi.read import apply_program, read
 PROGRAMS = {p.name: p for p in (*benign_programs()[:6], *varied_programs()[5::20])}
 
 
-def test_equal_operations_are_added_once():
-    builder = Builder()
-    x = builder.input("x", (3,))
-    assert builder.elementwise("sin", x) == builder.elementwise("sin", x)
-
-
-def test_constants_are_folded():
-    builder = Builder()
-    total = builder.elementwise("add", builder.constant([1, 2]), builder.constant(3))
-    assert builder.nodes[total].option.tolist() == [4, 5]
-
-
 @pytest.mark.parametrize(
     ("op", "kinds", "result"),
     [

@@ -17,8 +17,6 @@ from helpers.untrained_runs import write_run
 from lare_rl.config.resolve import resolve
 from lare_rl.config.settings import Settings
 from lare_rl.envs.load import load_task
-from lare_rl.evaluation.episode_credit import FactorLabel
-from lare_rl.evaluation.played_episodes import TeamSample
 from lare_rl.evaluation.video import encode_film
 from lare_rl.report import live_page, run_details
 from lare_rl.report.html import render_table, write_page
@@ -213,18 +211,6 @@ def test_each_team_is_compared_with_its_own_random_returns(tmp_path):
     assert [first == second for first, second in zip(*charts, strict=True)] == [True, False]
 
 
-@pytest.mark.parametrize(("n_rows", "n_factors", "n_pictures"), [(40, 1, 1), (30, 2, 0)])
-def test_tsne_needs_two_columns_and_some_rows(n_rows, n_factors, n_pictures):
-    pytest.importorskip("sklearn")
-    rng = np.random.default_rng(0)
-    sample = TeamSample(
-        next_observation=rng.random((n_rows, 3), np.float32),
-        factors=rng.random((n_rows, n_factors), np.float32),
-        reward=rng.random(n_rows, np.float32),
-    )
-    assert "".join(run_details._render_tsne(sample)).count("<figcaption>t-SNE") == n_pictures
-
-
 def test_run_without_evaluation(make_run, tmp_path):
     """Its report has what there is: the settings."""
     empty = make_run("b", [1.0], steps=())
@@ -320,28 +306,3 @@ def test_page_fits_phone_and_desktop(pages, tmp_path, width, columns):
     assert int(match[1]) <= width
     assert int(match[2]) >= 11
     assert int(match[3]) == columns
-
-
-def test_factor_of_two_states_has_one_row_and_one_curve(make_run):
-    labels = [FactorLabel(f"f_late ({state})", "late orders", "observation[8]") for state in ("before", "after")]
-    change = Finding("change_pays", {"slope": -2.0})
-    finding = Finding("factor", {"name": "f_late", "share": 0.96, "effect": change, "states": None, "shape": None})
-    run = make_run("a", [1.0], scored_observation="both")
-    table = "".join(run_details._render_factor_table([finding], labels, np.array([0.25, -0.5]), run))
-    assert (table.count("f_late"), table.count("96%")) == (1, 1)
-    assert "0.25 / -0.50" in table
-    curves = "".join(run_details._draw_factors(np.arange(8.0).reshape(4, 2), np.arange(4.0), labels))
-    assert curves.count("<figure>") == 1
-    assert run_details._make_bar(finding, {}).style == "minus"
-
-
-def test_what_else_there_is_to_say_about_an_effect(make_run):
-    effect = Finding("effect", {"slope": 1.0, "std": 0.1})
-    straight = {"name": "f_late", "share": 0.9, "effect": effect, "per_unit": 4.0, "states": None, "shape": None}
-    labels, run = [FactorLabel("f_late", "late orders", "observation[8]")], make_run("a", [1.0])
-    bent = straight | {"per_unit": None, "shape": Finding("depends_on_factor")}
-    for values, text in ((straight, "+4"), (bent, "depends on another factor")):
-        finding = Finding("factor", values)
-        table = "".join(run_details._render_factor_table([finding], labels, np.array([0.25]), run))
-        assert text in table
-        assert (run_details._make_bar(finding, {}).note != "") == (values["shape"] is not None)

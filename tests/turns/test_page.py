@@ -58,13 +58,6 @@ def test_numbers_have_the_unit_of_outcomes(tmp_path):
     assert f"{effect.first:+.7f} ± {effect.first_std:.7f}" in credit.words[1]
 
 
-def test_turns_that_are_left_out_are_counted(tmp_path):
-    html, _, _ = write(tmp_path, random_rollouts(n_turns=61))
-    assert html.count("first 60 of 61 turns") == 6
-    assert '<td class="number">60</td>' in html
-    assert '<td class="number">61</td>' not in html
-
-
 def test_logistic_effects_are_log_odds(tmp_path):
     for logistic in (False, True):
         html, credit, _ = write(tmp_path, random_rollouts(), logistic=logistic)

@@ -1,10 +1,9 @@
 import jax
-import matplotlib
 import numpy as np
 import pytest
 from matplotlib.patches import Circle
 
-from lare_rl.envs.canvas import OTHER_COLOUR, TEAM_COLOUR, blank_figure, to_pixels
+from lare_rl.envs.canvas import OTHER_COLOUR, TEAM_COLOUR, to_pixels
 from lare_rl.envs.particles.catalogue import TASKS
 from lare_rl.envs.particles.drawing import LANDMARK_COLOUR, draw_state
 from lare_rl.envs.particles.particle_env import ParticleEnv, ParticleState
@@ -52,9 +51,3 @@ def test_frames_have_common_scales():
     assert len({picture.tobytes() for picture in pictures}) == 4
     last = draw_state(TASKS["TriangleArea"], positions[-1], credit[-1])
     np.testing.assert_array_equal(pictures[-1], to_pixels(last))
-
-
-@pytest.mark.parametrize("dpi", [72, 150])
-def test_size_of_a_picture_is_no_setting_of_the_user(dpi):
-    with matplotlib.rc_context({"figure.dpi": dpi}):
-        assert to_pixels(blank_figure()[0]).shape == (400, 400, 3)
