@@ -118,12 +118,6 @@ def test_bad_runs(runs, metric, message, make_run):
         compare(read(runs, metric), ScoreChoice(metric))
 
 
-def test_draw_without_a_seed(make_run):
-    runs = [make_run("a", [1.0, 2.0]), make_run("b", [1.0], draw=1)]
-    with pytest.raises(LareError, match=r"dense has no run on Chase with seed 1 and draw 1, .*: train it\Z"):
-        compare(read(runs))
-
-
 def test_same_draw_twice(make_run):
     runs = [make_run(name, [1.0], method="lare-rrdu", draw=2) for name in "ab"]
     with pytest.raises(LareError, match=r"seed 0 .*draw 2"):

@@ -1,7 +1,5 @@
 from pathlib import Path
 
-import pytest
-
 from helpers.toy_envs import toy_spec
 from lare_rl.compare.collect import collect_results
 from lare_rl.compare.labels import find_differences, label_runs
@@ -109,16 +107,3 @@ def test_find_function_differences(make_run):
     ]
     assert find_differences([recorded, run("llm-reward", "b", "3")]) == []
     assert find_differences([recorded, run("lare-bayes", "b", "4")]) == []  # two labels
-
-
-@pytest.mark.parametrize(("key", "value"), [("lare", "0.2.0 (0123456789)"), ("machine", "Plan 9")])
-def test_find_origin_differences(make_run, key, value):
-    warmup = {"td3": {"warmup": 10}}
-    runs = [make_run("a", [1.0], **warmup), make_run("b", [2.0], method="rd", **warmup)]
-    paths = [run.directory for run in runs]
-    assert collect_results(paths)[1] == []
-    config = runs[1].config.model_copy(update={key: value})
-    (paths[1] / "config.json").write_text(config.model_dump_json())
-    (finding,) = collect_results(paths)[1]
-    (difference,) = finding.values["differences"]
-    assert difference.methods == {getattr(runs[0].config, key): ("dense",), value: ("rd",)}

@@ -3,28 +3,14 @@
 import gymnasium
 import numpy as np
 import pytest
-from gymnasium.spaces import Box, Dict, Discrete, Graph, MultiDiscrete, Tuple
+from gymnasium.spaces import Box, Dict, Discrete, MultiDiscrete, Tuple
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as arrays
 
-from lare_rl.envs.spaces import check_spaces, flatten_value
-from lare_rl.errors import LareError
+from lare_rl.envs.spaces import flatten_value
 
 PLANE = Box(-1, 1, (2,), np.float32)
-
-
-@pytest.mark.parametrize(
-    ("observation", "action", "content"),
-    [
-        (Dict({"net": Graph(PLANE, None)}), PLANE, "observation space of x"),
-        (PLANE, MultiDiscrete([2, 3]), "neither a Discrete nor a Box"),
-        (PLANE, Box(-np.inf, 1, (1,), np.float32), "no bounds"),
-    ],
-)
-def test_check_spaces_refuses(observation, action, content):
-    with pytest.raises(LareError, match=content):
-        check_spaces("x", observation, action)
 
 
 boxes = st.builds(

@@ -26,11 +26,6 @@ SMALL_BUFFER = {"learning_starts": 30, "buffer_size": 300, "batch_size": 8, "tra
 EPISODE_STEPS = 20
 
 
-@pytest.fixture(autouse=True, scope="module")
-def one_thread():
-    torch.set_num_threads(1)
-
-
 class DictChase(Chase):
     observation_space = Dict({"place": Box(-1, 1, (2,), np.float32), "side": Discrete(2)})
 

@@ -18,11 +18,6 @@ from lare_rl.errors import LareError
 from lare_rl.integrations.torchrl import CREDIT_STEP, REWARD, CreditTransform
 
 
-@pytest.fixture(autouse=True, scope="module")
-def one_thread():
-    torch.set_num_threads(1)
-
-
 def make_buffer(credit, *transforms, **options):
     values = {"storage": LazyTensorStorage(500), "batch_size": 32} | options
     return TensorDictReplayBuffer(transform=Compose(CreditTransform(credit), *transforms), **values)

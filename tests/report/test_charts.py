@@ -69,15 +69,6 @@ def test_ticks_have_the_digits_that_they_need(low, high, labels):
     assert f"--digits:{max(map(len, labels))};" in html
 
 
-def test_missing_values_move_no_label_and_no_band():
-    html = chart(Line(X, np.array([1, 2, np.nan]), "c0", "line", band=np.array([0.1, np.nan, 0.1])))
-    ((_, last),) = heights(html)
-    assert re.findall(r'class="label[^>]*top:([\d.]+)%', html) == [f"{last / 10:.1f}"]
-    (band,) = re.findall(r'<polygon[^>]*points="([^"]*)"', html)
-    assert {point.split(",")[0] for point in band.split()} == {"0"}
-    assert 'class="label' not in chart(Line(X, np.full(3, np.nan), "c0", "line", band=np.full(3, np.nan)))
-
-
 def test_wide_bands_do_not_flatten_a_line():
     lines = heights(chart(*[Line(X, X, "c0", band=np.full(3, 1000.0))] * 4))
     assert max(lines[0]) - min(lines[0]) > 450

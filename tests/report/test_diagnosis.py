@@ -173,20 +173,6 @@ def test_next_step_values():
     assert find(FLAT / 100 - 52)["is_stuck"].values["cause"].code == "repeats_behaviour"
 
 
-def test_needs_training_values():
-    def find_values(**facts):
-        values = find(FLAT - 51, **facts)["needs_training"].values
-        return {name for name, finding in values.items() if finding is not None}, values["limit"]
-
-    assert find_values(return_r2=0.7) == (set(), None)
-    names, limit = find_values(return_r2=0.9)
-    assert (names, limit.values) == ({"limit", "phi"}, {"agents": None, "rule": None})
-    names, limit = find_values(return_r2=0.9, task="mine.toml", many_agents=True, **FACTORS)
-    assert names == {"limit"}
-    assert limit.values == {"agents": Finding("among_agents"), "rule": Finding("own_rule")}
-    assert find(FLAT - 50)["needs_training"].values["evaluate"].values == {"directory": "runs/x"}
-
-
 def test_best_evaluation():
     """It is one of a trained policy. Of an own task, the last evaluations may vary too much to say that the policy fell."""
     lucky = np.array([[90.0, 80, 0, 0, 1, 0, 1, 0]])

@@ -18,7 +18,6 @@ import lare_rl
 from helpers import untrained_runs
 from lare_rl.errors import LareError
 from lare_rl.latent.function import verify_function
-from lare_rl.sweep import processes
 from lare_rl.sweep.jobs import job_to_json, train_job
 from lare_rl.sweep.processes import RunningProcesses, train_in_process
 from lare_rl.sweep.resources import Slot
@@ -237,23 +236,11 @@ def test_error_of_process(file, tmp_path):
     assert "not started" in train_in_process(job, Slot([], {}), running)
 
 
-def test_unexpected_error_is_not_the_note_of_jax(monkeypatch, capfd):
-    def fail(job):
-        error = TypeError("add got incompatible shapes\nand more")
-        error.add_note("JAX has removed its internal frames")
-        raise error
-
-    monkeypatch.setattr(processes, "train_job", fail)
-    assert processes._train_when_free({}) == "TypeError: add got incompatible shapes"
-    assert "Traceback" in capfd.readouterr().err
-
-
 @pytest.mark.parametrize(
     ("script", "error"),
     [
         ("exit 1", "exit status 1"),  # not the last line of an earlier process in the log
         ("kill -9 $$", "it was ended by SIGKILL"),
-        ("kill -40 $$", "it was ended by signal 40"),
         ("exit 0", "it ended at step 0 of 200"),  # an environment that ends the process
         ("echo no space is left; exit 2", "no space is left"),  # the log of a full disk has no room for it
         ("echo last line >&2; echo >&2; exit 3", "last line"),
@@ -277,15 +264,12 @@ def test_end_of_process(file, python_script, script, error):
         (("seeds = 2", "seeds = 2\nprocesses = 2"), "processes .*above"),
         (('["Reacher-v4"]', "[]"), r"tasks = \[\]"),
         (('["Reacher-v4"]', '["Reacher-v5"]'), "no recorded reply .* 'Reacher-v5'"),
-        (("rollout_steps = 50", 'method = "rd"'), "method .*methods = "),
         (("[settings]", '[functions]\nReacher = ["phi.py"]\n[settings]'), "functions of Reacher,"),
         (('["Reacher-v4"]', '["Reacher-v4", "Reacher-v4"]'), "Reacher-v4/dense-td3 .*twice"),
-        (("[settings]", "[settings"), "Expected"),
         (("[settings]", "[settings]\nsac = { gamma = 0.9 }"), r"sac\.gamma .*td3\.gamma"),
         (("[settings]", "[settings]\ncredit = { sum_form = true }"), r"credit\.sum_form .*dense.*, nor to lare-linear"),
         ((', "lare-linear"', ""), "draws"),
         ((FUNCTIONS[0], f"{FUNCTIONS[0]}\n{FUNCTIONS[1]}"), r"draws .*\[functions\]"),
-        (("draws = [0, 3]", "draws = [7]"), "draw 7"),
         (("rollout_steps = 50", "candidates = 3"), r"Reacher-v4.*reply 1"),
         (("rollout_steps = 50", "capacity = 40"), "capacity = 40"),
         (FUNCTIONS, "phi.py"),

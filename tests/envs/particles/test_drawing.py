@@ -32,16 +32,6 @@ def test_scale_and_colours():
     assert high > 9
 
 
-def test_credit_as_text_and_colour():
-    task, position = TASKS["TriangleArea"], start("TriangleArea")
-    figure = draw_state(task, position, np.array([-1, 0.25, 1]))
-    assert [text.get_text() for text in figure.axes[0].texts] == ["-1", "0.25", "1"]
-    red, _, blue = (circle.get_facecolor() for circle in circles(figure)[3:])
-    assert red[0] > red[2]
-    assert blue[2] > blue[0]
-    assert to_pixels(draw_state(task, position, np.zeros(3))).std() > 0
-
-
 def test_frames_have_common_scales():
     positions = np.linspace(1, 2, 4)[:, None, None] * start("TriangleArea")
     credit = np.arange(12.0).reshape(4, 3)
