@@ -10,6 +10,7 @@ from PIL import Image
 
 import lare_rl
 from helpers.toy_envs import Chase, levels_spec, pick_spec, toy_spec
+from lare_rl.config.resolve import resolve
 from lare_rl.envs.placement import make_host_env
 from lare_rl.envs.vec_env import LocalVecEnv
 from lare_rl.errors import LareError, check_count, install_command
@@ -29,10 +30,12 @@ from lare_rl.evaluation.evaluate import (
 )
 from lare_rl.evaluation.video import check_video_path, record_video, write_video
 from lare_rl.report.evaluation_lines import compare_actions, describe_evaluation
+from lare_rl.runs.directory import create_run
 from lare_rl.runs.metric_names import DETERMINISTIC_RETURN
 from lare_rl.training.evaluation import Evaluation
 from lare_rl.training.policy import get_actor
 from lare_rl.training.saved_state import load_learner
+from lare_rl.training.session import start_session
 from lare_rl.training.unroll_host import evaluate_on_host, evaluation_policy
 from lare_rl.util.statistics import format_mean_std
 
@@ -175,17 +178,21 @@ def test_measures_of_random_play(run, command):
     assert distances.std() > 0
 
 
-@pytest.mark.parametrize("by_turns", [False, True])
-def test_random_actions_play_the_same_groups(run, by_turns):
+def test_random_actions_play_the_same_groups(small, tmp_path, command):
     """Otherwise a sentence says so. The mean of the numbers of the groups is not reported."""
-    task = levels_spec(environment=f"toys/Levels{'ByTurns' * by_turns}-v0", payments=2)
-    changed = replace_task(run, task)
-    evaluation = evaluate_policy(changed, 3)
-    random = play_random(task, 3, seeds=None if by_turns else evaluation_seeds(changed, 3))
-    lines = list(describe_evaluation(changed, evaluation, random, None))
-    assert (
-        ("level" in " ".join(lines)) == lines[-1].startswith("random actions played other groups (level)") == by_turns
+    task = levels_spec(payments=2)
+    session = start_session(create_run(tmp_path / "run", task, resolve(small(method="dense", capacity=64), task), ()))
+    session.save()
+    session.close()
+    status, out, err = command("evaluate", session.run.directory, "--episodes", 3)
+    assert (status, err) == (0, "")
+    assert "over 12 episodes" in out
+    assert "level" not in out
+    by_turns = replace_task(session.run, levels_spec(environment="toys/LevelsByTurns-v0", payments=2))
+    lines = list(
+        describe_evaluation(by_turns, evaluate_policy(by_turns, 3), play_random(by_turns.config.task, 3), None)
     )
+    assert lines[-1].startswith("random actions played other groups (level)")
 
 
 def test_evaluate_in_another_environment(run, command):

@@ -88,9 +88,3 @@ def test_broken_plugin_of_an_installed_package(value, plugin, numbers):
     words = rf"'mine' of the package my-package \(entry point mine = {value}\).*No module named .*uninstall my-package"
     with pytest.raises(LareError, match=words):
         numbers.find("two")
-
-
-def test_command_with_a_broken_plugin_prints_one_line(plugin, command, monkeypatch):
-    monkeypatch.setenv("LARE_PLUGINS", "no_such_plugin")
-    status, _, error = command("methods")
-    assert (status, error.count("\n"), "'no_such_plugin'" in error) == (2, 1, True)
