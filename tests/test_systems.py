@@ -102,20 +102,27 @@ def run_elsewhere(tmp_path):
     return run
 
 
-def test_other_system(run_elsewhere):
-    run_elsewhere(LOST)
-
-
-@pytest.mark.skipif(sys.platform == "win32", reason="this is the other system")
-def test_host_environment_in_worker_processes(run_elsewhere, tmp_path):
+@pytest.fixture
+def task(tmp_path):
     for name, text in (("phi.py", PHI), ("pendulum.toml", TASK), ("study.toml", STUDY)):
         (tmp_path / name).write_text(textwrap.dedent(text), encoding="utf-8")
-    (job,) = read_sweep(tmp_path / "study.toml")[1]
+    return tmp_path / "study.toml"
+
+
+def test_task_and_function(run_elsewhere, task):
+    run_elsewhere(LOST)
+    run_elsewhere(PROGRAM, "new-task Pendulum-v1 --out new.toml", "verify phi.py --task pendulum.toml --kind reward")
+
+
+@pytest.mark.long
+@pytest.mark.skipif(sys.platform == "win32", reason="this is the other system")
+def test_study(run_elsewhere, task, tmp_path):
+    """With a host environment in worker processes."""
+    (job,) = read_sweep(task)[1]
     output = run_elsewhere(
         PROGRAM,
-        "new-task Pendulum-v1 --out new.toml",
-        "verify phi.py --task pendulum.toml --kind reward",
         "sweep study.toml",
+        f"train --resume {job.directory} --steps 300",
         f"evaluate {job.directory} --episodes 2",
         f"report {job.directory}",
         f"compare {job.directory}",

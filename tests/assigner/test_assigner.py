@@ -527,7 +527,7 @@ def test_must_learn_the_value_of_events_in_order():
     assert abs(other) < 0.05
 
 
-@pytest.mark.parametrize("method", ["bayes", "rd"])
+@pytest.mark.parametrize("method", ["bayes", long_case("rd")])
 def test_must_not_credit_steps_for_the_level(method, tmp_path):
     """Easy levels have larger returns and another state. With groups, the state gets no credit."""
     rng, names = np.random.default_rng(0), ("easy", "hard", "night")

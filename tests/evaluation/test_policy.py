@@ -152,6 +152,7 @@ def test_policy_checks_observations(chase_run, observation, words):
         load_policy(chase_run)(observation)
 
 
+@pytest.mark.long
 def test_policy_with_a_memory(untrained):
     """Each observation changes it, and `reset` empties it."""
     policy = load_policy(untrained(TASK, "vdn"))
