@@ -69,7 +69,6 @@ def test_groups_share_an_intercept(tmp_path):
     assert abs(means[0] - means[1]) < 1.5  # without groups: about 10
 
 
-@pytest.mark.long
 def test_predicted_returns_have_the_part_that_no_step_is_paid_for(tmp_path):
     episodes = list(logged_episodes(80, max_length=8))
     for episode in episodes:
