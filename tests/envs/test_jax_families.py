@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from helpers.jax_families import family_task, require_family
+from helpers.long_tests import long_case
 from lare_rl.envs.families import make_env
 from lare_rl.errors import LareError, install_command
 from lare_rl.new_task.single_agent import draft_task
@@ -25,7 +26,7 @@ CARTPOLE, TAG, KNAPSACK = "gymnax/CartPole-v1", "jaxmarl/MPE_simple_tag_v3", "ju
         (CARTPOLE, {"measures": ["speed"], "observation_size": 4, "action_size": 2}, "no measure 'speed'"),
         (CARTPOLE, {"observation_size": 4, "action_size": 3}, "action_size = 3, but .* actions of size 2"),
         ("brax/halfcheeta", {}, "did you mean 'halfcheetah'"),
-        ("playground/CheetaRun", {}, "did you mean 'CheetahRun'"),
+        long_case("playground/CheetaRun", {}, "did you mean 'CheetahRun'"),
         ("jumanji/Snake-v2", {}, "did you mean 'Snake-v1'"),
         (KNAPSACK, {}, "no time limit.*max_episode_steps"),
         ("jumanji/JobShop-v0", {"max_episode_steps": 9}, "10 choices at a time have 16679880978201 combinations"),

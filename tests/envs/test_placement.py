@@ -85,6 +85,9 @@ def test_familiar_packages_and_scripts_share_a_process(monkeypatch):
         assert not needs_process(task)
     with make_vec_env(toy_spec(), 1) as envs:
         assert isinstance(envs, LocalVecEnv)
+
+
+def test_an_environment_that_only_this_process_has(monkeypatch):
     monkeypatch.setattr(placement, "_find_package", lambda task: "script")
     assert not needs_process(toy_spec(name="another", max_episode_steps=7))
 

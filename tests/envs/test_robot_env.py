@@ -87,7 +87,7 @@ def test_ends_and_sums():
     ("environment", "arguments", "sizes", "ends"),
     [
         ("brax/inverted_pendulum", {"backend": "spring"}, (4, 1, 30), True),
-        ("playground/PendulumSwingup", {"episode_length": 3}, (3, 1, 3), False),
+        long_case("playground/PendulumSwingup", {"episode_length": 3}, (3, 1, 3), False),
     ],
 )
 def test_last_observation_is_the_terminal_state(environment, arguments, sizes, ends):
