@@ -54,6 +54,7 @@ def test_example_of_a_library(name, library, arguments):
     assert np.isfinite(runpy.run_path(str(path))["main"](**arguments)).all()
 
 
+@pytest.mark.long
 @pytest.mark.filterwarnings("ignore:.*v4 is out of date")
 def test_optuna_study(tmp_path):
     path = EXAMPLES / "optuna_study.py"

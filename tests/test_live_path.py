@@ -97,22 +97,6 @@ def test_live_model_to_trained_policy(serve, command, design_live, tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("options", "words"),
-    [
-        (["--requests", 2], "budget of 2 requests"),
-        (["--budget", 100], "budget of 100 tokens (0 are used)"),
-        (["--minutes", 1e-6], "waiting for the model are over"),
-    ],
-)
-def test_budget(serve, design_live, options, words):
-    server = serve(recorded_answers)
-    status, out, err = design_live(server, *options)
-    assert (status, out) == (2, "")
-    assert words in err
-    assert len(server.requests) <= 2
-
-
-@pytest.mark.parametrize(
     ("text", "options", "status", "words", "n_replies"),
     [
         ("I would rather talk about something else.", [], 1, ["not one JSON object"], 5),
@@ -144,8 +128,6 @@ def test_attempts_are_saved(serve, design_live, tmp_path, text, options, status,
     [
         (["--out", "."], ". is not the name of a file; choose another --out"),
         (["--out", "no/phi.py"], "there is no directory no; choose another --out"),
-        (["--record", "no/r.json"], "there is no directory no; choose another --record"),
-        (["--record", "r.json", "--out", "r.py"], "--out writes r.json too"),
         (["--record", "./r.json", "--out", "../{here}/r"], "--out writes r.json too"),
         (["--out", "n" * 300], "File name too long"),
         (["--reflect", 1, "--policy", "nowhere"], "nowhere is not a run"),

@@ -22,11 +22,8 @@ from helpers.chat_servers import Server, reply_with
 from helpers.scripted_model import to_reply
 from helpers.untrained_runs import invent_training
 from lare_rl.sweep import processes
-from lare_rl.sweep.sweep import read_sweep
 from lare_rl.tasks import spec
 from lare_rl.training import train as training
-from lare_rl.util.safe_io import read_toml
-from paper.exhibits import Exhibit
 from paper.trained import MEANING
 
 pytestmark = pytest.mark.docs
@@ -357,27 +354,6 @@ def test_excerpts_are_in_their_examples(name, examples):
         program = re.sub(r"\s+", "", (ROOT / "examples" / example).read_text(encoding="utf-8"))
         for line in text.splitlines():
             assert re.sub(r"\s+", "", line.split("  #")[0]) in program
-
-
-def test_task_files(tmp_path):
-    """One agent, many agents, and two teams, where the page leaves out the texts."""
-    for text in (PENDULUM_TASK, *(block("docs/how-to/many-agents.md", "toml", number) for number in range(3))):
-        if "description = " not in text:
-            text += "".join(f'{key} = "text"\n' for key in ("description", "observation", "action"))
-        name = tomllib.loads(text)["name"]
-        (tmp_path / ("simple_adversary_v3-adversary.toml" if name == "adversary" else f"{name}.toml")).write_text(text)
-    other = (tmp_path / "simple_adversary_v3-adversary.toml").read_text().replace("adversary_*", "agent_*")
-    agent = re.sub('(name|team) = "adversary"', r'\1 = "agent"', other)
-    (tmp_path / "simple_adversary_v3-agent.toml").write_text(agent)
-    loaded = [lare_rl.load_task(tmp_path / f"{name}.toml") for name in ("Pendulum", "spread", "simple_adversary_v3")]
-    assert [len(task.roles) for task in loaded] == [1, 1, 2]
-
-
-def test_study_and_exhibit(monkeypatch, tmp_path):
-    write_study(Page(None, monkeypatch, tmp_path))
-    assert len(read_sweep(tmp_path / "study.toml")[1]) == 2 * (2 + 2 + 3 + 1)
-    exhibit = Exhibit(**read_toml(block("docs/how-to/reproduce.md", "toml", 0)))
-    assert list(exhibit.contenders) == ["64 units", "256 units"]
 
 
 def test_notebook(tmp_path):

@@ -102,19 +102,25 @@ def run_elsewhere(tmp_path):
     return run
 
 
-def test_other_system(run_elsewhere):
-    run_elsewhere(LOST)
-
-
-@pytest.mark.skipif(sys.platform == "win32", reason="this is the other system")
-def test_host_environment_in_worker_processes(run_elsewhere, tmp_path):
+@pytest.fixture
+def task(tmp_path):
     for name, text in (("phi.py", PHI), ("pendulum.toml", TASK), ("study.toml", STUDY)):
         (tmp_path / name).write_text(textwrap.dedent(text), encoding="utf-8")
-    (job,) = read_sweep(tmp_path / "study.toml")[1]
+    return tmp_path / "study.toml"
+
+
+def test_task_and_function(run_elsewhere, task):
+    run_elsewhere(LOST)
+    run_elsewhere(PROGRAM, "new-task Pendulum-v1 --out new.toml", "verify phi.py --task pendulum.toml --kind reward")
+
+
+@pytest.mark.long
+@pytest.mark.skipif(sys.platform == "win32", reason="this is the other system")
+def test_study(run_elsewhere, task, tmp_path):
+    """With a host environment in worker processes."""
+    (job,) = read_sweep(task)[1]
     output = run_elsewhere(
         PROGRAM,
-        "new-task Pendulum-v1 --out new.toml",
-        "verify phi.py --task pendulum.toml --kind reward",
         "sweep study.toml",
         f"train --resume {job.directory} --steps 300",
         f"evaluate {job.directory} --episodes 2",
@@ -125,15 +131,3 @@ def test_host_environment_in_worker_processes(run_elsewhere, tmp_path):
     assert "over 2 episodes" in output
     assert (job.directory / "report.html").stat().st_size > 10_000
     assert (tmp_path / "runs" / "study" / "results.csv").is_file()
-
-
-@pytest.mark.long
-def test_compiled_environment(run_elsewhere, tmp_path):
-    run_elsewhere(
-        PROGRAM,
-        "design CN-6 --out phi.py",
-        "train CN-6 --method dense --steps 50 --environments 2 --evaluate-every 50 --evaluation-episodes 2 --ippo.hidden 8 "
-        "--out run",
-        "report run --no-film",
-    )
-    assert (tmp_path / "run" / "report.html").stat().st_size > 10_000

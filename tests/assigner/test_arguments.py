@@ -23,10 +23,9 @@ def test_environments_are_read_by_value(env_ids):
 
 
 def test_lists_are_needed():
-    with pytest.raises(LareError, match="env_ids is 3: give a list"):
-        read([1, 2], env_ids=3)
-    with pytest.raises(LareError, match=r"env_ids is array\(3\): give a list"):
-        read([1, 2], env_ids=np.array(3))
+    for env_ids, words in ((3, "is 3"), (np.array(3), r"is array\(3\)")):
+        with pytest.raises(LareError, match=f"env_ids {words}: give a list"):
+            read([1, 2], env_ids=env_ids)
     with pytest.raises(LareError, match="group is 5: give a list"):
         to_levels(small_assigner(groups=True).config, 5, read([1, 2]), {})
 
@@ -39,12 +38,11 @@ def test_environment_that_cannot_be_a_key_is_refused(env_ids):
 
 def test_episode_is_ended_and_dropped_by_value():
     credit = small_assigner()
-    for _ in range(2):
-        credit.add(np.zeros((1, 2)), np.zeros((1, 1)), np.zeros((1, 2)), [1], [0], [0], env_ids=["a"])
-        credit.end(np.array("a"))
-    credit.add(np.zeros((1, 2)), np.zeros((1, 1)), np.zeros((1, 2)), [1], [0], [0], env_ids=[5])
+    for env_id in ("a", 5):
+        credit.add(np.zeros((1, 2)), np.zeros((1, 1)), np.zeros((1, 2)), [1], [0], [0], env_ids=[env_id])
+    credit.end(np.array("a"))
     credit.drop(jnp.array(5))
-    assert (credit.store.n_ended, credit.store.dropped) == (2, 1)
+    assert (credit.store.n_ended, credit.store.dropped) == (1, 1)
 
 
 def test_team_reward_is_the_mean_over_the_agents_alive():

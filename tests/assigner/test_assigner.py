@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 
 from helpers.assigner_episodes import (
-    ANY_SCORE,
     SMALL_CREDIT,
     TASK,
     Episode,
@@ -22,16 +21,15 @@ from helpers.assigner_episodes import (
 from helpers.long_tests import long_case
 from helpers.toy_envs import pick_spec
 from lare_rl.assigner.assigner import CreditAssigner
-from lare_rl.assigner.assigner_config import AssignerConfig
 from lare_rl.assigner.decoder_learner import MAX_PENDING_UPDATES
 from lare_rl.assigner.explain import explain
 from lare_rl.credit.decoder_settings import CreditSettings
 from lare_rl.credit.methods import METHODS
 from lare_rl.errors import LareError
-from lare_rl.latent.function import LatentFunction, verify_function
+from lare_rl.latent.function import LatentFunction
 
 METHODS_FOR_STEPS = [m for m in METHODS.values() if m.has_proxy_rewards and not m.decoder_kind.whole_episodes]
-SINGLE_AGENT_KINDS = {"rd", "rrdu", "diaster", "lare-bayes", "lare-signs", "ircr", "llm-reward"}
+SINGLE_AGENT_KINDS = {"rrdu", "diaster", "lare-bayes", "lare-signs", "ircr", "llm-reward"}
 MANY_AGENT_KINDS = {"bayes", "lare-rd-shared", "ircr"}
 """Methods with all kinds of inputs, batches, fits and rewards."""
 
@@ -125,15 +123,6 @@ def test_rewards_depend_on_the_seed_and_the_newest_decoder():
     assert {device.platform for leaf in leaves for device in leaf.devices()} == {"cpu"}
 
 
-def test_many_raw_entries_and_different_lengths():
-    """A closed form that compares sum and average has no features of so many entries: the score is then a sum."""
-    credit = CreditAssigner("rrdu", observation_space=600, action_space=1, settings=ANY_SCORE)
-    for *steps, reward in random_episodes([5, 7]):
-        credit.add_episode(np.tile(steps[0], 300), steps[1], np.tile(steps[2], 300), reward)
-    credit.fit(1)
-    assert (credit.score_type, np.isfinite(credit.rewards_at([0])).all()) == ("sum", True)
-
-
 def test_rewards_can_be_scaled():
     episodes = random_episodes([8] * 12)
     assigners = [small_assigner(), small_assigner(scale_rewards=True)]
@@ -144,34 +133,28 @@ def test_rewards_can_be_scaled():
     np.testing.assert_allclose(scaled * scale, plain, rtol=1e-4)
 
 
-@pytest.mark.parametrize("method", ["bayes-progress", long_case("bayes")])
-def test_explanation_of_noise(method):
+def test_explanation_of_noise():
     """A fit to prefixes has a column for the time, which is not the return."""
-    credit, random = small_assigner(method), np.random.default_rng(0)
+    credit, random = small_assigner("bayes-progress"), np.random.default_rng(0)
     for *steps, _ in random_episodes(random.integers(9, 17, size=100)):
         credit.add_episode(*steps, random.normal())
     credit.learner.learn_returns()
     assert explain(credit.learner).total_r2 < 0.3
 
 
-@pytest.mark.parametrize("method", ["lare-bayes", "rd"])
-def test_steps_episodes_and_scores_give_the_same_rewards(method, function):
-    by_step, by_episode, by_score = (small_assigner(method, function) for _ in range(3))
-    for episode in random_episodes([8, 5, 6, 8, 7] * 3):
-        add_episode(by_step, episode)
-        by_episode.add_episode(*episode)
-        by_score.add_episode(*episode[:3], episode.reward.sum())
-        for credit in (by_step, by_episode, by_score):
-            credit.fit_pending()
-    steps = np.arange(by_step.store.n_added)
-    np.testing.assert_array_equal(by_episode.store.inputs, by_step.store.inputs)
-    np.testing.assert_array_equal(by_episode.rewards_at(steps), by_step.rewards_at(steps))
-    np.testing.assert_allclose(by_score.rewards_at(steps), by_step.rewards_at(steps), rtol=1e-3, atol=1e-4)
+@pytest.mark.parametrize("start_value", [True, False])
+def test_no_step_is_paid_for_the_start_value_of_a_sum(start_value, phi):
+    settings = SMALL_CREDIT.model_copy(update={"score": "auto", "start_value": start_value})
+    credit, episodes = small_assigner("lare-linear", phi, settings=settings), random_episodes([14, 3, 8, 5] * 15)
+    for *steps, reward in episodes:
+        credit.add_episode(*steps, reward.sum() - 50)
+    reward = np.concatenate([episode.reward for episode in episodes])
+    error = np.abs(credit.rewards_at(np.arange(len(reward))) - reward).max()
+    assert (credit.score_type == "sum", error < 0.05) == (start_value, start_value)
+    assert credit.metrics()["credit/return_r2"] > 0.9 or not start_value
 
 
-@pytest.mark.parametrize(
-    ("setting", "score"), [("auto", "sum"), ("auto", "average"), ("average", "average"), ("average", "sum")]
-)
+@pytest.mark.parametrize(("setting", "score"), [("auto", "sum"), ("auto", "average"), ("average", "sum")])
 def test_score_type_is_found_and_rewards_add_up_to_the_score(setting, score, phi):
     lengths = np.random.default_rng(0).integers(5, 9, size=80)
     settings = SMALL_CREDIT.model_copy(update={"score": setting})
@@ -187,28 +170,10 @@ def test_score_type_is_found_and_rewards_add_up_to_the_score(setting, score, phi
     *steps, _ = random_episodes([5])[0]
     short, long = (credit.rewards(*steps, length=[n] * 5) for n in (10, 20))
     np.testing.assert_allclose(short, (2 if credit.score_type == "average" else 1) * long, rtol=1e-5)
-    with pytest.raises(LareError, match="length"):
-        credit.rewards(*steps, length=3)
-
-
-@pytest.mark.parametrize("start_value", [True, False])
-def test_no_step_is_paid_for_the_start_value_of_a_sum(start_value, phi):
-    settings = ANY_SCORE.model_copy(update={"start_value": start_value})
-    credit, episodes = small_assigner("lare-linear", phi, settings=settings), random_episodes([14, 3, 8, 5] * 15)
-    for *steps, reward in episodes:
-        credit.add_episode(*steps, reward.sum() - 50)
-    reward = np.concatenate([episode.reward for episode in episodes])
-    error = np.abs(credit.rewards_at(np.arange(len(reward))) - reward).max()
-    assert (credit.score_type == "sum", error < 0.05) == (start_value, start_value)
-    assert credit.metrics()["credit/return_r2"] > 0.9 or not start_value
-
-
-def test_rewards_refuse_what_is_no_length_and_no_step_number():
-    (*steps, _), credit = random_episodes([2])[0], small_assigner()
     for length in (0, -1, 2.9, np.nan, np.inf):
         with pytest.raises(LareError, match=r"length of row 1 .* number of steps"):
-            credit.rewards(*steps, length=[2, length])
-    for numbers in ([0.5], [-2], ["0"], [True], 0.5, None, [[0], [1, 2]]):
+            credit.rewards(*steps, length=[2, length, 2, 2, 2])
+    for numbers in ([0.5], [-2], ["0"], [True], None, [[0], [1, 2]]):
         with pytest.raises(LareError, match="numbers"):
             credit.rewards_at(numbers)
 
@@ -322,32 +287,18 @@ def test_add_gives_no_number_to_rows_that_are_not_valid():
 
 def test_add_copies_arrays_that_an_environment_reuses():
     credit, (episode,) = small_assigner(), random_episodes([6])
-    observation, next_observation = np.zeros((1, 2), np.float32), np.zeros((1, 2), np.float32)
-    numbers = []
+    rows = [np.zeros_like(array[:1]) for array in episode]
     for t in range(6):
-        observation[:], next_observation[:] = episode.observation[t], episode.next_observation[t]
-        rows = observation, episode.action[[t]], next_observation, episode.reward[[t]]
-        numbers += credit.add(*rows, [t == 5], [False]).tolist()
-    assert credit.store.dropped == 0
+        for row, array in zip(rows, episode, strict=True):
+            row[:] = array[t]
+        numbers = credit.add(*rows, [t == 5], [False])
     credit.rewards_at(numbers)
-    expected = np.hstack([episode.next_observation, episode.action])
-    np.testing.assert_array_equal(credit.store.inputs[numbers], expected)
+    assert credit.store.dropped == 0
+    np.testing.assert_array_equal(credit.store.inputs[:6], np.hstack([episode.next_observation, episode.action]))
 
 
-def test_drop_and_an_unseen_reset_abandon_the_episode():
-    credit, episodes = small_assigner(), random_episodes([5, 4, 3, 2])
-    abandoned = add_episode(credit, episodes[0], end=False)
-    add_episode(credit, episodes[1])
-    add_episode(credit, episodes[2], end=False)
-    credit.drop(0)
-    credit.drop("unknown")
-    assert credit.metrics()["credit/dropped"] == 2
-    add_episode(credit, episodes[3])
-    assert stored(credit) == [(len(e.reward), sum(e.reward.tolist())) for e in (episodes[1], episodes[3])]
-    assert credit.rewards_at(abandoned).shape == (5,)
-
-
-def test_end_with_late_scores():
+def test_end_and_drop():
+    """An episode ends with a late score, or is abandoned: if it is dropped, or if a reset was not seen."""
     credit, episodes = small_assigner(), random_episodes([3, 5, 4])
     for i, episode in enumerate(episodes):
         add_episode(credit, episode, ("game", i), end=False)
@@ -358,7 +309,13 @@ def test_end_with_late_scores():
     for env_id, score in (("x", None), (("game", 2), float("nan")), (("game", 2), float("inf"))):
         with pytest.raises(LareError, match=str(env_id[0])):
             credit.end(env_id, score)
-    credit.end(("game", 2))
+    abandoned = add_episode(credit, episodes[0], ("game", 2), end=False)
+    credit.drop(("game", 2))
+    credit.drop("unknown")
+    add_episode(credit, episodes[1], ("game", 2))
+    assert stored(credit)[2:] == [(5, sum(episodes[1].reward.tolist()))]
+    assert credit.metrics()["credit/dropped"] == 2
+    assert credit.rewards_at(abandoned).shape == (3,)
 
 
 def test_capacity_removes_the_oldest_episodes():
@@ -393,31 +350,22 @@ STEPS = {name: ROWS[name] for name in ("observation", "action", "next_observatio
     [
         (ROWS | {"observation": np.zeros((2, 3))}, r"observation .*\(2, 3\).* 2 numbers"),
         (ROWS | {"observation": np.zeros(2)}, r"observation .*\(2,\).*\(steps, 2\)"),
-        (ROWS | {"action": np.zeros((3, 1))}, r"action .*\(3, 1\).*\(steps, 1\)"),
         (ROWS | {"next_observation": np.zeros((2, 1))}, r"next_observation .*\(2, 1\).* 2 numbers"),
         (ROWS | {"reward": np.zeros((2, 1))}, r"reward .*\(2, 1\).* 2 steps"),
         (ROWS | {"terminated": np.zeros(3)}, r"terminated .*\(3,\).* 2 steps"),
-        (ROWS | {"truncated": False}, r"truncated .*\(\).* 2 steps"),
         (ROWS | {"valid": [True]}, r"valid .*\(1,\).* 2 steps"),
-        (ROWS | {"env_ids": [0]}, "env_ids has 1 .* 2 steps"),
         (ROWS | {"env_ids": [0, 1], "lanes": [0, 1]}, "env_ids and lanes"),
         (ROWS | {"alive": np.ones((2, 1))}, "single agent.* alive"),
         (ROWS | {"terminated": ["False", "False"]}, "terminated .*'False'.* numbers"),
         (ROWS | {"truncated": [np.nan, 0.5]}, "truncated .*true or false"),
-        (ROWS | {"reward": [[1], [1, 2]]}, "reward .*numbers"),
         (ROWS | {"reward": [0, 1e16]}, r"reward\[1.*1e\+16"),
         (ROWS | {"observation": [[0, 0], [0, np.nan]]}, r"observation\[1, 1\] is nan"),
         (ROWS | {"observation": [[0, 0], [0, -1e16]]}, r"observation\[1, 1\] is -1.*at most 1e\+15"),
-        (ROWS | {"action": [[np.inf], [0]]}, r"action\[0.*inf"),
         (ROWS | {"next_observation": [[0, 0], [0, 1e300]]}, r"next_observation\[1.*inf"),
         (ROWS | {"reward": [0, -np.inf], "valid": [False, True]}, r"reward\[1.*-inf"),
-        (STEPS | {"reward": None}, "reward is None"),
         (STEPS | {"reward": np.nan}, "score is nan"),
-        (STEPS | {"reward": 1e300}, "score is 1e\\+300"),
         (STEPS | {"reward": [1e15, 1e15]}, "score is 2.*at most 1e\\+15"),
-        (STEPS | {"reward": [0.0, np.inf]}, r"reward\[1.*inf"),
         (STEPS | {"reward": 1.0, "next_observation": np.full((2, 2), np.nan)}, r"next_observation\[0.*nan"),
-        (STEPS | {"reward": [1.0]}, r"reward .*\(1,\).* 2 steps"),
         ({name: rows[:0] for name, rows in STEPS.items()} | {"reward": 1.0}, "no step"),
     ],
 )
@@ -433,11 +381,6 @@ def test_add_and_add_episode_refuse(values, message):
     assert (credit.store.n_ended, credit.store.dropped) == (1, 0)
 
 
-def test_method_by_default_depends_on_phi(phi):
-    assert CreditAssigner(phi=phi, task=TASK).config.method.name == "lare-bayes"
-    assert CreditAssigner(observation_space=2, action_space=1).config.method.name == "bayes"
-
-
 NO_TASK = {"task": None, "observation_space": 2, "action_space": 1}
 
 
@@ -445,7 +388,6 @@ NO_TASK = {"task": None, "observation_space": 2, "action_space": 1}
     ("method", "kind", "changes", "message"),
     [
         ("dense", None, {}, "assigns no credit"),
-        ("episodic", None, {}, "assigns no credit"),
         ("arel", None, {"agents": 2, "max_steps": 5}, "lare_rl.train"),
         ("lare-rd", None, {}, "needs a phi"),
         ("diaster", None, {"agents": 2, "max_steps": 5}, "2 agents"),
@@ -456,12 +398,8 @@ NO_TASK = {"task": None, "observation_space": 2, "action_space": 1}
         ("rd", None, {"action_space": None}, "action_space"),
         ("rd", None, {"task": TASK, "observation_space": 3}, "observation_space .*3 .*observation_size = 2"),
         ("rd", None, {"capacity": 0}, "capacity = 0"),
-        ("rd", None, {"capacity": 10**15}, "capacity = 1000"),
         ("rd", None, {"capacity": 10**20}, "capacity = 1000"),
-        ("rd", None, {"agents": 0}, "agents = 0"),
         ("rd", None, {"agents": 2, "max_steps": -3}, "max_steps = -3"),
-        ("rd", None, {"seed": -1}, "seed = -1"),
-        ("rd", None, {"seed": 2**63}, "seed = 9223"),
         ("rd", None, {"fits_per_step": float("nan")}, "fits_per_step = nan"),
         ("rd", "factors", {}, "no phi"),
         ("lare-rd", "reward", {}, "'factors'.*'reward'"),
@@ -476,22 +414,10 @@ def test_init_refuses(method, kind, changes, message, phi, reward):
         small_assigner(method, **({"phi": function} | changes))
 
 
-@pytest.mark.parametrize(
-    ("name", "value"),
-    [("agents", 2.5), ("seed", 1.5), ("fits_per_step", "a"), ("scored_observation", "later"), ("payments", "nonzero")],
-)
-def test_config_refuses_other_types(name, value):
-    config = small_assigner().config
-    values = {field: getattr(config, field) for field in AssignerConfig.model_fields} | {name: value}
-    with pytest.raises(LareError, match=f"^{name} = "):
-        AssignerConfig(**values)
-
-
-def test_signs_of_too_many_factors_are_refused():
-    columns = ", ".join(f"o[:, 0:1] * {k + 1}" for k in range(17))
-    many = verify_function(f"def evaluation_func(o, a):\n    return [{columns}]\n", TASK)
-    with pytest.raises(LareError, match=r"16 factors.* 17"):
-        small_assigner("lare-signs", many)
+def test_defaults(phi):
+    assert CreditAssigner(phi=phi, task=TASK).config.method.name == "lare-bayes"
+    assert CreditAssigner(observation_space=2, action_space=1).config.method.name == "bayes"
+    assert CreditAssigner("bayes", task=pick_spec(score="average")).config.settings.score == "average"
 
 
 def test_spaces_of_gymnasium_and_tasks():
@@ -503,8 +429,7 @@ def test_spaces_of_gymnasium_and_tasks():
     rows = [[1, 1, 1, 0, 0], [1, 1, 0, 0, 1]]
     expected = np.hstack([rows, [[1, 0, 0, 0], [0, 0, 0, 1]], np.zeros((2, 5))])
     np.testing.assert_array_equal(credit.store.inputs[:2], expected)
-    credit = CreditAssigner("bayes", task=pick_spec(score="average"))
-    assert credit.config.settings.score == "average"
+    credit = CreditAssigner("bayes", task=pick_spec())
     steps = np.eye(4)[:2], np.array([3, 0]), np.eye(4)[1:3], [0, 0], [False] * 2, [False] * 2
     credit.rewards_at(credit.add(*steps))
     np.testing.assert_array_equal(credit.store.inputs[:2, 4:], np.eye(4)[[3, 0]])
@@ -554,17 +479,9 @@ def test_rewards_of_many_agents(method, function):
         assert (r_hat[:, 0] == r_hat[:, 0, :1]).all()
     if method != "ircr":
         np.testing.assert_allclose(credit.rewards(*episode[:3])[0], r_hat[-1, 0], rtol=1e-4, atol=1e-5)
-
-
-def test_team_with_one_reward():
-    credit, random = small_assigner("ircr", agents=3), np.random.default_rng(0)
-    for _ in range(3):
-        episode, _ = team_episode(6, random)
-        credit.add_episode(*episode[:3], episode.reward.mean(axis=1))
-    assert credit.store.alive is None
-    assert credit.store.episodes[2].return_ == pytest.approx(episode.reward.mean(axis=1).sum())
-    credit.add_episode(*episode[:3], 5.0)
-    assert credit.store.episodes[3].return_ == 5.0
+        return
+    credit.add_episode(*episode[:3], 5.0)  # a score of the team
+    assert stored(credit)[-1] == (6, 5.0)
     assert credit.rewards_at([0, -1])[1].tolist() == [0, 0, 0]
     with pytest.raises(LareError, match=r"\(2, 2\).*\(steps, 3, 2\)"):
         credit.add(**ROWS)
@@ -573,8 +490,6 @@ def test_team_with_one_reward():
 SCORES = {
     "largest": lambda rows: rows[:, 0].max(),
     "smallest": lambda rows: rows[:, 1].min(),
-    "last": lambda rows: rows[-1, 0],
-    "ever above": lambda rows: float((rows[:, 0] > 0.9).any()),
     "sum": lambda rows: rows[:, 0].sum(),
 }
 """Scores of the observations after the steps of an episode."""
@@ -626,7 +541,7 @@ def test_must_learn_the_value_of_events_in_order():
     assert abs(other) < 0.05
 
 
-@pytest.mark.parametrize("method", ["bayes", "rd"])
+@pytest.mark.parametrize("method", ["bayes", long_case("rd")])
 def test_must_not_credit_steps_for_the_level(method, tmp_path):
     """Easy levels have larger returns and another state. With groups, the state gets no credit."""
     rng, names = np.random.default_rng(0), ("easy", "hard", "night")

@@ -84,28 +84,18 @@ def learn(method, env, phi=None, payments=PAID_AT_END, exact="no", group=None, s
     return learner, config, credit
 
 
-EVERY_5 = PaymentRule(period=5)
+EVERY_5, WINDOW = PaymentRule(period=5), PaymentRule(period=4, window=6)
 
 
 @pytest.mark.parametrize(
     ("method", "env", "changes"),
     [
         ("lare-bayes-history", PHI_ENV, {"score": "auto", "payments": EVERY_5, "exact": "spread", "n_running": 4}),
-        ("bayes-progress", ONE_AGENT, {"exact": "last", "n_running": 11}),
-        ("bayes", ONE_AGENT, {"score": "binary", "group": "map"}),
-        long_case("rd-linear", ONE_AGENT, {"payments": EVERY_5, "exact": "spread"}),
-        long_case("lare-bayes", PHI_ENV, {"score": "auto"}),
-        long_case("bayes", ONE_AGENT, {"group": "map"}),
-        long_case("lare-bayes-progress", PHI_ENV, {"payments": EVERY_5}),
         long_case("bayes-progress", ONE_TEAM, {"exact": "spread"}),
-        long_case("lare-bayes", PHI_ENV, {"score": "auto", "payments": EVERY_5, "exact": "spread"}),
-        long_case("bayes-history", ONE_TEAM, {}),
-        long_case("bayes-history", ONE_AGENT, {"payments": PaymentRule(period=5, window=2), "n_running": 4}),
-        long_case("rd-linear", ONE_AGENT, {"exact": "last", "score": "auto"}),
-        long_case("rd-linear", ONE_TEAM, {"score": "auto"}),
+        long_case("bayes-progress", ONE_AGENT, {"exact": "last", "n_running": 11}),
+        long_case("bayes", ONE_AGENT, {"score": "binary", "group": "map"}),
         long_case("rd-linear", ONE_AGENT, {"group": "map", "score": "auto"}),
-        long_case("ircr", ONE_AGENT, {"payments": EVERY_5}),
-        ("rd-linear", ONE_AGENT, {"payments": PaymentRule(period=4, window=6), "exact": "last", "score": "average"}),
+        long_case("rd-linear", ONE_AGENT, {"payments": WINDOW, "exact": "last", "score": "average"}),
     ],
 )
 def test_rewards_and_lengths_agree(method, env, changes, phi):

@@ -3,8 +3,7 @@
 import numpy as np
 import pytest
 
-from lare_rl.turns.messages import Call, Turn, message_features
-from turns.text_games import GENERIC, HORIZON, TextGames, template
+from turns.text_games import HORIZON, TextGames
 from turns.text_world import Command, ExploredGame, GameRules, make_game
 
 
@@ -62,24 +61,6 @@ def test_changes_of_exact_value_add_up(task, theta):
     truth = task.truth(theta, rollouts)
     # A rollout that is cut off has the value 0 at its end.
     np.testing.assert_allclose(truth.change.sum(axis=1), rollouts.outcome - truth.value[:, 0], atol=1e-12)
-
-
-def test_generic_features_are_those_of_messages(task, theta):
-    rollouts = task.play(theta, np.random.default_rng(3), n_groups=2)
-    games = [toy_game(0), toy_game(1)]
-    for k, length in enumerate(rollouts.length):
-        turns = []
-        for t in range(length):
-            node = task.anchor[rollouts.state[k, t]] - 5 * rollouts.level[k]
-            command = games[rollouts.level[k]].commands[node][rollouts.action[k, t]]
-            tool, arguments = template(command.text), command.text.partition(" ")[2]
-            turns.append(Turn("", (Call(tool, arguments, games[0].texts[command.result], failed=False),), ""))
-        expected = message_features(turns)
-        for t in range(length):
-            numbers = rollouts.features[k, t]
-            assert numbers[task.tools.index(turns[t].calls[0].tool)] == 1
-            for name in GENERIC:
-                assert numbers[task.names.index(name)] == expected[t][name]
 
 
 @pytest.mark.filterwarnings("ignore:Game .* is not fully supported")

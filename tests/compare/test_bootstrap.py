@@ -4,7 +4,6 @@ from scipy.stats import mannwhitneyu
 
 from lare_rl.compare import bootstrap
 from lare_rl.compare.bootstrap import (
-    estimate,
     interquartile_mean,
     mann_whitney,
     performance_profile,
@@ -62,25 +61,6 @@ def test_numbers_of_rliable(function, scores, value, low, high, monkeypatch):
     intervals = bootstrap.bootstrap(function, *scores)
     for numbers, expected in zip(intervals, (value, low, high), strict=True):
         np.testing.assert_allclose(numbers, expected, rtol=1e-12, atol=1e-14)
-
-
-def test_curves_share_the_draws_of_runs():
-    """The interval at each step is the interval of the scores at this step alone."""
-    curves = np.random.default_rng(0).normal(size=(6, 5, 2))
-    together = bootstrap.bootstrap(interquartile_mean, curves)
-    alone = [bootstrap.bootstrap(interquartile_mean, scores) for scores in curves]
-    np.testing.assert_array_equal(together, np.transpose(alone))
-
-
-def test_intervals_contain_true_mean(monkeypatch):
-    """Of 10 normal numbers, in most of 60 cases. The bootstrap's intervals of few numbers are a little too narrow."""
-    monkeypatch.setattr(bootstrap, "REPETITIONS", 300)
-    random = np.random.default_rng(0)
-    n_inside = 0
-    for _ in range(60):
-        mean = estimate(lambda scores: scores.mean(axis=(-2, -1)), random.normal(size=(10, 1)))
-        n_inside += mean.low <= 0 <= mean.high
-    assert 46 <= n_inside <= 60
 
 
 def test_mann_whitney_by_hand():

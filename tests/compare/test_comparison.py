@@ -1,18 +1,13 @@
-import json
-from pathlib import Path
-
 import numpy as np
 import pytest
 
-from helpers.toy_envs import toy_spec
 from lare_rl.compare import bootstrap
 from lare_rl.compare.bootstrap import Estimate
 from lare_rl.compare.comparison import compare, compare_over_tasks, compare_tasks
 from lare_rl.compare.labels import label_runs
-from lare_rl.compare.results import LearningCurve, read_run_results
+from lare_rl.compare.results import read_run_results
 from lare_rl.compare.scores import ScoreChoice, group_results
 from lare_rl.errors import LareError
-from lare_rl.runs.directory import Run
 from lare_rl.runs.metric_names import RETURN
 
 
@@ -103,17 +98,6 @@ def test_step_and_last_quarter(make_run):
         compare(read(runs), ScoreChoice(step=50))
 
 
-def test_other_metric(make_run):
-    run = make_run("a", [1.0, 3.0])
-    lines = [line | {"credit/error": 2 * line["seed"]} for line in run.metrics()]
-    (run.directory / "metrics.jsonl").write_text("".join(json.dumps(line) + "\n" for line in lines))
-    assert compare(read([run], "credit/error"), ScoreChoice("credit/error")).rows[0].mean == 1.0
-    lines = [line | ({"credit/error": None} if line["seed"] == 1 else {}) for line in lines]
-    (run.directory / "metrics.jsonl").write_text("".join(json.dumps(line) + "\n" for line in lines))
-    with pytest.raises(LareError, match="Chase/a has no credit/error of seed 1"):
-        compare(read([run], "credit/error"), ScoreChoice("credit/error"))
-
-
 @pytest.mark.parametrize(
     ("runs", "metric", "message"),
     [
@@ -132,33 +116,6 @@ def test_bad_runs(runs, metric, message, make_run):
     runs = [make_run(name, [1.0, 2.0], task, **settings) for name, task, settings in runs]
     with pytest.raises(LareError, match=message):
         compare(read(runs, metric), ScoreChoice(metric))
-
-
-def test_draw_without_a_seed(make_run):
-    runs = [make_run("a", [1.0, 2.0]), make_run("b", [1.0], draw=1)]
-    with pytest.raises(LareError, match=r"dense has no run on Chase with seed 1 and draw 1, .*: train it\Z"):
-        compare(read(runs))
-
-
-def test_two_tasks_with_one_name(make_run):
-    first, second = make_run("a", [1.0]), make_run("b", [2.0], method="rd")
-    second = Run(second.directory, second.config.model_copy(update={"task": toy_spec(scored_observation="after")}), ())
-    with pytest.raises(LareError, match=r"different tasks .*Chase"):
-        compare(read([first, second]))
-
-
-def curves(label, *steps_of_seeds):
-    """Return the curves of a method in a table, with the value 1 at some steps of each seed."""
-    values = (dict.fromkeys(steps, 1.0) for steps in steps_of_seeds)
-    return [LearningCurve(label, Path("own.csv"), "Chase", 0, *item) for item in enumerate(values)]
-
-
-def test_steps_without_overlap_are_listed_by_method():
-    with pytest.raises(LareError) as error:
-        group_results(curves("A", (1000, 1500), (1500, 2000)) + curves("B", (3000, 4000), (3000, 4000)))
-    first, second = str(error.value).split(";")
-    for text, words in ((first, ["A", "1,000 to 2,000"]), (second, ["B", "3,000 to 4,000"])):
-        assert all(word in text for word in ["Chase", "own.csv", *words]), text
 
 
 def test_same_draw_twice(make_run):

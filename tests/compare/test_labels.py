@@ -1,7 +1,5 @@
 from pathlib import Path
 
-import pytest
-
 from helpers.toy_envs import toy_spec
 from lare_rl.compare.collect import collect_results
 from lare_rl.compare.labels import find_differences, label_runs
@@ -73,20 +71,6 @@ def test_directories_split_labels(make_run):
     assert list(label_runs(sweeps)) == ["dense, one", "dense, two"]
 
 
-@pytest.mark.parametrize(
-    "seeds",
-    [
-        {"deep/study/a": 0, "deep/study/b": 0, "c": 1},  # c has a shorter path
-        {"a/x": 0, "a/y": 0, "b/x": 0},
-        {"a": 0, "a/y": 0},
-        {"s/x/a": 0, "s/x/b": 0, "q/x/a": 1},
-    ],
-)
-def test_directories_of_different_depths_split_labels(seeds, make_run):
-    runs = [make_run(directory, [1.0], seed=seed) for directory, seed in seeds.items()]
-    assert list(label_runs(runs)) == [f"dense, {directory}" for directory in seeds]
-
-
 def test_settings_without_effect_do_not_split_labels(make_run):
     default = {"scored_observation": toy_spec().scored_observation, "seed": 1}
     runs = [make_run("a", [1.0], method="lare-rd"), make_run("b", [2.0], method="lare-rd", **default)]
@@ -96,13 +80,6 @@ def test_settings_without_effect_do_not_split_labels(make_run):
     assert sizes(runs) == {"dense": 2}
     runs = [make_run("e", [1.0], method="lare-rd", scored_observation="after"), runs[0]]
     assert list(label_runs(runs)) == ["lare-rd", "dense"]
-
-
-def test_steps_split_labels_if_step_sizes_are_annealed(make_run):
-    short = make_run("a", [1.0], algorithm="ppo", rollout_steps=50)
-    long = change_run(short, settings=short.config.settings.model_copy(update={"steps": 500}))
-    assert list(label_runs([short, long])) == ["dense, steps 100", "dense, steps 500"]
-    assert texts(find_differences([short, long])) == ["steps (100: dense; 500: dense)"]
 
 
 def test_find_differences(make_run):
@@ -130,16 +107,3 @@ def test_find_function_differences(make_run):
     ]
     assert find_differences([recorded, run("llm-reward", "b", "3")]) == []
     assert find_differences([recorded, run("lare-bayes", "b", "4")]) == []  # two labels
-
-
-@pytest.mark.parametrize(("key", "value"), [("lare", "0.2.0 (0123456789)"), ("machine", "Plan 9")])
-def test_find_origin_differences(make_run, key, value):
-    warmup = {"td3": {"warmup": 10}}
-    runs = [make_run("a", [1.0], **warmup), make_run("b", [2.0], method="rd", **warmup)]
-    paths = [run.directory for run in runs]
-    assert collect_results(paths)[1] == []
-    config = runs[1].config.model_copy(update={key: value})
-    (paths[1] / "config.json").write_text(config.model_dump_json())
-    (finding,) = collect_results(paths)[1]
-    (difference,) = finding.values["differences"]
-    assert difference.methods == {getattr(runs[0].config, key): ("dense",), value: ("rd",)}

@@ -79,21 +79,6 @@ def test_same_seed_twice(write_csv, run):
         compare(collect_results((run.directory, path))[0])
 
 
-def test_table_and_draw(write_csv, make_run):
-    """A table is not a further draw of the runs with its label."""
-    other = make_run("a", [0.5, 0.75], draw=1)
-    path = write_csv(method_rows("dense"))
-    with pytest.raises(LareError, match=rf"{path} and {other.directory} both have dense.*rename"):
-        compare(collect_results((other.directory, path))[0])
-
-
-def test_foreign_seed(run):
-    with (run.directory / "metrics.jsonl").open("a") as file:
-        file.write('{"step": 150, "seed": 9, "evaluation/return": 1.0}\n')
-    with pytest.raises(LareError, match=f"{run.directory} have the seed 9"):
-        collect_results((run.directory,))
-
-
 @pytest.mark.parametrize(
     ("text", "header", "message"),
     [
@@ -101,13 +86,10 @@ def test_foreign_seed(run):
         ("", "", "no column 'method'"),
         ("", HEADER, "no row with a value of evaluation/return"),
         ("a,T,0,5,,x\n", HEADER, "no row with a value of evaluation/return"),
-        ("a,T,0,5\n", HEADER, "no row with a value of evaluation/return"),
         ("a,T,0,5,1,1\n", HEADER.replace("note", RETURN), f"2 columns '{RETURN}'"),
         ("a,T,0.5,5,1,x\n", HEADER, "line 2: seed '0.5'"),
         ("a,T,0,-5,1,x\n", HEADER, "line 2: step '-5'"),
-        ("a,T,0,inf,1,x\n", HEADER, "line 2: step 'inf'"),
         ("a,T,0,5,1,x\na,T,0,10,nan,x\n", HEADER, "line 3: evaluation/return 'nan'"),
-        (",T,0,5,1,x\n", HEADER, "line 2 has no method"),
         ("a" * 200_000 + ",T,0,5,1,x\n", HEADER, "not a CSV table"),
         ("a,T,0,5,1,x\n" * 2, HEADER, "line 3 is a second row of a on T with seed 0 at step 5"),
     ],
@@ -116,12 +98,6 @@ def test_bad_table(text, header, message, write_csv):
     path = write_csv(text, header)
     with pytest.raises(LareError, match=rf"\A{path}.*{message}"):
         read_results_table(path, RETURN)
-
-
-def test_steps_may_be_written_as_floats(write_csv):
-    """pandas does so for a column with gaps."""
-    (curves,) = read_results_table(write_csv("a,T,0.0,1000000.0,1,x\n"), RETURN)
-    assert (curves.seed, curves.values) == (0, {1_000_000: 1.0})
 
 
 @settings(max_examples=50, deadline=None)

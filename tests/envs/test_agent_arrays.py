@@ -85,6 +85,7 @@ NAMES = ["cat_0", "mouse_0", "cat_1"]
 def test_agent_kind():
     kinds = {"prey_12": "prey", "prey": "prey", "walker3": "walker", "red_2_1": "red_2", "7": "7", 7: "7", "_3": "_3"}
     assert {name: agent_kind(name) for name in kinds} == kinds
+    assert group_by_team(["cat_0", "cat_1"], toy_spec()) == (["cat_0", "cat_1"], (Team("cat", 0, 2),))
 
 
 def make_roles(**patterns):
@@ -110,10 +111,6 @@ def make_roles(**patterns):
 )
 def test_group_by_team(changes, order, teams):
     assert group_by_team(NAMES, toy_spec(**changes)) == (order, teams)
-
-
-def test_agents_of_one_kind_name_their_team():
-    assert group_by_team(["cat_0", "cat_1"], toy_spec()) == (["cat_0", "cat_1"], (Team("cat", 0, 2),))
 
 
 @pytest.mark.parametrize(

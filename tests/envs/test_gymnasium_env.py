@@ -114,17 +114,23 @@ def test_spec_of_real_environments(environment, sizes, low, high):
     assert (spec.state_size, spec.is_jax, spec.fixed_length, spec.agents_leave, spec.masks_actions) == (0, *[False] * 4)
 
 
-def test_environment_that_cannot_be_drawn_is_made_without_a_warning():
-    make_env("Undrawable", render_mode="rgb_array").close()
-
-
-def test_precision_of_bounds():
-    """A third in float32 is beyond a third in float64. Actions are scaled as floats, also to integer bounds."""
+def test_bounds_and_actions_of_spaces():
+    """A third in float32 is beyond a third in float64. Integers are rounded, and choices begin with any number."""
     third = np.array([1 / 3])
     boxes = Box(third, 2 * third, dtype=np.float64), Box(-3, 3, (1,), np.int8)
     precise, integers = (make_env("OtherActions", action_space=box).spec for box in boxes)
     assert (precise.low.dtype, precise.low[0, 0]) == (np.float64, 1 / 3)
     assert (integers.low.dtype, integers.low[0, 0]) == (np.float32, -3)
+    for space in (Box(0, 5, (2,), np.int64), Box(0, 5, (2,), np.float16), Discrete(2, start=5)):
+        env = make_env("OtherActions", action_space=space)
+        env.reset(0)
+        env.step(np.array([[3.25, 4.75]], np.float32))  # the environment asserts that the action is in the space
+    assert env.spec.first_choice == 5
+    for shape in ((), (2, 2)):
+        with pytest.raises(LareError, match="one axis"):
+            make_env("OtherActions", action_space=Box(-1, 1, shape, np.float32))
+    with pytest.raises(LareError, match=r"observation is 7, which is not in Discrete\(4\)"):
+        make_env("OutOfItsSpace").reset(0)
 
 
 @pytest.mark.parametrize("environment", ["Pendulum-v1", "CartPole-v1"])
@@ -175,21 +181,16 @@ def test_measures_are_those_of_the_last_step():
         ({"observation": np.array([0, np.nan], np.float32)}, r"observation contains nan in entry 1 \(noise\)$"),
         ({"observation": np.zeros(3)}, "observation has the shape"),
         ({"reward": 1e39}, "reward contains inf"),
-        ({"reward": None}, "reward is None"),
         ({"info": None}, "info None, which is not a dictionary"),
         ({"terminated": np.array([True, False])}, "failed in step: The truth value"),
-        ({"reset": [0.5, 0.25]}, "info 0.25, which is not a dictionary"),
         ({"fail_in": "reset", "error": OSError("no asset\ntrack.bin")}, "reset: no asset track.bin$"),
         ({"fail_in": "reset", "error": OSError("x" * 1000)}, f"reset: {'x' * MAX_ERROR}...$"),
         ({"fail_in": "step", "error": ZeroDivisionError()}, "step: ZeroDivisionError$"),
-        ({"fail_in": "step", "error": SystemExit(0)}, "step: 0$"),
         ({"fail_in": "step", "error": LareError("no battery")}, "^no battery$"),
         ({"fail_in": "render", "error": IndexError("range")}, "render: range$"),
         ({"info": {}, "terminated": True}, "'won'.*is empty"),
         ({"info": {"lost": 1, 3: 4}, "terminated": True}, "'won'.*only 3, lost"),
-        ({"info": {"won": 10**400}, "terminated": True}, "'won'.*not a number"),
         ({"info": {"level": 64}}, "group 'level'.*64.*from 0 to 63"),
-        ({"info": {"level": 0.5}}, "group 'level'.*0.5"),
         ({"info": {"level": np.nan}}, "group 'level'.*nan"),
     ],
 )
@@ -210,36 +211,9 @@ def test_invalid_value_or_failure(kwargs, content):
     assert isinstance(error.value, EnvOutputError) == content.startswith(("observation", "reward"))
 
 
-def test_error_in_close_is_a_warning(caplog):
-    """It would hide the error for which the environment is closed."""
-    make_env("Invalid", fail_in="close", error=OSError("no\nlink")).close()
-    assert caplog.messages == ["environment 'foreign/Invalid-v0' failed in close: no link"]
-
-
-def test_spaces_that_are_refused():
-    with pytest.raises(LareError, match=r"observation is 7, which is not in Discrete\(4\)"):
-        make_env("OutOfItsSpace").reset(0)
-    for shape in ((), (2, 2)):
-        with pytest.raises(LareError, match="one axis"):
-            make_env("OtherActions", action_space=Box(-1, 1, shape, np.float32))
-
-
-def test_actions_are_in_their_space():
-    """As the environment asserts: integers are rounded, and choices begin with any number."""
-    for space in (Box(0, 5, (2,), np.int64), Box(0, 5, (2,), np.float16), Discrete(2, start=5)):
-        env = make_env("OtherActions", action_space=space)
-        env.reset(0)
-        env.step(np.array([[3.25, 4.75]], np.float32))
-    assert env.spec.first_choice == 5
-
-
-def test_gymnasium_can_make_it_again():
-    env = make_gymnasium("toys/Chase-v0")
-    assert gymnasium.make(env.spec).reset(seed=0)[0] == pytest.approx(env.reset(seed=0)[0])
-
-
 @pytest.mark.filterwarnings("ignore:.*render_mode")
 def test_render():
+    make_env("Undrawable", render_mode="rgb_array").close()  # without a warning
     with contextlib.closing(GymnasiumEnv(toy_spec(environment="FrozenLake-v1"), render_mode="ansi")) as env:
         env.reset(0)
         assert "SFFF" in env.render().replace("\x1b[41mS\x1b[0m", "S")

@@ -68,12 +68,6 @@ def test_package_action_of_choices(fields, expected):
     np.testing.assert_array_equal(to_package_action(one_hot[1], spec), expected[1])
 
 
-@pytest.mark.parametrize(("shape", "expected"), [(None, (5, 4)), ((2, 2), (5, 2, 2))])
-def test_package_action_of_numbers(shape, expected):
-    spec = EnvSpec((Team("agent", 0, 1),), 1, 4, discrete=False, max_steps=1, package_shape=shape)
-    assert to_package_action(np.zeros((5, 4), np.float32), spec).shape == expected
-
-
 def test_continuous_action_is_scaled_to_the_bounds_of_each_agent():
     low, high = np.array([[-1, 0], [10, 10]], np.float32), np.array([[1, 4], [20, 10]], np.float32)
     spec = EnvSpec((Team("agent", 0, 2),), 1, 2, discrete=False, max_steps=1, low=low, high=high)

@@ -40,7 +40,6 @@ def test_last_observation_is_the_terminal_state():
 
 
 def test_time_limits():
-    assert make(family_task("jumanji/Maze-v0")).spec.max_steps == 100
     maze = make(family_task("jumanji/Maze-v0", max_episode_steps=7))
     assert (maze.spec.max_steps, maze.env.time_limit) == (7, 7)
     cut = make(family_task("jumanji/Game2048-v1", max_episode_steps=3, measures=["highest_tile"]))
@@ -50,6 +49,7 @@ def test_time_limits():
     assert (timesteps.measures["highest_tile"] >= 2).all()
 
 
+@pytest.mark.long
 def test_several_choices_are_one():
     env = make(family_task("jumanji/Tetris-v0"))
     assert env.spec.action_size == 40

@@ -39,8 +39,8 @@ def test_shipped_tasks(checks_all):
         task = read_task(name)
         assert task.name == name
         assert "reward" not in f"{task.description} {task.observation} {task.action}".lower()
-        # These have the sizes of their original tasks (test_mujoco_rewards.py), or repeat the way in which another is made.
-        repeats = task.environment.startswith("lare/") or name in ("CheetahRun", "WalkerRun")
+        # These have the sizes of their original tasks (test_mujoco_rewards.py), or a package that takes long to import.
+        repeats = task.environment.startswith("lare/") or task.family == "playground"
         if find_spec(OPTIONAL.get(task.family, "lare_rl")) and (checks_all or not repeats):
             check_environment(task)
 
@@ -52,29 +52,17 @@ def test_task_file(spec_file):
     )
 
 
-def test_like_over_two_generations(spec_file, tmp_path):
-    spec_file(like="Reacher-v4", action=None)
-    child = tmp_path / "child.toml"
-    child.write_text('like = "chase.toml"\nname = "Child"\n')
-    assert read_task(child) == toy_spec(name="Child", action=read_task("Reacher-v4").action)
-
-
 @pytest.mark.parametrize(
     ("changes", "content"),
     [
         ({"action": None, "observation": None}, "'observation', 'action' are missing"),
         ({"reward": "1 a step"}, "no key 'reward'"),
-        ({"scored_observations": "after"}, "did you mean 'scored_observation'"),
-        ({"description": "  "}, "description = '  '"),
         ({"scored_observation": "during"}, "scored_observation = 'during'"),
-        ({"name": "a/b"}, "name = 'a/b'"),
         ({"action_size": 0}, "action_size = 0"),
         ({"like": ["PP-6"]}, r"like = \['PP-6'\] must be"),
-        ({"teams": "PP-6"}, "teams = 'PP-6' must be"),
         ({"teams": [3]}, r"teams = \[3\] must be"),
         ({"like": "Reacher"}, "did you mean 'Reacher-v5'"),
         ({"environment": "CartPole-v1", "observation_size": 4}, "action_size = 1, but .* actions of size 2"),
-        ({"payments": True}, "payments"),
         ({"environment": "toys/Endless-v0"}, "no time limit.*max_episode_steps"),
         ({"teams": ["Reacher-v4"]}, "Reacher-v4 is not a team of toys/Chase-v0"),
         ({"environment": "particles/CN-6", "measures": ["info"]}, "no measure 'info'"),
@@ -82,10 +70,7 @@ def test_like_over_two_generations(spec_file, tmp_path):
         ({"environment": "Nope-v0"}, "'Nope-v0' cannot be made: .*MODULE:Nope-v0"),
         ({"environment": "nowhere/Chase-v0"}, "cannot be made: .*LARE_PLUGINS"),
         ({"environment": "nowhere:Chase-v0"}, "cannot be made: No module named 'nowhere'.*PYTHONPATH"),
-        ({"environment": "HalfCheetah-v99"}, "'HalfCheetah-v99' cannot be made: "),
-        ({"environment": "::"}, "'::' cannot be made: "),
         ({"evaluation_environment": "other:Chase-v0"}, "'other:Chase-v0' is not of the module"),
-        ({"evaluation_environment": "pettingzoo/toys:chase"}, "is not of the module"),
         ({"evaluation_environment": "toys/Missing-v0"}, "'toys/Missing-v0' cannot be made"),
         ({"evaluation_environment": "CartPole-v1"}, "observations of size 4"),
     ],
@@ -100,7 +85,6 @@ def test_invalid_task_file(spec_file, changes, content):
     ("text", "content"),
     [
         (b"name = ", "not valid TOML: Invalid value.*needs quotes"),
-        (b"Dear reader", "not valid TOML: Expected"),
         (b"\xff", "cannot be read"),
         (b"", "'name', 'environment', .* are missing"),
         # TOML has values that JSON lacks. A run would store them as null or text, which make another environment.
@@ -126,9 +110,7 @@ def test_arguments_are_as_a_run_stores_them():
     [
         ("walker2d-v4", "did you mean 'Walker2d-v4'"),
         ("chess", "no task 'chess'. .* CN-6"),
-        ("x" * 300, "no task 'xxx"),
-        ("no/such/file.toml", "no task file no/such/file.toml"),
-        ("/", "is a folder"),
+        ("no/file.toml", "no task file"),
     ],
 )
 def test_unknown_task(task, content):
@@ -153,42 +135,24 @@ def test_former_names_of_keys(spec_file, tmp_path):
     assert task == toy_spec(credit_scope="state")
     (tmp_path / "like.toml").write_text('like = "former.toml"\njudges = "both"\n')
     assert read_task(tmp_path / "like.toml") == task.model_copy(update={"scored_observation": "both"})
-
-
-def test_like_keeps_teams(tmp_path):
-    (tmp_path / "mine.toml").write_text('like = "CompetitivePP-6"\nname = "Mine"\n')
-    task = read_task(tmp_path / "mine.toml")
-    assert [(role.name, role.team) for role in task.roles] == [
-        ("CompetitivePP-6-predator", "predator"),
-        ("CompetitivePP-6-prey", "prey"),
-    ]
-    assert (task.family, task.name_in_family, task.team) == ("particles", "CompetitivePP-6", None)
-    assert read_task("CN-6").roles == (read_task("CN-6"),)
-
-
-def test_like_cycle_by_relative_paths(tmp_path):
-    file = tmp_path / "a.toml"
-    file.write_text(f'like = "../{tmp_path.name}/a.toml"')
-    with pytest.raises(LareError, match="without a cycle"):
-        read_task(file)
+    (tmp_path / "grandchild.toml").write_text('like = "like.toml"\nname = "Child"\n')
+    assert read_task(tmp_path / "grandchild.toml").scored_observation == "both"
 
 
 @pytest.mark.parametrize("circle", [["a"], ["a", "b", "c"]])
 def test_like_cycle(tmp_path, circle):
-    files = [tmp_path / name for name in circle]
-    for index, file in enumerate(files):
-        file.write_text(f'like = "{files[(index + 1) % len(files)]}"')
+    for index, name in enumerate(circle):
+        (tmp_path / name).write_text(f'like = "../{tmp_path.name}/{circle[(index + 1) % len(circle)]}"')
     with pytest.raises(LareError, match="without a cycle"):
-        read_task(files[0])
+        read_task(tmp_path / "a")
 
 
 # Tasks as values
 
 
-@pytest.mark.parametrize("key", ["name", "description", "observation", "action", "environment"])
-def test_digest_depends_on_every_text(key):
-    assert toy_spec().digest == toy_spec().digest
-    assert toy_spec(**{key: "another"}).digest != toy_spec().digest
+def test_digest_depends_on_every_text():
+    for key in ("name", "description", "observation", "action", "environment"):
+        assert toy_spec().digest == toy_spec().digest != toy_spec(**{key: "another"}).digest
 
 
 gymnasium.register("toys/LongChase-v0", entry_point=Chase, max_episode_steps=30)
@@ -200,9 +164,6 @@ def test_evaluation_environment():
     assert task.evaluation_task == toy_spec(environment="toys/LongChase-v0")
     assert load_env_spec(task.evaluation_task).max_steps == 30
     assert toy_spec().evaluation_task == toy_spec()
-
-
-def test_evaluation_environment_is_for_the_host():
     task = read_task("CN-6").model_copy(update={"evaluation_environment": "particles/CN-6"})
     with pytest.raises(LareError, match="evaluation_environment has no effect on particles/CN-6"):
         load_env_spec(task)

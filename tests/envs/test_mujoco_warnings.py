@@ -1,13 +1,10 @@
 """MuJoCo's warnings about models, and tasks of MuJoCo where it is not installed."""
 
-import sys
-
 import mujoco
 import pytest
 
 from lare_rl.envs.gymnasium_env import make_gymnasium
 from lare_rl.envs.mujoco_warnings import mujoco_warnings
-from lare_rl.errors import LareError, install_command
 
 NAMES = ["HalfCheetah-v4", "HalfCheetah-v5", "lare/HalfCheetahTarget-v4"]
 
@@ -37,12 +34,3 @@ def test_only_deprecations_are_dropped():
     assert [str(warning.message) for warning in warned] == [
         f"MuJoCo, environment {NAMES[0]!r}: the timestep is too large"
     ]
-
-
-@pytest.mark.parametrize("name", NAMES)
-def test_missing_mujoco(name, monkeypatch):
-    monkeypatch.setitem(sys.modules, "mujoco", None)
-    with pytest.raises(LareError) as error:
-        make_gymnasium(name)
-    assert str(error.value).startswith(f"environment {name!r} cannot be made: ")
-    assert str(error.value).endswith(f"(an extra: {install_command('mujoco')})")

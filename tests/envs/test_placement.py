@@ -59,7 +59,7 @@ def test_a_second_simulation_is_tried(name, separate, monkeypatch):
     if name == "Slow":
         monkeypatch.setattr(placement, "SLOW_STEP_S", 0.002)
     if name == "Hangs":
-        monkeypatch.setattr(placement, "SECOND_TIMEOUT_S", 2.0)
+        monkeypatch.setattr(placement, "SECOND_TIMEOUT_S", 1.5)
     task = single_spec(name)
     assert needs_process(task) == separate
     assert not simulations
@@ -94,31 +94,21 @@ def test_an_environment_that_only_this_process_has(monkeypatch):
 
 def test_separate_by_the_task_file_starts_once(starts, tmp_path):
     """The first look at the spaces, the steps for verification, a measurement, episodes and a batch share one simulation."""
-    task = single_spec("Fails", processes="separate")
+    task = single_spec("Fails", processes="separate", timeout=7.0)
     assert load_env_spec(task).max_steps == N_STEPS
+    with contextlib.closing(make_host_env(task)) as env, pytest.raises(LareError, match="cannot be drawn"):
+        env.render()
     random_steps(task)
     assert measure_step_s(task) > 0
     episodes = play_episodes(task, 2)
     assert [len(episode.reward) for episode in episodes] == [N_STEPS] * 2
     with make_vec_env(task, 1) as training:
-        assert starts() == training.pids
+        assert (starts(), training.timeout) == (training.pids, 7.0)
         with make_vec_env(task, 2) as evaluation:
             assert sorted(starts()) == sorted(training.pids + evaluation.pids)
     assert os.getpid() not in starts()
     close_idle_workers()
     assert len(starts()) == 3
-
-
-def test_separate_environment_cannot_be_drawn():
-    task = single_spec("Many", processes="separate")
-    with contextlib.closing(make_host_env(task)) as env, pytest.raises(LareError, match="cannot be drawn"):
-        env.render()
-
-
-def test_workers_use_the_timeout_of_the_task():
-    with make_vec_env(toy_spec(environment="helpers.toy_envs:toys/Chase-v0", timeout=7.0), 2, parallel=True) as envs:
-        assert isinstance(envs, workers.SubprocVecEnv)
-        assert envs.timeout == 7.0
 
 
 def test_hang_ends_soon_after_a_request_to_stop(monkeypatch):
@@ -148,9 +138,3 @@ def test_few_simulations_are_open_at_a_time(monkeypatch):
     assert [n_open_envs(separate, n_seeds, 10) for n_seeds in (1, 2, 3, 9)] == [4, 2, 1, 1]
     assert n_open_envs(separate, 1, 3) == 3
     assert n_open_envs(toy_spec(), 2, 10) == 10
-
-
-@pytest.mark.parametrize(("key", "value"), [("processes", "own"), ("timeout", 0), ("timeout", float("inf"))])
-def test_bad_keys(key, value):
-    with pytest.raises(LareError, match=key):
-        single_spec("Many", **{key: value})

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from helpers.jax_families import check_arrays, family_task, play, require_family, step_keys
+from helpers.long_tests import long_case
 from lare_rl.envs.families import make_env
 from lare_rl.envs.robot_env import adapt_robot
 from lare_rl.errors import LareError
@@ -60,34 +61,24 @@ def play_toy(**toy):
 def test_time_limit_truncates():
     timesteps = play_toy(measures=["time"])
     np.testing.assert_array_equal(timesteps.observation[:, 0, 0], [1, 2, 3, 4])
-    np.testing.assert_array_equal(
-        timesteps.state, np.repeat([[1], [2], [3], [4]], 2, axis=1)
-    )  # what only a critic may see
+    np.testing.assert_array_equal(timesteps.state, np.transpose([[1, 2, 3, 4]] * 2))  # what only a critic may see
     np.testing.assert_array_equal(timesteps.reward[:, 0], [1, 2, 3, 4])
     np.testing.assert_array_equal(timesteps.measures["time"], [1, 2, 3, 4])
     np.testing.assert_array_equal(timesteps.truncated, [False, False, False, True])
     assert not timesteps.terminated.any()
 
 
-def test_done_terminates():
+def test_ends_and_sums():
+    """`done` terminates, and so does a simulator that has diverged. A repeated action adds rewards."""
     np.testing.assert_array_equal(play_toy(end=3).terminated[:3], [False, False, True])
-
-
-def test_diverged_simulator_terminates():
     timesteps = play_toy(nan=3, measures=["time"])
     np.testing.assert_array_equal(timesteps.measures["time"][:3], [1, 2, 0])
     np.testing.assert_array_equal(timesteps.terminated[:3], [False, False, True])
     np.testing.assert_array_equal(timesteps.observation[:3, 0, 0], [1, 2, 2])
     np.testing.assert_array_equal(timesteps.reward[:3, 0], [1, 2, 0])
-
-
-def test_action_repeat_adds_rewards():
     timesteps = play_toy(action_repeat=2)
     np.testing.assert_array_equal(timesteps.observation[:, 0, 0], [2, 4, 6, 8])
     np.testing.assert_array_equal(timesteps.reward[:, 0], [3, 7, 11, 15])
-
-
-def test_pictures_as_observations_are_refused():
     with pytest.raises(LareError, match="observes pixels/view_0, but not 'state'"):
         make_toy(keys=("pixels/view_0",))
 
@@ -96,7 +87,7 @@ def test_pictures_as_observations_are_refused():
     ("environment", "arguments", "sizes", "ends"),
     [
         ("brax/inverted_pendulum", {"backend": "spring"}, (4, 1, 30), True),
-        ("playground/PendulumSwingup", {"episode_length": 3}, (3, 1, 3), False),
+        long_case("playground/PendulumSwingup", {"episode_length": 3}, (3, 1, 3), False),
     ],
 )
 def test_last_observation_is_the_terminal_state(environment, arguments, sizes, ends):
@@ -119,10 +110,9 @@ def test_last_observation_is_the_terminal_state(environment, arguments, sizes, e
     assert timesteps.reward[0, : last + 1].sum() == pytest.approx(rewards, rel=1e-3)
 
 
-@pytest.mark.parametrize("environment", ["brax/halfcheetah", "playground/CheetahRun"])
+@pytest.mark.parametrize("environment", ["brax/halfcheetah", long_case("playground/CheetahRun")])
 def test_deprecated_attributes_of_a_model_write_no_log(environment, tmp_path, monkeypatch):
     require_family(environment)
     monkeypatch.chdir(tmp_path)
-    sizes = (17, 6)
-    make_env(family_task(environment, *sizes))
+    make_env(family_task(environment, 17, 6))
     assert list(tmp_path.iterdir()) == []

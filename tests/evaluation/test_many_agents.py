@@ -5,25 +5,23 @@ from dataclasses import replace
 from functools import partial
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
 
 import lare_rl
 from helpers.markup import check_markup
 from lare_rl.envs.families import make_env
-from lare_rl.envs.interface import Team, team_mean
+from lare_rl.envs.interface import team_mean
 from lare_rl.errors import LareError
-from lare_rl.evaluation.cross_play import combine_policies, cross_play
-from lare_rl.evaluation.played_episodes import N_SAMPLE_EPISODES, play_run, sample_steps
-from lare_rl.evaluation.policy import load_policy
-from lare_rl.evaluation.video import record_frames, record_video
+from lare_rl.evaluation.cross_play import cross_play
+from lare_rl.evaluation.played_episodes import play_run
+from lare_rl.evaluation.video import record_frames
 from lare_rl.report import run_details
 from lare_rl.report.overview import render_learning_curves
 from lare_rl.report.reported_run import ReportedRun
 from lare_rl.training.collect_device import unroll_on_device
 from lare_rl.training.policy import get_actor
-from lare_rl.training.saved_state import load_actor, load_learner
+from lare_rl.training.saved_state import load_learner
 
 pytestmark = pytest.mark.long
 
@@ -49,31 +47,6 @@ def test_rollout(runs):
     assert [frame.shape for frame in record_frames(runs[0], played=played)[0]] == [(400, 400, 3)] * 25
 
 
-@pytest.mark.long
-def test_rollout_without_proxy_rewards(small_many, tmp_path):
-    run = lare_rl.train("TriangleArea", small_many(method="dense"), out=tmp_path / "run", listeners=[])
-    played = play_run(run)
-    assert played.training_reward is None
-    np.testing.assert_array_equal(played.credit, played.reward)
-    page = lare_rl.write_report(run, tmp_path / "report.html").read_text()
-    assert page.count('class="strip"') == 1
-    assert page.count("data:image/webp") == 1
-
-
-def first_actor(run):
-    return jax.tree.map(lambda leaf: leaf[:1], load_actor(run)[1])
-
-
-def test_sample_steps(runs):
-    (predators, preys), (other_predators, _) = (sample_steps(runs[0], actor) for actor in (None, first_actor(runs[1])))
-    n_steps = N_SAMPLE_EPISODES * 25
-    assert (predators.next_observation.shape, preys.next_observation.shape) == ((6 * n_steps, 24), (2 * n_steps, 24))
-    for sample, function in zip((predators, preys), runs[0].functions, strict=True):
-        assert sample.factors.shape == (len(sample.reward), function.size)
-        assert np.nanmax(np.abs(sample.correlations)) > 0.3
-    assert not np.array_equal(predators.next_observation, other_predators.next_observation)
-
-
 def test_cross_play(runs, command):
     matches = cross_play((runs[0], runs[1]), episodes=N_EPISODES)
     assert [(match.first, match.second) for match in matches] == [(a, b) for a in runs for b in runs]
@@ -92,14 +65,6 @@ def test_cross_play(runs, command):
     assert (status, err) == (0, "")
     assert out.count(" ± ") == 5  # four matches, and the line that explains the numbers
     assert out.startswith("predator of, against prey of")
-
-
-def test_combine_policies():
-    def policy(actor, memory, *inputs):
-        return jnp.full((1, 3, 8, 5), actor), memory
-
-    actions, _ = combine_policies((1.0, 4.0), (), policy=policy, team=Team("first", 0, 6))
-    np.testing.assert_array_equal(actions[0, :, :, 0], np.tile([1.0] * 6 + [4.0] * 2, (3, 1)))
 
 
 def change_run(run, **changes):
@@ -133,13 +98,6 @@ def test_evaluate_command(runs, command, tmp_path):
     ]
     assert [line.split(": ")[0] for line in out.splitlines()[1:-1]] == names
     assert (tmp_path / "film.gif").read_bytes().startswith(b"GIF8")
-
-
-def test_single_agent_functions_refuse_many_agents(runs, tmp_path):
-    with pytest.raises(LareError, match="best"):
-        record_video(runs[0], tmp_path / "film.gif", best=True)
-    with pytest.raises(LareError, match="many agents"):
-        load_policy(runs[0])
 
 
 def test_report(runs, monkeypatch):

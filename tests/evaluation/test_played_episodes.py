@@ -6,10 +6,13 @@ import pytest
 import lare_rl
 from helpers.jax_toy_envs import echo_spec
 from helpers.numpy_twins import assert_close
+from helpers.small_configs import add_steps, random_steps
 from lare_rl.config.resolve import resolve
 from lare_rl.evaluation import played_episodes as module
-from lare_rl.evaluation.played_episodes import play_run, sample_steps
+from lare_rl.evaluation.played_episodes import compute_training_rewards, play_run, sample_steps
 from lare_rl.runs.directory import create_run
+from lare_rl.training.saved_state import load_learner
+from lare_rl.training.seed_axis import select_seed
 from lare_rl.training.train import start_session
 
 TASK = echo_spec(environment="hosted/three", credit_scope="state", observation_size=9, action_size=9, payments=2)
@@ -18,7 +21,7 @@ N_EPISODES = 12
 
 @pytest.fixture(scope="module")
 def run(tmp_path_factory):
-    """An iteration alone: an evaluation and an explanation would take seconds to compile."""
+    """A run before its first step: nothing of its training is compiled."""
     settings = lare_rl.Settings(
         method="rd-linear",
         algorithm="ippo",
@@ -30,10 +33,17 @@ def run(tmp_path_factory):
         ippo={"hidden": (8,), "minibatch_size": 60, "epochs": 1},
     )
     session = start_session(create_run(tmp_path_factory.mktemp("runs") / "echo", TASK, resolve(settings, TASK), ()))
-    session.advance(120)
     session.save()
     session.close()
     return session.run
+
+
+@pytest.fixture(autouse=True, scope="module")
+def no_rewards():
+    """Leave out the training rewards, which take seconds to compile."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(module, "compute_training_rewards", lambda *_: None)
+        yield
 
 
 @pytest.fixture(scope="module")
@@ -41,13 +51,17 @@ def played(run):
     return play_run(run, N_EPISODES)
 
 
-def test_exact_rewards_add_up_to_payments(played):
+def test_exact_rewards_add_up_to_payments(run, played):
+    state = load_learner(run)
+    steps = random_steps(state.config.env, envs=2, lengths=(6, 4, 5, 6, 3, 6))
+    learner = add_steps(select_seed(state.learner), state.config, steps)
+    rewards = compute_training_rewards(learner, played.steps, played.factors, state.config)
     sums, payments = [], []
     for episode in range(N_EPISODES):
-        values = np.asarray(played.steps.timestep.alive), played.reward, played.training_reward
+        values = np.asarray(played.steps.timestep.alive), played.reward, rewards
         alive, true, training = (played.select_episode(x, episode) for x in values)
-        for total, rewards in ((sums, training), (payments, true)):
-            team_reward = (rewards * alive).sum(axis=1) / alive.sum(axis=1)
+        for total, rewards_ in ((sums, training), (payments, true)):
+            team_reward = (rewards_ * alive).sum(axis=1) / alive.sum(axis=1)
             total += [team_reward[start : start + 2].sum() for start in range(0, len(true), 2)]
     assert np.std(payments) > 0.1
     scale = np.dot(sums, payments) / np.dot(payments, payments)  # rewards are divided by their deviation
@@ -69,5 +83,4 @@ def test_an_episode_does_not_depend_on_the_number_of_environments(run, played, m
     few = play_run(run, N_EPISODES)
     assert len({int(mask.sum()) for mask in played.mask.T}) > 1
     for episode in range(N_EPISODES):
-        pair = (batch.select_episode((batch.steps, batch.training_reward), episode) for batch in (played, few))
-        assert_close(*pair)
+        assert_close(*(batch.select_episode(batch.steps, episode) for batch in (played, few)))

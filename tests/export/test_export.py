@@ -260,7 +260,7 @@ def export(export_run):
     return run, exported
 
 
-def test_reward_without_lare(export):
+def test_functions_without_lare(export):
     run, exported = export
     directory, rng = Path(exported.__file__).parent, np.random.default_rng(0)
     before, after = rng.uniform(-1, 1, (2, 5, 2)).astype(np.float32)
@@ -279,14 +279,9 @@ def test_reward_without_lare(export):
     np.testing.assert_allclose(exported.reward(before[0], action[0], after[0]), expected[0], rtol=1e-4)
     assert np.std(expected) > 0
     assert set(describe(exported, "reward")["inputs"]) == {"before", "action"}
-
-
-def test_policy_is_that_of_load_policy(export):
-    run, exported = export
-    observation = np.random.default_rng(0).uniform(-1, 1, (4, 2)).astype(np.float32)
     policy = lare_rl.load_policy(run, seed=1)
-    action = exported.load("policy")(observation=observation)["action"]
-    np.testing.assert_allclose(action, [policy(row) for row in observation], rtol=1e-5)
+    outputs = exported.load("policy")(observation=before)["action"]
+    np.testing.assert_allclose(outputs, [policy(row) for row in before], rtol=1e-5)
 
 
 def test_command(export, command, monkeypatch, tmp_path):

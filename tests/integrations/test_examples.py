@@ -6,7 +6,6 @@ import runpy
 from pathlib import Path
 
 import pytest
-import torch
 
 ROOT = Path(__file__).parents[2]
 SCRIPTS = {
@@ -14,11 +13,6 @@ SCRIPTS = {
     "cleanrl_ppo.py": {"total_timesteps": 160, "num_steps": 40, "num_minibatches": 4, "update_epochs": 1},
 }
 MARK = "  # LaRe"
-
-
-@pytest.fixture(autouse=True, scope="module")
-def one_thread():
-    torch.set_num_threads(1)
 
 
 def read_lines(name):

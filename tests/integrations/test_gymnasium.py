@@ -9,12 +9,11 @@ from gymnasium import spaces
 from gymnasium.utils import RecordConstructorArgs
 from gymnasium.utils.env_checker import check_env
 from gymnasium.vector import AutoresetMode, SyncVectorEnv, VectorEnv, VectorWrapper
-from gymnasium.wrappers import NormalizeObservation, TimeLimit
-from gymnasium.wrappers.vector import RecordEpisodeStatistics
+from gymnasium.wrappers import TimeLimit
 
 from helpers.logged_envs import LoggedEnv, RandomEnv, RecordingAssigner, check_episodes, recording_assigner
 from helpers.toy_envs import Levels, levels_spec, toy_spec
-from lare_rl.envs.episodic import TRUE_REWARD, EpisodicReward
+from lare_rl.envs.episodic import TRUE_REWARD
 from lare_rl.errors import LareError
 from lare_rl.integrations.gymnasium import Credit, VectorCredit
 from lare_rl.integrations.recorder import CREDIT_STEP, check_assigner, check_pay
@@ -66,19 +65,8 @@ def play_episodes(env, n_episodes):
     return results
 
 
-@pytest.mark.parametrize(
-    ("mode", "kind"), [(NEXT_STEP, "integers"), (DISABLED, "discrete"), (SAME_STEP, "dict"), (SAME_STEP, "tuple")]
-)
-def test_vector_steps_of_spaces(mode, kind):
-    vector, envs = make_vector(mode, SPACES[kind])
-    credit = recording_assigner(envs[0])
-    play(VectorCredit(vector, credit, pay="environment"), 40)
-    check_episodes(credit, envs)
-    assert credit.store.dropped == credit.n_fits == 0
-
-
 @pytest.mark.parametrize("kind", SPACES)
-def test_single_steps_of_spaces(kind):
+def test_steps_of_spaces(kind):
     env = LoggedEnv(RandomEnv(*SPACES[kind], rewrites=True))
     credit = recording_assigner(env)
     results = play_episodes(Credit(env, credit, pay="environment"), 8)
@@ -86,7 +74,30 @@ def test_single_steps_of_spaces(kind):
     logged_rewards = [step[3] for step in env.all_steps()]
     assert [reward for reward, _ in results] == [info[TRUE_REWARD] for _, info in results] == logged_rewards
     assert [info[CREDIT_STEP] for _, info in results] == list(range(credit.store.n_added))
-    assert credit.store.dropped == credit.n_fits == 0
+    vector, envs = make_vector(
+        {"dict": SAME_STEP, "tuple": SAME_STEP, "discrete": DISABLED}.get(kind, NEXT_STEP), SPACES[kind]
+    )
+    vector_credit = recording_assigner(envs[0])
+    play(VectorCredit(vector, vector_credit, pay="environment"), 40)
+    check_episodes(vector_credit, envs)
+    for assigner in (credit, vector_credit):
+        assert assigner.store.dropped == assigner.n_fits == 0
+
+
+def test_single_rewards_and_reset():
+    """A reset drops the running episode, also if all observations are the same. Environments may share an assigner."""
+    envs = [LoggedEnv(RandomEnv(spaces.Box(0, 0, (2,), np.float32), seed=seed)) for seed in range(2)]
+    credit = recording_assigner(envs[0], "rd-linear")
+    first, second = (Credit(env, credit) for env in envs)
+    for wrapped in (first, second):
+        wrapped.reset()
+        wrapped.unwrapped.steps_left = 3
+        wrapped.step(wrapped.action_space.sample())
+    play_episodes(second, 4)
+    results = play_episodes(first, 12)
+    check_episodes(credit, envs)
+    assert (credit.store.dropped, credit.n_fits) == (2, credit.store.n_added)
+    assert results[-1][0] == pytest.approx(float(credit.rewards_at([credit.store.n_added - 1])[0])) != 0
 
 
 @all_modes
@@ -116,26 +127,19 @@ def test_vector_rewards(mode):
 
 @all_modes
 def test_vector_reset_drops_episodes(mode):
+    """In NEXT_STEP mode, the call after an end resets, unless the loop has done it."""
     vector, envs = make_vector(mode)
     credit = recording_assigner(envs[0])
     wrapped = VectorCredit(vector, credit, pay="environment")
     play(wrapped, 10)
     n_running = sum(bool(env.steps) for env in envs)
-    play(wrapped, 10)
-    check_episodes(credit, envs)
-    assert credit.store.dropped == n_running > 0
-
-
-def test_reset_after_an_end_begins_with_a_step():
-    """In NEXT_STEP mode, the call after an end resets, unless the loop has done it."""
-    vector, envs = make_vector()
-    credit = recording_assigner(envs[0])
-    wrapped = VectorCredit(vector, credit, pay="environment")
     wrapped.reset()
-    envs[0].unwrapped.steps_left = 1
+    for env in envs:
+        env.unwrapped.steps_left = 1
     wrapped.step(wrapped.action_space.sample())
     play(wrapped, 10)
     check_episodes(credit, envs)
+    assert credit.store.dropped == n_running > 0
 
 
 def test_reset_mask_drops_one_episode():
@@ -153,20 +157,6 @@ def test_reset_mask_drops_one_episode():
         wrapped.step(actions)
     check_episodes(credit, envs)
     assert (len(credit.store.episodes), credit.store.dropped) == (2, 1)
-
-
-def test_single_rewards_and_reset():
-    """A reset drops the running episode, also if all observations are the same."""
-    env = LoggedEnv(RandomEnv(spaces.Box(0, 0, (2,), np.float32)))
-    credit = recording_assigner(env, "rd-linear")
-    wrapped = Credit(env, credit)
-    wrapped.reset()
-    env.unwrapped.steps_left = 3
-    wrapped.step(env.action_space.sample())
-    results = play_episodes(wrapped, 12)
-    check_episodes(credit, [env])
-    assert (credit.store.dropped, credit.n_fits) == (1, credit.store.n_added)
-    assert results[-1][0] == pytest.approx(float(credit.rewards_at([credit.store.n_added - 1])[0])) != 0
 
 
 @all_modes
@@ -197,8 +187,7 @@ class Ended(gymnasium.Wrapper):
         return *results, info
 
 
-@all_modes
-@pytest.mark.parametrize("payments", ["end", 2])
+@pytest.mark.parametrize(("mode", "payments"), [*((mode, "end") for mode in AutoresetMode), (NEXT_STEP, 2)])
 def test_groups_are_read_from_info(mode, payments):
     levels, credit = [], RecordingAssigner("bayes", task=levels_spec(payments=payments))
     vector = SyncVectorEnv([lambda n=n: Ended(TimeLimit(Levels(), n), levels) for n in (3, 4)], autoreset_mode=mode)
@@ -209,38 +198,6 @@ def test_groups_are_read_from_info(mode, payments):
         assert [names[episode.level] for episode in episodes] == levels
     assert set(levels) <= set(names)
     assert {type(name) for name in names} == {int}
-
-
-def test_shared_assigner():
-    envs = [LoggedEnv(RandomEnv(seed=seed)) for seed in range(3)]
-    credit = recording_assigner(envs[0])
-    play(SyncVectorEnv([lambda env=env: Credit(env, credit) for env in envs]), 30)
-    check_episodes(credit, envs)
-    assert credit.store.dropped == 0
-
-
-def test_other_wrappers():
-    """Statistics inside see the environment's rewards, statistics outside r_hat."""
-    vector, envs = make_vector()
-    inside = RecordEpisodeStatistics(vector)
-    outside = RecordEpisodeStatistics(VectorCredit(inside, recording_assigner(envs[0])), stats_key="r_hat")
-    play(outside, 40)
-    returns = [sum(step[3] for step in steps) for env in envs for steps, _ in env.episodes]
-    assert sorted(inside.return_queue) == pytest.approx(sorted(returns), abs=1e-5)
-    assert outside.return_queue != inside.return_queue
-    env = RandomEnv()
-    play_episodes(NormalizeObservation(Credit(TimeLimit(env, 3), recording_assigner(env))), 1)
-
-
-@all_modes
-def test_rewards_replaced_by_inner_wrapper(mode):
-    """`infos` still has the environment's own rewards."""
-    envs = [LoggedEnv(RandomEnv(seed=3 + seed)) for seed in range(2)]
-    vector = SyncVectorEnv([lambda env=env: EpisodicReward(env) for env in envs], autoreset_mode=mode)
-    results = play(VectorCredit(vector, recording_assigner(envs[0])), 20)
-    rewards = {step[3] for env in envs for step in env.all_steps()}
-    for *_, infos in results:
-        assert set(infos[TRUE_REWARD][infos[f"_{TRUE_REWARD}"]].tolist()) <= rewards
 
 
 def test_task_without_spaces():
@@ -315,13 +272,7 @@ class WithoutStepNumber(gymnasium.Wrapper, RecordConstructorArgs):
 @pytest.mark.filterwarnings("ignore:.*we recommend using a symmetric and normalized space:UserWarning")
 def test_checker_of_gymnasium():
     env = gymnasium.make("Pendulum-v1")
-    wrapped = WithoutStepNumber(Credit(env, recording_assigner(env)))
-    check_env(wrapped, skip_render_check=True)
+    wrapped = Credit(env, recording_assigner(env), score="score")
+    assert gymnasium.make(wrapped.spec).score == "score"
+    check_env(WithoutStepNumber(Credit(env, recording_assigner(env))), skip_render_check=True)
     wrapped.close()
-
-
-def test_make_from_spec():
-    env = gymnasium.make("Pendulum-v1")
-    again = gymnasium.make(Credit(env, recording_assigner(env), score="score").spec)
-    assert isinstance(again, Credit)
-    assert again.score == "score"

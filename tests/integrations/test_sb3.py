@@ -10,26 +10,20 @@ import sb3_contrib
 import torch
 from gymnasium.spaces import Box, Dict, Discrete
 from gymnasium.wrappers import TimeLimit
-from stable_baselines3 import A2C, DQN, PPO, SAC, TD3, HerReplayBuffer
+from stable_baselines3 import A2C, DQN, PPO, SAC, TD3
 from stable_baselines3.common.callbacks import BaseCallback, EveryNTimesteps
-from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.noise import NormalActionNoise
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
 from helpers.assigner_episodes import SMALL_CREDIT
 from helpers.logged_envs import LoggedEnv, RecordingAssigner, check_episodes
 from helpers.long_tests import long_case
-from helpers.toy_envs import Chase, Levels, Pick, levels_spec, toy_spec
+from helpers.toy_envs import Chase, Levels, Pick, levels_spec
 from lare_rl import CreditAssigner, EpisodicReward, LareError
 from lare_rl.integrations.sb3 import CreditCallback, CreditDictReplayBuffer, CreditNStepReplayBuffer, CreditReplayBuffer
 
 SMALL_BUFFER = {"learning_starts": 30, "buffer_size": 300, "batch_size": 8, "train_freq": 1, "gradient_steps": 1}
 EPISODE_STEPS = 20
-
-
-@pytest.fixture(autouse=True, scope="module")
-def one_thread():
-    torch.set_num_threads(1)
 
 
 class DictChase(Chase):
@@ -98,11 +92,9 @@ def check_shown(credit, envs):
     [
         (TD3, Chase, 1, {"action_noise": NormalActionNoise(np.zeros(1), np.ones(1))}),
         (TD3, DictChase, 2, {"buffer": CreditDictReplayBuffer, "policy": "MultiInputPolicy"}),
-        long_case(SAC, Chase, 2, {}),
         long_case(sb3_contrib.TQC, Chase, 3, {}),
         long_case(sb3_contrib.CrossQ, Chase, 2, {}),
         (DQN, Pick, 2, {}),
-        long_case(sb3_contrib.QRDQN, Pick, 2, {}),
     ],
 )
 def test_buffer_steps(kind, env_class, n_envs, options):
@@ -182,26 +174,6 @@ def test_units_and_newest_decoder():
     np.testing.assert_array_equal(sample, buffer.rewards[np.random.randint(0, 120, 8), 0])
 
 
-@pytest.mark.parametrize("algorithm", ["td3", long_case("ppo")])
-def test_policy_depends_on_returns_only(algorithm):
-    """Not on when rewards are paid."""
-    weights = []
-    for pays_at_end in (False, True):
-        env, envs = make_envs(2, pays_at_end=pays_at_end)
-        credit = make_assigner("rrdu")
-        if algorithm == "td3":
-            model = off_policy(env, credit)
-            model.learn(120)
-        else:
-            model = on_policy(env)
-            model.learn(192, callback=CreditCallback(credit, 16))
-        assert credit.metrics()["credit/fits"] > 0
-        check_shown(credit, envs)
-        weights.append({name: value.numpy().copy() for name, value in model.policy.state_dict().items()})
-    for name, values in weights[1].items():
-        np.testing.assert_array_equal(values, weights[0][name])
-
-
 class RolloutRecorder(BaseCallback):
     """Records what the rollout buffer holds before the algorithm learns from it."""
 
@@ -232,9 +204,7 @@ class RolloutRecorder(BaseCallback):
         self.next_value, self.dones = self._value(self.model._last_obs), self.locals["dones"]
 
 
-@pytest.mark.parametrize(
-    ("kind", "normalised"), [(PPO, True), (A2C, False), long_case(sb3_contrib.TRPO, False), long_case(A2C, True)]
-)
+@pytest.mark.parametrize(("kind", "normalised"), [(PPO, True), (A2C, False), long_case(sb3_contrib.TRPO, False)])
 def test_rewards_and_advantages_by_hand(kind, normalised):
     env, envs = make_envs(2)
     credit = make_assigner()
@@ -277,30 +247,6 @@ def test_second_learn_drops_running_episodes():
     assert "compute_returns_and_advantage" not in vars(model.rollout_buffer)
     model.learn(32)  # without the callback, by the environment's rewards
     assert np.abs(model.rollout_buffer.rewards).max() > 0
-
-
-@pytest.mark.long
-def test_learns_from_returns(phi):
-    """Returns of three seeds: -0.12 to -0.19 with r_hat, -0.13 to -0.19 with true rewards, -19 to -54 without; random -33."""
-    env = EpisodicReward(TimeLimit(Chase(), EPISODE_STEPS))
-    credit = CreditAssigner("lare-bayes", phi, task=toy_spec(), capacity=3000)
-    model = TD3(
-        "MlpPolicy",
-        env,
-        replay_buffer_class=CreditReplayBuffer,
-        replay_buffer_kwargs={"credit": credit},
-        learning_starts=200,
-        buffer_size=3000,
-        batch_size=64,
-        gamma=0.9,
-        policy_kwargs={"net_arch": [32]},
-        action_noise=NormalActionNoise(np.zeros(1), 0.3 * np.ones(1)),
-        seed=0,
-        device="cpu",
-    )
-    model.learn(1500)
-    assert evaluate_policy(model, TimeLimit(Chase(), EPISODE_STEPS), 20, warn=False)[0] > -1
-    assert credit.metrics()["credit/return_r2"] > 0.99
 
 
 def test_save_and_load(tmp_path):
@@ -357,15 +303,6 @@ def test_full_buffer():
     assert np.isfinite(buffer.sample(16).rewards.numpy()).all()
 
 
-def test_rollout_without_end():
-    with pytest.warns(UserWarning, match="n_steps"):
-        on_policy(make_env(), n_steps=8).learn(8, callback=CreditCallback(make_assigner()))
-
-
-class GoalBuffer(CreditDictReplayBuffer, HerReplayBuffer):
-    pass
-
-
 def learn_with_callback(env, credit):
     on_policy(env).learn(32, callback=CreditCallback(credit))
 
@@ -377,16 +314,10 @@ def learn_with_callback(env, credit):
         (lambda: off_policy(make_env(), make_assigner(capacity=99)), "capacity=300"),
         (lambda: learn_with_callback(make_env(), make_assigner(capacity=31)), "capacity=32"),
         (lambda: off_policy(make_env(), make_assigner(action_space=3)), "actions .* 1 numbers.* 3"),
-        (lambda: learn_with_callback(make_env(), make_assigner(observation_space=4)), "observations .* 2 numbers.* 4"),
         (lambda: off_policy(make_env(), make_assigner("rd", agents=2, max_steps=20)), "agents=2.* has 1"),
         (
             lambda: off_policy(make_env(DictChase), make_assigner(env_class=DictChase), policy="MultiInputPolicy"),
             "use CreditDictReplayBuffer",
-        ),
-        (lambda: off_policy(make_env(), make_assigner(), buffer=CreditDictReplayBuffer), "use CreditReplayBuffer"),
-        (
-            lambda: GoalBuffer(10, DictChase.observation_space, DictChase.action_space, credit=make_assigner()),
-            "GoalBuffer cannot relabel goals",
         ),
         (
             lambda: off_policy(make_env(), make_assigner(), buffer_options={"n_sampled_goal": 4}),

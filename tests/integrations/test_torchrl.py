@@ -1,7 +1,5 @@
 """Replay buffers of TorchRL: the assigner receives new steps, sampled steps have r_hat."""
 
-import threading
-
 import numpy as np
 import pytest
 import torch
@@ -18,11 +16,6 @@ from helpers.logged_envs import LoggedEnv, RandomEnv, RecordingAssigner, check_e
 from helpers.toy_envs import Levels, levels_spec
 from lare_rl.errors import LareError
 from lare_rl.integrations.torchrl import CREDIT_STEP, REWARD, CreditTransform
-
-
-@pytest.fixture(autouse=True, scope="module")
-def one_thread():
-    torch.set_num_threads(1)
 
 
 def make_buffer(credit, *transforms, **options):
@@ -96,8 +89,8 @@ def test_time_is_last_dimension():
     assert (credit.store.n_added, credit.store.dropped) == (63, 0)
 
 
-def test_padding_of_split_trajectories():
-    """Trajectories have different lengths, and go on in the next batch. Padding is no step."""
+def test_steps_in_other_forms():
+    """Single steps; `done` alone; and split trajectories, which go on in the next batch, and whose padding is no step."""
     env = make_env()
     credit = recording_assigner(env)
     buffer = make_buffer(credit)
@@ -105,30 +98,19 @@ def test_padding_of_split_trajectories():
         buffer.extend(split_trajectories(batch).reshape(-1))
     check_episodes(credit, [env])
     assert (credit.store.n_added, credit.store.dropped) == (50, 0)
-
-
-def test_whole_rewards():
-    batch = roll_out(20)
-    batch["next", "reward"] = batch["next", "reward"].int()
-    buffer = make_buffer(recording_assigner(make_env()))
-    buffer.extend(batch)
-    assert buffer[:][REWARD].is_floating_point()
-
-
-def test_single_steps():
     env = make_env()
     credit = recording_assigner(env)
     buffer = make_buffer(credit)
     for step in roll_out(30, env):
         buffer.add(step)
     check_episodes(credit, [env])
-
-
-def test_done_alone_ends_an_episode():
     batch = roll_out(30).exclude(("next", "terminated"), ("next", "truncated"))
+    batch["next", "reward"] = batch["next", "reward"].int()
     credit = recording_assigner(make_env())
-    make_buffer(credit).extend(batch)
+    buffer = make_buffer(credit)
+    buffer.extend(batch)
     assert credit.store.n_ended == int(batch["next", "done"].sum()) > 0
+    assert buffer[:][REWARD].is_floating_point()
 
 
 def test_samples():
@@ -150,28 +132,6 @@ def test_samples():
     assert before[REWARD].abs().max() > 0
     buffer.extend(roll_out(60, env))
     assert not torch.equal(buffer[:60][REWARD], before[REWARD])  # by a newer decoder
-
-
-def test_threads():
-    buffer = make_buffer(recording_assigner(make_env(), "rd-linear"), prefetch=2)
-    env = GymWrapper(make_env())
-    buffer.extend(env.rollout(60, break_when_any_done=False))
-    errors = []
-
-    def sample():
-        try:
-            for _ in range(10):
-                assert torch.isfinite(buffer.sample()[REWARD]).all()
-        except BaseException as error:  # a thread would keep it to itself
-            errors.append(error)
-
-    threads = [threading.Thread(target=sample) for _ in range(2)]
-    for thread in threads:
-        thread.start()
-    buffer.extend(env.rollout(60, break_when_any_done=False))
-    for thread in threads:
-        thread.join()
-    assert errors == []
 
 
 def test_bad_arguments():

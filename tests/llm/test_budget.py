@@ -19,11 +19,6 @@ def test_max_reply_tokens():
         budget.max_reply_tokens(REQUEST * 3)
 
 
-@pytest.mark.parametrize(("seconds", "timeout_s"), [(60.0, 120.0), (900.0, 120.0), (3600.0, 450.0)])
-def test_reply_timeout(seconds, timeout_s):
-    assert Budget(seconds=seconds).reply_timeout_s == timeout_s
-
-
 def test_summary_with_prices():
     budget = Budget(requests_used=2, tokens_in=1_000_000, tokens_out=500_000)
     assert budget.summary().startswith("2 requests, 1,000,000 tokens in, 500,000 out")

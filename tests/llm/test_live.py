@@ -86,7 +86,6 @@ def test_request(start_either):
 @pytest.mark.parametrize(
     ("answer", "text"),
     [
-        (reply_with(""), ""),
         (reply_with(None), ""),
         (reply_with(None, refusal="I would rather not."), "I would rather not."),
         (reply_with("x" * 100_000), "x" * 100_000),
@@ -148,9 +147,7 @@ def test_reply_after_temporary_errors(start, answers, expected_pauses):
     [
         (b'{"choices": [', "JSONDecodeError"),
         (b"<html>Bad gateway</html>", "'<html>Bad gateway</html>'"),
-        (b"null", "TypeError"),
         (b"{}", "KeyError: 'choices'"),
-        (b'{"choices": []}', "IndexError"),
         (b'{"choices": [{"message": null}]}', "AttributeError"),
         (b'{"choices": [{"message": {"content": ["x"]}}]}', "TypeError"),
         (b"[" * 5_000, "nested"),
@@ -172,7 +169,6 @@ def test_answer_without_completion(start, body, reason):
         (refuse(401, "you may not"), 1, ["HTTP 401", "you may not"]),
         (refuse(422, "you may not"), 4, ["HTTP 422", "you may not"]),
         (refuse(429, "insufficient_quota: pay first"), 1, ["HTTP 429", "pay first"]),
-        (raw_answer(b"Your plan has ended.", 401), 1, ["HTTP 401", "'Your plan has ended.'"]),
         (raw_answer(b"<html>\x1b[2J\xe2\x80\xae" + b"x" * 300, 403), 1, [f"'<html>?[2J?{'x' * 189}...'"]),
         (lambda handler: refuse(401, handler.headers["Authorization"])(handler), 1, ["Bearer [key]"]),
         (raw_answer(b"x" * 190 + KEY.encode(), 401), 1, [f"'{'x' * 190}[key]'"]),
@@ -209,9 +205,7 @@ def refuse_responses(answer, completion=None):
     [
         *map(refuse, (403, 404, 405, 500, 501)),
         refuse(400, "text.format is not supported"),
-        refuse(422, "unknown field input"),
         raw_answer(b'{"error": "Unexpected endpoint or method. (POST /v1/responses)"}'),
-        raw_answer(b"<html>Welcome</html>"),
         raw_answer(b'{"output": [{"type": "message", "content": [{"text": 1}]}]}'),
     ],
 )
@@ -251,35 +245,12 @@ def test_error_of_a_known_responses_api_is_retried(serve):
         RequestForms().read_answer(b'{"status": "failed", "error": "The model crashed."}')
 
 
-@pytest.mark.parametrize("status", [403, 404])
-def test_error_of_both_apis(serve, status):
-    server, model, _ = serve(refuse_responses(refuse(status, "first"), refuse(status, "there is no model m")))
-    with pytest.raises(ModelError, match="there is no model m"):
-        model.reply(REQUEST, 0)
-    assert server.apis == ["responses", "completions"]
-
-
-def test_client_without_the_responses_api(serve, monkeypatch):
-    server, _, _ = serve(reply_with("hello"), forms=RequestForms())
-    connect = LiveModel._connect
-    monkeypatch.setattr(LiveModel, "_connect", lambda self: OldClient(connect(self)))
-    assert LiveModel("m", server.url).reply(REQUEST, 0) == "hello"
-    assert server.apis == ["completions"]
-
-
-class OldClient:
-    """A client as before version 1.66 of OpenAI's package."""
-
-    def __init__(self, client):
-        self.chat, self.base_url = client.chat, client.base_url
-
-
 def hang(handler):
     threading.Event().wait(30)
 
 
-def test_closed_port(start_either):
-    server, model, pauses = start_either(reply_with("hello"))
+def test_closed_port(start):
+    server, model, pauses = start(reply_with("hello"))
     server.stop()
     with pytest.raises(ModelError, match=r"http://127\.0\.0\.1:\d+/v1/ cannot be reached"):
         model.reply(REQUEST, 0)
@@ -287,9 +258,9 @@ def test_closed_port(start_either):
 
 
 @pytest.mark.parametrize("answer", [drip_body(200), drip_body(500), drip_headers, hang])
-def test_slow_answer_ends_with_the_time_of_the_design(start_either, answer):
+def test_slow_answer_ends_with_the_time_of_the_design(start, answer):
     messages = []
-    server, model, _ = start_either(answer, budget=Budget(seconds=0.4), on_message=messages.append)
+    server, model, _ = start(answer, budget=Budget(seconds=0.4), on_message=messages.append)
     began = time.monotonic()
     with pytest.raises(BudgetExceededError, match="TimeoutError"):
         model.reply(REQUEST, 0)
@@ -304,13 +275,11 @@ def test_slow_answer_ends_with_the_time_of_the_design(start_either, answer):
     ("answer", "words"),
     [
         (flood(200), "more than 8 MB"),
-        (flood(500), "more than 8 MB"),
-        (compress("gzip", 1), "more than 8 MB"),
         (compress("gzip, gzip", 2), "gzip, gzip"),
     ],
 )
-def test_large_answer(start_either, answer, words):
-    server, model, _ = start_either(answer, budget=Budget(requests=1, tokens=100_000_000))
+def test_large_answer(start, answer, words):
+    server, model, _ = start(answer, budget=Budget(requests=1, tokens=100_000_000))
     with pytest.raises(LareError, match=words):
         model.reply(REQUEST, 0)
     assert server.headers[0]["Accept-Encoding"] == "identity"
@@ -343,9 +312,6 @@ def test_unsupported_options_are_dropped_for_good(start):
         {},
         {"prompt_tokens": "many", "completion_tokens": 1},
         {"prompt_tokens": float("inf"), "completion_tokens": 1},
-        {"prompt_tokens": 10**400, "completion_tokens": 1},
-        {"prompt_tokens": 1, "completion_tokens": -1},
-        {"input_tokens": 1},
         "many",
     ],
 )
@@ -377,9 +343,9 @@ def test_token_budget(start):
     assert [request["max_completion_tokens"] for request in server.requests[:2]] == [REPLY_TOKENS] * 2
 
 
-def test_pauses_count_as_waiting(start_either):
+def test_pauses_count_as_waiting(start):
     messages = []
-    _, model, pauses = start_either(
+    _, model, pauses = start(
         refuse(429, Retry_After="999999999"), budget=Budget(seconds=150.0), on_message=messages.append
     )
     with pytest.raises(BudgetExceededError, match="3 min"):
@@ -389,8 +355,8 @@ def test_pauses_count_as_waiting(start_either):
 
 
 @pytest.mark.parametrize(("content", "temperature"), [("half of \ud800", None), ("x", float("nan"))])
-def test_request_that_is_not_json(start_either, content, temperature):
-    server, model, pauses = start_either(reply_with("hello"), temperature=temperature)
+def test_request_that_is_not_json(start, content, temperature):
+    server, model, pauses = start(reply_with("hello"), temperature=temperature)
     with pytest.raises(ModelError, match="JSON"):
         model.reply([{"role": "user", "content": content}], 0)
     assert (server.requests, pauses, model.budget.tokens_out) == ([], [], 0)
@@ -400,8 +366,8 @@ def test_request_that_is_not_json(start_either, content, temperature):
     ("status", "location"),
     [(301, "https://elsewhere.example/v1"), (302, "http://127.0.0.1:1/v1/chat/completions"), (308, "//127.0.0.2/v1")],
 )
-def test_redirect_to_another_server(start_either, status, location):
-    server, model, pauses = start_either(raw_answer(b"", status, Location=location))
+def test_redirect_to_another_server(start, status, location):
+    server, model, pauses = start(raw_answer(b"", status, Location=location))
     with pytest.raises(ModelError, match="redirects to http"):
         model.reply(REQUEST, 0)
     assert (len(server.requests), pauses) == (1, [])
@@ -431,14 +397,10 @@ def test_key_is_required_for_openai_only(start, monkeypatch):
     ("url", "n_pauses"),
     [
         ("nowhere", 0),
-        ("ftp://127.0.0.1:1/v1", 0),
-        (" ", 0),
         ("http://[", 5),
         ("http://127.0.0.1:99999/v1", 5),
         ("http://user:secret@127.0.0.1:notaport/v1", 0),
-        ("http://user:secret@[", 5),
         ("user:secret@127.0.0.1/v1", 0),
-        ("http://user:secret@x@127.0.0.1:notaport/v1", 0),
         ("http://user:secret@127.0.0.1:1/v1", 5),
     ],
 )

@@ -56,9 +56,7 @@ def test_unknown_draw(kind, draw, draws):
     ("text", "words"),
     [
         ("", "not valid JSON"),
-        ('{"task": ', "not valid JSON"),
         ("[" * 100_000, "not valid JSON"),
-        ("[]", "not an object"),
         ('{"task": "\\ud800"}', "surrogate"),
         ("{}", "'exchanges'"),
         ({"Understand": "", "Analyze": "", "Functions": ""}, "lare-rl verify X.json"),

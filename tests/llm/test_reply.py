@@ -14,28 +14,19 @@ CODE = "def evaluation_func(observation, action):\n    return [action]"
 WITH_CODE = GOOD | {"Functions": CODE}
 
 
-def test_parse_reply():
-    reply = parse_reply(f"\n {json.dumps(GOOD | {'Notes': 'more'}, indent=1)} \n")
-    assert (reply.understand, reply.analyze, reply.functions) == ("u", "a", "def f(): ...")
-
-
 @pytest.mark.parametrize(
     ("text", "words"),
     [
         ("", "empty"),
-        (" \n", "empty"),
         ("x" * 200_001, "200001 characters"),
         ("Here it is.", "not one JSON object"),
-        ("```json\n{}\n```", "not one JSON object"),
         ("{} {}", "Extra data"),
         ('{"Understand": "u"', "line 1 column 19"),
         ('{"a": "\n"}', "'Understand', 'Analyze', 'Functions'"),
         ("[]", "not an object"),
-        ("null", "not an object"),
         ('{"Understand": "u", "Analyze": "a", "functions": "f"}', "'Functions'"),
         (json.dumps(GOOD | {"Functions": ""}), "Functions = ''"),
         (json.dumps(GOOD | {"Functions": ["def f(): ..."]}), "Functions = "),
-        (json.dumps(GOOD | {"Analyze": None}), "Analyze = None"),
         (json.dumps(GOOD | {"Analyze": "\ud800"}), "surrogate"),
         # Texts that took the parser quadratic time, or too much of the stack.
         ("```" + "\t" * 190_000, "not one JSON object"),

@@ -61,16 +61,6 @@ def test_round_trip(data_format, task):
     check_log(open_log(dataset), logged_episodes(12))  # reads `paid`
 
 
-def test_data_set_is_replaced(datasets):
-    create_dataset("toy/log-v0", logged_episodes(12))
-    for overwrite in (False, True):
-        write_rewards_plus_one("toy/log-v0", "toy/new-v0", overwrite=overwrite)
-    assert minari.load_dataset("toy/new-v0").total_episodes == 12
-    (datasets / "toy" / "new-v0" / "thesis").mkdir()
-    with pytest.raises(LareError, match="thesis in it is not a log"):
-        lare_rl.relabel("toy/log-v0", "toy/new-v0", overwrite=True)
-
-
 def test_unfinished_episode_of_collector():
     """Minari's collector marks an episode as truncated that nobody played to its end. The time limit tells it apart."""
     env = minari.DataCollector(gymnasium.make("Pendulum-v1", max_episode_steps=20))

@@ -1,4 +1,4 @@
-"""What is no log is refused."""
+"""What is no log is refused, and a log is written completely or not at all."""
 
 import sys
 
@@ -7,6 +7,7 @@ import pytest
 
 from lare_rl import LareError
 from lare_rl.errors import install_command
+from lare_rl.logs.log import atomic_output
 from lare_rl.logs.open_log import open_log
 
 
@@ -28,3 +29,10 @@ def test_path_is_not_a_log(tmp_path, monkeypatch):
         with pytest.raises(LareError) as error:
             open_log(source)
         assert message in str(error.value)
+
+
+def test_failed_output_is_undone(tmp_path):
+    (tmp_path / "log").write_text("old")
+    with pytest.raises(LareError, match="log cannot be written"), atomic_output(tmp_path / "log", True):
+        pass  # nothing is written
+    assert [file.read_text() for file in tmp_path.iterdir()] == ["old"]

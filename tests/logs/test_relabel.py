@@ -14,7 +14,6 @@ import pyarrow.parquet as pq
 import pytest
 
 import lare_rl
-from helpers.long_tests import long_case
 from helpers.toy_logs import PHI, logged_episodes, read_directory
 from lare_rl import LareError
 from lare_rl.credit.decoder_settings import CreditSettings
@@ -70,28 +69,11 @@ def test_groups_share_an_intercept(tmp_path):
     assert abs(means[0] - means[1]) < 1.5  # without groups: about 10
 
 
-@pytest.mark.parametrize(("method", "is_binary"), [("bayes-progress", False), long_case("bayes", True)])
-def test_predicted_returns_have_the_part_that_no_step_is_paid_for(method, is_binary, tmp_path):
+def test_predicted_returns_have_the_part_that_no_step_is_paid_for(tmp_path):
     episodes = list(logged_episodes(80, max_length=8))
     for episode in episodes:
-        score = 100 + episode.pop("rewards").sum()
-        episode["score"] = np.array(float(score > 104) if is_binary else score)
-    settings = CreditSettings(score="binary" if is_binary else "sum")
-    result = relabel(episodes, tmp_path / "new", method=method, settings=settings, hold_out=0.2)
-    assert result.return_r2 > 0.3
-
-
-def test_mean_scores_that_are_paid_several_times(task, tmp_path):
-    """Each payment is a mean over its own steps."""
-    episodes = list(logged_episodes(60))
-    for episode in episodes:
-        starts = np.arange(0, len(episode["rewards"]), 4)
-        lengths = np.diff(np.append(starts, len(episode["rewards"])))
-        payments = np.add.reduceat(episode["rewards"], starts) / lengths
-        episode["rewards"] = np.zeros_like(episode["rewards"])
-        episode["rewards"][starts + lengths - 1] = payments
-    task = task.model_copy(update={"payments": 4, "score": "average"})
-    assert relabel(episodes, tmp_path / "new", method="rd-linear", task=task, hold_out=0.2).return_r2 > 0.95
+        episode["score"] = np.array(100 + episode.pop("rewards").sum())
+    assert relabel(episodes, tmp_path / "new", method="bayes-progress", settings=SUM, hold_out=0.2).return_r2 > 0.3
 
 
 def paid_every_4(episodes, window, mean=False):
@@ -117,9 +99,7 @@ def new_rewards(path):
     return [episode["rewards"] for episode in read_directory(path)]
 
 
-@pytest.mark.parametrize(
-    ("window", "score", "exact"), [(2, "sum", "no"), (8, "sum", "no"), (8, "sum", "last"), (8, "average", "no")]
-)
+@pytest.mark.parametrize(("window", "score", "exact"), [(2, "sum", "last"), (8, "average", "no")])
 def test_payments_for_a_fixed_number_of_steps(window, score, exact, task, tmp_path):
     """Steps are in no payment, or in two. What each payment lacks is 0, so that `exact` changes nothing."""
     episodes, rewards = paid_every_4(list(logged_episodes(80)), window, mean=score == "average")
@@ -134,7 +114,7 @@ def test_payments_for_a_fixed_number_of_steps(window, score, exact, task, tmp_pa
     assert score == "average" or np.abs(unpaid[0]).max() < 0.05
 
 
-@pytest.mark.parametrize(("exact", "window"), [("last", 2), ("last", 8), ("last", None), ("spread", None)])
+@pytest.mark.parametrize(("exact", "window"), [("last", 8), ("spread", None)])
 def test_exact_pays_what_each_payment_lacks(exact, window, task, tmp_path):
     """The steps that a payment is for then add up to it, if no other payment is for them."""
     episodes, _ = paid_every_4([e for e in logged_episodes(60, noise=True) if len(e["actions"]) % 4 != 1], window or 4)
@@ -156,26 +136,20 @@ def test_exact_pays_what_each_payment_lacks(exact, window, task, tmp_path):
         assert np.abs(new - fitted).max() > 0.1
 
 
-def test_windows_cannot_be_spread(task, tmp_path):
-    task = task.model_copy(update={"payments": 4, "paid_for": PaidSteps(steps=8)})
-    with pytest.raises(LareError, match="several: use exact = 'last'"):
-        relabel(list(logged_episodes(20)), tmp_path / "new", task=task, settings=CreditSettings(exact="spread"))
-
-
-@pytest.mark.parametrize("window", [None, 8])
-def test_score_is_paid_at_the_end(window, task, tmp_path):
+def test_score_is_paid_at_the_end(task, tmp_path):
     """Whatever the payments of the task are, also when the log is relabelled again."""
     episodes = list(logged_episodes(80))
     rewards = [episode.pop("rewards") for episode in episodes]
     for episode, values in zip(episodes, rewards, strict=True):
         episode["score"] = values.sum()
-    update = {"payments": 4} if window is None else {"payments": 4, "paid_for": PaidSteps(steps=window)}
-    task = task.model_copy(update=update)
+    task = task.model_copy(update={"payments": 4, "paid_for": PaidSteps(steps=8)})
     for source in (episodes, tmp_path / "new"):
         result = relabel(source, tmp_path / "new", task=task, settings=SUM, hold_out=0.2, overwrite=True)
         assert result.return_r2 > 0.999
         for new, expected in zip(new_rewards(tmp_path / "new"), rewards, strict=True):
             np.testing.assert_allclose(new, expected, atol=0.05)
+    with pytest.raises(LareError, match="several: use exact = 'last'"):
+        relabel(episodes, tmp_path / "other", task=task, settings=CreditSettings(exact="spread"))
 
 
 def test_score_of_noise(tmp_path):
@@ -185,13 +159,11 @@ def test_score_of_noise(tmp_path):
     assert codes(result) == ["relabelled", "r2", "worthless"]
 
 
-@pytest.mark.parametrize("method", ["rrdu", long_case("rd"), long_case("diaster"), long_case("bayes")])
-def test_relabel_twice_in_place(folder, tmp_path, method):
+def test_relabel_twice_in_place(folder, tmp_path):
     """The second fit is to the original rewards, so that nothing changes."""
     path = folder(logged_episodes(40))
-    options = {"method": method, "updates": 16, "hold_out": 0.25, "overwrite": True, "settings": SUM}
-    result = relabel(path, path, **options)
-    assert math.isfinite(result.return_r2)
+    options = {"method": "rrdu", "updates": 16, "hold_out": 0.25, "overwrite": True, "settings": SUM}
+    assert math.isfinite(relabel(path, path, **options).return_r2)
     first = read_directory(path)
     relabel(path, path, **options)
     for before, after in zip(first, read_directory(path), strict=True):
@@ -264,35 +236,27 @@ def test_findings(changes, expected):
     assert "1 episode." in result.summary[0]
 
 
-@pytest.mark.parametrize(
-    ("new", "message"),
-    [
-        ({"count": 19}, "it had 20 episodes of 483 steps, and now 19 episodes of 457 steps"),
-        ({"seed": 1}, "it had 20 episodes of 483 steps, and now 20 episodes of"),
-    ],
-)
-def test_failure_in_second_pass_keeps_old_output(tmp_path, new, message):
+def test_old_output_is_kept(tmp_path):
+    """If the second pass fails, and if the directory has other files."""
+
     class ChangingLog:
         passes = 0
 
         def __iter__(self):
             self.passes += 1
-            return logged_episodes(**({"count": 20} | (new if self.passes >= 5 else {})))
+            return logged_episodes(20, seed=int(self.passes >= 5))
 
     (tmp_path / "new").mkdir()
     (tmp_path / "new" / "mine.npz").write_text("old")
-    with pytest.raises(LareError, match=f"changed while it was read: {message}"):
+    message = "changed while it was read: it had 20 episodes of 483 steps, and now 20 episodes of"
+    with pytest.raises(LareError, match=message):
         relabel(ChangingLog(), tmp_path / "new", method="rd-linear", settings=SUM, overwrite=True)
     assert [path.name for path in tmp_path.rglob("*")] == ["new", "mine.npz"]
     assert (tmp_path / "new" / "mine.npz").read_text() == "old"
-
-
-def test_directory_of_other_files_is_not_replaced(tmp_path):
-    (tmp_path / "precious").mkdir()
-    (tmp_path / "precious" / "thesis.txt").write_text("years")
-    with pytest.raises(LareError, match=r"precious .*thesis\.txt"):
-        relabel(list(logged_episodes(9)), tmp_path / "precious", overwrite=True)
-    assert (tmp_path / "precious" / "thesis.txt").read_text() == "years"
+    (tmp_path / "new" / "thesis.txt").write_text("years")
+    with pytest.raises(LareError, match=r"new .*thesis\.txt"):
+        relabel(list(logged_episodes(9)), tmp_path / "new", overwrite=True)
+    assert (tmp_path / "new" / "thesis.txt").read_text() == "years"
 
 
 @pytest.mark.parametrize(
@@ -302,15 +266,12 @@ def test_directory_of_other_files_is_not_replaced(tmp_path):
         (None, {"method": "dense"}, "dense assigns no credit"),
         (None, {"method": "lare-bayes"}, "lare-bayes needs a phi"),
         (None, {"hold_out": 1.0}, "hold_out = 1.0"),
-        (None, {"hold_out": math.nan}, "hold_out = nan"),
         (None, {"memory": 0.0}, "memory = 0.0"),
-        (None, {"memory": 1e300}, "memory = 1e"),
         (None, {"updates": 0}, "updates = 0"),
         ([episode | {"cut": True} for episode in logged_episodes(3)], {}, "none of 3 episodes"),
         ([], {}, "no episode"),
         ([7], {}, "episode 0 must be a mapping"),
         (logged_episodes(3), {}, "read twice"),
-        (b"log", {}, "b'log' is not a log"),
     ],
 )
 def test_bad_arguments(tmp_path, log, options, message):
@@ -321,22 +282,20 @@ def test_bad_arguments(tmp_path, log, options, message):
 
 @pytest.mark.skipif(not Path("/proc/self").exists(), reason="no directory in which nobody can write")
 def test_output_is_checked_before_the_fit():
-    stages = []
+    stages, log = [], list(logged_episodes(10))
     with pytest.raises(LareError, match="/proc/new cannot be written"):
-        relabel(
-            list(logged_episodes(10)), "/proc/new", method="rd-linear", listener=lambda *stage: stages.append(stage)
-        )
+        relabel(log, "/proc/new", method="rd-linear", listener=lambda *stage: stages.append(stage))
     assert stages == []
 
 
 def test_command(command, folder, tmp_path, task):
-    path = folder(logged_episodes(60))
+    path = folder(logged_episodes(40))
     keys = ("name", "environment", "observation_size", "action_size", "description", "observation", "action")
     (tmp_path / "task.toml").write_text("".join(f"{key} = {json.dumps(getattr(task, key))}\n" for key in keys))
     (tmp_path / "phi.py").write_text(PHI)
     options = ("--task", "task.toml", "--function", "phi.py", "--hold-out", 0.2, "--memory", 0.01)
     status, out, error = command("relabel", path, "--out", "new", *options)
-    assert (status, error) == (0, "learning, 60 episodes\nwriting, 60 episodes\n")
+    assert (status, error) == (0, "learning, 40 episodes\nwriting, 40 episodes\n")
     assert "lare-bayes" in out.splitlines()[0]
     assert "first" in out  # the rewarded factor
     assert "Warning" not in out

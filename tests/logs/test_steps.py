@@ -16,14 +16,13 @@ def distinct(rows):
 
 @pytest.mark.parametrize("scored_observation", ["before", "after", "both"])
 def test_logged_steps(task, scored_observation):
-    episodes = [episode["observations"] for episode in logged_episodes(40)]
-    observation, action = lare_rl.logged_steps(
-        list(logged_episodes(40)), task.model_copy(update={"scored_observation": scored_observation})
-    )
+    log = list(logged_episodes(40))
+    task = task.model_copy(update={"scored_observation": scored_observation})
+    observation, action = lare_rl.logged_steps(log, task)
     assert (observation.shape, action.shape) == ((256, 2), (256, 1))
     first, second = np.split(observation, 2)
-    before = distinct(row for episode in episodes for row in episode[:-1])
-    after = distinct(row for episode in episodes for row in episode[1:])
+    before = distinct(row for episode in log for row in episode["observations"][:-1])
+    after = distinct(row for episode in log for row in episode["observations"][1:])
     assert distinct(first) <= (after if scored_observation == "after" else before)
     assert distinct(second) <= (before if scored_observation == "before" else after)
 

@@ -10,7 +10,6 @@ from helpers.toy_logs import check_log, logged_episodes, write_rewards_plus_one
 from lare_rl import LareError
 from lare_rl.logs import log as log_module
 from lare_rl.logs import tables as tables_module
-from lare_rl.logs.episode import RelabelledEpisode
 from lare_rl.logs.open_log import open_log
 
 
@@ -55,8 +54,14 @@ def read_data_set(path):
     return datasets.load_from_disk(path).data.table.combine_chunks()
 
 
-@pytest.mark.parametrize(("write", "read"), [(write_parquet, pq.read_table), (write_data_set, read_data_set)])
-@pytest.mark.parametrize("rows", [step_rows, episode_rows])
+@pytest.mark.parametrize(
+    ("write", "read", "rows"),
+    [
+        (write_parquet, pq.read_table, step_rows),
+        (write_parquet, pq.read_table, episode_rows),
+        (write_data_set, read_data_set, step_rows),
+    ],
+)
 def test_round_trip(tmp_path, monkeypatch, write, read, rows):
     for module in (log_module, tables_module):
         monkeypatch.setattr(module, "BATCH_STEPS", 100)  # 12 episodes have more rows
@@ -89,14 +94,6 @@ def test_parquet_directory_continues_episodes(tmp_path):
         list(open_log(tmp_path / "log").episodes())
 
 
-def test_score_column(tmp_path):
-    rows = step_rows(logged_episodes(1))
-    rows = rows.drop_columns("rewards").append_column("score", pa.array([2.5] * len(rows)))
-    pq.write_table(rows, tmp_path / "log.parquet")
-    (episode,) = open_log(tmp_path / "log.parquet").episodes()
-    assert (episode.reward[-1], episode.reward.sum()) == (2.5, 2.5)
-
-
 def test_data_set_arrays_of_fixed_shape(tmp_path):
     episode = next(iter(logged_episodes(1)))
     n_steps = len(episode["actions"])
@@ -113,11 +110,13 @@ def test_data_set_arrays_of_fixed_shape(tmp_path):
 
 
 def test_data_set_with_splits(tmp_path):
-    splits = {name: datasets.Dataset(episode_rows(logged_episodes(2))) for name in ("train", "test")}
-    datasets.DatasetDict(splits).save_to_disk(tmp_path / "log")
+    rows = step_rows(logged_episodes(1))
+    rows = rows.drop_columns("rewards").append_column("score", pa.array([2.5] * len(rows)))
+    datasets.DatasetDict({name: datasets.Dataset(rows) for name in ("train", "test")}).save_to_disk(tmp_path / "log")
     with pytest.raises(LareError, match=r"name one of .*log/test, .*log/train"):
         open_log(tmp_path / "log")
-    assert len(list(open_log(tmp_path / "log" / "test").episodes())) == 2
+    (episode,) = open_log(tmp_path / "log" / "test").episodes()
+    assert (episode.reward[-1], episode.reward.sum()) == (2.5, 2.5)
 
 
 ROWS = step_rows(logged_episodes(1))
@@ -132,7 +131,6 @@ def with_column(name, values):
     ("rows", "message"),
     [
         (ROWS.drop_columns("episode"), "one column episode"),
-        (ROWS.drop_columns("next_observations"), "one column next_observations"),
         (with_column("episode", pa.array(np.ones(N_ROWS))), "episode must be whole numbers or strings, and is double"),
         (ROWS.drop_columns("actions"), "episode 0 has no actions"),
         (with_column("actions", pa.array(["left"] * N_ROWS)), "episode 0: actions must be numbers, and is string"),
@@ -141,7 +139,6 @@ def with_column(name, values):
         (pa.concat_tables([ROWS, with_column("episode", pa.array([1] * N_ROWS)), ROWS]), "episode 0 comes twice"),
         (with_column("episode", pa.array([0] * (N_ROWS - 2) + [None] * 2)), "episode has rows without a value"),
         (ROWS.append_column("actions", ROWS["actions"]), "has 2 columns actions"),
-        (ROWS.append_column("episode", ROWS["episode"]), "one column episode"),
         (ROWS.slice(0, 0), "no episode"),
     ],
 )
@@ -153,45 +150,21 @@ def test_bad_table(tmp_path, rows, message):
     assert list(tmp_path.iterdir()) == [path]
 
 
-@pytest.mark.parametrize("kind", [pa.large_string(), pa.dictionary(pa.int32(), pa.string())])
-def test_groups_are_texts_of_any_type(tmp_path, kind):
-    """polars writes large strings, pandas dictionaries."""
-    pq.write_table(ROWS.append_column("group", pa.array(["easy"] * N_ROWS, kind)), tmp_path / "log.parquet")
-    assert [episode.group for episode in open_log(tmp_path / "log.parquet").episodes()] == ["easy"]
-
-
-def test_episode_ids(tmp_path):
-    """pandas writes categories as dictionaries. A table of episodes may have a column of their ids."""
-    texts = pa.array([f"run {number}" for number in step_rows(logged_episodes(3))["episode"].to_pylist()])
+def test_texts_of_any_type(tmp_path):
+    """polars writes large strings, pandas dictionaries. A table of episodes may have a column of their ids."""
+    path = tmp_path / "log.parquet"
+    for kind in (pa.large_string(), pa.dictionary(pa.int32(), pa.string())):
+        pq.write_table(ROWS.append_column("group", pa.array(["easy"] * N_ROWS, kind)), path)
+        assert [episode.group for episode in open_log(path).episodes()] == ["easy"]
     rows = step_rows(logged_episodes(3))
-    rows = rows.set_column(0, "episode", texts.dictionary_encode())
-    pq.write_table(rows, tmp_path / "steps.parquet")
-    check_log(log := open_log(tmp_path / "steps.parquet"), logged_episodes(3))
+    texts = pa.array([f"run {number}" for number in rows["episode"].to_pylist()])
+    pq.write_table(rows.set_column(0, "episode", texts.dictionary_encode()), path)
+    check_log(log := open_log(path), logged_episodes(3))
     assert [episode.name[-5:] for episode in log.episodes()] == ["run 0", "run 1", "run 2"]
-    out = write_rewards_plus_one(tmp_path / "steps.parquet", tmp_path / "new.parquet")
+    out = write_rewards_plus_one(path, tmp_path / "new.parquet")
     assert pq.read_table(out)["episode"].to_pylist() == texts.to_pylist()
-    rows = episode_rows(logged_episodes(3)).append_column("episode", pa.array([7, 8, 9]))
-    pq.write_table(rows, tmp_path / "rows.parquet")
-    check_log(open_log(tmp_path / "rows.parquet"), logged_episodes(3))
-
-
-@pytest.mark.parametrize("rows", [step_rows, episode_rows])
-def test_few_episodes_are_read_before_the_first_write(tmp_path, monkeypatch, rows):
-    monkeypatch.setattr(log_module, "BATCH_STEPS", 100)
-    pq.write_table(rows(logged_episodes(60)), tmp_path / "log.parquet")
-    read, counts = [], []
-
-    def write(tables, open_writer):
-        for table in tables:
-            counts.append(len(read))
-            assert table.num_rows
-
-    monkeypatch.setattr(tables_module, "write_tables", write)
-    log = open_log(tmp_path / "log.parquet")
-    episodes = (read.append(item) or RelabelledEpisode(item, item.reward) for item in log.episodes())
-    with pytest.raises(LareError):  # there is no file to rename
-        log.write(tmp_path / "new.parquet", episodes, False, "")
-    assert (counts[0] < 10, len(counts) > 6, counts[-1]) == (True, True, 60)
+    pq.write_table(episode_rows(logged_episodes(3)).append_column("episode", pa.array([7, 8, 9])), path)
+    check_log(open_log(path), logged_episodes(3))
 
 
 def truncate(path):

@@ -44,11 +44,3 @@ def test_refusal_cannot_be_caught():
     )
     with pytest.raises(RefusedError, match="E-ROWS"):
         read(source, 17, 6)
-
-
-def test_program_sees_no_address():
-    body = (
-        "class A: pass\ntry:\n    raise ValueError(np.zeros(3), A(), len, lambda: 0)\nexcept ValueError as error:\n"
-        "    text = str(error)\nassert '0x' not in text + str(A()) + str([A]) + repr(len) + f'{A}'\nreturn [action[:, :1]]"
-    )
-    assert read(phi_source(body), 17, 6).n_factors == 1

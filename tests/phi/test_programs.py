@@ -84,23 +84,6 @@ def test_program_agrees_in_jax(index):
     assert close.mean() > 0.995, (result[~close], expected[~close])  # a threshold may fall the other way
 
 
-def test_gradient_flows_through_factors():
-    source = "import numpy as np\n" + phi_source("return [np.sum(observation ** 2, axis=1, keepdims=True) * action]")
-    graph = read(source, 3, 1)
-
-    def factor(observation):
-        return evaluate(graph, {"observation": observation, "action": jnp.ones(1)}, jnp)["factors"][0]
-
-    np.testing.assert_allclose(jax.grad(factor)(jnp.array([1.0, 2.0, 3.0])), [2.0, 4.0, 6.0])
-
-
-@pytest.mark.parametrize(("end", "total"), [(1, 0), (9, 5)])
-def test_else_of_a_loop_runs_unless_it_breaks(end, total):
-    body = f"total = 0\nfor i in range(3):\n    if i == {end}:\n        break\nelse:\n    total = 5\nreturn [action * 0 + total]"
-    inputs = {"observation": np.ones((2, 2)), "action": np.ones((2, 1))}
-    assert evaluate(read(phi_source(body), 2, 1), inputs)["factors"].tolist() == [[total]] * 2
-
-
 @pytest.mark.parametrize("xp", [np, jnp])
 def test_integers_never_fail(xp):
     expressions = {

@@ -1,5 +1,3 @@
-import ast
-import inspect
 from collections import defaultdict
 from dataclasses import replace
 
@@ -7,7 +5,6 @@ import numpy as np
 import pytest
 from reference_tables.conditions import CONDITIONS
 
-from lare_rl.report import diagnosis
 from lare_rl.report.diagnosis import diagnose
 from lare_rl.report.messages import MESSAGES
 from lare_rl.report.run_summary import EpisodicRun, RunSummary
@@ -43,11 +40,9 @@ def find(returns, **facts):
             "not_learned explained worse_than_mean explains_little single_seed",
         ),
         (RISING_2, {"return_r2": -3.0, "median_r2": 0.9}, "learned decoder_is_outdated worse_than_mean is_rising"),
-        (FLAT - 51, {"return_r2": -0.9}, "not_learned explained explains_little single_seed"),
         (FLAT - 51, {"return_r2": 0.9}, "not_learned explained needs_training single_seed"),
         (FLAT - 51, {"return_r2": 0.0, "uses_gradient": True}, "not_learned explained try_closed_form single_seed"),
         (FELL, {"episodic": EpisodicRun(40.0, 1)}, "learned below_episodic has_fallen single_seed"),
-        (LEVEL, {}, "learned single_seed"),
         (LEVEL, {"task": "TASK.toml"}, "learned needs_baseline single_seed"),
         # Two standard errors of a difference are 17. They would be 22.6 with an error of 8, and the end is lower by 19.75.
         (
@@ -57,19 +52,15 @@ def find(returns, **facts):
         ),
         (FELL_A_LITTLE, {"episode_error": 8.0}, "learned single_seed"),
         (FELL - 200, {}, "worse_than_random needs_training single_seed"),
-        (FLAT - 1000, {}, "worse_than_random needs_training single_seed"),
         (FLAT / 100 - 52, {"return_r2": 0.99}, "worse_than_random explained is_stuck single_seed"),
         (FLAT - 50, {}, "may_beat_random needs_training single_seed"),
         (FLAT - 1000, {"n_saturated": 1}, "worse_than_random is_stuck single_seed"),
         (FLAT_2, {"return_r2": -0.93, "median_r2": 0.98}, "not_learned decoder_is_outdated needs_training"),
         (np.vstack([FLAT - 50, [[0, 0, 38, 0, 1, 0, 1, 0]]]), {}, "not_learned one_seed_was_better"),
         (np.array([[0, 0, 0, 0, np.nan, 0, 0, 0], np.zeros(8)]), {}, "not_learned needs_training"),
-        (np.full((1, 8), np.nan), {}, "no_return"),
         (RISING, {"untrained": "all steps are random"}, "untrained"),
         (np.zeros((2, 8)), {"random_returns": np.zeros(10)}, "equal_returns"),
-        (np.ones((2, 8)), {"random_returns": np.zeros(10)}, "learned"),
         (np.zeros((2, 8)), {"random_returns": np.zeros(0)}, "outcome_unknown"),
-        (RISING[:, :3] - 10, {}, "learned single_seed"),  # too few evaluations for a trend
     ],
 )
 def test_codes(returns, facts, codes):
@@ -92,8 +83,6 @@ def test_few_seeds_establish_no_difference(n_seeds, n_episodic, is_hedged):
     [
         (10.1, "learned"),
         (9.9, "may_beat_random"),
-        (4.9, "not_learned"),
-        (-9.9, "not_learned"),
         (-10.1, "worse_than_random"),
     ],
 )
@@ -129,33 +118,11 @@ def test_better_of_sampled_and_most_likely_actions_is_judged(likeliest, outcome,
     assert (finding.code, finding.values["return_"]) == (named, likeliest)
 
 
-def test_seeds_that_learned_by_most_likely_actions_are_counted():
-    finding = find(FLAT_2, deterministic_returns=np.array([90.0, 0.5]))["some_seeds_learned"]
-    assert finding.values["n_learned"] == 1
-
-
-def test_seeds_that_learned_are_counted():
-    returns = np.vstack([FLAT, FLAT - 52, FLAT - 51])
-    finding = find(returns)["some_seeds_learned"]
-    assert (finding.values["n_learned"], finding.values["n_seeds"]) == (1, 3)
-    assert "not_learned" in find(returns, initial_returns=np.array([51.0, 51.5, 51.0]))
-
-
-def test_initial_policy_as_good():
-    assert list(find(FLAT, initial_returns=np.array([51.0])))[:2] == ["not_learned", "needs_training"]
-    assert "learned" in find(FLAT, initial_returns=np.array([30.0]))
-    doubtful = {"random_returns": 40 * RANDOM, "initial_returns": np.array([50.0]), "episode_error": 0.6}
-    findings = find(FLAT, **doubtful)
-    assert list(findings)[:2] == ["may_beat_initial_policy", "needs_training"]
-    assert findings["needs_training"].values["evaluate"] is None
-
-
 @pytest.mark.parametrize(
     ("initial", "episode_error", "code", "n_learned"),
     [
         ([-10.3, -49.7], 0.0, "some_seeds_learned", 2),
         ([-10.3, -49.7], 0.2, "some_seeds_learned", 1),
-        ([-11.1, -49.7], 0.0, "some_seeds_learned", 2),
         ([-9.0, -49.7], 0.0, "some_seeds_learned", 1),
         ([-40.3, -49.7], 0.0, "learned", None),
     ],
@@ -193,14 +160,6 @@ def test_little_explained_values(facts, cause, remedy, method):
     assert finding.values["remedy"] == Finding(remedy, {"task": "Toy"})
 
 
-def test_small_r2_of_a_binary_score_is_no_alarm():
-    use = ScoreUse(form="form_log_odds", is_binary=True, gain=0.07, gain_error=0.02)
-    assert "explains_little" not in find(FLAT - 51, return_r2=0.06, score_use=use)
-    assert find(FLAT - 51, return_r2=0.06, score_use=use)["score_use"].values["trust"].code == "trust_part"
-    doubtful = replace(use, gain_error=0.05)
-    assert {"explains_little", "score_use"} <= set(find(FLAT - 51, return_r2=0.06, score_use=doubtful))
-
-
 def test_next_step_values():
     command = Finding("resume_longer", {"directory": "runs/x", "steps": 16_000})
     assert find(RISING)["is_rising"].values == {"command": command}
@@ -214,44 +173,40 @@ def test_next_step_values():
     assert find(FLAT / 100 - 52)["is_stuck"].values["cause"].code == "repeats_behaviour"
 
 
-def test_needs_training_values():
-    def find_values(**facts):
-        values = find(FLAT - 51, **facts)["needs_training"].values
-        return {name for name, finding in values.items() if finding is not None}, values["limit"]
-
-    assert find_values(return_r2=0.7) == (set(), None)
-    names, limit = find_values(return_r2=0.9)
-    assert (names, limit.values) == ({"limit", "phi"}, {"agents": None, "rule": None})
-    names, limit = find_values(return_r2=0.9, task="mine.toml", many_agents=True, **FACTORS)
-    assert names == {"limit"}
-    assert limit.values == {"agents": Finding("among_agents"), "rule": Finding("own_rule")}
-    assert find(FLAT - 50)["needs_training"].values["evaluate"].values == {"directory": "runs/x"}
-
-
-def test_best_evaluation_is_trained():
+def test_best_evaluation():
+    """It is one of a trained policy. Of an own task, the last evaluations may vary too much to say that the policy fell."""
     lucky = np.array([[90.0, 80, 0, 0, 1, 0, 1, 0]])
     assert find(lucky)["one_seed_was_better"].values["step"] == 1000
     assert "needs_training" in find(lucky, warmup=2000)
     assert find(FELL, warmup=2999)["has_fallen"].values["return_"] == 92
     assert find(FELL, warmup=4000)["has_fallen"].values["return_"] == 60
-
-
-def test_an_evaluation_without_a_return_is_no_fall():
-    returns = np.array([[1.0, 2, 3, 4, 5, 6, 7, 8, 9, 10, np.nan, 10]])
-    codes = list(find(returns, steps=np.arange(12) + 1.0))
-    assert codes == list(find(np.delete(returns, 10, axis=1), steps=np.arange(11) + 1.0))
-    assert "has_fallen" not in codes
-    assert "is_rising" in find(np.hstack([RISING, [[np.nan, 80]]]), steps=np.arange(10) + 1.0)
-    no_start = find(np.hstack([[[np.nan]], LEVEL]), steps=np.arange(9) + 1.0, random_returns=np.zeros(0))
-    assert "has_fallen" not in no_start
-
-
-def test_best_evaluation_of_own_task():
-    """The last evaluations vary too much to say that the policy fell."""
     returns = np.array([[0.0, 20, 60, 50, 88, 60, 85, 60]])
     best = find(returns, task="mine.toml")["needs_baseline"].values["best"]
     assert best.values == {"step": 5000, "return_": 88, "directory": "runs/x"}
     assert find(LEVEL, task="mine.toml")["needs_baseline"].values["best"] is None
+
+
+def test_seeds_that_learned_are_counted():
+    returns = np.vstack([FLAT, FLAT - 52, FLAT - 51])
+    finding = find(returns)["some_seeds_learned"]
+    assert (finding.values["n_learned"], finding.values["n_seeds"]) == (1, 3)
+    assert "not_learned" in find(returns, initial_returns=np.array([51.0, 51.5, 51.0]))
+    likeliest = find(FLAT_2, deterministic_returns=np.array([90.0, 0.5]))["some_seeds_learned"]
+    assert likeliest.values["n_learned"] == 1
+
+
+def test_credit():
+    """Single steps are compared where they are known. A small R² of a binary score is no alarm."""
+    assert "single_steps" not in find(RISING_2, return_r2=0.9)
+    assert "steps_agree" in find(RISING_2, credit_error=1e-9, credit_correlation=0.999)
+    finding = find(RISING_2, credit_error=0.25, credit_correlation=0.5)["single_steps"]
+    assert (finding.values["error"], finding.values["correlation"]) == (0.25, 0.5)
+    use = ScoreUse(form="form_log_odds", is_binary=True, gain=0.07, gain_error=0.02)
+    findings = find(FLAT - 51, return_r2=0.06, score_use=use)
+    assert "explains_little" not in findings
+    assert findings["score_use"].values["trust"].code == "trust_part"
+    doubtful = find(FLAT - 51, return_r2=0.06, score_use=replace(use, gain_error=0.05))
+    assert {"explains_little", "score_use"} <= set(doubtful)
 
 
 def test_messages_render():
@@ -261,35 +216,3 @@ def test_messages_render():
         assert "{" not in text
     for group in ("Findings that stand alone", "The outcome"):
         assert {f"headline_{code}" for code in CONDITIONS[group]} <= MESSAGES.keys()
-
-
-def test_single_steps_are_compared_where_they_are_known():
-    assert "single_steps" not in find(RISING_2, return_r2=0.9)
-    assert "steps_agree" in find(RISING_2, credit_error=1e-9, credit_correlation=0.999)
-    finding = find(RISING_2, credit_error=0.25, credit_correlation=0.5)["single_steps"]
-    assert (finding.values["error"], finding.values["correlation"]) == (0.25, 0.5)
-
-
-CODES = [code for group in CONDITIONS.values() for code in group]
-
-
-def returned_codes():
-    """Return the codes of the findings that rules return, by the source of the diagnosis."""
-    tree = ast.parse(inspect.getsource(diagnosis))
-    values = [node.value for node in ast.walk(tree) if isinstance(node, ast.Return)]
-    calls = [call for v in values for call in ((v.body, v.orelse) if isinstance(v, ast.IfExp) else (v,))]
-    return {
-        constant.value
-        for call in calls
-        if isinstance(call, ast.Call) and ast.unparse(call.func) == "Finding"
-        for constant in ast.walk(call.args[0])
-        if isinstance(constant, ast.Constant)
-    }
-
-
-def test_every_finding_has_a_condition():
-    assert set(CODES) <= set(MESSAGES)
-    assert len(CODES) == len(set(CODES))
-    assert returned_codes() <= set(CODES)
-    computed = {"above_episodic", "below_episodic", "like_episodic", "score_use"}
-    assert set(CODES) - returned_codes() == computed | {"trust_nothing", "trust_part", "trust_sums"}

@@ -17,8 +17,6 @@ from helpers.untrained_runs import write_run
 from lare_rl.config.resolve import resolve
 from lare_rl.config.settings import Settings
 from lare_rl.envs.load import load_task
-from lare_rl.evaluation.episode_credit import FactorLabel
-from lare_rl.evaluation.played_episodes import TeamSample
 from lare_rl.evaluation.video import encode_film
 from lare_rl.report import live_page, run_details
 from lare_rl.report.html import render_table, write_page
@@ -157,12 +155,18 @@ def test_discounts_of_episodic(make_run):
 
 
 def test_names_of_runs(make_run, tmp_path):
+    """A report of several runs does not replace that of the first one."""
     first, second = make_run("a", [1.0]), make_run("<b>", [2.0], method="rd")
     page = page_of([second, first.directory, first], tmp_path)
     assert re.findall(r"<summary>(.*?): ", page) == ["rd", "dense (a) #2", "dense (a) #3"]
     page = page_of([first, make_run("<b>c", [2.0])], tmp_path)
     assert "<b>" not in page
     assert "&lt;b&gt;c" in page
+    assert default_path([tmp_path]) == tmp_path / "report.html"
+    assert default_path([tmp_path, tmp_path / "b"]) == Path("report.html")
+    for sources, out, words in (([], "report.html", "No runs"), ([first], "no/report.html", "no directory")):
+        with pytest.raises(lare_rl.LareError, match=words):
+            lare_rl.write_report(sources, tmp_path / out)
 
 
 def test_summary_of_runs(make_run):
@@ -207,49 +211,6 @@ def test_each_team_is_compared_with_its_own_random_returns(tmp_path):
     assert [first == second for first, second in zip(*charts, strict=True)] == [True, False]
 
 
-def test_default_settings_are_not_listed(make_run, tmp_path):
-    page = page_of(make_run("a", [1.0], method="bayes"), tmp_path)
-    differing = page[page.index("differ from the defaults") :].partition("</table>")[0]
-    assert "method" in differing
-    assert "credit." not in differing
-
-
-def test_environment_that_is_not_installed(make_run, tmp_path):
-    """The report has what the files of the run tell, and all of its settings."""
-    run = make_run("a", [1.0], method="bayes")
-    config = run.config.model_copy(update={"task": toy_spec(environment="not-installed/Chase-v0")})
-    page = page_of(replace(run, config=config), tmp_path)
-    assert 'class="chart' in page
-    assert "credit." in page[page.index("<summary>Settings") :].partition("</table>")[0]
-
-
-@pytest.mark.parametrize(("n_rows", "n_factors", "n_pictures"), [(40, 2, 2), (40, 1, 1), (30, 2, 0)])
-def test_tsne_needs_two_columns_and_some_rows(n_rows, n_factors, n_pictures):
-    pytest.importorskip("sklearn")
-    rng = np.random.default_rng(0)
-    sample = TeamSample(
-        next_observation=rng.random((n_rows, 3), np.float32),
-        factors=rng.random((n_rows, n_factors), np.float32),
-        reward=rng.random(n_rows, np.float32),
-    )
-    assert "".join(run_details._render_tsne(sample)).count("<figcaption>t-SNE") == n_pictures
-
-
-def test_report_errors(make_run, tmp_path):
-    for sources, out, words in (
-        ([], "report.html", "No runs"),
-        ([make_run("a", [1.0])], "no/report.html", "no directory"),
-    ):
-        with pytest.raises(lare_rl.LareError, match=words):
-            lare_rl.write_report(sources, tmp_path / out)
-
-
-def test_default_path(tmp_path):
-    """A report of several runs does not replace that of the first one."""
-    assert default_path([tmp_path]) == tmp_path / "report.html"
-    assert default_path([tmp_path, tmp_path / "b"]) == Path("report.html")
-
-
 def test_run_without_evaluation(make_run, tmp_path):
     """Its report has what there is: the settings."""
     empty = make_run("b", [1.0], steps=())
@@ -268,19 +229,33 @@ def test_unknown_step_rewards(pages):
         assert [text in page for page in pages] == [True, False]
     for text in ("R² of returns", ">proxy reward</li>"):
         assert all(text in page for page in pages)
-
-
-def test_equal_lengths_are_not_called_a_sum(pages):
     assert "credit can be trusted" in pages[1] or "Trust the credit in part" in pages[1]
-    assert "The score was taken as" not in pages[1]
+    assert "The score was taken as" not in pages[1]  # of equal lengths
 
 
-def test_code_in_findings(make_run, monkeypatch):
+def test_settings_of_a_run(make_run, tmp_path):
+    """Those that differ from the defaults are listed. Without its environment, the report has what its files tell."""
+    run = make_run("a", [1.0], method="bayes")
+    page = page_of(run, tmp_path)
+    differing = page[page.index("differ from the defaults") :].partition("</table>")[0]
+    assert ("method" in differing, "credit." in differing) == (True, False)
+    config = run.config.model_copy(update={"task": toy_spec(environment="not-installed/Chase-v0")})
+    page = page_of(replace(run, config=config), tmp_path)
+    assert 'class="chart' in page
+    assert "credit." in page[page.index("<summary>Settings") :].partition("</table>")[0]
+
+
+def test_texts_and_tables(make_run, monkeypatch, tmp_path):
     finding = Finding("score_type_is_certain", {"this": Finding("sum"), "other": Finding("mean")})
     monkeypatch.setattr(run_details, "find_explanations", lambda run: [[finding]])
     text = "".join(run_details._render_earnings(make_run("a", [1.0]), [np.zeros(0)]))
     assert "<code>--credit.score</code>" in text
     assert "`" not in text
+    table = render_table(("<a>", "b", "c"), [("<b>", "", "-"), ("", "-", "1")], numbers=[2])
+    assert re.findall(r"<th[^>]*>(.*?)</th>", table) == ["&lt;a&gt;", "c"]  # no empty columns
+    assert table.count("&lt;") == 2
+    page = write_page(tmp_path / "page.html", "<a>\udcff", "\ud83d").read_text(encoding="utf-8")
+    assert "<title>&lt;a&gt;\\udcff</title>" in page
 
 
 def test_live_page(make_run, monkeypatch):
@@ -306,19 +281,9 @@ def test_live_page(make_run, monkeypatch):
     assert "refresh" not in path.read_text()
 
 
-def test_tables_have_no_empty_columns():
-    table = render_table(("<a>", "b", "c"), [("<b>", "", "-"), ("", "-", "1")], numbers=[2])
-    assert re.findall(r"<th[^>]*>(.*?)</th>", table) == ["&lt;a&gt;", "c"]
-    assert table.count("&lt;") == 2
-
-
-def test_page_of_text_that_is_not_utf8(tmp_path):
-    page = write_page(tmp_path / "page.html", "<a>\udcff", "\ud83d").read_text(encoding="utf-8")
-    assert "<title>&lt;a&gt;\\udcff</title>" in page
-
-
 @pytest.mark.skipif(CHROMIUM is None, reason="there is no Chromium")
-@pytest.mark.parametrize(("width", "columns"), [(390, 1), pytest.param(1280, 2, marks=pytest.mark.long)])
+@pytest.mark.long
+@pytest.mark.parametrize(("width", "columns"), [(390, 1), (1280, 2)])
 def test_page_fits_phone_and_desktop(pages, tmp_path, width, columns):
     """Nothing is wider than the screen, no text is smaller than 11 pixels, and curves stand side by side where there is room."""
     probe = (
@@ -341,28 +306,3 @@ def test_page_fits_phone_and_desktop(pages, tmp_path, width, columns):
     assert int(match[1]) <= width
     assert int(match[2]) >= 11
     assert int(match[3]) == columns
-
-
-def test_factor_of_two_states_has_one_row_and_one_curve(make_run):
-    labels = [FactorLabel(f"f_late ({state})", "late orders", "observation[8]") for state in ("before", "after")]
-    change = Finding("change_pays", {"slope": -2.0})
-    finding = Finding("factor", {"name": "f_late", "share": 0.96, "effect": change, "states": None, "shape": None})
-    run = make_run("a", [1.0], scored_observation="both")
-    table = "".join(run_details._render_factor_table([finding], labels, np.array([0.25, -0.5]), run))
-    assert (table.count("f_late"), table.count("96%")) == (1, 1)
-    assert "0.25 / -0.50" in table
-    curves = "".join(run_details._draw_factors(np.arange(8.0).reshape(4, 2), np.arange(4.0), labels))
-    assert curves.count("<figure>") == 1
-    assert run_details._make_bar(finding, {}).style == "minus"
-
-
-def test_what_else_there_is_to_say_about_an_effect(make_run):
-    effect = Finding("effect", {"slope": 1.0, "std": 0.1})
-    straight = {"name": "f_late", "share": 0.9, "effect": effect, "per_unit": 4.0, "states": None, "shape": None}
-    labels, run = [FactorLabel("f_late", "late orders", "observation[8]")], make_run("a", [1.0])
-    bent = straight | {"per_unit": None, "shape": Finding("depends_on_factor")}
-    for values, text in ((straight, "+4"), (bent, "depends on another factor")):
-        finding = Finding("factor", values)
-        table = "".join(run_details._render_factor_table([finding], labels, np.array([0.25]), run))
-        assert text in table
-        assert (run_details._make_bar(finding, {}).note != "") == (values["shape"] is not None)

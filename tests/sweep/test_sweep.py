@@ -16,10 +16,8 @@ from pyarrow import parquet
 
 import lare_rl
 from helpers import untrained_runs
-from helpers.long_tests import long_case
 from lare_rl.errors import LareError
 from lare_rl.latent.function import verify_function
-from lare_rl.sweep import processes
 from lare_rl.sweep.jobs import job_to_json, train_job
 from lare_rl.sweep.processes import RunningProcesses, train_in_process
 from lare_rl.sweep.resources import Slot
@@ -164,21 +162,11 @@ def test_tables_of_command(command, file, copying_python, tmp_path):
     assert [row["credit/error"] == "" for row in table] == 4 * [True] + 4 * [False]
 
 
-@pytest.mark.long
-def test_ray(file, tmp_path):
-    """In its own process: Ray forks, and this one has threads."""
-    file.write_text(FILE.replace('"dense", ', "").replace("[0, 3]", "[0]"))
-    command = [sys.executable, "-c", "from lare_rl.cli import main; main()", "sweep", str(file), "--ray", "local"]
-    result = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True)
-    assert result.returncode == 0, result.stderr
-    assert result.stderr.splitlines()[-1] == "1 of 1: Reacher-v4/lare-linear-td3-draw0 is done"
-    assert read_sweep(file)[1][0].done
-
-
 SWEEPS = sorted((Path(__file__).parents[2] / "benchmarks" / "sweeps").glob("*.toml"))
 
 
-@pytest.mark.parametrize("path", [path if path.stem == "large" else long_case(path) for path in SWEEPS])
+@pytest.mark.long
+@pytest.mark.parametrize("path", SWEEPS)
 def test_sweeps_of_benchmarks(path):
     assert read_sweep(path)[1]
 
@@ -243,17 +231,9 @@ def test_error_of_process(file, tmp_path):
     error = train_in_process(job, Slot([], {}), RunningProcesses())
     assert error.startswith(f"{tmp_path}/\\udcff/dense-td3 exists")
     assert error.endswith("dense-td3.log)")
-
-
-def test_unexpected_error_is_not_the_note_of_jax(monkeypatch, capfd):
-    def fail(job):
-        error = TypeError("add got incompatible shapes\nand more")
-        error.add_note("JAX has removed its internal frames")
-        raise error
-
-    monkeypatch.setattr(processes, "train_job", fail)
-    assert processes._train_when_free({}) == "TypeError: add got incompatible shapes"
-    assert "Traceback" in capfd.readouterr().err
+    running = RunningProcesses()
+    running.stop()
+    assert "not started" in train_in_process(job, Slot([], {}), running)
 
 
 @pytest.mark.parametrize(
@@ -261,7 +241,6 @@ def test_unexpected_error_is_not_the_note_of_jax(monkeypatch, capfd):
     [
         ("exit 1", "exit status 1"),  # not the last line of an earlier process in the log
         ("kill -9 $$", "it was ended by SIGKILL"),
-        ("kill -40 $$", "it was ended by signal 40"),
         ("exit 0", "it ended at step 0 of 200"),  # an environment that ends the process
         ("echo no space is left; exit 2", "no space is left"),  # the log of a full disk has no room for it
         ("echo last line >&2; echo >&2; exit 3", "last line"),
@@ -277,33 +256,22 @@ def test_end_of_process(file, python_script, script, error):
     assert train_in_process(job, Slot([], {}), RunningProcesses()) == f"{error} ({log})"
 
 
-def test_no_process_after_stop(file):
-    running = RunningProcesses()
-    running.stop()
-    assert "not started" in train_in_process(read_sweep(file)[1][0], Slot([], {}), running)
-
-
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        (("tasks", "task"), "'tasks'"),
         (('"dense"', '"dence"'), "'dence' .*'dense'"),
         (("tasks = ", "seeds = 3\ntasks = "), "seeds is a setting"),
         (("seeds = 2", "seeds = 2\nprocesses = 2"), "processes .*above"),
         (('["Reacher-v4"]', "[]"), r"tasks = \[\]: should not be empty"),
-        (("seeds = 2", "seed = -1"), "seed = -1"),
         (('["Reacher-v4"]', '["Reacher-v5"]'), "no recorded reply .* 'Reacher-v5'"),
         (("rollout_steps = 50", 'method = "rd"'), "method.*methods = "),
-        (("tasks = ", 'method = "rd"\ntasks = '), "method.*methods = "),
         (("[settings]", '[functions]\nReacher = ["phi.py"]\n[settings]'), "functions of Reacher,"),
         (('["Reacher-v4"]', '["Reacher-v4", "Reacher-v4"]'), "Reacher-v4/dense-td3 .*twice"),
         (('"dense", ', '"dense", "dense", '), "dense-td3 .*twice: leave one out"),
-        (("[settings]", "[settings"), "Expected"),
         (("[settings]", "[settings]\nsac = { gamma = 0.9 }"), r"sac\.gamma.*td3\.gamma"),
         (("[settings]", "[settings]\ncredit = { sum_form = true }"), r"no run uses credit\.sum_form.*dense"),
         ((', "lare-linear"', ""), "draws"),
         ((FUNCTIONS[0], f"{FUNCTIONS[0]}\n{FUNCTIONS[1]}"), r"draws .*\[functions\]"),
-        (("draws = [0, 3]", "draws = [7]"), "draw 7"),
         (("rollout_steps = 50", "candidates = 3"), r"Reacher-v4.*reply 1"),
         (("rollout_steps = 50", "capacity = 40"), "capacity = 40"),
         (FUNCTIONS, "phi.py"),

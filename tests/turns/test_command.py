@@ -6,8 +6,7 @@ import pytest
 
 from helpers.turn_toys import sample_table, table_rollouts
 from lare_rl.errors import LareError
-from lare_rl.turns.credit import TurnCredit
-from lare_rl.turns.files import read_rollout_file, write_credit_file
+from lare_rl.turns.files import read_rollout_file
 
 PHI = "def turn_events(tool, arguments, result, text):\n    return {'works': 'ok' in result}\n"
 
@@ -111,10 +110,3 @@ def test_turn_phi_asks_a_model(monkeypatch, command, tmp_path, file):
         status, _, error = command("turn-phi", file, *options[:-1], target)
         assert (status, words in error) == (2, True)
     assert command("turn-credit", file, "--out", tmp_path / "c.jsonl", "--function", out)[::2] == (0, "")
-
-
-def test_half_characters_are_written(tmp_path):
-    rollouts = [{"turns": [{}], "outcome": 1, "note": "\ud800"}]
-    result = TurnCredit()(rollouts)
-    write_credit_file(tmp_path / "out.jsonl", rollouts, result)
-    assert json.loads((tmp_path / "out.jsonl").read_text())["note"] == "\ud800"

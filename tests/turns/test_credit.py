@@ -64,17 +64,6 @@ def test_one_rollout_and_equal_outcomes_get_no_advantage():
         np.testing.assert_allclose(np.concatenate(result.progress), 0, atol=1e-12)
 
 
-def test_trust_is_measured_over_the_window():
-    credit = lare_rl.TurnCredit(window=2)
-    tables = [table_rollouts(sample_table(n_groups=n_groups)) for n_groups in (6, 7, 8)]
-    sizes = [credit(rollouts).trust.n_rollouts for rollouts in tables]
-    assert sizes == [24, 52, 60]
-
-
-def test_noise_is_not_trusted():
-    assert lare_rl.TurnCredit()(table_rollouts(sample_table(n_groups=40, effect=0.0))).lambda_ > 0.9
-
-
 @pytest.mark.parametrize(
     ("gain", "surprise", "lambda_", "code"),
     [
@@ -138,12 +127,3 @@ print(len(result.advantage), result.lambda_)
 def test_it_needs_neither_jax_nor_torch():
     process = subprocess.run([sys.executable, "-c", PROGRAM], capture_output=True, text=True, check=True)
     assert process.stdout.startswith("40 ")
-
-
-@pytest.mark.parametrize("logistic", [False, True])
-def test_features_that_never_vary_and_copy_each_other(logistic):
-    rollouts = [
-        {"turns": [{"x": 1.0, "y": 1.0}] * (1 + k % 3), "outcome": float(k % 2), "group": k // 4} for k in range(32)
-    ]
-    result = lare_rl.TurnCredit(logistic=logistic)(rollouts)
-    assert np.isfinite(np.concatenate([*result.advantage, *result.deviation, *result.value])).all()

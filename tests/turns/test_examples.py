@@ -1,7 +1,6 @@
 """The single files for trainers of language models, on the data types of the libraries, where these are installed."""
 
 import asyncio
-import inspect
 import runpy
 import sys
 from pathlib import Path
@@ -91,37 +90,6 @@ def test_prime_rl_algorithm(fake_prime_rl):
         assert [values[0] for values in sampled] == pytest.approx(trace.info["turn_advantages"])
         assert np.sign(sampled[0][0]) == (1 if trace.reward else -1)
     assert [node.advantages for node in traces[7].nodes if any(node.mask)] == [[-0.5, -0.5]] * 2
-
-
-def test_traces_of_verifiers():
-    vf = pytest.importorskip("verifiers.v1")
-    graph, types = pytest.importorskip("verifiers.v1.graph"), pytest.importorskip("verifiers.v1.types")
-    example = load("turn_credit_prime_rl.py")
-    kinds = {"user": types.UserMessage, "assistant": types.AssistantMessage, "tool": types.ToolMessage}
-    nodes = []
-    for i, message in enumerate(make_messages(True)):
-        is_sampled = message["role"] == "assistant"
-        tokens = {"token_ids": [0, 1, 2], "mask": [False, is_sampled, is_sampled], "sampled": is_sampled}
-        message = kinds[message["role"]](**message)
-        nodes.append(graph.MessageNode(parent=i - 1 if i else None, message=message, **tokens))
-    trace = vf.Trace.model_construct(nodes=nodes, rewards={}, info={}, calls=[], stop_condition=None, errors=[])
-    assert example.is_linear(trace)
-    assert example.token_advantages(trace, [0.5, -1.0]) == [0.5, 0.5, -1.0, -1.0]
-    rollout = example.trace_rollout(SimpleNamespace(nodes=nodes, reward=1.0, info={}, is_truncated=False), "a")
-    assert rollout["messages"][1]["tool_calls"][0]["name"] == "test"
-
-
-@pytest.mark.filterwarnings("ignore")  # of the library
-def test_trainer_of_trl_has_the_methods_that_the_example_changes():
-    trainer = pytest.importorskip("trl", reason="TRL is not installed").GRPOTrainer
-    for name, parameters in {
-        "_generate_and_score_completions": ["self", "inputs"],
-        "_calculate_rewards": ["self", "inputs", "prompts", "completions", "completion_ids_list"],
-    }.items():
-        assert list(inspect.signature(getattr(trainer, name)).parameters) == parameters
-    source = inspect.getsource(trainer._compute_loss)
-    assert "advantages.dim() == 1" in source
-    assert '"tool_mask"' in source
 
 
 def test_trl_trainer(monkeypatch):

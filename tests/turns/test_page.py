@@ -33,7 +33,7 @@ def write(directory, rollouts, **options):
 
 @pytest.mark.parametrize(
     ("n_successes", "outcomes"),
-    [(n, [1, 0, 1, 0, 1, 0]) for n in (1, 3, 5, 7, 9)] + [(n, [n / 10] * 6) for n in (0, 10)],
+    [(n, [1, 0, 1, 0, 1, 0]) for n in (1, 5, 9)] + [(10, [1] * 6)],
 )
 def test_successes_and_failures_alternate(n_successes, outcomes):
     checked = read_rollouts(random_rollouts(n_successes))
@@ -56,13 +56,6 @@ def test_numbers_have_the_unit_of_outcomes(tmp_path):
     (effect,) = credit.effects
     assert f"{effect.first:+.7f} ± {effect.first_std:.7f}" in html
     assert f"{effect.first:+.7f} ± {effect.first_std:.7f}" in credit.words[1]
-
-
-def test_turns_that_are_left_out_are_counted(tmp_path):
-    html, _, _ = write(tmp_path, random_rollouts(n_turns=61))
-    assert html.count("first 60 of 61 turns") == 6
-    assert '<td class="number">60</td>' in html
-    assert '<td class="number">61</td>' not in html
 
 
 def test_logistic_effects_are_log_odds(tmp_path):

@@ -8,7 +8,7 @@ import pytest
 from helpers.turn_toys import dense_posterior, sample_table
 from lare_rl.credit.precisions import NUMPY_BACKEND, Regression
 from lare_rl.turns.features import build_prefixes
-from lare_rl.turns.regression import eliminate_groups, fit_linear, fixed_point, group_moments, sum_up
+from lare_rl.turns.regression import fit_linear, fixed_point, group_moments, sum_up
 
 
 @pytest.fixture
@@ -92,17 +92,3 @@ def test_equal_outcomes_give_no_weight(prefixes, outcome):
     fit = fit_linear(x, np.full_like(y, outcome), weight, group, n)
     assert not fit.weight.any()
     assert fit.mean == pytest.approx(outcome)
-
-
-def test_no_features_leaves_the_means_of_groups(prefixes):
-    _, y, weight, group, n = prefixes
-    fit = fit_linear(np.zeros((len(y), 0)), y, weight, group, n)
-    means = np.array([y[group == g].mean() for g in range(group.max() + 1)])
-    assert np.corrcoef(fit.intercept, means)[0, 1] > 0.99
-
-
-def test_groups_without_prefixes_have_no_intercept(prefixes):
-    x, y, weight, group, n = prefixes
-    sums = sum_up(x, y, weight, 2 * group, n)
-    posterior = eliminate_groups(sums, sums.problem.equal_alpha, 2.0)
-    assert not posterior.intercept[1::2].any()

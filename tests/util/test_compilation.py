@@ -42,12 +42,6 @@ def test_cache_variables(tmp_path):
     assert variables["JAX_COMPILATION_CACHE_MAX_SIZE"] == str(2**30)
 
 
-@pytest.mark.skipif(sys.platform != "linux", reason="XDG_CACHE_HOME is a variable of Linux")
-def test_default_directory(tmp_path, monkeypatch):
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
-    assert Path(cache_variables({})["JAX_COMPILATION_CACHE_DIR"]).parent == tmp_path / "lare"
-
-
 @pytest.mark.parametrize(
     "environment", [{"LARE_CACHE": "off"}, {"JAX_COMPILATION_CACHE_DIR": "other"}, {"LARE_CACHE": __file__}]
 )

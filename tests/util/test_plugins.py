@@ -47,14 +47,6 @@ def test_name_is_checked(name, numbers):
         numbers.register(name, 3)
 
 
-def test_file_in_place_of_a_module(numbers, monkeypatch):
-    monkeypatch.setenv("LARE_PLUGINS", "my_plugin.py")
-    load_plugins.cache_clear()
-    with pytest.raises(LareError, match="and write my_plugin"):
-        numbers.find("two")
-    load_plugins.cache_clear()
-
-
 def test_plugin_of_the_environment_variable(plugin, numbers, monkeypatch):
     plugin.write_text(PLUGIN)
     monkeypatch.setenv("LARE_PLUGINS", " my_plugin, ")
@@ -96,14 +88,3 @@ def test_broken_plugin_of_an_installed_package(value, plugin, numbers):
     words = rf"'mine' of the package my-package \(entry point mine = {value}\).*No module named .*uninstall my-package"
     with pytest.raises(LareError, match=words):
         numbers.find("two")
-
-
-def test_command_with_a_broken_plugin_prints_one_line(plugin, command, monkeypatch):
-    monkeypatch.setenv("LARE_PLUGINS", "no_such_plugin")
-    status, _, error = command("methods")
-    assert (status, error.count("\n"), "'no_such_plugin'" in error) == (2, 1, True)
-
-
-def test_plural_of_a_registry():
-    with pytest.raises(LareError, match="the families of environments are"):
-        Registry[int]("family of environments", "families of environments").find("two")

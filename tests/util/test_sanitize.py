@@ -7,19 +7,13 @@ from lare_rl.util.sanitize import first_invisible, one_line, sanitize
 INVISIBLE = {
     "escape": "\x1b",
     "tag": "\U000e0041",
-    "soft hyphen": "\u00ad",
-    "Mongolian vowel separator": "\u180e",
     "grapheme joiner": "\u034f",
-    "Hangul filler": "\u3164",
     "variation selector": "\ufe0f",
-    "empty Braille": "\u2800",
     "private use": "\ue000",
     "direction of writing": "\u202e",
     "zero width": "\u200b",
     "end of paragraph": "\u2029",
-    "unassigned": "\u0378",
     "surrogate": "\ud800",
-    "C1": "\x9b",
 }
 
 

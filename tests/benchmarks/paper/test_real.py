@@ -39,11 +39,3 @@ def test_missing_package(monkeypatch, tmp_path):
     monkeypatch.setattr(real, "find_spec", lambda name: None)
     with pytest.raises(LareError, match="pip install -e 'benchmarks/real"):
         real.plan_jobs("smoke", tmp_path, list(STUDY.tasks))
-
-
-def test_merge_settings():
-    assert real.merge_settings({"a": 1, "sac": {"x": 1, "y": 2}}, {"b": 3, "sac": {"y": 4}}) == {
-        "a": 1,
-        "b": 3,
-        "sac": {"x": 1, "y": 4},
-    }

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from paper import theory
-from paper.theory import MDP, Table
+from paper.theory import Table
 
 CORES, ACTIONS, HORIZON = 3, 2, 5
 
@@ -36,17 +36,6 @@ def test_the_estimate_against_least_squares():
     # Ridge regression is least squares on rows that ask for 0, sqrt(lambda) strong.
     rows, targets = np.vstack([counts, np.sqrt(2.0) * np.eye(6)]), np.append(totals, np.zeros(6))
     np.testing.assert_allclose(theory.estimate(state), np.linalg.lstsq(rows, targets)[0], rtol=1e-3, atol=1e-4)
-
-
-def test_the_radius_is_that_of_the_paper():
-    want = np.sqrt(0.25 * 8 * 12 * np.log((1 + 50 * 64 / 3.0) / (0.1 / 10))) + np.sqrt(3.0 * 12)
-    assert float(theory.radius(jnp.array(50.0), 8, 12, 3.0, 0.1)) == pytest.approx(want, rel=1e-5)
-
-
-def test_the_latent_radius_is_smaller_for_any_number_of_redundant_states():
-    k = jnp.arange(1000.0)
-    raw, latent = (theory.radius(k, HORIZON, Table(CORES, m, ACTIONS).size, 5.0, 0.1) for m in (2, 1))
-    assert (np.asarray(latent) < np.asarray(raw)).all()
 
 
 def test_optimism_against_trying_every_policy(mdp):
@@ -83,9 +72,3 @@ def test_the_bound_holds_and_the_latent_regret_does_not_grow(mdp):
         regret[redundant] = np.asarray(history.regret)
         assert (np.diff(regret[redundant], axis=1) >= -1e-6).all()
     assert regret[1][:, -1].mean() < regret[2][:, -1].mean() < regret[6][:, -1].mean()
-
-
-def test_where_nothing_is_to_be_chosen_there_is_no_regret():
-    still = MDP(jnp.full((2, 1, 2), 0.5), jnp.array([[0.2], [0.8]]))
-    history = theory.oful(jax.random.key(0), still, 3, 4, 50)
-    np.testing.assert_array_equal(history.regret, 0)

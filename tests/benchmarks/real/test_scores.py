@@ -54,14 +54,6 @@ def test_wheat_score_by_a_calendar_of_doses(make):
     assert info["score"] == pytest.approx((0.2 * info["grain"] - 1.2 * 105 - 3 * 8) / 100)
 
 
-def test_wheat_years(make):
-    make("wheat")
-    from final_score.wheat import find_years
-
-    train, test = find_years("train"), find_years("test")
-    assert (len(train), len(test), set(train) & set(test)) == (15, 7, set())
-
-
 def test_traffic_delays(make):
     """All trips of the day count, also those that did not end or never entered the net, with the times of SUMO's file."""
     env = make("traffic")
@@ -81,13 +73,6 @@ def test_traffic_delays(make):
     assert info["longest_delay"] == max(lost)
 
 
-def test_traffic_days():
-    from final_score.traffic import DAYS
-
-    assert not set(DAYS["train"]) & set(DAYS["test"])
-    assert max(DAYS["test"]) < 64  # LaRe's levels
-
-
 def test_jobshop_schedule(make):
     """The schedule is feasible, and its end is the makespan."""
     env = make("jobshop")
@@ -105,18 +90,6 @@ def test_jobshop_schedule(make):
             assert (starts[machines == machine][order][1:] >= ends[machines == machine][order][:-1]).all()
         assert info["makespan"] == ends.max() >= info["bound"]
         assert info["score"] == pytest.approx(100 - 100 * ends.max() / info["bound"])
-
-
-def test_jobshop_instances(make):
-    jobs = {}
-    for split in ("train", "test"):
-        env = make("jobshop", split)
-        jobs[split] = set()
-        for instance in range(20):
-            env.reset(options={"instance": instance})
-            jobs[split].add(env._durations.tobytes())
-    assert not jobs["train"] & jobs["test"]
-    assert len(jobs["train"]) == 20
 
 
 def test_jobshop_waits_cannot_stop_the_shop(make):
@@ -177,20 +150,3 @@ def test_grid_energy(make):
     assert info["losses"] == pytest.approx(losses, rel=1e-5)
     assert info["unserved"] == pytest.approx(grid.day_energy(3, 1) - served, abs=1e-3)
     assert info["score"] == pytest.approx(-100 * (info["losses"] + info["unserved"]) / grid.day_energy(3, 1))
-
-
-def test_grid_actions_are_safe(make):
-    """The configurations that may be chosen are those that `SAFE` describes."""
-    env = make("grid")
-    from final_score import grid
-
-    assert not set(grid.WEEKS["train"]) & set(grid.WEEKS["test"])
-    configurations = env.grid.action_space.get_all_unitary_topologies_set(env.grid.action_space)
-    survived = np.zeros(len(configurations))
-    moments = [(week, step) for week in grid.WEEKS["train"] for step in (0, 100)]
-    for week, step in moments:
-        begin = {"init ts": step} if step else {}
-        observation = env.grid.reset(options={"time serie id": week, **begin})
-        for index, configuration in enumerate(configurations):
-            survived[index] += not observation.simulate(configuration)[2]
-    assert tuple(np.flatnonzero(survived >= 0.9 * len(moments)) + 1) == grid.SAFE

@@ -3,7 +3,6 @@ import numpy as np
 import pytest
 from gymnasium.utils.env_checker import check_env
 
-from final_score.options import check_option
 from final_score.play import list_rules, play_scores
 
 SUMS = ("wheat", "jobshop")
@@ -86,30 +85,3 @@ def test_rules_beat_random_actions(name, make):
         if label not in ("no nitrogen", "shortest operation")  # which are no good rules
     }
     assert min(score for label, score in scores.items() if label != "random") > scores["random"]
-
-
-def test_picture(name, make):
-    env = make(name, render_mode="rgb_array")
-    env.reset(seed=0)
-    for index in range(3):
-        step(env, some_action(env, index))
-    picture = env.render()
-    assert (picture.dtype, picture.ndim, picture.shape[2]) == (np.uint8, 3, 3)
-    assert picture.std() > 1
-
-
-def test_registered_names(name):
-    names = {spec for spec in gymnasium.registry if spec.lower().startswith(name)}
-    assert names == (set() if name == "trains" else {f"{s}-v0" for s in variants(names)})
-
-
-def variants(names):
-    base = min(names, key=len).removesuffix("-v0")
-    return {base, f"{base}Test", f"{base}Proxy"}
-
-
-def test_wrong_options(name, make):
-    for option in ({"split": "all"}, {"pay": "never"}):
-        with pytest.raises(ValueError, match="must be one of"):
-            make(name, **option)
-    assert check_option("split", "test", ("train", "test")) == "test"

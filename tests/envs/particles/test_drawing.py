@@ -1,10 +1,9 @@
 import jax
-import matplotlib
 import numpy as np
 import pytest
 from matplotlib.patches import Circle
 
-from lare_rl.envs.canvas import OTHER_COLOUR, TEAM_COLOUR, blank_figure, to_pixels
+from lare_rl.envs.canvas import OTHER_COLOUR, TEAM_COLOUR, to_pixels
 from lare_rl.envs.particles.catalogue import TASKS
 from lare_rl.envs.particles.drawing import LANDMARK_COLOUR, draw_state
 from lare_rl.envs.particles.particle_env import ParticleEnv, ParticleState
@@ -33,16 +32,6 @@ def test_scale_and_colours():
     assert high > 9
 
 
-def test_credit_as_text_and_colour():
-    task, position = TASKS["TriangleArea"], start("TriangleArea")
-    figure = draw_state(task, position, np.array([-1, 0.25, 1]))
-    assert [text.get_text() for text in figure.axes[0].texts] == ["-1", "0.25", "1"]
-    red, _, blue = (circle.get_facecolor() for circle in circles(figure)[3:])
-    assert red[0] > red[2]
-    assert blue[2] > blue[0]
-    assert to_pixels(draw_state(task, position, np.zeros(3))).std() > 0
-
-
 def test_frames_have_common_scales():
     positions = np.linspace(1, 2, 4)[:, None, None] * start("TriangleArea")
     credit = np.arange(12.0).reshape(4, 3)
@@ -52,9 +41,3 @@ def test_frames_have_common_scales():
     assert len({picture.tobytes() for picture in pictures}) == 4
     last = draw_state(TASKS["TriangleArea"], positions[-1], credit[-1])
     np.testing.assert_array_equal(pictures[-1], to_pixels(last))
-
-
-@pytest.mark.parametrize("dpi", [72, 150])
-def test_size_of_a_picture_is_no_setting_of_the_user(dpi):
-    with matplotlib.rc_context({"figure.dpi": dpi}):
-        assert to_pixels(blank_figure()[0]).shape == (400, 400, 3)

@@ -2,7 +2,6 @@
 
 import warnings
 
-import numpy as np
 import pytest
 
 from lare_rl.envs.particles.parallel_env import ParticleParallelEnv
@@ -33,18 +32,6 @@ def test_episode():
     picture = env.render()
     assert picture.shape == (400, 400, 3)
     assert picture.std() > 0
-
-
-def test_agents_are_named_after_their_teams():
-    names = ParticleParallelEnv("CompetitivePP-6").possible_agents
-    assert names == [*[f"predator_{i}" for i in range(6)], "prey_0", "prey_1"]
-
-
-def test_episodes_without_a_seed_differ():
-    env = ParticleParallelEnv("TriangleArea")
-    starts = [env.reset(seed=seed)[0]["agent_0"] for seed in (0, None, 0)]
-    assert not np.array_equal(starts[0], starts[1])
-    np.testing.assert_array_equal(starts[0], starts[2])
 
 
 @pytest.mark.parametrize("action", [5, None])

@@ -10,8 +10,8 @@ import pytest
 from envs.particles import twin as slow
 from helpers.long_tests import long_case
 from lare_rl.envs.particles.catalogue import TASKS, find_particle_task
-from lare_rl.envs.particles.navigation import N_LAYOUTS, make_layouts
-from lare_rl.envs.particles.predator_prey import SIZES, logits, observe_preys, sample_actions, shipped_prey
+from lare_rl.envs.particles.navigation import N_LAYOUTS
+from lare_rl.envs.particles.predator_prey import SIZES, logits, observe_preys, shipped_prey
 from lare_rl.envs.particles.task import MAX_STEPS
 from lare_rl.envs.particles.world import State, at_rest, move, push
 from lare_rl.errors import LareError
@@ -120,12 +120,6 @@ def test_landmarks_of_navigation_are_separated(agents, radius, to_nearest):
     assert distance.min(axis=2).mean() == pytest.approx(to_nearest, abs=0.02)
 
 
-def test_layouts_are_reproducible():
-    first = make_layouts(6, 1.5, 0.675)
-    make_layouts.cache_clear()
-    np.testing.assert_array_equal(first, make_layouts(6, 1.5, 0.675))
-
-
 # Prey and predators
 
 
@@ -139,12 +133,6 @@ def test_prey_network_equals_numpy():
     np.testing.assert_allclose(logits(layers, jnp.asarray(observation, jnp.float32)), expected, rtol=1e-4, atol=1e-4)
 
 
-def test_prey_samples_from_the_softmax():
-    layers = ((np.zeros((26, 5), np.float32), np.log(np.array([0.1, 0.2, 0.4, 0.3, 1e-9], np.float32))),)
-    action = sample_actions(layers, jnp.zeros((4000, 26)), jax.random.key(0))
-    np.testing.assert_allclose(np.bincount(action, minlength=5) / 4000, [0.1, 0.2, 0.4, 0.3, 0], atol=0.03)
-
-
 def test_observation_of_preys():
     position = jnp.zeros((11, 2)).at[:, 0].set(jnp.arange(11.0))
     state = at_rest(position)._replace(velocity=position / 10)
@@ -153,13 +141,6 @@ def test_observation_of_preys():
     np.testing.assert_allclose(first[::2], [0.6, 6, 2, 3, 4, -1, -2, -3, -4, -5, -6, 1, 0.7], rtol=1e-6)
     np.testing.assert_allclose(second[::2], [0.7, 7, 1, 2, 3, -2, -3, -4, -5, -6, -7, -1, 0.6], rtol=1e-6)
     np.testing.assert_array_equal(first[1::2], 0)
-
-
-def test_greedy_predator_moves_along_the_longer_axis():
-    preys = jnp.array([(2, 1), (-2, 1), (1, 2), (1, -2)], float)
-    position = jnp.full((4, 11, 2), 20.0).at[:, 0].set(0).at[:, 6].set(preys)
-    actions = jax.jit(jax.vmap(lambda position: chase(SIZES["PP-6"], at_rest(position))[0]))(position)
-    assert actions.tolist() == [2, 1, 4, 3]
 
 
 @pytest.mark.parametrize("name", ["PP-6", long_case("PP-30")])

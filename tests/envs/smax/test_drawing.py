@@ -46,8 +46,3 @@ def test_hits_are_drawn_in_their_step(battles):
     assert (0, 5) not in find_hits(SCENARIO, battles[2], battles[1])
     n_lines = [len(paint(battles[1], previous).lines) for previous in (None, battles[0])]
     assert n_lines[0] < n_lines[1]
-
-
-def test_credit_is_written_beside_the_step(battles):
-    labels = [paint(battles[2], credit=credit).texts[-1].get_text() for credit in (0.25, None)]
-    assert labels == ["step 2   credit 0.25", "step 2"]

@@ -44,11 +44,6 @@ def test_attacks_the_closest_unit_and_stays_with_it():
     assert choose(battle, memory, 0)[1].attacked[0] == -1
 
 
-def test_does_not_attack_dead_units():
-    battle = make_battle([(16, 17.5), (17.2, 16), (30, 1)], (16, 16))
-    assert choose_first(battle._replace(health=battle.health.at[1].set(0))) == LAST
-
-
 @pytest.mark.parametrize(("position", "action"), [((16, 24.5), 0), ((24.5, 16), 1), ((16, 7.5), 2), ((7.5, 16), 3)])
 def test_walks_to_a_visible_unit(position, action):
     assert choose_first(make_battle([position, (1, 1), (1, 31)], (16, 16))) == action

@@ -11,12 +11,9 @@ from helpers.fake_smac import compiled_smax
 from helpers.long_tests import long_case
 from lare_rl.envs.interface import Timestep
 from lare_rl.envs.smax.battle import ATTACK, STOP
-from lare_rl.envs.smax.scenarios import SCENARIOS
 from lare_rl.envs.smax.smax_env import SMAX, SmaxState
 
 BATTLES = 8
-EXPECTED = {"2s3z": (5, 127, 120, 10, 120), "3s_vs_5z": (3, 101, 96, 10, 250), "1c3s5z": (9, 249, 234, 14, 180)}
-"""Numbers of agents, sizes of observations, states and actions, and time limits."""
 
 
 def sample_actions(env: SMAX, timestep: Timestep, key):
@@ -46,15 +43,6 @@ def play(name: str) -> tuple[SMAX, SmaxState, Timestep]:
 
     keys = jax.random.split(jax.random.key(0), BATTLES)
     return env, *jax.tree.map(np.asarray, play_battle(keys))
-
-
-def test_sizes():
-    for name in SCENARIOS:
-        spec = SMAX(name).spec
-        sizes = (spec.n_agents, spec.observation_size, spec.state_size, spec.action_size, spec.max_steps)
-        assert sizes == EXPECTED[name]
-        assert ([team.name for team in spec.teams], spec.measures) == (["ally"], ("won",))
-        assert (spec.discrete, spec.masks_actions, spec.agents_leave, spec.fixed_length) == (True, True, True, False)
 
 
 @pytest.mark.parametrize("name", ["2s3z", long_case("1c3s5z")])  # they differ in the number of unit types
