@@ -80,9 +80,6 @@ def collect(envs, n_steps, noise=0.0):
     return envs.collect_by(best_policy, np.full((n_steps, *envs.shape, 1, 1), noise, np.float32))
 
 
-# Actions.
-
-
 @pytest.mark.parametrize("dtype", [np.float32, np.float64])
 @settings(max_examples=30, deadline=None)
 @given(low=st.lists(st.floats(-1e3, 1e3, width=32), min_size=1, max_size=3), width=st.floats(0.125, 1e3, width=32))
@@ -95,15 +92,6 @@ def test_to_env_action_stays_in_space(dtype, low, width):
         assert space.contains(to_env_action(np.full((1, len(low)), action, np.float32), spec)[0])
 
 
-def test_collect_stores_unclipped_action():
-    steps = collect(make_envs(), 5, noise=3)
-    assert (steps.action > 1).all()
-    np.testing.assert_array_equal(steps.env_action, 2)
-
-
-# Steps.
-
-
 def test_episode_seeds_of_streams_differ():
     seeds = {episode_seed(seed, stream, number) for seed in range(3) for stream in Stream for number in range(20)}
     assert len(seeds) == 3 * len(Stream) * 20
@@ -112,26 +100,23 @@ def test_episode_seeds_of_streams_differ():
 
 
 def test_collect_steps_are_consecutive():
-    n_envs = 3
-    steps = collect(make_envs(n_envs=n_envs), 45)
-    assert steps.timestep.observation.shape == (2, 45, n_envs, 1, 2)
+    steps, alone = collect(make_envs(n_envs=3), 45), collect(make_envs((1,), 3), 45)
+    assert steps.timestep.observation.shape == (2, 45, 3, 1, 2)
     inside = ~steps.ended[:, :-1]
-    np.testing.assert_array_equal(
-        steps.next_timestep.observation[:, :-1][inside], steps.timestep.observation[:, 1:][inside]
-    )
-    for seed_index, env_index in np.ndindex(2, n_envs):
+    after, before = steps.next_timestep.observation[:, :-1], steps.timestep.observation[:, 1:]
+    np.testing.assert_array_equal(after[inside], before[inside])
+    for seed_index, env_index in np.ndindex(2, 3):
         np.testing.assert_array_equal(np.flatnonzero(steps.ended[seed_index, :, env_index]), [19, 39])
+    # Initial states depend on the seed alone.
+    np.testing.assert_array_equal(alone.timestep.observation[0], steps.timestep.observation[1])
+    assert len(np.unique(steps.timestep.observation[:, [0, 20, 40]].reshape(-1, 2), axis=0)) == 18
     assert not steps.next_timestep.terminated.any()
     np.testing.assert_allclose(steps.env_action, 2 * steps.action, rtol=1e-4, atol=1e-6)
     expected = -((steps.env_action[..., 0] - steps.timestep.observation[..., 0]) ** 2)
     np.testing.assert_allclose(steps.next_timestep.reward, expected, rtol=1e-4, atol=1e-6)
-
-
-def test_collect_initial_states_depend_on_seed_alone():
-    steps, alone = collect(make_envs((0, 1), 3), 60), collect(make_envs((1,), 3), 60)
-    np.testing.assert_array_equal(alone.timestep.observation[0], steps.timestep.observation[1])
-    initial = steps.timestep.observation[:, [0, 20, 40]].reshape(-1, 2)
-    assert len(np.unique(initial, axis=0)) == 18
+    beyond = collect(make_envs(), 5, noise=3)  # stored as chosen
+    assert (beyond.action > 1).all()
+    np.testing.assert_array_equal(beyond.env_action, 2)
 
 
 def test_collect_tells_policy_episode_starts():
@@ -163,9 +148,6 @@ def test_collect_distinguishes_termination(limit, ends, terminated, wrap):
     np.testing.assert_array_equal(np.flatnonzero(steps.next_timestep.terminated[0]), terminated)
 
 
-# Restored episodes.
-
-
 def test_restore_drops_only_other_observations():
     envs, restored = make_envs((0, 4), 2), make_envs((0, 4), 2)
     collect(envs, 27)
@@ -184,9 +166,6 @@ def test_restore_drops_episode_that_ends_early(wrap):
     collect(envs, 5)
     dropped, _ = envs.restore(envs.state_dict())
     assert dropped.all()
-
-
-# Whole episodes.
 
 
 def proportional(factor):
@@ -246,18 +225,12 @@ def test_actions_are_random_until_the_end_of_the_warmup(monkeypatch):
     settings = SMALL_SETTINGS["td3"].model_copy(update={"warmup": 8})
     envs = local_envs(2)
     config = small_config("dense", env=envs.spec, hyperparameters=settings)
-    monkeypatch.setattr(
-        collect_host,
-        "make_host_policy",
-        lambda *arguments, **options: lambda memory, *inputs: (np.full((2, 1, 1, 1), 0.5, np.float32), memory),
-    )
+    half = np.full((2, 1, 1, 1), 0.5, np.float32)
+    monkeypatch.setattr(collect_host, "make_host_policy", lambda *_, **options: lambda memory, *inputs: (half, memory))
     collector = HostCollector(envs, local_envs(2), config, (0, 1))
     warmup, first = (collector.collect(None, step).action for step in (4, 8))
     assert len(np.unique(warmup)) == warmup.size == 8
     assert (first == 0.5).all()
-
-
-# Faults.
 
 
 def test_policy_that_is_nan_is_reported():
@@ -303,16 +276,13 @@ def test_collect_locates_bad_outputs(wrap):
         collect(make_envs((4, 9), 2, task=WRAPPED), 40)
 
 
-def test_restore_locates_bad_outputs(wrap):
-    """The step is that of the repeated episode."""
+def test_restore_and_evaluate_locate_bad_outputs(wrap):
+    """The step is that of the repeated or evaluated episode."""
     envs = make_envs((4,), task=WRAPPED)
     collect(envs, 27)
     wrap(BadOutput, value=float("nan"), reward=True)
     with pytest.raises(EnvOutputError, match=r"reward.*nan.*, at step 3 of episode 1 of seed 4$"):
         make_envs((4,), task=WRAPPED).restore(envs.state_dict())
-
-
-def test_evaluate_locates_bad_output(wrap):
     wrap(BadOutput, value=float("nan"), seeds={episode_seed(1, Stream.EVALUATION_EPISODES, 2)}, reward=True)
     envs = local_envs(4, WRAPPED)
     evaluate_on_host(envs, proportional(0.0), (0, 1), 2)

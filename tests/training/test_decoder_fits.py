@@ -41,6 +41,10 @@ from lare_rl.training.decoder_fits import (
 )
 
 
+def stack_seeds(*seeds):
+    return jax.tree.map(lambda *leaves: jnp.stack(leaves), *seeds)
+
+
 def test_update_in_chunks_is_that_of_the_batch(monkeypatch):
     """Six episodes of twelve steps, in three chunks of two episodes."""
     env = replace(ONE_AGENT, fixed_length=True)
@@ -58,11 +62,11 @@ def test_update_in_chunks_is_that_of_the_batch(monkeypatch):
 
 def test_seeds_are_fitted_at_once_or_one_after_the_other():
     config = small_config("rd", fit_updates=2)
-    seeds = jax.tree.map(lambda *leaves: np.stack(leaves), *(learner_with_episodes(config, seed) for seed in (0, 1)))
-    results = []
-    for batched in (False, True):
-        fit = jax.jit(partial(fit_seeds, config=replace(config, batched=batched)))
-        results.append(fit(seeds, jax.random.split(jax.random.key(0))))
+    seeds, keys = (
+        stack_seeds(*(learner_with_episodes(config, seed) for seed in (0, 1))),
+        jax.random.split(jax.random.key(0)),
+    )
+    results = [jax.jit(partial(fit_seeds, config=replace(config, batched=batched)))(seeds, keys) for batched in (0, 1)]
     assert_close(*results, 1e-3, 1e-6)
 
 
@@ -94,24 +98,19 @@ def test_count_held_out(n_episodes, n_held_out):
     assert decoder_fits._count_held_out(buffer, window=32).tolist() == n_held_out
 
 
-def stack_seeds(*seeds):
-    return jax.tree.map(lambda *leaves: jnp.stack(leaves), *seeds)
-
-
 def test_fit_until_converged_keeps_the_best_decoders():
     """The only factor is the true reward, so a decoder's error is the distance of its weight from 1."""
     config = small_config("lare-linear", "ippo", ONE_TEAM, n_factors=(1,), n_envs=10)
     steps = random_steps(ONE_TEAM, 10, lengths=(12,))
-    learner = add_steps(untrained_learner(config), config, steps, steps.next_timestep.reward[..., None])
+    learner = add_steps(untrained_learner(config), config, steps, steps.next_timestep.reward[..., None], learn=False)
     errors, rounds = [[3.0, 3.0], [1.0, 4.0], [2.0, 2.0], [5.0, 5.0], [0.0, 6.0]], []
 
     def fit(learner, keys):
         seeds = [jax.tree.map(lambda leaf, seed=seed: leaf[seed], learner) for seed in (0, 1)]
         pairs = zip(seeds, errors[len(rounds)], strict=True)
         fitted = stack_seeds(*[with_factor_decoders(seed, [1 + error]) for seed, error in pairs])
-        rounds.append(
-            (np.asarray(learner.replay.current_episode).sum(axis=1).tolist(), jax.random.key_data(keys).tolist())
-        )
+        n_episodes = np.asarray(learner.replay.current_episode).sum(axis=1).tolist()
+        rounds.append((n_episodes, jax.random.key_data(keys).tolist()))
         return fitted, {"credit/loss": jnp.zeros(2)}
 
     keys = jax.random.split(jax.random.key(0), 2)

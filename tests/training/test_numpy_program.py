@@ -57,9 +57,8 @@ def test_policy_on_host_equals_compiled_policy(algorithm, monkeypatch):
     actor = policy.get_actor(learner.algorithm, 0, config)
     inputs = (), draw(2, 3, 1, 3), np.ones((2, 3, 1, 2), bool)
     for deterministic in (True, False):
-        noise = None if deterministic else draw(2, 3, 1, config.noise_size)
+        noise, results = None if deterministic else draw(2, 3, 1, config.noise_size), []
         assert policy._translate_policy(config, 2, 3, deterministic) is not None
-        results = []
         for _ in range(2):
             act = policy.make_host_policy(config, actor, 3, deterministic=deterministic)
             results.append(act(*inputs, noise, np.zeros((2, 3), bool))[0])

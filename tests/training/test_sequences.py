@@ -122,9 +122,9 @@ def test_targets_are_copied_after_enough_episodes():
     assert is_copied == [False, True, False, True]
 
 
-def train_step(config, learner, steps, key=0):
-    train = jax.jit(partial(sequences.train_step, config=config))
-    return train(add_seed_axis(learner), add_seed_axis(steps), jax.random.key(key)[None], jnp.array(0))
+def train_step(config, learner, steps, train=None):
+    train = train or jitted(sequences.train_step, config)
+    return train(add_seed_axis(learner), add_seed_axis(steps), jax.random.key(0)[None], jnp.array(0))
 
 
 @pytest.mark.parametrize("method", [long_case("dense"), long_case("lare-rd"), "lare-rrdu"])
@@ -161,7 +161,7 @@ def test_batch_lengths_change_nothing(monkeypatch):
     results = [train_step(config, learner, steps)]
     monkeypatch.setattr(sequences, "MIN_STEPS_TO_SHORTEN", 0)
     assert sequences._batch_lengths(config) == [3, 6, 12]
-    results.append(train_step(config, learner, steps))
+    results.append(train_step(config, learner, steps, jax.jit(partial(sequences.train_step, config=config))))
     assert float(results[1][1]["algorithm/updates"][0]) == 5
     assert_close(*results, 1e-3)
 
