@@ -6,21 +6,16 @@ from lare_rl.algorithms.registry import ALGORITHMS, register_algorithm
 from lare_rl.errors import LareError
 
 
-@pytest.mark.parametrize("discrete", [False, True])
-def test_greedy_samples_distributions_over_choices(discrete):
-    stochastic = {name for name, algorithm in ALGORITHMS.items() if not algorithm.deterministic_evaluation(discrete)}
-    assert stochastic == ({"ppo", "ippo"} if discrete else {"ippo"})
+def test_greedy_samples_distributions_over_choices():
+    for discrete, names in ((True, {"ppo", "ippo"}), (False, {"ippo"})):
+        assert {name for name, row in ALGORITHMS.items() if not row.deterministic_evaluation(discrete)} == names
 
 
-def test_register_algorithm_refuses_used_name():
+def test_register_algorithm_refuses():
     register_algorithm(ALGORITHMS["td3"])
     with pytest.raises(LareError, match="'td3'"):
         register_algorithm(replace(ALGORITHMS["sac"], name="td3"))
-
-
-@pytest.mark.parametrize(("name", "base"), [("td3", "OffPolicySettings"), ("vdn", "SequenceSettings")])
-def test_settings_must_derive_from_those_of_the_loop(name, base):
-    with pytest.raises(
-        LareError, match=f"algorithm mine: .* consumes {ALGORITHMS[name].consumes} derive from .*:{base}"
-    ):
-        register_algorithm(replace(ALGORITHMS[name], name="mine", settings=ALGORITHMS["ppo"].settings))
+    for name, base in (("td3", "OffPolicySettings"), ("vdn", "SequenceSettings")):
+        message = f"algorithm mine: .* consumes {ALGORITHMS[name].consumes} derive from .*:{base}"
+        with pytest.raises(LareError, match=message):
+            register_algorithm(replace(ALGORITHMS[name], name="mine", settings=ALGORITHMS["ppo"].settings))

@@ -45,19 +45,13 @@ def test_standardise():
     for factor in (1e-3, 1e3):
         other = standardise(observe(rows * factor), jnp.asarray(rows * factor))
         np.testing.assert_allclose(scaled, other, atol=1e-3)
-
-
-def test_standardise_if_observed():
+    for constant in (0.0, 1e9, -1e-9):
+        rows = jnp.full((50, 1), constant)
+        assert not standardise(update_mean_std(observe(rows), rows), rows).any()
     rows, statistics = jnp.array([[3.0, -70.0]]), observe(np.array([[1.0, 2.0], [3.0, 6.0]], np.float32))
     np.testing.assert_array_equal(normalise.standardise_if_observed(normalise.empty_mean_std(2), rows), rows)
     want = standardise(statistics, rows)
     np.testing.assert_array_equal(normalise.standardise_if_observed(statistics, rows), want)
-
-
-def test_constant_feature_becomes_zero():
-    for constant in (0.0, 1e9, -1e-9):
-        rows = jnp.full((50, 1), constant)
-        assert not standardise(update_mean_std(observe(rows), rows), rows).any()
 
 
 def test_root_mean_square():
