@@ -68,12 +68,9 @@ def test_metrics_are_parsed_once_per_file_state(run, monkeypatch):
     assert read_metrics(run.directory) == [line | {DETERMINISTIC_RETURN: 2.0}]
 
 
-METRIC = re.compile(r'"((?:evaluation|credit|critic|actor|time)/\w+)"')
-
-
 def test_every_metric_has_a_meaning():
-    files = Path(lare_rl.__file__).parent.rglob("*.py")
-    names = {name for path in files for name in METRIC.findall(path.read_text(encoding="utf-8"))}
+    metric, files = r'"((?:evaluation|credit|critic|actor|time)/\w+)"', Path(lare_rl.__file__).parent.rglob("*.py")
+    names = {name for path in files for name in re.findall(metric, path.read_text(encoding="utf-8"))}
     documented = {name for group in METRIC_GROUPS.values() for name in group}
     assert names - {"evaluation/won"} == documented - {"step", "seed"}  # tasks name their own measures
 
@@ -86,9 +83,6 @@ def test_lock_refuses_second_process(run):
         pass
 
 
-# Runs below a directory, as of a sweep
-
-
 def test_find_run_directories(make_run, tmp_path):
     """Each run counts once, and directories of killed processes do not count."""
     first, second, _ = make_run("a", [1.0]), make_run("b", [2.0], method="rd"), make_run(".c.0123.new", [3.0])
@@ -99,7 +93,7 @@ def test_find_run_directories(make_run, tmp_path):
     assert [path.resolve() for path in directories] == both[::-1]
 
 
-def test_logs_of_sweep_are_skipped(make_run):
+def test_logs_of_sweep_are_skipped_and_other_paths_refused(make_run, tmp_path):
     run = make_run("a-td3", [1.0])
     log = run.directory.with_name("a-td3.log")
     log.write_text("step 50")
@@ -108,11 +102,8 @@ def test_logs_of_sweep_are_skipped(make_run):
         find_run_directories([log])
     with pytest.raises(LareError, match=r"b\.log is not a run"):
         find_run_directories([run.directory, log.rename(log.with_name("b.log"))])
-
-
-@pytest.mark.parametrize(("name", "hint"), [("nothing", False), ("results.csv", True)])
-def test_other_paths_are_refused(name, hint, tmp_path):
     (tmp_path / "results.csv").touch()
-    with pytest.raises(LareError, match=f"{name} is not a run") as error:
-        find_run_directories([tmp_path / name])
-    assert ("docs/how-to/sweeps.md" in str(error.value)) == hint
+    for name, hint in (("nothing", False), ("results.csv", True)):
+        with pytest.raises(LareError, match=f"{name} is not a run") as error:
+            find_run_directories([tmp_path / name])
+        assert ("docs/how-to/sweeps.md" in str(error.value)) == hint

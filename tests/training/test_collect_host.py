@@ -38,28 +38,31 @@ gymnasium.register("toys/Wrapped-v0", entry_point=Wrapped, max_episode_steps=20,
 WRAPPED = toy_spec(environment="toys/Wrapped-v0")
 
 
-class Countdown(gymnasium.Wrapper):
-    """Episodes terminate after the next of some numbers of steps. Every reward is 1."""
+class Changed(gymnasium.Wrapper):
+    """Episodes of the next of some lengths, in which every reward is 1; and a bad output at the third step, for some seeds."""
 
-    def __init__(self, env, lengths):
+    def __init__(self, env, lengths=None, seeds=range(2**31), **bad):
         super().__init__(env)
-        self.lengths = lengths
+        self.lengths, self.seeds, self.bad = lengths, seeds, bad
 
     def reset(self, *, seed=None, options=None):
-        self.steps_left = next(self.lengths)
+        self.is_bad, self.steps, self.length = seed in self.seeds, 0, next(self.lengths) if self.lengths else None
         return self.env.reset(seed=seed)
 
     def step(self, action):
-        assert self.steps_left > 0, "stepped after the end"
-        self.steps_left -= 1
-        observation, _, _, truncated, _ = self.env.step(action)
-        return observation, 1.0, self.steps_left == 0, truncated, {"left": self.steps_left}
+        assert self.steps != self.length, "stepped after the end"
+        self.steps += 1
+        observation, reward, terminated, truncated, _ = self.env.step(action)
+        if self.length:
+            reward, terminated = 1.0, self.steps == self.length
+        output = {"observation": observation, "reward": reward} | (self.bad if self.is_bad and self.steps == 3 else {})
+        return *output.values(), terminated, truncated, {"left": (self.length or 0) - self.steps}
 
 
 @pytest.fixture
 def wrap(monkeypatch):
-    """Choose the wrapper of toys/Wrapped-v0."""
-    return lambda wrapper, **options: monkeypatch.setattr(Wrapped, "wrap", staticmethod(partial(wrapper, **options)))
+    """Choose how toys/Wrapped-v0 is changed."""
+    return lambda **options: monkeypatch.setattr(Wrapped, "wrap", staticmethod(partial(Changed, **options)))
 
 
 def local_envs(count, task=None):
@@ -142,7 +145,7 @@ def test_collect_result_is_not_overwritten():
 
 @pytest.mark.parametrize(("limit", "ends", "terminated"), [(5, [4, 9, 14, 19], []), (9, [6, 13], [6, 13])])
 def test_collect_distinguishes_termination(limit, ends, terminated, wrap):
-    wrap(Countdown, lengths=itertools.repeat(7))
+    wrap(lengths=itertools.repeat(7))
     steps = collect(make_envs((0,), task=WRAPPED.model_copy(update={"max_episode_steps": limit})), 20)
     np.testing.assert_array_equal(np.flatnonzero(steps.ended[0]), ends)
     np.testing.assert_array_equal(np.flatnonzero(steps.next_timestep.terminated[0]), terminated)
@@ -161,7 +164,7 @@ def test_restore_drops_only_other_observations():
 
 
 def test_restore_drops_episode_that_ends_early(wrap):
-    wrap(Countdown, lengths=iter((9, 2, 9)))
+    wrap(lengths=iter((9, 2, 9)))
     envs = make_envs((0,), task=WRAPPED)
     collect(envs, 5)
     dropped, _ = envs.restore(envs.state_dict())
@@ -209,7 +212,7 @@ def test_evaluated_episode_does_not_depend_on_the_number_of_environments():
 
 
 def test_evaluate_episodes_of_different_lengths(wrap):
-    wrap(Countdown, lengths=iter((3, 1, 7) * 2))
+    wrap(lengths=iter((3, 1, 7) * 2))
     envs = local_envs(3, WRAPPED.model_copy(update={"measures": ("left",)}))
     evaluation = evaluate_on_host(envs, proportional(0.0), [0], 3)
     np.testing.assert_array_equal(evaluation.returns[..., 0], [[3, 1, 7]])
@@ -241,35 +244,16 @@ def test_policy_that_is_nan_is_reported():
         evaluate_on_host(local_envs(2), lambda timestep, episode_start: action, (0, 1), 1)
 
 
-class BadOutput(gymnasium.Wrapper):
-    """Returns a bad observation or reward at the third step, in episodes of some seeds."""
-
-    def __init__(self, env, value=None, seeds=range(2**31), reward=False):
-        super().__init__(env)
-        self.value, self.seeds, self.reward = value, seeds, reward
-
-    def reset(self, *, seed=None, options=None):
-        self.is_bad, self.steps = seed in self.seeds, 0
-        return super().reset(seed=seed, options=options)
-
-    def step(self, action):
-        observation, reward, *rest = super().step(action)
-        self.steps += 1
-        if self.is_bad and self.steps == 3:
-            return (observation, self.value, *rest) if self.reward else (self.value, reward, *rest)
-        return observation, reward, *rest
-
-
 def test_collect_locates_bad_outputs(wrap):
     """The reward in the second episode of the second environment of seed 9, which is the seed's episode number 3.
 
     The fourth environment of the run has a single number in the message.
     """
-    wrap(BadOutput, value=np.zeros(3))
+    wrap(observation=np.zeros(3))
     with pytest.raises(EnvOutputError, match=r"observation.*\(3,\).*, at step 3 of episode 0 of seed 4$"):
         collect(make_envs((4,), task=WRAPPED), 20)
     seed = episode_seed(9, Stream.TRAINING_EPISODES, 3)
-    wrap(BadOutput, value=float("nan"), seeds={seed}, reward=True)
+    wrap(reward=float("nan"), seeds={seed})
     with pytest.raises(
         EnvOutputError, match=r"^the environment: .*reward.*nan.*, at step 3 of episode 1 of seed 9 in environment 1$"
     ):
@@ -280,10 +264,10 @@ def test_restore_and_evaluate_locate_bad_outputs(wrap):
     """The step is that of the repeated or evaluated episode."""
     envs = make_envs((4,), task=WRAPPED)
     collect(envs, 27)
-    wrap(BadOutput, value=float("nan"), reward=True)
+    wrap(reward=float("nan"))
     with pytest.raises(EnvOutputError, match=r"reward.*nan.*, at step 3 of episode 1 of seed 4$"):
         make_envs((4,), task=WRAPPED).restore(envs.state_dict())
-    wrap(BadOutput, value=float("nan"), seeds={episode_seed(1, Stream.EVALUATION_EPISODES, 2)}, reward=True)
+    wrap(reward=float("nan"), seeds={episode_seed(1, Stream.EVALUATION_EPISODES, 2)})
     envs = local_envs(4, WRAPPED)
     evaluate_on_host(envs, proportional(0.0), (0, 1), 2)
     with pytest.raises(EnvOutputError, match=r"nan.*, at step 3 of the episode, in an evaluation of seed 1$"):

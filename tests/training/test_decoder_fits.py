@@ -3,7 +3,6 @@
 In the first fit, held-out episodes are not fitted to, and each seed keeps its best decoder.
 """
 
-import signal
 from dataclasses import replace
 from functools import partial
 
@@ -12,8 +11,6 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-import lare_rl
-from helpers.listeners import metrics_without_times
 from helpers.numpy_twins import assert_close
 from helpers.small_configs import (
     ONE_AGENT,
@@ -25,14 +22,12 @@ from helpers.small_configs import (
     untrained_learner,
     with_factor_decoders,
 )
-from helpers.training_runs import resume_quietly, train_quietly
 from lare_rl.credit.decoder_settings import CreditSettings
 from lare_rl.data import replay
-from lare_rl.envs.load import read_task
-from lare_rl.latent.function import verify_function
 from lare_rl.training import compiled, decoder_fits
 from lare_rl.training.decoder_fits import (
     PATIENCE,
+    FirstFitStoppedError,
     config_of_first_fit,
     fit_decoders,
     fit_seeds,
@@ -123,31 +118,11 @@ def test_fit_until_converged_keeps_the_best_decoders():
     np.testing.assert_array_equal(fitted.replay.current_episode, [learner.replay.current_episode] * 2)
     np.testing.assert_array_equal(fitted.replay.running, [learner.replay.running] * 2)
     assert "credit/loss" in metrics
+    with pytest.raises(FirstFitStoppedError):
+        fit_until_converged(stack_seeds(learner, learner), fit, keys, config, lambda: True)
 
 
 @pytest.mark.parametrize(("steps", "first"), [(6400, 800), (400, 50), (80, 12), (10, 10)])
 def test_config_of_first_fit_reads_an_eighth_of_the_steps(steps, first):
     config = small_config("lare-rd", credit=CreditSettings(steps=steps))
     assert config_of_first_fit(config).credit.steps == first
-
-
-PHI = "def evaluation_func(o, a):\n    return [np.sum(np.square(o[:, 4:8]), axis=1, keepdims=True), o[:, 0:1]]"
-
-
-@pytest.mark.long
-def test_resume_after_a_stop_during_the_first_fit(small_many, tmp_path, monkeypatch):
-    task = read_task("CN-6")
-    changes = {"environments": 12, "steps": 600, "evaluate_every": 300, "capacity": 2000, "first_fit": "held-out"}
-    settings, function = small_many(method="lare-rd", seeds=1, **changes), verify_function(PHI, task)
-    uninterrupted = train_quietly(task, settings, tmp_path / "uninterrupted", function)
-
-    def request_stop(learner):
-        signal.raise_signal(signal.SIGINT)
-        return True
-
-    with monkeypatch.context() as patch:
-        patch.setattr(decoder_fits, "has_enough_episodes", request_stop)
-        with pytest.raises(lare_rl.LareError, match=r"first fit.*--resume"):
-            train_quietly(task, settings, tmp_path / "run", function)
-    resumed = resume_quietly(tmp_path / "run")
-    assert metrics_without_times(resumed) == metrics_without_times(uninterrupted)

@@ -1,7 +1,6 @@
 """Returns are predicted before they are learned from, and sufficient statistics are those from scratch."""
 
 from dataclasses import replace
-from functools import partial
 
 import jax
 import jax.numpy as jnp
@@ -14,10 +13,8 @@ from helpers.small_configs import (
     LENGTHS,
     ONE_AGENT,
     ONE_TEAM,
-    TOTAL,
     add_steps,
     jitted,
-    learner_with_episodes,
     random_factors,
     random_steps,
     small_config,
@@ -107,23 +104,6 @@ def test_learn_returns_keeps_the_statistics_from_scratch(method, algorithm, env,
     n_paid = sum(-(-length // (payments.period or length)) for length in LONG)
     assert 0.98 * n_paid - 1 <= float(statistics_of(closed).n_episodes) <= n_paid
     assert 5 < len(n_steps) < 25
-
-
-@pytest.mark.long
-def test_a_seed_without_new_episodes_does_not_change():
-    """The statistics of both seeds are outdated, but only the first seed has episodes to learn from."""
-    config = small_config("rd-linear")
-    learned = learner_with_episodes(config)
-    decoder = learned.decoders[0]
-    statistics = decoder.statistics._replace(n_rows=10 * decoder.statistics.n_rows)
-    learned = learned._replace(decoders=(decoder._replace(statistics=statistics),))
-    new = learned._replace(n_learned=jnp.zeros_like(learned.n_learned))
-    seeds = jax.tree.map(lambda *leaves: jnp.stack(leaves), new, learned)
-    with jax.enable_x64(True):
-        decoders = jax.jit(partial(episodes.learn_returns, config=config))(seeds).decoders
-    assert decoders[0].closed_form.n_steps.tolist() == [10 * TOTAL, TOTAL]
-    for leaf, before in zip(*map(jax.tree.leaves, (decoders, seeds.decoders)), strict=True):
-        np.testing.assert_array_equal(leaf[1], before[1])
 
 
 @pytest.mark.long

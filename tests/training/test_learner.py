@@ -53,22 +53,6 @@ def update_once(learner, config, key=0):
     return jitted(fit_decoders, config)(learner.decoders, learner.replay, sample, jax.random.key(1))
 
 
-@pytest.mark.parametrize("method", ["rd", *map(long_case, ("rrd", "rrdu", "vib-rd", "vib-rrdu"))])
-def test_fit_ignores_padding(method):
-    config = small_config(method)
-    learner = learner_with_episodes(config)
-    sample = jax.tree.map(lambda leaf: leaf[0], sample_credit(learner.replay, jax.random.key(2), 1, config))
-    padding = np.asarray(sample.episode) >= len(sample.episodes.length)
-    assert padding.any()
-    changed = sample._replace(steps=sample.steps._replace(number=jnp.where(padding, 40, sample.steps.number)))
-    assert (np.asarray(sample.steps.number) != changed.steps.number).any()
-    updates = (
-        jitted(fit_decoders, config)(learner.decoders, learner.replay, batch, jax.random.key(0))
-        for batch in (sample, changed)
-    )
-    assert_close(*updates, 1e-5, 1e-7)
-
-
 @pytest.mark.parametrize(
     ("method", "scale_rewards"),
     [("dense", True), ("lare-rrdu", False), long_case("lare-rrdu", True), ("llm-reward", True)],

@@ -11,7 +11,6 @@ import pytest
 from helpers.numpy_twins import assert_close
 from helpers.small_configs import (
     LENGTHS,
-    ONE_AGENT,
     ONE_TEAM,
     SMALL_SETTINGS,
     TOTAL,
@@ -101,23 +100,6 @@ def test_act_normalises_by_the_statistics_of_earlier_rollouts():
     prepared = ppo.prepare_batch(learner.algorithm, rollout, config.hyperparameters)[0]
     expected = standardise(statistics, rollout.observation[:, 0])
     np.testing.assert_allclose(prepared.observation, expected, rtol=1e-4, atol=1e-5)
-
-
-@pytest.mark.parametrize("discrete", [False, True])
-def test_act_with_and_without_noise(discrete):
-    config = ppo_config("dense", env=replace(ONE_AGENT, discrete=discrete))
-    actor, random = policy.get_actor(untrained_learner(config).algorithm, 0, config), np.random.default_rng(0)
-    noise = random.gumbel(size=(20, 1, 2)) if discrete else random.normal(size=(20, 1, 2))
-    noise, observation, available = jnp.asarray(noise, jnp.float32), jnp.ones((20, 1, 3)), jnp.ones((20, 1, 2), bool)
-    explored, memory = policy.act(actor, (), observation, available, noise, config)
-    assert memory == ()
-    greedy = policy.act(actor, (), observation, available, None, config)[0]
-    if discrete:
-        np.testing.assert_array_equal(np.sort(explored, axis=-1), np.broadcast_to([0, 1], explored.shape))
-        assert 0 < explored[..., 0].sum() < len(explored)
-        np.testing.assert_array_equal(greedy, np.broadcast_to(greedy[:1], greedy.shape))
-    else:
-        np.testing.assert_allclose(explored - greedy, noise, rtol=1e-4, atol=1e-5)
 
 
 def test_rollout_of_many_agents():

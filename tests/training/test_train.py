@@ -47,12 +47,16 @@ def test_config_names_everything_a_run_depends_on(factor_run, phi, tmp_path):
         open_run(run.directory)
 
 
-@pytest.mark.parametrize("candidates", [1, 5])
-def test_candidates_setting_chooses_recording(candidates):
+def test_candidates_setting_chooses_recording():
     task = lare_rl.load_task("Reacher-v4")
-    settings = resolve(lare_rl.Settings(method="lare-rd", candidates=candidates), task)
-    (function,) = choose_functions(task, settings, None)
-    assert function.source == lare_rl.design(task, candidates=candidates).source
+    for candidates in (1, 5):
+        settings = resolve(lare_rl.Settings(method="lare-rd", candidates=candidates), task)
+        (function,) = choose_functions(task, settings, None)
+        assert function.source == lare_rl.design(task, candidates=candidates).source
+
+
+MANY_FACTORS = f"def evaluation_func(o, a):\n    return [{', '.join(f'o[:, 0:1] * {i + 1}' for i in range(17))}]\n"
+SHORT = {"method": "dense", "rollout_steps": 1, "evaluate_every": 1}
 
 
 @pytest.mark.parametrize(
@@ -62,19 +66,11 @@ def test_candidates_setting_chooses_recording(candidates):
         ({"candidates": 1}, PHI, "draw and candidates"),
         ({"method": "rrdu"}, PHI, "rrdu needs no latent function"),
         ({"method": "llm-reward"}, PHI, "this one has 2"),
-        (
-            {"method": "lare-signs"},
-            f"def evaluation_func(o, a):\n    return [{', '.join(f'o[:, 0:1] * {i + 1}' for i in range(17))}]\n",
-            "at most 16 factors, and there are 17",
-        ),
+        ({"method": "lare-signs"}, MANY_FACTORS, "at most 16 factors, and there are 17"),
         ({"method": "dense", "capacity": 43}, None, "capacity = 43.*an iteration of Chase takes up to 44"),
         ({"method": "rrdu", "algorithm": "ppo", "capacity": 43}, None, "capacity = 43.*a rollout of Chase"),
-        ({"method": "dense", "steps": 9, "rollout_steps": 1, "evaluate_every": 1}, None, "steps = 9 are too few"),
-        (
-            {"method": "dense", "steps": 18, "rollout_steps": 1, "evaluate_every": 2, "environments": 2},
-            None,
-            "environments = 2 needs at least 20",
-        ),
+        (SHORT | {"steps": 9}, None, "steps = 9 are too few"),
+        (SHORT | {"steps": 18, "evaluate_every": 2, "environments": 2}, None, "environments = 2 needs at least 20"),
     ],
 )
 def test_bad_arguments_leave_no_directory(changes, function, message, small, tmp_path):
