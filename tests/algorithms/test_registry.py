@@ -6,12 +6,9 @@ from lare_rl.algorithms.registry import ALGORITHMS, register_algorithm
 from lare_rl.errors import LareError
 
 
-def test_greedy_samples_distributions_over_choices():
+def test_rows_and_what_register_algorithm_refuses():
     for discrete, names in ((True, {"ppo", "ippo"}), (False, {"ippo"})):
         assert {name for name, row in ALGORITHMS.items() if not row.deterministic_evaluation(discrete)} == names
-
-
-def test_register_algorithm_refuses():
     register_algorithm(ALGORITHMS["td3"])
     with pytest.raises(LareError, match="'td3'"):
         register_algorithm(replace(ALGORITHMS["sac"], name="td3"))

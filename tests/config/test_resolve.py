@@ -108,7 +108,7 @@ def test_resolve_completes_credit(task, default):
         assert resolve_named(task, {"credit": credit}).credit == default.model_copy(update=changes | {"exact": "no"})
 
 
-def test_resolve_fit_updates():
+def test_resolve_fit_updates_and_score():
     """The fit of diaster is expensive: one update for 50 steps."""
     ppo = {"algorithm": "ppo", "rollout_steps": 2000}
     cases = [
@@ -119,9 +119,6 @@ def test_resolve_fit_updates():
     ]
     for expected, settings in cases:
         assert resolve_named("Reacher-v4", settings).fit_updates == expected
-
-
-def test_resolve_score():
     cases = [
         (None, "auto", "auto"),
         ("average", "auto", "average"),
@@ -133,16 +130,13 @@ def test_resolve_score():
         assert resolve(settings, toy_spec(score=task_score)).credit.score == score
 
 
-def test_resolve_normalises_settings_without_effect():
+def test_settings_without_effect_and_replay_rows():
     """Runs that are the same have the same settings."""
     fixed_length = [{"method": "lare-rd", "credit": {"score": score}} for score in ("auto", "sum", "average")]
     assert len({resolve_named("CN-6", settings) for settings in fixed_length}) == 1
     assert resolve_named("Reacher-v4", {"method": "bayes", "scored_observation": "before"}).scored_observation is None
     assert resolve_named("Reacher-v4", {"method": "bayes", "scored_observation": "after"}).scored_observation == "after"
     assert resolve_named("SMAX-2s3z", {"method": "rd"}).credit.score == "sum"
-
-
-def test_replay_rows():
     ppo = {"algorithm": "ppo", "steps": 100_000}
     cases = [
         ("Reacher-v4", ppo | {"method": "rrdu"}, 50, 200_002),

@@ -100,7 +100,7 @@ def test_unused_settings(task, settings, names):
     assert not set(names) & set(effective_settings(resolved))
 
 
-def test_message_of_unused_settings():
+def test_messages_of_unused_settings_and_warmup():
     settings = Settings(method="dense", td3={"gamma": 0.5, "tau": 0.5}, scale_rewards=True, credit={"steps": 70})
     messages = unused_settings(settings, resolve(settings, pick_spec()), pick_spec())
     expected = {"td3.gamma": "ppo.gamma", "td3.tau": "ppo", "scale_rewards": "ppo", "credit.steps": "dense"}
@@ -109,9 +109,6 @@ def test_message_of_unused_settings():
         f"{name} makes no difference" in messages[name] and text in messages[name] for name, text in expected.items()
     )
     assert frozenset().union(*(method.settings for method in METHODS.values())) == set(CreditSettings.model_fields)
-
-
-def test_warmup_warning():
     settings = Settings(steps=10_000, algorithm="td3", td3={"warmup": 9_990})
     assert "10,000 are (td3.warmup)" in (warmup_warning(resolve(settings, read_task("Reacher-v4"))) or "")
     longer = settings.model_copy(update={"steps": 10_050})

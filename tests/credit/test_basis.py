@@ -13,7 +13,7 @@ def numpy_fourier_terms(u):
     return np.concatenate([wave(k * np.pi * clipped / 4) / k for k in (1, 2, 3) for wave in (np.cos, np.sin)])
 
 
-def test_expand_by_hand():
+def test_expand_by_hand_and_precision():
     basis = Basis(3, 2, extended=True)
     factor_pairs, raw_pairs = [0.5 * -1.0, 0.5 * 2.0, -1.0 * 2.0], [4.0 * -0.3]
     factors = [U[:3], numpy_fourier_terms(U[:3]), factor_pairs]
@@ -23,9 +23,6 @@ def test_expand_by_hand():
     assert basis.n_features == len(want)
     assert basis.group_index.tolist() == [0] * 3 + [1] * 18 + [2] * 3 + [3] * 2 + [4] * 12 + [5]
     assert basis.is_factor_feature.tolist() == [True] * 24 + [False] * 15
-
-
-def test_fourier_terms_have_the_precision_of_float32():
     u = np.linspace(-4, 4, 2001)
     cosine, sine = np.asarray(fourier_terms(jnp.asarray(u[:, None], jnp.float32), 1)).T
     np.testing.assert_allclose(cosine, np.cos(np.pi * u / 4), atol=5e-7)

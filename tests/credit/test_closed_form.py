@@ -40,7 +40,7 @@ def observed(rows):
     return update_mean_std(empty_mean_std(rows.shape[1]), jnp.asarray(rows, jnp.float32))
 
 
-def test_linear_decoder_by_hand():
+def test_linear_decoder_by_hand_and_split_double():
     basis = Basis(1, 2, extended=True)
     weight = np.random.default_rng(0).normal(size=basis.n_features).astype(np.float32)
     mean, std = np.array([1.0, 2.0, 3.0], np.float32), np.array([2.0, 0.0, 0.5], np.float32)
@@ -49,9 +49,6 @@ def test_linear_decoder_by_hand():
     u = np.stack([(rows[..., 0] - 1) / 2, np.zeros((5, 4)), (rows[..., 2] - 3) / 0.5], axis=-1)
     want = np.asarray(expand(basis, jnp.asarray(u, jnp.float32))) @ weight + 0.25
     np.testing.assert_allclose(decoder(jnp.asarray(rows)).r_hat, want, rtol=1e-5, atol=1e-5)
-
-
-def test_split_double_keeps_float64():
     with jax.enable_x64(True):
         numbers = jnp.asarray(1e6 + np.random.default_rng(0).normal(size=10))
         statistics = evidence.empty_statistics(8)._replace(mean=numbers)

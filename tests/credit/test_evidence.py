@@ -105,7 +105,7 @@ def test_fit_against_numpy(score_type):
             np.testing.assert_allclose(value, want, rtol=1e-4, atol=1e-8)
 
 
-def test_fit_recovers_rewards_and_switches_off_a_useless_group():
+def test_fit_recovers_rewards_where_returns_determine_them():
     means, returns, length, weight = sample_episodes(count=200, noise=0.0)
     posterior = fit(sum_up(means, returns, length))
     np.testing.assert_allclose(posterior.weight, weight, atol=1e-4)
@@ -114,6 +114,14 @@ def test_fit_recovers_rewards_and_switches_off_a_useless_group():
     assert noisy.n_effective[0] > 2.9
     assert noisy.n_effective[1] < 0.5
     assert np.abs(noisy.weight[3:7]).max() < 0.01  # the useless group is switched off
+    means, returns, length, _ = sample_episodes()
+    equal = fit(sum_up(means, 0.3 * length, length))
+    assert np.abs(equal.weight).max() < 1e-6
+    assert float(equal.bias) == pytest.approx(0.3)
+    for count, bias in ((0, 0), (1, returns[0] / length[0])):
+        posterior = fit(sum_up(means[:count], returns[:count], length[:count]))
+        assert not np.asarray(posterior.weight).any()
+        assert float(posterior.bias) == pytest.approx(bias)
 
 
 def test_fit_recovers_a_rare_event_from_few_episodes():
@@ -131,17 +139,6 @@ def test_fit_recovers_a_rare_event_from_few_episodes():
         means, returns, length = sample(200, seed + 100)
         predicted = length * (means @ np.asarray(posterior.weight) + float(posterior.bias))
         np.testing.assert_allclose(predicted, returns, atol=1.0)
-
-
-def test_few_or_equal_returns_determine_only_the_mean():
-    means, returns, length, _ = sample_episodes()
-    equal = fit(sum_up(means, 0.3 * length, length))
-    assert np.abs(equal.weight).max() < 1e-6
-    assert float(equal.bias) == pytest.approx(0.3)
-    for count, bias in ((0, 0), (1, returns[0] / length[0])):
-        posterior = fit(sum_up(means[:count], returns[:count], length[:count]))
-        assert not np.asarray(posterior.weight).any()
-        assert float(posterior.bias) == pytest.approx(bias)
 
 
 @pytest.mark.parametrize("error", [0.0, 1e-18, 1e-9])

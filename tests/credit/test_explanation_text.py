@@ -73,7 +73,7 @@ def test_codes(changes, factors, raw_features, codes):
     assert [finding.code for finding in find(changes, factors, raw_features)] == codes.split()
 
 
-def test_shares():
+def test_shares_groups_and_missing_pairs():
     values = find({}, raw_features=RAW_FEATURES)[0].values
     assert (values["share"], values["target"]) == (0.9, Finding("returns", {"n_episodes": 40}))
     assert values["raw"].values["share"] == pytest.approx(0.07)
@@ -87,9 +87,6 @@ def test_shares():
     about, _, *factors = find(shares, raw_features=RAW_FEATURES)[:4]
     assert (about.values["share"], about.values["raw"].values["share"]) == (0.90, 0.03)  # and 7% is not explained
     assert [factor.values["share"] for factor in factors] == [0.65, 0.25]
-
-
-def test_groups_and_missing_pairs():
     effects = {f"map {i}": float(-i if i == 5 else i) for i in range(11)}  # no episode was fitted to the first
     (finding,) = (finding for finding in find({}, groups=effects) if finding.code == "groups_differ")
     assert [group.values["name"] for group in finding.values["groups"]] == [f"map {i}" for i in range(10, 2, -1)]

@@ -86,14 +86,11 @@ def test_payments_are_in_the_unit_of_the_return():
     np.testing.assert_allclose(np.polyfit(payments, returns, 1)[0], 1, atol=0.15)
 
 
-def test_fit_changes_nothing_while_all_returns_are_equal():
+def test_equal_returns_and_the_window():
     x, _, _ = make_episodes(20)
     state = fit(x, np.full(20, 3.0))
     assert np.all(state.posterior.weight == 0)
     assert logistic.to_returns(state)[1] == 0
-
-
-def test_window_holds_the_last_episodes():
     x, _, returns = make_episodes(logistic.WINDOW + 10)
     state = logistic.init(GROUP_INDEX)
     with float64():

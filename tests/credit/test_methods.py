@@ -15,7 +15,7 @@ from lare_rl.credit.methods import METHODS, Fit, Method, Reward, register_method
 from lare_rl.errors import LareError
 
 
-def test_rows_are_consistent():
+def test_rows_and_names():
     for method in METHODS.values():
         assert (method.reward is Reward.PROXY) == (method.fit is not None)
         assert (method.reward in (Reward.PROXY, Reward.DESIGNED)) == (method.inputs is not None)
@@ -25,9 +25,6 @@ def test_rows_are_consistent():
     for name in (*fits, "lare-rd", "lare-rrdu"):
         inputs = methods.FACTORS if name.startswith("lare-") else methods.RAW
         assert (METHODS[name].inputs, METHODS[name].fit) == (inputs, fits[name.removeprefix("lare-")])
-
-
-def test_unknown_names():
     for name, words in (("lare_rrdu", "'lare_rrdu' .*'lare-rrdu'"), ("", "dense, episodic, ")):
         with pytest.raises(LareError, match=words):
             METHODS.find(name)
@@ -79,14 +76,11 @@ def test_registered_method_is_trained(fit, registered):
     assert np.isfinite(credit.metrics()["credit/loss"])
 
 
-def test_loss_of_a_decoder_is_for_a_single_agent(registered):
+def test_decoders_that_are_refused(registered):
     """Steps of several agents would be mixed with each other: `loss` has an axis of steps, and none of agents."""
     register(Fit.DECODER_LOSS)
     with pytest.raises(LareError, match="mine assigns credit to a single agent, and the task has 2 agents"):
         CreditAssigner("mine", observation_space=2, action_space=1, agents=2, max_steps=5)
-
-
-def test_decoder_with_functions_is_refused_in_one_line(registered):
     register(Fit.ALL_STEPS, lambda key, spec: eqx.nn.MLP(spec.n_inputs, 1, 4, 1, key=key))
     with pytest.raises(LareError, match=r"'mine' holds .* instead of eqx.nn.MLP.*, use lare_rl.nn.networks.MLP"):
         CreditAssigner("mine", observation_space=2, action_space=1)

@@ -107,7 +107,7 @@ def test_segments_match_slow_twin(rule, data):
         assert observation[sample.episode == i].tolist() == [step[0] for step in paid_for]
 
 
-def test_abandon_running_forgets_its_payments():
+def test_abandon_running_and_its_payments():
     buffer = filled_replay([stream([2, 5])] * ENVS, [6], CAPACITY, PaymentRule(period=2))
     assert replay.segments_as_episodes(buffer).current_episode.tolist() == [3] * ENVS
     abandoned = abandon_running(buffer, jnp.array([True, False, True]))
@@ -116,9 +116,6 @@ def test_abandon_running_forgets_its_payments():
     longer = extend(abandoned, *steps, payments=PaymentRule(period=2))
     assert replay.segments_as_episodes(longer).current_episode.tolist() == [2, 4, 2]
     assert read(longer, replay.newest_steps(longer, 3)).last.tolist()[::2] == [[False, True, False]] * 2
-
-
-def test_abandon_running():
     buffer = filled_replay([stream([2, 5], 0), stream([4, 3], 1), stream([3, 1, 9], 2)], [7], CAPACITY)
     assert buffer.running.tolist() == [True, True, True]
     abandoned = abandon_running(buffer, jnp.array([True, False, True]))

@@ -112,7 +112,7 @@ def test_episodes_in_order(buffer):
     assert_packed(jax.tree.map(np.asarray, sample), expected[:2])
 
 
-def test_sample_episode_steps_has_steps_of_its_episodes(buffer):
+def test_sample_steps_and_padded_episodes(buffer):
     sample = jax.tree.map(np.asarray, sample_episode_steps(buffer, jax.random.key(0), 7, 6, 4))
     lengths = [FIRST[first][0] for first in pairs(sample.episodes.first)]
     assert 3 in lengths
@@ -124,9 +124,6 @@ def test_sample_episode_steps_has_steps_of_its_episodes(buffer):
         # An episode of three steps has three rows; its fourth row is padding.
         slots = sample.episode.reshape(42, 4)[i]
         assert slots.tolist() == [i % 6] * min(length, 4) + [6] * (4 - min(length, 4))
-
-
-def test_sample_padded_repeats_the_last_step(buffer):
     sample = sample_padded(buffer, jax.random.key(0), 5, 8, LONGEST)
     firsts = pairs(sample.episodes.first)
     expected = [(env, first + min(t, FIRST[env, first][0] - 1)) for env, first in firsts for t in range(LONGEST)]

@@ -106,10 +106,16 @@ def test_correction_request(chase, bad, quote, errors):
     assert [exchange["stage"] for exchange in function.exchanges] == ["candidate", "correct"]
 
 
-def test_surrogates_go_back_as_an_error(chase, tmp_path):
+def test_requests_of_surrogates_and_of_a_reward(chase, tmp_path):
     model = scripted(GOOD.replace('""', '"\\ud800"', 1), "\ud800", GOOD)
     design(chase, model=model, candidates=1).save(tmp_path / "phi.py")
     assert "surrogate" in model.requests[1][-1]["content"]
+    model = scripted(GOOD, to_reply(phi_source("return [action]")))
+    function = design(chase, "reward", model=model, candidates=1)
+    error = verify(PHI, chase, "reward").errors
+    request = candidate(chase, "reward")
+    assert model.requests == [request, correct(request, GOOD, error)]
+    assert (function.kind, function.size) == ("reward", 1)
 
 
 def test_passing_candidates_are_combined(chase):
@@ -128,15 +134,6 @@ def test_passing_candidates_are_combined(chase):
     design(chase, model=model, candidates=3, on_message=messages.append)
     assert model.requests[-1] == combine(chase, [MALFORMED, two_errors, "x" * MAX_QUOTE])
     assert messages[1].endswith("(and 1 more)")
-
-
-def test_reward_has_its_own_request_and_check(chase):
-    model = scripted(GOOD, to_reply(phi_source("return [action]")))
-    function = design(chase, "reward", model=model, candidates=1)
-    error = verify(PHI, chase, "reward").errors
-    request = candidate(chase, "reward")
-    assert model.requests == [request, correct(request, GOOD, error)]
-    assert (function.kind, function.size) == ("reward", 1)
 
 
 def test_attempts_end(chase):

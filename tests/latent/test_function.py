@@ -104,7 +104,7 @@ def test_factor_that_is_not_finite_in_use(chase):
     assert str(pickle.loads(pickle.dumps(error.value))) == str(error.value)
 
 
-def test_names_meanings_and_features(function):
+def test_names_meanings_features_and_source(function):
     assert function.names == ["f_near", "f_effort"]
     assert function.meanings == ["how near the action comes", "effort"]
     source = phi_source("# Factor 1: energy,\n# squared\nenergy = action**2\nreturn [-energy, energy]")
@@ -116,9 +116,6 @@ def test_names_meanings_and_features(function):
     assert features_text({"observation": [], "action": []}) == "nothing"
     indices = {"observation": [8, 9, 13], "action": [0, 1, 2, 3, 4, 5]}
     assert features_text(indices) == "observation[8:10, 13], action[0:6]"
-
-
-def test_normalise_source():
     assert normalise_source("# lare: x\r\n\n  y\rz\x0c\x85\n\n") == "  y\nz\x0c\x85"
     assert normalise_source("x  # \u26a0\ufe0f sign") == "x  # \u26a0 sign"
     assert normalise_source("# lare: \n\n" * 60_000 + "\nx\n\n") == "x"  # quadratic time would take minutes

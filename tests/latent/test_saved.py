@@ -21,7 +21,7 @@ def path(function, tmp_path):
     return tmp_path / "phi.py"
 
 
-def test_saved_files(function, path):
+def test_save_and_load(function, path, verified, chase):
     header = [
         "task: Chase",
         "kind: factors",
@@ -31,9 +31,6 @@ def test_saved_files(function, path):
     ]
     assert path.read_text() == "".join(f"# lare: {line}\n" for line in header) + SOURCE + "\n"
     assert json.loads(path.with_suffix(".json").read_text())["exchanges"] == list(function.exchanges)
-
-
-def test_load_function(function, verified, chase, path):
     content = path.read_text()
     assert load_function(path.with_suffix(".json"), chase) == load_function(path, chase) == function
     load_function(path, chase).save(path)
@@ -56,21 +53,23 @@ def test_load_what_was_saved(chase, path, source, kind):
     assert load_function(path, chase) == function
 
 
-def test_function_of_another_task(chase, path):
+def test_other_task_and_names_of_models(chase, path, function):
     other = chase.model_copy(update={"name": "Depot"})
     with pytest.raises(LareError, match=r"phi\.py .*'Chase', not for 'Depot'.*\"# lare: task: Chase\""):
         load_function(path, other)
     path.write_text(path.read_text().replace("# lare: task: Chase\n", ""))
     assert load_function(path, other).task == "Depot"
+    replace(function, model="x\nimport os\r\x85import sys\u2028#").save(path)
+    assert load_function(path, chase).source == function.source
+    assert path.read_text().splitlines()[2] == "# lare: model: x import os import sys #"
+    replace(function, model="m\udcff").save(path)  # a name that no file can have
+    assert load_function(path, chase) == replace(function, model="m\\udcff")
 
 
-def test_read_source(path, tmp_path):
+def test_read_source_and_reply_of_a_chat(path, tmp_path, chase):
     assert read_source(path) == read_source(path.with_suffix(".json")) == (SOURCE, False, "Chase")
     path.write_text("\ufeff\n\nno Python\n", encoding="utf-8")
     assert read_source(path) == ("no Python", False, None)
-
-
-def test_reply_of_a_chat(chase, tmp_path):
     reply = json.dumps({"Understand": "", "Analyze": "", "Functions": PHI})
     path = tmp_path / "reply.json"
     path.write_text(f"Here it is:\n```json\n{reply}\n```\n")
@@ -104,14 +103,6 @@ def test_header_in_a_reply(chase, path, top):
     function.save(path)
     loaded = load_function(path, chase)
     assert (loaded.kind, loaded.source, loaded.changed) == ("factors", SOURCE, False)
-
-
-def test_model_name_is_no_code(function, chase, path):
-    replace(function, model="x\nimport os\r\x85import sys\u2028#").save(path)
-    assert load_function(path, chase).source == function.source
-    assert path.read_text().splitlines()[2] == "# lare: model: x import os import sys #"
-    replace(function, model="m\udcff").save(path)  # a name that no file can have
-    assert load_function(path, chase) == replace(function, model="m\\udcff")
 
 
 def test_names_of_files(function, tmp_path, monkeypatch):

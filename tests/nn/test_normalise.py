@@ -54,7 +54,7 @@ def test_standardise():
     np.testing.assert_array_equal(normalise.standardise_if_observed(statistics, rows), want)
 
 
-def test_root_mean_square():
+def test_scale():
     scale = normalise.empty_scale()
     assert float(normalise.root_mean_square(scale)) == 1.0
     scale = update_scale(scale, jnp.zeros(4), jnp.zeros(4, bool))
@@ -62,9 +62,6 @@ def test_root_mean_square():
     scale = update_scale(scale, jnp.array([3.0, 100.0]), jnp.array([True, False]))
     scale = update_scale(scale, jnp.array([4.0, 5.0]), jnp.array([True, True]))
     assert float(normalise.root_mean_square(scale)) == pytest.approx(np.sqrt((9 + 16 + 25) / 3))
-
-
-def test_min_max_scale():
     scale = update_scale(normalise.empty_scale(), jnp.array([3.0]), jnp.array([False]))
     assert (float(scale.lowest), float(scale.highest)) == (0, 0)
     scale = update_scale(scale, jnp.array([3.0, 9.0, -5.0]), jnp.array([True, False, False]))

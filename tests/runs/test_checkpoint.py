@@ -145,7 +145,7 @@ def test_truncated_file_is_refused(name, metadata, tmp_path):
         assert checkpoint.read_metadata(tmp_path) == metadata
 
 
-def test_replay_of_extended_run_may_be_larger(tmp_path):
+def test_larger_replay_and_missing_arrays(tmp_path):
     save(tmp_path / "checkpoint", np.arange(1.0, CAPACITY + 1), 9)
     with pytest.raises(LareError, match=r"\.replay\.row has shape \(1, 1, 16\), not \(1, 1, 12\)"):
         checkpoint.load(tmp_path / "checkpoint", template(1, 1, CAPACITY - 4))
@@ -153,8 +153,6 @@ def test_replay_of_extended_run_may_be_larger(tmp_path):
     np.testing.assert_array_equal(learner.replay.columns["reward"][0, 0], [*range(1, 11), *[0] * 10])
     np.testing.assert_array_equal(learner.replay.row[0, 0], [*range(CAPACITY), *[0] * 4])
 
-
-def test_arrays_that_earlier_checkpoints_lack_are_zero():
     class Closed(NamedTuple):
         strengths: Any
         weight: Any

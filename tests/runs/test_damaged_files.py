@@ -195,7 +195,7 @@ def test_state_with_false_header(directory, content):
     check_refused(directory)
 
 
-def test_state_that_is_compressed_or_encrypted(directory):
+def test_state_that_is_no_plain_archive(directory):
     content = bytearray((directory / "state.npz").read_bytes())
     with zipfile.ZipFile(directory / "state.npz", "a", zipfile.ZIP_DEFLATED) as archive:
         archive.writestr("latest/more.npy", header((1 << 24,)) + b"\0" * (8 << 24))
@@ -204,9 +204,6 @@ def test_state_that_is_compressed_or_encrypted(directory):
     content[content.index(b"PK\x01\x02") + 8] |= 1
     (directory / "state.npz").write_bytes(content)
     check_refused(directory, "encrypted")
-
-
-def test_state_that_is_no_archive(directory):
     for content in (b"", b"PK", b"PK\x03\x04" + b"\xff" * 99, header((0,)), b"\x80\x04."):
         (directory / "state.npz").write_bytes(content)
         check_refused(directory, "no .npz file")

@@ -28,7 +28,7 @@ def run(tmp_path):
     return create_run(tmp_path / "run", toy_spec(), settings, [verify_function(PHI, toy_spec())])
 
 
-def test_open_run_equals_created(run, monkeypatch):
+def test_open_run_equals_created_and_replaced_function(run, monkeypatch):
     opened = open_run(run.directory)
     assert opened.config == run.config
     assert opened.function.digest == run.function.digest
@@ -36,10 +36,7 @@ def test_open_run_equals_created(run, monkeypatch):
     assert {"jax", "python"} < set(run.config.versions)
     monkeypatch.setattr(config_file, "VERSIONED_PACKAGES", ("jax", "no-such-extra"))
     assert set(make_config(run.config.task, run.config.settings, []).versions) == {"jax", "python"}
-
-
-def test_function_that_was_replaced_during_run(run):
-    """Format 4 had runs that replaced phi. The checkpoint has the hash of the one in use."""
+    # Format 4 had runs that replaced phi. The checkpoint has the hash of the one in use.
     new = verify_function(PHI.replace("near", "close"), toy_spec())
     new.save(run.directory / "latent_function-600.py")
     assert open_run(run.directory).function.digest == run.function.digest
@@ -68,14 +65,11 @@ def test_metrics_are_parsed_once_per_file_state(run, monkeypatch):
     assert read_metrics(run.directory) == [line | {DETERMINISTIC_RETURN: 2.0}]
 
 
-def test_every_metric_has_a_meaning():
+def test_metrics_have_a_meaning_and_the_lock_refuses_a_second_process(run):
     metric, files = r'"((?:evaluation|credit|critic|actor|time)/\w+)"', Path(lare_rl.__file__).parent.rglob("*.py")
     names = {name for path in files for name in re.findall(metric, path.read_text(encoding="utf-8"))}
     documented = {name for group in METRIC_GROUPS.values() for name in group}
     assert names - {"evaluation/won"} == documented - {"step", "seed"}  # tasks name their own measures
-
-
-def test_lock_refuses_second_process(run):
     with lock_run(run), pytest.raises(RunBusyError, match="another process"), lock_run(run):
         pass
     shutil.rmtree(run.directory)

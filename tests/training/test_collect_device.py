@@ -177,7 +177,7 @@ class Still:
         return []
 
 
-def test_collect_acts_at_random_during_the_warmup():
+def test_collect_during_the_warmup_and_episode_that_never_ends():
     """Without exploration noise, the policy acts the same in every step."""
     hyperparameters = TD3Settings(hidden=(8,), warmup=400, exploration_noise=0.0)
     config = small_config("dense", env=ONE_AGENT, n_envs=4, rollout_steps=100, hyperparameters=hyperparameters)
@@ -189,9 +189,6 @@ def test_collect_acts_at_random_during_the_warmup():
         np.testing.assert_allclose(deciles, np.linspace(-0.8, 0.8, 9), atol=0.15)
     assert abs(np.corrcoef(action)[0, 1]) < 0.15
     assert np.ptp(np.asarray(trained.action), axis=(1, 2)).max() < 1e-6
-
-
-def test_episode_that_never_ends_is_refused():
     config = small_config("dense", env=ONE_AGENT, hyperparameters=TD3Settings(hidden=(8,)))
     with pytest.raises(LareError, match=f"has not ended, but max_steps is {ONE_AGENT.max_steps}"):
         DeviceCollector(Still(), config, SEEDS).evaluate(make_actor(config=config)[1], 2)
@@ -214,18 +211,19 @@ def test_states_with_random_keys_are_restored(learner):
     np.testing.assert_array_equal(*actions)
 
 
+CHANGES = {
+    "scalar": (lambda t: t._replace(reward=t.reward[0]), r"bad-echo/scalar: reward of reset .*\(\).*\(3,\)"),
+    "short": (lambda t: t._replace(observation=t.observation[:, 1:]), r"observation .*\(3, 3\).*\(3, 4\)"),
+    "whole": (lambda t: t._replace(reward=t.reward.astype(int)), "reward of reset has the type int32, not float32"),
+    "unmeasured": (lambda t: t._replace(measures={}), "measure 'right'"),
+}
+
+
 class BadEcho(Echo):
     """The toy, whose timestep after a reset is changed as the name of the environment says."""
 
-    CHANGES = {  # noqa: RUF012
-        "scalar": lambda timestep: timestep._replace(reward=timestep.reward[0]),
-        "short": lambda timestep: timestep._replace(observation=timestep.observation[:, 1:]),
-        "whole": lambda timestep: timestep._replace(reward=timestep.reward.astype(int)),
-        "unmeasured": lambda timestep: timestep._replace(measures={}),
-    }
-
     def __init__(self, task):
-        self.change = self.CHANGES[task.environment_name]
+        self.change = CHANGES[task.environment_name][0]
 
     def reset(self, key):
         state, timestep = super().reset(key)
@@ -235,15 +233,7 @@ class BadEcho(Echo):
 register_family("bad-echo", BadEcho)
 
 
-@pytest.mark.parametrize(
-    ("name", "message"),
-    [
-        ("scalar", r"bad-echo/scalar: reward of reset .*\(\).*\(3,\)"),
-        ("short", r"observation .*\(3, 3\).*\(3, 4\)"),
-        ("whole", "reward of reset has the type int32, not float32"),
-        ("unmeasured", "measure 'right'"),
-    ],
-)
-def test_arrays_are_those_of_the_spec(name, message):
-    with pytest.raises(LareError, match=message):
+@pytest.mark.parametrize("name", CHANGES)
+def test_arrays_are_those_of_the_spec(name):
+    with pytest.raises(LareError, match=CHANGES[name][1]):
         make_jax_env(echo_spec(environment=f"bad-echo/{name}"))

@@ -122,7 +122,7 @@ def test_collect_steps_are_consecutive():
     np.testing.assert_array_equal(beyond.env_action, 2)
 
 
-def test_collect_tells_policy_episode_starts():
+def test_collect_tells_policy_episode_starts_and_overwrites_nothing():
     starts, envs = [], make_envs((0,), 2)
 
     def policy(timestep, noise, episode_start):
@@ -133,9 +133,6 @@ def test_collect_tells_policy_episode_starts():
         envs.collect_by(policy, np.zeros((n_steps, *envs.shape, 1, 1), np.float32))
     assert np.flatnonzero(np.array(starts) == 3).tolist() == [0, 20, 40]
     assert starts.count(0) == 38
-
-
-def test_collect_result_is_not_overwritten():
     envs = make_envs()
     results = collect(envs, 7), envs.state_dict()
     copies = jax.tree.map(np.copy, results)
@@ -151,7 +148,7 @@ def test_collect_distinguishes_termination(limit, ends, terminated, wrap):
     np.testing.assert_array_equal(np.flatnonzero(steps.next_timestep.terminated[0]), terminated)
 
 
-def test_restore_drops_only_other_observations():
+def test_restore_drops_other_observations_and_episodes_that_end_early(wrap):
     envs, restored = make_envs((0, 4), 2), make_envs((0, 4), 2)
     collect(envs, 27)
     state = envs.state_dict()
@@ -161,9 +158,6 @@ def test_restore_drops_only_other_observations():
     state = restored.state_dict()
     assert state["episode"].tolist() == [1, 1, 1, 2]
     assert [len(state[f"actions{i}"]) for i in range(4)] == [7, 7, 7, 0]
-
-
-def test_restore_drops_episode_that_ends_early(wrap):
     wrap(lengths=iter((9, 2, 9)))
     envs = make_envs((0,), task=WRAPPED)
     collect(envs, 5)

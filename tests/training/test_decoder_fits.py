@@ -78,19 +78,20 @@ def test_seeds_are_fitted_at_once_where_that_is_much_faster(backend, seconds, ex
 # The first fit.
 
 
-@pytest.mark.parametrize(
-    ("n_episodes", "n_held_out"),
-    [
+def test_count_held_out_and_config_of_first_fit():
+    """It reads an eighth of the steps."""
+    for n_episodes, n_held_out in (
         ((10,), [2]),
         ((1,) * 10, [0] * 8 + [1] * 2),
         ((3, 3, 3, 3), [0, 0, 0, 2]),
         ((4, 0, 6), [0, 0, 2]),
         ((999,), [32]),
-    ],
-)
-def test_count_held_out(n_episodes, n_held_out):
-    buffer = replay.init_replay({}, len(n_episodes), 100, 1)._replace(current_episode=jnp.array(n_episodes))
-    assert decoder_fits._count_held_out(buffer, window=32).tolist() == n_held_out
+    ):
+        buffer = replay.init_replay({}, len(n_episodes), 100, 1)._replace(current_episode=jnp.array(n_episodes))
+        assert decoder_fits._count_held_out(buffer, window=32).tolist() == n_held_out
+    for steps, first in ((6400, 800), (400, 50), (80, 12), (10, 10)):
+        config = small_config("lare-rd", credit=CreditSettings(steps=steps))
+        assert config_of_first_fit(config).credit.steps == first
 
 
 def test_fit_until_converged_keeps_the_best_decoders():
@@ -120,9 +121,3 @@ def test_fit_until_converged_keeps_the_best_decoders():
     assert "credit/loss" in metrics
     with pytest.raises(FirstFitStoppedError):
         fit_until_converged(stack_seeds(learner, learner), fit, keys, config, lambda: True)
-
-
-@pytest.mark.parametrize(("steps", "first"), [(6400, 800), (400, 50), (80, 12), (10, 10)])
-def test_config_of_first_fit_reads_an_eighth_of_the_steps(steps, first):
-    config = small_config("lare-rd", credit=CreditSettings(steps=steps))
-    assert config_of_first_fit(config).credit.steps == first

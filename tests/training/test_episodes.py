@@ -106,15 +106,6 @@ def test_learn_returns_keeps_the_statistics_from_scratch(method, algorithm, env,
     assert 5 < len(n_steps) < 25
 
 
-@pytest.mark.long
-def test_learn_returns_rebuilds_from_stored_episodes_only():
-    config = small_config("lare-linear", capacity=60)
-    steps = random_steps(lengths=LONG)
-    learner = list(learn_in_chunks(config, steps, random_factors(config, steps), 40))[-1]
-    assert 3 <= float(statistics_of(learner.decoders[0].closed_form).n_episodes) < len(LONG)
-    assert learner.n_learned.tolist() == [len(LONG)]
-
-
 def inputs_from(buffer, start, config):
     """Return the decoder's inputs of the next twelve steps, as many as the longest episode has."""
     number = start + jnp.arange(12)

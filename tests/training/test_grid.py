@@ -75,9 +75,8 @@ def test_method_with_agents_that_leave(credit_scope, method_name, small_many, ec
     method, from_state = METHODS[method_name], credit_scope == "state"
     changes = {"credit_scope": "state", "observation_size": 9, "action_size": 9} if from_state else {}
     task = echo.model_copy(update=changes)
-    settings = small_many(
-        method=method_name, algorithm="qmix", seeds=1, steps=100, rollout_steps=25, credit=QUICK_CREDIT
-    )
+    quick = {"seeds": 1, "steps": 100, "rollout_steps": 25, "credit": QUICK_CREDIT}
+    settings = small_many(method=method_name, algorithm="qmix", **quick)
 
     def train():
         return train_quietly(task, settings, tmp_path / "run", make_functions(method, task))

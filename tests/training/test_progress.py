@@ -49,7 +49,7 @@ def record_lines(monkeypatch, seconds):
     return terminal, lambda: text.getvalue().splitlines()[1:]
 
 
-def test_line_per_minute(monkeypatch):
+def test_line_per_minute_and_one_line_a_step(monkeypatch):
     """Also before the first evaluation, and during a long one."""
     terminal, lines = record_lines(monkeypatch, 40)
     for step in (100, 200, 300, 400, 400, 400, 400):
@@ -58,10 +58,7 @@ def test_line_per_minute(monkeypatch):
         "step   300 of 20000: 2.5 steps/s with compiling",
         "step   400 of 20000: evaluating",
     ]
-
-
-def test_one_line_a_step(monkeypatch):
-    """A minute has passed when an iteration ends, and its evaluation follows."""
+    # A minute has passed when an iteration ends, and its evaluation follows.
     terminal, lines = record_lines(monkeypatch, 35)
     for step in (2000, 4000):
         for _ in range(2):  # when the iteration ends, and during the evaluation

@@ -62,6 +62,8 @@ def test_assessment_describes_factors(episodes):
     assert "standard deviation 0;" in dead
     assert "+1.00 with f_2" in first
     assert "+1.00 with f_1" in second
+    ranges = assess(WRONG, episodes, toy_spec(scored_observation="both")).ranges
+    assert [line.split(":")[0] for line in ranges] == ["- f_0 (before)", "- f_0 (after)"]
 
 
 def test_groups_have_intercepts(episodes):
@@ -74,12 +76,6 @@ def test_groups_have_intercepts(episodes):
     assert assessment.r2 > 0.98
     assert 0.5 < assessment.level_r2 < assessment.r2
     assert assess(RIGHT, episodes).level_r2 is None
-
-
-@pytest.mark.long
-def test_assessment_distinguishes_observations(episodes):
-    ranges = assess(WRONG, episodes, toy_spec(scored_observation="both")).ranges
-    assert [line.split(":")[0] for line in ranges] == ["- f_0 (before)", "- f_0 (after)"]
 
 
 def test_agents_that_left_do_not_count():

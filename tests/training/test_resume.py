@@ -111,14 +111,6 @@ def test_resume_many_agents_on_device_is_exact(echo_settings, echo_run, tmp_path
     assert_equal_runs(resume_quietly(tmp_path / "run"), echo_run)
 
 
-@pytest.mark.long
-def test_resume_many_agents_on_host_is_exact(hosted_settings, hosted_run, tmp_path):
-    """In the middle of an episode that the agents remember, after one of them has left."""
-    train_and_stop(HOSTED_ECHO, hosted_settings, tmp_path / "run", 40)
-    assert_equal_runs(resume_quietly(tmp_path / "run"), hosted_run)
-    assert 3 <= hosted_run.metrics()[-1]["evaluation/length"] <= 6
-
-
 HALF_EPISODES = {"rollout_steps": 10, "steps": 400, "evaluate_every": 80}
 
 

@@ -47,10 +47,8 @@ def test_wandb_gets_every_number(dense_run, tmp_path, monkeypatch):
 
     def init_and_record(**arguments):
         run = init(**arguments)
-        log = run.log
-        monkeypatch.setattr(
-            run, "log", lambda line, step: logged.append((arguments["name"], step, line)) or log(line, step=step)
-        )
+        record, log = (lambda line, step: logged.append((arguments["name"], step, line))), run.log
+        monkeypatch.setattr(run, "log", lambda line, step: record(line, step) or log(line, step=step))
         return run
 
     listener.init = init_and_record
