@@ -46,6 +46,8 @@ def resolve_named(task, settings):
         ("CN-6", {"algorithm": "qmix", "method": "rd", "capacity": 999}, ["capacity = 999", "iteration", "1000"]),
         (pick_spec(), {"algorithm": "sac"}, ["sac needs continuous actions", "ppo"]),
         (ECHO_STATE, {"method": "lare-rd-shared"}, ["lare-rd-shared", "credit_scope = 'state'"]),
+        (ECHO_STATE, {"method": "stas"}, ["stas"]),
+        (echo_spec(), {"method": "arel"}, ["arel reads whole episodes"]),
     ],
 )
 def test_resolve_refuses(task, settings, texts):
