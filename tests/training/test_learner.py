@@ -170,7 +170,7 @@ def test_assess_measures_each_team():
     factors = np.where(alive, steps.next_timestep.reward, 1e3)[..., None]
     learner = add_steps(untrained_learner(config), config, steps, factors, learn=False)
     results = {
-        name: float(value) for name, value in jitted(assess, config)(with_factor_decoders(learner, [1, -1])).items()
+        name: float(value) for name, value in jitted(assess, config)(with_factor_decoders(learner, [1.0, -1.0])).items()
     }
     assert [results[f"credit/correlation{team}"] for team in ("", "_first", "_second")] == pytest.approx([1, 1, -1])
     error = 2 * np.abs(steps.next_timestep.reward[..., 3:][alive[..., 3:]]).mean()

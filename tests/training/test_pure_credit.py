@@ -5,11 +5,12 @@ from functools import partial
 import jax
 import jax.numpy as jnp
 import numpy as np
+import optax
 import pytest
 from jax.sharding import PartitionSpec
 
 import lare_rl
-from lare_rl.credit.decoder_settings import CreditSettings
+from lare_rl.credit.decoder_settings import CreditSettings, default_credit
 from lare_rl.errors import LareError
 from lare_rl.training.pure_credit import CreditSteps, pure_credit
 
@@ -54,8 +55,8 @@ def test_phi_reads_actions_in_the_units_of_the_environment(reward):
 
 
 def test_invalid_factors_are_counted_and_not_used(phi):
-    """A step is invalid where the observation is NaN. `lare-linear` reads factors alone. Phi is part of the program."""
-    credit = pure_credit("lare-linear", phi, **SUM)
+    """A step is invalid where the observation is NaN. `lare-rrdu` reads factors alone. Phi is part of the program."""
+    credit = pure_credit("lare-rrdu", phi, **SUM, fit_updates=2)
     # Step 9 is the last one of an episode.
     is_invalid = jnp.zeros((N_STEPS, N_ENVS), bool).at[[3, 9, 14], [0, 1, 2]].set(True)
 
@@ -66,6 +67,7 @@ def test_invalid_factors_are_counted_and_not_used(phi):
 
     state = jax.jit(lambda key: train(credit, key, make=steps_of))(jax.random.key(0))
     assert int(state.n_invalid) == 90
+    assert int(optax.tree_utils.tree_get(state.learner.decoders[0].optimizer, "count")) == 30 * 2
     steps, _ = steps_of(jax.random.key(1))
     reward = jax.jit(credit.reward)
     r_hat = np.asarray(reward(state, steps))
@@ -80,12 +82,13 @@ def test_invalid_factors_are_counted_and_not_used(phi):
 
 def test_functions_are_mapped_over_seeds():
     """`vmap` within `shard_map` gives what single calls give: the rewards of many agents behind the returns."""
-    credit = pure_credit("rrdu", **SUM, agents=2, fit_updates=100)
-    make, keys = partial(make_steps, agents=(2,)), jax.random.split(jax.random.key(0), 2)
+    settings = default_credit(3).model_copy(update={"score": "sum"})
+    credit = pure_credit("bayes", **SIZES, settings=settings, agents=3)
+    make, keys = partial(make_steps, agents=(3,)), jax.random.split(jax.random.key(0), 2)
     steps, true_reward = make(jax.random.key(1))
     run = jax.jit(lambda key: credit.reward(train(credit, key, make=make), steps))
     expected = jnp.stack([run(key) for key in keys])
-    assert expected.shape == (2, N_STEPS, N_ENVS, 2)
+    assert expected.shape == (2, N_STEPS, N_ENVS, 3)
     assert np.corrcoef(expected[0].ravel(), true_reward.ravel())[0, 1] > 0.9
     mesh, spec = jax.sharding.Mesh(jax.devices()[:1], ("seeds",)), PartitionSpec("seeds")
     sharded = jax.shard_map(jax.vmap(run), mesh=mesh, in_specs=spec, out_specs=spec, check_vma=False)
